@@ -1,0 +1,26 @@
+# Two commands: `make roa` proves and checks the shipped policy, `make test` runs the suite.
+PYTHON ?= python3.11
+BIN := .venv/bin
+
+.PHONY: setup roa test lint clean
+
+setup: .venv/.installed
+
+.venv/.installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	$(BIN)/pip install -q -c constraints.txt torch
+	$(BIN)/pip install -q -c constraints.txt -e '.[controllers,test]'
+	touch $@
+
+roa: setup
+	$(BIN)/certify roa --policy examples/policies/pendulum.pt --out out/pendulum
+
+test: setup
+	$(BIN)/pytest -n 2
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+
+clean:
+	rm -rf .venv out build *.egg-info

@@ -1,0 +1,153 @@
+"""The policy file `certify-policy/1`: written and read with torch, plain tensors only.
+
+Nothing in a file is executed (`weights_only=True`), and equal policies give equal bytes: the archive is
+written through memory, so that neither a file name nor a clock enters it.
+"""
+
+from __future__ import annotations
+
+import io
+import pickle
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, cast
+
+import numpy as np
+
+from certify.errors import InputError
+from certify.policies.network import Array, Centre, Squash, TanhNetwork
+
+FORMAT = "certify-policy/1"
+_KEYS = {"format", "activation", "weights", "biases", "output", "centre", "system", "training"}
+_OPTIONAL = {"beta"}
+
+
+@dataclass(frozen=True, slots=True)
+class Policy:
+    """A network with the plant it was trained for.
+
+    Parameters
+    ----------
+    network : the policy itself.
+    system : name of the plant.
+    parameters : parameters of the plant as text or numbers (text means its decimal value).
+    training : how it was made (seed, steps, versions, A, B, K ...); never trusted, may be empty.
+    beta : rounded `atanh((u_eq - offset) / scale)` stored by another program, shape (m,), or None;
+        the proof uses the real number and reports the shift.
+    """
+
+    network: TanhNetwork
+    system: str
+    parameters: Mapping[str, float | int | str] = field(default_factory=dict)
+    training: Mapping[str, Any] = field(default_factory=dict)
+    beta: Array | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "parameters", MappingProxyType(dict(self.parameters)))
+        object.__setattr__(self, "training", MappingProxyType(dict(self.training)))
+
+
+def save_policy(path: str | Path, policy: Policy) -> None:
+    """Write `policy` to `path`; the same policy gives the same bytes."""
+    import torch
+
+    network = policy.network
+    # float32 where that loses nothing: the file is smaller, the numbers are the same.
+    arrays = (*network.weights, *network.biases, network.scale, network.offset)
+    single = all(np.array_equal(a.astype(np.float32).astype(np.float64), a) for a in arrays)
+
+    def tensor(array: Array) -> torch.Tensor:
+        return torch.tensor(array, dtype=torch.float32 if single else torch.float64)
+
+    data: dict[str, Any] = {
+        "format": FORMAT,
+        "activation": "tanh",
+        "weights": [tensor(w) for w in network.weights],
+        "biases": [tensor(b) for b in network.biases],
+        "output": {"squash": network.squash, "scale": tensor(network.scale), "offset": tensor(network.offset)},
+        "centre": network.centre,
+        "system": {"name": policy.system, "parameters": dict(policy.parameters)},
+        "training": dict(policy.training),
+    }
+    if policy.beta is not None:
+        data["beta"] = torch.tensor(policy.beta, dtype=torch.float64)
+    buffer = io.BytesIO()
+    torch.save(data, buffer)
+    Path(path).write_bytes(buffer.getvalue())
+
+
+def load_policy(path: str | Path) -> Policy:
+    """Read a policy file.
+
+    Raises
+    ------
+    InputError : the file is missing, is not an archive of plain tensors, or does not follow
+        `certify-policy/1`.
+    """
+    import torch
+
+    path = Path(path)
+    try:
+        raw = path.read_bytes()
+    except OSError as error:
+        raise InputError(f"policy file {path} cannot be read: {error.strerror}.") from error
+    try:
+        data = torch.load(io.BytesIO(raw), map_location="cpu", weights_only=True)
+    except pickle.UnpicklingError as error:
+        raise InputError(
+            f"policy file {path} must hold plain tensors only; it holds other objects or is damaged "
+            "(nothing in it was executed)."
+        ) from error
+    except Exception as error:  # torch.load has no closed list of what it raises on a damaged file
+        raise InputError(f"policy file {path} is not a file that torch.load can read: {error}.") from error
+    try:
+        return _policy(data)
+    except InputError as error:
+        raise InputError(f"policy file {path}: {error}") from error
+
+
+def _policy(data: Any) -> Policy:
+    if not isinstance(data, dict) or data.get("format") != FORMAT:
+        found = data.get("format") if isinstance(data, dict) else type(data).__name__
+        raise InputError(f"`format` must be {FORMAT!r}; found {found!r}.")
+    keys = set(data)
+    if not _KEYS - {"training"} <= keys <= _KEYS | _OPTIONAL:
+        odd = sorted(map(str, keys - _KEYS - _OPTIONAL))
+        raise InputError(f"missing keys {sorted(_KEYS - {'training'} - keys)}, unknown keys {odd}.")
+    if data["activation"] != "tanh":
+        raise InputError(f"`activation` must be 'tanh'; found {data['activation']!r}. Only tanh networks are proved.")
+    output, system, training = data["output"], data["system"], data.get("training", {})
+    if not isinstance(output, dict) or set(output) != {"squash", "scale", "offset"}:
+        raise InputError("`output` must be a dictionary with squash, scale and offset.")
+    if not isinstance(system, dict) or set(system) != {"name", "parameters"} or not isinstance(system["name"], str):
+        raise InputError("`system` must be a dictionary with name and parameters.")
+    if not isinstance(system["parameters"], dict) or not isinstance(training, dict):
+        raise InputError("`system.parameters` and `training` must be dictionaries.")
+    if not isinstance(data["weights"], list | tuple) or not isinstance(data["biases"], list | tuple):
+        raise InputError("`weights` and `biases` must be lists of tensors.")
+    network = TanhNetwork(
+        weights=tuple(_array(w, f"weights[{k}]") for k, w in enumerate(data["weights"])),
+        biases=tuple(_array(b, f"biases[{k}]") for k, b in enumerate(data["biases"])),
+        scale=_array(output["scale"], "output.scale"),
+        offset=_array(output["offset"], "output.offset"),
+        squash=cast(Squash, output["squash"]),
+        centre=cast(Centre, data["centre"]),
+    )
+    beta = _array(data["beta"], "beta") if "beta" in data else None
+    if beta is not None and (beta.shape != (network.m,) or network.centre != "preactivation"):
+        raise InputError(f"`beta` must have shape ({network.m},) and goes with centre 'preactivation'.")
+    return Policy(network, system["name"], system["parameters"], training, beta)
+
+
+def _array(value: Any, name: str) -> Array:
+    import torch
+
+    if not isinstance(value, torch.Tensor) or value.dtype not in (torch.float32, torch.float64):
+        found = value.dtype if isinstance(value, torch.Tensor) else type(value).__name__
+        raise InputError(f"`{name}` must be a float32 or float64 tensor; found {found}.")
+    if value.layout is not torch.strided:
+        raise InputError(f"`{name}` must be a dense tensor; found {value.layout}.")
+    result: Array = value.detach().to(torch.float64).numpy()
+    return result

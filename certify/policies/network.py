@@ -1,0 +1,190 @@
+"""The policy `u = pi(x)`: a tanh network with exact binary64 numbers and a centring that gives pi(0) = u_eq.
+
+`raw(x) = scale * tanh(net(x)) + offset` with squash `tanh`, or `scale * net(x) + offset` with squash
+`identity`. Centring makes pi(0) = u_eq by its form:
+
+- `output`: `pi(x) = raw(x) - raw(0) + u_eq` (the paper's step 4);
+- `preactivation`: `pi(x) = scale * tanh(net(x) - net(0) + beta) + offset` with the real number
+  `beta = atanh((u_eq - offset) / scale)`; the input never leaves `offset +- scale`;
+- `none`: pi = raw, usable only if raw(0) = u_eq holds exactly.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.errors import InputError
+
+Squash = Literal["tanh", "identity"]
+Centre = Literal["output", "preactivation", "none"]
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class TanhNetwork:
+    """Affine layers with tanh between them; float32 weights are converted, which is exact.
+
+    Parameters
+    ----------
+    weights : arrays of shape (out, in); the first `in` is n, the last `out` is m.
+    biases : arrays of shape (out,).
+    squash, centre : see the module's docstring.
+    scale, offset : arrays of shape (m,), in the input's units; scale is nonzero.
+
+    Raises
+    ------
+    InputError : shapes do not chain, a number is not finite, or an option is unknown.
+    """
+
+    weights: tuple[Array, ...]
+    biases: tuple[Array, ...]
+    scale: Array
+    offset: Array
+    squash: Squash = "tanh"
+    centre: Centre = "preactivation"
+
+    def __post_init__(self) -> None:
+        for name in ("weights", "biases"):
+            arrays = tuple(_frozen(a, name) for a in getattr(self, name))
+            object.__setattr__(self, name, arrays)
+        for name in ("scale", "offset"):
+            object.__setattr__(self, name, _frozen(getattr(self, name), name))
+        if self.squash not in get_args(Squash):
+            raise InputError(f"`squash` must be one of {get_args(Squash)}; found {self.squash!r}.")
+        if self.centre not in get_args(Centre):
+            raise InputError(f"`centre` must be one of {get_args(Centre)}; found {self.centre!r}.")
+        if self.centre == "preactivation" and self.squash != "tanh":
+            raise InputError("`centre` 'preactivation' needs `squash` 'tanh'; found 'identity'. Use 'output'.")
+        if not self.weights or len(self.weights) != len(self.biases):
+            raise InputError(
+                "a policy must have as many weights as biases, at least one; "
+                f"found {len(self.weights)} and {len(self.biases)}."
+            )
+        for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            if weight.ndim != 2 or bias.shape != weight.shape[:1] or 0 in weight.shape:
+                raise InputError(
+                    f"layer {k} must have a weight (out, in) and a bias (out,); "
+                    f"found {weight.shape} and {bias.shape}."
+                )
+            if k and weight.shape[1] != self.weights[k - 1].shape[0]:
+                raise InputError(
+                    f"layer {k} must take the {self.weights[k - 1].shape[0]} outputs of layer {k - 1}; "
+                    f"its weight has shape {weight.shape}."
+                )
+        if self.scale.shape != (self.m,) or self.offset.shape != (self.m,):
+            raise InputError(
+                f"`scale` and `offset` must have shape ({self.m},); found {self.scale.shape} and {self.offset.shape}."
+            )
+        if np.any(self.scale == 0):
+            raise InputError("`scale` must be nonzero.")
+
+    @property
+    def n(self) -> int:
+        """Number of states that the network reads."""
+        return int(self.weights[0].shape[1])
+
+    @property
+    def m(self) -> int:
+        """Number of inputs that the network commands."""
+        return int(self.weights[-1].shape[0])
+
+    @property
+    def layers(self) -> tuple[int, ...]:
+        """Widths from state to input, such as (2, 16, 16, 1)."""
+        return (self.n, *(int(w.shape[0]) for w in self.weights))
+
+    def beta(self, u_eq: Sequence[Fraction]) -> Array:
+        """`atanh((u_eq - offset) / scale)` rounded to binary64 (the proof uses the real number).
+
+        Raises
+        ------
+        InputError : u_eq does not lie strictly inside `offset +- scale`.
+        """
+        values = []
+        for u, scale, offset in zip(u_eq, self.scale, self.offset, strict=True):
+            ratio = (u - Fraction(float(offset))) / Fraction(float(scale))
+            if not -1 < ratio < 1:
+                raise InputError(
+                    f"u_eq = {float(u)} must lie strictly inside offset +- scale = {offset} +- {abs(scale)} "
+                    "for preactivation centring."
+                )
+            values.append(np.arctanh(float(ratio)))
+        return np.array(values)
+
+    def net(self, x: Any) -> Any:
+        """`net(x)`, last axis n to m, in the arithmetic of x (numpy array or torch tensor)."""
+        for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            if k:
+                x = _tanh(x)
+            x = x @ _like(weight.T, x) + _like(bias, x)
+        return x
+
+    def __call__(self, x: Any, u_eq: Sequence[Fraction]) -> Any:
+        """pi(x) in float64, shape (..., n) to (..., m); for simulation and search, not for proofs."""
+        scale, offset = _like(self.scale, x), _like(self.offset, x)
+        y = self.net(x)
+        if self.centre == "none":
+            return scale * (_tanh(y) if self.squash == "tanh" else y) + offset
+        y0 = self.net(x[..., :1, :] * 0 if x.ndim > 1 else x * 0)
+        if self.centre == "preactivation":
+            return scale * _tanh(y - y0 + _like(self.beta(u_eq), x)) + offset
+        equilibrium = _like(np.array([float(u) for u in u_eq]), x)
+        if self.squash == "tanh":
+            y, y0 = _tanh(y), _tanh(y0)
+        return scale * (y - y0) + equilibrium
+
+    def jacobian_at_origin(self, u_eq: Sequence[Fraction]) -> Array:
+        """`d pi / d x` at 0 in float64, shape (m, n)."""
+        x = np.zeros(self.n)
+        jacobian = np.eye(self.n)
+        for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            if k:
+                x = np.tanh(x)
+                jacobian = (1 - x**2)[:, None] * jacobian
+            x, jacobian = weight @ x + bias, weight @ jacobian
+        if self.squash == "tanh":
+            last = np.tanh(self.beta(u_eq) if self.centre == "preactivation" else x)
+            jacobian = (1 - last**2)[:, None] * jacobian
+        return np.asarray(self.scale[:, None] * jacobian)
+
+    def sha256(self) -> str:
+        """Hash of the canonical bytes: squash, centre, then each array's shape and little-endian binary64.
+
+        Every array (layers in order as weight, bias; then scale; then offset) contributes its number
+        of axes and its axes as unsigned 64-bit little-endian integers, then its numbers in row order.
+        """
+        digest = hashlib.sha256(b"certify-policy/1\0")
+        digest.update(f"{self.squash}\0{self.centre}\0".encode())
+        pairs = [a for pair in zip(self.weights, self.biases, strict=True) for a in pair]
+        for array in (*pairs, self.scale, self.offset):
+            digest.update(struct.pack(f"<{1 + array.ndim}Q", array.ndim, *array.shape))
+            digest.update(np.ascontiguousarray(array, dtype="<f8").tobytes())
+        return digest.hexdigest()
+
+
+def _frozen(array: Any, name: str) -> Array:
+    result = np.array(array, dtype=np.float64)
+    if not np.all(np.isfinite(result)):
+        raise InputError(f"`{name}` of the policy must be finite; found NaN or infinity.")
+    result.setflags(write=False)
+    return result
+
+
+def _tanh(x: Any) -> Any:
+    return np.tanh(x) if isinstance(x, np.ndarray) else x.tanh()
+
+
+def _like(array: Array, x: Any) -> Any:
+    if isinstance(x, np.ndarray):
+        return array
+    import torch
+
+    return torch.tensor(array, dtype=x.dtype, device=x.device)

@@ -1,0 +1,35 @@
+"""Inverted pendulum with a torque at the pivot (the paper's first example).
+
+State x = (theta, theta_dot): angle from upright in rad (unwrapped), angular rate in rad/s. Input u:
+torque in N m. `theta'' = (g/l) sin(theta) - b/(m l^2) theta' + u/(m l^2)`; upright is the origin.
+Values: mass 0.15 kg, length 0.5 m, friction 0.1 N m s, gravity 9.81 m/s^2, |u| <= 6 N m,
+domain |theta| <= 3.14 rad, |theta_dot| <= 20 rad/s.
+"""
+
+from __future__ import annotations
+
+import sympy
+
+from certify.systems.system import System, exact, symbols
+
+
+def pendulum() -> System:
+    """The inverted pendulum at its published parameters."""
+    theta, theta_dot, u, m, l, b, g = symbols(["theta", "theta_dot", "u", "m", "l", "b", "g"])
+    acceleration = g / l * sympy.sin(theta) - b / (m * l**2) * theta_dot + u / (m * l**2)
+    return System(
+        name="pendulum",
+        description="inverted pendulum with a torque at the pivot",
+        states=(theta, theta_dot),
+        inputs=(u,),
+        parameters={"m": exact("0.15"), "l": exact("0.5"), "b": exact("0.1"), "g": exact("9.81")},
+        dynamics=(theta_dot, acceleration),
+        u_eq=(sympy.Integer(0),),
+        domain=((exact("-3.14"), exact("3.14")), (exact(-20), exact(20))),
+        input_bounds=((exact(-6), exact(6)),),
+        positive=frozenset({"m", "l", "g"}),
+        units={
+            "theta": "rad", "theta_dot": "rad/s", "u": "N m",
+            "m": "kg", "l": "m", "b": "N m s", "g": "m/s^2",
+        },
+    )
