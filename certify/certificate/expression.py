@@ -1,0 +1,50 @@
+"""sympy expressions to the certificate's expression trees and back."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import sympy
+
+from certify.errors import CertificateFormatError
+
+_FUNCTIONS = {"sin": sympy.sin, "cos": sympy.cos, "tan": sympy.tan}
+
+
+def to_tree(expression: sympy.Expr) -> Any:
+    """Nested lists: a name, an exact fraction, or an operator with its operands (FORMAT.md)."""
+    if expression.is_Symbol:
+        return expression.name
+    if expression.is_Rational:
+        return str(expression)
+    arguments = [to_tree(a) for a in expression.args]
+    if expression.is_Add:
+        return ["+", *arguments]
+    if expression.is_Mul:
+        return ["*", *arguments]
+    if expression.is_Pow:
+        return ["**", arguments[0], int(expression.exp)]
+    for name, function in _FUNCTIONS.items():
+        if isinstance(expression, function):
+            return [name, arguments[0]]
+    raise CertificateFormatError(f"{expression} has no place in a certificate's grammar.")
+
+
+def from_tree(tree: Any, names: Mapping[str, sympy.Symbol]) -> sympy.Expr:
+    """The sympy expression of a tree; for pictures and summaries, not for proofs."""
+    if isinstance(tree, str):
+        return names[tree] if tree in names else sympy.Rational(tree)
+    operator, arguments = tree[0], tree[1:]
+    if operator == "**":
+        return from_tree(arguments[0], names) ** int(arguments[1])
+    values = [from_tree(a, names) for a in arguments]
+    if operator == "+":
+        return sympy.Add(*values)
+    if operator == "*":
+        return sympy.Mul(*values)
+    if operator == "-":
+        return -values[0] if len(values) == 1 else values[0] - values[1]
+    if operator == "/":
+        return values[0] / values[1]
+    return _FUNCTIONS[operator](*values)

@@ -1,0 +1,166 @@
+"""The certificate as data, its canonical writer and a reader for reports.
+
+Numbers never pass through decimal: hex floats, exact fractions, or raw little-endian bytes in base64. The reader here
+serves pictures and summaries; whether a certificate is valid is for the checker alone to say.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import sympy
+from numpy.typing import NDArray
+
+from certify.certificate.expression import from_tree, to_tree
+from certify.errors import CertificateFormatError, InputError
+from certify.policies import TanhNetwork
+from certify.systems import System
+
+Array = NDArray[np.float64]
+SCHEMA = "certify-certificate/1"
+
+
+@dataclass(frozen=True, slots=True)
+class Certificate:
+    """A claim with its evidence.
+
+    Parameters
+    ----------
+    system, network : the closed loop; parameters are already put into the equations.
+    P, T : (n, n); root : (n,) half-widths of the root box in z, x = T z.
+    local, roa : the levels c1 <= c2.
+    tree : the partition in preorder, one byte a node.
+    provenance : anything that helps people; the checker ignores it.
+    """
+
+    system: System
+    network: TanhNetwork
+    P: Array
+    T: Array
+    root: Array
+    local: float
+    roa: float
+    tree: bytes
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def to_json(self) -> str:
+        """The file's text: sorted by section, one line a section, the same bytes for the same certificate."""
+        system, network = self.system, self.network
+        sections: dict[str, Any] = {
+            "schema": SCHEMA,
+            "plant": {
+                "name": system.name,
+                "states": [s.name for s in system.states],
+                "inputs": [s.name for s in system.inputs],
+                "dynamics": [to_tree(e) for e in system.exact_dynamics()],
+                "u_eq": [str(u) for u in system.exact_u_eq()],
+                "domain": [[str(lo), str(hi)] for lo, hi in system.domain],
+                "input_bounds": [[str(lo), str(hi)] for lo, hi in system.input_bounds],
+            },
+            "policy": {
+                "layers": [
+                    {"shape": list(W.shape), "weight": _encode(W), "bias": _encode(b)}
+                    for W, b in zip(network.weights, network.biases, strict=True)
+                ],
+                "squash": network.squash,
+                "centre": network.centre,
+                "scale": _encode(network.scale),
+                "offset": _encode(network.offset),
+                "sha256": network.sha256(),
+            },
+            "lyapunov": {"P": _encode(self.P)},
+            "levels": {"local": float(self.local).hex(), "roa": float(self.roa).hex()},
+            "evidence": {
+                "kind": "partition-tree",
+                "T": _encode(self.T),
+                "root": _encode(self.root),
+                "tree": base64.b64encode(self.tree).decode("ascii"),
+            },
+            "provenance": {k: str(v) for k, v in self.provenance.items()},
+        }
+        lines = [f"{json.dumps(k)}: {json.dumps(v)}" for k, v in sections.items()]
+        return "{\n" + ",\n".join(lines) + "\n}\n"
+
+
+def write_certificate(path: Path, certificate: Certificate) -> None:
+    """Write atomically: the file is complete or absent, whatever interrupts the run.
+
+    Raises
+    ------
+    InputError : the file cannot be written.
+    """
+    temporary = path.with_name(path.name + ".partial")
+    try:
+        temporary.write_text(certificate.to_json(), encoding="utf-8")
+        os.replace(temporary, path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise InputError(f"{path} cannot be written: {error.strerror}.") from error
+
+
+def read_certificate(path: Path) -> Certificate:
+    """Read a certificate for a report or a picture. This does not check it.
+
+    Raises
+    ------
+    CertificateFormatError : the file cannot be read as a certificate.
+    """
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        if data["schema"] != SCHEMA:
+            raise CertificateFormatError(f"{path}: `schema` must be {SCHEMA!r}; found {data['schema']!r}.")
+        plant, policy, evidence = data["plant"], data["policy"], data["evidence"]
+        states, inputs = (tuple(sympy.Symbol(s) for s in plant[k]) for k in ("states", "inputs"))
+        names = {s.name: s for s in (*states, *inputs)}
+        n, m = len(states), len(inputs)
+        system = System(
+            name=plant["name"],
+            states=states,
+            inputs=inputs,
+            parameters={},
+            dynamics=tuple(from_tree(t, names) for t in plant["dynamics"]),
+            u_eq=tuple(sympy.Rational(q) for q in plant["u_eq"]),
+            domain=tuple((Fraction(lo), Fraction(hi)) for lo, hi in plant["domain"]),
+            input_bounds=tuple((Fraction(lo), Fraction(hi)) for lo, hi in plant["input_bounds"]),
+        )
+        network = TanhNetwork(
+            weights=tuple(_decode(x["weight"], tuple(x["shape"])) for x in policy["layers"]),
+            biases=tuple(_decode(x["bias"], (x["shape"][0],)) for x in policy["layers"]),
+            scale=_decode(policy["scale"], (m,)),
+            offset=_decode(policy["offset"], (m,)),
+            squash=policy["squash"],
+            centre=policy["centre"],
+        )
+        return Certificate(
+            system=system,
+            network=network,
+            P=_decode(data["lyapunov"]["P"], (n, n)),
+            T=_decode(evidence["T"], (n, n)),
+            root=_decode(evidence["root"], (n,)),
+            local=float.fromhex(data["levels"]["local"]),
+            roa=float.fromhex(data["levels"]["roa"]),
+            tree=base64.b64decode(evidence["tree"]),
+            provenance=data["provenance"],
+        )
+    except OSError as error:
+        raise CertificateFormatError(f"{path} cannot be read: {error.strerror}.") from error
+    except CertificateFormatError:
+        raise
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise CertificateFormatError(f"{path} is not a certificate: {type(error).__name__}: {error}.") from error
+
+
+def _encode(array: Array) -> str:
+    return base64.b64encode(np.ascontiguousarray(array, dtype="<f8").tobytes()).decode("ascii")
+
+
+def _decode(text: str, shape: tuple[int, ...]) -> Array:
+    return np.frombuffer(base64.b64decode(text), dtype="<f8").reshape(shape).astype(np.float64)

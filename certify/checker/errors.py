@@ -1,0 +1,15 @@
+"""The two ways in which the checker says no."""
+
+from __future__ import annotations
+
+
+class Rejected(Exception):
+    """The certificate was read and is not valid: a rule failed at a place, for a reason."""
+
+    def __init__(self, rule: str, at: str, detail: str) -> None:
+        super().__init__(f"REJECTED rule={rule} at={at}: {detail}")
+        self.rule, self.at, self.detail = rule, at, detail
+
+
+class Unreadable(Exception):
+    """The file cannot be read at all (missing, a directory, no permission)."""

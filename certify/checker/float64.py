@@ -1,0 +1,211 @@
+"""Rigorous bounds in binary64: every rounding error is bounded, in the safe direction.
+
+Conventions
+-----------
+u = 2^-53 is the unit roundoff. A computed value comes with a bound on its error that is itself computed
+in binary64, so `up` is applied to every bound: it covers the roundings made while the bound was formed.
+`up(b) = b (1 + 2^-40) + 2^-960` is safe for non-negative operands with fewer than 2^11 roundings in a row
+(2^11 u < 2^-41, and the last two roundings are those of `up` itself); longer sums go through `total`. Its
+absolute term covers underflow, at most 2^-1022 a product, for up to 2^60 products.
+
+Sums and matrix products are bounded for any order of summation and with or without fused multiply-add:
+|fl(AB) - AB| <= gamma_k |A||B| with gamma_k = k u / (1 - k u) (Higham 2002, section 3.5), and
+(|A||B|)_ij <= ||A_i:||_2 ||B_:j||_2 by Cauchy and Schwarz. `gamma` doubles k u to spare the denominator.
+
+Overflow never helps: it makes a bound infinite or NaN, and a comparison that has to hold is then False.
+
+tanh, sin and cos use a table of values on a grid of step h = 2^-5, which Arb computes at start-up, an addition
+theorem, and Taylor polynomials on |d| <= h/2 = 2^-6. No libm value is trusted.
+"""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+from flint import arb, ctx, fmpq
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+U = 2.0**-53
+EPS = 2.0**-50  # covers up to eight roundings of one coefficient
+TINY = 2.0**-960
+_STEP = 2.0**-5
+_TANH_END = 20.0  # 1 - tanh(20) < 2^-56
+_ANGLE_END = 64.0  # beyond, sin and cos are only known to lie in [-1, 1]
+ELEMENTARY = 2.0**-49  # error of tanh, sin and cos relative to the sum of their terms
+
+
+def up(bound: Any) -> Any:
+    """An upper bound of the exact value that the non-negative `bound` was computed for."""
+    return bound * (1 + 2.0**-40) + TINY
+
+
+def gamma(k: int) -> float:
+    """Bound of gamma_{k+2}: relative error of a sum of k products, or of a norm of k numbers."""
+    return 2 * (k + 2) * U
+
+
+def total(array: Any, axis: int) -> Any:
+    """An upper bound of the sum of non-negative numbers along an axis, for any order of summation."""
+    return up(np.sum(array, axis=axis) * (1 + gamma(array.shape[axis])))
+
+
+def norm(array: Any, axis: int) -> Any:
+    """An upper bound of the 2-norm along an axis."""
+    return up(np.sqrt(total(array * array, axis)))
+
+
+def float_with_error(q: Fraction) -> tuple[float, float]:
+    """The binary64 number nearest to q, and an upper bound of the distance; infinite if q is too large."""
+    try:
+        value = float(q)
+        return value, 0.0 if Fraction(value) == q else up(float(abs(Fraction(value) - q)))
+    except OverflowError:
+        return np.inf, np.inf
+
+
+def arb_with_error(x: arb) -> tuple[float, float]:
+    """A binary64 number and an upper bound of its distance from every point of the ball x."""
+    value = float(x.mid())
+    return value, up(float((x - arb(value)).abs_upper()))
+
+
+def atanh_with_error(q: Fraction) -> tuple[float, float]:
+    """`atanh(q)` for a rational q in (-1, 1)."""
+    return arb_with_error(arb(fmpq(q.numerator, q.denominator)).atanh())
+
+
+def _table(function: str, end: float) -> tuple[Array, ...]:
+    """Binary64 numbers nearest to function(k h), k = 0 .. end/h; for tanh, 1 - tanh^2 as well."""
+    points = [arb(k) / 32 for k in range(int(end / _STEP) + 1)]
+    if function == "tanh":
+        values = [x.tanh() for x in points]
+        columns = [values, [1 - t * t for t in values]]
+    else:
+        columns = [[x.sin() for x in points], [x.cos() for x in points]]
+    result = []
+    for column in columns:
+        pairs = [arb_with_error(x) for x in column]
+        # At 128 bits the midpoint rounds to within u |value| (1 + 2^-50) of the ball.
+        if any(error > U * abs(value) * (1 + 2.0**-20) + 4 * TINY for value, error in pairs):
+            raise ArithmeticError("a table entry is not accurate to one rounding")
+        result.append(np.array([value for value, _ in pairs]))
+    return tuple(result)
+
+
+def _tables() -> tuple[Array, ...]:
+    ctx.prec = 128
+    return (*_table("tanh", _TANH_END), *_table("sin", _ANGLE_END))
+
+
+_TANH, _SECH2, _SIN, _COS = _tables()
+
+
+def _split(y: Array, end: float) -> tuple[Any, Array]:
+    """Index k and remainder d with y = k h + d exactly, |d| <= h/2, for 0 <= y <= end.
+
+    k h has at most 11 bits. If k = 0, d = y. Otherwise y >= h/2, so d is a multiple of ulp(y) >= 2^-58 with
+    |d| <= 2^-6: it has at most 53 bits, and the subtraction is exact.
+    """
+    k = np.rint(y * (1 / _STEP))
+    return k.astype(np.intp), y - k * _STEP
+
+
+def tanh(y: Array) -> tuple[Array, Array]:
+    """(t, e) with |tanh(y) - t| <= e for every finite y; NaN where y is not finite.
+
+    With k and d from `_split`, `tanh(kh + d) = T + (1 - T^2) s / (1 + T s)`, T = tanh(kh), s = tanh(d).
+    s = d - d^3/3 + 2 d^5/15 - 17 d^7/315 + 62 d^9/2835 + r: the series alternates and its terms decrease
+    for |d| <= 2^-6, so |r| <= 1382/155925 |d|^11 <= 2^-66 |d|. Horner's rule on d^2 <= 2^-12 gives s with a relative
+    error of 4u; the quotient adds 6u and T and 1 - T^2 come with u each, the last addition with u: the error is at
+    most 12u |quotient| + 2u |T| + u |t| <= 2^-49 (|T| + |quotient|). For y > 20 the value 1 is within 2^-56.
+    """
+    finite = np.isfinite(y)
+    a = np.where(finite, np.minimum(np.abs(y), _TANH_END), 0.0)
+    k, d = _split(a, _TANH_END)
+    w = d * d
+    s = d + d * (w * (-1 / 3 + w * (2 / 15 + w * (-17 / 315 + w * (62 / 2835)))))
+    T = _TANH[k]
+    quotient = _SECH2[k] * s / (1 + T * s)
+    error = ELEMENTARY * (T + np.abs(quotient)) + TINY
+    return np.where(finite, np.copysign(T + quotient, y), np.nan), np.where(finite, error, np.nan)
+
+
+def sin_cos(y: Array) -> tuple[Array, Array, Array]:
+    """(s, c, e) with |sin(y) - s| <= e and |cos(y) - c| <= e; NaN where y is not finite.
+
+    Angle addition on the same grid; the Taylor polynomials of degree 9 and 8 at |d| <= 2^-6 leave
+    out less than |d|^11 / 11! <= 2^-91 and |d|^10 / 10! <= 2^-81. For |y| > 64: s = c = 0, e = 1.
+    """
+    finite, near = np.isfinite(y), np.abs(y) <= _ANGLE_END
+    k, d = _split(np.where(near, np.abs(y), 0.0), _ANGLE_END)
+    w = d * d
+    sd = d + d * (w * (-1 / 6 + w * (1 / 120 + w * (-1 / 5040 + w * (1 / 362880)))))
+    cd = 1 + w * (-1 / 2 + w * (1 / 24 + w * (-1 / 720 + w * (1 / 40320))))
+    S, C = _SIN[k], _COS[k]
+    s = np.copysign(1.0, y) * (S * cd + C * sd)
+    c = C * cd - S * sd
+    error = ELEMENTARY * (np.abs(S) + np.abs(C) + np.abs(sd)) + TINY
+    s, c, error = (np.where(near, v, far) for v, far in ((s, 0.0), (c, 0.0), (error, 1.0)))
+    return tuple(np.where(finite, v, np.nan) for v in (s, c, error))  # type: ignore[return-value]
+
+
+def frobenius_norm(G: Array) -> float:
+    """An upper bound of ||G||_F."""
+    return float(norm(norm(G, 0), 0))
+
+
+def spectral_norm(W: Array) -> float:
+    """An upper bound of ||W||_2 by repeated squaring.
+
+    ||G||_2^2 = ||G'G||_2 <= ||fl(G'G)||_2 + gamma_k ||G||_F^2. Six squarings leave the Frobenius norm at the end,
+    which is at most n^(1/128) times too large. G is divided by a power of two first, which is exact
+    but for underflow.
+    """
+    G = W if W.shape[0] >= W.shape[1] else W.T
+    steps: list[tuple[float, float]] = []
+    for _ in range(6):
+        frobenius = frobenius_norm(G)
+        if not frobenius < np.inf:
+            return np.inf
+        scale = math.ldexp(1.0, math.frexp(frobenius)[1])
+        G = G / scale
+        error = up(gamma(G.shape[0]) * up((frobenius / scale) ** 2)) + G.size * TINY
+        G = G.T @ G
+        steps.append((scale, error))
+    bound = frobenius_norm(G)
+    for scale, error in reversed(steps):
+        bound = float(up(scale * up(np.sqrt(up(bound + error)))))
+    return bound
+
+
+def self_test() -> None:
+    """Fail closed unless this machine rounds to nearest even and keeps subnormal numbers.
+
+    Raises
+    ------
+    ArithmeticError : a rounding mode other than nearest, flushed subnormals, or a matrix product whose
+        error exceeds its bound.
+    """
+    one = np.full(64, 1.0)
+    least = np.full(64, 2.0**-1022)
+    good = (
+        np.all(one + U == 1.0)
+        and np.all(one + 3 * U == 1.0 + 4 * U)
+        and np.all(-one - U == -1.0)
+        and np.all(one - U / 2 == 1.0)
+        and np.all((least * 0.5) * 2 == least)
+        and np.all(np.sqrt(one * 2) == float.fromhex("0x1.6a09e667f3bcdp+0"))
+        and np.all(one / 3 == float.fromhex("0x1.5555555555555p-2"))
+    )
+    A, B = np.random.default_rng(0).integers(-(2**53), 2**53, (2, 12, 12)).astype(np.float64)
+    product, bound = A @ B, gamma(12) * norm(A, 1)[:, None] * norm(B, 0)[None, :]
+    for i, row in enumerate(A.astype(np.int64).tolist()):
+        for j, column in enumerate(B.T.astype(np.int64).tolist()):
+            exact = sum(x * y for x, y in zip(row, column, strict=True))
+            good = good and abs(int(product[i, j]) - exact) <= bound[i, j]
+    if not good:
+        raise ArithmeticError("this machine's binary64 arithmetic is not IEEE round-to-nearest with subnormals")

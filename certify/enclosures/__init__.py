@@ -1,0 +1,12 @@
+"""Bounds on boxes in batched torch float64: Taylor models of the plant, affine forms of the policy.
+
+Untrusted: the checker repeats the proof with its own code. Rounding is still accounted for, so that what is proved
+here is accepted there.
+"""
+
+from __future__ import annotations
+
+from certify.enclosures.policy import PolicyEnclosure
+from certify.enclosures.taylor import Taylor, evaluate, upper_bound
+
+__all__ = ["PolicyEnclosure", "Taylor", "evaluate", "upper_bound"]

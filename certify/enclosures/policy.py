@@ -1,0 +1,121 @@
+"""The policy on a box: affine in the box coordinates, with an error of second order.
+
+Each layer is an affine form in d plus the errors made so far. tanh is relaxed by two parallel lines; errors pass
+forwards through |W| to give the next layer's range, and one backward pass sums each layer's fresh error times the
+magnitude of its weight at the output, so that errors cancel through W as they do in truth.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from certify.closed_loop import ClosedLoop
+from certify.enclosures.taylor import EPS, TINY
+
+_LIBM = 2.0**-47  # error allowed to torch.tanh, relative to 1
+
+
+class PolicyEnclosure:
+    """Affine enclosures of pi over batches of boxes, on the device that holds its weights."""
+
+    def __init__(self, loop: ClosedLoop, device: torch.device) -> None:
+        network = loop.network
+
+        def tensor(array: object) -> Tensor:
+            return torch.tensor(array, dtype=torch.float64, device=device)
+
+        self.weights = [tensor(w) for w in network.weights]
+        self.magnitudes = [w.abs() for w in self.weights]
+        self.biases = [tensor(b) for b in network.biases]
+        self.rows = [w.norm(dim=1) for w in self.weights]
+        self.squash = network.squash == "tanh"
+        self.scale, self.offset = tensor(network.scale), tensor(network.offset)
+        origin = torch.zeros(network.n, dtype=torch.float64, device=device)
+        u_eq = tensor([float(u) for u in loop.u_eq])
+        if network.centre == "preactivation":
+            self.biases[-1] = self.biases[-1] - network.net(origin) + tensor(network.beta(loop.u_eq))
+        elif network.centre == "output":
+            last = network.net(origin)
+            self.offset = u_eq - self.scale * (last.tanh() if self.squash else last)
+
+    def __call__(self, x: Tensor, x_error: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Enclose the policy for states `x[:, 0] + x[:, 1:] d` within x_error.
+
+        Parameters
+        ----------
+        x : (n, n + 1, B); x_error : (n, B)
+
+        Returns
+        -------
+        mid (m, B), slopes (m, n, B), error (m, B), share (n, B) : share says how much each axis spreads the
+            first layer, which is where a split reduces the error.
+        """
+        n, batch = x.shape[0], x.shape[2]
+        h, error = x, x_error
+        share = torch.ones(n, batch, dtype=x.dtype, device=x.device) / n
+        passed: list[tuple[Tensor, Tensor | None, Tensor]] = []
+        for k, W in enumerate(self.weights):
+            last = k == len(self.weights) - 1
+            width = W.shape[1]
+            y = (W @ h.reshape(width, -1)).reshape(-1, n + 1, batch)
+            y[:, 0] += self.biases[k][:, None]
+            rounding = (width + 2) * EPS * self.rows[k][:, None] * h.norm(dim=0).sum(0)
+            rounding = rounding + 8 * EPS * (y[:, 0].abs() + self.biases[k].abs()[:, None]) + TINY
+            error = self.magnitudes[k] @ error * (1 + width * EPS) + rounding
+            if last and not self.squash:
+                passed.append((W, None, rounding))
+                h = y
+                break
+            spreads = y[:, 1:].abs()
+            spread = spreads.sum(1)
+            slope, shift, gap = relax_tanh(y[:, 0], (spread + error) * (1 + n * EPS))
+            fresh = gap + slope * rounding + EPS * (slope * (y[:, 0].abs() + spread) + shift.abs()) + TINY
+            if k == 0:
+                share = (gap[:, None] * spreads / (spread[:, None] + TINY)).sum(0) + TINY
+                share = share / share.sum(0)
+            h = slope[:, None] * y
+            h[:, 0] += shift
+            error = slope * error + fresh
+            passed.append((W, slope, fresh))
+        through = self.scale[:, None] * h[:, 0]
+        mid, slopes = through + self.offset[:, None], self.scale[:, None, None] * h[:, 1:]
+        rounding = 4 * EPS * (through.abs() + self.offset.abs()[:, None] + slopes.abs().sum(1)) + TINY
+        return mid, slopes, (rounding + self._error_backwards(passed, x_error)) * (1 + 1e-12), share
+
+    def _error_backwards(self, passed: list[tuple[Tensor, Tensor | None, Tensor]], x_error: Tensor) -> Tensor:
+        m, batch = len(self.scale), x_error.shape[1]
+        weight = torch.diag(self.scale)[:, :, None].expand(m, m, batch)
+        result = torch.zeros(m, batch, dtype=x_error.dtype, device=x_error.device)
+        for W, slope, fresh in reversed(passed):
+            result = result + (weight.abs() * fresh[:, None]).sum(0)
+            through = weight if slope is None else slope[:, None] * weight
+            weight = (W.T @ through.reshape(len(W), -1)).reshape(-1, m, batch)
+        return result + (weight.abs() * x_error[:, None]).sum(0)
+
+
+def relax_tanh(centre: Tensor, radius: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Parallel lines: (s, m, gap) with |tanh(y) - s y - m| <= gap for |y - centre| <= radius.
+
+    s is near the chord's slope. With D(y) = tanh(y) - s y, concavity on y >= 0 puts D below its tangent at any p >= 0, and
+    convexity on y <= 0 puts the rest below the ends; D is odd.
+    """
+    radius = radius * (1 + EPS) + EPS * centre.abs() + TINY
+    lo, hi = centre - radius, centre + radius
+    t_lo, t_hi, t = lo.tanh(), hi.tanh(), centre.tanh()
+    slope = torch.where(radius > 1e-4, (t_hi - t_lo) / (hi - lo), 1 - t * t).clamp(0.0, 1.0)
+    critical = torch.atanh((1 - slope).clamp(0.0, 1 - EPS).sqrt())
+
+    def supremum(lo: Tensor, hi: Tensor, t_lo: Tensor, t_hi: Tensor) -> Tensor:
+        start = lo.clamp(min=0.0)
+        p = torch.minimum(torch.maximum(critical, start), hi)
+        t = p.tanh()
+        excess = 1 - t * t - slope
+        rise = torch.maximum(excess * (start - p), excess * (hi - p)) + _LIBM * (hi - start)
+        ends = torch.maximum(t_lo - slope * lo, t_hi - slope * hi)
+        return torch.where(hi > 0, torch.maximum(ends, t - slope * p + rise), ends) + _LIBM
+
+    upper = supremum(lo, hi, t_lo, t_hi)
+    lower = -supremum(-hi, -lo, -t_hi, -t_lo)
+    gap = (upper - lower) / 2 + EPS * (upper.abs() + lower.abs() + slope * (centre.abs() + radius)) + TINY
+    return slope, (upper + lower) / 2, gap

@@ -1,0 +1,1 @@
+"""Engines: how obligations are proved or refuted. None is trusted; the checker decides."""

@@ -1,0 +1,146 @@
+"""The falsifier: the lowest V at which Vdot >= 0, or at which the input leaves its bounds.
+
+Samples of the ellipsoid are improved by descending V along Vdot >= 0: a violating point is scaled towards the origin as
+far as it stays violating, and a gradient step on Vdot moves it to where it can be scaled further. A reported
+witness is shown in Arb; the search itself proves nothing.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from certify.obligations import Obligations
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Witness:
+    """A state `x` (n,) at which `kind` ("vdot" or "input") is violated; `level` is V(x)."""
+
+    x: Array
+    level: float
+    kind: str
+
+
+def falsify(obligations: Obligations, limit: float, samples: int = 20_000, seed: int = 0) -> Witness | None:
+    """Search {V <= limit} for the lowest violation; None if none was found."""
+    search = _Search(obligations)
+    generator = np.random.default_rng(seed)
+    n = obligations.loop.system.n
+    direction = generator.standard_normal((samples, n))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    # Half of the samples on the boundary, where violations usually begin, half spread over the levels.
+    radius = np.where(np.arange(samples) % 2 == 0, 1.0, generator.random(samples))
+    z = direction * (radius * np.sqrt(limit) * (1 - 1e-9))[:, None]
+    best = search.lowest(z)
+    if best is None:  # climb Vdot on the boundary before giving up
+        z = search.climb(z[:: max(1, samples // 512)], limit)
+        best = search.lowest(z)
+    return best
+
+
+def confirm(obligations: Obligations, witness: Witness) -> bool:
+    """True if the violation at the witness's binary64 point is shown in Arb."""
+    loop = obligations.loop
+    if witness.kind == "vdot":
+        return bool(np.any(witness.x != 0)) and loop.evaluate_vdot(obligations.P, witness.x) >= 0
+    for u, (lo, hi) in zip(loop.evaluate_policy(witness.x), loop.system.input_bounds, strict=True):
+        if u * lo.denominator < lo.numerator or u * hi.denominator > hi.numerator:
+            return True
+    return False
+
+
+class _Search:
+    def __init__(self, obligations: Obligations) -> None:
+        self.obligations = obligations
+        self.loop = obligations.loop
+        self.f = self.loop.system.function("torch")
+        self.P, self.T = (torch.tensor(a, dtype=torch.float64) for a in (obligations.P, obligations.T))
+        bounds = self.loop.system.input_bounds
+        self.lo = torch.tensor([float(b[0]) for b in bounds], dtype=torch.float64)
+        self.hi = torch.tensor([float(b[1]) for b in bounds], dtype=torch.float64)
+        self.check_inputs = not obligations.inputs_bounded_by_form
+
+    def violation(self, z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """(Vdot, how far the worst input lies outside its bounds) at x = T z, shapes (B,)."""
+        x = z @ self.T.T
+        u = self.loop.policy(x)
+        vdot = 2 * ((x @ self.P) * self.f(x, u)).sum(-1)
+        return vdot, torch.maximum(self.lo - u, u - self.hi).amax(-1)
+
+    def bad(self, z: torch.Tensor) -> torch.Tensor:
+        vdot, excess = self.violation(z)
+        return (vdot >= 0) | (excess > 0) if self.check_inputs else vdot >= 0
+
+    def lowest(self, start: Array) -> Witness | None:
+        """The lowest violation reached from the points `start` (B, n)."""
+        with torch.no_grad():
+            z = torch.tensor(start, dtype=torch.float64)
+            z = z[self.bad(z)]
+        if len(z) == 0:
+            return None
+        for _ in range(40):
+            with torch.no_grad():
+                z = self._shrink(z)
+                z = z[torch.argsort((z * z).sum(-1))][:64]
+            z = self._slide(z)
+        with torch.no_grad():
+            z = self._shrink(z)
+        # The binary64 state is what counts: pull outwards until the violation is certain there.
+        for point in z[torch.argsort((z * z).sum(-1))]:
+            for factor in (1.0, 1 + 1e-12, 1 + 1e-9, 1 + 1e-6):
+                x = (self.T @ (factor * point)).numpy()
+                for kind in ("vdot", "input"):
+                    witness = Witness(x, float(x @ self.obligations.P @ x), kind)
+                    if (kind == "vdot" or self.check_inputs) and confirm(self.obligations, witness):
+                        return witness
+        return None
+
+    def climb(self, start: Array, limit: float) -> Array:
+        """Gradient ascent of Vdot on the sphere V = limit."""
+        z = torch.tensor(start, dtype=torch.float64)
+        radius = np.sqrt(limit) * (1 - 1e-9)
+        step = 0.1
+        for _ in range(60):
+            z = z.detach().requires_grad_(True)
+            vdot, excess = self.violation(z)
+            value = (vdot / (z * z).sum(-1)).sum() + (excess.sum() if self.check_inputs else 0.0)
+            (gradient,) = torch.autograd.grad(value, z)
+            with torch.no_grad():
+                direction = gradient / (gradient.norm(dim=-1, keepdim=True) + 1e-300)
+                moved = z + step * radius * direction
+                z = radius * moved / moved.norm(dim=-1, keepdim=True)
+            step *= 0.95
+        result: Array = z.detach().numpy()
+        return result
+
+    def _shrink(self, z: torch.Tensor) -> torch.Tensor:
+        """Scale each violating point to the smallest violating multiple found by bisection."""
+        low, high = torch.zeros(len(z), 1, dtype=z.dtype), torch.ones(len(z), 1, dtype=z.dtype)
+        for _ in range(45):
+            middle = (low + high) / 2
+            bad = self.bad(middle * z)[:, None]
+            low, high = torch.where(bad, low, middle), torch.where(bad, middle, high)
+        return high * z
+
+    def _slide(self, z: torch.Tensor) -> torch.Tensor:
+        """Move along the sphere in the direction that raises the violation; keep only points that stay bad."""
+        z = z.detach().requires_grad_(True)
+        vdot, excess = self.violation(z)
+        value = torch.where(vdot >= 0, vdot, excess) if self.check_inputs else vdot
+        (gradient,) = torch.autograd.grad(value.sum(), z)
+        with torch.no_grad():
+            norm = z.norm(dim=-1, keepdim=True)
+            tangent = gradient - (gradient * z).sum(-1, keepdim=True) / norm**2 * z
+            tangent = tangent / (tangent.norm(dim=-1, keepdim=True) + 1e-300)
+            candidates = [z.detach()]
+            for size in (0.3, 0.1, 0.03, 0.01, 1e-3, 1e-4):
+                moved = z + size * norm * tangent
+                moved = moved * (norm / moved.norm(dim=-1, keepdim=True))
+                candidates.append(moved[self.bad(moved)])
+            return torch.cat(candidates)

@@ -1,0 +1,8 @@
+"""Quadratic Lyapunov functions `V(x) = x'Px`: candidates, coordinates, level sets."""
+
+from __future__ import annotations
+
+from certify.lyapunov.candidates import solve_lyapunov
+from certify.lyapunov.level_sets import diagonalising_coordinates, domain_limit, extents, semi_axes, volume
+
+__all__ = ["diagonalising_coordinates", "domain_limit", "extents", "semi_axes", "solve_lyapunov", "volume"]

@@ -1,0 +1,336 @@
+"""`certify_roa`: from a policy to a checked certificate. The one module that knows everybody.
+
+Nothing is PROVED before the checker, run as a process of its own, has accepted the bytes that were written.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.certificate import Certificate, write_certificate
+from certify.closed_loop import ClosedLoop
+from certify.engines.falsify import Witness, confirm, falsify
+from certify.engines.local import prove_local
+from certify.errors import BackendError, InputError, SoundnessError
+from certify.lyapunov import diagonalising_coordinates, domain_limit, extents, semi_axes, solve_lyapunov, volume
+from certify.obligations import Obligations
+from certify.policies import TanhNetwork
+from certify.systems import System
+from certify.verdict import Verdict
+
+Array = NDArray[np.float64]
+Candidate = Literal["lyapunov", "lqr"]
+Progress = Callable[[str, float, int], None]
+_BELOW = 1e-9  # relative distance from a limit that is itself out of reach (the domain's open condition)
+
+
+@dataclass(frozen=True, slots=True)
+class RoaOptions:
+    """How to certify.
+
+    Parameters
+    ----------
+    candidate : `lyapunov` solves `A'P + PA = -Q`; `lqr` takes `Q + K'RK` in the place of Q.
+    Q, R : diagonals of the weights, shapes (n,) and (m,); None means ones.
+    P : a Lyapunov matrix of one's own, (n, n); overrides the candidate.
+    level : prove exactly this level; None finds the largest.
+    device : where boxes are bounded, `cpu` or `cuda`.
+    time_limit : seconds for the ring.
+    max_boxes : boxes for the ring.
+    """
+
+    candidate: Candidate = "lyapunov"
+    Q: tuple[float, ...] | None = None
+    R: tuple[float, ...] | None = None
+    P: Array | None = None
+    level: float | None = None
+    device: str = "cpu"
+    time_limit: float = 600.0
+    max_boxes: int = 4_000_000
+
+    def __post_init__(self) -> None:
+        if self.candidate not in get_args(Candidate):
+            raise InputError(f"`candidate` must be one of {get_args(Candidate)}; found {self.candidate!r}.")
+        if self.level is not None and not (math.isfinite(self.level) and self.level > 0):
+            raise InputError(f"`level` must be a positive number; found {self.level}.")
+        if not self.time_limit > 0 or not self.max_boxes > 0:
+            raise InputError("`time_limit` and `max_boxes` must be positive.")
+
+
+@dataclass(frozen=True, slots=True)
+class RoaResult:
+    """What was proved. `reason` says what limits the level, or why nothing was proved.
+
+    `levels` has local (c1), roa (c2), sampled_limit and domain_limit; absent values are None. `checker` is what the
+    checker said, None if it was not reached.
+    """
+
+    verdict: Verdict
+    reason: str
+    system: System
+    network: TanhNetwork
+    P: Array | None = None
+    levels: Mapping[str, float | None] = field(default_factory=dict)
+    witness: Witness | None = None
+    eigenvalues: tuple[str, ...] = ()
+    boxes: int = 0
+    leaves: int = 0
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    certificate: Path | None = None
+    checker: Mapping[str, Any] | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """The JSON object of `certify roa --json`."""
+        level = self.levels.get("roa")
+        P = self.P
+        known = P is not None and level is not None
+        return {
+            "schema": "certify-roa/1",
+            "verdict": self.verdict.value,
+            "reason": self.reason,
+            "system": self.system.name,
+            "parameters": {name: str(q) for name, q in self.system.parameters.items()},
+            "policy": {"sha256": self.network.sha256(), "layers": list(self.network.layers)},
+            "lyapunov": {"P": None if P is None else P.tolist()},
+            "levels": {k: self.levels.get(k) for k in ("local", "roa", "sampled_limit", "domain_limit")},
+            "witness": None if self.witness is None else {
+                "x": self.witness.x.tolist(), "V": self.witness.level, "kind": self.witness.kind,
+            },
+            "eigenvalues": list(self.eigenvalues),
+            "volume": volume(P, level) if known else None,  # type: ignore[arg-type]
+            "semi_axes": semi_axes(P, level).tolist() if known else None,  # type: ignore[arg-type]
+            "extents": extents(P, level).tolist() if known else None,  # type: ignore[arg-type]
+            "engine": "bounds",
+            "boxes": self.boxes,
+            "leaves": self.leaves,
+            "seconds": {
+                k: self.seconds.get(k) for k in ("load", "candidate", "local", "ring", "write", "check", "total")
+            },
+            "certificate": None if self.certificate is None else str(self.certificate),
+            "checked": None if self.checker is None else self.checker.get("result"),
+        }  # fmt: skip
+
+
+class _Stopwatch:
+    def __init__(self, load: float) -> None:
+        self.seconds: dict[str, float] = {"load": load}
+        self.start = time.perf_counter()
+        self.load = load
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        begin = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
+
+    def total(self) -> dict[str, float]:
+        return {**self.seconds, "total": self.load + time.perf_counter() - self.start}
+
+
+def certify_roa(
+    system: System,
+    network: TanhNetwork,
+    out: Path,
+    options: RoaOptions | None = None,
+    *,
+    load_seconds: float = 0.0,
+    provenance: Mapping[str, Any] | None = None,
+    progress: Progress | None = None,
+) -> RoaResult:
+    """Certify a region of attraction of `system` under `network`.
+
+    Parameters
+    ----------
+    system, network : the closed loop.
+    out : folder for `certificate.json`; it is made if it is not there.
+    options : see `RoaOptions`.
+    load_seconds : time already spent on reading, for the report.
+    provenance : entries for the certificate that the checker ignores.
+    progress : called with (stage, level proved so far, boxes).
+
+    Returns
+    -------
+    RoaResult : PROVED only if the checker accepted the certificate.
+
+    Raises
+    ------
+    InputError : the closed loop or an option cannot be used, or `out` cannot be written.
+    BackendError : the checker process failed.
+    SoundnessError : the checker rejects what the engine proved.
+    """
+    options = options or RoaOptions()
+    watch = _Stopwatch(load_seconds)
+    loop = ClosedLoop(system, network)
+    _make_folder(out)
+
+    with watch.stage("candidate"):
+        A, _, K = loop.linearise()
+        unstable = _unstable(loop, A)
+        if unstable is not None:
+            verdict, reason, eigenvalues = unstable
+            return RoaResult(
+                verdict, reason, system, network, eigenvalues=eigenvalues, seconds=watch.total()
+            )
+        P = _candidate(options, A, K)
+        obligations = Obligations(loop, P, diagonalising_coordinates(P, A))
+        limit = domain_limit(P, system.domain)
+    levels: dict[str, float | None] = {"domain_limit": limit}
+
+    def unfinished(verdict: Verdict, reason: str, witness: Witness | None = None, boxes: int = 0) -> RoaResult:
+        return RoaResult(
+            verdict, reason, system, network, P, levels, witness, boxes=boxes, seconds=watch.total()
+        )
+
+    if options.level is not None and options.level >= limit:
+        return unfinished(
+            Verdict.REFUTED if options.level > limit * (1 + _BELOW) else Verdict.UNKNOWN,
+            f"domain: {{V <= {options.level:g}}} leaves the domain, whose limit is {limit:.12g}",
+        )
+    top = options.level if options.level is not None else limit * (1 - _BELOW)
+    with watch.stage("ring"):
+        witness = falsify(obligations, top)
+    if witness is not None:
+        levels["sampled_limit"] = witness.level
+        if options.level is not None:
+            return unfinished(Verdict.REFUTED, _describe(witness, system), witness)
+        top = witness.level * (1 - 1e-3)
+    with watch.stage("local"):
+        inner = prove_local(obligations, top)
+    if inner is None:
+        return unfinished(Verdict.UNKNOWN, "local: the linearisation does not dominate on any ball; try another --Q")
+
+    import torch
+
+    from certify.engines.branch_and_bound import Budget, prove_ring
+
+    with watch.stage("ring"):
+        if progress is not None:
+            progress("ring", inner, 0)
+        ring = prove_ring(
+            obligations, inner, top, Budget(boxes=options.max_boxes, seconds=options.time_limit),
+            torch.device(options.device),
+            None if progress is None else lambda level, boxes: progress("ring", level, boxes),
+        )  # fmt: skip
+    if options.level is not None and ring.level < options.level:
+        levels["local"] = inner
+        missed = f"{ring.reason}: proved only up to V <= {ring.level:.12g}, not {options.level:g}"
+        if ring.reason == "witness":
+            found = falsify(obligations, options.level, samples=200_000, seed=1)
+            if found is not None:
+                levels["sampled_limit"] = found.level
+                return unfinished(Verdict.REFUTED, _describe(found, system), found, ring.boxes)
+        return unfinished(Verdict.UNKNOWN, missed, boxes=ring.boxes)
+
+    if ring.reason == "requested" and options.level is None:
+        reason = "domain" if witness is None else ("inputs" if witness.kind == "input" else "witness")
+    else:
+        reason = ring.reason
+    levels |= {"local": inner, "roa": ring.level}
+    certificate = Certificate(
+        system, network, P, obligations.T, ring.root, inner, ring.level, ring.tree, provenance or {}
+    )
+    path = out / "certificate.json"
+    with watch.stage("write"):
+        write_certificate(path, certificate)
+    with watch.stage("check"):
+        answer = run_checker(path)
+    if answer["result"] != "ACCEPTED":
+        raise SoundnessError(
+            f"the checker rejects what the engine proved: {answer}. The certificate {path} reproduces it."
+        )
+    return RoaResult(
+        Verdict.PROVED, reason, system, network, P, levels, witness,
+        boxes=ring.boxes, leaves=ring.leaves, seconds=watch.total(), certificate=path, checker=answer,
+    )  # fmt: skip
+
+
+def run_checker(path: Path) -> dict[str, Any]:
+    """Run the checker on a file in a process of its own and return its JSON answer.
+
+    Raises
+    ------
+    BackendError : it ended with neither ACCEPTED nor REJECTED.
+    """
+    command = [sys.executable, "-I", "-m", "certify.checker", str(path), "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    try:
+        answer = json.loads(done.stdout)
+    except json.JSONDecodeError:
+        answer = {}
+    expected = {"ACCEPTED": 0, "REJECTED": 1}.get(answer.get("result", ""))
+    if expected is None or done.returncode != expected:
+        raise BackendError(
+            f"the checker ended with status {done.returncode} and no verdict: "
+            f"{answer.get('error', done.stderr.strip()[-300:])}"
+        )
+    return dict(answer)
+
+
+def _make_folder(out: Path) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        probe = out / ".certify-write-test"
+        probe.write_bytes(b"")
+        probe.unlink()
+    except OSError as error:
+        raise InputError(f"output folder {out} cannot be written: {error.strerror}.") from error
+
+
+def _unstable(loop: ClosedLoop, A: Array) -> tuple[Verdict, str, tuple[str, ...]] | None:
+    """REFUTED or UNKNOWN with the eigenvalues, or None if the spectrum is rigorously stable."""
+    enclosures = loop.eigenvalues()
+    if enclosures is None:
+        approximate = tuple(f"{v:.6g}" for v in np.linalg.eigvals(A))
+        if np.max(np.linalg.eigvals(A).real) < 0:
+            return None  # nearly multiple eigenvalues: the local proof decides
+        return Verdict.UNKNOWN, f"spectrum: eigenvalues {', '.join(approximate)} touch the axis", approximate
+    shown = tuple(f"{complex(v.mid()):.6g}" for v in enclosures)
+    if any(v.real > 0 for v in enclosures):
+        return Verdict.REFUTED, f"unstable linearisation: eigenvalues {', '.join(shown)}", shown
+    if not all(v.real < 0 for v in enclosures):
+        return Verdict.UNKNOWN, f"spectrum: eigenvalues {', '.join(shown)} touch the axis", shown
+    return None
+
+
+def _candidate(options: RoaOptions, A: Array, K: Array) -> Array:
+    n, m = A.shape[0], K.shape[0]
+    if options.P is not None:
+        P = np.array(options.P, dtype=np.float64)
+        if P.shape != (n, n) or not np.all(np.isfinite(P)) or not np.all(np.linalg.eigvalsh((P + P.T) / 2) > 0):
+            raise InputError(f"`P` must be a symmetric positive definite matrix of shape ({n}, {n}).")
+        return P
+    Q, R = _weights(options.Q, n, "Q"), _weights(options.R, m, "R")
+    if options.candidate == "lqr":
+        M = K.T @ R @ K
+        Q = Q + (M + M.T) / 2
+    return solve_lyapunov(A, Q)
+
+
+def _weights(diagonal: tuple[float, ...] | None, count: int, name: str) -> Array:
+    values = np.ones(count) if diagonal is None else np.array(diagonal, dtype=np.float64)
+    if values.shape != (count,) or not np.all(np.isfinite(values)) or not np.all(values > 0):
+        raise InputError(f"`{name}` must have {count} positive numbers; found {diagonal}.")
+    return np.diag(values)
+
+
+def _describe(witness: Witness, system: System) -> str:
+    names = ", ".join(f"{s} = {v:.6g}" for s, v in zip(system.states, witness.x, strict=True))
+    what = "Vdot >= 0" if witness.kind == "vdot" else "the input leaves its bounds"
+    return f"witness: {what} at {names} with V = {witness.level:.12g} (shown in Arb)"
+
+
+__all__ = ["RoaOptions", "RoaResult", "certify_roa", "confirm", "run_checker"]
