@@ -1,0 +1,155 @@
+"""Simulators of `certify.systems`: a batched stepper and gymnasium environments over the same equations.
+
+The plant that is trained on is the plant that is proved: nothing here restates an equation, and nothing else
+in this package reads one. An action is held over `dt` and the state moves by one classical Runge-Kutta step
+of order four, in float64; angles are never wrapped.
+
+Importing this module registers `certify/<plant>-v0` for each plant with a preset:
+
+>>> import gymnasium
+>>> environment = gymnasium.make("certify/pendulum-v0")
+>>> state, _ = environment.reset(seed=0)
+>>> state.dtype, environment.action_space
+(dtype('float64'), Box(-6.0, 6.0, (1,), float64))
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.errors import InputError
+from certify.systems import System, get_system
+from controllers.options import PRESETS, TrainingOptions, preset
+
+Array = NDArray[np.float64]
+Module = Literal["numpy", "torch"]
+
+
+def rk4(f: Callable[[Any], Any], x: Any, h: float) -> Any:
+    """One classical Runge-Kutta step of `xdot = f(x)`, numpy or torch, any leading shape."""
+    k1 = f(x)
+    k2 = f(x + (h / 2) * k1)
+    k3 = f(x + (h / 2) * k2)
+    k4 = f(x + h * k3)
+    return x + (h / 6) * (k1 + 2 * k2 + 2 * k3 + k4)
+
+
+class Stepper:
+    """The plant in discrete time, `x+ = F(x, u)`: zero-order hold over `dt`, RK4, batched.
+
+    Parameters
+    ----------
+    system : the plant.
+    dt : seconds for which u is held.
+    module : arithmetic of the arguments, numpy arrays or torch tensors.
+
+    Notes
+    -----
+    Called with x (..., n) and u (..., m) it returns x+ (..., n); with torch it can be differentiated.
+    u is used as given: clipping is the environment's business.
+    """
+
+    def __init__(self, system: System, dt: float, module: Module = "torch") -> None:
+        if not dt > 0:
+            raise InputError(f"`dt` must be positive; found {dt}.")
+        self.dt = dt
+        self._f = system.function(module)
+
+    def __call__(self, x: Any, u: Any) -> Any:
+        return rk4(lambda state: self._f(state, u), x, self.dt)
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """The state of an environment, enough to continue an episode exactly."""
+
+    x: tuple[float, ...]
+    elapsed: int
+
+
+class PlantEnvironment(gymnasium.Env):  # type: ignore[misc]  # gymnasium is untyped here
+    """A plant as a gymnasium environment.
+
+    Observation: the raw, unwrapped state in float64. Action: the physical input; outside its bounds it is
+    clipped, as an actuator would. Reward: `r0 - x'Q_r x` at the state reached, less `c` when that state lies
+    outside the domain, which is `terminated`; the time limit is `truncated`.
+
+    Parameters
+    ----------
+    system : the plant.
+    options : `dt`, `horizon`, `start`, and the reward's numbers.
+
+    Raises
+    ------
+    InputError : Q_r does not have one weight a state.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  # gymnasium's own signature
+
+    def __init__(self, system: System, options: TrainingOptions) -> None:
+        options.check_sizes(system)
+        self.system = system
+        self.options = options
+        self._step = Stepper(system, options.dt, "numpy")
+        self._lo, self._hi = np.array(system.domain, dtype=np.float64).T
+        self._u_lo, self._u_hi = np.array(system.input_bounds, dtype=np.float64).T
+        self._Q_r = np.array(options.reward_weights)
+        # The last observation of an episode lies outside the domain, so the space is unbounded.
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (system.n,), np.float64)
+        self.action_space = gymnasium.spaces.Box(self._u_lo, self._u_hi, dtype=np.float64)
+        self._x = np.zeros(system.n)
+        self._elapsed = 0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Array, dict[str, Any]]:
+        """Start uniformly in the share `start` of the domain, or in a ball with `options={"radius": eta}`."""
+        super().reset(seed=seed)
+        radius = None if options is None else options.get("radius")
+        if radius is None:
+            share = self.options.start
+            self._x = self.np_random.uniform(share * self._lo, share * self._hi)
+        else:
+            self._x = _uniform_in_ball(self.np_random, self.system.n, float(radius))
+        self._elapsed = 0
+        return self._x.copy(), {}
+
+    def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
+        """Hold `action` for dt."""
+        u = np.clip(np.asarray(action, dtype=np.float64), self._u_lo, self._u_hi)
+        x = self._x = self._step(self._x, u)
+        self._elapsed += 1
+        terminated = bool(((x < self._lo) | (x > self._hi)).any())
+        reward = self.options.reward_offset - float((self._Q_r * x * x).sum())
+        if terminated:
+            reward -= self.options.penalty
+        return x.copy(), reward, terminated, self._elapsed >= self.options.horizon, {}
+
+    def snapshot(self) -> Snapshot:
+        """Where the episode stands; the random generator is `np_random` and is saved by its owner."""
+        return Snapshot(tuple(self._x.tolist()), self._elapsed)
+
+    def restore(self, snapshot: Snapshot) -> None:
+        """Continue from `snapshot`."""
+        self._x, self._elapsed = np.array(snapshot.x), snapshot.elapsed
+
+
+def make_environment(name: str) -> PlantEnvironment:
+    """The registered plant `name` with its preset options."""
+    return PlantEnvironment(get_system(name), preset(name))
+
+
+def _uniform_in_ball(generator: np.random.Generator, n: int, radius: float) -> Array:
+    direction = generator.standard_normal(n)
+    length = radius * generator.uniform() ** (1 / n)
+    return np.asarray(direction * (length / np.linalg.norm(direction)))
+
+
+for _name in PRESETS:
+    gymnasium.register(f"certify/{_name}-v0", entry_point=make_environment, kwargs={"name": _name})

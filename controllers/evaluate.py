@@ -1,0 +1,234 @@
+"""How well a policy controls its plant, by simulation: figures for a report, never a proof.
+
+A run has *settled* when ||x|| < 1e-6 throughout the last second of 60 s. It is simulated twice from the same
+initial states: with the policy evaluated at every Runge-Kutta stage, in steps that resolve the fastest
+eigenvalue of the closed loop, and with the action held over the training step.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from certify.errors import InputError
+from certify.policies import Policy
+from certify.systems import System, get_system
+from controllers.environments import Stepper, rk4
+
+Array = NDArray[np.float64]
+
+INITIAL_STATES: dict[str, tuple[float, ...]] = {"pendulum": (math.pi / 2, 2.0)}
+"""Half-widths of the box from which each plant's initial states are drawn, in the states' units."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EvaluationOptions:
+    """How a policy is judged.
+
+    Parameters
+    ----------
+    states : number of initial states, uniform in the plant's box of `INITIAL_STATES`.
+    seed : of the initial states.
+    duration, window : seconds simulated, and the last seconds in which the state must stay small.
+    tolerance : bound on ||x|| in the window.
+    resolution : step of the continuous simulation, as a multiple of 1 / (fastest eigenvalue's modulus).
+    """
+
+    states: int = 1000
+    seed: int = 0
+    duration: float = 60.0
+    window: float = 1.0
+    tolerance: float = 1e-6
+    resolution: float = 0.2
+
+    def __post_init__(self) -> None:
+        for name in ("states", "duration", "window", "tolerance", "resolution"):
+            if not 0 < getattr(self, name) < math.inf:
+                raise InputError(f"`{name}` must be positive and finite; found {getattr(self, name)}.")
+        if self.seed < 0 or self.window > self.duration:
+            raise InputError("`seed` must be at least 0 and `window` at most `duration`.")
+
+
+@dataclass(frozen=True, slots=True)
+class Settling:
+    """One simulation of all initial states.
+
+    `largest` is the largest ||x|| of any run in the window; `left_domain` counts runs that were outside the
+    domain at some step. `cost` is the integral of `x'Q x + (u - u_eq)'R (u - u_eq)`, median over the runs.
+    """
+
+    settled: int
+    states: int
+    largest: float
+    left_domain: int
+    cost: float
+    step: float
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """Figures of one policy. A, B, K are the learned ones of its record; NaN where the record has none."""
+
+    system: str
+    sha256: str
+    gain_distance: float
+    gain_relative: float
+    A_relative_error: float
+    B_relative_error: float
+    eigenvalues: tuple[complex, ...]
+    continuous: Settling
+    held: Settling
+
+    def as_json(self) -> dict[str, Any]:
+        """Plain values; NaN and infinity become None."""
+
+        def settling(s: Settling) -> dict[str, Any]:
+            return {"settled": s.settled, "states": s.states, "largest": _finite(s.largest),
+                    "left_domain": s.left_domain, "cost": _finite(s.cost), "step": s.step}
+
+        return {
+            "system": self.system,
+            "policy": {"sha256": self.sha256},
+            "gain": {"distance": _finite(self.gain_distance), "relative": _finite(self.gain_relative)},
+            "identification": {"A": _finite(self.A_relative_error), "B": _finite(self.B_relative_error)},
+            "eigenvalues": [[e.real, e.imag] for e in self.eigenvalues],
+            "continuous": settling(self.continuous),
+            "held": settling(self.held),
+        }
+
+
+def evaluate(policy: Policy, options: EvaluationOptions | None = None) -> Evaluation:
+    """Simulate `policy` on the plant that it names and compare it with its learned gain.
+
+    Raises
+    ------
+    InputError : the plant is unknown or has no box of initial states, the sizes of policy and plant differ,
+        or the record lacks what the held simulation needs (`dt`, weights).
+    """
+    options = options or EvaluationOptions()
+    system = get_system(policy.system).with_parameters(policy.parameters)
+    network = policy.network
+    if (network.n, network.m) != (system.n, system.m):
+        raise InputError(
+            f"the policy must map {system.n} states to {system.m} inputs for {system.name}; "
+            f"it maps {network.n} to {network.m}."
+        )
+    if system.name not in INITIAL_STATES:
+        raise InputError(f"no box of initial states is known for the plant {system.name}.")
+    dt = _recorded(policy, "dt", ())
+    if not dt > 0:
+        raise InputError(f"`training.dt` of the policy must be positive; found {dt}.")
+    Q = np.asarray(_recorded(policy, "state_weights", (system.n,)))
+    R = np.asarray(_recorded(policy, "input_weights", (system.m,)))
+
+    u_eq = system.exact_u_eq()
+    equilibrium = np.array([float(u) for u in u_eq])
+    half_widths = np.array(INITIAL_STATES[system.name])
+    x0 = np.random.default_rng(options.seed).uniform(-half_widths, half_widths, (options.states, system.n))
+
+    def pi(x: Array) -> Array:
+        return np.asarray(network(x, u_eq))
+
+    def cost(x: Array, u: Array) -> Array:
+        return np.asarray((Q * x * x).sum(-1) + (R * (u - equilibrium) ** 2).sum(-1))
+
+    def flow(x: Array, _: Array) -> Array:
+        return np.asarray(rk4(lambda y: f(y, pi(y)), x, h))
+
+    eigenvalues = np.linalg.eigvals(_closed_loop_jacobian(system, policy))
+    fastest = float(np.abs(eigenvalues).max())
+    h = min(dt, options.resolution / fastest) if fastest > 0 else dt
+    f, hold = system.function("numpy"), Stepper(system, dt, "numpy")
+    domain = np.array(system.domain, dtype=np.float64)
+    with np.errstate(over="ignore", invalid="ignore"):  # a run that diverges is a result, not an accident
+        continuous = _simulate(_Loop(flow, h, pi, cost, domain), x0, options)
+        held = _simulate(_Loop(hold, dt, pi, cost, domain), x0, options)
+
+    distance = relative = A_error = B_error = math.nan
+    if {"A", "B", "K"} <= set(policy.training):
+        n, m = system.n, system.m
+        A, B, K = (_recorded(policy, *entry) for entry in (("A", (n, n)), ("B", (n, m)), ("K", (m, n))))
+        distance = float(np.linalg.norm(network.jacobian_at_origin(u_eq) + K))
+        relative = distance / float(np.linalg.norm(K))
+        A_true, B_true = discrete_linearisation(system, dt)
+        A_error = float(np.linalg.norm(A - A_true) / np.linalg.norm(A_true))
+        B_error = float(np.linalg.norm(B - B_true) / np.linalg.norm(B_true))
+    return Evaluation(
+        system=system.name, sha256=network.sha256(), gain_distance=distance, gain_relative=relative,
+        A_relative_error=A_error, B_relative_error=B_error,
+        eigenvalues=tuple(complex(e) for e in eigenvalues), continuous=continuous, held=held,
+    )
+
+
+def discrete_linearisation(system: System, dt: float) -> tuple[Array, Array]:
+    """A and B of the simulator itself at (0, u_eq): what least squares should have found."""
+    stepper = Stepper(system, dt, "torch")
+    x = torch.zeros(system.n, dtype=torch.float64)
+    u = torch.tensor([float(v) for v in system.exact_u_eq()], dtype=torch.float64)
+    A, B = torch.autograd.functional.jacobian(stepper, (x, u))  # type: ignore[no-untyped-call]
+    return A.numpy(), B.numpy()
+
+
+def _closed_loop_jacobian(system: System, policy: Policy) -> Array:
+    f, u_eq = system.function("torch"), system.exact_u_eq()
+    x = torch.zeros(system.n, dtype=torch.float64)
+    jacobian = torch.autograd.functional.jacobian(  # type: ignore[no-untyped-call]
+        lambda y: f(y, policy.network(y, u_eq)), x
+    )
+    return np.asarray(jacobian)
+
+
+@dataclass(frozen=True, slots=True)
+class _Loop:
+    """A closed loop in steps of h seconds: x, pi(x) to the next x, and what is measured on the way."""
+
+    step: Callable[[Array, Array], Array]
+    h: float
+    pi: Callable[[Array], Array]
+    cost: Callable[[Array, Array], Array]
+    domain: Array
+
+
+def _simulate(loop: _Loop, x: Array, options: EvaluationOptions) -> Settling:
+    h, domain = loop.h, loop.domain
+    count = math.ceil(options.duration / h - 1e-9)
+    window_begins = count - math.ceil(options.window / h - 1e-9)
+    largest = np.zeros(len(x))
+    outside = np.zeros(len(x), dtype=bool)
+    accumulated = np.zeros(len(x))
+    for k in range(count + 1):
+        if k >= window_begins:
+            norm = np.linalg.norm(x, axis=1)
+            largest = np.maximum(largest, np.where(np.isnan(norm), math.inf, norm))
+        outside |= ~((x >= domain[:, 0]) & (x <= domain[:, 1])).all(axis=1)
+        if k < count:
+            u = loop.pi(x)
+            accumulated += h * loop.cost(x, u)
+            x = loop.step(x, u)
+    return Settling(
+        settled=int((largest < options.tolerance).sum()), states=len(x), largest=float(largest.max()),
+        left_domain=int(outside.sum()), cost=float(np.median(accumulated)), step=h,
+    )
+
+
+def _recorded(policy: Policy, name: str, shape: Sequence[int]) -> Any:
+    """`training[name]`, which is not trusted: finite numbers of the given shape, or InputError."""
+    try:
+        value = np.array(policy.training[name], dtype=np.float64)
+    except KeyError as error:
+        raise InputError(f"the policy's `training` record must have {name!r}.") from error
+    except (TypeError, ValueError) as error:
+        raise InputError(f"`training.{name}` of the policy must hold numbers.") from error
+    if value.shape != tuple(shape) or not np.all(np.isfinite(value)):
+        raise InputError(f"`training.{name}` must hold finite numbers of shape {tuple(shape)}.")
+    return float(value) if not shape else value
+
+
+def _finite(value: float) -> float | None:
+    return value if math.isfinite(value) else None

@@ -1,0 +1,148 @@
+"""The LQR gain of an unknown plant: A, then B, by least squares on transitions near the origin; then K.
+
+Near the equilibrium `x+ = A x + B (u - u_eq)`. Transitions with zero action, u = u_eq, show A alone; B is
+then fitted to what A leaves unexplained. K solves the *discrete* Riccati equation at the training step, and
+the control law is `u = u_eq - K x`: the Jacobian of a matching policy is -K (the paper writes +K, with the
+other sign in K).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.errors import InputError
+
+Array = NDArray[np.float64]
+
+
+def fit_A(x: Array, x_next: Array) -> Array:
+    """Least-squares A of `x+ = A x`; rows of `x` and `x_next` (N, n) are transitions with u = u_eq.
+
+    >>> fit_A(np.array([[1.0, 0.0], [0.0, 2.0]]), np.array([[1.0, 3.0], [4.0, 0.0]]))
+    array([[1., 2.],
+           [3., 0.]])
+    """
+    return _least_squares(x, x_next, "A")
+
+
+def fit_B(x: Array, v: Array, x_next: Array, A: Array) -> Array:
+    """Least-squares B of `x+ - A x = B v` given A; `v = u - u_eq` has shape (N, m)."""
+    return _least_squares(v, x_next - x @ A.T, "B")
+
+
+def riccati_gain(A: Array, B: Array, Q: Array, R: Array) -> Array:
+    """K (m, n) of `u = -K x` that minimises the sum of `x'Q x + u'R u` along `x+ = A x + B u`.
+
+    Raises
+    ------
+    InputError : the Riccati equation has no stabilising solution.
+    """
+    import control
+
+    try:
+        K, _, eigenvalues = control.dlqr(A, B, Q, R)
+    except (np.linalg.LinAlgError, control.ControlArgument, ValueError) as error:
+        raise InputError(f"the discrete Riccati equation has no stabilising solution: {error}.") from error
+    if not np.all(np.abs(eigenvalues) < 1):
+        raise InputError(f"the LQR loop must be stable; its eigenvalues are {eigenvalues}.")
+    return np.asarray(K, dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class Identified:
+    """What was learned of the plant: `x+ = A x + B (u - u_eq)` and the gain K for it."""
+
+    A: Array
+    B: Array
+    K: Array
+
+
+Phase = Literal["A", "B", "idle"]
+
+
+class GainLearner:
+    """Collects transitions in the ball ||x|| <= eta and keeps the gain up to date: A always before B.
+
+    A round first asks for `n_A` transitions with zero action, then for `n_B` with the actor's actions;
+    `refresh` starts the next round, and the gain of the last complete round stays in force until then.
+
+    Parameters
+    ----------
+    eta : radius of the ball, in the units of the states.
+    n_A, n_B : transitions that fit A and B.
+    Q, R : LQR weights, shapes (n, n) and (m, m).
+    """
+
+    def __init__(self, eta: float, n_A: int, n_B: int, Q: Array, R: Array) -> None:
+        n, m = len(Q), len(R)
+        if n_A < n or n_B < m:
+            raise InputError(f"`n_A` and `n_B` must be at least {n} and {m}; found {n_A} and {n_B}.")
+        self.eta, self.n_A, self.n_B, self.Q, self.R = eta, n_A, n_B, Q, R
+        self.phase: Phase = "A"
+        self.identified: Identified | None = None
+        self._A: Array | None = None
+        self._rows: list[tuple[Array, Array, Array]] = []
+
+    def inside(self, x: Array) -> bool:
+        """Whether x lies in the ball."""
+        return bool(x @ x <= self.eta**2)
+
+    def observe(self, x: Array, v: Array, x_next: Array) -> None:
+        """Take one transition, v = u - u_eq; it counts when x is in the ball and the phase asks for it."""
+        if self.phase == "idle" or not self.inside(x) or (self.phase == "A" and np.any(v != 0)):
+            return
+        self._rows.append((x, v, x_next))
+        if self.phase == "A" and len(self._rows) >= self.n_A:
+            states, _, successors = self._stacked()
+            self._A = fit_A(states, successors)
+            self._begin("B")
+        elif self.phase == "B" and len(self._rows) >= self.n_B and self._A is not None:
+            states, inputs, successors = self._stacked()
+            B = fit_B(states, inputs, successors, self._A)
+            self.identified = Identified(self._A, B, riccati_gain(self._A, B, self.Q, self.R))
+            self._begin("idle")
+
+    def refresh(self) -> None:
+        """Start a new round with A; a round that is under way goes on."""
+        if self.phase == "idle":
+            self._begin("A")
+
+    def state(self) -> dict[str, Any]:
+        """Plain values for a checkpoint."""
+        found = self.identified
+        return {
+            "phase": self.phase,
+            "A": None if self._A is None else self._A.tolist(),
+            "rows": [[part.tolist() for part in row] for row in self._rows],
+            "identified": None if found is None else [found.A.tolist(), found.B.tolist(), found.K.tolist()],
+        }
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Continue from `state()`."""
+        self.phase = state["phase"]
+        self._A = None if state["A"] is None else np.array(state["A"])
+        self._rows = [(np.array(x), np.array(v), np.array(y)) for x, v, y in state["rows"]]
+        found = state["identified"]
+        self.identified = None if found is None else Identified(*(np.array(part) for part in found))
+
+    def _begin(self, phase: Phase) -> None:
+        self.phase = phase
+        self._rows = []
+
+    def _stacked(self) -> tuple[Array, Array, Array]:
+        x, v, x_next = zip(*self._rows, strict=True)
+        return np.array(x), np.array(v), np.array(x_next)
+
+
+def _least_squares(regressors: Array, targets: Array, name: str) -> Array:
+    solution, _, rank, _ = np.linalg.lstsq(regressors, targets, rcond=None)
+    if rank < regressors.shape[1]:
+        raise InputError(
+            f"the transitions do not determine {name}: they span {rank} of {regressors.shape[1]} directions. "
+            "Collect more of them, or from a larger ball."
+        )
+    return np.asarray(solution.T)

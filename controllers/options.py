@@ -1,0 +1,136 @@
+"""What a training run may choose: one frozen dataclass, which is also the command line, and a preset a plant.
+
+Numbers that the paper fixes are defaults of `TrainingOptions`; numbers that depend on the plant have no
+default there and come from `PRESETS`. All of them are written into the policy's `training` record.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+from typing import Annotated, Any, Literal, get_args
+
+from certify.errors import InputError
+from certify.systems import System
+
+Centre = Literal["preactivation", "output"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrainingOptions:
+    """Everything that a run of SAC with a learned LQR gain depends on, beside the plant.
+
+    Weights are the diagonals of Q_r, Q_c (one entry a state) and R_c (one entry an input).
+
+    Raises
+    ------
+    InputError : a number is out of its range; the message names it.
+    """
+
+    # The run
+    steps: Annotated[int, "Environment steps of the whole run."]
+    seed: Annotated[int, "Seed of everything random."] = 0
+    threads: Annotated[int, "Threads of torch; networks this small are fastest with one."] = 1
+    # The task
+    dt: Annotated[float, "Seconds for which an action is held, integrated by one RK4 step."]
+    horizon: Annotated[int, "Steps after which an episode is truncated."]
+    start: Annotated[float, "Episodes start uniformly in this share of the domain."] = 1.0
+    reward_offset: Annotated[float, "r0 of the reward r0 - x'Q_r x."]
+    reward_weights: Annotated[tuple[float, ...], "Diagonal of Q_r."]
+    penalty: Annotated[float, "c: subtracted from the reward when the state leaves the domain."]
+    # Soft actor-critic
+    learning_rate: Annotated[float, "Step of Adam, actor and critics."] = 3e-4
+    gamma: Annotated[float, "Discount factor."] = 0.99
+    replay: Annotated[int, "Transitions that the replay buffer holds."] = 1_000_000
+    batch: Annotated[int, "Transitions in a gradient step."] = 256
+    tau: Annotated[float, "Weight of the newest value network in its averaged target."] = 0.005
+    reward_scale: Annotated[float, "Factor on the reward, the inverse temperature."] = 2.0
+    warm_up: Annotated[int, "First steps, with uniform random actions and without gradient steps."] = 1000
+    actor: Annotated[tuple[int, ...], "Hidden widths of the actor."]
+    critic: Annotated[tuple[int, ...], "Hidden widths of the value and Q networks."]
+    anneal: Annotated[float, "Last share of the run in which the actor's step falls linearly to zero."] = 0.2
+    # The stabilising part
+    eta: Annotated[float, "Radius of the ball in which transitions identify A and B, in the states' units."]
+    n_A: Annotated[int, "Transitions with zero action that fit A."]
+    n_B: Annotated[int, "Transitions with actions that fit B given A."]
+    refresh: Annotated[int, "Steps between two identifications."]
+    gain_weight: Annotated[float, "Weight of ||J_mu(0) + K|| + ||mu(0) - u_eq|| in the actor's loss."]
+    state_weights: Annotated[tuple[float, ...], "Diagonal of Q_c, the LQR's state weights."]
+    input_weights: Annotated[tuple[float, ...], "Diagonal of R_c, the LQR's input weights."]
+    centre: Annotated[Centre, "How the mean action is centred: preactivation or output."] = "preactivation"
+
+    def __post_init__(self) -> None:
+        for name in ("steps", "threads", "dt", "horizon", "learning_rate", "replay", "batch", "reward_scale"):
+            self._require(name, getattr(self, name) > 0, "positive")
+        for name in ("eta", "n_A", "n_B", "refresh"):
+            self._require(name, getattr(self, name) > 0, "positive")
+        for name in ("seed", "penalty", "gain_weight", "warm_up"):
+            self._require(name, getattr(self, name) >= 0, "at least 0")
+        self._require("seed", self.seed < 2**63, "below 2^63")
+        for name in ("gamma", "anneal"):
+            self._require(name, 0 <= getattr(self, name) < 1, "in [0, 1)")
+        for name in ("tau", "start"):
+            self._require(name, 0 < getattr(self, name) <= 1, "in (0, 1]")
+        for name in ("actor", "critic"):
+            widths = getattr(self, name)
+            self._require(name, bool(widths) and all(w > 0 for w in widths), "positive widths, at least one")
+        for name in ("reward_weights", "state_weights"):
+            self._require(name, all(w >= 0 for w in getattr(self, name)), "at least 0")
+        self._require("input_weights", all(w > 0 for w in self.input_weights), "positive")
+        self._require("centre", self.centre in get_args(Centre), f"one of {get_args(Centre)}")
+        for option in fields(self):
+            value = getattr(self, option.name)
+            numbers = value if isinstance(value, tuple) else (value,)
+            self._require(option.name, all(map(_finite, numbers)), "finite")
+
+    def _require(self, name: str, holds: bool, requirement: str) -> None:
+        if not holds:
+            raise InputError(f"`{name}` must be {requirement}; found {getattr(self, name)!r}.")
+
+    def check_sizes(self, system: System) -> None:
+        """Raise InputError unless there is one weight a state and one an input."""
+        sizes = {"reward_weights": system.n, "state_weights": system.n, "input_weights": system.m}
+        for name, size in sizes.items():
+            self._require(name, len(getattr(self, name)) == size, f"{size} numbers for {system.name}")
+
+    def record(self) -> dict[str, Any]:
+        """All options as plain values, for the policy file and for checkpoints."""
+        values = {option.name: getattr(self, option.name) for option in fields(self)}
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
+
+
+def _finite(value: object) -> bool:
+    return not isinstance(value, float) or math.isfinite(value)
+
+
+PRESETS: dict[str, TrainingOptions] = {
+    "pendulum": TrainingOptions(
+        steps=40_000,
+        dt=0.02,
+        horizon=250,
+        reward_offset=1.0,
+        reward_weights=(1.0, 0.1),
+        penalty=100.0,
+        actor=(16, 16),
+        critic=(64, 64),
+        eta=0.1,
+        n_A=200,
+        n_B=200,
+        refresh=10_000,
+        gain_weight=3.0,
+        state_weights=(1.0, 0.5),
+        input_weights=(1.0,),
+    ),
+}
+
+
+def preset(name: str) -> TrainingOptions:
+    """The options that the plant `name` trains with unless told otherwise.
+
+    Raises
+    ------
+    InputError : no such plant.
+    """
+    if name not in PRESETS:
+        raise InputError(f"no training options for the plant {name!r}; known are {', '.join(PRESETS)}.")
+    return PRESETS[name]

@@ -1,0 +1,287 @@
+"""Soft actor-critic with a value network, and an actor that is tied to an LQR gain.
+
+The algorithm of Haarnoja et al. (2018, first version: a value network V with an exponentially averaged
+target, twin Q networks, temperature 1, rewards scaled), as Algorithm 1 of "Stochastic Reinforcement Learning
+with Stability Guarantees for Control of Unknown Nonlinear Systems" uses it. One gradient step minimises
+
+    V:      (V(x) - [min_i Q_i(x, u~) - log pi(u~|x)])^2,     u~ sampled from the actor
+    Q_i:    (Q_i(x, u) - [scale * r + gamma * V_target(x+)])^2
+    actor:  log pi(u~|x) - min_i Q_i(x, u~)  +  weight * (||J_mu(0) + K|| + ||mu(0) - u_eq||)
+
+where the last term is there once a gain K is known; mu is the mean action in physical units. Everything
+is float32, as is the exported policy; the states' factors are powers of two, so that folding them into the
+first layer rounds nothing and the exported network is the trained one bit for bit.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any, cast
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor, nn
+
+from certify.errors import InputError
+from certify.policies import TanhNetwork
+from certify.systems import System
+from controllers.options import Centre, TrainingOptions
+
+Array = NDArray[np.float64]
+
+LOG_STD_RANGE = (-5.0, 2.0)
+
+
+def squashed_log_likelihood(w: Tensor, mean: Tensor, log_std: Tensor, scale: Tensor) -> Tensor:
+    """Log density of `u = scale * tanh(w) + offset` with w ~ N(mean, exp(log_std)^2), summed over inputs.
+
+    The change of variables subtracts `log |du/dw| = log scale + log(1 - tanh(w)^2)`, here in the form
+    `2 (log 2 - w - softplus(-2 w))`, which does not cancel for large w.
+    """
+    gaussian = -0.5 * ((w - mean) * torch.exp(-log_std)) ** 2 - log_std - 0.5 * math.log(2 * math.pi)
+    stretch = torch.log(scale) + 2 * (math.log(2) - w - nn.functional.softplus(-2 * w))
+    return (gaussian - stretch).sum(-1)
+
+
+class Squash:
+    """The plant as the learner knows it: `u = scale * tanh(w) + offset`, u_eq, and factors on the states."""
+
+    def __init__(self, system: System) -> None:
+        u_lo, u_hi = np.array(system.input_bounds, dtype=np.float64).T
+        lo, hi = np.array(system.domain, dtype=np.float64).T
+        u_eq = np.array([float(u) for u in system.exact_u_eq()])
+        if not np.all((u_lo < u_eq) & (u_eq < u_hi)):
+            raise InputError(f"u_eq of {system.name} must lie inside the input bounds; found {u_eq}.")
+        self.scale, self.offset, self.u_eq = (u_hi - u_lo) / 2, (u_hi + u_lo) / 2, u_eq
+        self.state_factors = 0.5 ** np.round(np.log2(np.maximum(-lo, hi)))
+
+    def to_action(self, normalised: Array) -> Array:
+        """Physical input of `tanh(w)`."""
+        return np.asarray(self.scale * normalised + self.offset)
+
+    def to_normalised(self, u: Array) -> Array:
+        """`tanh(w)` of a physical input."""
+        return np.asarray((u - self.offset) / self.scale)
+
+
+class Actor(nn.Module):
+    """Tanh Gaussian policy; the network's mean head alone is the policy that ships.
+
+    Parameters
+    ----------
+    squash : the action's scale and offset, and the states' factors.
+    widths : hidden widths.
+    centre : how the mean will be centred; decides which Jacobian is compared with -K.
+    """
+
+    scale: Tensor
+    offset: Tensor
+    u_eq: Tensor
+    factors: Tensor
+    rest: Tensor
+
+    def __init__(self, squash: Squash, widths: Sequence[int], centre: Centre) -> None:
+        super().__init__()
+        n, m = len(squash.state_factors), len(squash.scale)
+        sizes = [n, *widths]
+        self.hidden = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(sizes))
+        self.mean = nn.Linear(sizes[-1], m)
+        self.log_std = nn.Linear(sizes[-1], m)
+        self.centre = centre
+        for name in ("scale", "offset", "u_eq"):
+            self.register_buffer(name, torch.tensor(getattr(squash, name), dtype=torch.float32))
+        self.register_buffer("factors", torch.tensor(squash.state_factors, dtype=torch.float32))
+        self.register_buffer("rest", torch.tensor(squash.to_normalised(squash.u_eq), dtype=torch.float32))
+
+    def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Mean and log standard deviation of w, before the squash."""
+        h = x * self.factors
+        for layer in self.hidden:
+            h = torch.tanh(layer(h))
+        return self.mean(h), self.log_std(h).clamp(*LOG_STD_RANGE)
+
+    def sample(self, x: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
+        """`tanh(w)` and the log-likelihood of the physical input, with `noise` ~ N(0, 1)."""
+        mean, log_std = self(x)
+        w = mean + torch.exp(log_std) * noise
+        return torch.tanh(w), squashed_log_likelihood(w, mean, log_std, self.scale)
+
+    def at_origin(self) -> tuple[Tensor, Tensor]:
+        """mu(0), shape (m,), and J_mu(0), shape (m, n), of the mean action; both can be differentiated.
+
+        Notes
+        -----
+        The Jacobian is the one of the *centred* mean, which ships. With preactivation centring its last slope
+        is taken at u_eq and not at mu(0); the two agree once mu(0) = u_eq.
+        """
+        h = torch.zeros_like(self.factors)
+        jacobian = torch.diag(self.factors)
+        for layer in self._layers():
+            h = torch.tanh(layer(h))
+            jacobian = (1 - h * h)[:, None] * (layer.weight @ jacobian)
+        normalised = torch.tanh(self.mean(h))
+        last = self.rest if self.centre == "preactivation" else normalised
+        jacobian = (self.scale * (1 - last * last))[:, None] * (self.mean.weight @ jacobian)
+        return self.scale * normalised + self.offset, jacobian
+
+    def gain_loss(self, K: Tensor) -> Tensor:
+        """`||J_mu(0) + K|| + ||mu(0) - u_eq||`, Frobenius norm; the sign is that of u = u_eq - K x."""
+        mean, jacobian = self.at_origin()
+        loss: Tensor = torch.linalg.vector_norm(jacobian + K) + torch.linalg.vector_norm(mean - self.u_eq)
+        return loss
+
+    def network(self) -> TanhNetwork:
+        """The mean action as an exact tanh network, centred; the states' factors are folded in exactly."""
+        layers = [*self._layers(), self.mean]
+        weights = [layer.weight.detach().double().numpy() for layer in layers]
+        weights[0] = weights[0] * self.factors.double().numpy()
+        return TanhNetwork(
+            weights=tuple(weights),
+            biases=tuple(layer.bias.detach().double().numpy() for layer in layers),
+            scale=self.scale.double().numpy(),
+            offset=self.offset.double().numpy(),
+            squash="tanh",
+            centre=self.centre,
+        )
+
+    def _layers(self) -> list[nn.Linear]:
+        return cast(list[nn.Linear], list(self.hidden))
+
+
+class Critic(nn.Module):
+    """`copies` independent tanh networks of one shape, evaluated together by batched products.
+
+    Returns shape (copies, batch) for inputs of shape (batch, inputs).
+    """
+
+    def __init__(self, inputs: int, widths: Sequence[int], copies: int) -> None:
+        super().__init__()
+        sizes = [inputs, *widths, 1]
+        self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
+        for a, b in pairwise(sizes):
+            bound = 1 / math.sqrt(a)
+            self.weights.append(nn.Parameter(torch.empty(copies, a, b).uniform_(-bound, bound)))
+            self.biases.append(nn.Parameter(torch.empty(copies, 1, b).uniform_(-bound, bound)))
+        self.copies = copies
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Values, shape (copies, batch)."""
+        h = x.expand(self.copies, *x.shape)
+        last = len(self.weights) - 1
+        for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            h = torch.baddbmm(bias, h, weight)
+            if k < last:
+                h = torch.tanh(h)
+        return h.squeeze(-1)
+
+
+class Replay:
+    """A ring of transitions (x, tanh(w), reward, x+, terminated) in one float32 table."""
+
+    def __init__(self, capacity: int, n: int, m: int) -> None:
+        self.table = torch.empty(capacity, 2 * n + m + 2)
+        self._sizes = [n, m, 1, n, 1]
+        self.count = 0
+
+    def __len__(self) -> int:
+        return min(self.count, len(self.table))
+
+    def add(self, x: Array, normalised: Array, reward: float, x_next: Array, terminated: bool) -> None:
+        """Store one transition over the oldest."""
+        row = np.concatenate([x, normalised, [reward], x_next, [terminated]])
+        self.table[self.count % len(self.table)] = torch.from_numpy(row)
+        self.count += 1
+
+    def sample(self, size: int, generator: torch.Generator) -> tuple[Tensor, ...]:
+        """`size` transitions, uniformly with replacement."""
+        index = torch.randint(len(self), (size,), generator=generator)
+        return torch.split(self.table[index], self._sizes, dim=1)
+
+
+class SAC:
+    """The learner: networks, optimisers, one gradient step.
+
+    Parameters
+    ----------
+    squash : what the learner is told of the plant.
+    options : hyperparameters.
+    generator : source of the actor's noise; initial weights come from torch's global generator.
+    """
+
+    def __init__(self, squash: Squash, options: TrainingOptions, generator: torch.Generator) -> None:
+        n, m = len(squash.state_factors), len(squash.scale)
+        self.options, self.generator = options, generator
+        self.actor = Actor(squash, options.actor, options.centre)
+        self.value = Critic(n, options.critic, copies=1)
+        self.value_target = Critic(n, options.critic, copies=1)
+        self.value_target.load_state_dict(self.value.state_dict())
+        self.q = Critic(n + m, options.critic, copies=2)
+        self._actor_weights = list(self.actor.parameters())
+        self._critic_weights = [*self.value.parameters(), *self.q.parameters()]
+        self._fresh: list[Tensor] = list(self.value.parameters())
+        self._averaged: list[Tensor] = list(self.value_target.parameters())
+        # `fused` is one call for all parameters; the critics share an optimiser but no parameter.
+        self.actor_optimiser = torch.optim.Adam(self._actor_weights, options.learning_rate, fused=True)
+        self.critic_optimiser = torch.optim.Adam(self._critic_weights, options.learning_rate, fused=True)
+
+    def act(self, x: Array) -> Array:
+        """A sampled action as `tanh(w)`, shape (m,)."""
+        with torch.no_grad():
+            noise = torch.randn(self.actor.scale.shape, generator=self.generator)
+            normalised, _ = self.actor.sample(torch.from_numpy(x).float(), noise)
+        return normalised.double().numpy()
+
+    def update(self, batch: tuple[Tensor, ...], K: Tensor | None, actor_step: float) -> None:
+        """One gradient step of every network.
+
+        Parameters
+        ----------
+        batch : x, tanh(w), reward, x+, terminated, each with the batch first.
+        K : learned gain, or None as long as there is none.
+        actor_step : share of the learning rate that the actor uses, in [0, 1].
+        """
+        x, action, reward, x_next, terminated = batch
+        options, scaled = self.options, x * self.actor.factors
+        noise = torch.randn((len(x), len(self.actor.scale)), generator=self.generator)
+        fresh, log_likelihood = self.actor.sample(x, noise)
+        q_fresh = self.q(torch.cat((scaled, fresh), 1)).amin(0)
+        actor_loss = (log_likelihood - q_fresh).mean()
+        if K is not None:
+            actor_loss = actor_loss + options.gain_weight * self.actor.gain_loss(K)
+        actor_gradients = torch.autograd.grad(actor_loss, self._actor_weights)
+
+        with torch.no_grad():
+            value_goal = q_fresh - log_likelihood
+            ahead = (1 - terminated.squeeze(1)) * self.value_target(x_next * self.actor.factors)
+            q_goal = options.reward_scale * reward.squeeze(1) + options.gamma * ahead
+        value_error = self.value(scaled) - value_goal
+        q_error = self.q(torch.cat((scaled, action), 1)) - q_goal
+        critic_loss = 0.5 * (value_error.square().sum() + q_error.square().sum()) / len(x)
+        critic_gradients = torch.autograd.grad(critic_loss, self._critic_weights)
+
+        self.actor_optimiser.param_groups[0]["lr"] = options.learning_rate * actor_step
+        _apply(self.actor_optimiser, self._actor_weights, actor_gradients)
+        _apply(self.critic_optimiser, self._critic_weights, critic_gradients)
+        with torch.no_grad():
+            torch._foreach_lerp_(self._averaged, self._fresh, options.tau)
+
+    def state(self) -> dict[str, Any]:
+        """Tensors and plain values for a checkpoint."""
+        return {name: getattr(self, name).state_dict() for name in _PARTS}
+
+    def load_state(self, state: dict[str, Any]) -> None:
+        """Continue from `state()`."""
+        for name in _PARTS:
+            getattr(self, name).load_state_dict(state[name])
+
+
+_PARTS = ("actor", "value", "value_target", "q", "actor_optimiser", "critic_optimiser")
+
+
+def _apply(optimiser: torch.optim.Adam, weights: list[nn.Parameter], gradients: Sequence[Tensor]) -> None:
+    for weight, gradient in zip(weights, gradients, strict=True):
+        weight.grad = gradient
+    optimiser.step()

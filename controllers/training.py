@@ -1,0 +1,337 @@
+"""The training run: Algorithm 1 of the paper around `sac.SAC` and `lqr.GainLearner`, with exact resumption.
+
+While a round of identification is under way, episodes start in the ball and end on leaving it, so that the
+transitions it needs are gathered within a few hundred steps; otherwise episodes start anywhere in
+the domain. Every transition also goes into the replay buffer.
+
+A checkpoint holds everything that the rest of the run depends on (networks, optimisers, replay buffer, random
+states, the episode under way, the identification), so that a resumed run equals an uninterrupted one.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import pickle
+import platform
+from collections.abc import Callable, Sequence
+from dataclasses import astuple, dataclass, fields
+from decimal import Decimal
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from certify.errors import InputError
+from certify.policies import Policy
+from certify.systems import System
+from controllers.environments import PlantEnvironment, Snapshot
+from controllers.lqr import GainLearner, Identified
+from controllers.options import TrainingOptions
+from controllers.sac import SAC, Replay, Squash
+
+Array = NDArray[np.float64]
+
+CHECKPOINT_FORMAT = "controllers-checkpoint/1"
+
+
+@dataclass(frozen=True, slots=True)
+class Episode:
+    """One finished episode, a row of the log.
+
+    `distance` is ||J_mu(0) + K|| and `offset` ||mu(0) - u_eq||; both are NaN as long as there is no gain.
+    """
+
+    step: int
+    kind: str
+    length: int
+    total: float
+    outcome: str
+    distance: float
+    offset: float
+
+
+class EpisodeLog:
+    """The episodes of a run as CSV, one row each; a resumed run begins with those of its checkpoint.
+
+    Parameters
+    ----------
+    path : file that is written anew when the log is entered as a context.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._written = 0
+
+    def __enter__(self) -> EpisodeLog:
+        self._file = self._path.open("w", newline="", encoding="utf-8")
+        self._writer = csv.writer(self._file)
+        self._writer.writerow([column.name for column in fields(Episode)])
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def extend(self, episodes: Sequence[Episode]) -> None:
+        """Write the episodes that are not written yet."""
+        for episode in episodes[self._written :]:
+            self._writer.writerow(astuple(episode))
+        if len(episodes) > self._written:
+            self._file.flush()
+        self._written = len(episodes)
+
+
+class Trainer:
+    """One run, advanced step by step.
+
+    Parameters
+    ----------
+    system : the plant; only the environment reads its equations.
+    options : everything else.
+
+    Raises
+    ------
+    InputError : weights do not fit the plant.
+    """
+
+    def __init__(self, system: System, options: TrainingOptions) -> None:
+        options.check_sizes(system)
+        self.system, self.options = system, options
+        self.environment = PlantEnvironment(system, options)
+        self.squash = Squash(system)
+        Q_c, R_c = np.diag(options.state_weights), np.diag(options.input_weights)
+        self.gain = GainLearner(options.eta, options.n_A, options.n_B, Q_c, R_c)
+        self.generator = torch.Generator().manual_seed(options.seed)
+        with torch.random.fork_rng(devices=[]):
+            torch.manual_seed(options.seed)
+            self.sac = SAC(self.squash, options, self.generator)
+        self.replay = Replay(min(options.replay, options.steps), system.n, system.m)
+        self.steps_done = 0
+        self.episodes: list[Episode] = []
+        self._K: torch.Tensor | None = None
+        self._x, _ = self.environment.reset(seed=options.seed)
+        self._begin_episode()
+
+    def advance(self) -> None:
+        """One environment step and, after the warm-up, one gradient step."""
+        options, x = self.options, self._x
+        if self.steps_done and self.steps_done % options.refresh == 0:
+            self.gain.refresh()
+        u, normalised = self._choose(x)
+        x_next, reward, terminated, truncated, _ = self.environment.step(u)
+        self.replay.add(x, normalised, reward, x_next, terminated)
+        known = self.gain.identified
+        self.gain.observe(x, u - self.squash.u_eq, x_next)
+        if self.gain.identified is not known:
+            self._learn_gain()
+        self.steps_done += 1
+        self._x = x_next
+        self._total += reward
+        self._length += 1
+        if terminated:
+            self._finish_episode("terminated")
+        elif truncated:
+            self._finish_episode("truncated")
+        elif self._near and not self.gain.inside(x_next):
+            self._finish_episode("left the ball")
+        if self.steps_done > options.warm_up:
+            batch = self.replay.sample(options.batch, self.generator)
+            self.sac.update(batch, self._K, self._actor_step())
+
+    def distance(self) -> tuple[float, float]:
+        """||J_mu(0) + K|| and ||mu(0) - u_eq|| of the actor as it is; NaN without a gain."""
+        if self._K is None:
+            return float("nan"), float("nan")
+        with torch.no_grad():
+            mean, jacobian = self.sac.actor.at_origin()
+            offset = torch.linalg.vector_norm(mean - self.sac.actor.u_eq)
+            return float(torch.linalg.vector_norm(jacobian + self._K)), float(offset)
+
+    def policy(self) -> Policy:
+        """The centred mean action with the record of how it was made.
+
+        Raises
+        ------
+        InputError : the run is too short to have learned a gain.
+        """
+        found = self.gain.identified
+        if found is None:
+            raise InputError(
+                f"the run ended after {self.steps_done} steps without a gain; it needs more `steps`."
+            )
+        return Policy(
+            network=self.sac.actor.network(),
+            system=self.system.name,
+            parameters=_parameters(self.system),
+            training=self._record(found),
+        )
+
+    def snapshot(self) -> bytes:
+        """The whole run as the bytes of a checkpoint file."""
+        state = {
+            "format": CHECKPOINT_FORMAT,
+            "system": [self.system.name, _parameters(self.system)],
+            "options": self.options.record(),
+            "steps_done": self.steps_done,
+            "sac": self.sac.state(),
+            "gain": self.gain.state(),
+            "replay": {"rows": self.replay.table[: len(self.replay)].clone(), "count": self.replay.count},
+            "generator": self.generator.get_state(),
+            # 128-bit integers: as text, which every reader of plain tensors accepts.
+            "environment_generator": json.dumps(self.environment.np_random.bit_generator.state),
+            "environment": [list(self.environment.snapshot().x), self.environment.snapshot().elapsed],
+            "episode": [self._near, self._total, self._length],
+            "episodes": [astuple(episode) for episode in self.episodes],
+        }
+        buffer = io.BytesIO()
+        torch.save(state, buffer)
+        return buffer.getvalue()
+
+    def restore(self, checkpoint: bytes) -> None:
+        """Continue from `snapshot()`.
+
+        Raises
+        ------
+        InputError : the bytes are no checkpoint, or one of a run with other options or another plant.
+        """
+        state = _read_checkpoint(checkpoint)
+        if state.get("system") != [self.system.name, _parameters(self.system)]:
+            raise InputError(f"the checkpoint must be of {self.system.name}; it is of {state['system']}.")
+        mine, theirs = self.options.record(), state.get("options", {})
+        changed = sorted(name for name in mine.keys() | theirs.keys() if mine.get(name) != theirs.get(name))
+        if changed:
+            name = changed[0]
+            raise InputError(
+                f"a run is resumed with the options it began with; `{name}` was {theirs.get(name)}, "
+                f"now it is {mine.get(name)}."
+            )
+        try:
+            self._load(state)
+        except (KeyError, TypeError, ValueError, IndexError, RuntimeError) as error:
+            raise InputError(f"the checkpoint is damaged: {error}.") from error
+
+    def _load(self, state: dict[str, Any]) -> None:
+        self.steps_done = state["steps_done"]
+        self.sac.load_state(state["sac"])
+        self.gain.load_state(state["gain"])
+        if self.gain.identified is not None:
+            self._learn_gain()
+        rows = state["replay"]["rows"]
+        self.replay.table[: len(rows)] = rows
+        self.replay.count = state["replay"]["count"]
+        self.generator.set_state(state["generator"])
+        self.environment.np_random.bit_generator.state = json.loads(state["environment_generator"])
+        x, elapsed = state["environment"]
+        self.environment.restore(Snapshot(tuple(x), elapsed))
+        self._x = np.array(x)
+        self._near, self._total, self._length = state["episode"]
+        self.episodes = [Episode(*row) for row in state["episodes"]]
+
+    def _choose(self, x: Array) -> tuple[Array, Array]:
+        """The input u and `tanh(w)` of it; zero action is u_eq to the last bit."""
+        if self.gain.phase == "A" and self.gain.inside(x):
+            return self.squash.u_eq, self.squash.to_normalised(self.squash.u_eq)
+        if self.steps_done < self.options.warm_up:
+            normalised = np.asarray(self.environment.np_random.uniform(-1.0, 1.0, self.system.m))
+        else:
+            normalised = self.sac.act(x)
+        return self.squash.to_action(normalised), normalised
+
+    def _actor_step(self) -> float:
+        anneal = self.options.anneal * self.options.steps
+        return min(1.0, (self.options.steps - self.steps_done) / anneal) if anneal > 0 else 1.0
+
+    def _learn_gain(self) -> None:
+        if self.gain.identified is not None:
+            self._K = torch.tensor(self.gain.identified.K, dtype=torch.float32)
+
+    def _begin_episode(self) -> None:
+        self._near = self.gain.phase != "idle"
+        self._x, _ = self.environment.reset(options={"radius": self.options.eta} if self._near else None)
+        self._total, self._length = 0.0, 0
+
+    def _finish_episode(self, outcome: str) -> None:
+        kind = "identification" if self._near else "training"
+        distance, offset = self.distance()
+        self.episodes.append(
+            Episode(self.steps_done, kind, self._length, self._total, outcome, distance, offset)
+        )
+        self._begin_episode()
+
+    def _record(self, found: Identified) -> dict[str, Any]:
+        distance, offset = self.distance()
+        return {
+            **self.options.record(),
+            "A": found.A.tolist(),
+            "B": found.B.tolist(),
+            "K": found.K.tolist(),
+            "distance": distance,
+            "offset_before_centring": offset,
+            "versions": {"python": platform.python_version(), "torch": torch.__version__.split("+")[0],
+                         "numpy": np.__version__},
+        }
+
+
+def train(
+    trainer: Trainer,
+    report: Callable[[Trainer], None] | None = None,
+    checkpoint: Path | None = None,
+    checkpoint_every: int = 10_000,
+) -> Policy:
+    """Run `trainer` to its last step and return the policy.
+
+    Parameters
+    ----------
+    trainer : a new or a restored run.
+    report : called after each step, for progress and logs.
+    checkpoint : file that is rewritten every `checkpoint_every` steps.
+    """
+    if checkpoint_every < 1:
+        raise InputError(f"`checkpoint_every` must be positive; found {checkpoint_every}.")
+    torch.set_num_threads(trainer.options.threads)
+    while trainer.steps_done < trainer.options.steps:
+        trainer.advance()
+        if report is not None:
+            report(trainer)
+        if checkpoint is not None and trainer.steps_done % checkpoint_every == 0:
+            write_atomically(checkpoint, trainer.snapshot())
+    return trainer.policy()
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Replace `path` by `content` in one move: a reader sees the old file or the new one.
+
+    Raises
+    ------
+    InputError : the file cannot be written there.
+    """
+    temporary = path.with_name(path.name + ".partial")
+    try:
+        temporary.write_bytes(content)
+        os.replace(temporary, path)
+    except OSError as error:
+        raise InputError(f"{path} cannot be written: {error.strerror}.") from error
+
+
+def _read_checkpoint(content: bytes) -> dict[str, Any]:
+    try:
+        state = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError) as error:
+        raise InputError(f"the checkpoint cannot be read: {error}.") from error
+    if not isinstance(state, dict) or state.get("format") != CHECKPOINT_FORMAT:
+        raise InputError(f"the checkpoint must have the format {CHECKPOINT_FORMAT!r}.")
+    return state
+
+
+def _parameters(system: System) -> dict[str, str]:
+    """Parameters as text, which stands for the exact value: decimal where that is exact, else a fraction."""
+    texts = {}
+    for name, value in system.parameters.items():
+        decimal = str(Decimal(value.numerator) / Decimal(value.denominator))
+        texts[name] = decimal if Fraction(decimal) == value else str(value)
+    return texts
