@@ -44,7 +44,7 @@ class ClosedLoop:
                 f"it reads {network.n} and commands {network.m}."
             )
         u_eq = system.exact_u_eq()
-        at_zero = {s: sympy.Integer(0) for s in system.states}
+        at_zero = dict.fromkeys(system.states, sympy.Integer(0))
         at_zero |= {s: sympy.Rational(u.numerator, u.denominator) for s, u in zip(system.inputs, u_eq, strict=True)}
         for name, expression in zip(system.states, system.exact_dynamics(), strict=True):
             value = expression.subs(at_zero)
@@ -108,9 +108,7 @@ class ClosedLoop:
 
     def evaluate_vdot(self, P: Array, x: Array) -> flint.arb:
         """`Vdot = 2 x'P F(x)` at a binary64 point, as an Arb ball."""
-        values: dict[sympy.Symbol, flint.arb] = dict(
-            zip(self.system.inputs, self.evaluate_policy(x), strict=True)
-        )
+        values: dict[sympy.Symbol, flint.arb] = dict(zip(self.system.inputs, self.evaluate_policy(x), strict=True))
         values |= {s: flint.arb(float(v)) for s, v in zip(self.system.states, x, strict=True)}
         F = [evaluate_arb(e, values) for e in self.system.exact_dynamics()]
         state = [flint.arb(float(v)) for v in x]
@@ -122,7 +120,7 @@ class ClosedLoop:
     def _plant_jacobians(self) -> tuple[sympy.Matrix, sympy.Matrix]:
         system = self.system
         f = sympy.Matrix(system.exact_dynamics())
-        at_zero = {s: 0 for s in system.states}
+        at_zero = dict.fromkeys(system.states, sympy.Integer(0))
         at_zero |= {
             s: sympy.Rational(u.numerator, u.denominator) for s, u in zip(system.inputs, self.u_eq, strict=True)
         }

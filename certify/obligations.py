@@ -45,9 +45,7 @@ class Obligations:
             object.__setattr__(self, name, array)
         if not np.array_equal(self.P, self.P.T):
             i, j = np.argwhere(self.P != self.P.T)[0]
-            raise InputError(
-                f"`P` must be symmetric; P[{i}, {j}] = {self.P[i, j]} but P[{j}, {i}] = {self.P[j, i]}."
-            )
+            raise InputError(f"`P` must be symmetric; P[{i}, {j}] = {self.P[i, j]} but P[{j}, {i}] = {self.P[j, i]}.")
 
     @property
     def inputs_bounded_by_form(self) -> bool:

@@ -33,6 +33,7 @@ from certify.verdict import Verdict
 Array = NDArray[np.float64]
 Candidate = Literal["lyapunov", "lqr"]
 Progress = Callable[[str, float, int], None]
+_SMALL_NETWORK = 10_000  # weights
 _BELOW = 1e-9  # relative distance from a limit that is itself out of reach (the domain's open condition)
 
 
@@ -172,8 +173,33 @@ def certify_roa(
     BackendError : the checker process failed.
     SoundnessError : the checker rejects what the engine proved.
     """
-    options = options or RoaOptions()
-    watch = _Stopwatch(load_seconds)
+    with _threads_for(network):
+        return _certify(system, network, out, options or RoaOptions(), _Stopwatch(load_seconds), provenance, progress)
+
+
+@contextmanager
+def _threads_for(network: TanhNetwork) -> Iterator[None]:
+    """One thread for small networks: their operations are shorter than the threads' handshakes."""
+    import torch
+
+    threads = torch.get_num_threads()
+    if sum(W.size for W in network.weights) < _SMALL_NETWORK:
+        torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _certify(
+    system: System,
+    network: TanhNetwork,
+    out: Path,
+    options: RoaOptions,
+    watch: _Stopwatch,
+    provenance: Mapping[str, Any] | None,
+    progress: Progress | None,
+) -> RoaResult:
     loop = ClosedLoop(system, network)
     _make_folder(out)
 
@@ -182,18 +208,14 @@ def certify_roa(
         unstable = _unstable(loop, A)
         if unstable is not None:
             verdict, reason, eigenvalues = unstable
-            return RoaResult(
-                verdict, reason, system, network, eigenvalues=eigenvalues, seconds=watch.total()
-            )
+            return RoaResult(verdict, reason, system, network, eigenvalues=eigenvalues, seconds=watch.total())
         P = _candidate(options, A, K)
         obligations = Obligations(loop, P, diagonalising_coordinates(P, A))
         limit = domain_limit(P, system.domain)
     levels: dict[str, float | None] = {"domain_limit": limit}
 
     def unfinished(verdict: Verdict, reason: str, witness: Witness | None = None, boxes: int = 0) -> RoaResult:
-        return RoaResult(
-            verdict, reason, system, network, P, levels, witness, boxes=boxes, seconds=watch.total()
-        )
+        return RoaResult(verdict, reason, system, network, P, levels, witness, boxes=boxes, seconds=watch.total())
 
     if options.level is not None and options.level >= limit:
         return unfinished(
@@ -218,8 +240,6 @@ def certify_roa(
     from certify.engines.branch_and_bound import Budget, prove_ring
 
     with watch.stage("ring"):
-        if progress is not None:
-            progress("ring", inner, 0)
         ring = prove_ring(
             obligations, inner, top, Budget(boxes=options.max_boxes, seconds=options.time_limit),
             torch.device(options.device),

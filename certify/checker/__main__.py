@@ -39,7 +39,7 @@ def main(arguments: list[str]) -> int:
         sys.stderr.write("" if as_json else stated["error"] + "\n")
         return 70
     if as_json:
-        stated = {
+        accepted = {
             "result": "ACCEPTED",
             "certificate_sha256": certificate.sha256,
             "policy_sha256": certificate.policy.sha256(),
@@ -48,7 +48,7 @@ def main(arguments: list[str]) -> int:
             "ring_leaves": tally.ring_leaves,
             "margins": {"local": tally.local_margin, "ring": tally.ring_margin},
         }
-        sys.stdout.write(json.dumps(stated) + "\n")
+        sys.stdout.write(json.dumps(accepted) + "\n")
     else:
         sys.stdout.write("\n".join(_claim(certificate)) + "\n")
         sys.stdout.write(
@@ -77,8 +77,8 @@ def _claim(c: document.Certificate) -> list[str]:
     )
     lines.append("V(x) = x'Px with P = " + "; ".join(" ".join(repr(float(v)) for v in row) for row in c.P))
     lines.append(
-        f"claim: the origin is asymptotically stable, and every trajectory of the closed loop that starts in V <= {c.c2!r} "
-        "stays there and converges to the origin; u stays in its bounds"
+        "claim: the origin is asymptotically stable, and every trajectory of the closed loop that starts in "
+        f"V <= {c.c2!r} stays there and converges to the origin; u stays in its bounds"
     )
     return lines
 

@@ -219,7 +219,7 @@ def _names(value: Any, at: str) -> tuple[str, ...]:
 
 def _rational(value: Any, at: str) -> Fraction:
     if not isinstance(value, str) or not _RATIONAL.fullmatch(value):
-        _fail(at, "must be an exact fraction such as \"3/20\"")
+        _fail(at, 'must be an exact fraction such as "3/20"')
     return Fraction(value)
 
 
@@ -235,7 +235,7 @@ def _intervals(value: Any, at: str, length: int) -> tuple[tuple[Fraction, Fracti
 
 def _hex_float(value: Any, at: str) -> float:
     if not isinstance(value, str) or not _HEX_FLOAT.fullmatch(value):
-        _fail(at, "must be a hex float such as \"0x1.8p+1\"")
+        _fail(at, 'must be a hex float such as "0x1.8p+1"')
     try:
         number = float.fromhex(value)
     except OverflowError:

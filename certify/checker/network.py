@@ -13,7 +13,6 @@ import numpy as np
 
 from .document import Policy
 from .errors import Rejected
-from .exact import Undecided
 from .float64 import (
     EPS,
     Array,
@@ -210,9 +209,9 @@ def enclose_at_origin(net: Folded, J: Array, slack: float) -> tuple[Array, float
     J (n, n) lies within `slack` of the true matrix in the 2-norm. Returns scale * G (m, n), and before scaling
     the slack of G in the 2-norm and k.
 
-    Layer by layer, with y(d) = y(0) + J d + R(d): tanh adds at most half the largest second derivative over the reached
-    range times (y_i(d) - y_i(0))^2, and W multiplies 2-norms by at most ||W||_2. The second derivative of tanh is at most
-    4 / (3 sqrt 3) < 0.77 in magnitude, the third at most 2.
+    Layer by layer, with y(d) = y(0) + J d + R(d): tanh adds at most half the largest second derivative over the
+    reached range times (y_i(d) - y_i(0))^2, and W multiplies 2-norms by at most ||W||_2. The second derivative of
+    tanh is at most 4 / (3 sqrt 3) < 0.77 in magnitude, the third at most 2.
     """
     y, error, k = np.zeros(len(J)), np.zeros(len(J)), 0.0
     for layer, (W, b) in enumerate(zip(net.weights, net.biases, strict=True)):

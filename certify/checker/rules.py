@@ -21,6 +21,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .document import Certificate
 from .errors import Rejected
@@ -74,8 +75,10 @@ def check(certificate: Certificate) -> Tally:
         bounded = _inputs_bounded_by_form(c)
         _check_local(c, net, least, bounded, tally)
         ring = _Ring(c, net, S, bounded)
-        for first, lo, hi in _leaves(c.tree, c.root, ring.batch):
-            ring.check(first, lo, hi, tally)
+        for first, lo_z, hi_z in _leaves(c.tree, c.root, ring.batch):
+            tally.leaves += len(lo_z)
+            if c.c1 < c.c2:  # otherwise the local rule has covered V <= c2
+                ring.check(first, lo_z.T, hi_z.T, tally)
     return tally
 
 
@@ -104,7 +107,7 @@ def _inputs_bounded_by_form(c: Certificate) -> bool:
     )
 
 
-def _within(bounds: tuple[Fraction, Fraction], mid: Array, radius: Array) -> Array:
+def _within(bounds: tuple[Fraction, Fraction], mid: Array, radius: Array) -> NDArray[np.bool_]:
     """Elementwise: [mid - radius, mid + radius] certainly lies in the bounds."""
     (lo, lo_error), (hi, hi_error) = float_with_error(bounds[0]), float_with_error(bounds[1])
     reach = up(radius + EPS * np.abs(mid))
@@ -115,10 +118,10 @@ def _within(bounds: tuple[Fraction, Fraction], mid: Array, radius: Array) -> Arr
 def _check_local(c: Certificate, net: Folded, least: Fraction, bounded: bool, tally: Tally) -> None:
     """Claim 3: with z = rho d, {V <= c1} lies in ||d|| <= 1 and Vdot = 2 rho d'G(d), G = T'P F(T rho d).
 
-    F(0) = 0 exactly, so G(d) = B d + R(d) with ||R(d)|| <= k ||d||^2, and Vdot <= 2 rho ||d||^2 (-mu + k ||d||) with mu a lower
-    bound of the smallest eigenvalue of -(B + B')/2.
+    F(0) = 0 exactly, so G(d) = B d + R(d) with ||R(d)|| <= k ||d||^2, and Vdot <= 2 rho ||d||^2 (-mu + k ||d||) with
+    mu a lower bound of the smallest eigenvalue of -(B + B')/2.
     """
-    n, m = len(c.states), len(c.inputs)
+    n = len(c.states)
     rho = float(np.sqrt(float(Fraction(c.c1) / least)) * (1 + 2.0**-40)) + 2.0**-960
     if not (rho < float("inf") and least * Fraction(rho) ** 2 >= Fraction(c.c1)):
         raise Rejected("local", "levels.local", "the level is out of range")
@@ -153,7 +156,9 @@ def _check_local(c: Certificate, net: Folded, least: Fraction, bounded: bool, ta
     mu = float(np.min(np.diag(M) - off)) - float(up(np.sqrt(doubt) + gamma(n) * float(norm(norm(M, 1), 0))))
     bound = float(up(np.sqrt(k)))
     if not mu > up(bound):
-        raise Rejected("local", "levels.local", f"Vdot < 0 is not shown on the local ball: {mu:.3g} against {bound:.3g}")
+        raise Rejected(
+            "local", "levels.local", f"Vdot < 0 is not shown on the local ball: {mu:.3g} against {bound:.3g}"
+        )
     tally.local_margin = 1 - bound / mu
 
 
@@ -178,10 +183,8 @@ class _Ring:
         self.batch = max(1, min(4096, _BATCH_NUMBERS // numbers))
 
     def check(self, first: int, lo: Array, hi: Array, tally: Tally) -> None:
-        """Leaves `first`, `first + 1`, ... with corners lo, hi (B, n) in the coordinates z."""
-        lo, hi = lo.T, hi.T
-        tally.leaves += lo.shape[1]
-        inside = np.flatnonzero(~self._misses(lo, hi))
+        """Leaves `first`, `first + 1`, ... with corners lo, hi (n, B) in the coordinates z."""
+        inside = np.flatnonzero(np.logical_not(self._misses(lo, hi)))
         if len(inside) == 0:
             return
         lo, hi = lo[:, inside], hi[:, inside]
@@ -191,9 +194,9 @@ class _Ring:
         mid, slopes, wide = enclose_on_boxes(self.net, x, error)
         if not self.bounded:
             for j, bounds in enumerate(self.c.input_bounds):
-                good = _within(bounds, mid[j], up(total(np.abs(slopes[j]), 0) + wide[j]))
-                if not np.all(good):
-                    leaf = first + int(inside[np.argmin(good)])
+                kept = _within(bounds, mid[j], up(total(np.abs(slopes[j]), 0) + wide[j]))
+                if not np.all(kept):
+                    leaf = first + int(inside[np.argmin(kept)])
                     raise Rejected("inputs", f"leaf {leaf}", f"{self.c.inputs[j]} may leave its bounds")
         bound = self._vdot(x, error, mid, slopes, wide)
         good = bound < 0
@@ -203,7 +206,7 @@ class _Ring:
         tally.ring_leaves += len(inside)
         tally.ring_margin = min(tally.ring_margin, float(np.min(-bound)))
 
-    def _misses(self, lo: Array, hi: Array) -> Array:
+    def _misses(self, lo: Array, hi: Array) -> NDArray[np.bool_]:
         """True where the leaf certainly has V < c1 everywhere, or V > c2 everywhere."""
         far = np.maximum(np.abs(lo), np.abs(hi))
         near = np.where((lo <= 0) & (hi >= 0), 0.0, np.minimum(np.abs(lo), np.abs(hi)))

@@ -37,7 +37,10 @@ class Taylor:
 
     def __add__(self, other: Taylor) -> Taylor:
         return Taylor(
-            self.c + other.c, self.g + other.g, self.Q + other.Q, up(self.r + other.r + EPS * (_size(self) + _size(other)))
+            self.c + other.c,
+            self.g + other.g,
+            self.Q + other.Q,
+            up(self.r + other.r + EPS * (_size(self) + _size(other))),
         )
 
     def scaled(self, value: float, error: float) -> Taylor:

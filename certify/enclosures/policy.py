@@ -97,8 +97,8 @@ class PolicyEnclosure:
 def relax_tanh(centre: Tensor, radius: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Parallel lines: (s, m, gap) with |tanh(y) - s y - m| <= gap for |y - centre| <= radius.
 
-    s is near the chord's slope. With D(y) = tanh(y) - s y, concavity on y >= 0 puts D below its tangent at any p >= 0, and
-    convexity on y <= 0 puts the rest below the ends; D is odd.
+    s is near the chord's slope. With D(y) = tanh(y) - s y, concavity on y >= 0 puts D below its tangent at any
+    p >= 0, and convexity on y <= 0 puts the rest below the ends; D is odd.
     """
     radius = radius * (1 + EPS) + EPS * centre.abs() + TINY
     lo, hi = centre - radius, centre + radius

@@ -85,9 +85,7 @@ class Taylor:
         return self.compose(c, -s, -c / 2, (s.abs() + self.radius() + EPS).clamp(max=1.0) / 6)
 
 
-def evaluate(
-    expression: sympy.Expr, values: Mapping[sympy.Symbol, Taylor], known: dict[sympy.Expr, Taylor]
-) -> Taylor:
+def evaluate(expression: sympy.Expr, values: Mapping[sympy.Symbol, Taylor], known: dict[sympy.Expr, Taylor]) -> Taylor:
     """An expression of the plant on Taylor models; `known` shares common subexpressions between calls."""
     if expression in known:
         return known[expression]
@@ -96,9 +94,7 @@ def evaluate(
     return result
 
 
-def _evaluate(
-    expression: sympy.Expr, values: Mapping[sympy.Symbol, Taylor], known: dict[sympy.Expr, Taylor]
-) -> Taylor:
+def _evaluate(expression: sympy.Expr, values: Mapping[sympy.Symbol, Taylor], known: dict[sympy.Expr, Taylor]) -> Taylor:
     if expression.is_Symbol:
         return values[expression]
     if expression.is_Rational:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import sympy
@@ -59,7 +60,7 @@ class _Tree:
     lowest: list[Array] = field(default_factory=list)
     size: int = 0
 
-    def add(self, lowest: Array) -> Array:
+    def add(self, lowest: Array) -> NDArray[np.int64]:
         numbers = np.arange(self.size, self.size + len(lowest))
         self.lowest.append(lowest)
         self.size += len(lowest)
@@ -85,6 +86,8 @@ def prove_ring(
     n = obligations.loop.system.n
     S = obligations.T.T @ obligations.P @ obligations.T
     root = np.sqrt(target * np.diag(np.linalg.inv(S))) * (1 + 1e-9)
+    if inner >= target:  # the ring is empty
+        return RingProof(target, "requested", bytes([LEAF]), root, 0, 1)
     start, target0 = time.monotonic(), target
     lo = torch.tensor(-root, dtype=torch.float64, device=device)[:, None]
     hi = -lo
@@ -92,7 +95,7 @@ def prove_ring(
     lowest, _ = bound.levels(lo, hi)
     tree = _Tree()
     number = torch.tensor(tree.add(lowest.cpu().numpy()), device=device)
-    splits: list[tuple[Array, Array, Array]] = []  # parents, axes, first children
+    splits: list[tuple[NDArray[Any], NDArray[np.uint8], NDArray[np.int64]]] = []  # parents, axes, first children
     boxes, reason = 0, "requested"
     while lo.shape[1]:
         # Best first: the boxes with the lowest V.
@@ -154,7 +157,9 @@ def prove_ring(
     return RingProof(level, reason, preorder, root, boxes, preorder.count(bytes([LEAF])))
 
 
-def _preorder(tree: _Tree, splits: list[tuple[Array, Array, Array]], level: float) -> bytes:
+def _preorder(
+    tree: _Tree, splits: list[tuple[NDArray[Any], NDArray[np.uint8], NDArray[np.int64]]], level: float
+) -> bytes:
     """The partition in preorder; a subtree that lies above the level altogether becomes one leaf."""
     lowest = np.concatenate(tree.lowest)
     axis, first = np.full(tree.size, LEAF, dtype=np.uint8), np.zeros(tree.size, dtype=np.int64)

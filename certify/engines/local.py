@@ -1,8 +1,8 @@
 """The local step: the largest level below which the linearisation alone proves Vdot < 0.
 
-On the ball `x = rho T d`, ||d|| <= 1, every quantity is written `v(0) + a.d + R(d)` with |R(d)| <= k ||d||^2 for all d in the
-ball, so the bound holds for every smaller radius too and leaves no hole at the origin. For the network the remainder
-is carried in the 2-norm, layer by layer, with spectral norms instead of products of |W|.
+On the ball `x = rho T d`, ||d|| <= 1, every quantity is written `v(0) + a.d + R(d)` with |R(d)| <= k ||d||^2 for all
+d in the ball, so the bound holds for every smaller radius too and leaves no hole at the origin. For the network the
+remainder is carried in the 2-norm, layer by layer, with spectral norms instead of products of |W|.
 """
 
 from __future__ import annotations

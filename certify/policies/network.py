@@ -71,8 +71,7 @@ class TanhNetwork:
         for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             if weight.ndim != 2 or bias.shape != weight.shape[:1] or 0 in weight.shape:
                 raise InputError(
-                    f"layer {k} must have a weight (out, in) and a bias (out,); "
-                    f"found {weight.shape} and {bias.shape}."
+                    f"layer {k} must have a weight (out, in) and a bias (out,); found {weight.shape} and {bias.shape}."
                 )
             if k and weight.shape[1] != self.weights[k - 1].shape[0]:
                 raise InputError(

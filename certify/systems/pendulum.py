@@ -15,8 +15,9 @@ from certify.systems.system import System, exact, symbols
 
 def pendulum() -> System:
     """The inverted pendulum at its published parameters."""
-    theta, theta_dot, u, m, l, b, g = symbols(["theta", "theta_dot", "u", "m", "l", "b", "g"])
-    acceleration = g / l * sympy.sin(theta) - b / (m * l**2) * theta_dot + u / (m * l**2)
+    theta, theta_dot, u, m, length, b, g = symbols(["theta", "theta_dot", "u", "m", "l", "b", "g"])
+    inertia = m * length**2
+    acceleration = g / length * sympy.sin(theta) - b / inertia * theta_dot + u / inertia
     return System(
         name="pendulum",
         description="inverted pendulum with a torque at the pivot",
@@ -29,7 +30,12 @@ def pendulum() -> System:
         input_bounds=((exact(-6), exact(6)),),
         positive=frozenset({"m", "l", "g"}),
         units={
-            "theta": "rad", "theta_dot": "rad/s", "u": "N m",
-            "m": "kg", "l": "m", "b": "N m s", "g": "m/s^2",
+            "theta": "rad",
+            "theta_dot": "rad/s",
+            "u": "N m",
+            "m": "kg",
+            "l": "m",
+            "b": "N m s",
+            "g": "m/s^2",
         },
     )

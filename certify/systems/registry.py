@@ -29,6 +29,4 @@ def get_system(name: str) -> System:
         return _REGISTRY[name]()
     if name.endswith(".toml"):
         return load_system(Path(name))
-    raise InputError(
-        f"unknown system {name!r}; known are {', '.join(_REGISTRY)}, or give the path of a .toml file."
-    )
+    raise InputError(f"unknown system {name!r}; known are {', '.join(_REGISTRY)}, or give the path of a .toml file.")

@@ -101,9 +101,7 @@ class System:
                 raise InputError(f"the bounds of {symbol} must satisfy lo < hi; found [{float(lo)}, {float(hi)}].")
         for name in sorted(self.positive):
             if not self.parameters[name] > 0:
-                raise InputError(
-                    f"parameter {name} of {self.name} must be positive; found {self.parameters[name]}."
-                )
+                raise InputError(f"parameter {name} of {self.name} must be positive; found {self.parameters[name]}.")
         parameters = {sympy.Symbol(p) for p in self.parameters}
         for expression in self.dynamics:
             _check_grammar(expression, {*self.states, *self.inputs, *parameters}, self.name)
@@ -157,6 +155,8 @@ class System:
 
         For simulation and search only: nothing is proved with it.
         """
+        stack: Callable[..., Any]
+        broadcast: Callable[..., Any]
         if module == "numpy":
             import numpy
 
@@ -178,9 +178,7 @@ class System:
         return f
 
     def _substitute(self, expression: sympy.Expr) -> sympy.Expr:
-        values = {
-            sympy.Symbol(name): sympy.Rational(q.numerator, q.denominator) for name, q in self.parameters.items()
-        }
+        values = {sympy.Symbol(name): sympy.Rational(q.numerator, q.denominator) for name, q in self.parameters.items()}
         result = expression.subs(values)
         if result.has(sympy.zoo, sympy.nan, sympy.oo):
             raise InputError(f"an equation of {self.name} divides by zero with the parameters {dict(self.parameters)}.")

@@ -19,8 +19,19 @@ from certify.errors import InputError
 from certify.systems.system import Interval, System, exact, symbols
 
 _FUNCTIONS = {"sin": sympy.sin, "cos": sympy.cos, "tan": sympy.tan}
-_KEYS = {"name", "description", "states", "inputs", "parameters", "positive", "dynamics", "u_eq", "domain",
-         "input_bounds", "units"}
+_KEYS = {
+    "name",
+    "description",
+    "states",
+    "inputs",
+    "parameters",
+    "positive",
+    "dynamics",
+    "u_eq",
+    "domain",
+    "input_bounds",
+    "units",
+}
 _REQUIRED = {"name", "states", "inputs", "dynamics", "u_eq", "domain", "input_bounds"}
 _MAX_EXPONENT = 64
 
@@ -81,7 +92,7 @@ def parse_expression(text: str | int | Fraction, names: Mapping[str, sympy.Symbo
         raise InputError(f"equation {source!r} cannot be read: {error}.") from error
 
 
-def _convert(node: ast.expr, source: str, names: Mapping[str, sympy.Symbol]) -> sympy.Expr:  # noqa: PLR0911
+def _convert(node: ast.expr, source: str, names: Mapping[str, sympy.Symbol]) -> sympy.Expr:
     if isinstance(node, ast.Constant) and isinstance(node.value, int | float) and not isinstance(node.value, bool):
         literal = _decimal(ast.get_source_segment(source, node) or "")
         return sympy.Rational(literal.numerator, literal.denominator)
@@ -113,7 +124,7 @@ def _convert(node: ast.expr, source: str, names: Mapping[str, sympy.Symbol]) -> 
 
 
 def _decimal(text: str) -> Fraction:
-    mantissa, _, exponent = text.lower().replace("_", "").partition("e")
+    exponent = text.lower().replace("_", "").partition("e")[2]
     if exponent and abs(int(exponent)) > 400:
         raise InputError(f"number {text} is out of range.")
     return exact(text.replace("_", ""))

@@ -1,0 +1,321 @@
+"""The command line `certify`: arguments, printing, exit statuses; no mathematics.
+
+Standard output carries the result, or with `--json` exactly one JSON object; progress and diagnostics go to
+standard error. Exit status: 0 proved or accepted, 1 refuted or rejected, 2 usage or unusable input, 3 unknown,
+70 internal error.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from contextlib import suppress
+from fractions import Fraction
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from certify.errors import BackendError, CertificateFormatError, CertifyError, InputError, SoundnessError
+
+if TYPE_CHECKING:
+    from certify.policies import Policy
+    from certify.systems import System
+
+app = typer.Typer(
+    help="Regions of attraction of plants controlled by tanh networks, proved and independently checked.",
+    no_args_is_help=True,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
+
+
+@app.command()
+def roa(
+    policy: Annotated[Path, typer.Option(help="Policy file (certify-policy/1, .pt).")],
+    system: Annotated[
+        str | None, typer.Option(help="Plant: a name or a .toml file; default: what the policy file says.")
+    ] = None,
+    param: Annotated[list[str] | None, typer.Option(help="Parameter of the plant, NAME=VALUE; repeatable.")] = None,
+    domain: Annotated[
+        list[str] | None, typer.Option(help="Half-width NAME=D or interval NAME=LO:HI of a state; repeatable.")
+    ] = None,
+    candidate: Annotated[str, typer.Option(help="Lyapunov candidate: lyapunov or lqr.")] = "lyapunov",
+    q: Annotated[str | None, typer.Option("--Q", help="Diagonal of Q, as in 1,1.")] = None,
+    r: Annotated[str | None, typer.Option("--R", help="Diagonal of R (candidate lqr), as in 1.")] = None,
+    level: Annotated[float | None, typer.Option(help="Prove exactly this level; less is not PROVED.")] = None,
+    device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
+    time_limit: Annotated[float, typer.Option(help="Seconds for the ring.")] = 600.0,
+    max_boxes: Annotated[int, typer.Option(help="Boxes for the ring.")] = 4_000_000,
+    out: Annotated[Path | None, typer.Option(help="Folder for the results; default: out/POLICY.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Certify a region of attraction: prove, write a certificate, have it checked, report."""
+    from certify.policies import load_policy
+    from certify.report import render_html, summary
+    from certify.roa import RoaOptions, certify_roa
+
+    start = time.perf_counter()
+    stored = load_policy(policy)
+    plant = _system(stored, system, param or [], domain or [])
+    _tell(_plant_line(stored, plant, system is not None))
+    shift = _beta_shift(stored, plant)
+    if shift:
+        _tell(shift)
+    options = RoaOptions(
+        candidate=candidate,  # type: ignore[arg-type]
+        Q=_numbers(q, "--Q"),
+        R=_numbers(r, "--R"),
+        level=level,
+        device=_device(device),
+        time_limit=time_limit,
+        max_boxes=max_boxes,
+    )
+    folder = out if out is not None else Path("out") / policy.stem
+    progress = _Progress()
+    try:
+        result = certify_roa(
+            plant, stored.network, folder, options,
+            load_seconds=time.perf_counter() - start, provenance=_provenance(policy), progress=progress,
+        )  # fmt: skip
+    finally:
+        progress.close()
+    data = result.to_dict()
+    if result.certificate is not None:
+        from certify.certificate import read_certificate
+
+        answer = None if result.checker is None else dict(result.checker)
+        page = render_html(read_certificate(result.certificate), answer, data, result.certificate)
+        _write(folder / "report.html", page)
+    if as_json:
+        sys.stdout.write(json.dumps(data) + "\n")
+    else:
+        _print(summary(data))
+        if result.certificate is not None:
+            sys.stdout.write(f"certificate  {result.certificate}\nreport       {folder / 'report.html'}\n")
+    raise typer.Exit(result.verdict.exit_status)
+
+
+@app.command()
+def check(
+    certificate: Annotated[Path, typer.Argument(help="Certificate file.")],
+    policy: Annotated[
+        Path | None, typer.Option(help="Policy file that the certificate must be about (compares hashes).")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Check a certificate with the independent checker, in a process of its own."""
+    import subprocess
+
+    if policy is not None:
+        from certify.certificate import read_certificate
+        from certify.policies import load_policy
+
+        network, claimed = load_policy(policy).network, None
+        with suppress(CertificateFormatError):  # the checker says below what is wrong with the file
+            claimed = read_certificate(certificate).network.sha256()
+        if claimed is not None and claimed != network.sha256():
+            detail = f"the certificate is about policy {claimed}, not about {policy} ({network.sha256()})"
+            if as_json:
+                stated = {"result": "REJECTED", "rule": "policy", "at": "policy.sha256", "detail": detail}
+                sys.stdout.write(json.dumps(stated) + "\n")
+            else:
+                sys.stdout.write(f"REJECTED rule=policy at=policy.sha256: {detail}\n")
+            raise typer.Exit(1)
+    command = [sys.executable, "-I", "-m", "certify.checker", str(certificate), *(["--json"] if as_json else [])]
+    raise typer.Exit(subprocess.run(command, check=False).returncode)
+
+
+@app.command()
+def report(
+    certificate: Annotated[Path, typer.Argument(help="Certificate file.")],
+    out: Annotated[Path | None, typer.Option(help="HTML file; default: report.html beside the certificate.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Check a certificate and draw its report."""
+    from certify.certificate import read_certificate
+    from certify.report import render_html
+    from certify.roa import run_checker
+
+    target = out if out is not None else certificate.parent / "report.html"
+    read = read_certificate(certificate)
+    answer = run_checker(certificate)
+    _write(target, render_html(read, answer, None, certificate))
+    stated = {"report": str(target), "result": answer["result"]}
+    sys.stdout.write((json.dumps(stated) if as_json else f"{answer['result']}  {target}") + "\n")
+    raise typer.Exit(0 if answer["result"] == "ACCEPTED" else 1)
+
+
+@app.command()
+def systems(as_json: Json = False) -> None:
+    """List the plants that ship, with their parameters, domain and input bounds."""
+    from certify.systems import available_systems, get_system
+
+    found = [get_system(name) for name in available_systems()]
+    if as_json:
+        sys.stdout.write(json.dumps({"systems": [_describe(s) for s in found]}) + "\n")
+        return
+    for s in found:
+        sys.stdout.write(f"{s.name}: {s.description}\n")
+        for symbol, expression in zip(s.states, s.dynamics, strict=True):
+            sys.stdout.write(f"  {symbol}' = {expression}\n")
+        for name, value in s.parameters.items():
+            sys.stdout.write(f"  {name} = {float(value):g} {s.units.get(name, '')}\n")
+        for symbols, intervals in ((s.states, s.domain), (s.inputs, s.input_bounds)):
+            for symbol, (lo, hi) in zip(symbols, intervals, strict=True):
+                unit = s.units.get(symbol.name, "")
+                sys.stdout.write(f"  {symbol} in [{float(lo):g}, {float(hi):g}] {unit}\n")
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point: turns every error into one sentence and the right exit status."""
+    given = sys.argv[1:] if arguments is None else arguments
+    sys.exit(_run(given, "--json" in given))
+
+
+def _run(arguments: list[str], as_json: bool) -> int:
+    command = typer.main.get_command(app)
+    try:
+        status = command.main(arguments, prog_name="certify", standalone_mode=False)
+        return status if isinstance(status, int) else 0
+    except typer.Exit as stop:
+        return stop.exit_code
+    except typer.TyperException as error:  # usage
+        return _fail(as_json, error.format_message() if hasattr(error, "format_message") else str(error), 2)
+    except (typer.Abort, KeyboardInterrupt):
+        return _fail(as_json, "interrupted; nothing was left half-written.", 130)
+    except (SoundnessError, BackendError) as error:
+        return _fail(as_json, f"internal error: {error}", 70)
+    except CertifyError as error:
+        return _fail(as_json, str(error), 2)
+    except BrokenPipeError:
+        return 70
+    except Exception as error:  # the last resort: no traceback reaches a user
+        return _fail(as_json, f"internal error: {type(error).__name__}: {error}", 70)
+
+
+def _fail(as_json: bool, message: str, status: int) -> int:
+    if as_json:
+        sys.stdout.write(json.dumps({"error": message}) + "\n")
+    else:
+        sys.stderr.write(f"certify: {message}\n")
+    return status
+
+
+def _system(stored: Policy, name: str | None, params: list[str], bounds: list[str]) -> System:
+    from certify.systems import exact, get_system
+
+    plant = get_system(name if name is not None else stored.system)
+    if name is None or name == stored.system:
+        plant = plant.with_parameters(stored.parameters)
+    plant = plant.with_parameters(dict(_assignment(p, "--param") for p in params))
+    domain: dict[str, tuple[Fraction, Fraction]] = {}
+    for text in bounds:
+        state, value = _assignment(text, "--domain")
+        lo, _, hi = value.rpartition(":")
+        domain[state] = (exact(lo, state), exact(hi, state)) if lo else (-exact(hi, state), exact(hi, state))
+    return plant.with_domain(domain)
+
+
+def _assignment(text: str, option: str) -> tuple[str, str]:
+    name, equals, value = text.partition("=")
+    if not equals or not name or not value:
+        raise InputError(f"{option} takes NAME=VALUE; found {text!r}.")
+    return name.strip(), value.strip()
+
+
+def _numbers(text: str | None, option: str) -> tuple[float, ...] | None:
+    if text is None:
+        return None
+    try:
+        return tuple(float(part) for part in text.split(","))
+    except ValueError as error:
+        raise InputError(f"{option} takes numbers separated by commas, as in 1,1; found {text!r}.") from error
+
+
+def _device(name: str) -> str:
+    import torch
+
+    if name == "cpu" or (name.startswith("cuda") and torch.cuda.is_available()):
+        return name
+    raise InputError(f"--device must be cpu, or cuda on a machine that has it; found {name!r}.")
+
+
+def _plant_line(stored: Policy, plant: System, overridden: bool) -> str:
+    values = ", ".join(f"{name} = {float(q):g}" for name, q in plant.parameters.items())
+    source = "from the command line" if overridden else "from the policy file"
+    layers = "-".join(map(str, stored.network.layers))
+    return f"plant {plant.name} ({source}) with {values or 'no parameters'}; policy {layers}"
+
+
+def _beta_shift(stored: Policy, plant: System) -> str | None:
+    """What reading a stored, rounded beta as the real number changes in u at the origin."""
+    import numpy as np
+
+    if stored.beta is None:
+        return None
+    network = stored.network
+    u = network.scale * np.tanh(stored.beta) + network.offset
+    shift = np.max(np.abs(u - np.array([float(v) for v in plant.exact_u_eq()])))
+    return f"the file's rounded beta is read as the real number; this shifts u(0) by {shift:.3g}"
+
+
+def _provenance(policy: Path) -> dict[str, Any]:
+    from importlib.metadata import version
+
+    packages = ("certify", "torch", "numpy", "scipy", "sympy", "python-flint")
+    return {"policy": policy.name, "python": sys.version.split()[0], **{p: version(p) for p in packages}}
+
+
+def _describe(s: System) -> dict[str, Any]:
+    return {
+        "name": s.name,
+        "description": s.description,
+        "states": [x.name for x in s.states],
+        "inputs": [u.name for u in s.inputs],
+        "parameters": {name: str(q) for name, q in s.parameters.items()},
+        "domain": {x.name: [str(lo), str(hi)] for x, (lo, hi) in zip(s.states, s.domain, strict=True)},
+        "input_bounds": {u.name: [str(lo), str(hi)] for u, (lo, hi) in zip(s.inputs, s.input_bounds, strict=True)},
+        "dynamics": {x.name: str(e) for x, e in zip(s.states, s.dynamics, strict=True)},
+        "units": dict(s.units),
+    }
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise InputError(f"{path} cannot be written: {error.strerror}.") from error
+
+
+def _print(renderable: Any) -> None:
+    from rich.console import Console
+
+    Console(file=sys.stdout).print(renderable)
+
+
+def _tell(line: str) -> None:
+    sys.stderr.write(line + "\n")
+
+
+class _Progress:
+    """A line on standard error, at most five times a second, only on a terminal."""
+
+    def __init__(self) -> None:
+        self.last = 0.0
+        self.shown = False
+
+    def __call__(self, stage: str, level: float, boxes: int) -> None:
+        now = time.monotonic()
+        if sys.stderr.isatty() and now - self.last > 0.2:
+            self.last, self.shown = now, True
+            sys.stderr.write(f"\r{stage}: proved to V <= {level:.6g}, {boxes} boxes\x1b[K")
+            sys.stderr.flush()
+
+    def close(self) -> None:
+        if self.shown:
+            sys.stderr.write("\r\x1b[K")
