@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from certify.certificate import Certificate, write_certificate
 from certify.closed_loop import ClosedLoop
-from certify.engines.falsify import Witness, confirm, falsify
+from certify.engines.falsify import Witness, descend, falsify
 from certify.engines.local import prove_local
 from certify.errors import BackendError, InputError, SoundnessError
 from certify.lyapunov import diagonalising_coordinates, domain_limit, extents, semi_axes, solve_lyapunov, volume
@@ -245,16 +245,17 @@ def _certify(
             torch.device(options.device),
             None if progress is None else lambda level, boxes: progress("ring", level, boxes),
         )  # fmt: skip
+    if ring.witness is not None:
+        lower = descend(obligations, ring.witness)
+        if lower is not None and (witness is None or lower.level < witness.level):
+            witness = lower
+            levels["sampled_limit"] = lower.level
     if options.level is not None and ring.level < options.level:
         levels["local"] = inner
+        if witness is not None and witness.level <= options.level:
+            return unfinished(Verdict.REFUTED, _describe(witness, system), witness, ring.boxes)
         missed = f"{ring.reason}: proved only up to V <= {ring.level:.12g}, not {options.level:g}"
-        if ring.reason == "witness":
-            found = falsify(obligations, options.level, samples=200_000, seed=1)
-            if found is not None:
-                levels["sampled_limit"] = found.level
-                return unfinished(Verdict.REFUTED, _describe(found, system), found, ring.boxes)
         return unfinished(Verdict.UNKNOWN, missed, boxes=ring.boxes)
-
     if ring.reason == "requested" and options.level is None:
         reason = "domain" if witness is None else ("inputs" if witness.kind == "input" else "witness")
     else:
@@ -351,6 +352,3 @@ def _describe(witness: Witness, system: System) -> str:
     names = ", ".join(f"{s} = {v:.6g}" for s, v in zip(system.states, witness.x, strict=True))
     what = "Vdot >= 0" if witness.kind == "vdot" else "the input leaves its bounds"
     return f"witness: {what} at {names} with V = {witness.level:.12g} (shown in Arb)"
-
-
-__all__ = ["RoaOptions", "RoaResult", "certify_roa", "confirm", "run_checker"]

@@ -42,6 +42,7 @@ class RingProof:
     """`level` is proved from `inner` on (equal to it if the ring is empty); `reason` says what stopped the pass.
 
     `tree` is the partition in preorder: an axis for a split, 255 for a leaf; `root` its half-widths (n,) in z.
+    `witness` (n,) is a point in z at which a claim fails, found along the way.
     """
 
     level: float
@@ -50,6 +51,7 @@ class RingProof:
     root: Array
     boxes: int
     leaves: int
+    witness: Array | None
 
 
 @dataclass
@@ -87,7 +89,7 @@ def prove_ring(
     S = obligations.T.T @ obligations.P @ obligations.T
     root = np.sqrt(target * np.diag(np.linalg.inv(S))) * (1 + 1e-9)
     if inner >= target:  # the ring is empty
-        return RingProof(target, "requested", bytes([LEAF]), root, 0, 1)
+        return RingProof(target, "requested", bytes([LEAF]), root, 0, 1, None)
     start, target0 = time.monotonic(), target
     lo = torch.tensor(-root, dtype=torch.float64, device=device)[:, None]
     hi = -lo
@@ -97,6 +99,7 @@ def prove_ring(
     number = torch.tensor(tree.add(lowest.cpu().numpy()), device=device)
     splits: list[tuple[NDArray[Any], NDArray[np.uint8], NDArray[np.int64]]] = []  # parents, axes, first children
     boxes, reason = 0, "requested"
+    witness: Array | None = None
     while lo.shape[1]:
         # Best first: the boxes with the lowest V.
         if lo.shape[1] > budget.batch:
@@ -107,9 +110,11 @@ def prove_ring(
         boxes += box_lo.shape[1]
         proved, score, centre_bad = bound(box_lo, box_hi)
         if bool(centre_bad.any()):  # a violation at a box's centre caps the level
-            highest = bound.levels_at((box_lo + box_hi) / 2)[centre_bad].min().item()
-            if highest < target:
-                target, reason = highest * (1 - 1e-6), "witness"
+            bad_centres = 0.5 * box_lo[:, centre_bad] + 0.5 * box_hi[:, centre_bad]
+            at = bound.levels_at(bad_centres)
+            if at.min().item() < target:
+                target, reason = at.min().item() * (1 - 1e-3), "witness"
+                witness = bad_centres[:, at.argmin()].cpu().numpy()
         open_ = ~proved
         box_lo, box_hi, box_number, score = box_lo[:, open_], box_hi[:, open_], box_number[open_], score[:, open_]
         width = box_hi - box_lo
@@ -154,7 +159,7 @@ def prove_ring(
             break
     level = max(target, inner)
     preorder = _preorder(tree, splits, level)
-    return RingProof(level, reason, preorder, root, boxes, preorder.count(bytes([LEAF])))
+    return RingProof(level, reason, preorder, root, boxes, preorder.count(bytes([LEAF])), witness)
 
 
 def _preorder(
@@ -236,7 +241,9 @@ class _VdotBound:
         if vdot is None:
             raise ValueError("a plant has at least one state")
         value, excess = upper_bound(vdot)
-        proved, bad = value < 0, vdot.c - vdot.r >= 0
+        # At the box's centre only the inputs' errors and the remainder are left.
+        doubt = vdot.g[n:].abs().sum(0) + vdot.Q[n:, n:].abs().sum((0, 1)) + vdot.r
+        proved, bad = value < 0, vdot.c - doubt >= 0
         # What the inputs' errors and the remainder add is charged to the axes that spread the network.
         extra = excess[n:].sum(0) + vdot.r
         score = excess[:n] + share * extra

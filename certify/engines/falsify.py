@@ -44,6 +44,11 @@ def falsify(obligations: Obligations, limit: float, samples: int = 20_000, seed:
     return best
 
 
+def descend(obligations: Obligations, z: Array) -> Witness | None:
+    """The lowest violation reached from a violating point `x = T z`, shape (n,)."""
+    return _Search(obligations).lowest(z[None])
+
+
 def confirm(obligations: Obligations, witness: Witness) -> bool:
     """True if the violation at the witness's binary64 point is shown in Arb."""
     loop = obligations.loop
@@ -84,15 +89,21 @@ class _Search:
             z = z[self.bad(z)]
         if len(z) == 0:
             return None
+        best = torch.inf
+        with torch.no_grad():
+            z = self._lowest_few(self._shrink(z, halvings=8), 256)
         for _ in range(40):
             with torch.no_grad():
-                z = self._shrink(z)
-                z = z[torch.argsort((z * z).sum(-1))][:64]
+                z = self._lowest_few(self._shrink(z, halvings=24), 64)
+            lowest = float((z[0] * z[0]).sum())
+            if lowest > best * (1 - 1e-7):
+                break
+            best = lowest
             z = self._slide(z)
         with torch.no_grad():
-            z = self._shrink(z)
+            z = self._lowest_few(self._shrink(z, halvings=50), 64)
         # The binary64 state is what counts: pull outwards until the violation is certain there.
-        for point in z[torch.argsort((z * z).sum(-1))]:
+        for point in z:
             for factor in (1.0, 1 + 1e-12, 1 + 1e-9, 1 + 1e-6):
                 x = (self.T @ (factor * point)).numpy()
                 for kind in ("vdot", "input"):
@@ -119,10 +130,13 @@ class _Search:
         result: Array = z.detach().numpy()
         return result
 
-    def _shrink(self, z: torch.Tensor) -> torch.Tensor:
+    def _lowest_few(self, z: torch.Tensor, count: int) -> torch.Tensor:
+        return z[torch.argsort((z * z).sum(-1), stable=True)][:count]
+
+    def _shrink(self, z: torch.Tensor, halvings: int) -> torch.Tensor:
         """Scale each violating point to the smallest violating multiple found by bisection."""
         low, high = torch.zeros(len(z), 1, dtype=z.dtype), torch.ones(len(z), 1, dtype=z.dtype)
-        for _ in range(45):
+        for _ in range(halvings):
             middle = (low + high) / 2
             bad = self.bad(middle * z)[:, None]
             low, high = torch.where(bad, low, middle), torch.where(bad, middle, high)

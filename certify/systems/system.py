@@ -171,7 +171,7 @@ class System:
         n, m = self.n, self.m
 
         def f(x: Any, u: Any) -> Any:
-            columns = [x[..., i] for i in range(n)] + [u[..., j] for j in range(m)]
+            columns: list[Any] = [x[..., i] for i in range(n)] + [u[..., j] for j in range(m)]
             zero = 0.0 * (columns[0] + columns[n])  # constant components take the batch's shape
             return stack(tuple(broadcast(*[value + zero for value in raw(*columns)])), -1)
 
