@@ -1,0 +1,86 @@
+"""The closed loop: equilibrium, linearisation, rigorous values at a point."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+import sympy
+
+from certify.closed_loop import ClosedLoop
+from certify.errors import InputError
+from certify.policies import TanhNetwork
+from certify.systems import System
+from tests.conftest import box, chain, pendulum_network, scalar_tanh
+
+
+def test_linearisation_of_the_pendulum(pendulum: System) -> None:
+    network = pendulum_network()
+    loop = ClosedLoop(pendulum, network)
+    A, B, K = loop.linearise()
+    np.testing.assert_allclose(B, [[0], [1 / (0.15 * 0.25)]])
+    np.testing.assert_allclose(A + B @ K, [[0, 1], [9.81 / 0.5, -0.1 / (0.15 * 0.25)]])
+    f = pendulum.function()
+    step = 1e-6 * np.eye(2)
+    numeric = (f(step, loop.policy(step)) - f(-step, loop.policy(-step))).T / 2e-6
+    np.testing.assert_allclose(A, numeric, rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("centre", ["preactivation", "output"])
+def test_eigenvalues_are_enclosed(pendulum: System, centre: str) -> None:
+    loop = ClosedLoop(pendulum, pendulum_network(centre=centre))
+    balls = loop.eigenvalues()
+    assert balls is not None
+    floats = sorted(np.linalg.eigvals(loop.linearise()[0]), key=lambda v: v.real)
+    for ball, value in zip(sorted(balls, key=lambda v: float(v.real)), floats, strict=True):
+        assert float(abs(ball - complex(value)).abs_upper()) < 1e-9 * abs(value)
+        assert float(ball.real.rad()) < 1e-20
+
+
+@pytest.mark.parametrize("centre", ["preactivation", "output"])
+def test_vdot_at_a_point_agrees_with_floats(pendulum: System, centre: str) -> None:
+    loop = ClosedLoop(pendulum, pendulum_network(centre=centre))
+    P = np.array([[1.0, 0.1], [0.1, 0.05]])
+    f = pendulum.function()
+    for x in np.random.default_rng(0).standard_normal((20, 2)):
+        ball = loop.evaluate_vdot(P, x)
+        assert float(abs(ball - 2 * float(x @ P @ f(x, loop.policy(x)))).abs_upper()) < 1e-11
+        assert float(ball.rad()) < 1e-40
+
+
+def test_scalar_plant_has_its_known_limit() -> None:
+    loop = ClosedLoop(*scalar_tanh())
+    P = np.eye(1)
+    assert loop.evaluate_vdot(P, np.array([1.915008])) < 0
+    assert loop.evaluate_vdot(P, np.array([1.915009])) > 0
+
+
+def test_counts_must_match(pendulum: System) -> None:
+    _, wrong = chain(3, [-1, -2, -3])
+    with pytest.raises(InputError, match="must read 2 states"):
+        ClosedLoop(pendulum, wrong)
+
+
+def test_the_origin_must_be_an_equilibrium() -> None:
+    x, u = sympy.symbols("x u")
+    system = System("s", (x,), (u,), {}, (x + u + sympy.Rational(1, 10**9),), (sympy.Integer(0),), box(1), box(1))
+    network = TanhNetwork((np.array([[-2.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
+    with pytest.raises(InputError, match="must be exactly 0"):
+        ClosedLoop(system, network)
+
+
+def test_uncentred_policy_is_refused(pendulum: System) -> None:
+    with pytest.raises(InputError, match="not centred"):
+        ClosedLoop(pendulum, pendulum_network(centre="none"))
+
+
+def test_nonzero_equilibrium_input() -> None:
+    x, u = sympy.symbols("x u")
+    c = sympy.Symbol("c")
+    system = System("s", (x,), (u,), {"c": Fraction(3, 10)}, (u - c,), (c,), box(1), box(1))
+    network = TanhNetwork((np.array([[-2.0]]),), (np.array([0.7]),), np.ones(1), np.array([0.1]))
+    loop = ClosedLoop(system, network)
+    value = loop.evaluate_policy(np.zeros(1))[0] * 10
+    assert value.contains(3) and float(value.rad()) < 1e-40
+    assert loop.evaluate_vdot(np.eye(1), np.array([0.5])) < 0

@@ -1,0 +1,205 @@
+"""The producer's bounds: containment against Arb without tolerance, order of convergence, width."""
+
+from __future__ import annotations
+
+import flint
+import numpy as np
+import pytest
+import sympy
+import torch
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from certify.closed_loop import ClosedLoop, evaluate_arb
+from certify.enclosures import PolicyEnclosure, Taylor, evaluate, upper_bound
+from certify.enclosures.policy import relax_tanh
+from certify.policies import TanhNetwork
+from certify.systems import System, get_system
+from tests.conftest import box, pendulum_network
+
+CPU = torch.device("cpu")
+
+
+def tensor(values: object) -> torch.Tensor:
+    return torch.tensor(values, dtype=torch.float64)
+
+
+def arb(value: float) -> flint.arb:
+    return flint.arb(float(value))
+
+
+@given(
+    st.floats(-30, 30),
+    st.one_of(st.floats(0, 40), st.floats(-12, 0).map(lambda e: 10.0**e)),
+    st.lists(st.floats(-1, 1), min_size=1, max_size=8),
+)
+def test_tanh_lies_between_its_parallel_lines(centre: float, radius: float, shares: list[float]) -> None:
+    flint.ctx.prec = 200
+    s, m, gap = (float(v[0]) for v in relax_tanh(tensor([centre]), tensor([radius])))
+    for share in [-1.0, 0.0, 1.0, *shares]:
+        y = arb(centre) + arb(radius) * arb(share)
+        assert abs(y.tanh() - arb(s) * y - arb(m)) <= arb(gap)
+
+
+@pytest.mark.parametrize("centre", [0.0, 0.3, -0.7, 1.5, -3.0])
+def test_relaxation_is_of_second_order_and_never_looser_than_an_interval(centre: float) -> None:
+    radii = tensor([2.0**-k for k in range(1, 10)])
+    s, _, gap = relax_tanh(torch.full_like(radii, centre), radii)
+    orders = torch.log2(gap[:-1] / gap[1:])
+    assert bool((orders[3:] > 1.85).all())
+    interval = (torch.tanh(centre + radii) - torch.tanh(centre - radii)) / 2
+    assert bool((gap <= interval * (1 + 1e-12) + 1e-13).all())
+    assert bool((s >= 0).all()) and bool((s <= 1).all())
+
+
+def _networks() -> list[tuple[System, TanhNetwork]]:
+    generator = np.random.default_rng(1)
+    pendulum = get_system("pendulum")
+    x, y, z, u, v = sympy.symbols("x y z u v")
+    two = System(
+        "two", (x, y, z), (u, v), {}, (u - sympy.Rational(1, 3), v, -z), (sympy.Rational(1, 3), sympy.Integer(0)), box(2, 2, 2), box(9, 9)
+    )
+    wide = TanhNetwork(
+        (generator.standard_normal((40, 3)), generator.standard_normal((30, 40)) / 3, generator.standard_normal((2, 30))),
+        (generator.standard_normal(40), generator.standard_normal(30), generator.standard_normal(2)),
+        np.array([2.0, -3.0]), np.array([0.2, 0.1]), "tanh", "preactivation",
+    )  # fmt: skip
+    linear = TanhNetwork(
+        (generator.standard_normal((2, 3)),), (np.ones(2),), np.ones(2), np.ones(2), "identity", "output"
+    )
+    return [
+        (pendulum, pendulum_network()),
+        (pendulum, pendulum_network(centre="output")),
+        (two, wide),
+        (two, TanhNetwork(wide.weights, wide.biases, wide.scale, wide.offset, "identity", "output")),
+        (two, linear),
+    ]
+
+
+@pytest.mark.parametrize("case", range(5))
+@pytest.mark.parametrize("size", [0.0, 1e-12, 1e-6, 1e-2, 0.5, 10.0, 1e6])
+def test_the_policy_lies_in_its_enclosure(case: int, size: float) -> None:
+    system, network = _networks()[case]
+    loop = ClosedLoop(system, network)
+    generator = np.random.default_rng(case)
+    n, m, batch = system.n, system.m, 4
+    centre = generator.standard_normal((n, batch))
+    slopes = size * generator.standard_normal((n, n, batch))
+    x = torch.cat([tensor(centre)[:, None], tensor(slopes)], 1)
+    mid, gradient, error, _ = PolicyEnclosure(loop, CPU)(x, torch.zeros(n, batch, dtype=torch.float64))
+    checked = 0
+    for b in range(batch):
+        for d in [np.ones(n), *generator.uniform(-1, 1, (3, n))]:
+            point = centre[:, b] + slopes[:, :, b] @ d  # a binary64 state, a rounding away from the affine form
+            slack = 1e-13 * (1 + size)
+            for j, u in enumerate(loop.evaluate_policy(point)):
+                form = arb(mid[j, b]) + sum((arb(gradient[j, i, b]) * arb(d[i]) for i in range(n)), flint.arb(0))
+                lipschitz = float(
+                    np.prod([np.linalg.norm(W, 2) for W in network.weights]) * np.max(np.abs(network.scale))
+                )
+                assert abs(u - form) <= arb(error[j, b]) + arb(slack * lipschitz)
+                checked += 1
+    assert checked == batch * 4 * m
+
+
+def test_policy_error_is_of_second_order(pendulum: System) -> None:
+    enclosure = PolicyEnclosure(ClosedLoop(pendulum, pendulum_network()), CPU)
+    errors = []
+    for k in range(8):
+        slopes = 0.2 * 2.0**-k * torch.eye(2, dtype=torch.float64)[:, :, None]
+        x = torch.cat([tensor([0.4, -0.3])[:, None, None], slopes], 1)
+        errors.append(float(enclosure(x, torch.zeros(2, 1, dtype=torch.float64))[2][0, 0]))
+    orders = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
+    assert np.all(orders[3:] > 1.8)
+
+
+X, Y = sympy.symbols("x y")
+EXPRESSIONS = [
+    X * Y,
+    X**3 - 2 * Y**2 + sympy.Rational(1, 3),
+    sympy.sin(X) * sympy.cos(Y),
+    sympy.tan(X / 4) + Y,
+    (X + Y) / (2 + sympy.sin(X) ** 2),
+    (3 + X**2) ** -2 * Y,
+    sympy.Rational(1, 7) * X * sympy.sin(X * Y) - sympy.cos(X),
+]
+
+
+def model(c: float, g: list[float]) -> Taylor:
+    zero = torch.zeros(2, 2, 1, dtype=torch.float64)
+    return Taylor(tensor([c]), tensor(g)[:, None], zero, torch.zeros(1, dtype=torch.float64))
+
+
+coefficient = st.floats(-1, 1).map(lambda v: round(v, 6))
+
+
+@pytest.mark.parametrize("expression", EXPRESSIONS, ids=str)
+@given(
+    st.lists(coefficient, min_size=6, max_size=6),
+    st.sampled_from([1.0, 0.1, 1e-3, 1e-9, 0.0]),
+    st.lists(st.tuples(st.floats(-1, 1), st.floats(-1, 1)), min_size=1, max_size=4),
+)
+def test_taylor_models_contain_the_function(
+    expression: sympy.Expr, numbers: list[float], size: float, points: list[tuple[float, float]]
+) -> None:
+    flint.ctx.prec = 200
+    (a, b), g, h = numbers[:2], [size * v for v in numbers[2:4]], [size * v for v in numbers[4:]]
+    result = evaluate(expression, {X: model(a, g), Y: model(b, h)}, {})
+    bound = float(upper_bound(result)[0][0])
+    assume(bool(torch.isfinite(result.r[0])))  # NaN: a pole could not be excluded, and nothing is claimed
+    for d in points:
+        values = {
+            X: arb(a) + arb(g[0]) * arb(d[0]) + arb(g[1]) * arb(d[1]),
+            Y: arb(b) + arb(h[0]) * arb(d[0]) + arb(h[1]) * arb(d[1]),
+        }
+        true = evaluate_arb(expression, values)
+        polynomial = arb(result.c[0])
+        for i in range(2):
+            polynomial += arb(result.g[i, 0]) * arb(d[i])
+            for j in range(2):
+                polynomial += arb(result.Q[i, j, 0]) * arb(d[i]) * arb(d[j])
+        assert abs(true - polynomial) <= arb(result.r[0])
+        assert true <= arb(bound)
+
+
+@pytest.mark.parametrize("expression", EXPRESSIONS, ids=str)
+def test_taylor_remainder_is_of_third_order(expression: sympy.Expr) -> None:
+    remainders = []
+    for k in range(2, 9):
+        size = 0.5 * 2.0**-k
+        result = evaluate(expression, {X: model(0.3, [size, -0.4 * size]), Y: model(-0.2, [0.1 * size, size])}, {})
+        remainders.append(float(result.r[0]))
+    if max(remainders) < 1e-13:  # a polynomial of degree two: nothing but rounding
+        assert sympy.Poly(expression, X, Y).total_degree() <= 2
+        return
+    orders = np.log2(np.array(remainders[:-1]) / np.array(remainders[1:]))
+    assert np.all(orders[2:] > 2.8)
+
+
+def test_a_pole_in_reach_is_never_bounded() -> None:
+    for expression, centre in ((1 / X, 0.05), (sympy.tan(X), 1.5), (X**-2, 0.0)):
+        result = evaluate(expression, {X: model(centre, [0.1, 0.0]), Y: model(0.0, [0.0, 0.0])}, {})
+        assert not bool(upper_bound(result)[0][0] < float("inf"))
+
+
+def test_upper_bound_is_exact_for_separable_quadratics() -> None:
+    generator = np.random.default_rng(3)
+    t = np.linspace(-1, 1, 20_001)
+    for _ in range(50):
+        g, q = generator.standard_normal(2), generator.standard_normal(2)
+        separable = Taylor(tensor([0.5]), tensor(g)[:, None], torch.diag(tensor(q))[:, :, None], tensor([0.0]))
+        value = 0.5 + sum(np.max(g[i] * t + q[i] * t**2) for i in range(2))
+        bound = float(upper_bound(separable)[0][0])
+        assert value <= bound <= value + 1e-6
+
+
+def test_the_enclosure_is_invariant_under_the_oddness_of_tanh(pendulum: System) -> None:
+    """Negating a hidden layer's incoming and outgoing weights leaves the function, and its bounds, as they are."""
+    network = pendulum_network()
+    W, b = network.weights, network.biases
+    flipped = TanhNetwork((-W[0], -W[1], W[2]), (-b[0], b[1], b[2]), network.scale, network.offset)
+    x = torch.cat([tensor([0.2, 0.5])[:, None, None], 0.3 * torch.eye(2, dtype=torch.float64)[:, :, None]], 1)
+    none = torch.zeros(2, 1, dtype=torch.float64)
+    first, second = (PolicyEnclosure(ClosedLoop(pendulum, w), CPU)(x, none) for w in (network, flipped))
+    for a, c in zip(first[:3], second[:3], strict=True):
+        np.testing.assert_allclose(a.numpy(), c.numpy(), rtol=1e-9, atol=1e-12)

@@ -1,0 +1,162 @@
+"""Plants: exact numbers, the grammar, and plants described in TOML."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+import sympy
+import torch
+
+from certify.errors import InputError
+from certify.systems import System, available_systems, exact, get_system, load_system
+from certify.systems.toml import parse_expression
+from tests.conftest import box
+
+VAN_DER_POL = Path(__file__).parent.parent / "examples" / "van_der_pol.toml"
+
+
+def test_text_is_decimal_and_a_float_is_binary() -> None:
+    assert exact("0.15") == Fraction(3, 20)
+    assert exact(0.15) == Fraction(0.15) != Fraction(3, 20)
+    assert exact("1e-3") == Fraction(1, 1000)
+
+
+@pytest.mark.parametrize("value", ["", "abc", "1/0", "nan", "inf", float("nan"), float("inf")])
+def test_what_is_no_number_is_refused(value: object) -> None:
+    with pytest.raises(InputError, match="mass"):
+        exact(value, "mass")  # type: ignore[arg-type]
+
+
+def test_pendulum_equations(pendulum: System) -> None:
+    x = np.array([[0.3, -1.2], [2.0, 5.0]])
+    u = np.array([[0.7], [-3.0]])
+    expected = np.stack([x[:, 1], 9.81 / 0.5 * np.sin(x[:, 0]) + (u[:, 0] - 0.1 * x[:, 1]) / (0.15 * 0.25)], -1)
+    np.testing.assert_allclose(pendulum.function()(x, u), expected, rtol=1e-14)
+    result = pendulum.function("torch")(torch.tensor(x), torch.tensor(u))
+    np.testing.assert_allclose(result.numpy(), expected, rtol=1e-14)
+    assert pendulum.exact_dynamics()[1].coeff(pendulum.inputs[0]) == sympy.Rational(80, 3)
+
+
+def test_every_registered_plant_has_its_equilibrium_and_units() -> None:
+    for name in available_systems():
+        system = get_system(name)
+        at_zero = dict.fromkeys(system.states, 0) | dict(
+            zip(system.inputs, (sympy.Rational(u) for u in system.exact_u_eq()), strict=True)
+        )
+        assert all(e.subs(at_zero) == 0 for e in system.exact_dynamics())
+        names = [s.name for s in (*system.states, *system.inputs)] + list(system.parameters)
+        assert set(names) <= set(system.units)
+
+
+def test_parameters_are_replaced_exactly(pendulum: System) -> None:
+    changed = pendulum.with_parameters({"m": "0.3"})
+    assert changed.parameters["m"] == Fraction(3, 10)
+    assert pendulum.parameters["m"] == Fraction(3, 20)
+    assert changed.exact_dynamics()[1].coeff(pendulum.inputs[0]) == sympy.Rational(40, 3)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"z": 1}, "no parameter 'z'"),
+        ({"m": 0}, "must be positive"),
+        ({"m": "-1"}, "must be positive"),
+        ({"m": "x"}, "m"),
+    ],
+)
+def test_bad_parameters(pendulum: System, change: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        pendulum.with_parameters(change)  # type: ignore[arg-type]
+
+
+def test_domain_must_surround_the_origin(pendulum: System) -> None:
+    assert pendulum.with_domain({"theta": (Fraction(-1), Fraction(2))}).domain[0] == (-1, 2)
+    with pytest.raises(InputError, match="interior"):
+        pendulum.with_domain({"theta": (Fraction(0), Fraction(2))})
+    with pytest.raises(InputError, match="no state 'phi'"):
+        pendulum.with_domain({"phi": (Fraction(-1), Fraction(2))})
+
+
+@pytest.mark.parametrize(
+    ("build", "message"),
+    [
+        (lambda x, u: sympy.exp(x) + u, "exp"),
+        (lambda x, u: 0.5 * x + u, "rounded number"),
+        (lambda x, u: x ** sympy.Rational(1, 2) + u, "allowed"),
+        (lambda x, u: sympy.Symbol("y") + u, "no state, input or parameter"),
+        (lambda x, u: sympy.pi * x + u, "allowed"),
+    ],
+)
+def test_the_grammar_is_closed(build: object, message: str) -> None:
+    x, u = sympy.symbols("x u")
+    with pytest.raises(InputError, match=message):
+        System("s", (x,), (u,), {}, (build(x, u),), (sympy.Integer(0),), box(1), box(1))  # type: ignore[operator]
+
+
+def test_unknown_plant_names_the_known_ones() -> None:
+    with pytest.raises(InputError, match="pendulum"):
+        get_system("pendulun")
+
+
+def test_toml_plant() -> None:
+    system = load_system(VAN_DER_POL)
+    x = np.array([0.5, -0.25])
+    np.testing.assert_allclose(system.function()(x, np.array([0.1])), [-0.25, -0.5 + (1 - 0.25) * -0.25 + 0.1])
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "__import__('os').system('x')",
+        "x.real",
+        "x^2",
+        "x**u",
+        "x**0.5",
+        "[x]",
+        "x if u else x",
+        "lambda: x",
+        "sin(x, u)",
+        "sin()",
+        "1/0",
+        "y",
+        "x**99999999",
+        "1e999999999",
+        "x <",
+        "0x+",
+    ],
+)
+def test_equations_are_parsed_not_executed(text: str) -> None:
+    names = {n: sympy.Symbol(n) for n in ("x", "u")}
+    with pytest.raises(InputError):
+        parse_expression(text, names)
+
+
+def test_decimals_in_equations_are_exact() -> None:
+    assert parse_expression("0.1*x", {"x": sympy.Symbol("x")}).args[0] == sympy.Rational(1, 10)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("mu = 1", "nu = 1", "mu"),
+        ('x1 = "x2"', 'x9 = "x2"', "x1"),
+        ("states =", "stated =", "unknown keys"),
+        ("name =", "name", "not valid TOML"),
+        ("[-5, 5]", "[5, -5]", "interior"),
+    ],
+)
+def test_bad_toml(tmp_path: Path, old: str, new: str, message: str) -> None:
+    text = VAN_DER_POL.read_text()
+    assert old in text
+    path = tmp_path / "plant.toml"
+    path.write_text(text.replace(old, new, 1))
+    with pytest.raises(InputError, match=message):
+        load_system(path)
+
+
+def test_missing_toml(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="cannot be read"):
+        get_system(str(tmp_path / "nothing.toml"))
