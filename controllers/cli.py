@@ -1,8 +1,8 @@
 """`controllers`: arguments, printing and exit statuses; no mathematics.
 
 Standard output carries the result, or exactly one JSON object with `--json`; progress goes to standard
-error. Exit status: 0 done, 2 bad usage or input. The options of `train` are the fields of `TrainingOptions`,
-read from the dataclass, so that an option cannot exist in one place only.
+error. Exit status: 0 done, 2 bad usage or input, 70 internal error. The options of `train` are the fields
+of `TrainingOptions`, read from the dataclass, so that an option cannot exist in one place only.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import inspect
 import json
 import os
 import tempfile
+import traceback
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import fields, replace
@@ -38,11 +39,15 @@ Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instea
 
 
 def main() -> None:
-    """Entry point of the `controllers` command."""
-    app()
+    """Entry point of the `controllers` command; a fault of the program itself exits 70."""
+    try:
+        app()
+    except Exception:
+        traceback.print_exc()
+        raise SystemExit(70) from None
 
 
-def _train(  # noqa: PLR0917  # a command line
+def _train(
     plant: Annotated[str, typer.Argument(help="The plant, for instance pendulum.")],
     out: Annotated[Path, typer.Option("--out", help="The policy file to write.")],
     log: Annotated[Path | None, typer.Option("--log", help="CSV file of episodes and returns.")] = None,

@@ -46,8 +46,11 @@ def squashed_log_likelihood(w: Tensor, mean: Tensor, log_std: Tensor, scale: Ten
     return (gaussian - stretch).sum(-1)
 
 
-class Squash:
-    """The plant as the learner knows it: `u = scale * tanh(w) + offset`, u_eq, and factors on the states."""
+class Interface:
+    """What the learner is told of the plant: its input bounds, u_eq and the ranges of its states.
+
+    `u = scale * tanh(w) + offset`; `state_factors` bring the states to order one.
+    """
 
     def __init__(self, system: System) -> None:
         u_lo, u_hi = np.array(system.input_bounds, dtype=np.float64).T
@@ -72,7 +75,7 @@ class Actor(nn.Module):
 
     Parameters
     ----------
-    squash : the action's scale and offset, and the states' factors.
+    interface : the action's scale and offset, u_eq, and the states' factors.
     widths : hidden widths.
     centre : how the mean will be centred; decides which Jacobian is compared with -K.
     """
@@ -83,18 +86,18 @@ class Actor(nn.Module):
     factors: Tensor
     rest: Tensor
 
-    def __init__(self, squash: Squash, widths: Sequence[int], centre: Centre) -> None:
+    def __init__(self, interface: Interface, widths: Sequence[int], centre: Centre) -> None:
         super().__init__()
-        n, m = len(squash.state_factors), len(squash.scale)
+        n, m = len(interface.state_factors), len(interface.scale)
         sizes = [n, *widths]
         self.hidden = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(sizes))
         self.mean = nn.Linear(sizes[-1], m)
         self.log_std = nn.Linear(sizes[-1], m)
         self.centre = centre
         for name in ("scale", "offset", "u_eq"):
-            self.register_buffer(name, torch.tensor(getattr(squash, name), dtype=torch.float32))
-        self.register_buffer("factors", torch.tensor(squash.state_factors, dtype=torch.float32))
-        self.register_buffer("rest", torch.tensor(squash.to_normalised(squash.u_eq), dtype=torch.float32))
+            self.register_buffer(name, torch.tensor(getattr(interface, name), dtype=torch.float32))
+        self.register_buffer("factors", torch.tensor(interface.state_factors, dtype=torch.float32))
+        self.register_buffer("rest", torch.tensor(interface.to_normalised(interface.u_eq), dtype=torch.float32))
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and log standard deviation of w, before the squash."""
@@ -206,15 +209,15 @@ class SAC:
 
     Parameters
     ----------
-    squash : what the learner is told of the plant.
+    interface : what the learner is told of the plant.
     options : hyperparameters.
     generator : source of the actor's noise; initial weights come from torch's global generator.
     """
 
-    def __init__(self, squash: Squash, options: TrainingOptions, generator: torch.Generator) -> None:
-        n, m = len(squash.state_factors), len(squash.scale)
+    def __init__(self, interface: Interface, options: TrainingOptions, generator: torch.Generator) -> None:
+        n, m = len(interface.state_factors), len(interface.scale)
         self.options, self.generator = options, generator
-        self.actor = Actor(squash, options.actor, options.centre)
+        self.actor = Actor(interface, options.actor, options.centre)
         self.value = Critic(n, options.critic, copies=1)
         self.value_target = Critic(n, options.critic, copies=1)
         self.value_target.load_state_dict(self.value.state_dict())

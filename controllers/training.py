@@ -14,7 +14,6 @@ import csv
 import io
 import json
 import os
-import pickle
 import platform
 from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass, fields
@@ -33,7 +32,7 @@ from certify.systems import System
 from controllers.environments import PlantEnvironment, Snapshot
 from controllers.lqr import GainLearner, Identified
 from controllers.options import TrainingOptions
-from controllers.sac import SAC, Replay, Squash
+from controllers.sac import SAC, Interface, Replay
 
 Array = NDArray[np.float64]
 
@@ -103,13 +102,13 @@ class Trainer:
         options.check_sizes(system)
         self.system, self.options = system, options
         self.environment = PlantEnvironment(system, options)
-        self.squash = Squash(system)
+        self.interface = Interface(system)
         Q_c, R_c = np.diag(options.state_weights), np.diag(options.input_weights)
         self.gain = GainLearner(options.eta, options.n_A, options.n_B, Q_c, R_c)
         self.generator = torch.Generator().manual_seed(options.seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(options.seed)
-            self.sac = SAC(self.squash, options, self.generator)
+            self.sac = SAC(self.interface, options, self.generator)
         self.replay = Replay(min(options.replay, options.steps), system.n, system.m)
         self.steps_done = 0
         self.episodes: list[Episode] = []
@@ -126,7 +125,7 @@ class Trainer:
         x_next, reward, terminated, truncated, _ = self.environment.step(u)
         self.replay.add(x, normalised, reward, x_next, terminated)
         known = self.gain.identified
-        self.gain.observe(x, u - self.squash.u_eq, x_next)
+        self.gain.observe(x, u - self.interface.u_eq, x_next)
         if self.gain.identified is not known:
             self._learn_gain()
         self.steps_done += 1
@@ -235,12 +234,12 @@ class Trainer:
     def _choose(self, x: Array) -> tuple[Array, Array]:
         """The input u and `tanh(w)` of it; zero action is u_eq to the last bit."""
         if self.gain.phase == "A" and self.gain.inside(x):
-            return self.squash.u_eq, self.squash.to_normalised(self.squash.u_eq)
+            return self.interface.u_eq, self.interface.to_normalised(self.interface.u_eq)
         if self.steps_done < self.options.warm_up:
             normalised = np.asarray(self.environment.np_random.uniform(-1.0, 1.0, self.system.m))
         else:
             normalised = self.sac.act(x)
-        return self.squash.to_action(normalised), normalised
+        return self.interface.to_action(normalised), normalised
 
     def _actor_step(self) -> float:
         anneal = self.options.anneal * self.options.steps
@@ -321,7 +320,7 @@ def write_atomically(path: Path, content: bytes) -> None:
 def _read_checkpoint(content: bytes) -> dict[str, Any]:
     try:
         state = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
-    except (pickle.UnpicklingError, RuntimeError, EOFError, ValueError, KeyError) as error:
+    except Exception as error:  # torch.load has no closed list of what it raises on a damaged file
         raise InputError(f"the checkpoint cannot be read: {error}.") from error
     if not isinstance(state, dict) or state.get("format") != CHECKPOINT_FORMAT:
         raise InputError(f"the checkpoint must have the format {CHECKPOINT_FORMAT!r}.")

@@ -1,0 +1,134 @@
+"""The `controllers` command: what goes where, exit statuses, and that failure leaves files alone."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from certify.policies import load_policy
+from controllers.cli import app
+
+SHIPPED = Path(__file__).parent.parent / "examples" / "policies" / "pendulum.pt"
+SHORT = ["--steps", "260", "--warm-up", "100", "--n-A", "60", "--n-B", "60", "--batch", "16", "--critic", "8,8"]
+
+runner = CliRunner()
+
+
+def _train(*arguments):
+    return runner.invoke(app, ["train", *map(str, arguments)])
+
+
+def test_train_writes_policy_log_and_checkpoint_and_resumes(tmp_path):
+    out, log, folder = tmp_path / "p.pt", tmp_path / "p.csv", tmp_path / "runs"
+    arguments = ["pendulum", *SHORT, "--log", log, "--checkpoint-dir", folder, "--checkpoint-every", 130]
+    first = _train(*arguments, "--out", out, "--seed", 3, "--centre", "output", "--json")
+    assert first.exit_code == 0, first.stderr
+    result = json.loads(first.stdout)
+    policy = load_policy(out)
+    assert result["sha256"] == policy.network.sha256()
+    assert policy.training["seed"] == 3 and policy.training["critic"] == [8, 8]
+    assert policy.network.centre == "output"
+    assert log.read_text().startswith("step,kind,length,total")
+    assert not list(tmp_path.glob("*.partial"))
+    assert (folder / "checkpoint.pt").is_file()
+    again = tmp_path / "again.pt"
+    resumed = _train(*arguments, "--out", again, "--seed", 3, "--centre", "output", "--resume")
+    assert resumed.exit_code == 0, resumed.stderr
+    assert again.read_bytes() == out.read_bytes()
+
+
+@pytest.mark.parametrize(
+    "arguments, message",
+    [
+        (["spaceship"], "spaceship"),
+        (["pendulum", "--gamma", "1.5"], "`gamma` must be in [0, 1)"),
+        (["pendulum", "--critic", "64,wide"], "`critic` must be numbers"),
+        (["pendulum", "--reward-weights", "1,2,3"], "`reward_weights` must be 2 numbers"),
+        (["pendulum", "--centre", "nowhere"], "`centre`"),
+        (["pendulum", "--resume"], "--checkpoint-dir"),
+        (["pendulum", "--checkpoint-every", "0"], "`checkpoint_every`"),
+        (["pendulum", "--steps", "20"], "without a gain"),
+        (["pendulum", "--log", "/nonexistent/folder/log.csv"], "cannot be written"),
+    ],
+)
+def test_bad_input_is_one_sentence_and_changes_nothing(tmp_path, arguments, message):
+    out = tmp_path / "p.pt"
+    out.write_bytes(b"precious")
+    result = _train(*arguments, "--out", out)
+    assert result.exit_code == 2
+    assert message in result.stderr
+    errors = [line for line in result.stderr.splitlines() if line.startswith("Error: ")]
+    assert len(errors) == 1 and "Traceback" not in result.stderr
+    assert result.stdout == ""
+    assert out.read_bytes() == b"precious"
+
+
+def test_an_output_that_cannot_be_written_is_refused_before_training(tmp_path):
+    for out in (tmp_path / "missing" / "p.pt", tmp_path):
+        result = _train("pendulum", "--out", out, "--json")  # the whole preset: minutes, if it began
+        assert result.exit_code == 2
+        assert list(json.loads(result.stdout)) == ["error"]
+
+
+def test_resuming_from_nothing_or_from_rubbish_is_refused(tmp_path):
+    arguments = ["pendulum", *SHORT, "--out", tmp_path / "p.pt", "--checkpoint-dir", tmp_path, "--resume"]
+    missing = _train(*arguments)
+    (tmp_path / "checkpoint.pt").write_bytes(b"rubbish")
+    damaged = _train(*arguments)
+    assert missing.exit_code == damaged.exit_code == 2
+    assert "there is no checkpoint" in missing.stderr and "cannot be read" in damaged.stderr
+    assert (tmp_path / "checkpoint.pt").read_bytes() == b"rubbish"
+    assert not (tmp_path / "p.pt").exists()
+
+
+def test_evaluate_prints_one_json_object():
+    result = runner.invoke(app, ["evaluate", str(SHIPPED), "--states", "3", "--json"])
+    assert result.exit_code == 0, result.stderr
+    figures = json.loads(result.stdout)
+    assert figures["continuous"]["settled"] == figures["held"]["settled"] == 3
+    assert figures["gain"]["relative"] < 0.01
+    assert figures["policy"]["sha256"] == load_policy(SHIPPED).network.sha256()
+
+
+def test_evaluate_prints_text():
+    result = runner.invoke(app, ["evaluate", str(SHIPPED), "--states", "2"])
+    assert result.exit_code == 0, result.stderr
+    assert "2 of 2 settled" in result.stdout
+
+
+@pytest.mark.parametrize("content", [None, b"rubbish"])
+def test_evaluate_refuses_a_file_it_cannot_read(tmp_path, content):
+    path = tmp_path / "p.pt"
+    if content is not None:
+        path.write_bytes(content)
+    result = runner.invoke(app, ["evaluate", str(path), "--json"])
+    assert result.exit_code == 2
+    assert str(path) in json.loads(result.stdout)["error"]
+
+
+def test_unknown_options_exit_2_without_a_traceback():
+    for arguments in (["train", "pendulum", "--bogus"], ["train", "pendulum", "--out", "p.pt", "--steps", "many"]):
+        result = runner.invoke(app, arguments)
+        assert result.exit_code == 2
+        assert "Traceback" not in result.stderr
+
+
+def test_help_lists_every_option_of_a_run():
+    from dataclasses import fields
+
+    from controllers.options import TrainingOptions
+
+    text = runner.invoke(app, ["train", "--help"]).stdout
+    for option in fields(TrainingOptions):
+        assert f"--{option.name.replace('_', '-')} " in text
+
+
+def test_help_loads_no_torch():
+    code = "import sys; import controllers.cli; print('torch' in sys.modules, 'gymnasium' in sys.modules)"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert result.stdout.split() == ["False", "False"]

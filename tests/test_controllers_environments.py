@@ -1,0 +1,117 @@
+"""The simulators: gymnasium's contract, the equations of the plant, how an episode ends."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import replace
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+
+from certify.errors import InputError
+from certify.systems import get_system
+from controllers.environments import PlantEnvironment, Stepper
+from controllers.options import PRESETS, preset
+
+
+@pytest.fixture
+def environment() -> PlantEnvironment:
+    return PlantEnvironment(get_system("pendulum"), preset("pendulum"))
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_registered_environments_pass_the_checker(name):
+    environment = gymnasium.make(f"certify/{name}-v0")
+    with warnings.catch_warnings():
+        # Advice that does not apply: states are unbounded after a termination, inputs are in physical units.
+        warnings.filterwarnings("ignore", message=".*(infinity|symmetric and normalized).*")
+        check_env(environment.unwrapped, skip_render_check=True)
+
+
+def test_observation_is_the_raw_float64_state_and_angles_are_not_wrapped(environment):
+    environment.reset(seed=0)
+    environment.restore(replace(environment.snapshot(), x=(3.13, 5.0)))
+    x, _, terminated, _, _ = environment.step(np.zeros(1))
+    assert x.dtype == np.float64
+    assert x[0] > 3.2 and terminated
+
+
+def test_step_agrees_with_a_fine_integration_of_the_written_equation(environment):
+    # theta'' = (g/l) sin theta - b/(m l^2) theta' + u/(m l^2), by many small midpoint steps.
+    x, u, pieces = np.array([0.7, -1.2]), 2.5, 2000
+    environment.reset(seed=0)
+    environment.restore(replace(environment.snapshot(), x=tuple(x)))
+
+    def f(y):
+        return np.array([y[1], 9.81 / 0.5 * np.sin(y[0]) + (u - 0.1 * y[1]) / (0.15 * 0.5**2)])
+
+    h = environment.options.dt / pieces
+    for _ in range(pieces):
+        x = x + h * f(x + h / 2 * f(x))
+    found, *_ = environment.step(np.array([u]))
+    np.testing.assert_allclose(found, x, rtol=0, atol=1e-5)
+
+
+def test_runge_kutta_converges_with_order_four():
+    system, x, u = get_system("pendulum"), np.array([0.7, -1.2]), np.array([2.5])
+
+    def after(steps):
+        stepper, y = Stepper(system, 0.2 / steps, "numpy"), x
+        for _ in range(steps):
+            y = stepper(y, u)
+        return y
+
+    exact = after(400)
+    errors = [np.linalg.norm(after(steps) - exact) for steps in (4, 8)]
+    assert 3.7 < np.log2(errors[0] / errors[1]) < 4.4
+
+
+def test_batched_torch_stepper_follows_the_environment(environment):
+    generator = np.random.default_rng(0)
+    x, u = generator.uniform(-2, 2, (5, 2)), generator.uniform(-6, 6, (5, 1))
+    batched = Stepper(environment.system, environment.options.dt, "torch")(torch.tensor(x), torch.tensor(u))
+    for k in range(5):
+        environment.reset(seed=0)
+        environment.restore(replace(environment.snapshot(), x=tuple(x[k])))
+        single, *_ = environment.step(u[k])
+        np.testing.assert_allclose(batched[k].numpy(), single, rtol=0, atol=1e-12)
+
+
+def test_an_action_beyond_its_bounds_is_clipped(environment):
+    ends = []
+    for action in (6.0, 60.0):
+        environment.reset(seed=3)
+        ends.append(environment.step(np.array([action]))[0])
+    np.testing.assert_array_equal(ends[0], ends[1])
+
+
+def test_leaving_the_domain_terminates_and_costs_the_penalty(environment):
+    options = environment.options
+    environment.reset(seed=0)
+    environment.restore(replace(environment.snapshot(), x=(3.1, 10.0)))
+    x, reward, terminated, truncated, _ = environment.step(np.zeros(1))
+    assert terminated and not truncated
+    quadratic = float(np.dot(options.reward_weights, x**2))
+    assert reward == pytest.approx(options.reward_offset - quadratic - options.penalty, abs=1e-12)
+
+
+def test_the_time_limit_truncates_and_does_not_terminate():
+    environment = PlantEnvironment(get_system("pendulum"), replace(preset("pendulum"), horizon=3))
+    environment.reset(seed=0, options={"radius": 0.01})
+    endings = [environment.step(np.zeros(1))[2:4] for _ in range(3)]
+    assert endings == [(False, False), (False, False), (False, True)]
+
+
+def test_starts_fill_the_ball_and_stay_inside(environment):
+    environment.reset(seed=0)
+    radii = [np.linalg.norm(environment.reset(options={"radius": 0.1})[0]) for _ in range(300)]
+    assert max(radii) <= 0.1
+    assert np.mean(np.array(radii) < 0.1 / np.sqrt(2)) == pytest.approx(0.5, abs=0.1)  # uniform in area
+
+
+def test_wrong_number_of_reward_weights_is_refused():
+    with pytest.raises(InputError, match="reward_weights"):
+        PlantEnvironment(get_system("pendulum"), replace(preset("pendulum"), reward_weights=(1.0,)))

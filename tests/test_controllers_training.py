@@ -1,0 +1,186 @@
+"""Whole runs: determinism, exact resumption, the exported file, and the policy that ships."""
+
+from __future__ import annotations
+
+import csv
+import io
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from certify.errors import InputError
+from certify.policies import load_policy, save_policy
+from certify.systems import get_system
+from controllers.evaluate import EvaluationOptions, evaluate
+from controllers.options import TrainingOptions, preset
+from controllers.training import EpisodeLog, Trainer, train
+
+SHIPPED = Path(__file__).parent.parent / "examples" / "policies" / "pendulum.pt"
+
+
+@pytest.fixture(scope="module")
+def short() -> TrainingOptions:
+    # Long enough for a gain, a refresh of it, gradient steps and an annealed end; short enough for a test.
+    return replace(
+        preset("pendulum"), steps=600, warm_up=100, n_A=60, n_B=60, refresh=300, batch=32, critic=(16, 16)
+    )
+
+
+def _trainer(options):
+    return Trainer(get_system("pendulum"), options)
+
+
+def _in_full(value):
+    if isinstance(value, dict):
+        return {name: _in_full(part) for name, part in value.items()}
+    return repr(value.tolist() if isinstance(value, torch.Tensor) else value)
+
+
+@pytest.fixture(scope="module")
+def whole(short, tmp_path_factory):
+    """An uninterrupted run, its policy file and a checkpoint from the middle of an episode."""
+    folder, checkpoints = tmp_path_factory.mktemp("whole"), {}
+
+    def keep(trainer):
+        if trainer.steps_done in (50, 333):  # the first is in the warm-up, while A is being collected
+            checkpoints[trainer.steps_done] = trainer.snapshot()
+
+    trainer = _trainer(short)
+    save_policy(folder / "policy.pt", train(trainer, keep))
+    return trainer, (folder / "policy.pt").read_bytes(), checkpoints
+
+
+def test_training_twice_gives_the_same_bytes_and_another_seed_does_not(short, whole, tmp_path):
+    save_policy(tmp_path / "again.pt", train(_trainer(short)))
+    assert (tmp_path / "again.pt").read_bytes() == whole[1]
+    other = train(_trainer(replace(short, seed=1)))
+    assert other.network.sha256() != whole[0].policy().network.sha256()
+
+
+@pytest.mark.parametrize("step", [50, 333])
+def test_a_resumed_run_equals_an_uninterrupted_one(short, whole, tmp_path, step):
+    trainer = _trainer(short)
+    trainer.restore(whole[2][step])
+    assert trainer.steps_done == step
+    save_policy(tmp_path / "resumed.pt", train(trainer))
+    assert (tmp_path / "resumed.pt").read_bytes() == whole[1]
+    assert repr(trainer.episodes) == repr(whole[0].episodes)  # repr: NaN before the first gain
+    # Everything else that a checkpoint holds; printed in full, since NaN is not equal to itself.
+    states = [torch.load(io.BytesIO(t.snapshot()), weights_only=True) for t in (trainer, whole[0])]
+    assert _in_full(states[0]) == _in_full(states[1])
+
+
+def test_a_run_is_resumed_with_its_own_options_only(short, whole):
+    with pytest.raises(InputError, match=r"`gamma` was 0\.99, now it is 0\.9"):
+        _trainer(replace(short, gamma=0.9)).restore(whole[2][50])
+    heavier = get_system("pendulum").with_parameters({"m": "0.2"})
+    with pytest.raises(InputError, match="checkpoint must be of pendulum"):
+        Trainer(heavier, short).restore(whole[2][50])
+
+
+def test_a_damaged_checkpoint_is_refused(short, whole):
+    for content in (b"", b"not a checkpoint", whole[2][50][:5000]):
+        with pytest.raises(InputError, match="checkpoint"):
+            _trainer(short).restore(content)
+
+
+def test_the_gain_is_identified_first_and_refreshed_later(short):
+    trainer, gains = _trainer(short), []
+
+    def keep(trainer):
+        if trainer.gain.identified is not None and (not gains or gains[-1] is not trainer.gain.identified):
+            gains.append(trainer.gain.identified)
+
+    train(trainer, keep)
+    assert len(gains) == 2
+    assert not np.array_equal(gains[0].A, gains[1].A)
+    np.testing.assert_allclose(gains[0].K, gains[1].K, rtol=0.02)
+    kinds = [episode.kind for episode in trainer.episodes]
+    assert kinds[0] == "identification" and "training" in kinds
+    assert {e.outcome for e in trainer.episodes if e.kind == "identification"} <= {"left the ball", "truncated"}
+
+
+def test_the_file_holds_the_policy_in_memory_bit_for_bit(whole, tmp_path):
+    trainer = whole[0]
+    save_policy(tmp_path / "policy.pt", trainer.policy())
+    loaded = load_policy(tmp_path / "policy.pt")
+    actor, factors = trainer.sac.actor, trainer.sac.actor.factors
+    weights = [actor.hidden[0].weight * factors, actor.hidden[1].weight, actor.mean.weight]
+    for found, weight in zip(loaded.network.weights, weights, strict=True):
+        np.testing.assert_array_equal(found, weight.detach().double().numpy())
+    x, u_eq = np.random.default_rng(0).uniform(-3, 3, (50, 2)), get_system("pendulum").exact_u_eq()
+    np.testing.assert_array_equal(loaded.network(x, u_eq), trainer.policy().network(x, u_eq))
+    assert loaded.parameters == {"m": "0.15", "l": "0.5", "b": "0.1", "g": "9.81"}
+    assert {**loaded.training}.items() >= trainer.options.record().items()
+
+
+@pytest.mark.parametrize("centre", ["preactivation", "output"])
+def test_each_centring_gives_u_eq_at_the_origin_and_records_it(short, centre):
+    policy = train(_trainer(replace(short, centre=centre, steps=300)))
+    u_eq = get_system("pendulum").exact_u_eq()
+    assert policy.network.centre == policy.training["centre"] == centre
+    raw = replace(policy.network, centre="none")
+    assert abs(raw(np.zeros(2), u_eq)[0]) > 1e-6
+    assert policy.network(np.zeros(2), u_eq) == pytest.approx(0.0, abs=0)
+
+
+def test_no_policy_without_a_gain(short):
+    with pytest.raises(InputError, match="without a gain"):
+        train(_trainer(replace(short, steps=30)))
+
+
+def test_the_log_holds_every_episode_once_also_after_a_resume(short, whole, tmp_path):
+    path = tmp_path / "log.csv"
+    trainer = _trainer(short)
+    trainer.restore(whole[2][333])
+    with EpisodeLog(path) as log:
+        train(trainer, lambda t: log.extend(t.episodes))
+    with path.open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["step"]) for row in rows] == [e.step for e in whole[0].episodes]
+    assert [float(row["total"]) for row in rows] == [e.total for e in whole[0].episodes]
+
+
+@pytest.mark.parametrize(
+    "change, name",
+    [({"steps": 0}, "steps"), ({"gamma": 1.0}, "gamma"), ({"tau": 0.0}, "tau"), ({"dt": float("nan")}, "dt"),
+     ({"penalty": float("inf")}, "penalty"), ({"actor": ()}, "actor"), ({"centre": "none"}, "centre"),
+     ({"input_weights": (0.0,)}, "input_weights"), ({"seed": -1}, "seed")],
+)  # fmt: skip
+def test_options_out_of_range_are_refused_by_name(short, change, name):
+    with pytest.raises(InputError, match=f"`{name}`"):
+        replace(short, **change)
+
+
+def test_the_shipped_policy_matches_its_gain_and_settles():
+    policy = load_policy(SHIPPED)
+    assert policy.network.layers == (2, 16, 16, 1)
+    result = evaluate(policy, EvaluationOptions(states=20, seed=7))
+    assert result.gain_relative < 1e-2
+    assert result.A_relative_error < 1e-2 and result.B_relative_error < 1e-2
+    assert max(e.real for e in result.eigenvalues) < -1
+    assert result.continuous.settled == result.held.settled == 20
+    assert result.continuous.left_domain == 0
+
+
+def test_a_policy_that_does_not_stabilise_does_not_settle():
+    policy = load_policy(SHIPPED)
+    options = EvaluationOptions(states=5, duration=3.0)
+    backwards = replace(policy, network=replace(policy.network, scale=-policy.network.scale))
+    result = evaluate(backwards, options)
+    assert result.continuous.settled == result.held.settled == 0
+    assert result.continuous.left_domain == 5
+    assert result.gain_relative == pytest.approx(2.0, abs=0.02)
+    # and one that does, but has not had the time
+    assert evaluate(policy, options).continuous.settled == 0
+
+
+def test_an_evaluation_needs_a_record_that_it_can_use():
+    policy = load_policy(SHIPPED)
+    with pytest.raises(InputError, match="'dt'"):
+        evaluate(replace(policy, training={}))
+    with pytest.raises(InputError, match="state_weights"):
+        evaluate(replace(policy, training={**policy.training, "state_weights": [1.0]}))
