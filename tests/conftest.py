@@ -8,10 +8,13 @@ from fractions import Fraction
 import numpy as np
 import pytest
 import sympy
+import torch
 from hypothesis import settings
 
 from certify.policies import TanhNetwork
 from certify.systems import System, get_system
+
+torch.set_num_threads(1)  # the suite runs one process a core
 
 settings.register_profile("ci", deadline=None, derandomize=True, max_examples=50)
 settings.register_profile("fuzz", deadline=None, max_examples=5000)

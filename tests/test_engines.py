@@ -1,0 +1,196 @@
+"""Engines: what they prove is so, what is false they never prove."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+
+from certify.closed_loop import ClosedLoop
+from certify.engines.branch_and_bound import LEAF, Budget, RingProof, prove_ring
+from certify.engines.falsify import Witness, confirm, falsify
+from certify.engines.local import local_margin, prove_local
+from certify.errors import InputError
+from certify.lyapunov import diagonalising_coordinates, domain_limit, solve_lyapunov
+from certify.obligations import Obligations
+from certify.policies import TanhNetwork
+from certify.systems import System, get_system
+from tests.conftest import chain, pendulum_network, scalar_tanh
+
+CPU = torch.device("cpu")
+
+
+def obligations(system: System, network: TanhNetwork) -> Obligations:
+    loop = ClosedLoop(system, network)
+    A, _, _ = loop.linearise()
+    P = solve_lyapunov(A, np.eye(system.n))
+    return Obligations(loop, P, diagonalising_coordinates(P, A))
+
+
+def vdot(claims: Obligations, x: np.ndarray) -> np.ndarray:
+    loop = claims.loop
+    return 2 * np.sum((x @ claims.P) * loop.system.function()(x, loop.policy(x)), axis=-1)
+
+
+def sphere(claims: Obligations, level: float, count: int) -> np.ndarray:
+    """Points on V = level."""
+    z = np.random.default_rng(0).standard_normal((count, claims.loop.system.n))
+    z *= np.sqrt(level) / np.linalg.norm(z, axis=1, keepdims=True)
+    return z @ claims.T.T
+
+
+def leaves(proof: RingProof) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    stack = [(-proof.root, proof.root)]
+    for axis in proof.tree:
+        lo, hi = stack.pop()
+        if axis == LEAF:
+            yield lo, hi
+            continue
+        middle = 0.5 * lo[axis] + 0.5 * hi[axis]
+        left, right = hi.copy(), lo.copy()
+        left[axis] = right[axis] = middle
+        stack += [(right, hi), (lo, left)]
+    assert not stack
+
+
+@pytest.mark.parametrize("case", ["scalar", "pendulum", "chain"])
+def test_the_local_proof_holds_on_samples_of_every_smaller_level(case: str) -> None:
+    system, network = {
+        "scalar": scalar_tanh(),
+        "pendulum": (get_system("pendulum"), pendulum_network()),
+        "chain": chain(4, [-1, -2, -3, -4]),
+    }[case]
+    claims = obligations(system, network)
+    level = prove_local(claims, domain_limit(claims.P, system.domain))
+    assert level is not None and local_margin(claims, level) > 0
+    for share in (1.0, 1e-2, 1e-4):
+        assert np.max(vdot(claims, sphere(claims, share * level, 2000))) < 0
+    # The margin shrinks with the level, so smaller levels are proved as well.
+    margins = [local_margin(claims, level * 4.0**-k) for k in range(6)]
+    assert margins == sorted(margins)
+
+
+def test_the_local_proof_knows_the_scalar_plant() -> None:
+    """|rem| <= x^2 sup|tanh''|/2: the proof must stop below the true limit but reach past V = 0.3."""
+    claims = obligations(*scalar_tanh())
+    level = prove_local(claims, 9.0)
+    assert level is not None
+    assert 0.3 < level < 1.915**2
+
+
+def test_the_ring_covers_and_holds(pendulum: System) -> None:
+    claims = obligations(pendulum, pendulum_network())
+    limit = domain_limit(claims.P, pendulum.domain) * (1 - 1e-9)
+    inner = prove_local(claims, limit)
+    assert inner is not None
+    proof = prove_ring(claims, inner, limit, Budget(), CPU)
+    assert (proof.level, proof.reason) == (limit, "requested")
+    boxes = list(leaves(proof))
+    assert len(boxes) == proof.leaves
+    volume = sum(np.prod(hi - lo) for lo, hi in boxes)
+    assert volume == pytest.approx(np.prod(2 * proof.root), rel=1e-12)
+    for share in np.geomspace(inner / limit, 1.0, 20):
+        assert np.max(vdot(claims, sphere(claims, share * limit, 500))) < 0
+
+
+def test_the_ring_is_deterministic(pendulum: System) -> None:
+    claims = obligations(pendulum, pendulum_network((8, 8)))
+    first, second = (prove_ring(claims, 1e-4, 0.2, Budget(), CPU) for _ in range(2))
+    assert first.tree == second.tree and first.level == second.level
+
+
+def test_budgets_stop_the_pass_with_what_is_proved_so_far(pendulum: System) -> None:
+    claims = obligations(pendulum, pendulum_network())
+    small = prove_ring(claims, 1e-6, 6.0, Budget(boxes=60, batch=16), CPU)
+    assert small.reason == "boxes" and 1e-6 <= small.level < 6.0
+    large = prove_ring(claims, 1e-6, 6.0, Budget(boxes=10_000, batch=16), CPU)
+    assert large.reason == "requested" and large.level == 6.0
+    timed = prove_ring(claims, 1e-6, 6.0, Budget(seconds=1e-9, batch=4), CPU)
+    assert timed.reason == "time" and timed.level < 6.0
+
+
+def test_a_level_beyond_the_truth_is_capped_by_a_witness() -> None:
+    claims = obligations(*scalar_tanh())
+    proof = prove_ring(claims, 0.5, 8.0, Budget(), CPU)
+    assert proof.reason in ("witness", "boxes")
+    assert 0.9 * 1.915008**2 < proof.level < 1.9150081**2
+
+
+def test_the_falsifier_finds_the_known_limit() -> None:
+    claims = obligations(*scalar_tanh())
+    witness = falsify(claims, 9.0)
+    assert witness is not None and witness.kind == "vdot"
+    assert 1.915008**2 <= witness.level <= 1.915009**2
+    assert confirm(claims, witness)
+    assert falsify(claims, 1.915**2) is None
+
+
+def test_a_wrong_witness_is_not_confirmed() -> None:
+    claims = obligations(*scalar_tanh())
+    assert not confirm(claims, Witness(np.array([1.9]), 1.9**2, "vdot"))
+    assert not confirm(claims, Witness(np.zeros(1), 0.0, "vdot"))
+    assert not confirm(claims, Witness(np.array([1.0]), 1.0, "input"))
+
+
+def test_inputs_that_leave_their_bounds_are_found(pendulum: System) -> None:
+    """Centred at the output, the input can pass 6 N m."""
+    claims = obligations(pendulum, pendulum_network(centre="output"))
+    assert not claims.inputs_bounded_by_form
+    witness = falsify(claims, domain_limit(claims.P, pendulum.domain))
+    assert witness is not None and confirm(claims, witness)
+    if witness.kind == "input":
+        assert np.max(np.abs(claims.loop.policy(witness.x))) > 6
+
+
+def planted(seed: int) -> tuple[Obligations, np.ndarray]:
+    """A stabilising policy with a narrow bump in the input, and the state at which it makes Vdot positive."""
+    generator = np.random.default_rng(seed)
+    system = get_system("pendulum")
+    K, width = np.array([2.8, 0.95]), 6 * 10.0 ** generator.uniform(-3, -0.5)
+    angle = generator.uniform(0, 2 * np.pi)
+    place = np.array([1.2 * np.cos(angle), 6.0 * np.sin(angle)]) * generator.uniform(0.4, 1.0)
+    if abs(place[1]) < 1:
+        place[1] = np.copysign(1.0, place[1])
+    normal = np.array([1.0, 0.2]) / np.hypot(1.0, 0.2)
+    steep, at = 6 / width, normal @ place
+    # tanh(-Kx/6) passes through one near-linear neuron; two steep neurons make the bump.
+    first = np.array([-K / 600, steep * normal, steep * normal])
+    bias = np.array([0.0, -steep * (at - width / 2), -steep * (at + width / 2)])
+    height = np.copysign(0.75, place[1])
+    network = TanhNetwork(
+        (first, np.array([[100.0, height, -height]])), (bias, np.zeros(1)), np.array([6.0]), np.zeros(1)
+    )
+    return obligations(system, network), place
+
+
+def _check_planted(seed: int) -> bool:
+    try:
+        claims, place = planted(seed)
+    except InputError:  # the bump reaches the origin and makes it unstable
+        return False
+    level = float(place @ claims.P @ place)
+    limit = domain_limit(claims.P, claims.loop.system.domain)
+    if not (claims.loop.evaluate_vdot(claims.P, place) > 0 and level < limit):
+        return False  # nothing false was planted: this seed does not count
+    inner = prove_local(claims, level)
+    if inner is not None:
+        proof = prove_ring(claims, inner, min(1.5 * level, limit), Budget(boxes=20_000), CPU)
+        assert proof.level < level
+    return True
+
+
+def test_planted_counterexamples_are_never_proved() -> None:
+    assert sum(_check_planted(seed) for seed in range(24)) >= 12
+
+
+@pytest.mark.slow
+def test_many_planted_counterexamples_are_never_proved() -> None:
+    assert sum(_check_planted(seed) for seed in range(24, 450)) >= 200
+
+
+def test_an_asymmetric_P_is_named(pendulum: System) -> None:
+    loop = ClosedLoop(pendulum, pendulum_network())
+    with pytest.raises(InputError, match=r"P\[0, 1\] = 0.25 but P\[1, 0\] = 0.26"):
+        Obligations(loop, np.array([[1.0, 0.25], [0.26, 1.0]]), np.eye(2))

@@ -1,0 +1,224 @@
+"""Known answers through the whole pipeline, checker included."""
+
+from __future__ import annotations
+
+import json
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+import sympy
+
+from certify.errors import BackendError, InputError, SoundnessError
+from certify.lyapunov import solve_lyapunov
+from certify.policies import TanhNetwork, load_policy
+from certify.roa import RoaOptions, certify_roa, run_checker
+from certify.systems import System, get_system
+from certify.verdict import Verdict
+from tests.conftest import box, chain, pendulum_network, scalar_tanh
+
+SHIPPED = Path(__file__).parent.parent / "examples" / "policies" / "pendulum.pt"
+
+
+@pytest.mark.parametrize("n", [2, 3, 4, 5, 6])
+def test_linear_plants_reach_their_domain(tmp_path: Path, n: int) -> None:
+    system, network = chain(n, [-1.0 - k for k in range(n)])
+    result = certify_roa(system, network, tmp_path)
+    assert result.verdict is Verdict.PROVED and result.reason == "domain"
+    # The limit in exact rationals, from the binary64 P that was proved.
+    assert result.P is not None
+    inverse = sympy.Matrix([[sympy.Rational(float(v)) for v in row] for row in result.P]).inv()
+    limit = min(
+        Fraction(hi) ** 2 / Fraction(int(inverse[i, i].p), int(inverse[i, i].q))
+        for i, (_, hi) in enumerate(system.domain)
+    )
+    level = result.levels["roa"]
+    assert level is not None
+    assert 0.99 * float(limit) <= level and Fraction(level) < limit
+
+
+def test_P_of_a_linear_plant_in_exact_rationals(tmp_path: Path) -> None:
+    system, network = chain(2, [-1.0, -2.0])
+    result = certify_roa(system, network, tmp_path)
+    np.testing.assert_allclose(result.P, [[1.25, 0.25], [0.25, 0.25]], rtol=1e-14)
+
+
+def test_a_pole_in_the_right_half_plane_is_refused(tmp_path: Path) -> None:
+    system, network = chain(3, [-1.0, -2.0, 0.5])
+    result = certify_roa(system, network, tmp_path)
+    assert result.verdict is Verdict.REFUTED
+    assert "unstable" in result.reason and "0.5" in result.reason
+    assert not (tmp_path / "certificate.json").exists()
+
+
+def test_a_spectrum_on_the_axis_is_unknown(tmp_path: Path) -> None:
+    system, network = chain(2, [1j, -1j])
+    result = certify_roa(system, network, tmp_path)
+    assert result.verdict is Verdict.UNKNOWN and "axis" in result.reason
+
+
+@pytest.mark.parametrize(
+    ("x", "verdict"),
+    [
+        (1.0, Verdict.PROVED),
+        (1.915, Verdict.PROVED),
+        (1.915008, Verdict.PROVED),
+        (1.915009, Verdict.REFUTED),
+        (2.5, Verdict.REFUTED),
+    ],
+)
+def test_scalar_plant_just_inside_and_just_outside(tmp_path: Path, x: float, verdict: Verdict) -> None:
+    result = certify_roa(*scalar_tanh(), tmp_path, RoaOptions(level=x * x))
+    assert result.verdict is verdict
+    if verdict is Verdict.PROVED:
+        assert result.levels["roa"] == x * x
+    else:
+        assert result.witness is not None and result.witness.level <= x * x
+        assert not (tmp_path / "certificate.json").exists()
+
+
+def test_scalar_plant_largest_level(tmp_path: Path) -> None:
+    result = certify_roa(*scalar_tanh(), tmp_path)
+    level = result.levels["roa"]
+    assert result.verdict is Verdict.PROVED and result.reason == "witness"
+    assert level is not None and 0.99 * 1.915008**2 < level < 1.915009**2
+
+
+def test_a_level_outside_the_domain(tmp_path: Path) -> None:
+    assert certify_roa(*scalar_tanh(), tmp_path, RoaOptions(level=9.5)).verdict is Verdict.REFUTED
+
+
+@pytest.mark.parametrize("centre", ["preactivation", "output"])
+def test_a_wrong_raw_equilibrium_is_centred(tmp_path: Path, pendulum: System, centre: str) -> None:
+    network = pendulum_network(centre=centre)
+    result = certify_roa(pendulum, network, tmp_path)
+    assert result.verdict is Verdict.PROVED and result.checker is not None
+    assert result.checker["result"] == "ACCEPTED"
+
+
+def test_uncentred_or_displaced_loops_are_refused(tmp_path: Path, pendulum: System) -> None:
+    with pytest.raises(InputError, match="not centred"):
+        certify_roa(pendulum, pendulum_network(centre="none"), tmp_path)
+    x, u = sympy.symbols("x u")
+    displaced = System("s", (x,), (u,), {}, (u - x + 1,), (sympy.Integer(0),), box(1), box(1))
+    with pytest.raises(InputError, match="must be exactly 0"):
+        certify_roa(displaced, scalar_tanh()[1], tmp_path)
+
+
+def test_levels_scale_with_P(tmp_path: Path, pendulum: System) -> None:
+    """(P, c) -> (aP, ac) leaves the set as it is."""
+    network = pendulum_network((8, 8))
+    base = certify_roa(pendulum, network, tmp_path)
+    assert base.P is not None and base.levels["roa"] is not None
+    scaled = certify_roa(pendulum, network, tmp_path, RoaOptions(P=4.0 * base.P))
+    assert scaled.levels["roa"] == pytest.approx(4.0 * base.levels["roa"], rel=1e-5)
+
+
+def test_the_lqr_candidate_solves_its_equation(tmp_path: Path, pendulum: System) -> None:
+    from certify.closed_loop import ClosedLoop
+
+    network = pendulum_network()
+    result = certify_roa(pendulum, network, tmp_path, RoaOptions(candidate="lqr", R=(2.0,)))
+    A, _, K = ClosedLoop(pendulum, network).linearise()
+    np.testing.assert_allclose(result.P, solve_lyapunov(A, np.eye(2) + 2 * K.T @ K), rtol=1e-12)
+    assert result.verdict is Verdict.PROVED
+
+
+def test_input_bounds_limit_the_level(tmp_path: Path) -> None:
+    """u = -1.5 x with |u| <= 1 on xdot = x/2 + u: V = x^2 / 2, so c <= (2/3)^2 / 2."""
+    x, u = sympy.symbols("x u")
+    system = System("s", (x,), (u,), {}, (x / 2 + u,), (sympy.Integer(0),), box(3), box(1))
+    network = TanhNetwork((np.array([[-1.5]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    result = certify_roa(system, network, tmp_path)
+    assert result.verdict is Verdict.PROVED and result.reason == "inputs"
+    level = result.levels["roa"]
+    assert level is not None and 0.99 * (4 / 9) / 2 < level < (4 / 9) / 2
+
+
+def test_an_exact_level_is_unknown_when_the_budget_runs_out(tmp_path: Path, pendulum: System) -> None:
+    result = certify_roa(pendulum, pendulum_network(), tmp_path, RoaOptions(level=6.0, max_boxes=10))
+    assert result.verdict is Verdict.UNKNOWN and result.reason.startswith("boxes")
+    assert not (tmp_path / "certificate.json").exists()
+
+
+def test_the_largest_level_within_a_budget_is_still_proved(tmp_path: Path, pendulum: System) -> None:
+    result = certify_roa(pendulum, pendulum_network(), tmp_path, RoaOptions(max_boxes=150))
+    full = certify_roa(pendulum, pendulum_network(), tmp_path)
+    assert result.verdict is Verdict.PROVED and result.reason == "boxes"
+    local, level, best = result.levels["local"], result.levels["roa"], full.levels["roa"]
+    assert local is not None and level is not None and best is not None
+    assert local <= level < best
+
+
+def test_the_shipped_policy(tmp_path: Path, pendulum: System) -> None:
+    policy = load_policy(SHIPPED)
+    assert policy.network.layers == (2, 16, 16, 1)
+    result = certify_roa(pendulum.with_parameters(policy.parameters), policy.network, tmp_path)
+    assert result.verdict is Verdict.PROVED
+    roa, limit = result.levels["roa"], result.levels["domain_limit"]
+    sampled = result.levels.get("sampled_limit")
+    assert roa is not None and limit is not None
+    assert roa >= 0.95 * min(limit, sampled if sampled is not None else np.inf)
+    data = json.loads(json.dumps(result.to_dict()))
+    assert data["checked"] == "ACCEPTED" and data["levels"]["roa"] == roa
+    assert set(data["seconds"]) == {"load", "candidate", "local", "ring", "write", "check", "total"}
+    assert run_checker(tmp_path / "certificate.json")["policy_sha256"] == policy.network.sha256()
+
+
+def test_equal_runs_write_equal_certificates(tmp_path: Path, pendulum: System) -> None:
+    for name in ("a", "b"):
+        certify_roa(pendulum, pendulum_network((8, 8)), tmp_path / name)
+    assert (tmp_path / "a" / "certificate.json").read_bytes() == (tmp_path / "b" / "certificate.json").read_bytes()
+
+
+def test_a_rejection_is_a_soundness_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """If the engine claims too much, the run ends loudly and never in PROVED."""
+    import certify.roa as roa
+
+    honest = roa.write_certificate
+
+    def exaggerate(path: Path, certificate: object) -> None:
+        import dataclasses
+
+        honest(path, dataclasses.replace(certificate, roa=certificate.roa * 1.5))  # type: ignore[type-var,attr-defined]
+
+    monkeypatch.setattr(roa, "write_certificate", exaggerate)
+    with pytest.raises(SoundnessError, match="rejects"):
+        certify_roa(*scalar_tanh(), tmp_path)
+
+
+def test_a_checker_that_cannot_run_is_a_backend_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sys.executable", "/bin/false")
+    with pytest.raises(BackendError, match="no verdict"):
+        certify_roa(*scalar_tanh(), tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"level": -1.0}, "level"),
+        ({"level": float("nan")}, "level"),
+        ({"candidate": "sos"}, "candidate"),
+        ({"time_limit": 0.0}, "time_limit"),
+    ],
+)
+def test_bad_options(options: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        RoaOptions(**options)  # type: ignore[arg-type]
+
+
+def test_bad_weights(tmp_path: Path) -> None:
+    for weights in ((1.0, 1.0), (0.0,), (float("nan"),)):
+        with pytest.raises(InputError, match="positive numbers"):
+            certify_roa(*scalar_tanh(), tmp_path, RoaOptions(Q=weights))
+
+
+def test_a_verdict_is_not_a_bool() -> None:
+    with pytest.raises(TypeError, match="three values"):
+        bool(Verdict.PROVED)
+    assert [v.exit_status for v in Verdict] == [0, 1, 3]
+
+
+def test_every_registered_plant_can_be_named() -> None:
+    assert get_system("pendulum").name == "pendulum"
