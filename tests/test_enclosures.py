@@ -57,10 +57,18 @@ def _networks() -> list[tuple[System, TanhNetwork]]:
     pendulum = get_system("pendulum")
     x, y, z, u, v = sympy.symbols("x y z u v")
     two = System(
-        "two", (x, y, z), (u, v), {}, (u - sympy.Rational(1, 3), v, -z), (sympy.Rational(1, 3), sympy.Integer(0)), box(2, 2, 2), box(9, 9)
+        name="two",
+        states=(x, y, z),
+        inputs=(u, v),
+        parameters={},
+        dynamics=(u - sympy.Rational(1, 3), v, -z),
+        u_eq=(sympy.Rational(1, 3), sympy.Integer(0)),
+        domain=box(2, 2, 2),
+        input_bounds=box(9, 9),
     )
+    normal = generator.standard_normal
     wide = TanhNetwork(
-        (generator.standard_normal((40, 3)), generator.standard_normal((30, 40)) / 3, generator.standard_normal((2, 30))),
+        (normal((40, 3)), normal((30, 40)) / 3, normal((2, 30))),
         (generator.standard_normal(40), generator.standard_normal(30), generator.standard_normal(2)),
         np.array([2.0, -3.0]), np.array([0.2, 0.1]), "tanh", "preactivation",
     )  # fmt: skip

@@ -56,8 +56,16 @@ class _Jet:
         return self.compose(c, -s, 1.0, min(1.0, abs(c) + self.radius))
 
 
-def local_margin(obligations: Obligations, level: float) -> float:
-    """Share of the smallest decay rate that the remainder leaves on {V <= level}; positive means Vdot < 0."""
+def spectral_norms(obligations: Obligations) -> tuple[float, ...]:
+    """||W||_2 of each layer, as loose as the checker's own bound can be."""
+    return tuple(float(np.linalg.norm(W, 2)) * min(W.shape) ** (1 / 128) for W in obligations.loop.network.weights)
+
+
+def local_margin(obligations: Obligations, level: float, norms: tuple[float, ...]) -> float:
+    """Share of the smallest decay rate that the remainder leaves on {V <= level}; positive means Vdot < 0.
+
+    `norms` are those of `spectral_norms`, which do not depend on the level.
+    """
     loop, P, T = obligations.loop, obligations.P, obligations.T
     system = loop.system
     S = T.T @ P @ T
@@ -67,7 +75,7 @@ def local_margin(obligations: Obligations, level: float) -> float:
     rho = math.sqrt(level / least)
     J = rho * T
     states = [_Jet(0.0, J[i], 0.0) for i in range(system.n)]
-    gradient, k = _policy(obligations, J)
+    gradient, k = _policy(obligations, J, norms)
     scale = np.abs(loop.network.scale)
     inputs = [_Jet(float(u), gradient[j], float(scale[j]) * k) for j, u in enumerate(loop.u_eq)]
     if not obligations.inputs_bounded_by_form:
@@ -86,8 +94,10 @@ def local_margin(obligations: Obligations, level: float) -> float:
 def prove_local(obligations: Obligations, limit: float) -> float | None:
     """The largest level up to `limit` that the local proof reaches, within 2 %; None if there is none."""
 
+    norms = spectral_norms(obligations)
+
     def good(level: float) -> bool:
-        return local_margin(obligations, level) > _MARGIN
+        return local_margin(obligations, level, norms) > _MARGIN
 
     if good(limit):
         return limit
@@ -102,14 +112,14 @@ def prove_local(obligations: Obligations, limit: float) -> float | None:
     return low
 
 
-def _policy(obligations: Obligations, J: Array) -> tuple[Array, float]:
+def _policy(obligations: Obligations, J: Array, norms: tuple[float, ...]) -> tuple[Array, float]:
     """scale * gradient of the network on x = J d, and the 2-norm remainder before scaling."""
     loop = obligations.loop
     network = loop.network
     y, k = np.zeros(network.n), 0.0
     for layer, (W, b) in enumerate(zip(network.weights, network.biases, strict=True)):
         last = layer == len(network.weights) - 1
-        k *= float(np.linalg.norm(W, 2)) * min(W.shape) ** (1 / 128)  # as tight as the checker's bound
+        k *= norms[layer]
         y, J = W @ y + b, W @ J
         if last:
             if network.squash == "identity":

@@ -6,11 +6,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 from certify.errors import InputError
+from certify.systems.cartpole import cartpole
 from certify.systems.pendulum import pendulum
 from certify.systems.system import System
 from certify.systems.toml import load_system
 
-_REGISTRY: dict[str, Callable[[], System]] = {"pendulum": pendulum}
+_REGISTRY: dict[str, Callable[[], System]] = {"pendulum": pendulum, "cartpole": cartpole}
 
 
 def available_systems() -> tuple[str, ...]:

@@ -155,8 +155,8 @@ class System:
 
         For simulation and search only: nothing is proved with it.
         """
-        stack: Callable[..., Any]
-        broadcast: Callable[..., Any]
+        stack: Any
+        broadcast: Any
         if module == "numpy":
             import numpy
 

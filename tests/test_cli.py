@@ -1,0 +1,244 @@
+"""The command line: what it prints where, exit statuses, and bad input in one sentence."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from certify.cli import _run
+from certify.policies import Policy, TanhNetwork, load_policy, save_policy
+from tests.conftest import chain, pendulum_network
+
+SHIPPED = Path(__file__).parent.parent / "examples" / "policies" / "pendulum.pt"
+VAN_DER_POL = Path(__file__).parent.parent / "examples" / "van_der_pol.toml"
+
+
+@pytest.fixture
+def policy_file(tmp_path: Path) -> Path:
+    path = tmp_path / "policy.pt"
+    save_policy(path, Policy(pendulum_network((8, 8)), "pendulum", {"m": "0.15"}))
+    return path
+
+
+def run(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> tuple[int, str, str]:
+    given = [str(a) for a in arguments]
+    status = _run(given, "--json" in given)
+    out, err = capsys.readouterr()
+    assert "Traceback" not in out + err
+    return status, out, err
+
+
+def test_roa_proves_writes_and_reports(tmp_path: Path, policy_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, err = run(capsys, "roa", "--policy", policy_file, "--out", tmp_path / "o", "--json")
+    assert status == 0
+    data = json.loads(out)
+    assert out.count("\n") == 1
+    assert data["verdict"] == "PROVED" and data["checked"] == "ACCEPTED"
+    assert data["policy"]["layers"] == [2, 8, 8, 1]
+    assert Path(data["certificate"]) == tmp_path / "o" / "certificate.json"
+    assert (tmp_path / "o" / "report.html").read_text().startswith("<!DOCTYPE html>")
+    assert "pendulum (from the policy file)" in err and "m = 0.15" in err
+
+
+def test_roa_in_words(tmp_path: Path, policy_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, _ = run(capsys, "roa", "--policy", policy_file, "--out", tmp_path / "o")
+    assert status == 0
+    assert "PROVED" in out and "ACCEPTED" in out and str(tmp_path / "o" / "report.html") in out.replace("\n", "")
+
+
+def test_check_accepts_and_compares_the_policy(
+    tmp_path: Path, policy_file: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    run(capfd, "roa", "--policy", policy_file, "--out", tmp_path)
+    certificate = tmp_path / "certificate.json"
+    status, out, _ = run(capfd, "check", certificate, "--policy", policy_file)
+    assert status == 0 and out.splitlines()[-1].startswith("ACCEPTED ")
+    status, out, _ = run(capfd, "check", certificate, "--policy", SHIPPED)
+    assert status == 1 and out.startswith("REJECTED rule=policy")
+    status, out, _ = run(capfd, "check", certificate, "--json")
+    assert status == 0 and json.loads(out)["result"] == "ACCEPTED"
+    text = certificate.read_text()
+    certificate.write_text(text.replace('"0x1.', '"0x2.', 1))
+    status, out, _ = run(capfd, "check", certificate)
+    assert status == 1 and out.startswith("REJECTED rule=format at=levels")
+    status, out, _ = run(capfd, "check", certificate, "--policy", policy_file)
+    assert status == 1 and "REJECTED rule=format" in out
+    certificate.write_text("{}")
+    assert run(capfd, "check", certificate, "--policy", policy_file)[0] == 1
+    assert run(capfd, "check", tmp_path / "missing.json")[0] == 2
+
+
+def test_report_of_a_certificate(tmp_path: Path, policy_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run(capsys, "roa", "--policy", policy_file, "--out", tmp_path)
+    (tmp_path / "report.html").unlink()
+    status, out, _ = run(capsys, "report", tmp_path / "certificate.json")
+    assert status == 0 and "ACCEPTED" in out and (tmp_path / "report.html").exists()
+    (tmp_path / "certificate.json").write_text("{}")
+    status, _, err = run(capsys, "report", tmp_path / "certificate.json")
+    assert status == 2 and "not a certificate" in err
+
+
+def test_systems(capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, _ = run(capsys, "systems")
+    assert status == 0 and "theta_dot" in out and "0.15 kg" in out
+    listed = json.loads(run(capsys, "systems", "--json")[1])["systems"]
+    assert listed[0]["parameters"]["m"] == "3/20"
+
+
+def test_a_requested_level(tmp_path: Path, policy_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, _ = run(capsys, "roa", "--policy", policy_file, "--out", tmp_path, "--level", "0.1", "--json")
+    assert status == 0 and json.loads(out)["levels"]["roa"] == 0.1
+    status, out, _ = run(capsys, "roa", "--policy", policy_file, "--out", tmp_path / "b", "--level", "1000", "--json")
+    assert status == 1 and json.loads(out)["verdict"] == "REFUTED"
+    status, out, _ = run(
+        capsys, "roa", "--policy", policy_file, "--out", tmp_path / "b", "--level", "0.15", "--max-boxes", "3", "--json"
+    )
+    assert status == 3 and json.loads(out)["verdict"] == "UNKNOWN"
+
+
+def test_unstable_loops_exit_1_and_name_the_eigenvalues(
+    tmp_path: Path, policy_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, out, _ = run(capsys, "roa", "--policy", policy_file, "--out", tmp_path, "--param", "m=5")
+    assert status == 1 and "REFUTED" in out and "eigenvalues" in out
+
+
+def test_a_plant_of_ones_own(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    network = TanhNetwork((np.array([[-0.5, -0.4]]),), (np.zeros(1),), np.array([6.0]), np.zeros(1))
+    save_policy(tmp_path / "v.pt", Policy(network, "somebody's plant"))
+    status, out, err = run(
+        capsys, "roa", "--policy", tmp_path / "v.pt", "--system", VAN_DER_POL, "--out", tmp_path, "--json"
+    )
+    assert status == 0 and json.loads(out)["system"] == "van_der_pol"
+    assert "from the command line" in err
+
+
+def test_a_rounded_beta_is_read_as_the_real_number(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    network = pendulum_network((8, 8))
+    save_policy(tmp_path / "b.pt", Policy(network, "pendulum", beta=np.array([1e-7])))
+    status, _, err = run(capsys, "roa", "--policy", tmp_path / "b.pt", "--out", tmp_path)
+    assert status == 0 and "this shifts u(0) by 6e-07" in err
+
+
+def bad_policies(tmp_path: Path) -> dict[str, Path]:
+    """Files that must be refused, by what is wrong with them."""
+    valid = torch.load(SHIPPED, weights_only=True)
+    wrong = {
+        "format": {**valid, "format": "other"},
+        "activation": {**valid, "activation": "relu"},
+        "nan": {**valid, "biases": [b * float("nan") for b in valid["biases"]]},
+        "infinite": {**valid, "biases": [b / 0 for b in valid["biases"]]},
+        "plant": {**valid, "system": {"name": "unicycle", "parameters": {}}},
+        "parameter": {**valid, "system": {"name": "pendulum", "parameters": {"z": 1.0}}},
+        "mass": {**valid, "system": {"name": "pendulum", "parameters": {"m": "-0.15"}}},
+        "object": {**valid, "training": {"path": Path("x")}},
+    }
+    paths = {}
+    for name, data in wrong.items():
+        paths[name] = tmp_path / f"{name}.pt"
+        torch.save(data, paths[name])
+    paths["missing"] = tmp_path / "missing.pt"
+    paths["garbage"] = tmp_path / "garbage.pt"
+    paths["garbage"].write_bytes(b"\x80garbage")
+    _, three = chain(3, [-1, -2, -3])
+    paths["shape"] = tmp_path / "shape.pt"
+    save_policy(paths["shape"], Policy(three, "pendulum"))
+    return paths
+
+
+def snapshot(folder: Path) -> dict[str, bytes]:
+    return {p.name: p.read_bytes() for p in folder.iterdir()}
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("missing", "cannot be read"), ("garbage", "policy file"), ("object", "plain tensors"), ("format", "format"),
+        ("activation", "tanh"), ("nan", "finite"), ("infinite", "finite"), ("plant", "unknown system"),
+        ("parameter", "no parameter"), ("mass", "must be positive"), ("shape", "must read 2 states"),
+    ],
+)  # fmt: skip
+def test_bad_policies_exit_2_and_overwrite_nothing(
+    tmp_path: Path, name: str, message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = bad_policies(tmp_path)[name]
+    out_folder = tmp_path / "out"
+    out_folder.mkdir()
+    (out_folder / "certificate.json").write_text("precious")
+    before = snapshot(out_folder)
+    status, out, err = run(capsys, "roa", "--policy", path, "--out", out_folder)
+    last = err.strip().splitlines()[-1]
+    assert (status, out) == (2, "") and last.startswith("certify: ") and message in last
+    assert snapshot(out_folder) == before
+    status, out, _ = run(capsys, "roa", "--policy", path, "--out", out_folder, "--json")
+    assert status == 2 and message in json.loads(out)["error"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--system", "unicycle"], "unknown system"),
+        (["--system", "missing.toml"], "cannot be read"),
+        (["--param", "z=1"], "no parameter"),
+        (["--param", "m=0"], "must be positive"),
+        (["--param", "m"], "NAME=VALUE"),
+        (["--param", "m=abc"], "finite number"),
+        (["--param", "m=nan"], "finite number"),
+        (["--domain", "theta=0"], "interior"),
+        (["--domain", "phi=1"], "no state"),
+        (["--domain", "theta=1:2"], "interior"),
+        (["--Q", "1"], "positive numbers"),
+        (["--Q", "1,x"], "separated by commas"),
+        (["--Q", "1,-1"], "positive numbers"),
+        (["--level", "-1"], "positive number"),
+        (["--level", "nan"], "positive number"),
+        (["--level", "x"], "--level"),
+        (["--candidate", "sos"], "candidate"),
+        (["--device", "tpu"], "device"),
+        (["--time-limit", "0"], "time_limit"),
+        (["--bogus"], "--bogus"),
+    ],
+)
+def test_bad_options_exit_2(
+    tmp_path: Path, policy_file: Path, arguments: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out_folder = tmp_path / "out"
+    status, out, err = run(capsys, "roa", "--policy", policy_file, "--out", out_folder, *arguments)
+    assert (status, out) == (2, "") and message in err
+    assert not list(out_folder.glob("*"))
+    status, out, _ = run(capsys, "roa", "--policy", policy_file, "--out", out_folder, *arguments, "--json")
+    assert status == 2 and message in json.loads(out)["error"]
+
+
+def test_an_output_folder_that_cannot_be_written(
+    tmp_path: Path, policy_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "file").write_text("precious")
+    status, _, err = run(capsys, "roa", "--policy", policy_file, "--out", tmp_path / "file" / "out")
+    assert status == 2 and "cannot be written" in err
+    assert (tmp_path / "file").read_text() == "precious"
+
+
+def test_usage_errors(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(capsys, "roa")[0] == 2
+    assert run(capsys, "prove")[0] == 2
+    status, out, _ = run(capsys, "--help")
+    assert status == 0 and "roa" in out
+
+
+def test_the_installed_command(tmp_path: Path) -> None:
+    """One run as a user has it: a process of its own, standard streams apart."""
+    command = [sys.executable, "-m", "certify", "roa", "--policy", str(SHIPPED), "--out", str(tmp_path), "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env={**os.environ})
+    assert done.returncode == 0, done.stderr
+    data: dict[str, Any] = json.loads(done.stdout)
+    assert data["policy"]["sha256"] == load_policy(SHIPPED).network.sha256()
+    assert data["reason"] in ("domain", "witness", "inputs")
