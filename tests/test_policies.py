@@ -49,11 +49,13 @@ def test_preactivation_needs_u_eq_inside_the_range() -> None:
 
 
 def test_file_round_trip_is_exact_and_repeatable(tmp_path: Path) -> None:
-    policy = Policy(network(), "pendulum", {"m": "0.15"}, {"seed": 3, "A": [[1.0, 2.0]]})
+    policy = Policy(network(), "pendulum", {"m": "0.15"}, {"seed": 3, "A": [[1.0, 2.0]], "mass": "".join(["0.", "15"])})
     save_policy(tmp_path / "a.pt", policy)
     save_policy(tmp_path / "other name.pt", policy)
     assert (tmp_path / "a.pt").read_bytes() == (tmp_path / "other name.pt").read_bytes()
     read = load_policy(tmp_path / "a.pt")
+    save_policy(tmp_path / "again.pt", read)
+    assert (tmp_path / "again.pt").read_bytes() == (tmp_path / "a.pt").read_bytes()
     assert read.network.sha256() == policy.network.sha256()
     assert (read.system, read.parameters, read.training) == (policy.system, policy.parameters, policy.training)
 

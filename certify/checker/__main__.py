@@ -84,7 +84,7 @@ def _claim(c: document.Certificate) -> list[str]:
 
 
 def _number(q: Fraction) -> str:
-    return str(q) if q.denominator == 1 else f"{q} (about {float(q):.6g})"
+    return str(q) if q.denominator == 1 or len(str(q)) > 40 else f"{q} (about {float(q):.6g})"
 
 
 if __name__ == "__main__":

@@ -74,6 +74,7 @@ class _Builder:
         self.names, self.rational = names, rational
         self.operations: list[Operation] = []
         self.known: dict[Operation, int] = {}
+        self.visited = 0
 
     def push(self, *operation: Any) -> int:
         if operation not in self.known:
@@ -85,8 +86,9 @@ class _Builder:
 
     def build(self, tree: Any, at: str, depth: int) -> tuple[int, str]:
         """Index of the tree's value on the tape, and the tree in words."""
-        if depth > MAX_DEPTH:
-            raise Rejected("format", at, f"deeper than {MAX_DEPTH}")
+        self.visited += 1
+        if depth > MAX_DEPTH or self.visited > MAX_OPERATIONS:
+            raise Rejected("format", at, f"deeper than {MAX_DEPTH} or more than {MAX_OPERATIONS} nodes")
         if isinstance(tree, str):
             if tree in self.names:
                 return self.push("var", self.names[tree]), tree

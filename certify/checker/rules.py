@@ -122,7 +122,8 @@ def _check_local(c: Certificate, net: Folded, least: Fraction, bounded: bool, ta
     mu a lower bound of the smallest eigenvalue of -(B + B')/2.
     """
     n = len(c.states)
-    rho = float(np.sqrt(float(Fraction(c.c1) / least)) * (1 + 2.0**-40)) + 2.0**-960
+    ratio, _ = float_with_error(Fraction(c.c1) / least)
+    rho = float(np.sqrt(ratio) * (1 + 2.0**-40)) + 2.0**-960
     if not (rho < float("inf") and least * Fraction(rho) ** 2 >= Fraction(c.c1)):
         raise Rejected("local", "levels.local", "the level is out of range")
     J = rho * c.T

@@ -7,7 +7,9 @@ written through memory, so that neither a file name nor a clock enters it.
 from __future__ import annotations
 
 import io
+import os
 import pickle
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -50,7 +52,12 @@ class Policy:
 
 
 def save_policy(path: str | Path, policy: Policy) -> None:
-    """Write `policy` to `path`; the same policy gives the same bytes."""
+    """Write `policy` to `path` in one step; the same policy gives the same bytes.
+
+    Raises
+    ------
+    InputError : the file cannot be written.
+    """
     import torch
 
     network = policy.network
@@ -74,8 +81,25 @@ def save_policy(path: str | Path, policy: Policy) -> None:
     if policy.beta is not None:
         data["beta"] = torch.tensor(policy.beta, dtype=torch.float64)
     buffer = io.BytesIO()
-    torch.save(data, buffer)
-    Path(path).write_bytes(buffer.getvalue())
+    torch.save(_interned(data), buffer)
+    target = Path(path)
+    temporary = target.with_name(target.name + ".partial")
+    try:
+        temporary.write_bytes(buffer.getvalue())
+        os.replace(temporary, target)
+    except OSError as error:
+        raise InputError(f"policy file {path} cannot be written: {error.strerror}.") from error
+
+
+def _interned(value: Any) -> Any:
+    """Equal strings become one object: pickle writes a repeated object as a reference, so identity shows in bytes."""
+    if isinstance(value, str):
+        return sys.intern(value)
+    if isinstance(value, dict):
+        return {_interned(k): _interned(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return type(value)(_interned(v) for v in value)
+    return value
 
 
 def load_policy(path: str | Path) -> Policy:
