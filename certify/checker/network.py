@@ -41,12 +41,14 @@ class Folded:
     scale: Array
     offset: Array
     offset_error: Array
+    norms: tuple[float, ...]  # upper bounds of ||W||_2
 
 
 def fold(policy: Policy, u_eq: tuple[Fraction, ...]) -> Folded:
     """Fold the centring into the last bias and the offset; raises `Rejected` under rule `centring`."""
     squash, zeros = policy.squash == "tanh", np.zeros_like(policy.offset)
-    plain = Folded(policy.weights, policy.biases, zeros, squash, policy.scale, policy.offset, zeros)
+    norms = tuple(spectral_norm(W) for W in policy.weights)
+    plain = Folded(policy.weights, policy.biases, zeros, squash, policy.scale, policy.offset, zeros, norms)
     if policy.centre == "none":
         _require_exact_equilibrium(policy, u_eq)
         return plain
@@ -63,14 +65,14 @@ def fold(policy: Policy, u_eq: tuple[Fraction, ...]) -> Folded:
         last = beta - product
         last_error = up(beta_error + product_error + EPS * (np.abs(beta) + np.abs(product)))
         biases = (*policy.biases[:-1], last)
-        return Folded(policy.weights, biases, last_error, True, policy.scale, policy.offset, zeros)
+        return Folded(policy.weights, biases, last_error, True, policy.scale, policy.offset, zeros, norms)
     if squash:
         h, e = tanh(h)
         error = up(error + e)
     centre, centre_error = np.array([float_with_error(q) for q in u_eq]).T
     shift = policy.scale * h
     offset_error = up(np.abs(policy.scale) * error + centre_error + EPS * (np.abs(shift) + np.abs(centre)))
-    return Folded(policy.weights, policy.biases, zeros, squash, policy.scale, centre - shift, offset_error)
+    return Folded(policy.weights, policy.biases, zeros, squash, policy.scale, centre - shift, offset_error, norms)
 
 
 def _product(W: Array, h: Array, error: Array) -> tuple[Array, Array]:
@@ -151,13 +153,14 @@ def enclose_on_boxes(net: Folded, x: Array, x_error: Array) -> tuple[Array, Arra
     x (n, n + 1, B) is the state as an affine form: centre, then the slope for each d_j; the state lies within
     x_error (n, B) of it. Returns mid (m, B), slopes (m, n, B), error (m, B).
 
-    Each layer's value is an affine form in d plus the errors made so far. Forwards, the errors pass through |W| and
-    give the range over which tanh is relaxed. The output's own error is found backwards: each layer's fresh
-    error times the magnitude of the weight with which it reaches the output, so that errors cancel through W as
-    they do in truth.
+    Each layer's value is an affine form in d, plus the `fresh` error made there, plus `old` errors from the layers
+    before, which are bounded both by component and, by `ball`, in the 2-norm. Forwards, fresh errors pass through |W|,
+    old ones through |W| or ||W_i|| ball, whichever is less; the 2-norm of all passes through ||W||_2. That gives the
+    range over which tanh is relaxed. The output's own error is found backwards: each layer's fresh error times the
+    magnitude of the weight with which it reaches the output, so that errors cancel through W as they do in truth.
     """
     n, batch = x.shape[0], x.shape[2]
-    h, error = x, x_error
+    h, fresh, old, ball = x, x_error, np.zeros_like(x_error), np.zeros(batch)
     passed: list[tuple[Array, Array, Array]] = []  # W, slope of the relaxation, fresh error behind it
     for k, (W, b) in enumerate(zip(net.weights, net.biases, strict=True)):
         last = k == len(net.weights) - 1
@@ -167,7 +170,9 @@ def enclose_on_boxes(net: Folded, x: Array, x_error: Array) -> tuple[Array, Arra
         rounding = gamma(width) * norm(W, 1)[:, None] * total(norm(h, 0), 0)
         rounding = rounding + EPS * (np.abs(y[:, 0]) + np.abs(b)[:, None])
         rounding = up(rounding + net.bias_error[:, None] if last else rounding)
-        error = up((np.abs(W) @ error) * (1 + gamma(width)) + rounding)
+        through_old = np.minimum((np.abs(W) @ old) * (1 + gamma(width)), norm(W, 1)[:, None] * ball)
+        error = up((np.abs(W) @ fresh) * (1 + gamma(width)) + through_old + rounding)
+        ball = up(net.norms[k] * up(ball + norm(fresh, 0)) + norm(rounding, 0))
         if last and not net.squash:
             passed.append((W, np.ones_like(error), rounding))
             h = y
@@ -177,7 +182,8 @@ def enclose_on_boxes(net: Folded, x: Array, x_error: Array) -> tuple[Array, Arra
         fresh = up(gap + slope * rounding + EPS * (slope * (np.abs(y[:, 0]) + spread) + np.abs(shift)))
         h = slope[:, None] * y
         h[:, 0] += shift
-        error = up(slope * error + fresh)
+        old = up(slope * error)
+        ball = np.minimum(up(np.max(slope, axis=0) * ball), norm(old, 0))
         passed.append((W, slope, fresh))
 
     through, slopes = net.scale[:, None] * h[:, 0], net.scale[:, None, None] * h[:, 1:]
@@ -216,7 +222,7 @@ def enclose_at_origin(net: Folded, J: Array, slack: float) -> tuple[Array, float
     y, error, k = np.zeros(len(J)), np.zeros(len(J)), 0.0
     for layer, (W, b) in enumerate(zip(net.weights, net.biases, strict=True)):
         last = layer == len(net.weights) - 1
-        sigma = spectral_norm(W)
+        sigma = net.norms[layer]
         slack = float(up(sigma * slack + gamma(W.shape[1]) * frobenius_norm(W) * frobenius_norm(J)))
         product, error = _product(W, y, error)
         y, J, k = product + b, W @ J, float(up(sigma * k))

@@ -8,10 +8,15 @@ from pathlib import Path
 from certify.errors import InputError
 from certify.systems.cartpole import cartpole
 from certify.systems.pendulum import pendulum
+from certify.systems.quadrotor2d import quadrotor2d
 from certify.systems.system import System
 from certify.systems.toml import load_system
 
-_REGISTRY: dict[str, Callable[[], System]] = {"pendulum": pendulum, "cartpole": cartpole}
+_REGISTRY: dict[str, Callable[[], System]] = {
+    "pendulum": pendulum,
+    "cartpole": cartpole,
+    "quadrotor2d": quadrotor2d,
+}
 
 
 def available_systems() -> tuple[str, ...]:
