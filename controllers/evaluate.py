@@ -23,7 +23,10 @@ from controllers.environments import Stepper, rk4
 
 Array = NDArray[np.float64]
 
-INITIAL_STATES: dict[str, tuple[float, ...]] = {"pendulum": (math.pi / 2, 2.0)}
+INITIAL_STATES: dict[str, tuple[float, ...]] = {
+    "pendulum": (math.pi / 2, 2.0),
+    "cartpole": (1.0, 0.5, 1.0, 1.0),
+}
 """Half-widths of the box from which each plant's initial states are drawn, in the states' units."""
 
 

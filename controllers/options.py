@@ -121,6 +121,24 @@ PRESETS: dict[str, TrainingOptions] = {
         state_weights=(1.0, 0.5),
         input_weights=(1.0,),
     ),
+    "cartpole": TrainingOptions(
+        steps=80_000,
+        dt=0.02,
+        horizon=250,
+        start=0.5,
+        reward_offset=1.0,
+        reward_weights=(1.0, 1.0, 0.1, 0.1),
+        penalty=100.0,
+        actor=(256, 256),
+        critic=(128, 128),
+        eta=0.1,
+        n_A=400,
+        n_B=400,
+        refresh=10_000,
+        gain_weight=3.0,
+        state_weights=(1.0, 1.0, 0.1, 0.1),
+        input_weights=(0.1,),
+    ),
 }
 
 

@@ -7,6 +7,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+import scipy.linalg
 import sympy
 import torch
 from hypothesis import settings
@@ -62,26 +63,48 @@ def chain(n: int, poles: list[float]) -> tuple[System, TanhNetwork]:
     return system, network
 
 
-def pendulum_network(widths: tuple[int, ...] = (16, 16), centre: str = "preactivation", seed: int = 0) -> TanhNetwork:
-    """A tanh policy near the saturated LQR u = 6 tanh(-Kx/6): random features, last layer by least squares."""
+def saturated_lqr(
+    K: np.ndarray, scale: float, offset: float, spread: list[float], widths: tuple[int, ...], centre: str, seed: int
+) -> TanhNetwork:
+    """A tanh policy near u = offset + scale tanh(-Kx/scale): random features, last layer by least squares.
+
+    K (m, n); spread (n,): half-widths of the states over which it is fitted.
+    """
     generator = np.random.default_rng(seed)
-    K = np.array([2.8, 0.95])
-    weights, biases, width = [], [], 2
+    m, n = K.shape
+    weights, biases, width = [], [], n
     for out in widths:
-        weights.append(generator.standard_normal((out, width)) / np.sqrt(width) * (0.7 if width == 2 else 1.0))
+        first = width == n and not weights
+        weights.append(generator.standard_normal((out, width)) * (1.4 / np.array(spread) if first else 1.0) / width**0.5)
         biases.append(generator.uniform(-0.5, 0.5, out))
         width = out
-    x = generator.uniform(-1, 1, (4000, 2)) * [3.5, 12.0] * generator.random((4000, 1))
-    x = np.concatenate([x, 1e-3 * generator.standard_normal((200, 2))])
-    h, h0 = x, np.zeros((1, 2))
+    x = generator.uniform(-1, 1, (4000, n)) * np.array(spread) * generator.random((4000, 1))
+    x = np.concatenate([x, 1e-3 * generator.standard_normal((200, n))])
+    h, h0 = x, np.zeros((1, n))
     for W, b in zip(weights, biases, strict=True):
         h, h0 = np.tanh(h @ W.T + b), np.tanh(h0 @ W.T + b)
-    importance = np.where(np.arange(len(x)) < 4000, 1.0, 3000.0)
-    target = -(x @ K) / 6
-    last, *_ = np.linalg.lstsq((h - h0) * importance[:, None], target * importance, rcond=1e-6)
+    importance = np.where(np.arange(len(x)) < 4000, 1.0, 3000.0)[:, None]
+    last, *_ = np.linalg.lstsq((h - h0) * importance, -(x @ K.T) / scale * importance, rcond=1e-6)
     return TanhNetwork(
-        (*weights, last[None, :]), (*biases, np.array([0.1])), np.array([6.0]), np.zeros(1), "tanh", centre
+        (*weights, last.T), (*biases, np.full(m, 0.1)), np.full(m, scale), np.full(m, offset), "tanh", centre
     )
+
+
+def pendulum_network(widths: tuple[int, ...] = (16, 16), centre: str = "preactivation", seed: int = 0) -> TanhNetwork:
+    """A policy for the pendulum that stabilises it."""
+    return saturated_lqr(np.array([[2.8, 0.95]]), 6.0, 0.0, [2.0, 8.0], widths, centre, seed)
+
+
+def lqr_gain(system: System, Q: np.ndarray, R: np.ndarray) -> np.ndarray:
+    """Continuous LQR gain of the plant's linearisation, (m, n)."""
+    f, n = system.function(), system.n
+    u_eq = np.array([float(u) for u in system.exact_u_eq()])
+    step = 1e-6
+    rows = np.concatenate([np.eye(n, n + system.m), np.eye(system.m, n + system.m, n)]) * step
+    forward, back = (f(s * rows[:, :n], u_eq + s * rows[:, n:]) for s in (1, -1))
+    J = ((forward - back) / (2 * step)).T
+    A, B = J[:, :n], J[:, n:]
+    return np.asarray(np.linalg.solve(R, B.T @ scipy.linalg.solve_continuous_are(A, B, Q, R)))
 
 
 @pytest.fixture

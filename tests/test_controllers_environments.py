@@ -22,6 +22,24 @@ def environment() -> PlantEnvironment:
     return PlantEnvironment(get_system("pendulum"), preset("pendulum"))
 
 
+def _pendulum(x, u):
+    # theta'' = (g/l) sin theta - b/(m l^2) theta' + u/(m l^2)
+    return np.array([x[1], 9.81 / 0.5 * np.sin(x[0]) + (u - 0.1 * x[1]) / (0.15 * 0.5**2)])
+
+
+def _cartpole(x, u):
+    # Forces on cart and pole with the accelerations unknown, solved as two linear equations.
+    (_, theta, p_dot, theta_dot), mc, mp, length, g = x, 1.0, 0.1, 0.5, 9.81
+    s, c = np.sin(theta), np.cos(theta)
+    mass = [[mc + mp, mp * length * c], [mp * length * c, mp * length**2]]
+    force = [u + mp * length * theta_dot**2 * s, mp * g * length * s]
+    return np.array([p_dot, theta_dot, *np.linalg.solve(mass, force)])
+
+
+WRITTEN = {"pendulum": (_pendulum, (0.7, -1.2), 2.5), "cartpole": (_cartpole, (0.4, -0.6, 1.1, 2.3), -17.0)}
+"""The equations of motion in a form of their own, with a state and an input."""
+
+
 @pytest.mark.parametrize("name", PRESETS)
 def test_registered_environments_pass_the_checker(name):
     environment = gymnasium.make(f"certify/{name}-v0")
@@ -39,18 +57,16 @@ def test_observation_is_the_raw_float64_state_and_angles_are_not_wrapped(environ
     assert x[0] > 3.2 and terminated
 
 
-def test_step_agrees_with_a_fine_integration_of_the_written_equation(environment):
-    # theta'' = (g/l) sin theta - b/(m l^2) theta' + u/(m l^2), by many small midpoint steps.
-    x, u, pieces = np.array([0.7, -1.2]), 2.5, 2000
+@pytest.mark.parametrize("name", PRESETS)
+def test_step_agrees_with_a_fine_integration_of_the_written_equation(name):
+    # By many small midpoint steps.
+    environment, pieces = PlantEnvironment(get_system(name), preset(name)), 2000
+    f, start, u = WRITTEN[name]
     environment.reset(seed=0)
-    environment.restore(replace(environment.snapshot(), x=tuple(x)))
-
-    def f(y):
-        return np.array([y[1], 9.81 / 0.5 * np.sin(y[0]) + (u - 0.1 * y[1]) / (0.15 * 0.5**2)])
-
-    h = environment.options.dt / pieces
+    environment.restore(replace(environment.snapshot(), x=start))
+    x, h = np.array(start), environment.options.dt / pieces
     for _ in range(pieces):
-        x = x + h * f(x + h / 2 * f(x))
+        x = x + h * f(x + h / 2 * f(x, u), u)
     found, *_ = environment.step(np.array([u]))
     np.testing.assert_allclose(found, x, rtol=0, atol=1e-5)
 
@@ -69,9 +85,11 @@ def test_runge_kutta_converges_with_order_four():
     assert 3.7 < np.log2(errors[0] / errors[1]) < 4.4
 
 
-def test_batched_torch_stepper_follows_the_environment(environment):
-    generator = np.random.default_rng(0)
-    x, u = generator.uniform(-2, 2, (5, 2)), generator.uniform(-6, 6, (5, 1))
+@pytest.mark.parametrize("name", PRESETS)
+def test_batched_torch_stepper_follows_the_environment(name):
+    environment, generator = PlantEnvironment(get_system(name), preset(name)), np.random.default_rng(0)
+    n, bound = environment.system.n, environment.action_space.high
+    x, u = generator.uniform(-1, 1, (5, n)), generator.uniform(-bound, bound, (5, len(bound)))
     batched = Stepper(environment.system, environment.options.dt, "torch")(torch.tensor(x), torch.tensor(u))
     for k in range(5):
         environment.reset(seed=0)

@@ -93,14 +93,24 @@ def test_a_refresh_begins_with_A_and_keeps_the_old_gain_meanwhile():
     np.testing.assert_array_equal(learner.identified.K, copy.identified.K)
 
 
-def test_the_pendulum_is_identified_from_a_small_ball():
-    system, dt = get_system("pendulum"), 0.02
+# Rows of the continuous [A B], written out for each plant.
+CONTINUOUS = {
+    "pendulum": [[0, 1, 0], [9.81 / 0.5, -0.1 / 0.0375, 1 / 0.0375]],
+    "cartpole": [
+        [0, 0, 1, 0, 0], [0, 0, 0, 1, 0], [0, -0.1 * 9.81, 0, 0, 1], [0, 1.1 * 9.81 / 0.5, 0, 0, -1 / 0.5],
+    ],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", CONTINUOUS)
+def test_a_plant_is_identified_from_a_small_ball(name):
+    system, dt = get_system(name), 0.02
     stepper, generator = Stepper(system, dt, "numpy"), np.random.default_rng(0)
-    x, u = generator.uniform(-0.01, 0.01, (100, 2)), generator.uniform(-0.1, 0.1, (100, 1))
+    x, u = generator.uniform(-0.01, 0.01, (100, system.n)), generator.uniform(-0.1, 0.1, (100, system.m))
     true_A, true_B = discrete_linearisation(system, dt)
-    continuous = np.array([[0, 1, 0], [9.81 / 0.5, -0.1 / 0.0375, 1 / 0.0375], [0, 0, 0]])
-    exact = scipy.linalg.expm(continuous * dt)
-    np.testing.assert_allclose(np.hstack([true_A, true_B]), exact[:2], atol=1e-5)  # RK4 against the exact one
-    found = fit_A(x, stepper(x, np.zeros((100, 1))))
+    square = np.vstack([CONTINUOUS[name], np.zeros((system.m, system.n + system.m))])
+    exact = scipy.linalg.expm(square * dt)[: system.n]
+    np.testing.assert_allclose(np.hstack([true_A, true_B]), exact, atol=1e-5)  # RK4 against the exact one
+    found = fit_A(x, stepper(x, np.zeros((100, system.m))))
     np.testing.assert_allclose(found, true_A, atol=1e-4)
     np.testing.assert_allclose(fit_B(x, u, stepper(x, u), found), true_B, atol=1e-4)

@@ -146,7 +146,7 @@ def upper_bound(model: Taylor) -> Array:
     q = np.array([model.Q[i, i] for i in range(N)])
     inside = (q < 0) & (g < -2 * q)
     denominator = np.where(inside, -4 * q, 1.0)
-    axes = np.where(inside, g * g / denominator, g + q)
+    axes = np.where(inside, g * (g / denominator), g + q)  # g * g could underflow; the quotient is below 1/2
     cross = np.zeros_like(model.c)
     for i in range(N):
         for j in range(i):
