@@ -1,0 +1,204 @@
+"""Simulation for pictures. Nothing here is proved, and whatever is shown of it is labelled as simulated.
+
+The continuous closed loop is integrated by the classical Runge-Kutta method of order four with the policy evaluated at
+every stage, many initial states at a time. Runs leave the batch as soon as they are decided, which is
+what keeps a grid of a few thousand states well below a second.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.closed_loop import ClosedLoop
+from certify.errors import InputError
+from certify.policies import TanhNetwork
+from certify.systems import System
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Field = Callable[[Array], Array]
+SETTLED = 1e-3
+"""A run has settled when V is at most this share of the certified level: a thirtieth of the set's radius."""
+_STEP = 1.0  # of the time constant of the fastest eigenvalue
+_HORIZON = 15.0  # time constants of the slowest eigenvalue
+_MAX_STEPS = 3000
+_GRID = {1: 401, 2: 35}
+
+
+@dataclass(frozen=True, slots=True)
+class SimulatedRoa:
+    """The region of attraction seen by simulation from a grid, beside the certified set.
+
+    Parameters
+    ----------
+    axes : grid coordinates along each state, the centres of equal cells.
+    attracted : runs that stayed in the domain and came near the origin; shape of the grid.
+    certified : grid points in the certified set; shape of the grid.
+    undecided : runs that did neither settle nor leave within the horizon; they count as not attracted.
+    step, horizon : of the integration, in seconds.
+    """
+
+    axes: tuple[Array, ...]
+    attracted: Mask
+    certified: Mask
+    undecided: int
+    step: float
+    horizon: float
+
+    @property
+    def fraction(self) -> float:
+        """Certified grid points over attracted grid points; NaN if nothing was attracted."""
+        count = int(self.attracted.sum())
+        return float(self.certified.sum()) / count if count else math.nan
+
+    @property
+    def contradictions(self) -> int:
+        """Certified grid points whose simulation did not settle; more than 0 calls for an explanation."""
+        return int((self.certified & ~self.attracted).sum())
+
+
+def closed_loop_field(loop: ClosedLoop) -> Field:
+    """`F(x) = f(x, pi(x))` in float64, shapes (..., n) to (..., n)."""
+    f, network, u_eq = loop.system.function(), loop.network, loop.u_eq
+
+    def F(x: Array) -> Array:
+        return np.asarray(f(x, network(x, u_eq)))
+
+    return F
+
+
+def rk4_step(field: Field, x: Array, step: float) -> Array:
+    """One step of the classical Runge-Kutta method."""
+    k1 = field(x)
+    k2 = field(x + step / 2 * k1)
+    k3 = field(x + step / 2 * k2)
+    k4 = field(x + step * k3)
+    return x + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+
+
+def time_scales(loop: ClosedLoop) -> tuple[float, float]:
+    """(step, horizon) in seconds: the fastest time constant, and 15 times the slowest of the linearisation.
+
+    The fastest is taken over Jacobians at the origin and at sampled states of the domain, because a plant can be
+    stiffer away from the origin; Runge-Kutta of order four is stable up to 2.8 of it. The horizon is cut at 3,000
+    steps.
+    """
+    eigenvalues = np.linalg.eigvals(loop.linearise()[0])
+    slowest = float(np.min(np.abs(eigenvalues.real)))
+    fastest = max(float(np.max(np.abs(eigenvalues))), _fastest_rate(loop))
+    step = _STEP / fastest if fastest > 0 else 1.0
+    return step, min(_HORIZON / slowest if slowest > 0 else math.inf, _MAX_STEPS * step)
+
+
+def _fastest_rate(loop: ClosedLoop) -> float:
+    """Largest |eigenvalue| of Jacobians (central differences) at 200 states of the domain; 0 where there is none."""
+    n = loop.system.n
+    lo, hi = domain_bounds(loop.system)
+    x = np.random.default_rng(0).uniform(lo, hi, (200, n))
+    delta = 1e-5 * (hi - lo)
+    shifted = x[:, None, None, :] + np.array([1.0, -1.0])[:, None, None] * np.diag(delta)
+    with np.errstate(all="ignore"):
+        F = closed_loop_field(loop)(shifted)
+        J = (F[:, 0] - F[:, 1]) / (2 * delta)[:, None]  # transposed; the eigenvalues are the same
+    J = J[np.all(np.isfinite(J), axis=(1, 2))]
+    return float(np.max(np.abs(np.linalg.eigvals(J)))) if len(J) else 0.0
+
+
+def simulate(loop: ClosedLoop, starts: Array, step: float, steps: int) -> Array:
+    """Trajectories from `starts` (N, n), shape (steps + 1, N, n); NaN from the first step outside the domain on."""
+    field = closed_loop_field(loop)
+    lo, hi = domain_bounds(loop.system)
+    x = np.array(starts, dtype=np.float64)
+    path = np.full((steps + 1, *x.shape), math.nan)
+    path[0] = x
+    alive = np.arange(len(x))
+    with np.errstate(over="ignore", invalid="ignore"):
+        for k in range(1, steps + 1):
+            if not alive.size:
+                break
+            x = rk4_step(field, x, step)
+            inside = np.all((x >= lo) & (x <= hi), axis=-1)
+            x, alive = x[inside], alive[inside]
+            path[k, alive] = x
+    return path
+
+
+def simulated_roa_fraction(
+    system: System,
+    network: TanhNetwork,
+    P: Array,
+    level: float,
+    *,
+    points: int | None = None,
+    step: float | None = None,
+    horizon: float | None = None,
+) -> SimulatedRoa:
+    """Simulate the closed loop from a grid over the domain and compare with `{x'Px <= level}`.
+
+    A grid point counts as attracted if its run stays inside the domain and comes as near to the origin as
+    `V <= SETTLED * level` within the horizon.
+
+    Parameters
+    ----------
+    system, network : the closed loop; one or two states.
+    P, level : the certified set.
+    points : grid points along each state; default 401 for one state, 35 for two.
+    step, horizon : in seconds; defaults from the eigenvalues, see `time_scales`.
+
+    Raises
+    ------
+    InputError : the plant has more than two states, or an option is not positive.
+    """
+    if system.n not in _GRID:
+        raise InputError(f"a grid needs a plant with one or two states; {system.name} has {system.n}.")
+    loop = ClosedLoop(system, network)
+    default_step, default_horizon = time_scales(loop)
+    step = default_step if step is None else step
+    horizon = default_horizon if horizon is None else horizon
+    points = _GRID[system.n] if points is None else points
+    if not (points >= 1 and 0 < step < math.inf and 0 < horizon < math.inf):
+        raise InputError("`points`, `step` and `horizon` must be positive and finite.")
+    lo, hi = domain_bounds(system)
+    centres = (np.arange(points) + 0.5) / points
+    axes = tuple(a + (b - a) * centres for a, b in zip(lo, hi, strict=True))
+    x = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, system.n)
+    certified = quadratic(P, x) <= level
+    attracted, undecided = _run(closed_loop_field(loop), x, lo, hi, P, SETTLED * level, step, horizon)
+    shape = (points,) * system.n
+    return SimulatedRoa(axes, attracted.reshape(shape), certified.reshape(shape), undecided, step, horizon)
+
+
+def _run(
+    field: Field, x: Array, lo: Array, hi: Array, P: Array, target: float, step: float, horizon: float
+) -> tuple[Mask, int]:
+    attracted = np.zeros(len(x), dtype=np.bool_)
+    alive = np.arange(len(x))
+    with np.errstate(over="ignore", invalid="ignore"):
+        for _ in range(math.ceil(horizon / step)):
+            near = quadratic(P, x) <= target
+            attracted[alive[near]] = True
+            x, alive = x[~near], alive[~near]
+            if not alive.size:
+                break
+            x = rk4_step(field, x, step)
+            inside = np.all((x >= lo) & (x <= hi), axis=-1)  # False for NaN
+            x, alive = x[inside], alive[inside]
+        near = quadratic(P, x) <= target
+    attracted[alive[near]] = True
+    return attracted, int((~near).sum())
+
+
+def quadratic(P: Array, x: Array) -> Array:
+    """`x'Px` along the last axis."""
+    return np.asarray(np.einsum("...i,...i->...", x @ P, x))
+
+
+def domain_bounds(system: System) -> tuple[Array, Array]:
+    """Lower and upper corner of the domain box in float64."""
+    bounds = np.array([[float(a), float(b)] for a, b in system.domain])
+    return bounds[:, 0], bounds[:, 1]
