@@ -75,7 +75,8 @@ def saturated_lqr(
     weights, biases, width = [], [], n
     for out in widths:
         first = width == n and not weights
-        weights.append(generator.standard_normal((out, width)) * (1.4 / np.array(spread) if first else 1.0) / width**0.5)
+        stretch = 1.4 / np.array(spread) if first else 1.0
+        weights.append(generator.standard_normal((out, width)) * stretch / width**0.5)
         biases.append(generator.uniform(-0.5, 0.5, out))
         width = out
     x = generator.uniform(-1, 1, (4000, n)) * np.array(spread) * generator.random((4000, 1))

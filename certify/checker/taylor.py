@@ -58,7 +58,7 @@ class Taylor:
             ca * b.r + cb * a.r  # constant times remainder
             + Ga * Qb + Gb * Qa + Qa * Qb  # third and fourth order
             + a.r * (Gb + Qb + b.r) + b.r * (Ga + Qa)
-            + EPS * (ca + Ga + Qa) * (cb + Gb + Qb)  # rounding of all coefficients
+            + EPS * ((ca + Ga + Qa) * (cb + Gb + Qb))  # rounding of all coefficients; infinite if one overflows
         )  # fmt: skip
         Q = a.c * b.Q + b.c * a.Q + a.g[:, None] * b.g[None, :]
         return Taylor(a.c * b.c, a.c * b.g + b.c * a.g, Q, up(r))
@@ -145,12 +145,12 @@ def upper_bound(model: Taylor) -> Array:
     N = g.shape[0]
     q = np.array([model.Q[i, i] for i in range(N)])
     inside = (q < 0) & (g < -2 * q)
-    denominator = np.where(inside, -4 * q, 1.0)
-    axes = np.where(inside, g * (g / denominator), g + q)  # g * g could underflow; the quotient is below 1/2
+    ratio = g / np.where(inside, -q, 1.0)  # below 2; squaring g first could underflow, and 4 q overflow
+    axes = np.where(inside, 0.25 * (g * ratio), g + q)
     cross = np.zeros_like(model.c)
     for i in range(N):
         for j in range(i):
             cross = cross + np.abs(model.Q[i, j] + model.Q[j, i])
     value = model.c + np.sum(axes, axis=0) + cross + model.r
-    size = np.abs(model.c) + total(np.abs(axes) + 2 * g, 0) + cross + model.r
+    size = np.abs(model.c) + total(np.abs(axes) + 2 * g + np.abs(q), 0) + cross + model.r  # infinite if any part is
     return np.asarray(value + up((gamma(N * N) + EPS) * size))

@@ -135,7 +135,7 @@ def upper_bound(model: Taylor) -> tuple[Tensor, Tensor]:
     g = model.g.abs()
     q = torch.diagonal(model.Q, dim1=0, dim2=1).T
     inside = (q < 0) & (g < -2 * q)
-    axes = torch.where(inside, g * (g / torch.where(inside, -4 * q, 1.0)), g + q)
+    axes = torch.where(inside, 0.25 * (g * (g / torch.where(inside, -q, 1.0))), g + q)
     symmetric = (model.Q + model.Q.transpose(0, 1)).abs() / 2
     cross = symmetric.sum(1) - q.abs()
     size = model.c.abs() + g.sum(0) + axes.abs().sum(0) + cross.sum(0) + model.r
