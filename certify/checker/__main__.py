@@ -51,9 +51,10 @@ def main(arguments: list[str]) -> int:
         sys.stdout.write(json.dumps(accepted) + "\n")
     else:
         sys.stdout.write("\n".join(_claim(certificate)) + "\n")
+        ring = "" if tally.ring_margin is None else f"; smallest -Vdot bound {tally.ring_margin:.3g}"
         sys.stdout.write(
-            f"checked: {tally.leaves} leaves, {tally.ring_leaves} of them in the ring; smallest -Vdot bound "
-            f"{tally.ring_margin:.3g}; local margin {tally.local_margin:.1%}\n"
+            f"checked: {tally.leaves} leaves, {tally.ring_leaves} of them in the ring{ring}; "
+            f"local margin {tally.local_margin:.1%}\n"
         )
         sys.stdout.write(f"ACCEPTED c1={certificate.c1!r} c2={certificate.c2!r} sha256={certificate.sha256}\n")
     return 0

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Matrix = list[list[Fraction]]
+MAX_BITS = 2**17
 
 
 def rational(array: NDArray[np.float64]) -> Matrix:
@@ -54,6 +55,13 @@ class Undecided(Exception):
     """The value is not a rational that this arithmetic can name."""
 
 
+def _small(a: Fraction) -> Fraction:
+    """`a` itself; powers of powers could grow without end."""
+    if max(a.numerator.bit_length(), a.denominator.bit_length()) > MAX_BITS:
+        raise Undecided(f"a number of more than {MAX_BITS} bits")
+    return a
+
+
 class RationalAlgebra:
     """Exact evaluation of a tape; sin and cos only at exact 0, no division by zero."""
 
@@ -61,13 +69,13 @@ class RationalAlgebra:
         return q
 
     def add(self, a: Fraction, b: Fraction) -> Fraction:
-        return a + b
+        return _small(a) + _small(b)
 
     def neg(self, a: Fraction) -> Fraction:
         return -a
 
     def mul(self, a: Fraction, b: Fraction) -> Fraction:
-        return a * b
+        return _small(a) * _small(b)
 
     def inv(self, a: Fraction) -> Fraction:
         if a == 0:

@@ -99,7 +99,7 @@ class _Builder:
         name, arguments = tree[0], tree[1:]
         if name == "**" and len(arguments) == 2:
             base, words = self.build(arguments[0], at, depth + 1)
-            return self.power(base, arguments[1], at), f"{words}**{arguments[1]}"
+            return self.power(base, arguments[1], at), f"({words}**{arguments[1]})"
         indices, words_of = zip(*(self.build(a, at, depth + 1) for a in arguments), strict=True)
         if name in ("+", "*"):
             result = indices[0]

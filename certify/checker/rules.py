@@ -43,8 +43,8 @@ class Tally:
 
     leaves: int = 0
     ring_leaves: int = 0
-    ring_margin: float = float("inf")  # smallest -Vdot bound over the ring's leaves
-    local_margin: float = float("inf")  # smallest eigenvalue less remainder, over the eigenvalue
+    ring_margin: float | None = None  # smallest -Vdot bound over the ring's leaves
+    local_margin: float = 0.0  # smallest eigenvalue less remainder, over the eigenvalue
 
 
 def check(certificate: Certificate) -> Tally:
@@ -205,7 +205,8 @@ class _Ring:
             worst = int(np.argmin(good))
             raise Rejected("ring", f"leaf {first + int(inside[worst])}", f"Vdot < 0 is not shown: {bound[worst]:.3g}")
         tally.ring_leaves += len(inside)
-        tally.ring_margin = min(tally.ring_margin, float(np.min(-bound)))
+        margin = float(np.min(-bound))
+        tally.ring_margin = margin if tally.ring_margin is None else min(tally.ring_margin, margin)
 
     def _misses(self, lo: Array, hi: Array) -> NDArray[np.bool_]:
         """True where the leaf certainly has V < c1 everywhere, or V > c2 everywhere."""
