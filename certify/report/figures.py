@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from certify.certificate import Certificate
 from certify.closed_loop import ClosedLoop
+from certify.errors import CertificateFormatError
 from certify.lyapunov import extents
 from certify.report.partition import Leaves, rebuild_leaves
 from certify.report.sampling import (
@@ -96,10 +97,19 @@ class Picture:
         return "data:image/svg+xml;base64," + base64.b64encode(self.svg.encode("utf-8")).decode("ascii")
 
 
+def is_ellipsoid(certificate: Certificate) -> bool:
+    """Whether `{V <= c2}` is one, in floats, with levels in order; a rejected file may hold anything."""
+    P = certificate.P
+    positive = np.all(np.isfinite(P)) and np.all(np.linalg.eigvalsh((P + P.T) / 2) > 0)
+    return bool(positive) and 0 < certificate.local <= certificate.roa < np.inf
+
+
 class _Scene:
     """What the figures of one certificate share."""
 
     def __init__(self, certificate: Certificate, accepted: bool) -> None:
+        if not is_ellipsoid(certificate):
+            raise CertificateFormatError("P must be positive definite and the levels positive and in order.")
         self.certificate = certificate
         self.word = "certified" if accepted else "claimed"
         self.system, self.P, self.c1, self.c2 = (
@@ -117,7 +127,10 @@ class _Scene:
         self.leaves: Leaves | None = rebuild_leaves(certificate.tree, certificate.root) if small else None
 
     def vdot(self, x: Array) -> Array:
-        return np.asarray(2 * np.einsum("...i,...i->...", x @ self.P, self.field(x)))
+        """Vdot in float64; NaN where the equations have a pole."""
+        with np.errstate(all="ignore"):
+            value = 2 * np.einsum("...i,...i->...", x @ self.P, self.field(x))
+        return np.where(np.isfinite(value), value, np.nan)
 
     def simulate(self, starts: Array, steps: int | None = None) -> Array:
         """Trajectories for a picture, by default over half the horizon."""
@@ -538,7 +551,7 @@ def _settled(scene: _Scene, paths: Array) -> NDArray[np.bool_]:
 
 def _refine(path: Array, field: Field, step: float) -> Array:
     """Each step in `_PARTS` pieces by cubic Hermite interpolation, so that curves look as smooth as they are."""
-    with np.errstate(over="ignore", invalid="ignore"):
+    with np.errstate(all="ignore"):
         slope = step * field(path)
     x0, x1, f0, f1 = path[:-1], path[1:], slope[:-1], slope[1:]
     fine = np.empty((_PARTS * (len(path) - 1) + 1, *path.shape[1:]))

@@ -6,12 +6,13 @@ these levels. Every text that comes from a file passes through jinja2's escaping
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import sympy
@@ -20,6 +21,8 @@ from certify.certificate import Certificate
 from certify.closed_loop import ClosedLoop
 from certify.errors import CertifyError
 from certify.lyapunov import domain_limit, extents, semi_axes, volume
+from certify.report.figures import Picture, draw, is_ellipsoid
+from certify.report.sampling import SimulatedRoa
 from certify.report.summary import limit_in_words
 from certify.report.words import (
     ABSENT,
@@ -35,10 +38,6 @@ from certify.report.words import (
     volume_name,
     volume_unit,
 )
-
-if TYPE_CHECKING:
-    from certify.report.figures import Picture
-    from certify.report.sampling import SimulatedRoa
 
 _LONG = 10**6  # numerators and denominators beyond it are shown rounded
 
@@ -91,8 +90,6 @@ def render_html(
     certificate_path : the file, for its name and its size.
     """
     import jinja2
-
-    from certify.report.figures import draw
 
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
     source = resources.files("certify.report").joinpath("template.html").read_text(encoding="utf-8")
@@ -181,7 +178,8 @@ def _is_long(value: sympy.Rational) -> bool:
 def _claim(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict[str, Any]:
     """The claim of DESIGN.md section 1 in words and numbers, and what the checker showed of each part."""
     system, units = certificate.system, units_of(certificate.system)
-    reach = extents(certificate.P, certificate.roa)
+    drawable = is_ellipsoid(certificate)
+    reach = extents(certificate.P, certificate.roa) if drawable else [math.nan] * system.n
     sides = [
         f"|{symbol(s.name)}| ≤ {_between(float(e), float(min(-lo, hi)))} < {number(float(min(-lo, hi)))}"
         + (f" {pretty_unit(units[s.name])}" if units.get(s.name) else "")
@@ -207,7 +205,7 @@ def _claim(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict[s
         "parts": [
             ("Equations", "The closed loop is twice continuously differentiable on {V ≤ c₂}.", ""),
             ("Equilibrium", "P is symmetric positive definite and f(0, u_eq) = 0 exactly.", ""),
-            ("Domain", "{V ≤ c₂} lies strictly inside the domain.", "; ".join(sides) + "."),
+            ("Domain", "{V ≤ c₂} lies strictly inside the domain.", "; ".join(sides) + "." if drawable else ""),
             ("Local", "V̇(x) < 0 for all x with 0 < V(x) ≤ c₁, by the linearisation and a bound on its remainder "
              "that holds at all smaller radii: there is no hole around the origin.", local_note),
             ("Ring", "V̇(x) < 0 for all x with c₁ ≤ V(x) ≤ c₂, leaf by leaf of a partition that covers the set by "
@@ -261,7 +259,7 @@ def _tables(
     ]
     geometry: list[tuple[str, str]] = []
     reach: list[tuple[str, str, str, str]] = []
-    if _positive_definite(P) and certificate.roa > 0:
+    if is_ellipsoid(certificate):
         levels.append(("domain's limit", number(domain_limit(P, system.domain), 10)))
         unit = volume_unit(state_units)
         geometry.append((volume_name(system.n), f"{below(volume(P, certificate.roa))} {unit}".rstrip()))
@@ -277,7 +275,8 @@ def _tables(
         sampled = result["levels"].get("sampled_limit")
         if sampled is not None:
             levels.append(("lowest V of a violation found", number(sampled, 10)))
-    geometry.append(("eigenvalues of P", ", ".join(number(float(v)) for v in np.linalg.eigvalsh(P))))
+    if np.all(np.isfinite(P)):
+        geometry.append(("eigenvalues of P", ", ".join(number(float(v)) for v in np.linalg.eigvalsh(P))))
     geometry.append(("eigenvalues of the closed loop", _eigenvalues(certificate)))
     evidence = [
         ("policy", f"{'-'.join(map(str, network.layers))} tanh, squash {network.squash}, centre {network.centre}"),
@@ -322,7 +321,3 @@ def _complex(value: complex) -> str:
     if value.imag == 0:
         return number(value.real, 5)
     return f"{number(value.real, 5)} {'+' if value.imag > 0 else MINUS} {number(abs(value.imag), 5)}i"
-
-
-def _positive_definite(P: Any) -> bool:
-    return bool(np.all(np.isfinite(P)) and np.all(np.linalg.eigvalsh((P + P.T) / 2) > 0))

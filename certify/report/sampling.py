@@ -117,7 +117,7 @@ def simulate(loop: ClosedLoop, starts: Array, step: float, steps: int) -> Array:
     path = np.full((steps + 1, *x.shape), math.nan)
     path[0] = x
     alive = np.arange(len(x))
-    with np.errstate(over="ignore", invalid="ignore"):
+    with np.errstate(all="ignore"):
         for k in range(1, steps + 1):
             if not alive.size:
                 break
@@ -178,7 +178,7 @@ def _run(
 ) -> tuple[Mask, int]:
     attracted = np.zeros(len(x), dtype=np.bool_)
     alive = np.arange(len(x))
-    with np.errstate(over="ignore", invalid="ignore"):
+    with np.errstate(all="ignore"):
         for _ in range(math.ceil(horizon / step)):
             near = quadratic(P, x) <= target
             attracted[alive[near]] = True

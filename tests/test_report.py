@@ -1,0 +1,587 @@
+"""Reports say what the certificate says, call nothing proved that is not, and load nothing from anywhere."""
+
+from __future__ import annotations
+
+import base64
+import io
+import json
+import math
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import sympy
+from hypothesis import given
+from hypothesis import strategies as st
+from rich.console import Console
+
+from certify.certificate import Certificate, read_certificate, write_certificate
+from certify.closed_loop import ClosedLoop
+from certify.errors import CertificateFormatError, InputError
+from certify.lyapunov import solve_lyapunov, volume
+from certify.policies import TanhNetwork
+from certify.report import figures as figures_module
+from certify.report import render_html, simulated_roa_fraction, summary
+from certify.report.figures import draw
+from certify.report.html import status_of
+from certify.report.partition import rebuild_leaves
+from certify.report.sampling import (
+    closed_loop_field,
+    domain_bounds,
+    quadratic,
+    rk4_step,
+    simulate,
+    time_scales,
+)
+from certify.report.words import below, label, number, symbol, units_of
+from certify.roa import certify_roa, run_checker
+from certify.systems import System, get_system
+from tests.conftest import box, chain, pendulum_network, scalar_tanh
+
+
+@dataclass(frozen=True)
+class Case:
+    """A certificate with all that a report may be given."""
+
+    certificate: Certificate
+    answer: dict[str, Any]
+    result: dict[str, Any]
+    path: Path
+
+    def page(self) -> str:
+        return render_html(self.certificate, self.answer, self.result, self.path)
+
+
+def certified(system: System, network: TanhNetwork, folder: Path) -> Case:
+    result = certify_roa(system, network, folder, provenance={"numpy": "1.2.3-test"})
+    assert result.certificate is not None and result.checker is not None
+    return Case(read_certificate(result.certificate), dict(result.checker), result.to_dict(), result.certificate)
+
+
+@pytest.fixture(scope="module")
+def pendulum_case(tmp_path_factory: pytest.TempPathFactory) -> Case:
+    return certified(get_system("pendulum"), pendulum_network(), tmp_path_factory.mktemp("pendulum"))
+
+
+@pytest.fixture(scope="module")
+def scalar_case(tmp_path_factory: pytest.TempPathFactory) -> Case:
+    return certified(*scalar_tanh(), tmp_path_factory.mktemp("scalar"))
+
+
+@pytest.fixture(scope="module")
+def chain_case(tmp_path_factory: pytest.TempPathFactory) -> Case:
+    return certified(*chain(4, [-1.0, -2.0, -3.0, -4.0]), tmp_path_factory.mktemp("chain"))
+
+
+class Page(HTMLParser):
+    """What a browser would see: tags with their attributes, and the text."""
+
+    def __init__(self, html: str) -> None:
+        super().__init__()
+        self.tags: list[tuple[str, dict[str, str | None]]] = []
+        self.pieces: list[str] = []
+        self._styles = 0
+        self.feed(html)
+        self.close()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append((tag, dict(attrs)))
+        self._styles += tag == "style"
+
+    def handle_endtag(self, tag: str) -> None:
+        self._styles -= tag == "style"
+
+    def handle_data(self, data: str) -> None:
+        if not self._styles:
+            self.pieces.append(data)
+
+    @property
+    def text(self) -> str:
+        return " ".join(" ".join(self.pieces).split())
+
+    def drawings(self) -> list[str]:
+        prefix = "data:image/svg+xml;base64,"
+        sources = [attributes["src"] or "" for tag, attributes in self.tags if tag == "img"]
+        assert all(source.startswith(prefix) for source in sources)
+        return [base64.b64decode(source.removeprefix(prefix)).decode("utf-8") for source in sources]
+
+
+# The partition
+
+
+def random_tree(draw: Callable[[st.SearchStrategy[int]], int], n: int, depth: int) -> bytes:
+    axis = draw(st.integers(-1, n - 1)) if depth else -1
+    if axis < 0:
+        return b"\xff"
+    return bytes([axis]) + random_tree(draw, n, depth - 1) + random_tree(draw, n, depth - 1)
+
+
+@st.composite
+def trees(draw: Any) -> tuple[bytes, np.ndarray]:
+    n = draw(st.integers(1, 4))
+    root = np.array(draw(st.lists(st.floats(0.1, 10), min_size=n, max_size=n)))
+    return random_tree(draw, n, 6), root
+
+
+def recursive_leaves(tree: bytes, root: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The rule of the format, word for word."""
+    leaves: list[tuple[np.ndarray, np.ndarray]] = []
+    nodes = iter(tree)
+
+    def visit(lower: np.ndarray, upper: np.ndarray) -> None:
+        axis = next(nodes)
+        if axis == 255:
+            leaves.append((lower, upper))
+            return
+        middle = 0.5 * lower[axis] + 0.5 * upper[axis]
+        below, above = upper.copy(), lower.copy()
+        below[axis] = above[axis] = middle
+        visit(lower, below)
+        visit(above, upper)
+
+    visit(-root, root)
+    return leaves
+
+
+@given(trees())
+def test_leaves_cover_the_root_box_exactly(case: tuple[bytes, np.ndarray]) -> None:
+    tree, root = case
+    leaves = rebuild_leaves(tree, root)
+    volumes = [
+        math.prod(Fraction(float(b)) - Fraction(float(a)) for a, b in zip(lower, upper, strict=True))
+        for lower, upper in zip(leaves.lower, leaves.upper, strict=True)
+    ]
+    assert sum(volumes) == math.prod(2 * Fraction(float(b)) for b in root)  # exact: no gap, given no overlap
+    assert all(v > 0 for v in volumes)
+    for (lower, upper), a, b in zip(recursive_leaves(tree, root), leaves.lower, leaves.upper, strict=True):
+        assert np.array_equal(lower, a) and np.array_equal(upper, b)
+
+
+def test_lower_half_first() -> None:
+    leaves = rebuild_leaves(bytes([1, 255, 0, 255, 255]), np.array([2.0, 4.0]))
+    assert leaves.lower.tolist() == [[-2, -4], [-2, 0], [0, 0]]
+    assert leaves.upper.tolist() == [[2, 0], [0, 4], [2, 4]]
+
+
+@pytest.mark.parametrize(
+    ("tree", "message"),
+    [
+        (b"", "ends early"),
+        (bytes([0, 255]), "ends early"),
+        (bytes([255, 255]), "too many"),
+        (bytes([2, 255, 255]), "axis"),
+    ],
+)
+def test_broken_trees_are_refused(tree: bytes, message: str) -> None:
+    with pytest.raises(CertificateFormatError, match=message):
+        rebuild_leaves(tree, np.ones(2))
+
+
+def test_leaves_of_a_real_certificate(pendulum_case: Case) -> None:
+    certificate = pendulum_case.certificate
+    leaves = rebuild_leaves(certificate.tree, certificate.root)
+    assert len(leaves) == pendulum_case.answer["leaves"]
+    total = np.prod(leaves.upper - leaves.lower, axis=1).sum()
+    assert total == pytest.approx(np.prod(2 * certificate.root), rel=1e-12)
+
+
+# Geometry of the drawings
+
+
+@given(st.integers(0, 10_000), st.floats(1e-6, 1e6))
+def test_drawn_ellipses_lie_on_the_level(seed: int, level: float) -> None:
+    generator = np.random.default_rng(seed)
+    M = generator.standard_normal((4, 4))
+    P = M @ M.T + 0.1 * np.eye(4)
+    i, j = 1, 3
+    section = np.zeros((241, 4))
+    section[:, i], section[:, j] = figures_module._ellipse(P, (i, j), level)
+    assert np.allclose(quadratic(P, section), level, rtol=1e-9)
+    # The projection: through each of its points passes a point of the level set, and none reaches further.
+    inverse = np.linalg.inv(P)[np.ix_((i, j), (i, j))]
+    shadow = np.stack(figures_module._shadow(P, (i, j), level), -1)
+    assert np.allclose(quadratic(np.linalg.inv(inverse), shadow), level, rtol=1e-6)
+    assert np.max(np.abs(shadow[:, 0])) <= math.sqrt(level * inverse[0, 0]) * (1 + 1e-9)
+    assert np.max(np.abs(shadow[:, 0])) >= math.sqrt(level * inverse[0, 0]) * (1 - 1e-3)
+
+
+def test_refined_paths_keep_their_points_and_follow_the_flow() -> None:
+    system, network = chain(2, [-1.0, -3.0])
+    loop = ClosedLoop(system, network)
+    field = closed_loop_field(loop)
+    errors = []
+    for step in (0.2, 0.1):
+        coarse = simulate(loop, np.array([[0.5, -0.2]]), step, 5)
+        fine = figures_module._refine(coarse, field, step)
+        assert np.array_equal(fine[:: figures_module._PARTS], coarse)
+        pieces = 8 * figures_module._PARTS  # of each step: exact enough
+        exact = simulate(loop, coarse[0], step / pieces, 5 * pieces)[::8]
+        errors.append(float(np.max(np.abs(fine - exact))))
+    assert errors[1] < errors[0] / 8 and errors[1] < 1e-4  # of fourth order
+
+
+# Simulation
+
+
+def test_runge_kutta_has_order_four() -> None:
+    errors = []
+    for steps in (8, 16, 32):
+        x = np.array([1.0, 0.0])
+        for _ in range(steps):
+            x = rk4_step(lambda s: np.array([s[1], -s[0]]), x, 1.0 / steps)
+        errors.append(float(np.linalg.norm(x - [math.cos(1), -math.sin(1)])))
+    assert 14 < errors[0] / errors[1] < 18 and 14 < errors[1] / errors[2] < 18
+
+
+def test_scalar_roa_by_simulation_is_the_known_one() -> None:
+    system, network = scalar_tanh()
+    roa = simulated_roa_fraction(system, network, np.eye(1), 1.0, points=1201)
+    inside = roa.axes[0][roa.attracted]
+    cell = 6 / 1201
+    assert abs(inside.max() - 1.915008048) < cell and abs(inside.min() + 1.915008048) < cell
+    assert roa.fraction == pytest.approx(1 / 1.915008048, abs=2e-3)
+    assert roa.contradictions == 0 and roa.undecided == 0
+
+
+def test_a_set_that_is_too_large_is_contradicted() -> None:
+    system, network = scalar_tanh()
+    roa = simulated_roa_fraction(system, network, np.eye(1), 2.5**2)
+    assert roa.contradictions > 0 and roa.fraction > 1
+
+
+def test_stable_linear_plants_lose_only_what_leaves_the_domain() -> None:
+    x, y, u = sympy.symbols("x y u")
+    system = System("decay", (x, y), (u,), {}, (-x, -y + u), (sympy.Integer(0),), box(1, 1), box(1))
+    network = TanhNetwork((np.zeros((1, 2)),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
+    roa = simulated_roa_fraction(system, network, np.eye(2), 1.0, points=60)
+    assert roa.attracted.all()
+    assert roa.fraction == pytest.approx(math.pi / 4, abs=0.01)
+
+
+def test_simulated_fraction_of_the_pendulum_contains_the_certified_set(pendulum_case: Case) -> None:
+    c = pendulum_case.certificate
+    roa = simulated_roa_fraction(c.system, c.network, c.P, c.roa)
+    assert roa.contradictions == 0 and 0.3 < roa.fraction < 1
+    finer = simulated_roa_fraction(c.system, c.network, c.P, c.roa, step=roa.step / 4)
+    assert abs(finer.fraction - roa.fraction) < 0.01
+
+
+def test_a_short_horizon_is_reported_as_undecided(pendulum_case: Case) -> None:
+    c = pendulum_case.certificate
+    assert simulated_roa_fraction(c.system, c.network, c.P, c.roa, points=9, horizon=0.01).undecided > 0
+
+
+def test_grids_are_for_planes() -> None:
+    system, network = chain(3, [-1.0, -2.0, -3.0])
+    with pytest.raises(InputError, match="one or two states"):
+        simulated_roa_fraction(system, network, np.eye(3), 1.0)
+
+
+@pytest.mark.parametrize("wrong", [{"points": 0}, {"step": -1.0}, {"horizon": math.inf}])
+def test_bad_options_are_refused(wrong: dict[str, Any]) -> None:
+    system, network = scalar_tanh()
+    with pytest.raises(InputError, match="positive and finite"):
+        simulated_roa_fraction(system, network, np.eye(1), 1.0, **wrong)
+
+
+def test_paths_end_where_they_leave_the_domain() -> None:
+    system, network = scalar_tanh()
+    loop = ClosedLoop(system, network)
+    path = simulate(loop, np.array([[2.9], [1.0]]), 0.5, 40)
+    lo, hi = domain_bounds(system)
+    assert np.isnan(path[-1, 0, 0]) and abs(path[-1, 1, 0]) < 0.1
+    finite = path[np.isfinite(path)]
+    assert finite.min() >= lo[0] and finite.max() <= hi[0]
+
+
+def test_the_step_resolves_a_plant_that_is_stiff_away_from_the_origin() -> None:
+    x, u = sympy.symbols("x u")
+    system = System("cubic", (x,), (u,), {}, (-x - x**3 + u,), (sympy.Integer(0),), box(10), box(1))
+    network = TanhNetwork((np.zeros((1, 1)),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
+    step, _ = time_scales(ClosedLoop(system, network))
+    assert 1 / 301 <= step < 2 / 301  # the Jacobian is -301 at the domain's edge, -1 at the origin
+    assert simulated_roa_fraction(system, network, np.eye(1), 1.0).attracted.all()
+
+
+# The page
+
+
+def test_the_page_loads_nothing_and_runs_nothing(pendulum_case: Case) -> None:
+    html = pendulum_case.page()
+    page = Page(html)
+    assert len(html) < 2_000_000
+    assert "http:" not in html and "https:" not in html and "url(" not in html and "@import" not in html
+    for tag, attributes in page.tags:
+        assert tag not in {"script", "link", "iframe", "object", "embed", "base", "form"}
+        assert not any(name.startswith("on") for name in attributes)
+        assert set(attributes) & {"href", "srcset", "action"} == set()
+    drawings = page.drawings()
+    assert len(drawings) == 5
+    for drawing in drawings:
+        root = ElementTree.fromstring(drawing)
+        assert root.tag.endswith("svg")
+        for element in root.iter():
+            assert not element.tag.endswith("script")
+            for name, value in element.attrib.items():
+                if name.endswith("href"):
+                    assert value.startswith(("#", "data:"))
+
+
+def test_numbers_on_the_page_are_the_certificates(pendulum_case: Case) -> None:
+    certificate, text = pendulum_case.certificate, Page(pendulum_case.page()).text
+    assert repr(certificate.local) in text and repr(certificate.roa) in text
+    for value in certificate.P.ravel():
+        assert repr(float(value)) in text
+    assert certificate.network.sha256() in text
+    assert pendulum_case.answer["certificate_sha256"] in text
+    assert f"{pendulum_case.path.stat().st_size:,} bytes" in text
+    assert f"{pendulum_case.answer['leaves']:,}, of which {pendulum_case.answer['ring_leaves']:,} in the ring" in text
+    assert below(volume(certificate.P, certificate.roa)) + " rad · rad/s" in text
+    assert "1.2.3-test" in text
+    assert f"boxes examined {pendulum_case.result['boxes']:,}" in text
+
+
+def test_what_was_proved_and_what_was_not(pendulum_case: Case) -> None:
+    text = Page(pendulum_case.page()).text
+    assert "PROVED · ACCEPTED" in text and "REJECTED." not in text
+    assert f"starts in the set {{V(x) ≤ {below(pendulum_case.certificate.roa)}}}" in text
+    assert f"the input stays within {number(-6.0)} ≤ u ≤ 6 N m" in text
+    for item in ("Anything outside the set", "Disturbances", "sampled controller", "exact real arithmetic",
+                 "Simulated figures"):  # fmt: skip
+        assert item in text
+    assert "certify check certificate.json" in text
+    assert "python -I -m certify.checker certificate.json" in text
+
+
+def test_every_simulated_figure_says_so(pendulum_case: Case, scalar_case: Case, chain_case: Case) -> None:
+    for case in (pendulum_case, scalar_case, chain_case):
+        pictures, _ = draw(case.certificate, accepted=True)
+        for picture in pictures:
+            simulated = any(word in picture.svg for word in ("trajectories", "simulated", "V(x(t))", "grid"))
+            assert picture.simulated or not simulated
+            if picture.simulated:
+                assert "not proved" in picture.caption
+        html = case.page()
+        assert html.count('<span class="tag">simulated, not proved</span>') == (
+            sum(p.simulated for p in pictures) + (case.certificate.system.n <= 2)
+        )
+
+
+def test_the_simulated_share_is_the_sampled_one(pendulum_case: Case) -> None:
+    c = pendulum_case.certificate
+    roa = simulated_roa_fraction(c.system, c.network, c.P, c.roa)
+    text = Page(pendulum_case.page()).text
+    assert f"By simulation, the certified set covers {100 * roa.fraction:.1f} % of the area" in text
+    assert "did not settle" not in text
+
+
+def test_a_set_beyond_the_simulated_roa_is_pointed_out(scalar_case: Case) -> None:
+    wider = replace(scalar_case.certificate, roa=2.5**2 * float(scalar_case.certificate.P[0, 0]))
+    text = Page(render_html(wider, None, None, scalar_case.path)).text
+    assert "grid points of the set did not settle in the simulation" in text
+
+
+def test_equal_certificates_give_equal_pages(pendulum_case: Case) -> None:
+    assert pendulum_case.page() == pendulum_case.page()
+
+
+def test_rejected_is_on_the_page_and_nothing_is_called_proved(pendulum_case: Case) -> None:
+    answer = {"result": "REJECTED", "rule": "ring", "at": "leaf 31", "detail": "Vdot < 0 is not shown"}
+    html = render_html(pendulum_case.certificate, answer, None, pendulum_case.path)
+    text = Page(html).text
+    assert "REJECTED" in text and "rule ring at leaf 31: Vdot < 0 is not shown" in text
+    assert "PROVED" not in text.replace("UNPROVED", "") and "What was proved" not in text
+    assert "ACCEPTED" not in text.replace("ACCEPTED or REJECTED", "")
+    assert "certified" not in text and "Shown on" not in text
+
+
+@pytest.mark.parametrize("change", ["none", "policy", "level", "odd"])
+def test_only_an_answer_about_this_certificate_counts(pendulum_case: Case, change: str) -> None:
+    answer: dict[str, Any] | None = dict(pendulum_case.answer)
+    assert status_of(pendulum_case.certificate, answer).accepted
+    assert answer is not None
+    if change == "none":
+        answer = None
+    elif change == "policy":
+        answer["policy_sha256"] = "0" * 64
+    elif change == "level":
+        answer["levels"] = {**answer["levels"], "roa": math.nextafter(answer["levels"]["roa"], 0.0)}
+    else:
+        answer["result"] = "accepted"
+    assert status_of(pendulum_case.certificate, answer).kind == "NOT CHECKED"
+    text = Page(render_html(pendulum_case.certificate, answer, None, pendulum_case.path)).text
+    assert "NOT CHECKED" in text and "What was proved" not in text
+
+
+def test_a_tampered_file_is_reported_as_rejected(pendulum_case: Case, tmp_path: Path) -> None:
+    path = tmp_path / "certificate.json"
+    write_certificate(path, replace(pendulum_case.certificate, roa=pendulum_case.certificate.roa * 1.5))
+    text = Page(render_html(read_certificate(path), run_checker(path), None, path)).text
+    assert "REJECTED" in text and "PROVED" not in text
+
+
+HOSTILE = "<script>alert('x')</script> $\\frac$ & \"quoted\" {{ 7 * 7 }}"
+
+
+def hostile_certificate() -> Certificate:
+    """Names that no producer gives; a page must survive them."""
+    x, y = sympy.Symbol("<img src=x onerror=alert(1)>"), sympy.Symbol("$y_1^{}")
+    u = sympy.Symbol("</svg><script>u</script>")
+    system = System(HOSTILE, (x, y), (u,), {}, (-x + u, -y + sympy.sin(x)), (sympy.Integer(0),), box(1, 1), box(2))
+    network = TanhNetwork((np.array([[0.1, 0.2]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
+    return Certificate(
+        system, network, np.eye(2), np.eye(2), np.ones(2), 0.1, 0.5, bytes([255]), {HOSTILE: HOSTILE}
+    )
+
+
+def test_hostile_names_are_text(tmp_path: Path) -> None:
+    path = tmp_path / "<b>&.json"
+    answer = {"result": "REJECTED", "rule": HOSTILE, "at": HOSTILE, "detail": HOSTILE}
+    html = render_html(hostile_certificate(), answer, None, path)
+    page = Page(html)
+    known = {"html", "head", "meta", "title", "style", "body", "main", "h1", "h2", "h3", "p", "code", "div", "strong",
+             "b", "span", "ol", "ul", "li", "figure", "img", "figcaption", "table", "thead", "tr", "th", "td", "pre",
+             "math", "mi", "mn", "mo", "mrow", "mfrac", "mover", "msup", "mspace", "mfenced"}  # fmt: skip
+    assert {tag for tag, _ in page.tags} <= known
+    assert not any(name.startswith("on") for _, attributes in page.tags for name in attributes)
+    assert "alert('x')" in page.text and "{{ 7 * 7 }}" in page.text
+    for drawing in page.drawings():
+        assert not any(e.tag.endswith(("script", "img")) for e in ElementTree.fromstring(drawing).iter())
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"tree": bytes([0, 255])}, {"P": -np.eye(2)}, {"P": np.zeros((2, 2))}, {"roa": -1.0}, {"local": math.inf}],
+    ids=["tree", "negative", "zero", "level", "infinite"],
+)
+def test_a_rejected_file_that_cannot_be_drawn_still_has_a_page(change: dict[str, Any], tmp_path: Path) -> None:
+    broken = replace(hostile_certificate(), **change)
+    answer = {"result": "REJECTED", "rule": "coverage", "at": "tree"}
+    text = Page(render_html(broken, answer, None, tmp_path / "none.json")).text
+    assert "There are no figures" in text and "rule coverage at tree" in text
+
+
+def test_an_accepted_certificate_that_cannot_be_drawn_is_an_error(pendulum_case: Case) -> None:
+    broken = replace(pendulum_case.certificate, tree=b"")
+    with pytest.raises(CertificateFormatError):
+        render_html(broken, pendulum_case.answer, None, pendulum_case.path)
+
+
+@pytest.mark.parametrize("name", ["scalar_case", "chain_case"])
+def test_other_dimensions(name: str, request: pytest.FixtureRequest) -> None:
+    case: Case = request.getfixturevalue(name)
+    page = Page(case.page())
+    assert "PROVED · ACCEPTED" in page.text
+    assert repr(case.certificate.roa) in page.text
+    assert len(page.drawings()) == {"scalar_case": 3, "chain_case": 5}[name]
+    if name == "chain_case":
+        assert "Section x₁, x₂" in page.text and "all states together" in page.text
+        assert "By simulation" not in page.text
+
+
+def test_many_leaves_are_rasterised() -> None:
+    system, network = chain(2, [-1.0, -3.0])
+    A, _, _ = ClosedLoop(system, network).linearise()
+    P = solve_lyapunov(A, np.eye(2))
+    depth = 12
+    tree = b"\xff"
+    for k in range(depth):
+        tree = bytes([k % 2]) + tree + tree
+    certificate = Certificate(system, network, P, np.eye(2), np.ones(2), 1e-3, 0.5, tree)
+    picture = next(p for p in draw(certificate, accepted=False)[0] if p.title == "The leaf partition")
+    assert "4,096 leaves" in picture.caption and "data:image/png" in picture.svg
+    assert len(picture.svg) < 500_000
+
+
+def test_long_fractions_are_rounded_and_the_page_says_so(scalar_case: Case) -> None:
+    c = scalar_case.certificate
+    x, u = c.system.states[0], c.system.inputs[0]
+    tenth = sympy.Rational(*(0.1).as_integer_ratio())
+    long = replace(c, system=replace(c.system, dynamics=(tenth * x + u,)))
+    text = Page(render_html(long, None, None, scalar_case.path)).text
+    assert "Long fractions are rounded here" in text
+    assert "Long fractions" not in Page(scalar_case.page()).text
+
+
+def test_a_pole_in_the_domain_does_no_harm() -> None:
+    x, y, u = sympy.symbols("x y u")
+    system = System("pole", (x, y), (u,), {}, (-x, -y + x**2 / (1 - x) + u), (sympy.Integer(0),), box(2, 2), box(2))
+    network = TanhNetwork((np.array([[0.1, 0.2]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
+    certificate = Certificate(system, network, np.eye(2), np.eye(2), np.ones(2), 0.01, 0.02, bytes([255]))
+    pictures, roa = draw(certificate, accepted=False)
+    assert len(pictures) == 5 and roa is not None and roa.contradictions == 0
+
+
+# Words
+
+
+def test_symbols_and_units(pendulum_case: Case) -> None:
+    assert symbol("theta_dot") == "θ\u0307" and symbol("x12") == "x₁₂" and symbol("_") == "_"
+    assert label("v", "m/s^2") == "v (m/s²)"
+    assert units_of(pendulum_case.certificate.system)["theta_dot"] == "rad/s"
+    assert units_of(replace(pendulum_case.certificate.system, name="elsewhere")) == {}
+
+
+@given(st.floats(1e-12, 1e12))
+def test_levels_are_rounded_down(value: float) -> None:
+    mantissa, _, power = below(value).partition(" \N{MULTIPLICATION SIGN} 10")
+    exponent = int(power.translate(str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-"))) if power else 0
+    shown = float(f"{mantissa}e{exponent}")
+    assert value * (1 - 2e-5) < shown <= value
+
+
+# The terminal
+
+
+def rendered(result: dict[str, Any], width: int = 100) -> str:
+    console = Console(file=io.StringIO(), width=width, color_system=None)
+    console.print(summary(result))
+    text = console.file.getvalue()  # type: ignore[attr-defined]
+    assert isinstance(text, str)
+    return text
+
+
+def test_summary_of_a_proof(pendulum_case: Case) -> None:
+    result = json.loads(json.dumps(pendulum_case.result))  # what `--json` prints is enough
+    text = rendered(result)
+    assert text.startswith("PROVED  pendulum")
+    for shown in (below(result["levels"]["roa"]), below(result["levels"]["local"]), below(result["volume"]),
+                  result["policy"]["sha256"], "2-16-16-1", f"{result['leaves']:,} leaves", "ACCEPTED", "rad/s",
+                  number(result["extents"][1]), number(result["semi_axes"][0])):  # fmt: skip
+        assert shown in text
+    assert all(stage in text for stage in ("candidate", "local", "ring", "write", "check"))
+
+
+def test_summary_without_a_proof() -> None:
+    refuted = {
+        "schema": "certify-roa/1", "verdict": "REFUTED", "reason": "unstable linearisation: eigenvalues 3.1, -5.8",
+        "system": "pendulum", "policy": {"sha256": "ab", "layers": [2, 1]}, "lyapunov": {"P": None},
+        "levels": {"local": None, "roa": None, "sampled_limit": None, "domain_limit": None}, "witness": None,
+        "eigenvalues": ["3.1", "-5.8"], "volume": None, "semi_axes": None, "extents": None, "boxes": 0, "leaves": 0,
+        "seconds": {"load": 0.0, "total": 0.1}, "certificate": None, "checked": None,
+    }  # fmt: skip
+    text = rendered(refuted)
+    assert text.startswith("REFUTED") and "3.1, -5.8" in text and "not reached" in text
+    assert "invariant" not in text
+    unknown = rendered({**refuted, "verdict": "UNKNOWN", "reason": "[bold]time[/bold]", "system": "[red]x[/red]"})
+    assert "nothing was proved" in unknown and "[bold]time[/bold]" in unknown and "[red]x[/red]" in unknown
+
+
+def test_importing_the_report_loads_no_drawing_library() -> None:
+    code = (
+        "import sys, certify.report\n"
+        "assert certify.report.summary and certify.report.render_html\n"
+        "loaded = {'matplotlib', 'jinja2'} & set(sys.modules)\n"
+        "assert not loaded, loaded\n"
+        "certify.report.warm_up()\n"
+        "assert {'matplotlib', 'jinja2'} <= set(sys.modules) and 'matplotlib.pyplot' not in sys.modules\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
