@@ -34,7 +34,7 @@ from certify.report.figures import draw
 from certify.report.html import status_of
 from certify.report.partition import rebuild_leaves
 from certify.report.sampling import (
-    closed_loop_field,
+    Flow,
     domain_bounds,
     quadratic,
     rk4_step,
@@ -215,15 +215,14 @@ def test_drawn_ellipses_lie_on_the_level(seed: int, level: float) -> None:
 
 def test_refined_paths_keep_their_points_and_follow_the_flow() -> None:
     system, network = chain(2, [-1.0, -3.0])
-    loop = ClosedLoop(system, network)
-    field = closed_loop_field(loop)
+    flow = Flow.of(ClosedLoop(system, network))
     errors = []
     for step in (0.2, 0.1):
-        coarse = simulate(loop, np.array([[0.5, -0.2]]), step, 5)
-        fine = figures_module._refine(coarse, field, step)
+        coarse = simulate(flow, np.array([[0.5, -0.2]]), step, 5)
+        fine = figures_module._refine(coarse, flow.field, step)
         assert np.array_equal(fine[:: figures_module._PARTS], coarse)
         pieces = 8 * figures_module._PARTS  # of each step: exact enough
-        exact = simulate(loop, coarse[0], step / pieces, 5 * pieces)[::8]
+        exact = simulate(flow, coarse[0], step / pieces, 5 * pieces)[::8]
         errors.append(float(np.max(np.abs(fine - exact))))
     assert errors[1] < errors[0] / 8 and errors[1] < 1e-4  # of fourth order
 
@@ -294,8 +293,8 @@ def test_bad_options_are_refused(wrong: dict[str, Any]) -> None:
 
 def test_paths_end_where_they_leave_the_domain() -> None:
     system, network = scalar_tanh()
-    loop = ClosedLoop(system, network)
-    path = simulate(loop, np.array([[2.9], [1.0]]), 0.5, 40)
+    flow = Flow.of(ClosedLoop(system, network))
+    path = simulate(flow, np.array([[2.9], [1.0]]), 0.5, 40)
     lo, hi = domain_bounds(system)
     assert np.isnan(path[-1, 0, 0]) and abs(path[-1, 1, 0]) < 0.1
     finite = path[np.isfinite(path)]
@@ -306,7 +305,7 @@ def test_the_step_resolves_a_plant_that_is_stiff_away_from_the_origin() -> None:
     x, u = sympy.symbols("x u")
     system = System("cubic", (x,), (u,), {}, (-x - x**3 + u,), (sympy.Integer(0),), box(10), box(1))
     network = TanhNetwork((np.zeros((1, 1)),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
-    step, _ = time_scales(ClosedLoop(system, network))
+    step, _ = time_scales(Flow.of(ClosedLoop(system, network)))
     assert 1 / 301 <= step < 2 / 301  # the Jacobian is -301 at the domain's edge, -1 at the origin
     assert simulated_roa_fraction(system, network, np.eye(1), 1.0).attracted.all()
 

@@ -22,9 +22,8 @@ from certify.lyapunov import extents
 from certify.report.partition import Leaves, rebuild_leaves
 from certify.report.sampling import (
     Field,
+    Flow,
     SimulatedRoa,
-    closed_loop_field,
-    domain_bounds,
     quadratic,
     simulate,
     simulated_roa_fraction,
@@ -116,9 +115,9 @@ class _Scene:
             certificate.system, certificate.P, certificate.local, certificate.roa,
         )  # fmt: skip
         self.loop = ClosedLoop(self.system, certificate.network)
-        self.field = closed_loop_field(self.loop)
-        self.lo, self.hi = domain_bounds(self.system)
-        self.step, self.horizon = time_scales(self.loop)
+        self.flow = Flow.of(self.loop)
+        self.lo, self.hi = self.flow.lo, self.flow.hi
+        self.step, self.horizon = time_scales(self.flow)
         self.n = self.system.n
         units = units_of(self.system)
         self.labels = [label(s.name, units.get(s.name, "")) for s in self.system.states]
@@ -129,14 +128,14 @@ class _Scene:
     def vdot(self, x: Array) -> Array:
         """Vdot in float64; NaN where the equations have a pole."""
         with np.errstate(all="ignore"):
-            value = 2 * np.einsum("...i,...i->...", x @ self.P, self.field(x))
+            value = 2 * np.einsum("...i,...i->...", x @ self.P, self.flow.field(x))
         return np.where(np.isfinite(value), value, np.nan)
 
     def simulate(self, starts: Array, steps: int | None = None) -> Array:
         """Trajectories for a picture, by default over half the horizon."""
         step = _PATH_STEP * self.step
         count = steps or min(int(0.5 * self.horizon / step) + 1, _MOST_STEPS)
-        return _refine(simulate(self.loop, starts, step, count), self.field, step)
+        return _refine(simulate(self.flow, starts, step, count), self.flow.field, step)
 
     def plane(self, i: int, j: int, points: int = _GRID) -> tuple[Array, Array, Array]:
         """Grid coordinates along states i and j, and the states themselves (all others 0)."""

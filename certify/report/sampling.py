@@ -62,14 +62,31 @@ class SimulatedRoa:
         return int((self.certified & ~self.attracted).sum())
 
 
-def closed_loop_field(loop: ClosedLoop) -> Field:
-    """`F(x) = f(x, pi(x))` in float64, shapes (..., n) to (..., n)."""
-    f, network, u_eq = loop.system.function(), loop.network, loop.u_eq
+@dataclass(frozen=True, slots=True)
+class Flow:
+    """The closed loop for simulation: its field `F(x) = f(x, pi(x))` in float64 and the corners of the domain box.
 
-    def F(x: Array) -> Array:
-        return np.asarray(f(x, network(x, u_eq)))
+    Parameters
+    ----------
+    loop : the closed loop.
+    field : shapes (..., n) to (..., n). Compiling it takes a while for large plants, hence this class.
+    lo, hi : shape (n,).
+    """
 
-    return F
+    loop: ClosedLoop
+    field: Field
+    lo: Array
+    hi: Array
+
+    @classmethod
+    def of(cls, loop: ClosedLoop) -> Flow:
+        """Compile the equations."""
+        f, network, u_eq = loop.system.function(), loop.network, loop.u_eq
+
+        def F(x: Array) -> Array:
+            return np.asarray(f(x, network(x, u_eq)))
+
+        return cls(loop, F, *domain_bounds(loop.system))
 
 
 def rk4_step(field: Field, x: Array, step: float) -> Array:
@@ -81,38 +98,34 @@ def rk4_step(field: Field, x: Array, step: float) -> Array:
     return x + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
 
 
-def time_scales(loop: ClosedLoop) -> tuple[float, float]:
+def time_scales(flow: Flow) -> tuple[float, float]:
     """(step, horizon) in seconds: the fastest time constant, and 15 times the slowest of the linearisation.
 
     The fastest is taken over Jacobians at the origin and at sampled states of the domain, because a plant can be
     stiffer away from the origin; Runge-Kutta of order four is stable up to 2.8 of it. The horizon is cut at 3,000
     steps.
     """
-    eigenvalues = np.linalg.eigvals(loop.linearise()[0])
+    eigenvalues = np.linalg.eigvals(flow.loop.linearise()[0])
     slowest = float(np.min(np.abs(eigenvalues.real)))
-    fastest = max(float(np.max(np.abs(eigenvalues))), _fastest_rate(loop))
+    fastest = max(float(np.max(np.abs(eigenvalues))), _fastest_rate(flow))
     step = _STEP / fastest if fastest > 0 else 1.0
     return step, min(_HORIZON / slowest if slowest > 0 else math.inf, _MAX_STEPS * step)
 
 
-def _fastest_rate(loop: ClosedLoop) -> float:
+def _fastest_rate(flow: Flow) -> float:
     """Largest |eigenvalue| of Jacobians (central differences) at 200 states of the domain; 0 where there is none."""
-    n = loop.system.n
-    lo, hi = domain_bounds(loop.system)
-    x = np.random.default_rng(0).uniform(lo, hi, (200, n))
-    delta = 1e-5 * (hi - lo)
+    x = np.random.default_rng(0).uniform(flow.lo, flow.hi, (200, len(flow.lo)))
+    delta = 1e-5 * (flow.hi - flow.lo)
     shifted = x[:, None, None, :] + np.array([1.0, -1.0])[:, None, None] * np.diag(delta)
     with np.errstate(all="ignore"):
-        F = closed_loop_field(loop)(shifted)
+        F = flow.field(shifted)
         J = (F[:, 0] - F[:, 1]) / (2 * delta)[:, None]  # transposed; the eigenvalues are the same
     J = J[np.all(np.isfinite(J), axis=(1, 2))]
     return float(np.max(np.abs(np.linalg.eigvals(J)))) if len(J) else 0.0
 
 
-def simulate(loop: ClosedLoop, starts: Array, step: float, steps: int) -> Array:
+def simulate(flow: Flow, starts: Array, step: float, steps: int) -> Array:
     """Trajectories from `starts` (N, n), shape (steps + 1, N, n); NaN from the first step outside the domain on."""
-    field = closed_loop_field(loop)
-    lo, hi = domain_bounds(loop.system)
     x = np.array(starts, dtype=np.float64)
     path = np.full((steps + 1, *x.shape), math.nan)
     path[0] = x
@@ -121,8 +134,8 @@ def simulate(loop: ClosedLoop, starts: Array, step: float, steps: int) -> Array:
         for k in range(1, steps + 1):
             if not alive.size:
                 break
-            x = rk4_step(field, x, step)
-            inside = np.all((x >= lo) & (x <= hi), axis=-1)
+            x = rk4_step(flow.field, x, step)
+            inside = np.all((x >= flow.lo) & (x <= flow.hi), axis=-1)
             x, alive = x[inside], alive[inside]
             path[k, alive] = x
     return path
@@ -156,26 +169,23 @@ def simulated_roa_fraction(
     """
     if system.n not in _GRID:
         raise InputError(f"a grid needs a plant with one or two states; {system.name} has {system.n}.")
-    loop = ClosedLoop(system, network)
-    default_step, default_horizon = time_scales(loop)
+    flow = Flow.of(ClosedLoop(system, network))
+    default_step, default_horizon = time_scales(flow)
     step = default_step if step is None else step
     horizon = default_horizon if horizon is None else horizon
     points = _GRID[system.n] if points is None else points
     if not (points >= 1 and 0 < step < math.inf and 0 < horizon < math.inf):
         raise InputError("`points`, `step` and `horizon` must be positive and finite.")
-    lo, hi = domain_bounds(system)
     centres = (np.arange(points) + 0.5) / points
-    axes = tuple(a + (b - a) * centres for a, b in zip(lo, hi, strict=True))
+    axes = tuple(a + (b - a) * centres for a, b in zip(flow.lo, flow.hi, strict=True))
     x = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, system.n)
     certified = quadratic(P, x) <= level
-    attracted, undecided = _run(closed_loop_field(loop), x, lo, hi, P, SETTLED * level, step, horizon)
+    attracted, undecided = _run(flow, x, P, SETTLED * level, step, horizon)
     shape = (points,) * system.n
     return SimulatedRoa(axes, attracted.reshape(shape), certified.reshape(shape), undecided, step, horizon)
 
 
-def _run(
-    field: Field, x: Array, lo: Array, hi: Array, P: Array, target: float, step: float, horizon: float
-) -> tuple[Mask, int]:
+def _run(flow: Flow, x: Array, P: Array, target: float, step: float, horizon: float) -> tuple[Mask, int]:
     attracted = np.zeros(len(x), dtype=np.bool_)
     alive = np.arange(len(x))
     with np.errstate(all="ignore"):
@@ -185,8 +195,8 @@ def _run(
             x, alive = x[~near], alive[~near]
             if not alive.size:
                 break
-            x = rk4_step(field, x, step)
-            inside = np.all((x >= lo) & (x <= hi), axis=-1)  # False for NaN
+            x = rk4_step(flow.field, x, step)
+            inside = np.all((x >= flow.lo) & (x <= flow.hi), axis=-1)  # False for NaN
             x, alive = x[inside], alive[inside]
         near = quadratic(P, x) <= target
     attracted[alive[near]] = True
