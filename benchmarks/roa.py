@@ -1,0 +1,102 @@
+"""The whole job on the shipped policies, and the engine's throughput against the machine's matrix product.
+
+Run with `python benchmarks/roa.py [--runs 5] [--threads 2] [POLICY ...]`. One warm-up run is not counted; the figures
+are medians of the counted runs in this one process. Absolute times are this machine's; the ratios are what to compare.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import tempfile
+import time
+from pathlib import Path
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+import numpy as np
+import torch
+
+from certify.closed_loop import ClosedLoop
+from certify.engines.branch_and_bound import _VdotBound
+from certify.lyapunov import diagonalising_coordinates, solve_lyapunov, volume
+from certify.obligations import Obligations
+from certify.policies import load_policy
+from certify.roa import RoaResult, certify_roa
+from certify.systems import get_system
+
+POLICIES = Path(__file__).parent.parent / "examples" / "policies"
+
+
+def whole_job(path: Path, runs: int) -> None:
+    """Levels, boxes, certificate size, and median seconds of each stage."""
+    policy = load_policy(path)
+    system = get_system(policy.system).with_parameters(policy.parameters)
+    results: list[RoaResult] = []
+    with tempfile.TemporaryDirectory() as folder:
+        for _ in range(runs + 1):
+            results.append(certify_roa(system, policy.network, Path(folder)))
+        last = results[-1]
+        size = last.certificate.stat().st_size if last.certificate is not None else 0
+    counted = results[1:]
+    seconds = {k: statistics.median(r.seconds.get(k, 0.0) for r in counted) for k in last.seconds}
+    prove = seconds["candidate"] + seconds["local"] + seconds["ring"]
+    print(
+        f"\n{path.name}: {last.verdict.value}, {'-'.join(map(str, policy.network.layers))}, limited by {last.reason[:60]}"
+    )
+    print("  levels  " + ", ".join(f"{k} {v:.6g}" for k, v in last.levels.items() if v is not None))
+    level = last.levels.get("roa")
+    if last.P is not None and level is not None:
+        print(f"  volume  {volume(last.P, level):.6g}")
+    print(f"  boxes   {last.boxes}, leaves {last.leaves}, certificate {size} bytes")
+    print("  seconds " + ", ".join(f"{k} {v:.3f}" for k, v in seconds.items()))
+    if prove > 0 and "check" in seconds:
+        print(f"  ratio   check / prove {seconds['check'] / prove:.2f} (the check starts a process of its own)")
+
+
+def throughput(path: Path, runs: int) -> None:
+    """Boxes a second of the ring's bound, and the share of dgemm that its matrix products take at that rate."""
+    policy = load_policy(path)
+    loop = ClosedLoop(get_system(policy.system).with_parameters(policy.parameters), policy.network)
+    A, _, _ = loop.linearise()
+    P = solve_lyapunov(A, np.eye(len(A)))
+    bound = _VdotBound(Obligations(loop, P, diagonalising_coordinates(P, A)), torch.device("cpu"))
+    n, m = loop.system.n, loop.system.m
+    batch = 1024
+    generator = torch.Generator().manual_seed(0)
+    lo = 0.1 * torch.rand(n, batch, dtype=torch.float64, generator=generator)
+    rates = []
+    a = torch.rand(512, 512, dtype=torch.float64)
+    b = torch.rand(512, 8192, dtype=torch.float64)
+    products = []
+    for _ in range(runs + 1):
+        start = time.perf_counter()
+        bound(lo, lo + 0.01)
+        middle = time.perf_counter()
+        _ = a @ b
+        rates.append(batch / (middle - start))
+        products.append(2 * 512 * 512 * 8192 / (time.perf_counter() - middle))
+    rate, dgemm = statistics.median(rates[1:]), statistics.median(products[1:])
+    flops = sum(2 * W.size * (n + 1 + 2 + m) for W in policy.network.weights)
+    print(
+        f"  bound   {rate:.0f} boxes/s; {flops * rate / dgemm:.1%} of dgemm ({dgemm / 1e9:.0f} Gflop/s) for its products"
+    )
+
+
+def main() -> None:
+    """Parse the arguments and run."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("policies", nargs="*", type=Path, default=sorted(POLICIES.glob("*.pt")))
+    parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--threads", type=int, default=2)
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    print(f"torch {torch.__version__}, {options.threads} threads, median of {options.runs} runs")
+    for path in options.policies:
+        whole_job(path, options.runs)
+        throughput(path, options.runs)
+
+
+if __name__ == "__main__":
+    main()
