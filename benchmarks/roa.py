@@ -42,9 +42,8 @@ def whole_job(path: Path, runs: int) -> None:
     counted = results[1:]
     seconds = {k: statistics.median(r.seconds.get(k, 0.0) for r in counted) for k in last.seconds}
     prove = seconds["candidate"] + seconds["local"] + seconds["ring"]
-    print(
-        f"\n{path.name}: {last.verdict.value}, {'-'.join(map(str, policy.network.layers))}, limited by {last.reason[:60]}"
-    )
+    layers = "-".join(map(str, policy.network.layers))
+    print(f"\n{path.name}: {last.verdict.value}, {layers}, limited by {last.reason}")
     print("  levels  " + ", ".join(f"{k} {v:.6g}" for k, v in last.levels.items() if v is not None))
     level = last.levels.get("roa")
     if last.P is not None and level is not None:
@@ -79,9 +78,8 @@ def throughput(path: Path, runs: int) -> None:
         products.append(2 * 512 * 512 * 8192 / (time.perf_counter() - middle))
     rate, dgemm = statistics.median(rates[1:]), statistics.median(products[1:])
     flops = sum(2 * W.size * (n + 1 + 2 + m) for W in policy.network.weights)
-    print(
-        f"  bound   {rate:.0f} boxes/s; {flops * rate / dgemm:.1%} of dgemm ({dgemm / 1e9:.0f} Gflop/s) for its products"
-    )
+    share = f"{flops * rate / dgemm:.1%} of dgemm ({dgemm / 1e9:.0f} Gflop/s)"
+    print(f"  bound   {rate:.0f} boxes/s; its matrix products are {share}")
 
 
 def main() -> None:
