@@ -140,8 +140,8 @@ def test_inputs_that_leave_their_bounds_are_found(pendulum: System) -> None:
     assert not claims.inputs_bounded_by_form
     witness = falsify(claims, domain_limit(claims.P, pendulum.domain))
     assert witness is not None and confirm(claims, witness)
-    if witness.kind == "input":
-        assert np.max(np.abs(claims.loop.policy(witness.x))) > 6
+    if witness.kind == "input":  # just outside 6 N m, too close for binary64 to tell
+        assert abs(claims.loop.evaluate_policy(witness.x)[0]) > 6
 
 
 def planted(seed: int) -> tuple[Obligations, np.ndarray]:
