@@ -49,6 +49,7 @@ def test_train_writes_policy_log_and_checkpoint_and_resumes(tmp_path):
         (["pendulum", "--gamma", "1.5"], "`gamma` must be in [0, 1)"),
         (["pendulum", "--critic", "64,wide"], "`critic` must be numbers"),
         (["pendulum", "--reward-weights", "1,2,3"], "`reward_weights` must be 2 numbers"),
+        (["cartpole", "--state-weights", "1,2"], "`state_weights` must be 4 numbers"),
         (["pendulum", "--centre", "nowhere"], "`centre`"),
         (["pendulum", "--resume"], "--checkpoint-dir"),
         (["pendulum", "--checkpoint-every", "0"], "`checkpoint_every`"),

@@ -12,16 +12,16 @@ import scipy.stats
 import torch
 
 from certify.systems import get_system
-from controllers.options import preset
+from controllers.options import PRESETS, preset
 from controllers.sac import SAC, Actor, Critic, Interface, Replay, squashed_log_likelihood
 
 K = torch.tensor([[1.76, 0.59]])
 
 
-def _actor(centre="preactivation", seed=0) -> Actor:
+def _actor(centre="preactivation", seed=0, plant="pendulum") -> Actor:
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        return Actor(Interface(get_system("pendulum")), (16, 16), centre)
+        return Actor(Interface(get_system(plant)), (16, 16), centre)
 
 
 def _sac(options, seed=0) -> SAC:
@@ -59,18 +59,19 @@ def test_likelihood_is_finite_far_out_and_sums_over_inputs():
     torch.testing.assert_close(both, single[0] + single[1])
 
 
+@pytest.mark.parametrize("plant", PRESETS)
 @pytest.mark.parametrize("centre", ["preactivation", "output"])
-def test_jacobian_at_the_origin_is_that_of_the_exported_policy(centre):
-    actor, u_eq = _actor(centre), (Fraction(0),)
+def test_jacobian_at_the_origin_is_that_of_the_exported_policy(centre, plant):
+    actor, u_eq = _actor(centre, plant=plant), (Fraction(0),)
     mean, jacobian = actor.at_origin()
     network, h = actor.network(), 1e-6
     columns = [
-        (network(h * e, u_eq) - network(-h * e, u_eq)) / (2 * h) for e in np.eye(2)
+        (network(h * e, u_eq) - network(-h * e, u_eq)) / (2 * h) for e in np.eye(network.n)
     ]
     np.testing.assert_allclose(jacobian.detach().numpy(), np.array(columns).T, atol=1e-5)
     raw = replace(network, centre="none")
-    np.testing.assert_allclose(mean.detach().numpy(), raw(np.zeros(2), u_eq), atol=1e-6)
-    assert abs(raw(np.zeros(2), u_eq)[0]) > 1e-3  # so that centring has something to do
+    np.testing.assert_allclose(mean.detach().numpy(), raw(np.zeros(network.n), u_eq), atol=1e-6)
+    assert abs(raw(np.zeros(network.n), u_eq)[0]) > 1e-3  # so that centring has something to do
 
 
 def test_descending_the_gain_term_moves_the_jacobian_to_minus_K():

@@ -14,11 +14,12 @@ import torch
 from certify.errors import InputError
 from certify.policies import load_policy, save_policy
 from certify.systems import get_system
-from controllers.evaluate import EvaluationOptions, evaluate
+from controllers.evaluate import EvaluationOptions, discrete_linearisation, evaluate
 from controllers.options import TrainingOptions, preset
 from controllers.training import EpisodeLog, Trainer, train
 
-SHIPPED = Path(__file__).parent.parent / "examples" / "policies" / "pendulum.pt"
+POLICIES = Path(__file__).parent.parent / "examples" / "policies"
+SHIPPED = POLICIES / "pendulum.pt"
 
 
 @pytest.fixture(scope="module")
@@ -155,15 +156,32 @@ def test_options_out_of_range_are_refused_by_name(short, change, name):
         replace(short, **change)
 
 
-def test_the_shipped_policy_matches_its_gain_and_settles():
-    policy = load_policy(SHIPPED)
-    assert policy.network.layers == (2, 16, 16, 1)
-    result = evaluate(policy, EvaluationOptions(states=20, seed=7))
+@pytest.mark.parametrize(("name", "layers"), [("pendulum", (2, 16, 16, 1)), ("cartpole", (4, 256, 256, 1))])
+def test_the_shipped_policy_matches_its_gain_and_settles(name, layers):
+    policy = load_policy(POLICIES / f"{name}.pt")
+    assert policy.system == name
+    assert policy.network.layers == layers
+    # The file was made by the preset as it is now.
+    assert {key: policy.training[key] for key in preset(name).record()} == preset(name).record()
+    result = evaluate(policy, EvaluationOptions(states=20, seed=7, duration=30.0))
     assert result.gain_relative < 1e-2
     assert result.A_relative_error < 1e-2 and result.B_relative_error < 1e-2
     assert max(e.real for e in result.eigenvalues) < -1
     assert result.continuous.settled == result.held.settled == 20
     assert result.continuous.left_domain == 0
+
+
+def test_a_run_on_the_cartpole_identifies_its_gain_within_the_first_episodes():
+    options = replace(preset("cartpole"), steps=1100, actor=(16, 16), critic=(16, 16), batch=32)
+    policy = train(Trainer(get_system("cartpole"), options))
+    A, B = discrete_linearisation(get_system("cartpole"), options.dt)
+    np.testing.assert_allclose(policy.training["A"], A, atol=1e-3)
+    np.testing.assert_allclose(policy.training["B"], B, atol=1e-3)
+    closed = np.array(policy.training["A"]) - np.array(policy.training["B"]) @ np.array(policy.training["K"])
+    assert np.abs(np.linalg.eigvals(closed)).max() < 1
+    assert policy.network.layers == (4, 16, 16, 1)
+    assert policy.network.scale == 30 and policy.network.offset == 0
+    assert policy.network.centre == "preactivation"
 
 
 def test_a_policy_that_does_not_stabilise_does_not_settle():
