@@ -432,7 +432,7 @@ HOSTILE = "<script>alert('x')</script> $\\frac$ & \"quoted\" {{ 7 * 7 }}"
 
 def hostile_certificate() -> Certificate:
     """Names that no producer gives; a page must survive them."""
-    x, y = sympy.Symbol("<img src=x onerror=alert(1)>"), sympy.Symbol("$y_1^{}")
+    x, y = sympy.Symbol("<img src=x onerror=alert(1)>"), sympy.Symbol("$\\frac$")
     u = sympy.Symbol("</svg><script>u</script>")
     system = System(HOSTILE, (x, y), (u,), {}, (-x + u, -y + sympy.sin(x)), (sympy.Integer(0),), box(1, 1), box(2))
     network = TanhNetwork((np.array([[0.1, 0.2]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
@@ -452,6 +452,7 @@ def test_hostile_names_are_text(tmp_path: Path) -> None:
     assert {tag for tag, _ in page.tags} <= known
     assert not any(name.startswith("on") for _, attributes in page.tags for name in attributes)
     assert "alert('x')" in page.text and "{{ 7 * 7 }}" in page.text
+    assert len(page.drawings()) == 5
     for drawing in page.drawings():
         assert not any(e.tag.endswith(("script", "img")) for e in ElementTree.fromstring(drawing).iter())
 
