@@ -7,9 +7,11 @@ standard error. Exit status: 0 proved or accepted, 1 refuted or rejected, 2 usag
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import sys
+import threading
 import time
 from contextlib import suppress
 from fractions import Fraction
@@ -174,6 +176,7 @@ def systems(as_json: Json = False) -> None:
 
 def main(arguments: list[str] | None = None) -> None:
     """Entry point: turns every error into one sentence and the right exit status."""
+    gc.set_threshold(100_000)  # most objects of a run are modules, which live to its end
     # Threads that wait must not spin: on a busy machine spinning costs a factor of ten.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     given = sys.argv[1:] if arguments is None else arguments
@@ -313,6 +316,10 @@ class _Progress:
         self.shown = False
 
     def __call__(self, stage: str, level: float, boxes: int) -> None:
+        if stage == "check":  # the checker works in a process of its own: load the drawing libraries meanwhile
+            from certify.report import warm_up
+
+            threading.Thread(target=warm_up, daemon=True).start()
         now = time.monotonic()
         if sys.stderr.isatty() and now - self.last > 0.2:
             self.last, self.shown = now, True

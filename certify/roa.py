@@ -161,7 +161,7 @@ def certify_roa(
     options : see `RoaOptions`.
     load_seconds : time already spent on reading, for the report.
     provenance : entries for the certificate that the checker ignores.
-    progress : called with (stage, level proved so far, boxes).
+    progress : called with (stage, level proved so far, boxes); stages are `ring` and `check`.
 
     Returns
     -------
@@ -267,6 +267,8 @@ def _certify(
     path = out / "certificate.json"
     with watch.stage("write"):
         write_certificate(path, certificate)
+    if progress is not None:
+        progress("check", ring.level, ring.boxes)
     with watch.stage("check"):
         answer = run_checker(path)
     if answer["result"] != "ACCEPTED":

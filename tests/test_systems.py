@@ -96,6 +96,13 @@ def test_the_grammar_is_closed(build: object, message: str) -> None:
         System("s", (x,), (u,), {}, (build(x, u),), (sympy.Integer(0),), box(1), box(1))  # type: ignore[operator]
 
 
+@pytest.mark.parametrize("name", ["x y", "", "1x", "x'", "y" * 65])
+def test_names_are_identifiers(name: str) -> None:
+    u = sympy.Symbol("u")
+    with pytest.raises(InputError, match="identifiers"):
+        System("s", (sympy.Symbol(name),), (u,), {}, (u,), (sympy.Integer(0),), box(1), box(1))
+
+
 def test_unknown_plant_names_the_known_ones() -> None:
     with pytest.raises(InputError, match="pendulum"):
         get_system("pendulun")

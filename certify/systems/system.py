@@ -8,6 +8,7 @@ one is refused.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from decimal import Decimal
@@ -89,6 +90,9 @@ class System:
         if n == 0 or m == 0:
             raise InputError(f"{self.name} must have at least one state and one input.")
         names = [s.name for s in (*self.states, *self.inputs)] + list(self.parameters)
+        for name in (self.name, *names):
+            if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]{0,63}", name):
+                raise InputError(f"names in {self.name} must be identifiers of at most 64 letters; found {name!r}.")
         if len(set(names)) != len(names):
             raise InputError(f"names of states, inputs and parameters of {self.name} must differ; found {names}.")
         for symbol, (lo, hi) in zip(self.states, self.domain, strict=True):
