@@ -225,9 +225,7 @@ def planes(scene: _Scene) -> list[tuple[int, int]]:
     return (pairs or [(i, i + 1) for i in range(0, scene.n - 1, 2)])[:3]
 
 
-def _portrait(
-    scene: _Scene, pair: tuple[int, int], paths: Array, roa: SimulatedRoa | None, *, single: bool
-) -> Picture:
+def _portrait(scene: _Scene, pair: tuple[int, int], paths: Array, roa: SimulatedRoa | None, *, single: bool) -> Picture:
     from matplotlib.collections import LineCollection
     from matplotlib.patches import Patch, Rectangle
 
@@ -351,9 +349,7 @@ def _partition(scene: _Scene, leaves: Leaves) -> Picture:
     )  # fmt: skip
 
 
-def _add_leaves(
-    axes: Any, scene: _Scene, leaves: Leaves, pair: tuple[int, int], within: Array | None
-) -> Array:
+def _add_leaves(axes: Any, scene: _Scene, leaves: Leaves, pair: tuple[int, int], within: Array | None) -> Array:
     """Add the leaves (n = 2: as parallelograms in x; else a cut in z); the corners that were drawn, (N * 4, 2)."""
     from matplotlib.collections import PolyCollection
 

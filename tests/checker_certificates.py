@@ -1,0 +1,241 @@
+"""Certificates for the checker's tests, written by hand: plain dictionaries in the format of the file.
+
+The partition tree is grown with the checker's own leaf rule, so that what is tested is whether a certificate is
+accepted and never how clever a producer is. Nothing here depends on the producer.
+"""
+
+from __future__ import annotations
+
+import base64
+import copy
+import hashlib
+import json
+import math
+import struct
+from collections.abc import Callable, Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from flint import arb, fmpq
+
+from certify.checker import document, exact, network, rules
+from certify.checker.document import Certificate, Policy
+from certify.checker.errors import Rejected
+from certify.checker.float64 import total, up
+
+Document = dict[str, Any]
+LEAF = 255
+
+
+def encode(array: Any) -> str:
+    """A float64 array as base64 of little-endian bytes."""
+    return base64.b64encode(np.asarray(array, dtype="<f8").tobytes()).decode("ascii")
+
+
+def decode(text: str) -> np.ndarray:
+    return np.frombuffer(base64.b64decode(text), dtype="<f8").copy()
+
+
+def policy_hash(policy: Document) -> str:
+    """The hash that FORMAT.md defines, written down a second time."""
+    digest = hashlib.sha256(b"certify-policy/1\0" + f"{policy['squash']}\0{policy['centre']}\0".encode())
+    for layer in policy["layers"]:
+        rows, columns = layer["shape"]
+        digest.update(struct.pack("<3Q", 2, rows, columns) + base64.b64decode(layer["weight"]))
+        digest.update(struct.pack("<2Q", 1, rows) + base64.b64decode(layer["bias"]))
+    for name in ("scale", "offset"):
+        raw = base64.b64decode(policy[name])
+        digest.update(struct.pack("<2Q", 1, len(raw) // 8) + raw)
+    return digest.hexdigest()
+
+
+def rehash(data: Document) -> Document:
+    data["policy"]["sha256"] = policy_hash(data["policy"])
+    return data
+
+
+def make(
+    dynamics: Sequence[Any],
+    layers: Sequence[tuple[Any, Any]],
+    P: Any,
+    levels: tuple[float, float],
+    *,
+    states: Sequence[str] = ("x",),
+    inputs: Sequence[str] = ("u",),
+    u_eq: Sequence[str] = ("0",),
+    domain: Sequence[tuple[str, str]] = (("-3", "3"),),
+    input_bounds: Sequence[tuple[str, str]] = (("-1", "1"),),
+    squash: str = "tanh",
+    centre: str = "preactivation",
+    scale: Sequence[float] = (-1.0,),
+    offset: Sequence[float] = (0.0,),
+    T: Any = None,
+    root: Any = None,
+    tree: bytes = bytes([LEAF]),
+) -> Document:
+    """A certificate's document; the root box is the least one that binary64 can name, unless it is given."""
+    P = np.atleast_2d(np.asarray(P, dtype=np.float64))
+    T = np.eye(len(P)) if T is None else np.atleast_2d(np.asarray(T, dtype=np.float64))
+    if root is None:
+        root = least_root(P, T, levels[1])
+    arrays = [(np.atleast_2d(np.asarray(W, dtype=np.float64)), np.atleast_1d(b)) for W, b in layers]
+    return rehash({
+        "schema": "certify-certificate/1",
+        "plant": {
+            "name": "plant",
+            "states": list(states),
+            "inputs": list(inputs),
+            "dynamics": list(dynamics),
+            "u_eq": list(u_eq),
+            "domain": [list(pair) for pair in domain],
+            "input_bounds": [list(pair) for pair in input_bounds],
+        },
+        "policy": {
+            "layers": [{"shape": list(W.shape), "weight": encode(W), "bias": encode(b)} for W, b in arrays],
+            "squash": squash,
+            "centre": centre,
+            "scale": encode(scale),
+            "offset": encode(offset),
+            "sha256": "",
+        },
+        "lyapunov": {"P": encode(P)},
+        "levels": {"local": float(levels[0]).hex(), "roa": float(levels[1]).hex()},
+        "evidence": {
+            "kind": "partition-tree",
+            "T": encode(T),
+            "root": encode(root),
+            "tree": base64.b64encode(tree).decode("ascii"),
+        },
+        "provenance": {"tool": "written by hand"},
+    })  # fmt: skip
+
+
+def least_root(P: np.ndarray, T: np.ndarray, level: float) -> np.ndarray:
+    """Half-widths of the smallest binary64 box in z around {V <= level}."""
+    inverse = exact.inverse_diagonal(exact.congruence(exact.rational(T), exact.rational(P)))
+    if inverse is None:
+        raise ValueError("T'PT must be positive definite")
+    root = []
+    for s in inverse:
+        square = Fraction(level) * s
+        shift = (square.denominator.bit_length() - square.numerator.bit_length()) // 2 + 64
+        b = float(Fraction(math.isqrt(int(square * Fraction(4) ** shift)), 1) / Fraction(2) ** shift)
+        while Fraction(b) ** 2 < square:
+            b = float(np.nextafter(b, np.inf))
+        root.append(b)
+    return np.array(root)
+
+
+def dump(data: Document) -> bytes:
+    return json.dumps(data).encode("ascii")
+
+
+def parse(data: Document) -> Certificate:
+    """The document as the checker reads it, through JSON text."""
+    return document._certificate(json.loads(dump(data)), "0" * 64)
+
+
+def verdict(data: Document) -> str:
+    """`ACCEPTED`, or the name of the rule that failed."""
+    try:
+        rules.check(parse(data))
+    except Rejected as no:
+        return no.rule
+    return "ACCEPTED"
+
+
+def grow(data: Document, max_leaves: int = 5000, depth: int = 40) -> Document:
+    """`data` with a tree: every leaf that the checker's rule does not accept is halved on its widest axis.
+
+    Leaves that are still not accepted at `depth` or at `max_leaves` stay, and the certificate is then rejected.
+    """
+    c = parse(data)
+    S = exact.congruence(exact.rational(c.T), exact.rational(c.P))
+    axes: dict[tuple[int, ...], int] = {}  # path from the root (0 lower, 1 upper) -> axis of the split
+    with np.errstate(all="ignore"):
+        ring = rules._Ring(c, network.fold(c.policy, c.u_eq), S, rules._inputs_bounded_by_form(c))
+        boxes = [((), -c.root, c.root.copy())]
+        for _ in range(depth):
+            if not boxes or len(axes) + len(boxes) > max_leaves:
+                break
+            good = passes(ring, np.stack([lo for _, lo, _ in boxes], 1), np.stack([hi for _, _, hi in boxes], 1))
+            halves = []
+            for (path, lo, hi), done in zip(boxes, good, strict=True):
+                if not done:
+                    axis = axes[path] = int(np.argmax((hi - lo) / c.root))
+                    middle = 0.5 * lo[axis] + 0.5 * hi[axis]
+                    left, right = hi.copy(), lo.copy()
+                    left[axis] = right[axis] = middle
+                    halves += [((*path, 0), lo, left), ((*path, 1), right, hi)]
+            boxes = halves
+    tree, stack = bytearray(), [()]
+    while stack:
+        path = stack.pop()
+        tree.append(axes.get(path, LEAF))
+        if path in axes:
+            stack += [(*path, 1), (*path, 0)]
+    return with_tree(data, bytes(tree))
+
+
+def passes(ring: rules._Ring, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
+    """The rule for a leaf, box by box, lo and hi (n, B)."""
+    centre = 0.5 * lo + 0.5 * hi
+    x, error = ring._states(centre, up(np.maximum(hi - centre, centre - lo)))
+    mid, slopes, wide = network.enclose_on_boxes(ring.net, x, error)
+    good = ring._vdot(x, error, mid, slopes, wide) < 0
+    if not ring.bounded:
+        for j, bounds in enumerate(ring.c.input_bounds):
+            good &= rules._within(bounds, mid[j], up(total(np.abs(slopes[j]), 0) + wide[j]))
+    return good | ring._misses(lo, hi)
+
+
+def tree_of(data: Document) -> bytes:
+    return base64.b64decode(data["evidence"]["tree"])
+
+
+def with_tree(data: Document, tree: bytes) -> Document:
+    return edited(data, "evidence.tree", base64.b64encode(tree).decode("ascii"))
+
+
+def edited(data: Document, path: str, value: Any) -> Document:
+    """A deep copy with the entry at `path` (dots and list indices) replaced by a value, or by value(old)."""
+    result = copy.deepcopy(data)
+    *parents, last = [int(p) if p.isdigit() else p for p in path.split(".")]
+    at: Any = result
+    for key in parents:
+        at = at[key]
+    at[last] = value(at[last]) if isinstance(value, Callable) else value  # type: ignore[arg-type]
+    return result
+
+
+def write(data: Document | bytes, folder: Path) -> Path:
+    path = folder / "certificate.json"
+    path.write_bytes(data if isinstance(data, bytes) else dump(data))
+    return path
+
+
+def policy_in_arb(policy: Policy, u_eq: Sequence[Fraction], x: Sequence[arb]) -> list[arb]:
+    """pi(x) in ball arithmetic at the current precision, by the words of FORMAT.md."""
+
+    def net(h: list[arb]) -> list[arb]:
+        for k, (W, b) in enumerate(zip(policy.weights, policy.biases, strict=True)):
+            h = [v.tanh() for v in h] if k else h
+            h = [
+                sum((arb(w) * v for w, v in zip(row, h, strict=True)), arb(bias))
+                for row, bias in zip(W.tolist(), b.tolist(), strict=True)
+            ]
+        return h
+
+    y, y0 = net(list(x)), net([arb(0)] * len(x))
+    eq = [arb(fmpq(q.numerator, q.denominator)) for q in u_eq]
+    scale, offset = ([arb(v) for v in a.tolist()] for a in (policy.scale, policy.offset))
+    result = []
+    for j in range(len(y)):
+        if policy.centre == "preactivation":
+            result.append(scale[j] * (y[j] - y0[j] + ((eq[j] - offset[j]) / scale[j]).atanh()).tanh() + offset[j])
+            continue
+        h, h0 = (y[j].tanh(), y0[j].tanh()) if policy.squash == "tanh" else (y[j], y0[j])
+        result.append(scale[j] * (h - h0) + eq[j] if policy.centre == "output" else scale[j] * h + offset[j])
+    return result

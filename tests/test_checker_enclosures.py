@@ -1,0 +1,717 @@
+"""The checker's enclosures against Arb: containment without any tolerance, then how wide and of which order they are.
+
+Each test draws a true function that the enclosure claims to hold, evaluates it in ball arithmetic of high precision,
+and asks for a comparison that is certain. Extreme exponents are drawn on purpose: an enclosure may become infinite or
+NaN there, which the rules read as a failure, but never too small.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterator
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from flint import arb, ctx, fmpq
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from certify.checker import float64
+from certify.checker.document import Policy
+from certify.checker.exact import gershgorin_lower, inverse_diagonal, rational
+from certify.checker.float64 import (
+    arb_with_error,
+    atanh_with_error,
+    float_with_error,
+    frobenius_norm,
+    norm,
+    self_test,
+    sin_cos,
+    spectral_norm,
+    tanh,
+    total,
+    up,
+)
+from certify.checker.local import Jet, JetAlgebra
+from certify.checker.network import enclose_at_origin, enclose_on_boxes, fold, relax_tanh
+from certify.checker.taylor import Taylor, TaylorAlgebra, upper_bound
+from tests.checker_certificates import policy_in_arb
+
+FLOATS = st.floats(allow_nan=False, allow_infinity=False)
+MAGNITUDES = st.floats(min_value=0.0, allow_nan=False, allow_infinity=False)
+
+
+@pytest.fixture(autouse=True)
+def _quiet() -> Iterator[None]:
+    """As in `rules.check`: overflow becomes infinity or NaN."""
+    with np.errstate(all="ignore"):
+        yield
+
+
+def certainly_within(value: arb, centre: float, bound: float) -> bool:
+    return bool(abs(value - arb(float(centre))) <= arb(float(bound)))
+
+
+def ball(q: Fraction) -> arb:
+    return arb(fmpq(q.numerator, q.denominator))
+
+
+# ------------------------------------------------------------------------------------------------ elementary functions
+
+
+def awkward(end: float) -> np.ndarray:
+    """Grid points, midpoints between them, the table's end and their neighbours; subnormals, huge numbers, zeros."""
+    grid = np.arange(int(end * 64) + 3) / 64
+    special = [5e-324, 1e-310, 2.0**-1022, 2.0**-600, 2.0**-30, end, 2 * end, 1e9, 2.0**60, 1e300, np.finfo(float).max]
+    points = np.concatenate([grid, special])
+    points = np.concatenate([points, np.nextafter(points, 0.0), np.nextafter(points, 1e308), [0.0]])
+    return np.concatenate([points, -points])
+
+
+def drawn(count: int, end: float, seed: int) -> np.ndarray:
+    generator = np.random.default_rng(seed)
+    signs = generator.choice([-1.0, 1.0], count)
+    return signs * np.where(
+        generator.random(count) < 0.5,
+        generator.uniform(0, 1.1 * end, count),
+        2.0 ** generator.uniform(-60, 8, count),
+    )
+
+
+def assert_tanh_encloses(points: np.ndarray) -> None:
+    t, e = tanh(points)
+    with ctx.workprec(200):
+        for y, value, error in zip(points.tolist(), t.tolist(), e.tolist(), strict=True):
+            assert certainly_within(arb(y).tanh(), value, error), y.hex()
+
+
+def assert_sin_cos_enclose(points: np.ndarray) -> None:
+    s, c, e = sin_cos(points)
+    with ctx.workprec(1300):  # the argument is reduced by multiples of pi/2 up to 2^1024
+        for y, sine, cosine, error in zip(points.tolist(), s.tolist(), c.tolist(), e.tolist(), strict=True):
+            x = arb(y)
+            assert certainly_within(x.sin(), sine, error), y.hex()
+            assert certainly_within(x.cos(), cosine, error), y.hex()
+
+
+def test_tanh() -> None:
+    assert_tanh_encloses(np.concatenate([awkward(20.0), drawn(10_000, 20.0, 1)]))
+
+
+def test_sin_cos() -> None:
+    assert_sin_cos_enclose(awkward(64.0))
+    with ctx.workprec(200):
+        assert_sin_cos_enclose(drawn(10_000, 64.0, 2))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("batch", range(10))
+def test_elementary_functions_at_length(batch: int) -> None:
+    assert_tanh_encloses(drawn(100_000, 20.0, 100 + batch))
+    points = drawn(100_000, 64.0, 200 + batch)
+    s, c, e = sin_cos(points)
+    with ctx.workprec(200):
+        for y, sine, cosine, error in zip(points.tolist(), s.tolist(), c.tolist(), e.tolist(), strict=True):
+            x = arb(y)
+            assert certainly_within(x.sin(), sine, error) and certainly_within(x.cos(), cosine, error), y.hex()
+
+
+def test_elementary_functions_are_narrow() -> None:
+    y = drawn(10_000, 20.0, 3)
+    t, e = tanh(y)
+    assert np.all(e <= 2.0**-47 * np.abs(t) + 2.0**-900)  # relative, also near 0
+    assert np.all(sin_cos(y[np.abs(y) <= 64])[2] <= 2.0**-48)
+
+
+@pytest.mark.parametrize("y", [np.nan, np.inf, -np.inf])
+def test_elementary_functions_know_nothing_of_what_is_not_finite(y: float) -> None:
+    assert all(np.isnan(v).all() for v in (*tanh(np.array([y])), *sin_cos(np.array([y]))))
+
+
+def test_tanh_is_odd_in_every_bit() -> None:
+    y = drawn(1000, 20.0, 4)
+    (t, e), (minus_t, minus_e) = tanh(y), tanh(-y)
+    assert np.array_equal(t, -minus_t) and np.array_equal(e, minus_e)  # `supremum` takes the lower line from -y
+
+
+def test_tables_are_accurate_to_one_rounding() -> None:
+    with ctx.workprec(200):
+        for k in range(0, 641, 8):
+            t = (arb(k) / 32).tanh()
+            assert certainly_within(t, float64._TANH[k], 2.0**-53 * float64._TANH[k] * (1 + 2.0**-19))
+            assert certainly_within(1 - t * t, float64._SECH2[k], 2.0**-53 * float64._SECH2[k] * (1 + 2.0**-19))
+        for k in range(0, 2049, 16):
+            x = arb(k) / 32
+            for value, table in ((x.sin(), float64._SIN), (x.cos(), float64._COS)):
+                assert certainly_within(value, table[k], 2.0**-53 * abs(table[k]) * (1 + 2.0**-19))
+
+
+# -------------------------------------------------------------------------------------------- sums, norms, conversions
+
+
+@given(st.lists(MAGNITUDES, min_size=1, max_size=40))
+def test_totals_and_norms_are_upper_bounds(numbers: list[float]) -> None:
+    array = np.array(numbers)
+    bound = float(total(array, 0))
+    assert bound == np.inf or Fraction(bound) >= sum(map(Fraction, numbers))
+    bound = float(norm(array, 0))
+    assert bound == np.inf or Fraction(bound) ** 2 >= sum(Fraction(v) ** 2 for v in numbers)
+    bound = frobenius_norm(array[:, None])
+    assert bound == np.inf or Fraction(bound) ** 2 >= sum(Fraction(v) ** 2 for v in numbers)
+
+
+@given(MAGNITUDES)
+def test_up_covers_its_roundings(bound: float) -> None:
+    result = float(up(bound))
+    assert result == np.inf or Fraction(result) >= Fraction(bound) * (1 + Fraction(1, 2**41)) + Fraction(1, 2**961)
+
+
+@given(st.integers(-(10**40), 10**40), st.integers(1, 10**40), st.integers(-1400, 1400))
+@example(1, 1, -1075)
+@example(3, 1, -1076)
+@example(1, 1, 1024)
+@example(2**1024 - 2**970, 1, 0)
+@example(2**1024 - 2**970 - 1, 1, 0)
+def test_rational_to_binary64(numerator: int, denominator: int, exponent: int) -> None:
+    q = Fraction(numerator, denominator) * Fraction(2) ** exponent
+    value, error = float_with_error(q)
+    assert error == np.inf or abs(Fraction(value) - q) <= Fraction(error)
+    assert error != np.inf or abs(q) > Fraction(2) ** 1023
+
+
+@given(st.integers(1, 10**12), st.integers(-(2**60) + 1, 2**60 - 1))
+def test_atanh_of_a_rational(denominator: int, position: int) -> None:
+    q = Fraction(position, 2**60) * Fraction(denominator, denominator + 1)
+    value, error = atanh_with_error(q)
+    with ctx.workprec(300):
+        assert certainly_within(ball(q).atanh(), value, error)
+
+
+def test_atanh_close_to_its_poles_is_finite_or_unknown() -> None:
+    for bits in (30, 100, 127, 128, 129, 400, 3000):
+        q = 1 - Fraction(1, 2**bits)
+        value, error = atanh_with_error(q)
+        with ctx.workprec(4000):
+            assert not np.isfinite(error) or certainly_within(ball(q).atanh(), value, error)
+
+
+def test_arb_with_error_holds_the_whole_ball() -> None:
+    for x in (arb(1) / 3, arb("1 +/- 0.25"), arb(2) ** -1080, arb("1e400")):
+        value, error = arb_with_error(x)
+        assert error == np.inf or (abs(x - arb(value)) <= arb(error))
+
+
+def test_self_test_passes_here_and_fails_closed(monkeypatch: pytest.MonkeyPatch) -> None:
+    self_test()
+    monkeypatch.setattr(float64, "gamma", lambda k: 0.0)  # no matrix product is exact
+    with pytest.raises(ArithmeticError):
+        self_test()
+
+
+def is_semidefinite(A: list[list[Fraction]]) -> bool:
+    """Exact, by leading minors of A + t I for a t that changes no sign that matters here."""
+    n, t = len(A), Fraction(1, 2**4000)
+    return inverse_diagonal([[A[i][j] + (t if i == j else 0) for j in range(n)] for i in range(n)]) is not None
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (2, 2), (1, 5), (5, 1), (3, 4), (6, 3), (5, 5)])
+@pytest.mark.parametrize("exponent", [-700, -520, -3, 0, 300, 500])
+def test_spectral_norm_is_an_upper_bound(shape: tuple[int, int], exponent: int) -> None:
+    generator = np.random.default_rng(abs(exponent) * 100 + shape[0] * 10 + shape[1])
+    kinds = [generator.standard_normal(shape), np.ones(shape), np.eye(*shape), np.zeros(shape)]
+    graded = generator.standard_normal(shape) * 2.0 ** generator.integers(-300, 1, shape)
+    for W in (*kinds, graded):
+        scaled = W * 2.0**exponent
+        sigma = spectral_norm(scaled)
+        R = rational(scaled.T if shape[0] >= shape[1] else scaled)
+        gram = [[sum((x * y for x, y in zip(p, q, strict=True)), Fraction(0)) for q in R] for p in R]
+        assert is_semidefinite([
+            [(Fraction(sigma) ** 2 if i == j else Fraction(0)) - v for j, v in enumerate(row)]
+            for i, row in enumerate(gram)
+        ])  # fmt: skip
+        if exponent > -300:
+            assert sigma <= np.linalg.norm(scaled, 2) * min(shape) ** (1 / 128) * (1 + 1e-9) + 2.0**-470
+
+
+def test_spectral_norm_of_what_overflows_is_infinite() -> None:
+    assert spectral_norm(np.full((2, 2), 2.0**600)) == np.inf
+    assert spectral_norm(np.full((2, 2), np.nan)) == np.inf
+
+
+# ------------------------------------------------------------------------------------------------- rational arithmetic
+
+
+@given(st.integers(1, 4), st.integers(0, 10**6))
+def test_definiteness_is_decided_exactly(n: int, seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    L = [[Fraction(int(v)) for v in row] for row in generator.integers(-3, 4, (n, n))]
+    D = [Fraction(int(v)) for v in generator.integers(-1, 4, n)]
+    A = [[sum((L[i][k] * D[k] * L[j][k] for k in range(n)), Fraction(0)) for j in range(n)] for i in range(n)]
+    exact_minors = [determinant([row[:k] for row in A[:k]]) for k in range(1, n + 1)]
+    diagonal = inverse_diagonal(A)
+    assert (diagonal is not None) == all(d > 0 for d in exact_minors)
+    if diagonal is not None:
+        for i, value in enumerate(diagonal):
+            minor = [[A[r][c] for c in range(n) if c != i] for r in range(n) if r != i]
+            assert value == (determinant(minor) if n > 1 else 1) / exact_minors[-1]
+    if gershgorin_lower(A) > 0:
+        assert diagonal is not None
+
+
+def determinant(A: list[list[Fraction]]) -> Fraction:
+    n, result = len(A), Fraction(0)
+    for order in itertools.permutations(range(n)):
+        sign = (-1) ** sum(order[i] > order[j] for i in range(n) for j in range(i + 1, n))
+        result += sign * math.prod((A[i][order[i]] for i in range(n)), start=Fraction(1))
+    return result
+
+
+def test_an_unsymmetric_matrix_is_not_definite() -> None:
+    A = [[Fraction(2), Fraction(1)], [Fraction(0), Fraction(2)]]
+    assert inverse_diagonal(A) is None
+
+
+# ------------------------------------------------------------------------------------------------------- Taylor models
+
+
+def models(generator: np.random.Generator, N: int, batch: int, low: int, high: int) -> Taylor:
+    """Random models: every coefficient with an exponent of its own below that of c, some exactly 0."""
+
+    def numbers(*shape: int, least: int, most: int) -> np.ndarray:
+        exponents = generator.integers(least, most + 1, shape).astype(float)
+        values = generator.choice([-1.0, 1.0], shape) * generator.uniform(1, 2, shape) * 2.0**exponents
+        return np.where(generator.random(shape) < 0.1, 0.0, values)
+
+    unit = 2.0 ** generator.integers(low, high + 1, batch).astype(float)
+    return Taylor(
+        numbers(batch, least=-2, most=2) * unit,
+        numbers(N, batch, least=-30, most=0) * unit,
+        numbers(N, N, batch, least=-40, most=-2) * unit,
+        np.abs(numbers(batch, least=-60, most=-3)) * unit,
+    )
+
+
+def polynomial(model: Taylor, b: int, d: list[float]) -> arb:
+    """c + g.d + d'Q d."""
+    value = arb(float(model.c[b]))
+    for i, x in enumerate(d):
+        value += arb(float(model.g[i, b])) * arb(x)
+        for j, y in enumerate(d):
+            value += arb(float(model.Q[i, j, b])) * arb(x) * arb(y)
+    return value
+
+
+def points_in_the_box(generator: np.random.Generator, N: int) -> list[list[float]]:
+    corners = generator.choice([-1.0, 1.0], (3, N))
+    return [[0.0] * N, *corners.tolist(), *generator.uniform(-1, 1, (4, N)).tolist()]
+
+
+def assert_contains(
+    result: Taylor, operands: list[Taylor], function: Callable[..., arb], generator: np.random.Generator
+) -> int:
+    """Every member of the operands' models goes into the result; returns how many bounds were finite."""
+    finite, N = 0, result.g.shape[0]
+    with ctx.workprec(400):
+        for b in range(len(result.c)):
+            if not np.isfinite(result.r[b]):
+                continue
+            finite += 1
+            for d in points_in_the_box(generator, N):
+                members = [
+                    polynomial(m, b, d) + arb(float(m.r[b])) * arb(float(generator.choice([-1.0, 1.0, 0.3])))
+                    for m in operands
+                ]
+                value = function(*members)
+                assert abs(value - polynomial(result, b, d)) <= arb(float(result.r[b])), (b, d)
+    return finite
+
+
+RANGES = [(-4, 4), (-300, 300), (-520, -480), (-1000, -900), (480, 520)]
+
+
+@pytest.mark.parametrize(("low", "high"), RANGES)
+@pytest.mark.parametrize("seed", range(2))
+def test_taylor_ring_operations_contain(low: int, high: int, seed: int) -> None:
+    generator = np.random.default_rng(1000 * low + high + seed + 10**7)
+    N = 2 + seed
+    algebra, a, b = TaylorAlgebra(N, 30), models(generator, N, 30, low, high), models(generator, N, 30, low, high)
+    assert assert_contains(a + b, [a, b], lambda x, y: x + y, generator) == 30
+    assert assert_contains(algebra.neg(a), [a], lambda x: -x, generator) == 30
+    assert_contains(a * b, [a, b], lambda x, y: x * y, generator)
+    assert_contains(a * a, [a, a], lambda x, y: x * y, generator)
+    factor, error = float(generator.standard_normal()), 2.0**-20
+    assert_contains(a.scaled(factor, error), [a], lambda x: x * (arb(factor) + arb(error)), generator)
+    assert_contains(a.scaled(factor, error), [a], lambda x: x * (arb(factor) - arb(error)), generator)
+    mixed = models(generator, N, 30, -high, -low)
+    assert assert_contains(a * mixed, [a, mixed], lambda x, y: x * y, generator) > 20
+
+
+@pytest.mark.parametrize(("low", "high"), [(-4, 4), (-300, 300), (-360, -330), (330, 360), (-700, -500), (500, 700)])
+def test_taylor_quotients_contain(low: int, high: int) -> None:
+    generator = np.random.default_rng(low + 2000)
+    a = models(generator, 2, 60, low, high)
+    shrink = 2.0 ** generator.integers(-40, 0, 60).astype(float)
+    a = Taylor(a.c, a.g * shrink, a.Q * shrink, a.r * shrink)
+    result = TaylorAlgebra(2, 60).inv(a)
+    finite = assert_contains(result, [a], lambda x: 1 / x, generator)
+    assert finite > 20 or abs(low) > 4
+
+
+@pytest.mark.parametrize("spread", [-40, -6, 0, 3])
+def test_taylor_sine_and_cosine_contain(spread: int) -> None:
+    generator = np.random.default_rng(spread + 3000)
+    a = models(generator, 2, 60, spread, spread)
+    a = Taylor(generator.uniform(-80, 80, 60), a.g, a.Q, a.r)
+    algebra = TaylorAlgebra(2, 60)
+    assert assert_contains(algebra.sin(a), [a], lambda x: x.sin(), generator) == 60
+    assert assert_contains(algebra.cos(a), [a], lambda x: x.cos(), generator) == 60
+
+
+@given(st.integers(-(10**30), 10**30), st.integers(1, 10**30))
+def test_taylor_constants_contain(numerator: int, denominator: int) -> None:
+    q = Fraction(numerator, denominator)
+    model = TaylorAlgebra(2, 3).const(q)
+    assert np.all(model.g == 0) and np.all(model.Q == 0)
+    assert all(abs(Fraction(c) - q) <= Fraction(r) for c, r in zip(model.c.tolist(), model.r.tolist(), strict=True))
+
+
+def test_a_divisor_that_may_vanish_gives_nothing() -> None:
+    algebra = TaylorAlgebra(1, 4)
+    c = np.array([1.0, 1.0, 0.0, -1.0])
+    g = np.array([[1.0, 0.5, 0.0, 0.25]])
+    r = np.array([0.0, 0.5, 0.0, 0.75])
+    result = algebra.inv(Taylor(c, g, np.zeros((1, 1, 4)), r))
+    assert np.isnan(result.r).all()
+    assert np.isnan((result * algebra.affine(np.zeros(4), np.zeros((1, 4)))).r).all()  # 0 times it is still unknown
+    assert not np.any(upper_bound(result) < 0)
+
+
+@pytest.mark.parametrize("operation", ["mul", "inv", "sin", "cos"])
+def test_taylor_remainders_are_of_third_order(operation: str) -> None:
+    generator = np.random.default_rng(7)
+    c, g, Q = generator.uniform(0.5, 1, 8), generator.uniform(-1, 1, (2, 8)), generator.uniform(-1, 1, (2, 2, 8))
+    algebra, remainders = TaylorAlgebra(2, 8), []
+    for h in (2.0**-6, 2.0**-7, 2.0**-8):
+        a = Taylor(c, g * h, Q * h * h, np.zeros(8))
+        result = a * a if operation == "mul" else getattr(algebra, operation)(a)
+        remainders.append(result.r)
+    orders = np.log2(np.array(remainders[:-1]) / np.array(remainders[1:]))
+    assert np.all(orders > 2.9), orders
+
+
+def maximum(c: Fraction, g: Fraction, q: Fraction) -> Fraction:
+    """Exact maximum of c + g t + q t^2 over |t| <= 1."""
+    g = abs(g)
+    return c + (g * g / (-4 * q) if q < 0 and g < -2 * q else g + q)
+
+
+@given(FLOATS, FLOATS, FLOATS, MAGNITUDES)
+@example(-(2.0**-545), 2.0**-540, -(2.0**-540), 0.0)  # g * g underflows
+@example(-(2.0**1000), 2.0**1018, -1.5 * 2.0**1022, 0.0)  # 4 q overflows
+@example(-(2.0**1010), 2.0**1023, -(2.0**1023), 0.0)
+@example(-1.0, 2.0**600, -(2.0**1000), 0.0)  # g * g overflows
+@example(-5e-324, 5e-324, -5e-324, 0.0)
+@example(-0.249999, 1.0, -1.0, 0.0)
+@example(-1.0, 2.0, -1.0, 0.0)
+def test_upper_bound_on_one_axis_against_exact_arithmetic(c: float, g: float, q: float, r: float) -> None:
+    model = Taylor(np.array([c]), np.array([[g]]), np.array([[[q]]]), np.array([r]))
+    bound = float(upper_bound(model)[0])
+    assert not bound < np.inf or Fraction(bound) >= maximum(*map(Fraction, (c, g, q))) + Fraction(r)
+
+
+@given(st.sampled_from([np.inf, -np.inf, np.nan]), st.sampled_from(["c", "g", "Q", "r", "cross"]), st.booleans())
+def test_upper_bound_of_what_is_not_finite_is_never_negative(value: float, where: str, other: bool) -> None:
+    parts = {
+        "c": np.array([-1.0]), "g": np.array([[1.0], [1.0]]), "Q": -np.ones((2, 2, 1)) * np.eye(2)[:, :, None],
+        "r": np.array([0.0]),
+    }  # fmt: skip
+    if where == "cross":
+        parts["Q"][0, 1] = value
+    else:
+        parts[where][(int(other),) * (parts[where].ndim - 1) or 0] = value
+    if where == "r" and value == -np.inf:
+        return  # a remainder is never negative
+    assert not upper_bound(Taylor(**parts))[0] < 0
+
+
+@pytest.mark.parametrize("exponent", [-900, -540, 0, 400, 1000])
+def test_upper_bound_on_many_axes_holds_all_samples(exponent: int) -> None:
+    generator = np.random.default_rng(exponent + 5000)
+    model = models(generator, 3, 40, exponent, exponent)
+    bound = upper_bound(model)
+    for b in range(40):
+        best = max(point_value(model, b, d) for d in stationary_points(generator, model, b))
+        assert not bound[b] < np.inf or Fraction(float(bound[b])) >= best + Fraction(float(model.r[b]))
+
+
+def point_value(model: Taylor, b: int, d: list[float]) -> Fraction:
+    x = [Fraction(v) for v in d]
+    value = Fraction(float(model.c[b]))
+    for i in range(3):
+        value += Fraction(float(model.g[i, b])) * x[i]
+        value += sum(Fraction(float(model.Q[i, j, b])) * x[i] * x[j] for j in range(3))
+    return value
+
+
+def stationary_points(generator: np.random.Generator, model: Taylor, b: int) -> list[list[float]]:
+    candidates = []
+    for i in range(3):
+        g, q = float(model.g[i, b]), float(model.Q[i, i, b])
+        t = -g / (2 * q) if q else 0.0
+        candidates.append([-1.0, 1.0, 0.0, min(1.0, max(-1.0, t))])
+    return [*map(list, itertools.product(*candidates)), *generator.uniform(-1, 1, (20, 3)).tolist()]
+
+
+def test_upper_bound_of_a_separable_model_is_its_maximum() -> None:
+    generator = np.random.default_rng(11)
+    g, q = generator.standard_normal((3, 200)), generator.standard_normal((3, 200))
+    Q = q[:, None] * np.eye(3)[:, :, None]
+    bound = upper_bound(Taylor(np.zeros(200), g, Q, np.zeros(200)))
+    for b in range(200):
+        exact = sum(maximum(Fraction(0), Fraction(float(g[i, b])), Fraction(float(q[i, b]))) for i in range(3))
+        assert exact <= Fraction(float(bound[b])) <= exact + Fraction(1, 2**40)
+
+
+# ---------------------------------------------------------------------------------------------------------------- jets
+
+
+class Member:
+    """A function that a jet holds: `c0 + a0.d + curvature d_axis^2`, every deviation drawn within the jet's bounds."""
+
+    def __init__(self, jet: Jet, generator: np.random.Generator) -> None:
+        s, t, w = (float(v) for v in generator.choice([-1.0, 1.0, 0.5, 0.0], 3))
+        self.c = arb(float(jet.c)) + arb(s) * arb(float(jet.error))
+        self.a = [arb(float(v)) for v in jet.a]
+        self.a[int(generator.integers(len(jet.a)))] += arb(t) * arb(float(jet.slack))
+        self.axis, self.k = int(generator.integers(len(jet.a))), arb(w) * arb(float(jet.k))
+
+    def __call__(self, d: list[float]) -> arb:
+        linear = sum((p * arb(x) for p, x in zip(self.a, d, strict=True)), self.c)
+        return linear + self.k * arb(d[self.axis]) ** 2
+
+
+def points_in_the_ball(generator: np.random.Generator, n: int) -> list[list[float]]:
+    d = generator.standard_normal((6, n))
+    d /= np.linalg.norm(d, axis=1, keepdims=True) * (1 + 2.0**-40)
+    return (d * np.array([1, 0.999, 0.5, 1e-3, 1e-30, 1e-200])[:, None]).tolist()
+
+
+def assert_jet(
+    result: Jet, value: Callable[[list[float]], arb], gradient: list[arb], points: list[list[float]]
+) -> bool:
+    """v(0), the gradient, and the remainder at every point; False if the jet says nothing."""
+    if not np.isfinite([result.error, result.slack, result.k]).all():
+        return False
+    n = len(gradient)
+    at_0 = value([0.0] * n)
+    assert abs(at_0 - arb(float(result.c))) <= arb(float(result.error))
+    distance = sum(((p - arb(float(q))) ** 2 for p, q in zip(gradient, result.a, strict=True)), arb(0))
+    assert distance <= arb(float(result.slack)) ** 2
+    for d in points:
+        linear = sum((p * arb(x) for p, x in zip(gradient, d, strict=True)), at_0)
+        square = sum((arb(x) ** 2 for x in d), arb(0))
+        assert abs(value(d) - linear) <= arb(float(result.k)) * square, d
+    return True
+
+
+def jets(generator: np.random.Generator, n: int, exponent: int) -> Jet:
+    scale = 2.0**exponent
+
+    def number(most: int) -> float:
+        return float(abs(generator.standard_normal()) * 2.0 ** generator.integers(-40, most) * scale)
+
+    sign = float(generator.choice([-1.0, 1.0]))
+    some = generator.random(3) < 0.8
+    return Jet(
+        sign * number(2), number(-4) * some[0], generator.standard_normal(n) * number(1), number(-4) * some[1],
+        number(0) * some[2],
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("exponent", [-600, -520, -300, 0, 300, 500])
+def test_jets_contain(exponent: int) -> None:
+    generator, finite = np.random.default_rng(exponent + 9000), 0
+    n = 3
+    algebra = JetAlgebra(n)
+    with ctx.workprec(3000):
+        for _ in range(25):
+            x, y = jets(generator, n, exponent), jets(generator, n, exponent)
+            v, w = Member(x, generator), Member(y, generator)
+            points = points_in_the_ball(generator, n)
+            sums = [p + q for p, q in zip(v.a, w.a, strict=True)]
+            products = [v.c * q + w.c * p for p, q in zip(v.a, w.a, strict=True)]
+            inverses = [-p / (v.c * v.c) for p in v.a]
+            assert assert_jet(algebra.add(x, y), lambda d, v=v, w=w: v(d) + w(d), sums, points)
+            assert assert_jet(algebra.neg(x), lambda d, v=v: -v(d), [-p for p in v.a], points)
+            finite += assert_jet(algebra.mul(x, y), lambda d, v=v, w=w: v(d) * w(d), products, points)
+            finite += assert_jet(algebra.inv(x), lambda d, v=v: 1 / v(d), inverses, points)
+    assert finite > 10 or abs(exponent) > 300
+
+
+@pytest.mark.parametrize("spread", [-30, -3, 0, 4])
+def test_jets_of_sine_and_cosine_contain(spread: int) -> None:
+    generator = np.random.default_rng(spread + 9500)
+    algebra = JetAlgebra(2)
+    with ctx.workprec(1600):
+        for _ in range(40):
+            x = jets(generator, 2, spread)
+            x = Jet(float(generator.choice([0.0, 1.0, 70.0]) * generator.standard_normal()), x.error, x.a, x.slack, x.k)
+            v, points = Member(x, generator), points_in_the_ball(generator, 2)
+            assert assert_jet(algebra.sin(x), lambda d, v=v: v(d).sin(), [v.c.cos() * p for p in v.a], points)
+            assert assert_jet(algebra.cos(x), lambda d, v=v: v(d).cos(), [-v.c.sin() * p for p in v.a], points)
+
+
+def test_a_jet_of_a_divisor_that_may_vanish_gives_nothing() -> None:
+    algebra = JetAlgebra(1)
+    for c, error, slope in ((1.0, 0.0, 1.0), (0.0, 0.0, 0.0), (1.0, 1.0, 0.0)):
+        x = Jet(c, error, np.full(1, slope), 0.0, 0.0)
+        assert np.isnan(algebra.inv(x).k) and np.isnan(algebra.inv(x).slack)
+    whole = Jet(float("inf"), float("inf"), np.zeros(1), 0.0, 0.0)
+    assert not np.isfinite(algebra.mul(whole, Jet(0.0, 0.0, np.zeros(1), 0.0, 0.0)).error)
+
+
+@given(st.integers(-(10**30), 10**30), st.integers(1, 10**30))
+def test_jets_of_constants_contain(numerator: int, denominator: int) -> None:
+    q = Fraction(numerator, denominator)
+    jet = JetAlgebra(2).const(q)
+    assert abs(Fraction(jet.c) - q) <= Fraction(jet.error) and jet.k == 0 and not jet.a.any()
+
+
+# --------------------------------------------------------------------------------------------- the policy's enclosures
+
+CENTRES = [0.0, -0.0, 1e-200, 1e-9, 3e-4, 0.1, -0.7, 1.5, -4.0, 9.0, 18.0, 25.0, -700.0, 1e9]
+RADII = [0.0, 1e-300, 1e-20, 1e-9, 9e-5, 1.1e-4, 1e-2, 0.3, 1.0, 4.0, 30.0, 1e4, 1e15, 1e300]
+
+
+def test_parallel_lines_enclose_tanh() -> None:
+    pairs = np.array(list(itertools.product(CENTRES, RADII)))
+    generator = np.random.default_rng(21)
+    extra = np.stack([3 * generator.standard_normal(400), np.abs(generator.standard_normal(400))], 1)
+    centre, radius = np.concatenate([pairs, extra]).T
+    slope, shift, gap = relax_tanh(centre, radius)
+    assert np.isfinite(gap).all() and np.all((slope >= 0) & (slope <= 1))
+    with ctx.workprec(1300):
+        for c, r, s, m, g in zip(*(a.tolist() for a in (centre, radius, slope, shift, gap)), strict=True):
+            critical = math.atanh(math.sqrt(min(1 - 2.0**-53, max(0.0, 1 - s))))
+            inside = [(p - c) / r for p in (critical, -critical) if r > 0 and abs(p - c) <= r * (1 - 1e-12)]
+            for t in (*np.linspace(-1, 1, 21).tolist(), *inside):
+                y = arb(c) + arb(r) * arb(t)
+                assert certainly_within(y.tanh() - arb(s) * y, m, g), (c, r, t)
+
+
+@pytest.mark.parametrize("first", [2.0**-3, 2.0**-14])  # chords, then tangents
+@pytest.mark.parametrize("centre", [0.3, -0.7, 2.0])
+def test_the_gap_is_of_second_order(first: float, centre: float) -> None:
+    radius = first / 2.0 ** np.arange(4)
+    _, _, gap = relax_tanh(np.full(4, centre), radius)
+    orders = np.log2(gap[:-1] / gap[1:])
+    assert np.all(orders > 1.9), orders
+
+
+def test_parallel_lines_are_never_looser_than_an_interval() -> None:
+    centre, radius = np.array(list(itertools.product(CENTRES, [r for r in RADII if r < 1e5]))).T
+    _, _, gap = relax_tanh(centre, radius)
+    interval = (np.tanh(centre + radius) - np.tanh(centre - radius)) / 2
+    assert np.all(gap <= interval * (1 + 1e-9) + 2.0**-45 * (1 + radius))
+
+
+def test_parallel_lines_of_what_is_not_finite_are_unknown() -> None:
+    for centre, radius in ((np.nan, 1.0), (1.0, np.nan), (np.inf, 1.0), (0.0, np.inf)):
+        assert np.isnan(relax_tanh(np.array([centre]), np.array([radius]))[2]).all()
+
+
+def random_policy(
+    generator: np.random.Generator, widths: list[int], size: float, squash: str, centre: str
+) -> tuple[Policy, tuple[Fraction, ...]]:
+    weights = tuple(size * generator.standard_normal((out, into)) for into, out in itertools.pairwise(widths))
+    biases = tuple(0.3 * generator.standard_normal(out) for out in widths[1:])
+    m = widths[-1]
+    scale, offset = generator.choice([-1.0, 1.0], m) * generator.uniform(0.5, 3, m), 0.2 * generator.standard_normal(m)
+    return Policy(weights, biases, scale, offset, squash, centre), tuple(Fraction(1, 5 + j) for j in range(m))
+
+
+POLICIES = list(
+    itertools.product(
+        [[2, 1], [2, 6, 1], [3, 5, 4, 2], [2, 7, 6, 5, 1]],
+        [1e-200, 1e-3, 0.8, 5.0, 1e4, 1e90],
+        [("tanh", "preactivation"), ("tanh", "output"), ("identity", "output")],
+    )
+)
+
+
+@pytest.mark.parametrize("radius", [0.0, 1e-200, 1e-12, 1e-2, 0.7, 50.0, 1e9])
+def test_the_policy_on_boxes(radius: float) -> None:
+    generator, finite, boxes = np.random.default_rng(int(radius) % 97 + 31), 0, 4
+    for widths, size, (squash, centre) in POLICIES:
+        policy, u_eq = random_policy(generator, widths, size, squash, centre)
+        n = widths[0]
+        x = generator.standard_normal((n, n + 1, boxes))
+        x[:, 1:] *= radius
+        x[:, 0, 0] = 0.0  # one box around the origin
+        x_error = np.abs(generator.standard_normal((n, boxes))) * 1e-9 * radius
+        mid, slopes, error = enclose_on_boxes(fold(policy, u_eq), x, x_error)
+        with ctx.workprec(900):
+            for b in range(boxes):
+                if not np.isfinite(error[:, b]).all():
+                    continue
+                finite += 1
+                for d in points_in_the_box(generator, n)[:5]:
+                    state = [
+                        sum((arb(float(x[i, 1 + k, b])) * arb(v) for k, v in enumerate(d)), arb(float(x[i, 0, b])))
+                        + arb(float(generator.choice([-1.0, 1.0]))) * arb(float(x_error[i, b]))
+                        for i in range(n)
+                    ]
+                    for j, u in enumerate(policy_in_arb(policy, u_eq, state)):
+                        line = sum((arb(float(slopes[j, k, b])) * arb(v) for k, v in enumerate(d)), arb(0))
+                        assert certainly_within(u - line, mid[j, b], error[j, b]), (widths, size, squash, centre, b)
+    assert finite > boxes * len(POLICIES) // 2
+
+
+def test_the_policys_error_on_boxes_is_of_second_order() -> None:
+    generator = np.random.default_rng(41)
+    policy, u_eq = random_policy(generator, [2, 8, 8, 1], 0.7, "tanh", "preactivation")
+    x = generator.standard_normal((2, 3, 5))
+    errors = []
+    for h in (2.0**-5, 2.0**-6, 2.0**-7):
+        forms = x.copy()
+        forms[:, 1:] *= h
+        errors.append(enclose_on_boxes(fold(policy, u_eq), forms, np.zeros((2, 5)))[2][0])
+    orders = np.log2(np.array(errors[:-1]) / np.array(errors[1:]))
+    assert np.all(orders > 1.8), orders
+
+
+@pytest.mark.parametrize("radius", [1e-200, 1e-9, 1e-3, 0.2, 3.0])
+def test_the_policy_at_the_origin(radius: float) -> None:
+    generator, finite = np.random.default_rng(int(radius * 1000) + 51), 0
+    for widths, size, (squash, centre) in POLICIES:
+        policy, u_eq = random_policy(generator, widths, size, squash, centre)
+        n = widths[0]
+        J, slack = radius * generator.standard_normal((n, n)), radius * 1e-9
+        folded = fold(policy, u_eq)
+        gradient, u_slack, k = enclose_at_origin(folded, J, slack)
+        if not np.isfinite([u_slack, k]).all():
+            continue
+        finite += 1
+        shifted = [[arb(float(v)) for v in row] for row in J]
+        shifted[0][0] += arb(slack)  # a matrix within the slack in the 2-norm
+        with ctx.workprec(3000):
+            for d in points_in_the_ball(generator, n):
+                square = sum((arb(v) ** 2 for v in d), arb(0))
+                state = [sum((p * arb(v) for p, v in zip(row, d, strict=True)), arb(0)) for row in shifted]
+                for j, (u, q) in enumerate(zip(policy_in_arb(policy, u_eq, state), u_eq, strict=True)):
+                    line = ball(q) + sum((arb(float(g)) * arb(v) for g, v in zip(gradient[j], d, strict=True)), arb(0))
+                    slip = 4 * arb(2.0**-53) * sum((abs(arb(float(g))) for g in gradient[j]), arb(0)) * square.sqrt()
+                    bound = abs(arb(float(folded.scale[j]))) * (arb(u_slack) * square.sqrt() + arb(k) * square)
+                    # `slip`: the caller, not this function, accounts for the rounding of scale * G
+                    assert abs(u - line) <= bound + slip, (widths, size, squash, centre, d)
+    assert finite > len(POLICIES) // 2
+
+
+@pytest.mark.parametrize("squash", ["tanh", "identity"])
+def test_without_centring_nothing_is_folded(squash: str) -> None:
+    policy = Policy((np.array([[2.0, -1.0]]),), (np.zeros(1),), np.array([3.0]), np.array([0.5]), squash, "none")
+    folded = fold(policy, (Fraction(1, 2),))
+    assert not folded.bias_error.any() and not folded.offset_error.any()
+    assert folded.biases[0] is policy.biases[0] and folded.offset is policy.offset
