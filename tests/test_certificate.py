@@ -177,3 +177,28 @@ def test_expressions_survive_the_round_trip() -> None:
         names = {s.name: s for s in (*system.states, *system.inputs)}
         for expression in system.exact_dynamics():
             assert sympy.simplify(from_tree(to_tree(expression), names) - expression) == 0
+
+
+@pytest.mark.parametrize(
+    ("edit", "detail"),
+    [
+        (lambda b: b[: len(b) // 2], "JSON"),
+        (lambda b: b.replace(b'"levels":', b'"levels": {}, "levels":', 1), "duplicate"),
+        (lambda b: b.replace(b'"provenance"', b'"proven\xffance"', 1), "JSON"),
+        (lambda b: b"[" * 100_000, "JSON"),
+        (lambda b: b"", "JSON"),
+        (lambda b: b.replace(b'"0x1.', b'"0x01.', 1), "hex float"),
+        (lambda b: b.replace(b'"shape": [16, 2]', b'"shape": [16, 99999999999999]', 1), "too long"),
+        (lambda b: b.replace(b'"shape": [16, 2]', b'"shape": [true, 2]', 1), "shape|out"),
+        (lambda b: b + b" " * (256 * 2**20), "larger"),
+    ],
+)
+def test_bytes_that_are_no_certificate(
+    tmp_path: Path, written: Path, edit: Callable[[bytes], bytes], detail: str
+) -> None:
+    edited = edit(written.read_bytes())
+    assert edited != written.read_bytes()
+    (tmp_path / "c.json").write_bytes(edited)
+    got = run_checker(tmp_path / "c.json")
+    assert (got["result"], got["rule"]) == ("REJECTED", "format")
+    assert any(word in got["detail"] for word in detail.split("|")), got
