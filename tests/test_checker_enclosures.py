@@ -669,6 +669,66 @@ def test_the_policy_on_boxes(radius: float) -> None:
     assert finite > boxes * len(POLICIES) // 2
 
 
+def assert_policy_enclosed(
+    policy: Policy, u_eq: tuple[Fraction, ...], x: np.ndarray, points: list[list[float]]
+) -> None:
+    n = x.shape[0]
+    mid, slopes, error = enclose_on_boxes(fold(policy, u_eq), x, np.zeros((n, x.shape[2])))
+    assert np.isfinite(error).all()
+    with ctx.workprec(400):
+        for b, d in itertools.product(range(x.shape[2]), points):
+            state = [
+                sum((arb(float(x[i, 1 + k, b])) * arb(v) for k, v in enumerate(d)), arb(float(x[i, 0, b])))
+                for i in range(n)
+            ]
+            for j, u in enumerate(policy_in_arb(policy, u_eq, state)):
+                line = sum((arb(float(slopes[j, k, b])) * arb(v) for k, v in enumerate(d)), arb(0))
+                assert certainly_within(u - line, mid[j, b], error[j, b]), (b, d)
+
+
+@pytest.mark.parametrize("second", [0.0, -3.0, 2.0])
+@pytest.mark.parametrize("third", [0.0, -3.0, 2.0])
+def test_errors_of_earlier_layers_widen_the_range_of_later_ones(second: float, third: float) -> None:
+    """The affine parts of two neurons cancel in the second layer, so its whole range is the errors made before.
+
+    A further neuron is saturated: the largest slope of a layer counts, not the least.
+    """
+    W1 = np.array([[3.0], [0.5]])
+    cancel = np.tanh(3.0) / np.tanh(0.5)
+    W2 = 3 * np.array([[1.0, -cancel], [0.0, 0.0]])
+    weights = (W1, W2, np.array([[3.0, 0.0]]))
+    policy = Policy(
+        weights, (np.zeros(2), np.array([second, 20.0]), np.array([third])), np.ones(1), np.zeros(1), "tanh", "output"
+    )
+    x = np.array([[[0.0], [1.0]]])
+    assert_policy_enclosed(policy, (Fraction(0),), x, [[t] for t in np.linspace(-1, 1, 81).tolist()])
+    wide = Policy((W1, W2[:1]), (*policy.biases[:1], policy.biases[1][:1]), np.ones(1), np.zeros(1), "tanh", "output")
+    assert_policy_enclosed(wide, (Fraction(0),), x, [[t] for t in np.linspace(-1, 1, 81).tolist()])
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_rounding_is_bounded_where_numbers_cancel(seed: int) -> None:
+    generator = np.random.default_rng(seed + 70)
+    half = generator.standard_normal((1, 8)) * 1e8
+    x = np.zeros((16, 17, 1))
+    x[:8, 0, 0] = generator.standard_normal(8)
+    x[8:, 0, 0] = x[:8, 0, 0] * (1 + 2.0**-40 * generator.standard_normal(8))
+    W = np.concatenate([half, -half], 1)  # W x is 12 digits smaller than its terms
+    origin = [[0.0] * 16]
+    for squash, centre in (("identity", "none"), ("identity", "output"), ("tanh", "output"), ("tanh", "preactivation")):
+        offset = 0.0 if centre == "none" else 0.1
+        policy = Policy((W,), (np.zeros(1),), np.ones(1), np.full(1, offset), squash, centre)
+        assert_policy_enclosed(policy, (Fraction(0),), x, origin)
+    shifted = Policy(
+        (1e-9 * W,), (np.array([-1e7 / 3]),), np.array([0.7]), np.array([0.7 * 1e7 / 3]), "identity", "output"
+    )
+    assert_policy_enclosed(shifted, (Fraction(10**8, 3),), x, origin)
+    deep = Policy(
+        (W, np.array([[1e6]])), (np.full(1, 1e-9), np.zeros(1)), np.ones(1), np.zeros(1), "identity", "output"
+    )
+    assert_policy_enclosed(deep, (Fraction(1, 3),), 1e-9 * x, origin)
+
+
 def test_the_policys_error_on_boxes_is_of_second_order() -> None:
     generator = np.random.default_rng(41)
     policy, u_eq = random_policy(generator, [2, 8, 8, 1], 0.7, "tanh", "preactivation")

@@ -431,10 +431,14 @@ HOSTILE = "<script>alert('x')</script> $\\frac$ & \"quoted\" {{ 7 * 7 }}"
 
 
 def hostile_certificate() -> Certificate:
-    """Names that no producer gives; a page must survive them."""
+    """Names that a System refuses, put in behind its back; a page must survive them all the same."""
     x, y = sympy.Symbol("<img src=x onerror=alert(1)>"), sympy.Symbol("$\\frac$")
     u = sympy.Symbol("</svg><script>u</script>")
-    system = System(HOSTILE, (x, y), (u,), {}, (-x + u, -y + sympy.sin(x)), (sympy.Integer(0),), box(1, 1), box(2))
+    a, b, v = sympy.symbols("a b v")
+    system = System("plain", (a, b), (v,), {}, (-a + v, -b + sympy.sin(a)), (sympy.Integer(0),), box(1, 1), box(2))
+    hostile = {"name": HOSTILE, "states": (x, y), "inputs": (u,), "dynamics": (-x + u, -y + sympy.sin(x))}
+    for field, value in hostile.items():
+        object.__setattr__(system, field, value)
     network = TanhNetwork((np.array([[0.1, 0.2]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
     return Certificate(
         system, network, np.eye(2), np.eye(2), np.ones(2), 0.1, 0.5, bytes([255]), {HOSTILE: HOSTILE}

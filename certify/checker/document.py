@@ -249,9 +249,12 @@ def _bytes(value: Any, at: str) -> bytes:
     if not isinstance(value, str):
         _fail(at, "must be base64 text")
     try:
-        return base64.b64decode(value.encode("ascii"), validate=True)
+        raw = base64.b64decode(value.encode("ascii"), validate=True)
     except (UnicodeEncodeError, binascii.Error):
         _fail(at, "must be base64 text")
+    if base64.b64encode(raw).decode("ascii") != value:
+        _fail(at, "must be canonical base64 text")
+    return raw
 
 
 def _array(value: Any, at: str, shape: tuple[int, ...]) -> Array:
