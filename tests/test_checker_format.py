@@ -162,6 +162,7 @@ NOT_BASE64 = [
     "\u00e9",
     "-_-_",
     "=AAA",
+    "AP9=",
 ]
 PATHS_OF_RATIONALS = [
     "plant.u_eq.0",
