@@ -769,6 +769,30 @@ def test_the_policy_at_the_origin(radius: float) -> None:
     assert finite > len(POLICIES) // 2
 
 
+@pytest.mark.parametrize("seed", range(10))
+@pytest.mark.parametrize(("squash", "centre"), [("identity", "output"), ("tanh", "output"), ("tanh", "preactivation")])
+def test_folded_numbers_are_enclosed(squash: str, centre: str, seed: int) -> None:
+    """Offset and last bias against Arb, where the last layer's terms cancel to 12 digits less."""
+    generator = np.random.default_rng(seed + 80)
+    half, bias = generator.standard_normal((1, 8)) * 1e6, generator.standard_normal(8)
+    W = np.concatenate([half, -half], 1)
+    b1 = np.concatenate([bias, bias * (1 + 2.0**-40 * generator.standard_normal(8))])
+    policy = Policy((np.ones((16, 1)), W), (b1, np.full(1, 1e-7)), np.full(1, -3e5), np.full(1, 1e4), squash, centre)
+    u_eq = (Fraction(1, 3),)
+    folded = fold(policy, u_eq)
+    with ctx.workprec(400):
+        product = sum((arb(w) * arb(b).tanh() for w, b in zip(W[0].tolist(), b1.tolist(), strict=True)), arb(0))
+        if centre == "preactivation":
+            beta = ((ball(u_eq[0]) - arb(1e4)) / arb(-3e5)).atanh()
+            assert certainly_within(beta - product, folded.biases[1][0], folded.bias_error[0])
+            assert folded.offset is policy.offset and not folded.offset_error.any()
+        else:
+            y = product + arb(1e-7)
+            h = y.tanh() if squash == "tanh" else y
+            assert certainly_within(ball(u_eq[0]) + arb(3e5) * h, folded.offset[0], folded.offset_error[0])
+            assert folded.biases is policy.biases and not folded.bias_error.any()
+
+
 @pytest.mark.parametrize("squash", ["tanh", "identity"])
 def test_without_centring_nothing_is_folded(squash: str) -> None:
     policy = Policy((np.array([[2.0, -1.0]]),), (np.zeros(1),), np.array([3.0]), np.array([0.5]), squash, "none")

@@ -32,6 +32,7 @@ from hypothesis import strategies as st
 
 import certify.checker
 from certify.checker import network, rules
+from certify.checker.document import Policy
 from certify.checker.errors import Rejected
 from certify.checker.rules import Tally
 from tests.checker_certificates import (
@@ -196,7 +197,7 @@ def array(path: str, change: Callable[[np.ndarray], np.ndarray]) -> Edit:
     return lambda data: edited(data, path, lambda text: encode(change(decode(text))))
 
 
-def policy(path: str, value: Any) -> Edit:
+def rehashed(path: str, value: Any) -> Edit:
     """An edit of the policy by someone who knows how to hash it."""
     return lambda data: rehash(edited(data, f"policy.{path}", value))
 
@@ -247,17 +248,17 @@ MUTANTS: list[tuple[str, str, str, Edit]] = [  # rule, base, what, edit
     ("format", "scalar", "schema", at("schema", "certify-certificate/2")),
     ("format", "scalar", "state not in the equations", at("plant.states", ["y"])),
     ("format", "scalar", "input not in the equations", at("plant.inputs", ["v"])),
-    ("format", "scalar", "shape", policy("layers.0.shape", [1, 2])),
+    ("format", "scalar", "shape", rehashed("layers.0.shape", [1, 2])),
     ("format", "scalar", "state named as an input", at("plant.states", ["u"])),
     ("format", "scalar", "name", at("plant.name", "two words")),
     ("format", "scalar", "one equation too many", at("plant.dynamics", lambda d: d * 2)),
     ("format", "scalar", "one equilibrium input too many", at("plant.u_eq", ["0", "0"])),
     ("format", "scalar", "empty domain", at("plant.domain", [["3", "3"]])),
     ("format", "scalar", "empty input bounds", at("plant.input_bounds", [["1", "-1"]])),
-    ("format", "scalar", "no layers", policy("layers", [])),
+    ("format", "scalar", "no layers", rehashed("layers", [])),
     ("format", "scalar", "squash", at("policy.squash", "relu")),
-    ("format", "scalar", "identity with preactivation", policy("squash", "identity")),
-    ("format", "scalar", "centre", policy("centre", "input")),
+    ("format", "scalar", "identity with preactivation", rehashed("squash", "identity")),
+    ("format", "scalar", "centre", rehashed("centre", "input")),
     ("format", "scalar", "scale of zero", policy_array("scale", lambda a: 0 * a)),
     ("format", "scalar", "scale of minus zero", policy_array("scale", lambda a: -0.0 * np.abs(a))),
     ("format", "scalar", "infinite weight", policy_array("layers.0.weight", lambda a: a * np.inf)),
@@ -298,15 +299,17 @@ MUTANTS: list[tuple[str, str, str, Edit]] = [  # rule, base, what, edit
     ("equilibrium", "scalar", "numbers without end", at(
         "plant.dynamics.0", ["*", "x", ["**", ["**", ["**", ["**", ["+", "u", "3/2"], 64], 64], 64], 64]])),
     ("centring", "scalar, no centring", "bias", policy_array("layers.0.bias", lambda a: a + 2.0**-1074)),
-    ("centring", "scalar", "centring left out", policy("centre", "none")),
+    ("centring", "scalar", "centring left out", rehashed("centre", "none")),
     ("centring", "scalar, no centring", "offset", policy_array("offset", lambda a: a + 1e-9)),
-    ("centring", "rotor", "no centring", policy("centre", "none")),
+    ("centring", "rotor", "no centring", rehashed("centre", "none")),
     ("centring", "rotor, preactivation", "u_eq at the end of the range", policy_array("scale", lambda a: 0 * a + 0.5)),
     ("centring", "rotor, preactivation", "u_eq out of the range", policy_array("scale", lambda a: 0 * a - 0.25)),
     ("centring", "scalar", "offset out of reach", policy_array("offset", lambda a: a + 2)),
     ("domain", "scalar", "left", at("plant.domain", [["-187/100", "3"]])),
     ("domain", "scalar", "right", at("plant.domain", [["-3", "187/100"]])),
     ("domain", "scalar", "without the origin", at("plant.domain", [["1/10", "30"]])),
+    ("domain", "scalar", "to the right of the origin", at("plant.domain", [["5", "30"]])),
+    ("domain", "scalar", "to the left of the origin", at("plant.domain", [["-30", "-5"]])),
     ("domain", "scalar", "origin at its edge", at("plant.domain", [["0", "30"]])),
     ("domain", "linear", "second axis", at("plant.domain.1", ["-4", "38/10"])),
     ("coordinates", "linear", "T singular", array("evidence.T", lambda a: a * [1, 1, 0, 0])),
@@ -489,6 +492,16 @@ FALSE: list[tuple[str, str, Document, float]] = [  # rule, what, certificate, po
 def test_false_claims_are_rejected(rule: str, data: Document, x: float) -> None:
     assert is_refuted_at(data, [x])
     assert verdict(data) == rule
+
+
+def test_the_interior_is_open_and_the_root_box_is_closed() -> None:
+    data = grow(scalar_claim(c2=2.25))
+    assert decode(data["evidence"]["root"])[0] == 1.5  # touches {V <= c2}
+    assert verdict(data) == "ACCEPTED"
+    assert verdict(edited(data, "plant.domain", [["-3/2", "3"]])) == "domain"
+    assert verdict(edited(data, "plant.domain", [["-3", "3/2"]])) == "domain"
+    barely = "1500000000000000000000000000001/1000000000000000000000000000000"
+    assert verdict(edited(data, "plant.domain", [["-" + barely, barely]])) == "ACCEPTED"
 
 
 def test_no_tree_helps_a_claim_beyond_the_region_of_attraction() -> None:
@@ -695,6 +708,37 @@ def test_with_one_rule_disabled_a_bad_certificate_gets_through(
 
 def test_every_rule_is_disabled_once() -> None:
     assert set(ABLATED) == {rule for rule, *_ in MUTANTS}
+
+
+@pytest.mark.parametrize(
+    ("hidden", "weight", "last", "squash", "offset", "u_eq", "known"),
+    [
+        (0.0, 2.0, 0.0, "tanh", 0.25, Fraction(1, 4), True),
+        (0.0, 2.0, 0.5, "identity", 0.25, Fraction(7, 4), True),
+        (0.5, 0.0, 0.0, "tanh", 0.0, Fraction(0), True),  # 0 times an unknown number
+        (0.5, 0.0, 0.5, "identity", 0.0, Fraction(3, 2), True),
+        (0.0, 2.0, 0.0, "tanh", 0.25, Fraction(1, 3), False),
+        (0.0, 2.0, 2.0**-1074, "tanh", 0.0, Fraction(0), False),
+        (0.5, 1.0, 0.0, "tanh", 0.0, Fraction(0), False),  # an unknown number is not 0
+        (0.5, 1.0, 0.0, "identity", 0.0, Fraction(0), False),
+        (0.5, 1.0, -0.5, "identity", 0.0, Fraction(0), False),  # tanh(1/2) is not 1/2
+        (0.0, 1.0, 0.5, "tanh", -1.5, Fraction(0), False),
+        (0.5, 1.0, float(-np.tanh(0.5)), "identity", 0.0, Fraction(0), False),  # nearly
+    ],
+)
+def test_without_centring_the_equilibrium_is_decided_exactly(
+    hidden: float, weight: float, last: float, squash: str, offset: float, u_eq: Fraction, known: bool
+) -> None:
+    policy = Policy(
+        (np.ones((1, 1)), np.full((1, 1), weight)), (np.full(1, hidden), np.full(1, last)), np.full(1, 3.0),
+        np.full(1, offset), squash, "none",
+    )  # fmt: skip
+    if known:
+        assert network.fold(policy, (u_eq,)).offset is policy.offset
+    else:
+        with pytest.raises(Rejected) as no:
+            network.fold(policy, (u_eq,))
+        assert no.value.rule == "centring"
 
 
 def test_a_leaf_that_overflows_is_never_accepted() -> None:
