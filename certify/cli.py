@@ -23,6 +23,7 @@ import typer
 from certify.errors import BackendError, CertificateFormatError, CertifyError, InputError, SoundnessError
 
 if TYPE_CHECKING:
+    from certify.engines.branch_and_bound import RingProgress
     from certify.policies import Policy
     from certify.systems import System
 
@@ -292,9 +293,12 @@ def _describe(s: System) -> dict[str, Any]:
 
 
 def _write(path: Path, text: str) -> None:
+    partial = path.with_name(path.name + ".partial")
     try:
-        path.write_text(text, encoding="utf-8")
+        partial.write_text(text, encoding="utf-8")
+        partial.replace(path)
     except OSError as error:
+        partial.unlink(missing_ok=True)
         raise InputError(f"{path} cannot be written: {error.strerror}.") from error
 
 
@@ -308,6 +312,14 @@ def _tell(line: str) -> None:
     sys.stderr.write(line + "\n")
 
 
+def _ring_line(state: RingProgress) -> str:
+    left = "" if state.seconds_left is None else f", about {state.seconds_left:.0f} s left"
+    return (
+        f"ring: proved to V <= {state.level:.4g} of {state.target:.4g} ({state.proved:.1%} of the volume), "
+        f"{state.boxes} boxes, {state.open} open{left}"
+    )
+
+
 class _Progress:
     """A line on standard error, at most five times a second, only on a terminal."""
 
@@ -315,7 +327,7 @@ class _Progress:
         self.last = 0.0
         self.shown = False
 
-    def __call__(self, stage: str, level: float, boxes: int) -> None:
+    def __call__(self, stage: str, state: RingProgress | None) -> None:
         if stage == "check":  # the checker works in a process of its own: load the drawing libraries meanwhile
             from certify.report import warm_up
 
@@ -323,7 +335,7 @@ class _Progress:
         now = time.monotonic()
         if sys.stderr.isatty() and now - self.last > 0.2:
             self.last, self.shown = now, True
-            sys.stderr.write(f"\r{stage}: proved to V <= {level:.6g}, {boxes} boxes\x1b[K")
+            sys.stderr.write(f"\r{_ring_line(state) if state is not None else 'checking'}\x1b[K")
             sys.stderr.flush()
 
     def close(self) -> None:

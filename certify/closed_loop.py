@@ -6,7 +6,7 @@ Floating-point values (numpy) serve the search; `evaluate_vdot` and `jacobian` i
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any
 
@@ -25,7 +25,7 @@ PRECISION = 200  # bits of Arb
 
 @dataclass(frozen=True, slots=True)
 class ClosedLoop:
-    """A plant under a tanh policy.
+    """A plant under a tanh policy; `u_eq` is the exact equilibrium input, `folded` the policy without its centring.
 
     Raises
     ------
@@ -35,6 +35,8 @@ class ClosedLoop:
 
     system: System
     network: TanhNetwork
+    u_eq: tuple[Fraction, ...] = field(init=False, repr=False, compare=False)
+    folded: TanhNetwork = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         system, network = self.system, self.network
@@ -53,9 +55,9 @@ class ClosedLoop:
                     f"f(0, u_eq) must be exactly 0; {name}' = {value} at the origin of {system.name}. "
                     "Shift the states or correct u_eq."
                 )
-        if network.centre == "preactivation":
-            network.beta(u_eq)
-        elif network.centre == "none":
+        object.__setattr__(self, "u_eq", u_eq)
+        object.__setattr__(self, "folded", network.folded(u_eq))
+        if network.centre == "none":
             raw = network(np.zeros(network.n), u_eq)
             if not np.allclose(raw, [float(u) for u in u_eq], rtol=1e-9, atol=1e-9):
                 raise InputError(
@@ -63,14 +65,9 @@ class ClosedLoop:
                     "Use centre 'output' or 'preactivation'."
                 )
 
-    @property
-    def u_eq(self) -> tuple[Fraction, ...]:
-        """The equilibrium input, exact."""
-        return self.system.exact_u_eq()
-
     def policy(self, x: Any) -> Any:
         """pi(x) in float64, (..., n) to (..., m)."""
-        return self.network(x, self.u_eq)
+        return self.folded(x, self.u_eq)
 
     def linearise(self) -> tuple[Array, Array, Array]:
         """(A, B, K) in float64: `A = df/dx - B K` the closed loop's Jacobian, K = -J_pi(0)."""

@@ -14,14 +14,14 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from certify.certificate import Certificate, write_certificate
 from certify.closed_loop import ClosedLoop
-from certify.engines.falsify import Witness, descend, falsify
+from certify.engines.falsify import Witness, falsify
 from certify.engines.local import prove_local
 from certify.errors import BackendError, InputError, SoundnessError
 from certify.lyapunov import diagonalising_coordinates, domain_limit, extents, semi_axes, solve_lyapunov, volume
@@ -30,9 +30,12 @@ from certify.policies import TanhNetwork
 from certify.systems import System
 from certify.verdict import Verdict
 
+if TYPE_CHECKING:
+    from certify.engines.branch_and_bound import RingProgress
+
 Array = NDArray[np.float64]
 Candidate = Literal["lyapunov", "lqr"]
-Progress = Callable[[str, float, int], None]
+Progress = Callable[[Literal["ring", "check"], "RingProgress | None"], None]
 _SMALL_NETWORK = 10_000  # weights
 _BELOW = 1e-9  # relative distance from a limit that is itself out of reach (the domain's open condition)
 
@@ -161,7 +164,7 @@ def certify_roa(
     options : see `RoaOptions`.
     load_seconds : time already spent on reading, for the report.
     provenance : entries for the certificate that the checker ignores.
-    progress : called with (stage, level proved so far, boxes); stages are `ring` and `check`.
+    progress : called with ("ring", where the pass stands) after every batch, and with ("check", None).
 
     Returns
     -------
@@ -243,13 +246,11 @@ def _certify(
         ring = prove_ring(
             obligations, inner, top, Budget(boxes=options.max_boxes, seconds=options.time_limit),
             torch.device(options.device),
-            None if progress is None else lambda level, boxes: progress("ring", level, boxes),
+            None if progress is None else lambda state: progress("ring", state),
         )  # fmt: skip
-    if ring.witness is not None:
-        lower = descend(obligations, ring.witness)
-        if lower is not None and (witness is None or lower.level < witness.level):
-            witness = lower
-            levels["sampled_limit"] = lower.level
+    if ring.witness is not None and (witness is None or ring.witness.level < witness.level):
+        witness = ring.witness
+        levels["sampled_limit"] = witness.level
     if options.level is not None and ring.level < options.level:
         levels["local"] = inner
         if witness is not None and witness.level <= options.level:
@@ -264,17 +265,22 @@ def _certify(
     certificate = Certificate(
         system, network, P, obligations.T, ring.root, inner, ring.level, ring.tree, provenance or {}
     )
-    path = out / "certificate.json"
+    path, unchecked = out / "certificate.json", out / "certificate.unchecked.json"
     with watch.stage("write"):
-        write_certificate(path, certificate)
+        write_certificate(unchecked, certificate)
     if progress is not None:
-        progress("check", ring.level, ring.boxes)
-    with watch.stage("check"):
-        answer = run_checker(path)
+        progress("check", None)
+    try:
+        with watch.stage("check"):
+            answer = run_checker(unchecked)
+    except KeyboardInterrupt:
+        unchecked.unlink()
+        raise
     if answer["result"] != "ACCEPTED":
         raise SoundnessError(
-            f"the checker rejects what the engine proved: {answer}. The certificate {path} reproduces it."
+            f"the checker rejects what the engine proved: {answer}. The certificate {unchecked} reproduces it."
         )
+    unchecked.replace(path)
     return RoaResult(
         Verdict.PROVED, reason, system, network, P, levels, witness,
         boxes=ring.boxes, leaves=ring.leaves, seconds=watch.total(), certificate=path, checker=answer,

@@ -18,10 +18,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from flint import arb, fmpq
 
 from certify.checker import document, exact, network, rules
-from certify.checker.document import Certificate, Policy
+from certify.checker.document import Certificate
 from certify.checker.errors import Rejected
 from certify.checker.float64 import total, up
 
@@ -182,9 +181,10 @@ def grow(data: Document, max_leaves: int = 5000, depth: int = 40) -> Document:
 def passes(ring: rules._Ring, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
     """The rule for a leaf, box by box, lo and hi (n, B)."""
     centre = 0.5 * lo + 0.5 * hi
-    x, error = ring._states(centre, up(np.maximum(hi - centre, centre - lo)))
+    radius = up(np.maximum(hi - centre, centre - lo))
+    x, error = ring._states(centre, radius)
     mid, slopes, wide = network.enclose_on_boxes(ring.net, x, error)
-    good = ring._vdot(x, error, mid, slopes, wide) < 0
+    good = ring._bound(ring._vdot(x, error, mid, slopes, wide), centre, radius) < 0
     if not ring.bounded:
         for j, bounds in enumerate(ring.c.input_bounds):
             good &= rules._within(bounds, mid[j], up(total(np.abs(slopes[j]), 0) + wide[j]))
@@ -214,28 +214,3 @@ def write(data: Document | bytes, folder: Path) -> Path:
     path = folder / "certificate.json"
     path.write_bytes(data if isinstance(data, bytes) else dump(data))
     return path
-
-
-def policy_in_arb(policy: Policy, u_eq: Sequence[Fraction], x: Sequence[arb]) -> list[arb]:
-    """pi(x) in ball arithmetic at the current precision, by the words of FORMAT.md."""
-
-    def net(h: list[arb]) -> list[arb]:
-        for k, (W, b) in enumerate(zip(policy.weights, policy.biases, strict=True)):
-            h = [v.tanh() for v in h] if k else h
-            h = [
-                sum((arb(w) * v for w, v in zip(row, h, strict=True)), arb(bias))
-                for row, bias in zip(W.tolist(), b.tolist(), strict=True)
-            ]
-        return h
-
-    y, y0 = net(list(x)), net([arb(0)] * len(x))
-    eq = [arb(fmpq(q.numerator, q.denominator)) for q in u_eq]
-    scale, offset = ([arb(v) for v in a.tolist()] for a in (policy.scale, policy.offset))
-    result = []
-    for j in range(len(y)):
-        if policy.centre == "preactivation":
-            result.append(scale[j] * (y[j] - y0[j] + ((eq[j] - offset[j]) / scale[j]).atanh()).tanh() + offset[j])
-            continue
-        h, h0 = (y[j].tanh(), y0[j].tanh()) if policy.squash == "tanh" else (y[j], y0[j])
-        result.append(scale[j] * (h - h0) + eq[j] if policy.centre == "output" else scale[j] * h + offset[j])
-    return result

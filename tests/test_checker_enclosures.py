@@ -14,7 +14,7 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from flint import arb, ctx, fmpq
+from flint import arb, ctx
 from hypothesis import example, given
 from hypothesis import strategies as st
 
@@ -37,7 +37,7 @@ from certify.checker.float64 import (
 from certify.checker.local import Jet, JetAlgebra
 from certify.checker.network import enclose_at_origin, enclose_on_boxes, fold, relax_tanh
 from certify.checker.taylor import Taylor, TaylorAlgebra, upper_bound
-from tests.checker_certificates import policy_in_arb
+from tests.oracle import awkward, ball, certainly_within, policy_in_arb
 
 FLOATS = st.floats(allow_nan=False, allow_infinity=False)
 MAGNITUDES = st.floats(min_value=0.0, allow_nan=False, allow_infinity=False)
@@ -50,24 +50,7 @@ def _quiet() -> Iterator[None]:
         yield
 
 
-def certainly_within(value: arb, centre: float, bound: float) -> bool:
-    return bool(abs(value - arb(float(centre))) <= arb(float(bound)))
-
-
-def ball(q: Fraction) -> arb:
-    return arb(fmpq(q.numerator, q.denominator))
-
-
 # ------------------------------------------------------------------------------------------------ elementary functions
-
-
-def awkward(end: float) -> np.ndarray:
-    """Grid points, midpoints between them, the table's end and their neighbours; subnormals, huge numbers, zeros."""
-    grid = np.arange(int(end * 64) + 3) / 64
-    special = [5e-324, 1e-310, 2.0**-1022, 2.0**-600, 2.0**-30, end, 2 * end, 1e9, 2.0**60, 1e300, np.finfo(float).max]
-    points = np.concatenate([grid, special])
-    points = np.concatenate([points, np.nextafter(points, 0.0), np.nextafter(points, 1e308), [0.0]])
-    return np.concatenate([points, -points])
 
 
 def drawn(count: int, end: float, seed: int) -> np.ndarray:
@@ -104,18 +87,6 @@ def test_sin_cos() -> None:
     assert_sin_cos_enclose(awkward(64.0))
     with ctx.workprec(200):
         assert_sin_cos_enclose(drawn(10_000, 64.0, 2))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("batch", range(10))
-def test_elementary_functions_at_length(batch: int) -> None:
-    assert_tanh_encloses(drawn(100_000, 20.0, 100 + batch))
-    points = drawn(100_000, 64.0, 200 + batch)
-    s, c, e = sin_cos(points)
-    with ctx.workprec(200):
-        for y, sine, cosine, error in zip(points.tolist(), s.tolist(), c.tolist(), e.tolist(), strict=True):
-            x = arb(y)
-            assert certainly_within(x.sin(), sine, error) and certainly_within(x.cos(), cosine, error), y.hex()
 
 
 def test_elementary_functions_are_narrow() -> None:

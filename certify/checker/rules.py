@@ -199,7 +199,7 @@ class _Ring:
                 if not np.all(kept):
                     leaf = first + int(inside[np.argmin(kept)])
                     raise Rejected("inputs", f"leaf {leaf}", f"{self.c.inputs[j]} may leave its bounds")
-        bound = self._vdot(x, error, mid, slopes, wide)
+        bound = self._bound(self._vdot(x, error, mid, slopes, wide), centre, radius)
         good = bound < 0
         if not np.all(good):
             worst = int(np.argmin(good))
@@ -213,8 +213,7 @@ class _Ring:
         far = np.maximum(np.abs(lo), np.abs(hi))
         near = np.where((lo <= 0) & (hi >= 0), 0.0, np.minimum(np.abs(lo), np.abs(hi)))
         value, error = self.S_diagonal[:, :1], self.S_diagonal[:, 1:]
-        cross = total(self.S_cross[:, :, None] * far[:, None] * far[None, :], 0)
-        cross = up(total(cross, 0) + total(error * far * far, 0))
+        cross = up(self._cross(far) + total(error * far * far, 0))
         least = np.sum(value * near * near, axis=0) * (1 - gamma(self.n + 4)) - cross - 2.0**-960
         most = up(total(value * far * far, 0) + cross)
         least = least - EPS * np.abs(least) - EPS * cross
@@ -228,8 +227,39 @@ class _Ring:
         error = gamma(self.n) * norm(T, 1)[:, None] * norm(centre, 0) + EPS * total(np.abs(slopes), 1)
         return x, np.asarray(up(error))
 
-    def _vdot(self, x: Array, error: Array, mid: Array, slopes: Array, wide: Array) -> Array:
-        """Upper bound of Vdot = (2 P x)'f(x, u) on the boxes; symbols: n box coordinates, m input errors."""
+    def _bound(self, vdot: Taylor, centre: Array, radius: Array) -> Array:
+        """Upper bound of Vdot on the part of each box that lies in the ring.
+
+        There c2 - V and V - c1 are not negative, so Vdot is at most Vdot + k (c2 - V), and at most Vdot + k (V - c1),
+        for any k >= 0.
+        """
+        bound = upper_bound(vdot)
+        for level, sign in ((self.c.c2, 1.0), (self.c.c1, -1.0)):
+            open_ = np.flatnonzero(np.logical_not(bound < 0))
+            gap, part = self._gap(centre[:, open_], radius[:, open_], level, sign), vdot.at(open_)
+            k = _multiplier(part.g[: self.n], gap.g[: self.n], gap.c)
+            bound[open_] = np.fmin(bound[open_], upper_bound(part + gap.scaled(k, 0.0)))
+        return bound
+
+    def _gap(self, centre: Array, radius: Array, level: float, sign: float) -> Taylor:
+        """sign (level - V) on the boxes, which is not negative on the part of a leaf that lies in the ring."""
+        far = up(np.abs(centre) + radius)
+        value, error = self.S_diagonal[:, :1], self.S_diagonal[:, 1:]
+        size = up(level + total(value * far * far, 0))
+        g = np.zeros((self.n + self.m, centre.shape[1]))
+        Q = np.zeros((self.n + self.m, *g.shape))
+        g[: self.n] = -2 * sign * value * centre * radius
+        for i in range(self.n):
+            Q[i, i] = -sign * value[i] * radius[i] * radius[i]
+        c = sign * (level - np.sum(value * centre * centre, axis=0))
+        return Taylor(c, g, Q, up(self._cross(far) + total(error * far * far, 0) + gamma(self.n + 8) * size))
+
+    def _cross(self, far: Array) -> Array:
+        """Upper bound of what the off-diagonal part of S adds to V in magnitude where |z| <= far."""
+        return np.asarray(total(total(self.S_cross[:, :, None] * far[:, None] * far[None, :], 0), 0))
+
+    def _vdot(self, x: Array, error: Array, mid: Array, slopes: Array, wide: Array) -> Taylor:
+        """Vdot = (2 P x)'f(x, u) on the boxes; symbols: n box coordinates, m input errors."""
         n, m, batch = self.n, self.m, x.shape[2]
         algebra = TaylorAlgebra(n + m, batch)
         variables = []
@@ -245,7 +275,18 @@ class _Ring:
         for i in range(n):
             gradient = [variables[j].scaled(2 * float(self.c.P[i, j]), 0.0) for j in range(n)]
             terms.append(_sum(gradient) * F[i])
-        return upper_bound(_sum(terms))
+        return _sum(terms)
+
+
+def _multiplier(a: Array, b: Array, c: Array) -> Array:
+    """The k >= 0 that minimises `c k + sum_i |a_i + k b_i|`, shape (B,): it is 0 or lies where a term vanishes.
+
+    Any number k >= 0 would do for the proof; an infinite one or NaN makes the bound NaN.
+    """
+    k = np.maximum(np.where(b != 0, -a / b, 0.0), 0.0)
+    value = c * k + np.sum(np.abs(a[:, None] + k * b[:, None]), axis=0)
+    best = np.argmin(value, axis=0)
+    return np.asarray(np.take_along_axis(k, best[None], 0)[0])
 
 
 def _sum(models: list[Taylor]) -> Taylor:

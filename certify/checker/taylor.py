@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
+from numpy.typing import NDArray
 
 from .float64 import EPS, Array, float_with_error, gamma, sin_cos, total, up
 
@@ -43,9 +44,13 @@ class Taylor:
             up(self.r + other.r + EPS * (_size(self) + _size(other))),
         )
 
-    def scaled(self, value: float, error: float) -> Taylor:
-        """Product with a constant in value +- error."""
-        size, k = _size(self), abs(value)
+    def at(self, index: NDArray[np.intp]) -> Taylor:
+        """The models of some members of the batch."""
+        return Taylor(self.c[index], self.g[:, index], self.Q[:, :, index], self.r[index])
+
+    def scaled(self, value: float | Array, error: float) -> Taylor:
+        """Product with a constant in value +- error; `value` may differ over the batch (B,)."""
+        size, k = _size(self), np.abs(value)
         return Taylor(
             value * self.c, value * self.g, value * self.Q, up(k * self.r + error * (size + self.r) + EPS * k * size)
         )

@@ -22,7 +22,8 @@ class PolicyEnclosure:
     """Affine enclosures of pi over batches of boxes, on the device that holds its weights."""
 
     def __init__(self, loop: ClosedLoop, device: torch.device) -> None:
-        network = loop.network
+        # Centring is folded into the last bias or the offset; their roundings are far below what `error` allows.
+        network = loop.folded
 
         def tensor(array: object) -> Tensor:
             return torch.tensor(array, dtype=torch.float64, device=device)
@@ -34,13 +35,6 @@ class PolicyEnclosure:
         self.norms = [float(torch.linalg.matrix_norm(w, 2)) * min(w.shape) ** (1 / 128) for w in self.weights]
         self.squash = network.squash == "tanh"
         self.scale, self.offset = tensor(network.scale), tensor(network.offset)
-        origin = torch.zeros(network.n, dtype=torch.float64, device=device)
-        u_eq = tensor([float(u) for u in loop.u_eq])
-        if network.centre == "preactivation":
-            self.biases[-1] = self.biases[-1] - network.net(origin) + tensor(network.beta(loop.u_eq))
-        elif network.centre == "output":
-            last = network.net(origin)
-            self.offset = u_eq - self.scale * (last.tanh() if self.squash else last)
 
     def __call__(self, x: Tensor, x_error: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Enclose the policy for states `x[:, 0] + x[:, 1:] d` within x_error.

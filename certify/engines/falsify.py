@@ -1,8 +1,8 @@
 """The falsifier: the lowest V at which Vdot >= 0, or at which the input leaves its bounds.
 
-Samples of the ellipsoid are improved by descending V along Vdot >= 0: a violating point is scaled towards the origin as
-far as it stays violating, and a gradient step on Vdot moves it to where it can be scaled further. A reported
-witness is shown in Arb; the search itself proves nothing.
+Violating samples of the ellipsoid are improved by descending V along Vdot = 0, each on its own so that they end in
+different valleys: a gradient step on Vdot along the sphere V = const makes room, and the point is scaled towards the
+origin as far as it stays violating. A reported witness is shown in Arb; the search itself proves nothing.
 """
 
 from __future__ import annotations
@@ -65,6 +65,12 @@ class _Search:
         self.obligations = obligations
         self.loop = obligations.loop
         self.f = self.loop.system.function("torch")
+        network = self.loop.folded
+        self.layers = [
+            (torch.tensor(W.T.copy()), torch.tensor(b)) for W, b in zip(network.weights, network.biases, strict=True)
+        ]
+        self.squash = network.squash == "tanh"
+        self.scale, self.offset = torch.tensor(network.scale), torch.tensor(network.offset)
         self.P, self.T = (torch.tensor(a, dtype=torch.float64) for a in (obligations.P, obligations.T))
         bounds = self.loop.system.input_bounds
         self.lo = torch.tensor([float(b[0]) for b in bounds], dtype=torch.float64)
@@ -74,7 +80,10 @@ class _Search:
     def violation(self, z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """(Vdot, how far the worst input lies outside its bounds) at x = T z, shapes (B,)."""
         x = z @ self.T.T
-        u = self.loop.policy(x)
+        h = x
+        for k, (W, b) in enumerate(self.layers):
+            h = torch.addmm(b, h.tanh() if k else h, W)
+        u = self.scale * (h.tanh() if self.squash else h) + self.offset
         vdot = 2 * ((x @ self.P) * self.f(x, u)).sum(-1)
         return vdot, torch.maximum(self.lo - u, u - self.hi).amax(-1)
 
@@ -89,19 +98,24 @@ class _Search:
             z = z[self.bad(z)]
         if len(z) == 0:
             return None
-        best = torch.inf
         with torch.no_grad():
-            z = self._lowest_few(self._shrink(z, halvings=8), 256)
-        for _ in range(40):
+            z = self._lowest_few(self._shrink(self._lowest_few(z, 2048), torch.ones(()), halvings=8), 32)
+        step = torch.full((len(z), 1), 0.3, dtype=torch.float64)
+        for _ in range(60):
+            uphill = self._uphill(z)
             with torch.no_grad():
-                z = self._lowest_few(self._shrink(z, halvings=24), 64)
-            lowest = float((z[0] * z[0]).sum())
-            if lowest > best * (1 - 1e-7):
+                norm = z.norm(dim=-1, keepdim=True)
+                moved = z + step * norm * uphill
+                moved = moved * (norm / moved.norm(dim=-1, keepdim=True))
+                bad = self.bad(moved)[:, None]
+                moved = torch.where(bad, self._shrink(moved, (4 * step).clamp(max=1.0), halvings=10), z)
+                better = moved.norm(dim=-1, keepdim=True) < norm
+                z = torch.where(better, moved, z)
+                step = torch.where(better, 1.5 * step, 0.4 * step).clamp(max=0.5)
+            if float(step.max()) < 1e-7:
                 break
-            best = lowest
-            z = self._slide(z)
         with torch.no_grad():
-            z = self._lowest_few(self._shrink(z, halvings=50), 64)
+            z = self._lowest_few(self._shrink(z, torch.ones(()), halvings=50), 32)
         # The binary64 state is what counts: pull outwards until the violation is certain there.
         for point in z:
             for factor in (1.0, 1 + 1e-12, 1 + 1e-9, 1 + 1e-6):
@@ -133,28 +147,26 @@ class _Search:
     def _lowest_few(self, z: torch.Tensor, count: int) -> torch.Tensor:
         return z[torch.argsort((z * z).sum(-1), stable=True)][:count]
 
-    def _shrink(self, z: torch.Tensor, halvings: int) -> torch.Tensor:
-        """Scale each violating point to the smallest violating multiple found by bisection."""
-        low, high = torch.zeros(len(z), 1, dtype=z.dtype), torch.ones(len(z), 1, dtype=z.dtype)
+    def _shrink(self, z: torch.Tensor, share: torch.Tensor, halvings: int) -> torch.Tensor:
+        """Scale violating points down to where they just violate, by bisection, but by `share` (B, 1) at most."""
+        high = torch.ones(len(z), 1, dtype=z.dtype)
+        low = high - share
+        whole = self.bad(low * z)[:, None] & (low > 0)
+        least = low
         for _ in range(halvings):
             middle = (low + high) / 2
             bad = self.bad(middle * z)[:, None]
             low, high = torch.where(bad, low, middle), torch.where(bad, middle, high)
-        return high * z
+        return torch.where(whole, least, high) * z
 
-    def _slide(self, z: torch.Tensor) -> torch.Tensor:
-        """Move along the sphere in the direction that raises the violation; keep only points that stay bad."""
+    def _uphill(self, z: torch.Tensor) -> torch.Tensor:
+        """Unit directions (B, n), tangent to the sphere, in which the violation grows fastest."""
         z = z.detach().requires_grad_(True)
         vdot, excess = self.violation(z)
         value = torch.where(vdot >= 0, vdot, excess) if self.check_inputs else vdot
         (gradient,) = torch.autograd.grad(value.sum(), z)
         with torch.no_grad():
-            norm = z.norm(dim=-1, keepdim=True)
-            tangent = gradient - (gradient * z).sum(-1, keepdim=True) / norm**2 * z
-            tangent = tangent / (tangent.norm(dim=-1, keepdim=True) + 1e-300)
-            candidates = [z.detach()]
-            for size in (0.3, 0.1, 0.03, 0.01, 1e-3, 1e-4):
-                moved = z + size * norm * tangent
-                moved = moved * (norm / moved.norm(dim=-1, keepdim=True))
-                candidates.append(moved[self.bad(moved)])
-            return torch.cat(candidates)
+            z = z / z.norm(dim=-1, keepdim=True)
+            tangent = gradient - (gradient * z).sum(-1, keepdim=True) * z
+            unit: torch.Tensor = tangent / (tangent.norm(dim=-1, keepdim=True) + 1e-300)
+            return unit

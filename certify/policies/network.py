@@ -128,17 +128,22 @@ class TanhNetwork:
 
     def __call__(self, x: Any, u_eq: Sequence[Fraction]) -> Any:
         """pi(x) in float64, shape (..., n) to (..., m); for simulation and search, not for proofs."""
-        scale, offset = _like(self.scale, x), _like(self.offset, x)
+        if self.centre != "none":
+            return self.folded(u_eq)(x, u_eq)
         y = self.net(x)
+        return _like(self.scale, x) * (_tanh(y) if self.squash == "tanh" else y) + _like(self.offset, x)
+
+    def folded(self, u_eq: Sequence[Fraction]) -> TanhNetwork:
+        """A network without centring that is pi up to rounding: for search and simulation."""
         if self.centre == "none":
-            return scale * (_tanh(y) if self.squash == "tanh" else y) + offset
-        y0 = self.net(x[..., :1, :] * 0 if x.ndim > 1 else x * 0)
+            return self
+        biases, offset = list(self.biases), self.offset
+        y = self.net(np.zeros(self.n))
         if self.centre == "preactivation":
-            return scale * _tanh(y - y0 + _like(self.beta(u_eq), x)) + offset
-        equilibrium = _like(np.array([float(u) for u in u_eq]), x)
-        if self.squash == "tanh":
-            y, y0 = _tanh(y), _tanh(y0)
-        return scale * (y - y0) + equilibrium
+            biases[-1] = biases[-1] - y + self.beta(u_eq)
+        else:
+            offset = np.array([float(u) for u in u_eq]) - self.scale * (np.tanh(y) if self.squash == "tanh" else y)
+        return TanhNetwork(self.weights, tuple(biases), self.scale, offset, self.squash, "none")
 
     def jacobian_at_origin(self, u_eq: Sequence[Fraction]) -> Array:
         """`d pi / d x` at 0 in float64, shape (m, n)."""
