@@ -35,6 +35,9 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
+_INTERRUPTED = 130
+_STOPPED = "interrupted; nothing was left half-written."
+
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
 
 
@@ -188,13 +191,15 @@ def _run(arguments: list[str], as_json: bool) -> int:
     command = typer.main.get_command(app)
     try:
         status = command.main(arguments, prog_name="certify", standalone_mode=False)
+        if status == _INTERRUPTED:  # what typer makes of Ctrl-C
+            return _fail(as_json, _STOPPED, _INTERRUPTED)
         return status if isinstance(status, int) else 0
     except typer.Exit as stop:
         return stop.exit_code
     except typer.TyperException as error:  # usage
         return _fail(as_json, error.format_message() if hasattr(error, "format_message") else str(error), 2)
     except (typer.Abort, KeyboardInterrupt):
-        return _fail(as_json, "interrupted; nothing was left half-written.", 130)
+        return _fail(as_json, _STOPPED, _INTERRUPTED)
     except (SoundnessError, BackendError) as error:
         return _fail(as_json, f"internal error: {error}", 70)
     except CertifyError as error:

@@ -14,7 +14,7 @@ import pytest
 import sympy
 
 from certify.certificate import read_certificate
-from certify.certificate.expression import from_tree, to_tree
+from certify.systems.trees import from_tree, to_tree
 from certify.errors import CertificateFormatError
 from certify.roa import certify_roa, run_checker
 from certify.systems import available_systems, get_system

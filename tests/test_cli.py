@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -242,3 +243,35 @@ def test_the_installed_command(tmp_path: Path) -> None:
     data: dict[str, Any] = json.loads(done.stdout)
     assert data["policy"]["sha256"] == load_policy(SHIPPED).network.sha256()
     assert data["reason"] in ("domain", "witness", "inputs")
+
+
+@pytest.mark.parametrize("where", ["ring", "check"])
+def test_an_interrupt_leaves_nothing_half_written(
+    where: str, tmp_path: Path, policy_file: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from certify.engines.vdot import VdotBound
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    if where == "ring":
+        monkeypatch.setattr(VdotBound, "__call__", interrupt)
+    else:
+        monkeypatch.setattr("certify.roa.run_checker", interrupt)
+    status, out, err = run(capsys, "roa", "--policy", policy_file, "--out", tmp_path / "o")
+    assert status == 130 and out == "" and "interrupted" in err
+    assert list((tmp_path / "o").iterdir()) == []
+
+
+def test_control_c_ends_a_running_command(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "certify", "roa", "--policy", str(SHIPPED.with_name("cartpole.pt"))]
+    running = subprocess.Popen(
+        [*command, "--out", str(tmp_path / "o")], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert running.stderr is not None
+    assert "cartpole" in running.stderr.readline()  # the plant is known, the proof begins
+    running.send_signal(signal.SIGINT)
+    out, err = running.communicate(timeout=60)
+    assert running.returncode == 130 and out == ""
+    assert "interrupted" in err and "Traceback" not in err
+    assert not [p for p in tmp_path.rglob("*") if p.is_file()]

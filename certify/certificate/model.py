@@ -19,7 +19,7 @@ import numpy as np
 import sympy
 from numpy.typing import NDArray
 
-from certify.certificate.expression import from_tree, to_tree
+from certify.systems.trees import from_tree, to_tree
 from certify.errors import CertificateFormatError, InputError
 from certify.policies import TanhNetwork
 from certify.systems import System

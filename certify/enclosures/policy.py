@@ -50,6 +50,7 @@ class PolicyEnclosure:
         """
         n, batch = x.shape[0], x.shape[2]
         h, fresh, old, ball = x, x_error, torch.zeros_like(x_error), torch.zeros_like(x_error[0])
+        size = x.abs().sum(1)  # sum_j |h_ij|; its 2-norm over i, times sqrt(n + 1), bounds the sum of ||h_j||_2
         share = torch.ones(n, batch, dtype=x.dtype, device=x.device) / n
         passed: list[tuple[Tensor, Tensor | None, Tensor]] = []
         for k, W in enumerate(self.weights):
@@ -57,7 +58,7 @@ class PolicyEnclosure:
             width = W.shape[1]
             y = (W @ h.reshape(width, -1)).reshape(-1, n + 1, batch)
             y[:, 0] += self.biases[k][:, None]
-            rounding = (width + 2) * EPS * self.rows[k][:, None] * h.norm(dim=0).sum(0)
+            rounding = (width + 2) * EPS * (n + 1) ** 0.5 * self.rows[k][:, None] * size.norm(dim=0)
             rounding = rounding + 8 * EPS * (y[:, 0].abs() + self.biases[k].abs()[:, None]) + TINY
             through_old = torch.minimum(self.magnitudes[k] @ old, self.rows[k][:, None] * ball)
             error = (self.magnitudes[k] @ fresh + through_old) * (1 + width * EPS) + rounding
@@ -75,6 +76,7 @@ class PolicyEnclosure:
                 share = share / share.sum(0)
             h = slope[:, None] * y
             h[:, 0] += shift
+            size = (h[:, 0].abs() + slope * spread) * (1 + n * EPS)
             old = slope * error
             ball = torch.minimum(slope.amax(0) * ball, old.norm(dim=0) * (1 + width * EPS))
             passed.append((W, slope, fresh))

@@ -28,8 +28,9 @@ Array = NDArray[np.float64]
 Bound = Callable[[Tensor, Tensor, float, float], BoxBounds]
 _SLACK = 1e-9  # relative distance kept from every level, so that the checker's own rounding agrees
 _BELOW_WITNESS = 1e-3  # relative distance kept from a violation
-_SHELL = 4.0  # a batch reaches up to this multiple of the lowest open level
+_SHELL = 16.0  # a batch reaches up to this multiple of the lowest open level
 _CHUNK = 256  # boxes that make a thread worth its while
+_MOST_SPLITS = 50_000_000  # what a certificate can hold, and two gibibytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +82,7 @@ def prove_ring(
     budget: Budget,
     device: torch.device,
     progress: Callable[[RingProgress], None] | None = None,
+    rule: VdotBound | None = None,
 ) -> RingProof:
     """Prove Vdot < 0 (and the input bounds) on `inner <= V <= level` for the largest level up to `target`.
 
@@ -88,6 +90,7 @@ def prove_ring(
     ----------
     inner, target : levels, 0 < inner <= target.
     progress : called after every batch.
+    rule : another bound for boxes, to compare with; None for `VdotBound`.
 
     Notes
     -----
@@ -98,7 +101,7 @@ def prove_ring(
     if inner >= target:  # the ring is empty
         return RingProof(target, "requested", bytes([LEAF]), root, 0, 1, None)
     start = time.monotonic()
-    rule = VdotBound(obligations, device)
+    rule = rule or VdotBound(obligations, device)
     partition = Partition(root)
     frontier = Frontier(partition, device)
     half = torch.tensor(root, device=device)[:, None]
@@ -108,8 +111,9 @@ def prove_ring(
     witness: Witness | None = None
     with _threaded(rule, device) as bound:
         while len(frontier):
-            if boxes >= budget.boxes or time.monotonic() - start > budget.seconds:
-                reason = "boxes" if boxes >= budget.boxes else "time"
+            full = boxes >= budget.boxes or partition.splits + 3 * budget.batch > _MOST_SPLITS
+            if full or time.monotonic() - start > budget.seconds:
+                reason = "boxes" if full else "time"
                 target = frontier.least() * (1 - 2 * _SLACK)
                 break
             count = min(budget.batch, budget.boxes - boxes)
@@ -133,6 +137,7 @@ def prove_ring(
             frontier.drop_above(target * (1 + _SLACK))
             if progress is not None:
                 progress(clock.read(min(frontier.least(), target), target, boxes, len(frontier)))
+    del frontier
     tree = partition.preorder()
     return RingProof(max(target, inner), reason, tree, root, boxes, tree.count(bytes([LEAF])), witness)
 

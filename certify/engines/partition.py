@@ -14,6 +14,7 @@ from torch import Tensor
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 LEAF = 255
+_HANDFUL = 256  # boxes that cost hardly more together than one alone
 
 
 class Partition:
@@ -78,7 +79,7 @@ class Frontier:
     """Open boxes, taken in the order of the lowest V on them.
 
     At most `capacity` boxes are at hand with their corners. When there are more, those with the highest V are put
-    away by number and rebuilt when their turn comes.
+    away by number, in chunks sorted by V, and rebuilt when their turn comes.
     """
 
     def __init__(self, partition: Partition, device: torch.device, capacity: int = 65_536) -> None:
@@ -87,18 +88,15 @@ class Frontier:
         self.lo, self.hi = (torch.zeros(n, 0, dtype=torch.float64, device=device) for _ in range(2))
         self.lowest = torch.zeros(0, dtype=torch.float64, device=device)
         self.number = torch.zeros(0, dtype=torch.int64, device=device)
-        self._away_lowest: list[Array] = []
-        self._away_number: list[NDArray[np.uint32]] = []
-        self._away_least = np.inf
-        self._ceiling = np.inf
+        self._away: list[tuple[Array, NDArray[np.uint32]]] = []  # lowest V, ascending, and number
 
     def __len__(self) -> int:
-        return len(self.lowest) + sum(len(a) for a in self._away_number)
+        return len(self.lowest) + sum(len(lowest) for lowest, _ in self._away)
 
     def least(self) -> float:
         """The lowest V on any open box; infinite if there is none."""
         at_hand = float(self.lowest.min()) if len(self.lowest) else np.inf
-        return min(at_hand, self._away_least)
+        return min(at_hand, self._least_away())
 
     def add(self, lo: Tensor, hi: Tensor, lowest: Tensor, number: Tensor) -> None:
         """Add boxes with corners (n, B), the lowest V on them (B,) and their numbers (B,)."""
@@ -106,46 +104,57 @@ class Frontier:
         self.lowest, self.number = torch.cat([self.lowest, lowest]), torch.cat([self.number, number])
         if len(self.lowest) > self.capacity:
             order = torch.argsort(self.lowest, stable=True)
-            away = order[self.capacity // 2 :]
-            self._away_lowest.append(self.lowest[away].cpu().numpy())
-            self._away_number.append(self.number[away].cpu().numpy().astype(np.uint32))
-            self._away_least = min(self._away_least, float(self._away_lowest[-1][0]))
-            self._keep(order[: self.capacity // 2])
-
-    def drop_above(self, level: float) -> None:
-        """Forget boxes on which V is above `level` everywhere."""
-        self._keep(torch.nonzero(self.lowest <= level)[:, 0])
-        self._ceiling = level
-        if self._away_least > level:
-            self._away_lowest, self._away_number, self._away_least = [], [], np.inf
+            near, far = order[: self.capacity // 2], order[self.capacity // 2 :]
+            self._away.append((self.lowest[far].cpu().numpy(), self.number[far].cpu().numpy().astype(np.uint32)))
+            self._keep(near)
 
     def take(self, count: int, limit: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Remove and return corners and numbers of up to `count` boxes, those with the lowest V, at most `limit`."""
-        if not len(self.lowest) or float(self.lowest.min()) > self._away_least:
+        """Remove and return corners and numbers of up to `count` boxes, those with the lowest V.
+
+        More than `_HANDFUL` are taken only if V is at most `limit` somewhere on them.
+        """
+        if not len(self.lowest) or float(self.lowest.min()) > self._least_away():
             self._bring_back()
         order = torch.argsort(self.lowest, stable=True)
-        allowed = int((self.lowest <= min(limit, self._away_least)).sum())
+        least_away = self._least_away()
+        wanted = max(_HANDFUL, int((self.lowest <= limit).sum()))
+        allowed = min(wanted, int((self.lowest <= least_away).sum()))
         now = order[: min(count, allowed)]
         taken = self.lo[:, now], self.hi[:, now], self.number[now]
         self._keep(order[len(now) :])
         return taken
 
+    def drop_above(self, level: float) -> None:
+        """Forget boxes on which V is above `level` everywhere."""
+        self._keep(torch.nonzero(self.lowest <= level)[:, 0])
+        self._cut_away(level)
+
     def _keep(self, index: Tensor) -> None:
         self.lo, self.hi = self.lo[:, index], self.hi[:, index]
         self.lowest, self.number = self.lowest[index], self.number[index]
 
+    def _least_away(self) -> float:
+        return min((float(lowest[0]) for lowest, _ in self._away), default=np.inf)
+
+    def _cut_away(self, level: float) -> None:
+        """Drop what was put away and lies above `level`."""
+        if any(lowest[-1] > level for lowest, _ in self._away):
+            kept = [(lowest[k], number[k]) for lowest, number in self._away for k in [lowest <= level]]
+            self._away = [chunk for chunk in kept if len(chunk[0])]
+
     def _bring_back(self) -> None:
-        """The lowest boxes that were put away, half a capacity of them."""
-        lowest, number = np.concatenate(self._away_lowest), np.concatenate(self._away_number)
-        self._away_lowest, self._away_number, self._away_least = [], [], np.inf
-        below = lowest <= self._ceiling
-        lowest, number = lowest[below], number[below]
-        if len(lowest) > self.capacity // 2:
-            order = np.argpartition(lowest, self.capacity // 2)
-            near, far = order[: self.capacity // 2], order[self.capacity // 2 :]
-            self._away_lowest, self._away_number = [lowest[far]], [number[far]]
-            self._away_least = float(lowest[far].min())
-            lowest, number = lowest[near], number[near]
-        lo, hi = self.partition.corners(number.astype(np.int64))
-        corners = (torch.tensor(side, device=self.device) for side in (lo, hi))
-        self.add(*corners, *(torch.tensor(a, device=self.device) for a in (lowest, number.astype(np.int64))))
+        """Rebuild the lowest boxes that were put away, about half a capacity of them."""
+        low, high = self._least_away(), max(float(lowest[-1]) for lowest, _ in self._away)
+        for _ in range(30):
+            middle = low + (high - low) / 2
+            few = sum(int(np.searchsorted(v, middle, side="right")) for v, _ in self._away) <= self.capacity // 2
+            low, high = (middle, high) if few else (low, middle)
+        split = [int(np.searchsorted(v, low, side="right")) for v, _ in self._away]
+        lowest = np.concatenate([v[:k] for (v, _), k in zip(self._away, split, strict=True)])
+        number = np.concatenate([w[:k] for (_, w), k in zip(self._away, split, strict=True)]).astype(np.int64)
+        self._away = [
+            (v[k:].copy(), w[k:].copy()) if k else (v, w)
+            for (v, w), k in zip(self._away, split, strict=True) if k < len(v)
+        ]  # fmt: skip
+        lo, hi = self.partition.corners(number)
+        self.add(*(torch.tensor(a, device=self.device) for a in (lo, hi, lowest, number)))

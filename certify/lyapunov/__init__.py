@@ -4,5 +4,14 @@ from __future__ import annotations
 
 from certify.lyapunov.candidates import solve_lyapunov
 from certify.lyapunov.level_sets import diagonalising_coordinates, domain_limit, extents, semi_axes, volume
+from certify.lyapunov.optimised import optimise_candidate
 
-__all__ = ["diagonalising_coordinates", "domain_limit", "extents", "semi_axes", "solve_lyapunov", "volume"]
+__all__ = [
+    "diagonalising_coordinates",
+    "domain_limit",
+    "extents",
+    "optimise_candidate",
+    "semi_axes",
+    "solve_lyapunov",
+    "volume",
+]

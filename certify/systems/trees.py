@@ -1,4 +1,4 @@
-"""sympy expressions to the certificate's expression trees and back."""
+"""Expressions as trees of nested lists, which is how certificates and solvers get them (checker/FORMAT.md)."""
 
 from __future__ import annotations
 

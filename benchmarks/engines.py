@@ -1,0 +1,120 @@
+"""One ring, several engines, in one run: bounds, plain interval propagation, and dReal where it is installed.
+
+`python benchmarks/engines.py [--limit 300] [--runs 3]`: the shipped policies, fitted pendulum networks of growing
+width, and the fitted planar quadrotor. Each engine is asked for the same ring `c1 <= V <= c2` with c1 from the local
+proof and c2 a share of the smaller of the domain's and the sampled limit. Bounds and intervals run in this
+process, dReal in one of its own, whose start is not counted. UNKNOWN rows stay in the table.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+
+import numpy as np
+import torch
+from fitted import fit_policy, spread_of
+from intervals import PlainIntervals
+
+from certify.closed_loop import ClosedLoop
+from certify.engines import dreal
+from certify.engines.branch_and_bound import Budget, prove_ring
+from certify.engines.falsify import falsify
+from certify.engines.local import prove_local
+from certify.errors import BackendError
+from certify.lyapunov import diagonalising_coordinates, domain_limit, solve_lyapunov
+from certify.obligations import Obligations, ring_query
+from certify.policies import load_policy
+from certify.systems import get_system
+
+POLICIES = Path(__file__).parent.parent / "examples" / "policies"
+CPU = torch.device("cpu")
+
+
+def loops() -> Iterator[tuple[str, ClosedLoop, float]]:
+    """(name, closed loop, c2 as a share of the limit)."""
+    for name, share in (("pendulum", 1 - 1e-9), ("cartpole", 0.5)):
+        policy = load_policy(POLICIES / f"{name}.pt")
+        system = get_system(policy.system).with_parameters(policy.parameters)
+        yield f"{name}, shipped", ClosedLoop(system, policy.network), share
+    pendulum = get_system("pendulum")
+    for width in (16, 32, 64, 128):
+        yield "pendulum, fitted", ClosedLoop(pendulum, fit_policy(pendulum, (width, width), spread_of(pendulum))), 0.9
+    quadrotor = get_system("quadrotor2d")
+    yield "quadrotor2d, fitted", ClosedLoop(quadrotor, fit_policy(quadrotor, (256,) * 4, spread_of(quadrotor))), 0.1
+
+
+def main() -> None:
+    """Run the table."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--limit", type=float, default=300.0, help="seconds for each engine and ring")
+    parser.add_argument("--runs", type=int, default=3, help="runs of what takes less than five seconds; medians count")
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--precision", type=float, default=1e-3)
+    parser.add_argument("--only", default="", help="rows whose name contains this")
+    options = parser.parse_args()
+    try:
+        backend: dreal.Backend | None = dreal.find_backend()
+    except BackendError as error:
+        print(error)
+        backend = None
+    version = "no dReal" if backend is None else f"dReal {backend.version}, precision {options.precision:g}"
+    print(f"torch {torch.__version__}, {options.threads} threads, {version}, {options.limit:g} s each")
+    for name, loop, share in loops():
+        if options.only not in name:
+            continue
+        torch.set_num_threads(options.threads)
+        A, _, _ = loop.linearise()
+        P = solve_lyapunov(A, np.eye(len(A)))
+        claims = Obligations(loop, P, diagonalising_coordinates(P, A))
+        limit = domain_limit(P, loop.system.domain)
+        witness = falsify(claims, limit)
+        outer = share * (limit if witness is None else witness.level)
+        inner = prove_local(claims, outer)
+        if inner is None:
+            print(f"{name}: the local proof fails")
+            continue
+        layers = "-".join(map(str, loop.network.layers))
+        print(f"\n{name} {layers}: {inner:.3g} <= V <= {outer:.6g}")
+        rows: dict[str, Callable[[], tuple[str, float, str]]] = {
+            "bounds": lambda c=claims, a=inner, b=outer: ring(c, a, b, options.limit, False),
+            "intervals": lambda c=claims, a=inner, b=outer: ring(c, a, b, options.limit, True),
+        }
+        if backend is not None:
+            query = ring_query(claims, inner, outer)
+            rows["dreal"] = lambda q=query: ask(backend, q, options)
+        reference = None
+        for engine, run in rows.items():
+            verdict, seconds, detail = run()
+            if seconds < 5:
+                seconds = statistics.median(run()[1] for _ in range(options.runs))
+            reference = reference or seconds
+            print(f"  {engine:<10}{verdict:<9}{seconds:>9.3f} s {seconds / reference:>9.1f} x   {detail}", flush=True)
+
+
+def ring(claims: Obligations, inner: float, outer: float, limit: float, plain: bool) -> tuple[str, float, str]:
+    """Verdict, seconds and detail of this project's branch and bound, with its own rule or with plain intervals."""
+    start = time.perf_counter()
+    rule = PlainIntervals(claims, CPU) if plain else None
+    proof = prove_ring(claims, inner, outer, Budget(seconds=limit, boxes=10**8), CPU, rule=rule)
+    seconds = time.perf_counter() - start
+    if proof.level >= outer:
+        return "PROVED", seconds, f"{proof.boxes} boxes"
+    return "UNKNOWN", seconds, f"{proof.boxes} boxes, proved to {proof.level / outer:.3g} of c2 ({proof.reason})"
+
+
+def ask(backend: dreal.Backend, query: dreal.Query, options: argparse.Namespace) -> tuple[str, float, str]:
+    """Verdict, seconds of the solver alone, and detail of dReal."""
+    answer = dreal.decide(backend, query, options.precision, 1, options.limit)
+    seconds = answer.seconds if answer.solver_seconds is None else answer.solver_seconds
+    return "PROVED" if answer.status == "unsat" else "UNKNOWN", seconds, answer.status + answer.detail
+
+
+if __name__ == "__main__":
+    main()

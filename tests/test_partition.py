@@ -1,0 +1,149 @@
+"""The partition and its open boxes: numbers stand for boxes, whatever was put away comes back, memory is bounded."""
+
+from __future__ import annotations
+
+import heapq
+import os
+import resource
+import subprocess
+import sys
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from certify.engines.partition import _HANDFUL, LEAF, Frontier, Partition
+
+CPU = torch.device("cpu")
+
+
+def grown(seed: int, calls: int = 30, n: int = 3) -> tuple[Partition, dict[int, tuple[np.ndarray, np.ndarray]]]:
+    """A partition, and its open boxes by number, kept the plain way."""
+    generator = np.random.default_rng(seed)
+    partition = Partition(generator.uniform(0.5, 2.0, n))
+    boxes = {0: (-partition.root, partition.root.copy())}
+    for _ in range(calls):
+        chosen = generator.permutation(sorted(boxes))[: generator.integers(1, 6)].astype(np.int64)
+        axes = generator.integers(0, n, len(chosen))
+        halves = partition.split(chosen, axes)
+        for k, (number, axis) in enumerate(zip(chosen.tolist(), axes.tolist(), strict=True)):
+            lo, hi = boxes.pop(number)
+            middle = 0.5 * lo[axis] + 0.5 * hi[axis]
+            left, right = hi.copy(), lo.copy()
+            left[axis] = right[axis] = middle
+            boxes[int(halves[2 * k])], boxes[int(halves[2 * k + 1])] = (lo, left), (right, hi)
+    return partition, boxes
+
+
+def leaves(partition: Partition) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """The boxes that the preorder stands for."""
+    stack = [(-partition.root, partition.root)]
+    for axis in partition.preorder():
+        lo, hi = stack.pop()
+        if axis == LEAF:
+            yield lo, hi
+            continue
+        middle = 0.5 * lo[axis] + 0.5 * hi[axis]
+        left, right = hi.copy(), lo.copy()
+        left[axis] = right[axis] = middle
+        stack += [(right, hi), (lo, left)]
+    assert not stack
+
+
+@given(seed=st.integers(0, 10**6))
+def test_corners_are_rebuilt_bit_for_bit(seed: int) -> None:
+    partition, boxes = grown(seed)
+    numbers = np.array(sorted(boxes))
+    lo, hi = partition.corners(numbers)
+    for k, number in enumerate(numbers.tolist()):
+        assert np.array_equal(lo[:, k], boxes[number][0]) and np.array_equal(hi[:, k], boxes[number][1])
+
+
+@given(seed=st.integers(0, 10**6))
+def test_the_preorder_has_the_open_boxes_as_leaves(seed: int) -> None:
+    partition, boxes = grown(seed)
+    expected = sorted((*lo, *hi) for lo, hi in boxes.values())
+    assert sorted((*lo, *hi) for lo, hi in leaves(partition)) == expected
+
+
+def test_a_partition_without_splits_is_one_leaf() -> None:
+    assert Partition(np.ones(2)).preorder() == bytes([LEAF])
+
+
+@given(seed=st.integers(0, 10**6), capacity=st.sampled_from([8, 16, 10_000]))
+def test_boxes_come_in_the_order_of_their_lowest_level(seed: int, capacity: int) -> None:
+    """Against a heap: with a small capacity most boxes are put away and rebuilt."""
+    generator = np.random.default_rng(seed)
+    partition = Partition(np.ones(2))
+    frontier = Frontier(partition, CPU, capacity)
+    model: list[tuple[float, int]] = [(0.0, 0)]
+    one = torch.ones(2, 1, dtype=torch.float64)
+    frontier.add(-one, one, torch.zeros(1, dtype=torch.float64), torch.zeros(1, dtype=torch.int64))
+    ceiling = np.inf
+    for _ in range(40):
+        assert len(frontier) == len(model)
+        if not model:
+            assert frontier.least() == np.inf
+            break
+        assert frontier.least() == model[0][0]
+        count = int(generator.integers(1, 5))
+        lo, hi, number = frontier.take(count, np.inf)
+        assert 1 <= len(number) <= count
+        expected = [heapq.heappop(model) for _ in range(len(number))]
+        assert sorted(number.tolist()) == sorted(k for _, k in expected)
+        rebuilt = partition.corners(number.numpy())
+        assert np.array_equal(rebuilt[0], lo.numpy()) and np.array_equal(rebuilt[1], hi.numpy())
+        halves = partition.split(number.numpy(), generator.integers(0, 2, len(number)))
+        level = generator.permutation(len(halves)) / 7.0 + max(v for v, _ in expected) + halves * 1e-9
+        keep = level <= ceiling
+        lo, hi = (torch.tensor(a) for a in partition.corners(halves[keep]))
+        frontier.add(lo, hi, torch.tensor(level[keep]), torch.tensor(halves[keep]))
+        for value, k in zip(level[keep].tolist(), halves[keep].tolist(), strict=True):
+            heapq.heappush(model, (value, k))
+        if generator.random() < 0.1:
+            ceiling = float(np.median([v for v, _ in model])) if model else 0.0
+            frontier.drop_above(ceiling)
+            model = [pair for pair in model if pair[0] <= ceiling]
+            heapq.heapify(model)
+
+
+def test_a_limit_holds_boxes_back_but_never_a_handful() -> None:
+    frontier = Frontier(Partition(np.ones(1)), CPU)
+    corner = torch.ones(1, 1000, dtype=torch.float64)
+    frontier.add(-corner, corner, torch.arange(1000, dtype=torch.float64), torch.arange(1000))
+    assert frontier.take(1000, 299.0)[2].tolist() == list(range(300))
+    assert frontier.take(1000, 0.0)[2].tolist() == list(range(300, 300 + _HANDFUL))
+    assert frontier.take(10, 0.0)[2].tolist() == list(range(300 + _HANDFUL, 310 + _HANDFUL))
+
+
+HARD = """
+import resource, torch, numpy as np
+from certify.engines import branch_and_bound as engine
+from certify.engines.vdot import BoxBounds, VdotBound
+from tests.test_engines import obligations
+from tests.conftest import chain
+
+class Undecided(VdotBound):
+    def __call__(self, lo, hi, inner, outer):
+        none = torch.zeros(lo.shape[1], dtype=torch.bool)
+        return BoxBounds(none, torch.ones(lo.shape[1], dtype=lo.dtype), hi - lo, none)
+
+claims = obligations(*chain(4, [-1, -2, -3, -4]))
+budget = engine.Budget(boxes=10**9, seconds=3000.0, batch=32768, least_width=0.0)
+proof = engine.prove_ring(claims, 1e-9, 1e-2, budget, torch.device("cpu"), rule=Undecided(claims, torch.device("cpu")))
+print(proof.reason, len(proof.tree), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+"""
+
+
+@pytest.mark.slow
+def test_memory_stays_below_two_gibibytes_when_no_box_is_ever_proved() -> None:
+    """The pass ends at the most splits that a certificate can hold, with nothing proved."""
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    done = subprocess.run([sys.executable, "-c", HARD], capture_output=True, text=True, check=True, env=environment)
+    reason, nodes, kilobytes = done.stdout.split()
+    assert reason == "boxes" and int(nodes) > 90_000_000
+    assert int(kilobytes) < 2 * 1024**2, f"{int(kilobytes) / 1024:.0f} MiB"
+    assert resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss >= int(kilobytes)
