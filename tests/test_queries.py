@@ -1,0 +1,171 @@
+"""Queries for solvers of formulas: each says in trees what the closed loop says in Arb."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import flint
+import numpy as np
+import pytest
+
+from certify.engines.dreal import to_smt2
+from certify.engines.local import prove_local
+from certify.errors import InputError
+from certify.obligations import (
+    Obligations,
+    Query,
+    decay,
+    domain_queries,
+    input_queries,
+    local_query,
+    queries,
+    ring_query,
+)
+from certify.policies import TanhNetwork
+from certify.systems import System, get_system
+from tests.conftest import chain, lqr_gain, pendulum_network, saturated_lqr, scalar_tanh
+from tests.oracle import value_of
+from tests.test_engines import obligations
+
+
+def quadrotor() -> tuple[System, TanhNetwork]:
+    """u_eq is not the middle of the inputs' range: beta is not 0."""
+    system = get_system("quadrotor2d")
+    K = lqr_gain(system, np.eye(6), np.eye(2))
+    return system, saturated_lqr(K, 3.0, 3.0, [1, 1, 0.5, 1, 1, 1], (40,), "preactivation", 0)
+
+
+CASES = {
+    "scalar": scalar_tanh,
+    "pendulum": lambda: (get_system("pendulum"), pendulum_network()),
+    "pendulum, output": lambda: (get_system("pendulum"), pendulum_network((16, 16), centre="output")),
+    "chain": lambda: chain(3, [-1, -2, -3]),
+    "quadrotor": quadrotor,
+}
+
+
+def values(query: Query, x: np.ndarray) -> dict[str, flint.arb]:
+    """Every definition of a query at a state, in Arb."""
+    flint.ctx.prec = 200
+    names = {name: flint.arb(float(v)) for (name, _, _), v in zip(query.variables, x, strict=True)}
+    for name, tree in query.definitions:
+        assert name not in names
+        names[name] = value_of(tree, names)
+    return names
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_definitions_are_the_closed_loop(case: str) -> None:
+    claims = obligations(*CASES[case]())
+    loop, n = claims.loop, claims.loop.system.n
+    A, _, _ = loop.linearise()
+    ring, local = ring_query(claims, 0.1, 1.0), local_query(claims, 0.1)
+    generator = np.random.default_rng(0)
+    for x in 0.3 * generator.standard_normal((4, n)):
+        names = values(ring, x)
+        assert names["Vdot."].overlaps(loop.evaluate_vdot(claims.P, x))
+        for symbol, u in zip(loop.system.inputs, loop.evaluate_policy(x), strict=True):
+            assert names[symbol.name].overlaps(u)
+        V = sum((Fraction(float(x[i])) * Fraction(float(claims.P[i, j])) * Fraction(float(x[j]))
+                 for i in range(n) for j in range(n)), Fraction(0))  # fmt: skip
+        assert names["V."].contains(flint.arb(flint.fmpq(V.numerator, V.denominator)))
+        # the Jacobian against central differences of the closed loop in floating point
+        at = values(local, x)
+        f, step = loop.system.function(), 1e-5
+        for j in range(n):
+            ahead, back = x.copy(), x.copy()
+            ahead[j] += step
+            back[j] -= step
+            slope = (f(ahead, loop.policy(ahead[None])[0]) - f(back, loop.policy(back[None])[0])) / (2 * step)
+            for i in range(n):
+                assert float(at[f"DF.{i}.{j}"].mid()) == pytest.approx(slope[i], rel=1e-5, abs=1e-5)
+    origin = values(local, np.zeros(n))
+    for i in range(n):
+        for j in range(n):
+            assert abs(origin[f"Dg.{i}.{j}"]) < 1e-9 * (1 + np.abs(A).max())
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_decay_is_below_the_smallest_eigenvalue(case: str) -> None:
+    claims = obligations(*CASES[case]())
+    A, _, _ = claims.loop.linearise()
+    smallest = np.linalg.eigvalsh(-(A.T @ claims.P + claims.P @ A))[0]
+    r = decay(claims.P, A)
+    assert 0.999 * smallest < r < smallest * (1 + 1e-9)
+
+
+def test_decay_refuses_what_does_not_decay() -> None:
+    with pytest.raises(InputError, match="positive definite"):
+        decay(np.eye(2), np.array([[0.0, 1.0], [-1.0, 0.0]]))
+
+
+def holds(query: Query, x: np.ndarray) -> bool:
+    """The constraints of a query at a state, in Arb; what is not certain counts as false."""
+    names = values(query, x)
+    found = [(value_of(a, names), relation, value_of(b, names)) for a, relation, b in query.constraints]
+    compare = {">=": lambda a, b: a >= b, "<=": lambda a, b: a <= b, ">": lambda a, b: a > b}
+    return all(bool(compare[relation](a, b)) for a, relation, b in found)
+
+
+def test_the_ring_query_is_satisfied_by_violations_only() -> None:
+    """xdot = x/2 - tanh x, whose region of attraction is |x| < 1.915008."""
+    claims = obligations(*scalar_tanh())
+    query = ring_query(claims, 0.5, 2.0**2)
+    level = float(claims.P[0, 0])
+    assert level == 1.0
+    assert holds(query, np.array([1.9151])) and holds(query, np.array([-1.99]))
+    for x in (1.914, 0.9, 2.01, 0.0):
+        assert not holds(query, np.array([x]))
+
+
+def test_domain_queries_are_satisfied_beyond_the_limit_only() -> None:
+    claims = obligations(*chain(2, [-1, -2]))
+    inverse = np.linalg.inv(claims.P)
+    for k, half in enumerate([1.0, 1.5]):
+        touching = inverse[:, k] / inverse[k, k] * half  # the lowest V on the side x_k = half
+        level = half**2 / inverse[k, k]
+        touching[k] = half
+        for outer, expected in ((0.999 * level, False), (1.001 * level, True)):
+            above = {q.name: q for q in domain_queries(claims, outer)}[f"domain-x{k + 1}-above"]
+            assert holds(above, touching) is expected
+
+
+def test_input_queries_name_what_is_exceeded() -> None:
+    claims = obligations(get_system("pendulum"), pendulum_network(centre="output"))
+    found = {q.name: q for q in input_queries(claims, 1e3)}
+    assert set(found) == {"inputs-u-below", "inputs-u-above"}
+    grid = np.stack(np.meshgrid(np.linspace(-3, 3, 25), np.linspace(-15, 15, 25)), -1).reshape(-1, 2)
+    u = claims.loop.policy(grid)[:, 0]
+    for name, x in (("inputs-u-above", grid[u.argmax()]), ("inputs-u-below", grid[u.argmin()])):
+        assert holds(found[name], x) is bool(abs(claims.loop.policy(x[None])[0, 0]) > 6)
+
+
+def test_one_query_a_claim() -> None:
+    pendulum = get_system("pendulum")
+    bounded, free = (obligations(pendulum, pendulum_network(centre=c)) for c in ("preactivation", "output"))
+    sides = [f"domain-{s}-{side}" for s in ("theta", "theta_dot") for side in ("below", "above")]
+    assert [q.name for q in queries(bounded, 0.1, 1.0)] == [*sides, "local", "ring"]
+    assert [q.name for q in queries(bounded, 1.0, 1.0)] == [*sides, "local"]
+    assert [q.name for q in queries(free, 0.1, 1.0)] == [*sides, "local", "ring", "inputs-u-below", "inputs-u-above"]
+
+
+def test_the_local_query_agrees_with_the_local_proof() -> None:
+    """Where the bounds prove the local level, no sampled state satisfies the query."""
+    claims: Obligations = obligations(get_system("pendulum"), pendulum_network())
+    level = prove_local(claims, 10.0)
+    assert level is not None
+    generator = np.random.default_rng(0)
+    z = generator.standard_normal((20, 2))
+    z *= np.sqrt(level * generator.random((20, 1))) / np.linalg.norm(z, axis=1, keepdims=True)
+    query = local_query(claims, level)
+    assert not any(holds(query, x) for x in z @ claims.T.T)
+    assert any(holds(local_query(claims, 4.0), x) for x in 10 * z @ claims.T.T * np.sqrt(0.04 / level))
+
+
+def test_smt2_is_balanced_and_exact() -> None:
+    text = to_smt2(ring_query(obligations(*quadrotor()), 0.01, 0.02), "unsat")
+    assert text.count("(") == text.count(")")
+    assert text.startswith("; ring") and "; expected: unsat" in text and "(set-logic QF_NRA)" in text
+    assert "(/ 243 500)" in text or "(/ 500 243)" in text  # m = 0.486, never rounded
+    assert "." not in "".join(line for line in text.splitlines() if "declare" in line)
+    assert text.rstrip().endswith("(check-sat)\n(exit)")
