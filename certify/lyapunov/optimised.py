@@ -1,0 +1,250 @@
+"""A candidate whose sublevel set is as large as sampling can make it: a sequence of small linear matrix inequalities.
+
+For a fixed state x, V(x) and `g(x) = Vdot(x) + 2 alpha V(x)` are linear in P. If the ray through x crosses g = 0 near
+x, the level at which it does is, to first order, `V(x) - mu g(x)`, with mu the ratio of the slopes of V and g along the
+ray. And whatever mu >= 0 is, keeping this at 1 or more forbids `g > 0` at x inside `{V < 1}` (the S-procedure, state by
+state). Each round samples the closed loop, remembers the states that limit the set, and minimises the linearised
+`log det P` in a trust region subject to them: a convex problem of the size of P, in coordinates in which the present
+set is a ball. Nothing is proved here, and nothing needs to be: the engines prove whatever binary64 matrix comes out.
+
+The margin alpha is asked for, not only the sign, because a proof needs many boxes where Vdot nearly vanishes.
+"""
+
+from __future__ import annotations
+
+import math
+import warnings
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.closed_loop import ClosedLoop
+from certify.errors import BackendError
+from certify.lyapunov.candidates import solve_lyapunov
+from certify.lyapunov.level_sets import domain_limit, volume
+
+Array = NDArray[np.float64]
+_RADII = np.linspace(0.1, 1.1, 12)  # of the samples on a ray, where 1 is the edge of the present set
+_FRESH, _NEAR = 400, 300  # new rays of a search: in any direction, and near those that limit the set
+_KEEP = 200  # rays of a search that are remembered for their crossing, and for their worst state
+_ROWS = 500  # states that each margin hands to the solver
+_ROUNDS = 30
+_SMALL = 0.01  # growth of the log of the volume, or trust radius, at which to stop
+_STEP = 1e-4  # relative, of the difference quotient along a ray
+_TOLERANCE = 1e-6  # of the solver
+_SLACK = 1e-4  # by which a state may violate its row: the next search rescales P
+_LINEAR, _SCORED = 1.3, 0.5  # shares of alpha: what the linearisation must keep, and what a sample must
+
+
+def optimise_candidate(loop: ClosedLoop, start: Array, decays: tuple[float, ...] = (0.2, 0.02), seed: int = 0) -> Array:
+    """Choose P for a large sampled set `{x'Px <= 1}` inside the domain with `Vdot <= -alpha V` (and inputs in bounds).
+
+    Parameters
+    ----------
+    loop : the closed loop; its linearisation A is Hurwitz.
+    start : (n, n), symmetric positive definite with `A'P + PA < 0`, such as a solution of the Lyapunov equation.
+    decays : alpha over the slowest decay rate of A, each between 0 and 0.7; the first that beats `start` is taken.
+    seed : of the samples; equal seeds give equal results.
+
+    Returns
+    -------
+    Array : P, (n, n), scaled so that the sampled limit, with the margin, is 1.
+
+    Raises
+    ------
+    BackendError : cvxpy is missing, its solver gave no usable answer, or the sampled set is not larger than start's.
+
+    Notes
+    -----
+    A local optimum. Boyd, El Ghaoui, Feron, Balakrishnan, Linear Matrix Inequalities in System and Control Theory, SIAM
+    1994: section 2.6.3 (S-procedure), chapter 5 (invariant ellipsoids of extreme volume).
+    """
+    A, _, _ = loop.linearise()
+    slowest = -float(np.max(np.linalg.eigvals(A).real))
+    found = given = 0.0
+    for decay in decays:
+        samples = _Samples(loop, 1e-3 * decay * slowest, np.random.default_rng(seed))
+        P = _enlarge(samples, A, start, decay * slowest)
+        if not (np.all(np.linalg.eigvalsh(P) > 0) and np.all(np.linalg.eigvalsh(A.T @ P + P @ A) < 0)):
+            raise BackendError("the optimised P must satisfy P > 0 and A'P + PA < 0; it does not. Use 'lyapunov'.")
+        found, given = (volume(samples.fit(candidate, 0.0), 1.0) for candidate in (P, start))
+        if found > given:
+            return P
+    raise BackendError(
+        f"the optimised candidate must be larger than its start; sampled, its volume is {found:.6g} and the "
+        f"start's {given:.6g}. Use the candidate 'lyapunov'."
+    )
+
+
+def _enlarge(samples: _Samples, A: Array, start: Array, alpha: float) -> Array:
+    """Rounds of sampling and solving, from `start` to P with its margin."""
+    Q = -(A.T @ start + start @ A)
+    # The linearisation of this P keeps `Vdot <= -2 lambda V`: its equation is the one of A + lambda I.
+    P = solve_lyapunov(A + _LINEAR * alpha * np.eye(len(A)), (Q + Q.T) / 2)
+    P = samples.fit(P, _SCORED * alpha)
+    radius, answers = 0.4, 0
+    for _ in range(_ROUNDS):
+        new = _solve(samples, P, A, alpha, radius)
+        if new is None:
+            radius /= 2
+            continue
+        answers += 1
+        hoped = (_log_det(P) - _log_det(new)) / 2
+        new = samples.rescale(new, _SCORED * alpha)
+        P = P / min(1.0, samples.known(P, _SCORED * alpha))  # both are scored on the same samples
+        gain = (_log_det(P) - _log_det(new)) / 2
+        P = new if gain > 0 else P
+        radius = radius / 2 if gain < 0.3 * hoped else min(0.5, 1.3 * radius)
+        if hoped < _SMALL or radius < _SMALL:
+            before = _log_det(P)
+            P = samples.rescale(P, _SCORED * alpha, searches=4)
+            if _log_det(P) - before < 2 * _SMALL:
+                break
+            radius = 0.1
+    if answers == 0:
+        raise BackendError("the solver found no optimised candidate. Use the candidate 'lyapunov'.")
+    return P
+
+
+class _Samples:
+    """States that limit sublevel sets of the closed loop, remembered from search to search.
+
+    x, F(x), (dF/dx) x : (N, n). outside : (N,), the input leaves its bounds at x or F has a pole there.
+    """
+
+    def __init__(self, loop: ClosedLoop, least: float, generator: np.random.Generator) -> None:
+        self.loop, self.least, self.generator = loop, least, generator
+        self.f = loop.system.function()
+        self.bounds = np.array([[float(v) for v in b] for b in loop.system.input_bounds]).T
+        self.x, self.F, self.dF = (np.zeros((0, loop.system.n)) for _ in range(3))
+        self.outside = np.zeros(0, dtype=bool)
+
+    def field(self, x: Array) -> tuple[Array, NDArray[np.bool_]]:
+        """F and `outside` at x, shapes (..., n) and (...)."""
+        u = self.loop.policy(x)
+        with np.errstate(all="ignore"):
+            F = self.f(x, u)
+        outside = ~np.isfinite(F).all(-1)
+        F = np.where(outside[..., None], 0.0, F)
+        return F, outside | np.any((u < self.bounds[0]) | (u > self.bounds[1]), axis=-1)
+
+    def known(self, P: Array, alpha: float) -> float:
+        """The lowest level of a remembered violation of `Vdot + 2 alpha V < 0`, inf if there is none."""
+        bad = ~(_g(P, self.x, self.F, alpha) < 0) | self.outside
+        return float(np.min(_form(P, self.x[bad], self.x[bad]), initial=np.inf))
+
+    def crossings(self, P: Array, alpha: float) -> tuple[Array, Array]:
+        """`V - mu g` and mu of the remembered states, (N,) each; mu = 0 where P cannot change the violation."""
+        V, g = _form(P, self.x, self.x), _g(P, self.x, self.F, alpha)
+        slope = 2 * _form(P, self.x, self.F + self.dF) + 4 * alpha * V
+        mu = np.where(self.outside, 0.0, 2 * V / np.maximum(slope, self.least * V))
+        return V - mu * g, mu
+
+    def fit(self, P: Array, alpha: float) -> Array:
+        """`rescale` from the domain's limit downwards."""
+        return self.rescale(P / domain_limit(P, self.loop.system.domain), alpha, searches=4)
+
+    def rescale(self, P: Array, alpha: float, searches: int = 1) -> Array:
+        """P scaled so that {V <= 1} lies in the domain and holds no violation that the searches found."""
+        for k in range(searches + 10):
+            self.search(P, alpha)
+            level = self.known(P, alpha)
+            P = P / min(level, domain_limit(P, self.loop.system.domain), float(_RADII[-1]) ** 2)
+            if k + 1 >= searches and level > 0.5:  # a lower level leaves the set too coarsely sampled
+                break
+        return P
+
+    def search(self, P: Array, alpha: float) -> None:
+        """Sample rays across {V <= 1.2}; remember where the first of them cross `g = 0`, and their worst states."""
+        L = np.linalg.cholesky(P)
+        n = len(P)
+        z = self.generator.standard_normal((_FRESH, n))
+        if len(self.x):
+            lowest = np.argsort(self.crossings(P, alpha)[0], kind="stable")[:100]
+            limiting = _unit(self.x[lowest] @ L)
+            size = 10 ** self.generator.uniform(-2.5, 0, (_NEAR, 1)) / math.sqrt(n)
+            near = limiting[self.generator.integers(0, len(limiting), _NEAR)]
+            z = np.concatenate([z, limiting, near + size * self.generator.standard_normal((_NEAR, n))])
+        rays = _unit(z) @ np.linalg.inv(L)
+        x = _RADII[:, None] * rays[:, None, :]
+        F, outside = self.field(x)
+        g = _g(P, x, F, alpha)
+        bad = ~(g < 0) | outside
+        first = np.where(bad.any(axis=1), bad.argmax(axis=1), len(_RADII))
+        share = np.where(np.arange(len(_RADII)) < first[:, None], g / _RADII**2, -np.inf)
+        worst = np.argsort(-share.max(axis=1), kind="stable")[:_KEEP]
+        worst = worst[first[worst] > 0]
+        crossed = np.argsort(first, kind="stable")[:_KEEP]
+        crossed = crossed[first[crossed] < len(_RADII)]
+        high = _RADII[first[crossed]]
+        low = np.where(first[crossed] > 0, _RADII[first[crossed] - 1], 0.0)
+        for _ in range(8):
+            middle = (low + high) / 2
+            state = middle[:, None] * rays[crossed]
+            F, outside = self.field(state)
+            bad = ~(_g(P, state, F, alpha) < 0) | outside
+            low, high = np.where(bad, low, middle), np.where(bad, middle, high)
+        self.remember(np.concatenate([x[worst, share[worst].argmax(axis=1)], high[:, None] * rays[crossed]]))
+
+    def remember(self, x: Array) -> None:
+        """Add states, (N, n)."""
+        F, outside = self.field(x)
+        dF = (self.field(x * (1 + _STEP))[0] - F) / _STEP
+        self.x, self.F, self.dF = (np.concatenate(p) for p in ((self.x, x), (self.F, F), (self.dF, dF)))
+        self.outside = np.concatenate([self.outside, outside])
+
+
+def _solve(samples: _Samples, P: Array, A: Array, alpha: float, radius: float) -> Array | None:
+    """The next P, (n, n), which is `L M L'` for the present `P = LL'`; None if the solver's status is not optimal."""
+    try:
+        import cvxpy
+    except ImportError as error:
+        raise BackendError("the optimised candidate needs cvxpy, which cannot be imported. Install cvxpy.") from error
+    n = len(P)
+    L = np.linalg.cholesky(P)
+    inverse = np.linalg.inv(L)
+    M = cvxpy.Variable((n, n), symmetric=True)
+    rate = M @ (L.T @ A @ inverse.T)
+    constraints = [M >> (1 - radius) * np.eye(n), M << (1 + radius) * np.eye(n)]
+    constraints.append(rate + rate.T + 2 * _LINEAR * alpha * M << 0)
+    for (lo, hi), column in zip(samples.loop.system.domain, inverse.T, strict=True):
+        e = column / min(float(-lo), float(hi))
+        constraints.append(M >> np.outer(e, e))  # (P^-1)_ii <= d_i^2
+    for margin in (_SCORED * alpha, alpha):
+        level, mu = samples.crossings(P, margin)
+        inside = np.flatnonzero(_form(P, samples.x, samples.x) * (1 - radius) < 1)  # the others cannot come in
+        rows = inside[np.argsort(level[inside], kind="stable")[:_ROWS]]
+        z = samples.x[rows] @ L
+        w = z - 2 * mu[rows, None] * ((samples.F[rows] + margin * samples.x[rows]) @ L)
+        G = ((z[:, :, None] * w[:, None, :] + w[:, :, None] * z[:, None, :]) / 2).reshape(len(rows), n * n)
+        size = np.linalg.norm(G, axis=1)
+        least = np.minimum(1.0, level[rows]) - _SLACK
+        constraints.append((G / size[:, None]) @ cvxpy.vec(M, order="C") >= least / size)
+    problem = cvxpy.Problem(cvxpy.Minimize(cvxpy.trace(M)), constraints)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # cvxpy warns of inaccurate answers, which the status says too
+            problem.solve(solver=cvxpy.CLARABEL, tol_gap_abs=_TOLERANCE, tol_gap_rel=_TOLERANCE, tol_feas=_TOLERANCE)
+    except cvxpy.error.SolverError:
+        return None
+    if problem.status != cvxpy.OPTIMAL:
+        return None
+    new = L @ np.asarray(M.value, dtype=np.float64) @ L.T
+    return np.asarray((new + new.T) / 2)
+
+
+def _unit(z: Array) -> Array:
+    return np.asarray(z / np.linalg.norm(z, axis=-1, keepdims=True))
+
+
+def _form(P: Array, x: Array, y: Array) -> Array:
+    return np.asarray(((x @ P) * y).sum(axis=-1))
+
+
+def _g(P: Array, x: Array, F: Array, alpha: float) -> Array:
+    """`Vdot + 2 alpha V`."""
+    return 2 * _form(P, x, F + alpha * x)
+
+
+def _log_det(P: Array) -> float:
+    return float(np.linalg.slogdet(P)[1])
