@@ -166,7 +166,11 @@ def evaluate_arb(expression: sympy.Expr, values: Mapping[sympy.Symbol, flint.arb
             result = result * a
         return result
     if expression.is_Pow:
-        return arguments[0] ** int(expression.exp)
+        base, exponent = arguments[0], int(expression.exp)
+        result = base
+        for _ in range(abs(exponent) - 1):  # Arb's own power is NaN for a ball around 0
+            result = result * base
+        return result if exponent > 0 else 1 / result
     functions = {sympy.sin: "sin", sympy.cos: "cos", sympy.tan: "tan"}
     return getattr(arguments[0], functions[expression.func])()
 

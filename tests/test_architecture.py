@@ -14,7 +14,7 @@ ARROWS = {  # package -> what of the project it may import, besides errors and v
     "certify.systems": set(),
     "certify.policies": set(),
     "certify.closed_loop": {"certify.systems", "certify.policies"},
-    "certify.obligations": {"certify.closed_loop"},
+    "certify.obligations": {"certify.closed_loop", "certify.systems"},
     "certify.lyapunov": {"certify.closed_loop", "certify.systems", "certify.policies"},
     "certify.enclosures": {"certify.closed_loop", "certify.systems", "certify.policies"},
     "certify.engines": {

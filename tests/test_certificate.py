@@ -14,10 +14,10 @@ import pytest
 import sympy
 
 from certify.certificate import read_certificate
-from certify.systems.trees import from_tree, to_tree
 from certify.errors import CertificateFormatError
 from certify.roa import certify_roa, run_checker
 from certify.systems import available_systems, get_system
+from certify.systems.trees import from_tree, to_tree
 from tests.conftest import pendulum_network
 
 Document = dict[str, Any]

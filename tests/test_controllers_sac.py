@@ -65,9 +65,7 @@ def test_jacobian_at_the_origin_is_that_of_the_exported_policy(centre, plant):
     actor, u_eq = _actor(centre, plant=plant), (Fraction(0),)
     mean, jacobian = actor.at_origin()
     network, h = actor.network(), 1e-6
-    columns = [
-        (network(h * e, u_eq) - network(-h * e, u_eq)) / (2 * h) for e in np.eye(network.n)
-    ]
+    columns = [(network(h * e, u_eq) - network(-h * e, u_eq)) / (2 * h) for e in np.eye(network.n)]
     np.testing.assert_allclose(jacobian.detach().numpy(), np.array(columns).T, atol=1e-5)
     raw = replace(network, centre="none")
     np.testing.assert_allclose(mean.detach().numpy(), raw(np.zeros(network.n), u_eq), atol=1e-6)
@@ -97,9 +95,7 @@ def test_export_is_exact_and_centred(centre):
     # The same weights as in memory: single precision layers differ from exact ones by rounding only.
     np.testing.assert_allclose(network.net(x.double().numpy()), mean.double().numpy(), atol=1e-5)
     factors = actor.factors.double().numpy()
-    np.testing.assert_array_equal(
-        network.weights[0] / factors, actor.hidden[0].weight.detach().double().numpy()
-    )
+    np.testing.assert_array_equal(network.weights[0] / factors, actor.hidden[0].weight.detach().double().numpy())
     assert set(np.log2(factors) % 1) == {0.0}  # powers of two: nothing was rounded
     assert network(np.zeros(2), (Fraction(0),)) == pytest.approx(0.0, abs=0)
     assert network.layers == (2, 16, 16, 1) and network.scale == 6 and network.offset == 0

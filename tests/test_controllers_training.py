@@ -25,9 +25,7 @@ SHIPPED = POLICIES / "pendulum.pt"
 @pytest.fixture(scope="module")
 def short() -> TrainingOptions:
     # Long enough for a gain, a refresh of it, gradient steps and an annealed end; short enough for a test.
-    return replace(
-        preset("pendulum"), steps=600, warm_up=100, n_A=60, n_B=60, refresh=300, batch=32, critic=(16, 16)
-    )
+    return replace(preset("pendulum"), steps=600, warm_up=100, n_A=60, n_B=60, refresh=300, batch=32, critic=(16, 16))
 
 
 def _trainer(options):

@@ -440,9 +440,7 @@ def hostile_certificate() -> Certificate:
     for field, value in hostile.items():
         object.__setattr__(system, field, value)
     network = TanhNetwork((np.array([[0.1, 0.2]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
-    return Certificate(
-        system, network, np.eye(2), np.eye(2), np.ones(2), 0.1, 0.5, bytes([255]), {HOSTILE: HOSTILE}
-    )
+    return Certificate(system, network, np.eye(2), np.eye(2), np.ones(2), 0.1, 0.5, bytes([255]), {HOSTILE: HOSTILE})
 
 
 def test_hostile_names_are_text(tmp_path: Path) -> None:

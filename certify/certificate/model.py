@@ -19,10 +19,10 @@ import numpy as np
 import sympy
 from numpy.typing import NDArray
 
-from certify.systems.trees import from_tree, to_tree
 from certify.errors import CertificateFormatError, InputError
 from certify.policies import TanhNetwork
 from certify.systems import System
+from certify.systems.trees import from_tree, to_tree
 
 Array = NDArray[np.float64]
 SCHEMA = "certify-certificate/1"

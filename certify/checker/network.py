@@ -46,33 +46,31 @@ class Folded:
 
 def fold(policy: Policy, u_eq: tuple[Fraction, ...]) -> Folded:
     """Fold the centring into the last bias and the offset; raises `Rejected` under rule `centring`."""
-    squash, zeros = policy.squash == "tanh", np.zeros_like(policy.offset)
+    squash, zeros, ones = policy.squash == "tanh", np.zeros_like(policy.offset), np.ones_like(policy.offset)
     norms = tuple(spectral_norm(W) for W in policy.weights)
     plain = Folded(policy.weights, policy.biases, zeros, squash, policy.scale, policy.offset, zeros, norms)
     if policy.centre == "none":
         _require_exact_equilibrium(policy, u_eq)
         return plain
-    # Values at 0: y0 of the last layer without its bias, and h0 after the squashing.
-    h, error = np.zeros(policy.weights[0].shape[1]), np.zeros(policy.weights[0].shape[1])
-    for k, (W, b) in enumerate(zip(policy.weights, policy.biases, strict=True)):
-        if k:
-            h, e = tanh(h)
-            error = up(error + e)
-        product, product_error = _product(W, h, error)
-        h, error = product + b, up(product_error + EPS * (np.abs(product) + np.abs(b)))
     if policy.centre == "preactivation":
+        biases = (*policy.biases[:-1], zeros)
+        y, error = _at_origin(Folded(policy.weights, biases, zeros, False, ones, zeros, zeros, norms))
         beta, beta_error = _beta(policy, u_eq)
-        last = beta - product
-        last_error = up(beta_error + product_error + EPS * (np.abs(beta) + np.abs(product)))
-        biases = (*policy.biases[:-1], last)
+        last_error = up(beta_error + error + EPS * (np.abs(beta) + np.abs(y)))
+        biases = (*policy.biases[:-1], beta - y)
         return Folded(policy.weights, biases, last_error, True, policy.scale, policy.offset, zeros, norms)
-    if squash:
-        h, e = tanh(h)
-        error = up(error + e)
+    h, error = _at_origin(Folded(policy.weights, policy.biases, zeros, squash, ones, zeros, zeros, norms))
     centre, centre_error = np.array([float_with_error(q) for q in u_eq]).T
     shift = policy.scale * h
     offset_error = up(np.abs(policy.scale) * error + centre_error + EPS * (np.abs(shift) + np.abs(centre)))
     return Folded(policy.weights, policy.biases, zeros, squash, policy.scale, centre - shift, offset_error, norms)
+
+
+def _at_origin(net: Folded) -> tuple[Array, Array]:
+    """The network's value at x = 0 and a bound of its error, each (m,): a box of one point."""
+    n = net.weights[0].shape[1]
+    mid, _, error = enclose_on_boxes(net, np.zeros((n, n + 1, 1)), np.zeros((n, 1)))
+    return mid[:, 0], error[:, 0]
 
 
 def _product(W: Array, h: Array, error: Array) -> tuple[Array, Array]:

@@ -22,8 +22,7 @@ class PolicyEnclosure:
     """Affine enclosures of pi over batches of boxes, on the device that holds its weights."""
 
     def __init__(self, loop: ClosedLoop, device: torch.device) -> None:
-        # Centring is folded into the last bias or the offset; their roundings are far below what `error` allows.
-        network = loop.folded
+        network = loop.network
 
         def tensor(array: object) -> Tensor:
             return torch.tensor(array, dtype=torch.float64, device=device)
@@ -35,6 +34,25 @@ class PolicyEnclosure:
         self.norms = [float(torch.linalg.matrix_norm(w, 2)) * min(w.shape) ** (1 / 128) for w in self.weights]
         self.squash = network.squash == "tanh"
         self.scale, self.offset = tensor(network.scale), tensor(network.offset)
+        self.bias_error = self.offset_error = torch.zeros_like(self.scale)
+        if network.centre != "none":
+            self._fold(loop, tensor([float(u) for u in loop.u_eq]))
+
+    def _fold(self, loop: ClosedLoop, u_eq: Tensor) -> None:
+        """Put the centring into the last bias or the offset, with what is not known of the network at the origin."""
+        network, squash, scale, offset = loop.network, self.squash, self.scale, self.offset
+        preactivation = network.centre == "preactivation"
+        self.squash, self.scale, self.offset = squash and not preactivation, scale / scale, 0 * offset
+        origin = torch.zeros(network.n, network.n + 1, 1, dtype=scale.dtype, device=scale.device)
+        at_0, _, error, _ = (v[..., 0] for v in self(origin, origin[:, 0]))
+        self.squash, self.scale, self.offset = squash, scale, offset
+        if preactivation:
+            beta, bias = torch.tensor(network.beta(loop.u_eq), device=scale.device), self.biases[-1]
+            self.biases[-1] = bias - at_0 + beta
+            self.bias_error = error + 4 * EPS * (bias.abs() + at_0.abs() + beta.abs())
+        else:
+            self.offset = u_eq - scale * at_0
+            self.offset_error = scale.abs() * error + 4 * EPS * (u_eq.abs() + (scale * at_0).abs())
 
     def __call__(self, x: Tensor, x_error: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Enclose the policy for states `x[:, 0] + x[:, 1:] d` within x_error.
@@ -60,6 +78,8 @@ class PolicyEnclosure:
             y[:, 0] += self.biases[k][:, None]
             rounding = (width + 2) * EPS * (n + 1) ** 0.5 * self.rows[k][:, None] * size.norm(dim=0)
             rounding = rounding + 8 * EPS * (y[:, 0].abs() + self.biases[k].abs()[:, None]) + TINY
+            if last:
+                rounding = rounding + self.bias_error[:, None]
             through_old = torch.minimum(self.magnitudes[k] @ old, self.rows[k][:, None] * ball)
             error = (self.magnitudes[k] @ fresh + through_old) * (1 + width * EPS) + rounding
             ball = (self.norms[k] * (ball + fresh.norm(dim=0)) + rounding.norm(dim=0)) * (1 + width * EPS)
@@ -83,6 +103,7 @@ class PolicyEnclosure:
         through = self.scale[:, None] * h[:, 0]
         mid, slopes = through + self.offset[:, None], self.scale[:, None, None] * h[:, 1:]
         rounding = 4 * EPS * (through.abs() + self.offset.abs()[:, None] + slopes.abs().sum(1)) + TINY
+        rounding = rounding + self.offset_error[:, None]
         return mid, slopes, (rounding + self._error_backwards(passed, x_error)) * (1 + 1e-12), share
 
     def _error_backwards(self, passed: list[tuple[Tensor, Tensor | None, Tensor]], x_error: Tensor) -> Tensor:

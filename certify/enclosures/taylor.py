@@ -74,7 +74,7 @@ class Taylor:
         least = torch.where(least > 0, least, torch.nan)
         f0 = 1 / self.c
         f2 = f0 * f0 * f0
-        return self.compose(f0, -f0 * f0, f2, f2.abs() / least * (1 + EPS))
+        return self.compose(f0, -f0 * f0, f2, f2.abs() / least * (1 + EPS) + TINY)
 
     def sin(self) -> Taylor:
         s, c = self.c.sin(), self.c.cos()
