@@ -80,6 +80,7 @@ def test_boxes_come_in_the_order_of_their_lowest_level(seed: int, capacity: int)
     partition = Partition(np.ones(2))
     frontier = Frontier(partition, CPU, capacity)
     model: list[tuple[float, int]] = [(0.0, 0)]
+    levels = {0: 0.0}
     one = torch.ones(2, 1, dtype=torch.float64)
     frontier.add(-one, one, torch.zeros(1, dtype=torch.float64), torch.zeros(1, dtype=torch.int64))
     ceiling = np.inf
@@ -93,16 +94,19 @@ def test_boxes_come_in_the_order_of_their_lowest_level(seed: int, capacity: int)
         lo, hi, number = frontier.take(count, np.inf)
         assert 1 <= len(number) <= count
         expected = [heapq.heappop(model) for _ in range(len(number))]
-        assert sorted(number.tolist()) == sorted(k for _, k in expected)
+        taken = [levels[k] for k in number.tolist()]
+        assert sorted(taken) == [v for v, _ in expected]
         rebuilt = partition.corners(number.numpy())
         assert np.array_equal(rebuilt[0], lo.numpy()) and np.array_equal(rebuilt[1], hi.numpy())
         halves = partition.split(number.numpy(), generator.integers(0, 2, len(number)))
-        level = generator.permutation(len(halves)) / 7.0 + max(v for v, _ in expected) + halves * 1e-9
+        step = 10.0 ** -generator.integers(0, 16)  # some levels differ in their last digits only
+        level = (generator.permutation(len(halves)) / 7.0 + halves * 1e-9) * step + max(v for v, _ in expected)
         keep = level <= ceiling
         lo, hi = (torch.tensor(a) for a in partition.corners(halves[keep]))
         frontier.add(lo, hi, torch.tensor(level[keep]), torch.tensor(halves[keep]))
         for value, k in zip(level[keep].tolist(), halves[keep].tolist(), strict=True):
             heapq.heappush(model, (value, k))
+            levels[k] = value
         if generator.random() < 0.1:
             ceiling = float(np.median([v for v, _ in model])) if model else 0.0
             frontier.drop_above(ceiling)
@@ -117,6 +121,26 @@ def test_a_limit_holds_boxes_back_but_never_a_handful() -> None:
     assert frontier.take(1000, 299.0)[2].tolist() == list(range(300))
     assert frontier.take(1000, 0.0)[2].tolist() == list(range(300, 300 + _HANDFUL))
     assert frontier.take(10, 0.0)[2].tolist() == list(range(300 + _HANDFUL, 310 + _HANDFUL))
+
+
+def test_levels_that_nearly_agree_keep_their_order() -> None:
+    """Three chunks put away with interleaved levels within 1e-13 of each other, and one far above."""
+    partition = Partition(np.ones(1))
+    halves = np.zeros(1, dtype=np.int64)
+    for _ in range(8):
+        halves = partition.split(halves, np.zeros(len(halves), dtype=np.int64))
+    frontier = Frontier(partition, CPU, capacity=16)
+    order = np.random.default_rng(0).permutation(len(halves))
+    levels = 1.0 + 1e-15 * order.astype(np.float64)
+    levels[0] = 1e6
+    for part in np.split(np.arange(len(halves)), 8):
+        lo, hi = (torch.tensor(a) for a in partition.corners(halves[part]))
+        frontier.add(lo, hi, torch.tensor(levels[part]), torch.tensor(halves[part]))
+    level_of = dict(zip(halves.tolist(), levels.tolist(), strict=True))
+    taken: list[float] = []
+    while len(frontier):
+        taken += sorted(level_of[k] for k in frontier.take(3, np.inf)[2].tolist())
+    assert taken == sorted(levels)
 
 
 HARD = """

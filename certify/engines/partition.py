@@ -145,11 +145,14 @@ class Frontier:
     def _bring_back(self) -> None:
         """Rebuild the lowest boxes that were put away, about half a capacity of them."""
         low, high = self._least_away(), max(float(lowest[-1]) for lowest, _ in self._away)
-        for _ in range(30):
-            middle = low + (high - low) / 2
+        while low < (middle := low + (high - low) / 2) < high:
             few = sum(int(np.searchsorted(v, middle, side="right")) for v, _ in self._away) <= self.capacity // 2
             low, high = (middle, high) if few else (low, middle)
-        split = [int(np.searchsorted(v, low, side="right")) for v, _ in self._away]
+        split = [int(np.searchsorted(v, low, side="left")) for v, _ in self._away]
+        room = self.capacity // 2 - sum(split)
+        for k, (v, _) in enumerate(self._away):  # boxes on a grid share their lowest V: ties fill what room is left
+            ties = min(room, int(np.searchsorted(v, high, side="right")) - split[k])
+            split[k], room = split[k] + ties, room - ties
         lowest = np.concatenate([v[:k] for (v, _), k in zip(self._away, split, strict=True)])
         number = np.concatenate([w[:k] for (_, w), k in zip(self._away, split, strict=True)]).astype(np.int64)
         self._away = [
