@@ -139,7 +139,9 @@ def test_levels_that_nearly_agree_keep_their_order() -> None:
     level_of = dict(zip(halves.tolist(), levels.tolist(), strict=True))
     taken: list[float] = []
     while len(frontier):
-        taken += sorted(level_of[k] for k in frontier.take(3, np.inf)[2].tolist())
+        number = frontier.take(3, np.inf)[2].tolist()
+        assert number
+        taken += sorted(level_of[k] for k in number)
     assert taken == sorted(levels)
 
 
