@@ -24,7 +24,9 @@ from certify.errors import BackendError, CertificateFormatError, CertifyError, I
 
 if TYPE_CHECKING:
     from certify.engines.branch_and_bound import RingProgress
+    from certify.lyapunov import Candidate
     from certify.policies import Policy
+    from certify.roa import RoaOptions, RoaResult
     from certify.systems import System
 
 app = typer.Typer(
@@ -51,7 +53,10 @@ def roa(
     domain: Annotated[
         list[str] | None, typer.Option(help="Half-width NAME=D or interval NAME=LO:HI of a state; repeatable.")
     ] = None,
-    candidate: Annotated[str, typer.Option(help="Lyapunov candidate: lyapunov or lqr.")] = "lyapunov",
+    candidate: Annotated[str, typer.Option(help="Lyapunov candidate: lyapunov, lqr or optimised.")] = "lyapunov",
+    compare: Annotated[
+        bool, typer.Option("--compare", help="Compare with the optimised candidate too; takes its time.")
+    ] = False,
     q: Annotated[str | None, typer.Option("--Q", help="Diagonal of Q, as in 1,1.")] = None,
     r: Annotated[str | None, typer.Option("--R", help="Diagonal of R (candidate lqr), as in 1.")] = None,
     level: Annotated[float | None, typer.Option(help="Prove exactly this level; less is not PROVED.")] = None,
@@ -92,7 +97,10 @@ def roa(
     finally:
         progress.close()
     data = result.to_dict()
+    if result.notice is not None:
+        _tell(result.notice)
     if result.certificate is not None:
+        data["candidates"] = _candidates(result, options, compare)
         from certify.certificate import read_certificate
 
         answer = None if result.checker is None else dict(result.checker)
@@ -216,6 +224,20 @@ def _fail(as_json: bool, message: str, status: int) -> int:
     else:
         sys.stderr.write(f"certify: {message}\n")
     return status
+
+
+def _candidates(result: RoaResult, options: RoaOptions, compare: bool) -> list[dict[str, Any]]:
+    """The volumes within reach of the other candidates, sampled, beside the one that was proved."""
+    from dataclasses import asdict
+
+    from certify.roa import compare_candidates
+
+    known = {} if result.candidate is None or result.P is None else {result.candidate: result.P}
+    names: list[Candidate] = ["lyapunov", "lqr"]
+    if compare or "optimised" in known:
+        names.append("optimised")
+    rows = compare_candidates(result.system, result.network, options, known, names)
+    return [{**asdict(row), "proved": row.candidate in known} for row in rows]
 
 
 def _system(stored: Policy, name: str | None, params: list[str], bounds: list[str]) -> System:

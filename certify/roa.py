@@ -10,7 +10,7 @@ import math
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,7 +24,15 @@ from certify.closed_loop import ClosedLoop
 from certify.engines.falsify import Witness, falsify
 from certify.engines.local import prove_local
 from certify.errors import BackendError, InputError, SoundnessError
-from certify.lyapunov import diagonalising_coordinates, domain_limit, extents, semi_axes, solve_lyapunov, volume
+from certify.lyapunov import (
+    Candidate,
+    choose_candidate,
+    diagonalising_coordinates,
+    domain_limit,
+    extents,
+    semi_axes,
+    volume,
+)
 from certify.obligations import Obligations
 from certify.policies import TanhNetwork
 from certify.systems import System
@@ -34,7 +42,6 @@ if TYPE_CHECKING:
     from certify.engines.branch_and_bound import RingProgress
 
 Array = NDArray[np.float64]
-Candidate = Literal["lyapunov", "lqr"]
 Progress = Callable[[Literal["ring", "check"], "RingProgress | None"], None]
 _SMALL_NETWORK = 10_000  # weights
 _BELOW = 1e-9  # relative distance from a limit that is itself out of reach (the domain's open condition)
@@ -46,7 +53,7 @@ class RoaOptions:
 
     Parameters
     ----------
-    candidate : `lyapunov` solves `A'P + PA = -Q`; `lqr` takes `Q + K'RK` in the place of Q.
+    candidate : where P comes from, see `choose_candidate`.
     Q, R : diagonals of the weights, shapes (n,) and (m,); None means ones.
     P : a Lyapunov matrix of one's own, (n, n); overrides the candidate.
     level : prove exactly this level; None finds the largest.
@@ -77,8 +84,9 @@ class RoaOptions:
 class RoaResult:
     """What was proved. `reason` says what limits the level, or why nothing was proved.
 
-    `levels` has local (c1), roa (c2), sampled_limit and domain_limit; absent values are None. `checker` is what the
-    checker said, None if it was not reached.
+    `candidate` is where P came from, `notice` why that is not what was asked for. `levels` has local (c1), roa (c2),
+    sampled_limit and domain_limit; absent values are None. `checker` is what the checker said, None if it was not
+    reached.
     """
 
     verdict: Verdict
@@ -86,6 +94,8 @@ class RoaResult:
     system: System
     network: TanhNetwork
     P: Array | None = None
+    candidate: str | None = None
+    notice: str | None = None
     levels: Mapping[str, float | None] = field(default_factory=dict)
     witness: Witness | None = None
     eigenvalues: tuple[str, ...] = ()
@@ -107,7 +117,9 @@ class RoaResult:
             "system": self.system.name,
             "parameters": {name: str(q) for name, q in self.system.parameters.items()},
             "policy": {"sha256": self.network.sha256(), "layers": list(self.network.layers)},
-            "lyapunov": {"P": None if P is None else P.tolist()},
+            "lyapunov": {
+                "P": None if P is None else P.tolist(), "candidate": self.candidate, "notice": self.notice,
+            },
             "levels": {k: self.levels.get(k) for k in ("local", "roa", "sampled_limit", "domain_limit")},
             "witness": None if self.witness is None else {
                 "x": self.witness.x.tolist(), "V": self.witness.level, "kind": self.witness.kind,
@@ -207,18 +219,20 @@ def _certify(
     _make_folder(out)
 
     with watch.stage("candidate"):
-        A, _, K = loop.linearise()
+        A, _, _ = loop.linearise()
         unstable = _unstable(loop, A)
         if unstable is not None:
             verdict, reason, eigenvalues = unstable
             return RoaResult(verdict, reason, system, network, eigenvalues=eigenvalues, seconds=watch.total())
-        P = _candidate(options, A, K)
+        P, name, notice = _candidate(loop, options)
         obligations = Obligations(loop, P, diagonalising_coordinates(P, A))
         limit = domain_limit(P, system.domain)
     levels: dict[str, float | None] = {"domain_limit": limit}
 
     def unfinished(verdict: Verdict, reason: str, witness: Witness | None = None, boxes: int = 0) -> RoaResult:
-        return RoaResult(verdict, reason, system, network, P, levels, witness, boxes=boxes, seconds=watch.total())
+        return RoaResult(
+            verdict, reason, system, network, P, name, notice, levels, witness, boxes=boxes, seconds=watch.total()
+        )
 
     if options.level is not None and options.level >= limit:
         return unfinished(
@@ -282,7 +296,7 @@ def _certify(
         )
     unchecked.replace(path)
     return RoaResult(
-        Verdict.PROVED, reason, system, network, P, levels, witness,
+        Verdict.PROVED, reason, system, network, P, name, notice, levels, witness,
         boxes=ring.boxes, leaves=ring.leaves, seconds=watch.total(), certificate=path, checker=answer,
     )  # fmt: skip
 
@@ -335,25 +349,44 @@ def _unstable(loop: ClosedLoop, A: Array) -> tuple[Verdict, str, tuple[str, ...]
     return None
 
 
-def _candidate(options: RoaOptions, A: Array, K: Array) -> Array:
-    n, m = A.shape[0], K.shape[0]
-    if options.P is not None:
-        P = np.array(options.P, dtype=np.float64)
-        if P.shape != (n, n) or not np.all(np.isfinite(P)) or not np.all(np.linalg.eigvalsh((P + P.T) / 2) > 0):
-            raise InputError(f"`P` must be a symmetric positive definite matrix of shape ({n}, {n}).")
-        return P
-    Q, R = _weights(options.Q, n, "Q"), _weights(options.R, m, "R")
-    if options.candidate == "lqr":
-        M = K.T @ R @ K
-        Q = Q + (M + M.T) / 2
-    return solve_lyapunov(A, Q)
+def _candidate(loop: ClosedLoop, options: RoaOptions) -> tuple[Array, str, str | None]:
+    """P, where it comes from, and a notice."""
+    if options.P is None:
+        chosen = choose_candidate(loop, options.candidate, options.Q, options.R)
+        return chosen.P, chosen.name, chosen.notice
+    n, P = loop.system.n, np.array(options.P, dtype=np.float64)
+    if P.shape != (n, n) or not np.all(np.isfinite(P)) or not np.all(np.linalg.eigvalsh((P + P.T) / 2) > 0):
+        raise InputError(f"`P` must be a symmetric positive definite matrix of shape ({n}, {n}).")
+    return P, "given", None
 
 
-def _weights(diagonal: tuple[float, ...] | None, count: int, name: str) -> Array:
-    values = np.ones(count) if diagonal is None else np.array(diagonal, dtype=np.float64)
-    if values.shape != (count,) or not np.all(np.isfinite(values)) or not np.all(values > 0):
-        raise InputError(f"`{name}` must have {count} positive numbers; found {diagonal}.")
-    return np.diag(values)
+@dataclass(frozen=True, slots=True)
+class CandidateVolume:
+    """What a candidate could give at most: `level` is the smaller of the domain's limit and the lowest violation found.
+
+    Sampled, not proved, unless the candidate is the one that was proved.
+    """
+
+    candidate: str
+    level: float
+    limited_by: Literal["domain", "sampled"]
+    volume: float
+
+
+def compare_candidates(
+    system: System, network: TanhNetwork, options: RoaOptions, known: Mapping[str, Array], names: Sequence[Candidate]
+) -> tuple[CandidateVolume, ...]:
+    """The volumes within reach of several candidates; `known` has those whose P is there already."""
+    loop = ClosedLoop(system, network)
+    A, _, _ = loop.linearise()
+    result = []
+    for name in names:
+        P = known[name] if name in known else choose_candidate(loop, name, options.Q, options.R).P
+        limit = domain_limit(P, system.domain)
+        witness = falsify(Obligations(loop, P, diagonalising_coordinates(P, A)), limit, samples=4000)
+        level = limit if witness is None else witness.level
+        result.append(CandidateVolume(name, level, "domain" if witness is None else "sampled", volume(P, level)))
+    return tuple(result)
 
 
 def _describe(witness: Witness, system: System) -> str:

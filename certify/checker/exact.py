@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Matrix = list[list[Fraction]]
-MAX_BITS = 2**17
+MAX_BITS = 2**14
 
 
 def rational(array: NDArray[np.float64]) -> Matrix:

@@ -73,7 +73,7 @@ class _Builder:
     def __init__(self, names: dict[str, int], rational: Callable[[Any, str], Fraction]) -> None:
         self.names, self.rational = names, rational
         self.operations: list[Operation] = []
-        self.known: dict[Operation, int] = {}
+        self.known: dict[object, int] = {}
         self.visited = 0
 
     def push(self, *operation: Any) -> int:
@@ -117,7 +117,7 @@ class _Builder:
         if name == "tan" and len(indices) == 1:
             sine, cosine = self.push("sin", indices[0]), self.push("cos", indices[0])
             return self.push("mul", sine, self.push("inv", cosine)), f"tan({words_of[0]})"
-        raise Rejected("format", at, f"operator {name[:20]!r} with {len(indices)} operands is not in the grammar")
+        raise Rejected("format", at, f"operator {name[:20]!a} with {len(indices)} operands is not in the grammar")
 
     def power(self, base: int, exponent: Any, at: str) -> int:
         if type(exponent) is not int or not 0 < abs(exponent) <= MAX_EXPONENT:

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from certify.lyapunov.candidates import solve_lyapunov
+from certify.lyapunov.choice import Candidate, Chosen, choose_candidate
 from certify.lyapunov.level_sets import diagonalising_coordinates, domain_limit, extents, semi_axes, volume
 from certify.lyapunov.optimised import optimise_candidate
 
 __all__ = [
+    "Candidate",
+    "Chosen",
+    "choose_candidate",
     "diagonalising_coordinates",
     "domain_limit",
     "extents",

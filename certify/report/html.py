@@ -293,7 +293,14 @@ def _tables(
         if result.get("boxes"):
             run.append(("boxes examined", f"{result['boxes']:,}"))
         run += [(f"{k}", seconds(v)) for k, v in result["seconds"].items() if v is not None]
-    return {"levels": levels, "geometry": geometry, "reach": reach, "evidence": evidence, "run": run}
+    candidates = [
+        (row["candidate"], number(row["level"]), f"{below(row['volume'])} {volume_unit(state_units)}".rstrip(),
+         "the domain" if row["limited_by"] == "domain" else "a violation found",
+         "the one proved here" if row["proved"] else "")
+        for row in (result or {}).get("candidates", [])
+    ]  # fmt: skip
+    tables = {"levels": levels, "geometry": geometry, "reach": reach, "evidence": evidence, "run": run}
+    return {**tables, "candidates": candidates}
 
 
 def _simulated(roa: SimulatedRoa, certificate: Certificate) -> dict[str, str]:

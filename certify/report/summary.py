@@ -82,6 +82,10 @@ def _rows(result: Mapping[str, Any], proved: bool) -> list[tuple[str, str]]:
     if result.get("volume") is not None:
         unit = volume_unit(units)
         rows.append((volume_name(len(units)), f"{below(result['volume'])} {unit}".rstrip()))
+    if len(result.get("candidates", [])) > 1:
+        unit = volume_unit(units)
+        shown = [f"{c['candidate']} {below(c['volume'])}" for c in result["candidates"]]
+        rows.append(("candidates", f"{', '.join(shown)} {unit}".rstrip() + " (sampled, at most)"))
     rows.append(("policy", "-".join(map(str, result["policy"]["layers"]))))
     rows.append(("its sha256", str(result["policy"]["sha256"])))
     if result.get("eigenvalues"):
