@@ -58,7 +58,7 @@ class RoaOptions:
     P : a Lyapunov matrix of one's own, (n, n); overrides the candidate.
     level : prove exactly this level; None finds the largest.
     device : where boxes are bounded, `cpu` or `cuda`.
-    time_limit : seconds for the ring.
+    time_limit : seconds for the ring, the falsifier included.
     max_boxes : boxes for the ring.
     """
 
@@ -256,10 +256,10 @@ def _certify(
 
     from certify.engines.branch_and_bound import Budget, prove_ring
 
+    budget = Budget(boxes=options.max_boxes, seconds=options.time_limit - watch.seconds["ring"])
     with watch.stage("ring"):
         ring = prove_ring(
-            obligations, inner, top, Budget(boxes=options.max_boxes, seconds=options.time_limit),
-            torch.device(options.device),
+            obligations, inner, top, budget, torch.device(options.device),
             None if progress is None else lambda state: progress("ring", state),
         )  # fmt: skip
     if ring.witness is not None and (witness is None or ring.witness.level < witness.level):

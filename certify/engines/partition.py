@@ -14,7 +14,7 @@ from torch import Tensor
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 LEAF = 255
-_HANDFUL = 256  # boxes that cost hardly more together than one alone
+_HANDFUL = 64  # boxes that cost hardly more together than one alone
 
 
 class Partition:
