@@ -45,6 +45,7 @@ Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instea
 
 @app.command()
 def roa(
+    context: typer.Context,
     policy: Annotated[Path, typer.Option(help="Policy file (certify-policy/1, .pt).")],
     system: Annotated[
         str | None, typer.Option(help="Plant: a name or a .toml file; default: what the policy file says.")
@@ -60,6 +61,11 @@ def roa(
     q: Annotated[str | None, typer.Option("--Q", help="Diagonal of Q, as in 1,1.")] = None,
     r: Annotated[str | None, typer.Option("--R", help="Diagonal of R (candidate lqr), as in 1.")] = None,
     level: Annotated[float | None, typer.Option(help="Prove exactly this level; less is not PROVED.")] = None,
+    engine: Annotated[
+        str, typer.Option(envvar="CERTIFY_ENGINE", help="bounds, dreal (trusted, not checked), or both.")
+    ] = "bounds",
+    precision: Annotated[float, typer.Option(help="dReal's delta.")] = 1e-3,
+    jobs: Annotated[int, typer.Option(help="dReal's threads.")] = 1,
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
     time_limit: Annotated[float, typer.Option(help="Seconds for the ring.")] = 600.0,
     max_boxes: Annotated[int, typer.Option(help="Boxes for the ring.")] = 4_000_000,
@@ -83,6 +89,9 @@ def roa(
         Q=_numbers(q, "--Q"),
         R=_numbers(r, "--R"),
         level=level,
+        engine=_engine(context, engine),  # type: ignore[arg-type]
+        dreal_precision=precision,
+        jobs=jobs,
         device=_device(device),
         time_limit=time_limit,
         max_boxes=max_boxes,
@@ -113,6 +122,40 @@ def roa(
         if result.certificate is not None:
             sys.stdout.write(f"certificate  {result.certificate}\nreport       {folder / 'report.html'}\n")
     raise typer.Exit(result.verdict.exit_status)
+
+
+@app.command("export-smt2")
+def export_smt2(
+    policy: Annotated[Path, typer.Option(help="Policy file (certify-policy/1, .pt).")],
+    out: Annotated[Path, typer.Option(help="Folder for the files, one a claim.")],
+    system: Annotated[str | None, typer.Option(help="Plant; default: what the policy file says.")] = None,
+    param: Annotated[list[str] | None, typer.Option(help="Parameter of the plant, NAME=VALUE; repeatable.")] = None,
+    domain: Annotated[list[str] | None, typer.Option(help="Half-width NAME=D or interval NAME=LO:HI.")] = None,
+    candidate: Annotated[str, typer.Option(help="Lyapunov candidate: lyapunov, lqr or optimised.")] = "lyapunov",
+    level: Annotated[float | None, typer.Option(help="c2; default: 0.99 of the largest that is proved.")] = None,
+    time_limit: Annotated[float, typer.Option(help="Seconds for the ring.")] = 600.0,
+    as_json: Json = False,
+) -> None:
+    """Prove levels with the bounds engine and write its claims as SMT-LIB 2 for another solver."""
+    from certify.engines.dreal import to_smt2
+    from certify.obligations import queries
+    from certify.policies import load_policy
+    from certify.roa import RoaOptions, certify_roa, obligations_of
+
+    stored = load_policy(policy)
+    plant = _system(stored, system, param or [], domain or [])
+    options = RoaOptions(candidate=candidate, level=level, time_limit=time_limit)  # type: ignore[arg-type]
+    result = certify_roa(plant, stored.network, out, options)
+    inner, outer = result.levels.get("local"), result.levels.get("roa")
+    if result.verdict.exit_status != 0 or inner is None or outer is None:
+        raise InputError(f"there are no levels to export; {result.verdict.value}: {result.reason}")
+    outer = outer if level is not None else max(inner, 0.99 * outer)
+    written = []
+    for query in queries(obligations_of(result), inner, outer):
+        path = out / f"{query.name}.smt2"
+        _write(path, to_smt2(query, "unsat (proved by the bounds engine, accepted by the checker)"))
+        written.append(str(path))
+    sys.stdout.write((json.dumps({"files": written}) if as_json else "\n".join(written)) + "\n")
 
 
 @app.command()
@@ -162,7 +205,7 @@ def report(
     _write(target, render_html(read, answer, None, certificate))
     stated = {"report": str(target), "result": answer["result"]}
     sys.stdout.write((json.dumps(stated) if as_json else f"{answer['result']}  {target}") + "\n")
-    raise typer.Exit(0 if answer["result"] == "ACCEPTED" else 1)
+    raise typer.Exit({"ACCEPTED": 0, "TRUSTED": 3}.get(answer["result"], 1))
 
 
 @app.command()
@@ -277,6 +320,20 @@ def _device(name: str) -> str:
     if name == "cpu" or (name.startswith("cuda") and torch.cuda.is_available()):
         return name
     raise InputError(f"--device must be cpu, or cuda on a machine that has it; found {name!r}.")
+
+
+def _engine(context: typer.Context, name: str) -> str:
+    """The engine; without dReal, one that only the environment names falls back to bounds with a notice."""
+    from certify.engines.dreal import find_backend
+
+    source = context.get_parameter_source("engine")
+    if name in ("dreal", "both") and source is not None and source.name == "ENVIRONMENT":
+        try:
+            find_backend()
+        except BackendError as error:
+            _tell(f"engine bounds in the place of {name}: {error}")
+            return "bounds"
+    return name
 
 
 def _plant_line(stored: Policy, plant: System, overridden: bool) -> str:

@@ -12,14 +12,14 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.certificate import Certificate, write_certificate
+from certify.certificate import Certificate, PartitionTree, TrustedSolver, write_certificate
 from certify.closed_loop import ClosedLoop
 from certify.engines.falsify import Witness, falsify
 from certify.engines.local import prove_local
@@ -40,8 +40,10 @@ from certify.verdict import Verdict
 
 if TYPE_CHECKING:
     from certify.engines.branch_and_bound import RingProgress
+    from certify.engines.dreal_proof import Asked
 
 Array = NDArray[np.float64]
+Engine = Literal["bounds", "dreal", "both"]
 Progress = Callable[[Literal["ring", "check"], "RingProgress | None"], None]
 _SMALL_NETWORK = 10_000  # weights
 _BELOW = 1e-9  # relative distance from a limit that is itself out of reach (the domain's open condition)
@@ -57,6 +59,8 @@ class RoaOptions:
     Q, R : diagonals of the weights, shapes (n,) and (m,); None means ones.
     P : a Lyapunov matrix of one's own, (n, n); overrides the candidate.
     level : prove exactly this level; None finds the largest.
+    engine : `bounds`, `dreal` (its word is trusted, not checked), or `both`: bounds prove, dReal is asked as well.
+    dreal_precision, jobs : dReal's delta and threads.
     device : where boxes are bounded, `cpu` or `cuda`.
     time_limit : seconds for the ring, the falsifier included.
     max_boxes : boxes for the ring.
@@ -67,6 +71,9 @@ class RoaOptions:
     R: tuple[float, ...] | None = None
     P: Array | None = None
     level: float | None = None
+    engine: Engine = "bounds"
+    dreal_precision: float = 1e-3
+    jobs: int = 1
     device: str = "cpu"
     time_limit: float = 600.0
     max_boxes: int = 4_000_000
@@ -74,6 +81,10 @@ class RoaOptions:
     def __post_init__(self) -> None:
         if self.candidate not in get_args(Candidate):
             raise InputError(f"`candidate` must be one of {get_args(Candidate)}; found {self.candidate!r}.")
+        if self.engine not in get_args(Engine):
+            raise InputError(f"`engine` must be one of {get_args(Engine)}; found {self.engine!r}.")
+        if not 0 < self.dreal_precision < 1 or self.jobs < 1:
+            raise InputError("`dreal_precision` must lie between 0 and 1, and `jobs` be at least 1.")
         if self.level is not None and not (math.isfinite(self.level) and self.level > 0):
             raise InputError(f"`level` must be a positive number; found {self.level}.")
         if not self.time_limit > 0 or not self.max_boxes > 0:
@@ -86,7 +97,7 @@ class RoaResult:
 
     `candidate` is where P came from, `notice` why that is not what was asked for. `levels` has local (c1), roa (c2),
     sampled_limit and domain_limit; absent values are None. `checker` is what the checker said, None if it was not
-    reached.
+    reached. `solver` has dReal's version and every query with its answer, None if it was not asked.
     """
 
     verdict: Verdict
@@ -104,6 +115,8 @@ class RoaResult:
     seconds: Mapping[str, float] = field(default_factory=dict)
     certificate: Path | None = None
     checker: Mapping[str, Any] | None = None
+    engine: Engine = "bounds"
+    solver: Mapping[str, Any] | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON object of `certify roa --json`."""
@@ -128,7 +141,8 @@ class RoaResult:
             "volume": volume(P, level) if known else None,  # type: ignore[arg-type]
             "semi_axes": semi_axes(P, level).tolist() if known else None,  # type: ignore[arg-type]
             "extents": extents(P, level).tolist() if known else None,  # type: ignore[arg-type]
-            "engine": "bounds",
+            "engine": self.engine,
+            "solver": None if self.solver is None else dict(self.solver),
             "boxes": self.boxes,
             "leaves": self.leaves,
             "seconds": {
@@ -249,6 +263,13 @@ def _certify(
         top = witness.level * (1 - 1e-3)
     with watch.stage("local"):
         inner = prove_local(obligations, top)
+    if options.engine == "dreal":
+        found = _ask_dreal(obligations, inner, top, options, out, watch, provenance, progress)
+        if witness is not None and (found.witness is None or witness.level < found.witness.level):
+            found = replace(found, witness=witness)
+        found = replace(found, reason=_limit(found.reason, options, witness))
+        known = {**levels, **{k: v for k, v in found.levels.items() if v is not None}}
+        return replace(found, candidate=name, notice=notice, levels=known, seconds=watch.total())
     if inner is None:
         return unfinished(Verdict.UNKNOWN, "local: the linearisation does not dominate on any ball; try another --Q")
 
@@ -271,13 +292,10 @@ def _certify(
             return unfinished(Verdict.REFUTED, _describe(witness, system), witness, ring.boxes)
         missed = f"{ring.reason}: proved only up to V <= {ring.level:.12g}, not {options.level:g}"
         return unfinished(Verdict.UNKNOWN, missed, boxes=ring.boxes)
-    if ring.reason == "requested" and options.level is None:
-        reason = "domain" if witness is None else ("inputs" if witness.kind == "input" else "witness")
-    else:
-        reason = ring.reason
+    reason = _limit(ring.reason, options, witness)
     levels |= {"local": inner, "roa": ring.level}
     certificate = Certificate(
-        system, network, P, obligations.T, ring.root, inner, ring.level, ring.tree, provenance or {}
+        system, network, P, inner, ring.level, PartitionTree(obligations.T, ring.root, ring.tree), provenance or {}
     )
     path, unchecked = out / "certificate.json", out / "certificate.unchecked.json"
     with watch.stage("write"):
@@ -295,10 +313,110 @@ def _certify(
             f"the checker rejects what the engine proved: {answer}. The certificate {unchecked} reproduces it."
         )
     unchecked.replace(path)
+    solver = _confirm(obligations, inner, ring.level, options, out) if options.engine == "both" else None
     return RoaResult(
-        Verdict.PROVED, reason, system, network, P, name, notice, levels, witness,
-        boxes=ring.boxes, leaves=ring.leaves, seconds=watch.total(), certificate=path, checker=answer,
+        Verdict.PROVED, reason, system, network, P, name, notice, levels, witness, boxes=ring.boxes, leaves=ring.leaves,
+        seconds=watch.total(), certificate=path, checker=answer, engine=options.engine, solver=solver,
     )  # fmt: skip
+
+
+def _limit(reason: str, options: RoaOptions, witness: Witness | None) -> str:
+    """What limits a level, from what stopped its proof."""
+    if reason != "requested" or options.level is not None:
+        return reason
+    return "domain" if witness is None else ("inputs" if witness.kind == "input" else "witness")
+
+
+def _ask_dreal(
+    obligations: Obligations, guess: float | None, top: float, options: RoaOptions, out: Path, watch: _Stopwatch,
+    provenance: Mapping[str, Any] | None, progress: Progress | None,
+) -> RoaResult:  # fmt: skip
+    """Levels by dReal; the certificate says that it was trusted, and the checker checks what it can."""
+    from certify.engines.dreal import find_backend
+    from certify.engines.dreal_proof import DrealOptions, prove_with_dreal
+
+    system, network, P = obligations.loop.system, obligations.loop.network, obligations.P
+    result = RoaResult(Verdict.UNKNOWN, "", system, network, P, engine="dreal")
+    try:
+        backend = find_backend()
+    except BackendError as error:
+        return replace(result, reason=str(error))
+    with watch.stage("ring"):
+        proof = prove_with_dreal(
+            obligations, 16 * guess if guess is not None else 1e-4 * top, top, backend,
+            DrealOptions(options.dreal_precision, options.jobs, options.time_limit - watch.seconds["ring"]),
+        )  # fmt: skip
+    sampled = None if proof.witness is None else proof.witness.level
+    result = replace(
+        result, reason=proof.reason, witness=proof.witness, solver=_solver(backend.version, options, proof.asked),
+        levels={"local": proof.inner, "roa": proof.level, "sampled_limit": sampled},
+    )  # fmt: skip
+    if proof.inner is None or proof.level is None:
+        return result
+    if options.level is not None and proof.level < options.level:
+        result = replace(result, levels={"local": proof.inner, "sampled_limit": sampled})
+        if proof.witness is not None and proof.witness.level <= options.level:
+            return replace(result, verdict=Verdict.REFUTED, reason=_describe(proof.witness, system))
+        return replace(result, reason=f"{proof.reason}: up to V <= {proof.level:.12g}, not {options.level:g}")
+    evidence = TrustedSolver(
+        "dreal", backend.version, options.dreal_precision,
+        tuple((f"{asked.name}-{asked.level!r}", asked.answer.status) for asked in proof.asked),
+    )  # fmt: skip
+    path, unchecked = out / "certificate.json", out / "certificate.unchecked.json"
+    with watch.stage("write"):
+        write_certificate(
+            unchecked, Certificate(system, network, P, proof.inner, proof.level, evidence, provenance or {})
+        )
+    if progress is not None:
+        progress("check", None)
+    with watch.stage("check"):
+        answer = run_checker(unchecked)
+    if answer["result"] != "TRUSTED":
+        raise SoundnessError(f"the checker rejects what dReal confirmed: {answer}; {unchecked} reproduces it.")
+    unchecked.replace(path)
+    return replace(result, verdict=Verdict.PROVED, certificate=path, checker=answer)
+
+
+def _confirm(obligations: Obligations, inner: float, outer: float, options: RoaOptions, out: Path) -> dict[str, Any]:
+    """dReal's answers about what the bounds engine proved.
+
+    Raises
+    ------
+    SoundnessError : dReal points at a genuine violation of what was proved and checked.
+    """
+    from certify.engines.dreal import find_backend
+    from certify.engines.dreal_proof import DrealOptions, confirm_with_dreal
+
+    try:
+        backend = find_backend()
+    except BackendError as error:
+        return {"solver": "dreal", "missing": str(error)}
+    allowed = DrealOptions(options.dreal_precision, options.jobs, options.time_limit)
+    asked, witness = confirm_with_dreal(obligations, inner, outer, backend, allowed)
+    if witness is not None:
+        path = out / "contradiction.json"
+        stated = {"x": [v.hex() for v in witness.x.tolist()], "kind": witness.kind, "V": witness.level}
+        path.write_text(json.dumps({"witness": stated, "certificate": "certificate.json"}) + "\n", encoding="utf-8")
+        raise SoundnessError(f"dReal and Arb contradict a checked certificate; {path} has the witness.")
+    return _solver(backend.version, options, asked)
+
+
+def _solver(version: str, options: RoaOptions, asked: Sequence[Asked]) -> dict[str, Any]:
+    """The record of every query."""
+    rows = [
+        {"query": a.name, "level": a.level, "answer": a.answer.status, "seconds": a.answer.seconds,
+         "detail": a.answer.detail}
+        for a in asked
+    ]  # fmt: skip
+    return {"solver": "dreal", "version": version, "precision": options.dreal_precision, "queries": rows}
+
+
+def obligations_of(result: RoaResult) -> Obligations:
+    """What a result was about, for asking another solver."""
+    if result.P is None:
+        raise InputError("there is no Lyapunov function: nothing was tried.")
+    loop = ClosedLoop(result.system, result.network)
+    return Obligations(loop, result.P, diagonalising_coordinates(result.P, loop.linearise()[0]))
 
 
 def run_checker(path: Path) -> dict[str, Any]:
@@ -306,7 +424,7 @@ def run_checker(path: Path) -> dict[str, Any]:
 
     Raises
     ------
-    BackendError : it ended with neither ACCEPTED nor REJECTED.
+    BackendError : it ended with neither ACCEPTED, nor TRUSTED, nor REJECTED.
     """
     command = [sys.executable, "-I", "-m", "certify.checker", str(path), "--json"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -314,7 +432,7 @@ def run_checker(path: Path) -> dict[str, Any]:
         answer = json.loads(done.stdout)
     except json.JSONDecodeError:
         answer = {}
-    expected = {"ACCEPTED": 0, "REJECTED": 1}.get(answer.get("result", ""))
+    expected = {"ACCEPTED": 0, "REJECTED": 1, "TRUSTED": 3}.get(answer.get("result", ""))
     if expected is None or done.returncode != expected:
         raise BackendError(
             f"the checker ended with status {done.returncode} and no verdict: "

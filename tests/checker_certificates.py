@@ -151,11 +151,11 @@ def grow(data: Document, max_leaves: int = 5000, depth: int = 40) -> Document:
     Leaves that are still not accepted at `depth` or at `max_leaves` stay, and the certificate is then rejected.
     """
     c = parse(data)
-    S = exact.congruence(exact.rational(c.T), exact.rational(c.P))
+    S = exact.congruence(exact.rational(c.evidence.T), exact.rational(c.P))
     axes: dict[tuple[int, ...], int] = {}  # path from the root (0 lower, 1 upper) -> axis of the split
     with np.errstate(all="ignore"):
-        ring = rules._Ring(c, network.fold(c.policy, c.u_eq), S, rules._inputs_bounded_by_form(c))
-        boxes = [((), -c.root, c.root.copy())]
+        ring = rules._Ring(c, c.evidence.T, network.fold(c.policy, c.u_eq), S, rules._inputs_bounded_by_form(c))
+        boxes = [((), -c.evidence.root, c.evidence.root.copy())]
         for _ in range(depth):
             if not boxes or len(axes) + len(boxes) > max_leaves:
                 break
@@ -163,7 +163,7 @@ def grow(data: Document, max_leaves: int = 5000, depth: int = 40) -> Document:
             halves = []
             for (path, lo, hi), done in zip(boxes, good, strict=True):
                 if not done:
-                    axis = axes[path] = int(np.argmax((hi - lo) / c.root))
+                    axis = axes[path] = int(np.argmax((hi - lo) / c.evidence.root))
                     middle = 0.5 * lo[axis] + 0.5 * hi[axis]
                     left, right = hi.copy(), lo.copy()
                     left[axis] = right[axis] = middle

@@ -25,8 +25,8 @@ CASES = ("scalar", "linear", "rotor", "rotor, preactivation")
 @cache
 def ring_of(name: str) -> rules._Ring:
     c = parse(honest(name))
-    S = rules.congruence(rules.rational(c.T), rules.rational(c.P))
-    return rules._Ring(c, rules.fold(c.policy, c.u_eq), S, rules._inputs_bounded_by_form(c))
+    S = rules.congruence(rules.rational(c.evidence.T), rules.rational(c.P))
+    return rules._Ring(c, c.evidence.T, rules.fold(c.policy, c.u_eq), S, rules._inputs_bounded_by_form(c))
 
 
 def vdot_on(ring: rules._Ring, centre: Array, radius: Array) -> Taylor:
@@ -51,7 +51,7 @@ def test_the_gap_contains_what_it_stands_for(name: str, seed: int, magnitude: fl
     """sign (level - V) with V = z'Sz in fractions, at points centre + radius d."""
     ring = ring_of(name)
     n = ring.n
-    S = rules.congruence(rules.rational(ring.c.T), rules.rational(ring.c.P))
+    S = rules.congruence(rules.rational(ring.T), rules.rational(ring.c.P))
     generator = np.random.default_rng(seed)
     centre = generator.standard_normal((n, 3)) * 10.0**magnitude
     radius = np.abs(generator.standard_normal((n, 3))) * 10.0 ** generator.uniform(-14, 6)
@@ -120,7 +120,7 @@ def test_the_bound_holds_wherever_a_box_meets_the_ring(name: str) -> None:
         z = np.where(generator.random(d.shape) < 0.3, np.sign(d), d) * radius[:, [index]] + centre[:, [index]]
         V = (diagonal * z * z).sum(0)
         inside = (c.c1 * (1 + 1e-9) < V) & (c.c2 * (1 - 1e-9) > V)
-        x = (c.T @ z[:, inside]).T
+        x = (c.evidence.T @ z[:, inside]).T
         met += len(x)
         for value in vdots(ring, x):
             assert value <= arb(float(bound[index])) + 1e-12 * abs(value)  # 1e-12 for x = T z rounded

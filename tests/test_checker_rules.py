@@ -559,7 +559,7 @@ def test_a_leaf_is_missed_only_if_it_lies_outside_the_ring(exponent: int) -> Non
         object.__setattr__(c, "c1", float(levels[0]))
         object.__setattr__(c, "c2", float(levels[1]))
         with np.errstate(all="ignore"):
-            ring = rules._Ring(c, network.fold(c.policy, c.u_eq), S, True)
+            ring = rules._Ring(c, c.evidence.T, network.fold(c.policy, c.u_eq), S, True)
             lo = generator.uniform(-3, 3, (2, 40))
             hi = lo + generator.uniform(0, 1, (2, 40))
             result = ring._misses(lo, hi)

@@ -272,6 +272,6 @@ def test_control_c_ends_a_running_command(tmp_path: Path) -> None:
     assert "cartpole" in running.stderr.readline()  # the plant is known, the proof begins
     running.send_signal(signal.SIGINT)
     out, err = running.communicate(timeout=60)
-    assert running.returncode == 130 and out == ""
+    assert running.returncode in (130, -signal.SIGINT) and out == ""
     assert "interrupted" in err and "Traceback" not in err
     assert not [p for p in tmp_path.rglob("*") if p.is_file()]

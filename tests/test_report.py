@@ -23,7 +23,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from certify.certificate import Certificate, read_certificate, write_certificate
+from certify.certificate import Certificate, PartitionTree, read_certificate, write_certificate
 from certify.closed_loop import ClosedLoop
 from certify.errors import CertificateFormatError, InputError
 from certify.lyapunov import solve_lyapunov, volume
@@ -45,6 +45,8 @@ from certify.report.words import below, label, number, symbol, units_of
 from certify.roa import certify_roa, run_checker
 from certify.systems import System, get_system
 from tests.conftest import box, chain, pendulum_network, scalar_tanh
+
+ONE_LEAF = PartitionTree(np.eye(2), np.ones(2), bytes([255]))
 
 
 @dataclass(frozen=True)
@@ -187,10 +189,12 @@ def test_broken_trees_are_refused(tree: bytes, message: str) -> None:
 
 def test_leaves_of_a_real_certificate(pendulum_case: Case) -> None:
     certificate = pendulum_case.certificate
-    leaves = rebuild_leaves(certificate.tree, certificate.root)
+    evidence = certificate.evidence
+    assert isinstance(evidence, PartitionTree)
+    leaves = rebuild_leaves(evidence.tree, evidence.root)
     assert len(leaves) == pendulum_case.answer["leaves"]
     total = np.prod(leaves.upper - leaves.lower, axis=1).sum()
-    assert total == pytest.approx(np.prod(2 * certificate.root), rel=1e-12)
+    assert total == pytest.approx(np.prod(2 * evidence.root), rel=1e-12)
 
 
 # Geometry of the drawings
@@ -440,7 +444,7 @@ def hostile_certificate() -> Certificate:
     for field, value in hostile.items():
         object.__setattr__(system, field, value)
     network = TanhNetwork((np.array([[0.1, 0.2]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
-    return Certificate(system, network, np.eye(2), np.eye(2), np.ones(2), 0.1, 0.5, bytes([255]), {HOSTILE: HOSTILE})
+    return Certificate(system, network, np.eye(2), 0.1, 0.5, ONE_LEAF, {HOSTILE: HOSTILE})
 
 
 def test_hostile_names_are_text(tmp_path: Path) -> None:
@@ -461,7 +465,13 @@ def test_hostile_names_are_text(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [{"tree": bytes([0, 255])}, {"P": -np.eye(2)}, {"P": np.zeros((2, 2))}, {"roa": -1.0}, {"local": math.inf}],
+    [
+        {"evidence": replace(ONE_LEAF, tree=bytes([0, 255]))},
+        {"P": -np.eye(2)},
+        {"P": np.zeros((2, 2))},
+        {"roa": -1.0},
+        {"local": math.inf},
+    ],
     ids=["tree", "negative", "zero", "level", "infinite"],
 )
 def test_a_rejected_file_that_cannot_be_drawn_still_has_a_page(change: dict[str, Any], tmp_path: Path) -> None:
@@ -472,7 +482,7 @@ def test_a_rejected_file_that_cannot_be_drawn_still_has_a_page(change: dict[str,
 
 
 def test_an_accepted_certificate_that_cannot_be_drawn_is_an_error(pendulum_case: Case) -> None:
-    broken = replace(pendulum_case.certificate, tree=b"")
+    broken = replace(pendulum_case.certificate, evidence=replace(ONE_LEAF, tree=b""))
     with pytest.raises(CertificateFormatError):
         render_html(broken, pendulum_case.answer, None, pendulum_case.path)
 
@@ -497,7 +507,7 @@ def test_many_leaves_are_rasterised() -> None:
     tree = b"\xff"
     for k in range(depth):
         tree = bytes([k % 2]) + tree + tree
-    certificate = Certificate(system, network, P, np.eye(2), np.ones(2), 1e-3, 0.5, tree)
+    certificate = Certificate(system, network, P, 1e-3, 0.5, PartitionTree(np.eye(2), np.ones(2), tree))
     picture = next(p for p in draw(certificate, accepted=False)[0] if p.title == "The leaf partition")
     assert "4,096 leaves" in picture.caption and "data:image/png" in picture.svg
     assert len(picture.svg) < 500_000
@@ -517,7 +527,7 @@ def test_a_pole_in_the_domain_does_no_harm() -> None:
     x, y, u = sympy.symbols("x y u")
     system = System("pole", (x, y), (u,), {}, (-x, -y + x**2 / (1 - x) + u), (sympy.Integer(0),), box(2, 2), box(2))
     network = TanhNetwork((np.array([[0.1, 0.2]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
-    certificate = Certificate(system, network, np.eye(2), np.eye(2), np.ones(2), 0.01, 0.02, bytes([255]))
+    certificate = Certificate(system, network, np.eye(2), 0.01, 0.02, ONE_LEAF)
     pictures, roa = draw(certificate, accepted=False)
     assert len(pictures) == 5 and roa is not None and roa.contradictions == 0
 

@@ -626,7 +626,9 @@ def random_ring(generator: Generator, name: str, squash: Squash, centre: Centre)
         T=T,
         root=np.ones(n),
     ))  # fmt: skip
-    return rules._Ring(c, checker.fold(c.policy, c.u_eq), congruence(rational(c.T), rational(c.P)), False)
+    return rules._Ring(
+        c, c.evidence.T, checker.fold(c.policy, c.u_eq), congruence(rational(c.evidence.T), rational(c.P)), False
+    )
 
 
 def vdot_bounds(ring: rules._Ring, lo: Array, hi: Array) -> tuple[Array, Array, Array]:
@@ -650,7 +652,7 @@ def levels_and_vdots(name: str, c: Certificate, z: Array) -> list[tuple[arb, arb
     """`x'P x` and `2 x'P f(x, pi(x))` at x = T z for each row of z."""
     system, trees = plant(name)
     names = [s.name for s in (*system.states, *system.inputs)]
-    states = states_in_arb(c.T, z)
+    states = states_in_arb(c.evidence.T, z)
     P = [[arb(p) for p in row] for row in c.P.tolist()]
     result = []
     for x, u in zip(states, policies_in_arb(c.policy, c.u_eq, states), strict=True):

@@ -2,6 +2,12 @@
 
 from __future__ import annotations
 
-from certify.certificate.model import Certificate, read_certificate, write_certificate
+from certify.certificate.model import (
+    Certificate,
+    PartitionTree,
+    TrustedSolver,
+    read_certificate,
+    write_certificate,
+)
 
-__all__ = ["Certificate", "read_certificate", "write_certificate"]
+__all__ = ["Certificate", "PartitionTree", "TrustedSolver", "read_certificate", "write_certificate"]

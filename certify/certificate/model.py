@@ -29,26 +29,43 @@ SCHEMA = "certify-certificate/1"
 
 
 @dataclass(frozen=True, slots=True)
+class PartitionTree:
+    """Evidence that the checker replays: T (n, n) and root (n,), half-widths of the root box in z, x = T z; `tree` is
+    the partition in preorder, one byte a node."""
+
+    T: Array
+    root: Array
+    tree: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class TrustedSolver:
+    """Evidence that cannot be replayed: what a solver answered. `queries` are pairs (name, answer)."""
+
+    solver: str
+    version: str
+    precision: float
+    queries: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True, slots=True)
 class Certificate:
     """A claim with its evidence.
 
     Parameters
     ----------
     system, network : the closed loop; parameters are already put into the equations.
-    P, T : (n, n); root : (n,) half-widths of the root box in z, x = T z.
+    P : (n, n).
     local, roa : the levels c1 <= c2.
-    tree : the partition in preorder, one byte a node.
     provenance : anything that helps people; the checker ignores it.
     """
 
     system: System
     network: TanhNetwork
     P: Array
-    T: Array
-    root: Array
     local: float
     roa: float
-    tree: bytes
+    evidence: PartitionTree | TrustedSolver
     provenance: Mapping[str, Any] = field(default_factory=dict)
 
     def to_json(self) -> str:
@@ -78,12 +95,7 @@ class Certificate:
             },
             "lyapunov": {"P": _encode(self.P)},
             "levels": {"local": float(self.local).hex(), "roa": float(self.roa).hex()},
-            "evidence": {
-                "kind": "partition-tree",
-                "T": _encode(self.T),
-                "root": _encode(self.root),
-                "tree": base64.b64encode(self.tree).decode("ascii"),
-            },
+            "evidence": _evidence(self.evidence),
             "provenance": {k: str(v) for k, v in self.provenance.items()},
         }
         lines = [f"{json.dumps(k)}: {json.dumps(v)}" for k, v in sections.items()]
@@ -143,11 +155,9 @@ def read_certificate(path: Path) -> Certificate:
             system=system,
             network=network,
             P=_decode(data["lyapunov"]["P"], (n, n)),
-            T=_decode(evidence["T"], (n, n)),
-            root=_decode(evidence["root"], (n,)),
             local=float.fromhex(data["levels"]["local"]),
             roa=float.fromhex(data["levels"]["roa"]),
-            tree=base64.b64decode(evidence["tree"]),
+            evidence=_read_evidence(evidence, n),
             provenance=data["provenance"],
         )
     except OSError as error:
@@ -156,6 +166,31 @@ def read_certificate(path: Path) -> Certificate:
         raise
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise CertificateFormatError(f"{path} is not a certificate: {type(error).__name__}: {error}.") from error
+
+
+def _evidence(evidence: PartitionTree | TrustedSolver) -> dict[str, Any]:
+    if isinstance(evidence, PartitionTree):
+        return {
+            "kind": "partition-tree",
+            "T": _encode(evidence.T),
+            "root": _encode(evidence.root),
+            "tree": base64.b64encode(evidence.tree).decode("ascii"),
+        }
+    return {
+        "kind": "trusted-solver",
+        "solver": evidence.solver,
+        "version": evidence.version,
+        "precision": float(evidence.precision).hex(),
+        "queries": [list(pair) for pair in evidence.queries],
+    }
+
+
+def _read_evidence(data: Mapping[str, Any], n: int) -> PartitionTree | TrustedSolver:
+    if data["kind"] == "partition-tree":
+        root = _decode(data["root"], (n,))
+        return PartitionTree(_decode(data["T"], (n, n)), root, base64.b64decode(data["tree"]))
+    queries = tuple((str(name), str(answer)) for name, answer in data["queries"])
+    return TrustedSolver(data["solver"], data["version"], float.fromhex(data["precision"]), queries)
 
 
 def _encode(array: Array) -> str:

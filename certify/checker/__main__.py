@@ -1,6 +1,7 @@
 """`python -I -m certify.checker FILE [--json]`: check one certificate.
 
-Exit status: 0 accepted, 1 rejected, 2 usage or unreadable file, 70 internal error.
+Exit status: 0 accepted, 1 rejected, 2 usage or unreadable file, 3 trusted (the evidence is a solver's word, which
+cannot be checked; what can be was), 70 internal error.
 """
 
 from __future__ import annotations
@@ -8,6 +9,7 @@ from __future__ import annotations
 import json
 import sys
 from fractions import Fraction
+from typing import Any
 
 from . import document
 from .errors import Rejected, Unreadable
@@ -38,12 +40,17 @@ def main(arguments: list[str]) -> int:
         sys.stdout.write(json.dumps(stated) + "\n" if as_json else "")
         sys.stderr.write("" if as_json else stated["error"] + "\n")
         return 70
+    about: dict[str, Any] = {
+        "certificate_sha256": certificate.sha256,
+        "policy_sha256": certificate.policy.sha256(),
+        "levels": {"local": certificate.c1, "roa": certificate.c2},
+    }
+    if isinstance(certificate.evidence, document.Trusted):
+        return _trusted(certificate, certificate.evidence, about, as_json)
     if as_json:
         accepted = {
             "result": "ACCEPTED",
-            "certificate_sha256": certificate.sha256,
-            "policy_sha256": certificate.policy.sha256(),
-            "levels": {"local": certificate.c1, "roa": certificate.c2},
+            **about,
             "leaves": tally.leaves,
             "ring_leaves": tally.ring_leaves,
             "margins": {"local": tally.local_margin, "ring": tally.ring_margin},
@@ -58,6 +65,17 @@ def main(arguments: list[str]) -> int:
         )
         sys.stdout.write(f"ACCEPTED c1={certificate.c1!r} c2={certificate.c2!r} sha256={certificate.sha256}\n")
     return 0
+
+
+def _trusted(c: document.Certificate, evidence: document.Trusted, about: dict[str, Any], as_json: bool) -> int:
+    answers = [f"{name}: {answer}" for name, answer in evidence.queries]
+    if as_json:
+        solver = {"solver": evidence.solver, "version": evidence.version, "answers": answers}
+        sys.stdout.write(json.dumps({"result": "TRUSTED", **about, **solver}) + "\n")
+    else:
+        sys.stdout.write("\n".join([*_claim(c), "not checked, the solver's word: " + ", ".join(answers)]) + "\n")
+        sys.stdout.write(f"TRUSTED {evidence.solver} {evidence.version} c1={c.c1!r} c2={c.c2!r} sha256={c.sha256}\n")
+    return 3
 
 
 def _claim(c: document.Certificate) -> list[str]:

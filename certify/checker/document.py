@@ -57,6 +57,24 @@ class Policy:
 
 
 @dataclass(frozen=True)
+class Partition:
+    """Evidence that is replayed: a partition tree of the box |z| <= root, x = T z."""
+
+    T: Array
+    root: Array
+    tree: bytes
+
+
+@dataclass(frozen=True)
+class Trusted:
+    """Evidence that cannot be replayed: a solver's name and version, and its answers as (query, answer)."""
+
+    solver: str
+    version: str
+    queries: tuple[tuple[str, str], ...]
+
+
+@dataclass(frozen=True)
 class Certificate:
     """The claim and its evidence. Provenance is not kept: nothing may depend on it."""
 
@@ -71,9 +89,7 @@ class Certificate:
     P: Array
     c1: float
     c2: float
-    T: Array
-    root: Array
-    tree: bytes
+    evidence: Partition | Trusted
     sha256: str
 
 
@@ -124,9 +140,6 @@ def _certificate(data: Any, sha256: str) -> Certificate:
 
     lyapunov = _keys(top["lyapunov"], "lyapunov", "P")
     levels = _keys(top["levels"], "levels", "local roa")
-    evidence = _keys(top["evidence"], "evidence", "kind T root tree")
-    if evidence["kind"] != "partition-tree":
-        _fail("evidence.kind", "must be 'partition-tree'")
     return Certificate(
         name=_name(plant["name"], "plant.name"),
         states=states,
@@ -139,11 +152,26 @@ def _certificate(data: Any, sha256: str) -> Certificate:
         P=_array(lyapunov["P"], "lyapunov.P", (n, n)),
         c1=_hex_float(levels["local"], "levels.local"),
         c2=_hex_float(levels["roa"], "levels.roa"),
-        T=_array(evidence["T"], "evidence.T", (n, n)),
-        root=_array(evidence["root"], "evidence.root", (n,)),
-        tree=_bytes(evidence["tree"], "evidence.tree"),
+        evidence=_evidence(top["evidence"], n),
         sha256=sha256,
     )
+
+
+def _evidence(data: Any, n: int) -> Partition | Trusted:
+    kind = data.get("kind") if isinstance(data, dict) else None
+    if kind == "trusted-solver":
+        stated = _keys(data, "evidence", "kind solver version precision queries")
+        _hex_float(stated["precision"], "evidence.precision")
+        pairs = [_list(pair, "evidence.queries", 2) for pair in _list(stated["queries"], "evidence.queries", None)]
+        words = [stated["solver"], stated["version"], *(word for pair in pairs for word in pair)]
+        if not all(isinstance(w, str) and re.fullmatch(r"[A-Za-z0-9_.+-]{1,80}", w, re.ASCII) for w in words):
+            _fail("evidence", "solver, version and answers must be words of letters, digits and _.+-")
+        return Trusted(stated["solver"], stated["version"], tuple((name, answer) for name, answer in pairs))
+    if kind != "partition-tree":
+        _fail("evidence.kind", "must be 'partition-tree' or 'trusted-solver'")
+    stated = _keys(data, "evidence", "kind T root tree")
+    root = _array(stated["root"], "evidence.root", (n,))
+    return Partition(_array(stated["T"], "evidence.T", (n, n)), root, _bytes(stated["tree"], "evidence.tree"))
 
 
 def _policy(stated: dict[str, Any], n: int, m: int) -> Policy:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.certificate import Certificate
+from certify.certificate import Certificate, PartitionTree
 from certify.closed_loop import ClosedLoop
 from certify.errors import CertificateFormatError
 from certify.lyapunov import extents
@@ -122,8 +122,13 @@ class _Scene:
         units = units_of(self.system)
         self.labels = [label(s.name, units.get(s.name, "")) for s in self.system.states]
         self.input_labels = [label(s.name, units.get(s.name, "")) for s in self.system.inputs]
-        small = len(certificate.tree) <= 2 * _MOST_LEAVES
-        self.leaves: Leaves | None = rebuild_leaves(certificate.tree, certificate.root) if small else None
+        # Another solver's word has no leaves; the partition in z, x = T z, is drawn only if it is small enough.
+        evidence = certificate.evidence
+        self.T, self.root = np.eye(self.n), np.ones(self.n)
+        self.leaves: Leaves | None = None
+        if isinstance(evidence, PartitionTree) and len(evidence.tree) <= 2 * _MOST_LEAVES:
+            self.T, self.root = evidence.T, evidence.root
+            self.leaves = rebuild_leaves(evidence.tree, evidence.root)
 
     def vdot(self, x: Array) -> Array:
         """Vdot in float64; NaN where the equations have a pole."""
@@ -179,7 +184,7 @@ def _line_figures(scene: _Scene, roa: SimulatedRoa | None) -> list[Picture]:
             ends = [float(inside.min()), float(inside.max())]
             axes.plot(ends, [0, 0], color=LEAVING, lw=2.4, label="simulated ROA (not proved)")
     if scene.leaves is not None and len(scene.leaves) <= _RASTER_FROM:
-        edges = scene.leaves.lower[:, 0] * scene.certificate.T[0, 0]
+        edges = scene.leaves.lower[:, 0] * scene.T[0, 0]
         axes.plot(edges, np.zeros_like(edges), "|", ms=5, color=SET, label="leaves")
     axes.set_xlim(scene.lo[0], scene.hi[0])
     axes.set_xlabel(scene.labels[0])
@@ -334,7 +339,7 @@ def _partition(scene: _Scene, leaves: Leaves) -> Picture:
     else:
         first, last = 0, scene.n - 1
         _add_leaves(axes, scene, leaves, (first, last), within=None)
-        reach = scene.certificate.root[[first, last]] * 1.04
+        reach = scene.root[[first, last]] * 1.04
         axes.set_xlim(-reach[0], reach[0])
         axes.set_ylim(-reach[1], reach[1])
         axes.set_xlabel(symbol(f"z{first + 1}"))
@@ -362,7 +367,7 @@ def _add_leaves(axes: Any, scene: _Scene, leaves: Leaves, pair: tuple[int, int],
         axis=1,
     )
     if scene.n == 2:
-        corners = corners @ scene.certificate.T.T
+        corners = corners @ scene.T.T
     ring = _in_ring(scene, lower, upper)
     if within is not None:
         visible = np.all((corners.min(axis=1) <= within) & (corners.max(axis=1) >= -within), axis=1)
@@ -380,7 +385,7 @@ def _add_leaves(axes: Any, scene: _Scene, leaves: Leaves, pair: tuple[int, int],
 
 def _in_ring(scene: _Scene, lower: Array, upper: Array) -> NDArray[np.bool_]:
     """Which leaves meet `c1 <= V <= c2`, by the diagonal of `T'PT`: for colour only."""
-    T = scene.certificate.T
+    T = scene.T
     weight = np.diag(T.T @ scene.P @ T)
     near, far = np.clip(0.0, lower, upper), np.maximum(np.abs(lower), np.abs(upper))
     return np.asarray((near**2 @ weight <= scene.c2) & (far**2 @ weight >= scene.c1))

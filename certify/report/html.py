@@ -44,7 +44,7 @@ _LONG = 10**6  # numerators and denominators beyond it are shown rounded
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """What may be said of a certificate: kind is ACCEPTED, REJECTED or NOT CHECKED; note says why."""
+    """What may be said of a certificate: kind is ACCEPTED, TRUSTED, REJECTED or NOT CHECKED; note says why."""
 
     kind: str
     note: str
@@ -63,6 +63,10 @@ def status_of(certificate: Certificate, answer: Mapping[str, Any] | None) -> Sta
         where = f"rule {answer.get('rule', '?')} at {answer.get('at', '?')}"
         detail = f": {answer['detail']}" if answer.get("detail") else ""
         return Status("REJECTED", f"The checker refuses the certificate by {where}{detail}. Nothing here is proved.")
+    if answer.get("result") == "TRUSTED":
+        solver = f"{answer.get('solver')} {answer.get('version')}"
+        return Status("TRUSTED", f"The checker checked what is exact (P, the domain, the equilibrium). That Vdot is "
+                      f"negative is the word of {solver}, which nothing here can check.")  # fmt: skip
     if answer.get("result") != "ACCEPTED":
         return Status("NOT CHECKED", "The checker gave no verdict. Nothing here is proved.")
     levels = answer.get("levels")

@@ -58,7 +58,8 @@ def summary(result: Mapping[str, Any]) -> RenderableType:
 def _headline(result: Mapping[str, Any]) -> str:
     name, level = result["system"], result["levels"].get("roa")
     if result["verdict"] == "PROVED" and level is not None:
-        return f"{name}: {{V <= {below(level)}}} is invariant and attracted by the origin"
+        word = ", if the solver is right: nothing checked its answers" if result.get("checked") == "TRUSTED" else ""
+        return f"{name}: {{V <= {below(level)}}} is invariant and attracted by the origin{word}"
     if result["verdict"] == "REFUTED":
         return f"{name}: the claim is false for this V"
     return f"{name}: nothing was proved"

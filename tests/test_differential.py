@@ -1,0 +1,104 @@
+"""The same obligations to every engine: bounds, codac, and dReal where it is; never PROVED against REFUTED."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+import torch
+
+from certify.engines.branch_and_bound import Budget, prove_ring
+from certify.engines.dreal import Backend, decide, find_backend
+from certify.engines.falsify import Witness, confirm, falsify
+from certify.errors import BackendError
+from certify.lyapunov import domain_limit
+from certify.obligations import Obligations, ring_query
+from certify.systems import get_system
+from tests import codac_prover
+from tests.conftest import chain, pendulum_network, scalar_tanh
+from tests.test_engines import obligations
+
+INNER = 0.05  # share of the limit below which the local proof speaks, and not these engines
+CASES = {
+    "scalar": scalar_tanh,
+    "chain": lambda: chain(2, [-1, -2]),
+    "pendulum 2-6-6-1": lambda: (get_system("pendulum"), pendulum_network((6, 6), seed=1)),
+    "pendulum 2-16-1": lambda: (get_system("pendulum"), pendulum_network((16,))),
+    "pendulum, output": lambda: (get_system("pendulum"), pendulum_network((16,), centre="output")),
+}
+
+
+@cache
+def claims_of(case: str) -> tuple[Obligations, float]:
+    """A closed loop, and the smaller of the domain's limit and the lowest violation of Vdot < 0."""
+    claims = obligations(*CASES[case]())
+    limit = domain_limit(claims.P, claims.loop.system.domain)
+    witness = falsify(claims, limit)
+    return claims, limit if witness is None else witness.level
+
+
+@cache
+def dreal() -> Backend | None:
+    try:
+        return find_backend()
+    except BackendError:
+        return None
+
+
+def genuine(claims: Obligations, x: np.ndarray | None, inner: float, outer: float) -> bool:
+    """Vdot >= 0 at a state of the ring, shown in Arb."""
+    if x is None:
+        return False
+    V = float(x @ claims.P @ x)
+    return bool(inner <= V <= outer and confirm(claims, Witness(x, V, "vdot")))
+
+
+def by_bounds(claims: Obligations, inner: float, outer: float) -> str:
+    witness = falsify(claims, outer, samples=4000)
+    if witness is not None and witness.kind == "vdot" and inner <= witness.level <= outer:
+        return "REFUTED"
+    proof = prove_ring(claims, inner, outer, Budget(boxes=50_000), torch.device("cpu"))
+    return "PROVED" if proof.level >= outer else "UNKNOWN"
+
+
+def by_codac(claims: Obligations, inner: float, outer: float) -> str:
+    status, x = codac_prover.decide(ring_query(claims, inner, outer))
+    if status == "unsat":
+        return "PROVED"
+    return "REFUTED" if x is not None and genuine(claims, np.array(x), inner, outer) else "UNKNOWN"
+
+
+def by_dreal(claims: Obligations, inner: float, outer: float, backend: Backend) -> str:
+    answer = decide(backend, ring_query(claims, inner, outer), 1e-3, 1, 60.0)
+    if answer.status == "unsat":
+        return "PROVED"
+    names = [s.name for s in claims.loop.system.states]
+    x = np.array([sum(answer.box[name]) / 2 for name in names]) if answer.status == "delta-sat" else None
+    return "REFUTED" if genuine(claims, x, inner, outer) else "UNKNOWN"
+
+
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("share", [0.3, 0.9, 0.99, 1.05, 1.5])
+def test_bounds_and_codac_do_not_contradict_each_other(case: str, share: float) -> None:
+    claims, limit = claims_of(case)
+    found = {by_bounds(claims, INNER * limit, share * limit), by_codac(claims, INNER * limit, share * limit)}
+    assert found != {"PROVED", "REFUTED"}
+    if share < 0.95:
+        assert found == {"PROVED"}
+    if case == "scalar" and share > 1:
+        assert found == {"REFUTED"} or found == {"REFUTED", "UNKNOWN"}
+
+
+@pytest.mark.skipif(dreal() is None, reason="dReal is neither importable (libibex.so of IBEX 2.7.4) nor on the PATH")
+@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("share", [0.3, 0.9, 1.05, 1.5])
+def test_dreal_contradicts_neither(case: str, share: float) -> None:
+    backend = dreal()
+    assert backend is not None
+    claims, limit = claims_of(case)
+    inner, outer = INNER * limit, share * limit
+    found = {by_bounds(claims, inner, outer), by_codac(claims, inner, outer), by_dreal(claims, inner, outer, backend)}
+    assert not {"PROVED", "REFUTED"} <= found
+    if share < 0.95:
+        assert found == {"PROVED"}
