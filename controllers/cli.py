@@ -54,12 +54,8 @@ def _train(
     checkpoint_dir: Annotated[
         Path | None, typer.Option("--checkpoint-dir", help="Folder that keeps checkpoint.pt.")
     ] = None,
-    checkpoint_every: Annotated[
-        int, typer.Option("--checkpoint-every", help="Steps between checkpoints.")
-    ] = 10_000,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on from checkpoint.pt in --checkpoint-dir.")
-    ] = False,
+    checkpoint_every: Annotated[int, typer.Option("--checkpoint-every", help="Steps between checkpoints.")] = 10_000,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from checkpoint.pt in --checkpoint-dir.")] = False,
     as_json: Json = False,
     **chosen: Any,  # one optional value for each field of TrainingOptions; the signature below names them
 ) -> None:
@@ -104,9 +100,7 @@ def _train_signature() -> inspect.Signature:
         flag = typer.Option("--" + option.name.replace("_", "-"), help=text)
         annotation = Annotated[plain | None, flag]
         parameters.append(
-            inspect.Parameter(
-                option.name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation
-            )
+            inspect.Parameter(option.name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
         )
     return inspect.Signature(parameters)
 
@@ -176,7 +170,9 @@ def _progress(trainer: Trainer) -> Iterator[Callable[[Trainer], None]]:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     columns = (
-        BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
         TextColumn("return {task.fields[mean]}  |J+K| {task.fields[distance]}"),
     )
     with Progress(*columns, console=Console(stderr=True)) as progress:
@@ -188,9 +184,7 @@ def _progress(trainer: Trainer) -> Iterator[Callable[[Trainer], None]]:
                 return
             totals = [e.total for e in trainer.episodes if e.kind == "training"][-10:]
             mean = f"{sum(totals) / len(totals):.1f}" if totals else "-"
-            progress.update(
-                task, completed=trainer.steps_done, mean=mean, distance=f"{trainer.distance()[0]:.1e}"
-            )
+            progress.update(task, completed=trainer.steps_done, mean=mean, distance=f"{trainer.distance()[0]:.1e}")
 
         yield show
 

@@ -106,9 +106,7 @@ class PlantEnvironment(gymnasium.Env):  # type: ignore[misc]  # gymnasium is unt
         self._x = np.zeros(system.n)
         self._elapsed = 0
 
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Array, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
         """Start uniformly in the share `start` of the domain, or in a ball with `options={"radius": eta}`."""
         super().reset(seed=seed)
         radius = None if options is None else options.get("radius")

@@ -92,8 +92,14 @@ class Evaluation:
         """Plain values; NaN and infinity become None."""
 
         def settling(s: Settling) -> dict[str, Any]:
-            return {"settled": s.settled, "states": s.states, "largest": _finite(s.largest),
-                    "left_domain": s.left_domain, "cost": _finite(s.cost), "step": s.step}
+            return {
+                "settled": s.settled,
+                "states": s.states,
+                "largest": _finite(s.largest),
+                "left_domain": s.left_domain,
+                "cost": _finite(s.cost),
+                "step": s.step,
+            }
 
         return {
             "system": self.system,
@@ -163,9 +169,15 @@ def evaluate(policy: Policy, options: EvaluationOptions | None = None) -> Evalua
         A_error = float(np.linalg.norm(A - A_true) / np.linalg.norm(A_true))
         B_error = float(np.linalg.norm(B - B_true) / np.linalg.norm(B_true))
     return Evaluation(
-        system=system.name, sha256=network.sha256(), gain_distance=distance, gain_relative=relative,
-        A_relative_error=A_error, B_relative_error=B_error,
-        eigenvalues=tuple(complex(e) for e in eigenvalues), continuous=continuous, held=held,
+        system=system.name,
+        sha256=network.sha256(),
+        gain_distance=distance,
+        gain_relative=relative,
+        A_relative_error=A_error,
+        B_relative_error=B_error,
+        eigenvalues=tuple(complex(e) for e in eigenvalues),
+        continuous=continuous,
+        held=held,
     )
 
 
@@ -215,8 +227,12 @@ def _simulate(loop: _Loop, x: Array, options: EvaluationOptions) -> Settling:
             accumulated += h * loop.cost(x, u)
             x = loop.step(x, u)
     return Settling(
-        settled=int((largest < options.tolerance).sum()), states=len(x), largest=float(largest.max()),
-        left_domain=int(outside.sum()), cost=float(np.median(accumulated)), step=h,
+        settled=int((largest < options.tolerance).sum()),
+        states=len(x),
+        largest=float(largest.max()),
+        left_domain=int(outside.sum()),
+        cost=float(np.median(accumulated)),
+        step=h,
     )
 
 

@@ -160,9 +160,7 @@ class Trainer:
         """
         found = self.gain.identified
         if found is None:
-            raise InputError(
-                f"the run ended after {self.steps_done} steps without a gain; it needs more `steps`."
-            )
+            raise InputError(f"the run ended after {self.steps_done} steps without a gain; it needs more `steps`.")
         return Policy(
             network=self.sac.actor.network(),
             system=self.system.name,
@@ -257,9 +255,7 @@ class Trainer:
     def _finish_episode(self, outcome: str) -> None:
         kind = "identification" if self._near else "training"
         distance, offset = self.distance()
-        self.episodes.append(
-            Episode(self.steps_done, kind, self._length, self._total, outcome, distance, offset)
-        )
+        self.episodes.append(Episode(self.steps_done, kind, self._length, self._total, outcome, distance, offset))
         self._begin_episode()
 
     def _record(self, found: Identified) -> dict[str, Any]:
@@ -271,8 +267,11 @@ class Trainer:
             "K": found.K.tolist(),
             "distance": distance,
             "offset_before_centring": offset,
-            "versions": {"python": platform.python_version(), "torch": torch.__version__.split("+")[0],
-                         "numpy": np.__version__},
+            "versions": {
+                "python": platform.python_version(),
+                "torch": torch.__version__.split("+")[0],
+                "numpy": np.__version__,
+            },
         }
 
 

@@ -1,7 +1,7 @@
 """Queries decided with codac, an interval-contractor library that shares no code with this project.
 
-In a process of its own: importing codac leaves the floating-point unit rounding upwards, which no other arithmetic in the
-process expects (the checker's self-test refuses to run then).
+In a process of its own: importing codac leaves the floating-point unit rounding upwards, which no other arithmetic in
+the process expects (the checker's self-test refuses to run then).
 """
 
 from __future__ import annotations
