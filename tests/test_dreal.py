@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from certify.certificate import read_certificate
 from certify.cli import _run
 from certify.engines import dreal, dreal_proof
 from certify.engines.dreal import Answer, Backend, decide, find_backend
@@ -22,6 +23,7 @@ from certify.engines.dreal_proof import DrealOptions, prove_with_dreal
 from certify.errors import BackendError, SoundnessError
 from certify.obligations import Query, local_query, ring_query
 from certify.policies import Policy, TanhNetwork, save_policy
+from certify.report import render_html
 from certify.roa import RoaOptions, certify_roa, run_checker
 from certify.systems import System, get_system
 from certify.verdict import Verdict
@@ -246,6 +248,20 @@ def test_both_engines_agree_or_say_so(pendulum: System, tmp_path: Path, monkeypa
     result = certify_roa(pendulum, pendulum_network(), tmp_path, RoaOptions(engine="both"))
     assert result.to_dict()["checked"] == "ACCEPTED" and {"local", "ring"} <= set(asked)
     assert result.solver is not None and all(q["answer"] == "unsat" for q in result.solver["queries"])
+    assert result.certificate is not None
+    page = render_html(read_certificate(result.certificate), result.checker, result.to_dict(), result.certificate)
+    assert "4.21-fake on ring" in page and "PROVED · ACCEPTED" in page
+
+
+def test_the_report_does_not_call_trusted_a_proof(
+    pendulum: System, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    answering(monkeypatch, unsat)
+    result = certify_roa(pendulum, pendulum_network((8, 8)), tmp_path, RoaOptions(engine="dreal"))
+    assert result.certificate is not None
+    page = render_html(read_certificate(result.certificate), result.checker, result.to_dict(), result.certificate)
+    assert "TRUSTED" in page and "ACCEPTED" not in page.split("<h2>How to check")[0].split("</style>")[1]
+    assert "the word of dreal 4.21-fake" in page
 
 
 def test_a_contradiction_is_an_error_with_a_reproduction(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -297,6 +297,10 @@ def _tables(
         if result.get("boxes"):
             run.append(("boxes examined", f"{result['boxes']:,}"))
         run += [(f"{k}", seconds(v)) for k, v in result["seconds"].items() if v is not None]
+        solver = result.get("solver") or {}
+        for q in solver.get("queries", []):
+            about = f"{solver['solver']} {solver['version']} on {q['query']}, V <= {number(q['level'])}"
+            run.append((about, f"{q['answer']}, {seconds(q['seconds'])}"))
     candidates = [
         (row["candidate"], number(row["level"]), f"{below(row['volume'])} {volume_unit(state_units)}".rstrip(),
          "the domain" if row["limited_by"] == "domain" else "a violation found",

@@ -93,6 +93,12 @@ def _rows(result: Mapping[str, Any], proved: bool) -> list[tuple[str, str]]:
         rows.append(("eigenvalues", ", ".join(map(str, result["eigenvalues"]))))
     if result.get("boxes"):
         rows.append(("work", f"{result['boxes']:,} boxes, {result['leaves']:,} leaves"))
+    solver = result.get("solver") or {}
+    if "missing" in solver:
+        rows.append(("dReal", f"not asked: {solver['missing']}"))
+    elif solver:
+        answers = [q["answer"] for q in solver["queries"]]
+        rows.append(("dReal", f"{answers.count('unsat')} of {len(answers)} queries unsat, version {solver['version']}"))
     rows.append(("time", _times(result["seconds"])))
     rows.append(("checker", result["checked"] or "not reached"))
     return rows
