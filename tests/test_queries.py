@@ -166,6 +166,6 @@ def test_smt2_is_balanced_and_exact() -> None:
     text = to_smt2(ring_query(obligations(*quadrotor()), 0.01, 0.02), "unsat")
     assert text.count("(") == text.count(")")
     assert text.startswith("; ring") and "; expected: unsat" in text and "(set-logic QF_NRA)" in text
-    assert "(/ 243 500)" in text or "(/ 500 243)" in text  # m = 0.486, never rounded
+    assert "(/ 243.0 500.0)" in text or "(/ 500.0 243.0)" in text  # m = 0.486, never rounded
     assert "." not in "".join(line for line in text.splitlines() if "declare" in line)
     assert text.rstrip().endswith("(check-sat)\n(exit)")

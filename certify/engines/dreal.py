@@ -177,5 +177,7 @@ def _all(trees: Iterable[Tree]) -> list[str]:
 
 
 def _smt_number(q: Fraction) -> str:
-    size = str(abs(q.numerator)) if q.denominator == 1 else f"(/ {abs(q.numerator)} {q.denominator})"
+    """Decimals, because solvers read integers into 64 bits; binary64 holds those of weights exactly."""
+    top = f"{abs(q.numerator)}.0"
+    size = top if q.denominator == 1 else f"(/ {top} {q.denominator}.0)"
     return size if q >= 0 else f"(- {size})"
