@@ -30,7 +30,7 @@ _SLACK = 1e-9  # relative distance kept from every level, so that the checker's 
 _BELOW_WITNESS = 1e-3  # relative distance kept from a violation
 _SHELL = 16.0  # a batch reaches up to this multiple of the lowest open level
 _CHUNK = 256  # boxes that make a thread worth its while
-_MOST_SPLITS = 50_000_000  # what a certificate can hold, and two gibibytes
+_MOST_SPLITS = 40_000_000  # what a certificate can hold, and two gibibytes
 
 
 @dataclass(frozen=True, slots=True)
