@@ -194,3 +194,12 @@ def test_an_asymmetric_P_is_named(pendulum: System) -> None:
     loop = ClosedLoop(pendulum, pendulum_network())
     with pytest.raises(InputError, match=r"P\[0, 1\] = 0.25 but P\[1, 0\] = 0.26"):
         Obligations(loop, np.array([[1.0, 0.25], [0.26, 1.0]]), np.eye(2))
+
+
+def test_every_tensor_of_the_ring_says_where_it_lives(pendulum: System) -> None:
+    """One made without a device would land on `meta` and meet the others with an error; none is, so any device will do."""
+    claims = obligations(pendulum, pendulum_network(centre="output"))
+    plain = prove_ring(claims, 1e-3, 0.5, Budget(), CPU)
+    with torch.device("meta"):
+        proof = prove_ring(claims, 1e-3, 0.5, Budget(), CPU)
+    assert proof.level == 0.5 and proof.tree == plain.tree
