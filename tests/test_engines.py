@@ -197,7 +197,7 @@ def test_an_asymmetric_P_is_named(pendulum: System) -> None:
 
 
 def test_every_tensor_of_the_ring_says_where_it_lives(pendulum: System) -> None:
-    """One made without a device would land on `meta` and meet the others with an error; none is, so any device will do."""
+    """One made without a device would land on `meta` and meet the others with an error: none is."""
     claims = obligations(pendulum, pendulum_network(centre="output"))
     plain = prove_ring(claims, 1e-3, 0.5, Budget(), CPU)
     with torch.device("meta"):
