@@ -194,7 +194,7 @@ def certify_roa(
 
     Returns
     -------
-    RoaResult : PROVED only if the checker accepted the certificate.
+    RoaResult : PROVED only if the checker accepted the certificate, or, with engine `dreal`, answered TRUSTED.
 
     Raises
     ------
@@ -245,8 +245,9 @@ def _certify(
 
     def unfinished(verdict: Verdict, reason: str, witness: Witness | None = None, boxes: int = 0) -> RoaResult:
         return RoaResult(
-            verdict, reason, system, network, P, name, notice, levels, witness, boxes=boxes, seconds=watch.total()
-        )
+            verdict, reason, system, network, P, name, notice, levels, witness,
+            boxes=boxes, seconds=watch.total(), engine=options.engine,
+        )  # fmt: skip
 
     if options.level is not None and options.level >= limit:
         return unfinished(
@@ -297,6 +298,23 @@ def _certify(
     certificate = Certificate(
         system, network, P, inner, ring.level, PartitionTree(obligations.T, ring.root, ring.tree), provenance or {}
     )
+    path, answer = _write_and_check(out, certificate, "ACCEPTED", watch, progress)
+    solver = _confirm(obligations, inner, ring.level, options, out) if options.engine == "both" else None
+    return RoaResult(
+        Verdict.PROVED, reason, system, network, P, name, notice, levels, witness, boxes=ring.boxes, leaves=ring.leaves,
+        seconds=watch.total(), certificate=path, checker=answer, engine=options.engine, solver=solver,
+    )  # fmt: skip
+
+
+def _write_and_check(
+    out: Path, certificate: Certificate, wanted: str, watch: _Stopwatch, progress: Progress | None
+) -> tuple[Path, dict[str, Any]]:
+    """The certificate's path and the checker's answer; it gets its name only when the answer is `wanted`.
+
+    Raises
+    ------
+    SoundnessError : the checker says something else.
+    """
     path, unchecked = out / "certificate.json", out / "certificate.unchecked.json"
     with watch.stage("write"):
         write_certificate(unchecked, certificate)
@@ -308,16 +326,12 @@ def _certify(
     except KeyboardInterrupt:
         unchecked.unlink()
         raise
-    if answer["result"] != "ACCEPTED":
+    if answer["result"] != wanted:
         raise SoundnessError(
             f"the checker rejects what the engine proved: {answer}. The certificate {unchecked} reproduces it."
         )
     unchecked.replace(path)
-    solver = _confirm(obligations, inner, ring.level, options, out) if options.engine == "both" else None
-    return RoaResult(
-        Verdict.PROVED, reason, system, network, P, name, notice, levels, witness, boxes=ring.boxes, leaves=ring.leaves,
-        seconds=watch.total(), certificate=path, checker=answer, engine=options.engine, solver=solver,
-    )  # fmt: skip
+    return path, answer
 
 
 def _limit(reason: str, options: RoaOptions, witness: Witness | None) -> str:
@@ -362,18 +376,8 @@ def _ask_dreal(
         "dreal", backend.version, options.dreal_precision,
         tuple((f"{asked.name}-{asked.level!r}", asked.answer.status) for asked in proof.asked),
     )  # fmt: skip
-    path, unchecked = out / "certificate.json", out / "certificate.unchecked.json"
-    with watch.stage("write"):
-        write_certificate(
-            unchecked, Certificate(system, network, P, proof.inner, proof.level, evidence, provenance or {})
-        )
-    if progress is not None:
-        progress("check", None)
-    with watch.stage("check"):
-        answer = run_checker(unchecked)
-    if answer["result"] != "TRUSTED":
-        raise SoundnessError(f"the checker rejects what dReal confirmed: {answer}; {unchecked} reproduces it.")
-    unchecked.replace(path)
+    certificate = Certificate(system, network, P, proof.inner, proof.level, evidence, provenance or {})
+    path, answer = _write_and_check(out, certificate, "TRUSTED", watch, progress)
     return replace(result, verdict=Verdict.PROVED, certificate=path, checker=answer)
 
 

@@ -157,6 +157,20 @@ def test_delta_sat_caps_the_level_only_with_a_genuine_violation(monkeypatch: pyt
         assert proof.reason == "witness" if genuine else proof.reason.startswith("solver")
 
 
+def test_inputs_are_confirmed_on_the_local_level_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without an answer about the inputs there is no level at all, though Vdot is confirmed everywhere."""
+    claims = obligations(get_system("pendulum"), pendulum_network(centre="output"))
+    for confirmed in (False, True):
+
+        def say(query: Query, name: str, confirmed: bool = confirmed) -> Answer:
+            return unsat() if confirmed or not name.startswith("inputs") else Answer("timeout", 0.1, "")
+
+        asked = answering(monkeypatch, say)
+        proof = prove_with_dreal(claims, 1e-3, 0.5, FAKE, DrealOptions())
+        assert "inputs-u-below" in asked
+        assert (proof.level == 0.5) if confirmed else (proof.level is None and proof.reason.startswith("inputs"))
+
+
 def test_time_runs_out_for_all_queries_together(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = answering(monkeypatch, unsat)
     proof = prove_with_dreal(obligations(*scalar_tanh()), 1e-3, 3.0, FAKE, DrealOptions(seconds=0.0))

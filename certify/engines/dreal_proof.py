@@ -77,9 +77,13 @@ def prove_with_dreal(
     if inner is None:
         return session.result(None, None, "local: dReal confirms no local level")
     top = target
-    if session.all_unsat(domain_queries, top) is None:
+    if not session.all_unsat(domain_queries, top):
         top *= 1 - 4 * options.precision  # a set that touches the domain is delta-sat; the checker decides it exactly
-    level, reason = session.ring(min(inner, top), top)
+    inner = min(inner, top)
+    # The local query is about Vdot alone, and the ring may add nothing to it.
+    if not obligations.inputs_bounded_by_form and not session.all_unsat(input_queries, inner):
+        return session.result(inner, None, "inputs: dReal does not confirm their bounds on the local level")
+    level, reason = session.ring(inner, top)
     return session.result(min(inner, level), level, "requested" if level >= target else reason)
 
 
@@ -124,8 +128,8 @@ class _Session:
             self._look(answer, "vdot" if query.name == "ring" else "input", level)
         return answer.status == "unsat"
 
-    def all_unsat(self, make: Callable[[Obligations, float], list[Query]], level: float) -> float | None:
-        return level if all(self.ask(q, level) for q in make(self.obligations, level)) else None
+    def all_unsat(self, make: Callable[[Obligations, float], list[Query]], level: float) -> bool:
+        return all(self.ask(q, level) for q in make(self.obligations, level))
 
     def local(self, guess: float, target: float) -> float | None:
         """Geometric bisection from the guess."""
@@ -153,10 +157,8 @@ class _Session:
         while high > _RING_RATIO * low or level == target:
             if self.left() <= 0:
                 return low, "time"
-            inputs = [] if self.obligations.inputs_bounded_by_form else input_queries(self.obligations, level)
-            if (level <= low or self.ask(ring_query(self.obligations, low, level), level)) and all(
-                self.ask(q, level) for q in inputs
-            ):
+            ring = level <= low or self.ask(ring_query(self.obligations, low, level), level)
+            if ring and (self.obligations.inputs_bounded_by_form or self.all_unsat(input_queries, level)):
                 low = level
                 if level >= target:
                     return level, "requested"
