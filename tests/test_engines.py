@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from certify.closed_loop import ClosedLoop
-from certify.engines.branch_and_bound import LEAF, Budget, RingProof, prove_ring
+from certify.engines.branch_and_bound import LEAF, Budget, prove_ring
 from certify.engines.falsify import Witness, confirm, falsify
 from certify.engines.local import local_margin, prove_local, spectral_norms
 from certify.errors import InputError
@@ -41,9 +41,10 @@ def sphere(claims: Obligations, level: float, count: int) -> np.ndarray:
     return z @ claims.T.T
 
 
-def leaves(proof: RingProof) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    stack = [(-proof.root, proof.root)]
-    for axis in proof.tree:
+def leaves(tree: bytes, root: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """The boxes that a preorder stands for."""
+    stack = [(-root, root)]
+    for axis in tree:
         lo, hi = stack.pop()
         if axis == LEAF:
             yield lo, hi
@@ -87,7 +88,7 @@ def test_the_ring_covers_and_holds(pendulum: System) -> None:
     assert inner is not None
     proof = prove_ring(claims, inner, limit, Budget(), CPU)
     assert (proof.level, proof.reason) == (limit, "requested")
-    boxes = list(leaves(proof))
+    boxes = list(leaves(proof.tree, proof.root))
     assert len(boxes) == proof.leaves
     volume = sum(np.prod(hi - lo) for lo, hi in boxes)
     assert volume == pytest.approx(np.prod(2 * proof.root), rel=1e-12)

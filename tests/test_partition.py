@@ -7,7 +7,6 @@ import os
 import resource
 import subprocess
 import sys
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -16,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from certify.engines.partition import _HANDFUL, LEAF, Frontier, Partition
+from tests.test_engines import leaves
 
 CPU = torch.device("cpu")
 
@@ -38,21 +38,6 @@ def grown(seed: int, calls: int = 30, n: int = 3) -> tuple[Partition, dict[int, 
     return partition, boxes
 
 
-def leaves(partition: Partition) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """The boxes that the preorder stands for."""
-    stack = [(-partition.root, partition.root)]
-    for axis in partition.preorder():
-        lo, hi = stack.pop()
-        if axis == LEAF:
-            yield lo, hi
-            continue
-        middle = 0.5 * lo[axis] + 0.5 * hi[axis]
-        left, right = hi.copy(), lo.copy()
-        left[axis] = right[axis] = middle
-        stack += [(right, hi), (lo, left)]
-    assert not stack
-
-
 @given(seed=st.integers(0, 10**6))
 def test_corners_are_rebuilt_bit_for_bit(seed: int) -> None:
     partition, boxes = grown(seed)
@@ -66,7 +51,7 @@ def test_corners_are_rebuilt_bit_for_bit(seed: int) -> None:
 def test_the_preorder_has_the_open_boxes_as_leaves(seed: int) -> None:
     partition, boxes = grown(seed)
     expected = sorted((*lo, *hi) for lo, hi in boxes.values())
-    assert sorted((*lo, *hi) for lo, hi in leaves(partition)) == expected
+    assert sorted((*lo, *hi) for lo, hi in leaves(partition.preorder(), partition.root)) == expected
 
 
 def test_a_partition_without_splits_is_one_leaf() -> None:
