@@ -164,11 +164,16 @@ def check(
     policy: Annotated[
         Path | None, typer.Option(help="Policy file that the certificate must be about (compares hashes).")
     ] = None,
+    arithmetic: Annotated[
+        str, typer.Option(help="float64 (binary64, every rounding bounded) or arb (balls; slow, the reference).")
+    ] = "float64",
     as_json: Json = False,
 ) -> None:
     """Check a certificate with the independent checker, in a process of its own."""
     import subprocess
 
+    if arithmetic not in ("float64", "arb"):
+        raise InputError(f"--arithmetic must be float64 or arb, not {arithmetic!r}.")
     if policy is not None:
         from certify.certificate import read_certificate
         from certify.policies import load_policy
@@ -184,7 +189,8 @@ def check(
             else:
                 sys.stdout.write(f"REJECTED rule=policy at=policy.sha256: {detail}\n")
             raise typer.Exit(1)
-    command = [sys.executable, "-I", "-m", "certify.checker", str(certificate), *(["--json"] if as_json else [])]
+    command = [sys.executable, "-I", "-m", "certify.checker", str(certificate), "--arithmetic", arithmetic]
+    command += ["--json"] if as_json else []
     raise typer.Exit(subprocess.run(command, check=False).returncode)
 
 

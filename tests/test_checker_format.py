@@ -29,7 +29,7 @@ from certify.checker import document, rules
 from certify.checker.__main__ import main
 from certify.checker.document import MAX_BYTES
 from certify.checker.errors import Rejected, Unreadable
-from certify.checker.exact import RationalAlgebra, Undecided
+from certify.checker.exact import Exact, Undecided
 from certify.checker.expression import evaluate, parse_dynamics
 from tests.checker_certificates import Document, decode, dump, edited, encode, grow, make, rehash, write
 
@@ -324,7 +324,8 @@ def test_depth_and_size_of_the_equations_are_limited(tmp_path: Path) -> None:
 def test_powers_mean_what_they_say(exponent: int) -> None:
 
     tape = parse_dynamics([["**", "x", exponent], ["**", "x", -exponent]], ["x"], document._rational)
-    assert evaluate(tape, RationalAlgebra(), [Fraction(-3, 2)]) == [Fraction(-3, 2) ** k for k in (exponent, -exponent)]
+    values = evaluate(tape, Exact, [Exact(Fraction(-3, 2))])
+    assert [v.value for v in values] == [Fraction(-3, 2) ** k for k in (exponent, -exponent)]
 
 
 def expressions() -> st.SearchStrategy[Any]:
@@ -355,7 +356,7 @@ def test_the_printed_equations_are_the_parsed_ones(tree: Any) -> None:
     exact_text = re.sub(r"(?<![\w*])\d+", lambda m: f"Fraction({m[0]})", tape.text[0])
     x, u = Fraction(7, 5), Fraction(-2, 3)
     try:
-        value = evaluate(tape, RationalAlgebra(), [x, u])[0]
+        value = evaluate(tape, Exact, [Exact(x), Exact(u)])[0].value
     except Undecided:
         return
     assert eval(exact_text, {"Fraction": Fraction, "x": x, "u": u}) == value
@@ -446,7 +447,7 @@ def test_accepted_prints_the_claim(tmp_path: Path) -> None:
     assert lines[1:4] == ["  x' = ((x / 2) + u)", "  domain x in [-3, 3]", "  input u in [-1, 1], u_eq = 0"]
     assert good()["policy"]["sha256"] in lines[4] and "1-1 tanh" in lines[4] and "preactivation" in lines[4]
     assert lines[5].endswith("P = 1.0") and "V <= 3.5 " in lines[6]
-    assert lines[-1].startswith("ACCEPTED c1=0.01 c2=3.5 sha256=") and len(lines) == 9
+    assert lines[-1].startswith("ACCEPTED c1=0.01 c2=3.5 sha256=") and len(lines) == 10
 
 
 def test_accepted_as_json_is_one_strict_object(tmp_path: Path) -> None:
@@ -463,6 +464,9 @@ def test_accepted_as_json_is_one_strict_object(tmp_path: Path) -> None:
         assert answer["certificate_sha256"] == hashlib.sha256(data).hexdigest()
         assert answer["policy_sha256"] == json.loads(data)["policy"]["sha256"]
         assert answer["levels"]["roa"] == float.fromhex(json.loads(data)["levels"]["roa"])
+        assert answer["rules"]["local"] == 1 and answer["rules"]["tree"] == answer["leaves"] >= 1
+        assert answer["rules"]["ring"] == answer["ring_leaves"] and answer["arithmetic"] == "float64"
+        assert 0 < answer["margins"]["local"] < 1 and set(answer["seconds"]) == {"start", "check"}
         assert done.stdout.count("\n") == 1
 
 
@@ -483,7 +487,8 @@ def test_not_json_is_rejected_rule_format(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "arguments", [[], ["a", "b"], ["--help"], ["-x"], ["--json"], ["--JSON", "a"], ["--json", "-"]]
+    "arguments",
+    [[], ["a", "b"], ["-x"], ["--json"], ["--JSON", "a"], ["--js", "a"], ["--arithmetic", "float32", "a"]],
 )
 def test_usage(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(arguments) == 2

@@ -100,7 +100,7 @@ def test_the_bound_holds_wherever_a_box_meets_the_ring(name: str) -> None:
     ring = ring_of(name)
     c, n, count = ring.c, ring.n, 200
     generator = np.random.default_rng(0)
-    diagonal = ring.S_diagonal[:, :1]
+    diagonal = ring.S
     direction = generator.standard_normal((n, count)) / np.sqrt(diagonal)
     direction /= np.sqrt((direction**2 * diagonal).sum(0))
     level = np.where(np.arange(count) % 2 == 0, c.c2, c.c1)

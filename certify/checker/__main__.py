@@ -1,4 +1,4 @@
-"""`python -I -m certify.checker FILE [--json]`: check one certificate.
+"""`python -I -m certify.checker FILE [--json] [--arithmetic float64|arb]`: check one certificate.
 
 Exit status: 0 accepted, 1 rejected, 2 usage or unreadable file, 3 trusted (the evidence is a solver's word, which
 cannot be checked; what can be was), 70 internal error.
@@ -6,8 +6,10 @@ cannot be checked; what can be was), 70 internal error.
 
 from __future__ import annotations
 
+import argparse
 import json
 import sys
+import time
 from fractions import Fraction
 from typing import Any
 
@@ -17,65 +19,62 @@ from .errors import Rejected, Unreadable
 
 def main(arguments: list[str]) -> int:
     """Print the claim and the verdict, or one JSON object; return the exit status."""
-    as_json = "--json" in arguments
-    paths = [a for a in arguments if a != "--json"]
-    if len(paths) != 1 or paths[0].startswith("-"):
-        sys.stderr.write("usage: python -m certify.checker FILE [--json]\n")
-        return 2
+    parser = argparse.ArgumentParser(
+        prog="python -I -m certify.checker", description="Check one certificate.", allow_abbrev=False
+    )
+    parser.add_argument("file", metavar="FILE")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--arithmetic", choices=("float64", "arb"), default="float64")
     try:
-        certificate = document.read(paths[0])
+        options = parser.parse_args(arguments)
+    except SystemExit as stop:
+        return int(stop.code or 0)
+    try:
+        certificate = document.read(options.file)
+        start = time.perf_counter()
         from . import rules  # after parsing: a malformed file needs no tables
 
-        tally = rules.check(certificate)
+        ready = time.perf_counter()
+        tally = rules.check(certificate, options.arithmetic)
+        seconds = {"start": ready - start, "check": time.perf_counter() - ready}
     except Unreadable as error:
-        sys.stdout.write(json.dumps({"error": str(error)}) + "\n" if as_json else "")
-        sys.stderr.write("" if as_json else f"{error}\n")
-        return 2
+        return _say(options.json, 2, {"error": str(error)}, [], str(error))
     except Rejected as no:
         stated = {"result": "REJECTED", "rule": no.rule, "at": no.at, "detail": no.detail}
-        sys.stdout.write((json.dumps(stated) if as_json else str(no)) + "\n")
-        return 1
+        return _say(options.json, 1, stated, [str(no)])
     except Exception as error:
-        stated = {"error": f"internal error: {type(error).__name__}: {error}"}
-        sys.stdout.write(json.dumps(stated) + "\n" if as_json else "")
-        sys.stderr.write("" if as_json else stated["error"] + "\n")
-        return 70
+        detail = f"internal error: {type(error).__name__}: {error}"
+        return _say(options.json, 70, {"error": detail}, [], detail)
+    evidence, c1, c2 = certificate.evidence, certificate.c1, certificate.c2
     about: dict[str, Any] = {
         "certificate_sha256": certificate.sha256,
         "policy_sha256": certificate.policy.sha256(),
-        "levels": {"local": certificate.c1, "roa": certificate.c2},
+        "levels": {"local": c1, "roa": c2},
+        "rules": tally.rules,
+        "arithmetic": options.arithmetic,
+        "seconds": seconds,
     }
-    if isinstance(certificate.evidence, document.Trusted):
-        return _trusted(certificate, certificate.evidence, about, as_json)
-    if as_json:
-        accepted = {
-            "result": "ACCEPTED",
-            **about,
-            "leaves": tally.leaves,
-            "ring_leaves": tally.ring_leaves,
-            "margins": {"local": tally.local_margin, "ring": tally.ring_margin},
-        }
-        sys.stdout.write(json.dumps(accepted) + "\n")
-    else:
-        sys.stdout.write("\n".join(_claim(certificate)) + "\n")
-        ring = "" if tally.ring_margin is None else f"; smallest -Vdot bound {tally.ring_margin:.3g}"
-        sys.stdout.write(
-            f"checked: {tally.leaves} leaves, {tally.ring_leaves} of them in the ring{ring}; "
-            f"local margin {tally.local_margin:.1%}\n"
-        )
-        sys.stdout.write(f"ACCEPTED c1={certificate.c1!r} c2={certificate.c2!r} sha256={certificate.sha256}\n")
-    return 0
+    counts = ", ".join(f"{rule} {count}" for rule, count in tally.rules.items())
+    lines = [*_claim(certificate), f"rules that held ({options.arithmetic}): {counts}"]
+    if isinstance(evidence, document.Trusted):
+        answers = [f"{name}: {answer}" for name, answer in evidence.queries]
+        about |= {"solver": evidence.solver, "version": evidence.version, "answers": answers}
+        lines.append("not checked, the solver's word: " + ", ".join(answers))
+        lines.append(f"TRUSTED {evidence.solver} {evidence.version} c1={c1!r} c2={c2!r} sha256={certificate.sha256}")
+        return _say(options.json, 3, {"result": "TRUSTED", **about}, lines)
+    about |= {"leaves": tally.rules["tree"], "ring_leaves": tally.rules["ring"]}
+    about["margins"] = {"local": tally.local_margin, "ring": tally.ring_margin}
+    ring = "" if tally.ring_margin is None else f"; smallest bound of -Vdot on a ring's leaf {tally.ring_margin:.3g}"
+    lines.append(f"margins: local {tally.local_margin:.1%}{ring}")
+    lines.append(f"ACCEPTED c1={c1!r} c2={c2!r} sha256={certificate.sha256}")
+    return _say(options.json, 0, {"result": "ACCEPTED", **about}, lines)
 
 
-def _trusted(c: document.Certificate, evidence: document.Trusted, about: dict[str, Any], as_json: bool) -> int:
-    answers = [f"{name}: {answer}" for name, answer in evidence.queries]
-    if as_json:
-        solver = {"solver": evidence.solver, "version": evidence.version, "answers": answers}
-        sys.stdout.write(json.dumps({"result": "TRUSTED", **about, **solver}) + "\n")
-    else:
-        sys.stdout.write("\n".join([*_claim(c), "not checked, the solver's word: " + ", ".join(answers)]) + "\n")
-        sys.stdout.write(f"TRUSTED {evidence.solver} {evidence.version} c1={c.c1!r} c2={c.c2!r} sha256={c.sha256}\n")
-    return 3
+def _say(as_json: bool, status: int, stated: dict[str, Any], lines: list[str], complaint: str = "") -> int:
+    """Print one JSON object, or lines and on stderr a complaint; return the status."""
+    sys.stdout.write(json.dumps(stated) + "\n" if as_json else "".join(f"{line}\n" for line in lines))
+    sys.stderr.write(f"{complaint}\n" if complaint and not as_json else "")
+    return status
 
 
 def _claim(c: document.Certificate) -> list[str]:

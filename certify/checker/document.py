@@ -26,6 +26,7 @@ from .expression import Tape, parse_dynamics
 
 SCHEMA = "certify-certificate/1"
 MAX_BYTES = 256 * 2**20
+MAX_VALUES = 1_000_000  # each takes up to 100 bytes of memory; numbers come as base64, never as lists
 MAX_STATES, MAX_LAYERS, MAX_WIDTH = 64, 64, 2**14
 _RATIONAL = re.compile(r"-?(0|[1-9][0-9]{0,1200})(/[1-9][0-9]{0,1200})?")
 _HEX_FLOAT = re.compile(r"-?0x[01]\.[0-9a-f]{1,13}p[+-][0-9]{1,4}")
@@ -103,6 +104,8 @@ def read(path: str) -> Certificate:
         raise Unreadable(f"{path} cannot be read: {error.strerror}") from error
     if size > MAX_BYTES or len(raw) > MAX_BYTES:
         _fail("file", f"larger than {MAX_BYTES} bytes")
+    if sum(map(raw.count, (b",", b"[", b"{"))) > MAX_VALUES:
+        _fail("file", f"more than {MAX_VALUES} commas and brackets")
     try:
         data = json.loads(
             raw.decode("utf-8"),

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 
 import numpy as np
+from flint import fmpq, fmpq_mat
 from numpy.typing import NDArray
 
 Matrix = list[list[Fraction]]
-MAX_BITS = 2**14
+MAX_BITS = 2**14  # of a number on the tape
+MAX_MATRIX_BITS = 2**15  # of a number in a matrix, times the matrix's size: beyond, an inverse takes minutes
 
 
 def rational(array: NDArray[np.float64]) -> Matrix:
@@ -19,75 +21,74 @@ def rational(array: NDArray[np.float64]) -> Matrix:
 
 def congruence(T: Matrix, P: Matrix) -> Matrix:
     """`T' P T`."""
-    n = len(P)
-    PT = [[sum((P[i][k] * T[k][j] for k in range(n)), Fraction(0)) for j in range(n)] for i in range(n)]
-    return [[sum((T[k][i] * PT[k][j] for k in range(n)), Fraction(0)) for j in range(n)] for i in range(n)]
+    return [[_fraction(v) for v in row] for row in (_flint(T).transpose() * _flint(P) * _flint(T)).tolist()]
 
 
 def inverse_diagonal(A: Matrix) -> list[Fraction] | None:
-    """Diagonal of `A^-1` for a symmetric A that is positive definite; None if it is not.
+    """Diagonal of `A^-1` for a symmetric positive definite A; None if A is not (or too large to tell soon).
 
-    Gauss-Jordan elimination without pivoting: a symmetric matrix is positive definite if and only if
-    every pivot is positive (they are the D of its LDL' factorisation).
+    A symmetric matrix is positive definite if and only if every leading principal minor is positive (Sylvester).
     """
-    n = len(A)
-    if any(A[i][j] != A[j][i] for i in range(n) for j in range(i)):
+    n, exact = len(A), _flint(A)
+    bits = max(max(v.numerator.bit_length(), v.denominator.bit_length()) for row in A for v in row)
+    if exact != exact.transpose() or n * bits > MAX_MATRIX_BITS:
         return None
-    rows = [[*A[i], *(Fraction(int(i == j)) for j in range(n))] for i in range(n)]
-    for k in range(n):
-        pivot = rows[k][k]
-        if not pivot > 0:
-            return None
-        rows[k] = [v / pivot for v in rows[k]]
-        for i in range(n):
-            factor = rows[i][k]
-            if i != k and factor != 0:
-                rows[i] = [v - factor * w for v, w in zip(rows[i], rows[k], strict=True)]
-    return [rows[i][n + i] for i in range(n)]
+    if not all(_flint([row[:k] for row in A[:k]]).det() > 0 for k in range(1, n + 1)):
+        return None
+    inverse = exact.inv()
+    return [_fraction(inverse[i, i]) for i in range(n)]
 
 
-def gershgorin_lower(A: Sequence[Sequence[Fraction]]) -> Fraction:
+def gershgorin_lower(A: Matrix) -> Fraction:
     """A lower bound of the smallest eigenvalue of a symmetric matrix."""
     return min(row[i] - sum((abs(v) for j, v in enumerate(row) if j != i), Fraction(0)) for i, row in enumerate(A))
+
+
+def _flint(A: Matrix) -> fmpq_mat:
+    return fmpq_mat([[fmpq(v.numerator, v.denominator) for v in row] for row in A])
+
+
+def _fraction(q: fmpq) -> Fraction:
+    return Fraction(int(q.p), int(q.q))
 
 
 class Undecided(Exception):
     """The value is not a rational that this arithmetic can name."""
 
 
-def _small(a: Fraction) -> Fraction:
-    """`a` itself; powers of powers could grow without end."""
-    if max(a.numerator.bit_length(), a.denominator.bit_length()) > MAX_BITS:
-        raise Undecided(f"a number of more than {MAX_BITS} bits")
-    return a
+@dataclass(frozen=True)
+class Exact:
+    """A rational on the tape; sin and cos only of exact 0, no division by zero."""
 
+    value: Fraction
 
-class RationalAlgebra:
-    """Exact evaluation of a tape; sin and cos only at exact 0, no division by zero."""
+    def __add__(self, other: Exact) -> Exact:
+        return Exact(self.small() + other.small())
 
-    def const(self, q: Fraction) -> Fraction:
-        return q
+    def __neg__(self) -> Exact:
+        return Exact(-self.value)
 
-    def add(self, a: Fraction, b: Fraction) -> Fraction:
-        return _small(a) + _small(b)
+    def __mul__(self, other: Exact) -> Exact:
+        return Exact(self.small() * other.small())
 
-    def neg(self, a: Fraction) -> Fraction:
-        return -a
-
-    def mul(self, a: Fraction, b: Fraction) -> Fraction:
-        return _small(a) * _small(b)
-
-    def inv(self, a: Fraction) -> Fraction:
-        if a == 0:
+    def inv(self) -> Exact:
+        if self.value == 0:
             raise Undecided("division by zero")
-        return 1 / a
+        return Exact(1 / self.value)
 
-    def sin(self, a: Fraction) -> Fraction:
-        if a != 0:
-            raise Undecided("sin of a number that is not 0")
-        return Fraction(0)
+    def sin(self) -> Exact:
+        return Exact(self._at_zero("sin", Fraction(0)))
 
-    def cos(self, a: Fraction) -> Fraction:
-        if a != 0:
-            raise Undecided("cos of a number that is not 0")
-        return Fraction(1)
+    def cos(self) -> Exact:
+        return Exact(self._at_zero("cos", Fraction(1)))
+
+    def _at_zero(self, name: str, result: Fraction) -> Fraction:
+        if self.value != 0:
+            raise Undecided(f"{name} of a number that is not 0")
+        return result
+
+    def small(self) -> Fraction:
+        """The value itself; powers of powers could grow without end."""
+        if max(self.value.numerator.bit_length(), self.value.denominator.bit_length()) > MAX_BITS:
+            raise Undecided(f"a number of more than {MAX_BITS} bits")
+        return self.value

@@ -2,21 +2,26 @@
 
 A leaf is a name or an exact fraction; a node is `["+", a, b, ...]`, `["*", a, b, ...]`, `["-", a]`,
 `["-", a, b]`, `["/", a, b]`, `["**", a, k]` with an integer k, `["sin", a]`, `["cos", a]` or `["tan", a]`.
-Powers and tan are expanded here, so that every arithmetic implements only
-const, var, add, neg, mul, inv, sin and cos.
+Powers and tan are expanded here, so that an arithmetic needs only +, *, unary -, inv, sin and cos.
 """
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 from .errors import Rejected
 
 MAX_OPERATIONS, MAX_DEPTH, MAX_EXPONENT = 20_000, 200, 64
 Operation = tuple[Any, ...]  # ("const", q) | ("var", i) | (name, operand indices ...)
+_METHODS: dict[str, Callable[..., Any]] = {
+    **{name: getattr(operator, name) for name in ("add", "mul", "neg")},
+    **{name: operator.methodcaller(name) for name in ("inv", "sin", "cos")},
+}
+V = TypeVar("V")
 
 
 @dataclass(frozen=True)
@@ -28,31 +33,21 @@ class Tape:
     text: tuple[str, ...]
 
 
-T = TypeVar("T")
-
-
-class Algebra(Protocol[T]):
-    """What an arithmetic must provide to evaluate a tape."""
-
-    def const(self, q: Fraction) -> T: ...
-    def add(self, a: T, b: T) -> T: ...
-    def neg(self, a: T) -> T: ...
-    def mul(self, a: T, b: T) -> T: ...
-    def inv(self, a: T) -> T: ...
-    def sin(self, a: T) -> T: ...
-    def cos(self, a: T) -> T: ...
-
-
-def evaluate(tape: Tape, algebra: Algebra[T], variables: Sequence[T]) -> list[T]:
-    """The outputs of `tape` at `variables` (states, then inputs) in the arithmetic `algebra`."""
-    values: list[T] = []
-    for name, *operands in tape.operations:
+def evaluate(tape: Tape, constant: Callable[[Fraction], V], variables: Sequence[V]) -> list[V]:
+    """The outputs of `tape` at `variables` (states, then inputs), in the arithmetic of these; a value is kept no
+    longer than it is needed."""
+    last = {i: k for k, operation in enumerate(tape.operations) if operation[0] in _METHODS for i in operation[1:]}
+    values: dict[int, V] = {}
+    for k, (name, *operands) in enumerate(tape.operations):
         if name == "const":
-            values.append(algebra.const(operands[0]))
+            values[k] = constant(operands[0])
         elif name == "var":
-            values.append(variables[operands[0]])
+            values[k] = variables[operands[0]]
         else:
-            values.append(getattr(algebra, name)(*[values[i] for i in operands]))
+            values[k] = _METHODS[name](*[values[i] for i in operands])
+            for i in set(operands):
+                if last[i] == k and i not in tape.outputs:
+                    del values[i]
     return [values[i] for i in tape.outputs]
 
 
@@ -73,16 +68,17 @@ class _Builder:
     def __init__(self, names: dict[str, int], rational: Callable[[Any, str], Fraction]) -> None:
         self.names, self.rational = names, rational
         self.operations: list[Operation] = []
-        self.known: dict[object, int] = {}
+        self.known: dict[str, int] = {}
         self.visited = 0
 
     def push(self, *operation: Any) -> int:
-        if operation not in self.known:
+        key = " ".join(map(str, operation))  # strings, whose hashes nobody can predict
+        if key not in self.known:
             if len(self.operations) >= MAX_OPERATIONS:
                 raise Rejected("format", "plant.dynamics", f"more than {MAX_OPERATIONS} operations")
-            self.known[operation] = len(self.operations)
+            self.known[key] = len(self.operations)
             self.operations.append(operation)
-        return self.known[operation]
+        return self.known[key]
 
     def build(self, tree: Any, at: str, depth: int) -> tuple[int, str]:
         """Index of the tree's value on the tape, and the tree in words."""

@@ -35,7 +35,6 @@ TINY = 2.0**-960
 _STEP = 2.0**-5
 _TANH_END = 20.0  # 1 - tanh(20) < 2^-56
 _ANGLE_END = 64.0  # beyond, sin and cos are only known to lie in [-1, 1]
-ELEMENTARY = 2.0**-49  # error of tanh, sin and cos relative to the sum of their terms
 
 
 def up(bound: Any) -> Any:
@@ -56,6 +55,12 @@ def total(array: Any, axis: int) -> Any:
 def norm(array: Any, axis: int) -> Any:
     """An upper bound of the 2-norm along an axis."""
     return up(np.sqrt(total(array * array, axis)))
+
+
+def ends(centre: Array, radius: Array) -> tuple[Array, Array]:
+    """(lo, hi), an interval around the one of that centre and radius."""
+    radius = up(radius + EPS * np.abs(centre))
+    return centre - radius, centre + radius
 
 
 def float_with_error(q: Fraction) -> tuple[float, float]:
@@ -105,23 +110,24 @@ _TANH, _SECH2, _SIN, _COS = _tables()
 
 
 def _split(y: Array, end: float) -> tuple[Any, Array]:
-    """Index k and remainder d with y = k h + d exactly, |d| <= h/2, for 0 <= y <= end.
+    """Index k and remainder d with y = k h + d exactly, for 0 <= y <= end: |d| <= h/2, or k = 0 and d = y <= h.
 
-    k h has at most 11 bits. If k = 0, d = y. Otherwise y >= h/2, so d is a multiple of ulp(y) >= 2^-58 with
-    |d| <= 2^-6: it has at most 53 bits, and the subtraction is exact.
+    k h has at most 11 bits. If k = 0, d = y. Otherwise y >= h, so d is a multiple of ulp(y) >= 2^-57 with
+    |d| <= 2^-6: it has at most 51 bits, and the subtraction is exact.
     """
-    k = np.rint(y * (1 / _STEP))
+    k = np.where(y < _STEP, 0.0, np.rint(y * (1 / _STEP)))
     return k.astype(np.intp), y - k * _STEP
 
 
 def tanh(y: Array) -> tuple[Array, Array]:
     """(t, e) with |tanh(y) - t| <= e for every finite y; NaN where y is not finite.
 
-    With k and d from `_split`, `tanh(kh + d) = T + (1 - T^2) s / (1 + T s)`, T = tanh(kh), s = tanh(d).
-    s = d - d^3/3 + 2 d^5/15 - 17 d^7/315 + 62 d^9/2835 + r: the series alternates and its terms decrease
-    for |d| <= 2^-6, so |r| <= 1382/155925 |d|^11 <= 2^-66 |d|. Horner's rule on d^2 <= 2^-12 gives s with a relative
-    error of 4u; the quotient adds 6u and T and 1 - T^2 come with u each, the last addition with u: the error is at
-    most 12u |quotient| + 2u |T| + u |t| <= 2^-49 (|T| + |quotient|). For y > 20 the value 1 is within 2^-56.
+    With k and d from `_split`, `tanh(kh + d) = T + q`, `q = (1 - T^2) s / (1 + T s)`, T = tanh(kh), s = tanh(d).
+    s = d - d^3/3 + 2 d^5/15 - 17 d^7/315 + 62 d^9/2835 + r: the series alternates and its terms decrease for |d| <= h,
+    so |r| <= 1382/155925 |d|^11 < 0.08u |d|. What Horner's rule adds to d is below |d|/3000, so that its roundings
+    are below 0.01u |d|: s is within 1.1u |s|. If k = 0, q = s exactly. Otherwise 1 - T^2 and T come with u each, and
+    T s <= 2^-6: q is within (1 + 1.1 + 1)u + 1.1u + u < 6u of itself, and the last addition adds u (T + |q|). The claim
+    is 3u T + 8u |q|, and 2u |q| if k = 0. For y > 20 the value 1 is within 2^-56.
     """
     finite = np.isfinite(y)
     a = np.where(finite, np.minimum(np.abs(y), _TANH_END), 0.0)
@@ -129,16 +135,18 @@ def tanh(y: Array) -> tuple[Array, Array]:
     w = d * d
     s = d + d * (w * (-1 / 3 + w * (2 / 15 + w * (-17 / 315 + w * (62 / 2835)))))
     T = _TANH[k]
-    quotient = _SECH2[k] * s / (1 + T * s)
-    error = ELEMENTARY * (T + np.abs(quotient)) + TINY
-    return np.where(finite, np.copysign(T + quotient, y), np.nan), np.where(finite, error, np.nan)
+    q = _SECH2[k] * s / (1 + T * s)
+    error = 3 * U * T + np.where(k > 0, 8 * U, 2 * U) * np.abs(q) + TINY
+    return np.where(finite, np.copysign(T + q, y), np.nan), np.where(finite, error, np.nan)
 
 
-def sin_cos(y: Array) -> tuple[Array, Array, Array]:
-    """(s, c, e) with |sin(y) - s| <= e and |cos(y) - c| <= e; NaN where y is not finite.
+def sin_cos(y: Array) -> tuple[Array, Array, Array, Array]:
+    """(s, c, es, ec) with |sin(y) - s| <= es and |cos(y) - c| <= ec; NaN where y is not finite.
 
-    Angle addition on the same grid; the Taylor polynomials of degree 9 and 8 at |d| <= 2^-6 leave
-    out less than |d|^11 / 11! <= 2^-91 and |d|^10 / 10! <= 2^-81. For |y| > 64: s = c = 0, e = 1.
+    sin(kh + d) = S cos(d) + C sin(d) and cos(kh + d) = C cos(d) - S sin(d) on the same grid. The Taylor polynomials of
+    degree 9 and 8 leave out less than |d|^11 / 11! and |d|^10 / 10!, |d| <= h; as above, sin(d) and cos(d) are within
+    1.1u of themselves. S and C come with u each: a product is within 3.2u of itself, and the sum adds u of both. The
+    claim is 5u times the products' magnitudes. For |y| > 64: s = c = 0, es = ec = 1.
     """
     finite, near = np.isfinite(y), np.abs(y) <= _ANGLE_END
     k, d = _split(np.where(near, np.abs(y), 0.0), _ANGLE_END)
@@ -148,14 +156,10 @@ def sin_cos(y: Array) -> tuple[Array, Array, Array]:
     S, C = _SIN[k], _COS[k]
     s = np.copysign(1.0, y) * (S * cd + C * sd)
     c = C * cd - S * sd
-    error = ELEMENTARY * (np.abs(S) + np.abs(C) + np.abs(sd)) + TINY
-    s, c, error = (np.where(near, v, far) for v, far in ((s, 0.0), (c, 0.0), (error, 1.0)))
-    return tuple(np.where(finite, v, np.nan) for v in (s, c, error))  # type: ignore[return-value]
-
-
-def frobenius_norm(G: Array) -> float:
-    """An upper bound of ||G||_F."""
-    return float(norm(norm(G, 0), 0))
+    s_error = 5 * U * (np.abs(S) + np.abs(C * sd)) + TINY
+    c_error = 5 * U * (np.abs(C) + np.abs(S * sd)) + TINY
+    pairs = ((s, 0.0), (c, 0.0), (s_error, 1.0), (c_error, 1.0))
+    return tuple(np.where(finite, np.where(near, v, far), np.nan) for v, far in pairs)  # type: ignore[return-value]
 
 
 def spectral_norm(W: Array) -> float:
@@ -168,7 +172,7 @@ def spectral_norm(W: Array) -> float:
     G = W if W.shape[0] >= W.shape[1] else W.T
     steps: list[tuple[float, float]] = []
     for _ in range(6):
-        frobenius = frobenius_norm(G)
+        frobenius = float(norm(norm(G, 0), 0))
         if not frobenius < np.inf:
             return np.inf
         scale = math.ldexp(1.0, math.frexp(frobenius)[1])
@@ -176,7 +180,7 @@ def spectral_norm(W: Array) -> float:
         error = up(gamma(G.shape[0]) * up((frobenius / scale) ** 2)) + G.size * TINY
         G = G.T @ G
         steps.append((scale, error))
-    bound = frobenius_norm(G)
+    bound = float(norm(norm(G, 0), 0))
     for scale, error in reversed(steps):
         bound = float(up(scale * up(np.sqrt(up(bound + error)))))
     return bound

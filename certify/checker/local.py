@@ -1,4 +1,4 @@
-"""First-order models with a quadratic remainder on the unit ball: the arithmetic of the local rule.
+"""First-order models with a quadratic remainder on the unit ball: what the local rule evaluates the plant in.
 
 A jet of v over d in R^n says: `v(d) = v(0) + a.d + R(d)` with |R(d)| <= k ||d||^2 for *all* ||d|| <= 1, so the
 bound holds on every smaller ball too. v(0) lies within `error` of c, and the true gradient within `slack` of a in the
@@ -12,55 +12,46 @@ from fractions import Fraction
 
 import numpy as np
 
-from .float64 import EPS, Array, float_with_error, norm, sin_cos, up
+from .arithmetic import Number, lesser, norm, sin_cos, up
+from .float64 import EPS, float_with_error
 
 
 @dataclass(frozen=True)
 class Jet:
     """`c` +- `error`, gradient `a` (n,) +- `slack`, quadratic remainder `k`."""
 
-    c: float
-    error: float
-    a: Array
-    slack: float
-    k: float
+    c: Number
+    error: Number
+    a: Number
+    slack: Number
+    k: Number
 
     @property
-    def size(self) -> float:
+    def size(self) -> Number:
         """Upper bound of |v(0)|."""
-        return float(up(abs(self.c) + self.error))
+        return up(abs(self.c) + self.error)
 
     @property
-    def slope(self) -> float:
+    def slope(self) -> Number:
         """Upper bound of the gradient's 2-norm."""
-        return float(up(norm(self.a, 0) + self.slack))
+        return up(norm(self.a, 0) + self.slack)
 
     @property
-    def radius(self) -> float:
+    def radius(self) -> Number:
         """Upper bound of |v(d) - v(0)| / ||d|| on the unit ball."""
-        return float(up(self.slope + self.k))
+        return up(self.slope + self.k)
 
-
-class JetAlgebra:
-    """Evaluates the plant's tape on jets over R^n."""
-
-    def __init__(self, n: int) -> None:
-        self.n = n
-
-    def const(self, q: Fraction) -> Jet:
-        value, error = float_with_error(q)
-        return Jet(value, error, np.zeros(self.n), 0.0, 0.0)
-
-    def add(self, x: Jet, y: Jet) -> Jet:
+    def __add__(self, other: Jet) -> Jet:
+        x, y = self, other
         c = x.c + y.c
         error = up(x.error + y.error + EPS * abs(c))
-        slack = up(x.slack + y.slack + EPS * (x.slope + y.slope))
-        return Jet(c, float(error), x.a + y.a, float(slack), float(up(x.k + y.k)))
+        return Jet(c, error, x.a + y.a, up(x.slack + y.slack + EPS * (x.slope + y.slope)), up(x.k + y.k))
 
-    def neg(self, x: Jet) -> Jet:
-        return Jet(-x.c, x.error, -x.a, x.slack, x.k)
+    def __neg__(self) -> Jet:
+        return Jet(-self.c, self.error, -self.a, self.slack, self.k)
 
-    def mul(self, x: Jet, y: Jet) -> Jet:
+    def __mul__(self, other: Jet) -> Jet:
+        x, y = self, other
         c = x.c * y.c
         error = up(x.size * y.error + y.size * x.error + EPS * abs(c))
         slack = up(
@@ -68,27 +59,34 @@ class JetAlgebra:
             + EPS * (x.size * y.slope + y.size * x.slope)
         )  # fmt: skip
         k = up(x.size * y.k + y.size * x.k + x.radius * y.radius)
-        return Jet(c, float(error), x.c * y.a + y.c * x.a, float(slack), float(k))
+        return Jet(c, error, x.c * y.a + y.c * x.a, slack, k)
 
-    def compose(self, x: Jet, f0: float, f1: float, error: float, first: float, second: float) -> Jet:
+    def _compose(self, f0: Number, f1: Number, error: Number, first: Number, second: Number) -> Jet:
         """phi(v) from phi(c), phi'(c) within `error`; first >= sup |phi'|, second >= sup |phi''| on the range."""
-        slack = up((error + second * x.error) * x.slope + abs(f1) * x.slack + EPS * abs(f1) * x.slope)
-        k = up(first * x.k + 0.5 * second * x.radius * x.radius)
-        return Jet(f0, float(up(error + first * x.error)), f1 * x.a, float(slack), float(k))
+        slack = up((error + second * self.error) * self.slope + abs(f1) * self.slack + EPS * abs(f1) * self.slope)
+        k = up(first * self.k + 0.5 * second * self.radius * self.radius)
+        return Jet(f0, up(error + first * self.error), f1 * self.a, slack, k)
 
-    def inv(self, x: Jet) -> Jet:
+    def inv(self) -> Jet:
         """1/v; NaN unless the range of v certainly excludes 0."""
-        least = np.float64(abs(x.c) - up(x.error + x.radius))
+        least = abs(self.c) - up(self.error + self.radius)
         least = least * (1 - 2.0**-40) if least > 0 else np.float64(np.nan)
-        f0 = float(np.float64(1.0) / x.c)
+        f0 = 1 / self.c
         first = up(1 / least * (1 / least))
-        second = up(2 * first / least)
-        return self.compose(x, f0, -f0 * f0, EPS * (abs(f0) + f0 * f0), float(first), float(second))
+        return self._compose(f0, -f0 * f0, EPS * (abs(f0) + f0 * f0), first, up(2 * first / least))
 
-    def sin(self, x: Jet) -> Jet:
-        s, c, e = (float(v) for v in sin_cos(np.float64(x.c)))  # type: ignore[arg-type]
-        return self.compose(x, s, c, e, 1.0, float(up(min(1.0, abs(s) + e + x.error + x.radius))))
+    def sin(self) -> Jet:
+        s, c, s_error, c_error = sin_cos(self.c)
+        second = up(lesser(abs(s) + s_error + self.error + self.radius, 1.0))
+        return self._compose(s, c, up(s_error + c_error), 1.0, second)
 
-    def cos(self, x: Jet) -> Jet:
-        s, c, e = (float(v) for v in sin_cos(np.float64(x.c)))  # type: ignore[arg-type]
-        return self.compose(x, c, -s, e, 1.0, float(up(min(1.0, abs(c) + e + x.error + x.radius))))
+    def cos(self) -> Jet:
+        s, c, s_error, c_error = sin_cos(self.c)
+        second = up(lesser(abs(c) + c_error + self.error + self.radius, 1.0))
+        return self._compose(c, -s, up(s_error + c_error), 1.0, second)
+
+
+def constant(q: Fraction, n: int) -> Jet:
+    """A rational over R^n."""
+    value, error = float_with_error(q)
+    return Jet(np.float64(value), error, np.zeros(n), 0.0, 0.0)

@@ -16,93 +16,101 @@ ring, inputs for each leaf: it misses c1 <= V <= c2, or Vdot < 0 (and u within i
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .document import Certificate, Trusted
+from .arithmetic import Number, carry, largest, lesser, maximum, middle, norm, product, total, up
+from .document import Certificate, Partition
 from .errors import Rejected
-from .exact import RationalAlgebra, Undecided, congruence, gershgorin_lower, inverse_diagonal, rational
+from .exact import Exact, Matrix, Undecided, congruence, gershgorin_lower, inverse_diagonal, rational
 from .expression import evaluate
-from .float64 import EPS, Array, float_with_error, gamma, norm, self_test, total, up
-from .local import Jet, JetAlgebra
+from .float64 import EPS, Array, float_with_error, gamma, self_test
+from .local import Jet
+from .local import constant as constant_jet
 from .network import Folded, enclose_at_origin, enclose_on_boxes, fold
-from .taylor import Taylor, TaylorAlgebra, upper_bound
+from .taylor import Taylor, affine, upper_bound
+from .taylor import constant as constant_model
 
+RULES = (
+    "format", "hash", "levels", "lyapunov", "equilibrium", "domain",
+    "coordinates", "root", "centring", "inputs", "local", "tree", "ring",
+)  # fmt: skip
 LEAF = 255
 MAX_DEPTH = 4096
-_BATCH_NUMBERS = 4_000_000  # numbers in the largest array of a batch
+_BATCH_NUMBERS = {"float64": 4_000_000, "arb": 100_000}  # numbers in the largest array of a batch
 
 
 @dataclass
 class Tally:
-    """What was checked, for the printed summary; margins are floats for people."""
+    """How often each rule was applied, and the margins, which are floats for people."""
 
-    leaves: int = 0
-    ring_leaves: int = 0
+    rules: Counter[str] = field(default_factory=lambda: Counter({**dict.fromkeys(RULES, 0), "format": 1, "hash": 1}))
     ring_margin: float | None = None  # smallest -Vdot bound over the ring's leaves
     local_margin: float = 0.0  # smallest eigenvalue less remainder, over the eigenvalue
 
 
-def check(certificate: Certificate) -> Tally:
+def check(c: Certificate, arithmetic: str = "float64") -> Tally:
     """Check every rule; returns the tally, raises `Rejected` at the first rule that fails.
 
     Of evidence that cannot be replayed only the exact rules are checked: levels, lyapunov, equilibrium, domain,
     centring. The tally then has no leaves, and the caller must not say ACCEPTED.
     """
     self_test()
-    c = certificate
-    tally = Tally()
     with np.errstate(all="ignore"):  # overflow becomes infinity or NaN, and every test below then fails
-        _check_levels(c)
+        tally = Tally()
         P = rational(c.P)
-        inverse_P = inverse_diagonal(P)
-        if inverse_P is None:
-            raise Rejected("lyapunov", "lyapunov.P", "P must be symmetric and positive definite")
-        _check_equilibrium(c)
-        c2 = Fraction(c.c2)
-        for i, ((lo, hi), p) in enumerate(zip(c.domain, inverse_P, strict=True)):
-            if not (lo < 0 < hi and c2 * p < min(-lo, hi) ** 2):
-                raise Rejected("domain", c.states[i], "{V <= c2} must lie in the interior of the domain")
-        if isinstance(c.evidence, Trusted):
-            fold(c.policy, c.u_eq)
-            return tally
-        T, root = c.evidence.T, c.evidence.root
-        S = congruence(rational(T), P)
-        inverse_S = inverse_diagonal(S)
-        least = gershgorin_lower(S)
-        if inverse_S is None or not least > 0:
-            raise Rejected("coordinates", "evidence.T", "T'PT must be positive definite and diagonally dominant")
-        for i, (b, s) in enumerate(zip(root, inverse_S, strict=True)):
-            if not (b > 0 and c2 * s <= Fraction(float(b)) ** 2):
-                raise Rejected("root", f"axis {i}", "the root box must contain {V <= c2}")
-        net = fold(c.policy, c.u_eq)
-        bounded = _inputs_bounded_by_form(c)
-        _check_local(c, T, net, least, bounded, tally)
-        ring = _Ring(c, T, net, S, bounded)
-        for first, lo_z, hi_z in _leaves(c.evidence.tree, root, ring.batch):
-            tally.leaves += len(lo_z)
-            if c.c1 < c.c2:  # otherwise the local rule has covered V <= c2
-                ring.check(first, lo_z.T, hi_z.T, tally)
+        _check_exactly(c, P, tally)
+        if isinstance(c.evidence, Partition):
+            _check_evidence(c, c.evidence, P, arithmetic, tally)
+        else:
+            fold(c.policy, c.u_eq, arithmetic)
+            tally.rules["centring"] += 1
     return tally
 
 
-def _check_levels(c: Certificate) -> None:
+def _check_exactly(c: Certificate, P: Matrix, tally: Tally) -> None:
     if not 0 < c.c1 <= c.c2 < float("inf"):
         raise Rejected("levels", "levels", "must satisfy 0 < local <= roa")
-
-
-def _check_equilibrium(c: Certificate) -> None:
+    inverse = inverse_diagonal(P)
+    if inverse is None:
+        raise Rejected("lyapunov", "lyapunov.P", "P must be symmetric and positive definite")
     try:
-        value = evaluate(c.dynamics, RationalAlgebra(), [*[Fraction(0)] * len(c.states), *c.u_eq])
+        origin = [Exact(q) for q in (*[Fraction(0)] * len(c.states), *c.u_eq)]
+        value = evaluate(c.dynamics, Exact, origin)
     except Undecided as error:
         raise Rejected("equilibrium", "plant.dynamics", f"f(0, u_eq) is not decided exactly: {error}") from error
     for name, v in zip(c.states, value, strict=True):
-        if v != 0:
+        if v.value != 0:
             raise Rejected("equilibrium", name, "f(0, u_eq) must be 0")
+    for name, (lo, hi), p in zip(c.states, c.domain, inverse, strict=True):
+        if not (lo < 0 < hi and Fraction(c.c2) * p < min(-lo, hi) ** 2):
+            raise Rejected("domain", name, "{V <= c2} must lie in the interior of the domain")
+    tally.rules.update(levels=1, lyapunov=1, equilibrium=len(value), domain=len(inverse))
+
+
+def _check_evidence(c: Certificate, evidence: Partition, P: Matrix, arithmetic: str, tally: Tally) -> None:
+    S = congruence(rational(evidence.T), P)
+    inverse = inverse_diagonal(S)
+    least = gershgorin_lower(S)
+    if inverse is None or not least > 0:
+        raise Rejected("coordinates", "evidence.T", "T'PT must be positive definite and diagonally dominant")
+    for i, (b, s) in enumerate(zip(evidence.root, inverse, strict=True)):
+        if not (b > 0 and Fraction(c.c2) * s <= Fraction(float(b)) ** 2):
+            raise Rejected("root", f"axis {i}", "the root box must contain {V <= c2}")
+    net = fold(c.policy, c.u_eq, arithmetic)
+    T, bounded = carry(evidence.T, arithmetic), _inputs_bounded_by_form(c)
+    tally.rules.update(coordinates=1, root=len(inverse), centring=1, inputs=len(c.inputs) if bounded else 0)
+    _check_local(c, T, net, least, bounded, tally)
+    ring = _Ring(c, T, net, S, bounded, arithmetic)
+    for first, lo, hi in _leaves(evidence.tree, evidence.root, ring.batch):
+        tally.rules["tree"] += len(lo)
+        if c.c1 < c.c2:  # otherwise the local rule has covered V <= c2
+            ring.check(first, carry(lo.T, arithmetic), carry(hi.T, arithmetic), tally)
 
 
 def _inputs_bounded_by_form(c: Certificate) -> bool:
@@ -115,7 +123,7 @@ def _inputs_bounded_by_form(c: Certificate) -> bool:
     )
 
 
-def _within(bounds: tuple[Fraction, Fraction], mid: Array, radius: Array) -> NDArray[np.bool_]:
+def _within(bounds: tuple[Fraction, Fraction], mid: Number, radius: Number) -> NDArray[np.bool_]:
     """Elementwise: [mid - radius, mid + radius] certainly lies in the bounds."""
     (lo, lo_error), (hi, hi_error) = float_with_error(bounds[0]), float_with_error(bounds[1])
     reach = up(radius + EPS * np.abs(mid))
@@ -123,7 +131,7 @@ def _within(bounds: tuple[Fraction, Fraction], mid: Array, radius: Array) -> NDA
     return np.asarray((mid - reach >= lo + slack) & (mid + reach <= hi - slack))
 
 
-def _check_local(c: Certificate, T: Array, net: Folded, least: Fraction, bounded: bool, tally: Tally) -> None:
+def _check_local(c: Certificate, T: Number, net: Folded, least: Fraction, bounded: bool, tally: Tally) -> None:
     """Claim 3: with z = rho d, {V <= c1} lies in ||d|| <= 1 and Vdot = 2 rho d'G(d), G = T'P F(T rho d).
 
     F(0) = 0 exactly, so G(d) = B d + R(d) with ||R(d)|| <= k ||d||^2, and Vdot <= 2 rho ||d||^2 (-mu + k ||d||) with
@@ -135,70 +143,61 @@ def _check_local(c: Certificate, T: Array, net: Folded, least: Fraction, bounded
     if not (rho < float("inf") and least * Fraction(rho) ** 2 >= Fraction(c.c1)):
         raise Rejected("local", "levels.local", "the level is out of range")
     J = rho * T
-    slack = float(up(EPS * float(norm(norm(J, 1), 0))))
-    states = [Jet(0.0, 0.0, J[i], slack, 0.0) for i in range(n)]
+    slack = up(EPS * norm(norm(J, 1), 0))
+    variables = [Jet(0 * J[i, 0], 0.0, J[i], slack, 0.0) for i in range(n)]
     gradient, u_slack, u_k = enclose_at_origin(net, J, slack)
-    inputs = []
-    for j, (q, scale) in enumerate(zip(c.u_eq, net.scale, strict=True)):
+    for name, q, scale, bounds, row in zip(c.inputs, c.u_eq, net.scale, c.input_bounds, gradient, strict=True):
         value, error = float_with_error(q)
-        wide = float(up(abs(scale) * u_slack + EPS * float(norm(gradient[j], 0))))
-        inputs.append(Jet(value, error, gradient[j], wide, float(up(abs(scale) * u_k))))
-        reach = up(np.array(error + inputs[j].radius))
-        if not bounded and not _within(c.input_bounds[j], np.array(value), reach):
-            raise Rejected("inputs", "local ball", f"{c.inputs[j]} may leave its bounds")
-    algebra = JetAlgebra(n)
-    F = evaluate(c.dynamics, algebra, [*states, *inputs])
-    PT = _product_with_error(c.P, T)
-    B, doubt, k = np.zeros((n, n)), 0.0, 0.0
-    for i in range(n):
-        row, slack_i, k_i = np.zeros(n), 0.0, 0.0
-        for j in range(n):
-            value, error = float(PT[0][j, i]), float(PT[1][j, i])
-            row = row + value * F[j].a
-            size = up(abs(value) + error)
-            slack_i = float(up(slack_i + size * F[j].slack + (error + EPS * n * size) * F[j].slope))
-            k_i = float(up(k_i + size * F[j].k))
-        B[i] = row
-        doubt, k = float(up(doubt + slack_i * slack_i)), float(up(k + k_i * k_i))
+        wide = up(abs(scale) * u_slack + EPS * norm(row, 0))
+        u = Jet(np.float64(value), error, row, wide, up(abs(scale) * u_k))
+        variables.append(u)
+        if not bounded:
+            tally.rules["inputs"] += 1
+            if not _within(bounds, u.c, up(error + u.radius)):
+                raise Rejected("inputs", "local ball", f"{name} may leave its bounds")
+    F = evaluate(c.dynamics, lambda q: constant_jet(q, n), variables)
+    gradients = np.array([jet.a for jet in F])  # row i: the gradient of F_i
+    PT, doubt = product(c.P, T), up(gamma(n) * norm(c.P, 1)[:, None] * norm(T, 0)[None, :])  # of each entry
+    size = up(np.abs(PT) + doubt)
+    slopes, slacks, ks = (np.array([[getattr(jet, name)] for jet in F]) for name in ("slope", "slack", "k"))
+    B = product(PT.T, gradients)
+    wrong = total(size * slacks + doubt * slopes + gamma(n) * size * slopes, 0)  # of each row of B, in the 2-norm
+    k = norm(total(size * ks, 0), 0)
     M = -(B + B.T) / 2
-    off = total(np.abs(M - np.diag(np.diag(M))), 1)
-    mu = float(np.min(np.diag(M) - off)) - float(up(np.sqrt(doubt) + gamma(n) * float(norm(norm(M, 1), 0))))
-    bound = float(up(np.sqrt(k)))
-    if not mu > up(bound):
-        raise Rejected(
-            "local", "levels.local", f"Vdot < 0 is not shown on the local ball: {mu:.3g} against {bound:.3g}"
-        )
-    tally.local_margin = 1 - bound / mu
-
-
-def _product_with_error(P: Array, T: Array) -> tuple[Array, Array]:
-    """`P T` and a bound of the rounding error of each entry."""
-    return P @ T, np.asarray(up(gamma(len(P)) * norm(P, 1)[:, None] * norm(T, 0)[None, :]))
+    off = total(np.abs(M) * (1 - np.eye(n)), 1)
+    diagonal = np.array([M[i, i] for i in range(n)])
+    mu = -largest(off - diagonal, 0) - up(norm(wrong, 0) + gamma(n) * norm(norm(M, 1), 0))
+    tally.rules["local"] += 1
+    if not mu > up(k):
+        numbers = f"{float(middle(mu)):.3g} against {float(middle(k)):.3g}"
+        raise Rejected("local", "levels.local", f"Vdot < 0 is not shown on the local ball: {numbers}")
+    tally.local_margin = 1 - float(middle(k)) / float(middle(mu))
 
 
 class _Ring:
     """The rule for a leaf, on batches of leaves."""
 
-    def __init__(self, c: Certificate, T: Array, net: Folded, S: list[list[Fraction]], bounded: bool) -> None:
+    def __init__(
+        self, c: Certificate, T: Number, net: Folded, S: Matrix, bounded: bool, arithmetic: str = "float64"
+    ) -> None:
         self.c, self.T, self.net, self.bounded = c, T, net, bounded
         self.n, self.m = len(c.states), len(c.inputs)
-        pairs = [[float_with_error(v) for v in row] for row in S]
-        self.S_diagonal = np.array([pairs[i][i] for i in range(self.n)])
-        size = np.array([[abs(v) + e for v, e in row] for row in pairs])
-        self.S_cross = up(size - np.diag(np.diag(size)))
+        value, error = np.moveaxis(np.array([[float_with_error(v) for v in row] for row in S]), 2, 0)
+        self.S, self.S_error = np.diag(value)[:, None], np.diag(error)[:, None]  # of the diagonal, (n, 1)
+        self.S_cross = up((np.abs(value) + error) * (1 - np.eye(self.n)))
         width = max(max(W.shape) for W in net.weights)
         symbols = self.n + self.m
-        numbers = max(width * (self.n + self.m + 4), symbols * symbols * (len(c.dynamics.operations) + 4))
-        self.batch = max(1, min(4096, _BATCH_NUMBERS // numbers))
+        numbers = max(width * (symbols + 4), symbols * symbols * (len(c.dynamics.operations) + 4))
+        self.batch = max(1, min(4096, _BATCH_NUMBERS[arithmetic] // numbers))
 
-    def check(self, first: int, lo: Array, hi: Array, tally: Tally) -> None:
+    def check(self, first: int, lo: Number, hi: Number, tally: Tally) -> None:
         """Leaves `first`, `first + 1`, ... with corners lo, hi (n, B) in the coordinates z."""
         inside = np.flatnonzero(np.logical_not(self._misses(lo, hi)))
         if len(inside) == 0:
             return
         lo, hi = lo[:, inside], hi[:, inside]
         centre = 0.5 * lo + 0.5 * hi
-        radius = up(np.maximum(hi - centre, centre - lo))
+        radius = up(maximum(hi - centre, centre - lo))
         x, error = self._states(centre, radius)
         mid, slopes, wide = enclose_on_boxes(self.net, x, error)
         if not self.bounded:
@@ -207,35 +206,35 @@ class _Ring:
                 if not np.all(kept):
                     leaf = first + int(inside[np.argmin(kept)])
                     raise Rejected("inputs", f"leaf {leaf}", f"{self.c.inputs[j]} may leave its bounds")
+                tally.rules["inputs"] += len(kept)
         bound = self._bound(self._vdot(x, error, mid, slopes, wide), centre, radius)
         good = bound < 0
         if not np.all(good):
             worst = int(np.argmin(good))
-            raise Rejected("ring", f"leaf {first + int(inside[worst])}", f"Vdot < 0 is not shown: {bound[worst]:.3g}")
-        tally.ring_leaves += len(inside)
-        margin = float(np.min(-bound))
+            number = f"{middle(bound)[worst]:.3g}"
+            raise Rejected("ring", f"leaf {first + int(inside[worst])}", f"Vdot < 0 is not shown: {number}")
+        tally.rules["ring"] += len(inside)
+        margin = float(np.min(middle(-bound)))
         tally.ring_margin = margin if tally.ring_margin is None else min(tally.ring_margin, margin)
 
-    def _misses(self, lo: Array, hi: Array) -> NDArray[np.bool_]:
+    def _misses(self, lo: Number, hi: Number) -> NDArray[np.bool_]:
         """True where the leaf certainly has V < c1 everywhere, or V > c2 everywhere."""
-        far = np.maximum(np.abs(lo), np.abs(hi))
-        near = np.where((lo <= 0) & (hi >= 0), 0.0, np.minimum(np.abs(lo), np.abs(hi)))
-        value, error = self.S_diagonal[:, :1], self.S_diagonal[:, 1:]
-        cross = up(self._cross(far) + total(error * far * far, 0))
-        least = np.sum(value * near * near, axis=0) * (1 - gamma(self.n + 4)) - cross - 2.0**-960
-        most = up(total(value * far * far, 0) + cross)
+        far = maximum(np.abs(lo), np.abs(hi))
+        near = np.where((lo <= 0) & (hi >= 0), 0.0, lesser(np.abs(lo), np.abs(hi)))  # corners are exact
+        cross = up(self._cross(far) + total(self.S_error * far * far, 0))
+        least = np.sum(self.S * near * near, axis=0) * (1 - gamma(self.n + 4)) - cross - 2.0**-960
+        most = up(total(self.S * far * far, 0) + cross)
         least = least - EPS * np.abs(least) - EPS * cross
         return np.asarray((least > self.c.c2) | (most < self.c.c1))
 
-    def _states(self, centre: Array, radius: Array) -> tuple[Array, Array]:
+    def _states(self, centre: Number, radius: Number) -> tuple[Number, Number]:
         """x = T z on the boxes as affine forms (n, n + 1, B), and a bound of their rounding errors (n, B)."""
-        T = self.T
-        slopes = T[:, :, None] * radius[None]
-        x = np.concatenate([(T @ centre)[:, None], slopes], axis=1)
-        error = gamma(self.n) * norm(T, 1)[:, None] * norm(centre, 0) + EPS * total(np.abs(slopes), 1)
-        return x, np.asarray(up(error))
+        slopes = self.T[:, :, None] * radius[None]
+        x = np.concatenate([product(self.T, centre)[:, None], slopes], axis=1)
+        error = gamma(self.n) * norm(self.T, 1)[:, None] * norm(centre, 0) + EPS * total(np.abs(slopes), 1)
+        return x, up(error)
 
-    def _bound(self, vdot: Taylor, centre: Array, radius: Array) -> Array:
+    def _bound(self, vdot: Taylor, centre: Number, radius: Number) -> Number:
         """Upper bound of Vdot on the part of each box that lies in the ring.
 
         There c2 - V and V - c1 are not negative, so Vdot is at most Vdot + k (c2 - V), and at most Vdot + k (V - c1),
@@ -245,40 +244,38 @@ class _Ring:
         for level, sign in ((self.c.c2, 1.0), (self.c.c1, -1.0)):
             open_ = np.flatnonzero(np.logical_not(bound < 0))
             gap, part = self._gap(centre[:, open_], radius[:, open_], level, sign), vdot.at(open_)
-            k = _multiplier(part.g[: self.n], gap.g[: self.n], gap.c)
-            bound[open_] = np.fmin(bound[open_], upper_bound(part + gap.scaled(k, 0.0)))
+            k = _multiplier(middle(part.g[: self.n]), middle(gap.g[: self.n]), middle(gap.c))
+            other = upper_bound(part + gap.scaled(k, 0.0))
+            better = np.full(bound.shape, np.inf, dtype=other.dtype)
+            better[open_] = other
+            bound = lesser(better, bound)
         return bound
 
-    def _gap(self, centre: Array, radius: Array, level: float, sign: float) -> Taylor:
+    def _gap(self, centre: Number, radius: Number, level: float, sign: float) -> Taylor:
         """sign (level - V) on the boxes, which is not negative on the part of a leaf that lies in the ring."""
         far = up(np.abs(centre) + radius)
-        value, error = self.S_diagonal[:, :1], self.S_diagonal[:, 1:]
-        size = up(level + total(value * far * far, 0))
-        g = np.zeros((self.n + self.m, centre.shape[1]))
-        Q = np.zeros((self.n + self.m, *g.shape))
-        g[: self.n] = -2 * sign * value * centre * radius
-        for i in range(self.n):
-            Q[i, i] = -sign * value[i] * radius[i] * radius[i]
-        c = sign * (level - np.sum(value * centre * centre, axis=0))
-        return Taylor(c, g, Q, up(self._cross(far) + total(error * far * far, 0) + gamma(self.n + 8) * size))
+        size = up(level + total(self.S * far * far, 0))
+        zeros = np.zeros((self.m, centre.shape[1]))
+        g = np.concatenate([-2 * sign * self.S * centre * radius, zeros])
+        q = np.concatenate([-sign * self.S * radius * radius, zeros])
+        c = sign * (level - np.sum(self.S * centre * centre, axis=0))
+        r = up(self._cross(far) + total(self.S_error * far * far, 0) + gamma(self.n + 8) * size)
+        return Taylor(c, g, np.eye(len(q))[:, :, None] * q, r)
 
-    def _cross(self, far: Array) -> Array:
+    def _cross(self, far: Number) -> Number:
         """Upper bound of what the off-diagonal part of S adds to V in magnitude where |z| <= far."""
-        return np.asarray(total(total(self.S_cross[:, :, None] * far[:, None] * far[None, :], 0), 0))
+        return total(total(self.S_cross[:, :, None] * far[:, None] * far[None, :], 0), 0)
 
-    def _vdot(self, x: Array, error: Array, mid: Array, slopes: Array, wide: Array) -> Taylor:
+    def _vdot(self, x: Number, error: Number, mid: Number, slopes: Number, wide: Number) -> Taylor:
         """Vdot = (2 P x)'f(x, u) on the boxes; symbols: n box coordinates, m input errors."""
         n, m, batch = self.n, self.m, x.shape[2]
-        algebra = TaylorAlgebra(n + m, batch)
         variables = []
         for i in range(n):
-            plain = algebra.affine(x[i, 0], np.concatenate([x[i, 1:], np.zeros((m, batch))]))
+            plain = affine(x[i, 0], np.concatenate([x[i, 1:], np.zeros((m, batch))]))
             variables.append(Taylor(plain.c, plain.g, plain.Q, error[i]))
         for j in range(m):
-            own = np.zeros((m, batch))
-            own[j] = wide[j]
-            variables.append(algebra.affine(mid[j], np.concatenate([slopes[j], own])))
-        F = evaluate(self.c.dynamics, algebra, variables)
+            variables.append(affine(mid[j], np.concatenate([slopes[j], np.eye(m)[:, j : j + 1] * wide[j]])))
+        F = evaluate(self.c.dynamics, lambda q: constant_model(q, n + m, batch), variables)
         terms = []
         for i in range(n):
             gradient = [variables[j].scaled(2 * float(self.c.P[i, j]), 0.0) for j in range(n)]

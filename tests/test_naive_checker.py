@@ -1,0 +1,388 @@
+"""Two checkers written apart, from one page: `certify.checker` and `naive_checker` give the same verdicts.
+
+Where they may differ: on a leaf, the naive checker tries several multipliers k and lines of its own around each tanh,
+and so it may accept a leaf that the other refuses by a hair. It must never refuse what the other accepts.
+"""
+
+from __future__ import annotations
+
+import ast
+import copy
+import json
+import math
+import sys
+from collections.abc import Callable
+from fractions import Fraction
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from flint import arb, ctx
+from hypothesis import example, given
+from hypothesis import strategies as st
+
+from certify.policies import load_policy
+from certify.roa import certify_roa
+from certify.systems import get_system
+from certify.verdict import Verdict
+from tests import naive_checker
+from tests.checker_certificates import (
+    LEAF,
+    Document,
+    decode,
+    dump,
+    edited,
+    encode,
+    grow,
+    make,
+    parse,
+    rehash,
+    tree_of,
+    verdict,
+    with_tree,
+)
+from tests.naive_checker import Leaf, judge, judge_bytes
+from tests.oracle import policy_in_arb, value_of
+from tests.test_checker_format import NOT_A_HEX_FLOAT, NOT_A_RATIONAL, NOT_BASE64, NOT_IN_THE_GRAMMAR, RAW, SHAPES
+from tests.test_checker_rules import (
+    ABLATED,
+    FALSE,
+    HARMLESS,
+    HONEST,
+    MUTANTS,
+    Edit,
+    bump,
+    coordinates,
+    honest,
+    lyapunov,
+    reordered,
+    scalar_claim,
+)
+
+SHIPPED = Path(__file__).parent.parent / "examples" / "policies" / "pendulum.pt"
+
+
+def both(data: Document) -> tuple[str, str]:
+    return judge(data) or "ACCEPTED", verdict(data)
+
+
+@pytest.fixture(scope="module")
+def shipped(tmp_path_factory: pytest.TempPathFactory) -> Document:
+    """The certificate of the policy that ships."""
+    policy = load_policy(SHIPPED)
+    system = get_system("pendulum").with_parameters(policy.parameters)
+    result = certify_roa(system, policy.network, tmp_path_factory.mktemp("shipped"))
+    assert result.verdict is Verdict.PROVED and result.certificate is not None
+    return json.loads(result.certificate.read_text())
+
+
+@cache
+def crane(centre: str, v: tuple[str, str]) -> Document:
+    """Three states, two inputs, tan, cos and a quotient; `v` are the bounds of the second input."""
+    generator = np.random.default_rng(3)
+    W, b, scale = 0.5 * generator.standard_normal((8, 3)), generator.uniform(-0.3, 0.3, 8), np.array([1.5, 1.0])
+    x = generator.uniform(-1, 1, (3000, 3))
+    h, at_0 = np.tanh(x @ W.T + b), np.tanh(b)
+    target = np.arctanh(np.clip(-(x @ np.array([[2.0, 0.3, 0.1], [0.2, 0.1, 1.5]]).T) / scale, -0.9, 0.9))
+    last = np.linalg.lstsq(h - at_0, target, rcond=1e-2)[0].T
+    A = np.array([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 0.5]])
+    A[1:] += scale[:, None] * (last * (1 - at_0**2)) @ W
+    P = lyapunov(A)
+    dynamics: list[Any] = [
+        "y",
+        ["+", ["-", ["sin", "y"]], ["*", "u", ["/", "1", ["+", "1", ["*", "1/4", ["**", "x", 2]]]]]],
+        ["+", ["*", "1/2", ["tan", "z"]], ["*", "v", ["cos", "x"]]],
+    ]
+    return grow(make(
+        dynamics, [(W, b), (last, -last @ at_0)], P, (1e-4, 0.05), states="xyz", inputs="uv", u_eq=["0", "0"],
+        domain=[("-3/2", "3/2")] * 3, input_bounds=[("-2", "2"), v], centre=centre, scale=scale, offset=[0.0, 0.0],
+        T=coordinates(P, A),
+    ))  # fmt: skip
+
+
+# ------------------------------------------------------------------------------------------------------- what is honest
+
+
+@pytest.mark.parametrize("name", HONEST)
+def test_honest_certificates_are_accepted(name: str) -> None:
+    assert judge(honest(name)) is None
+
+
+def test_the_certificate_of_the_policy_that_ships_is_accepted(shipped: Document) -> None:
+    assert both(shipped) == ("ACCEPTED", "ACCEPTED")
+
+
+@pytest.mark.parametrize("centre", ["output", "preactivation"])
+@pytest.mark.parametrize("v", [("-3/2", "3/2"), ("-9/10", "1")])
+def test_two_inputs_and_three_states_are_accepted(centre: str, v: tuple[str, str]) -> None:
+    assert both(crane(centre, v)) == ("ACCEPTED", "ACCEPTED")
+
+
+@pytest.mark.parametrize("edit", HARMLESS)
+def test_harmless_edits_stay_accepted(edit: str) -> None:
+    assert judge_bytes(HARMLESS[edit](honest("linear"))) is None
+
+
+@pytest.mark.parametrize("exponent", [-200, 0, 200])
+def test_units_do_not_matter(exponent: int) -> None:
+    assert both(grow(bump(exponent, "+"), max_leaves=3000, depth=30)) == ("ACCEPTED", "ACCEPTED")
+
+
+# ------------------------------------------------------------------------------------------------------- what is false
+
+
+@pytest.mark.parametrize(
+    ("rule", "base", "edit", "what"), [pytest.param(r, b, e, what, id=f"{r}-{b}-{what}") for r, b, what, e in MUTANTS]
+)
+def test_mutants_are_rejected_by_the_same_rule(rule: str, base: str, edit: Edit, what: str) -> None:
+    found = judge(edit(honest(base)))
+    if what == "a leaf in place of a split":  # the claim is still true, and a finer bound may prove it
+        assert found in (None, "ring")
+    else:
+        assert found == rule
+
+
+@pytest.mark.parametrize("rule", ABLATED)
+def test_a_certificate_that_breaks_one_rule_alone(rule: str) -> None:
+    assert judge(ABLATED[rule]()) == rule
+
+
+@pytest.mark.parametrize(("rule", "data"), [pytest.param(rule, data, id=what) for rule, what, data, _ in FALSE])
+def test_false_claims(rule: str, data: Document) -> None:
+    assert judge(data) == rule
+
+
+@pytest.mark.parametrize("exponent", [-430, -100, 0, 300])
+def test_a_claim_that_is_false_on_a_small_interval(exponent: int) -> None:
+    assert judge(grow(bump(exponent), max_leaves=3000, depth=16)) is not None
+
+
+def test_a_claim_just_beyond_the_region_of_attraction() -> None:
+    assert judge(grow(scalar_claim(c2=1.915009**2), max_leaves=4000, depth=40)) == "ring"
+    assert judge(grow(scalar_claim(c2=1.915007**2), max_leaves=4000, depth=40)) is None
+
+
+def number(path: str, change: Callable[[np.ndarray], Any]) -> Edit:
+    """An edit of an array, hashed honestly."""
+    return lambda data: rehash(edited(data, path, lambda text: encode(change(decode(text)))))
+
+
+def scaled_level(name: str, factor: float) -> Edit:
+    return lambda data: edited(data, f"levels.{name}", lambda text: (factor * float.fromhex(text)).hex())
+
+
+def leaf_in_place_of(split: int) -> Edit:
+    """The whole branch at that byte becomes one leaf."""
+
+    def change(data: Document) -> Document:
+        tree, end, open_ = tree_of(data), split, 1
+        while open_:
+            open_ += 1 if tree[end] != LEAF else -1
+            end += 1
+        return with_tree(data, tree[:split] + bytes([LEAF]) + tree[end:])
+
+    return change
+
+
+SABOTAGE: list[tuple[str, Edit]] = [
+    ("hash", lambda d: edited(d, "policy.layers.1.weight", lambda text: encode(-decode(text)))),
+    ("levels", scaled_level("local", 1e4)),
+    ("domain", scaled_level("roa", 1.01)),
+    ("root", number("evidence.root", lambda a: a * (1 - 2.0**-20))),
+    ("root", number("evidence.T", lambda a: a * (1 - 2.0**-20))),
+    ("coordinates", number("evidence.T", lambda a: a * [1, 0, 1, 0])),
+    ("centring", number("policy.offset", lambda a: a - 6)),
+    ("local", scaled_level("local", 100)),
+    ("local", number("policy.layers.2.weight", lambda a: -a)),
+    ("local", number("policy.scale", lambda a: a / 6)),
+    ("tree", lambda d: with_tree(d, tree_of(d)[:-1])),
+    ("tree", lambda d: with_tree(d, tree_of(d) + bytes([LEAF]))),
+    ("tree", lambda d: with_tree(d, tree_of(d)[:-1] + bytes([2, LEAF, LEAF]))),
+    ("ring", leaf_in_place_of(0)),
+    ("ring", leaf_in_place_of(1)),
+    ("ring", scaled_level("local", 1e-6)),
+    ("ring", lambda d: edited(d, "plant.dynamics.1", lambda f: [*f, ["*", "1/50", ["**", "theta_dot", 3]]])),
+    ("ring", lambda d: edited(d, "plant.dynamics.1", lambda f: [*f, ["*", "3", ["**", "theta", 3]]])),
+    ("inputs", lambda d: edited(d, "plant.input_bounds.0.1", "5")),
+]
+
+
+@pytest.mark.parametrize(("rule", "edit"), SABOTAGE)
+def test_sabotage_of_the_certificate_that_ships(shipped: Document, rule: str, edit: Edit) -> None:
+    assert both(edit(shipped)) == (rule, rule)
+
+
+def test_every_leaf_of_the_certificate_that_ships_is_needed(shipped: Document) -> None:
+    """Without any one leaf the tree is no tree."""
+    tree = tree_of(shipped)
+    for k in [k for k, byte in enumerate(tree) if byte == LEAF][::7]:
+        assert judge(with_tree(shipped, tree[:k] + tree[k + 1 :])) == "tree"
+
+
+@pytest.mark.parametrize("rule", ["inputs", "ring"])
+def test_false_claims_about_two_inputs(rule: str) -> None:
+    data = crane("output", ("-3/2", "3/2"))
+    if rule == "inputs":
+        data = edited(data, "plant.input_bounds.1", ["-1/10", "1/10"])
+    else:
+        data = edited(data, "plant.dynamics.2.1.1", "3/4")
+    assert both(data) == (rule, rule)
+
+
+# ------------------------------------------------------------------------------------------------------------- the file
+
+
+@pytest.mark.parametrize("name", RAW)
+def test_malformed_files(name: str) -> None:
+    assert judge_bytes(RAW[name]()) == "format"
+
+
+MALFORMED = [
+    *(("plant.u_eq.0", v) for v in NOT_A_RATIONAL),
+    *(("levels.local", v) for v in NOT_A_HEX_FLOAT),
+    *((path, v) for path in ("lyapunov.P", "policy.scale", "evidence.tree") for v in NOT_BASE64),
+    *(("policy.layers.0.shape", v) for v in SHAPES),
+    *(("plant.dynamics.0.2", v) for v in NOT_IN_THE_GRAMMAR.values()),
+    *(("plant.name", v) for v in ("", "1a", "a b", "a.b", "\u00e9", "x" * 65, 7)),
+]
+
+
+def test_malformed_values() -> None:
+    for path, value in MALFORMED:
+        data = edited(honest("scalar"), path, value)
+        assert judge(data) == "format", (path, value)
+
+
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        ("plant.u_eq.0", "-0/7"),
+        ("plant.domain.0.1", "1" * 1201),
+        ("plant.name", "x" * 64),
+        ("plant.name", "_sin"),
+        ("plant.dynamics.0", ["+", ["+", ["/", "x", "2"], "u"]]),
+        ("plant.dynamics.0", ["+", ["/", "x", "2"], "u", ["*", "0", ["sin", "22/7"]]]),
+        ("plant.dynamics.0", ["+", ["/", "x", "2"], "u", ["-", ["cos", "x"], "1"]]),
+        ("plant.dynamics.0", ["+", ["/", "x", "2"], "u", ["*", "1/1000", "x", ["tan", ["/", "x", "4"]]]]),
+        ("plant.dynamics.0", ["+", ["/", "x", "2"], "u", ["*", "1/1000", "x", ["**", ["+", "x", "9"], -3]]]),
+        ("plant.input_bounds", [["1", "1"]]),
+        ("policy.sha256", 3),
+        ("evidence.tree", "/w=="),
+        ("evidence.tree", ""),
+    ],
+)
+def test_odd_values_are_read_alike(path: str, value: Any) -> None:
+    mine, theirs = both(edited(honest("scalar"), path, value))
+    assert mine == theirs
+
+
+@pytest.mark.parametrize("splits", [4096, 4097])
+def test_the_limit_on_open_boxes(splits: int) -> None:
+    mine, theirs = both(with_tree(scalar_claim(0.01, 0.01), bytes([0]) * splits + bytes([LEAF]) * (splits + 1)))
+    assert mine == theirs == ("ACCEPTED" if splits == 4096 else "tree")
+
+
+def trusted(data: Document, **changes: Any) -> Document:
+    evidence = {
+        "kind": "trusted-solver", "solver": "dReal", "version": "4.21.06.2", "precision": (1e-3).hex(),
+        "queries": [["local", "unsat"], ["ring", "unsat"]], **changes,
+    }  # fmt: skip
+    return edited(data, "evidence", evidence)
+
+
+def test_what_a_solver_says_is_trusted_and_called_so() -> None:
+    assert judge(trusted(honest("scalar"))) == "TRUSTED"
+    assert judge(trusted(scalar_claim(4.0, 4.0))) == "TRUSTED"  # false; claims 3 to 5 are the solver's
+    for word in ("two words", "", "a\nb", "x" * 81, "\u00e9", 1):
+        assert both(trusted(honest("scalar"), solver=word)) == ("format", "format")
+
+
+@pytest.mark.parametrize("rule", ["hash", "levels", "lyapunov", "equilibrium", "centring", "domain"])
+def test_what_remains_of_the_rules_when_a_solver_is_trusted(rule: str) -> None:
+    for found, base, _, edit in MUTANTS:
+        if found == rule:
+            data = edit(honest(base))
+            assert both(trusted(data)) == (rule, rule)
+
+
+# -------------------------------------------------------------------------------------------------- the naive checker
+
+
+def test_it_shares_no_code_with_the_checker() -> None:
+    tree = ast.parse(Path(naive_checker.__file__).read_text())
+    modules = {node.module for node in ast.walk(tree) if isinstance(node, ast.ImportFrom)}
+    modules |= {alias.name for node in ast.walk(tree) if isinstance(node, ast.Import) for alias in node.names}
+    assert {str(name).split(".")[0] for name in modules} - set(sys.stdlib_module_names) == {"flint"}
+
+
+def test_it_leaves_the_document_and_the_precision_as_they_are() -> None:
+    data, precision = copy.deepcopy(honest("rotor")), ctx.prec
+    judge(data)
+    judge(reordered(data))
+    assert data == honest("rotor") and ctx.prec == precision
+
+
+@given(st.floats(-30, 30), st.floats(0, 40))
+@example(0.0, 0.0)
+@example(-1e-300, 2e-300)
+@example(-0.5, 1.0)
+@example(700.0, 1.0)
+@example(-3.0, 1e-12)
+def test_a_tanh_lies_between_its_two_lines(lo: float, width: float) -> None:
+    with ctx.workprec(160):
+        slope, shift, gap = naive_checker.lines(arb(lo), arb(lo + width))
+        for t in np.linspace(0, 1, 33).tolist():
+            y = arb(lo) + arb(t) * (arb(lo + width) - arb(lo))
+            assert abs(y.tanh() - slope * y - shift) <= arb((gap * (1 + arb(2) ** -100)).upper() + arb(2) ** -140)
+        if 1e-12 < width < 1:
+            assert 0 <= gap <= 0.1 * width**2  # |tanh''| < 0.77, an eighth of it
+
+
+@given(st.floats(-9, 9), st.floats(0, 9))
+def test_half_the_curvature_of_tanh(centre: float, radius: float) -> None:
+    with ctx.workprec(160):
+        bound = naive_checker.half_curvature(naive_checker.about(arb(centre), arb(radius)))
+        t = np.tanh(centre + radius * np.linspace(-1, 1, 101))
+        values = np.abs(t * (1 - t * t))
+        assert float(values.max()) * (1 - 1e-9) - 1e-16 <= float(bound) <= 2 / math.sqrt(27) + 1e-12
+
+
+@given(st.integers(1, 5), st.integers(1, 5), st.integers(0, 10**6))
+def test_the_norm_of_a_matrix(rows: int, columns: int, seed: int) -> None:
+    W = np.random.default_rng(seed).standard_normal((rows, columns))
+    exact = [[Fraction(v) for v in row] for row in W.tolist()]
+    with ctx.workprec(160):
+        bound = float(naive_checker.spectral_norm(exact))
+    norm = np.linalg.norm(W, 2)
+    assert norm * (1 - 1e-12) <= bound <= 1.02 * norm
+
+
+def leaves_of(data: Document) -> list[Leaf]:
+    c = naive_checker.read(dump(data))
+    product, transpose = naive_checker.product, naive_checker.transpose
+    S = product(product(transpose(c.T), c.P), c.T)
+    return [Leaf(c, S, lo, hi) for lo, hi in naive_checker.partition(c)]
+
+
+@pytest.mark.parametrize("name", ["rotor", "rotor, preactivation", "crane"])
+def test_leaves_enclose_the_policy_V_and_Vdot(name: str) -> None:
+    """At points of each leaf, against ball arithmetic that shares nothing with the leaf's models."""
+    data = crane("output", ("-3/2", "3/2")) if name == "crane" else honest(name)
+    c, generator = parse(data), np.random.default_rng(1)
+    with ctx.workprec(160):
+        for leaf in leaves_of(data)[::5]:
+            Vdot, V = leaf.Vdot().bound(), (leaf.V().bound(), (-leaf.V()).bound())
+            for d in generator.uniform(-1, 1, (3, len(leaf.lo))).round().tolist():
+                z = [m + r * Fraction(t) for m, r, t in zip(leaf.centre, leaf.radius, d, strict=True)]
+                x = [naive_checker.ball(naive_checker.dot(row, z)) for row in leaf.claim.T]
+                u = policy_in_arb(c.policy, c.u_eq, x)
+                for value, (centre, radius) in zip(u, leaf.policy(), strict=True):
+                    assert abs(value - centre) <= radius * (1 + arb(2) ** -100)
+                names = dict(zip(leaf.claim.states + leaf.claim.inputs, x + u, strict=True))
+                f = [value_of(e, names) for e in data["plant"]["dynamics"]]
+                Px = [sum((arb(p) * v for p, v in zip(row, x, strict=True)), arb(0)) for row in c.P.tolist()]
+                assert 2 * sum((p * v for p, v in zip(Px, f, strict=True)), arb(0)) <= Vdot
+                value = sum((p * v for p, v in zip(Px, x, strict=True)), arb(0))
+                assert value <= V[0] + arb(2) ** -100 and -value <= V[1] + arb(2) ** -100
