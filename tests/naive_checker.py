@@ -146,7 +146,7 @@ def read(raw: bytes) -> Claim:
     T, root, tree = [0.0] * (n * n), [0.0] * n, b""
     if trusted:
         evidence = keys(evidence, "kind", "solver", "version", "precision", "queries")
-        binary64(evidence["precision"])
+        require(binary64(evidence["precision"]) > 0, "format")
         queries = [word for pair in entries(evidence["queries"]) for word in entries(pair, 2)]
         for word in [evidence["solver"], evidence["version"], *queries]:
             require(isinstance(word, str) and re.fullmatch(WORD, word) is not None, "format")
@@ -620,8 +620,9 @@ class Taylor:
         """phi(c) + phi'(c) e + phi''(c) e^2 / 2 + phi'''(.) e^3 / 6 with e the model less its constant c."""
         size = range(len(self.g))
         rest = self.second() + self.r
-        whole = self.first() + rest
-        at, on = derivatives(name, self.c), derivatives(name, about(self.c, whole))
+        lo, hi = -(-self).bound(), self.bound()
+        whole = (self.c - lo).max(hi - self.c)
+        at, on = derivatives(name, self.c), derivatives(name, lo.union(hi))
         Q = [[at[1] * self.Q[i][j] + at[2] / 2 * self.g[i] * self.g[j] for j in size] for i in size]
         r = abs(at[1]) * self.r + abs(at[2]) / 2 * (2 * self.first() * rest + rest * rest)
         return Taylor(at[0], [at[1] * v for v in self.g], Q, r + sup(on[3]) * whole**3 / 6)

@@ -297,6 +297,8 @@ def test_what_a_solver_says_is_trusted_and_called_so() -> None:
     assert judge(trusted(scalar_claim(4.0, 4.0))) == "TRUSTED"  # false; claims 3 to 5 are the solver's
     for word in ("two words", "", "a\nb", "x" * 81, "\u00e9", 1):
         assert both(trusted(honest("scalar"), solver=word)) == ("format", "format")
+    for precision in (0.0, -0.0, -1e-3):
+        assert both(trusted(honest("scalar"), precision=precision.hex())) == ("format", "format")
 
 
 @pytest.mark.parametrize("rule", ["hash", "levels", "lyapunov", "equilibrium", "centring", "domain"])

@@ -164,7 +164,8 @@ def _evidence(data: Any, n: int) -> Partition | Trusted:
     kind = data.get("kind") if isinstance(data, dict) else None
     if kind == "trusted-solver":
         stated = _keys(data, "evidence", "kind solver version precision queries")
-        _hex_float(stated["precision"], "evidence.precision")
+        if not _hex_float(stated["precision"], "evidence.precision") > 0:
+            _fail("evidence.precision", "must be positive")
         pairs = [_list(pair, "evidence.queries", 2) for pair in _list(stated["queries"], "evidence.queries", None)]
         words = [stated["solver"], stated["version"], *(word for pair in pairs for word in pair)]
         if not all(isinstance(w, str) and re.fullmatch(r"[A-Za-z0-9_.+-]{1,80}", w, re.ASCII) for w in words):

@@ -127,8 +127,8 @@ def _within(bounds: tuple[Fraction, Fraction], mid: Number, radius: Number) -> N
     """Elementwise: [mid - radius, mid + radius] certainly lies in the bounds."""
     (lo, lo_error), (hi, hi_error) = float_with_error(bounds[0]), float_with_error(bounds[1])
     reach = up(radius + EPS * np.abs(mid))
-    slack = up(lo_error + hi_error + EPS * (abs(lo) + abs(hi)))
-    return np.asarray((mid - reach >= lo + slack) & (mid + reach <= hi - slack))
+    least, most = lo + up(lo_error + EPS * abs(lo)), hi - up(hi_error + EPS * abs(hi))
+    return np.asarray((mid - reach >= least) & (mid + reach <= most))
 
 
 def _check_local(c: Certificate, T: Number, net: Folded, least: Fraction, bounded: bool, tally: Tally) -> None:
