@@ -1,8 +1,8 @@
 """How wide the checker's enclosures of the elementary functions are, in units in the last place of the value.
 
 Run with `python benchmarks/enclosures.py [--arguments 1000000]`. Width means hi - lo of the enclosure. Near a zero of
-sin or cos other than the origin the width is a few ulp of 1. tan is a quotient of Taylor models, as the ring rule evaluates
-it: its remainder bounds the rounding of all coefficients together, so that it is small only against the largest.
+sin or cos other than the origin the width is a few ulp of 1. tan is a quotient of Taylor models, as the ring rule
+evaluates it: its remainder bounds the rounding of all coefficients together, small only against the largest.
 """
 
 from __future__ import annotations

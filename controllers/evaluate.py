@@ -26,6 +26,8 @@ Array = NDArray[np.float64]
 INITIAL_STATES: dict[str, tuple[float, ...]] = {
     "pendulum": (math.pi / 2, 2.0),
     "cartpole": (1.0, 0.5, 1.0, 1.0),
+    "quadrotor2d": (1.0, 1.0, 0.5, 1.0, 1.0, 1.0),
+    "quadrotor3d": (*(0.5,) * 3, *(0.3,) * 3, *(0.5,) * 6),
 }
 """Half-widths of the box from which each plant's initial states are drawn, in the states' units."""
 

@@ -23,11 +23,13 @@ def environment() -> PlantEnvironment:
 
 
 def _pendulum(x, u):
+    (u,) = u
     # theta'' = (g/l) sin theta - b/(m l^2) theta' + u/(m l^2)
     return np.array([x[1], 9.81 / 0.5 * np.sin(x[0]) + (u - 0.1 * x[1]) / (0.15 * 0.5**2)])
 
 
 def _cartpole(x, u):
+    (u,) = u
     # Forces on cart and pole with the accelerations unknown, solved as two linear equations.
     (_, theta, p_dot, theta_dot), mc, mp, length, g = x, 1.0, 0.1, 0.5, 9.81
     s, c = np.sin(theta), np.cos(theta)
@@ -36,7 +38,33 @@ def _cartpole(x, u):
     return np.array([p_dot, theta_dot, *np.linalg.solve(mass, force)])
 
 
-WRITTEN = {"pendulum": (_pendulum, (0.7, -1.2), 2.5), "cartpole": (_cartpole, (0.4, -0.6, 1.1, 2.3), -17.0)}
+def _quadrotor2d(x, u):
+    along = np.array([-np.sin(x[2]), np.cos(x[2])])  # the thrusters' direction
+    force = (u[0] + u[1]) * along - [0, 0.486 * 9.81]
+    return np.array([*x[3:], *force / 0.486, 0.25 * (u[0] - u[1]) / 0.00383])
+
+
+def _quadrotor3d(x, u):
+    # Newton and Euler with rotation matrices; the angles' rates from the body rates as a linear equation.
+    (cf, ct, cp), (sf, st, sp) = np.cos(x[3:6]), np.sin(x[3:6])
+    yaw, pitch = np.array([[cp, -sp, 0], [sp, cp, 0], [0, 0, 1]]), np.array([[ct, 0, st], [0, 1, 0], [-st, 0, ct]])
+    roll = np.array([[1, 0, 0], [0, cf, -sf], [0, sf, cf]])
+    inertia, w = np.diag([4.9e-3, 4.9e-3, 8.8e-3]), x[9:]
+    rates = np.column_stack([[1, 0, 0], roll.T @ [0, 1, 0], roll.T @ pitch.T @ [0, 0, 1]])
+    torque = np.array([0.225 * (u[1] - u[3]), 0.225 * (u[2] - u[0]), 1.1 / 29 * (u[0] - u[1] + u[2] - u[3])])
+    force = yaw @ pitch @ roll @ [0, 0, sum(u)] - [0, 0, 0.486 * 9.81]
+    turning = np.linalg.solve(inertia, torque - np.cross(w, inertia @ w))
+    return np.array([*x[6:9], *np.linalg.solve(rates, w), *force / 0.486, *turning])
+
+
+WRITTEN = {
+    "pendulum": (_pendulum, (0.7, -1.2), (2.5,)),
+    "cartpole": (_cartpole, (0.4, -0.6, 1.1, 2.3), (-17.0,)),
+    "quadrotor2d": (_quadrotor2d, (0.4, -0.6, 0.7, 1.1, 2.3, -1.5), (2.5, 2.2)),
+    "quadrotor3d": (
+        _quadrotor3d, (0.4, -0.6, 0.7, 0.3, -0.5, 1.2, 1.1, 2.3, -1.5, 0.8, -0.9, 0.4), (1.2, 1.0, 1.3, 1.4)
+    ),
+}  # fmt: skip
 """The equations of motion in a form of their own, with a state and an input."""
 
 
@@ -67,7 +95,7 @@ def test_step_agrees_with_a_fine_integration_of_the_written_equation(name):
     x, h = np.array(start), environment.options.dt / pieces
     for _ in range(pieces):
         x = x + h * f(x + h / 2 * f(x, u), u)
-    found, *_ = environment.step(np.array([u]))
+    found, *_ = environment.step(np.array(u))
     np.testing.assert_allclose(found, x, rtol=0, atol=1e-5)
 
 
@@ -88,8 +116,8 @@ def test_runge_kutta_converges_with_order_four():
 @pytest.mark.parametrize("name", PRESETS)
 def test_batched_torch_stepper_follows_the_environment(name):
     environment, generator = PlantEnvironment(get_system(name), preset(name)), np.random.default_rng(0)
-    n, bound = environment.system.n, environment.action_space.high
-    x, u = generator.uniform(-1, 1, (5, n)), generator.uniform(-bound, bound, (5, len(bound)))
+    n, space = environment.system.n, environment.action_space
+    x, u = generator.uniform(-1, 1, (5, n)), generator.uniform(space.low, space.high, (5, len(space.high)))
     batched = Stepper(environment.system, environment.options.dt, "torch")(torch.tensor(x), torch.tensor(u))
     for k in range(5):
         environment.reset(seed=0)

@@ -51,6 +51,46 @@ def test_every_registered_plant_has_its_equilibrium_and_units() -> None:
         assert set(names) <= set(system.units)
 
 
+def rotation(phi: float, theta: float, psi: float) -> np.ndarray:
+    """Body to world for ZYX angles, Rz(psi) Ry(theta) Rx(phi)."""
+    (cf, sf), (ct, st), (cp, sp) = ((np.cos(v), np.sin(v)) for v in (phi, theta, psi))
+    about_x = np.array([[1, 0, 0], [0, cf, -sf], [0, sf, cf]])
+    about_y = np.array([[ct, 0, st], [0, 1, 0], [-st, 0, ct]])
+    return np.array([[cp, -sp, 0], [sp, cp, 0], [0, 0, 1]]) @ about_y @ about_x
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_quadrotor3d_is_a_rigid_body(seed: int) -> None:
+    """Thrust along the body's z axis, R' = R [w]x, and the power of forces and torques is the change of energy."""
+    system = get_system("quadrotor3d")
+    generator = np.random.default_rng(seed)
+    m, inertia, g, a, k = 0.486, np.array([4.9e-3, 4.9e-3, 8.8e-3]), 9.81, 0.225, 1.1 / 29
+    x, u = generator.uniform(-0.9, 0.9, 12), generator.uniform(0, 3.6, 4)
+    position, angles, v, w = np.split(system.function()(x, u), 4)
+    R, rates = rotation(*x[3:6]), x[9:]
+    np.testing.assert_allclose(position, x[6:9], rtol=1e-15)
+    np.testing.assert_allclose(v, R[:, 2] * u.sum() / m - [0, 0, g], rtol=1e-12, atol=1e-12)
+    h = 1e-6
+    moved = (rotation(*(x[3:6] + h * angles)) - rotation(*(x[3:6] - h * angles))) / (2 * h)
+    cross = np.array([[0, -rates[2], rates[1]], [rates[2], 0, -rates[0]], [-rates[1], rates[0], 0]])
+    np.testing.assert_allclose(moved, R @ cross, atol=1e-8)
+    torque = [a * (u[1] - u[3]), a * (u[2] - u[0]), k * (u[0] - u[1] + u[2] - u[3])]
+    np.testing.assert_allclose(inertia * w + np.cross(rates, inertia * rates), torque, atol=1e-12)
+    energy = m * x[6:9] @ v + rates @ (inertia * w) + m * g * x[8]
+    np.testing.assert_allclose(energy, x[6:9] @ R[:, 2] * u.sum() + rates @ torque, rtol=1e-10)
+
+
+def test_quadrotor2d_is_one_plane_of_quadrotor3d() -> None:
+    """Roll alone, seen from -y: the same trajectory as the planar plant with the same mass, arm and inertia."""
+    planar = get_system("quadrotor2d").with_parameters({"l": "0.225", "I": "4.9e-3"})
+    x, u = np.array([0.3, -0.2, 0.4, 1.0, -0.5, 2.0]), np.array([2.0, 1.5])
+    y, z, phi, vy, vz, p = x
+    whole = np.array([0, y, z, phi, 0, 0, 0, vy, vz, p, 0, 0])
+    # u2 and u4 make the roll; u1 and u3 are off, so that the yaw torque -k (u2 + u4) only turns psi
+    change = get_system("quadrotor3d").function()(whole, np.array([0, u[0], 0, u[1]]))
+    np.testing.assert_allclose(change[[1, 2, 3, 7, 8, 9]], planar.function()(x, u), rtol=1e-12)
+
+
 def test_parameters_are_replaced_exactly(pendulum: System) -> None:
     changed = pendulum.with_parameters({"m": "0.3"})
     assert changed.parameters["m"] == Fraction(3, 10)

@@ -9,6 +9,7 @@ from certify.errors import InputError
 from certify.systems.cartpole import cartpole
 from certify.systems.pendulum import pendulum
 from certify.systems.quadrotor2d import quadrotor2d
+from certify.systems.quadrotor3d import quadrotor3d
 from certify.systems.system import System
 from certify.systems.toml import load_system
 
@@ -16,6 +17,7 @@ _REGISTRY: dict[str, Callable[[], System]] = {
     "pendulum": pendulum,
     "cartpole": cartpole,
     "quadrotor2d": quadrotor2d,
+    "quadrotor3d": quadrotor3d,
 }
 
 
