@@ -26,7 +26,7 @@ from certify.checker.taylor import Taylor, affine, constant, upper_bound
 from certify.policies import load_policy
 from certify.roa import certify_roa
 from certify.systems import get_system
-from tests.checker_certificates import Document, parse, verdict
+from tests.checker_certificates import Document, make, parse, verdict
 from tests.oracle import ball, policy_in_arb, value_of
 from tests.test_checker_rules import HONEST, MUTANTS, honest
 
@@ -253,6 +253,17 @@ def test_primitives_keep_the_radius(name: str) -> None:
             lo, hi = arithmetic.ends(x, y)
             assert lo[0, 0] <= arb(0.5) - arb(1.7) and hi[0, 0] >= arb(1.5) + arb(1.7)
             assert lo[0, 0].is_exact() and hi[0, 0].is_exact()
+
+
+def test_margins_below_every_binary64_number_are_no_accident() -> None:
+    """Balls do not underflow: here the local rule holds by a number that a float would round to 0."""
+    far = "1" + "0" * 400
+    data = make(
+        [["+", "u", ["-", ["tan", "x1"]]], ["-", ["+", ["**", "x2", 3], "x2"]]], [([[1.0, 1.0]], [0.0])], np.eye(2),
+        (2.0**-1020, 2.0**-1018), states=("x1", "x2"), domain=[(f"-{far}", far)] * 2, input_bounds=[("-1000", "1000")],
+        centre="none", scale=(-4.9e-91,), T=np.eye(2) * 8.9e-308, root=[6.8e153, 6.8e153],
+    )  # fmt: skip
+    assert (verdict(data), verdict_in_balls(data)) == ("local", "ring")
 
 
 def test_a_number_that_is_no_number_proves_nothing() -> None:

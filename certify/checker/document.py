@@ -26,6 +26,7 @@ from .expression import Tape, parse_dynamics
 
 SCHEMA = "certify-certificate/1"
 MAX_BYTES = 256 * 2**20
+MAX_WIDE_BYTES = 2**24  # with a character beyond ASCII: each may take four bytes
 MAX_VALUES = 1_000_000  # each takes up to 100 bytes of memory; numbers come as base64, never as lists
 MAX_STATES, MAX_LAYERS, MAX_WIDTH = 64, 64, 2**14
 _RATIONAL = re.compile(r"-?(0|[1-9][0-9]{0,1200})(/[1-9][0-9]{0,1200})?")
@@ -104,6 +105,8 @@ def read(path: str) -> Certificate:
         raise Unreadable(f"{path} cannot be read: {error.strerror}") from error
     if size > MAX_BYTES or len(raw) > MAX_BYTES:
         _fail("file", f"larger than {MAX_BYTES} bytes")
+    if len(raw) > MAX_WIDE_BYTES and not raw.isascii():
+        _fail("file", f"larger than {MAX_WIDE_BYTES} bytes and not ASCII")
     if sum(map(raw.count, (b",", b"[", b"{"))) > MAX_VALUES:
         _fail("file", f"more than {MAX_VALUES} commas and brackets")
     try:

@@ -171,7 +171,7 @@ def _check_local(c: Certificate, T: Number, net: Folded, least: Fraction, bounde
     if not mu > up(k):
         numbers = f"{float(middle(mu)):.3g} against {float(middle(k)):.3g}"
         raise Rejected("local", "levels.local", f"Vdot < 0 is not shown on the local ball: {numbers}")
-    tally.local_margin = 1 - float(middle(k)) / float(middle(mu))
+    tally.local_margin = float(middle(1 - k / mu))
 
 
 class _Ring:

@@ -79,10 +79,10 @@ class Taylor:
         return Taylor(a.c * b.c, a.c * b.g + b.c * a.g, Q, up(r))
 
     def _compose(self, f0: Number, f1: Number, f2: Number, third: Number, error: Number) -> Taylor:
-        """phi(v) from phi(c), phi'(c), phi''(c)/2 (each within `error`) and `third` >= sup |phi'''|/6.
+        """phi(v) from phi(c), phi'(c), phi''(c)/2 (each within `error`) and `third`, as sup |phi'''|/6.
 
-        With v = c + D, |D| <= rho = G + Q + r: `phi(v) = f0 + f1 D + f2 D^2 + R`, |R| <= third rho^3, and D^2 differs
-        from (g.d)^2 by at most 2 G q + q^2, q = Q + r.
+        With v = c + D, |D| <= rho = G + Q + r: `phi(v) = f0 + f1 D + f2 D^2 + R`, and `third` is any number with
+        |R| <= third rho^3. D^2 differs from (g.d)^2 by at most 2 G q + q^2, q = Q + r.
         """
         G, q = self.linear, up(self.quadratic + self.r)
         rho = up(G + q)
@@ -102,7 +102,7 @@ class Taylor:
         least = np.where(least > 0, least * (1 - 2.0**-40), np.nan)
         f0 = 1 / self.c
         f1, f2 = -f0 * f0, f0 * f0 * f0
-        third = up(up(np.abs(f2)) / least)
+        third = up(up(np.abs(f2)) / least)  # R = -D^3 / (c^3 v) exactly
         return self._compose(f0, f1, f2, third, EPS * (np.abs(f0) + np.abs(f1) + np.abs(f2)))
 
     def sin(self) -> Taylor:
