@@ -55,6 +55,7 @@ def _train(
         Path | None, typer.Option("--checkpoint-dir", help="Folder that keeps checkpoint.pt.")
     ] = None,
     checkpoint_every: Annotated[int, typer.Option("--checkpoint-every", help="Steps between checkpoints.")] = 10_000,
+    device: Annotated[str, typer.Option("--device", help="Where the networks live: cpu or cuda.")] = "cpu",
     resume: Annotated[bool, typer.Option("--resume", help="Go on from checkpoint.pt in --checkpoint-dir.")] = False,
     as_json: Json = False,
     **chosen: Any,  # one optional value for each field of TrainingOptions; the signature below names them
@@ -66,13 +67,14 @@ def _train(
     with _errors(as_json):
         options = replace(preset(plant), **_given(chosen))
         from certify.systems import get_system
+        from controllers.sac import find_device
         from controllers.training import EpisodeLog, Trainer, train
 
         if checkpoint_every < 1:
             raise InputError(f"`checkpoint_every` must be positive; found {checkpoint_every}.")
         for path in filter(None, (out, log)):
             _require_writable(path)
-        trainer = Trainer(get_system(plant), options)
+        trainer = Trainer(get_system(plant), options, find_device(device))
         checkpoint = _checkpoint(checkpoint_dir, resume)
         if resume and checkpoint is not None:
             trainer.restore(_read(checkpoint))

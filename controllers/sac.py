@@ -11,6 +11,9 @@ with Stability Guarantees for Control of Unknown Nonlinear Systems" uses it. One
 where the last term is there once a gain K is known; mu is the mean action in physical units. Everything
 is float32, as is the exported policy; the states' factors are powers of two, so that folding them into the
 first layer rounds nothing and the exported network is the trained one bit for bit.
+
+Networks, replay table and batches live on one device. Random numbers are drawn on the CPU wherever the
+networks live, so that a device changes the rounding of a run and not its random stream.
 """
 
 from __future__ import annotations
@@ -33,6 +36,21 @@ from controllers.options import Centre, TrainingOptions
 Array = NDArray[np.float64]
 
 LOG_STD_RANGE = (-5.0, 2.0)
+CPU = torch.device("cpu")
+
+
+def find_device(name: str) -> torch.device:
+    """The device `name`, cpu or cuda.
+
+    Raises
+    ------
+    InputError : it is neither, or this machine or this torch has none.
+    """
+    if name not in ("cpu", "cuda"):
+        raise InputError(f"`device` must be cpu or cuda; found {name!r}.")
+    if name == "cuda" and not torch.cuda.is_available():
+        raise InputError("`device` is cuda, but torch finds no CUDA device here.")
+    return torch.device(name)
 
 
 def squashed_log_likelihood(w: Tensor, mean: Tensor, log_std: Tensor, scale: Tensor) -> Tensor:
@@ -90,14 +108,18 @@ class Actor(nn.Module):
         super().__init__()
         n, m = len(interface.state_factors), len(interface.scale)
         sizes = [n, *widths]
-        self.hidden = nn.ModuleList(nn.Linear(a, b) for a, b in pairwise(sizes))
-        self.mean = nn.Linear(sizes[-1], m)
-        self.log_std = nn.Linear(sizes[-1], m)
+        self.hidden = nn.ModuleList(nn.Linear(a, b, device=CPU) for a, b in pairwise(sizes))
+        self.mean = nn.Linear(sizes[-1], m, device=CPU)
+        self.log_std = nn.Linear(sizes[-1], m, device=CPU)
         self.centre = centre
-        for name in ("scale", "offset", "u_eq"):
-            self.register_buffer(name, torch.tensor(getattr(interface, name), dtype=torch.float32))
-        self.register_buffer("factors", torch.tensor(interface.state_factors, dtype=torch.float32))
-        self.register_buffer("rest", torch.tensor(interface.to_normalised(interface.u_eq), dtype=torch.float32))
+        for name, numbers in (
+            ("scale", interface.scale),
+            ("offset", interface.offset),
+            ("u_eq", interface.u_eq),
+            ("factors", interface.state_factors),
+            ("rest", interface.to_normalised(interface.u_eq)),
+        ):
+            self.register_buffer(name, torch.from_numpy(numbers).float())
 
     def forward(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and log standard deviation of w, before the squash."""
@@ -139,13 +161,13 @@ class Actor(nn.Module):
     def network(self) -> TanhNetwork:
         """The mean action as an exact tanh network, centred; the states' factors are folded in exactly."""
         layers = [*self._layers(), self.mean]
-        weights = [layer.weight.detach().double().numpy() for layer in layers]
-        weights[0] = weights[0] * self.factors.double().numpy()
+        weights = [_exact(layer.weight) for layer in layers]
+        weights[0] = weights[0] * _exact(self.factors)
         return TanhNetwork(
             weights=tuple(weights),
-            biases=tuple(layer.bias.detach().double().numpy() for layer in layers),
-            scale=self.scale.double().numpy(),
-            offset=self.offset.double().numpy(),
+            biases=tuple(_exact(layer.bias) for layer in layers),
+            scale=_exact(self.scale),
+            offset=_exact(self.offset),
             squash="tanh",
             centre=self.centre,
         )
@@ -166,8 +188,8 @@ class Critic(nn.Module):
         self.weights, self.biases = nn.ParameterList(), nn.ParameterList()
         for a, b in pairwise(sizes):
             bound = 1 / math.sqrt(a)
-            self.weights.append(nn.Parameter(torch.empty(copies, a, b).uniform_(-bound, bound)))
-            self.biases.append(nn.Parameter(torch.empty(copies, 1, b).uniform_(-bound, bound)))
+            self.weights.append(nn.Parameter(torch.empty(copies, a, b, device=CPU).uniform_(-bound, bound)))
+            self.biases.append(nn.Parameter(torch.empty(copies, 1, b, device=CPU).uniform_(-bound, bound)))
         self.copies = copies
 
     def forward(self, x: Tensor) -> Tensor:
@@ -184,8 +206,8 @@ class Critic(nn.Module):
 class Replay:
     """A ring of transitions (x, tanh(w), reward, x+, terminated) in one float32 table."""
 
-    def __init__(self, capacity: int, n: int, m: int) -> None:
-        self.table = torch.empty(capacity, 2 * n + m + 2)
+    def __init__(self, capacity: int, n: int, m: int, device: torch.device = CPU) -> None:
+        self.table = torch.empty(capacity, 2 * n + m + 2, device=device)
         self._sizes = [n, m, 1, n, 1]
         self.count = 0
 
@@ -195,13 +217,13 @@ class Replay:
     def add(self, x: Array, normalised: Array, reward: float, x_next: Array, terminated: bool) -> None:
         """Store one transition over the oldest."""
         row = np.concatenate([x, normalised, [reward], x_next, [terminated]])
-        self.table[self.count % len(self.table)] = torch.from_numpy(row)
+        self.table[self.count % len(self.table)].copy_(torch.from_numpy(row))
         self.count += 1
 
     def sample(self, size: int, generator: torch.Generator) -> tuple[Tensor, ...]:
-        """`size` transitions, uniformly with replacement."""
-        index = torch.randint(len(self), (size,), generator=generator)
-        return torch.split(self.table[index], self._sizes, dim=1)
+        """`size` transitions, uniformly with replacement; `generator` lives on the CPU."""
+        index = torch.randint(len(self), (size,), generator=generator, device=CPU)
+        return torch.split(self.table[index.to(self.table.device)], self._sizes, dim=1)
 
 
 class SAC:
@@ -211,17 +233,24 @@ class SAC:
     ----------
     interface : what the learner is told of the plant.
     options : hyperparameters.
-    generator : source of the actor's noise; initial weights come from torch's global generator.
+    generator : source of the actor's noise, on the CPU; initial weights come from torch's global generator.
+    device : where the networks live and where batches come from.
     """
 
-    def __init__(self, interface: Interface, options: TrainingOptions, generator: torch.Generator) -> None:
+    def __init__(
+        self,
+        interface: Interface,
+        options: TrainingOptions,
+        generator: torch.Generator,
+        device: torch.device = CPU,
+    ) -> None:
         n, m = len(interface.state_factors), len(interface.scale)
-        self.options, self.generator = options, generator
-        self.actor = Actor(interface, options.actor, options.centre)
-        self.value = Critic(n, options.critic, copies=1)
-        self.value_target = Critic(n, options.critic, copies=1)
+        self.options, self.generator, self.device = options, generator, device
+        self.actor = Actor(interface, options.actor, options.centre).to(device)
+        self.value = Critic(n, options.critic, copies=1).to(device)
+        self.value_target = Critic(n, options.critic, copies=1).to(device)
         self.value_target.load_state_dict(self.value.state_dict())
-        self.q = Critic(n + m, options.critic, copies=2)
+        self.q = Critic(n + m, options.critic, copies=2).to(device)
         self._actor_weights = list(self.actor.parameters())
         self._critic_weights = [*self.value.parameters(), *self.q.parameters()]
         self._fresh: list[Tensor] = list(self.value.parameters())
@@ -233,9 +262,9 @@ class SAC:
     def act(self, x: Array) -> Array:
         """A sampled action as `tanh(w)`, shape (m,)."""
         with torch.no_grad():
-            noise = torch.randn(self.actor.scale.shape, generator=self.generator)
-            normalised, _ = self.actor.sample(torch.from_numpy(x).float(), noise)
-        return normalised.double().numpy()
+            noise = self._noise(*self.actor.scale.shape)
+            normalised, _ = self.actor.sample(torch.from_numpy(x).float().to(self.device), noise)
+        return _exact(normalised)
 
     def update(self, batch: tuple[Tensor, ...], K: Tensor | None, actor_step: float) -> None:
         """One gradient step of every network.
@@ -248,7 +277,7 @@ class SAC:
         """
         x, action, reward, x_next, terminated = batch
         options, scaled = self.options, x * self.actor.factors
-        noise = torch.randn((len(x), len(self.actor.scale)), generator=self.generator)
+        noise = self._noise(len(x), len(self.actor.scale))
         fresh, log_likelihood = self.actor.sample(x, noise)
         q_fresh = self.q(torch.cat((scaled, fresh), 1)).amin(0)
         actor_loss = (log_likelihood - q_fresh).mean()
@@ -280,6 +309,9 @@ class SAC:
         for name in _PARTS:
             getattr(self, name).load_state_dict(state[name])
 
+    def _noise(self, *shape: int) -> Tensor:
+        return torch.randn(shape, generator=self.generator, device=CPU).to(self.device)
+
 
 _PARTS = ("actor", "value", "value_target", "q", "actor_optimiser", "critic_optimiser")
 
@@ -288,3 +320,7 @@ def _apply(optimiser: torch.optim.Adam, weights: list[nn.Parameter], gradients: 
     for weight, gradient in zip(weights, gradients, strict=True):
         weight.grad = gradient
     optimiser.step()
+
+
+def _exact(tensor: Tensor) -> Array:
+    return tensor.detach().cpu().double().numpy()

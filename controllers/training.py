@@ -32,7 +32,7 @@ from certify.systems import System
 from controllers.environments import PlantEnvironment, Snapshot
 from controllers.lqr import GainLearner, Identified
 from controllers.options import TrainingOptions
-from controllers.sac import SAC, Interface, Replay
+from controllers.sac import CPU, SAC, Interface, Replay
 
 Array = NDArray[np.float64]
 
@@ -92,24 +92,25 @@ class Trainer:
     ----------
     system : the plant; only the environment reads its equations.
     options : everything else.
+    device : where the networks and the replay table live; of no account for checkpoints and policies.
 
     Raises
     ------
     InputError : weights do not fit the plant.
     """
 
-    def __init__(self, system: System, options: TrainingOptions) -> None:
+    def __init__(self, system: System, options: TrainingOptions, device: torch.device = CPU) -> None:
         options.check_sizes(system)
         self.system, self.options = system, options
         self.environment = PlantEnvironment(system, options)
         self.interface = Interface(system)
         Q_c, R_c = np.diag(options.state_weights), np.diag(options.input_weights)
         self.gain = GainLearner(options.eta, options.n_A, options.n_B, Q_c, R_c)
-        self.generator = torch.Generator().manual_seed(options.seed)
+        self.generator = torch.Generator(CPU).manual_seed(options.seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(options.seed)
-            self.sac = SAC(self.interface, options, self.generator)
-        self.replay = Replay(min(options.replay, options.steps), system.n, system.m)
+            self.sac = SAC(self.interface, options, self.generator, device)
+        self.replay = Replay(min(options.replay, options.steps), system.n, system.m, device)
         self.steps_done = 0
         self.episodes: list[Episode] = []
         self._K: torch.Tensor | None = None
@@ -177,7 +178,7 @@ class Trainer:
             "steps_done": self.steps_done,
             "sac": self.sac.state(),
             "gain": self.gain.state(),
-            "replay": {"rows": self.replay.table[: len(self.replay)].clone(), "count": self.replay.count},
+            "replay": {"rows": self.replay.table[: len(self.replay)].cpu().clone(), "count": self.replay.count},
             "generator": self.generator.get_state(),
             # 128-bit integers: as text, which every reader of plain tensors accepts.
             "environment_generator": json.dumps(self.environment.np_random.bit_generator.state),
@@ -245,7 +246,7 @@ class Trainer:
 
     def _learn_gain(self) -> None:
         if self.gain.identified is not None:
-            self._K = torch.tensor(self.gain.identified.K, dtype=torch.float32)
+            self._K = torch.from_numpy(self.gain.identified.K).float().to(self.sac.device)
 
     def _begin_episode(self) -> None:
         self._near = self.gain.phase != "idle"
@@ -272,6 +273,7 @@ class Trainer:
                 "torch": torch.__version__.split("+")[0],
                 "numpy": np.__version__,
             },
+            "device": self.sac.device.type,
         }
 
 
