@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import math
 import os
 import tempfile
 import traceback
@@ -163,7 +164,7 @@ def _emit(result: dict[str, Any], as_json: bool) -> None:
         return
     width = max(map(len, result))
     for name, value in result.items():
-        typer.echo(f"{name:<{width}}  {value}")
+        typer.echo(f"{name:<{width}}  {'-' if value is None else value}")
 
 
 @contextmanager
@@ -199,8 +200,8 @@ def _trained(policy: Policy, out: Path) -> dict[str, Any]:
         "layers": list(policy.network.layers),
         "steps": training["steps"],
         "seed": training["seed"],
-        "K": training["K"],
-        "distance": training["distance"],
+        "K": training.get("K"),
+        "distance": training.get("distance"),
     }
 
 
@@ -212,11 +213,12 @@ def _table(result: Evaluation) -> dict[str, Any]:
         )
 
     A_error, B_error = 100 * result.A_relative_error, 100 * result.B_relative_error
+    learned = not math.isnan(result.gain_relative)
     return {
         "system": result.system,
         "sha256": result.sha256,
-        "||J+K||/||K||": f"{100 * result.gain_relative:.3g} %",
-        "learned A, B": f"off by {A_error:.2g} % and {B_error:.2g} %",
+        "||J+K||/||K||": f"{100 * result.gain_relative:.3g} %" if learned else None,
+        "learned A, B": f"off by {A_error:.2g} % and {B_error:.2g} %" if learned else None,
         "eigenvalues": ", ".join(f"{e:.4g}" for e in result.eigenvalues),
         "continuous": settling(result.continuous),
         "held": settling(result.held),

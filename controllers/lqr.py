@@ -75,14 +75,15 @@ class GainLearner:
     eta : radius of the ball, in the units of the states.
     n_A, n_B : transitions that fit A and B.
     Q, R : LQR weights, shapes (n, n) and (m, m).
+    phase : what it asks for first; `idle` waits for a `refresh`.
     """
 
-    def __init__(self, eta: float, n_A: int, n_B: int, Q: Array, R: Array) -> None:
+    def __init__(self, eta: float, n_A: int, n_B: int, Q: Array, R: Array, phase: Phase = "A") -> None:
         n, m = len(Q), len(R)
         if n_A < n or n_B < m:
             raise InputError(f"`n_A` and `n_B` must be at least {n} and {m}; found {n_A} and {n_B}.")
         self.eta, self.n_A, self.n_B, self.Q, self.R = eta, n_A, n_B, Q, R
-        self.phase: Phase = "A"
+        self.phase: Phase = phase
         self.identified: Identified | None = None
         self._A: Array | None = None
         self._rows: list[tuple[Array, Array, Array]] = []

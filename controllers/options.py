@@ -8,12 +8,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
-from typing import Annotated, Any, Literal, get_args
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 from certify.errors import InputError
-from certify.systems import System
 
-Centre = Literal["preactivation", "output"]
+if TYPE_CHECKING:
+    from certify.systems import System
+
+Centre = Literal["preactivation", "output", "none"]
+Identification = Literal["during", "before", "never"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,14 +53,17 @@ class TrainingOptions:
     critic: Annotated[tuple[int, ...], "Hidden widths of the value and Q networks."]
     anneal: Annotated[float, "Last share of the run in which the actor's step falls linearly to zero."] = 0.2
     # The stabilising part
+    identification: Annotated[
+        Identification, "When A and B are learned: during the run, once before the warm-up, or never (plain SAC)."
+    ] = "during"
     eta: Annotated[float, "Radius of the ball in which transitions identify A and B, in the states' units."]
     n_A: Annotated[int, "Transitions with zero action that fit A."]
     n_B: Annotated[int, "Transitions with actions that fit B given A."]
-    refresh: Annotated[int, "Steps between two identifications."]
-    gain_weight: Annotated[float, "Weight of ||J_mu(0) + K|| + ||mu(0) - u_eq|| in the actor's loss."]
+    refresh: Annotated[int, "Steps between two identifications during the run."]
+    gain_weight: Annotated[float, "Weight of ||J_mu(0) + K|| + ||mu(0) - u_eq|| in the actor's loss; 0 drops the term."]
     state_weights: Annotated[tuple[float, ...], "Diagonal of Q_c, the LQR's state weights."]
     input_weights: Annotated[tuple[float, ...], "Diagonal of R_c, the LQR's input weights."]
-    centre: Annotated[Centre, "How the mean action is centred: preactivation or output."] = "preactivation"
+    centre: Annotated[Centre, "How the mean action is centred: preactivation, output, or none."] = "preactivation"
 
     def __post_init__(self) -> None:
         for name in ("steps", "threads", "dt", "horizon", "learning_rate", "replay", "batch", "reward_scale"):
@@ -77,7 +83,8 @@ class TrainingOptions:
         for name in ("reward_weights", "state_weights"):
             self._require(name, all(w >= 0 for w in getattr(self, name)), "at least 0")
         self._require("input_weights", all(w > 0 for w in self.input_weights), "positive")
-        self._require("centre", self.centre in get_args(Centre), f"one of {get_args(Centre)}")
+        for name, choices in (("centre", get_args(Centre)), ("identification", get_args(Identification))):
+            self._require(name, getattr(self, name) in choices, f"one of {choices}")
         for option in fields(self):
             value = getattr(self, option.name)
             numbers = value if isinstance(value, tuple) else (value,)

@@ -8,9 +8,9 @@ with Stability Guarantees for Control of Unknown Nonlinear Systems" uses it. One
     Q_i:    (Q_i(x, u) - [scale * r + gamma * V_target(x+)])^2
     actor:  log pi(u~|x) - min_i Q_i(x, u~)  +  weight * (||J_mu(0) + K|| + ||mu(0) - u_eq||)
 
-where the last term is there once a gain K is known; mu is the mean action in physical units. Everything
-is float32, as is the exported policy; the states' factors are powers of two, so that folding them into the
-first layer rounds nothing and the exported network is the trained one bit for bit.
+where the last term is there once a gain K is known, unless its weight is 0; mu is the mean action in
+physical units. Everything is float32, as is the exported policy; the states' factors are powers of two, so that
+folding them into the first layer rounds nothing and the exported network is the trained one bit for bit.
 
 Networks, replay table and batches live on one device. Random numbers are drawn on the CPU wherever the
 networks live, so that a device changes the rounding of a run and not its random stream.
@@ -95,7 +95,7 @@ class Actor(nn.Module):
     ----------
     interface : the action's scale and offset, u_eq, and the states' factors.
     widths : hidden widths.
-    centre : how the mean will be centred; decides which Jacobian is compared with -K.
+    centre : how the mean will be centred, if at all; decides which Jacobian is compared with -K.
     """
 
     scale: Tensor
@@ -139,7 +139,7 @@ class Actor(nn.Module):
 
         Notes
         -----
-        The Jacobian is the one of the *centred* mean, which ships. With preactivation centring its last slope
+        The Jacobian is the one of the mean as it ships. With preactivation centring its last slope
         is taken at u_eq and not at mu(0); the two agree once mu(0) = u_eq.
         """
         h = torch.zeros_like(self.factors)
@@ -159,7 +159,7 @@ class Actor(nn.Module):
         return loss
 
     def network(self) -> TanhNetwork:
-        """The mean action as an exact tanh network, centred; the states' factors are folded in exactly."""
+        """The mean action as an exact tanh network with its centring; the states' factors are folded in exactly."""
         layers = [*self._layers(), self.mean]
         weights = [_exact(layer.weight) for layer in layers]
         weights[0] = weights[0] * _exact(self.factors)
@@ -281,7 +281,7 @@ class SAC:
         fresh, log_likelihood = self.actor.sample(x, noise)
         q_fresh = self.q(torch.cat((scaled, fresh), 1)).amin(0)
         actor_loss = (log_likelihood - q_fresh).mean()
-        if K is not None:
+        if K is not None and options.gain_weight > 0:
             actor_loss = actor_loss + options.gain_weight * self.actor.gain_loss(K)
         actor_gradients = torch.autograd.grad(actor_loss, self._actor_weights)
 

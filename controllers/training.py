@@ -2,7 +2,9 @@
 
 While a round of identification is under way, episodes start in the ball and end on leaving it, so that the
 transitions it needs are gathered within a few hundred steps; otherwise episodes start anywhere in
-the domain. Every transition also goes into the replay buffer.
+the domain. Every transition also goes into the replay buffer. With `identification` "before" there is one
+round, at the beginning and with random actions, and the warm-up is counted from its end; with "never" there is
+none, and no gain.
 
 A checkpoint holds everything that the rest of the run depends on (networks, optimisers, replay buffer, random
 states, the episode under way, the identification), so that a resumed run equals an uninterrupted one.
@@ -30,20 +32,20 @@ from certify.errors import InputError
 from certify.policies import Policy
 from certify.systems import System
 from controllers.environments import PlantEnvironment, Snapshot
-from controllers.lqr import GainLearner, Identified
+from controllers.lqr import GainLearner, Identified, Phase
 from controllers.options import TrainingOptions
 from controllers.sac import CPU, SAC, Interface, Replay
 
 Array = NDArray[np.float64]
 
-CHECKPOINT_FORMAT = "controllers-checkpoint/1"
+CHECKPOINT_FORMAT = "controllers-checkpoint/2"
 
 
 @dataclass(frozen=True, slots=True)
 class Episode:
     """One finished episode, a row of the log.
 
-    `distance` is ||J_mu(0) + K|| and `offset` ||mu(0) - u_eq||; both are NaN as long as there is no gain.
+    `distance` is ||J_mu(0) + K||, NaN as long as there is no gain; `offset` is ||mu(0) - u_eq||.
     """
 
     step: int
@@ -105,13 +107,15 @@ class Trainer:
         self.environment = PlantEnvironment(system, options)
         self.interface = Interface(system)
         Q_c, R_c = np.diag(options.state_weights), np.diag(options.input_weights)
-        self.gain = GainLearner(options.eta, options.n_A, options.n_B, Q_c, R_c)
+        first: Phase = "idle" if options.identification == "never" else "A"
+        self.gain = GainLearner(options.eta, options.n_A, options.n_B, Q_c, R_c, first)
         self.generator = torch.Generator(CPU).manual_seed(options.seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(options.seed)
             self.sac = SAC(self.interface, options, self.generator, device)
         self.replay = Replay(min(options.replay, options.steps), system.n, system.m, device)
         self.steps_done = 0
+        self._prelude = 0  # steps of the identification before the warm-up
         self.episodes: list[Episode] = []
         self._K: torch.Tensor | None = None
         self._x, _ = self.environment.reset(seed=options.seed)
@@ -120,8 +124,10 @@ class Trainer:
     def advance(self) -> None:
         """One environment step and, after the warm-up, one gradient step."""
         options, x = self.options, self._x
-        if self.steps_done and self.steps_done % options.refresh == 0:
+        if options.identification == "during" and self.steps_done and self.steps_done % options.refresh == 0:
             self.gain.refresh()
+        if options.identification == "before" and self.gain.phase != "idle":
+            self._prelude = self.steps_done + 1
         u, normalised = self._choose(x)
         x_next, reward, terminated, truncated, _ = self.environment.step(u)
         self.replay.add(x, normalised, reward, x_next, terminated)
@@ -139,28 +145,28 @@ class Trainer:
             self._finish_episode("truncated")
         elif self._near and not self.gain.inside(x_next):
             self._finish_episode("left the ball")
-        if self.steps_done > options.warm_up:
+        if self.steps_done > self._prelude + options.warm_up:
             batch = self.replay.sample(options.batch, self.generator)
             self.sac.update(batch, self._K, self._actor_step())
 
     def distance(self) -> tuple[float, float]:
-        """||J_mu(0) + K|| and ||mu(0) - u_eq|| of the actor as it is; NaN without a gain."""
-        if self._K is None:
-            return float("nan"), float("nan")
+        """||J_mu(0) + K||, NaN without a gain, and ||mu(0) - u_eq|| of the actor as it is."""
         with torch.no_grad():
             mean, jacobian = self.sac.actor.at_origin()
-            offset = torch.linalg.vector_norm(mean - self.sac.actor.u_eq)
-            return float(torch.linalg.vector_norm(jacobian + self._K)), float(offset)
+            offset = float(torch.linalg.vector_norm(mean - self.sac.actor.u_eq))
+            if self._K is None:
+                return float("nan"), offset
+            return float(torch.linalg.vector_norm(jacobian + self._K)), offset
 
     def policy(self) -> Policy:
-        """The centred mean action with the record of how it was made.
+        """The mean action, centred, with the record of how it was made.
 
         Raises
         ------
-        InputError : the run is too short to have learned a gain.
+        InputError : the run is too short to have learned a gain, and was to learn one.
         """
         found = self.gain.identified
-        if found is None:
+        if found is None and self.options.identification != "never":
             raise InputError(f"the run ended after {self.steps_done} steps without a gain; it needs more `steps`.")
         return Policy(
             network=self.sac.actor.network(),
@@ -176,6 +182,7 @@ class Trainer:
             "system": [self.system.name, _parameters(self.system)],
             "options": self.options.record(),
             "steps_done": self.steps_done,
+            "prelude": self._prelude,
             "sac": self.sac.state(),
             "gain": self.gain.state(),
             "replay": {"rows": self.replay.table[: len(self.replay)].cpu().clone(), "count": self.replay.count},
@@ -214,7 +221,7 @@ class Trainer:
             raise InputError(f"the checkpoint is damaged: {error}.") from error
 
     def _load(self, state: dict[str, Any]) -> None:
-        self.steps_done = state["steps_done"]
+        self.steps_done, self._prelude = state["steps_done"], state["prelude"]
         self.sac.load_state(state["sac"])
         self.gain.load_state(state["gain"])
         if self.gain.identified is not None:
@@ -234,7 +241,7 @@ class Trainer:
         """The input u and `tanh(w)` of it; zero action is u_eq to the last bit."""
         if self.gain.phase == "A" and self.gain.inside(x):
             return self.interface.u_eq, self.interface.to_normalised(self.interface.u_eq)
-        if self.steps_done < self.options.warm_up:
+        if self.steps_done < self._prelude + self.options.warm_up:
             normalised = np.asarray(self.environment.np_random.uniform(-1.0, 1.0, self.system.m))
         else:
             normalised = self.sac.act(x)
@@ -259,14 +266,14 @@ class Trainer:
         self.episodes.append(Episode(self.steps_done, kind, self._length, self._total, outcome, distance, offset))
         self._begin_episode()
 
-    def _record(self, found: Identified) -> dict[str, Any]:
+    def _record(self, found: Identified | None) -> dict[str, Any]:
         distance, offset = self.distance()
+        learned: dict[str, Any] = {}
+        if found is not None:
+            learned = {"A": found.A.tolist(), "B": found.B.tolist(), "K": found.K.tolist(), "distance": distance}
         return {
             **self.options.record(),
-            "A": found.A.tolist(),
-            "B": found.B.tolist(),
-            "K": found.K.tolist(),
-            "distance": distance,
+            **learned,
             "offset_before_centring": offset,
             "versions": {
                 "python": platform.python_version(),
