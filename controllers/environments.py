@@ -4,10 +4,11 @@ The plant that is trained on is the plant that is proved: nothing here restates 
 in this package reads one. An action is held over `dt` and the state moves by one classical Runge-Kutta step
 of order four, in float64; angles are never wrapped.
 
-Importing this module registers `certify/<plant>-v0` for each plant with a preset:
+Importing this module registers `certify/<plant>-v0` for each plant with a preset. Gymnasium 1.0 and later read no
+entry points of installed packages; an id that names this module finds the environment without an import:
 
 >>> import gymnasium
->>> environment = gymnasium.make("certify/pendulum-v0")
+>>> environment = gymnasium.make("controllers.environments:certify/pendulum-v0")
 >>> state, _ = environment.reset(seed=0)
 >>> state.dtype, environment.action_space
 (dtype('float64'), Box(-6.0, 6.0, (1,), float64))
@@ -150,4 +151,7 @@ def _uniform_in_ball(generator: np.random.Generator, n: int, radius: float) -> A
 
 
 for _name in PRESETS:
-    gymnasium.register(f"certify/{_name}-v0", entry_point=make_environment, kwargs={"name": _name})
+    _id = f"certify/{_name}-v0"
+    if _id not in gymnasium.registry:  # executed twice, it would warn of every id
+        # By name: the entry point is looked up when an environment is made.
+        gymnasium.register(_id, entry_point="controllers.environments:make_environment", kwargs={"name": _name})

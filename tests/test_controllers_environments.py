@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import warnings
 from dataclasses import replace
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -15,6 +18,9 @@ from certify.errors import InputError
 from certify.systems import get_system
 from controllers.environments import PlantEnvironment, Stepper
 from controllers.options import PRESETS, preset
+
+
+ROOT = Path(__file__).parent.parent
 
 
 @pytest.fixture
@@ -75,6 +81,22 @@ def test_registered_environments_pass_the_checker(name):
         # Advice that does not apply: states are unbounded after a termination, inputs are in physical units.
         warnings.filterwarnings("ignore", message=".*(infinity|symmetric and normalized).*")
         check_env(environment.unwrapped, skip_render_check=True)
+
+
+def test_a_fresh_process_finds_an_environment_without_importing_this_package():
+    code = """
+import sys, gymnasium
+assert not any(name.startswith("controllers") for name in sys.modules)
+environment = gymnasium.make("controllers.environments:certify/pendulum-v0")
+print(environment.reset(seed=0)[0].shape, environment.spec.id)
+import importlib
+importlib.reload(sys.modules["controllers.environments"])  # once more, and -W error makes of a warning a failure
+print(type(gymnasium.make("certify/cartpole-v0").unwrapped).__module__)
+"""
+    command = [sys.executable, "-W", "error", "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.splitlines() == ["(2,) certify/pendulum-v0", "controllers.environments"]
 
 
 def test_observation_is_the_raw_float64_state_and_angles_are_not_wrapped(environment):
