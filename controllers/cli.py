@@ -202,6 +202,7 @@ def _trained(policy: Policy, out: Path) -> dict[str, Any]:
         "seed": training["seed"],
         "K": training.get("K"),
         "distance": training.get("distance"),
+        "curvature": training["curvature"],
     }
 
 
@@ -219,6 +220,7 @@ def _table(result: Evaluation) -> dict[str, Any]:
         "sha256": result.sha256,
         "||J+K||/||K||": f"{100 * result.gain_relative:.3g} %" if learned else None,
         "learned A, B": f"off by {A_error:.2g} % and {B_error:.2g} %" if learned else None,
+        "curvature": None if math.isnan(result.curvature) else f"{result.curvature:.4g}",
         "eigenvalues": ", ".join(f"{e:.4g}" for e in result.eigenvalues),
         "continuous": settling(result.continuous),
         "held": settling(result.held),

@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from certify.policies import Policy
+from certify.policies import Policy, TanhNetwork
 from certify.systems import System, get_system
 from controllers.environments import Stepper, rk4
 
@@ -78,12 +78,16 @@ class Settling:
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """Figures of one policy. A, B, K are the learned ones of its record; NaN where the record has none."""
+    """Figures of one policy. A, B, K are the learned ones of its record; NaN where the record has none.
+
+    `curvature` is that of `curvature()` in the ball in which the plant was identified; NaN without `training.eta`.
+    """
 
     system: str
     sha256: str
     gain_distance: float
     gain_relative: float
+    curvature: float
     A_relative_error: float
     B_relative_error: float
     eigenvalues: tuple[complex, ...]
@@ -107,6 +111,7 @@ class Evaluation:
             "system": self.system,
             "policy": {"sha256": self.sha256},
             "gain": {"distance": _finite(self.gain_distance), "relative": _finite(self.gain_relative)},
+            "curvature": _finite(self.curvature),
             "identification": {"A": _finite(self.A_relative_error), "B": _finite(self.B_relative_error)},
             "eigenvalues": [[e.real, e.imag] for e in self.eigenvalues],
             "continuous": settling(self.continuous),
@@ -175,12 +180,37 @@ def evaluate(policy: Policy, options: EvaluationOptions | None = None) -> Evalua
         sha256=network.sha256(),
         gain_distance=distance,
         gain_relative=relative,
+        curvature=curvature(network, system, _recorded(policy, "eta", ())) if "eta" in policy.training else math.nan,
         A_relative_error=A_error,
         B_relative_error=B_error,
         eigenvalues=tuple(complex(e) for e in eigenvalues),
         continuous=continuous,
         held=held,
     )
+
+
+def curvature(network: TanhNetwork, system: System, radius: float, points: int = 256) -> float:
+    """Largest `||J_pi(x) - J_pi(0)|| / ||x||` over random states of ||x|| <= radius, Frobenius norm.
+
+    An estimate from below of the largest second derivative of pi in the ball, in input units per state squared.
+    What the local proof must absorb near the origin grows with it, so the certified local level shrinks.
+    The states are always the same ones.
+
+    Raises
+    ------
+    InputError : `radius` is not positive.
+    """
+    if not radius > 0:
+        raise InputError(f"`radius` must be positive; found {radius}.")
+    generator = np.random.default_rng(0)
+    x = generator.standard_normal((points, system.n))
+    length = radius * generator.uniform(size=(points, 1)) ** (1 / system.n)
+    x *= length / np.linalg.norm(x, axis=1, keepdims=True)
+    u_eq = system.exact_u_eq()
+    folded = network.folded(u_eq)
+    jacobians = torch.func.vmap(torch.func.jacrev(lambda y: folded(y, u_eq)))(torch.from_numpy(x)).numpy()
+    change = np.linalg.norm(jacobians - network.jacobian_at_origin(u_eq), axis=(1, 2))
+    return float((change / length[:, 0]).max())
 
 
 def discrete_linearisation(system: System, dt: float) -> tuple[Array, Array]:

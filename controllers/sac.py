@@ -9,8 +9,9 @@ with Stability Guarantees for Control of Unknown Nonlinear Systems" uses it. One
     actor:  log pi(u~|x) - min_i Q_i(x, u~)  +  weight * (||J_mu(0) + K|| + ||mu(0) - u_eq||)
 
 where the last term is there once a gain K is known, unless its weight is 0; mu is the mean action in
-physical units. Everything is float32, as is the exported policy; the states' factors are powers of two, so that
-folding them into the first layer rounds nothing and the exported network is the trained one bit for bit.
+physical units. Another option adds the curvature near the origin, `Actor.curvature_loss`. Everything is float32,
+as is the exported policy; the states' factors are powers of two, so that folding them into the first layer rounds
+nothing and the exported network is the trained one bit for bit.
 
 Networks, replay table and batches live on one device. Random numbers are drawn on the CPU wherever the
 networks live, so that a device changes the rounding of a run and not its random stream.
@@ -36,6 +37,7 @@ from controllers.options import Centre, TrainingOptions
 Array = NDArray[np.float64]
 
 LOG_STD_RANGE = (-5.0, 2.0)
+CURVATURE_POINTS = 8  # states of the ball in the curvature's term, new ones in each gradient step
 CPU = torch.device("cpu")
 
 
@@ -151,6 +153,26 @@ class Actor(nn.Module):
         last = self.rest if self.centre == "preactivation" else normalised
         jacobian = (self.scale * (1 - last * last))[:, None] * (self.mean.weight @ jacobian)
         return self.scale * normalised + self.offset, jacobian
+
+    def jacobian(self, x: Tensor) -> Tensor:
+        """J_mu at states x (batch, n), shape (batch, m, n), of the mean action as it ships; can be differentiated."""
+        h, rest = x * self.factors, torch.zeros_like(self.factors)
+        jacobian = torch.diag(self.factors).expand(len(x), -1, -1)
+        for layer in self._layers():
+            h, rest = torch.tanh(layer(h)), torch.tanh(layer(rest))
+            jacobian = (1 - h * h)[..., None] * (layer.weight @ jacobian)
+        w = self.mean(h)
+        if self.centre == "preactivation":
+            w = w - self.mean(rest) + torch.atanh(self.rest)
+        slope = 1 - torch.tanh(w) ** 2
+        result: Tensor = (self.scale * slope)[..., None] * (self.mean.weight @ jacobian)
+        return result
+
+    def curvature_loss(self, x: Tensor) -> Tensor:
+        """Mean of `||J_mu(x) - J_mu(0)|| / ||x||` over states x (batch, n), none of them 0; Frobenius norm."""
+        change = self.jacobian(x) - self.jacobian(torch.zeros_like(x[:1]))
+        quotients: Tensor = torch.linalg.vector_norm(change, dim=(1, 2)) / torch.linalg.vector_norm(x, dim=1)
+        return quotients.mean()
 
     def gain_loss(self, K: Tensor) -> Tensor:
         """`||J_mu(0) + K|| + ||mu(0) - u_eq||`, Frobenius norm; the sign is that of u = u_eq - K x."""
@@ -283,6 +305,8 @@ class SAC:
         actor_loss = (log_likelihood - q_fresh).mean()
         if K is not None and options.gain_weight > 0:
             actor_loss = actor_loss + options.gain_weight * self.actor.gain_loss(K)
+        if options.curvature_weight > 0:
+            actor_loss = actor_loss + options.curvature_weight * self.actor.curvature_loss(self._ball())
         actor_gradients = torch.autograd.grad(actor_loss, self._actor_weights)
 
         with torch.no_grad():
@@ -308,6 +332,14 @@ class SAC:
         """Continue from `state()`."""
         for name in _PARTS:
             getattr(self, name).load_state_dict(state[name])
+
+    def _ball(self) -> Tensor:
+        """States that are uniform in ||x|| <= eta, shape (CURVATURE_POINTS, n)."""
+        n = len(self.actor.factors)
+        x = self._noise(CURVATURE_POINTS, n)
+        length = torch.rand((CURVATURE_POINTS, 1), generator=self.generator, device=CPU).to(self.device) ** (1 / n)
+        norm: Tensor = torch.linalg.vector_norm(x, dim=1, keepdim=True)
+        return x * (self.options.eta * length / norm)
 
     def _noise(self, *shape: int) -> Tensor:
         return torch.randn(shape, generator=self.generator, device=CPU).to(self.device)

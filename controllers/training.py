@@ -32,6 +32,7 @@ from certify.errors import InputError
 from certify.policies import Policy
 from certify.systems import System
 from controllers.environments import PlantEnvironment, Snapshot
+from controllers.evaluate import curvature
 from controllers.lqr import GainLearner, Identified, Phase
 from controllers.options import TrainingOptions
 from controllers.sac import CPU, SAC, Interface, Replay
@@ -275,6 +276,7 @@ class Trainer:
             **self.options.record(),
             **learned,
             "offset_before_centring": offset,
+            "curvature": curvature(self.sac.actor.network(), self.system, self.options.eta),
             "versions": {
                 "python": platform.python_version(),
                 "torch": torch.__version__.split("+")[0],
