@@ -56,6 +56,12 @@ def _train(
         Path | None, typer.Option("--checkpoint-dir", help="Folder that keeps checkpoint.pt.")
     ] = None,
     checkpoint_every: Annotated[int, typer.Option("--checkpoint-every", help="Steps between checkpoints.")] = 10_000,
+    evaluations: Annotated[
+        Path | None, typer.Option("--evaluations", help="CSV file of the evaluations during the run.")
+    ] = None,
+    evaluate_every: Annotated[
+        int, typer.Option("--evaluate-every", help="Steps between evaluations during the run; 0 means none.")
+    ] = 10_000,
     device: Annotated[str, typer.Option("--device", help="Where the networks live: cpu or cuda.")] = "cpu",
     resume: Annotated[bool, typer.Option("--resume", help="Go on from checkpoint.pt in --checkpoint-dir.")] = False,
     as_json: Json = False,
@@ -69,26 +75,33 @@ def _train(
         options = replace(preset(plant), **_given(chosen))
         from certify.systems import get_system
         from controllers.sac import find_device
-        from controllers.training import EpisodeLog, Trainer, train
+        from controllers.training import Episode, Log, Monitored, Trainer, train
 
         if checkpoint_every < 1:
             raise InputError(f"`checkpoint_every` must be positive; found {checkpoint_every}.")
-        for path in filter(None, (out, log)):
+        if evaluate_every < 0:
+            raise InputError(f"`evaluate_every` must be at least 0; found {evaluate_every}.")
+        if evaluations is not None and not evaluate_every:
+            raise InputError("`--evaluations` needs an `--evaluate-every` above 0.")
+        for path in filter(None, (out, log, evaluations)):
             _require_writable(path)
         trainer = Trainer(get_system(plant), options, find_device(device))
         checkpoint = _checkpoint(checkpoint_dir, resume)
         if resume and checkpoint is not None:
             trainer.restore(_read(checkpoint))
         with ExitStack() as stack:
-            episodes = None if log is None else stack.enter_context(EpisodeLog(log))
+            episodes = None if log is None else stack.enter_context(Log(log, Episode))
+            rows = None if evaluations is None else stack.enter_context(Log(evaluations, Monitored))
             show = stack.enter_context(_progress(trainer))
 
             def report(trainer: Trainer) -> None:
                 if episodes is not None:
                     episodes.extend(trainer.episodes)
+                if rows is not None:
+                    rows.extend(trainer.monitored)
                 show(trainer)
 
-            policy = train(trainer, report, checkpoint, checkpoint_every)
+            policy = train(trainer, report, checkpoint, checkpoint_every, evaluate_every)
         _save(policy, out)
         _emit(_trained(policy, out), as_json)
 
@@ -176,18 +189,25 @@ def _progress(trainer: Trainer) -> Iterator[Callable[[Trainer], None]]:
         BarColumn(),
         MofNCompleteColumn(),
         TimeRemainingColumn(),
-        TextColumn("return {task.fields[mean]}  |J+K| {task.fields[distance]}"),
+        TextColumn("return {task.fields[mean]}  |J+K| {task.fields[distance]}  settled {task.fields[settled]}"),
     )
     with Progress(*columns, console=Console(stderr=True)) as progress:
         steps = trainer.options.steps
-        task = progress.add_task("", total=steps, completed=trainer.steps_done, mean="-", distance="-")
+        task = progress.add_task("", total=steps, completed=trainer.steps_done, mean="-", distance="-", settled="-")
 
         def show(trainer: Trainer) -> None:
             if trainer.steps_done % 200 and trainer.steps_done != steps:
                 return
             totals = [e.total for e in trainer.episodes if e.kind == "training"][-10:]
             mean = f"{sum(totals) / len(totals):.1f}" if totals else "-"
-            progress.update(task, completed=trainer.steps_done, mean=mean, distance=f"{trainer.distance()[0]:.1e}")
+            last = trainer.monitored[-1].settled if trainer.monitored else math.nan
+            progress.update(
+                task,
+                completed=trainer.steps_done,
+                mean=mean,
+                distance=f"{trainer.distance()[0]:.1e}",
+                settled="-" if math.isnan(last) else f"{last:.0%}",
+            )
 
         yield show
 

@@ -32,7 +32,7 @@ from certify.errors import InputError
 from certify.policies import Policy
 from certify.systems import System
 from controllers.environments import PlantEnvironment, Snapshot
-from controllers.evaluate import curvature
+from controllers.evaluate import INITIAL_STATES, curvature, settle
 from controllers.lqr import GainLearner, Identified, Phase
 from controllers.options import TrainingOptions
 from controllers.sac import CPU, SAC, Interface, Replay
@@ -58,34 +58,52 @@ class Episode:
     offset: float
 
 
-class EpisodeLog:
-    """The episodes of a run as CSV, one row each; a resumed run begins with those of its checkpoint.
+@dataclass(frozen=True, slots=True)
+class Monitored:
+    """The policy after `step` steps: a row of the second log.
+
+    `distance` and `offset` are those of `Episode`, `curvature` is that of `controllers.evaluate`. `settled` is the
+    share of the initial states from which the policy as it would ship settles in the sense of `MONITORING`, and
+    `cost` the median of their costs; both are NaN for a plant without a box of initial states.
+    """
+
+    step: int
+    distance: float
+    offset: float
+    curvature: float
+    settled: float
+    cost: float
+
+
+class Log:
+    """Episodes or other rows of a run as CSV; a resumed run begins with those of its checkpoint.
 
     Parameters
     ----------
     path : file that is written anew when the log is entered as a context.
+    row : the dataclass whose fields are the columns.
     """
 
-    def __init__(self, path: Path) -> None:
-        self._path = path
+    def __init__(self, path: Path, row: type[Episode] | type[Monitored]) -> None:
+        self._path, self._row = path, row
         self._written = 0
 
-    def __enter__(self) -> EpisodeLog:
+    def __enter__(self) -> Log:
         self._file = self._path.open("w", newline="", encoding="utf-8")
         self._writer = csv.writer(self._file)
-        self._writer.writerow([column.name for column in fields(Episode)])
+        self._writer.writerow([column.name for column in fields(self._row)])
         return self
 
     def __exit__(self, *_: object) -> None:
         self._file.close()
 
-    def extend(self, episodes: Sequence[Episode]) -> None:
-        """Write the episodes that are not written yet."""
-        for episode in episodes[self._written :]:
-            self._writer.writerow(astuple(episode))
-        if len(episodes) > self._written:
+    def extend(self, rows: Sequence[Episode] | Sequence[Monitored]) -> None:
+        """Write the rows that are not written yet."""
+        for row in rows[self._written :]:
+            self._writer.writerow(astuple(row))
+        if len(rows) > self._written:
             self._file.flush()
-        self._written = len(episodes)
+        self._written = len(rows)
 
 
 class Trainer:
@@ -118,6 +136,7 @@ class Trainer:
         self.steps_done = 0
         self._prelude = 0  # steps of the identification before the warm-up
         self.episodes: list[Episode] = []
+        self.monitored: list[Monitored] = []
         self._K: torch.Tensor | None = None
         self._x, _ = self.environment.reset(seed=options.seed)
         self._begin_episode()
@@ -159,6 +178,17 @@ class Trainer:
                 return float("nan"), offset
             return float(torch.linalg.vector_norm(jacobian + self._K)), offset
 
+    def monitor(self) -> None:
+        """Judge the policy as it is, in a second or so; draws none of the run's random numbers."""
+        network, options = self.sac.actor.network(), self.options
+        settled = cost = float("nan")
+        if self.system.name in INITIAL_STATES:
+            Q, R = np.array(options.state_weights), np.array(options.input_weights)
+            found = settle(network, self.system, options.dt, Q, R)
+            settled, cost = found.settled / found.states, found.cost
+        bend = curvature(network, self.system, options.eta)
+        self.monitored.append(Monitored(self.steps_done, *self.distance(), bend, settled, cost))
+
     def policy(self) -> Policy:
         """The mean action, centred, with the record of how it was made.
 
@@ -193,6 +223,7 @@ class Trainer:
             "environment": [list(self.environment.snapshot().x), self.environment.snapshot().elapsed],
             "episode": [self._near, self._total, self._length],
             "episodes": [astuple(episode) for episode in self.episodes],
+            "monitored": [astuple(row) for row in self.monitored],
         }
         buffer = io.BytesIO()
         torch.save(state, buffer)
@@ -237,6 +268,7 @@ class Trainer:
         self._x = np.array(x)
         self._near, self._total, self._length = state["episode"]
         self.episodes = [Episode(*row) for row in state["episodes"]]
+        self.monitored = [Monitored(*row) for row in state["monitored"]]
 
     def _choose(self, x: Array) -> tuple[Array, Array]:
         """The input u and `tanh(w)` of it; zero action is u_eq to the last bit."""
@@ -291,6 +323,7 @@ def train(
     report: Callable[[Trainer], None] | None = None,
     checkpoint: Path | None = None,
     checkpoint_every: int = 10_000,
+    evaluate_every: int = 0,
 ) -> Policy:
     """Run `trainer` to its last step and return the policy.
 
@@ -299,15 +332,21 @@ def train(
     trainer : a new or a restored run.
     report : called after each step, for progress and logs.
     checkpoint : file that is rewritten every `checkpoint_every` steps.
+    evaluate_every : steps between two calls of `Trainer.monitor`, which is also called at the end; 0 means never.
     """
     if checkpoint_every < 1:
         raise InputError(f"`checkpoint_every` must be positive; found {checkpoint_every}.")
+    if evaluate_every < 0:
+        raise InputError(f"`evaluate_every` must be at least 0; found {evaluate_every}.")
     torch.set_num_threads(trainer.options.threads)
     while trainer.steps_done < trainer.options.steps:
         trainer.advance()
+        done = trainer.steps_done
+        if evaluate_every and (done % evaluate_every == 0 or done == trainer.options.steps):
+            trainer.monitor()
         if report is not None:
             report(trainer)
-        if checkpoint is not None and trainer.steps_done % checkpoint_every == 0:
+        if checkpoint is not None and done % checkpoint_every == 0:
             write_atomically(checkpoint, trainer.snapshot())
     return trainer.policy()
 

@@ -17,7 +17,7 @@ from certify.policies import load_policy, save_policy
 from certify.systems import get_system
 from controllers.evaluate import EvaluationOptions, discrete_linearisation, evaluate
 from controllers.options import TrainingOptions, preset
-from controllers.training import EpisodeLog, Trainer, train
+from controllers.training import Episode, Log, Trainer, train
 
 POLICIES = Path(__file__).parent.parent / "examples" / "policies"
 SHIPPED = POLICIES / "pendulum.pt"
@@ -163,7 +163,7 @@ def test_the_log_holds_every_episode_once_also_after_a_resume(short, whole, tmp_
     path = tmp_path / "log.csv"
     trainer = _trainer(short)
     trainer.restore(whole[2][333])
-    with EpisodeLog(path) as log:
+    with Log(path, Episode) as log:
         train(trainer, lambda t: log.extend(t.episodes))
     with path.open(newline="") as file:
         rows = list(csv.DictReader(file))
