@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin, get_type
 import typer
 
 from certify.errors import CertifyError, InputError
+from controllers import comparison
 from controllers.options import TrainingOptions, preset
 
 if TYPE_CHECKING:
@@ -291,6 +292,8 @@ def _save(policy: Policy, out: Path) -> None:
     except OSError as error:
         raise InputError(f"{out} cannot be written: {error.strerror}.") from error
 
+
+app.command("train-baseline")(comparison.train_baseline)
 
 if __name__ == "__main__":
     main()

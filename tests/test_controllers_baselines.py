@@ -1,0 +1,229 @@
+"""The baselines: same environment and budget, inputs of the right size, files that are read back exactly."""
+
+from __future__ import annotations
+
+import io
+import json
+import sys
+import zipfile
+from dataclasses import fields, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from typer.testing import CliRunner
+
+from certify.errors import InputError
+from certify.policies import load_policy
+from certify.systems import get_system
+from controllers import baselines
+from controllers.cli import app
+from controllers.options import preset
+from controllers.sac import Interface
+from controllers.training import Trainer
+
+SHIPPED = Path(__file__).parent.parent / "examples" / "policies" / "pendulum.pt"
+TINY = replace(preset("pendulum"), steps=150, warm_up=50, n_A=20, n_B=20, batch=8, actor=(6, 5), critic=(7,), seed=3)
+X = np.random.default_rng(0).uniform(-1, 1, (40, 2)) * [2.0, 8.0]
+
+runner = CliRunner()
+
+
+@pytest.fixture(scope="module")
+def pendulum_system():
+    return get_system("pendulum")
+
+
+@pytest.fixture(scope="module", params=["ppo", "sac"])
+def reference(request, pendulum_system, tmp_path_factory):
+    """Bytes of a trained baseline."""
+    path = tmp_path_factory.mktemp(request.param) / "model"  # no suffix: the file is written where it was asked for
+    baselines.train_reference(request.param, pendulum_system, TINY, path)
+    return request.param, path.read_bytes()
+
+
+@pytest.fixture(scope="module")
+def checkpoint(pendulum_system):
+    """A run of the same SAC without the gain, ended after a few gradient steps."""
+    trainer = Trainer(pendulum_system, baselines.without_gain(TINY))
+    while trainer.steps_done < 60:
+        trainer.advance()
+    return trainer, trainer.snapshot()
+
+
+def test_a_baseline_is_read_back_as_stable_baselines_itself_would(reference, pendulum_system):
+    import stable_baselines3
+
+    algorithm, content = reference
+    trained = baselines.from_reference(content, pendulum_system, TINY)
+    assert (trained.system, trained.steps, trained.seed) == ("pendulum", 150, 3)
+    model = {"ppo": stable_baselines3.PPO, "sac": stable_baselines3.SAC}[algorithm].load(io.BytesIO(content))
+    factors = Interface(pendulum_system).state_factors
+    action, _ = model.predict((X * factors).astype(np.float32), deterministic=True)
+    np.testing.assert_allclose(trained.mean(X), 6.0 * action, rtol=0, atol=1e-5)
+    assert model.policy.net_arch["pi"] == [6, 5]
+    assert model.policy.activation_fn is torch.nn.Tanh
+
+
+def test_samples_are_spread_around_the_mean_and_stay_in_the_bounds(reference, pendulum_system):
+    algorithm, content = reference
+    trained = baselines.from_reference(content, pendulum_system, TINY)
+    many = np.repeat(X[:1], 4000, axis=0)
+    u = trained.sample(many, np.random.default_rng(1))
+    assert u.shape == (4000, 1) and np.abs(u).max() <= 6.0
+    np.testing.assert_array_equal(u, trained.sample(many, np.random.default_rng(1)))
+    mean = trained.mean(X[:1])[0, 0]
+    assert np.median(u) == pytest.approx(mean, abs=0.6)
+    assert u.std() > 0.5
+    if algorithm == "ppo":  # its deviation is one parameter, near 1 at first, and samples are clipped
+        assert (np.abs(u) == 6.0).mean() == pytest.approx(0.32, abs=0.05)
+
+
+def test_training_a_baseline_twice_gives_the_same_networks(reference, pendulum_system, tmp_path):
+    algorithm, content = reference
+    baselines.train_reference(algorithm, pendulum_system, TINY, tmp_path / "again.zip")
+    baselines.train_reference(algorithm, pendulum_system, replace(TINY, seed=4), tmp_path / "other.zip")
+    first = baselines.from_reference(content, pendulum_system, TINY).mean(X)
+    again, other = (
+        baselines.from_reference((tmp_path / name).read_bytes(), pendulum_system, TINY).mean(X)
+        for name in ("again.zip", "other.zip")
+    )
+    np.testing.assert_array_equal(again, first)
+    assert np.abs(other - first).max() > 1e-3
+
+
+def test_training_leaves_torch_s_generator_alone(pendulum_system, tmp_path):
+    before = torch.random.get_rng_state()
+    baselines.train_reference("ppo", pendulum_system, replace(TINY, steps=20), tmp_path / "m.zip")
+    assert torch.equal(before, torch.random.get_rng_state())
+
+
+def test_the_scaled_environment_is_the_plant_s(pendulum_system):
+    scaled = baselines.scaled_environment(pendulum_system, TINY)
+    plant, factors = scaled.unwrapped, Interface(pendulum_system).state_factors
+    seen, _ = scaled.reset(seed=5)
+    start = np.array(plant.snapshot().x)
+    np.testing.assert_array_equal(seen, (start * factors).astype(np.float32))
+    assert seen.dtype == np.float32 and scaled.action_space.high == 1.0
+    seen, reward, *_ = scaled.step(np.array([0.5], dtype=np.float32))
+    plant.reset(seed=5)
+    x, expected, *_ = plant.step(np.array([3.0]))
+    np.testing.assert_array_equal(seen, (x * factors).astype(np.float32))
+    assert reward == expected
+
+
+def test_ppo_makes_whole_rollouts_within_the_budget(pendulum_system, tmp_path, monkeypatch):
+    monkeypatch.setattr(baselines, "_ROLLOUT", 20)
+    seen = []
+    made = baselines.train_reference("ppo", pendulum_system, replace(TINY, steps=45), tmp_path / "m.zip", seen.append)
+    assert seen == list(range(1, 45)) and made == 44  # two rollouts of 22
+    assert baselines.from_reference((tmp_path / "m.zip").read_bytes(), pendulum_system, TINY).steps == 44
+
+
+def test_without_the_gain_everything_else_is_the_same():
+    changed = baselines.without_gain(TINY)
+    assert changed.gain_weight == 0.0
+    known = {option.name for option in fields(TINY)}
+    if "identification" in known:
+        assert changed.identification == "never"
+    rest = known - {"gain_weight", "identification"}
+    assert {name: getattr(changed, name) for name in rest} == {name: getattr(TINY, name) for name in rest}
+
+
+def test_a_checkpoint_gives_the_whole_actor(checkpoint, pendulum_system):
+    trainer, content = checkpoint
+    trained = baselines.from_checkpoint(content, pendulum_system)
+    assert (trained.system, trained.steps, trained.seed) == ("pendulum", 60, 3)
+    x = torch.from_numpy(X).float()
+    with torch.no_grad():
+        mean, log_std = (part.double().numpy() for part in trainer.sac.actor(x))
+    np.testing.assert_allclose(trained.mean(X), 6.0 * np.tanh(mean), rtol=0, atol=1e-5)
+    u = trained.sample(X, np.random.default_rng(2))
+    noise = np.random.default_rng(2).standard_normal((40, 1))
+    np.testing.assert_allclose(u, 6.0 * np.tanh(mean + np.exp(log_std) * noise), rtol=0, atol=1e-4)
+    # The mean is what was trained: not centred, so the input at the origin is not u_eq.
+    assert np.abs(trained.mean(np.zeros((1, 2)))).max() > 1e-6
+
+
+def test_an_exported_policy_is_taken_as_it_ships(pendulum_system):
+    policy = load_policy(SHIPPED)
+    trained = baselines.from_policy(policy, pendulum_system)
+    np.testing.assert_array_equal(trained.mean(X), policy.network(X, pendulum_system.exact_u_eq()))
+    assert trained.sample is None
+    assert (trained.steps, trained.seed) == (policy.training["steps"], policy.training["seed"])
+    with pytest.raises(InputError, match="must be of cartpole; it is of pendulum"):
+        baselines.from_policy(policy, get_system("cartpole"))
+    with pytest.raises(InputError, match="`steps` and `seed`"):
+        baselines.from_policy(replace(policy, training={}), pendulum_system)
+
+
+def test_files_of_another_plant_other_widths_or_no_file_at_all_are_refused(reference, checkpoint, pendulum_system):
+    _, content = reference
+    with pytest.raises(InputError, match="of cartpole; it is"):
+        baselines.from_reference(content, get_system("cartpole"), TINY)
+    with pytest.raises(InputError, match="preset's widths"):
+        baselines.from_reference(content, pendulum_system, preset("pendulum"))
+    with pytest.raises(InputError, match="must be of cartpole; it is of pendulum"):
+        baselines.from_checkpoint(checkpoint[1], get_system("cartpole"))
+    for rubbish in (b"", b"rubbish", content[:1000]):
+        with pytest.raises(InputError, match="cannot be read"):
+            baselines.from_reference(rubbish, pendulum_system, TINY)
+        with pytest.raises(InputError, match="checkpoint cannot be read"):
+            baselines.from_checkpoint(rubbish, pendulum_system)
+
+
+def test_nothing_in_a_baseline_s_file_is_unpickled(reference, pendulum_system):
+    _, content = reference
+    hostile = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(content)) as old, zipfile.ZipFile(hostile, "w") as new:
+        for name in old.namelist():
+            data = old.read(name)
+            if name == "data":  # every pickled object of it becomes rubbish
+                record = json.loads(data)
+                for entry in record.values():
+                    if isinstance(entry, dict) and ":serialized:" in entry:
+                        entry[":serialized:"] = "AAAA"
+                data = json.dumps(record).encode()
+            new.writestr(name, data)
+    changed = baselines.from_reference(hostile.getvalue(), pendulum_system, TINY)
+    expected = baselines.from_reference(content, pendulum_system, TINY)
+    np.testing.assert_array_equal(changed.mean(X), expected.mean(X))
+
+
+def test_the_command_writes_the_file_and_says_what_it_did(tmp_path):
+    out = tmp_path / "ppo.zip"
+    arguments = ["train-baseline", "ppo", "pendulum", "--out", str(out), "--seed", "2", "--steps", "60", "--json"]
+    result = runner.invoke(app, arguments)
+    assert result.exit_code == 0, result.stderr
+    assert json.loads(result.stdout) == {
+        "baseline": str(out), "algorithm": "ppo", "system": "pendulum", "steps": 60, "seed": 2,
+    }  # fmt: skip
+    trained = baselines.from_reference(out.read_bytes(), get_system("pendulum"), preset("pendulum"))
+    assert (trained.steps, trained.seed) == (60, 2)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["td3", "pendulum"], "must be one of ppo, sac; found 'td3'"),
+        (["ppo", "spaceship"], "spaceship"),
+        (["ppo", "pendulum", "--steps", "0"], "`steps` must be positive"),
+        (["ppo", "pendulum", "--steps", "1"], "at least 2"),
+    ],
+)
+def test_bad_input_is_one_sentence(tmp_path, arguments, message):
+    result = runner.invoke(app, ["train-baseline", *arguments, "--out", str(tmp_path / "m.zip")])
+    assert result.exit_code == 2
+    assert message in result.stderr and result.stderr.startswith("Error: ") and result.stderr.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_without_stable_baselines_the_command_says_what_to_install(tmp_path, monkeypatch):
+    for name in [name for name in sys.modules if name.split(".")[0] == "stable_baselines3"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "stable_baselines3", None)
+    result = runner.invoke(app, ["train-baseline", "sac", "pendulum", "--out", str(tmp_path / "m.zip")])
+    assert result.exit_code == 2
+    assert result.stderr == "Error: stable-baselines3 is not installed; `pip install 'certify[baselines]'` brings it.\n"
+    assert not list(tmp_path.iterdir())
