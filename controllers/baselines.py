@@ -158,7 +158,7 @@ def train_reference(
     torch.set_num_threads(options.threads)
     with torch.random.fork_rng(devices=[]):
         model = _model(algorithm, system, options)
-        steps, _ = _budget(algorithm, options.steps)
+        steps, _ = budget(algorithm, options.steps)
         model.learn(total_timesteps=steps, callback=step)
     # Plain values, which the file keeps as JSON: they are read back without unpickling anything.
     model.trained_on = {
@@ -244,7 +244,7 @@ def _model(algorithm: Algorithm, system: System, options: TrainingOptions) -> An
     shape: dict[str, Any] = {"pi": list(options.actor)}
     if algorithm == "ppo":
         shape["vf"] = list(options.critic)
-        _, common["n_steps"] = _budget(algorithm, options.steps)
+        _, common["n_steps"] = budget(algorithm, options.steps)
         common["batch_size"] = min(64, common["n_steps"])
         make = library.PPO
     else:
@@ -259,10 +259,10 @@ def _model(algorithm: Algorithm, system: System, options: TrainingOptions) -> An
         return make("MlpPolicy", environment, policy_kwargs=networks, **common)
 
 
-def _budget(algorithm: Algorithm, steps: int) -> tuple[int, int]:
+def budget(algorithm: Algorithm, steps: int) -> tuple[int, int]:
     """Steps to make in all, at most `steps`, and steps of one rollout.
 
-    >>> _budget("ppo", 40_000), _budget("ppo", 80_000), _budget("sac", 40_000)
+    >>> budget("ppo", 40_000), budget("ppo", 80_000), budget("sac", 40_000)
     ((40000, 2000), (79989, 2051), (40000, 1))
     """
     if algorithm == "sac":

@@ -294,6 +294,7 @@ def _save(policy: Policy, out: Path) -> None:
 
 
 app.command("train-baseline")(comparison.train_baseline)
+app.command("compare")(comparison.compare)
 
 if __name__ == "__main__":
     main()

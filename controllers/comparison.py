@@ -1,10 +1,11 @@
-"""The command `controllers train-baseline`: arguments and printing, no mathematics.
+"""The commands `controllers train-baseline` and `controllers compare`: arguments and printing, no mathematics.
 
-`controllers.cli` registers it; what it shares with its own commands it takes from there when it is called.
+`controllers.cli` registers them; what they share with its own commands they take from there when they are called.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, cast
@@ -37,6 +38,49 @@ def train_baseline(
         made = train_reference(cast(Algorithm, algorithm), system, options, out)
         result = {"baseline": str(out), "algorithm": algorithm, "system": plant, "steps": made, "seed": seed}
         cli._emit(result, as_json)
+
+
+def compare(
+    plant: Plant,
+    runs: Annotated[Path, typer.Option("--runs", help="Folder of trained runs; missing ones are trained into it.")],
+    out: Annotated[Path, typer.Option("--out", help="Folder for the figures and the table.")],
+    seeds: Annotated[int, typer.Option("--seeds", help="Runs of each method, with the seeds 0, 1, ...")] = 5,
+    duration: Annotated[float, typer.Option("--duration", help="Seconds simulated.")] = 20.0,
+    states: Annotated[int, typer.Option("--states", help="Number of initial states.")] = 50,
+    steps: Steps = None,
+    as_json: Json = False,
+) -> None:
+    """Compare our policy with SAC without the gain and with SAC and PPO of stable-baselines3: figures and a table."""
+    from controllers import cli
+
+    with cli._errors(as_json):
+        training = _options(plant, 0, steps)
+        from certify.systems import get_system
+        from controllers.compare import CompareOptions
+        from controllers.compare import compare as run
+
+        options = CompareOptions(seeds=seeds, duration=duration, states=states)
+        result = run(get_system(plant), training, runs, out, options, lambda line: typer.echo(line, err=True))
+        if as_json:
+            cli._emit(result, as_json)
+            return
+        typer.echo(_table(result["rows"]))
+        cli._emit(result["files"], as_json)
+
+
+def _table(rows: Sequence[dict[str, Any]]) -> str:
+    """The rows as aligned text; what is not finite is infinite."""
+    lines = [("method", "seed", "steps", "settled", "diverged", "left domain", "floor", "cost: quartiles and median")]
+    for row in rows:
+        floor, lower, median, upper = (
+            "inf" if row[name] is None else f"{row[name]:.3g}"
+            for name in ("floor", "cost_lower", "cost_median", "cost_upper")
+        )
+        seed = "all" if row["seed"] is None else str(row["seed"])
+        counts = [f"{row[name]} of {row['trajectories']}" for name in ("settled", "diverged", "left_domain")]
+        lines.append((row["method"], seed, str(row["steps"]), *counts, floor, f"{lower} {median} {upper}"))
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return "\n".join("  ".join(f"{cell:<{w}}" for cell, w in zip(line, widths, strict=True)).rstrip() for line in lines)
 
 
 def _options(plant: str, seed: int, steps: int | None) -> Any:

@@ -1,0 +1,253 @@
+"""The comparison: sums, quartiles and counts against hand-computed ones, resuming, divergence, figures, the command."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from certify.errors import InputError
+from certify.systems import get_system
+from controllers import baselines, compare, options
+from controllers.cli import app
+from controllers.compare import METHODS, CompareOptions, Method, Response, quartiles, simulate, table
+from controllers.environments import PlantEnvironment
+from controllers.evaluate import INITIAL_STATES
+from controllers.options import preset
+
+TINY = replace(preset("pendulum"), steps=160, warm_up=60, n_A=25, n_B=25, batch=8, actor=(6, 5), critic=(7,))
+SHORT = CompareOptions(seeds=1, states=4, duration=1.2)
+OURS, SAC = Method("ours", False), Method("sac", False)
+
+runner = CliRunner()
+
+
+@pytest.fixture(scope="module")
+def pendulum_system():
+    return get_system("pendulum")
+
+
+@pytest.fixture(scope="module")
+def finished(pendulum_system, tmp_path_factory):
+    """A whole comparison: its folder of runs, of results, and what it returned."""
+    runs, out = tmp_path_factory.mktemp("runs"), tmp_path_factory.mktemp("results") / "new"
+    lines = []
+    result = compare.compare(pendulum_system, TINY, runs, out, SHORT, lines.append)
+    return runs, out, result, lines
+
+
+def test_accumulated_cost_is_the_sum_over_the_environment_s_own_steps(pendulum_system):
+    x0, gain = np.array([[0.4, -0.3], [2.0, 6.0]]), np.array([-40.0, -3.0])  # the second saturates
+    states, cost = simulate(pendulum_system, TINY, lambda x: (x @ gain)[:, None], x0, 0.1)
+    assert states.shape == (6, 2, 2) and cost.shape == (6, 2)
+    environment = PlantEnvironment(pendulum_system, TINY)
+    for k in range(2):
+        environment.reset(seed=0)
+        environment.restore(replace(environment.snapshot(), x=tuple(x0[k])))
+        x, total = x0[k], 0.0
+        for t in range(5):
+            assert cost[t, k] == pytest.approx(total, abs=1e-13)
+            u = min(6.0, max(-6.0, float(gain @ x)))
+            total += 0.02 * (1.0 * x[0] ** 2 + 0.5 * x[1] ** 2 + 1.0 * u**2)
+            x, *_ = environment.step(np.array([u]))
+            np.testing.assert_array_equal(states[t + 1, k], x)
+        assert cost[5, k] == pytest.approx(total, abs=1e-13)
+
+
+def test_the_input_s_cost_is_counted_from_the_equilibrium():
+    system = get_system("quadrotor2d")
+    hover = float(system.exact_u_eq()[0])
+    training = replace(TINY, reward_weights=(1.0,) * 6, state_weights=(2.0,) * 6, input_weights=(3.0, 5.0))
+    u = np.array([[hover + 0.1, hover - 0.2]])
+    _, cost = simulate(system, training, lambda x: u, np.zeros((1, 6)), 0.02)
+    assert cost[:, 0] == pytest.approx([0.0, 0.02 * (3 * 0.1**2 + 5 * 0.2**2)], abs=1e-15)
+
+
+def test_quartiles_are_numpy_s_for_finite_numbers_and_survive_infinity():
+    values = np.random.default_rng(0).standard_normal((3, 10))
+    np.testing.assert_allclose(quartiles(values), np.quantile(values, [0.25, 0.5, 0.75], axis=-1), rtol=0, atol=1e-15)
+    inf = math.inf
+    assert quartiles(np.array([5.0])).tolist() == [5.0, 5.0, 5.0]
+    assert quartiles(np.array([inf, 1.0, 2.0, 3.0])).tolist() == [1.75, 2.5, inf]
+    assert quartiles(np.array([inf, inf, 1.0, inf])).tolist() == [inf, inf, inf]
+    assert quartiles(np.array([1.0, 2.0, 3.0, 4.0, inf])).tolist() == [2.0, 3.0, 4.0]
+
+
+def test_a_divergent_trajectory_is_counted_and_costs_infinity(pendulum_system, monkeypatch):
+    monkeypatch.setattr(compare, "DIVERGED", 5.0)
+    x0, asked = np.array([[0.0, 0.0], [1.0, 0.0]]), []
+
+    def act(x):
+        asked.append(x.copy())
+        return 6.0 * np.sign(x[:, :1])
+
+    states, cost = simulate(pendulum_system, TINY, act, x0, 1.0)
+    assert np.all(np.isfinite(asked))
+    gone = np.isnan(states[:, 1]).any(axis=1)
+    first = int(gone.argmax())
+    assert 0 < first < 50 and gone[first:].all() and not gone[:first].any()
+    assert np.isfinite(cost[:first, 1]).all() and np.isinf(cost[first + 1 :, 1]).all()
+    assert (cost[:, 0] == 0).all()
+    [row, pooled] = table(pendulum_system, 0.02, [Response(OURS, 0, 160, states, cost)], CompareOptions(duration=1.0))
+    assert (row.trajectories, row.settled, row.diverged, row.left_domain) == (2, 1, 1, 1)
+    assert row.cost_lower == row.cost_median == row.cost_upper == math.inf
+    assert row.as_json()["cost_median"] is None and row.as_json()["floor"] is None
+    assert replace(pooled, seed=0) == row
+
+
+def test_the_floor_is_the_median_of_the_largest_norm_in_the_last_second(pendulum_system):
+    x = np.zeros((101, 3, 2))
+    x[:, :, 0] = [1e-3, 2e-3, 1e-9]
+    x[50, 0] = [0.3, 0.4]  # the last second begins here
+    x[49, 1] = [9.0, 0.0]  # before it; outside the domain
+    response = Response(SAC, 0, 160, x, np.tile([1.0, 2.0, 4.0], (101, 1)))
+    other = replace(response, seed=1, x=0 * x)
+    rows = table(pendulum_system, 0.02, [response, other], CompareOptions(duration=2.0))
+    assert [(r.method, r.seed, r.trajectories) for r in rows] == [
+        ("sac mean", 0, 3), ("sac mean", 1, 3), ("sac mean", None, 6),
+    ]  # fmt: skip
+    assert rows[0].floor == 2e-3 and rows[0].settled == 1 and rows[0].left_domain == 1
+    assert (rows[0].cost_lower, rows[0].cost_median, rows[0].cost_upper) == (1.5, 2.0, 3.0)
+    assert rows[2].settled == 4 and rows[2].floor == pytest.approx(5e-10)
+    later = x.copy()
+    later[50] = x[51]
+    assert table(pendulum_system, 0.02, [replace(response, x=later)], CompareOptions(duration=2.0))[0].floor == 1e-3
+
+
+def test_a_comparison_trains_every_run_and_writes_figures_and_table(finished):
+    runs, out, result, lines = finished
+    assert sorted(str(path.relative_to(runs)) for path in runs.rglob("*") if path.is_file()) == [
+        "ours/seed-0/policy.pt", "sac/seed-0/checkpoint.pt", "sb3-ppo/seed-0/model.zip", "sb3-sac/seed-0/model.zip",
+    ]  # fmt: skip
+    assert "sac seed 0: 160 of 160 steps" in lines and "sb3-ppo seed 0: 16 of 160 steps" in lines
+    for name in ("cost", "norm", "positions"):
+        assert (out / f"pendulum-{name}.png").read_bytes().startswith(b"\x89PNG")
+    assert json.loads((out / "pendulum-table.json").read_text())["rows"] == result["rows"]
+    with (out / "pendulum-table.csv").open(newline="") as file:
+        written = list(csv.DictReader(file))
+    assert [(row["method"], row["seed"]) for row in written] == [(m.name, s) for m in METHODS for s in ("0", "all")]
+    assert [float(row["floor"]) for row in written] == [row["floor"] for row in result["rows"]]
+    assert {row["trajectories"] for row in result["rows"]} == {4}
+    assert {row["steps"] for row in result["rows"]} == {160}
+
+
+def test_sampled_actions_give_other_figures_than_means(finished):
+    rows = {row["method"]: row for row in finished[2]["rows"]}
+    for run in ("sac", "sb3-sac", "sb3-ppo"):
+        assert rows[f"{run} mean"]["cost_median"] != rows[f"{run} stochastic"]["cost_median"]
+
+
+def test_sac_without_the_gain_is_not_centred_and_ours_is(finished, pendulum_system):
+    runs = finished[0]
+    ours, sac = (compare.obtain(run, pendulum_system, TINY, runs) for run in ("ours", "sac"))
+    origin = np.zeros((1, 2))
+    assert ours.mean(origin) == pytest.approx(0.0, abs=1e-15)
+    assert abs(sac.mean(origin)[0, 0]) > 1e-6
+
+
+def test_what_is_there_is_not_trained_again(finished, pendulum_system, tmp_path, monkeypatch):
+    def refuse(*_):
+        raise AssertionError("nothing is missing")
+
+    monkeypatch.setattr(compare, "_train", refuse)
+    again = compare.compare(pendulum_system, TINY, finished[0], tmp_path, SHORT)
+    assert again["rows"] == finished[2]["rows"]
+    assert (tmp_path / "pendulum-table.csv").read_bytes() == (finished[1] / "pendulum-table.csv").read_bytes()
+    with pytest.raises(AssertionError, match="nothing is missing"):  # a second seed is
+        compare.compare(pendulum_system, TINY, finished[0], tmp_path, replace(SHORT, seeds=2))
+
+
+@pytest.mark.parametrize("run", ["ours", "sac"])
+def test_an_interrupted_run_of_ours_goes_on_from_its_checkpoint(finished, pendulum_system, tmp_path, run):
+    chosen = TINY if run == "ours" else baselines.without_gain(TINY)
+    trainer = compare.Trainer(pendulum_system, chosen)
+    while trainer.steps_done < 90:
+        trainer.advance()
+    folder = tmp_path / run / "seed-0"
+    folder.mkdir(parents=True)
+    (folder / "checkpoint.pt").write_bytes(trainer.snapshot())
+    lines = []
+    trained = compare.obtain(run, pendulum_system, TINY, tmp_path, lines.append)
+    assert lines[0] == f"{run} seed 0: 96 of 160 steps"
+    x = np.random.default_rng(0).uniform(-1, 1, (5, 2))
+    expected = compare.obtain(run, pendulum_system, TINY, finished[0])
+    np.testing.assert_array_equal(trained.mean(x), expected.mean(x))
+
+
+def test_runs_of_another_budget_or_seed_are_refused(finished, pendulum_system, tmp_path):
+    runs = finished[0]
+    for run in ("ours", "sb3-sac", "sb3-ppo"):
+        with pytest.raises(InputError, match="must be a run of 170 steps with seed 0; it has 160"):
+            compare.obtain(run, pendulum_system, replace(TINY, steps=170), runs)
+    with pytest.raises(InputError, match="`steps` was 160, now it is 170"):  # it would have gone on
+        compare.obtain("sac", pendulum_system, replace(TINY, steps=170), runs)
+    (tmp_path / "ours").mkdir()
+    (tmp_path / "ours" / "seed-1").symlink_to(runs / "ours" / "seed-0")
+    with pytest.raises(InputError, match="with seed 1; it has 160 steps with seed 0"):
+        compare.obtain("ours", pendulum_system, replace(TINY, seed=1), tmp_path)
+
+
+def test_figures_hold_when_everything_diverges(finished, pendulum_system, tmp_path, monkeypatch):
+    monkeypatch.setattr(compare, "DIVERGED", 1e-3)
+    result = compare.compare(pendulum_system, TINY, finished[0], tmp_path, SHORT)
+    assert all(row["diverged"] == 4 and row["floor"] is None and row["settled"] == 0 for row in result["rows"])
+    assert len(list(tmp_path.glob("*.png"))) == 3
+    assert "inf" in (tmp_path / "pendulum-table.csv").read_text()
+
+
+def test_positions_are_states_of_their_plants():
+    for name, positions in compare.POSITIONS.items():
+        try:
+            system = get_system(name)
+        except InputError:  # a plant that does not ship yet
+            continue
+        assert set(positions) <= {symbol.name for symbol in system.states}
+    assert set(INITIAL_STATES) <= set(compare.POSITIONS)
+
+
+def _compare(*arguments):
+    return runner.invoke(app, ["compare", *map(str, arguments)])
+
+
+def test_the_command_prints_the_table_or_one_json_object(finished, tmp_path, monkeypatch):
+    monkeypatch.setitem(options.PRESETS, "pendulum", TINY)
+    arguments = ["pendulum", "--runs", finished[0], "--out", tmp_path, "--seeds", 1, "--duration", 1.2, "--states", 4]
+    result = _compare(*arguments, "--json")
+    assert result.exit_code == 0, result.stderr
+    assert json.loads(result.stdout)["rows"] == finished[2]["rows"]
+    text = _compare(*arguments)
+    assert text.exit_code == 0, text.stderr
+    assert text.stdout.startswith("method") and "sb3-ppo stochastic" in text.stdout
+    assert str(tmp_path / "pendulum-cost.png") in text.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["spaceship"], "spaceship"),
+        (["pendulum", "--seeds", "0"], "`seeds` must be positive"),
+        (["pendulum", "--duration", "0.5"], "`window` at most `duration`"),
+        (["pendulum", "--duration", "nan"], "`duration`"),
+    ],
+)
+def test_bad_input_is_one_sentence(tmp_path, arguments, message):
+    result = _compare(*arguments, "--runs", tmp_path / "runs", "--out", tmp_path / "out")
+    assert result.exit_code == 2
+    assert message in result.stderr and result.stderr.startswith("Error: ") and result.stderr.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_without_stable_baselines_nothing_is_trained(tmp_path, monkeypatch):
+    for name in [name for name in sys.modules if name.split(".")[0] == "stable_baselines3"]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, "stable_baselines3", None)
+    result = _compare("pendulum", "--runs", tmp_path / "runs", "--out", tmp_path / "out")
+    assert result.exit_code == 2
+    assert result.stderr == "Error: stable-baselines3 is not installed; `pip install 'certify[baselines]'` brings it.\n"
+    assert not list(tmp_path.iterdir())
