@@ -468,8 +468,10 @@ def _draw_over_time(
             title = "accumulated cost"
         else:
             panels[0].set_ylabel("‖x‖ (units of the states)")
-            title = "distance from the equilibrium; dotted: median of the largest ‖x‖ in the last second"
-        figure.suptitle(f"{system.name}: {title}; median and quartiles of {_count(seeds, 'seed')} × {states} states")
+            title = "distance from the equilibrium (dotted: floor, the largest in the last second)"
+        figure.suptitle(
+            f"{system.name}: {title}\nmedian and quartiles of {_count(seeds, 'seed')} × {states} states", fontsize=10.0
+        )
         return _png(figure)
 
 
@@ -495,7 +497,13 @@ def _draw_positions(system: System, dt: float, responses: Sequence[Response]) ->
                 outside = int((~(np.abs(path) <= reach)).any(axis=0).sum())
                 if outside:
                     panel.text(
-                        0.98, 0.03, f"{outside} leave the frame", transform=panel.transAxes, ha="right", fontsize=7.5
+                        0.98,
+                        0.03,
+                        f"{outside} leave the frame",
+                        transform=panel.transAxes,
+                        ha="right",
+                        fontsize=7.5,
+                        bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0},
                     )
             line[0].set_ylim(-reach, reach)
             line[0].set_ylabel(f"{'θ' if position == 'theta' else position} ({system.units.get(position, '')})")
@@ -505,7 +513,9 @@ def _draw_positions(system: System, dt: float, responses: Sequence[Response]) ->
             panel.set_xlabel("time (s)")
             panel.set_xlim(0, time[-1])
         number = next(iter(chosen.values())).shape[1]
-        figure.suptitle(f"{system.name}: {_count(number, 'trajectory', 'trajectories')}, held actions, seed {seed}")
+        figure.suptitle(
+            f"{system.name}: {_count(number, 'trajectory', 'trajectories')}, held actions, seed {seed}", fontsize=10.0
+        )
         return _png(figure)
 
 
