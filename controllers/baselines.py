@@ -16,7 +16,7 @@ import io
 import json
 import warnings
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from types import ModuleType
@@ -73,11 +73,11 @@ def from_policy(policy: Policy, system: System) -> Trained:
 
     Raises
     ------
-    InputError : the policy is of another plant, or its record lacks `steps` or `seed`.
+    InputError : the policy is of another plant or other parameters, or its record lacks `steps` or `seed`.
     """
-    if policy.system != system.name:
-        raise InputError(f"the policy must be of {system.name}; it is of {policy.system}.")
-    u_eq, network = system.exact_u_eq(), policy.network
+    _require_plant("policy", policy.system, policy.parameters, system)
+    u_eq = system.exact_u_eq()
+    network = policy.network.folded(u_eq)
     try:
         steps, seed = int(policy.training["steps"]), int(policy.training["seed"])
     except (KeyError, TypeError, ValueError) as error:
@@ -100,12 +100,13 @@ def from_checkpoint(checkpoint: bytes, system: System) -> Trained:
         raise InputError(f"the checkpoint must have the format {CHECKPOINT_FORMAT!r}.")
     interface = Interface(system)
     try:
-        name, options = state["system"][0], state["options"]
-        if name != system.name:
-            raise InputError(f"the checkpoint must be of {system.name}; it is of {name}.")
+        (name, parameters), options = state["system"], state["options"]
+        _require_plant("checkpoint", name, parameters, system)
         actor = Actor(interface, options["actor"], options["centre"])
         actor.load_state_dict(state["sac"]["actor"])
         steps, seed = int(state["steps_done"]), int(options["seed"])
+    except InputError:
+        raise
     except (KeyError, TypeError, ValueError, IndexError, RuntimeError) as error:
         raise InputError(f"the checkpoint is damaged: {error}.") from error
     network, u_eq = replace(actor.network(), centre="none"), system.exact_u_eq()
@@ -233,6 +234,13 @@ def scaled_environment(system: System, options: TrainingOptions) -> Any:
 def require_stable_baselines() -> None:
     """Raise InputError, which says what to install, unless stable-baselines3 is there."""
     _stable_baselines()
+
+
+def _require_plant(what: str, name: str, parameters: Mapping[str, float | int | str], system: System) -> None:
+    if name != system.name:
+        raise InputError(f"the {what} must be of {system.name}; it is of {name}.")
+    if system.with_parameters(parameters).parameters != system.parameters:
+        raise InputError(f"the {what} must be of {name} at the same parameters; it is of {dict(parameters)}.")
 
 
 def _model(algorithm: Algorithm, system: System, options: TrainingOptions) -> Any:

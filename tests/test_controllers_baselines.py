@@ -154,6 +154,9 @@ def test_an_exported_policy_is_taken_as_it_ships(pendulum_system):
     assert (trained.steps, trained.seed) == (policy.training["steps"], policy.training["seed"])
     with pytest.raises(InputError, match="must be of cartpole; it is of pendulum"):
         baselines.from_policy(policy, get_system("cartpole"))
+    heavier = pendulum_system.with_parameters({"m": "0.2"})
+    with pytest.raises(InputError, match="at the same parameters"):
+        baselines.from_policy(policy, heavier)
     with pytest.raises(InputError, match="`steps` and `seed`"):
         baselines.from_policy(replace(policy, training={}), pendulum_system)
 
@@ -166,6 +169,8 @@ def test_files_of_another_plant_other_widths_or_no_file_at_all_are_refused(refer
         baselines.from_reference(content, pendulum_system, preset("pendulum"))
     with pytest.raises(InputError, match="must be of cartpole; it is of pendulum"):
         baselines.from_checkpoint(checkpoint[1], get_system("cartpole"))
+    with pytest.raises(InputError, match="at the same parameters"):
+        baselines.from_checkpoint(checkpoint[1], pendulum_system.with_parameters({"m": "0.2"}))
     for rubbish in (b"", b"rubbish", content[:1000]):
         with pytest.raises(InputError, match="cannot be read"):
             baselines.from_reference(rubbish, pendulum_system, TINY)
