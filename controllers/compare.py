@@ -8,7 +8,7 @@ is trained, what is there is used; our own runs also go on from a checkpoint tha
 Everything is simulated with the action held over the training step and clipped to the input's bounds, in the plant's
 box of `INITIAL_STATES`; a run goes on outside the domain. A trajectory whose state is no longer finite, or beyond
 `DIVERGED`, has *diverged*: its cost and norm are infinite from there on, and infinity takes part in every quartile.
-Quartiles of means and sums are over seeds and states. These are figures for a report, never a proof.
+Quartiles are over seeds and states together. These are figures for a report, never a proof.
 """
 
 from __future__ import annotations

@@ -70,7 +70,18 @@ def compare(
 
 def _table(rows: Sequence[dict[str, Any]]) -> str:
     """The rows as aligned text; what is not finite is infinite."""
-    lines = [("method", "seed", "steps", "settled", "diverged", "left domain", "floor", "cost: quartiles and median")]
+    lines = [
+        (
+            "method",
+            "seed",
+            "steps",
+            "settled",
+            "diverged",
+            "left domain",
+            "floor",
+            "cost: lower quartile, median, upper",
+        )
+    ]
     for row in rows:
         floor, lower, median, upper = (
             "inf" if row[name] is None else f"{row[name]:.3g}"
