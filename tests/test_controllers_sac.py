@@ -62,14 +62,14 @@ def test_likelihood_is_finite_far_out_and_sums_over_inputs():
 @pytest.mark.parametrize("plant", PRESETS)
 @pytest.mark.parametrize("centre", ["preactivation", "output"])
 def test_jacobian_at_the_origin_is_that_of_the_exported_policy(centre, plant):
-    actor, u_eq = _actor(centre, plant=plant), (Fraction(0),)
+    actor, u_eq = _actor(centre, plant=plant), get_system(plant).exact_u_eq()
     mean, jacobian = actor.at_origin()
     network, h = actor.network(), 1e-6
     columns = [(network(h * e, u_eq) - network(-h * e, u_eq)) / (2 * h) for e in np.eye(network.n)]
     np.testing.assert_allclose(jacobian.detach().numpy(), np.array(columns).T, atol=1e-5)
     raw = replace(network, centre="none")
     np.testing.assert_allclose(mean.detach().numpy(), raw(np.zeros(network.n), u_eq), atol=1e-6)
-    assert abs(raw(np.zeros(network.n), u_eq)[0]) > 1e-3  # so that centring has something to do
+    assert abs(raw(np.zeros(network.n), u_eq)[0] - float(u_eq[0])) > 1e-3  # so that centring has something to do
 
 
 def test_descending_the_gain_term_moves_the_jacobian_to_minus_K():
@@ -104,13 +104,13 @@ def test_export_is_exact_and_centred(centre):
 def test_batched_critics_are_independent_networks():
     with torch.random.fork_rng():
         torch.manual_seed(0)
-        twin = Critic(3, (8, 8), copies=2)
+        twin = Critic(3, (8, 8), copies=2, scale=3.0)
     x = torch.linspace(-1, 1, 15).reshape(5, 3)
     for copy in range(2):
         h = x
         for k, (weight, bias) in enumerate(zip(twin.weights, twin.biases, strict=True)):
             h = (torch.tanh(h) if k else h) @ weight[copy] + bias[copy]
-        torch.testing.assert_close(twin(x)[copy], h.squeeze(1))
+        torch.testing.assert_close(twin(x)[copy], 3.0 * h.squeeze(1))
     assert not torch.allclose(twin(x)[0], twin(x)[1])
 
 
@@ -141,12 +141,25 @@ def test_q_learns_the_scaled_reward_and_bootstraps_only_before_a_termination(opt
     with torch.no_grad():  # a target network that is 10 everywhere
         for parameter in sac.value_target.parameters():
             parameter.zero_()
-        sac.value_target.biases[-1].fill_(10.0)
+        sac.value_target.biases[-1].fill_(10.0 / options.critic_scale)
     batch = _batch(terminated=terminated)
     for _ in range(600):
         sac.update(batch, None, actor_step=0.0)
     q = sac.q(torch.cat((batch[0] * sac.actor.factors, batch[1]), 1))
     assert (q - goal).abs().max().item() < 0.1
+
+
+@pytest.mark.parametrize(("scale", "learned"), [(100.0, True), (1.0, False)])
+def test_returns_of_some_hundreds_are_learned_in_their_own_unit(options, scale, learned):
+    """Goals around -500, Adam's steps of 3e-4: in units of one the critic is still far off."""
+    options = replace(options, critic=(64, 64), critic_scale=scale, reward_scale=1.0, gamma=0.0)
+    sac = _sac(options)
+    x, action, _, x_next, terminated = _batch(size=256, terminated=1.0)
+    goal = -500.0 + 20.0 * x[:, :1]
+    for _ in range(700):
+        sac.update((x, action, goal, x_next, terminated), None, actor_step=0.0)
+    q = sac.q(torch.cat((x * sac.actor.factors, action), 1))
+    assert ((q - goal.T).abs().mean().item() < 20) == learned
 
 
 def test_the_value_target_is_an_exponential_average(options):
