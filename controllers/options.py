@@ -155,7 +155,7 @@ PRESETS: dict[str, TrainingOptions] = {
         state_weights=(1.0, 1.0, 0.1, 0.1),
         input_weights=(0.1,),
     ),
-    # The LQR weights of both quadrotors keep the closed loop's rates between 0.7 and 9 per second, and with them the
+    # The LQR weights of both quadrotors keep the closed loop's rates between 0.7 and 7 per second, and with them the
     # condition of P: what is proved shrinks with it.
     "quadrotor2d": TrainingOptions(
         steps=50_000,
