@@ -183,14 +183,14 @@ def test_options_out_of_range_are_refused_by_name(short, change, name):
         replace(short, **change)
 
 
-SHIPPED = [
+MEMBERS = [
     ("pendulum", (2, 16, 16, 1), 20, -1.0),
     ("cartpole", (4, 256, 256, 1), 20, -1.0),
     ("quadrotor2d", (6, 256, 256, 256, 256, 2), 5, -0.6),
 ]
 
 
-@pytest.mark.parametrize(("name", "layers", "states", "slowest"), SHIPPED)
+@pytest.mark.parametrize(("name", "layers", "states", "slowest"), MEMBERS)
 def test_the_shipped_policy_matches_its_gain_and_settles(name, layers, states, slowest):
     policy = load_policy(POLICIES / f"{name}.pt")
     assert policy.system == name
