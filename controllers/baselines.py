@@ -17,7 +17,7 @@ import json
 import warnings
 import zipfile
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal, get_args
@@ -33,7 +33,7 @@ from certify.systems import System
 from controllers.environments import PlantEnvironment
 from controllers.options import TrainingOptions
 from controllers.sac import Actor, Interface
-from controllers.training import CHECKPOINT_FORMAT, write_atomically
+from controllers.training import read_checkpoint, write_atomically
 
 Array = NDArray[np.float64]
 Algorithm = Literal["ppo", "sac"]
@@ -61,11 +61,8 @@ class Trained:
 
 
 def without_gain(options: TrainingOptions) -> TrainingOptions:
-    """The same SAC without the gain: its weight is zero, and nothing is identified where a run can do without."""
-    changes: dict[str, Any] = {"gain_weight": 0.0}
-    if any(option.name == "identification" for option in fields(options)):
-        changes["identification"] = "never"
-    return replace(options, **changes)
+    """The same SAC without the gain: its weight is zero, and nothing is identified."""
+    return replace(options, gain_weight=0.0, identification="never")
 
 
 def from_policy(policy: Policy, system: System) -> Trained:
@@ -92,12 +89,7 @@ def from_checkpoint(checkpoint: bytes, system: System) -> Trained:
     ------
     InputError : the bytes are no checkpoint of a run on this plant.
     """
-    try:
-        state = torch.load(io.BytesIO(checkpoint), map_location="cpu", weights_only=True)
-    except Exception as error:  # torch.load has no closed list of what it raises on a damaged file
-        raise InputError(f"the checkpoint cannot be read: {error}.") from error
-    if not isinstance(state, dict) or state.get("format") != CHECKPOINT_FORMAT:
-        raise InputError(f"the checkpoint must have the format {CHECKPOINT_FORMAT!r}.")
+    state = read_checkpoint(checkpoint)
     interface = Interface(system)
     try:
         (name, parameters), options = state["system"], state["options"]

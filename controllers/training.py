@@ -236,7 +236,7 @@ class Trainer:
         ------
         InputError : the bytes are no checkpoint, or one of a run with other options or another plant.
         """
-        state = _read_checkpoint(checkpoint)
+        state = read_checkpoint(checkpoint)
         if state.get("system") != [self.system.name, _parameters(self.system)]:
             raise InputError(f"the checkpoint must be of {self.system.name}; it is of {state['system']}.")
         mine, theirs = self.options.record(), state.get("options", {})
@@ -366,7 +366,13 @@ def write_atomically(path: Path, content: bytes) -> None:
         raise InputError(f"{path} cannot be written: {error.strerror}.") from error
 
 
-def _read_checkpoint(content: bytes) -> dict[str, Any]:
+def read_checkpoint(content: bytes) -> dict[str, Any]:
+    """The state that `Trainer.snapshot` wrote, on the CPU; what it holds is not looked at.
+
+    Raises
+    ------
+    InputError : the bytes are no checkpoint.
+    """
     try:
         state = torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
     except Exception as error:  # torch.load has no closed list of what it raises on a damaged file

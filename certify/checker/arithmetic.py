@@ -19,7 +19,6 @@ from flint import arb, arb_mat
 from . import float64
 
 Number = Any  # a binary64 number, a ball, or an array of either
-ARITHMETICS = ("float64", "arb")
 
 
 def is_ball(x: Number) -> bool:
