@@ -47,6 +47,9 @@ def compare(
     seeds: Annotated[int, typer.Option("--seeds", help="Runs of each method, with the seeds 0, 1, ...")] = 5,
     duration: Annotated[float, typer.Option("--duration", help="Seconds simulated.")] = 20.0,
     states: Annotated[int, typer.Option("--states", help="Number of initial states.")] = 50,
+    ablations: Annotated[
+        bool, typer.Option("--ablations", help="Compare with ablations of our own training, not with baselines.")
+    ] = False,
     steps: Steps = None,
     as_json: Json = False,
 ) -> None:
@@ -56,10 +59,11 @@ def compare(
     with cli._errors(as_json):
         training = _options(plant, 0, steps)
         from certify.systems import get_system
-        from controllers.compare import CompareOptions
         from controllers.compare import compare as run
+        from controllers.responses import ABLATIONS, BASELINES, CompareOptions
 
-        options = CompareOptions(seeds=seeds, duration=duration, states=states)
+        methods = ABLATIONS if ablations else BASELINES
+        options = CompareOptions(methods=methods, seeds=seeds, duration=duration, states=states)
         result = run(get_system(plant), training, runs, out, options, lambda line: typer.echo(line, err=True))
         if as_json:
             cli._emit(result, as_json)

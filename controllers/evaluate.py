@@ -9,7 +9,7 @@ eigenvalue of the closed loop, and with the action held over the training step. 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,17 +20,10 @@ from numpy.typing import NDArray
 from certify.errors import InputError
 from certify.policies import Policy, TanhNetwork
 from certify.systems import System, get_system
-from controllers.environments import Stepper, rk4
+from controllers.environments import Stepper
+from controllers.simulation import Loop, continuous_loop, held_loop, initial_states, mean_action
 
 Array = NDArray[np.float64]
-
-INITIAL_STATES: dict[str, tuple[float, ...]] = {
-    "pendulum": (math.pi / 2, 2.0),
-    "cartpole": (1.0, 0.5, 1.0, 1.0),
-    "quadrotor2d": (1.0, 1.0, 0.5, 1.0, 1.0, 1.0),
-    "quadrotor3d": (*(0.5,) * 3, *(0.3,) * 3, *(0.5,) * 6),
-}
-"""Half-widths of the box from which each plant's initial states are drawn, in the states' units."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -140,31 +133,24 @@ def evaluate(policy: Policy, options: EvaluationOptions | None = None) -> Evalua
             f"the policy must map {system.n} states to {system.m} inputs for {system.name}; "
             f"it maps {network.n} to {network.m}."
         )
-    x0 = _initial_states(system, options)
+    x0 = initial_states(system, options.states, options.seed)
     dt = _recorded(policy, "dt", ())
     if not dt > 0:
         raise InputError(f"`training.dt` of the policy must be positive; found {dt}.")
     Q = np.asarray(_recorded(policy, "state_weights", (system.n,)))
     R = np.asarray(_recorded(policy, "input_weights", (system.m,)))
 
-    u_eq, f = system.exact_u_eq(), system.function("numpy")
-    pi = _policy(network, system)
-
-    def flow(x: Array, _: Array) -> Array:
-        return np.asarray(rk4(lambda y: f(y, pi(y)), x, h))
-
     eigenvalues = np.linalg.eigvals(_closed_loop_jacobian(system, policy))
     fastest = float(np.abs(eigenvalues).max())
     h = min(dt, options.resolution / fastest) if fastest > 0 else dt
-    domain, cost = np.array(system.domain, dtype=np.float64), _cost(system, Q, R)
-    continuous = _simulate(_Loop(flow, h, pi, cost, domain), x0, options)
+    continuous = _settling(continuous_loop(system, h, mean_action(network, system), Q, R), system, x0, options)
     held = settle(network, system, dt, Q, R, options)
 
     distance = relative = A_error = B_error = math.nan
     if {"A", "B", "K"} <= set(policy.training):
         n, m = system.n, system.m
         A, B, K = (_recorded(policy, *entry) for entry in (("A", (n, n)), ("B", (n, m)), ("K", (m, n))))
-        distance = float(np.linalg.norm(network.jacobian_at_origin(u_eq) + K))
+        distance = float(np.linalg.norm(network.jacobian_at_origin(system.exact_u_eq()) + K))
         relative = distance / float(np.linalg.norm(K))
         A_true, B_true = discrete_linearisation(system, dt)
         A_error = float(np.linalg.norm(A - A_true) / np.linalg.norm(A_true))
@@ -196,9 +182,8 @@ def settle(
     ------
     InputError : the plant has no box of initial states.
     """
-    x0, domain = _initial_states(system, options), np.array(system.domain, dtype=np.float64)
-    loop = _Loop(Stepper(system, dt, "numpy"), dt, _policy(network, system), _cost(system, Q, R), domain)
-    return _simulate(loop, x0, options)
+    loop = held_loop(system, dt, mean_action(network, system), Q, R)
+    return _settling(loop, system, initial_states(system, options.states, options.seed), options)
 
 
 def curvature(network: TanhNetwork, system: System, radius: float, points: int = 256) -> float:
@@ -243,59 +228,23 @@ def _closed_loop_jacobian(system: System, policy: Policy) -> Array:
     return np.asarray(jacobian)
 
 
-def _initial_states(system: System, options: EvaluationOptions) -> Array:
-    if system.name not in INITIAL_STATES:
-        raise InputError(f"no box of initial states is known for the plant {system.name}.")
-    half_widths = np.array(INITIAL_STATES[system.name])
-    return np.random.default_rng(options.seed).uniform(-half_widths, half_widths, (options.states, system.n))
-
-
-def _policy(network: TanhNetwork, system: System) -> Callable[[Array], Array]:
-    u_eq = system.exact_u_eq()
-    folded = network.folded(u_eq)  # once, not in every step
-    return lambda x: np.asarray(folded(x, u_eq))
-
-
-def _cost(system: System, Q: Array, R: Array) -> Callable[[Array, Array], Array]:
-    equilibrium = np.array([float(u) for u in system.exact_u_eq()])
-    return lambda x, u: np.asarray((Q * x * x).sum(-1) + (R * (u - equilibrium) ** 2).sum(-1))
-
-
-@dataclass(frozen=True, slots=True)
-class _Loop:
-    """A closed loop in steps of h seconds: x, pi(x) to the next x, and what is measured on the way."""
-
-    step: Callable[[Array, Array], Array]
-    h: float
-    pi: Callable[[Array], Array]
-    cost: Callable[[Array, Array], Array]
-    domain: Array
-
-
-@np.errstate(over="ignore", invalid="ignore")  # a run that diverges is a result, not an accident
-def _simulate(loop: _Loop, x: Array, options: EvaluationOptions) -> Settling:
-    h, domain = loop.h, loop.domain
-    count = math.ceil(options.duration / h - 1e-9)
-    window_begins = count - math.ceil(options.window / h - 1e-9)
-    largest = np.zeros(len(x))
-    outside = np.zeros(len(x), dtype=bool)
-    accumulated = np.zeros(len(x))
-    for k in range(count + 1):
+def _settling(loop: Loop, system: System, x0: Array, options: EvaluationOptions) -> Settling:
+    domain = np.array(system.domain, dtype=np.float64)
+    window_begins = loop.count(options.duration) - loop.count(options.window)
+    largest, outside, cost = np.zeros(len(x0)), np.zeros(len(x0), dtype=bool), np.zeros(len(x0))
+    for k, (x, total) in enumerate(loop.run(x0, options.duration)):
         if k >= window_begins:
             norm = np.linalg.norm(x, axis=1)
             largest = np.maximum(largest, np.where(np.isnan(norm), math.inf, norm))
         outside |= ~((x >= domain[:, 0]) & (x <= domain[:, 1])).all(axis=1)
-        if k < count:
-            u = loop.pi(x)
-            accumulated += h * loop.cost(x, u)
-            x = loop.step(x, u)
+        cost = total
     return Settling(
         settled=int((largest < options.tolerance).sum()),
-        states=len(x),
+        states=len(x0),
         largest=float(largest.max()),
         left_domain=int(outside.sum()),
-        cost=float(np.median(accumulated)),
-        step=h,
+        cost=float(np.median(cost)),
+        step=loop.h,
     )
 
 

@@ -32,10 +32,11 @@ from certify.errors import InputError
 from certify.policies import Policy
 from certify.systems import System
 from controllers.environments import PlantEnvironment, Snapshot
-from controllers.evaluate import INITIAL_STATES, curvature, settle
+from controllers.evaluate import curvature, settle
 from controllers.lqr import GainLearner, Identified, Phase
 from controllers.options import TrainingOptions
 from controllers.sac import CPU, SAC, Interface, Replay
+from controllers.simulation import INITIAL_STATES
 
 Array = NDArray[np.float64]
 

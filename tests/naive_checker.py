@@ -453,8 +453,10 @@ def inputs(c: Claim, ranges: Sequence[tuple[arb, arb]]) -> None:
     `ranges` has the centre and the radius of each input's enclosure.
     """
     each = zip(c.scale, c.offset, c.input_bounds, strict=True)
-    if c.centre != "output" and c.squash == "tanh" and all(
-        lo <= b - abs(s) and b + abs(s) <= hi for s, b, (lo, hi) in each
+    if (
+        c.centre != "output"
+        and c.squash == "tanh"
+        and all(lo <= b - abs(s) and b + abs(s) <= hi for s, b, (lo, hi) in each)
     ):
         return
     for (centre, radius), (lo, hi) in zip(ranges, c.input_bounds, strict=True):

@@ -470,5 +470,3 @@ def test_the_checker_loads_nothing_of_the_project(tmp_path: Path) -> None:
     done = subprocess.run([sys.executable, "-I", "-c", code], capture_output=True, text=True, check=False, cwd=tmp_path)
     assert done.returncode == 0
     assert all(m == "certify" or m.startswith("certify.checker") for m in done.stderr.split())
-
-

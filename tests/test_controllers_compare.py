@@ -13,17 +13,19 @@ import pytest
 from typer.testing import CliRunner
 
 from certify.errors import InputError
+from certify.policies import load_policy
 from certify.systems import get_system
-from controllers import baselines, compare, options
+from controllers import baselines, compare, figures, options, simulation
 from controllers.cli import app
-from controllers.compare import METHODS, CompareOptions, Method, Response, quartiles, simulate, table
+from controllers.compare import simulate
 from controllers.environments import PlantEnvironment
-from controllers.evaluate import INITIAL_STATES
 from controllers.options import preset
+from controllers.responses import ABLATIONS, BASELINES, OURS, CompareOptions, Method, Response, quartiles, table
+from controllers.simulation import INITIAL_STATES
 
 TINY = replace(preset("pendulum"), steps=160, warm_up=60, n_A=25, n_B=25, batch=8, actor=(6, 5), critic=(7,))
 SHORT = CompareOptions(seeds=1, states=4, duration=1.2)
-OURS, SAC = Method("ours", False), Method("sac", False)
+SAC = Method("sac", False)
 
 runner = CliRunner()
 
@@ -80,7 +82,7 @@ def test_quartiles_are_numpy_s_for_finite_numbers_and_survive_infinity():
 
 
 def test_a_divergent_trajectory_is_counted_and_costs_infinity(pendulum_system, monkeypatch):
-    monkeypatch.setattr(compare, "DIVERGED", 5.0)
+    monkeypatch.setattr(simulation, "DIVERGED", 5.0)
     x0, asked = np.array([[0.0, 0.0], [1.0, 0.0]]), []
 
     def act(x):
@@ -92,7 +94,7 @@ def test_a_divergent_trajectory_is_counted_and_costs_infinity(pendulum_system, m
     gone = np.isnan(states[:, 1]).any(axis=1)
     first = int(gone.argmax())
     assert 0 < first < 50 and gone[first:].all() and not gone[:first].any()
-    assert np.isfinite(cost[:first, 1]).all() and np.isinf(cost[first + 1 :, 1]).all()
+    assert np.isfinite(cost[:first, 1]).all() and np.isinf(cost[first:, 1]).all()
     assert (cost[:, 0] == 0).all()
     [row, pooled] = table(pendulum_system, 0.02, [Response(OURS, 0, 160, states, cost)], CompareOptions(duration=1.0))
     assert (row.trajectories, row.settled, row.diverged, row.left_domain) == (2, 1, 1, 1)
@@ -131,7 +133,7 @@ def test_a_comparison_trains_every_run_and_writes_figures_and_table(finished):
     assert json.loads((out / "pendulum-table.json").read_text())["rows"] == result["rows"]
     with (out / "pendulum-table.csv").open(newline="") as file:
         written = list(csv.DictReader(file))
-    assert [(row["method"], row["seed"]) for row in written] == [(m.name, s) for m in METHODS for s in ("0", "all")]
+    assert [(row["method"], row["seed"]) for row in written] == [(m.name, s) for m in BASELINES for s in ("0", "all")]
     assert [float(row["floor"]) for row in written] == [row["floor"] for row in result["rows"]]
     assert {row["trajectories"] for row in result["rows"]} == {4}
     assert {row["steps"] for row in result["rows"]} == {160}
@@ -194,7 +196,7 @@ def test_runs_of_another_budget_or_seed_are_refused(finished, pendulum_system, t
 
 
 def test_figures_hold_when_everything_diverges(finished, pendulum_system, tmp_path, monkeypatch):
-    monkeypatch.setattr(compare, "DIVERGED", 1e-3)
+    monkeypatch.setattr(simulation, "DIVERGED", 1e-3)
     result = compare.compare(pendulum_system, TINY, finished[0], tmp_path, SHORT)
     assert all(row["diverged"] == 4 and row["floor"] is None and row["settled"] == 0 for row in result["rows"])
     assert len(list(tmp_path.glob("*.png"))) == 3
@@ -202,13 +204,13 @@ def test_figures_hold_when_everything_diverges(finished, pendulum_system, tmp_pa
 
 
 def test_positions_are_states_of_their_plants():
-    for name, positions in compare.POSITIONS.items():
+    for name, positions in figures.POSITIONS.items():
         try:
             system = get_system(name)
         except InputError:  # a plant that does not ship yet
             continue
         assert set(positions) <= {symbol.name for symbol in system.states}
-    assert set(INITIAL_STATES) <= set(compare.POSITIONS)
+    assert set(INITIAL_STATES) <= set(figures.POSITIONS)
 
 
 def _compare(*arguments):
@@ -251,3 +253,33 @@ def test_without_stable_baselines_nothing_is_trained(tmp_path, monkeypatch):
     assert result.exit_code == 2
     assert result.stderr == "Error: stable-baselines3 is not installed; `pip install 'certify[baselines]'` brings it.\n"
     assert not list(tmp_path.iterdir())
+
+
+def test_ablations_change_one_part_of_our_own_training(finished, pendulum_system, tmp_path):
+    runs = tmp_path / "runs"
+    for run in ("ours", "sac"):
+        (runs / run).mkdir(parents=True)
+        (runs / run / "seed-0").symlink_to(finished[0] / run / "seed-0")
+    result = compare.compare(pendulum_system, TINY, runs, tmp_path / "out", replace(SHORT, methods=ABLATIONS))
+    rows = {row["method"]: row for row in result["rows"]}
+    assert list(rows) == ["ours", "sac mean", "before mean", "uncentred mean"]
+    assert rows["ours"] == next(row for row in finished[2]["rows"] if row["method"] == "ours" and row["seed"] is None)
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {
+        *(f"pendulum-ablations-{name}.png" for name in ("cost", "norm", "positions")),
+        *(f"pendulum-ablations-table.{kind}" for kind in ("csv", "json")),
+    }
+    records = {
+        run: load_policy(runs / run / "seed-0" / "policy.pt").training for run in ("ours", "before", "uncentred")
+    }
+    assert [records[run]["identification"] for run in records] == ["during", "before", "during"]
+    assert [records[run]["centre"] for run in records] == ["preactivation", "preactivation", "none"]
+    origin = np.zeros((1, 2))
+    drift = {run: compare.obtain(run, pendulum_system, TINY, runs).mean(origin)[0, 0] for run in records}
+    assert abs(drift["before"]) < 1e-15 and abs(drift["uncentred"]) > 1e-6
+
+
+def test_a_policy_that_is_called_by_another_s_name_is_refused(finished, pendulum_system, tmp_path):
+    (tmp_path / "before").mkdir()
+    (tmp_path / "before" / "seed-0").symlink_to(finished[0] / "ours" / "seed-0")
+    with pytest.raises(InputError, match="`identification` must be 'before' for the run before; it is 'during'"):
+        compare.obtain("before", pendulum_system, TINY, tmp_path)

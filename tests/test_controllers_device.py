@@ -66,9 +66,10 @@ _Adam = partial(torch.optim.Adam, fused=False)  # the fused kernels exist for re
 def test_the_random_stream_and_the_weights_are_those_before_there_was_a_device():
     # Made at the commit before: the generators' states are integers and must agree; weights may round otherwise.
     trainer, _ = _run(critic_scale=1.0)
-    states = trainer.generator.get_state().numpy().tobytes() + json.dumps(
-        trainer.environment.np_random.bit_generator.state, sort_keys=True
-    ).encode()
+    states = (
+        trainer.generator.get_state().numpy().tobytes()
+        + json.dumps(trainer.environment.np_random.bit_generator.state, sort_keys=True).encode()
+    )
     assert hashlib.sha256(states).hexdigest() == STREAM
     found = [float(part.double().square().sum()) for part in trainer.sac.actor.state_dict().values()]
     np.testing.assert_allclose(found, WEIGHTS, rtol=1e-5)

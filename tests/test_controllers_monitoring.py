@@ -16,8 +16,9 @@ from certify.errors import InputError
 from certify.policies import load_policy
 from certify.systems import get_system
 from controllers.cli import app
-from controllers.evaluate import INITIAL_STATES, MONITORING, curvature, evaluate, settle
+from controllers.evaluate import MONITORING, curvature, evaluate, settle
 from controllers.options import TrainingOptions, preset
+from controllers.simulation import INITIAL_STATES
 from controllers.training import Trainer, train
 
 PENDULUM = get_system("pendulum")

@@ -121,7 +121,8 @@ class _Samples:
 
     def field(self, x: Array) -> tuple[Array, NDArray[np.bool_]]:
         """F and `outside` at x, shapes (..., n) and (...)."""
-        u = self.loop.policy(x)
+        # One matrix product for all states: numpy would make one for each leading index.
+        u = self.loop.policy(x.reshape(-1, x.shape[-1])).reshape(*x.shape[:-1], -1)
         with np.errstate(all="ignore"):
             F = self.f(x, u)
         outside = ~np.isfinite(F).all(-1)

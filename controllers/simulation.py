@@ -1,0 +1,110 @@
+"""Closed loops in discrete time, run from many initial states at once: what `evaluate` and `compare` measure on.
+
+A trajectory whose state is no longer finite, or beyond `DIVERGED`, has *diverged*: from there on its state is NaN
+and its cost infinite. These are figures for a report, never a proof.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from certify.errors import InputError
+from certify.policies import TanhNetwork
+from certify.systems import System
+from controllers.environments import Stepper, rk4
+
+Array = NDArray[np.float64]
+Action = Callable[[Array], Array]
+
+INITIAL_STATES: dict[str, tuple[float, ...]] = {
+    "pendulum": (math.pi / 2, 2.0),
+    "cartpole": (1.0, 0.5, 1.0, 1.0),
+    "quadrotor2d": (1.0, 1.0, 0.5, 1.0, 1.0, 1.0),
+    "quadrotor3d": (*(0.5,) * 3, *(0.3,) * 3, *(0.5,) * 6),
+}
+"""Half-widths of the box from which each plant's initial states are drawn, in the states' units."""
+
+DIVERGED = 1e9
+"""Bound on |x_i|, in the states' units: beyond it a trajectory counts as diverged."""
+
+
+@dataclass(frozen=True, slots=True)
+class Loop:
+    """A closed loop in steps of h seconds.
+
+    Parameters
+    ----------
+    step : states (N, n) and inputs (N, m) to the next states.
+    act : states (N, n) to inputs (N, m); never asked about a state that has diverged.
+    cost : states and inputs to the running cost (N,), per second.
+    """
+
+    step: Callable[[Array, Array], Array]
+    act: Action
+    cost: Callable[[Array, Array], Array]
+    h: float
+
+    def count(self, duration: float) -> int:
+        """Steps that cover `duration` seconds."""
+        return math.ceil(duration / self.h - 1e-9)
+
+    def run(self, x: Array, duration: float) -> Iterator[tuple[Array, Array]]:
+        """States (N, n) and accumulated cost (N,) at 0, h, 2 h, ... until `duration` is covered."""
+        total = np.zeros(len(x))
+        yield x, total
+        for _ in range(self.count(duration)):
+            u = self.act(np.where(np.isnan(x), 0.0, x))
+            with np.errstate(over="ignore", invalid="ignore"):  # a run that diverges is a result, not an accident
+                total = total + self.h * self.cost(x, u)
+                x = self.step(x, u)
+                x = np.where((np.abs(x) <= DIVERGED).all(axis=1, keepdims=True), x, math.nan)
+            total = np.where(np.isnan(x).any(axis=1), math.inf, total)
+            yield x, total
+
+
+def held_loop(system: System, dt: float, act: Action, Q: Array, R: Array) -> Loop:
+    """The loop in which an action is held for dt seconds; Q (n,) and R (m,) are the diagonals of the cost's weights."""
+    return Loop(Stepper(system, dt, "numpy"), act, _cost(system, Q, R), dt)
+
+
+def continuous_loop(system: System, h: float, act: Action, Q: Array, R: Array) -> Loop:
+    """The loop in which the policy is evaluated at every Runge-Kutta stage of a step of h seconds."""
+    f = system.function("numpy")
+
+    def step(x: Array, u: Array) -> Array:
+        # The first stage is at x itself, where the action is already known.
+        return np.asarray(rk4(lambda y: f(y, u if y is x else act(y)), x, h))
+
+    return Loop(step, act, _cost(system, Q, R), h)
+
+
+def mean_action(network: TanhNetwork, system: System) -> Action:
+    """`network` as an `Action`, in float64; torch's tanh takes a fraction of numpy's time."""
+    u_eq = system.exact_u_eq()
+    folded = network.folded(u_eq)  # once, not in every step
+    return lambda x: np.asarray(folded(torch.from_numpy(x), u_eq))
+
+
+def initial_states(system: System, count: int, seed: int) -> Array:
+    """States (count, n), uniform in the plant's box of `INITIAL_STATES`.
+
+    Raises
+    ------
+    InputError : the plant has no such box.
+    """
+    if system.name not in INITIAL_STATES:
+        raise InputError(f"no box of initial states is known for the plant {system.name}.")
+    half_widths = np.array(INITIAL_STATES[system.name])
+    return np.random.default_rng(seed).uniform(-half_widths, half_widths, (count, system.n))
+
+
+def _cost(system: System, Q: Array, R: Array) -> Callable[[Array, Array], Array]:
+    """`x'Qx + (u - u_eq)'R(u - u_eq)` for diagonal weights."""
+    equilibrium = np.array([float(u) for u in system.exact_u_eq()])
+    return lambda x, u: np.asarray((Q * x * x).sum(-1) + (R * (u - equilibrium) ** 2).sum(-1))
