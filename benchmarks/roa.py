@@ -1,7 +1,8 @@
 """The whole job on the shipped policies, and the engine's throughput against the machine's matrix product.
 
-Run with `python benchmarks/roa.py [--runs 5] [--threads 2] [POLICY ...]`. One warm-up run is not counted; the figures
-are medians of the counted runs in this one process. Absolute times are this machine's; the ratios are what to compare.
+Run with `python benchmarks/roa.py [--runs 5] [--threads 2] [--candidate lqr] [--time-limit 100] [POLICY ...]`. One
+warm-up run is not counted; the figures are medians of the counted runs in this one process. Absolute times are this
+machine's; the ratios are what to compare.
 """
 
 from __future__ import annotations
@@ -24,20 +25,20 @@ from certify.engines.vdot import VdotBound
 from certify.lyapunov import diagonalising_coordinates, solve_lyapunov, volume
 from certify.obligations import Obligations
 from certify.policies import load_policy
-from certify.roa import RoaResult, certify_roa
+from certify.roa import RoaOptions, RoaResult, certify_roa
 from certify.systems import get_system
 
 POLICIES = Path(__file__).parent.parent / "examples" / "policies"
 
 
-def whole_job(path: Path, runs: int) -> None:
+def whole_job(path: Path, options: RoaOptions, runs: int) -> None:
     """Levels, boxes, certificate size, and median seconds of each stage."""
     policy = load_policy(path)
     system = get_system(policy.system).with_parameters(policy.parameters)
     results: list[RoaResult] = []
     with tempfile.TemporaryDirectory() as folder:
         for _ in range(runs + 1):
-            results.append(certify_roa(system, policy.network, Path(folder)))
+            results.append(certify_roa(system, policy.network, Path(folder), options))
         last = results[-1]
         size = last.certificate.stat().st_size if last.certificate is not None else 0
     counted = results[1:]
@@ -97,11 +98,13 @@ def main() -> None:
     parser.add_argument("policies", nargs="*", type=Path, default=sorted(POLICIES.glob("*.pt")))
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--candidate", default="lyapunov", choices=("lyapunov", "lqr", "optimised"))
+    parser.add_argument("--time-limit", type=float, default=100.0, help="seconds for a ring")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     print(f"torch {torch.__version__}, {options.threads} threads, median of {options.runs} runs")
     for path in options.policies:
-        whole_job(path, options.runs)
+        whole_job(path, RoaOptions(candidate=options.candidate, time_limit=options.time_limit), options.runs)
         throughput(path, options.runs)
 
 

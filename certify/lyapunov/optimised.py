@@ -122,7 +122,7 @@ class _Samples:
     def field(self, x: Array) -> tuple[Array, NDArray[np.bool_]]:
         """F and `outside` at x, shapes (..., n) and (...)."""
         # One matrix product for all states: numpy would make one for each leading index.
-        u = self.loop.policy(x.reshape(-1, x.shape[-1])).reshape(*x.shape[:-1], -1)
+        u = self.loop.policy(x.reshape(-1, x.shape[-1])).reshape(*x.shape[:-1], self.loop.system.m)
         with np.errstate(all="ignore"):
             F = self.f(x, u)
         outside = ~np.isfinite(F).all(-1)
