@@ -32,6 +32,7 @@ _COLOURS: dict[Run, str] = {  # Okabe and Ito's, told apart with any colour visi
     "sb3-sac": "#009e73",
     "sb3-ppo": "#cc79a7",
 }
+_STYLE = {**STYLE, "text.parse_math": True}  # powers of ten on a logarithmic axis are mathematical text
 _SMALLEST = 1e-16  # norms are drawn from here on: a logarithmic axis has no 0
 
 
@@ -45,7 +46,7 @@ def draw_over_time(
     seeds, states = len({response.seed for response in responses}), responses[0].x.shape[1]
     methods = list(dict.fromkeys(response.method for response in responses))
     kinds = sorted({method.sampled for method in methods})
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(5.0 * len(kinds) + (len(kinds) == 1), 4.8), layout="constrained")
         panels = figure.subplots(1, len(kinds), sharey=True, squeeze=False)[0]
         for panel, sampled in zip(panels, kinds, strict=True):
@@ -98,7 +99,7 @@ def draw_positions(system: System, dt: float, responses: Sequence[Response]) -> 
     names, seed = [symbol.name for symbol in system.states], responses[0].seed
     chosen = {response.method: response.x[:, :50] for response in responses if response.seed == seed}
     positions, time = POSITIONS[system.name], dt * np.arange(len(responses[0].x))
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(15.0, 0.9 + 1.9 * len(positions)), layout="constrained")
         panels = figure.subplots(len(positions), len(chosen), sharex=True, sharey="row", squeeze=False)
         for position, line in zip(positions, panels, strict=True):

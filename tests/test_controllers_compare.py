@@ -203,6 +203,20 @@ def test_figures_hold_when_everything_diverges(finished, pendulum_system, tmp_pa
     assert "inf" in (tmp_path / "pendulum-table.csv").read_text()
 
 
+def test_numbers_on_a_logarithmic_axis_are_readable(finished, pendulum_system, tmp_path, monkeypatch):
+    labels, png = [], figures._png
+
+    def keep(figure):
+        content = png(figure)
+        labels.extend(label for axes in figure.axes for label in axes.get_yticklabels() if label.get_text())
+        return content
+
+    monkeypatch.setattr(figures, "_png", keep)
+    compare.compare(pendulum_system, TINY, finished[0], tmp_path, SHORT)
+    powers = [label for label in labels if "10^" in label.get_text()]
+    assert powers and all(label.get_parse_math() for label in powers)
+
+
 def test_positions_are_states_of_their_plants():
     for name, positions in figures.POSITIONS.items():
         try:
