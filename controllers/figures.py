@@ -10,7 +10,6 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.report.figures import STYLE
 from certify.systems import System
 from controllers.responses import NAMES, OURS, Response, Row, Run, quartiles
 
@@ -32,7 +31,18 @@ _COLOURS: dict[Run, str] = {  # Okabe and Ito's, told apart with any colour visi
     "sb3-sac": "#009e73",
     "sb3-ppo": "#cc79a7",
 }
-_STYLE = {**STYLE, "text.parse_math": True}  # powers of ten on a logarithmic axis are mathematical text
+_STYLE: dict[str, Any] = {
+    "font.family": "sans-serif",
+    "font.sans-serif": ["DejaVu Sans"],
+    "font.size": 9.0,
+    "axes.linewidth": 0.7,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.titlesize": 9.5,
+    "legend.fontsize": 8.0,
+    "legend.frameon": False,
+    "lines.linewidth": 1.2,
+}
 _SMALLEST = 1e-16  # norms are drawn from here on: a logarithmic axis has no 0
 
 
