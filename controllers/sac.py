@@ -336,10 +336,11 @@ class SAC:
             getattr(self, name).load_state_dict(state[name])
 
     def _ball(self) -> Tensor:
-        """States that are uniform in ||x|| <= eta, shape (CURVATURE_POINTS, n)."""
+        """States that are uniform in ||x|| <= eta, shape (CURVATURE_POINTS, n), none of them 0."""
         n = len(self.actor.factors)
         x = self._noise(CURVATURE_POINTS, n)
-        length = torch.rand((CURVATURE_POINTS, 1), generator=self.generator, device=CPU).to(self.device) ** (1 / n)
+        share = torch.rand((CURVATURE_POINTS, 1), generator=self.generator, device=CPU)  # a multiple of 2^-24, 0 too
+        length = share.clamp(min=2.0**-24).to(self.device) ** (1 / n)
         norm: Tensor = torch.linalg.vector_norm(x, dim=1, keepdim=True)
         return x * (self.options.eta * length / norm)
 

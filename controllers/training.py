@@ -15,6 +15,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import math
 import os
 import platform
 from collections.abc import Callable, Sequence
@@ -195,8 +196,9 @@ class Trainer:
 
         Raises
         ------
-        InputError : the run is too short to have learned a gain, and was to learn one.
+        InputError : the run is too short to have learned a gain, and was to learn one; or it has diverged.
         """
+        self._require_finite(self.distance()[1])
         found = self.gain.identified
         if found is None and self.options.identification != "never":
             raise InputError(f"the run ended after {self.steps_done} steps without a gain; it needs more `steps`.")
@@ -208,7 +210,13 @@ class Trainer:
         )
 
     def snapshot(self) -> bytes:
-        """The whole run as the bytes of a checkpoint file."""
+        """The whole run as the bytes of a checkpoint file.
+
+        Raises
+        ------
+        InputError : the run has diverged.
+        """
+        self._require_finite(self.distance()[1])
         state = {
             "format": CHECKPOINT_FORMAT,
             "system": [self.system.name, _parameters(self.system)],
@@ -297,8 +305,16 @@ class Trainer:
     def _finish_episode(self, outcome: str) -> None:
         kind = "identification" if self._near else "training"
         distance, offset = self.distance()
+        self._require_finite(offset)
         self.episodes.append(Episode(self.steps_done, kind, self._length, self._total, outcome, distance, offset))
         self._begin_episode()
+
+    def _require_finite(self, offset: float) -> None:
+        if not math.isfinite(offset):
+            raise InputError(
+                f"the run has diverged: the actor's weights are not finite after {self.steps_done} steps. Try a "
+                "smaller `learning_rate` or `gain_weight`, or another `seed`; an earlier checkpoint is still sound."
+            )
 
     def _record(self, found: Identified | None) -> dict[str, Any]:
         distance, offset = self.distance()

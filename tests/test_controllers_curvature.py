@@ -77,6 +77,15 @@ def test_its_states_fill_the_ball():
     assert (radii < 0.3 / 2**0.5).double().mean().item() == pytest.approx(0.5, abs=0.06)  # uniform in area
 
 
+def test_its_states_are_never_the_origin(monkeypatch):
+    """torch.rand draws 0 once in 2^24 times, and ||J(x) - J(0)|| / ||x|| is not finite there."""
+    sac = _sac()
+    monkeypatch.setattr(torch, "rand", lambda shape, **_: torch.zeros(shape))
+    x = sac._ball()
+    assert (torch.linalg.vector_norm(x, dim=1) > 0).all()
+    assert torch.isfinite(sac.actor.curvature_loss(x))
+
+
 def test_its_weight_lowers_the_curvature_and_without_weight_nothing_is_drawn():
     x = torch.linspace(-1, 1, 64).reshape(32, 2)
     batch = (x, x[:, :1], torch.ones(32, 1), x, torch.zeros(32, 1))

@@ -154,6 +154,20 @@ def test_each_centring_gives_u_eq_at_the_origin_and_records_it(short, centre):
     assert policy.network(np.zeros(2), u_eq) == pytest.approx(0.0, abs=0)
 
 
+def test_a_run_that_diverges_ends_with_the_reason_and_keeps_its_checkpoint(short, tmp_path):
+    trainer, path = _case("pendulum"), tmp_path / "checkpoint.pt"
+    while trainer.steps_done < 200:
+        trainer.advance()
+    path.write_bytes(trainer.snapshot())
+    kept = path.read_bytes()
+    with torch.no_grad():
+        trainer.sac.actor.mean.bias.fill_(float("nan"))
+    for attempt in (trainer.snapshot, trainer.policy, lambda: train(trainer, checkpoint=path, checkpoint_every=10)):
+        with pytest.raises(InputError, match="diverged"):
+            attempt()
+    assert path.read_bytes() == kept
+
+
 def test_no_policy_without_a_gain(short):
     with pytest.raises(InputError, match="without a gain"):
         train(_trainer(replace(short, steps=30)))
