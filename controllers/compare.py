@@ -38,7 +38,7 @@ from controllers.baselines import (
 )
 from controllers.figures import POSITIONS, draw_over_time, draw_positions
 from controllers.options import TrainingOptions
-from controllers.responses import ABLATIONS, CompareOptions, Response, Row, Run, table
+from controllers.responses import CompareOptions, Response, Row, Run, table
 from controllers.simulation import Action, held_loop, initial_states
 from controllers.training import Trainer, train, write_atomically
 
@@ -101,7 +101,8 @@ def compare(
         "norm": draw_over_time("norm", system, training.dt, responses, rows),
         "positions": draw_positions(system, training.dt, responses),
     }
-    stem = system.name + ("-ablations" if options.methods == ABLATIONS else "")
+    ablations = {method.run for method in options.methods} & {"before", "uncentred"}
+    stem = system.name + ("-ablations" if ablations else "")
     result: dict[str, Any] = {
         "system": system.name,
         "dt": training.dt,

@@ -50,6 +50,9 @@ def compare(
     ablations: Annotated[
         bool, typer.Option("--ablations", help="Compare with ablations of our own training, not with baselines.")
     ] = False,
+    without: Annotated[
+        list[str] | None, typer.Option("--without", help="A kind of run to leave out, such as sb3-sac; repeatable.")
+    ] = None,
     steps: Steps = None,
     as_json: Json = False,
 ) -> None:
@@ -60,9 +63,9 @@ def compare(
         training = _options(plant, 0, steps)
         from certify.systems import get_system
         from controllers.compare import compare as run
-        from controllers.responses import ABLATIONS, BASELINES, CompareOptions
+        from controllers.responses import ABLATIONS, BASELINES, CompareOptions, remaining
 
-        methods = ABLATIONS if ablations else BASELINES
+        methods = remaining(ABLATIONS if ablations else BASELINES, without or [])
         options = CompareOptions(methods=methods, seeds=seeds, duration=duration, states=states)
         result = run(get_system(plant), training, runs, out, options, lambda line: typer.echo(line, err=True))
         if as_json:

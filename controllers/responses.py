@@ -59,6 +59,20 @@ ABLATIONS: tuple[Method, ...] = (OURS, *(Method(run, False) for run in ("sac", "
 """Ours with one part changed: no gain; A and B learned once before training; the mean not centred."""
 
 
+def remaining(methods: Sequence[Method], without: Sequence[str]) -> tuple[Method, ...]:
+    """`methods` less those of the kinds of runs in `without`.
+
+    Raises
+    ------
+    InputError : a name is of none of them, or ours.
+    """
+    kinds = {method.run for method in methods} - {"ours"}
+    for name in without:
+        if name not in kinds:
+            raise InputError(f"`without` must be one of {', '.join(sorted(kinds))}; found {name!r}.")
+    return tuple(method for method in methods if method.run not in without)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CompareOptions:
     """What is compared.

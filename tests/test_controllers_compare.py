@@ -20,7 +20,17 @@ from controllers.cli import app
 from controllers.compare import simulate
 from controllers.environments import PlantEnvironment
 from controllers.options import preset
-from controllers.responses import ABLATIONS, BASELINES, OURS, CompareOptions, Method, Response, quartiles, table
+from controllers.responses import (
+    ABLATIONS,
+    BASELINES,
+    OURS,
+    CompareOptions,
+    Method,
+    Response,
+    quartiles,
+    remaining,
+    table,
+)
 from controllers.simulation import INITIAL_STATES
 
 TINY = replace(preset("pendulum"), steps=160, warm_up=60, n_A=25, n_B=25, batch=8, actor=(6, 5), critic=(7,))
@@ -250,6 +260,8 @@ def test_the_command_prints_the_table_or_one_json_object(finished, tmp_path, mon
         (["pendulum", "--seeds", "0"], "`seeds` must be positive"),
         (["pendulum", "--duration", "0.5"], "`window` at most `duration`"),
         (["pendulum", "--duration", "nan"], "`duration`"),
+        (["pendulum", "--without", "ours"], "`without` must be one of sac, sb3-ppo, sb3-sac"),
+        (["pendulum", "--ablations", "--without", "sb3-sac"], "`without` must be one of before, sac, uncentred"),
     ],
 )
 def test_bad_input_is_one_sentence(tmp_path, arguments, message):
@@ -267,6 +279,15 @@ def test_without_stable_baselines_nothing_is_trained(tmp_path, monkeypatch):
     assert result.exit_code == 2
     assert result.stderr == "Error: stable-baselines3 is not installed; `pip install 'certify[baselines]'` brings it.\n"
     assert not list(tmp_path.iterdir())
+
+
+def test_a_kind_of_run_can_be_left_out(finished, pendulum_system, tmp_path, monkeypatch):
+    monkeypatch.setattr(compare, "require_stable_baselines", lambda: pytest.fail("nothing of it is compared"))
+    methods = remaining(BASELINES, ["sb3-sac", "sb3-ppo"])
+    result = compare.compare(pendulum_system, TINY, finished[0], tmp_path, replace(SHORT, methods=methods))
+    assert list(dict.fromkeys(row["method"] for row in result["rows"])) == ["ours", "sac mean", "sac stochastic"]
+    rows = [row for row in finished[2]["rows"] if not row["method"].startswith("sb3")]
+    assert result["rows"] == rows
 
 
 def test_ablations_change_one_part_of_our_own_training(finished, pendulum_system, tmp_path):
