@@ -61,8 +61,8 @@ class Trained:
 
 
 def without_gain(options: TrainingOptions) -> TrainingOptions:
-    """The same SAC without what ties it to the gain: no term of the gain, none of the curvature, no identification."""
-    return replace(options, gain_weight=0.0, curvature_weight=0.0, identification="never")
+    """The same SAC without the gain: no term of it in the actor's loss, no identification."""
+    return replace(options, gain_weight=0.0, identification="never")
 
 
 def from_policy(policy: Policy, system: System) -> Trained:

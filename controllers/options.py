@@ -56,6 +56,9 @@ class TrainingOptions:
     curvature_weight: Annotated[
         float, "Weight of the mean ||J_mu(x) - J_mu(0)|| / ||x|| in the ball in the actor's loss; 0 drops the term."
     ] = 0.0
+    rest_weight: Annotated[
+        float, "Weight of the hidden units' norms at the origin, summed over layers, in the actor's loss; 0 drops it."
+    ] = 0.0
     # The stabilising part
     identification: Annotated[
         Identification, "When A and B are learned: during the run, once before the warm-up, or never (plain SAC)."
@@ -74,7 +77,7 @@ class TrainingOptions:
             self._require(name, getattr(self, name) > 0, "positive")
         for name in ("critic_scale", "eta", "n_A", "n_B", "refresh"):
             self._require(name, getattr(self, name) > 0, "positive")
-        for name in ("seed", "penalty", "gain_weight", "curvature_weight", "warm_up"):
+        for name in ("seed", "penalty", "gain_weight", "curvature_weight", "rest_weight", "warm_up"):
             self._require(name, getattr(self, name) >= 0, "at least 0")
         self._require("seed", self.seed < 2**63, "below 2^63")
         for name in ("gamma", "anneal"):

@@ -9,9 +9,10 @@ with Stability Guarantees for Control of Unknown Nonlinear Systems" uses it. One
     actor:  log pi(u~|x) - min_i Q_i(x, u~)  +  weight * (||J_mu(0) + K|| + ||mu(0) - u_eq||)
 
 where the last term is there once a gain K is known, unless its weight is 0; mu is the mean action in
-physical units. Another option adds the curvature near the origin, `Actor.curvature_loss`. Everything is float32,
-as is the exported policy; the states' factors are powers of two, so that folding them into the first layer rounds
-nothing and the exported network is the trained one bit for bit.
+physical units. Two more terms hold down the curvature near the origin, for the sake of proofs: `Actor.curvature_loss`
+lowers what it is, `Actor.rest_loss` what a bound of it sees. Everything is float32, as is the exported policy; the
+states' factors are powers of two, so that folding them into the first layer rounds nothing and the exported network is
+the trained one bit for bit.
 
 Networks, replay table and batches live on one device. Random numbers are drawn on the CPU wherever the
 networks live, so that a device changes the rounding of a run and not its random stream.
@@ -174,6 +175,20 @@ class Actor(nn.Module):
         quotients: Tensor = torch.linalg.vector_norm(change, dim=(1, 2)) / torch.linalg.vector_norm(x, dim=1)
         return quotients.mean()
 
+    def rest_loss(self) -> Tensor:
+        """Sum over the hidden layers of ||h(0)||_2, h the layer's tanh units.
+
+        Where all of them are 0, so is every second derivative of the mean before its last tanh, unit by unit and not
+        only in sum: bounds that add magnitudes find no curvature there either. Units far from 0 are also nearly
+        saturated, which slows learning down.
+        """
+        h = torch.zeros_like(self.factors)
+        norms = []
+        for layer in self._layers():
+            h = torch.tanh(layer(h))
+            norms.append(torch.linalg.vector_norm(h))
+        return torch.stack(norms).sum()
+
     def gain_loss(self, K: Tensor) -> Tensor:
         """`||J_mu(0) + K|| + ||mu(0) - u_eq||`, Frobenius norm; the sign is that of u = u_eq - K x."""
         mean, jacobian = self.at_origin()
@@ -307,6 +322,8 @@ class SAC:
         actor_loss = (log_likelihood - q_fresh).mean()
         if K is not None and options.gain_weight > 0:
             actor_loss = actor_loss + options.gain_weight * self.actor.gain_loss(K)
+        if options.rest_weight > 0:
+            actor_loss = actor_loss + options.rest_weight * self.actor.rest_loss()
         if options.curvature_weight > 0:
             actor_loss = actor_loss + options.curvature_weight * self.actor.curvature_loss(self._ball())
         actor_gradients = torch.autograd.grad(actor_loss, self._actor_weights)

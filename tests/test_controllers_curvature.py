@@ -103,6 +103,35 @@ def test_its_weight_lowers_the_curvature_and_without_weight_nothing_is_drawn():
     assert torch.equal(draws[0], plain.get_state()) and not torch.equal(draws[1], plain.get_state())
 
 
+def test_units_at_rest_have_no_curvature_one_by_one():
+    """rest_loss is the norms of h(0); where it is 0, the Jacobian of the preactivation is even around the origin."""
+    sac = _sac(2)
+    network = sac.actor.network()
+    h, total = np.zeros(2), 0.0
+    for W, b in zip(network.weights[:-1], network.biases[:-1], strict=True):
+        h = np.tanh(W @ h + b)
+        total += np.linalg.norm(h)
+    assert sac.actor.rest_loss().item() == pytest.approx(total, rel=1e-5)
+    with torch.no_grad():
+        for layer in sac.actor._layers():
+            layer.bias.zero_()
+    assert sac.actor.rest_loss().item() == 0.0
+    x = torch.tensor([[0.1, -0.2]])
+    torch.testing.assert_close(sac.actor.jacobian(x), sac.actor.jacobian(-x))
+
+
+def test_its_weight_brings_the_units_to_rest():
+    x = torch.linspace(-1, 1, 64).reshape(32, 2)
+    batch = (x, x[:, :1], torch.ones(32, 1), x, torch.zeros(32, 1))
+    found = []
+    for weight in (0.0, 1.0):
+        sac = _sac(rest_weight=weight, learning_rate=3e-3)
+        for _ in range(150):
+            sac.update(batch, None, 1.0)
+        found.append(sac.actor.rest_loss().item())
+    assert found[1] < 0.3 * found[0]
+
+
 def test_a_run_records_it_and_the_evaluation_reports_the_same():
     changes = {"steps": 200, "warm_up": 100, "n_A": 40, "n_B": 40, "batch": 16, "critic": (8,)}
     policy = train(Trainer(PENDULUM, replace(preset("pendulum"), **changes)))
@@ -115,6 +144,7 @@ def test_a_run_records_it_and_the_evaluation_reports_the_same():
     assert np.isnan(foreign.curvature) and _table(foreign)["curvature"] is None
 
 
-def test_a_negative_weight_is_refused():
-    with pytest.raises(InputError, match="`curvature_weight`"):
-        replace(preset("pendulum"), curvature_weight=-1.0)
+@pytest.mark.parametrize("name", ["curvature_weight", "rest_weight"])
+def test_a_negative_weight_is_refused(name):
+    with pytest.raises(InputError, match=f"`{name}`"):
+        replace(preset("pendulum"), **{name: -1.0})

@@ -29,13 +29,13 @@ def _run(device=CPU, **changes):
 
 @pytest.fixture(scope="module")
 def whole():
-    return _run(curvature_weight=0.1)
+    return _run(curvature_weight=0.1, rest_weight=0.1)
 
 
 def test_a_run_creates_every_tensor_on_its_own_device(whole):
     # Whatever is created without a device is now on `meta`, has no numbers and mixes with no tensor that has.
     with META:
-        trainer, policy = _run(curvature_weight=0.1)
+        trainer, policy = _run(curvature_weight=0.1, rest_weight=0.1)
         checkpoint = trainer.snapshot()
         trainer.restore(checkpoint)
     assert policy.network.sha256() == whole[1].network.sha256()
@@ -45,7 +45,7 @@ def test_a_run_creates_every_tensor_on_its_own_device(whole):
 def test_a_learner_on_another_device_leaves_nothing_behind(monkeypatch):
     # The other way round: `meta` stands for the accelerator, and a tensor left on the CPU does not mix with it.
     monkeypatch.setattr(torch.optim, "Adam", lambda weights, rate, fused: _Adam(weights, rate))
-    options = replace(preset("pendulum"), **SHORT, curvature_weight=0.1)
+    options = replace(preset("pendulum"), **SHORT, curvature_weight=0.1, rest_weight=0.1)
     generator = torch.Generator().manual_seed(0)
     sac = SAC(Interface(get_system("pendulum")), options, generator, META)
     replay = Replay(10, 2, 1, META)
@@ -93,7 +93,7 @@ def test_a_device_that_is_not_there_is_refused(tmp_path, monkeypatch):
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
 def test_a_run_on_cuda_goes_on_on_the_cpu(whole):
-    trainer, policy = _run(torch.device("cuda"), curvature_weight=0.1)
+    trainer, policy = _run(torch.device("cuda"), curvature_weight=0.1, rest_weight=0.1)
     assert policy.training["device"] == "cuda"
     np.testing.assert_allclose(policy.training["K"], whole[1].training["K"], rtol=1e-3)
     other = Trainer(trainer.system, trainer.options)
