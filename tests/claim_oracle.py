@@ -768,12 +768,13 @@ def _local_fault(claim: str, encoded: str) -> tuple[str, str] | None:
                     return None
                 k[i] = k[i].max(abs(R) / size)
         M = [[-(B[i][j] + B[j][i]) / 2 for j in range(n)] for i in range(n)]
-        bound = sum((v * v for v in k), arb(0)).sqrt()
+        # the margins cover the differences' error, of relative order 2^-300
+        mu = [M[i][i] - sum((abs(M[i][j]) for j in range(n) if j != i), arb(0)) for i in range(n)]
+        mu = [v + arb(2) ** -60 * abs(M[i][i]) for i, v in enumerate(mu)]
+        share = sum((v * v / w for v, w in zip(k, mu, strict=True)), arb(0)) * (1 - arb(2) ** -60)
         for i in range(n):
-            mu = M[i][i] - sum((abs(M[i][j]) for j in range(n) if j != i), arb(0))
-            # the margin covers the differences' error, of relative order 2^-300
-            if mu + arb(2) ** -60 * abs(M[i][i]) <= bound * (1 - arb(2) ** -60):
-                return "local", f"disc {i} reaches {float(mu.mid()):.3g}, the remainder {float(bound.mid()):.3g}"
+            if mu[i] <= 0 or (all(v > 0 for v in mu) and mu[i] <= share):
+                return "local", f"disc {i} reaches {float(mu[i].mid()):.3g}, the remainder {float(share.mid()):.3g}"
     return None
 
 

@@ -2,8 +2,8 @@
 
 It shares no code and no arithmetic with `certify.checker`. What is rational is decided in `fractions.Fraction`, the
 rest in Arb balls of 160 bits, one scalar at a time; a comparison of balls counts only if it is certain. Where FORMAT.md
-leaves a choice (the two lines around a tanh, the multiplier k of the S-procedure, a bound of a matrix norm) the choice
-here is this module's own, so that the two checkers may differ by a hair on a leaf, and on nothing else.
+leaves a choice (the two lines around a tanh, the multiplier k of the S-procedure) the choice here is this module's
+own, so that the two checkers may differ by a hair on a leaf, and on nothing else.
 
 `judge` returns None if the certificate is accepted, the name of the first rule that fails, or `TRUSTED`.
 """
@@ -22,7 +22,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
-from flint import arb, arb_mat, ctx, fmpq
+from flint import arb, ctx, fmpq
 
 LEAF = 255
 MAX_BYTES = 256 * 2**20
@@ -496,7 +496,7 @@ class Local:
 
 
 def local(c: Claim, S: list[list[Fraction]]) -> None:
-    """Rule `local`: lambda_min(-(B + B')/2) > ||k||, after Gershgorin, on z = rho d; rule `inputs` on that ball."""
+    """Rule `local`: mu_i > 0 and sum_i k_i^2 / mu_i < mu_i for every i, on z = rho d; rule `inputs` on that ball."""
     size = range(len(c.states))
     rho = arb(ball(c.c1 / discs(S)).sqrt().upper())
     states = [Local(arb(0), [rho * ball(t) for t in row], arb(0)) for row in c.T]
@@ -506,37 +506,46 @@ def local(c: Claim, S: list[list[Fraction]]) -> None:
     F = [evaluate(node, names, lambda q: Local(ball(q), [arb(0) for _ in size], arb(0))) for node in c.dynamics]
     TP = [[ball(v) for v in row] for row in product(transpose(c.T), c.P)]
     B = [[total(TP[i][k] * F[k].a[j] for k in size) for j in size] for i in size]
-    k = norm([total(abs(TP[i][j]) * F[j].k for j in size) for i in size])
+    k = [total(abs(TP[i][j]) * F[j].k for j in size) for i in size]
     M = [[-(B[i][j] + B[j][i]) / 2 for j in size] for i in size]
-    for i in size:
-        require(bool(M[i][i] - total(abs(M[i][j]) for j in size if j != i) > k), "local")
+    mu = [M[i][i] - total(abs(M[i][j]) for j in size if j != i) for i in size]
+    bend = total(v * v / m for v, m in zip(k, mu, strict=True))
+    require(all(m.is_finite() and bool(m > 0) and bool(bend < m) for m in mu), "local")
 
 
 def local_policy(c: Claim, states: list[Local]) -> list[Local]:
-    """The policy on the local ball; one k bounds the 2-norm of a layer's remainders. Rows are y(0) and then J_i."""
-    rows, k = [[arb(0), *x.a] for x in states], arb(0)
-    for number, layer in enumerate(c.layers):
-        if number:
-            rows, k = local_tanh(rows, k)
-        rows, k = affine(layer, rows), spectral_norm(layer.W) * k
+    """The policy on the local ball: y(d) = y(0) + J d + M E(d), |E_q(d)| <= e_q ||d||^2.
+
+    A row is y_i(0), then J_i, then M_i: one entry for each tanh q of the layers before.
+    """
+    rows, e = affine(c.layers[0], [[arb(0), *x.a] for x in states]), list[arb]()
+    for layer in c.layers[1:]:
+        rows, own = local_tanh(rows, e)
+        rows, e = [[*row, *map(ball, w)] for row, w in zip(affine(layer, rows), layer.W, strict=True)], e + own
     if c.centre == "preactivation":
         rows = [[y, *row[1:]] for y, row in zip(beta(c), rows, strict=True)]
-    if c.squash == "tanh":
-        rows, k = local_tanh(rows, k)
+    rows, own = local_tanh(rows, e) if c.squash == "tanh" else (rows, [arb(0) for _ in rows])
     result = []
-    for q, s, (_, *slopes) in zip(c.u_eq, c.scale, rows, strict=True):
-        result.append(Local(ball(q), [ball(s) * v for v in slopes], ball(abs(s)) * k))  # pi(0) = u_eq exactly
+    for q, s, row, last in zip(c.u_eq, c.scale, rows, own, strict=True):
+        slopes = [ball(s) * v for v in row[1 : len(row) - len(e)]]
+        result.append(Local(ball(q), slopes, ball(abs(s)) * (remainder(row, e) + last)))  # pi(0) = u_eq exactly
     return result
 
 
-def local_tanh(rows: list[list[arb]], k: arb) -> tuple[list[list[arb]], arb]:
-    """k' = max(1 - t^2) k + max_i(h_i reach_i) (||J||_F + k), reach_i = ||J_i|| + k."""
-    t = [row[0].tanh() for row in rows]
-    slopes = [1 - v * v for v in t]
-    reach = [norm(row[1:]) + k for row in rows]
-    bend = [half_curvature(about(row[0], r)) * r for row, r in zip(rows, reach, strict=True)]
-    k = largest(slopes) * k + largest(bend) * (norm(v for row in rows for v in row[1:]) + k)
-    return [[v, *(s * x for x in row[1:])] for v, s, row in zip(t, slopes, rows, strict=True)], k
+def local_tanh(rows: list[list[arb]], e: list[arb]) -> tuple[list[list[arb]], list[arb]]:
+    """The tangents at y_i(0), and the bounds h_i reach_i^2 of what each tanh adds to its own."""
+    result, own = [], []
+    for row in rows:
+        t = row[0].tanh()
+        reach = norm(row[1 : len(row) - len(e)]) + remainder(row, e)
+        result.append([t, *((1 - t * t) * v for v in row[1:])])
+        own.append(half_curvature(about(row[0], reach)) * reach**2)
+    return result, own
+
+
+def remainder(row: list[arb], e: list[arb]) -> arb:
+    """sum_q |M_q| e_q, M the end of the row."""
+    return total(abs(m) * bound for m, bound in zip(row[len(row) - len(e) :], e, strict=True))
 
 
 def half_curvature(y: arb) -> arb:
@@ -546,16 +555,6 @@ def half_curvature(y: arb) -> arb:
     if all(hi < p or lo > p for p in (peak, -peak)):
         return largest([abs(lo * (1 - lo * lo)), abs(hi * (1 - hi * hi))])
     return 2 / arb(27).sqrt()
-
-
-def spectral_norm(W: list[list[Fraction]]) -> arb:
-    """An upper bound of ||W||_2: ||(W'W)^64||_F^(1/128)."""
-    A = arb_mat([[ball(w) for w in row] for row in W])
-    G, root = A.transpose() * A, 2
-    for _ in range(6):
-        G, root = G * G, root * 2
-    size = norm(G.entries())
-    return size.root(root) if size > 0 else size
 
 
 # --------------------------------------------------------------------------------------------------------- the leaves

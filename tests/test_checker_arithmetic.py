@@ -205,7 +205,7 @@ def test_vdot_of_a_wide_transformation_holds_its_members(name: str, radius: floa
 @pytest.mark.parametrize("name", ["rotor", "rotor, preactivation", "linear"])
 @pytest.mark.parametrize("radius", [1e-9, 1e-3])
 def test_the_policy_on_a_wide_ball_holds_its_members(name: str, radius: float) -> None:
-    """On x = J d: `|pi(J d) - u_eq - G d| <= |scale| k ||d||^2`, for each J in the ball G was made from."""
+    """On x = J d: `|pi_j(J d) - u_eq_j - G_j d| <= |scale_j| k_j ||d||^2`, for each J in the ball G was made from."""
     generator = np.random.default_rng(31)
     c = parse(honest(name))
     J = generator.standard_normal((len(c.states),) * 2) * 0.05
@@ -218,9 +218,9 @@ def test_the_policy_on_a_wide_ball_holds_its_members(name: str, radius: float) -
             square = sum((arb(v) ** 2 for v in d), arb(0))
             point = [sum((arb(p) * arb(v) for p, v in zip(row, d, strict=True)), arb(0)) for row in member]
             inputs = policy_in_arb(c.policy, c.u_eq, point)
-            for row, u, q, scale in zip(gradient, inputs, c.u_eq, c.policy.scale, strict=True):
+            for row, u, q, scale, rest in zip(gradient, inputs, c.u_eq, c.policy.scale, k, strict=True):
                 linear = sum((arb(g) * arb(v) for g, v in zip(row, d, strict=True)), ball(q))
-                wide_enough = abs(arb(float(scale))) * (arb(k) * square + arb(slack) * square.sqrt())
+                wide_enough = abs(arb(float(scale))) * (arb(rest) * square + arb(slack) * square.sqrt())
                 assert (linear + arb(0, 1) * wide_enough).contains(u)
 
 

@@ -19,8 +19,9 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from certify.checker import float64
-from certify.checker.arithmetic import frobenius
+from certify.checker.arithmetic import carry, frobenius
 from certify.checker.document import Policy
+from certify.checker.errors import Rejected
 from certify.checker.exact import gershgorin_lower, inverse_diagonal, rational
 from certify.checker.float64 import (
     arb_with_error,
@@ -602,6 +603,7 @@ def random_policy(
     biases = tuple(0.3 * generator.standard_normal(out) for out in widths[1:])
     m = widths[-1]
     scale, offset = generator.choice([-1.0, 1.0], m) * generator.uniform(0.5, 3, m), 0.2 * generator.standard_normal(m)
+    offset = np.clip(offset, -0.29, 0.29)  # so that u_eq lies inside offset +- scale
     return Policy(weights, biases, scale, offset, squash, centre), tuple(Fraction(1, 5 + j) for j in range(m))
 
 
@@ -724,7 +726,7 @@ def test_the_policy_at_the_origin(radius: float) -> None:
         J, slack = radius * generator.standard_normal((n, n)), radius * 1e-9
         folded = fold(policy, u_eq)
         gradient, u_slack, k = enclose_at_origin(folded, J, slack)
-        if not np.isfinite([u_slack, k]).all():
+        if not np.isfinite([u_slack, *k]).all():
             continue
         finite += 1
         shifted = [[arb(float(v)) for v in row] for row in J]
@@ -736,10 +738,28 @@ def test_the_policy_at_the_origin(radius: float) -> None:
                 for j, (u, q) in enumerate(zip(policy_in_arb(policy, u_eq, state), u_eq, strict=True)):
                     line = ball(q) + sum((arb(float(g)) * arb(v) for g, v in zip(gradient[j], d, strict=True)), arb(0))
                     slip = 4 * arb(2.0**-53) * sum((abs(arb(float(g))) for g in gradient[j]), arb(0)) * square.sqrt()
-                    bound = abs(arb(float(folded.scale[j]))) * (arb(u_slack) * square.sqrt() + arb(k) * square)
+                    bound = arb(u_slack) * square.sqrt() + arb(float(k[j])) * square
+                    bound = abs(arb(float(folded.scale[j]))) * bound
                     # `slip`: the caller, not this function, accounts for the rounding of scale * G
                     assert abs(u - line) <= bound + slip, (widths, size, squash, centre, d)
     assert finite > len(POLICIES) // 2
+
+
+@pytest.mark.parametrize("arithmetic", ["float64", "arb"])
+def test_a_network_too_large_for_the_local_rule_is_refused_at_once(arithmetic: str) -> None:
+    """A file of some hundred KiB whose bound would take gigabytes; a little less is enclosed."""
+    wide = {"float64": 6000, "arb": 2100}[arithmetic]
+
+    def enclose(wide: int) -> None:
+        widths = [1, wide, 1, wide, 1]
+        weights = tuple(np.full((out, into), 1e-9) for into, out in itertools.pairwise(widths))
+        biases = tuple(np.zeros(out) for out in widths[1:])
+        policy = Policy(weights, biases, np.ones(1), np.zeros(1), "tanh", "preactivation")
+        enclose_at_origin(fold(policy, (Fraction(0),), arithmetic), carry(np.ones((1, 1)), arithmetic), 0.0)
+
+    with pytest.raises(Rejected, match=r"rule=local at=policy\.layers"):
+        enclose(wide)
+    enclose(wide // 12)
 
 
 @pytest.mark.parametrize("seed", range(10))

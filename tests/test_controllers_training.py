@@ -210,9 +210,7 @@ def test_the_shipped_policy_matches_its_gain_and_settles(name, layers, states, s
     assert policy.system == name
     assert policy.network.layers == layers
     record = preset(name).record()
-    for option in fields(
-        TrainingOptions
-    ):  # made by the preset as it is, or before an option came that it leaves
+    for option in fields(TrainingOptions):  # made by the preset as it is, or before an option came that it leaves
         found = policy.training.get(option.name, option.default)
         assert record[option.name] == (list(found) if isinstance(found, tuple) else found)
     result = evaluate(policy, EvaluationOptions(states=states, seed=7, duration=30.0))

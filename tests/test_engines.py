@@ -11,7 +11,7 @@ import torch
 from certify.closed_loop import ClosedLoop
 from certify.engines.branch_and_bound import LEAF, Budget, prove_ring
 from certify.engines.falsify import Witness, confirm, falsify
-from certify.engines.local import local_margin, prove_local, spectral_norms
+from certify.engines.local import local_margin, paths, prove_local
 from certify.errors import InputError
 from certify.lyapunov import diagonalising_coordinates, domain_limit, solve_lyapunov
 from certify.obligations import Obligations
@@ -65,11 +65,11 @@ def test_the_local_proof_holds_on_samples_of_every_smaller_level(case: str) -> N
     }[case]
     claims = obligations(system, network)
     level = prove_local(claims, domain_limit(claims.P, system.domain))
-    assert level is not None and local_margin(claims, level, spectral_norms(claims)) > 0
+    assert level is not None and local_margin(claims, level, paths(claims)) > 0
     for share in (1.0, 1e-2, 1e-4):
         assert np.max(vdot(claims, sphere(claims, share * level, 2000))) < 0
     # The margin shrinks with the level, so smaller levels are proved as well.
-    margins = [local_margin(claims, level * 4.0**-k, spectral_norms(claims)) for k in range(6)]
+    margins = [local_margin(claims, level * 4.0**-k, paths(claims)) for k in range(6)]
     assert margins == sorted(margins)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import ast
 import copy
+import itertools
 import json
 import math
 import sys
@@ -194,7 +195,7 @@ SABOTAGE: list[tuple[str, Edit]] = [
     ("root", number("evidence.T", lambda a: a * (1 - 2.0**-20))),
     ("coordinates", number("evidence.T", lambda a: a * [1, 0, 1, 0])),
     ("centring", number("policy.offset", lambda a: a - 6)),
-    ("local", scaled_level("local", 100)),
+    ("local", scaled_level("local", 10)),
     ("local", number("policy.layers.2.weight", lambda a: -a)),
     ("local", number("policy.scale", lambda a: a / 6)),
     ("tree", lambda d: with_tree(d, tree_of(d)[:-1])),
@@ -203,8 +204,8 @@ SABOTAGE: list[tuple[str, Edit]] = [
     ("ring", leaf_in_place_of(0)),
     ("ring", leaf_in_place_of(1)),
     ("ring", scaled_level("local", 1e-6)),
-    ("ring", lambda d: edited(d, "plant.dynamics.1", lambda f: [*f, ["*", "1/50", ["**", "theta_dot", 3]]])),
-    ("ring", lambda d: edited(d, "plant.dynamics.1", lambda f: [*f, ["*", "3", ["**", "theta", 3]]])),
+    ("ring", lambda d: edited(d, "plant.dynamics.1", lambda f: [*f, ["*", "1/2000", ["**", "theta_dot", 5]]])),
+    ("ring", lambda d: edited(d, "plant.dynamics.1", lambda f: [*f, ["**", "theta", 5]])),
     ("inputs", lambda d: edited(d, "plant.input_bounds.0.1", "5")),
 ]
 
@@ -351,14 +352,72 @@ def test_half_the_curvature_of_tanh(centre: float, radius: float) -> None:
         assert float(values.max()) * (1 - 1e-9) - 1e-16 <= float(bound) <= 2 / math.sqrt(27) + 1e-12
 
 
-@given(st.integers(1, 5), st.integers(1, 5), st.integers(0, 10**6))
-def test_the_norm_of_a_matrix(rows: int, columns: int, seed: int) -> None:
-    W = np.random.default_rng(seed).standard_normal((rows, columns))
-    exact = [[Fraction(v) for v in row] for row in W.tolist()]
+def local_inputs(data: Document, rho: float) -> list[naive_checker.Local]:
+    """The policy on the ball x = T rho d, ||d|| <= 1."""
+    c = naive_checker.read(dump(data))
+    states = [naive_checker.Local(arb(0), [arb(rho) * naive_checker.ball(t) for t in row], arb(0)) for row in c.T]
+    return naive_checker.local_policy(c, states)
+
+
+def deep(squash: str, centre: str) -> Document:
+    """Three hidden layers, two states and two inputs; only the policy is of interest."""
+    generator = np.random.default_rng(7)
+    sizes = [2, 5, 4, 3, 2]
+    layers = [(generator.standard_normal((b, a)), generator.uniform(-1, 1, b)) for a, b in itertools.pairwise(sizes)]
+    return make(
+        ["u", "v"], layers, np.eye(2), (0.01, 0.01), states="xy", inputs="uv", u_eq=["1/4", "-1/3"],
+        domain=[("-3", "3")] * 2, input_bounds=[("-9", "9")] * 2, squash=squash, centre=centre, scale=[-2.0, 1.5],
+        offset=[0.0, 0.125], T=np.array([[1.0, 0.25], [-0.5, 2.0]]),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("name", ["rotor", "tanh output", "tanh preactivation", "identity output"])
+@pytest.mark.parametrize("rho", [0.01, 0.1, 1.0])
+def test_the_local_ball_encloses_the_policy(name: str, rho: float) -> None:
+    """At points of the ball, against ball arithmetic that shares nothing with it."""
+    data = honest(name) if name == "rotor" else deep(*name.split())
+    c, generator = parse(data), np.random.default_rng(1)
+    exact = naive_checker.read(dump(data))
     with ctx.workprec(160):
-        bound = float(naive_checker.spectral_norm(exact))
-    norm = np.linalg.norm(W, 2)
-    assert norm * (1 - 1e-12) <= bound <= 1.02 * norm
+        for direction in generator.standard_normal((40, len(exact.states))):
+            d = direction / np.linalg.norm(direction) * generator.uniform(0, 1 - 1e-12)
+            z = [arb(rho) * v for v in d.tolist()]
+            x = [sum((naive_checker.ball(t) * v for t, v in zip(row, z, strict=True)), arb(0)) for row in exact.T]
+            for value, u in zip(policy_in_arb(c.policy, c.u_eq, x), local_inputs(data, rho), strict=True):
+                rest = value - u.v - sum((a * v for a, v in zip(u.a, d.tolist(), strict=True)), arb(0))
+                assert abs(rest) <= u.k * float(d @ d) * (1 + 1e-9) + arb(2) ** -100
+
+
+@pytest.mark.parametrize("squash", ["tanh", "identity"])
+def test_the_local_bound_is_sharp_on_a_small_ball(squash: str) -> None:
+    """A chain of tanhs that all bend the same way: k is the remainder itself as the ball shrinks."""
+    layers = [(np.array([[w]]), np.array([-b])) for w, b in ((0.75, 0.5), (1.25, 0.25), (0.875, 0.375), (1.5, 0.125))]
+    data = make(["u"], layers, np.eye(1), (0.01, 0.01), squash=squash, centre="output", scale=[2.0])
+    rho, policy = 2.0**-20, parse(data).policy
+    with ctx.workprec(160):
+        (u,) = local_inputs(data, rho)
+        (value,) = policy_in_arb(policy, [Fraction(0)], [arb(rho)])
+        assert abs((value - u.v - u.a[0]) / u.k - 1) < 1e-4
+
+
+@pytest.mark.parametrize("what", ["a", "k"])
+@pytest.mark.parametrize("bad", ["nan", "inf", "-inf", "[0 +/- inf]"])
+def test_what_is_not_finite_is_not_accepted(monkeypatch: pytest.MonkeyPatch, what: str, bad: str) -> None:
+    c = naive_checker.read(dump(honest("local only")))
+    S = naive_checker.product(naive_checker.product(naive_checker.transpose(c.T), c.P), c.T)
+    policy = naive_checker.local_policy
+
+    def broken(*arguments: Any) -> list[naive_checker.Local]:
+        u = policy(*arguments)
+        setattr(u[0], what, [arb(bad)] * len(u[0].a) if what == "a" else arb(bad))
+        return u
+
+    with ctx.workprec(160):
+        naive_checker.local(c, S)
+        monkeypatch.setattr(naive_checker, "local_policy", broken)
+        monkeypatch.setattr(naive_checker, "inputs", lambda *_: None)
+        with pytest.raises(naive_checker.Refused, match="local"):
+            naive_checker.local(c, S)
 
 
 def leaves_of(data: Document) -> list[Leaf]:

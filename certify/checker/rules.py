@@ -51,7 +51,7 @@ class Tally:
 
     rules: Counter[str] = field(default_factory=lambda: Counter({**dict.fromkeys(RULES, 0), "format": 1, "hash": 1}))
     ring_margin: float | None = None  # smallest -Vdot bound over the ring's leaves
-    local_margin: float = 0.0  # smallest eigenvalue less remainder, over the eigenvalue
+    local_margin: float = 0.0  # 1 - the remainder's largest part of the decay
 
 
 def check(c: Certificate, arithmetic: str = "float64") -> Tally:
@@ -134,8 +134,9 @@ def _within(bounds: tuple[Fraction, Fraction], mid: Number, radius: Number) -> N
 def _check_local(c: Certificate, T: Number, net: Folded, least: Fraction, bounded: bool, tally: Tally) -> None:
     """Claim 3: with z = rho d, {V <= c1} lies in ||d|| <= 1 and Vdot = 2 rho d'G(d), G = T'P F(T rho d).
 
-    F(0) = 0 exactly, so G(d) = B d + R(d) with ||R(d)|| <= k ||d||^2, and Vdot <= 2 rho ||d||^2 (-mu + k ||d||) with
-    mu a lower bound of the smallest eigenvalue of -(B + B')/2.
+    F(0) = 0 exactly, so G(d) = B d + R(d) with |R_i(d)| <= k_i ||d||^2. By Gershgorin -(B + B')/2 - diag(mu) is
+    positive semidefinite. Let mu > 0 and a = sum mu_i d_i^2. By Cauchy and Schwarz d'R <= sqrt(a share) ||d||^2 with
+    share = sum k_i^2 / mu_i; if min mu_i > share, that is less than a, since a >= min mu_i ||d||^2 >= min mu_i ||d||^4.
     """
     n = len(c.states)
     ratio, _ = float_with_error(Fraction(c.c1) / least)
@@ -146,10 +147,11 @@ def _check_local(c: Certificate, T: Number, net: Folded, least: Fraction, bounde
     slack = up(EPS * norm(norm(J, 1), 0))
     variables = [Jet(0 * J[i, 0], 0.0, J[i], slack, 0.0) for i in range(n)]
     gradient, u_slack, u_k = enclose_at_origin(net, J, slack)
-    for name, q, scale, bounds, row in zip(c.inputs, c.u_eq, net.scale, c.input_bounds, gradient, strict=True):
+    each = zip(c.inputs, c.u_eq, net.scale, c.input_bounds, gradient, u_k, strict=True)
+    for name, q, scale, bounds, row, k in each:
         value, error = float_with_error(q)
         wide = up(abs(scale) * u_slack + EPS * norm(row, 0))
-        u = Jet(np.float64(value), error, row, wide, up(abs(scale) * u_k))
+        u = Jet(np.float64(value), error, row, wide, up(abs(scale) * k))
         variables.append(u)
         if not bounded:
             tally.rules["inputs"] += 1
@@ -162,16 +164,17 @@ def _check_local(c: Certificate, T: Number, net: Folded, least: Fraction, bounde
     slopes, slacks, ks = (np.array([[getattr(jet, name)] for jet in F]) for name in ("slope", "slack", "k"))
     B = product(PT.T, gradients)
     wrong = total(size * slacks + doubt * slopes + gamma(n) * size * slopes, 0)  # of each row of B, in the 2-norm
-    k = norm(total(size * ks, 0), 0)
+    k = total(size * ks, 0)
     M = -(B + B.T) / 2
     off = total(np.abs(M) * (1 - np.eye(n)), 1)
     diagonal = np.array([M[i, i] for i in range(n)])
-    mu = -largest(off - diagonal, 0) - up(norm(wrong, 0) + gamma(n) * norm(norm(M, 1), 0))
+    mu = diagonal - off - up(norm(wrong, 0) + gamma(n) * norm(norm(M, 1), 0))
+    decay, share = -largest(-mu, 0), total(k * (k / mu), 0)
     tally.rules["local"] += 1
-    if not mu > up(k):
-        numbers = f"{float(middle(mu)):.3g} against {float(middle(k)):.3g}"
+    if not (decay > 0 and decay > share):
+        numbers = f"{float(middle(decay)):.3g} against {float(middle(share)):.3g}"
         raise Rejected("local", "levels.local", f"Vdot < 0 is not shown on the local ball: {numbers}")
-    tally.local_margin = float(middle(1 - k / mu))
+    tally.local_margin = float(1 - np.sqrt(middle(share / decay)))
 
 
 class _Ring:

@@ -1,8 +1,9 @@
 """The local step: the largest level below which the linearisation alone proves Vdot < 0.
 
 On the ball `x = rho T d`, ||d|| <= 1, every quantity is written `v(0) + a.d + R(d)` with |R(d)| <= k ||d||^2 for all
-d in the ball, so the bound holds for every smaller radius too and leaves no hole at the origin. For the network the
-remainder is carried in the 2-norm, layer by layer, with spectral norms instead of products of |W|.
+d in the ball, so the bound holds for every smaller radius too and leaves no hole at the origin. What each tanh adds to
+its tangent reaches the output through the products of weights and slopes at the origin, `Paths`, in which it cancels as
+it does in truth; they do not depend on the level.
 """
 
 from __future__ import annotations
@@ -18,7 +19,8 @@ from numpy.typing import NDArray
 from certify.obligations import Obligations
 
 Array = NDArray[np.float64]
-_MARGIN = 1e-3  # share of the smallest eigenvalue that is left to the checker's rounding
+MOST_PATHS = 2**25  # entries of a layer's J and M together: the checker refuses more
+_MARGIN = 1e-3  # share of the decay that is left to the checker's rounding
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,15 +58,52 @@ class _Jet:
         return self.compose(c, -s, 1.0, min(1.0, abs(c) + self.radius))
 
 
-def spectral_norms(obligations: Obligations) -> tuple[float, ...]:
-    """||W||_2 of each layer, as loose as the checker's own bound can be."""
-    return tuple(float(np.linalg.norm(W, 2)) * min(W.shape) ** (1 / 128) for W in obligations.loop.network.weights)
+@dataclass(frozen=True, slots=True)
+class _Layer:
+    """`y = y(0) + J z + M E`: E stacks what every tanh before this layer adds to its tangent at the origin."""
+
+    J: Array
+    M: Array
+    slope: Array  # of the tanh behind it; 1 where there is none
+    bend: Array  # half the magnitude of its second derivative at the origin
 
 
-def local_margin(obligations: Obligations, level: float, norms: tuple[float, ...]) -> float:
-    """Share of the smallest decay rate that the remainder leaves on {V <= level}; positive means Vdot < 0.
+@dataclass(frozen=True, slots=True)
+class Paths:
+    """The network at the origin in the coordinates z: all of the local proof that does not depend on the level."""
 
-    `norms` are those of `spectral_norms`, which do not depend on the level.
+    layers: tuple[_Layer, ...]
+    squash: bool
+
+
+def paths(obligations: Obligations) -> Paths | None:
+    """Follow T and every tanh's output through the network's linearisation at the origin; None if that is too large."""
+    network = obligations.loop.network
+    n, squash, columns = network.n, network.squash == "tanh", network.n
+    for W in network.weights[1:]:
+        columns += W.shape[1]
+        if len(W) * columns > MOST_PATHS:
+            return None
+    h, X = np.zeros(n), obligations.T
+    layers = []
+    for number, (W, b) in enumerate(zip(network.weights, network.biases, strict=True)):
+        last = number == len(network.weights) - 1
+        y, X = W @ h + b, W @ X
+        if number:
+            X = np.concatenate([X, W], axis=1)
+        if last and squash and network.centre == "preactivation":
+            y = network.beta(obligations.loop.u_eq)
+        h = np.tanh(y)
+        slope = np.ones_like(h) if last and not squash else 1 - h**2
+        layers.append(_Layer(X[:, :n], X[:, n:], slope, np.abs(h) * slope))
+        X = slope[:, None] * X
+    return Paths(tuple(layers), squash)
+
+
+def local_margin(obligations: Obligations, level: float, known: Paths) -> float:
+    """Share of the decay that the remainder leaves on {V <= level}; positive means Vdot < 0.
+
+    `known` are the `paths` of these obligations.
     """
     loop, P, T = obligations.loop, obligations.P, obligations.T
     system = loop.system
@@ -75,9 +114,9 @@ def local_margin(obligations: Obligations, level: float, norms: tuple[float, ...
     rho = math.sqrt(level / least)
     J = rho * T
     states = [_Jet(0.0, J[i], 0.0) for i in range(system.n)]
-    gradient, k = _policy(obligations, J, norms)
-    scale = np.abs(loop.network.scale)
-    inputs = [_Jet(float(u), gradient[j], float(scale[j]) * k) for j, u in enumerate(loop.u_eq)]
+    slopes, ks = _policy(known, rho)
+    each = zip(loop.u_eq, loop.network.scale, slopes, ks, strict=True)
+    inputs = [_Jet(float(u), float(s) * a, abs(float(s)) * float(k)) for u, s, a, k in each]
     if not obligations.inputs_bounded_by_form:
         for jet, (lo, hi) in zip(inputs, system.input_bounds, strict=True):
             if not (float(lo) < jet.c - jet.radius and jet.c + jet.radius < float(hi)):
@@ -85,19 +124,23 @@ def local_margin(obligations: Obligations, level: float, norms: tuple[float, ...
     values = dict(zip((*system.states, *system.inputs), (*states, *inputs), strict=True))
     F = [_evaluate(e, values) for e in system.exact_dynamics()]
     B = T.T @ P @ np.array([v.a for v in F])
-    k_total = float(np.linalg.norm(np.abs(T.T @ P) @ np.array([v.k for v in F])))
+    k = np.abs(T.T @ P) @ np.array([v.k for v in F])
     M = -(B + B.T) / 2
-    mu = float(np.min(2 * np.diag(M) - np.abs(M).sum(axis=1)))
-    return 1 - k_total / mu if mu > 0 and math.isfinite(k_total) else -math.inf
+    mu = 2 * np.diag(M) - np.abs(M).sum(axis=1)
+    if not (np.all(mu > 0) and np.all(np.isfinite(k))):
+        return -math.inf
+    return 1 - math.sqrt(float(np.sum(k**2 / mu)) / float(np.min(mu)))
 
 
 def prove_local(obligations: Obligations, limit: float) -> float | None:
     """The largest level up to `limit` that the local proof reaches, within 2 %; None if there is none."""
 
-    norms = spectral_norms(obligations)
+    known = paths(obligations)
+    if known is None:
+        return None
 
     def good(level: float) -> bool:
-        return local_margin(obligations, level, norms) > _MARGIN
+        return local_margin(obligations, level, known) > _MARGIN
 
     if good(limit):
         return limit
@@ -112,27 +155,17 @@ def prove_local(obligations: Obligations, limit: float) -> float | None:
     return low
 
 
-def _policy(obligations: Obligations, J: Array, norms: tuple[float, ...]) -> tuple[Array, float]:
-    """scale * gradient of the network on x = J d, and the 2-norm remainder before scaling."""
-    loop = obligations.loop
-    network = loop.network
-    y, k = np.zeros(network.n), 0.0
-    for layer, (W, b) in enumerate(zip(network.weights, network.biases, strict=True)):
-        last = layer == len(network.weights) - 1
-        k *= norms[layer]
-        y, J = W @ y + b, W @ J
-        if last:
-            if network.squash == "identity":
-                break
-            if network.centre == "preactivation":
-                y = network.beta(loop.u_eq)
-        reach = np.linalg.norm(J, axis=1) + k
-        t = np.tanh(y)
-        slope = 1 - t**2
-        half = np.minimum(0.385, np.abs(t) * slope + reach)
-        k = float(np.max(slope)) * k + float(np.max(half * reach)) * (float(np.linalg.norm(J)) + k)
-        y, J = t, slope[:, None] * J
-    return network.scale[:, None] * J, k
+def _policy(known: Paths, rho: float) -> tuple[Array, Array]:
+    """Gradients (m, n) and remainders (m,) of the network's outputs on z = rho d, before scaling."""
+    added = np.zeros(0)
+    for layer in known.layers:
+        k = np.abs(layer.M) @ added
+        reach = rho * np.linalg.norm(layer.J, axis=1) + k
+        fresh = np.minimum(0.385, layer.bend + reach) * reach**2
+        added = np.concatenate([added, fresh])
+    if known.squash:
+        k = layer.slope * k + fresh
+    return rho * layer.slope[:, None] * layer.J, k
 
 
 def _evaluate(expression: sympy.Expr, values: Mapping[sympy.Symbol, _Jet]) -> _Jet:
