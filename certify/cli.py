@@ -238,8 +238,10 @@ def systems(as_json: Json = False) -> None:
 def main(arguments: list[str] | None = None) -> None:
     """Entry point: turns every error into one sentence and the right exit status."""
     gc.set_threshold(100_000)  # most objects of a run are modules, which live to its end
-    # Threads that wait must not spin: on a busy machine spinning costs a factor of ten.
+    # Threads that wait must not spin: on a busy machine spinning costs a factor of ten. OpenBLAS cannot be told so, and
+    # numpy's matrices are small here, also the checker's; the engine's threads are torch's.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     given = sys.argv[1:] if arguments is None else arguments
     sys.exit(_run(given, "--json" in given))
 

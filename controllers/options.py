@@ -161,7 +161,7 @@ PRESETS: dict[str, TrainingOptions] = {
     # The LQR weights of both quadrotors keep the closed loop's rates between 0.7 and 7 per second, and with them the
     # condition of P: what is proved shrinks with it.
     "quadrotor2d": TrainingOptions(
-        steps=50_000,
+        steps=20_000,
         dt=0.02,
         horizon=250,
         start=0.35,
@@ -170,6 +170,8 @@ PRESETS: dict[str, TrainingOptions] = {
         penalty=100.0,
         actor=(256,) * 4,
         critic=(128, 128),
+        curvature_weight=0.5,
+        rest_weight=1.0,
         eta=0.1,
         n_A=600,
         n_B=600,
@@ -179,7 +181,7 @@ PRESETS: dict[str, TrainingOptions] = {
         input_weights=(10.0,) * 2,
     ),
     "quadrotor3d": TrainingOptions(
-        steps=50_000,
+        steps=30_000,
         dt=0.02,
         horizon=250,
         start=0.2,
@@ -188,7 +190,8 @@ PRESETS: dict[str, TrainingOptions] = {
         penalty=100.0,
         actor=(256,) * 5,
         critic=(128, 128),
-        curvature_weight=0.1,
+        curvature_weight=0.5,
+        rest_weight=1.0,
         eta=0.1,
         n_A=1000,
         n_B=1000,

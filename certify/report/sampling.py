@@ -81,10 +81,10 @@ class Flow:
     @classmethod
     def of(cls, loop: ClosedLoop) -> Flow:
         """Compile the equations."""
-        f, network, u_eq = loop.system.function(), loop.network, loop.u_eq
+        f = loop.system.function()
 
         def F(x: Array) -> Array:
-            return np.asarray(f(x, network(x, u_eq)))
+            return np.asarray(f(x, loop.policy(x)))  # folded once, not in every step
 
         return cls(loop, F, *domain_bounds(loop.system))
 
