@@ -709,17 +709,16 @@ class Leaf:
         return False
 
     def Vdot(self) -> Taylor:
-        """2 z'T'P F."""
+        """(2 P x)'F, where 2 P x = 2 P T z is affine in d."""
         c, n = self.claim, len(self.lo)
         names = {name: self.model(row[0], row[1:]) for name, row in zip(c.states, self.states(), strict=True)}
         for j, (name, (form, e)) in enumerate(zip(c.inputs, self.enclosure(), strict=True)):
             names[name] = self.model(form[0], form[1:]) + self.model(arb(0), [e], first=n + j)
-        F = [evaluate(node, names, lambda q: self.model(ball(q))) for node in c.dynamics]
         result = self.model(arb(0))
-        for i, row in enumerate(product(transpose(c.T), c.P)):
-            z = self.model(ball(self.centre[i]), [ball(self.radius[i])], first=i)
-            for weight, f in zip(row, F, strict=True):
-                result = result + z * f.scaled(2 * ball(weight))
+        for node, row in zip(c.dynamics, product(c.P, c.T), strict=True):
+            slopes = [ball(2 * v * r) for v, r in zip(row, self.radius, strict=True)]
+            gradient = self.model(ball(2 * dot(row, self.centre)), slopes)
+            result = result + gradient * evaluate(node, names, lambda q: self.model(ball(q)))
         return result
 
     def V(self) -> Taylor:
