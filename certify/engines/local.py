@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from certify.obligations import Obligations
 
 Array = NDArray[np.float64]
-MOST_PATHS = 2**25  # entries of a layer's J and M together: the checker refuses more
+_MOST_PATHS = 2**25  # entries of a layer's J and M together: the checker refuses more
 _MARGIN = 1e-3  # share of the decay that is left to the checker's rounding
 
 
@@ -64,7 +64,6 @@ class _Layer:
 
     J: Array
     M: Array
-    slope: Array  # of the tanh behind it; 1 where there is none
     bend: Array  # half the magnitude of its second derivative at the origin
 
 
@@ -73,7 +72,7 @@ class Paths:
     """The network at the origin in the coordinates z: all of the local proof that does not depend on the level."""
 
     layers: tuple[_Layer, ...]
-    squash: bool
+    slope: Array | None  # of the last layer's tanh, (m,); None with squash `identity`
 
 
 def paths(obligations: Obligations) -> Paths | None:
@@ -82,7 +81,7 @@ def paths(obligations: Obligations) -> Paths | None:
     n, squash, columns = network.n, network.squash == "tanh", network.n
     for W in network.weights[1:]:
         columns += W.shape[1]
-        if len(W) * columns > MOST_PATHS:
+        if len(W) * columns > _MOST_PATHS:
             return None
     h, X = np.zeros(n), obligations.T
     layers = []
@@ -94,10 +93,10 @@ def paths(obligations: Obligations) -> Paths | None:
         if last and squash and network.centre == "preactivation":
             y = network.beta(obligations.loop.u_eq)
         h = np.tanh(y)
-        slope = np.ones_like(h) if last and not squash else 1 - h**2
-        layers.append(_Layer(X[:, :n], X[:, n:], slope, np.abs(h) * slope))
+        slope = 1 - h**2
+        layers.append(_Layer(X[:, :n], X[:, n:], np.abs(h) * slope))
         X = slope[:, None] * X
-    return Paths(tuple(layers), squash)
+    return Paths(tuple(layers), slope if squash else None)
 
 
 def local_margin(obligations: Obligations, level: float, known: Paths) -> float:
@@ -163,9 +162,9 @@ def _policy(known: Paths, rho: float) -> tuple[Array, Array]:
         reach = rho * np.linalg.norm(layer.J, axis=1) + k
         fresh = np.minimum(0.385, layer.bend + reach) * reach**2
         added = np.concatenate([added, fresh])
-    if known.squash:
-        k = layer.slope * k + fresh
-    return rho * layer.slope[:, None] * layer.J, k
+    if known.slope is None:
+        return rho * layer.J, k
+    return rho * known.slope[:, None] * layer.J, known.slope * k + fresh
 
 
 def _evaluate(expression: sympy.Expr, values: Mapping[sympy.Symbol, _Jet]) -> _Jet:

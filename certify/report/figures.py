@@ -46,7 +46,7 @@ _ON_BOUNDARY = 14  # trajectories that start on the certified boundary, in each 
 _PATH_STEP = 0.6  # of the step of `time_scales`
 _MOST_STEPS = 500
 _PARTS = 3  # pieces that each step is drawn in
-STYLE: dict[str, Any] = {
+_RC: dict[str, Any] = {
     "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans"],
     "font.size": 9.0,
@@ -159,7 +159,7 @@ def draw(certificate: Certificate, accepted: bool) -> tuple[list[Picture], Simul
     """
     import matplotlib
 
-    with matplotlib.rc_context(STYLE):
+    with matplotlib.rc_context(_RC):
         scene = _Scene(certificate, accepted)
         roa = None
         if scene.n <= 2:
