@@ -5,7 +5,7 @@ A *fault* is a reason to refuse the file, in one of three ways.
 Exact: the file is not in the format, or a rule that is decided in rationals fails.
 Refuted: a point with 0 < V <= c2 where, in ball arithmetic, Vdot >= 0, an input leaves its bounds, or F is undefined.
 Incomplete: a leaf that contains points of the ring, and no multiplier of the S-procedure makes the bound negative at
-all of a few of the leaf's points; or a local ball on which the remainder, sampled, outweighs the discs of B.
+all of a few of the leaf's points; or a local ball on which, at a sampled point, d'G(d) - d'B d outweighs -d'B d.
 
 Every fault is a fact. The absence of faults proves nothing: points are looked for in binary64, by sampling.
 """
@@ -728,8 +728,8 @@ def _without_multiplier(loop: Loop, T: Array, z: Array, V: Array, vdot: Array, m
 def local_fault(data: Document) -> tuple[str, str] | None:
     """("local" or "inputs", why) if the local rule cannot hold on the ball that FORMAT.md prescribes; None otherwise.
 
-    The two sides are bounded by B, from central differences of step 2^-150 in balls of 700 bits, and by
-    |R_i(d)| / ||d||^2 at sampled d.
+    The rule implies that -d'B d exceeds |d'G(d) - d'B d| everywhere on the ball; B is from central differences of step
+    2^-150 in balls of 700 bits, and d is sampled.
     """
     return _local_fault(json.dumps([data[k] for k in _CLAIM]), data["evidence"]["T"])
 
@@ -759,22 +759,15 @@ def _local_fault(claim: str, encoded: str) -> tuple[str, str] | None:
         TP = [[_ball(v) for v in row] for row in _times(_matrix(T.T), P)]
         G = [[sum((p * f for p, f in zip(row, F, strict=True)), arb(0)) for row in TP] for _, F in values]
         B = [[(G[j][i] - G[n + j][i]) / (2 * step) for j in range(n)] for i in range(n)]
-        k = [arb(0)] * n
+        slack = arb(2) ** -60  # covers the differences' error, of relative order 2^-300
         for s, g in zip(samples, G[2 * n :], strict=True):
-            size = sum((v * v for v in s), arb(0))
-            for i in range(n):
-                R = g[i] - sum((b * v for b, v in zip(B[i], s, strict=True)), arb(0))
-                if not R.is_finite():
-                    return None
-                k[i] = k[i].max(abs(R) / size)
-        M = [[-(B[i][j] + B[j][i]) / 2 for j in range(n)] for i in range(n)]
-        # the margins cover the differences' error, of relative order 2^-300
-        mu = [M[i][i] - sum((abs(M[i][j]) for j in range(n) if j != i), arb(0)) for i in range(n)]
-        mu = [v + arb(2) ** -60 * abs(M[i][i]) for i, v in enumerate(mu)]
-        share = sum((v * v / w for v, w in zip(k, mu, strict=True)), arb(0)) * (1 - arb(2) ** -60)
-        for i in range(n):
-            if mu[i] <= 0 or (all(v > 0 for v in mu) and mu[i] <= share):
-                return "local", f"disc {i} reaches {float(mu[i].mid()):.3g}, the remainder {float(share.mid()):.3g}"
+            linear = [sum((b * v for b, v in zip(row, s, strict=True)), arb(0)) for row in B]
+            decay = -sum((p * q for p, q in zip(s, linear, strict=True)), arb(0))
+            rest = abs(sum((p * (q - v) for p, q, v in zip(s, g, linear, strict=True)), arb(0)))
+            if not rest.is_finite():
+                return None
+            if decay + slack * abs(decay) <= rest * (1 - slack):
+                return "local", f"at d = {s}: decay {float(decay.mid()):.3g}, the rest {float(rest.mid()):.3g}"
     return None
 
 

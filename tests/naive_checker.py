@@ -1,9 +1,10 @@
 """A second checker of certificates, written from FORMAT.md alone: as plain as possible, and slow.
 
-It shares no code and no arithmetic with `certify.checker`. What is rational is decided in `fractions.Fraction`, the
-rest in Arb balls of 160 bits, one scalar at a time; a comparison of balls counts only if it is certain. Where FORMAT.md
-leaves a choice (the two lines around a tanh, the multiplier k of the S-procedure) the choice here is this module's
-own, so that the two checkers may differ by a hair on a leaf, and on nothing else.
+It shares no code with `certify.checker`. What is rational is decided in `fractions.Fraction`, the rest in Arb balls of
+160 bits; a comparison of balls counts only if it is certain. Where FORMAT.md leaves a choice (the two lines around a
+tanh, the multiplier k of the S-procedure, the range of a third derivative on a leaf, the bound of a spectral norm) the
+choice here is this module's own, so that the two checkers may differ by a hair on a leaf or on the local ball. What
+`this checker refuses` for its size alone is not refused here.
 
 `judge` returns None if the certificate is accepted, the name of the first rule that fails, or `TRUSTED`.
 """
@@ -22,7 +23,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
-from flint import arb, ctx, fmpq
+from flint import arb, arb_mat, ctx, fmpq
 
 LEAF = 255
 MAX_BYTES = 256 * 2**20
@@ -246,11 +247,8 @@ def evaluate(node: Any, names: Mapping[str, Any], constant: Callable[[Fraction],
         return names[node] if node in names else constant(Fraction(node))
     name, *operands = node
     if name == "**":
-        base = evaluate(operands[0], names, constant)
-        power = base
-        for _ in range(abs(operands[1]) - 1):
-            power = power * base
-        return power if operands[1] > 0 else power.function("1/")
+        result = power(evaluate(operands[0], names, constant), abs(operands[1]))
+        return result if operands[1] > 0 else result.function("1/")
     first, *others = [evaluate(operand, names, constant) for operand in operands]
     for other in others:
         if name == "*":
@@ -259,7 +257,17 @@ def evaluate(node: Any, names: Mapping[str, Any], constant: Callable[[Fraction],
             first = first + (-other if name == "-" else other) if name != "/" else first * other.function("1/")
     if name == "-" and not others:
         return -first
-    return first.function(name) if name in ("sin", "cos", "tan") else first
+    if name == "tan":
+        return first.function("sin") * first.function("cos").function("1/")
+    return first.function(name) if name in ("sin", "cos") else first
+
+
+def power(base: Any, k: int) -> Any:
+    """The product of k > 0 factors, by repeated squaring."""
+    if k == 1:
+        return base
+    half = power(base, k // 2)
+    return half * half * base if k % 2 else half * half
 
 
 # ------------------------------------------------------------------------------------------------- the rational rules
@@ -403,11 +411,6 @@ def norm(values: Iterable[arb]) -> arb:
     return total(sup(v) ** 2 for v in values).sqrt()
 
 
-def about(centre: arb, radius: arb) -> arb:
-    """A ball that contains [centre - radius, centre + radius]."""
-    return (centre - radius).union(centre + radius)
-
-
 def sup(value: arb) -> arb:
     """The largest absolute value in a ball."""
     return arb(value.abs_upper())
@@ -425,10 +428,6 @@ def derivatives(name: str, y: arb) -> list[arb]:
     if name == "1/":
         p = 1 / y
         return [p, -(p * p), 2 * p * p * p, -6 * p * p * p * p]
-    if name == "tan":
-        t = y.tan()
-        d = 1 + t * t
-        return [t, d, 2 * t * d, 2 * d * (1 + 3 * t * t)]
     s, k = y.sin(), y.cos()
     return [s, k, -s, -k] if name == "sin" else [k, -s, -k, s]
 
@@ -468,93 +467,144 @@ def inputs(c: Claim, ranges: Sequence[tuple[arb, arb]]) -> None:
 
 @dataclass
 class Local:
-    """v(0) + a.d + R(d) with |R(d)| <= k ||d||^2 on ||d|| <= 1."""
+    """v(0) + a.d + d'Qd + r(d) with |r(d)| <= d'Ed, for ||d|| <= 1; a is a column."""
 
     v: arb
-    a: list[arb]
-    k: arb
+    a: arb_mat
+    Q: arb_mat
+    E: arb_mat
+
+    def __post_init__(self) -> None:
+        self.slope, self.bend = norm(self.a.entries()), norm(self.Q.entries())
+        self.curve = self.bend + norm(self.E.entries())
+        self.radius = self.slope + self.curve
+
+    @classmethod
+    def affine(cls, v: arb, a: Sequence[arb]) -> Local:
+        n = len(a)
+        return cls(v, arb_mat(n, 1, list(a)), arb_mat(n, n), arb_mat(n, n))
 
     def __add__(self, other: Local) -> Local:
-        return Local(self.v + other.v, [x + y for x, y in zip(self.a, other.a, strict=True)], self.k + other.k)
+        return Local(self.v + other.v, self.a + other.a, self.Q + other.Q, self.E + other.E)
 
     def __neg__(self) -> Local:
-        return Local(-self.v, [-x for x in self.a], self.k)
+        return Local(-self.v, -self.a, -self.Q, self.E)
 
     def __mul__(self, other: Local) -> Local:
-        a = [self.v * y + other.v * x for x, y in zip(self.a, other.a, strict=True)]
-        k = abs(self.v) * other.k + abs(other.v) * self.k + self.reach() * other.reach()
-        return Local(self.v * other.v, a, k)
-
-    def reach(self) -> arb:
-        """A bound of |v(d) - v(0)| / ||d||."""
-        return norm(self.a) + self.k
+        """v w = v(0) w(0) + v(0) dw + w(0) dv + (a_v.d)(a_w.d) + dv (dw - a_w.d) + (dv - a_v.d)(a_w.d)."""
+        v, w, outer = self, other, self.a * other.a.transpose()
+        Q = v.v * w.Q + w.v * v.Q + (outer + outer.transpose()) / 2
+        E = (abs(v.v) + v.radius) * w.E + (abs(w.v) + w.slope) * v.E
+        E += (v.radius * w.bend + w.slope * v.bend) * identity(outer.nrows())
+        return Local(v.v * w.v, v.v * w.a + w.v * v.a, Q, E)
 
     def function(self, name: str) -> Local:
-        at, on = derivatives(name, self.v), derivatives(name, about(self.v, self.reach()))
-        k = sup(on[1]) * self.k + sup(on[2]) * self.reach() ** 2 / 2
-        return Local(at[0], [at[1] * x for x in self.a], k + 0 * on[0])  # no value on the range, no bound
+        at = derivatives(name, self.v)
+        if name == "1/":
+            least = abs(self.v) - self.radius
+            require(bool(least > 0), "local")
+            third = 6 / least**4
+        else:
+            third = (abs(at[3]) + self.radius).min(arb(1))
+        H, R = self.beyond_tangent(at[2] / 2, third)
+        return Local(at[0], at[1] * self.a, at[1] * self.Q + H, abs(at[1]) * self.E + R)
+
+    def beyond_tangent(self, half: arb, third: arb) -> tuple[arb_mat, arb_mat]:
+        """(H, R): a function of v less its tangent at v(0) is d'Hd within d'Rd.
+
+        half = phi''(v(0)) / 2, third >= |phi'''| on the range. (v - v(0))^2 is d'aa'd but for (v - v(0) - a.d)(v - v(0)
+        + a.d), that is within (2 slope + curve) d'(bend I + E)d, and |v - v(0)|^3 <= radius (v - v(0))^2.
+        """
+        square, cubic = self.a * self.a.transpose(), third * self.radius / 6
+        spread = (abs(half) + cubic) * (2 * self.slope + self.curve)
+        return half * square, spread * self.E + cubic * square + spread * self.bend * identity(square.nrows())
+
+    def tanh(self) -> tuple[arb, arb, arb_mat, arb_mat]:
+        """The value and the slope of the tangent at v(0), and (H, R) of what tanh adds to it; |tanh'''| <= 2."""
+        t = self.v.tanh()
+        return t, 1 - t * t, *self.beyond_tangent(-t * (1 - t * t), arb(2))
 
 
 def local(c: Claim, S: list[list[Fraction]]) -> None:
-    """Rule `local`: mu_i > 0 and sum_i k_i^2 / mu_i < mu_i for every i, on z = rho d; rule `inputs` on that ball."""
-    size = range(len(c.states))
-    rho = arb(ball(c.c1 / discs(S)).sqrt().upper())
-    states = [Local(arb(0), [rho * ball(t) for t in row], arb(0)) for row in c.T]
+    """Rule `local`: ||I - N||_2 + ||W||_2 < 1 on z = rho d; rule `inputs` on that ball."""
+    n, rho = len(c.states), arb(ball(c.c1 / discs(S)).sqrt().upper())
+    states = local_states(c, rho)
     u = local_policy(c, states)
-    inputs(c, [(v.v, v.reach()) for v in u])
-    names = dict(zip(c.states + c.inputs, states + u, strict=True))
-    F = [evaluate(node, names, lambda q: Local(ball(q), [arb(0) for _ in size], arb(0))) for node in c.dynamics]
-    TP = [[ball(v) for v in row] for row in product(transpose(c.T), c.P)]
-    B = [[total(TP[i][k] * F[k].a[j] for k in size) for j in size] for i in size]
-    k = [total(abs(TP[i][j]) * F[j].k for j in size) for i in size]
-    M = [[-(B[i][j] + B[j][i]) / 2 for j in size] for i in size]
-    mu = [M[i][i] - total(abs(M[i][j]) for j in size if j != i) for i in size]
-    bend = total(v * v / m for v, m in zip(k, mu, strict=True))
-    require(all(m.is_finite() and bool(m > 0) and bool(bend < m) for m in mu), "local")
+    inputs(c, [(v.v, v.radius) for v in u])
+    B, C, E = local_vdot(c, states, u)
+    require(all(v.is_finite() for A in (B, E, *C) for v in A.entries()), "local")
+    require(all(bool(B[i, i] < 0) for i in range(n)), "local")
+    D = arb_mat([[1 / (-B[i, i]).sqrt() if i == j else arb(0) for j in range(n)] for i in range(n)])
+    N = D * (-(B + B.transpose()) / 2 - E) * D
+    W = arb_mat([(D * A * D).entries() for A in C])
+    require(bool(spectral(identity(n) - N) + spectral(W) < 1), "local")
+
+
+def local_states(c: Claim, rho: arb) -> list[Local]:
+    """x = T rho d."""
+    return [Local.affine(arb(0), [rho * ball(t) for t in row]) for row in c.T]
 
 
 def local_policy(c: Claim, states: list[Local]) -> list[Local]:
-    """The policy on the local ball: y(d) = y(0) + J d + M E(d), |E_q(d)| <= e_q ||d||^2.
+    """The policy on the local ball: y(d) = y(0) + J d + L A(d), and A_q(d) is d'H_q d within d'R_q d.
 
-    A row is y_i(0), then J_i, then M_i: one entry for each tanh q of the layers before.
+    A row is y_i(0), then J_i, then L_i: one entry for each tanh q of the layers before.
     """
-    rows, e = affine(c.layers[0], [[arb(0), *x.a] for x in states]), list[arb]()
+    rows, bends = affine(c.layers[0], [[x.v, *x.a.entries()] for x in states]), list[tuple[arb_mat, arb_mat]]()
     for layer in c.layers[1:]:
-        rows, own = local_tanh(rows, e)
-        rows, e = [[*row, *map(ball, w)] for row, w in zip(affine(layer, rows), layer.W, strict=True)], e + own
+        tangents, own = [], []
+        for row in rows:
+            t, slope, H, R = local_model(row, bends).tanh()
+            tangents.append([t, *(slope * v for v in row[1:])])
+            own.append((H, R))
+        rows = [[*row, *map(ball, w)] for row, w in zip(affine(layer, tangents), layer.W, strict=True)]
+        bends += own
     if c.centre == "preactivation":
         rows = [[y, *row[1:]] for y, row in zip(beta(c), rows, strict=True)]
-    rows, own = local_tanh(rows, e) if c.squash == "tanh" else (rows, [arb(0) for _ in rows])
-    result = []
-    for q, s, row, last in zip(c.u_eq, c.scale, rows, own, strict=True):
-        slopes = [ball(s) * v for v in row[1 : len(row) - len(e)]]
-        result.append(Local(ball(q), slopes, ball(abs(s)) * (remainder(row, e) + last)))  # pi(0) = u_eq exactly
+    result, zero = [], arb_mat(len(states), len(states))
+    for q, s, row in zip(c.u_eq, map(ball, c.scale), rows, strict=True):
+        y = local_model(row, bends)
+        _, slope, H, R = y.tanh() if c.squash == "tanh" else (y.v, arb(1), zero, zero)
+        result.append(  # pi(0) = u_eq exactly
+            Local(ball(q), s * slope * y.a, s * (slope * y.Q + H), abs(s) * (slope * y.E + R))
+        )
     return result
 
 
-def local_tanh(rows: list[list[arb]], e: list[arb]) -> tuple[list[list[arb]], list[arb]]:
-    """The tangents at y_i(0), and the bounds h_i reach_i^2 of what each tanh adds to its own."""
-    result, own = [], []
-    for row in rows:
-        t = row[0].tanh()
-        reach = norm(row[1 : len(row) - len(e)]) + remainder(row, e)
-        result.append([t, *((1 - t * t) * v for v in row[1:])])
-        own.append(half_curvature(about(row[0], reach)) * reach**2)
-    return result, own
+def local_model(row: list[arb], bends: list[tuple[arb_mat, arb_mat]]) -> Local:
+    """Q = sum_q L_q H_q and E = sum_q |L_q| R_q, L the end of the row."""
+    y = Local.affine(row[0], row[1 : len(row) - len(bends)])
+    L = row[len(row) - len(bends) :]
+    Q = sum((v * H for v, (H, _) in zip(L, bends, strict=True)), y.Q)
+    return Local(y.v, y.a, Q, sum((abs(v) * R for v, (_, R) in zip(L, bends, strict=True)), y.E))
 
 
-def remainder(row: list[arb], e: list[arb]) -> arb:
-    """sum_q |M_q| e_q, M the end of the row."""
-    return total(abs(m) * bound for m, bound in zip(row[len(row) - len(e) :], e, strict=True))
+def local_vdot(c: Claim, states: list[Local], u: list[Local]) -> tuple[arb_mat, list[arb_mat], arb_mat]:
+    """B, C, E: Vdot / (2 rho) is d'Bd + sum_j d_j d'C_j d within d'Ed; F(0) = 0 exactly."""
+    size = range(len(states))
+    names = dict(zip(c.states + c.inputs, states + u, strict=True))
+    F = [evaluate(node, names, lambda q: Local.affine(ball(q), [arb(0) for _ in size])) for node in c.dynamics]
+    PT = arb_mat([[ball(v) for v in row] for row in product(c.P, c.T)])
+    zero = arb_mat(len(F), len(F))
+    B = PT.transpose() * arb_mat([f.a.entries() for f in F])
+    C = [sum((PT[i, j] * f.Q for i, f in enumerate(F)), zero) for j in size]
+    E = sum((norm(row) * f.E for row, f in zip(PT.tolist(), F, strict=True)), zero)
+    return B, C, E
 
 
-def half_curvature(y: arb) -> arb:
-    """sup |tanh''| / 2 = sup |t (1 - t^2)| over y, t = tanh y; its maximum is 2/sqrt(27), at t^2 = 1/3."""
-    lo, hi = arb(y.lower()).tanh(), arb(y.upper()).tanh()
-    peak = 1 / arb(3).sqrt()
-    if all(hi < p or lo > p for p in (peak, -peak)):
-        return largest([abs(lo * (1 - lo * lo)), abs(hi * (1 - hi * hi))])
-    return 2 / arb(27).sqrt()
+def identity(n: int) -> arb_mat:
+    return arb_mat(n, n, [int(i == j) for i in range(n) for j in range(n)])
+
+
+def spectral(A: arb_mat) -> arb:
+    """A bound of the largest singular value: the root of ||(AA')^(2^k)||_F, at most n^(1/2^(k+2)) too large."""
+    result, squared = norm(A.entries()), A * A.transpose()
+    for k in range(30):
+        bound = norm(squared.entries())
+        for _ in range(k + 1):
+            bound = bound.sqrt()
+        result, squared = bound if bound < result else result, squared * squared
+    return result
 
 
 # --------------------------------------------------------------------------------------------------------- the leaves

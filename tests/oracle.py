@@ -93,3 +93,9 @@ def policies_in_arb(policy: Policy, u_eq: Sequence[Fraction], states: Sequence[S
 
 def _tanh(h: arb_mat) -> arb_mat:
     return arb_mat(h.nrows(), h.ncols(), [v.tanh() for v in h.entries()])
+
+
+def quadratic(matrix: Any, d: Sequence[float]) -> arb:
+    """d'M d, the entries of M being binary64 numbers or balls."""
+    each = zip(d, matrix, strict=True)
+    return sum((arb(p) * arb(m) * arb(q) for p, row in each for m, q in zip(row, d, strict=True)), arb(0))

@@ -35,12 +35,12 @@ from certify.checker.float64 import (
     total,
     up,
 )
-from certify.checker.local import Jet
+from certify.checker.local import Jet, enclose_at_origin, refuse_large, widen
 from certify.checker.local import constant as constant_jet
-from certify.checker.network import enclose_at_origin, enclose_on_boxes, fold, relax_tanh
+from certify.checker.network import Folded, enclose_on_boxes, fold, relax_tanh
 from certify.checker.taylor import Taylor, affine, upper_bound
 from certify.checker.taylor import constant as constant_model
-from tests.oracle import awkward, ball, certainly_within, policy_in_arb
+from tests.oracle import awkward, ball, certainly_within, policy_in_arb, quadratic
 
 FLOATS = st.floats(allow_nan=False, allow_infinity=False)
 MAGNITUDES = st.floats(min_value=0.0, allow_nan=False, allow_infinity=False)
@@ -454,18 +454,18 @@ def test_upper_bound_of_a_separable_model_is_its_maximum() -> None:
 
 
 class Member:
-    """A function that a jet holds: `c0 + a0.d + curvature d_axis^2`, every deviation drawn within the jet's bounds."""
+    """A function that a jet holds: `c0 + a0.d + d'Q d + w d'E d`, every deviation drawn within the jet's bounds."""
 
     def __init__(self, jet: Jet, generator: np.random.Generator) -> None:
-        s, t, w = (float(v) for v in generator.choice([-1.0, 1.0, 0.5, 0.0], 3))
+        s, t, self.w = (float(v) for v in generator.choice([-1.0, 1.0, 0.5, 0.0], 3))
+        self.jet = jet
         self.c = arb(float(jet.c)) + arb(s) * arb(float(jet.error))
         self.a = [arb(float(v)) for v in jet.a]
         self.a[int(generator.integers(len(jet.a)))] += arb(t) * arb(float(jet.slack))
-        self.axis, self.k = int(generator.integers(len(jet.a))), arb(w) * arb(float(jet.k))
 
     def __call__(self, d: list[float]) -> arb:
         linear = sum((p * arb(x) for p, x in zip(self.a, d, strict=True)), self.c)
-        return linear + self.k * arb(d[self.axis]) ** 2
+        return linear + quadratic(self.jet.Q, d) + arb(self.w) * quadratic(self.jet.E, d)
 
 
 def points_in_the_ball(generator: np.random.Generator, n: int) -> list[list[float]]:
@@ -478,17 +478,16 @@ def assert_jet(
     result: Jet, value: Callable[[list[float]], arb], gradient: list[arb], points: list[list[float]]
 ) -> bool:
     """v(0), the gradient, and the remainder at every point; False if the jet says nothing."""
-    if not np.isfinite([result.error, result.slack, result.k]).all():
-        return False
     n = len(gradient)
+    if not np.isfinite([result.error, result.slack, *np.ravel(result.Q), *np.ravel(result.E)]).all():
+        return False
     at_0 = value([0.0] * n)
     assert abs(at_0 - arb(float(result.c))) <= arb(float(result.error))
     distance = sum(((p - arb(float(q))) ** 2 for p, q in zip(gradient, result.a, strict=True)), arb(0))
     assert distance <= arb(float(result.slack)) ** 2
     for d in points:
         linear = sum((p * arb(x) for p, x in zip(gradient, d, strict=True)), at_0)
-        square = sum((arb(x) ** 2 for x in d), arb(0))
-        assert abs(value(d) - linear) <= arb(float(result.k)) * square, d
+        assert abs(value(d) - linear - quadratic(result.Q, d)) <= quadratic(result.E, d), d
     return True
 
 
@@ -499,10 +498,12 @@ def jets(generator: np.random.Generator, n: int, exponent: int) -> Jet:
         return float(abs(generator.standard_normal()) * 2.0 ** generator.integers(-40, most) * scale)
 
     sign = float(generator.choice([-1.0, 1.0]))
-    some = generator.random(3) < 0.8
+    some = generator.random(4) < 0.8
+    half, root = generator.standard_normal((2, n, n))
+    E = root @ root.T * number(0) * some[3]
     return Jet(
         np.float64(sign * number(2)), number(-4) * some[0], generator.standard_normal(n) * number(1),
-        number(-4) * some[1], number(0) * some[2],
+        number(-4) * some[1], (half + half.T) * number(0) * some[2], widen((E + E.T) / 2, 0.0, 2.0**-40),
     )  # fmt: skip
 
 
@@ -532,25 +533,26 @@ def test_jets_of_sine_and_cosine_contain(spread: int) -> None:
         for _ in range(40):
             x = jets(generator, 2, spread)
             centre = np.float64(generator.choice([0.0, 1.0, 70.0]) * generator.standard_normal())
-            x = Jet(centre, x.error, x.a, x.slack, x.k)
+            x = Jet(centre, x.error, x.a, x.slack, x.Q, x.E)
             v, points = Member(x, generator), points_in_the_ball(generator, 2)
             assert assert_jet(x.sin(), lambda d, v=v: v(d).sin(), [v.c.cos() * p for p in v.a], points)
             assert assert_jet(x.cos(), lambda d, v=v: v(d).cos(), [-v.c.sin() * p for p in v.a], points)
 
 
 def test_a_jet_of_a_divisor_that_may_vanish_gives_nothing() -> None:
+    nothing = np.zeros((1, 1))
     for c, error, slope in ((1.0, 0.0, 1.0), (0.0, 0.0, 0.0), (1.0, 1.0, 0.0)):
-        x = Jet(np.float64(c), error, np.full(1, slope), 0.0, 0.0)
-        assert np.isnan(x.inv().k) and np.isnan(x.inv().slack)
-    whole = Jet(np.float64("inf"), float("inf"), np.zeros(1), 0.0, 0.0)
-    assert not np.isfinite((whole * Jet(np.float64(0), 0.0, np.zeros(1), 0.0, 0.0)).error)
+        x = Jet(np.float64(c), error, np.full(1, slope), 0.0, nothing, nothing)
+        assert np.isnan(x.inv().E) and np.isnan(x.inv().slack)
+    whole = Jet(np.float64("inf"), float("inf"), np.zeros(1), 0.0, nothing, nothing)
+    assert not np.isfinite((whole * Jet(np.float64(0), 0.0, np.zeros(1), 0.0, nothing, nothing)).error)
 
 
 @given(st.integers(-(10**30), 10**30), st.integers(1, 10**30))
 def test_jets_of_constants_contain(numerator: int, denominator: int) -> None:
     q = Fraction(numerator, denominator)
     jet = constant_jet(q, 2)
-    assert abs(Fraction(jet.c) - q) <= Fraction(jet.error) and jet.k == 0 and not jet.a.any()
+    assert abs(Fraction(jet.c) - q) <= Fraction(jet.error) and not (jet.a.any() or jet.Q.any() or jet.E.any())
 
 
 # --------------------------------------------------------------------------------------------- the policy's enclosures
@@ -725,8 +727,8 @@ def test_the_policy_at_the_origin(radius: float) -> None:
         n = widths[0]
         J, slack = radius * generator.standard_normal((n, n)), radius * 1e-9
         folded = fold(policy, u_eq)
-        gradient, u_slack, k = enclose_at_origin(folded, J, slack)
-        if not np.isfinite([u_slack, *k]).all():
+        gradient, u_slack, Q, E = enclose_at_origin(folded, J, slack)
+        if not np.isfinite([u_slack, *np.ravel(E)]).all():
             continue
         finite += 1
         shifted = [[arb(float(v)) for v in row] for row in J]
@@ -738,28 +740,38 @@ def test_the_policy_at_the_origin(radius: float) -> None:
                 for j, (u, q) in enumerate(zip(policy_in_arb(policy, u_eq, state), u_eq, strict=True)):
                     line = ball(q) + sum((arb(float(g)) * arb(v) for g, v in zip(gradient[j], d, strict=True)), arb(0))
                     slip = 4 * arb(2.0**-53) * sum((abs(arb(float(g))) for g in gradient[j]), arb(0)) * square.sqrt()
-                    bound = arb(u_slack) * square.sqrt() + arb(float(k[j])) * square
-                    bound = abs(arb(float(folded.scale[j]))) * bound
+                    bound = arb(u_slack) * square.sqrt() + quadratic(E[j], d)
+                    scale = arb(float(folded.scale[j]))
                     # `slip`: the caller, not this function, accounts for the rounding of scale * G
-                    assert abs(u - line) <= bound + slip, (widths, size, squash, centre, d)
+                    assert abs(u - line - scale * quadratic(Q[j], d)) <= abs(scale) * bound + slip, (
+                        widths,
+                        size,
+                        squash,
+                        centre,
+                        d,
+                    )
     assert finite > len(POLICIES) // 2
 
 
 @pytest.mark.parametrize("arithmetic", ["float64", "arb"])
-def test_a_network_too_large_for_the_local_rule_is_refused_at_once(arithmetic: str) -> None:
-    """A file of some hundred KiB whose bound would take gigabytes; a little less is enclosed."""
-    wide = {"float64": 6000, "arb": 2100}[arithmetic]
+def test_what_is_too_large_for_the_local_rule_is_refused_at_once(arithmetic: str) -> None:
+    """Files of some hundred KiB whose bounds would take gigabytes; a network a little smaller is enclosed."""
 
-    def enclose(wide: int) -> None:
-        widths = [1, wide, 1, wide, 1]
+    def folded(widths: list[int]) -> Folded:
         weights = tuple(np.full((out, into), 1e-9) for into, out in itertools.pairwise(widths))
         biases = tuple(np.zeros(out) for out in widths[1:])
         policy = Policy(weights, biases, np.ones(1), np.zeros(1), "tanh", "preactivation")
-        enclose_at_origin(fold(policy, (Fraction(0),), arithmetic), carry(np.ones((1, 1)), arithmetic), 0.0)
+        return fold(policy, (Fraction(0),), arithmetic)
 
-    with pytest.raises(Rejected, match=r"rule=local at=policy\.layers"):
-        enclose(wide)
-    enclose(wide // 12)
+    wide = {"float64": 6000, "arb": 2100}[arithmetic]
+    for widths in ([1, wide, 1, wide, 1], [64, *[1] * 1100, 1] if arithmetic == "arb" else [64, *[1] * 9000, 1]):
+        with pytest.raises(Rejected, match=r"rule=local at=policy\.layers"):
+            refuse_large(folded(widths), 1, widths[0], arithmetic)
+    with pytest.raises(Rejected, match=r"rule=local at=plant\.dynamics"):
+        refuse_large(folded([64, 1]), 10_000, 64, arithmetic)
+    small = folded([1, wide // 12, 1, wide // 12, 1])
+    refuse_large(small, 1, 1, arithmetic)
+    enclose_at_origin(small, carry(np.ones((1, 1)), arithmetic), 0.0)
 
 
 @pytest.mark.parametrize("seed", range(10))

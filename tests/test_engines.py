@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from certify.closed_loop import ClosedLoop
+from certify.engines import local
 from certify.engines.branch_and_bound import LEAF, Budget, prove_ring
 from certify.engines.falsify import Witness, confirm, falsify
 from certify.engines.local import local_margin, paths, prove_local
 from certify.errors import InputError
 from certify.lyapunov import diagonalising_coordinates, domain_limit, solve_lyapunov
 from certify.obligations import Obligations
-from certify.policies import TanhNetwork
+from certify.policies import TanhNetwork, load_policy
 from certify.systems import System, get_system
 from tests.conftest import chain, pendulum_network, scalar_tanh
 
 CPU = torch.device("cpu")
+POLICIES = Path(__file__).parent.parent / "examples" / "policies"
 
 
 def obligations(system: System, network: TanhNetwork) -> Obligations:
@@ -81,6 +84,21 @@ def test_the_local_proof_knows_the_scalar_plant() -> None:
     assert 0.3 < level < 1.915**2
 
 
+def test_the_local_proof_uses_signs_and_directions() -> None:
+    """Twelve states, five layers: sums of magnitudes and one number a remainder reach 2.0e-6 here."""
+    policy = load_policy(POLICIES / "quadrotor3d.pt")
+    level = prove_local(obligations(get_system("quadrotor3d"), policy.network), 1.0)
+    assert level is not None and 4e-4 < level < 0.043  # the falsifier's limit
+
+
+@pytest.mark.parametrize("limit", ["_MOST_NUMBERS", "_MOST_PRODUCTS"])
+def test_a_network_too_large_for_the_local_proof_is_named(limit: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    claims = obligations(get_system("pendulum"), pendulum_network())
+    monkeypatch.setattr(local, limit, 100)
+    with pytest.raises(InputError, match="too large for the local proof"):
+        prove_local(claims, 1.0)
+
+
 def test_the_ring_covers_and_holds(pendulum: System) -> None:
     claims = obligations(pendulum, pendulum_network())
     limit = domain_limit(claims.P, pendulum.domain) * (1 - 1e-9)
@@ -110,6 +128,8 @@ def test_budgets_stop_the_pass_with_what_is_proved_so_far(pendulum: System) -> N
     assert large.reason == "requested" and large.level == 6.0
     timed = prove_ring(claims, 1e-6, 6.0, Budget(seconds=1e-9, batch=4), CPU)
     assert timed.reason == "time" and timed.level < 6.0
+    nothing = prove_ring(claims, 1.0, 6.0, Budget(seconds=1e-9), CPU)
+    assert (nothing.reason, nothing.level, nothing.tree, nothing.leaves) == ("time", 1.0, bytes([LEAF]), 1)
 
 
 def test_a_level_beyond_the_truth_is_capped_by_a_witness() -> None:

@@ -17,6 +17,7 @@ import numpy as np
 from flint import arb, arb_mat
 
 from . import float64
+from .float64 import spectral_norm
 
 Number = Any  # a binary64 number, a ball, or an array of either
 
@@ -71,5 +72,10 @@ ends = _either(lambda c, r: (_lower(c - r), _upper(c + r)), float64.ends)
 
 
 def frobenius(G: Number) -> Number:
-    """An upper bound of ||G||_F."""
-    return norm(norm(G, 0), 0)
+    """An upper bound of ||G||_F, G (..., n, n)."""
+    return norm(norm(G, -1), -1)
+
+
+def spectral(G: Number) -> Number:
+    """An upper bound of ||G||_2, G a matrix."""
+    return up(spectral_norm(middle(G)) + frobenius(up(np.abs(G - middle(G)))))

@@ -1,8 +1,9 @@
-"""First-order models with a quadratic remainder on the unit ball: what the local rule evaluates the plant in.
+"""Second-order models on the unit ball: what the local rule evaluates the plant and the policy in.
 
-A jet of v over d in R^n says: `v(d) = v(0) + a.d + R(d)` with |R(d)| <= k ||d||^2 for *all* ||d|| <= 1, so the
-bound holds on every smaller ball too. v(0) lies within `error` of c, and the true gradient within `slack` of a in the
-2-norm.
+A jet of v over d in R^n says, for *all* ||d|| <= 1: `v(d) = v(0) + a.d + d'Q d + r(d)` with |r(d)| <= d'E d. It
+holds on every smaller ball too. v(0) lies within `error` of c, and the true gradient within `slack` of a in the 2-norm;
+Q is the matrix that is stored, and whatever it leaves out lies in E. E is positive semidefinite, being a sum of such
+matrices with weights >= 0, and knows the directions in which v is far from its linearisation.
 """
 
 from __future__ import annotations
@@ -12,19 +13,39 @@ from fractions import Fraction
 
 import numpy as np
 
-from .arithmetic import Number, lesser, norm, sin_cos, up
-from .float64 import EPS, float_with_error
+from .arithmetic import Number, carry, frobenius, is_ball, largest, lesser, norm, product, sin_cos, tanh, total, up
+from .errors import Rejected
+from .float64 import EPS, float_with_error, gamma
+from .network import Folded
+
+_MOST_NUMBERS = {"float64": 2**25, "arb": 2**22}  # in the matrices of all jets, or of a layer and the paths to it
+_MOST_PRODUCTS = {"float64": 2**33, "arb": 2**28}  # in the sums over paths
+
+
+def widen(E: Number, extra: Number, relative: float = EPS) -> Number:
+    """E (..., n, n) enlarged by its own rounding errors, at most `relative` a term, and by `extra` ||d||^2.
+
+    E sums semidefinite matrices with weights >= 0. The Frobenius norm of each is at most its trace, so the 2-norm of
+    all rounding errors is at most `relative` times the trace of the sum.
+    """
+    trace = total(np.diagonal(E, axis1=-2, axis2=-1), -1)
+    return E + np.asarray(up(2 * relative * trace + extra))[..., None, None] * np.eye(E.shape[-1])
+
+
+def _outer(a: Number, b: Number) -> Number:
+    return a[..., :, None] * b[..., None, :]
 
 
 @dataclass(frozen=True)
 class Jet:
-    """`c` +- `error`, gradient `a` (n,) +- `slack`, quadratic remainder `k`."""
+    """`c` +- `error`, gradient `a` (n,) +- `slack`, half the Hessian `Q` (n, n), remainder `E` (n, n)."""
 
     c: Number
     error: Number
     a: Number
     slack: Number
-    k: Number
+    Q: Number
+    E: Number
 
     @property
     def size(self) -> Number:
@@ -37,18 +58,29 @@ class Jet:
         return up(norm(self.a, 0) + self.slack)
 
     @property
+    def bend(self) -> Number:
+        """Upper bound of ||Q||_2."""
+        return frobenius(self.Q)
+
+    @property
+    def curve(self) -> Number:
+        """Upper bound of |v(d) - v(0) - a.d| / ||d||^2, a being the true gradient."""
+        return up(self.bend + frobenius(self.E))
+
+    @property
     def radius(self) -> Number:
         """Upper bound of |v(d) - v(0)| / ||d|| on the unit ball."""
-        return up(self.slope + self.k)
+        return up(self.slope + self.curve)
 
     def __add__(self, other: Jet) -> Jet:
         x, y = self, other
         c = x.c + y.c
         error = up(x.error + y.error + EPS * abs(c))
-        return Jet(c, error, x.a + y.a, up(x.slack + y.slack + EPS * (x.slope + y.slope)), up(x.k + y.k))
+        slack = up(x.slack + y.slack + EPS * (x.slope + y.slope))
+        return Jet(c, error, x.a + y.a, slack, x.Q + y.Q, widen(x.E + y.E, EPS * (x.bend + y.bend)))
 
     def __neg__(self) -> Jet:
-        return Jet(-self.c, self.error, -self.a, self.slack, self.k)
+        return Jet(-self.c, self.error, -self.a, self.slack, -self.Q, self.E)
 
     def __mul__(self, other: Jet) -> Jet:
         x, y = self, other
@@ -58,35 +90,131 @@ class Jet:
             x.size * y.slack + x.error * y.slope + y.size * x.slack + y.error * x.slope
             + EPS * (x.size * y.slope + y.size * x.slope)
         )  # fmt: skip
-        k = up(x.size * y.k + y.size * x.k + x.radius * y.radius)
-        return Jet(c, error, x.c * y.a + y.c * x.a, slack, k)
+        outer = _outer(x.a, y.a)
+        Q = x.c * y.Q + y.c * x.Q + (outer + outer.T) / 2
+        # (x.a.d) s_y + (y.a.d) s_x + s_x s_y, s what each adds to its linearisation: |s| <= d'(bend I + E)d
+        third = x.radius * y.bend + y.slope * x.bend
+        wrong = x.error * y.bend + y.error * x.bend + x.slack * y.slope + y.slack * x.slope
+        wrong = wrong + EPS * (x.size * y.bend + y.size * x.bend + x.slope * y.slope)
+        E = widen((x.size + x.radius) * y.E + (y.size + y.slope) * x.E, third + wrong)
+        return Jet(c, error, x.c * y.a + y.c * x.a, slack, Q, E)
 
-    def _compose(self, f0: Number, f1: Number, error: Number, first: Number, second: Number) -> Jet:
-        """phi(v) from phi(c), phi'(c) within `error`; first >= sup |phi'|, second >= sup |phi''| on the range."""
-        slack = up((error + second * self.error) * self.slope + abs(f1) * self.slack + EPS * abs(f1) * self.slope)
-        k = up(first * self.k + 0.5 * second * self.radius * self.radius)
-        return Jet(f0, up(error + first * self.error), f1 * self.a, slack, k)
+    def _compose(self, f: tuple[Number, ...], errors: tuple[Number, ...], second: Number, third: Number) -> Jet:
+        """phi(v) from phi, phi', phi'' at c, each within its error, and the largest |phi''| and |phi'''| on the range.
+
+        With v = v(0) + delta: phi(v(0)) + phi' delta + phi'' delta^2 / 2 + at most third/6 |delta|^3, |delta| <= radius
+        and |delta^2 - (a.d)^2| <= (2 slope + curve) d'(bend I + E)d.
+        """
+        x = self
+        first_error = errors[1] + second * x.error
+        second_error = errors[2] + third * x.error
+        first = abs(f[1]) + first_error
+        cubic = up(third * x.radius / 6)
+        square = up(abs(f[2]) / 2 + second_error / 2 + cubic)
+        spread = square * (2 * x.slope + x.curve)
+        slack = first_error * x.slope + abs(f[1]) * x.slack + EPS * abs(f[1]) * x.slope
+        wrong = first_error * x.bend + second_error * x.slope * x.slope + 2 * square * x.slope * x.slack
+        wrong = wrong + EPS * (abs(f[1]) * x.bend + abs(f[2]) * x.slope * x.slope)
+        outer = _outer(x.a, x.a)
+        E = widen((first + spread) * x.E + cubic * outer, spread * x.bend + wrong)
+        Q = f[1] * x.Q + (f[2] / 2) * outer
+        return Jet(f[0], up(errors[0] + first * x.error), f[1] * x.a, up(slack), Q, E)
 
     def inv(self) -> Jet:
         """1/v; NaN unless the range of v certainly excludes 0."""
         least = abs(self.c) - up(self.error + self.radius)
         least = least * (1 - 2.0**-40) if least > 0 else np.float64(np.nan)
         f0 = 1 / self.c
-        first = up(1 / least * (1 / least))
-        return self._compose(f0, -f0 * f0, EPS * (abs(f0) + f0 * f0), first, up(2 * first / least))
+        f = (f0, -f0 * f0, 2 * f0 * f0 * f0)
+        second = up(2 / least * (1 / least) * (1 / least))
+        return self._compose(f, tuple(EPS * abs(v) for v in f), second, up(3 * second / least))
 
     def sin(self) -> Jet:
         s, c, s_error, c_error = sin_cos(self.c)
-        second = up(lesser(abs(s) + s_error + self.error + self.radius, 1.0))
-        return self._compose(s, c, up(s_error + c_error), 1.0, second)
+        return self._compose((s, c, -s), (s_error, c_error, s_error), self._most(s, s_error), self._most(c, c_error))
 
     def cos(self) -> Jet:
         s, c, s_error, c_error = sin_cos(self.c)
-        second = up(lesser(abs(c) + c_error + self.error + self.radius, 1.0))
-        return self._compose(c, -s, up(s_error + c_error), 1.0, second)
+        return self._compose((c, -s, -c), (c_error, s_error, c_error), self._most(c, c_error), self._most(s, s_error))
+
+    def _most(self, value: Number, error: Number) -> Number:
+        """Upper bound of |sin| or |cos| on the range, from its value at c."""
+        return up(lesser(abs(value) + error + self.error + self.radius, 1.0))
+
+
+def refuse_large(net: Folded, operations: int, n: int, arithmetic: str) -> None:
+    """Raise `Rejected` if jets of so many operations in n states, or the network's, take too much memory or time."""
+    if operations * n * n > _MOST_NUMBERS[arithmetic]:
+        raise Rejected("local", "plant.dynamics", "the equations are too large for this rule")
+    columns, products = n, 0
+    for W in net.weights[1:]:
+        columns += W.shape[1]
+        products += len(W) * columns * n * n
+        if columns * (len(W) + n * n) > _MOST_NUMBERS[arithmetic] or products > _MOST_PRODUCTS[arithmetic]:
+            raise Rejected("local", "policy.layers", "the network is too large for this rule")
 
 
 def constant(q: Fraction, n: int) -> Jet:
     """A rational over R^n."""
     value, error = float_with_error(q)
-    return Jet(np.float64(value), error, np.zeros(n), 0.0, 0.0)
+    return Jet(np.float64(value), error, np.zeros(n), 0.0, np.zeros((n, n)), np.zeros((n, n)))
+
+
+def enclose_at_origin(net: Folded, J: Number, slack: Number) -> tuple[Number, Number, Number, Number]:
+    """The policy on the ball x = J d, ||d|| <= 1: `pi = u_eq + scale * (G d + d'Q d + r(d))` with |r_j(d)| <= d'E_j d.
+
+    J (n, n) lies within `slack` of the true matrix in the 2-norm. Returns, all before scaling, G (m, n), the slack of
+    each of its rows, Q and E (m, n, n).
+
+    Every layer's value is y(d) = y(0) + J d + M A(d), where A_q is what a tanh of the layers before adds to its tangent
+    at y_q(0), and M the product of weights and slopes with which that reaches y, so that errors cancel as they do in
+    truth. With delta = y_q(d) - y_q(0), A_q is tanh'' / 2 delta^2 + at most |delta|^3 / 3, the third derivative of tanh
+    being at most 2 in magnitude: d'(quad_q)d within d'(rest_q)d. Each column of X = [J, M] lies within `doubt` of the
+    true one in the 2-norm.
+    """
+    n, arithmetic = J.shape[1], "arb" if is_ball(J) else "float64"
+    y, error = 0 * J[:, :1], np.zeros((len(J), 1))
+    X, doubt = J, slack + np.zeros(n)
+    quad, rest, bends = 0 * _outer(J, J), 0 * _outer(J, J), np.zeros(n)  # of the states: nothing is added to them
+    for layer, (W, b) in enumerate(zip(net.weights, net.biases, strict=True)):
+        last, width = layer == len(net.weights) - 1, W.shape[1]
+        error = total(np.abs(W) * error[:, 0], 1) + gamma(width) * norm(W, 1) * norm(y[:, 0], 0)
+        Wy = product(W, y)[:, 0]
+        error = up(error + EPS * (np.abs(Wy) + np.abs(b)) + (net.bias_error if last else 0.0))[:, None]
+        doubt = up(net.norms[layer] * doubt + gamma(width) * frobenius(W) * norm(X, 0))
+        y, X = (Wy + b)[:, None], product(W, X)
+        if layer > 0:  # what the tanh just before has added arrives through W alone
+            X, doubt = np.concatenate([X, carry(W, arithmetic)], 1), np.concatenate([doubt, np.zeros(width)])
+        count = len(doubt)
+        weight = np.abs(X) + doubt
+        Q = product(X, quad.reshape(count, -1)).reshape(-1, n, n)
+        E = product(weight, rest.reshape(count, -1)).reshape(-1, n, n)
+        E = widen(E, total((doubt + gamma(count) * weight) * bends, 1), gamma(count) + EPS)
+        G, G_error = X[:, :n], norm(doubt[:n], 0)
+        if last and not net.squash:
+            break
+        length, bend = up(norm(G, 1) + G_error), frobenius(Q)
+        curve = up(bend + frobenius(E))
+        t, e = tanh(y[:, 0])
+        e = up(e + error[:, 0])
+        slope = 1 - t * t
+        slope_error = up(2 * e * (1 + e) + EPS)
+        steepest = up(slope + slope_error)
+        half = -t * slope
+        half_error = up(e * steepest + np.abs(t) * slope_error + EPS * np.abs(half))
+        cubic = up((length + curve) / 3)
+        square = up(np.abs(half) + half_error + cubic)
+        spread = square * (2 * length + curve)
+        outer = _outer(G, G)
+        added = half[:, None, None] * outer
+        wrong = half_error * length * length + 2 * square * length * G_error + EPS * np.abs(half) * length * length
+        beyond = widen(spread[:, None, None] * E + cubic[:, None, None] * outer, spread * bend + wrong)
+        doubt = up(largest(steepest, 0) * doubt + (largest(slope_error, 0) + EPS) * norm(X, 0))
+        y, error, X = t[:, None], e[:, None], slope[:, None] * X
+        bends = np.concatenate([bends, up(np.abs(half) * length * length)])
+        quad, rest = np.concatenate([quad, added]), np.concatenate([rest, beyond])
+    else:  # through the last layer's tanh as well
+        wrong = slope_error * bend + EPS * (steepest * bend + bends[count:])
+        E = widen(steepest[:, None, None] * E + beyond, wrong)
+        Q, G, G_error = slope[:, None, None] * Q + added, X[:, :n], norm(doubt[:n], 0)
+    return net.scale[:, None] * G, G_error, Q, E

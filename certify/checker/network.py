@@ -1,4 +1,4 @@
-"""The policy, enclosed: affine in the box coordinates on a leaf, a jet with quadratic remainder on the local ball.
+"""The policy, and its enclosure on a leaf: affine in the box coordinates within an error.
 
 Centring is folded into the last bias and the offset first. `fold` encloses net(0), so that the folded numbers
 carry an error bound; at x = 0 the policy equals u_eq by its form, which the local rule uses.
@@ -11,12 +11,11 @@ from fractions import Fraction
 
 import numpy as np
 
-from .arithmetic import Number, carry, ends, frobenius, largest, lesser, maximum, middle, norm, product, tanh, total, up
+from .arithmetic import Number, carry, ends, lesser, maximum, middle, norm, product, tanh, total, up
 from .document import Policy
 from .errors import Rejected
 from .float64 import EPS, Array, atanh_with_error, float_with_error, gamma, spectral_norm
 
-_MOST_PATHS = {"float64": 2**25, "arb": 2**22}  # entries of X in `enclose_at_origin`
 _SLOPE_ERROR = 2.0**-46  # of 1 - t^2 - s, computed from t = tanh(y) within 2^-47.5
 
 
@@ -190,48 +189,3 @@ def _error_backwards(scale: Number, passed: list[tuple[Array, Number, Number]], 
         doubt = up(doubt + gamma(len(W)) * float(np.max(norm(W, 0))) * norm(through, 0))
         weight = product(W.T, through.reshape(len(W), -1)).reshape(W.shape[1], m, batch)
     return up(result + total((np.abs(weight) + doubt) * x_error[:, None], 0))
-
-
-def enclose_at_origin(net: Folded, J: Number, slack: Number) -> tuple[Number, Number, Number]:
-    """The policy on the ball x = J d, ||d|| <= 1: `pi = u_eq + scale * (G d + R(d))` with |R_j(d)| <= k_j ||d||^2.
-
-    J (n, n) lies within `slack` of the true matrix in the 2-norm. Returns scale * G (m, n), and before scaling
-    the slack of G in the 2-norm and k (m,).
-
-    Every layer's value is y(d) = y(0) + J d + M E(d), where E_q is what a tanh of the layers before adds to its tangent
-    at y_q(0), and M the product of weights and slopes with which that reaches y, so that errors cancel as they do in
-    truth. |E_q| <= bend_q ||d||^2: half the largest second derivative over the reached range times the square of
-    y_q(d) - y_q(0). The second derivative of tanh is at most 4 / (3 sqrt 3) < 0.77 in magnitude, the third at most
-    2. Each column of X = [J, M] lies within `doubt` of the true one in the 2-norm. Raises `Rejected` if X is too large.
-    """
-    n, arithmetic, columns = J.shape[1], "arb" if J.dtype == object else "float64", J.shape[1]
-    for W in net.weights[1:]:
-        columns += W.shape[1]
-        if len(W) * columns > _MOST_PATHS[arithmetic]:
-            raise Rejected("local", "policy.layers", "the network is too large for this rule")
-    y, error = 0 * J[:, :1], np.zeros((len(J), 1))
-    X, doubt, bend = J, slack + np.zeros(n), np.zeros(0)
-    for layer, (W, b) in enumerate(zip(net.weights, net.biases, strict=True)):
-        last, width = layer == len(net.weights) - 1, W.shape[1]
-        error = total(np.abs(W) * error[:, 0], 1) + gamma(width) * norm(W, 1) * norm(y[:, 0], 0)
-        Wy = product(W, y)[:, 0]
-        error = up(error + EPS * (np.abs(Wy) + np.abs(b)) + (net.bias_error if last else 0.0))[:, None]
-        doubt = up(net.norms[layer] * doubt + gamma(width) * frobenius(W) * norm(X, 0))
-        y, X = (Wy + b)[:, None], product(W, X)
-        if layer > 0:  # what the tanh just before has added arrives through W alone
-            X, doubt = np.concatenate([X, carry(W, arithmetic)], 1), np.concatenate([doubt, np.zeros(width)])
-        k = total((np.abs(X[:, n:]) + doubt[n:]) * bend, 1)
-        if last and not net.squash:
-            break
-        reach = up(norm(X[:, :n], 1) + norm(doubt[:n], 0) + k)  # |y_i(d) - y_i(0)| <= reach_i ||d||
-        t, e = tanh(y[:, 0])
-        e = up(e + error[:, 0])
-        slope = 1 - t * t
-        slope_error = up(2 * e * (1 + e) + EPS)
-        steepest = up(slope + slope_error)
-        half = lesser(up((np.abs(t) + e) * steepest + reach), 0.385)
-        fresh = up(half * reach * reach)
-        k, bend = up(steepest * k + fresh), np.concatenate([bend, fresh])
-        doubt = up(largest(steepest, 0) * doubt + (largest(slope_error, 0) + EPS) * norm(X, 0))
-        y, error, X = t[:, None], e[:, None], slope[:, None] * X
-    return net.scale[:, None] * X[:, :n], norm(doubt[:n], 0), k

@@ -24,15 +24,15 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from .arithmetic import Number, carry, largest, lesser, maximum, middle, norm, product, total, up
+from .arithmetic import Number, carry, frobenius, is_ball, lesser, maximum, middle, norm, product, spectral, total, up
 from .document import Certificate, Partition
 from .errors import Rejected
 from .exact import Exact, Matrix, Undecided, congruence, gershgorin_lower, inverse_diagonal, rational
 from .expression import evaluate
 from .float64 import EPS, Array, float_with_error, gamma, self_test
-from .local import Jet
+from .local import Jet, enclose_at_origin, refuse_large, widen
 from .local import constant as constant_jet
-from .network import Folded, enclose_at_origin, enclose_on_boxes, fold
+from .network import Folded, enclose_on_boxes, fold
 from .taylor import Taylor, affine, upper_bound
 from .taylor import constant as constant_model
 
@@ -134,9 +134,9 @@ def _within(bounds: tuple[Fraction, Fraction], mid: Number, radius: Number) -> N
 def _check_local(c: Certificate, T: Number, net: Folded, least: Fraction, bounded: bool, tally: Tally) -> None:
     """Claim 3: with z = rho d, {V <= c1} lies in ||d|| <= 1 and Vdot = 2 rho d'G(d), G = T'P F(T rho d).
 
-    F(0) = 0 exactly, so G(d) = B d + R(d) with |R_i(d)| <= k_i ||d||^2. By Gershgorin -(B + B')/2 - diag(mu) is
-    positive semidefinite. Let mu > 0 and a = sum mu_i d_i^2. By Cauchy and Schwarz d'R <= sqrt(a share) ||d||^2 with
-    share = sum k_i^2 / mu_i; if min mu_i > share, that is less than a, since a >= min mu_i ||d||^2 >= min mu_i ||d||^4.
+    F(0) = 0 exactly, so d'G = d'B d + sum_j d_j d'C_j d + R, where |R| <= d'E d with E = sum_i ||(PT)_i|| E_i. Take any
+    diagonal D > 0 and d = D e. With N = D (-(B + B')/2 - E) D and the n x n^2 matrix W of all D C_j D, d'G is at most
+    -e'N e + ||W||_2 ||e||^2, and e'N e >= (1 - ||I - N||_2) ||e||^2.
     """
     n = len(c.states)
     ratio, _ = float_with_error(Fraction(c.c1) / least)
@@ -144,37 +144,41 @@ def _check_local(c: Certificate, T: Number, net: Folded, least: Fraction, bounde
     if not (rho < float("inf") and least * Fraction(rho) ** 2 >= Fraction(c.c1)):
         raise Rejected("local", "levels.local", "the level is out of range")
     J = rho * T
-    slack = up(EPS * norm(norm(J, 1), 0))
-    variables = [Jet(0 * J[i, 0], 0.0, J[i], slack, 0.0) for i in range(n)]
-    gradient, u_slack, u_k = enclose_at_origin(net, J, slack)
-    each = zip(c.inputs, c.u_eq, net.scale, c.input_bounds, gradient, u_k, strict=True)
-    for name, q, scale, bounds, row, k in each:
+    refuse_large(net, len(c.dynamics.operations), n, "arb" if is_ball(J) else "float64")
+    slack = up(EPS * frobenius(J))
+    nothing = np.zeros((n, n))
+    variables = [Jet(0 * J[i, 0], 0.0, J[i], slack, nothing, nothing) for i in range(n)]
+    gradient, u_slack, u_Q, u_E = enclose_at_origin(net, J, slack)
+    each = zip(c.inputs, c.u_eq, net.scale, c.input_bounds, gradient, u_Q, u_E, strict=True)
+    for name, q, scale, bounds, row, Q, E in each:
         value, error = float_with_error(q)
         wide = up(abs(scale) * u_slack + EPS * norm(row, 0))
-        u = Jet(np.float64(value), error, row, wide, up(abs(scale) * k))
+        rest = widen(abs(scale) * E, EPS * abs(scale) * frobenius(Q))
+        u = Jet(np.float64(value), error, row, wide, scale * Q, rest)
         variables.append(u)
         if not bounded:
             tally.rules["inputs"] += 1
             if not _within(bounds, u.c, up(error + u.radius)):
                 raise Rejected("inputs", "local ball", f"{name} may leave its bounds")
     F = evaluate(c.dynamics, lambda q: constant_jet(q, n), variables)
-    gradients = np.array([jet.a for jet in F])  # row i: the gradient of F_i
+    gradients, Q, E = (np.array([getattr(jet, field) for jet in F]) for field in ("a", "Q", "E"))
+    slopes, slacks, bends = (np.array([[getattr(jet, field)] for jet in F]) for field in ("slope", "slack", "bend"))
     PT, doubt = product(c.P, T), up(gamma(n) * norm(c.P, 1)[:, None] * norm(T, 0)[None, :])  # of each entry
     size = up(np.abs(PT) + doubt)
-    slopes, slacks, ks = (np.array([[getattr(jet, name)] for jet in F]) for name in ("slope", "slack", "k"))
-    B = product(PT.T, gradients)
+    B, C = product(PT.T, gradients), product(PT.T, Q.reshape(n, -1))
     wrong = total(size * slacks + doubt * slopes + gamma(n) * size * slopes, 0)  # of each row of B, in the 2-norm
-    k = total(size * ks, 0)
+    wrong = norm(wrong, 0) + norm(total((doubt + gamma(n) * size) * bends, 0), 0)  # and of each C_j
+    E = product(norm(size, 1)[None], E.reshape(n, -1)).reshape(n, n)
     M = -(B + B.T) / 2
-    off = total(np.abs(M) * (1 - np.eye(n)), 1)
-    diagonal = np.array([M[i, i] for i in range(n)])
-    mu = diagonal - off - up(norm(wrong, 0) + gamma(n) * norm(norm(M, 1), 0))
-    decay, share = -largest(-mu, 0), total(k * (k / mu), 0)
+    D = 1 / np.sqrt(middle(np.diagonal(M)))
+    N = D[:, None] * (M - widen(E, wrong + EPS * frobenius(M), gamma(n) + EPS)) * D
+    W = (C.reshape(n, n, n) * D[:, None] * D).reshape(n, -1)
+    remainder = spectral(np.eye(n) - N) + spectral(W) + EPS * (frobenius(N) + frobenius(W) + n)
     tally.rules["local"] += 1
-    if not (decay > 0 and decay > share):
-        numbers = f"{float(middle(decay)):.3g} against {float(middle(share)):.3g}"
-        raise Rejected("local", "levels.local", f"Vdot < 0 is not shown on the local ball: {numbers}")
-    tally.local_margin = float(1 - np.sqrt(middle(share / decay)))
+    if not remainder < 1:
+        number = f"{float(middle(remainder)):.3g}"
+        raise Rejected("local", "levels.local", f"Vdot < 0 is not shown on the local ball: {number} of the decay")
+    tally.local_margin = float(1 - middle(remainder))
 
 
 class _Ring:

@@ -138,8 +138,10 @@ def prove_ring(
             if progress is not None:
                 progress(clock.read(min(frontier.least(), target), target, boxes, len(frontier)))
     del frontier
+    if target <= inner:  # nothing beyond the local level, which needs no tree
+        return RingProof(inner, reason, bytes([LEAF]), root, boxes, 1, witness)
     tree = partition.preorder()
-    return RingProof(max(target, inner), reason, tree, root, boxes, tree.count(bytes([LEAF])), witness)
+    return RingProof(target, reason, tree, root, boxes, tree.count(bytes([LEAF])), witness)
 
 
 def _split(

@@ -1,9 +1,9 @@
 """The local step: the largest level below which the linearisation alone proves Vdot < 0.
 
-On the ball `x = rho T d`, ||d|| <= 1, every quantity is written `v(0) + a.d + R(d)` with |R(d)| <= k ||d||^2 for all
-d in the ball, so the bound holds for every smaller radius too and leaves no hole at the origin. What each tanh adds to
-its tangent reaches the output through the products of weights and slopes at the origin, `Paths`, in which it cancels as
-it does in truth; they do not depend on the level.
+On the ball `x = rho T d`, ||d|| <= 1, every quantity is written `v(0) + a.d + d'Q d + r(d)` with |r(d)| <= d'E d and E
+positive semidefinite, for all d in the ball, so the bound holds for every smaller radius too and leaves no hole at the
+origin. What each tanh adds to its tangent reaches the output through the products of weights and slopes at the origin,
+`Paths`, in which it cancels as it does in truth; they do not depend on the level.
 """
 
 from __future__ import annotations
@@ -16,10 +16,11 @@ import numpy as np
 import sympy
 from numpy.typing import NDArray
 
+from certify.errors import InputError
 from certify.obligations import Obligations
 
 Array = NDArray[np.float64]
-_MOST_PATHS = 2**25  # entries of a layer's J and M together: the checker refuses more
+_MOST_NUMBERS, _MOST_PRODUCTS = 2**25, 2**33  # of the sums over paths: the checker refuses more
 _MARGIN = 1e-3  # share of the decay that is left to the checker's rounding
 
 
@@ -27,44 +28,63 @@ _MARGIN = 1e-3  # share of the decay that is left to the checker's rounding
 class _Jet:
     c: float
     a: Array
-    k: float
+    Q: Array
+    E: Array
+
+    @property
+    def slope(self) -> float:
+        return float(np.linalg.norm(self.a))
+
+    @property
+    def bend(self) -> float:
+        return float(np.linalg.norm(self.Q))
+
+    @property
+    def curve(self) -> float:
+        return self.bend + float(np.linalg.norm(self.E))
 
     @property
     def radius(self) -> float:
-        return float(np.linalg.norm(self.a)) + self.k
+        return self.slope + self.curve
 
     def __add__(self, other: _Jet) -> _Jet:
-        return _Jet(self.c + other.c, self.a + other.a, self.k + other.k)
+        return _Jet(self.c + other.c, self.a + other.a, self.Q + other.Q, self.E + other.E)
 
     def __mul__(self, other: _Jet) -> _Jet:
-        k = abs(self.c) * other.k + abs(other.c) * self.k + self.radius * other.radius
-        return _Jet(self.c * other.c, self.c * other.a + other.c * self.a, k)
+        x, y = self, other
+        outer = np.outer(x.a, y.a)
+        Q = x.c * y.Q + y.c * x.Q + (outer + outer.T) / 2
+        E = (abs(x.c) + x.radius) * y.E + (abs(y.c) + y.slope) * x.E
+        return _Jet(x.c * y.c, x.c * y.a + y.c * x.a, Q, E + (x.radius * y.bend + y.slope * x.bend) * np.eye(len(x.a)))
 
-    def compose(self, f0: float, f1: float, first: float, second: float) -> _Jet:
-        return _Jet(f0, f1 * self.a, first * self.k + 0.5 * second * self.radius**2)
+    def compose(self, f0: float, f1: float, f2: float, third: float) -> _Jet:
+        """A function's value and derivatives at c, and the largest third derivative on the range."""
+        cubic, outer = third * self.radius / 6, np.outer(self.a, self.a)
+        spread = (abs(f2) / 2 + cubic) * (2 * self.slope + self.curve)
+        E = (abs(f1) + spread) * self.E + cubic * outer + spread * self.bend * np.eye(len(self.a))
+        return _Jet(f0, f1 * self.a, f1 * self.Q + f2 / 2 * outer, E)
 
     def inverse(self) -> _Jet:
         least = abs(self.c) - self.radius
         if not least > 0:
-            return _Jet(math.nan, self.a, math.inf)
-        return self.compose(1 / self.c, -1 / self.c**2, 1 / least**2, 2 / least**3)
+            return _Jet(math.nan, self.a, self.Q, self.E + math.inf)
+        return self.compose(1 / self.c, -1 / self.c**2, 2 / self.c**3, 6 / least**4)
 
     def sin(self) -> _Jet:
         s, c = math.sin(self.c), math.cos(self.c)
-        return self.compose(s, c, 1.0, min(1.0, abs(s) + self.radius))
+        return self.compose(s, c, -s, min(1.0, abs(c) + self.radius))
 
     def cos(self) -> _Jet:
         s, c = math.sin(self.c), math.cos(self.c)
-        return self.compose(c, -s, 1.0, min(1.0, abs(c) + self.radius))
+        return self.compose(c, -s, -c, min(1.0, abs(s) + self.radius))
 
 
 @dataclass(frozen=True, slots=True)
 class _Layer:
-    """`y = y(0) + J z + M E`: E stacks what every tanh before this layer adds to its tangent at the origin."""
+    """`y = y(0) + X [z, A]`: A stacks what every tanh before this layer adds to its tangent at the origin."""
 
-    J: Array
-    M: Array
-    bend: Array  # half the magnitude of its second derivative at the origin
+    X: Array
+    half: Array  # half of this layer's tanh's second derivative at the origin
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,14 +95,20 @@ class Paths:
     slope: Array | None  # of the last layer's tanh, (m,); None with squash `identity`
 
 
-def paths(obligations: Obligations) -> Paths | None:
-    """Follow T and every tanh's output through the network's linearisation at the origin; None if that is too large."""
+def paths(obligations: Obligations) -> Paths:
+    """Follow T and every tanh's output through the network's linearisation at the origin.
+
+    Raises
+    ------
+    InputError : the network is larger than the checker's local rule allows.
+    """
     network = obligations.loop.network
-    n, squash, columns = network.n, network.squash == "tanh", network.n
+    n, squash, columns, products = network.n, network.squash == "tanh", network.n, 0
     for W in network.weights[1:]:
         columns += W.shape[1]
-        if len(W) * columns > _MOST_PATHS:
-            return None
+        products += len(W) * columns * n**2
+        if columns * (len(W) + n**2) > _MOST_NUMBERS or products > _MOST_PRODUCTS:
+            raise InputError("The network is too large for the local proof: use fewer or narrower layers.")
     h, X = np.zeros(n), obligations.T
     layers = []
     for number, (W, b) in enumerate(zip(network.weights, network.biases, strict=True)):
@@ -94,7 +120,7 @@ def paths(obligations: Obligations) -> Paths | None:
             y = network.beta(obligations.loop.u_eq)
         h = np.tanh(y)
         slope = 1 - h**2
-        layers.append(_Layer(X[:, :n], X[:, n:], np.abs(h) * slope))
+        layers.append(_Layer(X, -h * slope))
         X = slope[:, None] * X
     return Paths(tuple(layers), slope if squash else None)
 
@@ -106,37 +132,42 @@ def local_margin(obligations: Obligations, level: float, known: Paths) -> float:
     """
     loop, P, T = obligations.loop, obligations.P, obligations.T
     system = loop.system
+    n = system.n
     S = T.T @ P @ T
     least = float(np.min(2 * np.diag(S) - np.abs(S).sum(axis=1)))
     if not least > 0:
         return -math.inf
     rho = math.sqrt(level / least)
-    J = rho * T
-    states = [_Jet(0.0, J[i], 0.0) for i in range(system.n)]
-    slopes, ks = _policy(known, rho)
-    each = zip(loop.u_eq, loop.network.scale, slopes, ks, strict=True)
-    inputs = [_Jet(float(u), float(s) * a, abs(float(s)) * float(k)) for u, s, a, k in each]
+    nothing = np.zeros((n, n))
+    states = [_Jet(0.0, row, nothing, nothing) for row in rho * T]
+    each = zip(loop.u_eq, loop.network.scale, *_policy(known, rho, n), strict=True)
+    inputs = [_Jet(float(u), float(s) * a, float(s) * Q, abs(float(s)) * E) for u, s, a, Q, E in each]
     if not obligations.inputs_bounded_by_form:
         for jet, (lo, hi) in zip(inputs, system.input_bounds, strict=True):
             if not (float(lo) < jet.c - jet.radius and jet.c + jet.radius < float(hi)):
                 return -math.inf
     values = dict(zip((*system.states, *system.inputs), (*states, *inputs), strict=True))
     F = [_evaluate(e, values) for e in system.exact_dynamics()]
-    B = T.T @ P @ np.array([v.a for v in F])
-    k = np.abs(T.T @ P) @ np.array([v.k for v in F])
+    PT = P @ T
+    B = PT.T @ np.array([v.a for v in F])
+    C = np.tensordot(PT.T, np.array([v.Q for v in F]), 1)
+    E = np.tensordot(np.linalg.norm(PT, axis=1), np.array([v.E for v in F]), 1)
     M = -(B + B.T) / 2
-    mu = 2 * np.diag(M) - np.abs(M).sum(axis=1)
-    if not (np.all(mu > 0) and np.all(np.isfinite(k))):
+    if not (np.all(np.isfinite(M - E)) and np.all(np.diag(M) > 0)):
         return -math.inf
-    return 1 - math.sqrt(float(np.sum(k**2 / mu)) / float(np.min(mu)))
+    D = 1 / np.sqrt(np.diag(M))
+    W, N = C * D[:, None] * D, D[:, None] * (M - E) * D
+    return 1 - float(np.linalg.norm(np.eye(n) - N, 2) + np.linalg.norm(W.reshape(n, -1), 2))
 
 
 def prove_local(obligations: Obligations, limit: float) -> float | None:
-    """The largest level up to `limit` that the local proof reaches, within 2 %; None if there is none."""
+    """The largest level up to `limit` that the local proof reaches, within 2 %; None if there is none.
 
+    Raises
+    ------
+    InputError : the network is larger than the checker's local rule allows.
+    """
     known = paths(obligations)
-    if known is None:
-        return None
 
     def good(level: float) -> bool:
         return local_margin(obligations, level, known) > _MARGIN
@@ -154,24 +185,33 @@ def prove_local(obligations: Obligations, limit: float) -> float | None:
     return low
 
 
-def _policy(known: Paths, rho: float) -> tuple[Array, Array]:
-    """Gradients (m, n) and remainders (m,) of the network's outputs on z = rho d, before scaling."""
-    added = np.zeros(0)
+def _policy(known: Paths, rho: float, n: int) -> tuple[Array, Array, Array]:
+    """Gradients (m, n), half Hessians and remainders (m, n, n) of the outputs on z = rho d, before scaling."""
+    quad, rest = np.zeros((n, n * n)), np.zeros((n, n * n))
+    eye = np.eye(n).ravel()
     for layer in known.layers:
-        k = np.abs(layer.M) @ added
-        reach = rho * np.linalg.norm(layer.J, axis=1) + k
-        fresh = np.minimum(0.385, layer.bend + reach) * reach**2
-        added = np.concatenate([added, fresh])
-    if known.slope is None:
-        return rho * layer.J, k
-    return rho * known.slope[:, None] * layer.J, known.slope * k + fresh
+        G = rho * layer.X[:, :n]
+        Q, E = layer.X @ quad, np.abs(layer.X) @ rest
+        bend = np.linalg.norm(Q, axis=1)
+        length, curve = np.linalg.norm(G, axis=1), bend + np.linalg.norm(E, axis=1)
+        cubic = (length + curve) / 3
+        spread = (np.abs(layer.half) + cubic) * (2 * length + curve)
+        outer = (G[:, :, None] * G[:, None, :]).reshape(len(G), -1)
+        added = layer.half[:, None] * outer
+        beyond = spread[:, None] * E + cubic[:, None] * outer + (spread * bend)[:, None] * eye
+        quad, rest = np.concatenate([quad, added]), np.concatenate([rest, beyond])
+    if known.slope is not None:
+        s = known.slope[:, None]
+        G, Q, E = s * G, s * Q + added, s * E + beyond
+    return G, Q.reshape(-1, n, n), E.reshape(-1, n, n)
 
 
 def _evaluate(expression: sympy.Expr, values: Mapping[sympy.Symbol, _Jet]) -> _Jet:
     if expression.is_Symbol:
         return values[expression]
     if expression.is_Rational:
-        return _Jet(float(expression), np.zeros_like(next(iter(values.values())).a), 0.0)
+        a, Q = next((v.a, v.Q) for v in values.values())
+        return _Jet(float(expression), 0 * a, 0 * Q, 0 * Q)
     if expression.is_Pow:
         base, exponent = _evaluate(expression.base, values), int(expression.exp)
         result = base
