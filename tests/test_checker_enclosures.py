@@ -548,6 +548,16 @@ def test_a_jet_of_a_divisor_that_may_vanish_gives_nothing() -> None:
     assert not np.isfinite((whole * Jet(np.float64(0), 0.0, np.zeros(1), 0.0, nothing, nothing)).error)
 
 
+@pytest.mark.parametrize(("c", "slope"), [(1e170, 1e150), (-1e160, 1e140), (1e170, 1e120)])
+def test_an_inverse_whose_derivative_underflows_contains(c: float, slope: float) -> None:
+    """1/c^2 is 0 in binary64, and its error is multiplied by a large gradient."""
+    nothing = np.zeros((1, 1))
+    jet = Jet(np.float64(c), 0.0, np.full(1, slope), 0.0, nothing, nothing)
+    with ctx.workprec(3000):
+        value = Member(jet, np.random.default_rng(0))
+        assert assert_jet(jet.inv(), lambda d: 1 / value(d), [-arb(slope) / arb(c) ** 2], [[0.9], [-1e-30]])
+
+
 @given(st.integers(-(10**30), 10**30), st.integers(1, 10**30))
 def test_jets_of_constants_contain(numerator: int, denominator: int) -> None:
     q = Fraction(numerator, denominator)

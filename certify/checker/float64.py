@@ -6,7 +6,8 @@ u = 2^-53 is the unit roundoff. A computed value comes with a bound on its error
 in binary64, so `up` is applied to every bound: it covers the roundings made while the bound was formed.
 `up(b) = b (1 + 2^-40) + 2^-960` is safe for non-negative operands with fewer than 2^11 roundings in a row
 (2^11 u < 2^-41, and the last two roundings are those of `up` itself); longer sums go through `total`. Its
-absolute term covers underflow, at most 2^-1022 a product, for up to 2^60 products.
+absolute term covers underflow, at most 2^-1022 a product, for up to 2^60 products; a bound that is multiplied by a
+large number later on gets an `up` of its own before.
 
 Sums and matrix products are bounded for any order of summation and with or without fused multiply-add:
 |fl(AB) - AB| <= gamma_k |A||B| with gamma_k = k u / (1 - k u) (Higham 2002, section 3.5), and

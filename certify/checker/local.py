@@ -2,8 +2,8 @@
 
 A jet of v over d in R^n says, for *all* ||d|| <= 1: `v(d) = v(0) + a.d + d'Q d + r(d)` with |r(d)| <= d'E d. It
 holds on every smaller ball too. v(0) lies within `error` of c, and the true gradient within `slack` of a in the 2-norm;
-Q is the matrix that is stored, and whatever it leaves out lies in E. E is positive semidefinite, being a sum of such
-matrices with weights >= 0, and knows the directions in which v is far from its linearisation.
+Q is the matrix that is stored, and whatever it leaves out lies in E. E dominates a sum of positive semidefinite
+matrices with weights >= 0, so it is one, and knows the directions in which v is far from its linearisation.
 """
 
 from __future__ import annotations
@@ -29,7 +29,12 @@ def widen(E: Number, extra: Number, relative: float = EPS) -> Number:
     all rounding errors is at most `relative` times the trace of the sum.
     """
     trace = total(np.diagonal(E, axis1=-2, axis2=-1), -1)
-    return E + np.asarray(up(2 * relative * trace + extra))[..., None, None] * np.eye(E.shape[-1])
+    return E + _each(up(2 * relative * trace + extra)) * np.eye(E.shape[-1])
+
+
+def _each(x: Number) -> Number:
+    """Numbers (...,) as factors of matrices (..., n, n)."""
+    return np.asarray(x)[..., None, None]
 
 
 def _outer(a: Number, b: Number) -> Number:
@@ -38,7 +43,7 @@ def _outer(a: Number, b: Number) -> Number:
 
 @dataclass(frozen=True)
 class Jet:
-    """`c` +- `error`, gradient `a` (n,) +- `slack`, half the Hessian `Q` (n, n), remainder `E` (n, n)."""
+    """`c` +- `error`, gradient `a` (n,) +- `slack`, half the Hessian `Q` (n, n), remainder `E` (n, n); or a batch."""
 
     c: Number
     error: Number
@@ -55,7 +60,7 @@ class Jet:
     @property
     def slope(self) -> Number:
         """Upper bound of the gradient's 2-norm."""
-        return up(norm(self.a, 0) + self.slack)
+        return up(norm(self.a, -1) + self.slack)
 
     @property
     def bend(self) -> Number:
@@ -99,31 +104,36 @@ class Jet:
         E = widen((x.size + x.radius) * y.E + (y.size + y.slope) * x.E, third + wrong)
         return Jet(c, error, x.c * y.a + y.c * x.a, slack, Q, E)
 
-    def _compose(self, f: tuple[Number, ...], errors: tuple[Number, ...], second: Number, third: Number) -> Jet:
-        """phi(v) from phi, phi', phi'' at c, each within its error, and the largest |phi''| and |phi'''| on the range.
+    def beyond_tangent(self, half: Number, half_error: Number, third: Number) -> tuple[Number, Number]:
+        """(H, R): phi(v) less its tangent at v(0) is d'H d within d'R d.
 
-        With v = v(0) + delta: phi(v(0)) + phi' delta + phi'' delta^2 / 2 + at most third/6 |delta|^3, |delta| <= radius
-        and |delta^2 - (a.d)^2| <= (2 slope + curve) d'(bend I + E)d.
+        half is phi''/2 at v(0), within half_error; third >= |phi'''| on the range. With delta = v - v(0) what is left
+        is half delta^2 within third/6 |delta|^3, where |delta| <= radius and, a being the true gradient, |delta^2 -
+        (a.d)^2| <= (2 slope + curve) d'(bend I + E)d.
         """
+        cubic = up(third * self.radius / 6)
+        square = up(np.abs(half) + half_error + cubic)
+        spread = square * (2 * self.slope + self.curve)
+        outer = _outer(self.a, self.a)
+        wrong = (half_error + EPS * np.abs(half)) * self.slope * self.slope + 2 * square * self.slope * self.slack
+        R = widen(_each(spread) * self.E + _each(cubic) * outer, spread * self.bend + wrong)
+        return _each(half) * outer, R
+
+    def _compose(self, f: tuple[Number, ...], errors: tuple[Number, ...], second: Number, third: Number) -> Jet:
+        """phi(v): phi, phi', phi'' at c within `errors`; |phi''| <= second and |phi'''| <= third on the range of v."""
         x = self
-        first_error = errors[1] + second * x.error
-        second_error = errors[2] + third * x.error
+        first_error = up(errors[1] + second * x.error)
         first = abs(f[1]) + first_error
-        cubic = up(third * x.radius / 6)
-        square = up(abs(f[2]) / 2 + second_error / 2 + cubic)
-        spread = square * (2 * x.slope + x.curve)
+        H, R = x.beyond_tangent(f[2] / 2, up(errors[2] + third * x.error) / 2, third)
         slack = first_error * x.slope + abs(f[1]) * x.slack + EPS * abs(f[1]) * x.slope
-        wrong = first_error * x.bend + second_error * x.slope * x.slope + 2 * square * x.slope * x.slack
-        wrong = wrong + EPS * (abs(f[1]) * x.bend + abs(f[2]) * x.slope * x.slope)
-        outer = _outer(x.a, x.a)
-        E = widen((first + spread) * x.E + cubic * outer, spread * x.bend + wrong)
-        Q = f[1] * x.Q + (f[2] / 2) * outer
+        wrong = first_error * x.bend + EPS * (abs(f[1]) * x.bend + frobenius(H))
+        Q, E = f[1] * x.Q + H, widen(first * x.E + R, wrong)
         return Jet(f[0], up(errors[0] + first * x.error), f[1] * x.a, up(slack), Q, E)
 
     def inv(self) -> Jet:
         """1/v; NaN unless the range of v certainly excludes 0."""
         least = abs(self.c) - up(self.error + self.radius)
-        least = least * (1 - 2.0**-40) if least > 0 else np.float64(np.nan)
+        least = least if least > 0 else np.float64(np.nan)
         f0 = 1 / self.c
         f = (f0, -f0 * f0, 2 * f0 * f0 * f0)
         second = up(2 / least * (1 / least) * (1 / least))
@@ -149,7 +159,7 @@ def refuse_large(net: Folded, operations: int, n: int, arithmetic: str) -> None:
     columns, products = n, 0
     for W in net.weights[1:]:
         columns += W.shape[1]
-        products += len(W) * columns * n * n
+        products += len(W) * columns * max(n * n, W.shape[1])
         if columns * (len(W) + n * n) > _MOST_NUMBERS[arithmetic] or products > _MOST_PRODUCTS[arithmetic]:
             raise Rejected("local", "policy.layers", "the network is too large for this rule")
 
@@ -175,7 +185,7 @@ def enclose_at_origin(net: Folded, J: Number, slack: Number) -> tuple[Number, Nu
     n, arithmetic = J.shape[1], "arb" if is_ball(J) else "float64"
     y, error = 0 * J[:, :1], np.zeros((len(J), 1))
     X, doubt = J, slack + np.zeros(n)
-    quad, rest, bends = 0 * _outer(J, J), 0 * _outer(J, J), np.zeros(n)  # of the states: nothing is added to them
+    quad, rest, bends = np.zeros((n, n, n)), np.zeros((n, n, n)), np.zeros(n)  # of the states: nothing is added to them
     for layer, (W, b) in enumerate(zip(net.weights, net.biases, strict=True)):
         last, width = layer == len(net.weights) - 1, W.shape[1]
         error = total(np.abs(W) * error[:, 0], 1) + gamma(width) * norm(W, 1) * norm(y[:, 0], 0)
@@ -190,11 +200,9 @@ def enclose_at_origin(net: Folded, J: Number, slack: Number) -> tuple[Number, Nu
         Q = product(X, quad.reshape(count, -1)).reshape(-1, n, n)
         E = product(weight, rest.reshape(count, -1)).reshape(-1, n, n)
         E = widen(E, total((doubt + gamma(count) * weight) * bends, 1), gamma(count) + EPS)
-        G, G_error = X[:, :n], norm(doubt[:n], 0)
+        value = Jet(y[:, 0], error[:, 0], X[:, :n], norm(doubt[:n], 0), Q, E)
         if last and not net.squash:
             break
-        length, bend = up(norm(G, 1) + G_error), frobenius(Q)
-        curve = up(bend + frobenius(E))
         t, e = tanh(y[:, 0])
         e = up(e + error[:, 0])
         slope = 1 - t * t
@@ -202,19 +210,13 @@ def enclose_at_origin(net: Folded, J: Number, slack: Number) -> tuple[Number, Nu
         steepest = up(slope + slope_error)
         half = -t * slope
         half_error = up(e * steepest + np.abs(t) * slope_error + EPS * np.abs(half))
-        cubic = up((length + curve) / 3)
-        square = up(np.abs(half) + half_error + cubic)
-        spread = square * (2 * length + curve)
-        outer = _outer(G, G)
-        added = half[:, None, None] * outer
-        wrong = half_error * length * length + 2 * square * length * G_error + EPS * np.abs(half) * length * length
-        beyond = widen(spread[:, None, None] * E + cubic[:, None, None] * outer, spread * bend + wrong)
+        added, beyond = value.beyond_tangent(half, half_error, 2.0)
+        quad, rest = np.concatenate([quad, added]), np.concatenate([rest, beyond])
+        bends = np.concatenate([bends, frobenius(added)])
         doubt = up(largest(steepest, 0) * doubt + (largest(slope_error, 0) + EPS) * norm(X, 0))
         y, error, X = t[:, None], e[:, None], slope[:, None] * X
-        bends = np.concatenate([bends, up(np.abs(half) * length * length)])
-        quad, rest = np.concatenate([quad, added]), np.concatenate([rest, beyond])
     else:  # through the last layer's tanh as well
-        wrong = slope_error * bend + EPS * (steepest * bend + bends[count:])
-        E = widen(steepest[:, None, None] * E + beyond, wrong)
-        Q, G, G_error = slope[:, None, None] * Q + added, X[:, :n], norm(doubt[:n], 0)
-    return net.scale[:, None] * G, G_error, Q, E
+        wrong = slope_error * value.bend + EPS * (steepest * value.bend + bends[count:])
+        E = widen(_each(steepest) * E + beyond, wrong)
+        value = Jet(t, e, X[:, :n], norm(doubt[:n], 0), _each(slope) * Q + added, E)
+    return net.scale[:, None] * value.a, value.slack, value.Q, value.E
