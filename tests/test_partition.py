@@ -130,6 +130,26 @@ def test_levels_that_nearly_agree_keep_their_order() -> None:
     assert taken == sorted(levels)
 
 
+def test_the_lowest_comes_back_before_many_a_hair_above_it() -> None:
+    """Two chunks away: the first holds more ties than come back at once, the second one box a last digit lower."""
+    partition = Partition(np.ones(1))
+    halves = np.zeros(1, dtype=np.int64)
+    for _ in range(4):
+        halves = partition.split(halves, np.zeros(len(halves), dtype=np.int64))
+    frontier, high = Frontier(partition, CPU, capacity=4), np.nextafter(1.0, 2.0)
+    taken: list[float] = []
+    levels = np.array([0.0, 0.0, high, high, high, high, 0.0, 0.0, 1.0])
+    for part in (np.arange(6), np.arange(6, 9)):
+        lo, hi = (torch.tensor(a) for a in partition.corners(halves[part]))
+        frontier.add(lo, hi, torch.tensor(levels[part]), torch.tensor(halves[part]))
+    level_of = dict(zip(halves.tolist(), levels.tolist(), strict=False))
+    while len(frontier):
+        number = frontier.take(1, np.inf)[2].tolist()
+        assert number
+        taken.append(level_of[number[0]])
+    assert taken == sorted(levels)
+
+
 HARD = """
 import resource, torch, numpy as np
 from certify.engines import branch_and_bound as engine

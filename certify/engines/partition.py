@@ -144,15 +144,22 @@ class Frontier:
 
     def _bring_back(self) -> None:
         """Rebuild the lowest boxes that were put away, about half a capacity of them."""
+        room = self.capacity // 2
+
+        def up_to(level: float) -> list[int]:
+            return [int(np.searchsorted(v, level, side="right")) for v, _ in self._away]
+
         low, high = self._least_away(), max(float(lowest[-1]) for lowest, _ in self._away)
         while low < (middle := low + (high - low) / 2) < high:
-            few = sum(int(np.searchsorted(v, middle, side="right")) for v, _ in self._away) <= self.capacity // 2
-            low, high = (middle, high) if few else (low, middle)
-        split = [int(np.searchsorted(v, low, side="left")) for v, _ in self._away]
-        room = self.capacity // 2 - sum(split)
-        for k, (v, _) in enumerate(self._away):  # boxes on a grid share their lowest V: ties fill what room is left
-            ties = min(room, int(np.searchsorted(v, high, side="right")) - split[k])
-            split[k], room = split[k] + ties, room - ties
+            low, high = (middle, high) if sum(up_to(middle)) <= room else (low, middle)
+        split = next((k for k in (up_to(high), up_to(low)) if sum(k) <= room), [0] * len(self._away))
+        room -= sum(split)
+        ties = up_to(
+            min((float(v[k]) for (v, _), k in zip(self._away, split, strict=True) if k < len(v)), default=high)
+        )
+        for k, most in enumerate(ties):  # boxes on a grid share their lowest V: the next ones fill what room is left
+            more = min(room, most - split[k])
+            split[k], room = split[k] + more, room - more
         lowest = np.concatenate([v[:k] for (v, _), k in zip(self._away, split, strict=True)])
         number = np.concatenate([w[:k] for (_, w), k in zip(self._away, split, strict=True)]).astype(np.int64)
         self._away = [
