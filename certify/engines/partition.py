@@ -154,10 +154,9 @@ class Frontier:
             low, high = (middle, high) if sum(up_to(middle)) <= room else (low, middle)
         split = next((k for k in (up_to(high), up_to(low)) if sum(k) <= room), [0] * len(self._away))
         room -= sum(split)
-        ties = up_to(
-            min((float(v[k]) for (v, _), k in zip(self._away, split, strict=True) if k < len(v)), default=high)
-        )
-        for k, most in enumerate(ties):  # boxes on a grid share their lowest V: the next ones fill what room is left
+        later = [float(v[k]) for (v, _), k in zip(self._away, split, strict=True) if k < len(v)]
+        # Boxes on a grid share their lowest V: the next ones fill what room is left.
+        for k, most in enumerate(up_to(min(later, default=high))):
             more = min(room, most - split[k])
             split[k], room = split[k] + more, room - more
         lowest = np.concatenate([v[:k] for (v, _), k in zip(self._away, split, strict=True)])
