@@ -119,16 +119,15 @@ class Jet:
         R = widen(_each(spread) * self.E + _each(cubic) * outer, spread * self.bend + wrong)
         return _each(half) * outer, R
 
-    def _compose(self, f: tuple[Number, ...], errors: tuple[Number, ...], second: Number, third: Number) -> Jet:
-        """phi(v): phi, phi', phi'' at c within `errors`; |phi''| <= second and |phi'''| <= third on the range of v."""
+    def _compose(self, f: tuple[Number, ...], errors: tuple[Number, ...], most: tuple[Number, ...]) -> Jet:
+        """phi(v): phi, phi', phi'' at c within `errors`; |phi'|, |phi''|, |phi'''| at most `most` on the range of v."""
         x = self
-        first_error = up(errors[1] + second * x.error)
-        first = abs(f[1]) + first_error
-        H, R = x.beyond_tangent(f[2] / 2, up(errors[2] + third * x.error) / 2, third)
+        first_error, second_error = up(errors[1] + most[1] * x.error), up(errors[2] + most[2] * x.error)
+        H, R = x.beyond_tangent(f[2] / 2, second_error / 2, most[2])
         slack = first_error * x.slope + abs(f[1]) * x.slack + EPS * abs(f[1]) * x.slope
         wrong = first_error * x.bend + EPS * (abs(f[1]) * x.bend + frobenius(H))
-        Q, E = f[1] * x.Q + H, widen(first * x.E + R, wrong)
-        return Jet(f[0], up(errors[0] + first * x.error), f[1] * x.a, up(slack), Q, E)
+        Q, E = f[1] * x.Q + H, widen((abs(f[1]) + first_error) * x.E + R, wrong)
+        return Jet(f[0], up(errors[0] + most[0] * x.error), f[1] * x.a, up(slack), Q, E)
 
     def inv(self) -> Jet:
         """1/v; NaN unless the range of v certainly excludes 0."""
@@ -136,16 +135,19 @@ class Jet:
         least = least if least > 0 else np.float64(np.nan)
         f0 = 1 / self.c
         f = (f0, -f0 * f0, 2 * f0 * f0 * f0)
-        second = up(2 / least * (1 / least) * (1 / least))
-        return self._compose(f, tuple(EPS * abs(v) for v in f), second, up(3 * second / least))
+        first = up(1 / least * (1 / least))
+        second = up(2 * first / least)
+        return self._compose(f, tuple(EPS * abs(v) for v in f), (first, second, up(3 * second / least)))
 
     def sin(self) -> Jet:
         s, c, s_error, c_error = sin_cos(self.c)
-        return self._compose((s, c, -s), (s_error, c_error, s_error), self._most(s, s_error), self._most(c, c_error))
+        most = (1.0, self._most(s, s_error), self._most(c, c_error))
+        return self._compose((s, c, -s), (s_error, c_error, s_error), most)
 
     def cos(self) -> Jet:
         s, c, s_error, c_error = sin_cos(self.c)
-        return self._compose((c, -s, -c), (c_error, s_error, c_error), self._most(c, c_error), self._most(s, s_error))
+        most = (1.0, self._most(c, c_error), self._most(s, s_error))
+        return self._compose((c, -s, -c), (c_error, s_error, c_error), most)
 
     def _most(self, value: Number, error: Number) -> Number:
         """Upper bound of |sin| or |cos| on the range, from its value at c."""
@@ -158,8 +160,9 @@ def refuse_large(net: Folded, operations: int, n: int, arithmetic: str) -> None:
         raise Rejected("local", "plant.dynamics", "the equations are too large for this rule")
     columns, products = n, 0
     for W in net.weights[1:]:
+        products += len(W) * columns * W.shape[1]
         columns += W.shape[1]
-        products += len(W) * columns * max(n * n, W.shape[1])
+        products += len(W) * columns * n * n
         if columns * (len(W) + n * n) > _MOST_NUMBERS[arithmetic] or products > _MOST_PRODUCTS[arithmetic]:
             raise Rejected("local", "policy.layers", "the network is too large for this rule")
 

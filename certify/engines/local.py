@@ -105,6 +105,7 @@ def paths(obligations: Obligations) -> Paths:
     network = obligations.loop.network
     n, squash, columns, products = network.n, network.squash == "tanh", network.n, 0
     for W in network.weights[1:]:
+        products += len(W) * columns * W.shape[1]
         columns += W.shape[1]
         products += len(W) * columns * n**2
         if columns * (len(W) + n**2) > _MOST_NUMBERS or products > _MOST_PRODUCTS:
