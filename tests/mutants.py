@@ -1075,7 +1075,7 @@ def cartpole() -> Iterator[Mutant]:
         ("root", "a thousandth less", array(data, "evidence.root", at_index(2, lambda v: 0.999 * v))),
         ("root", "roa up within the domain", with_level(data, "roa", 1.01 * c2)),
         ("centring", "offset out of reach", rehash(array(data, "policy.offset", lambda a: a + 31))),
-        ("local", "local up", with_level(data, "local", 1e3 * c1)),
+        ("local", "local up", with_level(data, "local", c2)),
         ("tree", "cut", with_tree(data, tree[:-1])), ("tree", "leaf behind", with_tree(data, tree + b"\xff")),
         ("tree", "axis 4", with_tree(data, tree.replace(b"\x03", b"\x04", 1))),
         ("ring", "one leaf", with_tree(data, b"\xff")),
