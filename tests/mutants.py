@@ -1054,7 +1054,7 @@ def cartpole() -> Iterator[Mutant]:
     """The largest certificate: 256 x 256 weights, four states, thousands of leaves."""
     generator = np.random.default_rng(11)
     data = base("cartpole")
-    tree, (c1, c2) = tree_of(data), levels(data)
+    tree, (_, c2) = tree_of(data), levels(data)
     for k in range(3):
         index, bit = int(generator.integers(256 * 256)), int(generator.integers(52))
         change = at_index(index, lambda v, bit=bit: flipped(v, bit))

@@ -99,7 +99,7 @@ TAMPERED: dict[str, tuple[Callable[[Document], None], str]] = {
     "level of the ring up": (scaled("levels", "roa", by=1.5), "root"),
     "level of the ring far up": (scaled("levels", "roa", by=100.0), "domain"),
     "level and box up": (level_and_box, "ring|inputs"),
-    "local level up": (scaled("levels", "local", by=50.0), "local"),
+    "local level up": (scaled("levels", "local", by=1.2), "local"),
     "local level down": (scaled("levels", "local", by=1e-6), "ring"),
     "local level negative": (scaled("levels", "local", by=-1.0), "levels"),
     "levels exchanged": (scaled("levels", "local", by=1e12), "levels"),
