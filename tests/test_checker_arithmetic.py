@@ -227,7 +227,21 @@ def test_the_policy_on_a_wide_ball_holds_its_members(name: str, radius: float) -
 
 
 @pytest.mark.parametrize(
-    "name", ["up", "total", "norm", "maximum", "largest", "lesser", "product", "tanh", "sin_cos", "ends"]
+    "name",
+    [
+        "up",
+        "total",
+        "norm",
+        "frobenius",
+        "spectral",
+        "maximum",
+        "largest",
+        "lesser",
+        "product",
+        "tanh",
+        "sin_cos",
+        "ends",
+    ],
 )
 def test_primitives_keep_the_radius(name: str) -> None:
     """Each on overlapping balls, against the ends of what they may hold."""
@@ -238,6 +252,9 @@ def test_primitives_keep_the_radius(name: str) -> None:
             result = np.ravel(arithmetic.up(x) if name == "up" else getattr(arithmetic, name)(x, 0))
             least = {"up": 1.5, "total": 2.7, "norm": (1.5**2 + 1.2**2) ** 0.5}[name]
             assert all(v.is_exact() for v in result) and result[0] >= least * (1 - 1e-15)
+        elif name in ("frobenius", "spectral"):
+            result = getattr(arithmetic, name)(x)
+            assert (1.5**2 + 1.2**2) ** 0.5 * (1 - 1e-15) <= result <= 2.0
         elif name == "maximum":
             for result in (arithmetic.maximum(x, y), arithmetic.maximum(y, x)):
                 assert result[0, 0].contains(arb(1.7)) and result[1, 0].contains(arb(1.2)) and result[1, 0] > 0
