@@ -18,7 +18,7 @@ from certify.errors import CertificateFormatError
 from certify.roa import certify_roa, run_checker
 from certify.systems import available_systems, get_system
 from certify.systems.trees import from_tree, to_tree
-from tests.conftest import pendulum_network
+from tests.support.loops import pendulum_network
 
 Document = dict[str, Any]
 

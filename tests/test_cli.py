@@ -16,7 +16,7 @@ import torch
 
 from certify.cli import _run
 from certify.policies import Policy, TanhNetwork, load_policy, save_policy
-from tests.conftest import chain, pendulum_network
+from tests.support.loops import chain, pendulum_network
 
 SHIPPED = Path(__file__).parent.parent / "examples" / "policies" / "pendulum.pt"
 VAN_DER_POL = Path(__file__).parent.parent / "examples" / "van_der_pol.toml"

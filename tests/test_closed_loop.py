@@ -12,7 +12,7 @@ from certify.closed_loop import ClosedLoop
 from certify.errors import InputError
 from certify.policies import TanhNetwork
 from certify.systems import System
-from tests.conftest import box, chain, pendulum_network, scalar_tanh
+from tests.support.loops import box, chain, pendulum_network, scalar_tanh
 
 
 def test_linearisation_of_the_pendulum(pendulum: System) -> None:

@@ -15,7 +15,7 @@ from certify.enclosures import PolicyEnclosure, Taylor, evaluate, upper_bound
 from certify.enclosures.policy import relax_tanh
 from certify.policies import TanhNetwork
 from certify.systems import System, get_system
-from tests.conftest import box, pendulum_network
+from tests.support.loops import box, pendulum_network
 
 CPU = torch.device("cpu")
 

@@ -16,7 +16,7 @@ from certify.policies import TanhNetwork, load_policy
 from certify.roa import RoaOptions, certify_roa, run_checker
 from certify.systems import System, get_system
 from certify.verdict import Verdict
-from tests.conftest import box, chain, pendulum_network, scalar_tanh
+from tests.support.loops import box, chain, pendulum_network, scalar_tanh
 
 SHIPPED = Path(__file__).parent.parent / "examples" / "policies" / "pendulum.pt"
 

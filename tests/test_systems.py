@@ -13,7 +13,7 @@ import torch
 from certify.errors import InputError
 from certify.systems import System, available_systems, exact, get_system, load_system
 from certify.systems.toml import parse_expression
-from tests.conftest import box
+from tests.support.loops import box
 
 VAN_DER_POL = Path(__file__).parent.parent / "examples" / "van_der_pol.toml"
 

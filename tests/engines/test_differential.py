@@ -15,9 +15,9 @@ from certify.errors import BackendError
 from certify.lyapunov import domain_limit
 from certify.obligations import Obligations, ring_query
 from certify.systems import get_system
-from tests import codac_prover
-from tests.conftest import chain, pendulum_network, scalar_tanh
-from tests.test_engines import obligations
+from tests.engines.test_bounds import obligations
+from tests.support import codac_prover
+from tests.support.loops import chain, pendulum_network, scalar_tanh
 
 INNER = 0.05  # share of the limit below which the local proof speaks, and not these engines
 CASES = {

@@ -14,7 +14,7 @@ from certify.errors import BackendError
 from certify.lyapunov import domain_limit, extents, optimise_candidate, solve_lyapunov, volume
 from certify.policies import TanhNetwork
 from certify.systems import System, get_system
-from tests.conftest import box, pendulum_network, scalar_tanh
+from tests.support.loops import box, pendulum_network, scalar_tanh
 
 
 def closed_loop(dynamics: tuple[sympy.Expr, ...], domain: tuple[str, ...], gain: list[float], bound: str) -> ClosedLoop:

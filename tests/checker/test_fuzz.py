@@ -42,11 +42,11 @@ from certify.policies import load_policy
 from certify.roa import certify_roa
 from certify.systems import get_system
 from certify.verdict import Verdict
-from tests.checker_certificates import LEAF, Document, dump, edited, encode, grow, make, rehash
-from tests.oracle import ball, policies_in_arb, value_of
+from tests.support.certificates import LEAF, Document, dump, edited, encode, grow, make, rehash
+from tests.support.oracle import ball, policies_in_arb, value_of
 
 CHECKER = Path(certify.checker.__file__).parent
-SHIPPED = Path(__file__).parent.parent / "examples" / "policies" / "pendulum.pt"
+SHIPPED = Path(__file__).parents[2] / "examples" / "policies" / "pendulum.pt"
 RULES = {
     "format", "hash", "levels", "lyapunov", "equilibrium", "centring", "domain", "coordinates", "root", "local", "tree",
     "ring", "inputs",

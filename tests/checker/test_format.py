@@ -29,7 +29,7 @@ from certify.checker.document import MAX_BYTES
 from certify.checker.errors import Rejected, Unreadable
 from certify.checker.exact import Exact, Undecided
 from certify.checker.expression import evaluate, parse_dynamics
-from tests.checker_certificates import Document, dump, edited, encode, grow, make, rehash, write
+from tests.support.certificates import Document, dump, edited, encode, grow, make, rehash, write
 
 
 @cache

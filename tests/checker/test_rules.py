@@ -30,8 +30,8 @@ from certify.checker import network, rules
 from certify.checker.document import Policy
 from certify.checker.errors import Rejected
 from certify.checker.rules import Tally
-from tests.ablation import checker_without
-from tests.checker_certificates import (
+from tests.support.ablation import checker_without
+from tests.support.certificates import (
     LEAF,
     Document,
     decode,
@@ -48,7 +48,7 @@ from tests.checker_certificates import (
     with_tree,
     write,
 )
-from tests.oracle import policy_in_arb, value_of
+from tests.support.oracle import policy_in_arb, value_of
 
 # ------------------------------------------------------------------------------------------------- honest certificates
 

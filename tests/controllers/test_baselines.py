@@ -23,7 +23,7 @@ from controllers.options import preset
 from controllers.sac import Interface
 from controllers.training import Trainer
 
-SHIPPED = Path(__file__).parent.parent / "examples" / "policies" / "pendulum.pt"
+SHIPPED = Path(__file__).parents[2] / "examples" / "policies" / "pendulum.pt"
 TINY = replace(preset("pendulum"), steps=150, warm_up=50, n_A=20, n_B=20, batch=8, actor=(6, 5), critic=(7,), seed=3)
 X = np.random.default_rng(0).uniform(-1, 1, (40, 2)) * [2.0, 8.0]
 

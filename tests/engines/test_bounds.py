@@ -19,10 +19,10 @@ from certify.lyapunov import diagonalising_coordinates, domain_limit, solve_lyap
 from certify.obligations import Obligations
 from certify.policies import TanhNetwork, load_policy
 from certify.systems import System, get_system
-from tests.conftest import chain, pendulum_network, scalar_tanh
+from tests.support.loops import chain, pendulum_network, scalar_tanh
 
 CPU = torch.device("cpu")
-POLICIES = Path(__file__).parent.parent / "examples" / "policies"
+POLICIES = Path(__file__).parents[2] / "examples" / "policies"
 
 
 def obligations(system: System, network: TanhNetwork) -> Obligations:

@@ -19,7 +19,7 @@ from certify.systems import get_system
 from controllers.environments import PlantEnvironment, Stepper
 from controllers.options import PRESETS, preset
 
-ROOT = Path(__file__).parent.parent
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture

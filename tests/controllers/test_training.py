@@ -19,7 +19,7 @@ from controllers.evaluate import EvaluationOptions, discrete_linearisation, eval
 from controllers.options import TrainingOptions, preset
 from controllers.training import Episode, Log, Trainer, train
 
-POLICIES = Path(__file__).parent.parent / "examples" / "policies"
+POLICIES = Path(__file__).parents[2] / "examples" / "policies"
 SHIPPED = POLICIES / "pendulum.pt"
 
 

@@ -22,7 +22,7 @@ from controllers.simulation import INITIAL_STATES
 from controllers.training import Trainer, train
 
 PENDULUM = get_system("pendulum")
-SHIPPED = Path(__file__).parent.parent / "examples" / "policies" / "pendulum.pt"
+SHIPPED = Path(__file__).parents[2] / "examples" / "policies" / "pendulum.pt"
 ARGUMENTS = ["--steps", "250", "--warm-up", "100", "--n-A", "60", "--n-B", "60", "--batch", "16", "--critic", "8,8"]
 
 

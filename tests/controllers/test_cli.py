@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from certify.policies import load_policy
 from controllers.cli import app
 
-SHIPPED = Path(__file__).parent.parent / "examples" / "policies" / "pendulum.pt"
+SHIPPED = Path(__file__).parents[2] / "examples" / "policies" / "pendulum.pt"
 SHORT = ["--steps", "260", "--warm-up", "100", "--n-A", "60", "--n-B", "60", "--batch", "16", "--critic", "8,8"]
 
 runner = CliRunner()

@@ -40,7 +40,7 @@ from certify.checker.local import constant as constant_jet
 from certify.checker.network import Folded, enclose_on_boxes, fold, relax_tanh
 from certify.checker.taylor import Taylor, affine, upper_bound
 from certify.checker.taylor import constant as constant_model
-from tests.oracle import awkward, ball, certainly_within, policy_in_arb, quadratic
+from tests.support.oracle import awkward, ball, certainly_within, policy_in_arb, quadratic
 
 FLOATS = st.floats(allow_nan=False, allow_infinity=False)
 MAGNITUDES = st.floats(min_value=0.0, allow_nan=False, allow_infinity=False)

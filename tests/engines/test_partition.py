@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from certify.engines.partition import _HANDFUL, LEAF, Frontier, Partition
-from tests.test_engines import leaves
+from tests.engines.test_bounds import leaves
 
 CPU = torch.device("cpu")
 
@@ -154,8 +154,8 @@ HARD = """
 import resource, torch, numpy as np
 from certify.engines import branch_and_bound as engine
 from certify.engines.vdot import BoxBounds, VdotBound
-from tests.test_engines import obligations
-from tests.conftest import chain
+from tests.engines.test_bounds import obligations
+from tests.support.loops import chain
 
 class Undecided(VdotBound):
     def __call__(self, lo, hi, inner, outer):

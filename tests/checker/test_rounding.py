@@ -6,8 +6,8 @@ name, which is exact (it is formed in Arb, never in binary64). A violation is an
 against the enclosure; what is not certain at 200 bits is asked again at 4,000 before it counts. An infinite or NaN
 error claims nothing, and each test says how many arguments may end so.
 
-Each test has a sample that always runs and the full size, `pytest -m slow tests/test_rounding.py`, which also writes
-the largest |true - value| / error to standard output and to the report.
+Each test has a sample that always runs and the full size, `pytest -m slow tests/checker/test_rounding.py`, which also
+writes the largest |true - value| / error to standard output and to the report.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ from certify.policies import TanhNetwork
 from certify.policies.network import Centre, Squash
 from certify.systems import System, get_system
 from certify.systems.trees import to_tree
-from tests.checker_certificates import make, parse
-from tests.conftest import box
-from tests.oracle import Array, awkward, policies_in_arb, policy_in_arb, value_of
+from tests.support.certificates import make, parse
+from tests.support.loops import box
+from tests.support.oracle import Array, awkward, policies_in_arb, policy_in_arb, value_of
 
 BITS, MANY_BITS = 200, 4000
 CHUNK = 2**15

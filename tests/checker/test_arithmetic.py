@@ -26,11 +26,11 @@ from certify.checker.taylor import Taylor, affine, constant, upper_bound
 from certify.policies import load_policy
 from certify.roa import certify_roa
 from certify.systems import get_system
-from tests.checker_certificates import Document, make, parse, verdict
-from tests.oracle import ball, policy_in_arb, quadratic, value_of
-from tests.test_checker_rules import HONEST, MUTANTS, honest
+from tests.checker.test_rules import HONEST, MUTANTS, honest
+from tests.support.certificates import Document, make, parse, verdict
+from tests.support.oracle import ball, policy_in_arb, quadratic, value_of
 
-POLICY = Path(__file__).parent.parent / "examples" / "policies" / "pendulum.pt"
+POLICY = Path(__file__).parents[2] / "examples" / "policies" / "pendulum.pt"
 
 
 @pytest.fixture(autouse=True)

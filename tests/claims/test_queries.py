@@ -23,9 +23,9 @@ from certify.obligations import (
 )
 from certify.policies import TanhNetwork
 from certify.systems import System, get_system
-from tests.conftest import chain, lqr_gain, pendulum_network, saturated_lqr, scalar_tanh
-from tests.oracle import value_of
-from tests.test_engines import obligations
+from tests.engines.test_bounds import obligations
+from tests.support.loops import chain, lqr_gain, pendulum_network, saturated_lqr, scalar_tanh
+from tests.support.oracle import value_of
 
 
 def quadrotor() -> tuple[System, TanhNetwork]:

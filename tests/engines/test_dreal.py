@@ -27,9 +27,9 @@ from certify.report import render_html
 from certify.roa import RoaOptions, certify_roa, run_checker
 from certify.systems import System, get_system
 from certify.verdict import Verdict
-from tests.checker_certificates import encode
-from tests.conftest import pendulum_network, scalar_tanh
-from tests.test_engines import obligations
+from tests.engines.test_bounds import obligations
+from tests.support.certificates import encode
+from tests.support.loops import pendulum_network, scalar_tanh
 
 FAKE = Backend("binary", ("dreal",), "4.21-fake")
 

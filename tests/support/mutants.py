@@ -20,7 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from tests.checker_certificates import (
+from tests.checker.test_rules import honest, linear_claim, rotor_claim, scalar_claim
+from tests.support.certificates import (
     LEAF,
     Document,
     decode,
@@ -34,10 +35,9 @@ from tests.checker_certificates import (
     tree_of,
     with_tree,
 )
-from tests.claim_oracle import EXACT, LARGEST_FILE, Loop, bounded_by_form, exact_faults, local_fault
-from tests.test_checker_rules import honest, linear_claim, rotor_claim, scalar_claim
+from tests.support.claim_oracle import EXACT, LARGEST_FILE, Loop, bounded_by_form, exact_faults, local_fault
 
-POLICIES = Path(__file__).parent.parent / "examples" / "policies"
+POLICIES = Path(__file__).parents[2] / "examples" / "policies"
 BASES = ("pendulum", "rotor", "rotor, preactivation", "linear", "local only", "scalar")
 BY_FORM = ("pendulum", "scalar")  # offset +- scale lies in the input bounds
 NETWORKS = ("pendulum", "rotor", "rotor, preactivation")

@@ -44,7 +44,7 @@ from certify.report.sampling import (
 from certify.report.words import below, label, number, symbol, units_of
 from certify.roa import certify_roa, run_checker
 from certify.systems import System, get_system
-from tests.conftest import box, chain, pendulum_network, scalar_tanh
+from tests.support.loops import box, chain, pendulum_network, scalar_tanh
 
 ONE_LEAF = PartitionTree(np.eye(2), np.ones(2), bytes([255]))
 

@@ -10,8 +10,8 @@ from certify.engines.branch_and_bound import _threaded
 from certify.engines.vdot import VdotBound
 from certify.obligations import Obligations
 from certify.systems import get_system
-from tests.conftest import lqr_gain, pendulum_network, saturated_lqr, scalar_tanh
-from tests.test_engines import obligations, vdot
+from tests.engines.test_bounds import obligations, vdot
+from tests.support.loops import lqr_gain, pendulum_network, saturated_lqr, scalar_tanh
 
 CPU = torch.device("cpu")
 INNER, OUTER = 0.02, 0.5

@@ -30,8 +30,23 @@ from certify.policies import load_policy
 from certify.roa import certify_roa
 from certify.systems import get_system
 from certify.verdict import Verdict
-from tests import naive_checker
-from tests.checker_certificates import (
+from tests.checker.test_format import NOT_A_HEX_FLOAT, NOT_A_RATIONAL, NOT_BASE64, NOT_IN_THE_GRAMMAR, RAW, SHAPES
+from tests.checker.test_rules import (
+    ABLATED,
+    FALSE,
+    HARMLESS,
+    HONEST,
+    MUTANTS,
+    Edit,
+    bump,
+    coordinates,
+    honest,
+    lyapunov,
+    reordered,
+    scalar_claim,
+)
+from tests.support import naive_checker
+from tests.support.certificates import (
     LEAF,
     Document,
     decode,
@@ -46,25 +61,10 @@ from tests.checker_certificates import (
     verdict,
     with_tree,
 )
-from tests.naive_checker import Leaf, judge, judge_bytes
-from tests.oracle import policy_in_arb, value_of
-from tests.test_checker_format import NOT_A_HEX_FLOAT, NOT_A_RATIONAL, NOT_BASE64, NOT_IN_THE_GRAMMAR, RAW, SHAPES
-from tests.test_checker_rules import (
-    ABLATED,
-    FALSE,
-    HARMLESS,
-    HONEST,
-    MUTANTS,
-    Edit,
-    bump,
-    coordinates,
-    honest,
-    lyapunov,
-    reordered,
-    scalar_claim,
-)
+from tests.support.naive_checker import Leaf, judge, judge_bytes
+from tests.support.oracle import policy_in_arb, value_of
 
-SHIPPED = Path(__file__).parent.parent / "examples" / "policies" / "pendulum.pt"
+SHIPPED = Path(__file__).parents[2] / "examples" / "policies" / "pendulum.pt"
 
 
 def both(data: Document) -> tuple[str, str]:

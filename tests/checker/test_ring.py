@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 from certify.checker import rules
 from certify.checker.network import enclose_on_boxes
 from certify.checker.taylor import Taylor, upper_bound
-from tests.checker_certificates import grow, parse, verdict
-from tests.oracle import policies_in_arb, value_of
-from tests.test_checker_rules import honest, scalar_claim
+from tests.checker.test_rules import honest, scalar_claim
+from tests.support.certificates import grow, parse, verdict
+from tests.support.oracle import policies_in_arb, value_of
 
 Array = np.ndarray
 CASES = ("scalar", "linear", "rotor", "rotor, preactivation")

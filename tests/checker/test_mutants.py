@@ -20,10 +20,10 @@ import pytest
 
 from certify.checker import document, rules
 from certify.checker.errors import Rejected
-from tests.ablation import checker_without
-from tests.claim_oracle import EXACT, faults, read
-from tests.mutants import BASES, FAMILIES, Mutant, base, dump, family, true_edits
-from tests.naive_checker import judge
+from tests.support.ablation import checker_without
+from tests.support.claim_oracle import EXACT, faults, read
+from tests.support.mutants import BASES, FAMILIES, Mutant, base, dump, family, true_edits
+from tests.support.naive_checker import judge
 
 ORDER = ("format", "hash", "levels", "lyapunov", "equilibrium", "domain", "coordinates", "root", "centring", "local",
          "tree", "ring", "inputs")  # fmt: skip

@@ -15,7 +15,7 @@ from certify.lyapunov import choice, choose_candidate, domain_limit, volume
 from certify.policies import Policy, save_policy
 from certify.roa import RoaOptions, certify_roa, compare_candidates
 from certify.systems import System
-from tests.conftest import chain, pendulum_network
+from tests.support.loops import chain, pendulum_network
 
 
 def test_each_candidate_solves_its_equation(pendulum: System) -> None:

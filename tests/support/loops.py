@@ -1,0 +1,98 @@
+"""Small closed loops with known answers, shared by the tests."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+import scipy.linalg
+import sympy
+
+from certify.policies import TanhNetwork
+from certify.systems import System
+
+
+def box(*half_widths: float | str) -> tuple[tuple[Fraction, Fraction], ...]:
+    """Symmetric intervals."""
+    return tuple((-Fraction(d), Fraction(d)) for d in half_widths)
+
+
+def scalar_tanh() -> tuple[System, TanhNetwork]:
+    """xdot = x/2 - tanh(x): the origin attracts exactly |x| < 1.915008048..."""
+    x, u = sympy.symbols("x u")
+    system = System(
+        name="scalar",
+        states=(x,),
+        inputs=(u,),
+        parameters={},
+        dynamics=(x / 2 + u,),
+        u_eq=(sympy.Integer(0),),
+        domain=box(3),
+        input_bounds=box(1),
+    )
+    network = TanhNetwork((np.array([[-1.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
+    return system, network
+
+
+def chain(n: int, poles: list[float]) -> tuple[System, TanhNetwork]:
+    """An integrator chain of n states under linear feedback that places `poles` exactly (up to integers)."""
+    coefficients = np.poly(poles)[:0:-1].real.round(9)  # of s^0 .. s^(n-1)
+    x = sympy.symbols(f"x1:{n + 1}")
+    u = sympy.Symbol("u")
+    system = System(
+        name=f"chain{n}",
+        states=tuple(x),
+        inputs=(u,),
+        parameters={},
+        dynamics=(*x[1:], u),
+        u_eq=(sympy.Integer(0),),
+        domain=box(*[1 + Fraction(i, 2) for i in range(n)]),
+        input_bounds=box(10_000),
+    )
+    network = TanhNetwork((-coefficients[None, :],), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    return system, network
+
+
+def saturated_lqr(
+    K: np.ndarray, scale: float, offset: float, spread: list[float], widths: tuple[int, ...], centre: str, seed: int
+) -> TanhNetwork:
+    """A tanh policy near u = offset + scale tanh(-Kx/scale): random features, last layer by least squares.
+
+    K (m, n); spread (n,): half-widths of the states over which it is fitted.
+    """
+    generator = np.random.default_rng(seed)
+    m, n = K.shape
+    weights, biases, width = [], [], n
+    for out in widths:
+        first = width == n and not weights
+        stretch = 1.4 / np.array(spread) if first else 1.0
+        weights.append(generator.standard_normal((out, width)) * stretch / width**0.5)
+        biases.append(generator.uniform(-0.5, 0.5, out))
+        width = out
+    x = generator.uniform(-1, 1, (4000, n)) * np.array(spread) * generator.random((4000, 1))
+    x = np.concatenate([x, 1e-3 * generator.standard_normal((200, n))])
+    h, h0 = x, np.zeros((1, n))
+    for W, b in zip(weights, biases, strict=True):
+        h, h0 = np.tanh(h @ W.T + b), np.tanh(h0 @ W.T + b)
+    importance = np.where(np.arange(len(x)) < 4000, 1.0, 3000.0)[:, None]
+    last, *_ = np.linalg.lstsq((h - h0) * importance, -(x @ K.T) / scale * importance, rcond=1e-6)
+    return TanhNetwork(
+        (*weights, last.T), (*biases, np.full(m, 0.1)), np.full(m, scale), np.full(m, offset), "tanh", centre
+    )
+
+
+def pendulum_network(widths: tuple[int, ...] = (16, 16), centre: str = "preactivation", seed: int = 0) -> TanhNetwork:
+    """A policy for the pendulum that stabilises it."""
+    return saturated_lqr(np.array([[2.8, 0.95]]), 6.0, 0.0, [2.0, 8.0], widths, centre, seed)
+
+
+def lqr_gain(system: System, Q: np.ndarray, R: np.ndarray) -> np.ndarray:
+    """Continuous LQR gain of the plant's linearisation, (m, n)."""
+    f, n = system.function(), system.n
+    u_eq = np.array([float(u) for u in system.exact_u_eq()])
+    step = 1e-6
+    rows = np.concatenate([np.eye(n, n + system.m), np.eye(system.m, n + system.m, n)]) * step
+    forward, back = (f(s * rows[:, :n], u_eq + s * rows[:, n:]) for s in (1, -1))
+    J = ((forward - back) / (2 * step)).T
+    A, B = J[:, :n], J[:, n:]
+    return np.asarray(np.linalg.solve(R, B.T @ scipy.linalg.solve_continuous_are(A, B, Q, R)))
