@@ -25,7 +25,7 @@ from certify.systems import System
 from certify.systems.trees import from_tree, to_tree
 
 Array = NDArray[np.float64]
-SCHEMA = "certify-certificate/1"
+SCHEMA = "certify-certificate/2"
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,6 +73,7 @@ class Certificate:
         system, network = self.system, self.network
         sections: dict[str, Any] = {
             "schema": SCHEMA,
+            "claim": {"kind": "asymptotic"},
             "plant": {
                 "name": system.name,
                 "states": [s.name for s in system.states],
@@ -93,7 +94,7 @@ class Certificate:
                 "offset": _encode(network.offset),
                 "sha256": network.sha256(),
             },
-            "lyapunov": {"P": _encode(self.P)},
+            "lyapunov": {"kind": "quadratic", "P": _encode(self.P)},
             "levels": {"local": float(self.local).hex(), "roa": float(self.roa).hex()},
             "evidence": _evidence(self.evidence),
             "provenance": {k: str(v) for k, v in self.provenance.items()},

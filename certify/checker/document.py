@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from .errors import Rejected, Unreadable
 from .expression import Tape, parse_dynamics
 
-SCHEMA = "certify-certificate/1"
+SCHEMA = "certify-certificate/2"
 MAX_BYTES = 256 * 2**20
 MAX_WIDE_BYTES = 2**24  # with a character beyond ASCII: each may take four bytes
 MAX_VALUES = 1_000_000  # each takes up to 100 bytes of memory; numbers come as base64, never as lists
@@ -123,10 +123,12 @@ def read(path: str) -> Certificate:
 
 
 def _certificate(data: Any, sha256: str) -> Certificate:
-    top = _keys(data, "file", "schema plant policy lyapunov levels evidence provenance")
+    top = _keys(data, "file", "schema claim plant policy lyapunov levels evidence provenance")
     if top["schema"] != SCHEMA:
         _fail("schema", f"must be {SCHEMA!r}")
     _keys(top["provenance"], "provenance", None)
+    if _keys(top["claim"], "claim", "kind")["kind"] != "asymptotic":
+        _fail("claim.kind", "must be 'asymptotic'")
 
     plant = _keys(top["plant"], "plant", "name states inputs dynamics u_eq domain input_bounds")
     states, inputs = _names(plant["states"], "plant.states"), _names(plant["inputs"], "plant.inputs")
@@ -144,7 +146,9 @@ def _certificate(data: Any, sha256: str) -> Certificate:
     if stated["sha256"] != policy.sha256():
         raise Rejected("hash", "policy.sha256", "does not match the layers in the file")
 
-    lyapunov = _keys(top["lyapunov"], "lyapunov", "P")
+    lyapunov = _keys(top["lyapunov"], "lyapunov", "kind P")
+    if lyapunov["kind"] != "quadratic":
+        _fail("lyapunov.kind", "must be 'quadratic'")
     levels = _keys(top["levels"], "levels", "local roa")
     return Certificate(
         name=_name(plant["name"], "plant.name"),

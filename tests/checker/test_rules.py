@@ -241,7 +241,9 @@ def collapsed(name: str) -> bytes:
 
 
 MUTANTS: list[tuple[str, str, str, Edit]] = [  # rule, base, what, edit
-    ("format", "scalar", "schema", at("schema", "certify-certificate/2")),
+    ("format", "scalar", "schema", at("schema", "certify-certificate/1")),
+    ("format", "scalar", "claim", at("claim.kind", "stable")),
+    ("format", "scalar", "Lyapunov function", at("lyapunov.kind", "neural")),
     ("format", "scalar", "state not in the equations", at("plant.states", ["y"])),
     ("format", "scalar", "input not in the equations", at("plant.inputs", ["v"])),
     ("format", "scalar", "shape", rehashed("layers.0.shape", [1, 2])),

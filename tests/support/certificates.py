@@ -81,7 +81,8 @@ def make(
         root = least_root(P, T, levels[1])
     arrays = [(np.atleast_2d(np.asarray(W, dtype=np.float64)), np.atleast_1d(b)) for W, b in layers]
     return rehash({
-        "schema": "certify-certificate/1",
+        "schema": "certify-certificate/2",
+        "claim": {"kind": "asymptotic"},
         "plant": {
             "name": "plant",
             "states": list(states),
@@ -99,7 +100,7 @@ def make(
             "offset": encode(offset),
             "sha256": "",
         },
-        "lyapunov": {"P": encode(P)},
+        "lyapunov": {"kind": "quadratic", "P": encode(P)},
         "levels": {"local": float(levels[0]).hex(), "roa": float(levels[1]).hex()},
         "evidence": {
             "kind": "partition-tree",

@@ -164,8 +164,8 @@ def _expression(node: Any, names: set[str]) -> None:
 
 def _shape(data: Any) -> None:
     """Every section, key, count and number."""
-    _section(data, "schema", "plant", "policy", "lyapunov", "levels", "evidence", "provenance")
-    _need(data["schema"] == "certify-certificate/1", "schema")
+    _section(data, "schema", "claim", "plant", "policy", "lyapunov", "levels", "evidence", "provenance")
+    _need(data["schema"] == "certify-certificate/2", "schema")
     _need(isinstance(data["provenance"], dict), "provenance")
     plant, policy, evidence = data["plant"], data["policy"], data["evidence"]
     _section(plant, "name", "states", "inputs", "dynamics", "u_eq", "domain", "input_bounds")
@@ -201,7 +201,10 @@ def _shape(data: Any) -> None:
     _need(np.all(_array(policy["scale"], m) != 0), "nonzero scale")
     _array(policy["offset"], m)
 
-    _section(data["lyapunov"], "P")
+    _section(data["claim"], "kind")
+    _need(data["claim"]["kind"] == "asymptotic", "claim")
+    _section(data["lyapunov"], "kind", "P")
+    _need(data["lyapunov"]["kind"] == "quadratic", "lyapunov")
     _array(data["lyapunov"]["P"], n, n)
     _section(data["levels"], "local", "roa")
     _binary64(data["levels"]["local"])

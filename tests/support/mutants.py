@@ -812,7 +812,7 @@ def structure() -> Iterator[Mutant]:
             ("negative shape", "policy.layers.0.shape", lambda s: [-s[0], s[1]]),
             ("shape of booleans", "policy.layers.0.shape", lambda s: [True, True]),
             ("squash", "policy.squash", lambda s: "relu"), ("centre", "policy.centre", lambda s: "input"),
-            ("schema", "schema", lambda s: "certify-certificate/2"), ("kind", "evidence.kind", lambda s: "trust-me"),
+            ("schema", "schema", lambda s: "certify-certificate/1"), ("kind", "evidence.kind", lambda s: "trust-me"),
             ("zero scale", "policy.scale", lambda s: encode([0.0])),
             ("scale -0", "policy.scale", lambda s: encode([-0.0])),
             ("kind of a solver", "evidence.kind", lambda s: "trusted-solver"),

@@ -101,8 +101,8 @@ def read(raw: bytes) -> Claim:
         )
     except (ValueError, RecursionError):
         raise Refused("format") from None
-    data = keys(data, "schema", "plant", "policy", "lyapunov", "levels", "evidence", "provenance")
-    require(data["schema"] == "certify-certificate/1" and isinstance(data["provenance"], dict), "format")
+    data = keys(data, "schema", "claim", "plant", "policy", "lyapunov", "levels", "evidence", "provenance")
+    require(data["schema"] == "certify-certificate/2" and isinstance(data["provenance"], dict), "format")
 
     plant = keys(data["plant"], "name", "states", "inputs", "dynamics", "u_eq", "domain", "input_bounds")
     states, inputs = entries(plant["states"]), entries(plant["inputs"])
@@ -139,7 +139,10 @@ def read(raw: bytes) -> Claim:
         digest.update(struct.pack("<2Q", 1, m) + packed(a))
     require(policy["sha256"] == digest.hexdigest(), "hash")
 
-    P = square(array(keys(data["lyapunov"], "P")["P"], n * n), n)
+    require(keys(data["claim"], "kind")["kind"] == "asymptotic", "format")
+    lyapunov = keys(data["lyapunov"], "kind", "P")
+    require(lyapunov["kind"] == "quadratic", "format")
+    P = square(array(lyapunov["P"], n * n), n)
     levels = keys(data["levels"], "local", "roa")
     c1, c2 = binary64(levels["local"]), binary64(levels["roa"])
     evidence = data["evidence"]
