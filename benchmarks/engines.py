@@ -24,13 +24,13 @@ from fitted import fit_policy, spread_of
 from intervals import PlainIntervals
 
 from certify.closed_loop import ClosedLoop
-from certify.engines import dreal
-from certify.engines.branch_and_bound import Budget, prove_ring
+from certify.engines.dreal import backend as dreal
+from certify.engines.bounds.search import Budget, prove_outwards
 from certify.engines.falsify import falsify
 from certify.engines.local import prove_local
 from certify.errors import BackendError
 from certify.lyapunov import diagonalising_coordinates, domain_limit, solve_lyapunov
-from certify.obligations import Obligations, ring_query
+from certify.obligations import Case, ring_query
 from certify.policies import load_policy
 from certify.systems import get_system
 
@@ -73,22 +73,22 @@ def main() -> None:
         torch.set_num_threads(options.threads)
         A, _, _ = loop.linearise()
         P = solve_lyapunov(A, np.eye(len(A)))
-        claims = Obligations(loop, P, diagonalising_coordinates(P, A))
+        case = Case(loop, P, diagonalising_coordinates(P, A))
         limit = domain_limit(P, loop.system.domain)
-        witness = falsify(claims, limit)
+        witness = falsify(case.problem, case.T, limit)
         outer = share * (limit if witness is None else witness.level)
-        inner = prove_local(claims, outer)
+        inner = prove_local(case.problem, case.T, outer)
         if inner is None:
             print(f"{name}: the local proof fails")
             continue
         layers = "-".join(map(str, loop.network.layers))
         print(f"\n{name} {layers}: {inner:.3g} <= V <= {outer:.6g}")
         rows: dict[str, Callable[[], tuple[str, float, str]]] = {
-            "bounds": lambda c=claims, a=inner, b=outer: ring(c, a, b, options.limit, False),
-            "intervals": lambda c=claims, a=inner, b=outer: ring(c, a, b, options.limit, True),
+            "bounds": lambda c=case, a=inner, b=outer: ring(c, a, b, options.limit, False),
+            "intervals": lambda c=case, a=inner, b=outer: ring(c, a, b, options.limit, True),
         }
         if backend is not None:
-            query = ring_query(claims, inner, outer)
+            query = query(ring_condition(inner, outer), case.problem)
             rows["dreal"] = lambda q=query: ask(backend, q, options)
         reference = None
         for engine, run in rows.items():
@@ -99,11 +99,11 @@ def main() -> None:
             print(f"  {engine:<10}{verdict:<9}{seconds:>9.3f} s {seconds / reference:>9.1f} x   {detail}", flush=True)
 
 
-def ring(claims: Obligations, inner: float, outer: float, limit: float, plain: bool) -> tuple[str, float, str]:
+def ring(case: Case, inner: float, outer: float, limit: float, plain: bool) -> tuple[str, float, str]:
     """Verdict, seconds and detail of this project's branch and bound, with its own rule or with plain intervals."""
     start = time.perf_counter()
-    rule = PlainIntervals(claims, CPU) if plain else None
-    proof = prove_ring(claims, inner, outer, Budget(seconds=limit, boxes=10**8), CPU, rule=rule)
+    rule = PlainIntervals(case, CPU) if plain else None
+    proof = prove_outwards(case.problem, case.T, inner, outer, Budget(seconds=limit, boxes=10**8), CPU, rule=rule)
     seconds = time.perf_counter() - start
     if proof.level >= outer:
         return "PROVED", seconds, f"{proof.boxes} boxes"

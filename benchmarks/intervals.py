@@ -12,7 +12,7 @@ import sympy
 import torch
 from torch import Tensor
 
-from certify.engines.vdot import BoxBounds, VdotBound
+from certify.engines.bounds.rule import BoxBounds, VdotBound
 
 Interval = tuple[Tensor, Tensor]
 

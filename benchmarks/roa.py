@@ -21,10 +21,9 @@ import numpy as np
 import torch
 
 from certify.closed_loop import ClosedLoop
-from certify.engines.branch_and_bound import _threaded
-from certify.engines.vdot import VdotBound
+from certify.engines.bounds.search import _threaded
+from certify.engines.bounds.rule import VdotBound
 from certify.lyapunov import diagonalising_coordinates, solve_lyapunov, volume
-from certify.obligations import Obligations
 from certify.policies import load_policy
 from certify.roa import RoaOptions, RoaResult, certify_roa
 from certify.systems import get_system
@@ -69,7 +68,7 @@ def throughput(path: Path, runs: int) -> None:
     A, _, _ = loop.linearise()
     P = solve_lyapunov(A, np.eye(len(A)))
     cpu = torch.device("cpu")
-    rule = VdotBound(Obligations(loop, P, diagonalising_coordinates(P, A)), cpu)
+    rule = VdotBound(Case(loop, P, diagonalising_coordinates(P, A)), cpu)
     n, m = loop.system.n, loop.system.m
     batch = 2048
     generator = torch.Generator().manual_seed(0)

@@ -1,8 +1,8 @@
 """The command line `certify`: arguments, printing, exit statuses; no mathematics.
 
 Standard output carries the result, or with `--json` exactly one JSON object; progress and diagnostics go to
-standard error. Exit status: 0 proved or accepted, 1 refuted or rejected, 2 usage or unusable input, 3 unknown,
-70 internal error.
+standard error. Exit status: 0 proved or accepted, 1 refuted or rejected, 2 usage or unusable input, 3 unknown
+or trusted, 70 internal error; 130 and 141 after Ctrl-C and a closed pipe.
 """
 
 from __future__ import annotations
@@ -13,20 +13,20 @@ import os
 import sys
 import threading
 import time
-from contextlib import suppress
-from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from certify.errors import BackendError, CertificateFormatError, CertifyError, InputError, SoundnessError
+from certify.arguments import numbers, plant_of
+from certify.errors import BackendError, CertifyError, InputError, SoundnessError
 
 if TYPE_CHECKING:
-    from certify.engines.branch_and_bound import RingProgress
+    from certify.engines.base import Progress
     from certify.lyapunov import Candidate
     from certify.policies import Policy
-    from certify.roa import RoaOptions, RoaResult
+    from certify.results import RoaResult
+    from certify.roa import RoaOptions
     from certify.systems import System
 
 app = typer.Typer(
@@ -37,7 +37,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-_INTERRUPTED = 130
+_INTERRUPTED, _CLOSED_PIPE = 130, 141  # as a shell reports SIGINT and SIGPIPE
 _STOPPED = "interrupted; nothing was left half-written."
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
@@ -54,6 +54,10 @@ def roa(
     domain: Annotated[
         list[str] | None, typer.Option(help="Half-width NAME=D or interval NAME=LO:HI of a state; repeatable.")
     ] = None,
+    claim: Annotated[
+        str,
+        typer.Option(help="asymptotic (converges to the origin) or practical (enters a small set and stays there)."),
+    ] = "asymptotic",
     candidate: Annotated[str, typer.Option(help="Lyapunov candidate: lyapunov, lqr or optimised.")] = "lyapunov",
     compare: Annotated[
         bool, typer.Option("--compare", help="Compare with the optimised candidate too; takes its time.")
@@ -79,15 +83,16 @@ def roa(
 
     start = time.perf_counter()
     stored = load_policy(policy)
-    plant = _system(stored, system, param or [], domain or [])
+    plant = plant_of(stored, system, param or [], domain or [])
     _tell(_plant_line(stored, plant, system is not None))
-    shift = _beta_shift(stored, plant)
+    shift = stored.beta_shift(plant.exact_u_eq())
     if shift:
-        _tell(shift)
+        _tell(f"the file's rounded beta is read as the real number; this shifts u(0) by {shift:.3g}")
     options = RoaOptions(
+        claim=claim,  # type: ignore[arg-type]
         candidate=candidate,  # type: ignore[arg-type]
-        Q=_numbers(q, "--Q"),
-        R=_numbers(r, "--R"),
+        Q=numbers(q, "--Q"),
+        R=numbers(r, "--R"),
         level=level,
         engine=_engine(context, engine),  # type: ignore[arg-type]
         dreal_precision=precision,
@@ -97,7 +102,7 @@ def roa(
         max_boxes=max_boxes,
     )
     folder = out if out is not None else Path("out") / policy.stem
-    progress = _Progress()
+    progress = _ProgressLine()
     try:
         result = certify_roa(
             plant, stored.network, folder, options,
@@ -116,11 +121,11 @@ def roa(
         page = render_html(read_certificate(result.certificate), answer, data, result.certificate)
         _write(folder / "report.html", page)
     if as_json:
-        sys.stdout.write(json.dumps(data) + "\n")
+        _out(json.dumps(data))
     else:
         _print(summary(data))
         if result.certificate is not None:
-            sys.stdout.write(f"certificate  {result.certificate}\nreport       {folder / 'report.html'}\n")
+            _out(f"certificate  {result.certificate}\nreport       {folder / 'report.html'}")
     raise typer.Exit(result.verdict.exit_status)
 
 
@@ -137,25 +142,28 @@ def export_smt2(
     as_json: Json = False,
 ) -> None:
     """Prove levels with the bounds engine and write its claims as SMT-LIB 2 for another solver."""
-    from certify.engines.dreal import to_smt2
-    from certify.obligations import queries
+    from certify.claims import Asymptotic, conditions
+    from certify.claims.queries import query
+    from certify.engines.dreal.backend import to_smt2
     from certify.policies import load_policy
-    from certify.roa import RoaOptions, certify_roa, obligations_of
+    from certify.roa import RoaOptions, certify_roa
+    from certify.verdict import Verdict
 
     stored = load_policy(policy)
-    plant = _system(stored, system, param or [], domain or [])
+    plant = plant_of(stored, system, param or [], domain or [])
     options = RoaOptions(candidate=candidate, level=level, time_limit=time_limit)  # type: ignore[arg-type]
     result = certify_roa(plant, stored.network, out, options)
-    inner, outer = result.levels.get("local"), result.levels.get("roa")
-    if result.verdict.exit_status != 0 or inner is None or outer is None:
+    inner, outer = result.levels.local, result.levels.roa
+    if result.verdict is not Verdict.PROVED or result.problem is None or inner is None or outer is None:
         raise InputError(f"there are no levels to export; {result.verdict.value}: {result.reason}")
     outer = outer if level is not None else max(inner, 0.99 * outer)
     written = []
-    for query in queries(obligations_of(result), inner, outer):
-        path = out / f"{query.name}.smt2"
-        _write(path, to_smt2(query, "unsat (proved by the bounds engine, accepted by the checker)"))
+    for condition in conditions(Asymptotic(roa=outer, local=inner), result.problem):
+        path = out / f"{condition.name}.smt2"
+        text = to_smt2(query(condition, result.problem), "unsat (proved by the bounds engine, accepted by the checker)")
+        _write(path, text)
         written.append(str(path))
-    sys.stdout.write((json.dumps({"files": written}) if as_json else "\n".join(written)) + "\n")
+    _out(json.dumps({"files": written}) if as_json else "\n".join(written))
 
 
 @app.command()
@@ -164,34 +172,29 @@ def check(
     policy: Annotated[
         Path | None, typer.Option(help="Policy file that the certificate must be about (compares hashes).")
     ] = None,
-    arithmetic: Annotated[
-        str, typer.Option(help="float64 (binary64, every rounding bounded) or arb (balls; slow, the reference).")
-    ] = "float64",
+    reference: Annotated[
+        bool, typer.Option("--reference", help="Ask the second checker (fractions and balls): slower, shares no code.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
     """Check a certificate with the independent checker, in a process of its own."""
-    import subprocess
+    from certify.certificate.checking import ask
 
-    if arithmetic not in ("float64", "arb"):
-        raise InputError(f"--arithmetic must be float64 or arb, not {arithmetic!r}.")
+    wanted = None
     if policy is not None:
-        from certify.certificate import read_certificate
         from certify.policies import load_policy
 
-        network, claimed = load_policy(policy).network, None
-        with suppress(CertificateFormatError):  # the checker says below what is wrong with the file
-            claimed = read_certificate(certificate).network.sha256()
-        if claimed is not None and claimed != network.sha256():
-            detail = f"the certificate is about policy {claimed}, not about {policy} ({network.sha256()})"
-            if as_json:
-                stated = {"result": "REJECTED", "rule": "policy", "at": "policy.sha256", "detail": detail}
-                sys.stdout.write(json.dumps(stated) + "\n")
-            else:
-                sys.stdout.write(f"REJECTED rule=policy at=policy.sha256: {detail}\n")
-            raise typer.Exit(1)
-    command = [sys.executable, "-I", "-m", "certify.checker", str(certificate), "--arithmetic", arithmetic]
-    command += ["--json"] if as_json else []
-    raise typer.Exit(subprocess.run(command, check=False).returncode)
+        wanted = load_policy(policy).network.sha256()
+    status, answer = ask(certificate, "reference" if reference else "checker")
+    lines = answer.pop("text", [])
+    if wanted is not None and "policy_sha256" in answer and answer["policy_sha256"] != wanted:
+        detail = f"the certificate is about policy {answer['policy_sha256']}, not about {policy} ({wanted})"
+        answer = {"result": "REJECTED", "rule": "policy", "at": "policy.sha256", "detail": detail}
+        status, lines = 1, [f"REJECTED rule=policy at=policy.sha256: {detail}"]
+    if "error" in answer and not as_json:
+        raise typer.Exit(_fail(False, answer["error"], status))
+    _out(json.dumps(answer) if as_json else "\n".join(lines))
+    raise typer.Exit(status)
 
 
 @app.command()
@@ -201,16 +204,15 @@ def report(
     as_json: Json = False,
 ) -> None:
     """Check a certificate and draw its report."""
-    from certify.certificate import read_certificate
+    from certify.certificate import read_certificate, run_checker
     from certify.report import render_html
-    from certify.roa import run_checker
 
     target = out if out is not None else certificate.parent / "report.html"
     read = read_certificate(certificate)
     answer = run_checker(certificate)
     _write(target, render_html(read, answer, None, certificate))
     stated = {"report": str(target), "result": answer["result"]}
-    sys.stdout.write((json.dumps(stated) if as_json else f"{answer['result']}  {target}") + "\n")
+    _out(json.dumps(stated) if as_json else f"{answer['result']}  {target}")
     raise typer.Exit({"ACCEPTED": 0, "TRUSTED": 3}.get(answer["result"], 1))
 
 
@@ -221,18 +223,16 @@ def systems(as_json: Json = False) -> None:
 
     found = [get_system(name) for name in available_systems()]
     if as_json:
-        sys.stdout.write(json.dumps({"systems": [_describe(s) for s in found]}) + "\n")
+        _out(json.dumps({"systems": [_describe(s) for s in found]}))
         return
     for s in found:
-        sys.stdout.write(f"{s.name}: {s.description}\n")
-        for symbol, expression in zip(s.states, s.dynamics, strict=True):
-            sys.stdout.write(f"  {symbol}' = {expression}\n")
-        for name, value in s.parameters.items():
-            sys.stdout.write(f"  {name} = {float(value):g} {s.units.get(name, '')}\n")
+        lines = [f"{s.name}: {s.description}"]
+        lines += [f"  {symbol}' = {expression}" for symbol, expression in zip(s.states, s.dynamics, strict=True)]
+        lines += [f"  {name} = {float(value):g} {s.units.get(name, '')}" for name, value in s.parameters.items()]
         for symbols, intervals in ((s.states, s.domain), (s.inputs, s.input_bounds)):
             for symbol, (lo, hi) in zip(symbols, intervals, strict=True):
-                unit = s.units.get(symbol.name, "")
-                sys.stdout.write(f"  {symbol} in [{float(lo):g}, {float(hi):g}] {unit}\n")
+                lines.append(f"  {symbol} in [{float(lo):g}, {float(hi):g}] {s.units.get(symbol.name, '')}")
+        _out("\n".join(lines))
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -264,17 +264,35 @@ def _run(arguments: list[str], as_json: bool) -> int:
     except CertifyError as error:
         return _fail(as_json, str(error), 2)
     except BrokenPipeError:
-        return 70
+        return _closed()
     except Exception as error:  # the last resort: no traceback reaches a user
         return _fail(as_json, f"internal error: {type(error).__name__}: {error}", 70)
 
 
 def _fail(as_json: bool, message: str, status: int) -> int:
     if as_json:
-        sys.stdout.write(json.dumps({"error": message}) + "\n")
+        try:
+            _out(json.dumps({"error": message}))
+        except typer.Exit as closed:
+            return closed.exit_code
     else:
-        sys.stderr.write(f"certify: {message}\n")
+        _tell(f"certify: {message}")
     return status
+
+
+def _closed() -> int:
+    """What is left to say goes nowhere: whoever read it has gone, which is no verdict."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return _CLOSED_PIPE
+
+
+def _out(text: str) -> None:
+    """Print the result, and be sure that it has left: a reader that has gone must not look like a verdict."""
+    try:
+        sys.stdout.write(text + "\n")
+        sys.stdout.flush()
+    except BrokenPipeError:
+        raise typer.Exit(_closed()) from None
 
 
 def _candidates(result: RoaResult, options: RoaOptions, compare: bool) -> list[dict[str, Any]]:
@@ -283,43 +301,12 @@ def _candidates(result: RoaResult, options: RoaOptions, compare: bool) -> list[d
 
     from certify.roa import compare_candidates
 
-    known = {} if result.candidate is None or result.P is None else {result.candidate: result.P}
+    known = {} if result.candidate is None or result.problem is None else {result.candidate: result.problem.V.P}
     names: list[Candidate] = ["lyapunov", "lqr"]
     if compare or "optimised" in known:
         names.append("optimised")
     rows = compare_candidates(result.system, result.network, options, known, names)
     return [{**asdict(row), "proved": row.candidate in known} for row in rows]
-
-
-def _system(stored: Policy, name: str | None, params: list[str], bounds: list[str]) -> System:
-    from certify.systems import exact, get_system
-
-    plant = get_system(name if name is not None else stored.system)
-    if name is None or name == stored.system:
-        plant = plant.with_parameters(stored.parameters)
-    plant = plant.with_parameters(dict(_assignment(p, "--param") for p in params))
-    domain: dict[str, tuple[Fraction, Fraction]] = {}
-    for text in bounds:
-        state, value = _assignment(text, "--domain")
-        lo, _, hi = value.rpartition(":")
-        domain[state] = (exact(lo, state), exact(hi, state)) if lo else (-exact(hi, state), exact(hi, state))
-    return plant.with_domain(domain)
-
-
-def _assignment(text: str, option: str) -> tuple[str, str]:
-    name, equals, value = text.partition("=")
-    if not equals or not name or not value:
-        raise InputError(f"{option} takes NAME=VALUE; found {text!r}.")
-    return name.strip(), value.strip()
-
-
-def _numbers(text: str | None, option: str) -> tuple[float, ...] | None:
-    if text is None:
-        return None
-    try:
-        return tuple(float(part) for part in text.split(","))
-    except ValueError as error:
-        raise InputError(f"{option} takes numbers separated by commas, as in 1,1; found {text!r}.") from error
 
 
 def _device(name: str) -> str:
@@ -332,7 +319,7 @@ def _device(name: str) -> str:
 
 def _engine(context: typer.Context, name: str) -> str:
     """The engine; without dReal, one that only the environment names falls back to bounds with a notice."""
-    from certify.engines.dreal import find_backend
+    from certify.engines.dreal.backend import find_backend
 
     source = context.get_parameter_source("engine")
     if name in ("dreal", "both") and source is not None and source.name == "ENVIRONMENT":
@@ -349,18 +336,6 @@ def _plant_line(stored: Policy, plant: System, overridden: bool) -> str:
     source = "from the command line" if overridden else "from the policy file"
     layers = "-".join(map(str, stored.network.layers))
     return f"plant {plant.name} ({source}) with {values or 'no parameters'}; policy {layers}"
-
-
-def _beta_shift(stored: Policy, plant: System) -> str | None:
-    """What reading a stored, rounded beta as the real number changes in u at the origin."""
-    import numpy as np
-
-    if stored.beta is None:
-        return None
-    network = stored.network
-    u = network.scale * np.tanh(stored.beta) + network.offset
-    shift = np.max(np.abs(u - np.array([float(v) for v in plant.exact_u_eq()])))
-    return f"the file's rounded beta is read as the real number; this shifts u(0) by {shift:.3g}"
 
 
 def _provenance(policy: Path) -> dict[str, Any]:
@@ -385,41 +360,40 @@ def _describe(s: System) -> dict[str, Any]:
 
 
 def _write(path: Path, text: str) -> None:
-    partial = path.with_name(path.name + ".partial")
-    try:
-        partial.write_text(text, encoding="utf-8")
-        partial.replace(path)
-    except OSError as error:
-        partial.unlink(missing_ok=True)
-        raise InputError(f"{path} cannot be written: {error.strerror}.") from error
+    from certify.certificate import write_atomically
+
+    write_atomically(path, text.encode())
 
 
 def _print(renderable: Any) -> None:
     from rich.console import Console
 
-    Console(file=sys.stdout).print(renderable)
+    console = Console(file=sys.stdout)
+    with console.capture() as captured:
+        console.print(renderable)
+    _out(captured.get().rstrip("\n"))
 
 
 def _tell(line: str) -> None:
     sys.stderr.write(line + "\n")
 
 
-def _ring_line(state: RingProgress) -> str:
+def _ring_line(state: Progress) -> str:
     left = "" if state.seconds_left is None else f", about {state.seconds_left:.0f} s left"
     return (
-        f"ring: proved to V <= {state.level:.4g} of {state.target:.4g} ({state.proved:.1%} of the volume), "
+        f"ring: proved to V = {state.level:.4g} of {state.target:.4g} ({state.proved:.1%} of the volume), "
         f"{state.boxes} boxes, {state.open} open{left}"
     )
 
 
-class _Progress:
+class _ProgressLine:
     """A line on standard error, at most five times a second, only on a terminal."""
 
     def __init__(self) -> None:
         self.last = 0.0
         self.shown = False
 
-    def __call__(self, stage: str, state: RingProgress | None) -> None:
+    def __call__(self, stage: str, state: Progress | None) -> None:
         if stage == "check":  # the checker works in a process of its own: load the drawing libraries meanwhile
             from certify.report import warm_up
 

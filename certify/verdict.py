@@ -1,7 +1,7 @@
-"""The three answers to a proof question.
+"""How an attempt to prove a claim ends: the verdict, and what stopped the level from being higher.
 
-A verdict is never a bool: a program that writes `if verdict:` has merged
-REFUTED with UNKNOWN, or worse, so `bool(verdict)` raises.
+A verdict is never a bool: a program that writes `if verdict:` has merged REFUTED with UNKNOWN, or worse, so
+`bool(verdict)` raises.
 """
 
 from __future__ import annotations
@@ -14,18 +14,41 @@ class Verdict(Enum):
     """Outcome of an attempt to prove a claim.
 
     PROVED: an independent checker accepted the written certificate.
+    TRUSTED: a solver says so, and nobody can replay its word.
     REFUTED: the claim is false for this V and level, shown in rigorous arithmetic.
-    UNKNOWN: neither; the accompanying reason says what ran out.
+    UNKNOWN: none of these; the accompanying reason says what ran out.
     """
 
     PROVED = "PROVED"
+    TRUSTED = "TRUSTED"
     REFUTED = "REFUTED"
     UNKNOWN = "UNKNOWN"
 
     def __bool__(self) -> NoReturn:
-        raise TypeError("a Verdict has three values; compare it with `is`, do not use it as a bool.")
+        raise TypeError("a Verdict has four values; compare it with `is`, do not use it as a bool.")
 
     @property
     def exit_status(self) -> int:
-        """Exit status of the command line: 0 proved, 1 refuted, 3 unknown."""
-        return {Verdict.PROVED: 0, Verdict.REFUTED: 1, Verdict.UNKNOWN: 3}[self]
+        """Exit status of the command line: 0 proved, 1 refuted, 3 unknown or trusted."""
+        return {Verdict.PROVED: 0, Verdict.REFUTED: 1}.get(self, 3)
+
+
+class Stop(Enum):
+    """What limits a level, or why there is none; the value is the message, and details may follow it."""
+
+    REQUESTED = "requested"
+    DOMAIN = "domain"
+    WITNESS = "witness"
+    INPUTS = "inputs"
+    TIME = "time"
+    BOXES = "boxes"
+    LOCAL = "local"
+    FLOOR = "floor"
+    SMOOTH = "smooth"
+    SOLVER = "solver"
+    SPECTRUM = "spectrum"
+    UNSTABLE = "unstable linearisation"
+
+    def explain(self, detail: str = "") -> str:
+        """The message with its detail."""
+        return f"{self.value}: {detail}" if detail else self.value

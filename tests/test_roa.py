@@ -173,7 +173,7 @@ def test_equal_runs_write_equal_certificates(tmp_path: Path, pendulum: System) -
 
 
 def test_a_rejection_is_a_soundness_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """If the engine claims too much, the run ends loudly and never in PROVED."""
+    """If the engine case too much, the run ends loudly and never in PROVED."""
     import certify.roa as roa
 
     honest = roa.write_certificate

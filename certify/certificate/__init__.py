@@ -1,13 +1,18 @@
-"""Writing certificates; reading them for reports. Their meaning is the checker's FORMAT.md."""
+"""Writing certificates, having them checked, reading them for reports. Their meaning is the checker's FORMAT.md."""
 
 from __future__ import annotations
 
-from certify.certificate.model import (
-    Certificate,
-    PartitionTree,
-    TrustedSolver,
-    read_certificate,
-    write_certificate,
-)
+from certify.certificate.checking import run_checker
+from certify.certificate.model import Certificate, PartitionTree, TrustedSolver, read_certificate
+from certify.certificate.writing import sole_writer, write_atomically, write_beside
 
-__all__ = ["Certificate", "PartitionTree", "TrustedSolver", "read_certificate", "write_certificate"]
+__all__ = [
+    "Certificate",
+    "PartitionTree",
+    "TrustedSolver",
+    "read_certificate",
+    "run_checker",
+    "sole_writer",
+    "write_atomically",
+    "write_beside",
+]

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import base64
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -19,10 +18,12 @@ import numpy as np
 import sympy
 from numpy.typing import NDArray
 
-from certify.errors import CertificateFormatError, InputError
+from certify.claims import CLAIMS, Claim
+from certify.errors import CertificateFormatError
+from certify.expressions import from_tree, to_tree
+from certify.lyapunov.function import Quadratic
 from certify.policies import TanhNetwork
 from certify.systems import System
-from certify.systems.trees import from_tree, to_tree
 
 Array = NDArray[np.float64]
 SCHEMA = "certify-certificate/2"
@@ -55,25 +56,44 @@ class Certificate:
     Parameters
     ----------
     system, network : the closed loop; parameters are already put into the equations.
-    P : (n, n).
-    local, roa : the levels c1 <= c2.
+    V : the Lyapunov function.
+    claim : what is said about them, with its levels.
     provenance : anything that helps people; the checker ignores it.
     """
 
     system: System
     network: TanhNetwork
-    P: Array
-    local: float
-    roa: float
+    V: Quadratic
+    claim: Claim
     evidence: PartitionTree | TrustedSolver
     provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def P(self) -> Array:
+        """The matrix of V, (n, n)."""
+        return self.V.P
+
+    @property
+    def kind(self) -> str:
+        """The claim's kind."""
+        return self.claim.kind
+
+    @property
+    def inner(self) -> float:
+        """The level from which the ring reaches outwards."""
+        return self.claim.inner
+
+    @property
+    def roa(self) -> float:
+        """c2."""
+        return self.claim.roa
 
     def to_json(self) -> str:
         """The file's text: sorted by section, one line a section, the same bytes for the same certificate."""
         system, network = self.system, self.network
         sections: dict[str, Any] = {
             "schema": SCHEMA,
-            "claim": {"kind": "asymptotic"},
+            "claim": {"kind": self.claim.kind},
             "plant": {
                 "name": system.name,
                 "states": [s.name for s in system.states],
@@ -94,29 +114,13 @@ class Certificate:
                 "offset": _encode(network.offset),
                 "sha256": network.sha256(),
             },
-            "lyapunov": {"kind": "quadratic", "P": _encode(self.P)},
-            "levels": {"local": float(self.local).hex(), "roa": float(self.roa).hex()},
+            "lyapunov": {"kind": "quadratic", "P": _encode(self.V.P)},
+            "levels": {name: float(level).hex() for name, level in self.claim.levels.items()},
             "evidence": _evidence(self.evidence),
             "provenance": {k: str(v) for k, v in self.provenance.items()},
         }
         lines = [f"{json.dumps(k)}: {json.dumps(v)}" for k, v in sections.items()]
         return "{\n" + ",\n".join(lines) + "\n}\n"
-
-
-def write_certificate(path: Path, certificate: Certificate) -> None:
-    """Write atomically: the file is complete or absent, whatever interrupts the run.
-
-    Raises
-    ------
-    InputError : the file cannot be written.
-    """
-    temporary = path.with_name(path.name + ".partial")
-    try:
-        temporary.write_text(certificate.to_json(), encoding="utf-8")
-        os.replace(temporary, path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise InputError(f"{path} cannot be written: {error.strerror}.") from error
 
 
 def read_certificate(path: Path) -> Certificate:
@@ -155,9 +159,8 @@ def read_certificate(path: Path) -> Certificate:
         return Certificate(
             system=system,
             network=network,
-            P=_decode(data["lyapunov"]["P"], (n, n)),
-            local=float.fromhex(data["levels"]["local"]),
-            roa=float.fromhex(data["levels"]["roa"]),
+            V=Quadratic(_decode(data["lyapunov"]["P"], (n, n))),
+            claim=CLAIMS[data["claim"]["kind"]](**{k: float.fromhex(v) for k, v in data["levels"].items()}),
             evidence=_read_evidence(evidence, n),
             provenance=data["provenance"],
         )

@@ -7,6 +7,6 @@ here is accepted there.
 from __future__ import annotations
 
 from certify.enclosures.policy import PolicyEnclosure
-from certify.enclosures.taylor import Taylor, evaluate, upper_bound
+from certify.enclosures.taylor import Models, Taylor, upper_bound
 
-__all__ = ["PolicyEnclosure", "Taylor", "evaluate", "upper_bound"]
+__all__ = ["Models", "PolicyEnclosure", "Taylor", "upper_bound"]

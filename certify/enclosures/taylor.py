@@ -8,12 +8,14 @@ Makino and Berz (2003) describe Taylor models; here the order is fixed at two.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 
-import sympy
 import torch
 from torch import Tensor
+
+from certify.expressions import Algebra
 
 EPS = 2.0**-50
 TINY = 2.0**-900
@@ -85,45 +87,22 @@ class Taylor:
         return self.compose(c, -s, -c / 2, (s.abs() + self.radius() + EPS).clamp(max=1.0) / 6)
 
 
-def evaluate(expression: sympy.Expr, values: Mapping[sympy.Symbol, Taylor], known: dict[sympy.Expr, Taylor]) -> Taylor:
-    """An expression of the plant on Taylor models; `known` shares common subexpressions between calls."""
-    if expression in known:
-        return known[expression]
-    result = _evaluate(expression, values, known)
-    known[expression] = result
-    return result
+class Models(Algebra[Taylor]):
+    """Expressions of the plant on Taylor models of the shape of `like`; constants enter sums and products last."""
 
+    def __init__(self, like: Taylor) -> None:
+        self.zero = Taylor(*(torch.zeros_like(t) for t in (like.c, like.g, like.Q, like.r)))
 
-def _evaluate(expression: sympy.Expr, values: Mapping[sympy.Symbol, Taylor], known: dict[sympy.Expr, Taylor]) -> Taylor:
-    if expression.is_Symbol:
-        return values[expression]
-    if expression.is_Rational:
-        model = next(iter(values.values()))
-        zero = Taylor(*(torch.zeros_like(t) for t in (model.c, model.g, model.Q, model.r)))
-        return zero.shifted(float(expression))
-    if expression.is_Pow:
-        base, exponent = evaluate(expression.base, values, known), int(expression.exp)
-        result = base
-        for bit in bin(abs(exponent))[3:]:
-            result = result * result
-            if bit == "1":
-                result = result * base
-        return result if exponent > 0 else result.inverse()
-    if expression.is_Add or expression.is_Mul:
-        constants = [float(a) for a in expression.args if a.is_Rational]
-        models = [evaluate(a, values, known) for a in expression.args if not a.is_Rational]
-        result = models[0]
-        for model in models[1:]:
-            result = result + model if expression.is_Add else result * model
-        for k in constants:
-            result = result.shifted(k) if expression.is_Add else result.scaled(k)
-        return result
-    argument = evaluate(expression.args[0], values, known)
-    if isinstance(expression, sympy.sin):
-        return argument.sin()
-    if isinstance(expression, sympy.cos):
-        return argument.cos()
-    return argument.sin() * argument.cos().inverse()
+    def constant(self, q: Fraction) -> Taylor:
+        return self.zero.shifted(float(q))
+
+    def total(self, constant: Fraction | None, terms: Sequence[Taylor]) -> Taylor:
+        result = super().total(None, terms)
+        return result if constant is None else result.shifted(float(constant))
+
+    def product(self, constant: Fraction | None, factors: Sequence[Taylor]) -> Taylor:
+        result = super().product(None, factors)
+        return result if constant is None else result.scaled(float(constant))
 
 
 def upper_bound(model: Taylor) -> tuple[Tensor, Tensor]:

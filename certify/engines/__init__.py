@@ -1,1 +1,1 @@
-"""Engines: how obligations are proved or refuted. None is trusted; the checker decides."""
+"""Engines: how conditions are proved or refuted. None is trusted; the checker decides."""

@@ -8,30 +8,43 @@ origin as far as it stays violating. A reported witness is shown in Arb; the sea
 from __future__ import annotations
 
 from dataclasses import dataclass
+from fractions import Fraction
+from typing import Literal
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from certify.obligations import Obligations
+from certify.claims import Problem
+from certify.policies import bounded_by_form
+from certify.rigorous import evaluate_policy, evaluate_vdot
+from certify.systems import System
 
 Array = NDArray[np.float64]
+Band = tuple[float, float, float]
+_LEVELS, _LOWEST = 60, 1e-9  # of a survey: how many levels, and the lowest as a share of the highest
 
 
 @dataclass(frozen=True, slots=True)
 class Witness:
-    """A state `x` (n,) at which `kind` ("vdot" or "input") is violated; `level` is V(x)."""
+    """A state `x` (n,) with Vdot >= 0 (kind `vdot`) or an input out of bounds (`input`); `level` is V(x), rounded."""
 
     x: Array
     level: float
-    kind: str
+    kind: Literal["vdot", "input"]
+
+    def describe(self, system: System) -> str:
+        """The violation in words."""
+        names = ", ".join(f"{s} = {v:.6g}" for s, v in zip(system.states, self.x, strict=True))
+        what = "Vdot >= 0" if self.kind == "vdot" else "the input leaves its bounds"
+        return f"{what} at {names} with V = {self.level:.12g} (shown in Arb)"
 
 
-def falsify(obligations: Obligations, limit: float, samples: int = 20_000, seed: int = 0) -> Witness | None:
-    """Search {V <= limit} for the lowest violation; None if none was found."""
-    search = _Search(obligations)
+def falsify(problem: Problem, T: Array, limit: float, samples: int = 20_000, seed: int = 0) -> Witness | None:
+    """Search {V <= limit} for the lowest violation; None if none was found. `x = T z`, (n, n): T'PT is about I."""
+    search = _Search(problem, T)
     generator = np.random.default_rng(seed)
-    n = obligations.loop.system.n
+    n = problem.loop.system.n
     direction = generator.standard_normal((samples, n))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     # Half of the samples on the boundary, where violations usually begin, half spread over the levels.
@@ -44,26 +57,64 @@ def falsify(obligations: Obligations, limit: float, samples: int = 20_000, seed:
     return best
 
 
-def descend(obligations: Obligations, z: Array) -> Witness | None:
+def survey(problem: Problem, T: Array, limit: float, samples: int = 512, seed: int = 0) -> Band | None:
+    """The widest band of levels up to `limit` on which no violation was found; None if there is none.
+
+    Returns
+    -------
+    (below, floor, top) : no violation was found from `floor` to `top`; `below` is the next lower level that
+        was sampled, at which there is one (or the lowest of all).
+    """
+    search = _Search(problem, T)
+    generator = np.random.default_rng(seed)
+    direction = generator.standard_normal((samples, problem.loop.system.n))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    levels = limit * np.geomspace(_LOWEST, 1.0, _LEVELS)
+    good = []
+    for level in levels:
+        z = torch.tensor(search.climb(np.sqrt(level) * direction, level, steps=20), dtype=torch.float64)
+        with torch.no_grad():
+            good.append(not bool(search.bad(z).any()))
+    best, first = range(0), None
+    for k, ok in enumerate([*good, False]):
+        if ok and first is None:
+            first = k
+        if not ok and first is not None:
+            best, first = max(best, range(first, k), key=len), None
+    if not best:
+        return None
+    return tuple(float(levels[k]) for k in (max(0, best[0] - 1), best[0], best[-1]))  # type: ignore[return-value]
+
+
+def descend(problem: Problem, T: Array, z: Array) -> Witness | None:
     """The lowest violation reached from a violating point `x = T z`, shape (n,)."""
-    return _Search(obligations).lowest(z[None])
+    return _Search(problem, T).lowest(z[None])
 
 
-def confirm(obligations: Obligations, witness: Witness) -> bool:
+def confirm(problem: Problem, witness: Witness) -> bool:
     """True if the violation at the witness's binary64 point is shown in Arb."""
-    loop = obligations.loop
+    loop = problem.loop
     if witness.kind == "vdot":
-        return bool(np.any(witness.x != 0)) and loop.evaluate_vdot(obligations.P, witness.x) >= 0
-    for u, (lo, hi) in zip(loop.evaluate_policy(witness.x), loop.system.input_bounds, strict=True):
+        return bool(np.any(witness.x != 0)) and evaluate_vdot(loop, problem.V.P, witness.x) >= 0
+    for u, (lo, hi) in zip(evaluate_policy(loop, witness.x), loop.system.input_bounds, strict=True):
         if u * lo.denominator < lo.numerator or u * hi.denominator > hi.numerator:
             return True
     return False
 
 
+def refutes(problem: Problem, witness: Witness, level: float) -> bool:
+    """True if the witness shows that no asymptotic claim holds on {V <= level}.
+
+    The violation is shown in Arb, and `V(x) <= level` is decided in rationals: a point that lies above the level by
+    less than a rounding says nothing about it.
+    """
+    return problem.V.exactly(witness.x) <= Fraction(level) and confirm(problem, witness)
+
+
 class _Search:
-    def __init__(self, obligations: Obligations) -> None:
-        self.obligations = obligations
-        self.loop = obligations.loop
+    def __init__(self, problem: Problem, T: Array) -> None:
+        self.problem = problem
+        self.loop = problem.loop
         self.f = self.loop.system.function("torch")
         network = self.loop.folded
         self.layers = [
@@ -71,11 +122,11 @@ class _Search:
         ]
         self.squash = network.squash == "tanh"
         self.scale, self.offset = torch.tensor(network.scale), torch.tensor(network.offset)
-        self.P, self.T = (torch.tensor(a, dtype=torch.float64) for a in (obligations.P, obligations.T))
+        self.P, self.T = (torch.tensor(a, dtype=torch.float64) for a in (problem.V.P, T))
         bounds = self.loop.system.input_bounds
         self.lo = torch.tensor([float(b[0]) for b in bounds], dtype=torch.float64)
         self.hi = torch.tensor([float(b[1]) for b in bounds], dtype=torch.float64)
-        self.check_inputs = not obligations.inputs_bounded_by_form
+        self.check_inputs = not bounded_by_form(network, bounds)
 
     def violation(self, z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """(Vdot, how far the worst input lies outside its bounds) at x = T z, shapes (B,)."""
@@ -120,18 +171,19 @@ class _Search:
         for point in z:
             for factor in (1.0, 1 + 1e-12, 1 + 1e-9, 1 + 1e-6):
                 x = (self.T @ (factor * point)).numpy()
-                for kind in ("vdot", "input"):
-                    witness = Witness(x, float(x @ self.obligations.P @ x), kind)
-                    if (kind == "vdot" or self.check_inputs) and confirm(self.obligations, witness):
+                kinds: tuple[Literal["vdot", "input"], ...] = ("vdot", "input") if self.check_inputs else ("vdot",)
+                for kind in kinds:
+                    witness = Witness(x, float(self.problem.V(x)), kind)
+                    if confirm(self.problem, witness):
                         return witness
         return None
 
-    def climb(self, start: Array, limit: float) -> Array:
+    def climb(self, start: Array, limit: float, steps: int = 60) -> Array:
         """Gradient ascent of Vdot on the sphere V = limit."""
         z = torch.tensor(start, dtype=torch.float64)
         radius = np.sqrt(limit) * (1 - 1e-9)
         step = 0.1
-        for _ in range(60):
+        for _ in range(steps):
             z = z.detach().requires_grad_(True)
             vdot, excess = self.violation(z)
             value = (vdot / (z * z).sum(-1)).sum() + (excess.sum() if self.check_inputs else 0.0)

@@ -9,15 +9,17 @@ origin. What each tanh adds to its tangent reaches the output through the produc
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
 
 import numpy as np
-import sympy
 from numpy.typing import NDArray
 
+from certify.claims import Problem
 from certify.errors import InputError
-from certify.obligations import Obligations
+from certify.expressions import Algebra, evaluate
+from certify.policies import bounded_by_form
 
 Array = NDArray[np.float64]
 _MOST_NUMBERS, _MOST_PRODUCTS = 2**25, 2**33  # of the sums over paths: the checker refuses more
@@ -79,6 +81,15 @@ class _Jet:
         return self.compose(c, -s, -c, min(1.0, abs(s) + self.radius))
 
 
+class _Jets(Algebra[_Jet]):
+    def __init__(self, n: int) -> None:
+        self.n = n
+
+    def constant(self, q: Fraction) -> _Jet:
+        nothing = np.zeros((self.n, self.n))
+        return _Jet(float(q), np.zeros(self.n), nothing, nothing)
+
+
 @dataclass(frozen=True, slots=True)
 class _Layer:
     """`y = y(0) + X [z, A]`: A stacks what every tanh before this layer adds to its tangent at the origin."""
@@ -95,14 +106,14 @@ class Paths:
     slope: Array | None  # of the last layer's tanh, (m,); None with squash `identity`
 
 
-def paths(obligations: Obligations) -> Paths:
+def paths(problem: Problem, T: Array) -> Paths:
     """Follow T and every tanh's output through the network's linearisation at the origin.
 
     Raises
     ------
     InputError : the network is larger than the checker's local rule allows.
     """
-    network = obligations.loop.network
+    network = problem.loop.network
     n, squash, columns, products = network.n, network.squash == "tanh", network.n, 0
     for W in network.weights[1:]:
         products += len(W) * columns * W.shape[1]
@@ -110,15 +121,15 @@ def paths(obligations: Obligations) -> Paths:
         products += len(W) * columns * n**2
         if columns * (len(W) + n**2) > _MOST_NUMBERS or products > _MOST_PRODUCTS:
             raise InputError("The network is too large for the local proof: use fewer or narrower layers.")
-    h, X = np.zeros(n), obligations.T
+    h, X = np.zeros(n), T
     layers = []
     for number, (W, b) in enumerate(zip(network.weights, network.biases, strict=True)):
         last = number == len(network.weights) - 1
         y, X = W @ h + b, W @ X
         if number:
             X = np.concatenate([X, W], axis=1)
-        if last and squash and network.centre == "preactivation":
-            y = network.beta(obligations.loop.u_eq)
+        if last and squash:
+            y = network.squashed_at_origin(y, problem.loop.u_eq)
         h = np.tanh(y)
         slope = 1 - h**2
         layers.append(_Layer(X, -h * slope))
@@ -126,12 +137,12 @@ def paths(obligations: Obligations) -> Paths:
     return Paths(tuple(layers), slope if squash else None)
 
 
-def local_margin(obligations: Obligations, level: float, known: Paths) -> float:
+def local_margin(problem: Problem, T: Array, level: float, known: Paths) -> float:
     """Share of the decay that the remainder leaves on {V <= level}; positive means Vdot < 0.
 
-    `known` are the `paths` of these obligations.
+    T : (n, n), the coordinates x = T z; `known` are the `paths` in them.
     """
-    loop, P, T = obligations.loop, obligations.P, obligations.T
+    loop, P = problem.loop, problem.V.P
     system = loop.system
     n = system.n
     S = T.T @ P @ T
@@ -143,12 +154,13 @@ def local_margin(obligations: Obligations, level: float, known: Paths) -> float:
     states = [_Jet(0.0, row, nothing, nothing) for row in rho * T]
     each = zip(loop.u_eq, loop.network.scale, *_policy(known, rho, n), strict=True)
     inputs = [_Jet(float(u), float(s) * a, float(s) * Q, abs(float(s)) * E) for u, s, a, Q, E in each]
-    if not obligations.inputs_bounded_by_form:
+    if not bounded_by_form(loop.network, system.input_bounds):
         for jet, (lo, hi) in zip(inputs, system.input_bounds, strict=True):
             if not (float(lo) < jet.c - jet.radius and jet.c + jet.radius < float(hi)):
                 return -math.inf
     values = dict(zip((*system.states, *system.inputs), (*states, *inputs), strict=True))
-    F = [_evaluate(e, values) for e in system.exact_dynamics()]
+    jets, shared = _Jets(n), dict[Any, _Jet]()
+    F = [evaluate(e, values, jets, shared) for e in system.exact_dynamics()]
     PT = P @ T
     B = PT.T @ np.array([v.a for v in F])
     C = np.tensordot(PT.T, np.array([v.Q for v in F]), 1)
@@ -161,17 +173,17 @@ def local_margin(obligations: Obligations, level: float, known: Paths) -> float:
     return 1 - float(np.linalg.norm(np.eye(n) - N, 2) + np.linalg.norm(W.reshape(n, -1), 2))
 
 
-def prove_local(obligations: Obligations, limit: float) -> float | None:
+def prove_local(problem: Problem, T: Array, limit: float) -> float | None:
     """The largest level up to `limit` that the local proof reaches, within 2 %; None if there is none.
 
     Raises
     ------
     InputError : the network is larger than the checker's local rule allows.
     """
-    known = paths(obligations)
+    known = paths(problem, T)
 
     def good(level: float) -> bool:
-        return local_margin(obligations, level, known) > _MARGIN
+        return local_margin(problem, T, level, known) > _MARGIN
 
     if good(limit):
         return limit
@@ -205,30 +217,3 @@ def _policy(known: Paths, rho: float, n: int) -> tuple[Array, Array, Array]:
         s = known.slope[:, None]
         G, Q, E = s * G, s * Q + added, s * E + beyond
     return G, Q.reshape(-1, n, n), E.reshape(-1, n, n)
-
-
-def _evaluate(expression: sympy.Expr, values: Mapping[sympy.Symbol, _Jet]) -> _Jet:
-    if expression.is_Symbol:
-        return values[expression]
-    if expression.is_Rational:
-        a, Q = next((v.a, v.Q) for v in values.values())
-        return _Jet(float(expression), 0 * a, 0 * Q, 0 * Q)
-    if expression.is_Pow:
-        base, exponent = _evaluate(expression.base, values), int(expression.exp)
-        result = base
-        for bit in bin(abs(exponent))[3:]:
-            result = result * result
-            if bit == "1":
-                result = result * base
-        return result if exponent > 0 else result.inverse()
-    arguments = [_evaluate(a, values) for a in expression.args]
-    if expression.is_Add or expression.is_Mul:
-        result = arguments[0]
-        for argument in arguments[1:]:
-            result = result + argument if expression.is_Add else result * argument
-        return result
-    if isinstance(expression, sympy.sin):
-        return arguments[0].sin()
-    if isinstance(expression, sympy.cos):
-        return arguments[0].cos()
-    return arguments[0].sin() * arguments[0].cos().inverse()

@@ -4,7 +4,14 @@ from __future__ import annotations
 
 from certify.lyapunov.candidates import solve_lyapunov
 from certify.lyapunov.choice import Candidate, Chosen, choose_candidate
-from certify.lyapunov.level_sets import diagonalising_coordinates, domain_limit, extents, semi_axes, volume
+from certify.lyapunov.level_sets import (
+    diagonalising_coordinates,
+    domain_limit,
+    extents,
+    leaves_domain,
+    semi_axes,
+    volume,
+)
 from certify.lyapunov.optimised import optimise_candidate
 
 __all__ = [
@@ -14,6 +21,7 @@ __all__ = [
     "diagonalising_coordinates",
     "domain_limit",
     "extents",
+    "leaves_domain",
     "optimise_candidate",
     "semi_axes",
     "solve_lyapunov",

@@ -20,6 +20,10 @@ def domain_limit(P: Array, domain: Sequence[tuple[Fraction, Fraction]]) -> float
     return min(float(min(-lo, hi)) ** 2 / float(p) for (lo, hi), p in zip(domain, np.diag(inverse), strict=True))
 
 
+def leaves_domain(P: Array, level: float, domain: Sequence[tuple[Fraction, Fraction]]) -> bool:
+    return level >= domain_limit(P, domain)
+
+
 def semi_axes(P: Array, level: float) -> Array:
     """`sqrt(c / P_ii)`: how far the set reaches along each coordinate axis, shape (n,)."""
     return np.asarray(np.sqrt(level / np.diag(P)))

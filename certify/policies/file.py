@@ -10,8 +10,9 @@ import io
 import os
 import pickle
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from fractions import Fraction
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, cast
@@ -24,6 +25,7 @@ from certify.policies.network import Array, Centre, Squash, TanhNetwork
 FORMAT = "certify-policy/1"
 _KEYS = {"format", "activation", "weights", "biases", "output", "centre", "system", "training"}
 _OPTIONAL = {"beta"}
+_BETA_ROUNDING = 2.0**-20  # of tanh(beta): a few operations in single precision
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +51,27 @@ class Policy:
     def __post_init__(self) -> None:
         object.__setattr__(self, "parameters", MappingProxyType(dict(self.parameters)))
         object.__setattr__(self, "training", MappingProxyType(dict(self.training)))
+
+
+    def beta_shift(self, u_eq: Sequence[Fraction]) -> float:
+        """What reading the stored beta as the real number changes in u at the origin, in the input's units.
+
+        Raises
+        ------
+        InputError : the stored beta is another number than the real one rounded.
+        """
+        if self.beta is None:
+            return 0.0
+        network, ratios = self.network, np.array([float(q) for q in self.network.ratios(u_eq)])
+        off = np.abs(np.tanh(self.beta) - ratios)
+        if not np.all(off <= _BETA_ROUNDING):
+            j = int(np.argmax(off))
+            raise InputError(
+                f"`beta` must be atanh((u_eq - offset) / scale) up to rounding, {network.beta(u_eq)[j]:.9g} for input "
+                f"{j}; the file has {self.beta[j]:.9g}, which shifts u(0) by {abs(network.scale[j]) * off[j]:.3g}. "
+                "Was it trained for other parameters?"
+            )
+        return float(np.max(np.abs(network.scale) * off))
 
 
 def save_policy(path: str | Path, policy: Policy) -> None:

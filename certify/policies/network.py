@@ -100,8 +100,8 @@ class TanhNetwork:
         """Widths from state to input, such as (2, 16, 16, 1)."""
         return (self.n, *(int(w.shape[0]) for w in self.weights))
 
-    def beta(self, u_eq: Sequence[Fraction]) -> Array:
-        """`atanh((u_eq - offset) / scale)` rounded to binary64 (the proof uses the real number).
+    def ratios(self, u_eq: Sequence[Fraction]) -> tuple[Fraction, ...]:
+        """`(u_eq - offset) / scale`, exactly, (m,): what tanh must be at the origin with preactivation centring.
 
         Raises
         ------
@@ -115,8 +115,12 @@ class TanhNetwork:
                     f"u_eq = {float(u)} must lie strictly inside offset +- scale = {offset} +- {abs(scale)} "
                     "for preactivation centring."
                 )
-            values.append(np.arctanh(float(ratio)))
-        return np.array(values)
+            values.append(ratio)
+        return tuple(values)
+
+    def beta(self, u_eq: Sequence[Fraction]) -> Array:
+        """`atanh((u_eq - offset) / scale)` rounded to binary64, (m,); the proof uses the real number."""
+        return np.array([np.arctanh(float(ratio)) for ratio in self.ratios(u_eq)])
 
     def net(self, x: Any) -> Any:
         """`net(x)`, last axis n to m, in the arithmetic of x (numpy array or torch tensor)."""
@@ -145,6 +149,10 @@ class TanhNetwork:
             offset = np.array([float(u) for u in u_eq]) - self.scale * (np.tanh(y) if self.squash == "tanh" else y)
         return TanhNetwork(self.weights, tuple(biases), self.scale, offset, self.squash, "none")
 
+    def squashed_at_origin(self, at_0: Array, u_eq: Sequence[Fraction]) -> Array:
+        """What enters the last tanh at the origin, (m,), given net(0)."""
+        return self.beta(u_eq) if self.centre == "preactivation" else at_0
+
     def jacobian_at_origin(self, u_eq: Sequence[Fraction]) -> Array:
         """`d pi / d x` at 0 in float64, shape (m, n)."""
         x = np.zeros(self.n)
@@ -155,7 +163,7 @@ class TanhNetwork:
                 jacobian = (1 - x**2)[:, None] * jacobian
             x, jacobian = weight @ x + bias, weight @ jacobian
         if self.squash == "tanh":
-            last = np.tanh(self.beta(u_eq) if self.centre == "preactivation" else x)
+            last = np.tanh(self.squashed_at_origin(x, u_eq))
             jacobian = (1 - last**2)[:, None] * jacobian
         return np.asarray(self.scale[:, None] * jacobian)
 

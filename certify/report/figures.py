@@ -100,7 +100,7 @@ def is_ellipsoid(certificate: Certificate) -> bool:
     """Whether `{V <= c2}` is one, in floats, with levels in order; a rejected file may hold anything."""
     P = certificate.P
     positive = np.all(np.isfinite(P)) and np.all(np.linalg.eigvalsh((P + P.T) / 2) > 0)
-    return bool(positive) and 0 < certificate.local <= certificate.roa < np.inf
+    return bool(positive) and 0 < certificate.inner <= certificate.roa < np.inf
 
 
 class _Scene:
@@ -112,7 +112,7 @@ class _Scene:
         self.certificate = certificate
         self.word = "certified" if accepted else "claimed"
         self.system, self.P, self.c1, self.c2 = (
-            certificate.system, certificate.P, certificate.local, certificate.roa,
+            certificate.system, certificate.P, certificate.inner, certificate.roa,
         )  # fmt: skip
         self.loop = ClosedLoop(self.system, certificate.network)
         self.flow = Flow.of(self.loop)

@@ -71,7 +71,7 @@ def status_of(certificate: Certificate, answer: Mapping[str, Any] | None) -> Sta
         return Status("NOT CHECKED", "The checker gave no verdict. Nothing here is proved.")
     levels = answer.get("levels")
     same_levels = isinstance(levels, Mapping) and (levels.get("local"), levels.get("roa")) == (
-        certificate.local, certificate.roa,
+        certificate.inner, certificate.roa,
     )  # fmt: skip
     if answer.get("policy_sha256") != certificate.network.sha256() or not same_levels:
         return Status("NOT CHECKED", "The checker's answer is about another certificate. Nothing here is proved.")
@@ -203,7 +203,7 @@ def _claim(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict[s
         ring_note += f"; the smallest bound on {MINUS}V̇ is {number(ring, 3)}." if ring is not None else "."
     return {
         "level": below(certificate.roa),
-        "local": below(certificate.local),
+        "local": below(certificate.inner),
         "exact_level": repr(certificate.roa),
         "bounds": bounds,
         "parts": [
@@ -258,7 +258,7 @@ def _tables(
     units = units_of(system)
     state_units = [units.get(s.name, "") for s in system.states]
     levels = [
-        ("c₁, local", repr(certificate.local)),
+        ("c₁, local", repr(certificate.inner)),
         ("c₂, enlarged", repr(certificate.roa)),
     ]
     geometry: list[tuple[str, str]] = []

@@ -19,9 +19,9 @@ from typing import Any
 import sympy
 
 from certify.errors import InputError
+from certify.expressions import FUNCTIONS
 
 Interval = tuple[Fraction, Fraction]
-_FUNCTIONS = (sympy.sin, sympy.cos, sympy.tan)
 
 
 def exact(value: Fraction | float | int | str | Decimal, name: str = "value") -> Fraction:
@@ -200,7 +200,7 @@ def _check_grammar(expression: sympy.Expr, allowed: set[sympy.Symbol], system: s
             continue
         if node.is_Pow and node.exp.is_Integer:
             continue
-        if isinstance(node, _FUNCTIONS):
+        if isinstance(node, tuple(FUNCTIONS.values())):
             continue
         if node.is_Float:
             raise InputError(f"an equation of {system} holds the rounded number {node}; write it as a fraction.")
@@ -208,5 +208,5 @@ def _check_grammar(expression: sympy.Expr, allowed: set[sympy.Symbol], system: s
             raise InputError(f"an equation of {system} uses {node}, which is no state, input or parameter.")
         raise InputError(
             f"an equation of {system} uses {node}; "
-            "allowed are + - * /, integer powers, sin, cos, tan and exact numbers."
+            f"allowed are + - * /, integer powers, {', '.join(FUNCTIONS)} and exact numbers."
         )

@@ -16,9 +16,9 @@ from typing import Any
 import sympy
 
 from certify.errors import InputError
+from certify.expressions import FUNCTIONS
 from certify.systems.system import Interval, System, exact, symbols
 
-_FUNCTIONS = {"sin": sympy.sin, "cos": sympy.cos, "tan": sympy.tan}
 _KEYS = {
     "name",
     "description",
@@ -102,7 +102,7 @@ def _convert(node: ast.expr, source: str, names: Mapping[str, sympy.Symbol]) -> 
         operand = _convert(node.operand, source, names)
         return -operand if isinstance(node.op, ast.USub) else operand
     if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and not node.keywords and len(node.args) == 1:
-        function = _FUNCTIONS.get(node.func.id)
+        function = FUNCTIONS.get(node.func.id)
         if function is not None:
             return function(_convert(node.args[0], source, names))
     if isinstance(node, ast.BinOp):
@@ -119,7 +119,7 @@ def _convert(node: ast.expr, source: str, names: Mapping[str, sympy.Symbol]) -> 
             return left**right
     raise InputError(
         f"equation {source!r}: {ast.get_source_segment(source, node)!r} is not allowed; use the plant's names, "
-        f"numbers, + - * /, integer powers up to {_MAX_EXPONENT}, sin, cos, tan."
+        f"numbers, + - * /, integer powers up to {_MAX_EXPONENT}, {', '.join(FUNCTIONS)}."
     )
 
 

@@ -8,11 +8,11 @@ import flint
 import numpy as np
 import pytest
 
-from certify.engines.dreal import to_smt2
+from certify.engines.dreal.backend import to_smt2
 from certify.engines.local import prove_local
 from certify.errors import InputError
 from certify.obligations import (
-    Obligations,
+    Case,
     Query,
     decay,
     domain_queries,
@@ -23,7 +23,7 @@ from certify.obligations import (
 )
 from certify.policies import TanhNetwork
 from certify.systems import System, get_system
-from tests.engines.test_bounds import obligations
+from tests.support.cases import Case, case_of
 from tests.support.loops import chain, lqr_gain, pendulum_network, saturated_lqr, scalar_tanh
 from tests.support.oracle import value_of
 
@@ -56,17 +56,17 @@ def values(query: Query, x: np.ndarray) -> dict[str, flint.arb]:
 
 @pytest.mark.parametrize("case", CASES)
 def test_definitions_are_the_closed_loop(case: str) -> None:
-    claims = obligations(*CASES[case]())
-    loop, n = claims.loop, claims.loop.system.n
+    case = case_of(*CASES[case]())
+    loop, n = case.loop, case.loop.system.n
     A, _, _ = loop.linearise()
-    ring, local = ring_query(claims, 0.1, 1.0), local_query(claims, 0.1)
+    ring, local = query(ring_condition(0.1, 1.0), case.problem), query(local_condition(0.1), case.problem)
     generator = np.random.default_rng(0)
     for x in 0.3 * generator.standard_normal((4, n)):
         names = values(ring, x)
-        assert names["Vdot."].overlaps(loop.evaluate_vdot(claims.P, x))
+        assert names["Vdot."].overlaps(evaluate_vdot(loop, case.P, x))
         for symbol, u in zip(loop.system.inputs, loop.evaluate_policy(x), strict=True):
             assert names[symbol.name].overlaps(u)
-        V = sum((Fraction(float(x[i])) * Fraction(float(claims.P[i, j])) * Fraction(float(x[j]))
+        V = sum((Fraction(float(x[i])) * Fraction(float(case.P[i, j])) * Fraction(float(x[j]))
                  for i in range(n) for j in range(n)), Fraction(0))  # fmt: skip
         assert names["V."].contains(flint.arb(flint.fmpq(V.numerator, V.denominator)))
         # the Jacobian against central differences of the closed loop in floating point
@@ -87,10 +87,10 @@ def test_definitions_are_the_closed_loop(case: str) -> None:
 
 @pytest.mark.parametrize("case", CASES)
 def test_decay_is_below_the_smallest_eigenvalue(case: str) -> None:
-    claims = obligations(*CASES[case]())
-    A, _, _ = claims.loop.linearise()
-    smallest = np.linalg.eigvalsh(-(A.T @ claims.P + claims.P @ A))[0]
-    r = decay(claims.P, A)
+    case = case_of(*CASES[case]())
+    A, _, _ = case.loop.linearise()
+    smallest = np.linalg.eigvalsh(-(A.T @ case.P + case.P @ A))[0]
+    r = decay(case.P, A)
     assert 0.999 * smallest < r < smallest * (1 + 1e-9)
 
 
@@ -109,9 +109,9 @@ def holds(query: Query, x: np.ndarray) -> bool:
 
 def test_the_ring_query_is_satisfied_by_violations_only() -> None:
     """xdot = x/2 - tanh x, whose region of attraction is |x| < 1.915008."""
-    claims = obligations(*scalar_tanh())
-    query = ring_query(claims, 0.5, 2.0**2)
-    level = float(claims.P[0, 0])
+    case = case_of(*scalar_tanh())
+    query = query(ring_condition(0.5, 2.0**2), case.problem)
+    level = float(case.P[0, 0])
     assert level == 1.0
     assert holds(query, np.array([1.9151])) and holds(query, np.array([-1.99]))
     for x in (1.914, 0.9, 2.01, 0.0):
@@ -119,30 +119,30 @@ def test_the_ring_query_is_satisfied_by_violations_only() -> None:
 
 
 def test_domain_queries_are_satisfied_beyond_the_limit_only() -> None:
-    claims = obligations(*chain(2, [-1, -2]))
-    inverse = np.linalg.inv(claims.P)
+    case = case_of(*chain(2, [-1, -2]))
+    inverse = np.linalg.inv(case.P)
     for k, half in enumerate([1.0, 1.5]):
         touching = inverse[:, k] / inverse[k, k] * half  # the lowest V on the side x_k = half
         level = half**2 / inverse[k, k]
         touching[k] = half
         for outer, expected in ((0.999 * level, False), (1.001 * level, True)):
-            above = {q.name: q for q in domain_queries(claims, outer)}[f"domain-x{k + 1}-above"]
+            above = {q.name: q for q in domain_queries(case, outer)}[f"domain-x{k + 1}-above"]
             assert holds(above, touching) is expected
 
 
 def test_input_queries_name_what_is_exceeded() -> None:
-    claims = obligations(get_system("pendulum"), pendulum_network(centre="output"))
-    found = {q.name: q for q in input_queries(claims, 1e3)}
+    case = case_of(get_system("pendulum"), pendulum_network(centre="output"))
+    found = {q.name: q for q in input_queries(case, 1e3)}
     assert set(found) == {"inputs-u-below", "inputs-u-above"}
     grid = np.stack(np.meshgrid(np.linspace(-3, 3, 25), np.linspace(-15, 15, 25)), -1).reshape(-1, 2)
-    u = claims.loop.policy(grid)[:, 0]
+    u = case.loop.policy(grid)[:, 0]
     for name, x in (("inputs-u-above", grid[u.argmax()]), ("inputs-u-below", grid[u.argmin()])):
-        assert holds(found[name], x) is bool(abs(claims.loop.policy(x[None])[0, 0]) > 6)
+        assert holds(found[name], x) is bool(abs(case.loop.policy(x[None])[0, 0]) > 6)
 
 
 def test_one_query_a_claim() -> None:
     pendulum = get_system("pendulum")
-    bounded, free = (obligations(pendulum, pendulum_network(centre=c)) for c in ("preactivation", "output"))
+    bounded, free = (case_of(pendulum, pendulum_network(centre=c)) for c in ("preactivation", "output"))
     sides = [f"domain-{s}-{side}" for s in ("theta", "theta_dot") for side in ("below", "above")]
     assert [q.name for q in queries(bounded, 0.1, 1.0)] == [*sides, "local", "ring"]
     assert [q.name for q in queries(bounded, 1.0, 1.0)] == [*sides, "local"]
@@ -151,19 +151,19 @@ def test_one_query_a_claim() -> None:
 
 def test_the_local_query_agrees_with_the_local_proof() -> None:
     """Where the bounds prove the local level, no sampled state satisfies the query."""
-    claims: Obligations = obligations(get_system("pendulum"), pendulum_network())
-    level = prove_local(claims, 10.0)
+    case: Case = case_of(get_system("pendulum"), pendulum_network())
+    level = prove_local(case.problem, case.T, 10.0)
     assert level is not None
     generator = np.random.default_rng(0)
     z = generator.standard_normal((20, 2))
     z *= np.sqrt(level * generator.random((20, 1))) / np.linalg.norm(z, axis=1, keepdims=True)
-    query = local_query(claims, level)
-    assert not any(holds(query, x) for x in z @ claims.T.T)
-    assert any(holds(local_query(claims, 4.0), x) for x in 10 * z @ claims.T.T * np.sqrt(0.04 / level))
+    query = query(local_condition(level), case.problem)
+    assert not any(holds(query, x) for x in z @ case.T.T)
+    assert any(holds(query(local_condition(4.0), case.problem), x) for x in 10 * z @ case.T.T * np.sqrt(0.04 / level))
 
 
 def test_smt2_is_balanced_and_exact() -> None:
-    text = to_smt2(ring_query(obligations(*quadrotor()), 0.01, 0.02), "unsat")
+    text = to_smt2(ring_query(case_of(*quadrotor()), 0.01, 0.02), "unsat")
     assert text.count("(") == text.count(")")
     assert text.startswith("; ring") and "; expected: unsat" in text and "(set-logic QF_NRA)" in text
     assert "(/ 243.0 500.0)" in text or "(/ 500.0 243.0)" in text  # m = 0.486, never rounded

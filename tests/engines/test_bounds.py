@@ -11,12 +11,11 @@ import torch
 
 from certify.closed_loop import ClosedLoop
 from certify.engines import local
-from certify.engines.branch_and_bound import LEAF, Budget, prove_ring
+from certify.engines.bounds.search import LEAF, Budget, prove_outwards
 from certify.engines.falsify import Witness, confirm, falsify
 from certify.engines.local import local_margin, paths, prove_local
 from certify.errors import InputError
 from certify.lyapunov import diagonalising_coordinates, domain_limit, solve_lyapunov
-from certify.obligations import Obligations
 from certify.policies import TanhNetwork, load_policy
 from certify.systems import System, get_system
 from tests.support.loops import chain, pendulum_network, scalar_tanh
@@ -25,23 +24,23 @@ CPU = torch.device("cpu")
 POLICIES = Path(__file__).parents[2] / "examples" / "policies"
 
 
-def obligations(system: System, network: TanhNetwork) -> Obligations:
+def case_of(system: System, network: TanhNetwork) -> Case:
     loop = ClosedLoop(system, network)
     A, _, _ = loop.linearise()
     P = solve_lyapunov(A, np.eye(system.n))
-    return Obligations(loop, P, diagonalising_coordinates(P, A))
+    return Case(loop, P, diagonalising_coordinates(P, A))
 
 
-def vdot(claims: Obligations, x: np.ndarray) -> np.ndarray:
-    loop = claims.loop
-    return 2 * np.sum((x @ claims.P) * loop.system.function()(x, loop.policy(x)), axis=-1)
+def vdot(case: Case, x: np.ndarray) -> np.ndarray:
+    loop = case.loop
+    return 2 * np.sum((x @ case.P) * loop.system.function()(x, loop.policy(x)), axis=-1)
 
 
-def sphere(claims: Obligations, level: float, count: int) -> np.ndarray:
+def sphere(case: Case, level: float, count: int) -> np.ndarray:
     """Points on V = level."""
-    z = np.random.default_rng(0).standard_normal((count, claims.loop.system.n))
+    z = np.random.default_rng(0).standard_normal((count, case.loop.system.n))
     z *= np.sqrt(level) / np.linalg.norm(z, axis=1, keepdims=True)
-    return z @ claims.T.T
+    return z @ case.T.T
 
 
 def leaves(tree: bytes, root: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -66,20 +65,20 @@ def test_the_local_proof_holds_on_samples_of_every_smaller_level(case: str) -> N
         "pendulum": (get_system("pendulum"), pendulum_network()),
         "chain": chain(4, [-1, -2, -3, -4]),
     }[case]
-    claims = obligations(system, network)
-    level = prove_local(claims, domain_limit(claims.P, system.domain))
-    assert level is not None and local_margin(claims, level, paths(claims)) > 0
+    case = case_of(system, network)
+    level = prove_local(case.problem, case.T, domain_limit(case.P, system.domain))
+    assert level is not None and local_margin(case.problem, case.T, level, paths(case.problem, case.T)) > 0
     for share in (1.0, 1e-2, 1e-4):
-        assert np.max(vdot(claims, sphere(claims, share * level, 2000))) < 0
+        assert np.max(vdot(case, sphere(case, share * level, 2000))) < 0
     # The margin shrinks with the level, so smaller levels are proved as well.
-    margins = [local_margin(claims, level * 4.0**-k, paths(claims)) for k in range(6)]
+    margins = [local_margin(case.problem, case.T, level * 4.0**-k, paths(case.problem, case.T)) for k in range(6)]
     assert margins == sorted(margins)
 
 
 def test_the_local_proof_knows_the_scalar_plant() -> None:
     """|rem| <= x^2 sup|tanh''|/2: the proof must stop below the true limit but reach past V = 0.3."""
-    claims = obligations(*scalar_tanh())
-    level = prove_local(claims, 9.0)
+    case = case_of(*scalar_tanh())
+    level = prove_local(case.problem, case.T, 9.0)
     assert level is not None
     assert 0.3 < level < 1.915**2
 
@@ -87,85 +86,85 @@ def test_the_local_proof_knows_the_scalar_plant() -> None:
 def test_the_local_proof_uses_signs_and_directions() -> None:
     """Twelve states, five layers: sums of magnitudes and one number a remainder reach 2.0e-6 here."""
     policy = load_policy(POLICIES / "quadrotor3d.pt")
-    level = prove_local(obligations(get_system("quadrotor3d"), policy.network), 1.0)
+    level = prove_local(case_of(get_system("quadrotor3d"), policy.network), 1.0)
     assert level is not None and 4e-4 < level < 0.043  # the falsifier's limit
 
 
 @pytest.mark.parametrize("limit", ["_MOST_NUMBERS", "_MOST_PRODUCTS"])
 def test_a_network_too_large_for_the_local_proof_is_named(limit: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    claims = obligations(get_system("pendulum"), pendulum_network())
+    case = case_of(get_system("pendulum"), pendulum_network())
     monkeypatch.setattr(local, limit, 100)
     with pytest.raises(InputError, match="too large for the local proof"):
-        prove_local(claims, 1.0)
+        prove_local(case.problem, case.T, 1.0)
 
 
 def test_the_ring_covers_and_holds(pendulum: System) -> None:
-    claims = obligations(pendulum, pendulum_network())
-    limit = domain_limit(claims.P, pendulum.domain) * (1 - 1e-9)
-    inner = prove_local(claims, limit)
+    case = case_of(pendulum, pendulum_network())
+    limit = domain_limit(case.P, pendulum.domain) * (1 - 1e-9)
+    inner = prove_local(case.problem, case.T, limit)
     assert inner is not None
-    proof = prove_ring(claims, inner, limit, Budget(), CPU)
+    proof = prove_outwards(case.problem, case.T, inner, limit, Budget(), CPU)
     assert (proof.level, proof.reason) == (limit, "requested")
     boxes = list(leaves(proof.tree, proof.root))
     assert len(boxes) == proof.leaves
     volume = sum(np.prod(hi - lo) for lo, hi in boxes)
     assert volume == pytest.approx(np.prod(2 * proof.root), rel=1e-12)
     for share in np.geomspace(inner / limit, 1.0, 20):
-        assert np.max(vdot(claims, sphere(claims, share * limit, 500))) < 0
+        assert np.max(vdot(case, sphere(case, share * limit, 500))) < 0
 
 
 def test_the_ring_is_deterministic(pendulum: System) -> None:
-    claims = obligations(pendulum, pendulum_network((8, 8)))
-    first, second = (prove_ring(claims, 1e-4, 0.2, Budget(), CPU) for _ in range(2))
+    case = case_of(pendulum, pendulum_network((8, 8)))
+    first, second = (prove_outwards(case.problem, case.T, 1e-4, 0.2, Budget(), CPU) for _ in range(2))
     assert first.tree == second.tree and first.level == second.level
 
 
 def test_budgets_stop_the_pass_with_what_is_proved_so_far(pendulum: System) -> None:
-    claims = obligations(pendulum, pendulum_network())
-    small = prove_ring(claims, 1e-6, 6.0, Budget(boxes=60, batch=16), CPU)
+    case = case_of(pendulum, pendulum_network())
+    small = prove_outwards(case.problem, case.T, 1e-6, 6.0, Budget(boxes=60, batch=16), CPU)
     assert small.reason == "boxes" and 1e-6 <= small.level < 6.0
-    large = prove_ring(claims, 1e-6, 6.0, Budget(boxes=10_000, batch=16), CPU)
+    large = prove_outwards(case.problem, case.T, 1e-6, 6.0, Budget(boxes=10_000, batch=16), CPU)
     assert large.reason == "requested" and large.level == 6.0
-    timed = prove_ring(claims, 1e-6, 6.0, Budget(seconds=1e-9, batch=4), CPU)
+    timed = prove_outwards(case.problem, case.T, 1e-6, 6.0, Budget(seconds=1e-9, batch=4), CPU)
     assert timed.reason == "time" and timed.level < 6.0
-    nothing = prove_ring(claims, 1.0, 6.0, Budget(seconds=1e-9), CPU)
+    nothing = prove_outwards(case.problem, case.T, 1.0, 6.0, Budget(seconds=1e-9), CPU)
     assert (nothing.reason, nothing.level, nothing.tree, nothing.leaves) == ("time", 1.0, bytes([LEAF]), 1)
 
 
 def test_a_level_beyond_the_truth_is_capped_by_a_witness() -> None:
-    claims = obligations(*scalar_tanh())
-    proof = prove_ring(claims, 0.5, 8.0, Budget(), CPU)
+    case = case_of(*scalar_tanh())
+    proof = prove_outwards(case.problem, case.T, 0.5, 8.0, Budget(), CPU)
     assert proof.reason in ("witness", "boxes")
     assert 0.9 * 1.915008**2 < proof.level < 1.9150081**2
 
 
 def test_the_falsifier_finds_the_known_limit() -> None:
-    claims = obligations(*scalar_tanh())
-    witness = falsify(claims, 9.0)
+    case = case_of(*scalar_tanh())
+    witness = falsify(case.problem, case.T, 9.0)
     assert witness is not None and witness.kind == "vdot"
     assert 1.915008**2 <= witness.level <= 1.915009**2
-    assert confirm(claims, witness)
-    assert falsify(claims, 1.915**2) is None
+    assert confirm(case.problem, witness)
+    assert falsify(case.problem, case.T, 1.915**2) is None
 
 
 def test_a_wrong_witness_is_not_confirmed() -> None:
-    claims = obligations(*scalar_tanh())
-    assert not confirm(claims, Witness(np.array([1.9]), 1.9**2, "vdot"))
-    assert not confirm(claims, Witness(np.zeros(1), 0.0, "vdot"))
-    assert not confirm(claims, Witness(np.array([1.0]), 1.0, "input"))
+    case = case_of(*scalar_tanh())
+    assert not confirm(case.problem, Witness(np.array([1.9]), 1.9**2, "vdot"))
+    assert not confirm(case.problem, Witness(np.zeros(1), 0.0, "vdot"))
+    assert not confirm(case.problem, Witness(np.array([1.0]), 1.0, "input"))
 
 
 def test_inputs_that_leave_their_bounds_are_found(pendulum: System) -> None:
     """Centred at the output, the input can pass 6 N m."""
-    claims = obligations(pendulum, pendulum_network(centre="output"))
-    assert not claims.inputs_bounded_by_form
-    witness = falsify(claims, domain_limit(claims.P, pendulum.domain))
-    assert witness is not None and confirm(claims, witness)
+    case = case_of(pendulum, pendulum_network(centre="output"))
+    assert not case.inputs_bounded_by_form
+    witness = falsify(case.problem, case.T, domain_limit(case.P, pendulum.domain))
+    assert witness is not None and confirm(case.problem, witness)
     if witness.kind == "input":  # just outside 6 N m, too close for binary64 to tell
-        assert abs(claims.loop.evaluate_policy(witness.x)[0]) > 6
+        assert abs(evaluate_policy(case.loop, witness.x)[0]) > 6
 
 
-def planted(seed: int) -> tuple[Obligations, np.ndarray]:
+def planted(seed: int) -> tuple[Case, np.ndarray]:
     """A stabilising policy with a narrow bump in the input, and the state at which it makes Vdot positive."""
     generator = np.random.default_rng(seed)
     system = get_system("pendulum")
@@ -183,21 +182,21 @@ def planted(seed: int) -> tuple[Obligations, np.ndarray]:
     network = TanhNetwork(
         (first, np.array([[100.0, height, -height]])), (bias, np.zeros(1)), np.array([6.0]), np.zeros(1)
     )
-    return obligations(system, network), place
+    return case_of(system, network), place
 
 
 def _check_planted(seed: int) -> bool:
     try:
-        claims, place = planted(seed)
+        case, place = planted(seed)
     except InputError:  # the bump reaches the origin and makes it unstable
         return False
-    level = float(place @ claims.P @ place)
-    limit = domain_limit(claims.P, claims.loop.system.domain)
-    if not (claims.loop.evaluate_vdot(claims.P, place) > 0 and level < limit):
+    level = float(place @ case.P @ place)
+    limit = domain_limit(case.P, case.loop.system.domain)
+    if not (evaluate_vdot(case.loop, case.P, place) > 0 and level < limit):
         return False  # nothing false was planted: this seed does not count
-    inner = prove_local(claims, level)
+    inner = prove_local(case.problem, case.T, level)
     if inner is not None:
-        proof = prove_ring(claims, inner, min(1.5 * level, limit), Budget(boxes=20_000), CPU)
+        proof = prove_outwards(case.problem, case.T, inner, min(1.5 * level, limit), Budget(boxes=20_000), CPU)
         assert proof.level < level
     return True
 
@@ -214,13 +213,13 @@ def test_many_planted_counterexamples_are_never_proved() -> None:
 def test_an_asymmetric_P_is_named(pendulum: System) -> None:
     loop = ClosedLoop(pendulum, pendulum_network())
     with pytest.raises(InputError, match=r"P\[0, 1\] = 0.25 but P\[1, 0\] = 0.26"):
-        Obligations(loop, np.array([[1.0, 0.25], [0.26, 1.0]]), np.eye(2))
+        Case(loop, np.array([[1.0, 0.25], [0.26, 1.0]]), np.eye(2))
 
 
 def test_every_tensor_of_the_ring_says_where_it_lives(pendulum: System) -> None:
     """One made without a device would land on `meta` and meet the others with an error: none is."""
-    claims = obligations(pendulum, pendulum_network(centre="output"))
-    plain = prove_ring(claims, 1e-3, 0.5, Budget(), CPU)
+    case = case_of(pendulum, pendulum_network(centre="output"))
+    plain = prove_outwards(case.problem, case.T, 1e-3, 0.5, Budget(), CPU)
     with torch.device("meta"):
-        proof = prove_ring(claims, 1e-3, 0.5, Budget(), CPU)
+        proof = prove_outwards(case.problem, case.T, 1e-3, 0.5, Budget(), CPU)
     assert proof.level == 0.5 and proof.tree == plain.tree

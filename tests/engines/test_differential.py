@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from certify.engines.branch_and_bound import Budget, prove_ring
-from certify.engines.dreal import Backend, decide, find_backend
+from certify.engines.bounds.search import Budget, prove_outwards
+from certify.engines.dreal.backend import Backend, decide, find_backend
 from certify.engines.falsify import Witness, confirm, falsify
 from certify.errors import BackendError
 from certify.lyapunov import domain_limit
-from certify.obligations import Obligations, ring_query
+from certify.obligations import Case, ring_query
 from certify.systems import get_system
-from tests.engines.test_bounds import obligations
+from tests.support.cases import Case, case_of
 from tests.support import codac_prover
 from tests.support.loops import chain, pendulum_network, scalar_tanh
 
@@ -30,12 +30,12 @@ CASES = {
 
 
 @cache
-def claims_of(case: str) -> tuple[Obligations, float]:
+def claims_of(case: str) -> tuple[Case, float]:
     """A closed loop, and the smaller of the domain's limit and the lowest violation of Vdot < 0."""
-    claims = obligations(*CASES[case]())
-    limit = domain_limit(claims.P, claims.loop.system.domain)
-    witness = falsify(claims, limit)
-    return claims, limit if witness is None else witness.level
+    case = case_of(*CASES[case]())
+    limit = domain_limit(case.P, case.loop.system.domain)
+    witness = falsify(case.problem, case.T, limit)
+    return case, limit if witness is None else witness.level
 
 
 @cache
@@ -46,43 +46,43 @@ def dreal() -> Backend | None:
         return None
 
 
-def genuine(claims: Obligations, x: np.ndarray | None, inner: float, outer: float) -> bool:
+def genuine(case: Case, x: np.ndarray | None, inner: float, outer: float) -> bool:
     """Vdot >= 0 at a state of the ring, shown in Arb."""
     if x is None:
         return False
-    V = float(x @ claims.P @ x)
-    return bool(inner <= V <= outer and confirm(claims, Witness(x, V, "vdot")))
+    V = float(x @ case.P @ x)
+    return bool(inner <= V <= outer and confirm(case.problem, Witness(x, V, "vdot")))
 
 
-def by_bounds(claims: Obligations, inner: float, outer: float) -> str:
-    witness = falsify(claims, outer, samples=4000)
+def by_bounds(case: Case, inner: float, outer: float) -> str:
+    witness = falsify(case.problem, case.T, outer, samples=4000)
     if witness is not None and witness.kind == "vdot" and inner <= witness.level <= outer:
         return "REFUTED"
-    proof = prove_ring(claims, inner, outer, Budget(boxes=50_000), torch.device("cpu"))
+    proof = prove_outwards(case.problem, case.T, inner, outer, Budget(boxes=50_000), torch.device("cpu"))
     return "PROVED" if proof.level >= outer else "UNKNOWN"
 
 
-def by_codac(claims: Obligations, inner: float, outer: float) -> str:
-    status, x = codac_prover.decide(ring_query(claims, inner, outer))
+def by_codac(case: Case, inner: float, outer: float) -> str:
+    status, x = codac_prover.decide(query(ring_condition(inner, outer), case.problem))
     if status == "unsat":
         return "PROVED"
-    return "REFUTED" if x is not None and genuine(claims, np.array(x), inner, outer) else "UNKNOWN"
+    return "REFUTED" if x is not None and genuine(case, np.array(x), inner, outer) else "UNKNOWN"
 
 
-def by_dreal(claims: Obligations, inner: float, outer: float, backend: Backend) -> str:
-    answer = decide(backend, ring_query(claims, inner, outer), 1e-3, 1, 60.0)
+def by_dreal(case: Case, inner: float, outer: float, backend: Backend) -> str:
+    answer = decide(backend, query(ring_condition(inner, outer), case.problem), 1e-3, 1, 60.0)
     if answer.status == "unsat":
         return "PROVED"
-    names = [s.name for s in claims.loop.system.states]
+    names = [s.name for s in case.loop.system.states]
     x = np.array([sum(answer.box[name]) / 2 for name in names]) if answer.status == "delta-sat" else None
-    return "REFUTED" if genuine(claims, x, inner, outer) else "UNKNOWN"
+    return "REFUTED" if genuine(case, x, inner, outer) else "UNKNOWN"
 
 
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("share", [0.3, 0.9, 0.99, 1.05, 1.5])
 def test_bounds_and_codac_do_not_contradict_each_other(case: str, share: float) -> None:
-    claims, limit = claims_of(case)
-    found = {by_bounds(claims, INNER * limit, share * limit), by_codac(claims, INNER * limit, share * limit)}
+    case, limit = claims_of(case)
+    found = {by_bounds(case, INNER * limit, share * limit), by_codac(case, INNER * limit, share * limit)}
     assert found != {"PROVED", "REFUTED"}
     if share < 0.95:
         assert found == {"PROVED"}
@@ -96,9 +96,9 @@ def test_bounds_and_codac_do_not_contradict_each_other(case: str, share: float) 
 def test_dreal_contradicts_neither(case: str, share: float) -> None:
     backend = dreal()
     assert backend is not None
-    claims, limit = claims_of(case)
+    case, limit = claims_of(case)
     inner, outer = INNER * limit, share * limit
-    found = {by_bounds(claims, inner, outer), by_codac(claims, inner, outer), by_dreal(claims, inner, outer, backend)}
+    found = {by_bounds(case, inner, outer), by_codac(case, inner, outer), by_dreal(case, inner, outer, backend)}
     assert not {"PROVED", "REFUTED"} <= found
     if share < 0.95:
         assert found == {"PROVED"}

@@ -18,8 +18,8 @@ import pytest
 from certify.certificate import read_certificate
 from certify.cli import _run
 from certify.engines import dreal, dreal_proof
-from certify.engines.dreal import Answer, Backend, decide, find_backend
-from certify.engines.dreal_proof import DrealOptions, prove_with_dreal
+from certify.engines.dreal.backend import Answer, Backend, decide, find_backend
+from certify.engines.dreal.proof import DrealOptions, prove_with_dreal
 from certify.errors import BackendError, SoundnessError
 from certify.obligations import Query, local_query, ring_query
 from certify.policies import Policy, TanhNetwork, save_policy
@@ -27,7 +27,7 @@ from certify.report import render_html
 from certify.roa import RoaOptions, certify_roa, run_checker
 from certify.systems import System, get_system
 from certify.verdict import Verdict
-from tests.engines.test_bounds import obligations
+from tests.support.cases import Case, case_of
 from tests.support.certificates import encode
 from tests.support.loops import pendulum_network, scalar_tanh
 
@@ -84,10 +84,10 @@ def level_of(query: Query) -> float:
     ],
 )
 def test_only_a_clean_unsat_is_unsat(script: str, status: str, tmp_path: Path) -> None:
-    claims = obligations(*scalar_tanh())
+    case = case_of(*scalar_tanh())
     start = time.monotonic()
     answer = decide(binary(tmp_path, f"exec {script}" if script.startswith("sleep") else script),
-                    ring_query(claims, 0.5, 1.0), 1e-3, 1, 1.0)  # fmt: skip
+                    query(ring_condition(0.5, 1.0), case.problem), 1e-3, 1, 1.0)  # fmt: skip
     assert answer.status == status
     assert time.monotonic() - start < 20  # the process does not live on
     if status == "delta-sat":
@@ -95,10 +95,10 @@ def test_only_a_clean_unsat_is_unsat(script: str, status: str, tmp_path: Path) -
 
 
 def test_the_binary_gets_the_query_the_precision_and_the_jobs(tmp_path: Path) -> None:
-    claims = obligations(*scalar_tanh())
+    case = case_of(*scalar_tanh())
     keep = tmp_path / "kept"
     backend = binary(tmp_path, f'for last; do :; done; echo "$@" > {keep}; cat "$last" >> {keep}; echo unsat')
-    assert decide(backend, ring_query(claims, 0.5, 1.0), 1e-4, 3, 10.0).status == "unsat"
+    assert decide(backend, query(ring_condition(0.5, 1.0), case.problem), 1e-4, 3, 10.0).status == "unsat"
     text = keep.read_text()
     assert "--precision 0.0001" in text and "--jobs 3" in text
     assert "(declare-fun x () Real)" in text and "(check-sat)" in text
@@ -119,14 +119,14 @@ def test_without_dreal_the_message_says_what_to_get(monkeypatch: pytest.MonkeyPa
 
 def test_levels_are_found_by_bisection(monkeypatch: pytest.MonkeyPatch) -> None:
     """dReal plays along up to V = 0.7 locally and V = 2.1 in the ring."""
-    claims = obligations(*scalar_tanh())
+    case = case_of(*scalar_tanh())
 
     def say(query: Query, name: str) -> Answer:
         bound = {"local": 0.7, "ring": 2.1}.get(name, np.inf)
         return unsat() if level_of(query) <= bound else Answer("timeout", 0.1, "")
 
     answering(monkeypatch, say)
-    proof = prove_with_dreal(claims, 1e-3, 3.0, FAKE, DrealOptions())
+    proof = prove_with_dreal(case, 1e-3, 3.0, FAKE, DrealOptions())
     assert proof.inner is not None and 0.7 / 1.06 < proof.inner <= 0.7
     assert proof.level is not None and 2.1 / 1.01 < proof.level <= 2.1
     assert proof.witness is None and proof.reason.startswith("solver")
@@ -135,13 +135,13 @@ def test_levels_are_found_by_bisection(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize("status", ["timeout", "failed", "delta-sat"])
 def test_no_answer_is_no_proof(status: dreal.Status, monkeypatch: pytest.MonkeyPatch) -> None:
     answering(monkeypatch, lambda query, name: Answer(status, 0.1, ""))
-    proof = prove_with_dreal(obligations(*scalar_tanh()), 1e-3, 3.0, FAKE, DrealOptions())
+    proof = prove_with_dreal(case_of(*scalar_tanh()), 1e-3, 3.0, FAKE, DrealOptions())
     assert proof.level is None and proof.inner is None
 
 
 def test_delta_sat_caps_the_level_only_with_a_genuine_violation(monkeypatch: pytest.MonkeyPatch) -> None:
     """Truth is 1.915008: a box at 2.0 holds a violation, a box at 1.5 does not."""
-    claims = obligations(*scalar_tanh())
+    case = case_of(*scalar_tanh())
     for at, genuine in ((2.0, True), (1.5, False)):
 
         def say(query: Query, name: str, at: float = at) -> Answer:
@@ -151,7 +151,7 @@ def test_delta_sat_caps_the_level_only_with_a_genuine_violation(monkeypatch: pyt
             return Answer("delta-sat", 0.1, "", {"x": (at, at + 1e-6)}) if beyond else unsat()
 
         answering(monkeypatch, say)
-        proof = prove_with_dreal(claims, 1e-3, 2.5**2, FAKE, DrealOptions())
+        proof = prove_with_dreal(case, 1e-3, 2.5**2, FAKE, DrealOptions())
         assert proof.level is not None and proof.level <= 1.9**2
         assert (proof.witness is not None) is genuine
         assert proof.reason == "witness" if genuine else proof.reason.startswith("solver")
@@ -159,21 +159,21 @@ def test_delta_sat_caps_the_level_only_with_a_genuine_violation(monkeypatch: pyt
 
 def test_inputs_are_confirmed_on_the_local_level_too(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without an answer about the inputs there is no level at all, though Vdot is confirmed everywhere."""
-    claims = obligations(get_system("pendulum"), pendulum_network(centre="output"))
+    case = case_of(get_system("pendulum"), pendulum_network(centre="output"))
     for confirmed in (False, True):
 
         def say(query: Query, name: str, confirmed: bool = confirmed) -> Answer:
             return unsat() if confirmed or not name.startswith("inputs") else Answer("timeout", 0.1, "")
 
         asked = answering(monkeypatch, say)
-        proof = prove_with_dreal(claims, 1e-3, 0.5, FAKE, DrealOptions())
+        proof = prove_with_dreal(case, 1e-3, 0.5, FAKE, DrealOptions())
         assert "inputs-u-below" in asked
         assert (proof.level == 0.5) if confirmed else (proof.level is None and proof.reason.startswith("inputs"))
 
 
 def test_time_runs_out_for_all_queries_together(monkeypatch: pytest.MonkeyPatch) -> None:
     asked = answering(monkeypatch, unsat)
-    proof = prove_with_dreal(obligations(*scalar_tanh()), 1e-3, 3.0, FAKE, DrealOptions(seconds=0.0))
+    proof = prove_with_dreal(case_of(*scalar_tanh()), 1e-3, 3.0, FAKE, DrealOptions(seconds=0.0))
     assert proof.level is None and not asked
 
 
@@ -286,7 +286,7 @@ def test_a_contradiction_is_an_error_with_a_reproduction(tmp_path: Path, monkeyp
         lambda q, name: Answer("delta-sat", 0.1, "", {"x": (1.0, 1.0)}) if name == "ring" else unsat(),
     )
     assert certify_roa(system, network, tmp_path, RoaOptions(engine="both")).verdict is Verdict.PROVED
-    monkeypatch.setattr(dreal_proof, "confirm", lambda claims, witness: True)
+    monkeypatch.setattr(dreal_proof, "confirm", lambda case, witness: True)
     with pytest.raises(SoundnessError, match=r"contradiction\.json"):
         certify_roa(system, network, tmp_path, RoaOptions(engine="both"))
     stated = json.loads((tmp_path / "contradiction.json").read_text())
@@ -331,6 +331,6 @@ def test_real_dreal_on_the_pendulum(real: Backend, tmp_path: Path) -> None:
     options = RoaOptions(engine="dreal", level=0.5, time_limit=60)
     result = certify_roa(get_system("pendulum"), network, tmp_path, options)
     assert result.verdict is Verdict.PROVED and result.to_dict()["checked"] == "TRUSTED"
-    claims = obligations(get_system("pendulum"), network)
-    assert decide(real, local_query(claims, 1e-3), 1e-3, 1, 60.0).status == "unsat"
-    assert decide(real, ring_query(claims, 0.01, 0.5), 1e-3, 1, 60.0).solver_seconds is not None
+    case = case_of(get_system("pendulum"), network)
+    assert decide(real, query(local_condition(1e-3), case.problem), 1e-3, 1, 60.0).status == "unsat"
+    assert decide(real, query(ring_condition(0.01, 0.5), case.problem), 1e-3, 1, 60.0).solver_seconds is not None

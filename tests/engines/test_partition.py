@@ -14,7 +14,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from certify.engines.partition import _HANDFUL, LEAF, Frontier, Partition
+from certify.engines.bounds.partition import _HANDFUL, LEAF, Frontier, Partition
 from tests.engines.test_bounds import leaves
 
 CPU = torch.device("cpu")
@@ -153,8 +153,8 @@ def test_the_lowest_comes_back_before_many_a_hair_above_it() -> None:
 HARD = """
 import resource, torch, numpy as np
 from certify.engines import branch_and_bound as engine
-from certify.engines.vdot import BoxBounds, VdotBound
-from tests.engines.test_bounds import obligations
+from certify.engines.bounds.rule import BoxBounds, VdotBound
+from tests.support.cases import Case, case_of
 from tests.support.loops import chain
 
 class Undecided(VdotBound):
@@ -162,9 +162,9 @@ class Undecided(VdotBound):
         none = torch.zeros(lo.shape[1], dtype=torch.bool)
         return BoxBounds(none, torch.ones(lo.shape[1], dtype=lo.dtype), hi - lo, none)
 
-claims = obligations(*chain(4, [-1, -2, -3, -4]))
+case = case_of(*chain(4, [-1, -2, -3, -4]))
 budget = engine.Budget(boxes=10**9, seconds=3000.0, batch=32768, least_width=0.0)
-proof = engine.prove_ring(claims, 1e-9, 1e-2, budget, torch.device("cpu"), rule=Undecided(claims, torch.device("cpu")))
+proof = engine.prove_outwards(case.problem, case.T, 1e-9, 1e-2, budget, torch.device("cpu"), rule=Undecided(case, torch.device("cpu")))
 print(proof.reason, len(proof.tree), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 """
 

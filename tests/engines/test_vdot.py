@@ -6,26 +6,26 @@ import numpy as np
 import pytest
 import torch
 
-from certify.engines.branch_and_bound import _threaded
-from certify.engines.vdot import VdotBound
-from certify.obligations import Obligations
+from certify.engines.bounds.search import _threaded
+from certify.engines.bounds.rule import VdotBound
 from certify.systems import get_system
-from tests.engines.test_bounds import obligations, vdot
+from tests.engines.test_bounds import vdot
+from tests.support.cases import Case, case_of
 from tests.support.loops import lqr_gain, pendulum_network, saturated_lqr, scalar_tanh
 
 CPU = torch.device("cpu")
 INNER, OUTER = 0.02, 0.5
 
 
-def cartpole_claims() -> Obligations:
+def cartpole_claims() -> Case:
     system = get_system("cartpole")
     K = lqr_gain(system, np.eye(4), 0.1 * np.eye(1))
-    return obligations(system, saturated_lqr(K, 30.0, 0.0, [1.0, 0.5, 1.5, 2.0], (24, 24), "preactivation", 0))
+    return case_of(system, saturated_lqr(K, 30.0, 0.0, [1.0, 0.5, 1.5, 2.0], (24, 24), "preactivation", 0))
 
 
 CASES = {
-    "scalar": lambda: obligations(*scalar_tanh()),
-    "pendulum": lambda: obligations(get_system("pendulum"), pendulum_network()),
+    "scalar": lambda: case_of(*scalar_tanh()),
+    "pendulum": lambda: case_of(get_system("pendulum"), pendulum_network()),
     "cartpole": cartpole_claims,
 }
 
@@ -42,10 +42,10 @@ def boxes(n: int, count: int, size: float, seed: int = 0) -> tuple[torch.Tensor,
 @pytest.mark.parametrize("case", CASES)
 @pytest.mark.parametrize("size", [0.5, 0.1, 1e-3])
 def test_the_bound_holds_wherever_a_box_meets_the_ring(case: str, size: float) -> None:
-    claims = CASES[case]()
-    n = claims.loop.system.n
+    case = CASES[case]()
+    n = case.loop.system.n
     lo, hi = boxes(n, 300, size)
-    found = VdotBound(claims, CPU)(lo, hi, INNER, OUTER)
+    found = VdotBound(case.problem, case.T, CPU)(lo, hi, INNER, OUTER)
     generator = np.random.default_rng(1)
     met = 0
     for _ in range(30):
@@ -53,7 +53,7 @@ def test_the_bound_holds_wherever_a_box_meets_the_ring(case: str, size: float) -
         share = np.where(generator.random(lo.shape) < 0.3, np.round(share), share)
         z = (lo.numpy() + share * (hi - lo).numpy()).T
         inside = ((z**2).sum(1) >= INNER) & ((z**2).sum(1) <= OUTER)
-        values = vdot(claims, z[inside] @ claims.T.T)
+        values = vdot(case, z[inside] @ case.T.T)
         assert np.all(values <= found.bound.numpy()[inside] + 1e-12)
         met += int(inside.sum())
     assert met > 500
@@ -63,16 +63,16 @@ def test_the_bound_holds_wherever_a_box_meets_the_ring(case: str, size: float) -
 @pytest.mark.parametrize("case", CASES)
 def test_the_bound_is_of_second_order(case: str) -> None:
     """Bound less the sampled maximum, at halved sizes, away from the ring's edges."""
-    claims = CASES[case]()
-    n = claims.loop.system.n
-    rule = VdotBound(claims, CPU)
+    case = CASES[case]()
+    n = case.loop.system.n
+    rule = VdotBound(case.problem, case.T, CPU)
     corners = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * n, indexing="ij"), -1).reshape(-1, n)
     errors = []
     for size in (0.04, 0.02, 0.01):
         lo, hi = boxes(n, 60, size)
         centre, radius = ((lo + hi) / 2).numpy(), ((hi - lo) / 2).numpy()
         z = centre.T[:, None] + corners[None] * radius.T[:, None]
-        highest = vdot(claims, z.reshape(-1, n) @ claims.T.T).reshape(60, -1).max(1)
+        highest = vdot(case, z.reshape(-1, n) @ case.T.T).reshape(60, -1).max(1)
         errors.append(float(np.median(rule(lo, hi, 1e-12, 1e12).bound.numpy() - highest)))
     orders = np.log2(np.array(errors[:-1]) / errors[1:])
     assert np.all(orders > 1.7), errors
@@ -99,8 +99,8 @@ def test_a_violation_at_the_centre_is_seen() -> None:
 
 
 def test_threads_do_not_change_the_bounds() -> None:
-    claims = CASES["cartpole"]()
-    rule = VdotBound(claims, CPU)
+    case = CASES["cartpole"]()
+    rule = VdotBound(case.problem, case.T, CPU)
     lo, hi = boxes(4, 1500, 0.05)
     threads = torch.get_num_threads()
     torch.set_num_threads(2)

@@ -1,13 +1,7 @@
-"""What has to be proved, as frozen data: the same description for every engine.
+"""Conditions for solvers of formulas: the negation of each, so that a proof is the answer "unsatisfiable".
 
-For the closed loop F, `V = x'Px` and `Vdot = 2 x'P F`:
-
-- local: Vdot < 0 on 0 < V <= inner, for every smaller level too;
-- ring: Vdot < 0 on inner <= V <= outer, and the input stays in its bounds;
-- domain: {V <= outer} lies in the interior of the domain box.
-
-`Obligations` is what the bounds engine takes. A solver of formulas takes a `Query`: the negation of one claim, as
-constraints over the states, so that a proof is the answer "unsatisfiable".
+A `Query` holds constraints over the states and is satisfiable if and only if its condition fails; the local condition,
+whose margin vanishes at the origin, is asked through one that implies it.
 """
 
 from __future__ import annotations
@@ -15,61 +9,22 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from certify.claims.claim import Problem
+from certify.claims.conditions import Condition, OfState, Vdot
 from certify.closed_loop import ClosedLoop
 from certify.errors import InputError
-from certify.systems.trees import to_tree
+from certify.expressions import Tree, to_tree
 
 Array = NDArray[np.float64]
-Tree = Any  # nested lists: a name, an exact fraction as text, or an operator with its operands
-
-
-@dataclass(frozen=True, slots=True)
-class Obligations:
-    """The claims about one closed loop and one quadratic Lyapunov function.
-
-    Parameters
-    ----------
-    loop : the closed loop.
-    P : (n, n), symmetric.
-    T : (n, n), invertible; `x = T z` are the coordinates in which boxes are drawn. No claim depends on it.
-    """
-
-    loop: ClosedLoop
-    P: Array
-    T: Array
-
-    def __post_init__(self) -> None:
-        n = self.loop.system.n
-        for name in ("P", "T"):
-            array = np.array(getattr(self, name), dtype=np.float64)
-            if array.shape != (n, n) or not np.all(np.isfinite(array)):
-                raise InputError(f"`{name}` must be a finite matrix of shape ({n}, {n}); found shape {array.shape}.")
-            array.setflags(write=False)
-            object.__setattr__(self, name, array)
-        if not np.array_equal(self.P, self.P.T):
-            i, j = np.argwhere(self.P != self.P.T)[0]
-            raise InputError(f"`P` must be symmetric; P[{i}, {j}] = {self.P[i, j]} but P[{j}, {i}] = {self.P[j, i]}.")
-
-    @property
-    def inputs_bounded_by_form(self) -> bool:
-        """True if the squashing alone keeps the input in its bounds."""
-        network, bounds = self.loop.network, self.loop.system.input_bounds
-        if network.squash != "tanh" or network.centre == "output":
-            return False
-        return all(
-            lo <= float(o) - abs(float(s)) and float(o) + abs(float(s)) <= hi
-            for o, s, (lo, hi) in zip(network.offset, network.scale, bounds, strict=True)
-        )
 
 
 @dataclass(frozen=True, slots=True)
 class Query:
-    """Satisfiable if and only if a claim is false.
+    """Satisfiable if and only if a condition fails.
 
     `variables` are names with their exact bounds; `definitions` are names with trees, each over what comes before
     it; `constraints` are relations (tree, ">=" or "<=" or ">", tree) that hold together. Beside the operators of the
@@ -82,71 +37,54 @@ class Query:
     constraints: tuple[tuple[Tree, str, Tree], ...]
 
 
-def queries(obligations: Obligations, inner: float, outer: float) -> list[Query]:
-    """One query for each claim: domain, local, ring, inputs."""
-    found = [*domain_queries(obligations, outer), local_query(obligations, inner)]
-    if inner < outer:
-        found.append(ring_query(obligations, inner, outer))
-    return found if obligations.inputs_bounded_by_form else [*found, *input_queries(obligations, outer)]
-
-
-def domain_queries(obligations: Obligations, outer: float) -> list[Query]:
-    """For each side of the domain box: V <= outer somewhere on it.
-
-    {V <= outer} is connected and holds the origin, so it leaves the interior of the box only through a side.
-    """
-    system = obligations.loop.system
-    result = []
-    for symbol, (lo, hi) in zip(system.states, system.domain, strict=True):
-        for side, relation, end in (("below", "<=", lo), ("above", ">=", hi)):
-            constraints = [("V.", "<=", exact(outer)), (symbol.name, relation, exact(end))]
-            result.append(_query(obligations, f"domain-{symbol.name}-{side}", _level(obligations), constraints))
-    return result
-
-
-def local_query(obligations: Obligations, inner: float) -> Query:
-    """Somewhere in V <= inner, `||P Dg + (P Dg)'||_F >= r` with g = F - A x and r < lambda_min(-(A'P + PA)).
-
-    `Vdot = x'(A'P + PA)x + 2 x'P g(x)`, g(0) = 0, and g(x) is the mean of Dg(t x) x over 0 <= t <= 1; so if there is no
-    such state, Vdot < 0 for 0 < V <= inner. A is a binary64 matrix and r is shown in rationals. The query of LyZNet
-    (Liu, Meng, Fitzsimmons, Zhou 2024).
+def query(condition: Condition, problem: Problem) -> Query:
+    """The negation of a condition: somewhere in the domain box every guard holds and the margin does not.
 
     Raises
     ------
-    InputError : -(A'P + PA) is not positive definite.
+    InputError : the local condition, where -(A'P + PA) is not positive definite.
     """
-    o, n = obligations, obligations.loop.system.n
-    A, _, _ = o.loop.linearise()
-    r = decay(o.P, A)
-    definitions = [*_level(o), *_policy(o.loop), *_policy_jacobian(o.loop), *_jacobian(o.loop)]
+    system = problem.loop.system
+    constraints: list[tuple[Tree, str, Tree]] = [
+        ("V.", "<=" if guard.side == "inside" else ">=", exact(guard.level)) for guard in condition.guards
+    ]
+    definitions = _level(problem)
+    margin = condition.margin
+    if condition.punctured:
+        definitions, constraint = _local(problem)
+        constraints.append(constraint)
+    elif isinstance(margin, Vdot):
+        definitions += [*_policy(problem.loop), *_vdot(problem)]
+        constraints.append(("Vdot.", ">=", "0"))
+    else:
+        names = system.states if isinstance(margin, OfState) else system.inputs
+        definitions += [] if isinstance(margin, OfState) else _policy(problem.loop)
+        fails = {("above", True): ">=", ("below", True): "<=", ("above", False): ">", ("below", False): "<"}
+        constraints.append((names[margin.index].name, fails[margin.side, condition.strict], exact(margin.bound)))
+    variables = tuple((s.name, lo, hi) for s, (lo, hi) in zip(system.states, system.domain, strict=True))
+    return Query(condition.name, variables, tuple(definitions), tuple(constraints))
+
+
+def _local(problem: Problem) -> tuple[list[tuple[str, Tree]], tuple[Tree, str, Tree]]:
+    """`||P Dg + (P Dg)'||_F >= r` with g = F - A x and r < lambda_min(-(A'P + PA)).
+
+    `Vdot = x'(A'P + PA)x + 2 x'P g(x)`, g(0) = 0, and g(x) is the mean of Dg(t x) x over 0 <= t <= 1; so if there is no
+    such state, Vdot < 0 for 0 < V <= c1. A is a binary64 matrix and r is shown in rationals. The query of LyZNet
+    (Liu, Meng, Fitzsimmons, Zhou 2024).
+    """
+    P, n = problem.V.P, problem.loop.system.n
+    A, _, _ = problem.loop.linearise()
+    r = decay(P, A)
+    definitions = [*_level(problem), *_policy(problem.loop), *_policy_jacobian(problem.loop), *_jacobian(problem.loop)]
     for i in range(n):
         for j in range(n):
             definitions.append((f"Dg.{i}.{j}", ["-", f"DF.{i}.{j}", exact(float(A[i, j]))]))
     for i in range(n):
         for j in range(n):
             column = [f"Dg.{k}.{j}" for k in range(n)]
-            definitions.append((f"PDg.{i}.{j}", combination(o.P[i], column)))
+            definitions.append((f"PDg.{i}.{j}", combination(P[i], column)))
     squares = [["**", ["+", f"PDg.{i}.{j}", f"PDg.{j}.{i}"], 2] for i in range(n) for j in range(n)]
-    return _query(o, "local", definitions, [("V.", "<=", exact(inner)), (total(squares), ">=", str(r * r))])
-
-
-def ring_query(obligations: Obligations, inner: float, outer: float) -> Query:
-    """Somewhere in inner <= V <= outer, Vdot >= 0."""
-    level = [("V.", ">=", exact(inner)), ("V.", "<=", exact(outer))]
-    definitions = [*_level(obligations), *_policy(obligations.loop), *_vdot(obligations)]
-    return _query(obligations, "ring", definitions, [*level, ("Vdot.", ">=", "0")])
-
-
-def input_queries(obligations: Obligations, outer: float) -> list[Query]:
-    """For each input and bound: somewhere in V <= outer, pi lies beyond it."""
-    system = obligations.loop.system
-    definitions = [*_level(obligations), *_policy(obligations.loop)]
-    result = []
-    for symbol, (lo, hi) in zip(system.inputs, system.input_bounds, strict=True):
-        for side, pair in (("below", (exact(lo), symbol.name)), ("above", (symbol.name, exact(hi)))):
-            constraints = [("V.", "<=", exact(outer)), (pair[0], ">", pair[1])]
-            result.append(_query(obligations, f"inputs-{symbol.name}-{side}", definitions, constraints))
-    return result
+    return definitions, (total(squares), ">=", str(r * r))
 
 
 def decay(P: Array, A: Array) -> Fraction:
@@ -183,14 +121,6 @@ def _positive_definite(M: list[list[Fraction]]) -> bool:
     return True
 
 
-def _query(
-    o: Obligations, name: str, definitions: Iterable[tuple[str, Tree]], constraints: Iterable[tuple[Tree, str, Tree]]
-) -> Query:
-    system = o.loop.system
-    variables = tuple((s.name, lo, hi) for s, (lo, hi) in zip(system.states, system.domain, strict=True))
-    return Query(name, variables, tuple(definitions), tuple(constraints))
-
-
 def exact(value: float | Fraction) -> str:
     """A number as an exact fraction."""
     return str(Fraction(value))
@@ -207,14 +137,14 @@ def combination(coefficients: Iterable[float], trees: Iterable[Tree], constant: 
     return total([*terms, exact(constant)] if constant or not terms else terms)
 
 
-def _level(o: Obligations) -> list[tuple[str, Tree]]:
+def _level(o: Problem) -> list[tuple[str, Tree]]:
     """Definition of `V.`, with `Px.i` on the way."""
     x = [s.name for s in o.loop.system.states]
-    result: list[tuple[str, Tree]] = [(f"Px.{i}", combination(row, x)) for i, row in enumerate(o.P)]
+    result: list[tuple[str, Tree]] = [(f"Px.{i}", combination(row, x)) for i, row in enumerate(o.V.P)]
     return [*result, ("V.", total([["*", s, f"Px.{i}"] for i, s in enumerate(x)]))]
 
 
-def _vdot(o: Obligations) -> list[tuple[str, Tree]]:
+def _vdot(o: Problem) -> list[tuple[str, Tree]]:
     """Definition of `Vdot.` = 2 x'P f(x, pi(x))."""
     F = o.loop.system.exact_dynamics()
     result: list[tuple[str, Tree]] = [(f"f.{i}", to_tree(e)) for i, e in enumerate(F)]
@@ -234,7 +164,7 @@ def _policy(loop: ClosedLoop) -> list[tuple[str, Tree]]:
         origin = f"o.{last}.{j}"
         scale, offset, u_eq = exact(network.scale[j]), exact(network.offset[j]), str(loop.u_eq[j])
         if network.centre == "preactivation":
-            ratio = (loop.u_eq[j] - Fraction(float(network.offset[j]))) / Fraction(float(network.scale[j]))
+            ratio = network.ratios(loop.u_eq)[j]
             # atanh(q) = log((1 + q) / (1 - q)) / 2
             beta: Tree = "0" if ratio == 0 else ["/", ["log", str((1 + ratio) / (1 - ratio))], "2"]
             net = ["+", ["-", net, origin], beta]

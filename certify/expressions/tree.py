@@ -7,13 +7,19 @@ from typing import Any
 
 import sympy
 
-from certify.errors import CertificateFormatError
+from certify.errors import CertificateFormatError, InputError
 
-_FUNCTIONS = {"sin": sympy.sin, "cos": sympy.cos, "tan": sympy.tan}
+FUNCTIONS: Mapping[str, Any] = {"sin": sympy.sin, "cos": sympy.cos, "tan": sympy.tan}
+Tree = Any  # nested lists: a name, an exact fraction as text, or an operator with its operands
 
 
-def to_tree(expression: sympy.Expr) -> Any:
-    """Nested lists: a name, an exact fraction, or an operator with its operands (FORMAT.md)."""
+def to_tree(expression: sympy.Expr) -> Tree:
+    """Nested lists: a name, an exact fraction, or an operator with its operands (FORMAT.md).
+
+    Raises
+    ------
+    InputError : the expression is outside the grammar.
+    """
     if expression.is_Symbol:
         return expression.name
     if expression.is_Rational:
@@ -23,16 +29,22 @@ def to_tree(expression: sympy.Expr) -> Any:
         return ["+", *arguments]
     if expression.is_Mul:
         return ["*", *arguments]
-    if expression.is_Pow:
+    if expression.is_Pow and expression.exp.is_Integer:
         return ["**", arguments[0], int(expression.exp)]
-    for name, function in _FUNCTIONS.items():
+    for name, function in FUNCTIONS.items():
         if isinstance(expression, function):
             return [name, arguments[0]]
-    raise CertificateFormatError(f"{expression} has no place in a certificate's grammar.")
+    known_names = ", ".join(FUNCTIONS)
+    raise InputError(f"{expression} is outside the grammar; allowed are + - * /, integer powers, {known_names}.")
 
 
-def from_tree(tree: Any, names: Mapping[str, sympy.Symbol]) -> sympy.Expr:
-    """The sympy expression of a tree; for pictures and summaries, not for proofs."""
+def from_tree(tree: Tree, names: Mapping[str, sympy.Symbol]) -> sympy.Expr:
+    """The sympy expression of a tree; for pictures and summaries, not for proofs.
+
+    Raises
+    ------
+    CertificateFormatError : an operator that no certificate has.
+    """
     if isinstance(tree, str):
         return names[tree] if tree in names else sympy.Rational(tree)
     operator, arguments = tree[0], tree[1:]
@@ -47,4 +59,6 @@ def from_tree(tree: Any, names: Mapping[str, sympy.Symbol]) -> sympy.Expr:
         return -values[0] if len(values) == 1 else values[0] - values[1]
     if operator == "/":
         return values[0] / values[1]
-    return _FUNCTIONS[operator](*values)
+    if operator in FUNCTIONS:
+        return FUNCTIONS[operator](*values)
+    raise CertificateFormatError(f"{operator!r} is no operator of a certificate.")

@@ -20,8 +20,9 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Literal
 
+from certify.claims.queries import Query
 from certify.errors import BackendError
-from certify.obligations import Query, Tree
+from certify.expressions import Tree
 
 Status = Literal["unsat", "delta-sat", "timeout", "failed"]
 _INSTALL = (
@@ -67,7 +68,7 @@ def find_backend() -> Backend:
         probe = [sys.executable, "-c", "import dreal; print(getattr(dreal, '__version__', 'unknown'))"]
         done = subprocess.run(probe, capture_output=True, text=True, check=False)
         if done.returncode == 0:
-            command = (sys.executable, "-m", "certify.engines.dreal_child")
+            command = (sys.executable, "-m", "certify.engines.dreal.child")
             return Backend("module", command, done.stdout.strip())
         lines = done.stderr.strip().splitlines()
         missing = f"`import dreal` fails ({lines[-1] if lines else 'no message'})"

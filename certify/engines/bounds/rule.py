@@ -14,39 +14,52 @@ from typing import NamedTuple
 import numpy as np
 import sympy
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from certify.enclosures import PolicyEnclosure, Taylor, evaluate, upper_bound
+from certify.claims import Problem
+from certify.enclosures import Models, PolicyEnclosure, Taylor, upper_bound
 from certify.enclosures.taylor import EPS, TINY
-from certify.obligations import Obligations
+from certify.expressions import evaluate
+from certify.policies import bounded_by_form
+
+Array = NDArray[np.float64]
+_SLACK = 1e-9  # relative distance from the inner level at which a box counts as inside
 
 
 class BoxBounds(NamedTuple):
     """What is known of each box: `proved` (B,), `bound` of Vdot (B,), `score` (n, B): what each axis adds to the bound,
-    `violated` (B,): a claim fails at the centre."""
+    `violated` (B,): a condition fails at the centre; `smooth` (B,): F is enclosed on the box and the inputs keep their
+    bounds there."""
 
     proved: Tensor
     bound: Tensor
     score: Tensor
     violated: Tensor
+    smooth: Tensor
 
 
 class VdotBound:
-    """Upper bounds of Vdot, and bounds of V, over batches of boxes in the coordinates z."""
+    """Upper bounds of Vdot, and bounds of V, over batches of boxes in the coordinates z.
 
-    def __init__(self, obligations: Obligations, device: torch.device) -> None:
-        loop = obligations.loop
+    With `inside`, a box on which V is below the inner level is proved if F is enclosed there and the inputs keep their
+    bounds; otherwise such a box is nobody's concern here.
+    """
+
+    def __init__(self, problem: Problem, T: Array, device: torch.device, inside: bool = False) -> None:
+        self.inside = inside
+        loop = problem.loop
         self.system = loop.system
-        self.T = torch.tensor(obligations.T, dtype=torch.float64, device=device)
-        self.P = obligations.P
-        S = obligations.T.T @ obligations.P @ obligations.T
+        self.T = torch.tensor(T, dtype=torch.float64, device=device)
+        self.P = problem.V.P
+        S = T.T @ self.P @ T
         cross = np.abs(S - np.diag(np.diag(S))) + 1e-13 * np.sqrt(np.outer(np.diag(S), np.diag(S)))
         self.S_diagonal = torch.tensor(np.diag(S).copy(), dtype=torch.float64, device=device)[:, None]
         self.S_cross = torch.tensor(cross, dtype=torch.float64, device=device)
         self.S = torch.tensor(S, dtype=torch.float64, device=device)
         self.policy = PolicyEnclosure(loop, device)
         self.dynamics: tuple[sympy.Expr, ...] = loop.system.exact_dynamics()
-        self.check_inputs = not obligations.inputs_bounded_by_form
+        self.check_inputs = not bounded_by_form(loop.network, loop.system.input_bounds)
 
     def levels(self, lo: Tensor, hi: Tensor) -> tuple[Tensor, Tensor]:
         """Bounds of V from below and above on boxes (n, B)."""
@@ -70,11 +83,14 @@ class VdotBound:
         mid, slopes, wide, share = self.policy(x, error)
         vdot = self._vdot(x, error, mid, slopes, wide)
         bound, excess = upper_bound(vdot)
+        smooth = torch.isfinite(bound)  # a component of F that is not enclosed leaves a NaN in the sum over all
         # At the box's centre only the inputs' errors and the remainder are left.
         doubt = vdot.g[n:].abs().sum(0) + vdot.Q[n:, n:].abs().sum((0, 1)) + vdot.r
         violated = vdot.c - doubt >= 0
         bound = self._within_ring(bound, vdot, lo, hi, centre, radius, inner, outer)
         proved = bound < 0
+        if self.inside:
+            proved = smooth & (proved | (self.levels(lo, hi)[1] < inner * (1 - _SLACK)))
         # What the inputs' errors and the remainder add is charged to the axes that spread the network.
         extra = excess[n:].sum(0) + vdot.r
         score = excess[:n] + share * extra
@@ -85,10 +101,10 @@ class VdotBound:
                 slack = 1e-11 * (abs(float(low)) + abs(float(high)))
                 inside = (mid[j] - reach[j] > float(low) + slack) & (mid[j] + reach[j] < float(high) - slack)
                 outside = (mid[j] - wide[j] > float(high) + slack) | (mid[j] + wide[j] < float(low) - slack)
-                proved, violated = proved & inside, violated | outside
+                proved, violated, smooth = proved & inside, violated | outside, smooth & inside
                 spread = slopes[j].abs() + share * wide[j]
                 score = torch.where(inside, score, spread)
-        return BoxBounds(proved, bound, score, violated)
+        return BoxBounds(proved, bound, score, violated, smooth)
 
     def _vdot(self, x: Tensor, error: Tensor, mid: Tensor, slopes: Tensor, wide: Tensor) -> Taylor:
         """Vdot = (2 P x)'f(x, u); symbols: n box coordinates, m input errors."""
@@ -103,13 +119,14 @@ class VdotBound:
             own[j] = wide[j]
             values[symbol] = Taylor(mid[j], torch.cat([slopes[j], own]), zeros, zeros[0, 0])
         known: dict[sympy.Expr, Taylor] = {}
+        models = Models(values[self.system.states[0]])
         states = [values[s] for s in self.system.states]
         terms = []
         for i, expression in enumerate(self.dynamics):
             gradient = states[0].scaled(2 * float(self.P[i, 0]))
             for j in range(1, n):
                 gradient = gradient + states[j].scaled(2 * float(self.P[i, j]))
-            terms.append(gradient * evaluate(expression, values, known))
+            terms.append(gradient * evaluate(expression, values, models, known))
         result = terms[0]
         for term in terms[1:]:
             result = result + term

@@ -7,11 +7,14 @@ Reads one JSON object from standard input (the fields of `Query`, `precision`, `
 from __future__ import annotations
 
 import json
+import operator
 import sys
 import time
 from collections.abc import Mapping
 from fractions import Fraction
 from typing import Any
+
+_RELATIONS = {">=": operator.ge, "<=": operator.le, ">": operator.gt, "<": operator.lt}
 
 
 def main() -> None:
@@ -29,7 +32,7 @@ def main() -> None:
         values[name] = _expression(dreal, tree, values)
     for left, relation, right in query["constraints"]:
         a, b = _expression(dreal, left, values), _expression(dreal, right, values)
-        constraints.append(a >= b if relation == ">=" else (a <= b if relation == "<=" else a > b))
+        constraints.append(_RELATIONS[relation](a, b))
     config = dreal.Config()
     config.precision = query["precision"]
     config.number_of_jobs = query["jobs"]

@@ -1,0 +1,64 @@
+"""The two checkers as child processes: the ones beside this package, isolated, on a file by its path.
+
+`python -m certify.checker` would run whichever package is installed; here the folder is named. Each program runs
+under `-I`, so that neither the current folder nor the environment lends it a module.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any, Literal
+
+from certify.errors import BackendError
+
+Program = Literal["checker", "reference"]
+_STATUS = {"ACCEPTED": 0, "REJECTED": 1, "TRUSTED": 3}
+_LAUNCH = """
+import importlib, importlib.util, sys
+name, folder = sys.argv[1:3]
+spec = importlib.util.spec_from_file_location(name, folder + "/__init__.py", submodule_search_locations=[folder])
+sys.modules[name] = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(sys.modules[name])
+sys.exit(importlib.import_module(name + ".__main__").main(sys.argv[3:]))
+"""
+
+
+def command(program: Program, arguments: list[str]) -> list[str]:
+    """The command line of the checker or the reference that belongs to this package."""
+    folder = Path(__file__).resolve().parent.parent / program
+    return [sys.executable, "-I", "-c", _LAUNCH, f"certify_{program}", str(folder), *arguments]
+
+
+def ask(path: Path, program: Program = "checker") -> tuple[int, dict[str, Any]]:
+    """Run a checker on a file in a process of its own: its exit status and its JSON answer.
+
+    Raises
+    ------
+    BackendError : it printed no JSON object, or its status is not the answer's.
+    """
+    line = command(program, ["--json", "--", str(path)])
+    done = subprocess.run(line, capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL)
+    try:
+        answer = dict(json.loads(done.stdout))
+    except (ValueError, TypeError) as error:
+        said = done.stderr.strip()[-300:]
+        raise BackendError(f"the {program} ended with status {done.returncode} and no verdict: {said}") from error
+    if done.returncode != _STATUS.get(answer.get("result", ""), done.returncode if "error" in answer else -1):
+        raise BackendError(f"the {program} ended with status {done.returncode} and says {answer}.")
+    return done.returncode, answer
+
+
+def run_checker(path: Path, program: Program = "checker") -> dict[str, Any]:
+    """The JSON answer of a checker that came to a verdict.
+
+    Raises
+    ------
+    BackendError : it ended with neither ACCEPTED, nor TRUSTED, nor REJECTED.
+    """
+    status, answer = ask(path, program)
+    if "error" in answer:
+        raise BackendError(f"the {program} ended with status {status} and no verdict: {answer['error']}")
+    return answer

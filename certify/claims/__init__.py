@@ -1,0 +1,20 @@
+"""Claims as data: what a certificate says, and the conditions that have to be shown for it."""
+
+from __future__ import annotations
+
+from certify.claims.claim import CLAIMS, Asymptotic, Claim, Practical, Problem
+from certify.claims.conditions import Condition, Guard, OfInput, OfState, Vdot, conditions
+
+__all__ = [
+    "CLAIMS",
+    "Asymptotic",
+    "Claim",
+    "Condition",
+    "Guard",
+    "OfInput",
+    "OfState",
+    "Practical",
+    "Problem",
+    "Vdot",
+    "conditions",
+]

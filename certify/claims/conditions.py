@@ -1,0 +1,110 @@
+"""What has to be shown for a claim, in one form: *where these guards are not negative, this margin is negative*.
+
+The bounds engine proves the ring and the inputs box by box, a solver of formulas is asked for a point at which a
+condition fails, and the checker has a rule for each. Two conditions have no margin and are shown along the way: P is
+positive definite (in rationals), and F is smooth on {V <= c2} (whatever encloses F there has no pole).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Literal
+
+from certify.claims.claim import Asymptotic, Claim, Problem
+from certify.policies import bounded_by_form
+
+
+@dataclass(frozen=True, slots=True)
+class Guard:
+    """`level - V >= 0` (side `inside`), or `V - level >= 0` (side `outside`)."""
+
+    side: Literal["inside", "outside"]
+    level: float
+
+
+@dataclass(frozen=True, slots=True)
+class Vdot:
+    """The margin `2 x'P F(x)`."""
+
+
+@dataclass(frozen=True, slots=True)
+class OfState:
+    """The margin `x_index - bound` (side `above`), or `bound - x_index` (side `below`)."""
+
+    index: int
+    side: Literal["below", "above"]
+    bound: Fraction
+
+
+@dataclass(frozen=True, slots=True)
+class OfInput:
+    """The margin `pi_index(x) - bound` (side `above`), or `bound - pi_index(x)` (side `below`)."""
+
+    index: int
+    side: Literal["below", "above"]
+    bound: Fraction
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """For all x in the domain box where every guard holds, `margin < 0` (`strict`) or `margin <= 0`.
+
+    With `punctured` the origin is left out: there Vdot is 0, and a proof needs the rate at which it leaves 0.
+    """
+
+    name: str
+    guards: tuple[Guard, ...]
+    margin: Vdot | OfState | OfInput
+    strict: bool = True
+    punctured: bool = False
+
+
+def conditions(claim: Claim, problem: Problem) -> tuple[Condition, ...]:
+    """Everything that has to be shown for `claim`: domain, local, ring, inputs.
+
+    The domain's conditions are about the box itself: {V <= c2} is connected and holds the origin, so it leaves the
+    interior of the box only through a side.
+    """
+    found = domain_conditions(problem, claim.roa)
+    if isinstance(claim, Asymptotic):
+        found += (local_condition(claim.local),)
+    if claim.inner < claim.roa or not isinstance(claim, Asymptotic):
+        found += (ring_condition(claim.inner, claim.roa),)
+    return found + input_conditions(problem, claim.roa)
+
+
+def domain_conditions(problem: Problem, level: float) -> tuple[Condition, ...]:
+    """{V <= level} lies in the interior of the domain: one condition a side."""
+    system = problem.loop.system
+    return tuple(
+        Condition(f"domain-{symbol.name}-{side}", (Guard("inside", level),), OfState(i, side, bound))
+        for i, (symbol, (lo, hi)) in enumerate(zip(system.states, system.domain, strict=True))
+        for side, bound in _sides(lo, hi)
+    )
+
+
+def local_condition(level: float) -> Condition:
+    """Vdot < 0 for 0 < V <= level."""
+    return Condition("local", (Guard("inside", level),), Vdot(), punctured=True)
+
+
+def ring_condition(inner: float, outer: float) -> Condition:
+    """Vdot < 0 for inner <= V <= outer."""
+    return Condition("ring", (Guard("outside", inner), Guard("inside", outer)), Vdot())
+
+
+def input_conditions(problem: Problem, level: float) -> tuple[Condition, ...]:
+    """The inputs lie in their bounds on {V <= level}; none where the squashing alone keeps them there."""
+    system = problem.loop.system
+    if bounded_by_form(problem.loop.network, system.input_bounds):
+        return ()
+    return tuple(
+        Condition(f"inputs-{symbol.name}-{side}", (Guard("inside", level),), OfInput(j, side, bound), strict=False)
+        for j, (symbol, (lo, hi)) in enumerate(zip(system.inputs, system.input_bounds, strict=True))
+        for side, bound in _sides(lo, hi)
+    )
+
+
+def _sides(lo: Fraction, hi: Fraction) -> tuple[tuple[Literal["below", "above"], Fraction], ...]:
+    return (("below", lo), ("above", hi))

@@ -1,0 +1,87 @@
+"""What every engine takes and gives. No engine is trusted: the checker decides."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+from certify.certificate import PartitionTree, TrustedSolver
+from certify.claims import Claim, Problem
+from certify.claims.claim import Kind
+from certify.engines.falsify import Witness
+from certify.verdict import Stop
+
+
+@dataclass(frozen=True, slots=True)
+class Budget:
+    """What a proof may use: seconds on the wall from the engine's start, boxes, boxes at once, and the width of the
+    smallest box relative to the root box."""
+
+    seconds: float = 600.0
+    boxes: int = 4_000_000
+    batch: int = 2048
+    least_width: float = 2.0**-24
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """What an engine is asked for: a claim of this kind about the largest set {V <= c2}, c2 up to `target`.
+
+    `exactly` says that less than `target` is of no use; `witness` is the violation that made `target` what it is.
+    """
+
+    problem: Problem
+    kind: Kind
+    target: float
+    exactly: bool = False
+    witness: Witness | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """Where a proof stands: `level` is proved, `target` aimed at, `boxes` were bounded and `open` wait.
+
+    `proved` is the share of the ring's volume that is done; `seconds_left` is extrapolated, None at first.
+    """
+
+    level: float
+    target: float
+    boxes: int
+    open: int
+    proved: float
+    seconds_left: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Proof:
+    """What an engine found: a claim with evidence for it, or None and why there is none.
+
+    `stop` and `detail` say what limits the level; `witness` is the lowest violation met on the way; `partial` are
+    levels that were reached without making a claim; `solver` is the record of a solver's answers; `seconds` the
+    stages `local` and `ring`.
+    """
+
+    claim: Claim | None
+    evidence: PartitionTree | TrustedSolver | None
+    stop: Stop
+    detail: str = ""
+    witness: Witness | None = None
+    boxes: int = 0
+    leaves: int = 0
+    partial: Mapping[str, float] = field(default_factory=dict)
+    solver: Mapping[str, Any] | None = None
+    seconds: Mapping[str, float] = field(default_factory=dict)
+
+
+Report = Callable[[Progress], None]
+
+
+class Engine(Protocol):
+    """A way to prove claims."""
+
+    def prove(self, task: Task, budget: Budget, report: Report | None = None) -> Proof:
+        """The best claim of the task's kind that the budget allows."""
+
+
+

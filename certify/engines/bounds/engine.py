@@ -1,0 +1,91 @@
+"""The bounds engine: local proof, ring, and for practical stability the smallest level that a ring can start from."""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.certificate import PartitionTree
+from certify.claims import Asymptotic, Practical
+from certify.engines.base import Budget, Proof, Report, Task
+from certify.engines.bounds.search import RingProof, prove_inwards, prove_outwards
+from certify.engines.falsify import survey
+from certify.engines.local import prove_local
+from certify.running import Runner
+from certify.verdict import Stop
+
+Array = NDArray[np.float64]
+_SHARE = 0.4  # of the time, for finding c2 before c0
+_TRIES = 4  # inner levels from which c2 is looked for
+
+
+class BoundsEngine:
+    """Branch and bound in the coordinates `x = T z`, T (n, n), on a runner."""
+
+    def __init__(self, T: Array, runner: Runner) -> None:
+        self.T, self.runner = T, runner
+
+    def prove(self, task: Task, budget: Budget, report: Report | None = None) -> Proof:
+        """The largest c2 up to the task's target; with claim `practical`, the smallest c0 for it."""
+        prove = self._asymptotic if task.kind == "asymptotic" else self._practical
+        return prove(task, budget, report)
+
+    def _asymptotic(self, task: Task, budget: Budget, report: Report | None) -> Proof:
+        start = time.perf_counter()
+        inner = prove_local(task.problem, self.T, task.target)
+        local = time.perf_counter() - start
+        if inner is None:
+            why = "the linearisation does not dominate on any ball; try another --Q"
+            return Proof(None, None, Stop.LOCAL, why, seconds={"local": local})
+        ring = prove_outwards(task.problem, self.T, inner, task.target, budget, self.runner, report)
+        seconds = {"local": local, "ring": time.perf_counter() - start - local}
+        return self._proof(ring, Asymptotic(roa=ring.outer, local=inner), seconds)
+
+    def _practical(self, task: Task, budget: Budget, report: Report | None) -> Proof:
+        start = time.perf_counter()
+        found = survey(task.problem, self.T, task.target)
+        if found is None or (task.exactly and found[2] < task.target):
+            near = "around any level" if found is None else "near the level that was asked for"
+            why = f"Vdot >= 0 or an input out of bounds was sampled {near}"
+            return Proof(None, None, Stop.FLOOR, why, seconds={"ring": time.perf_counter() - start})
+        below, floor, top = found
+        outer = top
+        if not task.exactly:
+            outer = self._outer_level(task, floor, top, replace(budget, seconds=_SHARE * budget.seconds), report)
+        left = budget.seconds - (time.perf_counter() - start)
+        ring = prove_inwards(task.problem, self.T, below, outer, replace(budget, seconds=left), self.runner, report)
+        seconds = {"ring": time.perf_counter() - start}
+        if not ring.inner < ring.outer:
+            why = f"no ring below V = {outer:.6g} is proved"
+            return Proof(None, None, Stop.FLOOR, why, boxes=ring.boxes, seconds=seconds)
+        if not ring.covered:
+            why = f"F and its inputs are not enclosed on all of V <= {ring.inner:.6g}"
+            return Proof(None, None, Stop.SMOOTH, why, boxes=ring.boxes, seconds=seconds)
+        proof = self._proof(ring, Practical(roa=ring.outer, floor=ring.inner), seconds)
+        return replace(proof, stop=Stop.REQUESTED if ring.outer >= task.target else Stop.WITNESS)
+
+    def _outer_level(self, task: Task, floor: float, top: float, budget: Budget, report: Report | None) -> float:
+        """The largest c2 that a ring from somewhat above the floor reaches."""
+        inner, best = min(4 * floor, math.sqrt(floor * top)), floor
+        for _ in range(_TRIES):
+            part = replace(budget, seconds=budget.seconds / _TRIES)
+            best = max(best, prove_outwards(task.problem, self.T, inner, top, part, self.runner, report).outer)
+            if best > inner:
+                break
+            inner = math.sqrt(inner * top)
+        return best
+
+    def _proof(self, ring: RingProof, claim: Asymptotic | Practical, seconds: dict[str, float]) -> Proof:
+        return Proof(
+            claim,
+            PartitionTree(self.T, ring.root, ring.tree),
+            ring.stop,
+            witness=ring.witness,
+            boxes=ring.boxes,
+            leaves=ring.leaves,
+            seconds=seconds,
+        )

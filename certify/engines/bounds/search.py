@@ -1,0 +1,348 @@
+"""The ring: one best-first pass of branch and bound that finds the best provable level as it goes.
+
+A pass outwards keeps the inner level and looks for the largest outer one: boxes are taken in the order of the lowest V
+on them, and everything below the lowest undecided box is proved. A pass inwards keeps the outer level and looks for the
+smallest inner one, in the order of the highest V. Either way the answer is ready whenever the pass stops: for a
+violation, a budget, or because nothing is left. No trial level is ever proved again from scratch.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from certify.claims import Problem
+from certify.engines.base import Budget, Progress, Report
+from certify.engines.bounds.frontier import Frontier
+from certify.engines.bounds.partition import LEAF, Partition
+from certify.engines.bounds.rule import BoxBounds, VdotBound
+from certify.engines.falsify import Witness, descend
+from certify.running import Runner
+from certify.verdict import Stop
+
+Array = NDArray[np.float64]
+_SLACK = 1e-9  # relative distance kept from every level, so that the checker's own rounding agrees
+_BESIDE_WITNESS = 1e-3  # relative distance kept from a violation
+_SHELL = 16.0  # a batch reaches up to this multiple of the nearest open level
+_MOST_SPLITS = 40_000_000  # what a certificate can hold, and two gibibytes
+
+
+@dataclass(frozen=True, slots=True)
+class RingProof:
+    """Vdot < 0 is proved for `inner <= V <= outer` (equal if the ring is empty); `stop` says what ended the pass.
+
+    `tree` is the partition in preorder: an axis for a split, 255 for a leaf; `root` its half-widths (n,) in z.
+    `witness` is the lowest violation found along the way. `covered` is False if a pass inwards left boxes inside
+    the inner level on which F could not be enclosed.
+    """
+
+    inner: float
+    outer: float
+    stop: Stop
+    tree: bytes
+    root: Array
+    boxes: int
+    leaves: int
+    witness: Witness | None
+    covered: bool = True
+
+
+def prove_outwards(
+    problem: Problem,
+    T: Array,
+    inner: float,
+    target: float,
+    budget: Budget,
+    runner: Runner,
+    report: Report | None = None,
+    rule: VdotBound | None = None,
+) -> RingProof:
+    """Prove Vdot < 0 (and the input bounds) on `inner <= V <= level` for the largest level up to `target`.
+
+    Parameters
+    ----------
+    T : (n, n), invertible; boxes are drawn in z, x = T z.
+    inner, target : levels, 0 < inner <= target.
+    report : called after every batch.
+    rule : another bound for boxes, to compare with; None for `VdotBound`.
+
+    Notes
+    -----
+    Deterministic for a machine and a number of threads, unless `budget.seconds` stops the pass.
+    """
+    root = _root(problem, T, target)
+    if inner >= target:  # the ring is empty
+        return RingProof(target, target, Stop.REQUESTED, bytes([LEAF]), root, 0, 1, None)
+    sweep = _Outwards(problem, T, inner, target)
+    return _run(sweep, root, budget, runner, report, rule or VdotBound(problem, T, runner.device))
+
+
+def prove_inwards(
+    problem: Problem,
+    T: Array,
+    floor: float,
+    outer: float,
+    budget: Budget,
+    runner: Runner,
+    report: Report | None = None,
+) -> RingProof:
+    """Prove Vdot < 0 on `level <= V <= outer` for the smallest level from `floor` on, and F and its inputs inside it.
+
+    Parameters are those of `prove_outwards`. On {V < level} every leaf of the tree has a finite enclosure of F
+    and inputs in their bounds; if the budget ends before, the proof is not `covered`.
+    """
+    sweep = _Inwards(problem, T, floor, outer)
+    rule = VdotBound(problem, T, runner.device, inside=True)
+    return _run(sweep, _root(problem, T, outer), budget, runner, report, rule)
+
+
+def _root(problem: Problem, T: Array, level: float) -> Array:
+    """Half-widths (n,) of a box in z around {V <= level}, a hair larger for the checker's rounding."""
+    S = T.T @ problem.V.P @ T
+    return np.asarray(np.sqrt(level * np.diag(np.linalg.inv(S))) * (1 + 1e-9))
+
+
+class _Sweep(ABC):
+    """The moving level of a pass: `inner` or `outer` gives way to what cannot be proved."""
+
+    def __init__(self, problem: Problem, T: Array, inner: float, outer: float) -> None:
+        self.problem, self.T = problem, T
+        self.inner, self.outer = inner, outer
+        self.witness: Witness | None = None
+
+    @abstractmethod
+    def key(self, lowest: Tensor, highest: Tensor) -> Tensor:
+        """Ascending in the order in which boxes are taken, from the bounds of V on them (B,)."""
+
+    @abstractmethod
+    def wanted(self, lowest: Tensor, highest: Tensor) -> Tensor:
+        """True for boxes (B,) that still have to be decided."""
+
+    @abstractmethod
+    def reach(self, least: float) -> float:
+        """The key up to which a batch may go, where `least` is the smallest."""
+
+    @abstractmethod
+    def last(self) -> float:
+        """The key beyond which open boxes no longer count."""
+
+    @abstractmethod
+    def violated(self, centres: Tensor, level: Tensor) -> bool:
+        """Move the level off violations at `centres` (n, B), V being `level` (infinite elsewhere); True if it moved."""
+
+    @abstractmethod
+    def stuck(self, lowest: Tensor, highest: Tensor) -> bool:
+        """Move the level off boxes that are too small to halve; True if it moved."""
+
+    @abstractmethod
+    def settle(self, least: float) -> bool:
+        """Take what is proved when the budget ends, `least` the smallest open key; True if open boxes still matter."""
+
+    @abstractmethod
+    def stand(self, least: float) -> tuple[float, float, float]:
+        """(level reached, level aimed at, share of the ring's volume that lies between)."""
+
+    def share(self, a: float, b: float) -> float:
+        """The volume of `a <= V <= b` as a share of the ring's."""
+        power = len(self.T) / 2
+        whole = self.outer**power - self.inner**power
+        return float(min(1.0, max(0.0, (b**power - a**power) / whole))) if whole > 0 else 1.0
+
+
+class _Outwards(_Sweep):
+    def key(self, lowest: Tensor, highest: Tensor) -> Tensor:
+        return lowest
+
+    def wanted(self, lowest: Tensor, highest: Tensor) -> Tensor:
+        return (lowest <= self.outer * (1 + _SLACK)) & (highest >= self.inner * (1 - _SLACK))
+
+    def reach(self, least: float) -> float:
+        return _SHELL * max(least, self.inner)
+
+    def last(self) -> float:
+        return self.outer * (1 + _SLACK)
+
+    def violated(self, centres: Tensor, level: Tensor) -> bool:
+        lowest = float(level.min())
+        if lowest > self.outer:
+            return False
+        found = descend(self.problem, self.T, centres[:, level.argmin()].cpu().numpy())
+        if found is not None and (self.witness is None or found.level < self.witness.level):
+            self.witness = found
+        known = math.inf if self.witness is None else self.witness.level
+        self.outer = min(lowest, known) * (1 - _BESIDE_WITNESS)
+        return True
+
+    def stuck(self, lowest: Tensor, highest: Tensor) -> bool:
+        bottom = float(lowest.min()) if len(lowest) else math.inf
+        if not bottom < self.outer:
+            return False
+        self.outer = bottom * (1 - _SLACK)
+        return True
+
+    def settle(self, least: float) -> bool:
+        self.outer = least * (1 - 2 * _SLACK)
+        return False
+
+    def stand(self, least: float) -> tuple[float, float, float]:
+        level = max(self.inner, min(least, self.outer))
+        return level, self.outer, self.share(self.inner, level)
+
+
+class _Inwards(_Sweep):
+    def key(self, lowest: Tensor, highest: Tensor) -> Tensor:
+        return -highest
+
+    def wanted(self, lowest: Tensor, highest: Tensor) -> Tensor:
+        return lowest <= self.outer * (1 + _SLACK)
+
+    def reach(self, least: float) -> float:
+        return least / _SHELL
+
+    def last(self) -> float:
+        return math.inf
+
+    def violated(self, centres: Tensor, level: Tensor) -> bool:
+        highest = float(torch.where(level <= self.outer, level, -math.inf).max())
+        if not highest >= self.inner:
+            return False
+        self.inner = highest * (1 + _BESIDE_WITNESS)
+        return True
+
+    def stuck(self, lowest: Tensor, highest: Tensor) -> bool:
+        top = float(highest.max()) if len(highest) else -math.inf
+        if not top >= self.inner:
+            return False
+        self.inner = top * (1 + 2 * _SLACK)
+        return True
+
+    def settle(self, least: float) -> bool:
+        self.inner = max(self.inner, -least * (1 + 2 * _SLACK))
+        return True
+
+    def stand(self, least: float) -> tuple[float, float, float]:
+        level = max(self.inner, min(-least, self.outer))
+        return level, self.inner, self.share(level, self.outer)
+
+
+def _run(
+    sweep: _Sweep, root: Array, budget: Budget, runner: Runner, report: Report | None, rule: VdotBound
+) -> RingProof:
+    """The pass: take boxes, bound them, give way to violations, halve what is undecided."""
+    start = time.monotonic()
+    device = runner.device
+    partition = Partition(root)
+    frontier = Frontier(partition, device)
+    half = torch.tensor(root, device=device)[:, None]
+    first = torch.zeros(1, dtype=torch.int64, device=device)
+    frontier.add(-half, half, sweep.key(*rule.levels(-half, half)), first)
+    clock = _Clock()
+    boxes, most, seconds = 0, budget.boxes, budget.seconds
+    stop, covered, settled = Stop.REQUESTED, True, False
+    with runner.start(rule) as bound:
+        while len(frontier):
+            full = boxes >= most or partition.splits + 3 * budget.batch > _MOST_SPLITS
+            if full or time.monotonic() - start > seconds:
+                stop = Stop.BOXES if full else Stop.TIME
+                if settled or not sweep.settle(frontier.least()):
+                    covered = not settled
+                    break
+                settled, most, seconds = True, 2 * most, 2 * seconds  # what is open lies inside and needs one look each
+                continue
+            lo, hi, number = frontier.take(min(budget.batch, most - boxes), sweep.reach(frontier.least()))
+            boxes += lo.shape[1]
+            found = bound(lo, hi, sweep.inner, sweep.outer)
+            centres = 0.5 * lo + 0.5 * hi
+            if sweep.violated(centres, torch.where(found.violated, rule.levels_at(centres), math.inf)):
+                stop = Stop.WITNESS
+            halves_lo, halves_hi, halves, small = _split(partition, lo, hi, number, found, budget.least_width * half)
+            if bool(small.any()):
+                covered = covered and bool(found.smooth[small].all())
+                if sweep.stuck(*rule.levels(lo[:, small], hi[:, small])):
+                    stop = Stop.BOXES
+            lowest, highest = rule.levels(halves_lo, halves_hi)
+            keep = sweep.wanted(lowest, highest)
+            frontier.add(halves_lo[:, keep], halves_hi[:, keep], sweep.key(lowest, highest)[keep], halves[keep])
+            frontier.drop_above(sweep.last())
+            if report is not None:
+                report(clock.read(*sweep.stand(frontier.least()), boxes, len(frontier)))
+    del frontier
+    if sweep.outer <= sweep.inner:  # nothing beyond the inner level
+        return RingProof(sweep.inner, sweep.inner, stop, bytes([LEAF]), root, boxes, 1, sweep.witness, covered)
+    tree = partition.preorder()
+    leaves = tree.count(bytes([LEAF]))
+    return RingProof(sweep.inner, sweep.outer, stop, tree, root, boxes, leaves, sweep.witness, covered)
+
+
+def _split(
+    partition: Partition, lo: Tensor, hi: Tensor, number: Tensor, found: BoxBounds, least_width: Tensor
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Halve the boxes that are not proved: corners (n, B) and numbers of the halves, and which boxes are too small.
+
+    A half whose bound would stay positive if the split took away three quarters of its axis's share is halved
+    again at once, along the next axis.
+    """
+    undecided = ~found.proved
+    lo, hi, number = lo[:, undecided], hi[:, undecided], number[undecided]
+    bound, score = found.bound[undecided], found.score[:, undecided]
+    # An axis that is already much thinner than the others, or too thin to halve, is not split.
+    width = hi - lo
+    relative = width / least_width
+    score = torch.where((relative * 2.0**12 < relative.amax(0)) | (relative < 2), -torch.inf, score)
+    best = score.amax(0)
+    stuck = best == -torch.inf
+    small = undecided.clone()
+    small[undecided] = stuck
+    if bool(stuck.any()):
+        lo, hi, number, bound, score, best = (a[..., ~stuck] for a in (lo, hi, number, bound, score, best))
+    order = score.argsort(dim=0, descending=True, stable=True)
+    lo, hi, number = _halve(partition, lo, hi, number, order[0])
+    if len(order) > 1:
+        second = score.gather(0, order[1:2])[0]
+        again = ((bound - 0.75 * best > 0) & (second > -torch.inf)).repeat_interleave(2)
+        axis = order[1].repeat_interleave(2)[again]
+        quarters = _halve(partition, lo[:, again], hi[:, again], number[again], axis)
+        halves = lo[:, ~again], hi[:, ~again], number[~again]
+        lo, hi, number = (torch.cat(pair, -1) for pair in zip(halves, quarters, strict=True))
+    return lo, hi, number, small
+
+
+def _halve(partition: Partition, lo: Tensor, hi: Tensor, number: Tensor, axis: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Corners (n, 2B) and numbers (2B,) of the halves along `axis` (B,), lower and upper in turn."""
+    n, count = lo.shape
+    index = torch.arange(count, device=lo.device)
+    middle = 0.5 * lo[axis, index] + 0.5 * hi[axis, index]
+    lower_hi, upper_lo = hi.clone(), lo.clone()
+    lower_hi[axis, index] = middle
+    upper_lo[axis, index] = middle
+    halves = partition.split(number.cpu().numpy(), axis.cpu().numpy())
+    return (
+        torch.stack([lo, upper_lo], 2).reshape(n, 2 * count),
+        torch.stack([lower_hi, hi], 2).reshape(n, 2 * count),
+        torch.tensor(halves, device=lo.device),
+    )
+
+
+class _Clock:
+    """Extrapolates how long a pass still takes: seconds grow about as a power of the volume that is done."""
+
+    def __init__(self) -> None:
+        self.start = time.monotonic()
+        self.history: list[tuple[float, float]] = []
+
+    def read(self, level: float, target: float, share: float, boxes: int, open_: int) -> Progress:
+        seconds = time.monotonic() - self.start
+        self.history.append((seconds, share))
+        earlier = next((s for t, s in reversed(self.history) if t <= seconds / 2), share)
+        left = None
+        if 0 < earlier < share:
+            growth = math.log(2) / math.log(share / earlier)
+            left = seconds * math.expm1(min(700.0, -growth * math.log(share)))
+        return Progress(level, target, boxes, open_, share, left)

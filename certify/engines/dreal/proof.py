@@ -1,0 +1,219 @@
+"""The paper's way: levels by bisection, each step one query to dReal.
+
+The local level grows from a guess as long as its query is unsatisfiable; the ring is asked from the local level to the
+target at once, and by bisection only if that fails. A "delta-sat" is looked at in Arb: if its box holds a genuine
+violation, that caps the level (or refutes the one that was asked for), else nothing is known there.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.certificate import TrustedSolver
+from certify.claims import Asymptotic, Claim, Condition, Problem, conditions
+from certify.claims.conditions import domain_conditions, input_conditions, local_condition, ring_condition
+from certify.claims.queries import query
+from certify.engines.base import Budget, Proof, Report, Task
+from certify.engines.dreal.backend import Answer, Backend, decide, find_backend
+from certify.engines.falsify import Witness, confirm
+from certify.engines.local import prove_local
+from certify.errors import BackendError, InputError
+from certify.verdict import Stop
+
+Array = NDArray[np.float64]
+_LOCAL_RATIO, _RING_RATIO = 1.05, 1.002  # at which bisection stops
+_BELOW_WITNESS = 1e-3
+_LOCAL_SHARE = 0.3  # of the time, after which a local level that is there will do
+
+
+@dataclass(frozen=True, slots=True)
+class DrealOptions:
+    """`precision` is dReal's delta, `jobs` its threads, `seconds` for all queries together."""
+
+    precision: float = 1e-3
+    jobs: int = 1
+    seconds: float = 600.0
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """A query, the level it was about, and the answer."""
+
+    name: str
+    level: float
+    answer: Answer
+
+
+class DrealEngine:
+    """The claim `asymptotic` by queries; T (n, n) gives the coordinates in which the first local level is guessed."""
+
+    def __init__(self, T: Array, precision: float, jobs: int) -> None:
+        self.T, self.precision, self.jobs = T, precision, jobs
+
+    def prove(self, task: Task, budget: Budget, report: Report | None = None) -> Proof:
+        """A local level near the largest, and the largest level up to the target with every query unsatisfiable.
+
+        Raises
+        ------
+        InputError : the claim is another than `asymptotic`.
+        """
+        if task.kind != "asymptotic":
+            raise InputError(f"engine dreal proves the claim asymptotic only, not {task.kind}. Use engine bounds.")
+        start = time.perf_counter()
+        try:
+            backend = find_backend()
+        except BackendError as error:
+            return Proof(None, None, Stop.SOLVER, str(error))
+        guess = prove_local(task.problem, self.T, task.target)
+        local = time.perf_counter() - start
+        options = DrealOptions(self.precision, self.jobs, budget.seconds - local)
+        session = _Session(task.problem, backend, options, None)
+        first = 16 * guess if guess is not None else 1e-4 * task.target
+        inner, level, stop, detail = session.levels(first, task.target)
+        seconds = {"local": local, "ring": time.perf_counter() - start - local}
+        reached = {} if inner is None else {"local": inner} | ({} if level is None else {"roa": level})
+        record = record_of(backend.version, options, session.asked)
+        proof = Proof(
+            None, None, stop, detail, session.witness, partial=reached, solver=record, seconds=seconds
+        )
+        if inner is None or level is None:
+            return proof
+        answers = tuple((f"{a.name}-{a.level!r}", a.answer.status) for a in session.asked)
+        evidence = TrustedSolver("dreal", backend.version, self.precision, answers)
+        return replace(proof, claim=Asymptotic(roa=level, local=min(inner, level)), evidence=evidence)
+
+
+def confirm_with_dreal(
+    problem: Problem, claim: Claim, backend: Backend, options: DrealOptions
+) -> tuple[tuple[Asked, ...], Witness | None]:
+    """Ask dReal for every condition of a claim that was proved otherwise; a witness contradicts that proof."""
+    session = _Session(problem, backend, options, None)
+    for condition in conditions(claim, problem):
+        session.ask(condition, claim.inner if condition.name == "local" else claim.roa)
+    return tuple(session.asked), session.witness
+
+
+def record_of(version: str, options: DrealOptions, asked: Sequence[Asked]) -> dict[str, Any]:
+    """The record of every query, for JSON."""
+    rows = [
+        {
+            "query": a.name,
+            "level": a.level,
+            "answer": a.answer.status,
+            "seconds": a.answer.seconds,
+            "detail": a.answer.detail,
+        }
+        for a in asked
+    ]
+    return {"solver": "dreal", "version": version, "precision": options.precision, "queries": rows}
+
+
+@dataclass
+class _Session:
+    problem: Problem
+    backend: Backend
+    options: DrealOptions
+    progress: Callable[[str, float], None] | None
+    asked: list[Asked] = field(default_factory=list)
+    witness: Witness | None = None
+
+    def __post_init__(self) -> None:
+        self.deadline = time.monotonic() + self.options.seconds
+
+    def levels(self, guess: float, target: float) -> tuple[float | None, float | None, Stop, str]:
+        """(local level, largest level, what stopped it, details)."""
+        inner = self.local(guess, target)
+        if inner is None:
+            return None, None, Stop.LOCAL, "dReal confirms no local level"
+        top = target
+        if not self.all_unsat(domain_conditions(self.problem, top)):
+            # A set that touches the domain is delta-sat; the checker decides it exactly.
+            top *= 1 - 4 * self.options.precision
+        inner = min(inner, top)
+        # The local query is about Vdot alone, and the ring may add nothing to it.
+        if not self.all_unsat(input_conditions(self.problem, inner)):
+            return inner, None, Stop.INPUTS, "dReal does not confirm their bounds on the local level"
+        level, stop, detail = self.ring(inner, top)
+        return (inner, level, Stop.REQUESTED, "") if level >= target else (inner, level, stop, detail)
+
+    def left(self) -> float:
+        return self.deadline - time.monotonic()
+
+    def ask(self, condition: Condition, level: float) -> bool:
+        """True only for "unsat"."""
+        if self.progress is not None:
+            self.progress(condition.name, level)
+        if self.left() <= 0:
+            return False
+        allowed = min(self.left(), 0.5 * _LOCAL_SHARE * self.options.seconds if condition.name == "local" else math.inf)
+        asked = query(condition, self.problem)
+        answer = decide(self.backend, asked, self.options.precision, self.options.jobs, allowed)
+        self.asked.append(Asked(condition.name, level, answer))
+        if answer.status == "delta-sat" and (condition.name == "ring" or condition.name.startswith("inputs")):
+            self._look(answer, "vdot" if condition.name == "ring" else "input", level)
+        return answer.status == "unsat"
+
+    def all_unsat(self, wanted: Sequence[Condition]) -> bool:
+        return all(self.ask(c, c.guards[-1].level) for c in wanted)
+
+    def local(self, guess: float, target: float) -> float | None:
+        """Geometric bisection from the guess."""
+        low, high = None, None
+        level = min(guess, target)
+        while level > 1e-12 * target:
+            enough = low is not None and self.left() < (1 - _LOCAL_SHARE) * self.options.seconds
+            if self.left() <= 0 or enough:
+                break
+            if self.ask(local_condition(level), level):
+                low = level
+                if level >= target:
+                    break
+                level = min(4 * level, target) if high is None else math.sqrt(low * high)
+            else:
+                high = level
+                level = level / 4 if low is None else math.sqrt(low * high)
+            if low is not None and high is not None and high < _LOCAL_RATIO * low:
+                break
+        return low
+
+    def ring(self, inner: float, target: float) -> tuple[float, Stop, str]:
+        """(largest level on which ring and inputs are unsatisfiable, what stopped it, details)."""
+        low, high, level = inner, target, target
+        while high > _RING_RATIO * low or level == target:
+            if self.left() <= 0:
+                return low, Stop.TIME, ""
+            ring = level <= low or self.ask(ring_condition(low, level), level)
+            if ring and self.all_unsat(input_conditions(self.problem, level)):
+                low = level
+                if level >= target:
+                    return level, Stop.REQUESTED, ""
+            else:
+                high = level
+            if self.witness is not None and self.witness.level < high:
+                high = self.witness.level * (1 - _BELOW_WITNESS)
+            level = math.sqrt(low * high)
+        if self.witness is not None:
+            return low, Stop.WITNESS, ""
+        return low, Stop.SOLVER, "dReal gives no answer above"
+
+    def _look(self, answer: Answer, kind: Literal["vdot", "input"], level: float) -> None:
+        """Points of the answer's box, in Arb: a genuine violation below the level becomes the witness."""
+        names = [s.name for s in self.problem.loop.system.states]
+        box = np.array([answer.box.get(name, (math.nan, math.nan)) for name in names])
+        if not np.all(np.isfinite(box)):
+            return
+        generator = np.random.default_rng(0)
+        shares = np.concatenate([[0.5 * np.ones(len(box))], generator.random((15, len(box)))])
+        for x in box[:, 0] + shares * (box[:, 1] - box[:, 0]):
+            V = float(self.problem.V(x))
+            witness = Witness(x, V, kind)
+            lower = self.witness is None or self.witness.level > V
+            if level >= V and lower and confirm(self.problem, witness):
+                self.witness = witness

@@ -1,0 +1,9 @@
+"""Expressions of plants: as nested lists, and evaluated in any arithmetic. The one list of functions is here."""
+
+from __future__ import annotations
+
+from certify.expressions.evaluate import Algebra, evaluate
+from certify.expressions.rational import evaluate_exactly
+from certify.expressions.tree import FUNCTIONS, Tree, from_tree, to_tree
+
+__all__ = ["FUNCTIONS", "Algebra", "Tree", "evaluate", "evaluate_exactly", "from_tree", "to_tree"]

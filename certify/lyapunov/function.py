@@ -1,0 +1,54 @@
+"""Lyapunov functions as values. Quadratic ones are all there is today; claims and engines ask only for what is here."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.errors import InputError
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Quadratic:
+    """`V(x) = x'Px`, the entries of P meaning exactly their binary64 values.
+
+    Parameters
+    ----------
+    P : (n, n), symmetric, finite. That it is positive definite is a condition of the claim, decided in rationals.
+
+    Raises
+    ------
+    InputError : P is not a finite symmetric matrix.
+    """
+
+    P: Array
+
+    def __post_init__(self) -> None:
+        P = np.array(self.P, dtype=np.float64)
+        if P.ndim != 2 or P.shape[0] != P.shape[1] or not np.all(np.isfinite(P)):
+            raise InputError(f"`P` must be a finite square matrix; found shape {P.shape}.")
+        if not np.array_equal(P, P.T):
+            i, j = np.argwhere(P != P.T)[0]
+            raise InputError(f"`P` must be symmetric; P[{i}, {j}] = {P[i, j]} but P[{j}, {i}] = {P[j, i]}.")
+        P.setflags(write=False)
+        object.__setattr__(self, "P", P)
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return len(self.P)
+
+    def __call__(self, x: Array) -> Array:
+        """V in float64, shape (..., n) to (...)."""
+        return np.asarray(x @ self.P @ x if x.ndim == 1 else ((x @ self.P) * x).sum(-1))
+
+    def exactly(self, x: Array) -> Fraction:
+        """V at a binary64 point, shape (n,), as a rational."""
+        exact = [Fraction(float(v)) for v in x]
+        rows = (sum((Fraction(float(p)) * v for p, v in zip(row, exact, strict=True)), Fraction(0)) for row in self.P)
+        return sum((v * r for v, r in zip(exact, rows, strict=True)), Fraction(0))
