@@ -137,7 +137,8 @@ def _affine(W: Array, b: Array, h: Balls) -> Balls:
 
 def _through_tanh(y: Balls, J: flint.arb_mat) -> tuple[Balls, flint.arb_mat]:
     t = [v.tanh() for v in y]
-    return t, flint.arb_mat([[(1 - t[i] ** 2) * J[i, j] for j in range(J.ncols())] for i in range(J.nrows())])
+    slope = [1 - v * v for v in t]  # Arb's own power is NaN for a ball around 0
+    return t, flint.arb_mat([[slope[i] * J[i, j] for j in range(J.ncols())] for i in range(J.nrows())])
 
 
 def _matrix(W: Array) -> flint.arb_mat:

@@ -249,7 +249,7 @@ def test_the_installed_command(tmp_path: Path) -> None:
 def test_an_interrupt_leaves_nothing_half_written(
     where: str, tmp_path: Path, policy_file: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from certify.engines.vdot import VdotBound
+    from certify.engines.bounds.rule import VdotBound
 
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt

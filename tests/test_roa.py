@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from fractions import Fraction
 from pathlib import Path
@@ -10,10 +11,11 @@ import numpy as np
 import pytest
 import sympy
 
+from certify.certificate import Certificate, run_checker
 from certify.errors import BackendError, InputError, SoundnessError
 from certify.lyapunov import solve_lyapunov
 from certify.policies import TanhNetwork, load_policy
-from certify.roa import RoaOptions, certify_roa, run_checker
+from certify.roa import RoaOptions, certify_roa
 from certify.systems import System, get_system
 from certify.verdict import Verdict
 from tests.support.loops import box, chain, pendulum_network, scalar_tanh
@@ -33,7 +35,7 @@ def test_linear_plants_reach_their_domain(tmp_path: Path, n: int) -> None:
         Fraction(hi) ** 2 / Fraction(int(inverse[i, i].p), int(inverse[i, i].q))
         for i, (_, hi) in enumerate(system.domain)
     )
-    level = result.levels["roa"]
+    level = result.levels.roa
     assert level is not None
     assert 0.99 * float(limit) <= level and Fraction(level) < limit
 
@@ -72,7 +74,7 @@ def test_scalar_plant_just_inside_and_just_outside(tmp_path: Path, x: float, ver
     result = certify_roa(*scalar_tanh(), tmp_path, RoaOptions(level=x * x))
     assert result.verdict is verdict
     if verdict is Verdict.PROVED:
-        assert result.levels["roa"] == x * x
+        assert result.levels.roa == x * x
     else:
         assert result.witness is not None and result.witness.level <= x * x
         assert not (tmp_path / "certificate.json").exists()
@@ -80,7 +82,7 @@ def test_scalar_plant_just_inside_and_just_outside(tmp_path: Path, x: float, ver
 
 def test_scalar_plant_largest_level(tmp_path: Path) -> None:
     result = certify_roa(*scalar_tanh(), tmp_path)
-    level = result.levels["roa"]
+    level = result.levels.roa
     assert result.verdict is Verdict.PROVED and result.reason == "witness"
     assert level is not None and 0.99 * 1.915008**2 < level < 1.915009**2
 
@@ -110,9 +112,9 @@ def test_levels_scale_with_P(tmp_path: Path, pendulum: System) -> None:
     """(P, c) -> (aP, ac) leaves the set as it is."""
     network = pendulum_network((8, 8))
     base = certify_roa(pendulum, network, tmp_path)
-    assert base.P is not None and base.levels["roa"] is not None
+    assert base.P is not None and base.levels.roa is not None
     scaled = certify_roa(pendulum, network, tmp_path, RoaOptions(P=4.0 * base.P))
-    assert scaled.levels["roa"] == pytest.approx(4.0 * base.levels["roa"], rel=1e-5)
+    assert scaled.levels.roa == pytest.approx(4.0 * base.levels.roa, rel=1e-5)
 
 
 def test_the_lqr_candidate_solves_its_equation(tmp_path: Path, pendulum: System) -> None:
@@ -132,7 +134,7 @@ def test_input_bounds_limit_the_level(tmp_path: Path) -> None:
     network = TanhNetwork((np.array([[-1.5]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
     result = certify_roa(system, network, tmp_path)
     assert result.verdict is Verdict.PROVED and result.reason == "inputs"
-    level = result.levels["roa"]
+    level = result.levels.roa
     assert level is not None and 0.99 * (4 / 9) / 2 < level < (4 / 9) / 2
 
 
@@ -146,7 +148,7 @@ def test_the_largest_level_within_a_budget_is_still_proved(tmp_path: Path, pendu
     result = certify_roa(pendulum, pendulum_network(), tmp_path, RoaOptions(max_boxes=150))
     full = certify_roa(pendulum, pendulum_network(), tmp_path)
     assert result.verdict is Verdict.PROVED and result.reason == "boxes"
-    local, level, best = result.levels["local"], result.levels["roa"], full.levels["roa"]
+    local, level, best = result.levels.local, result.levels.roa, full.levels.roa
     assert local is not None and level is not None and best is not None
     assert local <= level < best
 
@@ -156,8 +158,8 @@ def test_the_shipped_policy(tmp_path: Path, pendulum: System) -> None:
     assert policy.network.layers == (2, 16, 16, 1)
     result = certify_roa(pendulum.with_parameters(policy.parameters), policy.network, tmp_path)
     assert result.verdict is Verdict.PROVED
-    roa, limit = result.levels["roa"], result.levels["domain_limit"]
-    sampled = result.levels.get("sampled_limit")
+    roa, limit = result.levels.roa, result.levels.domain_limit
+    sampled = result.levels.sampled_limit
     assert roa is not None and limit is not None
     assert roa >= 0.95 * min(limit, sampled if sampled is not None else np.inf)
     data = json.loads(json.dumps(result.to_dict()))
@@ -173,17 +175,14 @@ def test_equal_runs_write_equal_certificates(tmp_path: Path, pendulum: System) -
 
 
 def test_a_rejection_is_a_soundness_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """If the engine case too much, the run ends loudly and never in PROVED."""
-    import certify.roa as roa
+    """If the engine claims too much, the run ends loudly and never in PROVED."""
+    honest = Certificate.to_json
 
-    honest = roa.write_certificate
+    def exaggerate(certificate: Certificate) -> str:
+        claim = dataclasses.replace(certificate.claim, roa=certificate.roa * 1.5)
+        return honest(dataclasses.replace(certificate, claim=claim))
 
-    def exaggerate(path: Path, certificate: object) -> None:
-        import dataclasses
-
-        honest(path, dataclasses.replace(certificate, roa=certificate.roa * 1.5))  # type: ignore[type-var,attr-defined]
-
-    monkeypatch.setattr(roa, "write_certificate", exaggerate)
+    monkeypatch.setattr(Certificate, "to_json", exaggerate)
     with pytest.raises(SoundnessError, match="rejects"):
         certify_roa(*scalar_tanh(), tmp_path)
 
@@ -215,9 +214,9 @@ def test_bad_weights(tmp_path: Path) -> None:
 
 
 def test_a_verdict_is_not_a_bool() -> None:
-    with pytest.raises(TypeError, match="three values"):
+    with pytest.raises(TypeError, match="four values"):
         bool(Verdict.PROVED)
-    assert [v.exit_status for v in Verdict] == [0, 1, 3]
+    assert {v.name: v.exit_status for v in Verdict} == {"PROVED": 0, "TRUSTED": 3, "REFUTED": 1, "UNKNOWN": 3}
 
 
 def test_every_registered_plant_can_be_named() -> None:
