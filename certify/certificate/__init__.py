@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from certify.certificate.checking import run_checker
+from certify.certificate.limits import require_short, require_within_limits
 from certify.certificate.model import Certificate, PartitionTree, TrustedSolver, read_certificate
 from certify.certificate.writing import sole_writer, write_atomically, write_beside
 
@@ -11,6 +12,8 @@ __all__ = [
     "PartitionTree",
     "TrustedSolver",
     "read_certificate",
+    "require_short",
+    "require_within_limits",
     "run_checker",
     "sole_writer",
     "write_atomically",
