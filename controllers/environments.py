@@ -16,7 +16,6 @@ entry points of installed packages; an id that names this module finds the envir
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -26,19 +25,11 @@ from numpy.typing import NDArray
 
 from certify.errors import InputError
 from certify.systems import System, get_system
+from certify.systems.ode import rk4_step
 from controllers.options import PRESETS, TrainingOptions, preset
 
 Array = NDArray[np.float64]
 Module = Literal["numpy", "torch"]
-
-
-def rk4(f: Callable[[Any], Any], x: Any, h: float) -> Any:
-    """One classical Runge-Kutta step of `xdot = f(x)`, numpy or torch, any leading shape."""
-    k1 = f(x)
-    k2 = f(x + (h / 2) * k1)
-    k3 = f(x + (h / 2) * k2)
-    k4 = f(x + h * k3)
-    return x + (h / 6) * (k1 + 2 * k2 + 2 * k3 + k4)
 
 
 class Stepper:
@@ -63,7 +54,7 @@ class Stepper:
         self._f = system.function(module)
 
     def __call__(self, x: Any, u: Any) -> Any:
-        return rk4(lambda state: self._f(state, u), x, self.dt)
+        return rk4_step(lambda state: self._f(state, u), x, self.dt)
 
 
 @dataclass(frozen=True, slots=True)

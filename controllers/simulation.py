@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 from certify.errors import InputError
 from certify.policies import TanhNetwork
 from certify.systems import System
-from controllers.environments import Stepper, rk4
+from certify.systems.ode import rk4_step
+from controllers.environments import Stepper
 
 Array = NDArray[np.float64]
 Action = Callable[[Array], Array]
@@ -43,6 +44,12 @@ class Loop:
     step : states (N, n) and inputs (N, m) to the next states.
     act : states (N, n) to inputs (N, m); never asked about a state that has diverged.
     cost : states and inputs to the running cost (N,), per second.
+
+    Notes
+    -----
+    The arithmetic of a trajectory is its own, to the last bit, whatever else is in the batch, as far as that holds for
+    `act`. It does not hold for a matrix product, and so not for a network: BLAS chooses its kernel, with or without
+    fused multiply-adds, by the number of rows.
     """
 
     step: Callable[[Array, Array], Array]
@@ -79,7 +86,7 @@ def continuous_loop(system: System, h: float, act: Action, Q: Array, R: Array) -
 
     def step(x: Array, u: Array) -> Array:
         # The first stage is at x itself, where the action is already known.
-        return np.asarray(rk4(lambda y: f(y, u if y is x else act(y)), x, h))
+        return np.asarray(rk4_step(lambda y: f(y, u if y is x else act(y)), x, h))
 
     return Loop(step, act, _cost(system, Q, R), h)
 
