@@ -14,22 +14,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from certify.errors import InputError
 from certify.policies import TanhNetwork
 from certify.systems import System
 from certify.systems.ode import rk4_step
 from controllers.environments import Stepper
+from controllers.options import get_plant
 
 Array = NDArray[np.float64]
 Action = Callable[[Array], Array]
-
-INITIAL_STATES: dict[str, tuple[float, ...]] = {
-    "pendulum": (math.pi / 2, 2.0),
-    "cartpole": (1.0, 0.5, 1.0, 1.0),
-    "quadrotor2d": (1.0, 1.0, 0.5, 1.0, 1.0, 1.0),
-    "quadrotor3d": (*(0.5,) * 3, *(0.3,) * 3, *(0.5,) * 6),
-}
-"""Half-widths of the box from which each plant's initial states are drawn, in the states' units."""
 
 DIVERGED = 1e9
 """Bound on |x_i|, in the states' units: beyond it a trajectory counts as diverged."""
@@ -99,15 +91,15 @@ def mean_action(network: TanhNetwork, system: System) -> Action:
 
 
 def initial_states(system: System, count: int, seed: int) -> Array:
-    """States (count, n), uniform in the plant's box of `INITIAL_STATES`.
+    """States (count, n), uniform in the box that the plant's file gives.
 
     Raises
     ------
-    InputError : the plant has no such box.
+    InputError : the plant has no such file, or it does not fit the plant's states.
     """
-    if system.name not in INITIAL_STATES:
-        raise InputError(f"no box of initial states is known for the plant {system.name}.")
-    half_widths = np.array(INITIAL_STATES[system.name])
+    plant = get_plant(system.name)
+    plant.check(system)
+    half_widths = np.array(plant.initial_states)
     return np.random.default_rng(seed).uniform(-half_widths, half_widths, (count, system.n))
 
 

@@ -15,11 +15,12 @@ from typer.testing import CliRunner
 from certify.errors import InputError
 from certify.policies import load_policy
 from certify.systems import available_systems, get_system
-from controllers import baselines, compare, figures, options, simulation
+from controllers import baselines, compare, figures, simulation
 from controllers.cli import app
 from controllers.compare import simulate
 from controllers.environments import PlantEnvironment
-from controllers.options import preset
+from controllers.options import get_plant, preset
+from controllers.plants import pendulum
 from controllers.responses import (
     ABLATIONS,
     BASELINES,
@@ -31,7 +32,6 @@ from controllers.responses import (
     remaining,
     table,
 )
-from controllers.simulation import INITIAL_STATES
 
 TINY = replace(preset("pendulum"), steps=160, warm_up=60, n_A=25, n_B=25, batch=8, actor=(6, 5), critic=(7,))
 SHORT = CompareOptions(seeds=1, states=4, duration=1.2)
@@ -147,8 +147,10 @@ def test_the_floor_is_the_median_of_the_largest_norm_in_the_last_second(pendulum
     other = replace(response, seed=1, x=0 * x)
     rows = table(pendulum_system, 0.02, [response, other], CompareOptions(duration=2.0))
     assert [(r.method, r.seed, r.trajectories) for r in rows] == [
-        ("sac mean", 0, 3), ("sac mean", 1, 3), ("sac mean", None, 6),
-    ]  # fmt: skip
+        ("sac mean", 0, 3),
+        ("sac mean", 1, 3),
+        ("sac mean", None, 6),
+    ]
     assert rows[0].floor == 2e-3 and rows[0].settled == 1 and rows[0].left_domain == 1
     assert (rows[0].cost_lower, rows[0].cost_median, rows[0].cost_upper) == (1.5, 2.0, 3.0)
     assert rows[2].settled == 4 and rows[2].floor == pytest.approx(5e-10)
@@ -160,8 +162,11 @@ def test_the_floor_is_the_median_of_the_largest_norm_in_the_last_second(pendulum
 def test_a_comparison_trains_every_run_and_writes_figures_and_table(finished):
     runs, out, result, lines = finished
     assert sorted(str(path.relative_to(runs)) for path in runs.rglob("*") if path.is_file()) == [
-        "ours/seed-0/policy.pt", "sac/seed-0/checkpoint.pt", "sb3-ppo/seed-0/model.zip", "sb3-sac/seed-0/model.zip",
-    ]  # fmt: skip
+        "ours/seed-0/policy.pt",
+        "sac/seed-0/checkpoint.pt",
+        "sb3-ppo/seed-0/model.zip",
+        "sb3-sac/seed-0/model.zip",
+    ]
     assert "sac seed 0: 160 of 160 steps" in lines and "sb3-ppo seed 0: 16 of 160 steps" in lines
     for name in ("cost", "norm", "positions"):
         assert (out / f"pendulum-{name}.png").read_bytes().startswith(b"\x89PNG")
@@ -252,22 +257,12 @@ def test_numbers_on_a_logarithmic_axis_are_readable(finished, pendulum_system, t
     assert powers and all(label.get_parse_math() for label in powers)
 
 
-def test_positions_are_states_of_their_plants():
-    for name, positions in figures.POSITIONS.items():
-        try:
-            system = get_system(name)
-        except InputError:  # a plant that does not ship yet
-            continue
-        assert set(positions) <= {symbol.name for symbol in system.states}
-    assert set(INITIAL_STATES) <= set(figures.POSITIONS)
-
-
 def _compare(*arguments):
     return runner.invoke(app, ["compare", *map(str, arguments)])
 
 
 def test_the_command_prints_the_table_or_one_json_object(finished, tmp_path, monkeypatch):
-    monkeypatch.setitem(options.PRESETS, "pendulum", TINY)
+    monkeypatch.setattr(pendulum, "PLANT", replace(get_plant("pendulum"), preset=TINY))
     arguments = ["pendulum", "--runs", finished[0], "--out", tmp_path, "--seeds", 1, "--duration", 1.2, "--states", 4]
     result = _compare(*arguments, "--json")
     assert result.exit_code == 0, result.stderr
