@@ -75,6 +75,13 @@ WRITTEN = {
 """The equations of motion in a form of their own, with a state and an input."""
 
 
+def _own(name):
+    """The plant's own equations where nobody has written them in another form, half way to a corner of the domain."""
+    system = get_system(name)
+    f, u = system.function(), tuple(float(u) for u in system.exact_u_eq())
+    return lambda x, u: f(x, np.array(u)), tuple(0.5 * float(hi) for _, hi in system.domain), u
+
+
 @pytest.mark.parametrize("name", available_plants())
 def test_registered_environments_pass_the_checker(name):
     environment = gymnasium.make(f"certify/{name}-v0")
@@ -112,7 +119,7 @@ def test_observation_is_the_raw_float64_state_and_angles_are_not_wrapped(environ
 def test_step_agrees_with_a_fine_integration_of_the_written_equation(name):
     # By many small midpoint steps.
     environment, pieces = PlantEnvironment(get_system(name), preset(name)), 2000
-    f, start, u = WRITTEN[name]
+    f, start, u = WRITTEN.get(name) or _own(name)
     environment.reset(seed=0)
     environment.restore(replace(environment.snapshot(), x=start))
     x, h = np.array(start), environment.options.dt / pieces
