@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
 
@@ -11,10 +12,14 @@ import numpy as np
 import pytest
 import sympy
 
-from certify.certificate import Certificate, run_checker
+from certify.certificate import Certificate, checking, run_checker, sole_writer
+from certify.claims import Problem
+from certify.closed_loop import ClosedLoop
+from certify.engines.falsify import Witness, refutes
 from certify.errors import BackendError, InputError, SoundnessError
-from certify.lyapunov import solve_lyapunov
-from certify.policies import TanhNetwork, load_policy
+from certify.lyapunov import domain_limit, leaves_domain, solve_lyapunov
+from certify.lyapunov.function import Quadratic
+from certify.policies import TanhNetwork, bounded_by_form, load_policy
 from certify.roa import RoaOptions, certify_roa
 from certify.systems import System, get_system
 from certify.verdict import Verdict
@@ -221,3 +226,112 @@ def test_a_verdict_is_not_a_bool() -> None:
 
 def test_every_registered_plant_can_be_named() -> None:
     assert get_system("pendulum").name == "pendulum"
+
+
+def test_two_runs_in_one_folder_do_not_meet(tmp_path: Path) -> None:
+    with sole_writer(tmp_path), pytest.raises(InputError, match="another run is writing"):
+        certify_roa(*scalar_tanh(), tmp_path)
+    assert certify_roa(*scalar_tanh(), tmp_path, RoaOptions(level=1.0)).verdict is Verdict.PROVED
+
+
+def test_an_answer_about_other_bytes_is_no_proof(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another run's certificate is accepted in the place of this one's."""
+    other = certify_roa(*scalar_tanh(), tmp_path / "other", RoaOptions(level=1.0)).certificate
+    assert other is not None
+    monkeypatch.setattr("certify.roa.run_checker", lambda _: run_checker(other))
+    with pytest.raises(SoundnessError, match="other bytes"):
+        certify_roa(*scalar_tanh(), tmp_path / "mine", RoaOptions(level=2.0))
+    assert not (tmp_path / "mine" / "certificate.json").exists()
+
+
+def test_the_checker_beside_the_running_package_is_meant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "elsewhere" / "checker"
+    folder.mkdir(parents=True)
+    (folder / "__init__.py").write_text("")
+    (folder / "__main__.py").write_text("def main(arguments):\n    print('{\"error\": \"another\"}')\n    return 70\n")
+    monkeypatch.setattr(checking, "__file__", str(tmp_path / "elsewhere" / "certificate" / "checking.py"))
+    assert checking.ask(tmp_path) == (70, {"error": "another"})
+
+
+ILL = np.array([[1.0, 1.0 - 2.0**-40], [1.0 - 2.0**-40, 1.0]])
+
+
+def test_the_domain_is_decided_in_rationals() -> None:
+    """A float inverse of this P is off by more than the level's distance from the limit."""
+    domain = box(1, 1)
+    a, b = Fraction(ILL[0, 0]), Fraction(ILL[0, 1])
+    limit = (a * a - b * b) / a  # 1 / (P^-1)_11
+    level = float(limit)
+    while Fraction(level) >= limit:
+        level = float(np.nextafter(level, 0))
+    assert not leaves_domain(ILL, level, domain)
+    assert leaves_domain(ILL, float(np.nextafter(np.nextafter(level, 1), 1)), domain)
+    assert domain_limit(ILL, domain) <= float(limit)
+
+
+def test_a_witness_above_the_level_refutes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    x = np.array([1.9150081])
+    loop = ClosedLoop(*scalar_tanh())
+    problem = Problem(loop, Quadratic(np.eye(1)))
+    witness = Witness(x, float(x[0] ** 2), "vdot")
+    exact = Fraction(x[0]) ** 2
+    above, below = float(exact), float(exact)
+    while Fraction(above) < exact:
+        above = float(np.nextafter(above, 9))
+    while Fraction(below) >= exact:
+        below = float(np.nextafter(below, 0))
+    assert refutes(problem, witness, above) and not refutes(problem, witness, below)
+    monkeypatch.setattr("certify.roa.falsify", lambda *_: witness)
+    result = certify_roa(*scalar_tanh(), tmp_path, RoaOptions(level=3.0))
+    assert result.verdict is Verdict.PROVED and result.levels.roa == 3.0
+
+
+def test_a_policy_that_is_nearly_centred_is_named_before_any_work(tmp_path: Path) -> None:
+    system, network = scalar_tanh()
+    off = dataclasses.replace(network, biases=(np.array([1e-12]),))
+    with pytest.raises(InputError, match=r"not centred.*practical"):
+        certify_roa(system, off, tmp_path)
+
+
+def test_an_equilibrium_that_is_not_decided_in_rationals_is_named(tmp_path: Path) -> None:
+    x, u = sympy.symbols("x u")
+    dynamics = (sympy.sin(1 + x) - sympy.sin(1) + u,)
+    system = System("s", (x,), (u,), {}, dynamics, (sympy.Integer(0),), box(1), box(9))
+    network = TanhNetwork((np.array([[-5.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    with pytest.raises(InputError, match="not decided in rationals: sin of 1"):
+        certify_roa(system, network, tmp_path)
+
+
+def test_input_bounds_are_decided_in_rationals(tmp_path: Path) -> None:
+    """offset + scale is 1 + 2^-53, which rounds to the bound 1: the squash alone does not keep the input below it."""
+    half = float(np.nextafter(0.5, 1))
+    network = TanhNetwork((np.array([[-2.0]]),), (np.zeros(1),), np.array([half]), np.array([0.5]))
+    bounds = ((Fraction(-1), Fraction(1)),)
+    assert 0.5 + half == 1.0 and not bounded_by_form(network, bounds)
+    assert bounded_by_form(network, ((Fraction(-1), Fraction(2)),))
+
+
+@pytest.mark.parametrize(
+    ("dynamics", "named"),
+    [
+        (lambda x, u: u - x**65, "largest exponent"),
+        (lambda x, u: u - x * sympy.Rational(1, 10**1300), "digits"),
+        (lambda x, u: u - sum((x + k) * sympy.sin(x + k * x**2) for k in range(1, 3000)) * x**2, "nodes"),
+        (lambda x, u: u - nested(x, 101), "nesting"),
+    ],
+)
+def test_a_plant_too_large_for_a_certificate_is_named(
+    tmp_path: Path, dynamics: Callable[[sympy.Symbol, sympy.Symbol], sympy.Expr], named: str
+) -> None:
+    x, u = sympy.symbols("x u")
+    system = System("large", (x,), (u,), {}, (dynamics(x, u),), (sympy.Integer(0),), box(1), box(9))
+    network = TanhNetwork((np.array([[-5.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    with pytest.raises(InputError, match=f"too large for a certificate.*{named}"):
+        certify_roa(system, network, tmp_path)
+
+
+def nested(x: sympy.Symbol, depth: int) -> sympy.Expr:
+    result = x
+    for _ in range(depth):
+        result = sympy.sin(x * result)
+    return result

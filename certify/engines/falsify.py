@@ -42,8 +42,8 @@ class Witness:
 
 @dataclass(frozen=True, slots=True)
 class Band:
-    """Levels between which sampling found no violation; `below` and `above` are their neighbours, at which it did, or the
-    ends of what was sampled."""
+    """Levels between which sampling found no violation; `below` and `above` are their neighbours, at which it did,
+    or the ends of what was sampled."""
 
     below: float
     floor: float
