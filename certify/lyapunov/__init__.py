@@ -4,7 +4,15 @@ from __future__ import annotations
 
 from certify.lyapunov.candidates import solve_lyapunov
 from certify.lyapunov.choice import Candidate, Chosen, choose_candidate
-from certify.lyapunov.level_sets import diagonalising_coordinates, domain_limit, extents, semi_axes, volume
+from certify.lyapunov.level_sets import (
+    diagonalising_coordinates,
+    domain_limit,
+    extents,
+    inverse,
+    is_positive_definite,
+    semi_axes,
+    volume,
+)
 from certify.lyapunov.optimised import optimise_candidate
 
 __all__ = [
@@ -14,6 +22,8 @@ __all__ = [
     "diagonalising_coordinates",
     "domain_limit",
     "extents",
+    "inverse",
+    "is_positive_definite",
     "optimise_candidate",
     "semi_axes",
     "solve_lyapunov",
