@@ -3,11 +3,25 @@
 from __future__ import annotations
 
 from certify.certificate.model import (
+    INNER,
     Certificate,
     PartitionTree,
     TrustedSolver,
+    parse_certificate,
     read_certificate,
+    read_raw,
     write_certificate,
 )
+from certify.certificate.tree import leaves
 
-__all__ = ["Certificate", "PartitionTree", "TrustedSolver", "read_certificate", "write_certificate"]
+__all__ = [
+    "INNER",
+    "Certificate",
+    "PartitionTree",
+    "TrustedSolver",
+    "leaves",
+    "parse_certificate",
+    "read_certificate",
+    "read_raw",
+    "write_certificate",
+]

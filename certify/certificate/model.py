@@ -2,6 +2,10 @@
 
 Numbers never pass through decimal: hex floats, exact fractions, or raw little-endian bytes in base64. The reader here
 serves pictures and summaries; whether a certificate is valid is for the checker alone to say.
+
+A file may change between two reads, and some give other bytes at each. Whoever says something about a certificate
+reads it once (`read_raw`) and takes everything from these bytes: `parse_certificate`, their sha256, and the checker's
+answer about a file of its own that holds them.
 """
 
 from __future__ import annotations
@@ -26,6 +30,10 @@ from certify.systems.trees import from_tree, to_tree
 
 Array = NDArray[np.float64]
 SCHEMA = "certify-certificate/2"
+INNER = {"asymptotic": "local", "practical": "floor"}
+"""Of each claim's kind, what the file calls the inner level."""
+MAX_BYTES = 256 * 2**20
+_LONGEST_UNIT = 40
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,8 +64,9 @@ class Certificate:
     ----------
     system, network : the closed loop; parameters are already put into the equations.
     P : (n, n).
-    local, roa : the levels c1 <= c2.
-    provenance : anything that helps people; the checker ignores it.
+    local, roa : the inner and the outer level; what the inner one means is for the claim to say, see `inner`.
+    provenance : anything that helps people; the checker ignores it. The plant's units are written there too.
+    kind : the claim's, "asymptotic" or "practical" (FORMAT.md).
     """
 
     system: System
@@ -67,13 +76,23 @@ class Certificate:
     roa: float
     evidence: PartitionTree | TrustedSolver
     provenance: Mapping[str, Any] = field(default_factory=dict)
+    kind: str = "asymptotic"
+
+    def __post_init__(self) -> None:
+        if self.kind not in INNER:
+            raise CertificateFormatError(f"`kind` of the claim must be one of {', '.join(INNER)}; found {self.kind!r}.")
+
+    @property
+    def inner(self) -> float:
+        """c1 of the asymptotic claim, below which the local rule holds; c0 of the practical one, into which all go."""
+        return self.local
 
     def to_json(self) -> str:
         """The file's text: sorted by section, one line a section, the same bytes for the same certificate."""
         system, network = self.system, self.network
         sections: dict[str, Any] = {
             "schema": SCHEMA,
-            "claim": {"kind": "asymptotic"},
+            "claim": {"kind": self.kind},
             "plant": {
                 "name": system.name,
                 "states": [s.name for s in system.states],
@@ -95,9 +114,9 @@ class Certificate:
                 "sha256": network.sha256(),
             },
             "lyapunov": {"kind": "quadratic", "P": _encode(self.P)},
-            "levels": {"local": float(self.local).hex(), "roa": float(self.roa).hex()},
+            "levels": {INNER[self.kind]: float(self.inner).hex(), "roa": float(self.roa).hex()},
             "evidence": _evidence(self.evidence),
-            "provenance": {k: str(v) for k, v in self.provenance.items()},
+            "provenance": {k: str(v) for k, v in self.provenance.items()} | _units(system),
         }
         lines = [f"{json.dumps(k)}: {json.dumps(v)}" for k, v in sections.items()]
         return "{\n" + ",\n".join(lines) + "\n}\n"
@@ -119,21 +138,57 @@ def write_certificate(path: Path, certificate: Certificate) -> None:
         raise InputError(f"{path} cannot be written: {error.strerror}.") from error
 
 
+def read_raw(path: Path) -> bytes:
+    """The file's bytes, read once.
+
+    Raises
+    ------
+    CertificateFormatError : the file cannot be read, or is larger than a certificate may be.
+    """
+    try:
+        with path.open("rb") as stream:
+            raw = stream.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise CertificateFormatError(f"{path} cannot be read: {error.strerror}.") from error
+    if len(raw) > MAX_BYTES:
+        raise CertificateFormatError(f"{path} is not a certificate: it is larger than {MAX_BYTES:,} bytes.")
+    return raw
+
+
 def read_certificate(path: Path) -> Certificate:
-    """Read a certificate for a report or a picture. This does not check it.
+    """Read a certificate for a report or a picture, once. This does not check it.
 
     Raises
     ------
     CertificateFormatError : the file cannot be read as a certificate.
     """
+    return parse_certificate(read_raw(path), str(path))
+
+
+def parse_certificate(raw: bytes, name: str) -> Certificate:
+    """The certificate that the bytes hold. This does not check it.
+
+    Parameters
+    ----------
+    raw : the file's bytes.
+    name : what messages call them.
+
+    Raises
+    ------
+    CertificateFormatError : the bytes are no certificate.
+    """
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = json.loads(raw.decode("utf-8"))
         if data["schema"] != SCHEMA:
-            raise CertificateFormatError(f"{path}: `schema` must be {SCHEMA!r}; found {data['schema']!r}.")
+            raise CertificateFormatError(f"{name}: `schema` must be {SCHEMA!r}; found {data['schema']!r}.")
+        kind = data["claim"]["kind"]
+        if kind not in INNER:
+            raise CertificateFormatError(f"{name}: `claim.kind` must be one of {', '.join(INNER)}; found {kind!r}.")
         plant, policy, evidence = data["plant"], data["policy"], data["evidence"]
         states, inputs = (tuple(sympy.Symbol(s) for s in plant[k]) for k in ("states", "inputs"))
         names = {s.name: s for s in (*states, *inputs)}
         n, m = len(states), len(inputs)
+        provenance, units = _read_provenance(data["provenance"], names)
         system = System(
             name=plant["name"],
             states=states,
@@ -143,6 +198,7 @@ def read_certificate(path: Path) -> Certificate:
             u_eq=tuple(sympy.Rational(q) for q in plant["u_eq"]),
             domain=tuple((Fraction(lo), Fraction(hi)) for lo, hi in plant["domain"]),
             input_bounds=tuple((Fraction(lo), Fraction(hi)) for lo, hi in plant["input_bounds"]),
+            units=units,
         )
         network = TanhNetwork(
             weights=tuple(_decode(x["weight"], tuple(x["shape"])) for x in policy["layers"]),
@@ -156,17 +212,36 @@ def read_certificate(path: Path) -> Certificate:
             system=system,
             network=network,
             P=_decode(data["lyapunov"]["P"], (n, n)),
-            local=float.fromhex(data["levels"]["local"]),
+            local=float.fromhex(data["levels"][INNER[kind]]),
             roa=float.fromhex(data["levels"]["roa"]),
             evidence=_read_evidence(evidence, n),
-            provenance=data["provenance"],
+            provenance=provenance,
+            kind=kind,
         )
-    except OSError as error:
-        raise CertificateFormatError(f"{path} cannot be read: {error.strerror}.") from error
     except CertificateFormatError:
         raise
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise CertificateFormatError(f"{path} is not a certificate: {type(error).__name__}: {error}.") from error
+        raise CertificateFormatError(f"{name} is not a certificate: {type(error).__name__}: {error}.") from error
+
+
+def _units(system: System) -> dict[str, dict[str, str]]:
+    """The provenance's entry for units of states and inputs; none if the plant has none."""
+    names = [s.name for s in (*system.states, *system.inputs)]
+    units = {name: system.units[name] for name in names if name in system.units}
+    return {"units": units} if units else {}
+
+
+def _read_provenance(data: Any, names: Mapping[str, Any]) -> tuple[dict[str, str], dict[str, str]]:
+    """The provenance as text, and the units in it; it is for people, so what cannot be used is passed over."""
+    found = data if isinstance(data, dict) else {}
+    units = found.get("units")
+    if not isinstance(units, dict) or not all(k in names and _is_unit(v) for k, v in units.items()):
+        return {k: str(v) for k, v in found.items()}, {}
+    return {k: str(v) for k, v in found.items() if k != "units"}, units
+
+
+def _is_unit(value: Any) -> bool:
+    return isinstance(value, str) and len(value) <= _LONGEST_UNIT and value.isprintable()
 
 
 def _evidence(evidence: PartitionTree | TrustedSolver) -> dict[str, Any]:
@@ -191,7 +266,7 @@ def _read_evidence(data: Mapping[str, Any], n: int) -> PartitionTree | TrustedSo
         root = _decode(data["root"], (n,))
         return PartitionTree(_decode(data["T"], (n, n)), root, base64.b64decode(data["tree"]))
     queries = tuple((str(name), str(answer)) for name, answer in data["queries"])
-    return TrustedSolver(data["solver"], data["version"], float.fromhex(data["precision"]), queries)
+    return TrustedSolver(str(data["solver"]), str(data["version"]), float.fromhex(data["precision"]), queries)
 
 
 def _encode(array: Array) -> str:
