@@ -104,7 +104,7 @@ def status_of(certificate: Certificate, sha256: str, answer: Mapping[str, Any] |
 
 def _checked(kind: str) -> str:
     """What is checked whatever the evidence is."""
-    names = {"Lyapunov function": "P", "Equilibrium": "P and the equilibrium", "Domain": "the domain"}
+    names = {"Lyapunov function": "P", "Equilibrium": "P, the equilibrium", "Domain": "the domain"}
     return ", ".join(names[name] for name, _, _ in words_for(kind).parts if name in CHECKED_ALWAYS)
 
 
@@ -275,10 +275,10 @@ def _claim(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict[s
 
 def _not_proved(certificate: Certificate, words: Words) -> list[tuple[str, str]]:
     items = [
-        *words.excluded,
+        *words.excluded[:-1],
         (
             "Anything outside the set.",
-            "The largest such set may be larger; what starts outside {V ≤ c₂} may do the same or not.",
+            "The true set may be larger: what starts outside {V ≤ c₂} may do the same or not.",
         ),
         (
             "Any other plant.",
@@ -295,6 +295,7 @@ def _not_proved(certificate: Certificate, words: Words) -> list[tuple[str, str]]
             "The policy is evaluated in exact real arithmetic on its binary64 numbers; an embedded float32 evaluation "
             "differs by its rounding errors.",
         ),
+        *words.excluded[-1:],
         ("Wrapped angles.", "States are real numbers: an angle of a full turn is not the origin."),
         (
             "Simulated figures.",
@@ -373,7 +374,7 @@ def _tables(
     candidates = [
         (
             row["candidate"],
-            number(row["level"]),
+            below(row["level"]),
             f"{below(row['volume'])} {unit}".rstrip(),
             "the domain" if row["limited_by"] == "domain" else "a violation found",
             "the one of this certificate" if row["proved"] else "",

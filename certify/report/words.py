@@ -154,7 +154,7 @@ class Words:
     meaning : of the outer set, for captions.
     decay : what of a falling V is part of the claim and what is not; {word} is "proved" or "claimed".
     simulated : which runs count in the simulated figures.
-    settles : what becomes of a run that counts.
+    settles, runs : what becomes of a run that counts, and what a legend calls such runs.
     parts : name, condition, and how it is shown from a partition; None where that is in the condition.
     excluded : head and text of what this claim, other than its siblings, does not say.
     """
@@ -169,6 +169,7 @@ class Words:
     decay: str
     simulated: str
     settles: str
+    runs: str
     parts: tuple[tuple[str, str, str], ...]
     excluded: tuple[tuple[str, str], ...]
 
@@ -194,6 +195,7 @@ CLAIMS: Mapping[str, Words] = {
         decay="That V falls to 0 is {word}; how fast is not.",
         simulated="stay in the domain and come near the origin",
         settles="settle",
+        runs="trajectories that settle",
         parts=(
             SMOOTH,
             ("Equilibrium", "P is symmetric positive definite and f(0, u_eq) = 0 exactly.", ""),
@@ -224,6 +226,7 @@ CLAIMS: Mapping[str, Words] = {
         "not.",
         simulated="stay in the domain and enter {V ≤ c₀}",
         settles="enter {V ≤ c₀}",
+        runs="trajectories that enter",
         parts=(
             SMOOTH,
             DEFINITE,

@@ -37,7 +37,7 @@ def line_figure(scene: Scene, roa: SimulatedRoa | None) -> Picture:
         inside = roa.axes[0][roa.attracted]
         if inside.size:
             ends = [float(inside.min()), float(inside.max())]
-            axes.plot(ends, [0, 0], color=LEAVING, lw=2.4, label=f"runs that {scene.words.settles} (not proved)")
+            axes.plot(ends, [0, 0], color=LEAVING, lw=2.4, label="simulated region (not proved)")
     if scene.leaves is not None and len(scene.leaves[0]) <= RASTER_FROM:
         edges = scene.leaves[0][:, 0] * scene.T[0, 0]
         axes.plot(edges, np.zeros_like(edges), "|", ms=5, color=SET, label="leaves")
@@ -47,7 +47,7 @@ def line_figure(scene: Scene, roa: SimulatedRoa | None) -> Picture:
     legend_beside(axes)
     return Picture(
         "V̇ along the state",
-        f"Shaded: the {scene.word} interval, {scene.words.meaning}. The curve of V̇ and the interval of the runs that "
+        f"Shaded: the {scene.word} interval, {scene.meaning}. The curve of V̇ and the interval of the runs that "
         f"{scene.words.settles} come from floating point and simulation; they are not proved.",
         to_svg(figure),
         simulated=True,

@@ -38,7 +38,7 @@ def surface(scene: Scene, pair: tuple[int, int]) -> Picture:
     boundary = ellipse(scene.P, pair, scene.outer)
     for k, centre in enumerate([float(v) for v in scene.system.exact_u_eq()[:shown]]):
         left, bottom = 4.2 * (k % 2), 3.6 * (rows - 1 - k // 2)
-        axes = add_axes(figure, left + 0.66, bottom + 0.52, 2.72, 2.96)
+        axes = add_axes(figure, left + 0.66, bottom + 0.52, 2.54, 2.96)
         spread = max(float(np.max(np.abs(u[..., k] - centre))), 1e-9)
         image = axes.imshow(
             u[..., k],
@@ -52,7 +52,7 @@ def surface(scene: Scene, pair: tuple[int, int]) -> Picture:
         )
         axes.contour(a, b, u[..., k], levels=11, colors=INK, linewidths=0.35, alpha=0.7, linestyles="solid")
         axes.plot(*boundary, color=SET, lw=1.6)
-        bar = figure.colorbar(image, cax=add_axes(figure, left + 3.48, bottom + 0.52, 0.1, 2.96))
+        bar = figure.colorbar(image, cax=add_axes(figure, left + 3.3, bottom + 0.52, 0.1, 2.96))
         bar.outline.set_visible(False)
         bar.set_label(scene.input_labels[k])
         axes.set_xlabel(scene.labels[pair[0]])

@@ -55,7 +55,7 @@ def portrait(scene: Scene, pair: tuple[int, int], paths: Array, roa: SimulatedRo
         sign = " V̇ < 0 at every grid point, so that no line V̇ = 0 appears.*"
     calm = settled(scene, paths)
     for keep, colour, text in (
-        (calm, SIMULATED, f"trajectories that {scene.words.settles}*"),
+        (calm, SIMULATED, f"{scene.words.runs}*"),
         (~calm, LEAVING, "other trajectories*"),
     ):
         lines = [thin(paths[:, k][:, [i, j]], scene, pair) for k in np.flatnonzero(keep)]
@@ -96,7 +96,7 @@ def portrait(scene: Scene, pair: tuple[int, int], paths: Array, roa: SimulatedRo
     )
     return Picture(
         "Phase portrait" if scene.n == 2 else f"Section {_title(scene, pair)}",
-        f"{what if scene.n > 2 else ''}Blue: the {scene.word} set, {scene.words.meaning}. "
+        f"{what if scene.n > 2 else ''}Blue: the {scene.word} set, {scene.meaning}. "
         f"*\N{NO-BREAK SPACE}Simulated or evaluated on a grid, not proved.{sign}",
         to_svg(figure),
         simulated=True,

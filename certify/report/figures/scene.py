@@ -69,6 +69,11 @@ class Scene:
         """V at which a run has done what the claim says of it: near the origin, or in {V <= c0}."""
         return self.inner if self.kind == "practical" else SETTLED * self.outer
 
+    @property
+    def meaning(self) -> str:
+        """Of the outer set, for captions."""
+        return self.words.meaning + ("" if self.proved == "proved" else ", if the claim is true")
+
     def vdot(self, x: Array) -> Array:
         """Vdot in float64; NaN where the equations have a pole."""
         with np.errstate(all="ignore"):
