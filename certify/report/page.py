@@ -21,7 +21,7 @@ import sympy
 
 from certify.certificate import INNER, Certificate, PartitionTree, TrustedSolver
 from certify.closed_loop import ClosedLoop
-from certify.errors import CertifyError, SoundnessError
+from certify.errors import CertifyError, InputError, SoundnessError
 from certify.lyapunov import domain_limit, extents, semi_axes, volume
 from certify.report.figures import Picture, draw
 from certify.report.figures.scene import is_ellipsoid
@@ -134,6 +134,7 @@ def render_html(
     Raises
     ------
     SoundnessError : the answer is not about these bytes.
+    InputError : the result is not of the run that made the certificate.
     """
     import jinja2
 
@@ -143,6 +144,11 @@ def render_html(
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
     source = resources.files("certify.report").joinpath("template.html").read_text(encoding="utf-8")
     status = status_of(certificate, sha256, answer)
+    if result is not None and (result["policy"]["sha256"], result["levels"].get("roa")) != (
+        certificate.network.sha256(),
+        certificate.roa,
+    ):
+        raise InputError("`result` must be of the run that made the certificate; its policy or level is another.")
     words = words_for(certificate.kind)
     pictures: list[Picture] = []
     roa, trouble = None, ""
@@ -250,7 +256,9 @@ def _claim(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict[s
     notes = {"Domain": "; ".join(sides) + "." if drawable else "", "Inputs": "; ".join(bounds) + "."}
     if local:
         notes["Local"] = f"Margin of the linear part over the remainder: {below(100 * local, 3)} %."
-    if answer:
+    if answer and certificate.kind == "asymptotic" and certificate.inner == certificate.roa:
+        notes["Ring"] = "As c₁ = c₂, the local part covers the whole set."
+    elif answer:
         shown = f"Shown on {answer.get('ring_leaves', 0):,} of {answer.get('leaves', 0):,} leaves"
         notes["Ring"] = f"{shown}; the smallest bound on {MINUS}V̇ is {below(ring, 3)}." if ring is not None else shown
     parts = []

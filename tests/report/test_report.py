@@ -523,6 +523,19 @@ def test_one_read_is_enough(pendulum_case: Case, tmp_path: Path) -> None:
         render_html(parse_certificate(read, str(pipe)), answer, None, pipe)
 
 
+def test_the_run_must_be_the_certificates(pendulum_case: Case) -> None:
+    for key, other in (("policy", {"sha256": "0" * 64, "layers": [2, 1]}), ("levels", {"roa": 1.0})):
+        with pytest.raises(InputError, match="`result` must be of the run"):
+            replace(pendulum_case, result={**pendulum_case.result, key: other}).page()
+
+
+def test_leaves_that_were_not_asked_are_not_called_shown(chain_case: Case) -> None:
+    assert chain_case.certificate.inner == chain_case.certificate.roa
+    page = Page(chain_case.page())
+    assert "As c₁ = c₂, the local part covers the whole set." in page.text
+    assert "the checker showed" not in page.text and "Shown on" not in page.text
+
+
 def test_a_page_reads_no_file(pendulum_case: Case) -> None:
     elsewhere = Path("/nowhere/at/all/certificate.json")
     c = pendulum_case

@@ -36,11 +36,14 @@ def partition(scene: Scene, leaves: Leaves) -> Picture:
         axes.set_xlabel(symbol(f"z{first + 1}"))
         axes.set_ylabel(symbol(f"z{last + 1}"))
         where = "cut by a plane through the origin of the coordinates x = T z"
+    if scene.local_is_enough:
+        asked = "As c₁ = c₂, the local part covers the whole set, and V̇ is not asked for on leaves."
+    else:
+        shown = "showed" if scene.proved == "proved" else "has to show"
+        asked = f"On each blue one the checker {shown} V̇ < 0; white ones lie outside the ring between the two levels."
     return Picture(
         "The leaf partition",
-        f"The {_count(len(leaves[0]))} of the certificate, {where}. On each blue one the checker "
-        f"{'showed' if scene.word == 'certified' else 'has to show'} V̇ < 0; white ones lie outside the ring between "
-        "the two levels.",
+        f"The {_count(len(leaves[0]))} of the certificate, {where}. {asked}",
         to_svg(figure),
         simulated=False,
     )
@@ -60,7 +63,7 @@ def add_leaves(axes: Any, scene: Scene, leaves: Leaves, pair: tuple[int, int], w
     )
     if scene.n == 2:
         corners = corners @ scene.T.T
-    ring = _in_ring(scene, lower, upper)
+    ring = np.zeros(len(lower), dtype=np.bool_) if scene.local_is_enough else _in_ring(scene, lower, upper)
     if within is not None:
         visible = np.all((corners.min(axis=1) <= within) & (corners.max(axis=1) >= -within), axis=1)
         corners, ring = corners[visible], ring[visible]

@@ -70,6 +70,11 @@ class Scene:
         return self.inner if self.kind == "practical" else SETTLED * self.outer
 
     @property
+    def local_is_enough(self) -> bool:
+        """Whether the local rule covers the whole set, so that leaves are not asked (FORMAT.md, local)."""
+        return self.kind == "asymptotic" and self.inner == self.outer
+
+    @property
     def meaning(self) -> str:
         """Of the outer set, for captions."""
         return self.words.meaning + ("" if self.proved == "proved" else ", if the claim is true")
