@@ -93,7 +93,7 @@ class RoaResult:
             "verdict": self.verdict.value,
             "reason": self.reason,
             "stop": self.stop.name.lower(),
-            "claim": self.claim,
+            "claim": {"kind": self.claim},
             "system": system.name,
             "parameters": {name: str(q) for name, q in system.parameters.items()},
             "states": [{"name": s.name, "unit": system.units.get(s.name, "")} for s in system.states],
