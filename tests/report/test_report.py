@@ -396,7 +396,7 @@ def test_the_page_loads_nothing_and_runs_nothing(pendulum_case: Case) -> None:
 
 def test_numbers_on_the_page_are_the_certificates(pendulum_case: Case) -> None:
     certificate, text = pendulum_case.certificate, Page(pendulum_case.page()).text
-    assert repr(certificate.local) in text and repr(certificate.roa) in text
+    assert repr(certificate.inner) in text and repr(certificate.roa) in text
     for value in certificate.P.ravel():
         assert repr(float(value)) in text
     assert certificate.network.sha256() in text
@@ -599,10 +599,10 @@ def test_hostile_names_are_text(tmp_path: Path) -> None:
     "change",
     [
         {"evidence": replace(ONE_LEAF, tree=bytes([0, 255]))},
-        {"P": -np.eye(2)},
-        {"P": np.zeros((2, 2))},
-        {"roa": -1.0},
-        {"local": math.inf},
+        {"V": Quadratic(-np.eye(2))},
+        {"V": Quadratic(np.zeros((2, 2)))},
+        {"claim": Asymptotic(roa=-1.0, local=0.1)},
+        {"claim": Asymptotic(roa=0.5, local=math.inf)},
     ],
     ids=["tree", "negative", "zero", "level", "infinite"],
 )
@@ -817,7 +817,7 @@ def trusted_case(pendulum_case: Case, tmp_path_factory: pytest.TempPathFactory) 
         "verdict": "PROVED",
         "checked": "TRUSTED",
         "reason": "domain",
-        "levels": {"local": c.local, "roa": level, "domain_limit": limit, "sampled_limit": None},
+        "levels": {"local": c.inner, "roa": level, "domain_limit": limit, "sampled_limit": None},
         "solver": {"solver": "dreal", "version": "4.21.06", "precision": 1e-3, "queries": [query]},
         "boxes": 0,
         "leaves": 0,
