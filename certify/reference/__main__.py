@@ -1,6 +1,6 @@
 """The command line: `python -I -m certify.reference FILE [--json]`.
 
-The claim in words and the verdict. Exit status 0 accepted, 1 rejected, 2 usage or a file that cannot be read, 3 trusted,
+The claim in words and the verdict. Exit status 0 accepted, 1 rejected, 2 usage or an unreadable file, 3 trusted,
 70 an error of this program.
 """
 
