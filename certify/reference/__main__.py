@@ -33,6 +33,11 @@ def read_once(path: str) -> bytes:
 
 def in_words(c: Certificate) -> str:
     bounds = f"{', '.join(c.plant.inputs)} within the input bounds"
+    if c.claim == "practical":
+        return (
+            f"{c.plant.name}, policy {c.policy.sha256}: every trajectory that starts in V <= {c.outer!r} stays there, "
+            f"enters V <= {c.inner!r} in finite time and stays in that set from then on, with {bounds}"
+        )
     return (
         f"{c.plant.name}, policy {c.policy.sha256}: every trajectory that starts in V <= {c.outer!r} stays there and "
         f"converges to the origin, which is asymptotically stable, with {bounds}"
@@ -41,7 +46,8 @@ def in_words(c: Certificate) -> str:
 
 def level_names(c: Certificate) -> tuple[tuple[str, str, float], ...]:
     """Key in the file, letter, value."""
-    return ("local", "c1", c.inner), ("roa", "c2", c.outer)
+    inner = ("local", "c1", c.inner) if c.claim == "asymptotic" else ("floor", "c0", c.inner)
+    return inner, ("roa", "c2", c.outer)
 
 
 def line(verdict: Verdict) -> str:

@@ -84,7 +84,7 @@ class Trusted:
 
 @dataclass(frozen=True)
 class Certificate:
-    """`inner` and `outer` are the levels between which Vdot < 0 is claimed leaf by leaf: c1 and c2."""
+    """`inner` and `outer`, between which the leaves show Vdot < 0, are c1 (`practical`: c0) and c2."""
 
     claim: str
     plant: Plant
@@ -110,15 +110,16 @@ def read(raw: bytes) -> Certificate:
     require(data["schema"] == "certify-certificate/2", "format", "schema", "'certify-certificate/2' was expected")
     require(isinstance(data["provenance"], dict), "format", "provenance", "an object was expected")
     claim = keys(data["claim"], "claim", "kind")["kind"]
-    require(claim == "asymptotic", "format", "claim.kind", "'asymptotic' was expected")
+    require(claim in ("asymptotic", "practical"), "format", "claim.kind", "'asymptotic' or 'practical' was expected")
+    inner_name = "local" if claim == "asymptotic" else "floor"
     plant = read_plant(data["plant"])
     n = len(plant.states)
     policy = read_policy(data["policy"], n, len(plant.inputs))
     lyapunov = keys(data["lyapunov"], "lyapunov", "kind", "P")
     require(lyapunov["kind"] == "quadratic", "format", "lyapunov.kind", "'quadratic' was expected")
     P = numbers(lyapunov["P"], "lyapunov.P", n * n)
-    levels = keys(data["levels"], "levels", "local", "roa")
-    inner, outer = binary64(levels["local"], "levels.local"), binary64(levels["roa"], "levels.roa")
+    levels = keys(data["levels"], "levels", inner_name, "roa")
+    inner, outer = binary64(levels[inner_name], f"levels.{inner_name}"), binary64(levels["roa"], "levels.roa")
     return Certificate(claim, plant, policy, matrix(P, n), inner, outer, read_evidence(data["evidence"], n))
 
 
