@@ -25,6 +25,12 @@ def absolute(A: arb_mat) -> arb_mat:
     return arb_mat(A.nrows(), A.ncols(), [abs(v) for v in A.entries()])
 
 
+def columns_scaled(A: arb_mat, factors: Sequence[arb]) -> arb_mat:
+    """A times a diagonal matrix."""
+    scale = list(factors) * A.nrows()
+    return arb_mat(A.nrows(), A.ncols(), [a * s for a, s in zip(A.entries(), scale, strict=True)])
+
+
 def finite(values: Iterable[arb]) -> bool:
     return all(v.is_finite() for v in values)
 

@@ -18,6 +18,7 @@ from certify.reference.balls import (
     absolute,
     beta,
     bounded_by_form,
+    columns_scaled,
     total,
     weights,
     within_bounds,
@@ -164,26 +165,39 @@ class Leaves:
     def policy(self, forms: arb_mat, count: int) -> list[list[Affine]]:
         """For each input and each leaf, given x on the leaves.
 
-        Each tanh lies in slope y + shift +- gap. The tanhs behind it see the gaps through the absolute weights; the
-        output sees them through the products of the weights themselves, taken from the output backwards.
+        Each tanh lies in slope y + shift +- gap. The output sees the gaps through products of weights and slopes, taken
+        backwards. The tanhs between see them through such products too, but with one slope for all leaves of the
+        batch, that of its first, so that a product is shared; by what a leaf's own slope differs from it, the error of
+        y goes into a `rest` that spreads by absolute weights. That takes far more leaves than absolute weights alone
+        where there are three layers of tanhs or more.
         """
         policy, last = self.c.policy, len(self.weights) - 1
-        errors, slopes, gaps = None, list[list[list[arb]]](), list[list[list[arb]]]()
+        slopes, gaps = list[list[list[arb]]](), list[list[list[arb]]]()
+        ways, rest = list[arb_mat](), None
         for k, (W, layer) in enumerate(zip(self.weights, policy.layers, strict=True)):
             preactivations = (W * forms).tolist()
             if k == last:
                 break
-            reached = (self.absolute[k] * errors).tolist() if errors is not None else [[ZERO] * count] * layer.rows
-            entries, wide = [], []
+            if k:  # the way of each earlier layer's gaps to this layer's y
+                ways = [columns_scaled(W, [slope[0] for slope in slopes[-1]]) * way for way in ways] + [W]
+            seen = arb_mat(layer.rows, count)
+            for way, gap in zip(ways, gaps, strict=True):
+                seen += absolute(way) * arb_mat(gap)
+            beyond = self.absolute[k] * rest if rest is not None else arb_mat(layer.rows, count)
+            entries, left = [], []
             slopes.append([])
             gaps.append([])
-            for row, bias, extra in zip(preactivations, map(arb, layer.bias), reached, strict=True):
-                lined = [tanh((row[b] + bias, row[b + 1 : b + self.n + 1], error)) for b, error in self.places(extra)]
+            for row, bias, near, far in zip(
+                preactivations, map(arb, layer.bias), seen.tolist(), beyond.tolist(), strict=True
+            ):
+                reached = [v + w for v, w in zip(near, far, strict=True)]
+                lined = [tanh((row[b] + bias, row[b + 1 : b + self.n + 1], error)) for b, error in self.places(reached)]
                 entries += [v for (mid, slope, _), _, _ in lined for v in (mid, *slope)]
-                wide += [error for (_, _, error), _, _ in lined]
-                slopes[k].append([slope for _, slope, _ in lined])
+                own = [slope for _, slope, _ in lined]
+                left += [abs(s - own[0]) * v + s * w for s, v, w in zip(own, near, far, strict=True)]
+                slopes[k].append(own)
                 gaps[k].append([gap for _, _, gap in lined])
-            forms, errors = arb_mat(layer.rows, len(row), entries), arb_mat(layer.rows, count, wide)
+            forms, rest = arb_mat(layer.rows, len(row), entries), arb_mat(layer.rows, count, left)
         behind = self.backwards(slopes, gaps, count)
         result = []
         for j, row in enumerate(preactivations):

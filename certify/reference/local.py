@@ -13,6 +13,7 @@ from certify.reference.balls import (
     absolute,
     beta,
     bounded_by_form,
+    columns_scaled,
     derivatives,
     finite,
     identity,
@@ -131,9 +132,8 @@ def local_policy(c: Certificate, states: Sequence[Local]) -> list[Local]:
         if k:
             tangents = [y.tanh() for y in rows(at_0, J, bends)]
             at_0 = arb_mat(len(tangents), 1, [t for t, *_ in tangents])
-            slopes = arb_mat(1, len(tangents), [slope for _, slope, *_ in tangents])
             own = (W, stacked([H for *_, H, _ in tangents], n), stacked([R for *_, R in tangents], n))
-            weighted = columns_scaled(W, slopes)
+            weighted = columns_scaled(W, [slope for _, slope, *_ in tangents])
             bends = [(weighted * L, H, R) for L, H, R in bends]
         else:
             weighted = W
@@ -163,11 +163,6 @@ def rows(at_0: arb_mat, J: arb_mat, bends: Sequence[tuple[arb_mat, arb_mat, arb_
 
 def stacked(matrices: Sequence[arb_mat], n: int) -> arb_mat:
     return arb_mat(len(matrices), n * n, [v for A in matrices for v in A.entries()])
-
-
-def columns_scaled(A: arb_mat, factors: arb_mat) -> arb_mat:
-    scale = factors.entries() * A.nrows()
-    return arb_mat(A.nrows(), A.ncols(), [a * s for a, s in zip(A.entries(), scale, strict=True)])
 
 
 def local_vdot(

@@ -14,7 +14,7 @@ from certify.reference.leaves import Leaves, check_leaves, structure
 from certify.reference.local import local
 from certify.reference.refusal import Refused, require
 
-MAX_WORK = 2**24  # numbers of a model times operations of the plant; entries of the matrices of a network
+MAX_WORK = 2**22  # numbers of a model times operations of the plant; entries of the matrices of a network
 
 
 @dataclass(frozen=True)
