@@ -622,3 +622,58 @@ def test_leaves_enclose_the_policy_V_and_Vdot(name: str) -> None:
                 assert 2 * sum((p * v for p, v in zip(Px, f, strict=True)), arb(0)) <= Vdot
                 value = sum((p * v for p, v in zip(Px, x, strict=True)), arb(0))
                 assert value <= V[0] + arb(2) ** -100 and -value <= V[1] + arb(2) ** -100
+
+
+@pytest.mark.parametrize("name", ["tanh output", "tanh preactivation", "tanh none", "identity output"])
+def test_leaves_of_a_batch_enclose_a_deep_policy(name: str) -> None:
+    """Three layers of tanhs, boxes of many sizes in one batch: each has slopes of its own, the products are shared."""
+    tree, generator = bytes([0, LEAF, 1, LEAF, 0, LEAF, 1, LEAF, LEAF]), np.random.default_rng(2)
+    data = with_tree(deep(*name.split()), tree)
+    data = edited(data, "evidence.root", encode([0.5, 0.75]))
+    c, (shared, each) = parse(data), leaves_of(data)
+    T, worst = tree_evidence(shared.c).T.tolist(), 0.0
+    assert len({tuple(leaf.box.lo) + tuple(leaf.box.hi) for leaf in each}) == 5
+    with ctx.workprec(128):
+        for leaf in each:
+            points = [*itertools.product([-1.0, 1.0], repeat=2), *generator.uniform(-1, 1, (60, 2)).tolist()]
+            for at in points:
+                ends = zip(leaf.box.lo, leaf.box.hi, at, strict=True)
+                z = [0.5 * lo + 0.5 * hi + 0.5 * (hi - lo) * t for lo, hi, t in ends]
+                x = [balls.total(arb(t) * v for t, v in zip(row, z, strict=True)) for row in T]
+                d = [(arb(v) - m) / r for v, m, r in zip(z, leaf.centre, leaf.radius, strict=True)]
+                for value, (mid, slopes, error) in zip(policy_in_arb(c.policy, c.u_eq, x), leaf.u, strict=True):
+                    off = abs(value - mid - balls.total(s * t for s, t in zip(slopes, d, strict=True)))
+                    assert off <= error * (1 + arb(2) ** -60)
+                    worst = max(worst, float(off / error))
+    assert worst > 0.05  # not by being wide
+
+
+def test_what_a_batch_shares_loses_no_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A box that is alone knows each gap's way exactly; among others it must not have less error in front of any tanh.
+
+    In the place of tanh stand lines that depend on the middle alone, which the other boxes do not change.
+    """
+    seen: list[arb] = []
+
+    def line(y: leaves.Affine) -> tuple[leaves.Affine, arb, arb]:
+        mid, slopes, error = y
+        seen.append(error)
+        slope = 1 / (1 + mid * mid)
+        return (slope * mid, [slope * v for v in slopes], slope * error + slope / 4), slope, slope / 4
+
+    monkeypatch.setattr(leaves, "tanh", line)
+    data = edited(deep("tanh", "output"), "evidence.root", encode([0.5, 0.75]))
+    shared, each = leaves_of(with_tree(data, bytes([0, LEAF, 1, LEAF, 0, LEAF, 1, LEAF, LEAF])))
+    with ctx.workprec(128):
+        seen.clear()
+        shared.enclose([leaf.box for leaf in each])
+        together, count, more = list(seen), len(each), 0
+        for k, leaf in enumerate(each):
+            seen.clear()
+            shared.enclose([leaf.box])
+            hidden = len(seen) - shared.c.m
+            # the outputs come input by input, the tanhs layer by layer and unit by unit, the boxes innermost
+            mine = together[k : hidden * count : count]
+            assert all(v >= w * (1 - arb(2) ** -60) for v, w in zip(mine, seen[:hidden], strict=True))
+            more += sum(bool(v > w * (1 + arb(2) ** -60)) for v, w in zip(mine, seen[:hidden], strict=True))
+    assert more > 0
