@@ -13,7 +13,7 @@ from flint import arb, arb_mat
 
 from certify.reference.document import Certificate, Policy, exact
 
-PRECISION = 128  # bits; on a leaf of the widest networks 64 would save one part in ten
+PRECISION = 128  # bits; single operations of flint cost about the same with 64
 ZERO, ONE = arb(0), arb(1)
 
 
