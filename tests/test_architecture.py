@@ -112,10 +112,21 @@ def test_the_checker_stands_alone() -> None:
             assert not imported.startswith("certify") or imported.startswith("certify.checker"), f"{path}: {imported}"
 
 
-def test_nobody_imports_the_checker() -> None:
+def test_the_reference_stands_alone() -> None:
+    """The second checker shares nothing with the first, and has no floats but the numbers of a file."""
+    found = modules("certify.reference")
+    assert len(found) > 5
+    for path in found:
+        for imported in imports(path):
+            assert imported.split(".")[0] in sys.stdlib_module_names | {"flint", "certify"}, f"{path}: {imported}"
+            assert not imported.startswith("certify") or imported.startswith("certify.reference"), f"{path}: {imported}"
+
+
+@pytest.mark.parametrize("name", ["checker", "reference"])
+def test_nobody_imports_the_checkers(name: str) -> None:
     for path in [*ROOT.glob("certify/**/*.py"), *ROOT.glob("controllers/**/*.py")]:
-        if "checker" not in path.parts:
-            assert not any(i.startswith("certify.checker") for i in imports(path)), path
+        if name not in path.parts:
+            assert not any(i.startswith(f"certify.{name}") for i in imports(path)), path
 
 
 def test_certify_never_imports_controllers() -> None:
@@ -129,6 +140,7 @@ def test_certify_never_imports_controllers() -> None:
         ("import certify", ["torch", "sympy", "scipy", "numpy", "matplotlib"]),
         ("import certify.cli", ["torch", "sympy", "scipy", "matplotlib"]),
         ("import certify.checker.rules, certify.checker.__main__", ["torch", "sympy", "scipy", "matplotlib"]),
+        ("import certify.reference.__main__", ["torch", "sympy", "scipy", "matplotlib", "numpy", "certify.checker"]),
         ("import certify.systems", ["torch", "scipy", "matplotlib"]),
         ("import certify.report", ["matplotlib", "jinja2"]),
     ],

@@ -23,7 +23,7 @@ from certify.checker.errors import Rejected
 from tests.support.ablation import checker_without
 from tests.support.claim_oracle import EXACT, faults, read
 from tests.support.mutants import BASES, FAMILIES, Mutant, base, dump, family, true_edits
-from tests.support.naive_checker import judge
+from tests.support.reference import judge
 
 ORDER = ("format", "hash", "levels", "lyapunov", "equilibrium", "domain", "coordinates", "root", "centring", "local",
          "tree", "ring", "inputs")  # fmt: skip
