@@ -6,8 +6,12 @@ u = 2^-53 is the unit roundoff. A computed value comes with a bound on its error
 in binary64, so `up` is applied to every bound: it covers the roundings made while the bound was formed.
 `up(b) = b (1 + 2^-40) + 2^-960` is safe for non-negative operands with fewer than 2^11 roundings in a row
 (2^11 u < 2^-41, and the last two roundings are those of `up` itself); longer sums go through `total`. Its
-absolute term covers underflow, at most 2^-1022 a product, for up to 2^60 products; a bound that is multiplied by a
-large number later on gets an `up` of its own before.
+absolute term covers underflow, at most 2^-1022 a product, for up to 2^60 products, as long as nothing large multiplies
+afterwards what has underflowed. So there is one order of factors for all bounds, in which only numbers up to 1 do:
+
+- what stands in one `up` is a sum of products of two factors: numbers of which there is no doubt, or results of `up`;
+- EPS, gamma and other constants below 1 multiply the product: `EPS * (a * b)`, never `EPS * a * b`;
+- a product of three is `a * up(b * c)`, or `k * b * b` with k from `up`: where k b underflows, b is below 1.
 
 Sums and matrix products are bounded for any order of summation and with or without fused multiply-add:
 |fl(AB) - AB| <= gamma_k |A||B| with gamma_k = k u / (1 - k u) (Higham 2002, section 3.5), and

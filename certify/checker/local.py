@@ -113,9 +113,9 @@ class Jet:
         """
         cubic = up(third * self.radius / 6)
         square = up(np.abs(half) + half_error + cubic)
-        spread = square * (2 * self.slope + self.curve)
+        spread = up(square * (2 * self.slope + self.curve))
         outer = _outer(self.a, self.a)
-        wrong = (half_error + EPS * np.abs(half)) * self.slope * self.slope + 2 * square * self.slope * self.slack
+        wrong = up(half_error + EPS * np.abs(half)) * self.slope * self.slope + 2 * up(square * self.slope) * self.slack
         R = widen(_each(spread) * self.E + _each(cubic) * outer, spread * self.bend + wrong)
         return _each(half) * outer, R
 
@@ -124,7 +124,7 @@ class Jet:
         x = self
         first_error, second_error = up(errors[1] + most[1] * x.error), up(errors[2] + most[2] * x.error)
         H, R = x.beyond_tangent(f[2] / 2, second_error / 2, most[2])
-        slack = first_error * x.slope + abs(f[1]) * x.slack + EPS * abs(f[1]) * x.slope
+        slack = first_error * x.slope + abs(f[1]) * x.slack + EPS * (abs(f[1]) * x.slope)
         wrong = first_error * x.bend + EPS * (abs(f[1]) * x.bend + frobenius(H))
         Q, E = f[1] * x.Q + H, widen((abs(f[1]) + first_error) * x.E + R, wrong)
         return Jet(f[0], up(errors[0] + most[0] * x.error), f[1] * x.a, up(slack), Q, E)
@@ -202,7 +202,7 @@ def enclose_at_origin(net: Folded, J: Number, slack: Number) -> tuple[Number, Nu
         weight = np.abs(X) + doubt
         Q = product(X, quad.reshape(count, -1)).reshape(-1, n, n)
         E = product(weight, rest.reshape(count, -1)).reshape(-1, n, n)
-        E = widen(E, total((doubt + gamma(count) * weight) * bends, 1), gamma(count) + EPS)
+        E = widen(E, total(doubt * bends + gamma(count) * (weight * bends), 1), gamma(count) + EPS)
         value = Jet(y[:, 0], error[:, 0], X[:, :n], norm(doubt[:n], 0), Q, E)
         if last and not net.squash:
             break

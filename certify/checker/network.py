@@ -185,7 +185,7 @@ def _error_backwards(scale: Number, passed: list[tuple[Array, Number, Number]], 
     for W, slope, fresh in reversed(passed):
         result = result + total((np.abs(weight) + doubt) * fresh[:, None], 0)
         through = slope[:, None] * weight
-        doubt = float(np.max(total(np.abs(W), 0))) * (doubt + EPS * np.max(np.abs(weight), axis=0))
+        doubt = float(np.max(total(np.abs(W), 0))) * up(doubt + EPS * np.max(np.abs(weight), axis=0))
         doubt = up(doubt + gamma(len(W)) * float(np.max(norm(W, 0))) * norm(through, 0))
         weight = product(W.T, through.reshape(len(W), -1)).reshape(W.shape[1], m, batch)
     return up(result + total((np.abs(weight) + doubt) * x_error[:, None], 0))

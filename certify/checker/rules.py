@@ -151,14 +151,11 @@ def _check_local(c: Certificate, T: Number, net: Folded, least: Fraction, bounde
     gradient, u_slack, u_Q, u_E = enclose_at_origin(net, J, slack)
     each = zip(c.inputs, c.u_eq, net.scale, c.input_bounds, gradient, u_Q, u_E, strict=True)
     for name, q, scale, bounds, row, Q, E in each:
-        value, error = float_with_error(q)
-        wide = up(abs(scale) * u_slack + EPS * norm(row, 0))
-        rest = widen(abs(scale) * E, EPS * abs(scale) * frobenius(Q))
-        u = Jet(np.float64(value), error, row, wide, scale * Q, rest)
+        u = _input(q, scale, row, u_slack, Q, E)
         variables.append(u)
         if not bounded:
             tally.rules["inputs"] += 1
-            if not _within(bounds, u.c, up(error + u.radius)):
+            if not _within(bounds, u.c, up(u.error + u.radius)):
                 raise Rejected("inputs", "local ball", f"{name} may leave its bounds")
     F = evaluate(c.dynamics, lambda q: constant_jet(q, n), variables)
     gradients, Q, E = (np.array([getattr(jet, field) for jet in F]) for field in ("a", "Q", "E"))
@@ -166,8 +163,8 @@ def _check_local(c: Certificate, T: Number, net: Folded, least: Fraction, bounde
     PT, doubt = product(c.P, T), up(gamma(n) * norm(c.P, 1)[:, None] * norm(T, 0)[None, :])  # of each entry
     size = up(np.abs(PT) + doubt)
     B, C = product(PT.T, gradients), product(PT.T, Q.reshape(n, -1))
-    wrong = total(size * slacks + doubt * slopes + gamma(n) * size * slopes, 0)  # of each row of B, in the 2-norm
-    wrong = norm(wrong, 0) + norm(total((doubt + gamma(n) * size) * bends, 0), 0)  # and of each C_j
+    wrong = total(size * slacks + doubt * slopes + gamma(n) * (size * slopes), 0)  # of each row of B, in the 2-norm
+    wrong = norm(wrong, 0) + norm(total(doubt * bends + gamma(n) * (size * bends), 0), 0)  # and of each C_j
     E = product(norm(size, 1)[None], E.reshape(n, -1)).reshape(n, n)
     M = -(B + B.T) / 2
     D = 1 / np.sqrt(middle(np.diagonal(M)))
@@ -179,6 +176,13 @@ def _check_local(c: Certificate, T: Number, net: Folded, least: Fraction, bounde
         number = f"{float(middle(remainder)):.3g}"
         raise Rejected("local", "levels.local", f"Vdot < 0 is not shown on the local ball: {number} of the decay")
     tally.local_margin = float(1 - middle(remainder))
+
+
+def _input(u_eq: Fraction, scale: Number, gradient: Number, slack: Number, Q: Number, E: Number) -> Jet:
+    """u_eq + scale (G.d + d'Q d + r(d)), `gradient` being scale G, computed, and G within `slack` before scaling."""
+    value, error = float_with_error(u_eq)
+    rest = widen(abs(scale) * E, EPS * (abs(scale) * frobenius(Q)))
+    return Jet(np.float64(value), error, gradient, up(abs(scale) * slack + EPS * norm(gradient, 0)), scale * Q, rest)
 
 
 class _Ring:
@@ -271,7 +275,7 @@ class _Ring:
 
     def _cross(self, far: Number) -> Number:
         """Upper bound of what the off-diagonal part of S adds to V in magnitude where |z| <= far."""
-        return total(total(self.S_cross[:, :, None] * far[:, None] * far[None, :], 0), 0)
+        return total(far * total(self.S_cross[:, :, None] * far[None, :], 1), 0)
 
     def _vdot(self, x: Number, error: Number, mid: Number, slopes: Number, wide: Number) -> Taylor:
         """Vdot = (2 P x)'f(x, u) on the boxes; symbols: n box coordinates, m input errors."""

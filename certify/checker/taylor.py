@@ -55,7 +55,7 @@ class Taylor:
         """Product with a constant in value +- error; `value` may differ over the batch (B,)."""
         size, k = self.size, np.abs(value)
         return Taylor(
-            value * self.c, value * self.g, value * self.Q, up(k * self.r + error * (size + self.r) + EPS * k * size)
+            value * self.c, value * self.g, value * self.Q, up(k * self.r + error * (size + self.r) + EPS * (k * size))
         )
 
     def __add__(self, other: Taylor) -> Taylor:
@@ -88,10 +88,10 @@ class Taylor:
         rho = up(G + q)
         r = (
             np.abs(f1) * self.r
-            + np.abs(f2) * (2 * G * q + q * q)
+            + np.abs(f2) * up(2 * G * q + q * q)
             + third * rho * rho * rho
             + error * (1 + rho + rho * rho)
-            + EPS * (np.abs(f0) + np.abs(f1) * rho + np.abs(f2) * G * G)
+            + EPS * (np.abs(f0) + np.abs(f1) * rho + np.abs(f2) * up(G * G))
         )
         Q = f1 * self.Q + f2 * (self.g[:, None] * self.g[None, :])
         return Taylor(f0, f1 * self.g, Q, up(r))
@@ -103,7 +103,7 @@ class Taylor:
         f0 = 1 / self.c
         f1, f2 = -f0 * f0, f0 * f0 * f0
         third = up(up(np.abs(f2)) / least)  # R = -D^3 / (c^3 v) exactly
-        return self._compose(f0, f1, f2, third, EPS * (np.abs(f0) + np.abs(f1) + np.abs(f2)))
+        return self._compose(f0, f1, f2, third, up(EPS * (np.abs(f0) + np.abs(f1) + np.abs(f2))))
 
     def sin(self) -> Taylor:
         s, c, s_error, c_error = sin_cos(self.c)

@@ -18,7 +18,7 @@ from flint import arb, ctx
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from certify.checker import float64
+from certify.checker import float64, rules
 from certify.checker.arithmetic import carry, frobenius
 from certify.checker.document import Policy
 from certify.checker.errors import Rejected
@@ -814,3 +814,41 @@ def test_without_centring_nothing_is_folded(squash: str) -> None:
     folded = fold(policy, (Fraction(1, 2),))
     assert not folded.bias_error.any() and not folded.offset_error.any()
     assert folded.biases[0] is policy.biases[0] and folded.offset is policy.offset
+
+
+# --------------------------------------------------------------- what underflows and is multiplied by much afterwards
+
+
+@pytest.mark.parametrize("k", [5e-324, 3 * 2.0**-1074, 5 * 2.0**-1060, -(2.0**-1073)])
+@pytest.mark.parametrize("value", [1 + 2.0**-52, 3.0 / 7.0])
+def test_a_subnormal_multiple_of_a_large_model_contains(k: float, value: float) -> None:
+    """EPS k is 0 in binary64, but EPS k times the model's size is not."""
+    model = Taylor(np.full(1, value * 2.0**900), np.full((1, 1), 2.0**900 / 3), np.zeros((1, 1, 1)), np.zeros(1))
+    result = model.scaled(k, 0.0)
+    with ctx.workprec(2500):
+        for d in (-1.0, 0.3, 1.0):
+            truth = arb(k) * polynomial(model, 0, [d])
+            assert abs(truth - polynomial(result, 0, [d])) <= arb(float(result.r[0]))
+    least = 2.0**-53 * (Fraction(float(model.c[0])) + Fraction(float(model.g[0, 0]))) * abs(Fraction(k))
+    assert Fraction(float(result.r[0])) >= least  # what the roundings of normal numbers may come to
+
+
+@pytest.mark.parametrize("scale", [5e-324, -(2.0**-1060)])
+def test_a_subnormal_scale_of_an_input_that_bends_much_contains(scale: float) -> None:
+    Q = np.full((1, 1), 2.0**500 / 3)
+    u = rules._input(Fraction(0), np.float64(scale), np.zeros(1), 0.0, Q, np.zeros((1, 1)))
+    least = 2.0**-53 * abs(Fraction(scale)) * Fraction(float(Q[0, 0]))
+    assert Fraction(float(u.E[0, 0])) >= least
+
+
+@pytest.mark.parametrize("exponent", [-900, -200, -100])
+def test_products_of_far_corners_in_the_off_diagonal_part_of_V_are_not_lost(exponent: int) -> None:
+    """S_01 far_0 underflows, and far_1 is large."""
+    ring = object.__new__(rules._Ring)
+    small = 2.0**-900
+    ring.S_cross = np.array([[0.0, small], [small, 0.0]])
+    far = np.array([[2.0**exponent], [2.0**1000]])
+    assert Fraction(float(ring._cross(far)[0])) >= 2 * Fraction(small) * Fraction(far[0, 0]) * Fraction(far[1, 0])
+    far = np.full((2, 1), 2.0**-600)
+    ring.S_cross = np.array([[0.0, 2.0**900], [2.0**900, 0.0]])
+    assert Fraction(float(ring._cross(far)[0])) >= 2 * Fraction(2) ** 900 * Fraction(2) ** -1200
