@@ -31,9 +31,8 @@ from typing import Any
 
 import numpy as np
 from flint import arb, ctx, fmpq
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+Array = Any  # of binary64; numpy's own types say nothing of shapes
 U = 2.0**-53
 EPS = 2.0**-50  # covers up to eight roundings of one coefficient
 TINY = 2.0**-960
@@ -62,6 +61,11 @@ def norm(array: Any, axis: int) -> Any:
     return up(np.sqrt(total(array * array, axis)))
 
 
+def frobenius(G: Any) -> Any:
+    """An upper bound of ||G||_F, G (..., n, n)."""
+    return norm(norm(G, -1), -1)
+
+
 def ends(centre: Array, radius: Array) -> tuple[Array, Array]:
     """(lo, hi), an interval around the one of that centre and radius."""
     radius = up(radius + EPS * np.abs(centre))
@@ -75,6 +79,14 @@ def float_with_error(q: Fraction) -> tuple[float, float]:
         return value, 0.0 if Fraction(value) == q else up(float(abs(Fraction(value) - q)))
     except OverflowError:
         return np.inf, np.inf
+
+
+def within(bounds: tuple[Fraction, Fraction], mid: Any, radius: Any) -> Any:
+    """Elementwise: [mid - radius, mid + radius] certainly lies in the bounds."""
+    (lo, lo_error), (hi, hi_error) = map(float_with_error, bounds)
+    reach = up(radius + EPS * np.abs(mid))
+    least, most = lo + up(lo_error + EPS * abs(lo)), hi - up(hi_error + EPS * abs(hi))
+    return (mid - reach >= least) & (mid + reach <= most)
 
 
 def arb_with_error(x: arb) -> tuple[float, float]:
