@@ -53,13 +53,15 @@ def _examine(path: str) -> tuple[int, dict[str, Any], list[str]]:
         "result": "ACCEPTED",
         "certificate_sha256": certificate.sha256,
         "policy_sha256": certificate.policy.sha256(),
-        "levels": {"local": certificate.c1, "roa": certificate.c2},
+        "claim": certificate.claim,
+        "levels": certificate.levels,
         "rules": tally.rules,
         "seconds": {"start": ready - start, "check": time.perf_counter() - ready},
     }
     counts = ", ".join(f"{rule} {count}" for rule, count in tally.rules.items())
     lines = [*words.claim(certificate), f"rules that held: {counts}"]
-    verdict = f"c1={certificate.c1!r} c2={certificate.c2!r} sha256={certificate.sha256}"
+    inner = "c0" if certificate.claim == "practical" else "c1"
+    verdict = f"{inner}={certificate.c1!r} c2={certificate.c2!r} sha256={certificate.sha256}"
     evidence = certificate.evidence
     if isinstance(evidence, document.Trusted):
         answers = [f"{name}: {answer}" for name, answer in evidence.queries]
@@ -68,8 +70,10 @@ def _examine(path: str) -> tuple[int, dict[str, Any], list[str]]:
         return 3, answer, [*lines, f"TRUSTED {evidence.solver} {evidence.version} {verdict}"]
     answer |= {"leaves": tally.rules["tree"], "ring_leaves": tally.rules["ring"]}
     answer["margins"] = {"local": tally.local_margin, "ring": tally.ring_margin}
-    of_ring = "" if tally.ring_margin is None else f"; smallest bound of -Vdot on a ring's leaf {tally.ring_margin:.3g}"
-    return 0, answer, [*lines, f"margins: local {tally.local_margin:.1%}{of_ring}", f"ACCEPTED {verdict}"]
+    margins = [] if tally.local_margin is None else [f"local {tally.local_margin:.1%}"]
+    if tally.ring_margin is not None:
+        margins.append(f"smallest bound of -Vdot on a ring's leaf {tally.ring_margin:.3g}")
+    return 0, answer, [*lines, f"margins: {'; '.join(margins)}", f"ACCEPTED {verdict}"]
 
 
 if __name__ == "__main__":

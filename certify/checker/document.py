@@ -32,6 +32,7 @@ from .schema import (
     word,
 )
 
+LEVELS = {"asymptotic": section(local=binary64, roa=binary64), "practical": section(floor=binary64, roa=binary64)}
 MAX_STATES, MAX_LAYERS, MAX_WIDTH = 64, 64, 2**14
 Array = NDArray[np.float64]
 
@@ -78,7 +79,12 @@ class Trusted:
 
 @dataclass(frozen=True)
 class Certificate:
-    """The claim and its evidence. Provenance is not kept: nothing may depend on it."""
+    """The claim and its evidence. Provenance is not kept: nothing may depend on it.
+
+    `levels` are as stated: the inner edge of the ring, which is c1 (`local`) or c0 (`floor`), and c2 (`roa`).
+    """
+
+    claim: str
 
     name: str
     states: tuple[str, ...]
@@ -89,10 +95,18 @@ class Certificate:
     input_bounds: tuple[tuple[Fraction, Fraction], ...]
     policy: Policy
     P: Array
-    c1: float
-    c2: float
+    levels: dict[str, float]
     evidence: Partition | Trusted
     sha256: str
+
+    @property
+    def c1(self) -> float:
+        """The ring's inner edge: c1, or c0 of a practical claim."""
+        return self.levels["floor" if self.claim == "practical" else "local"]
+
+    @property
+    def c2(self) -> float:
+        return self.levels["roa"]
 
 
 def _plant(stated: dict[str, Any], at: str, known: Known) -> dict[str, Any]:
@@ -137,7 +151,7 @@ def _trusted(stated: dict[str, Any], at: str, known: Known) -> Trusted:
 
 _DOCUMENT = section(
     schema=choice("certify-certificate/2"),
-    claim=section(kind=choice("asymptotic")),
+    claim=then(section(kind=choice(*LEVELS)), lambda stated, at, known: known.setdefault("claim", stated["kind"])),
     plant=then(
         section(
             name=name,
@@ -164,7 +178,7 @@ _DOCUMENT = section(
         _policy,
     ),
     lyapunov=section(kind=choice("quadratic"), P=array("n", "n")),
-    levels=section(local=binary64, roa=binary64),
+    levels=lambda value, at, known: LEVELS[known["claim"]](value, at, known),
     evidence=by_kind(
         partition_tree=then(
             section(kind=anything, T=array("n", "n"), root=array("n"), tree=base64_bytes),
@@ -188,11 +202,11 @@ def certificate(data: Any, sha256: str) -> Certificate:
     """A JSON value as a certificate."""
     top = _DOCUMENT(data, "", {})
     return Certificate(
+        claim=top["claim"],
         **top["plant"],
         policy=top["policy"],
         P=top["lyapunov"]["P"],
-        c1=top["levels"]["local"],
-        c2=top["levels"]["roa"],
+        levels=top["levels"],
         evidence=top["evidence"],
         sha256=sha256,
     )

@@ -130,14 +130,25 @@ class Leaves:
     broken: tuple[str, str] | None
 
     @cached_property
+    def misses(self) -> tuple[Array, Array]:
+        """Which lie outside of the ring, and which inside of it."""
+        return self.ring.misses(self.lo, self.hi)
+
+    @cached_property
     def met(self) -> NDArray[np.intp]:
-        """The leaves that may meet the ring."""
-        outside, inside = self.ring.misses(self.lo, self.hi)
-        return np.flatnonzero(np.logical_not(outside | inside))
+        """The leaves of which something is asked: those that may meet the ring and, under a practical claim, those
+        inside of it as well, which no other rule covers then."""
+        outside, inside = self.misses
+        return np.flatnonzero(np.logical_not(outside if self.ring.c.claim == "practical" else outside | inside))
+
+    @property
+    def met_ring(self) -> Array:
+        """Which of these may meet the ring."""
+        return np.logical_not(self.misses[1][self.met])
 
     @cached_property
     def boxes(self) -> tuple[Array, Array]:
-        """Centres and radii of the leaves that may meet the ring."""
+        """Their centres and radii."""
         lo, hi = self.lo[:, self.met], self.hi[:, self.met]
         centre = 0.5 * lo + 0.5 * hi
         return centre, up(np.maximum(hi - centre, centre - lo))
@@ -149,9 +160,19 @@ class Leaves:
         return (x, error, *enclose_on_boxes(self.ring.net, x, error))
 
     @cached_property
+    def dynamics(self) -> tuple[list[Taylor], list[Taylor]]:
+        """The states and F, on these."""
+        return self.ring.dynamics(*self.policy)
+
+    @cached_property
     def bound(self) -> Array:
         """Of Vdot, on these."""
-        return self.ring.bound(self.ring.vdot(*self.ring.dynamics(*self.policy)), *self.boxes)
+        return self.ring.bound(self.ring.vdot(*self.dynamics), *self.boxes)
+
+    @property
+    def defined(self) -> Array:
+        """On which of these every component of F has a finite model; what divides by a range that holds 0 has none."""
+        return np.logical_and.reduce([np.isfinite(f.size + f.r) for f in self.dynamics[1]])
 
     def place(self, holds: Array) -> str:
         """The first of these for which something does not hold."""
@@ -176,11 +197,15 @@ def keeps_inputs(leaves: Leaves) -> Failures:
 
 
 def decreases(leaves: Leaves) -> Failures:
-    """`ring`: Vdot < 0."""
+    """`ring`: Vdot < 0 on leaves that may meet the ring; on others of which anything is asked, F is smooth."""
     holds = leaves.bound < 0
+    if not np.all(leaves.met_ring):
+        holds = np.where(leaves.met_ring, holds, leaves.defined)
     if not np.all(holds):
-        yield leaves.place(holds), f"Vdot < 0 is not shown: {leaves.bound[np.argmin(holds)]:.3g}"
-    return len(holds)
+        worst = np.argmin(holds)
+        smooth = f"Vdot < 0 is not shown: {leaves.bound[worst]:.3g}"
+        yield leaves.place(holds), smooth if leaves.met_ring[worst] else "F may be undefined"
+    return int(np.sum(leaves.met_ring))
 
 
 def batches(ring: Ring, tree: bytes, root: Array) -> Iterator[Leaves]:

@@ -27,7 +27,7 @@ from .network import reaches
 
 def levels(case: Case) -> Failures:
     if not 0 < case.c.c1 <= case.c.c2 < float("inf"):
-        yield "levels", "must satisfy 0 < local <= roa"
+        yield "levels", f"must satisfy 0 < {' <= '.join(case.c.levels)}"
     return 1
 
 
@@ -78,7 +78,7 @@ def centring(case: Case) -> Failures:
     policy, u_eq = case.c.policy, case.c.u_eq
     if policy.centre == "preactivation" and not all(-1 < q < 1 for q in reaches(policy, u_eq)):
         yield "policy.offset", "u_eq must lie strictly inside offset +- scale"
-    if policy.centre == "none" and raw_at_origin(policy) != list(u_eq):
+    if policy.centre == "none" and case.c.claim != "practical" and raw_at_origin(policy) != list(u_eq):
         yield "policy.centre", "pi(0) = u_eq cannot be shown exactly without centring"
     return 1
 
@@ -106,6 +106,7 @@ ON_LEAVES: Table[ring.Leaves] = (
     ("ring", ring.decreases),
 )
 OF_THE_TREE = {"coordinates", "root"}  # not asked of a solver's word
+OF_THE_ORIGIN = {"equilibrium"}  # nor this of a practical claim
 READ = {"format": 1, "hash": 1}  # rules of document.py, which have held
 RULES = (*READ, *dict.fromkeys(name for table in (STATED, ON_THE_BALL, ON_LEAVES) for name, _ in table))
 
@@ -116,7 +117,7 @@ class Tally:
 
     rules: Counter[str] = field(default_factory=lambda: Counter(dict.fromkeys(RULES, 0) | READ))
     ring_margin: float | None = None  # smallest -Vdot bound over the ring's leaves
-    local_margin: float = 0.0  # 1 - the remainder's largest part of the decay
+    local_margin: float | None = None  # 1 - the remainder's largest part of the decay
 
     def hold(self, table: Table[Subject], subject: Subject, but: frozenset[str] = frozenset()) -> None:
         """Raise `Rejected` at the first failure of the first rule that fails; count what the rules have looked at."""
@@ -139,19 +140,23 @@ def check(c: Certificate) -> Tally:
     """
     self_test()
     with np.errstate(all="ignore"):  # overflow becomes infinity or NaN, and every test then fails
-        tally, case = Tally(), Case(c)
+        tally, case, practical = Tally(), Case(c), c.claim == "practical"
+        origin = frozenset(OF_THE_ORIGIN if practical else ())
         if not isinstance(c.evidence, Partition):
-            tally.hold(STATED, case, frozenset(OF_THE_TREE))
+            tally.hold(STATED, case, origin | OF_THE_TREE)
             return tally
-        tally.hold(STATED, case)
-        ball = local.Ball(case)
-        tally.hold(ON_THE_BALL, ball)
-        tally.local_margin = 1 - ball.remainder
+        tally.hold(STATED, case, origin)
+        if not practical:
+            ball = local.Ball(case)
+            tally.hold(ON_THE_BALL, ball)
+            tally.local_margin = 1 - ball.remainder
         bounds = ring.Ring(c, case.T, case.net, case.S)
-        skipped = frozenset({"ring", "inputs"} if c.c1 == c.c2 else {"inputs"} if case.bounded else ())
+        skipped = frozenset(
+            {"ring", "inputs"} if c.c1 == c.c2 and not practical else {"inputs"} if case.bounded else ()
+        )
         for leaves in ring.batches(bounds, c.evidence.tree, c.evidence.root):
             tally.hold(ON_LEAVES, leaves, skipped)
-            if "ring" not in skipped and len(leaves.met):
-                margin = float(np.min(-leaves.bound))
+            if "ring" not in skipped and np.any(leaves.met_ring):
+                margin = float(np.min(-leaves.bound[leaves.met_ring]))
                 tally.ring_margin = margin if tally.ring_margin is None else min(tally.ring_margin, margin)
     return tally

@@ -7,6 +7,14 @@ from typing import Any
 
 from .document import Certificate
 
+CLAIMS = {
+    "asymptotic": "the origin is asymptotically stable, and every trajectory of the closed loop that starts in "
+    "V <= {c.c2!r} stays there and converges to the origin",
+    "practical": "every trajectory of the closed loop that starts in V <= {c.c2!r} stays there, enters "
+    "V <= {c.c1!r} in finite time and stays there from then on; nothing is claimed about what happens inside "
+    "V <= {c.c1!r}, and the origin need not be an equilibrium",
+}
+
 
 def claim(c: Certificate) -> list[str]:
     """The plant, the policy, V, and what is claimed of them, line by line."""
@@ -20,8 +28,7 @@ def claim(c: Certificate) -> list[str]:
         f"policy {'-'.join(map(str, widths))} tanh, squash {c.policy.squash}, centred by {c.policy.centre}, "
         f"sha256 {c.policy.sha256()}",
         "V(x) = x'Px with P = " + "; ".join(" ".join(repr(float(v)) for v in row) for row in c.P),
-        "claim: the origin is asymptotically stable, and every trajectory of the closed loop that starts in "
-        f"V <= {c.c2!r} stays there and converges to the origin; u stays in its bounds",
+        f"claim: {CLAIMS[c.claim].format(c=c)}; u stays in its bounds",
     ]
 
 

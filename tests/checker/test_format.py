@@ -478,3 +478,31 @@ def test_a_file_whose_name_looks_like_an_option(tmp_path: Path) -> None:
         for path in (f"./{name}", name):
             done = run("--", path, cwd=tmp_path)
             assert done.returncode == 0 and "ACCEPTED" in done.stdout, done.stderr
+
+
+def test_a_practical_claim_is_printed_for_what_it_is(tmp_path: Path) -> None:
+    data = grow(make(
+        [["+", ["/", "x", "2"], "u", "1/100"]], [([[1.0]], [0.25])], [[1.0]], (0.04, 3.0), claim="practical",
+    ))  # fmt: skip
+    path = write(data, tmp_path)
+    lines = run(path).stdout.splitlines()
+    said = next(line for line in lines if line.startswith("claim: "))
+    assert said == (
+        "claim: every trajectory of the closed loop that starts in V <= 3.0 stays there, enters V <= 0.04 in finite "
+        "time and stays there from then on; nothing is claimed about what happens inside V <= 0.04, and the origin "
+        "need not be an equilibrium; u stays in its bounds"
+    )
+    assert lines[-1].startswith("ACCEPTED c0=0.04 c2=3.0 ") and not any("asymptotic" in line for line in lines)
+    answer = json.loads(run("--json", path).stdout)
+    assert answer["claim"] == "practical" and answer["levels"] == {"floor": 0.04, "roa": 3.0}
+    assert answer["margins"]["local"] is None and answer["margins"]["ring"] > 0
+    assert answer["rules"]["equilibrium"] == answer["rules"]["local"] == 0
+
+
+def test_a_practical_claim_with_one_level_asks_the_leaves(tmp_path: Path) -> None:
+    """c0 = c2: the ring is a surface, and leaves are not skipped."""
+    stable = make([["-", "x"]], [([[1.0]], [0.0])], [[1.0]], (1.0, 1.0), claim="practical")
+    assert outcome(dump(grow(stable)), tmp_path) == "ACCEPTED"
+    for wrong in ("x", ["*", "-1", "x", ["/", "x", "x"]]):
+        assert outcome(dump(grow(edited(stable, "plant.dynamics.0", wrong), max_leaves=50)), tmp_path) == "ring"
+    assert outcome(dump(edited(stable, "evidence.tree", "AA==")), tmp_path) == "tree"

@@ -22,7 +22,18 @@ from certify.checker import document, rules
 from certify.checker.errors import Rejected
 from tests.support.ablation import checker_without
 from tests.support.claim_oracle import EXACT, faults, read
-from tests.support.mutants import BASES, FAMILIES, Mutant, base, dump, family, true_edits
+from tests.support.mutants import (
+    BASES,
+    FAMILIES,
+    PRACTICAL,
+    Mutant,
+    base,
+    dump,
+    family,
+    practical,
+    practical_base,
+    true_edits,
+)
 from tests.support.naive_checker import judge
 
 ORDER = ("format", "hash", "levels", "lyapunov", "equilibrium", "domain", "coordinates", "root", "centring", "local",
@@ -166,6 +177,38 @@ def test_no_size_takes_a_gigabyte(tmp_path: Path) -> None:
     )
     done = subprocess.run([sys.executable, "-I", "-c", code, *paths], capture_output=True, text=True, check=True)
     assert int(done.stdout.split()[-1]) < 2**20  # KiB
+
+
+# ------------------------------------------------------------------------------------------------------ another claim
+
+
+@pytest.mark.parametrize("name", PRACTICAL)
+def test_honest_practical_certificates_are_accepted(name: str, tmp_path: Path) -> None:
+    """The origin is no equilibrium of any of them."""
+    path = Mutant(name, practical_base(name), frozenset()).write(tmp_path / "certificate.json")
+    assert (verdict_on(path), faults(path)) == ("ACCEPTED", {})
+    tally = rules.check(document.read(str(path)))
+    assert tally.rules["equilibrium"] == tally.rules["local"] == 0 and tally.local_margin is None
+    assert tally.rules["tree"] >= tally.rules["ring"] > 0
+    kind, floor = practical_base(name)["claim"]["kind"], practical_base(name)["levels"]["floor"]
+    asymptotic = {**practical_base(name), "claim": {"kind": "asymptotic"}}
+    asymptotic["levels"] = {"local": floor, "roa": asymptotic["levels"]["roa"]}
+    assert kind == "practical"
+    assert verdict_on(Mutant(name, asymptotic, frozenset()).write(path)) in ("equilibrium", "centring")
+
+
+def test_forged_practical_certificates_are_refused_by_the_expected_rule(tmp_path: Path) -> None:
+    """Each is shown to be false, malformed or incomplete without the checker."""
+    path, wrong, met, count = tmp_path / "mutant.json", [], set(), 0
+    for one in practical():
+        verdict, found = verdict_on(one.write(path)), faults(path, one.hints)
+        count += 1
+        met.add(verdict)
+        if verdict not in one.rules or not found:
+            wrong.append(f"{one.name}: {verdict} in place of {sorted(one.rules)}; {found}")
+    assert not wrong, "\n".join([f"{len(wrong)} of {count}", *wrong])
+    assert count >= 100
+    assert met == set(ORDER) - {"equilibrium", "local"}
 
 
 # ------------------------------------------------------------------------------------- each rule is there for a reason

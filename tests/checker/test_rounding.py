@@ -693,7 +693,7 @@ def test_vdot_on_boxes(first: int, second: int, report: Report) -> None:
         z = np.where(share == 1, hi[:, None], z).reshape(n, -1).T
         truth = levels_and_vdots(name, ring.c, z)
         c1, c2 = np.quantile([float(V) for V, _ in truth], [0.2, 0.8]).tolist()
-        ring.c = replace(ring.c, c1=c1, c2=c2)
+        ring.c = replace(ring.c, levels={"local": c1, "roa": c2})
 
         def residual(
             row: int, low: float, high: float, name: str = name, c: Certificate = ring.c, z: Array = z,

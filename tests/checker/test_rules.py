@@ -561,8 +561,7 @@ def test_a_leaf_is_missed_only_if_it_lies_outside_the_ring(exponent: int) -> Non
         S = [[Fraction(float(v)) for v in row] for row in [[2.0**exponent, 0.0], [0.0, 2.0**exponent]]]
         S[0][1] = S[1][0] = Fraction(float(generator.uniform(-0.9, 0.9))) * Fraction(2) ** exponent
         levels = sorted(generator.uniform(0.1, 2, 2) * 2.0 ** (exponent + 2))
-        object.__setattr__(c, "c1", float(levels[0]))
-        object.__setattr__(c, "c2", float(levels[1]))
+        c = replace(c, levels={"local": float(levels[0]), "roa": float(levels[1])})
         with np.errstate(all="ignore"):
             ring = Ring(c, c.evidence.T, network.fold(c.policy, c.u_eq), S)
             lo = generator.uniform(-3, 3, (2, 40))
@@ -580,7 +579,7 @@ def test_a_leaf_is_missed_only_if_it_lies_outside_the_ring(exponent: int) -> Non
 
 def test_a_lower_bound_of_V_that_overflows_puts_no_leaf_outside() -> None:
     """V computed is infinite, V itself is below c2, the largest binary64 number."""
-    c = replace(parse(scalar_claim()), c2=float(np.finfo(float).max))
+    c = replace(parse(scalar_claim()), levels={"local": 1.0, "roa": float(np.finfo(float).max)})
     generator, met = np.random.default_rng(0), 0
     for s in (1 + generator.random(600)).tolist():
         near = float(np.sqrt(2.0**1023 / s) * np.sqrt(2.0))

@@ -28,6 +28,7 @@ from certify.checker.ring import Ring
 
 Document = dict[str, Any]
 LEAF = 255
+INNER = {"asymptotic": "local", "practical": "floor"}  # the name of the inner level
 
 
 def encode(array: Any) -> str:
@@ -75,6 +76,7 @@ def make(
     T: Any = None,
     root: Any = None,
     tree: bytes = bytes([LEAF]),
+    claim: str = "asymptotic",
 ) -> Document:
     """A certificate's document; the root box is the least one that binary64 can name, unless it is given."""
     P = np.atleast_2d(np.asarray(P, dtype=np.float64))
@@ -84,7 +86,7 @@ def make(
     arrays = [(np.atleast_2d(np.asarray(W, dtype=np.float64)), np.atleast_1d(b)) for W, b in layers]
     return rehash({
         "schema": "certify-certificate/2",
-        "claim": {"kind": "asymptotic"},
+        "claim": {"kind": claim},
         "plant": {
             "name": "plant",
             "states": list(states),
@@ -103,7 +105,7 @@ def make(
             "sha256": "",
         },
         "lyapunov": {"kind": "quadratic", "P": encode(P)},
-        "levels": {"local": float(levels[0]).hex(), "roa": float(levels[1]).hex()},
+        "levels": {INNER[claim]: float(levels[0]).hex(), "roa": float(levels[1]).hex()},
         "evidence": {
             "kind": "partition-tree",
             "T": encode(T),
@@ -188,11 +190,15 @@ def passes(ring: Ring, bounded: bool, lo: np.ndarray, hi: np.ndarray) -> np.ndar
     radius = up(np.maximum(hi - centre, centre - lo))
     x, error = ring.states(centre, radius)
     mid, slopes, wide = network.enclose_on_boxes(ring.net, x, error)
-    good = ring.bound(ring.vdot(*ring.dynamics(x, error, mid, slopes, wide)), centre, radius) < 0
+    states, F = ring.dynamics(x, error, mid, slopes, wide)
+    good = ring.bound(ring.vdot(states, F), centre, radius) < 0
+    outside, inside = ring.misses(lo, hi)
+    if ring.c.claim == "practical":
+        good |= inside & np.all([np.isfinite(f.size + f.r) for f in F], axis=0)
     if not bounded:
         for j, bounds in enumerate(ring.c.input_bounds):
             good &= within(bounds, mid[j], up(total(np.abs(slopes[j]), 0) + wide[j]))
-    return good | np.logical_or(*ring.misses(lo, hi))
+    return good | outside | (inside & (ring.c.claim == "asymptotic"))
 
 
 def tree_of(data: Document) -> bytes:
