@@ -11,28 +11,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from . import schema as s
 from . import strict
 from .errors import Rejected
 from .expression import Tape, parse_dynamics
-from .schema import (
-    Known,
-    anything,
-    array,
-    base64_bytes,
-    binary64,
-    by_kind,
-    choice,
-    interval,
-    listed,
-    mapping,
-    name,
-    rational,
-    section,
-    then,
-    word,
-)
+from .schema import Known
 
-LEVELS = {"asymptotic": section(local=binary64, roa=binary64), "practical": section(floor=binary64, roa=binary64)}
+LEVELS = {
+    "asymptotic": s.section(local=s.binary64, roa=s.binary64),
+    "practical": s.section(floor=s.binary64, roa=s.binary64),
+}
 MAX_STATES, MAX_LAYERS, MAX_WIDTH = 64, 64, 2**14
 Array = NDArray[np.float64]
 
@@ -118,7 +106,7 @@ def _plant(stated: dict[str, Any], at: str, known: Known) -> dict[str, Any]:
 
 def _shape(value: Any, at: str, known: Known) -> None:
     """[rows, columns] of a layer: the columns are the rows of the layer before, the first ones the states."""
-    rows, columns = listed(anything, 2)(value, at, known)
+    rows, columns = s.listed(s.anything, 2)(value, at, known)
     if not (type(rows) is type(columns) is int and 1 <= rows <= MAX_WIDTH and columns == known.get("rows", known["n"])):
         strict.fail(at, f"must be [out, {known.get('rows', known['n'])}] with out at most {MAX_WIDTH}")
     known |= {"rows": rows, "columns": columns}
@@ -149,47 +137,55 @@ def _trusted(stated: dict[str, Any], at: str, known: Known) -> Trusted:
     return Trusted(stated["solver"], stated["version"], stated["queries"])
 
 
-_DOCUMENT = section(
-    schema=choice("certify-certificate/2"),
-    claim=then(section(kind=choice(*LEVELS)), lambda stated, at, known: known.setdefault("claim", stated["kind"])),
-    plant=then(
-        section(
-            name=name,
-            states=listed(name, "n", 1, MAX_STATES),
-            inputs=listed(name, "m", 1, MAX_STATES),
-            dynamics=listed(anything, "n"),
-            u_eq=listed(rational, "m"),
-            domain=listed(interval, "n"),
-            input_bounds=listed(interval, "m"),
+_DOCUMENT = s.section(
+    schema=s.choice("certify-certificate/2"),
+    claim=s.then(
+        s.section(kind=s.choice(*LEVELS)), lambda stated, at, known: known.setdefault("claim", stated["kind"])
+    ),
+    plant=s.then(
+        s.section(
+            name=s.name,
+            states=s.listed(s.name, "n", 1, MAX_STATES),
+            inputs=s.listed(s.name, "m", 1, MAX_STATES),
+            dynamics=s.listed(s.anything, "n"),
+            u_eq=s.listed(s.rational, "m"),
+            domain=s.listed(s.interval, "n"),
+            input_bounds=s.listed(s.interval, "m"),
         ),
         _plant,
     ),
-    policy=then(
-        section(
-            squash=choice("tanh", "identity"),
-            centre=choice("output", "preactivation", "none"),
-            layers=listed(
-                section(shape=_shape, weight=array("rows", "columns"), bias=array("rows")), "", 1, MAX_LAYERS
+    policy=s.then(
+        s.section(
+            squash=s.choice("tanh", "identity"),
+            centre=s.choice("output", "preactivation", "none"),
+            layers=s.listed(
+                s.section(shape=_shape, weight=s.array("rows", "columns"), bias=s.array("rows")), "", 1, MAX_LAYERS
             ),
-            scale=array("m"),
-            offset=array("m"),
-            sha256=anything,
+            scale=s.array("m"),
+            offset=s.array("m"),
+            sha256=s.anything,
         ),
         _policy,
     ),
-    lyapunov=section(kind=choice("quadratic"), P=array("n", "n")),
+    lyapunov=s.section(kind=s.choice("quadratic"), P=s.array("n", "n")),
     levels=lambda value, at, known: LEVELS[known["claim"]](value, at, known),
-    evidence=by_kind(
-        partition_tree=then(
-            section(kind=anything, T=array("n", "n"), root=array("n"), tree=base64_bytes),
+    evidence=s.by_kind(
+        partition_tree=s.then(
+            s.section(kind=s.anything, T=s.array("n", "n"), root=s.array("n"), tree=s.base64_bytes),
             lambda stated, at, known: Partition(stated["T"], stated["root"], stated["tree"]),
         ),
-        trusted_solver=then(
-            section(kind=anything, solver=word, version=word, precision=binary64, queries=listed(listed(word, 2))),
+        trusted_solver=s.then(
+            s.section(
+                kind=s.anything,
+                solver=s.word,
+                version=s.word,
+                precision=s.binary64,
+                queries=s.listed(s.listed(s.word, 2)),
+            ),
             _trusted,
         ),
     ),
-    provenance=mapping,
+    provenance=s.mapping,
 )
 
 

@@ -95,16 +95,8 @@ STATED: Table[Case] = (
     ("root", root),
     ("centring", centring),
 )
-ON_THE_BALL: Table[local.Ball] = (
-    ("local", local.fits),
-    ("inputs", local.keeps_inputs),
-    ("local", local.decreases),
-)
-ON_LEAVES: Table[ring.Leaves] = (
-    ("tree", ring.is_whole),
-    ("inputs", ring.keeps_inputs),
-    ("ring", ring.decreases),
-)
+ON_THE_BALL: Table[local.Ball] = (("local", local.fits), ("inputs", local.keeps_inputs), ("local", local.decreases))
+ON_LEAVES: Table[ring.Leaves] = (("tree", ring.is_whole), ("inputs", ring.keeps_inputs), ("ring", ring.decreases))
 OF_THE_TREE = {"coordinates", "root"}  # not asked of a solver's word
 OF_THE_ORIGIN = {"equilibrium"}  # nor this of a practical claim
 READ = {"format": 1, "hash": 1}  # rules of document.py, which have held
