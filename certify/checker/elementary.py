@@ -53,5 +53,5 @@ def elementary(name: str, c: Any, error: Any, radius: Any) -> tuple[Triple, Trip
 
 
 def _rounded_down(x: Any) -> Any:
-    """NaN unless x > 0."""
-    return np.where(x > 0, x * (1 - 2.0**-40), np.nan)
+    """NaN unless 0 < x < infinity."""
+    return np.where((x > 0) & (x < np.inf), x * (1 - 2.0**-40), np.nan)

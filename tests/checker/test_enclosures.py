@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 
 from certify.checker import float64
 from certify.checker.document import Policy
+from certify.checker.elementary import elementary
 from certify.checker.exact import gershgorin_lower, inverse_diagonal, rational
 from certify.checker.float64 import (
     arb_with_error,
@@ -849,3 +850,33 @@ def test_products_of_far_corners_in_the_off_diagonal_part_of_V_are_not_lost(expo
     far = np.full((2, 1), 2.0**-600)
     ring.S_cross = np.array([[0.0, 2.0**900], [2.0**900, 0.0]])
     assert Fraction(float(ring.cross(far)[0])) >= 2 * Fraction(2) ** 900 * Fraction(2) ** -1200
+
+
+# ------------------------------------------------------------------------------------------------- what is no number
+
+
+@pytest.mark.parametrize("name", ["sin", "cos", "inv", "tanh"])
+def test_nothing_is_known_of_a_function_where_nothing_is_known_of_its_argument(name: str) -> None:
+    radii = (0.0, 1.0, 1e300, np.inf, np.nan)
+    wrong = [(c, 0.0) for c in (np.nan, np.inf, -np.inf)] + [(1.0, np.nan), (np.nan, np.nan), (np.inf, np.inf)]
+    for (c, error), radius in itertools.product(wrong, radii):
+        _, errors, _ = elementary(name, np.array([c]), error, np.array([radius]))
+        assert not np.isfinite([float(np.ravel(e)[0]) for e in errors]).any(), (c, error, radius)
+    for c, error, radius in ((1.0, 0.0, np.nan), (1.0, 0.0, np.inf), (0.0, 0.0, 1.0), (-0.0, 0.0, 0.0), (1.0, 1.0, 0.0)):
+        if name == "inv":
+            _, errors, third = elementary(name, np.array([c]), error, np.array([radius]))
+            assert all(np.isnan(np.ravel(v)[0]) for v in (*errors, third)), (c, error, radius)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("where", range(4))
+def test_what_is_not_finite_never_ends_in_a_negative_bound(value: float, where: int) -> None:
+    if where == 3 and value == -np.inf:
+        return  # a remainder is never negative
+    parts = [np.array([-1.0]), np.array([[0.1], [0.2]]), np.zeros((2, 2, 1)), np.array([0.01])]
+    parts[where].flat[0] = value
+    m, one = Taylor(*parts), affine(np.array([-1.0]), np.zeros((2, 1)))
+    zero = one.scaled(0.0, 0.0)
+    unary = (-m, m.sin(), m.cos(), m.inv(), m.scaled(1.0, 0.0), m.scaled(0.0, 0.0), m.scaled(5e-324, 0.0))
+    for result in (*unary, m + one, m * one, one * m, m * zero, m.sin() * zero + one, m.inv() * zero + one):
+        assert not np.isfinite((result.size + result.r)[0]) and not upper_bound(result)[0] < 0
