@@ -862,7 +862,7 @@ def test_nothing_is_known_of_a_function_where_nothing_is_known_of_its_argument(n
     for (c, error), radius in itertools.product(wrong, radii):
         _, errors, _ = elementary(name, np.array([c]), error, np.array([radius]))
         assert not np.isfinite([float(np.ravel(e)[0]) for e in errors]).any(), (c, error, radius)
-    for c, error, radius in ((1.0, 0.0, np.nan), (1.0, 0.0, np.inf), (0.0, 0.0, 1.0), (-0.0, 0.0, 0.0), (1.0, 1.0, 0.0)):
+    for c, error, radius in ((1.0, 0.0, np.nan), (1.0, 0.0, np.inf), (0.0, 0.0, 1.0), (-0.0, 0.0, 0.0), (1.0, 1.0, 0)):
         if name == "inv":
             _, errors, third = elementary(name, np.array([c]), error, np.array([radius]))
             assert all(np.isnan(np.ravel(v)[0]) for v in (*errors, third)), (c, error, radius)
