@@ -15,8 +15,8 @@ import time
 from collections.abc import Sequence
 from typing import Any
 
-from certify.reference.document import MAX_BYTES, Certificate
-from certify.reference.rules import Verdict, judge
+from .document import MAX_BYTES, Certificate
+from .rules import Verdict, judge
 
 STATUS = {"ACCEPTED": 0, "REJECTED": 1, "TRUSTED": 3}
 UNUSABLE, INTERNAL = 2, 70
@@ -65,12 +65,13 @@ def as_json(verdict: Verdict, seconds: float) -> dict[str, Any]:
         "rule": verdict.rule,
         "at": verdict.at,
         "detail": verdict.detail,
-        "claim": c and in_words(c),
+        "claim": c and c.claim,
         "certificate_sha256": verdict.certificate_sha256,
         "policy_sha256": c and c.policy.sha256,
         "levels": c and {key: value for key, _, value in level_names(c)},
         "leaves": verdict.leaves,
         "seconds": {"check": seconds},
+        "text": [*([in_words(c)] if c and verdict.result != "REJECTED" else []), line(verdict)],
     }
 
 

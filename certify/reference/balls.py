@@ -11,7 +11,7 @@ from collections.abc import Iterable, Sequence
 
 from flint import arb, arb_mat
 
-from certify.reference.document import Certificate, Policy, exact
+from .document import Certificate, Policy, exact
 
 PRECISION = 128  # bits; single operations of flint cost about the same with 64
 ZERO, ONE = arb(0), arb(1)

@@ -19,8 +19,8 @@ from typing import Any
 
 from flint import fmpq, fmpq_mat
 
-from certify.reference.expressions import Equations, equations, rational
-from certify.reference.refusal import Refused, require
+from .expressions import Equations, equations, rational
+from .refusal import Refused, require
 
 MAX_BYTES, MAX_BYTES_BEYOND_ASCII = 256 * 2**20, 16 * 2**20
 MAX_TOKENS = 10**6  # commas and opening brackets

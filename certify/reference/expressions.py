@@ -13,7 +13,7 @@ from typing import Any
 
 from flint import fmpq
 
-from certify.reference.refusal import require
+from .refusal import require
 
 MAX_NESTING, MAX_NODES = 200, 20_000  # of lists; of lists, names and numbers in all equations
 RATIONAL = re.compile(r"-?(0|[1-9][0-9]{0,1200})(/[1-9][0-9]{0,1200})?")

@@ -12,7 +12,7 @@ from itertools import islice
 
 from flint import arb, arb_mat, fmpq_mat
 
-from certify.reference.balls import (
+from .balls import (
     ONE,
     ZERO,
     absolute,
@@ -23,9 +23,9 @@ from certify.reference.balls import (
     weights,
     within_bounds,
 )
-from certify.reference.document import Certificate, Tree
-from certify.reference.refusal import Refused, require
-from certify.reference.taylor import Taylor, pairs
+from .document import Certificate, Tree
+from .refusal import Refused, require
+from .taylor import Taylor, pairs
 
 LEAF = 255
 MAX_WAITING = 4096  # boxes of the tree beside the one in hand

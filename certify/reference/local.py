@@ -8,7 +8,7 @@ from functools import cached_property
 
 from flint import arb, arb_mat, fmpq, fmpq_mat
 
-from certify.reference.balls import (
+from .balls import (
     ZERO,
     absolute,
     beta,
@@ -23,9 +23,9 @@ from certify.reference.balls import (
     weights,
     within_bounds,
 )
-from certify.reference.document import Certificate, exact
-from certify.reference.rational import discs
-from certify.reference.refusal import Refused, require
+from .document import Certificate, exact
+from .rational import discs
+from .refusal import Refused, require
 
 
 @dataclass(frozen=True)

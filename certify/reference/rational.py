@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 from flint import fmpq, fmpq_mat
 
-from certify.reference.document import Certificate, Policy, Tree, exact
-from certify.reference.refusal import require
+from .document import Certificate, Policy, Tree, exact
+from .refusal import require
 
 MAX_BITS = 2**14  # of a numerator or denominator on the way to f(0, u_eq)
 ZERO = fmpq(0)

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 from flint import ctx
 
-from certify.reference import rational
-from certify.reference.balls import PRECISION
-from certify.reference.document import Certificate, Trusted, read
-from certify.reference.leaves import Leaves, check_leaves, structure
-from certify.reference.local import local
-from certify.reference.refusal import Refused, require
+from . import rational
+from .balls import PRECISION
+from .document import Certificate, Trusted, read
+from .leaves import Leaves, check_leaves, structure
+from .local import local
+from .refusal import Refused, require
 
 MAX_WORK = 2**22  # numbers of a model times operations of the plant; entries of the matrices of a network
 

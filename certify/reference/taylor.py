@@ -13,8 +13,8 @@ from itertools import combinations_with_replacement
 
 from flint import arb
 
-from certify.reference.balls import ZERO, derivatives, finite, third, total
-from certify.reference.refusal import Refused
+from .balls import ZERO, derivatives, finite, third, total
+from .refusal import Refused
 
 Coefficients = list[arb] | None
 
