@@ -11,7 +11,6 @@ import gc
 import json
 import os
 import sys
-import threading
 import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -20,9 +19,9 @@ import typer
 
 from certify.arguments import numbers, plant_of
 from certify.errors import BackendError, CertifyError, InputError, SoundnessError
+from certify.terminal import ProgressLine, closed_pipe, say, show, tell
 
 if TYPE_CHECKING:
-    from certify.engines.base import Progress
     from certify.lyapunov import Candidate
     from certify.policies import Policy
     from certify.results import RoaResult
@@ -37,7 +36,7 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
 )
 
-_INTERRUPTED, _CLOSED_PIPE = 130, 141  # as a shell reports SIGINT and SIGPIPE
+_INTERRUPTED = 130  # as a shell reports SIGINT
 _STOPPED = "interrupted; nothing was left half-written."
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
@@ -84,10 +83,10 @@ def roa(
     start = time.perf_counter()
     stored = load_policy(policy)
     plant = plant_of(stored, system, param or [], domain or [])
-    _tell(_plant_line(stored, plant, system is not None))
+    tell(_plant_line(stored, plant, system is not None))
     shift = stored.beta_shift(plant.exact_u_eq())
     if shift:
-        _tell(f"the file's rounded beta is read as the real number; this shifts u(0) by {shift:.3g}")
+        tell(f"the file's rounded beta is read as the real number; this shifts u(0) by {shift:.3g}")
     options = RoaOptions(
         claim=claim,  # type: ignore[arg-type]
         candidate=candidate,  # type: ignore[arg-type]
@@ -102,7 +101,7 @@ def roa(
         max_boxes=max_boxes,
     )
     folder = out if out is not None else Path("out") / policy.stem
-    progress = _ProgressLine()
+    progress = ProgressLine()
     try:
         result = certify_roa(
             plant, stored.network, folder, options,
@@ -112,16 +111,16 @@ def roa(
         progress.close()
     data = result.to_dict()
     if result.notice is not None:
-        _tell(result.notice)
+        tell(result.notice)
     if result.certificate is not None:
         data["candidates"] = _candidates(result, options, compare) if claim == "asymptotic" else []
         _write(folder / "report.html", _page(result, data))
     if as_json:
-        _out(json.dumps(data))
+        say(json.dumps(data))
     else:
-        _print(summary(data))
+        show(summary(data))
         if result.certificate is not None:
-            _out(f"certificate  {result.certificate}\nreport       {folder / 'report.html'}")
+            say(f"certificate  {result.certificate}\nreport       {folder / 'report.html'}")
     raise typer.Exit(result.verdict.exit_status)
 
 
@@ -159,7 +158,7 @@ def export_smt2(
         text = to_smt2(query(condition, result.problem), "unsat (proved by the bounds engine, accepted by the checker)")
         _write(path, text)
         written.append(str(path))
-    _out(json.dumps({"files": written}) if as_json else "\n".join(written))
+    say(json.dumps({"files": written}) if as_json else "\n".join(written))
 
 
 @app.command()
@@ -189,7 +188,7 @@ def check(
         status, lines = 1, [f"REJECTED rule=policy at=policy.sha256: {detail}"]
     if "error" in answer and not as_json:
         raise typer.Exit(_fail(False, answer["error"], status))
-    _out(json.dumps(answer) if as_json else "\n".join(lines))
+    say(json.dumps(answer) if as_json else "\n".join(lines))
     raise typer.Exit(status)
 
 
@@ -216,7 +215,7 @@ def report(
     page = render_html(read, answer, None, certificate, sha256=hashlib.sha256(raw).hexdigest(), size=len(raw))
     _write(target, page)
     stated = {"report": str(target), "result": answer["result"]}
-    _out(json.dumps(stated) if as_json else f"{answer['result']}  {target}")
+    say(json.dumps(stated) if as_json else f"{answer['result']}  {target}")
     raise typer.Exit({"ACCEPTED": 0, "TRUSTED": 3}.get(answer["result"], 1))
 
 
@@ -227,7 +226,7 @@ def systems(as_json: Json = False) -> None:
 
     found = [get_system(name) for name in available_systems()]
     if as_json:
-        _out(json.dumps({"systems": [_describe(s) for s in found]}))
+        say(json.dumps({"systems": [_describe(s) for s in found]}))
         return
     for s in found:
         lines = [f"{s.name}: {s.description}"]
@@ -236,7 +235,7 @@ def systems(as_json: Json = False) -> None:
         for symbols, intervals in ((s.states, s.domain), (s.inputs, s.input_bounds)):
             for symbol, (lo, hi) in zip(symbols, intervals, strict=True):
                 lines.append(f"  {symbol} in [{float(lo):g}, {float(hi):g}] {s.units.get(symbol.name, '')}")
-        _out("\n".join(lines))
+        say("\n".join(lines))
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -268,7 +267,7 @@ def _run(arguments: list[str], as_json: bool) -> int:
     except CertifyError as error:
         return _fail(as_json, str(error), 2)
     except BrokenPipeError:
-        return _closed()
+        return closed_pipe()
     except Exception as error:  # the last resort: no traceback reaches a user
         return _fail(as_json, f"internal error: {type(error).__name__}: {error}", 70)
 
@@ -276,40 +275,24 @@ def _run(arguments: list[str], as_json: bool) -> int:
 def _fail(as_json: bool, message: str, status: int) -> int:
     if as_json:
         try:
-            _out(json.dumps({"error": message}))
+            say(json.dumps({"error": message}))
         except typer.Exit as closed:
             return closed.exit_code
     else:
-        _tell(f"certify: {message}")
+        tell(f"certify: {message}")
     return status
-
-
-def _closed() -> int:
-    """What is left to say goes nowhere: whoever read it has gone, which is no verdict."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    return _CLOSED_PIPE
-
-
-def _out(text: str) -> None:
-    """Print the result, and be sure that it has left: a reader that has gone must not look like a verdict."""
-    try:
-        sys.stdout.write(text + "\n")
-        sys.stdout.flush()
-    except BrokenPipeError:
-        raise typer.Exit(_closed()) from None
 
 
 def _page(result: RoaResult, data: dict[str, Any]) -> str:
     """The report of a run, about the very bytes that its checker read."""
     import hashlib
 
-    from certify.certificate import parse_certificate, read_raw
+    from certify.certificate import parse_certificate
     from certify.report import render_html
 
-    if result.certificate is None:
+    if result.certificate is None or result.raw is None:
         raise InputError("there is no certificate to report on.")
-    raw = read_raw(result.certificate)
-    answer = None if result.checker is None else dict(result.checker)
+    raw, answer = result.raw, None if result.checker is None else dict(result.checker)
     read, sha256 = parse_certificate(raw, str(result.certificate)), hashlib.sha256(raw).hexdigest()
     return render_html(read, answer, data, result.certificate, sha256=sha256, size=len(raw))
 
@@ -345,7 +328,7 @@ def _engine(context: typer.Context, name: str) -> str:
         try:
             find_backend()
         except BackendError as error:
-            _tell(f"engine bounds in the place of {name}: {error}")
+            tell(f"engine bounds in the place of {name}: {error}")
             return "bounds"
     return name
 
@@ -382,47 +365,3 @@ def _write(path: Path, text: str) -> None:
     from certify.certificate import write_atomically
 
     write_atomically(path, text.encode())
-
-
-def _print(renderable: Any) -> None:
-    from rich.console import Console
-
-    console = Console(file=sys.stdout)
-    with console.capture() as captured:
-        console.print(renderable)
-    _out(captured.get().rstrip("\n"))
-
-
-def _tell(line: str) -> None:
-    sys.stderr.write(line + "\n")
-
-
-def _ring_line(state: Progress) -> str:
-    left = "" if state.seconds_left is None else f", about {state.seconds_left:.0f} s left"
-    return (
-        f"ring: proved to V = {state.level:.4g} of {state.target:.4g} ({state.proved:.1%} of the volume), "
-        f"{state.boxes} boxes, {state.open} open{left}"
-    )
-
-
-class _ProgressLine:
-    """A line on standard error, at most five times a second, only on a terminal."""
-
-    def __init__(self) -> None:
-        self.last = 0.0
-        self.shown = False
-
-    def __call__(self, stage: str, state: Progress | None) -> None:
-        if stage == "check":  # the checker works in a process of its own: load the drawing libraries meanwhile
-            from certify.report import warm_up
-
-            threading.Thread(target=warm_up, daemon=True).start()
-        now = time.monotonic()
-        if sys.stderr.isatty() and now - self.last > 0.2:
-            self.last, self.shown = now, True
-            sys.stderr.write(f"\r{_ring_line(state) if state is not None else 'checking'}\x1b[K")
-            sys.stderr.flush()
-
-    def close(self) -> None:
-        if self.shown:
-            sys.stderr.write("\r\x1b[K")

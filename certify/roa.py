@@ -233,17 +233,17 @@ class _Run:
             missed = f"proved only up to V <= {claim.roa:.12g}, not {task.target:g}"
             return replace(result, detail=f"{proof.detail}; {missed}" if proof.detail else missed)
         certificate = Certificate(self.system, self.network, task.problem.V, claim, proof.evidence, self.provenance)  # type: ignore[arg-type]
-        path, answer = self._write_and_check(certificate)
+        path, data, answer = self._write_and_check(certificate)
         trusted = isinstance(proof.evidence, TrustedSolver)
         if not trusted and self.options.engine == "both":
             result = replace(result, solver=self._confirm(task.problem, claim))
         return replace(
             _with_levels(result, claim.levels, witness), verdict=Verdict.TRUSTED if trusted else Verdict.PROVED,
-            stop=_limit(proof.stop, task, witness), leaves=proof.leaves, certificate=path, checker=answer,
+            stop=_limit(proof.stop, task, witness), leaves=proof.leaves, certificate=path, raw=data, checker=answer,
         )  # fmt: skip
 
-    def _write_and_check(self, certificate: Certificate) -> tuple[Path, dict[str, Any]]:
-        """The certificate's path and the checker's answer; it gets its name only when the answer is the wanted one.
+    def _write_and_check(self, certificate: Certificate) -> tuple[Path, bytes, dict[str, Any]]:
+        """The certificate's path, its bytes and the checker's answer, without which it does not get its name.
 
         Raises
         ------
@@ -269,7 +269,7 @@ class _Run:
         if answer["certificate_sha256"] != hashlib.sha256(data).hexdigest():
             raise SoundnessError(f"the checker's answer is about other bytes than those of {unchecked}: {answer}.")
         unchecked.replace(path)
-        return path, answer
+        return path, data, answer
 
     def _confirm(self, problem: Problem, claim: Claim) -> dict[str, Any]:
         """dReal's answers about what the bounds engine proved.

@@ -27,6 +27,7 @@ EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows th
     "rigorous": "closed_loop expressions policies",
     "roa": "certificate claims closed_loop engines lyapunov policies results rigorous running systems",
     "systems": "expressions",
+    "terminal": "engines report",
     "controllers": "policies systems",
 }
 
