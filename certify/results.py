@@ -46,9 +46,9 @@ class Levels:
 class RoaResult:
     """What was proved. `stop` and `detail` say what limits the level, or why nothing was proved.
 
-    `candidate` is where P came from, `notice` why that is not what was asked for. `checker` is what the checker said, None
-    if it was not reached, about `raw`, the certificate's bytes; `solver` has dReal's version and every query with its
-    answer, None if it was not asked.
+    `candidate` is where P came from, `notice` why that is not what was asked for. `checker` is what the checker said,
+    None if it was not reached, about `raw`, the certificate's bytes; `solver` has dReal's version and every query with
+    its answer, None if it was not asked.
     """
 
     verdict: Verdict
