@@ -345,3 +345,36 @@ def test_a_beta_that_is_not_the_rounded_one_is_refused(
     status, out, err = run(capsys, "roa", "--policy", tmp_path / "b.pt", "--out", tmp_path / "o")
     assert (status, out) == (2, "") and "`beta` must be atanh" in err and "shifts u(0) by" in err
     assert not (tmp_path / "o").exists()
+
+
+def test_practical_stability_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    plain = SHIPPED.parent / "without_gain" / "pendulum.pt"
+    status, out, err = run(capsys, "roa", "--policy", plain, "--out", tmp_path)
+    assert (status, out) == (2, "") and "claim practical stability" in err
+    arguments = ("roa", "--policy", plain, "--claim", "practical", "--candidate", "lqr", "--out", tmp_path)
+    status, out, _ = run(capsys, *arguments)
+    assert status == 0 and "enters" in out and "converge" not in out and "floor c0" in out
+    page = (tmp_path / "report.html").read_text()
+    assert "Practical stability" in page and "asymptotically stable" not in page
+    for program in ([], ["--reference"]):
+        status, out, _ = run(capsys, "check", tmp_path / "certificate.json", "--policy", plain, *program)
+        assert status == 0 and "in finite time" in out and out.splitlines()[-1].startswith("ACCEPTED c0=")
+        status, out, _ = run(capsys, "check", tmp_path / "certificate.json", "--policy", SHIPPED, *program)
+        assert status == 1 and out.startswith("REJECTED rule=policy")
+    status, _, err = run(capsys, *arguments, "--engine", "dreal")
+    assert status in (2, 3)  # without dReal unknown, with it a claim that it does not prove
+    assert run(capsys, *arguments[:4], "stable")[0] == 2
+
+
+def test_both_checkers_refuse_a_level_that_was_not_proved(
+    tmp_path: Path, policy_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    certificate = certified(tmp_path, policy_file, capsys)
+    data = json.loads(certificate.read_text())
+    data["levels"]["roa"] = (float.fromhex(data["levels"]["roa"]) * 1.5).hex()
+    certificate.write_text(json.dumps(data))
+    for program in ([], ["--reference"]):
+        status, out, _ = run(capsys, "check", certificate, "--json", *program)
+        assert status == 1 and json.loads(out)["result"] == "REJECTED"
+        status, out, err = run(capsys, "check", tmp_path / "missing.json", *program)
+        assert (status, out) == (2, "") and "cannot be read" in err
