@@ -23,19 +23,24 @@ import torch
 from fitted import fit_policy, spread_of
 from intervals import PlainIntervals
 
+from certify.claims import Problem
+from certify.claims.conditions import ring_condition
+from certify.claims.queries import Query, query
 from certify.closed_loop import ClosedLoop
+from certify.engines.base import Budget
+from certify.engines.bounds.search import prove_outwards
 from certify.engines.dreal import backend as dreal
-from certify.engines.bounds.search import Budget, prove_outwards
 from certify.engines.falsify import falsify
 from certify.engines.local import prove_local
 from certify.errors import BackendError
 from certify.lyapunov import diagonalising_coordinates, domain_limit, solve_lyapunov
-from certify.obligations import Case, ring_query
+from certify.lyapunov.function import Quadratic
 from certify.policies import load_policy
+from certify.running import ThreadRunner
 from certify.systems import get_system
 
 POLICIES = Path(__file__).parent.parent / "examples" / "policies"
-CPU = torch.device("cpu")
+RUNNER = ThreadRunner()
 
 
 def loops() -> Iterator[tuple[str, ClosedLoop, float]]:
@@ -73,23 +78,23 @@ def main() -> None:
         torch.set_num_threads(options.threads)
         A, _, _ = loop.linearise()
         P = solve_lyapunov(A, np.eye(len(A)))
-        case = Case(loop, P, diagonalising_coordinates(P, A))
+        problem, T = Problem(loop, Quadratic(P)), diagonalising_coordinates(P, A)
         limit = domain_limit(P, loop.system.domain)
-        witness = falsify(case.problem, case.T, limit)
+        witness = falsify(problem, T, limit)
         outer = share * (limit if witness is None else witness.level)
-        inner = prove_local(case.problem, case.T, outer)
+        inner = prove_local(problem, T, outer)
         if inner is None:
             print(f"{name}: the local proof fails")
             continue
         layers = "-".join(map(str, loop.network.layers))
         print(f"\n{name} {layers}: {inner:.3g} <= V <= {outer:.6g}")
         rows: dict[str, Callable[[], tuple[str, float, str]]] = {
-            "bounds": lambda c=case, a=inner, b=outer: ring(c, a, b, options.limit, False),
-            "intervals": lambda c=case, a=inner, b=outer: ring(c, a, b, options.limit, True),
+            "bounds": lambda p=problem, T=T, a=inner, b=outer: ring(p, T, a, b, options.limit, False),
+            "intervals": lambda p=problem, T=T, a=inner, b=outer: ring(p, T, a, b, options.limit, True),
         }
         if backend is not None:
-            query = query(ring_condition(inner, outer), case.problem)
-            rows["dreal"] = lambda q=query: ask(backend, q, options)
+            asked = query(ring_condition(inner, outer), problem)
+            rows["dreal"] = lambda q=asked: ask(backend, q, options)
         reference = None
         for engine, run in rows.items():
             verdict, seconds, detail = run()
@@ -99,18 +104,21 @@ def main() -> None:
             print(f"  {engine:<10}{verdict:<9}{seconds:>9.3f} s {seconds / reference:>9.1f} x   {detail}", flush=True)
 
 
-def ring(case: Case, inner: float, outer: float, limit: float, plain: bool) -> tuple[str, float, str]:
+def ring(
+    problem: Problem, T: np.ndarray, inner: float, outer: float, limit: float, plain: bool
+) -> tuple[str, float, str]:
     """Verdict, seconds and detail of this project's branch and bound, with its own rule or with plain intervals."""
     start = time.perf_counter()
-    rule = PlainIntervals(case, CPU) if plain else None
-    proof = prove_outwards(case.problem, case.T, inner, outer, Budget(seconds=limit, boxes=10**8), CPU, rule=rule)
+    rule = PlainIntervals(problem, T, RUNNER.device) if plain else None
+    budget = Budget(seconds=limit, boxes=10**8)
+    proof = prove_outwards(problem, T, inner, outer, budget, RUNNER, rule=rule)
     seconds = time.perf_counter() - start
-    if proof.level >= outer:
+    if proof.outer >= outer:
         return "PROVED", seconds, f"{proof.boxes} boxes"
-    return "UNKNOWN", seconds, f"{proof.boxes} boxes, proved to {proof.level / outer:.3g} of c2 ({proof.reason})"
+    return "UNKNOWN", seconds, f"{proof.boxes} boxes, proved to {proof.outer / outer:.3g} of c2 ({proof.stop.value})"
 
 
-def ask(backend: dreal.Backend, query: dreal.Query, options: argparse.Namespace) -> tuple[str, float, str]:
+def ask(backend: dreal.Backend, query: Query, options: argparse.Namespace) -> tuple[str, float, str]:
     """Verdict, seconds of the solver alone, and detail of dReal."""
     answer = dreal.decide(backend, query, options.precision, 1, options.limit)
     seconds = answer.seconds if answer.solver_seconds is None else answer.solver_seconds

@@ -18,11 +18,15 @@ import numpy as np
 import torch
 from fitted import chain, fit_policy, spread_of
 
+from certify.claims import Problem
 from certify.closed_loop import ClosedLoop
-from certify.engines.bounds.search import Budget, prove_outwards
+from certify.engines.base import Budget
+from certify.engines.bounds.search import prove_outwards
 from certify.engines.falsify import falsify
 from certify.engines.local import prove_local
 from certify.lyapunov import diagonalising_coordinates, domain_limit, solve_lyapunov
+from certify.lyapunov.function import Quadratic
+from certify.running import ThreadRunner
 from certify.systems import System, get_system
 
 WIDTHS = (10, 10, 10, 9, 9, 9)
@@ -40,13 +44,13 @@ def cases() -> Iterator[tuple[str, System, tuple[int, ...], float | None]]:
         yield f"c2/c1 1e{exponent}", get_system("cartpole"), (64, 64), 10.0**exponent
 
 
-def obligations_for(system: System, widths: tuple[int, ...]) -> Case:
-    """P from Q = I for a policy that is fitted here."""
+def problem_for(system: System, widths: tuple[int, ...]) -> tuple[Problem, np.ndarray]:
+    """P from Q = I for a policy that is fitted here, and coordinates for boxes."""
     torch.set_num_threads(1)
     loop = ClosedLoop(system, fit_policy(system, widths, spread_of(system)))
     A, _, _ = loop.linearise()
     P = solve_lyapunov(A, np.eye(system.n))
-    return Case(loop, P, diagonalising_coordinates(P, A))
+    return Problem(loop, Quadratic(P)), diagonalising_coordinates(P, A)
 
 
 def main() -> None:
@@ -59,25 +63,25 @@ def main() -> None:
     print(
         f"{'case':<15}{'layers':<18}{'c1':>10}{'c2':>10}{'boxes':>10}{'leaves':>9}{'seconds':>9}{'boxes/s':>9}  result"
     )
-    known: dict[tuple[str, tuple[int, ...]], Case] = {}
+    known: dict[tuple[str, tuple[int, ...]], tuple[Problem, np.ndarray]] = {}
     for what, system, widths, ratio in cases():
         key = (system.name, widths)
         if key not in known:
-            known[key] = obligations_for(system, widths)
-        case = known[key]
-        limit = domain_limit(case.P, system.domain)
-        witness = falsify(case.problem, case.T, limit)
+            known[key] = problem_for(system, widths)
+        problem, T = known[key]
+        limit = domain_limit(problem.V.P, system.domain)
+        witness = falsify(problem, T, limit)
         target = 0.5 * (limit if witness is None else witness.level)
-        inner = prove_local(case.problem, case.T, target) if ratio is None else target / ratio
+        inner = prove_local(problem, T, target) if ratio is None else target / ratio
         if inner is None:
             print(f"{what:<15}the local proof fails")
             continue
         torch.set_num_threads(options.threads)
         start = time.perf_counter()
-        proof = prove_outwards(case.problem, case.T, inner, target, Budget(seconds=options.seconds), torch.device("cpu"))
+        proof = prove_outwards(problem, T, inner, target, Budget(seconds=options.seconds), ThreadRunner())
         seconds = time.perf_counter() - start
-        layers = "-".join(map(str, case.loop.network.layers))
-        share = "proved" if proof.level >= target else f"{proof.reason}: {proof.level / target:.3f} of c2"
+        layers = "-".join(map(str, problem.loop.network.layers))
+        share = "proved" if proof.outer >= target else f"{proof.stop.value}: {proof.outer / target:.3f} of c2"
         print(
             f"{what:<15}{layers:<18}{inner:>10.2e}{target:>10.2e}{proof.boxes:>10}{proof.leaves:>9}"
             f"{seconds:>9.2f}{proof.boxes / seconds:>9.0f}  {share}",

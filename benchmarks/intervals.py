@@ -6,13 +6,15 @@ kept between the parts of an expression. Rounding is left out, which only helps 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Sequence
+from fractions import Fraction
+from functools import reduce
 
-import sympy
 import torch
 from torch import Tensor
 
 from certify.engines.bounds.rule import BoxBounds, VdotBound
+from certify.expressions import Algebra, evaluate
 
 Interval = tuple[Tensor, Tensor]
 
@@ -29,7 +31,7 @@ class PlainIntervals(VdotBound):
         gradient = affine(2 * torch.tensor(self.P.copy()), x)
         total: Interval | None = None
         for i, expression in enumerate(self.dynamics):
-            term = times((gradient[0][i], gradient[1][i]), evaluate(expression, values))
+            term = times((gradient[0][i], gradient[1][i]), evaluate(expression, values, Intervals(x[0][0])))
             total = term if total is None else (total[0] + term[0], total[1] + term[1])
         if total is None:
             raise ValueError("a plant has at least one state")
@@ -37,7 +39,7 @@ class PlainIntervals(VdotBound):
         if self.check_inputs:
             for j, (low, high) in enumerate(self.system.input_bounds):
                 proved = proved & (u[0][j] > float(low)) & (u[1][j] < float(high))
-        return BoxBounds(proved, total[1], hi - lo, total[0] > 0)
+        return BoxBounds(proved, total[1], hi - lo, total[0] > 0, torch.isfinite(total[1]))
 
     def _policy(self, x: Interval) -> Interval:
         h = x
@@ -73,32 +75,36 @@ def cosine(x: Interval) -> Interval:
     return torch.where(bottom, -1.0, values.amin(0)), torch.where(top, 1.0, values.amax(0))
 
 
-def evaluate(expression: sympy.Expr, values: Mapping[sympy.Symbol, Interval]) -> Interval:
-    """An expression of the plant on intervals; a division by an interval around 0 gives NaN."""
-    if expression.is_Symbol:
-        return values[expression]
-    if expression.is_Rational:
-        constant = torch.full_like(next(iter(values.values()))[0], float(expression))
-        return constant, constant
-    if expression.is_Pow:
-        base, exponent = evaluate(expression.base, values), int(expression.exp)
-        ends = torch.stack([base[0] ** abs(exponent), base[1] ** abs(exponent)])
+class Intervals(Algebra[Interval]):
+    """Natural interval extension in the shape of `like`; a division by an interval around 0 gives NaN."""
+
+    def __init__(self, like: Tensor) -> None:
+        self.like = like
+
+    def constant(self, q: Fraction) -> Interval:
+        value = torch.full_like(self.like, float(q))
+        return value, value
+
+    def total(self, constant: Fraction | None, terms: Sequence[Interval]) -> Interval:
+        first = [] if constant is None else [self.constant(constant)]
+        return reduce(lambda a, b: (a[0] + b[0], a[1] + b[1]), [*first, *terms])
+
+    def product(self, constant: Fraction | None, factors: Sequence[Interval]) -> Interval:
+        first = [] if constant is None else [self.constant(constant)]
+        return reduce(times, [*first, *factors])
+
+    def power(self, base: Interval, exponent: int) -> Interval:
+        ends = torch.stack([base[0] ** exponent, base[1] ** exponent])
         low = ends.amin(0)
         if exponent % 2 == 0:
             low = torch.where((base[0] <= 0) & (base[1] >= 0), 0.0, low)
-        high = ends.amax(0)
-        if exponent > 0:
-            return low, high
-        safe = (base[0] > 0) | (base[1] < 0)
-        return torch.where(safe, 1 / high, torch.nan), torch.where(safe, 1 / low, torch.nan)
-    arguments = [evaluate(a, values) for a in expression.args]
-    if expression.is_Add or expression.is_Mul:
-        result = arguments[0]
-        for other in arguments[1:]:
-            result = (result[0] + other[0], result[1] + other[1]) if expression.is_Add else times(result, other)
-        return result
-    if isinstance(expression, sympy.sin):
-        return cosine((arguments[0][0] - torch.pi / 2, arguments[0][1] - torch.pi / 2))
-    if isinstance(expression, sympy.cos):
-        return cosine(arguments[0])
-    raise NotImplementedError(f"{expression.func} is not needed by the plants that are compared")
+        return low, ends.amax(0)
+
+    def inverse(self, value: Interval) -> Interval:
+        safe = (value[0] > 0) | (value[1] < 0)
+        return torch.where(safe, 1 / value[1], torch.nan), torch.where(safe, 1 / value[0], torch.nan)
+
+    def function(self, name: str, value: Interval) -> Interval:
+        if name == "tan":
+            return super().function(name, value)
+        return cosine((value[0] - torch.pi / 2, value[1] - torch.pi / 2) if name == "sin" else value)

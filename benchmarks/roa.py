@@ -12,6 +12,7 @@ import os
 import statistics
 import tempfile
 import time
+from dataclasses import asdict
 from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
@@ -20,12 +21,15 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 import torch
 
+from certify.claims import Problem
 from certify.closed_loop import ClosedLoop
-from certify.engines.bounds.search import _threaded
 from certify.engines.bounds.rule import VdotBound
 from certify.lyapunov import diagonalising_coordinates, solve_lyapunov, volume
+from certify.lyapunov.function import Quadratic
 from certify.policies import load_policy
-from certify.roa import RoaOptions, RoaResult, certify_roa
+from certify.results import RoaResult
+from certify.roa import RoaOptions, certify_roa
+from certify.running import ThreadRunner
 from certify.systems import get_system
 
 POLICIES = Path(__file__).parent.parent / "examples" / "policies"
@@ -46,8 +50,8 @@ def whole_job(path: Path, options: RoaOptions, runs: int) -> None:
     prove = seconds["candidate"] + seconds["local"] + seconds["ring"]
     layers = "-".join(map(str, policy.network.layers))
     print(f"\n{path.name}: {last.verdict.value}, {layers}, limited by {last.reason}")
-    print("  levels  " + ", ".join(f"{k} {v:.6g}" for k, v in last.levels.items() if v is not None))
-    level = last.levels.get("roa")
+    print("  levels  " + ", ".join(f"{k} {v:.6g}" for k, v in asdict(last.levels).items() if v is not None))
+    level = last.levels.roa
     if last.P is not None and level is not None:
         print(f"  volume  {volume(last.P, level):.6g}")
     print(f"  boxes   {last.boxes}, leaves {last.leaves}, certificate {size} bytes")
@@ -67,8 +71,8 @@ def throughput(path: Path, runs: int) -> None:
     loop = ClosedLoop(get_system(policy.system).with_parameters(policy.parameters), policy.network)
     A, _, _ = loop.linearise()
     P = solve_lyapunov(A, np.eye(len(A)))
-    cpu = torch.device("cpu")
-    rule = VdotBound(Case(loop, P, diagonalising_coordinates(P, A)), cpu)
+    runner = ThreadRunner()
+    rule = VdotBound(Problem(loop, Quadratic(P)), diagonalising_coordinates(P, A), runner.device)
     n, m = loop.system.n, loop.system.m
     batch = 2048
     generator = torch.Generator().manual_seed(0)
@@ -78,7 +82,7 @@ def throughput(path: Path, runs: int) -> None:
     b = torch.rand(512, 8192, dtype=torch.float64)
     products = []
     for _ in range(runs + 1):  # in turn, so that both see the same machine
-        with _threaded(rule, cpu) as bound:
+        with runner.start(rule) as bound:
             bound(lo, lo + 0.01, 1e-9, 1e9)
             start = time.perf_counter()
             bound(lo, lo + 0.01, 1e-9, 1e9)

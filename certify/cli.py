@@ -78,7 +78,7 @@ def roa(
 ) -> None:
     """Certify a region of attraction: prove, write a certificate, have it checked, report."""
     from certify.policies import load_policy
-    from certify.report import render_html, summary
+    from certify.report import summary
     from certify.roa import RoaOptions, certify_roa
 
     start = time.perf_counter()
@@ -115,11 +115,7 @@ def roa(
         _tell(result.notice)
     if result.certificate is not None:
         data["candidates"] = _candidates(result, options, compare)
-        from certify.certificate import read_certificate
-
-        answer = None if result.checker is None else dict(result.checker)
-        page = render_html(read_certificate(result.certificate), answer, data, result.certificate)
-        _write(folder / "report.html", page)
+        _write(folder / "report.html", _page(result, data))
     if as_json:
         _out(json.dumps(data))
     else:
@@ -204,13 +200,21 @@ def report(
     as_json: Json = False,
 ) -> None:
     """Check a certificate and draw its report."""
-    from certify.certificate import read_certificate, run_checker
+    import hashlib
+    import tempfile
+
+    from certify.certificate import parse_certificate, read_raw, run_checker
     from certify.report import render_html
 
     target = out if out is not None else certificate.parent / "report.html"
-    read = read_certificate(certificate)
-    answer = run_checker(certificate)
-    _write(target, render_html(read, answer, None, certificate))
+    raw = read_raw(certificate)
+    read = parse_certificate(raw, str(certificate))
+    with tempfile.TemporaryDirectory() as folder:  # what is checked is what is drawn, whatever happens to the path
+        private = Path(folder) / "certificate.json"
+        private.write_bytes(raw)
+        answer = run_checker(private)
+    page = render_html(read, answer, None, certificate, sha256=hashlib.sha256(raw).hexdigest(), size=len(raw))
+    _write(target, page)
     stated = {"report": str(target), "result": answer["result"]}
     _out(json.dumps(stated) if as_json else f"{answer['result']}  {target}")
     raise typer.Exit({"ACCEPTED": 0, "TRUSTED": 3}.get(answer["result"], 1))
@@ -293,6 +297,21 @@ def _out(text: str) -> None:
         sys.stdout.flush()
     except BrokenPipeError:
         raise typer.Exit(_closed()) from None
+
+
+def _page(result: RoaResult, data: dict[str, Any]) -> str:
+    """The report of a run, about the very bytes that its checker read."""
+    import hashlib
+
+    from certify.certificate import parse_certificate, read_raw
+    from certify.report import render_html
+
+    if result.certificate is None:
+        raise InputError("there is no certificate to report on.")
+    raw = read_raw(result.certificate)
+    answer = None if result.checker is None else dict(result.checker)
+    read, sha256 = parse_certificate(raw, str(result.certificate)), hashlib.sha256(raw).hexdigest()
+    return render_html(read, answer, data, result.certificate, sha256=sha256, size=len(raw))
 
 
 def _candidates(result: RoaResult, options: RoaOptions, compare: bool) -> list[dict[str, Any]]:

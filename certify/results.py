@@ -7,6 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from certify.claims import Problem
 from certify.claims.claim import Kind
 from certify.engines.falsify import Witness
@@ -15,6 +18,7 @@ from certify.policies import TanhNetwork
 from certify.systems import System
 from certify.verdict import Stop, Verdict
 
+Array = NDArray[np.float64]
 _STAGES = ("load", "candidate", "local", "ring", "write", "check", "total")
 
 
@@ -67,6 +71,11 @@ class RoaResult:
     solver: Mapping[str, Any] | None = None
 
     @property
+    def P(self) -> Array | None:
+        """The matrix of V, (n, n); None if nothing was tried."""
+        return None if self.problem is None else self.problem.V.P
+
+    @property
     def reason(self) -> str:
         """What limits the level, or why nothing was proved, in words."""
         return self.stop.explain(self.detail)
@@ -74,7 +83,7 @@ class RoaResult:
     def to_dict(self) -> dict[str, Any]:
         """The JSON object of `certify roa --json`; lengths along the states are in their units."""
         system, network, witness = self.system, self.network, self.witness
-        P, level = (None if self.problem is None else self.problem.V.P), self.levels.roa
+        P, level = self.P, self.levels.roa
         geometry: dict[str, Any] = dict.fromkeys(("volume", "semi_axes", "extents"))
         if P is not None and level is not None:
             axes, reach = semi_axes(P, level).tolist(), extents(P, level).tolist()
@@ -84,7 +93,7 @@ class RoaResult:
             "verdict": self.verdict.value,
             "reason": self.reason,
             "stop": self.stop.name.lower(),
-            "claim": self.claim,
+            "claim": {"kind": self.claim},
             "system": system.name,
             "parameters": {name: str(q) for name, q in system.parameters.items()},
             "states": [{"name": s.name, "unit": system.units.get(s.name, "")} for s in system.states],

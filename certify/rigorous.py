@@ -6,7 +6,7 @@ counts as not shown.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from fractions import Fraction
 from typing import Any
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from certify.closed_loop import ClosedLoop
 from certify.expressions import Algebra, evaluate
 from certify.policies import TanhNetwork
+from certify.policies.exact import centring, squash
 
 Array = NDArray[np.float64]
 _PRECISION = 200  # bits
@@ -57,11 +58,28 @@ def evaluate_policy(loop: ClosedLoop, x: Array) -> Balls:
     with _precision():
         network = loop.network
         y = _net(network, _points(x))
-        shift, offset = _shift_and_offset(loop)
+        shift, offset = _centring(loop)
         return [
-            flint.arb(float(s)) * _squash(network)(v + d) + o
+            flint.arb(float(s)) * squash(network, v + d, _Numbers()) + o
             for v, d, s, o in zip(y, shift, network.scale, offset, strict=True)
         ]
+
+
+def centring_with_errors(loop: ClosedLoop) -> tuple[Array, Array, Array, Array]:
+    """`shift` and `offset` of the centring rounded to binary64, each followed by an upper bound of its error, (m,)."""
+    with _precision():
+        columns = []
+        for balls in _centring(loop):
+            middle = [float(b.mid()) for b in balls]
+            columns += [middle, [_above((b - m).abs_upper()) for b, m in zip(balls, middle, strict=True)]]
+    shift, shift_error, offset, offset_error = map(np.array, columns)
+    return shift, shift_error, offset, offset_error
+
+
+def _above(x: flint.arb) -> float:
+    """A binary64 number that is not below x >= 0."""
+    value = float(x)
+    return value if value >= x else float(np.nextafter(value * (1 + 2.0**-50), np.inf))
 
 
 def evaluate_vdot(loop: ClosedLoop, P: Array, x: Array) -> flint.arb:
@@ -96,7 +114,7 @@ def _jacobian(loop: ClosedLoop) -> flint.arb_mat:
             y, J = _through_tanh(y, J)
         y, J = _affine(W, b, y), _matrix(W) * J
     if network.squash == "tanh":
-        shift, _ = _shift_and_offset(loop)
+        shift, _ = _centring(loop)
         _, J = _through_tanh([v + d for v, d in zip(y, shift, strict=True)], J)
     scale = _points(network.scale)
     gain = flint.arb_mat([[scale[i] * J[i, j] for j in range(network.n)] for i in range(network.m)])
@@ -107,21 +125,20 @@ def _jacobian(loop: ClosedLoop) -> flint.arb_mat:
     return A + B * gain
 
 
-def _shift_and_offset(loop: ClosedLoop) -> tuple[Balls, Balls]:
-    """The centring, see `certify.policies.exact`."""
-    network, u_eq = loop.network, loop.u_eq
-    offset = _points(network.offset)
-    if network.centre == "none":
-        return [flint.arb(0)] * network.m, offset
-    at_0 = _net(network, [flint.arb(0)] * network.n)
-    if network.centre == "preactivation":
-        return [ball(q).atanh() - v for q, v in zip(network.ratios(u_eq), at_0, strict=True)], offset
-    each = zip(u_eq, network.scale, at_0, strict=True)
-    return [flint.arb(0)] * network.m, [ball(u) - flint.arb(float(s)) * _squash(network)(v) for u, s, v in each]
+class _Numbers:
+    def number(self, q: Fraction) -> flint.arb:
+        return ball(q)
+
+    def atanh(self, q: Fraction) -> flint.arb:
+        return ball(q).atanh()
+
+    def tanh(self, v: flint.arb) -> flint.arb:
+        return v.tanh()
 
 
-def _squash(network: TanhNetwork) -> Callable[[flint.arb], flint.arb]:
-    return (lambda v: v.tanh()) if network.squash == "tanh" else (lambda v: v)
+def _centring(loop: ClosedLoop) -> tuple[Balls, Balls]:
+    at_0 = _net(loop.network, [flint.arb(0)] * loop.network.n)
+    return centring(loop.network, loop.u_eq, at_0, _Numbers())
 
 
 def _net(network: TanhNetwork, h: Balls) -> Balls:
@@ -137,7 +154,8 @@ def _affine(W: Array, b: Array, h: Balls) -> Balls:
 
 def _through_tanh(y: Balls, J: flint.arb_mat) -> tuple[Balls, flint.arb_mat]:
     t = [v.tanh() for v in y]
-    return t, flint.arb_mat([[(1 - t[i] ** 2) * J[i, j] for j in range(J.ncols())] for i in range(J.nrows())])
+    slope = [1 - v * v for v in t]  # Arb's own power is NaN for a ball around 0
+    return t, flint.arb_mat([[slope[i] * J[i, j] for j in range(J.ncols())] for i in range(J.nrows())])
 
 
 def _matrix(W: Array) -> flint.arb_mat:

@@ -18,7 +18,15 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.certificate import Certificate, TrustedSolver, run_checker, sole_writer, write_beside
+from certify.certificate import (
+    Certificate,
+    TrustedSolver,
+    require_short,
+    require_within_limits,
+    run_checker,
+    sole_writer,
+    write_beside,
+)
 from certify.claims import Asymptotic, Claim, Problem
 from certify.claims.claim import Kind
 from certify.closed_loop import ClosedLoop
@@ -158,6 +166,7 @@ class _Run:
     def _decide(self) -> RoaResult:
         """Choose, falsify, prove, check."""
         options, loop = self.options, ClosedLoop(self.system, self.network)
+        require_within_limits(self.system, self.network)
         result = RoaResult(
             Verdict.UNKNOWN, Stop.REQUESTED, self.system, self.network, options.claim, engine=options.engine
         )
@@ -170,6 +179,7 @@ class _Run:
                     detail = f"eigenvalues {', '.join(shown)}" + (" touch the axis" if stop is Stop.SPECTRUM else "")
                     return replace(result, verdict=verdict, stop=stop, detail=detail, eigenvalues=shown)
             V, name, notice = _candidate(loop, options)
+            require_short(V.P)
             problem = Problem(loop, V)
             T = diagonalising_coordinates(V.P, loop.linearise()[0])
             limit = domain_limit(V.P, self.system.domain)

@@ -31,9 +31,10 @@ from certify.errors import InputError
 from certify.policies import Policy
 from certify.systems import System
 from controllers.environments import PlantEnvironment
+from controllers.files import write_atomically
 from controllers.options import TrainingOptions
 from controllers.sac import Actor, Interface
-from controllers.training import read_checkpoint, write_atomically
+from controllers.training import read_checkpoint
 
 Array = NDArray[np.float64]
 Algorithm = Literal["ppo", "sac"]
@@ -155,8 +156,11 @@ def train_reference(
         model.learn(total_timesteps=steps, callback=step)
     # Plain values, which the file keeps as JSON: they are read back without unpickling anything.
     model.trained_on = {
-        "algorithm": algorithm, "system": system.name, "steps": int(model.num_timesteps), "seed": options.seed,
-    }  # fmt: skip
+        "algorithm": algorithm,
+        "system": system.name,
+        "steps": int(model.num_timesteps),
+        "seed": options.seed,
+    }
     buffer = io.BytesIO()
     model.save(buffer)
     write_atomically(out, buffer.getvalue())
@@ -208,10 +212,12 @@ def from_reference(content: bytes, system: System, options: TrainingOptions) -> 
         return np.asarray(np.tanh(w) if algorithm == "sac" else np.clip(w, -1.0, 1.0))
 
     return Trained(
-        system.name, steps, seed,
+        system.name,
+        steps,
+        seed,
         mean=lambda x: interface.to_action(normalised(x, 0.0)),
         sample=lambda x, generator: interface.to_action(normalised(x, generator.standard_normal((len(x), system.m)))),
-    )  # fmt: skip
+    )
 
 
 def scaled_environment(system: System, options: TrainingOptions) -> Any:
@@ -239,8 +245,11 @@ def _model(algorithm: Algorithm, system: System, options: TrainingOptions) -> An
     library = _stable_baselines()
     environment = scaled_environment(system, options)
     common: dict[str, Any] = {
-        "learning_rate": options.learning_rate, "gamma": options.gamma, "seed": options.seed, "device": "cpu",
-    }  # fmt: skip
+        "learning_rate": options.learning_rate,
+        "gamma": options.gamma,
+        "seed": options.seed,
+        "device": "cpu",
+    }
     shape: dict[str, Any] = {"pi": list(options.actor)}
     if algorithm == "ppo":
         shape["vf"] = list(options.critic)

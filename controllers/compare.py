@@ -5,7 +5,7 @@ writes it, in `ours`, `before` and `uncentred`; `checkpoint.pt`, as `--checkpoin
 without the gain; `model.zip`, as `controllers train-baseline` writes it, in `sb3-sac` and `sb3-ppo`. What is missing
 is trained, what is there is used; our own runs also go on from a checkpoint that lies there.
 
-Everything is simulated from the plant's box of `INITIAL_STATES`, with the action held over the training step and
+Everything is simulated from the plant's box of initial states, with the action held over the training step and
 clipped to the input's bounds; a run goes on outside the domain. These are figures for a report, never a proof.
 """
 
@@ -14,7 +14,6 @@ from __future__ import annotations
 import csv
 import io
 import json
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import astuple, fields, replace
 from pathlib import Path
@@ -36,11 +35,12 @@ from controllers.baselines import (
     train_reference,
     without_gain,
 )
-from controllers.figures import POSITIONS, draw_over_time, draw_positions
+from controllers.figures import draw_over_time, draw_positions
+from controllers.files import make_folder, read, write_atomically
 from controllers.options import TrainingOptions
 from controllers.responses import CompareOptions, Response, Row, Run, table
 from controllers.simulation import Action, held_loop, initial_states
-from controllers.training import Trainer, train, write_atomically
+from controllers.training import Trainer, train
 
 Array = NDArray[np.float64]
 
@@ -75,17 +75,15 @@ def compare(
 
     Raises
     ------
-    InputError : the plant has no box of initial states or no positions, stable-baselines3 is missing, a file in `runs`
+    InputError : the plant has no file among `controllers.plants`, stable-baselines3 is missing, a file in `runs`
         is of another plant, seed or budget, or a folder cannot be written.
     """
     options = options or CompareOptions()
     x0 = initial_states(system, options.states, options.start_seed)
-    if system.name not in POSITIONS:
-        raise InputError(f"no positions are known for the plant {system.name}.")
     training.check_sizes(system)
     if any(method.run in ("sb3-sac", "sb3-ppo") for method in options.methods):
         require_stable_baselines()
-    _make(out)
+    make_folder(out)
     responses = []
     for run in dict.fromkeys(method.run for method in options.methods):
         for seed in range(options.seeds):
@@ -135,7 +133,7 @@ def obtain(
     steps = budget("ppo" if run == "sb3-ppo" else "sac", training.steps)[0]
     trained = _load(run, path, system, training) if path.is_file() else None
     if trained is None or (run == "sac" and trained.steps < steps and trained.seed == training.seed):
-        _make(folder)
+        make_folder(folder)
         _train(run, system, training, path, _progress(what, steps, say))
         trained = _load(run, path, system, training)
     if (trained.steps, trained.seed) != (steps, training.seed):
@@ -180,17 +178,14 @@ def _action(trained: Trained, sampled: bool, start_seed: int) -> Callable[[Array
 
 
 def _load(run: Run, path: Path, system: System, training: TrainingOptions) -> Trained:
-    try:
-        if run in ("ours", "before", "uncentred"):
-            policy = load_policy(path)
-            for name in ("identification", "centre"):  # what tells these runs apart
-                asked, found = getattr(variant(run, training), name), policy.training.get(name)
-                if found != asked:
-                    raise InputError(f"{path}: `{name}` must be {asked!r} for the run {run}; it is {found!r}.")
-            return from_policy(policy, system)
-        content = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"{path} cannot be read: {error.strerror}.") from error
+    if run in ("ours", "before", "uncentred"):
+        policy = load_policy(path)
+        for name in ("identification", "centre"):  # what tells these runs apart
+            asked, found = getattr(variant(run, training), name), policy.training.get(name)
+            if found != asked:
+                raise InputError(f"{path}: `{name}` must be {asked!r} for the run {run}; it is {found!r}.")
+        return from_policy(policy, system)
+    content = read(path)
     return from_checkpoint(content, system) if run == "sac" else from_reference(content, system, training)
 
 
@@ -206,9 +201,7 @@ def _train(run: Run, system: System, training: TrainingOptions, path: Path, repo
     if run == "sac":
         write_atomically(checkpoint, trainer.snapshot())
         return
-    temporary = path.with_name(path.name + ".partial")
-    save_policy(temporary, policy)
-    os.replace(temporary, path)
+    save_policy(path, policy)
     checkpoint.unlink(missing_ok=True)
 
 
@@ -221,13 +214,6 @@ def _progress(what: str, steps: int, say: Callable[[str], None]) -> Callable[[in
             say(f"{what}: {done} of {steps} steps")
 
     return report
-
-
-def _make(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"the folder {folder} cannot be made: {error.strerror}.") from error
 
 
 def _csv(rows: Sequence[Row]) -> bytes:

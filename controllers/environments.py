@@ -4,8 +4,8 @@ The plant that is trained on is the plant that is proved: nothing here restates 
 in this package reads one. An action is held over `dt` and the state moves by one classical Runge-Kutta step
 of order four, in float64; angles are never wrapped.
 
-Importing this module registers `certify/<plant>-v0` for each plant with a preset. Gymnasium 1.0 and later read no
-entry points of installed packages; an id that names this module finds the environment without an import:
+Importing this module registers `certify/<plant>-v0` for each file of `controllers.plants`. Gymnasium 1.0 and later
+read no entry points of installed packages; an id that names this module finds the environment without an import:
 
 >>> import gymnasium
 >>> environment = gymnasium.make("controllers.environments:certify/pendulum-v0")
@@ -16,7 +16,6 @@ entry points of installed packages; an id that names this module finds the envir
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -26,19 +25,11 @@ from numpy.typing import NDArray
 
 from certify.errors import InputError
 from certify.systems import System, get_system
-from controllers.options import PRESETS, TrainingOptions, preset
+from certify.systems.ode import rk4_step
+from controllers.options import TrainingOptions, available_plants, preset
 
 Array = NDArray[np.float64]
 Module = Literal["numpy", "torch"]
-
-
-def rk4(f: Callable[[Any], Any], x: Any, h: float) -> Any:
-    """One classical Runge-Kutta step of `xdot = f(x)`, numpy or torch, any leading shape."""
-    k1 = f(x)
-    k2 = f(x + (h / 2) * k1)
-    k3 = f(x + (h / 2) * k2)
-    k4 = f(x + h * k3)
-    return x + (h / 6) * (k1 + 2 * k2 + 2 * k3 + k4)
 
 
 class Stepper:
@@ -63,7 +54,7 @@ class Stepper:
         self._f = system.function(module)
 
     def __call__(self, x: Any, u: Any) -> Any:
-        return rk4(lambda state: self._f(state, u), x, self.dt)
+        return rk4_step(lambda state: self._f(state, u), x, self.dt)
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,7 +141,7 @@ def _uniform_in_ball(generator: np.random.Generator, n: int, radius: float) -> A
     return np.asarray(direction * (length / np.linalg.norm(direction)))
 
 
-for _name in PRESETS:
+for _name in available_plants():
     _id = f"certify/{_name}-v0"
     if _id not in gymnasium.registry:  # executed twice, it would warn of every id
         # By name: the entry point is looked up when an environment is made.

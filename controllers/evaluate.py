@@ -32,7 +32,7 @@ class EvaluationOptions:
 
     Parameters
     ----------
-    states : number of initial states, uniform in the plant's box of `INITIAL_STATES`.
+    states : number of initial states, uniform in the plant's box.
     seed : of the initial states.
     duration, window : seconds simulated, and the last seconds in which the state must stay small.
     tolerance : bound on ||x|| in the window.

@@ -11,17 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.systems import System
+from controllers.options import get_plant
 from controllers.responses import NAMES, OURS, Response, Row, Run, quartiles
 
 Array = NDArray[np.float64]
-
-POSITIONS: dict[str, tuple[str, ...]] = {
-    "pendulum": ("theta",),
-    "cartpole": ("p", "theta"),
-    "quadrotor2d": ("x", "y", "theta"),
-    "quadrotor3d": ("x", "y", "z"),
-}
-"""The states of each plant whose trajectories are drawn."""
 
 _COLOURS: dict[Run, str] = {  # Okabe and Ito's, told apart with any colour vision
     "ours": "#0072b2",
@@ -108,7 +101,7 @@ def draw_positions(system: System, dt: float, responses: Sequence[Response]) -> 
 
     names, seed = [symbol.name for symbol in system.states], responses[0].seed
     chosen = {response.method: response.x[:, :50] for response in responses if response.seed == seed}
-    positions, time = POSITIONS[system.name], dt * np.arange(len(responses[0].x))
+    positions, time = get_plant(system.name).positions, dt * np.arange(len(responses[0].x))
     with matplotlib.rc_context(_STYLE):
         figure = Figure(figsize=(15.0, 0.9 + 1.9 * len(positions)), layout="constrained")
         panels = figure.subplots(len(positions), len(chosen), sharex=True, sharey="row", squeeze=False)

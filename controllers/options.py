@@ -1,16 +1,22 @@
-"""What a training run may choose: one frozen dataclass, which is also the command line, and a preset a plant.
+"""What a training run may choose: one frozen dataclass, which is also the command line, and what each plant chooses.
 
-Numbers that the paper fixes are defaults of `TrainingOptions`; numbers that depend on the plant have no
-default there and come from `PRESETS`. All of them are written into the policy's `training` record.
+Numbers that the paper fixes are defaults of `TrainingOptions`; numbers that depend on the plant have no default there
+and come from the plant's preset. All of them are written into the policy's `training` record.
+
+There is no list of plants: the plant `NAME` is the file `plants/NAME.py` with its constant `PLANT`, as its equations
+are the file `NAME.py` among `certify.systems.plants`.
 """
 
 from __future__ import annotations
 
+import importlib
 import math
+import pkgutil
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 from certify.errors import InputError
+from controllers import plants
 
 if TYPE_CHECKING:
     from certify.systems import System
@@ -117,99 +123,70 @@ def _finite(value: object) -> bool:
     return not isinstance(value, float) or math.isfinite(value)
 
 
-PRESETS: dict[str, TrainingOptions] = {
-    "pendulum": TrainingOptions(
-        steps=40_000,
-        dt=0.02,
-        horizon=250,
-        reward_offset=1.0,
-        reward_weights=(1.0, 0.1),
-        penalty=100.0,
-        actor=(16, 16),
-        critic=(64, 64),
-        eta=0.1,
-        n_A=200,
-        n_B=200,
-        refresh=10_000,
-        gain_weight=3.0,
-        state_weights=(1.0, 0.5),
-        input_weights=(1.0,),
-    ),
-    # Near the corners of the domain the pole leaves it whatever the force, so episodes start in half of it. The
-    # critics are narrower than the actor: they cost most of a gradient step and their width does not ship. The
-    # LQR weights were chosen before training, by sampling Vdot under u = 30 tanh(-K x / 30): eigenvalues within a
-    # factor of about three, and a level set without Vdot >= 0 that is among the largest of those compared.
-    "cartpole": TrainingOptions(
-        steps=40_000,
-        dt=0.02,
-        horizon=250,
-        start=0.5,
-        reward_offset=1.0,
-        reward_weights=(1.0, 1.0, 0.1, 0.1),
-        penalty=100.0,
-        actor=(256, 256),
-        critic=(128, 128),
-        curvature_weight=0.1,
-        eta=0.1,
-        n_A=400,
-        n_B=400,
-        refresh=10_000,
-        gain_weight=3.0,
-        state_weights=(1.0, 1.0, 0.1, 0.1),
-        input_weights=(0.1,),
-    ),
-    # The LQR weights of both quadrotors keep the closed loop's rates between 0.7 and 7 per second, and with them the
-    # condition of P: what is proved shrinks with it.
-    "quadrotor2d": TrainingOptions(
-        steps=20_000,
-        dt=0.02,
-        horizon=250,
-        start=0.35,
-        reward_offset=1.0,
-        reward_weights=(1.0, 1.0, 1.0, 0.1, 0.1, 0.1),
-        penalty=100.0,
-        actor=(256,) * 4,
-        critic=(128, 128),
-        curvature_weight=0.5,
-        rest_weight=1.0,
-        eta=0.1,
-        n_A=600,
-        n_B=600,
-        refresh=10_000,
-        gain_weight=3.0,
-        state_weights=(1.0, 1.0, 1.0, 0.1, 0.1, 0.1),
-        input_weights=(10.0,) * 2,
-    ),
-    "quadrotor3d": TrainingOptions(
-        steps=30_000,
-        dt=0.02,
-        horizon=250,
-        start=0.2,
-        reward_offset=1.0,
-        reward_weights=(1.0,) * 6 + (0.1,) * 6,
-        penalty=100.0,
-        actor=(256,) * 5,
-        critic=(128, 128),
-        curvature_weight=0.5,
-        rest_weight=1.0,
-        eta=0.1,
-        n_A=1000,
-        n_B=1000,
-        refresh=10_000,
-        gain_weight=3.0,
-        state_weights=(1.0,) * 6 + (0.1,) * 6,
-        input_weights=(10.0,) * 4,
-    ),
-}
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plant:
+    """How one plant is trained, judged and drawn.
 
-
-def preset(name: str) -> TrainingOptions:
-    """The options that the plant `name` trains with unless told otherwise.
+    Parameters
+    ----------
+    preset : the options that it trains with unless told otherwise.
+    initial_states : n half-widths, in the states' units, of the box from which simulations start, uniformly.
+    positions : names of the states whose trajectories are drawn, from the top of the figure to its bottom.
 
     Raises
     ------
-    InputError : no such plant.
+    InputError : a half-width is not positive and finite, or there is no position.
     """
-    if name not in PRESETS:
-        raise InputError(f"no training options for the plant {name!r}; known are {', '.join(PRESETS)}.")
-    return PRESETS[name]
+
+    preset: TrainingOptions
+    initial_states: tuple[float, ...]
+    positions: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        if not self.initial_states or not all(0 < width < math.inf for width in self.initial_states):
+            raise InputError(f"`initial_states` must be positive and finite; found {self.initial_states}.")
+        if not self.positions:
+            raise InputError("`positions` must name at least one state.")
+
+    def check(self, system: System) -> None:
+        """Raise InputError unless weights, box and positions are those of a plant with the states of `system`."""
+        self.preset.check_sizes(system)
+        if len(self.initial_states) != system.n:
+            raise InputError(
+                f"`initial_states` of {system.name} must have {system.n} half-widths; found {len(self.initial_states)}."
+            )
+        names = [symbol.name for symbol in system.states]
+        unknown = [name for name in self.positions if name not in names]
+        if unknown:
+            raise InputError(f"`positions` of {system.name} must be among its states {names}; found {unknown[0]!r}.")
+
+
+def available_plants() -> tuple[str, ...]:
+    """Names that `get_plant` knows, in alphabetical order; none of them is imported."""
+    names = (module.name for module in pkgutil.iter_modules(plants.__path__))
+    return tuple(sorted(name for name in names if not name.startswith("_")))
+
+
+def get_plant(name: str) -> Plant:
+    """The plant `name` of the folder `plants`.
+
+    Raises
+    ------
+    InputError : no such plant, or its file does not define what it must.
+    """
+    known = available_plants()
+    if name not in known:
+        raise InputError(
+            f"no training options, box of initial states and positions are known for the plant {name!r}; "
+            f"known are {', '.join(known)}."
+        )
+    module = importlib.import_module(f"{plants.__name__}.{name}")
+    plant = getattr(module, "PLANT", None)
+    if not isinstance(plant, Plant):
+        raise InputError(f"{module.__file__} must define `PLANT`, a Plant; found {type(plant).__name__}.")
+    return plant
+
+
+def preset(name: str) -> TrainingOptions:
+    """The options that the plant `name` trains with unless told otherwise; raises as `get_plant` does."""
+    return get_plant(name).preset

@@ -50,10 +50,8 @@ class Method:
 
 
 OURS = Method("ours", False)
-BASELINES: tuple[Method, ...] = (
-    OURS,
-    *(Method(run, sampled) for run in ("sac", "sb3-sac", "sb3-ppo") for sampled in (False, True)),
-)  # fmt: skip
+_OTHERS: tuple[Run, ...] = ("sac", "sb3-sac", "sb3-ppo")
+BASELINES: tuple[Method, ...] = (OURS, *(Method(run, sampled) for run in _OTHERS for sampled in (False, True)))
 """Ours beside the same SAC without the gain and beside stable-baselines3."""
 ABLATIONS: tuple[Method, ...] = (OURS, *(Method(run, False) for run in ("sac", "before", "uncentred")))
 """Ours with one part changed: no gain; A and B learned once before training; the mean not centred."""

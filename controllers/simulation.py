@@ -14,21 +14,14 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from certify.errors import InputError
 from certify.policies import TanhNetwork
 from certify.systems import System
-from controllers.environments import Stepper, rk4
+from certify.systems.ode import rk4_step
+from controllers.environments import Stepper
+from controllers.options import get_plant
 
 Array = NDArray[np.float64]
 Action = Callable[[Array], Array]
-
-INITIAL_STATES: dict[str, tuple[float, ...]] = {
-    "pendulum": (math.pi / 2, 2.0),
-    "cartpole": (1.0, 0.5, 1.0, 1.0),
-    "quadrotor2d": (1.0, 1.0, 0.5, 1.0, 1.0, 1.0),
-    "quadrotor3d": (*(0.5,) * 3, *(0.3,) * 3, *(0.5,) * 6),
-}
-"""Half-widths of the box from which each plant's initial states are drawn, in the states' units."""
 
 DIVERGED = 1e9
 """Bound on |x_i|, in the states' units: beyond it a trajectory counts as diverged."""
@@ -43,6 +36,12 @@ class Loop:
     step : states (N, n) and inputs (N, m) to the next states.
     act : states (N, n) to inputs (N, m); never asked about a state that has diverged.
     cost : states and inputs to the running cost (N,), per second.
+
+    Notes
+    -----
+    The arithmetic of a trajectory is its own, to the last bit, whatever else is in the batch, as far as that holds for
+    `act`. It does not hold for a matrix product, and so not for a network: BLAS chooses its kernel, with or without
+    fused multiply-adds, by the number of rows.
     """
 
     step: Callable[[Array, Array], Array]
@@ -79,7 +78,7 @@ def continuous_loop(system: System, h: float, act: Action, Q: Array, R: Array) -
 
     def step(x: Array, u: Array) -> Array:
         # The first stage is at x itself, where the action is already known.
-        return np.asarray(rk4(lambda y: f(y, u if y is x else act(y)), x, h))
+        return np.asarray(rk4_step(lambda y: f(y, u if y is x else act(y)), x, h))
 
     return Loop(step, act, _cost(system, Q, R), h)
 
@@ -92,15 +91,15 @@ def mean_action(network: TanhNetwork, system: System) -> Action:
 
 
 def initial_states(system: System, count: int, seed: int) -> Array:
-    """States (count, n), uniform in the plant's box of `INITIAL_STATES`.
+    """States (count, n), uniform in the box that the plant's file gives.
 
     Raises
     ------
-    InputError : the plant has no such box.
+    InputError : the plant has no such file, or it does not fit the plant's states.
     """
-    if system.name not in INITIAL_STATES:
-        raise InputError(f"no box of initial states is known for the plant {system.name}.")
-    half_widths = np.array(INITIAL_STATES[system.name])
+    plant = get_plant(system.name)
+    plant.check(system)
+    half_widths = np.array(plant.initial_states)
     return np.random.default_rng(seed).uniform(-half_widths, half_widths, (count, system.n))
 
 

@@ -12,14 +12,12 @@ states, the episode under way, the identification), so that a resumed run equals
 
 from __future__ import annotations
 
-import csv
 import io
 import json
 import math
-import os
 import platform
-from collections.abc import Callable, Sequence
-from dataclasses import astuple, dataclass, fields
+from collections.abc import Callable
+from dataclasses import astuple
 from decimal import Decimal
 from fractions import Fraction
 from pathlib import Path
@@ -34,78 +32,15 @@ from certify.policies import Policy
 from certify.systems import System
 from controllers.environments import PlantEnvironment, Snapshot
 from controllers.evaluate import curvature, settle
+from controllers.files import write_atomically
+from controllers.logs import Episode, Monitored
 from controllers.lqr import GainLearner, Identified, Phase
-from controllers.options import TrainingOptions
+from controllers.options import TrainingOptions, available_plants
 from controllers.sac import CPU, SAC, Interface, Replay
-from controllers.simulation import INITIAL_STATES
 
 Array = NDArray[np.float64]
 
 CHECKPOINT_FORMAT = "controllers-checkpoint/2"
-
-
-@dataclass(frozen=True, slots=True)
-class Episode:
-    """One finished episode, a row of the log.
-
-    `distance` is ||J_mu(0) + K||, NaN as long as there is no gain; `offset` is ||mu(0) - u_eq||.
-    """
-
-    step: int
-    kind: str
-    length: int
-    total: float
-    outcome: str
-    distance: float
-    offset: float
-
-
-@dataclass(frozen=True, slots=True)
-class Monitored:
-    """The policy after `step` steps: a row of the second log.
-
-    `distance` and `offset` are those of `Episode`, `curvature` is that of `controllers.evaluate`. `settled` is the
-    share of the initial states from which the policy as it would ship settles in the sense of `MONITORING`, and
-    `cost` the median of their costs; both are NaN for a plant without a box of initial states.
-    """
-
-    step: int
-    distance: float
-    offset: float
-    curvature: float
-    settled: float
-    cost: float
-
-
-class Log:
-    """Episodes or other rows of a run as CSV; a resumed run begins with those of its checkpoint.
-
-    Parameters
-    ----------
-    path : file that is written anew when the log is entered as a context.
-    row : the dataclass whose fields are the columns.
-    """
-
-    def __init__(self, path: Path, row: type[Episode] | type[Monitored]) -> None:
-        self._path, self._row = path, row
-        self._written = 0
-
-    def __enter__(self) -> Log:
-        self._file = self._path.open("w", newline="", encoding="utf-8")
-        self._writer = csv.writer(self._file)
-        self._writer.writerow([column.name for column in fields(self._row)])
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._file.close()
-
-    def extend(self, rows: Sequence[Episode] | Sequence[Monitored]) -> None:
-        """Write the rows that are not written yet."""
-        for row in rows[self._written :]:
-            self._writer.writerow(astuple(row))
-        if len(rows) > self._written:
-            self._file.flush()
-        self._written = len(rows)
 
 
 class Trainer:
@@ -184,7 +119,7 @@ class Trainer:
         """Judge the policy as it is, in a second or so; draws none of the run's random numbers."""
         network, options = self.sac.actor.network(), self.options
         settled = cost = float("nan")
-        if self.system.name in INITIAL_STATES:
+        if self.system.name in available_plants():
             Q, R = np.array(options.state_weights), np.array(options.input_weights)
             found = settle(network, self.system, options.dt, Q, R)
             settled, cost = found.settled / found.states, found.cost
@@ -366,21 +301,6 @@ def train(
         if checkpoint is not None and done % checkpoint_every == 0:
             write_atomically(checkpoint, trainer.snapshot())
     return trainer.policy()
-
-
-def write_atomically(path: Path, content: bytes) -> None:
-    """Replace `path` by `content` in one move: a reader sees the old file or the new one.
-
-    Raises
-    ------
-    InputError : the file cannot be written there.
-    """
-    temporary = path.with_name(path.name + ".partial")
-    try:
-        temporary.write_bytes(content)
-        os.replace(temporary, path)
-    except OSError as error:
-        raise InputError(f"{path} cannot be written: {error.strerror}.") from error
 
 
 def read_checkpoint(content: bytes) -> dict[str, Any]:

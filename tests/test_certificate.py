@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 import sympy
 
-from certify.certificate import read_certificate
+from certify.certificate import read_certificate, run_checker
 from certify.errors import CertificateFormatError
-from certify.roa import certify_roa, run_checker
+from certify.expressions import from_tree, to_tree
+from certify.roa import certify_roa
 from certify.systems import available_systems, get_system
-from certify.systems.trees import from_tree, to_tree
 from tests.support.loops import pendulum_network
 
 Document = dict[str, Any]

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 from pathlib import Path
 from typing import Any
 
@@ -91,7 +92,7 @@ def test_systems(capsys: pytest.CaptureFixture[str]) -> None:
     status, out, _ = run(capsys, "systems")
     assert status == 0 and "theta_dot" in out and "0.15 kg" in out
     listed = json.loads(run(capsys, "systems", "--json")[1])["systems"]
-    assert listed[0]["parameters"]["m"] == "3/20"
+    assert {s["name"]: s for s in listed}["pendulum"]["parameters"]["m"] == "3/20"
 
 
 def test_a_requested_level(tmp_path: Path, policy_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -249,7 +250,7 @@ def test_the_installed_command(tmp_path: Path) -> None:
 def test_an_interrupt_leaves_nothing_half_written(
     where: str, tmp_path: Path, policy_file: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from certify.engines.vdot import VdotBound
+    from certify.engines.bounds.rule import VdotBound
 
     def interrupt(*_: object) -> None:
         raise KeyboardInterrupt
@@ -264,9 +265,17 @@ def test_an_interrupt_leaves_nothing_half_written(
 
 
 def test_control_c_ends_a_running_command(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "certify", "roa", "--policy", str(SHIPPED.with_name("cartpole.pt"))]
+    """A suite in the background of a script ignores SIGINT, and its children inherit that: this one listens again."""
+    listening = (
+        "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
+        "from certify.cli import main; main(sys.argv[1:])"
+    )
+    command = [sys.executable, "-c", listening, "roa", "--policy", str(SHIPPED.with_name("cartpole.pt"))]
     running = subprocess.Popen(
-        [*command, "--out", str(tmp_path / "o")], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        [*command, "--out", str(tmp_path / "o")],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
     )
     assert running.stderr is not None
     assert "cartpole" in running.stderr.readline()  # the plant is known, the proof begins
@@ -275,3 +284,64 @@ def test_control_c_ends_a_running_command(tmp_path: Path) -> None:
     assert running.returncode in (130, -signal.SIGINT) and out == ""
     assert "interrupted" in err and "Traceback" not in err
     assert not [p for p in tmp_path.rglob("*") if p.is_file()]
+
+
+def certified(folder: Path, policy_file: Path, capsys: pytest.CaptureFixture[str]) -> Path:
+    assert run(capsys, "roa", "--policy", policy_file, "--out", folder)[0] == 0
+    return folder / "certificate.json"
+
+
+def test_a_wrong_policy_is_named_however_deep_the_provenance_nests(
+    tmp_path: Path, policy_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The comparison is with what the checker says of the bytes that it read: there is no second reader to fail."""
+    certificate = certified(tmp_path, policy_file, capsys)
+    deep = "[" * 985 + "]" * 985
+    text = certificate.read_text().replace('"provenance": {', '"provenance": {"deep": ' + deep + ", ", 1)
+    certificate.write_text(text)
+    status, out, _ = run(capsys, "check", certificate, "--policy", SHIPPED)
+    assert status == 1 and out.startswith("REJECTED rule=")
+    assert run(capsys, "check", certificate, "--policy", policy_file)[0] in (0, 1)  # or too deep to be read at all
+
+
+def test_a_wrong_policy_is_named_when_the_certificate_comes_through_a_pipe(
+    tmp_path: Path, policy_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    raw, pipe = certified(tmp_path, policy_file, capsys).read_bytes(), tmp_path / "pipe"
+    os.mkfifo(pipe)
+    for policy, expected in ((SHIPPED, (1, "REJECTED rule=policy")), (policy_file, (0, "ACCEPTED "))):
+        writer = threading.Thread(target=pipe.write_bytes, args=(raw,), daemon=True)
+        writer.start()
+        status, out, _ = run(capsys, "check", pipe, "--policy", policy)
+        writer.join(timeout=10)
+        assert (status, out.splitlines()[-1][: len(expected[1])]) == expected
+
+
+def test_a_file_whose_name_is_an_option_is_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("--help").write_text("{}")
+    command = [sys.executable, "-m", "certify", "check", "./--help"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 1 and "REJECTED rule=format" in done.stdout
+
+
+@pytest.mark.parametrize("arguments", [["systems"], ["systems", "--json"], ["roa", "--policy", str(SHIPPED)]])
+def test_a_reader_that_has_gone_is_not_a_refutation(tmp_path: Path, arguments: list[str]) -> None:
+    out = ["--out", str(tmp_path)] if arguments[0] == "roa" else []
+    reading, writing = os.pipe()
+    os.close(reading)
+    command = [sys.executable, "-m", "certify", *arguments, *out]
+    done = subprocess.run(command, stdout=writing, stderr=subprocess.PIPE, text=True, check=False)
+    os.close(writing)
+    assert done.returncode == 141 and "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("beta", [0.7, -1e-3])
+def test_a_beta_that_is_not_the_rounded_one_is_refused(
+    tmp_path: Path, beta: float, capsys: pytest.CaptureFixture[str]
+) -> None:
+    network = pendulum_network((8, 8))
+    save_policy(tmp_path / "b.pt", Policy(network, "pendulum", beta=np.array([beta])))
+    status, out, err = run(capsys, "roa", "--policy", tmp_path / "b.pt", "--out", tmp_path / "o")
+    assert (status, out) == (2, "") and "`beta` must be atanh" in err and "shifts u(0) by" in err
+    assert not (tmp_path / "o").exists()

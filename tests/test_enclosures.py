@@ -10,10 +10,12 @@ import torch
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from certify.closed_loop import ClosedLoop, evaluate_arb
-from certify.enclosures import PolicyEnclosure, Taylor, evaluate, upper_bound
+from certify.closed_loop import ClosedLoop
+from certify.enclosures import Models, PolicyEnclosure, Taylor, upper_bound
 from certify.enclosures.policy import relax_tanh
+from certify.expressions import evaluate
 from certify.policies import TanhNetwork
+from certify.rigorous import evaluate_arb, evaluate_policy
 from certify.systems import System, get_system
 from tests.support.loops import box, pendulum_network
 
@@ -100,7 +102,7 @@ def test_the_policy_lies_in_its_enclosure(case: int, size: float) -> None:
         for d in [np.ones(n), *generator.uniform(-1, 1, (3, n))]:
             point = centre[:, b] + slopes[:, :, b] @ d  # a binary64 state, a rounding away from the affine form
             slack = 1e-13 * (1 + size)
-            for j, u in enumerate(loop.evaluate_policy(point)):
+            for j, u in enumerate(evaluate_policy(loop, point)):
                 form = arb(mid[j, b]) + sum((arb(gradient[j, i, b]) * arb(d[i]) for i in range(n)), flint.arb(0))
                 lipschitz = float(
                     np.prod([np.linalg.norm(W, 2) for W in network.weights]) * np.max(np.abs(network.scale))
@@ -138,6 +140,10 @@ def model(c: float, g: list[float]) -> Taylor:
     return Taylor(tensor([c]), tensor(g)[:, None], zero, torch.zeros(1, dtype=torch.float64))
 
 
+def on_models(expression: sympy.Expr, x: Taylor, y: Taylor) -> Taylor:
+    return evaluate(expression, {X: x, Y: y}, Models(x))
+
+
 coefficient = st.floats(-1, 1).map(lambda v: round(v, 6))
 
 
@@ -152,7 +158,7 @@ def test_taylor_models_contain_the_function(
 ) -> None:
     flint.ctx.prec = 200
     (a, b), g, h = numbers[:2], [size * v for v in numbers[2:4]], [size * v for v in numbers[4:]]
-    result = evaluate(expression, {X: model(a, g), Y: model(b, h)}, {})
+    result = on_models(expression, model(a, g), model(b, h))
     bound = float(upper_bound(result)[0][0])
     assume(bool(torch.isfinite(result.r[0])))  # NaN: a pole could not be excluded, and nothing is claimed
     for d in points:
@@ -175,7 +181,7 @@ def test_taylor_remainder_is_of_third_order(expression: sympy.Expr) -> None:
     remainders = []
     for k in range(2, 9):
         size = 0.5 * 2.0**-k
-        result = evaluate(expression, {X: model(0.3, [size, -0.4 * size]), Y: model(-0.2, [0.1 * size, size])}, {})
+        result = on_models(expression, model(0.3, [size, -0.4 * size]), model(-0.2, [0.1 * size, size]))
         remainders.append(float(result.r[0]))
     if max(remainders) < 1e-13:  # a polynomial of degree two: nothing but rounding
         assert sympy.Poly(expression, X, Y).total_degree() <= 2
@@ -186,7 +192,7 @@ def test_taylor_remainder_is_of_third_order(expression: sympy.Expr) -> None:
 
 def test_a_pole_in_reach_is_never_bounded() -> None:
     for expression, centre in ((1 / X, 0.05), (sympy.tan(X), 1.5), (X**-2, 0.0)):
-        result = evaluate(expression, {X: model(centre, [0.1, 0.0]), Y: model(0.0, [0.0, 0.0])}, {})
+        result = on_models(expression, model(centre, [0.1, 0.0]), model(0.0, [0.0, 0.0]))
         assert not bool(upper_bound(result)[0][0] < float("inf"))
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
+from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
 
@@ -10,10 +12,15 @@ import numpy as np
 import pytest
 import sympy
 
+from certify.certificate import Certificate, checking, run_checker, sole_writer
+from certify.claims import Problem
+from certify.closed_loop import ClosedLoop
+from certify.engines.falsify import Witness, refutes
 from certify.errors import BackendError, InputError, SoundnessError
-from certify.lyapunov import solve_lyapunov
-from certify.policies import TanhNetwork, load_policy
-from certify.roa import RoaOptions, certify_roa, run_checker
+from certify.lyapunov import domain_limit, leaves_domain, solve_lyapunov
+from certify.lyapunov.function import Quadratic
+from certify.policies import TanhNetwork, bounded_by_form, load_policy
+from certify.roa import RoaOptions, certify_roa
 from certify.systems import System, get_system
 from certify.verdict import Verdict
 from tests.support.loops import box, chain, pendulum_network, scalar_tanh
@@ -33,7 +40,7 @@ def test_linear_plants_reach_their_domain(tmp_path: Path, n: int) -> None:
         Fraction(hi) ** 2 / Fraction(int(inverse[i, i].p), int(inverse[i, i].q))
         for i, (_, hi) in enumerate(system.domain)
     )
-    level = result.levels["roa"]
+    level = result.levels.roa
     assert level is not None
     assert 0.99 * float(limit) <= level and Fraction(level) < limit
 
@@ -72,7 +79,7 @@ def test_scalar_plant_just_inside_and_just_outside(tmp_path: Path, x: float, ver
     result = certify_roa(*scalar_tanh(), tmp_path, RoaOptions(level=x * x))
     assert result.verdict is verdict
     if verdict is Verdict.PROVED:
-        assert result.levels["roa"] == x * x
+        assert result.levels.roa == x * x
     else:
         assert result.witness is not None and result.witness.level <= x * x
         assert not (tmp_path / "certificate.json").exists()
@@ -80,7 +87,7 @@ def test_scalar_plant_just_inside_and_just_outside(tmp_path: Path, x: float, ver
 
 def test_scalar_plant_largest_level(tmp_path: Path) -> None:
     result = certify_roa(*scalar_tanh(), tmp_path)
-    level = result.levels["roa"]
+    level = result.levels.roa
     assert result.verdict is Verdict.PROVED and result.reason == "witness"
     assert level is not None and 0.99 * 1.915008**2 < level < 1.915009**2
 
@@ -110,9 +117,9 @@ def test_levels_scale_with_P(tmp_path: Path, pendulum: System) -> None:
     """(P, c) -> (aP, ac) leaves the set as it is."""
     network = pendulum_network((8, 8))
     base = certify_roa(pendulum, network, tmp_path)
-    assert base.P is not None and base.levels["roa"] is not None
+    assert base.P is not None and base.levels.roa is not None
     scaled = certify_roa(pendulum, network, tmp_path, RoaOptions(P=4.0 * base.P))
-    assert scaled.levels["roa"] == pytest.approx(4.0 * base.levels["roa"], rel=1e-5)
+    assert scaled.levels.roa == pytest.approx(4.0 * base.levels.roa, rel=1e-5)
 
 
 def test_the_lqr_candidate_solves_its_equation(tmp_path: Path, pendulum: System) -> None:
@@ -132,7 +139,7 @@ def test_input_bounds_limit_the_level(tmp_path: Path) -> None:
     network = TanhNetwork((np.array([[-1.5]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
     result = certify_roa(system, network, tmp_path)
     assert result.verdict is Verdict.PROVED and result.reason == "inputs"
-    level = result.levels["roa"]
+    level = result.levels.roa
     assert level is not None and 0.99 * (4 / 9) / 2 < level < (4 / 9) / 2
 
 
@@ -146,7 +153,7 @@ def test_the_largest_level_within_a_budget_is_still_proved(tmp_path: Path, pendu
     result = certify_roa(pendulum, pendulum_network(), tmp_path, RoaOptions(max_boxes=150))
     full = certify_roa(pendulum, pendulum_network(), tmp_path)
     assert result.verdict is Verdict.PROVED and result.reason == "boxes"
-    local, level, best = result.levels["local"], result.levels["roa"], full.levels["roa"]
+    local, level, best = result.levels.local, result.levels.roa, full.levels.roa
     assert local is not None and level is not None and best is not None
     assert local <= level < best
 
@@ -156,8 +163,8 @@ def test_the_shipped_policy(tmp_path: Path, pendulum: System) -> None:
     assert policy.network.layers == (2, 16, 16, 1)
     result = certify_roa(pendulum.with_parameters(policy.parameters), policy.network, tmp_path)
     assert result.verdict is Verdict.PROVED
-    roa, limit = result.levels["roa"], result.levels["domain_limit"]
-    sampled = result.levels.get("sampled_limit")
+    roa, limit = result.levels.roa, result.levels.domain_limit
+    sampled = result.levels.sampled_limit
     assert roa is not None and limit is not None
     assert roa >= 0.95 * min(limit, sampled if sampled is not None else np.inf)
     data = json.loads(json.dumps(result.to_dict()))
@@ -173,17 +180,14 @@ def test_equal_runs_write_equal_certificates(tmp_path: Path, pendulum: System) -
 
 
 def test_a_rejection_is_a_soundness_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """If the engine case too much, the run ends loudly and never in PROVED."""
-    import certify.roa as roa
+    """If the engine claims too much, the run ends loudly and never in PROVED."""
+    honest = Certificate.to_json
 
-    honest = roa.write_certificate
+    def exaggerate(certificate: Certificate) -> str:
+        claim = dataclasses.replace(certificate.claim, roa=certificate.roa * 1.5)
+        return honest(dataclasses.replace(certificate, claim=claim))
 
-    def exaggerate(path: Path, certificate: object) -> None:
-        import dataclasses
-
-        honest(path, dataclasses.replace(certificate, roa=certificate.roa * 1.5))  # type: ignore[type-var,attr-defined]
-
-    monkeypatch.setattr(roa, "write_certificate", exaggerate)
+    monkeypatch.setattr(Certificate, "to_json", exaggerate)
     with pytest.raises(SoundnessError, match="rejects"):
         certify_roa(*scalar_tanh(), tmp_path)
 
@@ -215,10 +219,119 @@ def test_bad_weights(tmp_path: Path) -> None:
 
 
 def test_a_verdict_is_not_a_bool() -> None:
-    with pytest.raises(TypeError, match="three values"):
+    with pytest.raises(TypeError, match="four values"):
         bool(Verdict.PROVED)
-    assert [v.exit_status for v in Verdict] == [0, 1, 3]
+    assert {v.name: v.exit_status for v in Verdict} == {"PROVED": 0, "TRUSTED": 3, "REFUTED": 1, "UNKNOWN": 3}
 
 
 def test_every_registered_plant_can_be_named() -> None:
     assert get_system("pendulum").name == "pendulum"
+
+
+def test_two_runs_in_one_folder_do_not_meet(tmp_path: Path) -> None:
+    with sole_writer(tmp_path), pytest.raises(InputError, match="another run is writing"):
+        certify_roa(*scalar_tanh(), tmp_path)
+    assert certify_roa(*scalar_tanh(), tmp_path, RoaOptions(level=1.0)).verdict is Verdict.PROVED
+
+
+def test_an_answer_about_other_bytes_is_no_proof(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Another run's certificate is accepted in the place of this one's."""
+    other = certify_roa(*scalar_tanh(), tmp_path / "other", RoaOptions(level=1.0)).certificate
+    assert other is not None
+    monkeypatch.setattr("certify.roa.run_checker", lambda _: run_checker(other))
+    with pytest.raises(SoundnessError, match="other bytes"):
+        certify_roa(*scalar_tanh(), tmp_path / "mine", RoaOptions(level=2.0))
+    assert not (tmp_path / "mine" / "certificate.json").exists()
+
+
+def test_the_checker_beside_the_running_package_is_meant(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder = tmp_path / "elsewhere" / "checker"
+    folder.mkdir(parents=True)
+    (folder / "__init__.py").write_text("")
+    (folder / "__main__.py").write_text("def main(arguments):\n    print('{\"error\": \"another\"}')\n    return 70\n")
+    monkeypatch.setattr(checking, "__file__", str(tmp_path / "elsewhere" / "certificate" / "checking.py"))
+    assert checking.ask(tmp_path) == (70, {"error": "another"})
+
+
+ILL = np.array([[1.0, 1.0 - 2.0**-40], [1.0 - 2.0**-40, 1.0]])
+
+
+def test_the_domain_is_decided_in_rationals() -> None:
+    """A float inverse of this P is off by more than the level's distance from the limit."""
+    domain = box(1, 1)
+    a, b = Fraction(ILL[0, 0]), Fraction(ILL[0, 1])
+    limit = (a * a - b * b) / a  # 1 / (P^-1)_11
+    level = float(limit)
+    while Fraction(level) >= limit:
+        level = float(np.nextafter(level, 0))
+    assert not leaves_domain(ILL, level, domain)
+    assert leaves_domain(ILL, float(np.nextafter(np.nextafter(level, 1), 1)), domain)
+    assert domain_limit(ILL, domain) <= float(limit)
+
+
+def test_a_witness_above_the_level_refutes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    x = np.array([1.9150081])
+    loop = ClosedLoop(*scalar_tanh())
+    problem = Problem(loop, Quadratic(np.eye(1)))
+    witness = Witness(x, float(x[0] ** 2), "vdot")
+    exact = Fraction(x[0]) ** 2
+    above, below = float(exact), float(exact)
+    while Fraction(above) < exact:
+        above = float(np.nextafter(above, 9))
+    while Fraction(below) >= exact:
+        below = float(np.nextafter(below, 0))
+    assert refutes(problem, witness, above) and not refutes(problem, witness, below)
+    monkeypatch.setattr("certify.roa.falsify", lambda *_: witness)
+    result = certify_roa(*scalar_tanh(), tmp_path, RoaOptions(level=3.0))
+    assert result.verdict is Verdict.PROVED and result.levels.roa == 3.0
+
+
+def test_a_policy_that_is_nearly_centred_is_named_before_any_work(tmp_path: Path) -> None:
+    system, network = scalar_tanh()
+    off = dataclasses.replace(network, biases=(np.array([1e-12]),))
+    with pytest.raises(InputError, match=r"not centred.*practical"):
+        certify_roa(system, off, tmp_path)
+
+
+def test_an_equilibrium_that_is_not_decided_in_rationals_is_named(tmp_path: Path) -> None:
+    x, u = sympy.symbols("x u")
+    dynamics = (sympy.sin(1 + x) - sympy.sin(1) + u,)
+    system = System("s", (x,), (u,), {}, dynamics, (sympy.Integer(0),), box(1), box(9))
+    network = TanhNetwork((np.array([[-5.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    with pytest.raises(InputError, match="not decided in rationals: sin of 1"):
+        certify_roa(system, network, tmp_path)
+
+
+def test_input_bounds_are_decided_in_rationals(tmp_path: Path) -> None:
+    """offset + scale is 1 + 2^-53, which rounds to the bound 1: the squash alone does not keep the input below it."""
+    half = float(np.nextafter(0.5, 1))
+    network = TanhNetwork((np.array([[-2.0]]),), (np.zeros(1),), np.array([half]), np.array([0.5]))
+    bounds = ((Fraction(-1), Fraction(1)),)
+    assert 0.5 + half == 1.0 and not bounded_by_form(network, bounds)
+    assert bounded_by_form(network, ((Fraction(-1), Fraction(2)),))
+
+
+@pytest.mark.parametrize(
+    ("dynamics", "named"),
+    [
+        (lambda x, u: u - x**65, "largest exponent"),
+        (lambda x, u: u - x * sympy.Rational(1, 10**1300), "digits"),
+        (lambda x, u: u - sum((x + k) * sympy.sin(x + k * x**2) for k in range(1, 3000)) * x**2, "nodes"),
+        (lambda x, u: u - nested(x, 101), "nesting"),
+    ],
+)
+def test_a_plant_too_large_for_a_certificate_is_named(
+    tmp_path: Path, dynamics: Callable[[sympy.Symbol, sympy.Symbol], sympy.Expr], named: str
+) -> None:
+    x, u = sympy.symbols("x u")
+    system = System("large", (x,), (u,), {}, (dynamics(x, u),), (sympy.Integer(0),), box(1), box(9))
+    network = TanhNetwork((np.array([[-5.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    with pytest.raises(InputError, match=f"too large for a certificate.*{named}"):
+        certify_roa(system, network, tmp_path)
+
+
+def nested(x: sympy.Symbol, depth: int) -> sympy.Expr:
+    result = x
+    for _ in range(depth):
+        result = sympy.sin(x * result)
+    return result

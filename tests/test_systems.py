@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
+import importlib
+import itertools
+import math
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +18,8 @@ import sympy
 import torch
 
 from certify.errors import InputError
-from certify.systems import System, available_systems, exact, get_system, load_system
+from certify.systems import System, available_systems, exact, get_system, load_system, plants
+from certify.systems.ode import rk4_step
 from certify.systems.toml import parse_expression
 from tests.support.loops import box
 
@@ -146,6 +154,117 @@ def test_names_are_identifiers(name: str) -> None:
 def test_unknown_plant_names_the_known_ones() -> None:
     with pytest.raises(InputError, match="pendulum"):
         get_system("pendulun")
+
+
+PLANT = """
+import sympy
+from certify.systems import System
+
+def {function}() -> System:
+    x, u = sympy.symbols("x u")
+    return System("{name}", (x,), (u,), {{}}, (u - x,), (sympy.Integer(0),), (({lo}, 1),), ((-1, 1),))
+"""
+
+
+@pytest.fixture
+def plant_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[str, str], Path]]:
+    """Writes a plant's file as if it lay in the folder of the plants; what was imported of it is forgotten."""
+    monkeypatch.setattr(plants, "__path__", [*plants.__path__, str(tmp_path)])
+    written = []
+
+    def write(name: str, text: str) -> Path:
+        written.append(name)
+        path = tmp_path / f"{name}.py"
+        path.write_text(text)
+        importlib.invalidate_caches()
+        return path
+
+    yield write
+    for name in written:
+        sys.modules.pop(f"{plants.__name__}.{name}", None)
+        vars(plants).pop(name, None)
+
+
+def test_a_plant_is_one_file(plant_file: Callable[[str, str], Path]) -> None:
+    before = available_systems()
+    plant_file("leak", PLANT.format(function="leak", name="leak", lo=-1))
+    plant_file("_helpers", "raise RuntimeError")
+    assert available_systems() == tuple(sorted([*before, "leak"]))
+    assert get_system("leak").exact_dynamics() == (sympy.Symbol("u") - sympy.Symbol("x"),)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("x = 1", r"leak\.py must define a function `leak\(\)`"),
+        ("leak = 1", r"leak\.py must define a function `leak\(\)`"),
+        ("def leak(): return 1", r"`leak\(\)` in .*leak\.py must return a System; it returns int"),
+        (PLANT.format(function="leak", name="drip", lo=-1), "must have the name 'leak'; it is called 'drip'"),
+        (PLANT.format(function="leak", name="leak", lo=0), "the domain of x must contain 0"),
+    ],
+)
+def test_a_file_that_holds_no_plant_is_refused_and_the_others_still_work(
+    plant_file: Callable[[str, str], Path], text: str, message: str
+) -> None:
+    plant_file("leak", text)
+    assert "leak" in available_systems() and get_system("pendulum").n == 2
+    with pytest.raises(InputError, match=message):
+        get_system("leak")
+
+
+def test_listing_plants_imports_none_of_them() -> None:
+    code = "import sys, certify.systems as s; s.available_systems(); print([n for n in sys.modules if '.plants.' in n])"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"
+
+
+@pytest.mark.parametrize("name", ["plants", "system", "pendulum.pendulum", "../system", ".pendulum", ""])
+def test_what_is_no_plant_s_file_is_an_unknown_plant(name: str) -> None:
+    with pytest.raises(InputError, match="unknown system"):
+        get_system(name)
+
+
+@pytest.mark.parametrize("module", ["numpy", "torch"])
+def test_runge_kutta_converges_with_order_four(module: str) -> None:
+    """Harmonic oscillators of several frequencies in one batch, against their exact flow over 2 s."""
+    make = np.array if module == "numpy" else partial(torch.tensor, dtype=torch.float64)
+    stack = np.stack if module == "numpy" else torch.stack
+    w = np.array([0.5, 1.0, 2.0])
+    squared, exact_end = make(w**2), np.stack([np.cos(2 * w), -w * np.sin(2 * w)], -1)
+
+    def error(steps: int) -> np.ndarray:
+        x = make([[1.0, 0.0]] * 3)
+        for _ in range(steps):
+            x = rk4_step(lambda y: stack((y[..., 1], -squared * y[..., 0]), -1), x, 2.0 / steps)
+        return np.linalg.norm(np.asarray(x) - exact_end, axis=-1)
+
+    errors = [error(steps) for steps in (20, 40, 80)]
+    orders = [np.log2(coarse / fine) for coarse, fine in itertools.pairwise(errors)]
+    assert all(np.abs(order - 4).max() < 0.1 for order in orders), orders
+    assert np.abs(orders[1] - 4).max() < np.abs(orders[0] - 4).max()  # and tends to it
+
+
+def test_a_runge_kutta_step_is_taylor_s_polynomial_for_a_linear_plant() -> None:
+    """Of degree four exactly: in rationals, where nothing rounds."""
+    x, h, a = Fraction(3, 7), Fraction(1, 5), Fraction(-9, 4)
+    expected = x * sum((a * h) ** k / math.factorial(k) for k in range(5))
+    assert rk4_step(lambda y: a * y, x, h) == expected
+
+
+def test_a_runge_kutta_step_passes_x_itself_first_and_takes_a_step_a_state(pendulum: System) -> None:
+    f, x, asked = pendulum.function(), np.array([[0.3, -1.2], [2.0, 5.0]]), []
+    u = np.zeros((2, 1))
+
+    def field(y: np.ndarray) -> np.ndarray:
+        asked.append(y)
+        return f(y, u)
+
+    h = np.array([[0.02], [0.05]])
+    after = rk4_step(field, x, h)
+    assert asked[0] is x and len(asked) == 4
+    for k in range(2):  # a row of the batch is what it is alone, to the last bit
+        alone = rk4_step(lambda y: f(y, u[:1]), x[k : k + 1], float(h[k, 0]))
+        np.testing.assert_array_equal(after[k : k + 1], alone)
 
 
 def test_toml_plant() -> None:

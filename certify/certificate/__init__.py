@@ -3,14 +3,28 @@
 from __future__ import annotations
 
 from certify.certificate.checking import run_checker
-from certify.certificate.model import Certificate, PartitionTree, TrustedSolver, read_certificate
+from certify.certificate.limits import require_short, require_within_limits
+from certify.certificate.model import (
+    Certificate,
+    PartitionTree,
+    TrustedSolver,
+    parse_certificate,
+    read_certificate,
+    read_raw,
+)
+from certify.certificate.tree import leaves
 from certify.certificate.writing import sole_writer, write_atomically, write_beside
 
 __all__ = [
     "Certificate",
     "PartitionTree",
     "TrustedSolver",
+    "leaves",
+    "parse_certificate",
     "read_certificate",
+    "read_raw",
+    "require_short",
+    "require_within_limits",
     "run_checker",
     "sole_writer",
     "write_atomically",

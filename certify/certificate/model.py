@@ -2,6 +2,10 @@
 
 Numbers never pass through decimal: hex floats, exact fractions, or raw little-endian bytes in base64. The reader here
 serves pictures and summaries; whether a certificate is valid is for the checker alone to say.
+
+A file may change between two reads, and some give other bytes at each. Whoever says something about a certificate
+reads it once (`read_raw`) and takes everything from these bytes: `parse_certificate`, their sha256, and the checker's
+answer about a file of its own that holds them.
 """
 
 from __future__ import annotations
@@ -27,6 +31,9 @@ from certify.systems import System
 
 Array = NDArray[np.float64]
 SCHEMA = "certify-certificate/2"
+"""Of each claim's kind, what the file calls the inner level."""
+MAX_BYTES = 256 * 2**20
+_LONGEST_UNIT = 40
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,27 +124,63 @@ class Certificate:
             "lyapunov": {"kind": "quadratic", "P": _encode(self.V.P)},
             "levels": {name: float(level).hex() for name, level in self.claim.levels.items()},
             "evidence": _evidence(self.evidence),
-            "provenance": {k: str(v) for k, v in self.provenance.items()},
+            "provenance": {k: str(v) for k, v in self.provenance.items()} | _units(system),
         }
         lines = [f"{json.dumps(k)}: {json.dumps(v)}" for k, v in sections.items()]
         return "{\n" + ",\n".join(lines) + "\n}\n"
 
 
+def read_raw(path: Path) -> bytes:
+    """The file's bytes, read once.
+
+    Raises
+    ------
+    CertificateFormatError : the file cannot be read, or is larger than a certificate may be.
+    """
+    try:
+        with path.open("rb") as stream:
+            raw = stream.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise CertificateFormatError(f"{path} cannot be read: {error.strerror}.") from error
+    if len(raw) > MAX_BYTES:
+        raise CertificateFormatError(f"{path} is not a certificate: it is larger than {MAX_BYTES:,} bytes.")
+    return raw
+
+
 def read_certificate(path: Path) -> Certificate:
-    """Read a certificate for a report or a picture. This does not check it.
+    """Read a certificate for a report or a picture, once. This does not check it.
 
     Raises
     ------
     CertificateFormatError : the file cannot be read as a certificate.
     """
+    return parse_certificate(read_raw(path), str(path))
+
+
+def parse_certificate(raw: bytes, name: str) -> Certificate:
+    """The certificate that the bytes hold. This does not check it.
+
+    Parameters
+    ----------
+    raw : the file's bytes.
+    name : what messages call them.
+
+    Raises
+    ------
+    CertificateFormatError : the bytes are no certificate.
+    """
     try:
-        data = json.loads(path.read_text(encoding="utf-8"))
+        data = json.loads(raw.decode("utf-8"))
         if data["schema"] != SCHEMA:
-            raise CertificateFormatError(f"{path}: `schema` must be {SCHEMA!r}; found {data['schema']!r}.")
+            raise CertificateFormatError(f"{name}: `schema` must be {SCHEMA!r}; found {data['schema']!r}.")
+        kind = data["claim"]["kind"]
+        if kind not in CLAIMS:
+            raise CertificateFormatError(f"{name}: `claim.kind` must be one of {', '.join(CLAIMS)}; found {kind!r}.")
         plant, policy, evidence = data["plant"], data["policy"], data["evidence"]
         states, inputs = (tuple(sympy.Symbol(s) for s in plant[k]) for k in ("states", "inputs"))
         names = {s.name: s for s in (*states, *inputs)}
         n, m = len(states), len(inputs)
+        provenance, units = _read_provenance(data["provenance"], names)
         system = System(
             name=plant["name"],
             states=states,
@@ -147,6 +190,7 @@ def read_certificate(path: Path) -> Certificate:
             u_eq=tuple(sympy.Rational(q) for q in plant["u_eq"]),
             domain=tuple((Fraction(lo), Fraction(hi)) for lo, hi in plant["domain"]),
             input_bounds=tuple((Fraction(lo), Fraction(hi)) for lo, hi in plant["input_bounds"]),
+            units=units,
         )
         network = TanhNetwork(
             weights=tuple(_decode(x["weight"], tuple(x["shape"])) for x in policy["layers"]),
@@ -162,14 +206,32 @@ def read_certificate(path: Path) -> Certificate:
             V=Quadratic(_decode(data["lyapunov"]["P"], (n, n))),
             claim=CLAIMS[data["claim"]["kind"]](**{k: float.fromhex(v) for k, v in data["levels"].items()}),
             evidence=_read_evidence(evidence, n),
-            provenance=data["provenance"],
+            provenance=provenance,
         )
-    except OSError as error:
-        raise CertificateFormatError(f"{path} cannot be read: {error.strerror}.") from error
     except CertificateFormatError:
         raise
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise CertificateFormatError(f"{path} is not a certificate: {type(error).__name__}: {error}.") from error
+        raise CertificateFormatError(f"{name} is not a certificate: {type(error).__name__}: {error}.") from error
+
+
+def _units(system: System) -> dict[str, dict[str, str]]:
+    """The provenance's entry for units of states and inputs; none if the plant has none."""
+    names = [s.name for s in (*system.states, *system.inputs)]
+    units = {name: system.units[name] for name in names if name in system.units}
+    return {"units": units} if units else {}
+
+
+def _read_provenance(data: Any, names: Mapping[str, Any]) -> tuple[dict[str, str], dict[str, str]]:
+    """The provenance as text, and the units in it; it is for people, so what cannot be used is passed over."""
+    found = data if isinstance(data, dict) else {}
+    units = found.get("units")
+    if not isinstance(units, dict) or not all(k in names and _is_unit(v) for k, v in units.items()):
+        return {k: str(v) for k, v in found.items()}, {}
+    return {k: str(v) for k, v in found.items() if k != "units"}, units
+
+
+def _is_unit(value: Any) -> bool:
+    return isinstance(value, str) and len(value) <= _LONGEST_UNIT and value.isprintable()
 
 
 def _evidence(evidence: PartitionTree | TrustedSolver) -> dict[str, Any]:
@@ -194,7 +256,7 @@ def _read_evidence(data: Mapping[str, Any], n: int) -> PartitionTree | TrustedSo
         root = _decode(data["root"], (n,))
         return PartitionTree(_decode(data["T"], (n, n)), root, base64.b64decode(data["tree"]))
     queries = tuple((str(name), str(answer)) for name, answer in data["queries"])
-    return TrustedSolver(data["solver"], data["version"], float.fromhex(data["precision"]), queries)
+    return TrustedSolver(str(data["solver"]), str(data["version"]), float.fromhex(data["precision"]), queries)
 
 
 def _encode(array: Array) -> str:

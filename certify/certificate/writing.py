@@ -49,7 +49,7 @@ def write_beside(path: Path, data: bytes, suffix: str) -> Path:
 
 @contextmanager
 def sole_writer(folder: Path) -> Iterator[None]:
-    """Make `folder` and keep other runs out of it until the end; the system lets go of a run that dies.
+    """Make `folder` and lock it until the end; the system lets go of a run that dies.
 
     Raises
     ------
@@ -57,7 +57,7 @@ def sole_writer(folder: Path) -> Iterator[None]:
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        handle = os.open(folder / ".lock", os.O_RDWR | os.O_CREAT, 0o666)
+        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     except OSError as error:
         raise InputError(f"output folder {folder} cannot be written: {error.strerror}.") from error
     try:

@@ -6,7 +6,6 @@ in which coordinates and with which boxes, is the evidence's affair.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Literal
@@ -37,22 +36,23 @@ class Problem:
 
 
 @dataclass(frozen=True, slots=True)
-class Claim(ABC):
+class Claim:
     """`roa` is c2: the claim is about every trajectory that starts in {V <= c2}."""
 
     kind: ClassVar[Kind]
     at_rest: ClassVar[bool]  # the origin must be an equilibrium, exactly
+    inner_name: ClassVar[str]  # of the level from which the ring reaches outwards to c2
     roa: float
 
     @property
-    @abstractmethod
     def inner(self) -> float:
         """The level from which the ring reaches outwards to c2."""
+        return float(getattr(self, self.inner_name))
 
     @property
-    @abstractmethod
     def levels(self) -> Mapping[str, float]:
         """The section `levels` of the certificate, in its order."""
+        return {self.inner_name: self.inner, "roa": self.roa}
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,15 +64,8 @@ class Asymptotic(Claim):
 
     kind = "asymptotic"
     at_rest = True
+    inner_name = "local"
     local: float
-
-    @property
-    def inner(self) -> float:
-        return self.local
-
-    @property
-    def levels(self) -> Mapping[str, float]:
-        return {"local": self.local, "roa": self.roa}
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,15 +77,8 @@ class Practical(Claim):
 
     kind = "practical"
     at_rest = False
+    inner_name = "floor"
     floor: float
-
-    @property
-    def inner(self) -> float:
-        return self.floor
-
-    @property
-    def levels(self) -> Mapping[str, float]:
-        return {"floor": self.floor, "roa": self.roa}
 
 
 CLAIMS: Mapping[str, type[Asymptotic] | type[Practical]] = {c.kind: c for c in (Asymptotic, Practical)}

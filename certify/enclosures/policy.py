@@ -14,6 +14,7 @@ from torch import Tensor
 
 from certify.closed_loop import ClosedLoop
 from certify.enclosures.taylor import EPS, TINY
+from certify.rigorous import centring_with_errors
 
 _LIBM = 2.0**-47  # error allowed to torch.tanh, relative to 1
 
@@ -33,26 +34,12 @@ class PolicyEnclosure:
         self.rows = [w.norm(dim=1) for w in self.weights]
         self.norms = [float(torch.linalg.matrix_norm(w, 2)) * min(w.shape) ** (1 / 128) for w in self.weights]
         self.squash = network.squash == "tanh"
-        self.scale, self.offset = tensor(network.scale), tensor(network.offset)
-        self.bias_error = self.offset_error = torch.zeros_like(self.scale)
-        if network.centre != "none":
-            self._fold(loop, tensor([float(u) for u in loop.u_eq]))
-
-    def _fold(self, loop: ClosedLoop, u_eq: Tensor) -> None:
-        """Put the centring into the last bias or the offset, with what is not known of the network at the origin."""
-        network, squash, scale, offset = loop.network, self.squash, self.scale, self.offset
-        preactivation = network.centre == "preactivation"
-        self.squash, self.scale, self.offset = squash and not preactivation, scale / scale, 0 * offset
-        origin = torch.zeros(network.n, network.n + 1, 1, dtype=scale.dtype, device=scale.device)
-        at_0, _, error, _ = (v[..., 0] for v in self(origin, origin[:, 0]))
-        self.squash, self.scale, self.offset = squash, scale, offset
-        if preactivation:
-            beta, bias = torch.tensor(network.beta(loop.u_eq), device=scale.device), self.biases[-1]
-            self.biases[-1] = bias - at_0 + beta
-            self.bias_error = error + 4 * EPS * (bias.abs() + at_0.abs() + beta.abs())
-        else:
-            self.offset = u_eq - scale * at_0
-            self.offset_error = scale.abs() * error + 4 * EPS * (u_eq.abs() + (scale * at_0).abs())
+        self.scale = tensor(network.scale)
+        shift, shift_error, offset, offset_error = (tensor(a) for a in centring_with_errors(loop))
+        bias = self.biases[-1]
+        self.biases[-1], self.offset = bias + shift, offset
+        self.bias_error = torch.where(shift == 0, 0.0, shift_error + EPS * (bias.abs() + shift.abs()))
+        self.offset_error = offset_error
 
     def __call__(self, x: Tensor, x_error: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Enclose the policy for states `x[:, 0] + x[:, 1:] d` within x_error.

@@ -7,6 +7,7 @@ origin as far as it stays violating. A reported witness is shown in Arb; the sea
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Literal
@@ -21,8 +22,7 @@ from certify.rigorous import evaluate_policy, evaluate_vdot
 from certify.systems import System
 
 Array = NDArray[np.float64]
-Band = tuple[float, float, float]
-_LEVELS, _LOWEST = 60, 1e-9  # of a survey: how many levels, and the lowest as a share of the highest
+_RATIO, _LEVELS, _LOWEST = 1.4, 60, 1e-24  # of a survey: between levels, how many, and the lowest it goes on to
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +38,17 @@ class Witness:
         names = ", ".join(f"{s} = {v:.6g}" for s, v in zip(system.states, self.x, strict=True))
         what = "Vdot >= 0" if self.kind == "vdot" else "the input leaves its bounds"
         return f"{what} at {names} with V = {self.level:.12g} (shown in Arb)"
+
+
+@dataclass(frozen=True, slots=True)
+class Band:
+    """Levels between which sampling found no violation; `below` and `above` are their neighbours, at which it did,
+    or the ends of what was sampled."""
+
+    below: float
+    floor: float
+    top: float
+    above: float
 
 
 def falsify(problem: Problem, T: Array, limit: float, samples: int = 20_000, seed: int = 0) -> Witness | None:
@@ -58,32 +69,28 @@ def falsify(problem: Problem, T: Array, limit: float, samples: int = 20_000, see
 
 
 def survey(problem: Problem, T: Array, limit: float, samples: int = 512, seed: int = 0) -> Band | None:
-    """The widest band of levels up to `limit` on which no violation was found; None if there is none.
-
-    Returns
-    -------
-    (below, floor, top) : no violation was found from `floor` to `top`; `below` is the next lower level that
-        was sampled, at which there is one (or the lowest of all).
-    """
+    """The widest band of levels up to `limit` on which no violation was found; None if there is none."""
     search = _Search(problem, T)
     generator = np.random.default_rng(seed)
     direction = generator.standard_normal((samples, problem.loop.system.n))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-    levels = limit * np.geomspace(_LOWEST, 1.0, _LEVELS)
-    good = []
-    for level in levels:
+
+    def good(level: float) -> bool:
         z = torch.tensor(search.climb(np.sqrt(level) * direction, level, steps=20), dtype=torch.float64)
         with torch.no_grad():
-            good.append(not bool(search.bad(z).any()))
-    best, first = range(0), None
-    for k, ok in enumerate([*good, False]):
-        if ok and first is None:
-            first = k
-        if not ok and first is not None:
-            best, first = max(best, range(first, k), key=len), None
-    if not best:
+            return not bool(search.bad(z).any())
+
+    levels = [limit * _RATIO**-k for k in range(_LEVELS)]  # from the highest
+    found = [good(level) for level in levels]
+    while found[-1] and levels[-1] > _LOWEST * limit:
+        levels.append(levels[-1] / _RATIO**8)
+        found.append(good(levels[-1]))
+    runs = [list(run) for ok, run in itertools.groupby(range(len(levels)), key=found.__getitem__) if ok]
+    if not runs:
         return None
-    return tuple(float(levels[k]) for k in (max(0, best[0] - 1), best[0], best[-1]))  # type: ignore[return-value]
+    best = max(runs, key=lambda run: levels[run[0]] / levels[run[-1]])
+    below, above = min(best[-1] + 1, len(levels) - 1), max(best[0] - 1, 0)
+    return Band(levels[below], levels[best[-1]], levels[best[0]], levels[above])
 
 
 def descend(problem: Problem, T: Array, z: Array) -> Witness | None:

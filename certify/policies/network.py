@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
+from certify.policies.exact import centring
 
 Squash = Literal["tanh", "identity"]
 Centre = Literal["output", "preactivation", "none"]
@@ -141,13 +142,9 @@ class TanhNetwork:
         """A network without centring that is pi up to rounding: for search and simulation."""
         if self.centre == "none":
             return self
-        biases, offset = list(self.biases), self.offset
-        y = self.net(np.zeros(self.n))
-        if self.centre == "preactivation":
-            biases[-1] = biases[-1] - y + self.beta(u_eq)
-        else:
-            offset = np.array([float(u) for u in u_eq]) - self.scale * (np.tanh(y) if self.squash == "tanh" else y)
-        return TanhNetwork(self.weights, tuple(biases), self.scale, offset, self.squash, "none")
+        shift, offset = centring(self, u_eq, self.net(np.zeros(self.n)).tolist(), _Floats())
+        biases = (*self.biases[:-1], self.biases[-1] + np.array(shift))
+        return TanhNetwork(self.weights, biases, self.scale, np.array(offset), self.squash, "none")
 
     def squashed_at_origin(self, at_0: Array, u_eq: Sequence[Fraction]) -> Array:
         """What enters the last tanh at the origin, (m,), given net(0)."""
@@ -180,6 +177,17 @@ class TanhNetwork:
             digest.update(struct.pack(f"<{1 + array.ndim}Q", array.ndim, *array.shape))
             digest.update(np.ascontiguousarray(array, dtype="<f8").tobytes())
         return digest.hexdigest()
+
+
+class _Floats:
+    def number(self, q: Fraction) -> float:
+        return float(q)
+
+    def atanh(self, q: Fraction) -> float:
+        return float(np.arctanh(float(q)))
+
+    def tanh(self, v: float) -> float:
+        return float(np.tanh(v))
 
 
 def _frozen(array: Any, name: str) -> Array:

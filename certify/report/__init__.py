@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any
 from certify.report.summary import summary
 
 if TYPE_CHECKING:
-    from certify.report.html import render_html
+    from certify.report.page import render_html
     from certify.report.sampling import SimulatedRoa, simulated_roa_fraction
 
 __all__ = ["SimulatedRoa", "render_html", "simulated_roa_fraction", "summary", "warm_up"]
 
 _PUBLIC = {
-    "render_html": "certify.report.html",
+    "render_html": "certify.report.page",
     "simulated_roa_fraction": "certify.report.sampling",
     "SimulatedRoa": "certify.report.sampling",
 }
@@ -33,5 +33,5 @@ def __getattr__(name: str) -> Any:
 
 def warm_up() -> None:
     """Import what `render_html` needs; in a thread beside the checker process this costs no time."""
-    for module in ("matplotlib.figure", "matplotlib.backends.backend_svg", "jinja2", "certify.report.html"):
+    for module in ("matplotlib.figure", "matplotlib.backends.backend_svg", "jinja2", "certify.report.page"):
         import_module(module)

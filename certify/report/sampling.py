@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.closed_loop import ClosedLoop
 from certify.errors import InputError
 from certify.policies import TanhNetwork
 from certify.systems import System
+from certify.systems.ode import rk4_step
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -27,6 +27,7 @@ SETTLED = 1e-3
 _STEP = 1.0  # of the time constant of the fastest eigenvalue
 _HORIZON = 15.0  # time constants of the slowest eigenvalue
 _MAX_STEPS = 3000
+_RATE_SAMPLES = 200
 _GRID = {1: 401, 2: 35}
 
 
@@ -64,64 +65,69 @@ class SimulatedRoa:
 
 @dataclass(frozen=True, slots=True)
 class Flow:
-    """The closed loop for simulation: its field `F(x) = f(x, pi(x))` in float64 and the corners of the domain box.
+    """The closed loop for simulation, in float64. It need not have an equilibrium at the origin.
 
     Parameters
     ----------
-    loop : the closed loop.
-    field : shapes (..., n) to (..., n). Compiling it takes a while for large plants, hence this class.
-    lo, hi : shape (n,).
+    field : `F(x) = f(x, pi(x))`, shapes (..., n) to (..., n). Compiling it takes a while for large plants, hence this
+        class.
+    policy : pi, shapes (..., n) to (..., m).
+    lo, hi : corners of the domain box, shape (n,).
     """
 
-    loop: ClosedLoop
     field: Field
+    policy: Field
     lo: Array
     hi: Array
 
     @classmethod
-    def of(cls, loop: ClosedLoop) -> Flow:
-        """Compile the equations."""
-        f = loop.system.function()
+    def of(cls, system: System, network: TanhNetwork) -> Flow:
+        """Compile the equations.
 
-        def F(x: Array) -> Array:
-            return np.asarray(f(x, loop.policy(x)))  # folded once, not in every step
+        Raises
+        ------
+        InputError : the policy is not one for this plant.
+        """
+        if (network.n, network.m) != (system.n, system.m):
+            raise InputError(
+                f"the policy must read {system.n} states and command {system.m} inputs of {system.name}; "
+                f"it reads {network.n} and commands {network.m}."
+            )
+        f, u_eq = system.function(), system.exact_u_eq()
+        folded = network.folded(u_eq)  # once, not in every step
 
-        return cls(loop, F, *domain_bounds(loop.system))
+        def policy(x: Array) -> Array:
+            return np.asarray(folded(x, u_eq))
 
+        def field(x: Array) -> Array:
+            return np.asarray(f(x, policy(x)))
 
-def rk4_step(field: Field, x: Array, step: float) -> Array:
-    """One step of the classical Runge-Kutta method."""
-    k1 = field(x)
-    k2 = field(x + step / 2 * k1)
-    k3 = field(x + step / 2 * k2)
-    k4 = field(x + step * k3)
-    return x + step / 6 * (k1 + 2 * k2 + 2 * k3 + k4)
+        return cls(field, policy, *domain_bounds(system))
 
 
 def time_scales(flow: Flow) -> tuple[float, float]:
-    """(step, horizon) in seconds: the fastest time constant, and 15 times the slowest of the linearisation.
+    """(step, horizon) in seconds: the fastest time constant, and 15 times the slowest at the origin.
 
     The fastest is taken over Jacobians at the origin and at sampled states of the domain, because a plant can be
     stiffer away from the origin; Runge-Kutta of order four is stable up to 2.8 of it. The horizon is cut at 3,000
     steps.
     """
-    eigenvalues = np.linalg.eigvals(flow.loop.linearise()[0])
-    slowest = float(np.min(np.abs(eigenvalues.real)))
-    fastest = max(float(np.max(np.abs(eigenvalues))), _fastest_rate(flow))
+    x = np.random.default_rng(0).uniform(flow.lo, flow.hi, (_RATE_SAMPLES, len(flow.lo)))
+    rates = _eigenvalues(flow, np.concatenate([np.zeros((1, len(flow.lo))), x]))
+    fastest = float(np.max(np.abs(rates), initial=0.0))
+    slowest = float(np.min(np.abs(rates[:1].real), initial=math.inf))
     step = _STEP / fastest if fastest > 0 else 1.0
     return step, min(_HORIZON / slowest if slowest > 0 else math.inf, _MAX_STEPS * step)
 
 
-def _fastest_rate(flow: Flow) -> float:
-    """Largest |eigenvalue| of Jacobians (central differences) at 200 states of the domain; 0 where there is none."""
-    x = np.random.default_rng(0).uniform(flow.lo, flow.hi, (200, len(flow.lo)))
+def _eigenvalues(flow: Flow, x: Array) -> NDArray[np.complex128]:
+    """Eigenvalues of the Jacobians (central differences) at states (N, n), without those states that have none."""
     delta = 1e-5 * (flow.hi - flow.lo)
     shifted = x[:, None, None, :] + np.array([1.0, -1.0])[:, None, None] * np.diag(delta)
     with np.errstate(all="ignore"):
         F = flow.field(shifted)
         J = (F[:, 0] - F[:, 1]) / (2 * delta)[:, None]  # transposed; the eigenvalues are the same
-    J = J[np.all(np.isfinite(J), axis=(1, 2))]
-    return float(np.max(np.abs(np.linalg.eigvals(J)))) if len(J) else 0.0
+    return np.asarray(np.linalg.eigvals(J[np.all(np.isfinite(J), axis=(1, 2))]), dtype=np.complex128)
 
 
 def simulate(flow: Flow, starts: Array, step: float, steps: int) -> Array:
@@ -150,11 +156,12 @@ def simulated_roa_fraction(
     points: int | None = None,
     step: float | None = None,
     horizon: float | None = None,
+    settled: float | None = None,
 ) -> SimulatedRoa:
     """Simulate the closed loop from a grid over the domain and compare with `{x'Px <= level}`.
 
-    A grid point counts as attracted if its run stays inside the domain and comes as near to the origin as
-    `V <= SETTLED * level` within the horizon.
+    A grid point counts as attracted if its run stays inside the domain and comes to `V <= settled` within the
+    horizon.
 
     Parameters
     ----------
@@ -162,6 +169,7 @@ def simulated_roa_fraction(
     P, level : the certified set.
     points : grid points along each state; default 401 for one state, 35 for two.
     step, horizon : in seconds; defaults from the eigenvalues, see `time_scales`.
+    settled : the level that a run has to reach; default `SETTLED * level`, near the origin.
 
     Raises
     ------
@@ -169,7 +177,7 @@ def simulated_roa_fraction(
     """
     if system.n not in _GRID:
         raise InputError(f"a grid needs a plant with one or two states; {system.name} has {system.n}.")
-    flow = Flow.of(ClosedLoop(system, network))
+    flow = Flow.of(system, network)
     default_step, default_horizon = time_scales(flow)
     step = default_step if step is None else step
     horizon = default_horizon if horizon is None else horizon
@@ -180,7 +188,8 @@ def simulated_roa_fraction(
     axes = tuple(a + (b - a) * centres for a, b in zip(flow.lo, flow.hi, strict=True))
     x = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, system.n)
     certified = quadratic(P, x) <= level
-    attracted, undecided = _run(flow, x, P, SETTLED * level, step, horizon)
+    target = SETTLED * level if settled is None else settled
+    attracted, undecided = _run(flow, x, P, target, step, horizon)
     shape = (points,) * system.n
     return SimulatedRoa(axes, attracted.reshape(shape), certified.reshape(shape), undecided, step, horizon)
 

@@ -1,30 +1,32 @@
-"""The terminal summary of `certify roa`: what the result says, in one screen."""
+"""The terminal summary of `certify roa`: what the result says, in one screen.
+
+Everything comes from the result: names and units too, because a plant of one's own may bear the name of another.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
+from unicodedata import normalize
 
-from certify.report.words import below, label, number, pretty_unit, registered, seconds, volume_name, volume_unit
+from certify.report.words import (
+    above,
+    below,
+    inner_level,
+    label,
+    limited_by,
+    pretty_unit,
+    seconds,
+    volume_name,
+    volume_unit,
+    words_for,
+)
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
 
-_COLOURS = {"PROVED": "bold green", "REFUTED": "bold red", "UNKNOWN": "bold yellow"}
-_LIMITS = {
-    "domain": "the domain",
-    "inputs": "the input bounds: beyond it the policy asks for more than the actuator gives",
-    "witness": "a point where Vdot >= 0",
-    "time": "the time limit: more may be provable",
-    "boxes": "the limit on boxes: more may be provable",
-    "requested": "the level that was asked for",
-}
+_COLOURS = {"PROVED": "bold green", "REFUTED": "bold red", "UNKNOWN": "bold yellow", "TRUSTED": "bold yellow"}
 _STAGES = ("load", "candidate", "local", "ring", "write", "check")
-
-
-def limit_in_words(reason: str) -> str:
-    """What limits the level, in words; other reasons are sentences already."""
-    return _LIMITS.get(reason, reason)
 
 
 def summary(result: Mapping[str, Any]) -> RenderableType:
@@ -32,7 +34,8 @@ def summary(result: Mapping[str, Any]) -> RenderableType:
 
     Parameters
     ----------
-    result : the object that `certify roa --json` prints.
+    result : the object that `certify roa --json` prints. Of its keys `states` and `inputs` (lists of `{name, unit}`)
+        and `claim` (`{kind}`) may be absent: then there are no units, and the claim is the asymptotic one.
 
     Returns
     -------
@@ -42,51 +45,76 @@ def summary(result: Mapping[str, Any]) -> RenderableType:
     from rich.table import Table
     from rich.text import Text
 
-    verdict, proved = str(result["verdict"]), result["verdict"] == "PROVED"
-    head = Text.assemble((verdict, _COLOURS.get(verdict, "bold")), "  ", (_headline(result), "bold"))
+    verdict = _verdict(result)
+    shown = verdict in ("PROVED", "TRUSTED")
+    head = Text.assemble((verdict, _COLOURS.get(verdict, "bold")), "  ", (_headline(result, verdict), "bold"))
     grid = Table.grid(padding=(0, 2))
     grid.add_column(style="dim", no_wrap=True)
     grid.add_column(overflow="fold")
-    for name, value in _rows(result, proved):
+    for name, value in _rows(result, shown):
         grid.add_row(Text(name), Text(value))
     parts: list[RenderableType] = [head, Text(), grid]
-    if proved and result.get("extents"):
+    if shown and result.get("extents"):
         parts += [Text(), _reach(result)]
     return Group(*parts, Text())
 
 
-def _headline(result: Mapping[str, Any]) -> str:
-    name, level = result["system"], result["levels"].get("roa")
-    if result["verdict"] == "PROVED" and level is not None:
-        word = ", if the solver is right: nothing checked its answers" if result.get("checked") == "TRUSTED" else ""
-        return f"{name}: {{V <= {below(level)}}} is invariant and attracted by the origin{word}"
-    if result["verdict"] == "REFUTED":
+def _verdict(result: Mapping[str, Any]) -> str:
+    """The verdict, unless it says more than the checker did: PROVED is only what the checker accepted."""
+    verdict, checked = str(result["verdict"]), result.get("checked")
+    if verdict == "PROVED" and checked != "ACCEPTED":
+        return "TRUSTED" if checked == "TRUSTED" else "UNKNOWN"
+    return verdict
+
+
+def _kind(result: Mapping[str, Any]) -> str:
+    return str((result.get("claim") or {}).get("kind", "asymptotic"))
+
+
+def _inner(result: Mapping[str, Any]) -> float | None:
+    value: float | None = result["levels"].get(words_for(_kind(result)).inner_word)
+    return value
+
+
+def _headline(result: Mapping[str, Any], verdict: str) -> str:
+    name, level, kind = result["system"], result["levels"].get("roa"), _kind(result)
+    if verdict in ("PROVED", "TRUSTED") and level is not None:
+        inner = _inner(result)
+        stated = words_for(kind).headline.format(
+            outer=below(level), inner="?" if inner is None else inner_level(kind, inner)
+        )
+        word = ", if the solver is right: nothing checked its answers" if verdict == "TRUSTED" else ""
+        return f"{name}: {stated}{word}"
+    if verdict == "REFUTED":
         return f"{name}: the claim is false for this V"
     return f"{name}: nothing was proved"
 
 
-def _rows(result: Mapping[str, Any], proved: bool) -> list[tuple[str, str]]:
+def _rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
     levels, rows = result["levels"], []
-    if proved:
-        rows.append(("limited by", limit_in_words(str(result["reason"]))))
+    if shown:
+        rows.append(("limited by", limited_by(result)))
     else:
         rows.append(("reason", str(result["reason"])))
-    known = [f"{key} {shown}" for key, shown in (
-        ("local c1", _level(levels.get("local"))),
+    kind, inner = _kind(result), _inner(result)
+    words = words_for(kind)
+    known = [
+        (f"{words.inner_word} {normalize('NFKC', words.inner)}", "" if inner is None else inner_level(kind, inner)),
         ("enlarged c2", _level(levels.get("roa"))),
         ("domain limit", _level(levels.get("domain_limit"))),
         ("sampled limit", _level(levels.get("sampled_limit"))),
-    ) if shown]  # fmt: skip
-    if known:
-        rows.append(("levels of V", ", ".join(known)))
+    ]
+    stated = [f"{name} {text}" for name, text in known if text]
+    if stated:
+        rows.append(("levels of V", ", ".join(stated)))
     units = _state_units(result)
     if result.get("volume") is not None:
         unit = volume_unit(units)
         rows.append((volume_name(len(units)), f"{below(result['volume'])} {unit}".rstrip()))
     if len(result.get("candidates", [])) > 1:
         unit = volume_unit(units)
-        shown = [f"{c['candidate']} {below(c['volume'])}" for c in result["candidates"]]
-        rows.append(("candidates", f"{', '.join(shown)} {unit}".rstrip() + " (sampled, at most)"))
+        volumes = [f"{c['candidate']} {below(c['volume'])}" for c in result["candidates"]]
+        rows.append(("candidates", f"{', '.join(volumes)} {unit}".rstrip() + " (sampled, at most)"))
     rows.append(("policy", "-".join(map(str, result["policy"]["layers"]))))
     rows.append(("its sha256", str(result["policy"]["sha256"])))
     if result.get("eigenvalues"):
@@ -125,15 +153,19 @@ def _reach(result: Mapping[str, Any]) -> RenderableType:
     columns = zip(_state_names(result), _state_units(result), result["semi_axes"], result["extents"], strict=True)
     for name, unit, semi_axis, extent in columns:
         title = label(name, unit) if name.isascii() else f"{name} {pretty_unit(unit)}"
-        table.add_row(Text(title), Text(number(semi_axis)), Text(number(extent)))
+        table.add_row(Text(title), Text(below(semi_axis)), Text(above(extent)))
     return table
 
 
-def _state_names(result: Mapping[str, Any]) -> Sequence[str]:
-    plant, n = registered(str(result["system"])), len(result["extents"])
-    return [s.name for s in plant.states] if plant and plant.n == n else [f"x{i + 1}" for i in range(n)]
+def _state_names(result: Mapping[str, Any]) -> list[str]:
+    return [s["name"] for s in _states(result)]
 
 
 def _state_units(result: Mapping[str, Any]) -> list[str]:
-    plant, n = registered(str(result["system"])), result["policy"]["layers"][0]
-    return [plant.units.get(s.name, "") for s in plant.states] if plant and plant.n == n else [""] * n
+    return [s.get("unit") or "" for s in _states(result)]
+
+
+def _states(result: Mapping[str, Any]) -> list[Mapping[str, Any]]:
+    """Names and units of the states as the result gives them; never those of a plant that is called the same."""
+    n = result["policy"]["layers"][0]
+    return list(result.get("states") or ({"name": f"x{i + 1}"} for i in range(n)))

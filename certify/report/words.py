@@ -1,17 +1,20 @@
-"""Names, units and numbers as people read them. Shared by the terminal summary, the figures and the page."""
+"""What a report says, and how: names, units and numbers as people read them, and each kind of claim in words.
+
+Shared by the terminal summary, the figures and the page. Numbers are rounded in a direction wherever a reader could
+take them for a bound: `below` what is claimed of a set, `above` what contains it.
+"""
 
 from __future__ import annotations
 
 import math
 import re
 import unicodedata
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
 
-from certify.errors import CertifyError
-
-if TYPE_CHECKING:
-    from certify.systems import System
+from certify.errors import CertificateFormatError
 
 MINUS, TIMES, ABSENT = "\N{MINUS SIGN}", "\N{MULTIPLICATION SIGN}", "\N{EN DASH}"
 _LETTERS = "alpha beta gamma delta epsilon zeta eta theta kappa mu nu xi rho sigma tau phi chi psi omega"
@@ -47,26 +50,6 @@ def pretty_unit(unit: str) -> str:
     return re.sub(r"\^(-?\d+)", lambda match: match.group(1).translate(_SUPERSCRIPTS), unit)
 
 
-def registered(name: str) -> System | None:
-    """The plant of that name that ships with certify, or None."""
-    from certify.systems import available_systems, get_system
-
-    try:
-        return get_system(name) if name in available_systems() else None
-    except CertifyError:
-        return None
-
-
-def units_of(system: System) -> dict[str, str]:
-    """Units of states and inputs; a certificate has none, so they come from the shipped plant of the same name."""
-    if system.units:
-        return dict(system.units)
-    shipped = registered(system.name)
-    if shipped is None or (shipped.states, shipped.inputs) != (system.states, system.inputs):
-        return {}
-    return dict(shipped.units)
-
-
 def volume_name(n: int) -> str:
     """What the n-dimensional volume is called."""
     return {1: "length", 2: "area"}.get(n, "volume")
@@ -78,7 +61,7 @@ def volume_unit(units: Sequence[str]) -> str:
 
 
 def number(value: float | None, digits: int = 6) -> str:
-    """A number rounded for reading; a dash if it is absent.
+    """A number rounded to the nearest, for reading; a dash if it is absent.
 
     >>> number(1.25e-6), number(-2.5)
     ('1.25 × 10⁻⁶', '−2.5')
@@ -86,19 +69,64 @@ def number(value: float | None, digits: int = 6) -> str:
     return ABSENT if value is None or math.isnan(value) else _typeset(f"{value:.{digits}g}")
 
 
-def below(value: float, digits: int = 6) -> str:
-    """A positive number rounded towards zero, for levels: the text never says more than was proved.
+def below(value: float | Fraction, digits: int = 6) -> str:
+    """A number rounded down to so many digits: the decimal that is shown is not above the exact value.
 
-    >>> below(7.1670597510)
-    '7.16705'
+    >>> below(7.1670597510), below(2e-7), below(Fraction(2, 3), 3)
+    ('7.16705', '1.99999 × 10⁻⁷', '0.666')
     """
-    if not (math.isfinite(value) and value > 0):
+    return _rounded(value, digits, math.floor)
+
+
+def above(value: float | Fraction, digits: int = 6) -> str:
+    """A number rounded up to so many digits: the decimal that is shown is not below the exact value.
+
+    >>> above(7.1670597510), above(0.5), above(Fraction(2, 3), 3)
+    ('7.16706', '0.5', '0.667')
+    """
+    return _rounded(value, digits, math.ceil)
+
+
+def _rounded(value: float | Fraction, digits: int, direction: Callable[[Fraction], int]) -> str:
+    if isinstance(value, float) and not math.isfinite(value):
         return number(value, digits)
-    text = f"{value:.{digits}g}"
-    if float(text) > value:
-        unit = 10.0 ** (math.floor(math.log10(value)) - digits + 1)
-        text = f"{float(text) - unit:.{digits}g}"
-    return _typeset(text)
+    exact = Fraction(value)
+    if exact == 0:
+        return "0"
+    coefficient, last = _decimal(exact, digits, direction)
+    text = str(abs(coefficient))
+    exponent = last + len(text) - 1
+    text = text.rstrip("0")
+    if -5 < exponent < digits:  # as format code g does
+        whole = text[: exponent + 1].ljust(exponent + 1, "0") if exponent >= 0 else "0"
+        fraction = text[exponent + 1 :] if exponent >= 0 else "0" * (-exponent - 1) + text
+        shown = whole + ("." + fraction if fraction else "")
+    else:
+        shown = text[0] + ("." + text[1:] if text[1:] else "") + f"e{exponent}"
+    return _typeset(("-" if coefficient < 0 else "") + shown)
+
+
+def _decimal(exact: Fraction, digits: int, direction: Callable[[Fraction], int]) -> tuple[int, int]:
+    """(coefficient, exponent of ten) of a nonzero number rounded to so many digits."""
+    size = abs(exact)
+    exponent = len(str(size.numerator)) - len(str(size.denominator))  # of the leading digit, or one more
+    exponent -= Fraction(10) ** exponent > size
+    last = exponent - digits + 1
+    return direction(exact / Fraction(10) ** last), last
+
+
+def kept_apart(value: float, limit: Fraction) -> str:
+    """`value < limit`, the value rounded up and the limit down, in as many digits as keep the one below the other.
+
+    >>> kept_apart(1.9999999, Fraction(2)), kept_apart(1.0, Fraction(2))
+    ('1.9999999 < 2', '1 < 2')
+    """
+    if 0 < value < limit:
+        for digits in range(6, 30):
+            (a, at), (b, below_at) = _decimal(Fraction(value), digits, math.ceil), _decimal(limit, digits, math.floor)
+            if a * Fraction(10) ** at < b * Fraction(10) ** below_at:
+                return f"{above(value, digits)} < {below(limit, digits)}"
+    return f"{above(value)}, domain {below(limit)}"
 
 
 def _typeset(text: str) -> str:
@@ -110,3 +138,158 @@ def _typeset(text: str) -> str:
 def seconds(value: float | None) -> str:
     """A duration; a dash if it is absent."""
     return ABSENT if value is None else f"{value:.2f} s" if value >= 0.095 else f"{value * 1000:.0f} ms"
+
+
+@dataclass(frozen=True, slots=True)
+class Words:
+    """One kind of claim in words. In texts, {inner} and {outer} stand for its levels in digits.
+
+    Parameters
+    ----------
+    title : the page's.
+    inner, inner_word : symbol and name of the inner level.
+    inner_set : what the figures call the inner set.
+    statement : the claim, after which nothing has to be added.
+    headline : the same in a line of the terminal.
+    meaning : of the outer set, for captions.
+    decay : what of a falling V is part of the claim and what is not; {word} is "proved" or "claimed".
+    simulated : which runs count in the simulated figures.
+    settles, runs : what becomes of a run that counts, and what a legend calls such runs.
+    parts : name, condition, and how it is shown from a partition; None where that is in the condition.
+    excluded : head and text of what this claim, other than its siblings, does not say.
+    """
+
+    title: str
+    inner: str
+    inner_word: str
+    inner_set: str
+    statement: str
+    headline: str
+    meaning: str
+    decay: str
+    simulated: str
+    settles: str
+    runs: str
+    parts: tuple[tuple[str, str, str], ...]
+    excluded: tuple[tuple[str, str], ...]
+
+
+SMOOTH = ("Equations", "The closed loop is twice continuously differentiable on {V ≤ c₂}.", "")
+DEFINITE = ("Lyapunov function", "P is symmetric positive definite, so that {V ≤ c₂} is compact.", "")
+DOMAIN = ("Domain", "{V ≤ c₂} lies strictly inside the domain.", "")
+INPUTS = ("Inputs", "On {V ≤ c₂} the input stays in its bounds, so that an actuator that clips changes nothing.", "")
+LEAF_BY_LEAF = "leaf by leaf of a partition that covers the set by construction"
+CHECKED_ALWAYS = frozenset({"Lyapunov function", "Equilibrium", "Domain"})
+"""The parts that the checker checks whatever the evidence is; the others are then the solver's word."""
+
+CLAIMS: Mapping[str, Words] = {
+    "asymptotic": Words(
+        title="Region of attraction",
+        inner="c₁",
+        inner_word="local",
+        inner_set="local set",
+        statement="Every trajectory of the closed loop that starts in the set {{V(x) ≤ {outer}}} stays in it for all "
+        "time and converges to the origin, which is asymptotically stable.",
+        headline="{{V <= {outer}}} is invariant and attracted by the origin",
+        meaning="in which every trajectory converges to the origin",
+        decay="That V falls to 0 is {word}; how fast is not.",
+        simulated="stay in the domain and come near the origin",
+        settles="settle",
+        runs="trajectories that settle",
+        parts=(
+            SMOOTH,
+            ("Equilibrium", "P is symmetric positive definite and f(0, u_eq) = 0 exactly.", ""),
+            DOMAIN,
+            (
+                "Local",
+                "V̇(x) < 0 for all x with 0 < V(x) ≤ c₁",
+                "by the linearisation and a bound on its remainder that holds at all smaller radii: there is no hole "
+                "around the origin",
+            ),
+            ("Ring", "V̇(x) < 0 for all x with c₁ ≤ V(x) ≤ c₂", LEAF_BY_LEAF),
+            INPUTS,
+        ),
+        excluded=(("Speed and cost.", "Trajectories converge; how fast, and at what cost, is not part of the claim."),),
+    ),
+    "practical": Words(
+        title="Practical stability",
+        inner="c₀",
+        inner_word="floor",
+        inner_set="inner set",
+        statement="Every trajectory of the closed loop that starts in the set {{V(x) ≤ {outer}}} stays in it for all "
+        "time, enters the smaller set {{V(x) ≤ {inner}}} in finite time, and stays there from then on. That is all: "
+        "of what happens inside the smaller set nothing is said.",
+        headline="from {{V <= {outer}}} every trajectory enters {{V <= {inner}}} and stays there; nothing is said of "
+        "the origin",
+        meaning="from which every trajectory enters the green set and stays there",
+        decay="That V falls below c₀ in finite time and stays there is {word}; how soon, and what V does below c₀, is "
+        "not.",
+        simulated="stay in the domain and enter {V ≤ c₀}",
+        settles="enter {V ≤ c₀}",
+        runs="trajectories that enter",
+        parts=(
+            SMOOTH,
+            DEFINITE,
+            DOMAIN,
+            ("Ring", "V̇(x) < 0 for all x with c₀ ≤ V(x) ≤ c₂, both boundaries included", LEAF_BY_LEAF),
+            INPUTS,
+        ),
+        excluded=(
+            (
+                "Anything inside {V ≤ c₀}.",
+                "Trajectories end up in this set and remain there, whatever they do in it: circle, jitter, or rest "
+                "somewhere. The origin need not attract them, and need not be an equilibrium at all.",
+            ),
+            ("Speed and cost.", "The time to reach {V ≤ c₀} is finite; how long, and at what cost, is not stated."),
+        ),
+    ),
+}
+
+
+def words_for(kind: str) -> Words:
+    """The words of a claim.
+
+    Raises
+    ------
+    CertificateFormatError : there are none for this kind; a page must not guess.
+    """
+    if kind not in CLAIMS:
+        raise CertificateFormatError(f"reports know the claims {', '.join(CLAIMS)}; found {kind!r}.")
+    return CLAIMS[kind]
+
+
+def inner_level(kind: str, value: float | Fraction, digits: int = 6) -> str:
+    """The inner level rounded to the safe side: down where something is claimed inside it, up where outside."""
+    return above(value, digits) if kind == "practical" else below(value, digits)
+
+
+_LIMITS = {
+    "domain": "the domain",
+    "inputs": "the input bounds: beyond it the policy asks for more than the actuator gives",
+    "witness": "a point where Vdot >= 0",
+    "time": "the time limit: more may be provable",
+    "boxes": "the limit on boxes: more may be provable",
+    "requested": "the level that was asked for",
+}
+_TOUCHING = Fraction(1, 10**6)  # relative distance from the domain's limit below which a set is said to touch it
+
+
+def limited_by(result: Mapping[str, Any]) -> str:
+    """What limits the level of a result, in words; reasons that are sentences already stay as they are.
+
+    An engine may stop short of the domain's limit by a margin of its own, such as a solver's precision. Then the
+    margin limits, and it is named with its size.
+    """
+    reason = str(result["reason"])
+    levels = result["levels"]
+    level, limit = levels.get("roa"), levels.get("domain_limit")
+    if reason == "domain" and level and limit:
+        short = 1 - Fraction(level) / Fraction(limit)
+        if short > _TOUCHING:
+            solver: Mapping[str, Any] = result.get("solver") or {}
+            precision = solver.get("precision")
+            apart = f"{number(float(100 * short), 3)} % below the domain's limit {below(limit)}"
+            if precision is None:
+                return f"a margin that the engine keeps: {apart}"
+            return f"the precision of {solver['solver']} (delta {number(precision)}), which stops {apart}"
+    return _LIMITS.get(reason, reason)

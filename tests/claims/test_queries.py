@@ -7,20 +7,19 @@ from fractions import Fraction
 import flint
 import numpy as np
 import pytest
-
-from certify.engines.dreal.backend import to_smt2
-from certify.engines.local import prove_local
-from certify.errors import InputError
 from certify.obligations import (
     Case,
     Query,
     decay,
     domain_queries,
     input_queries,
-    local_query,
     queries,
     ring_query,
 )
+
+from certify.engines.dreal.backend import to_smt2
+from certify.engines.local import prove_local
+from certify.errors import InputError
 from certify.policies import TanhNetwork
 from certify.systems import System, get_system
 from tests.support.cases import Case, case_of

@@ -202,8 +202,12 @@ def test_the_command_writes_the_file_and_says_what_it_did(tmp_path):
     result = runner.invoke(app, arguments)
     assert result.exit_code == 0, result.stderr
     assert json.loads(result.stdout) == {
-        "baseline": str(out), "algorithm": "ppo", "system": "pendulum", "steps": 60, "seed": 2,
-    }  # fmt: skip
+        "baseline": str(out),
+        "algorithm": "ppo",
+        "system": "pendulum",
+        "steps": 60,
+        "seed": 2,
+    }
     trained = baselines.from_reference(out.read_bytes(), get_system("pendulum"), preset("pendulum"))
     assert (trained.steps, trained.seed) == (60, 2)
 

@@ -11,9 +11,9 @@ import torch
 from certify.errors import InputError
 from certify.policies import TanhNetwork
 from certify.systems import get_system
-from controllers.cli import _table
+from controllers.commands.evaluate import _table
 from controllers.evaluate import EvaluationOptions, curvature, evaluate
-from controllers.options import PRESETS, preset
+from controllers.options import available_plants, preset
 from controllers.sac import CURVATURE_POINTS, SAC, Actor, Interface
 from controllers.training import Trainer, train
 
@@ -28,7 +28,7 @@ def _sac(seed=0, **changes) -> SAC:
 
 
 @pytest.mark.parametrize("centre", ["preactivation", "output", "none"])
-@pytest.mark.parametrize("plant", PRESETS)
+@pytest.mark.parametrize("plant", available_plants())
 def test_the_jacobian_anywhere_is_that_of_the_exported_policy(plant, centre):
     system = get_system(plant)
     with torch.random.fork_rng():

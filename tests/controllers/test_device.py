@@ -77,9 +77,20 @@ def test_the_random_stream_and_the_weights_are_those_before_there_was_a_device()
 
 STREAM = "94b98728ed670c604cca102335b55633ec487666bc01e1e2453b0c5fbb916bf8"
 WEIGHTS = [
-    36.0, 0.0, 0.0, 0.06640625, 0.0, 5.14428125, 3.03805852,
-    5.16821129, 0.184912431, 0.420708237, 0.0353047886, 0.408676237, 0.00858804395,
-]  # fmt: skip
+    36.0,
+    0.0,
+    0.0,
+    0.06640625,
+    0.0,
+    5.14428125,
+    3.03805852,
+    5.16821129,
+    0.184912431,
+    0.420708237,
+    0.0353047886,
+    0.408676237,
+    0.00858804395,
+]
 
 
 def test_a_device_that_is_not_there_is_refused(tmp_path, monkeypatch):

@@ -97,9 +97,12 @@ def test_a_refresh_begins_with_A_and_keeps_the_old_gain_meanwhile():
 CONTINUOUS = {
     "pendulum": [[0, 1, 0], [9.81 / 0.5, -0.1 / 0.0375, 1 / 0.0375]],
     "cartpole": [
-        [0, 0, 1, 0, 0], [0, 0, 0, 1, 0], [0, -0.1 * 9.81, 0, 0, 1], [0, 1.1 * 9.81 / 0.5, 0, 0, -1 / 0.5],
+        [0, 0, 1, 0, 0],
+        [0, 0, 0, 1, 0],
+        [0, -0.1 * 9.81, 0, 0, 1],
+        [0, 1.1 * 9.81 / 0.5, 0, 0, -1 / 0.5],
     ],
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", CONTINUOUS)

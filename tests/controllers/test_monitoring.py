@@ -18,7 +18,6 @@ from certify.systems import get_system
 from controllers.cli import app
 from controllers.evaluate import MONITORING, curvature, evaluate, settle
 from controllers.options import TrainingOptions, preset
-from controllers.simulation import INITIAL_STATES
 from controllers.training import Trainer, train
 
 PENDULUM = get_system("pendulum")
@@ -31,10 +30,10 @@ def short() -> TrainingOptions:
     return replace(preset("pendulum"), steps=250, warm_up=100, n_A=60, n_B=60, batch=16, critic=(8, 8))
 
 
-def _settle(network, options=MONITORING):
+def _settle(network, options=MONITORING, system=PENDULUM):
     chosen = preset("pendulum")
     weights = np.array(chosen.state_weights), np.array(chosen.input_weights)
-    return settle(network, PENDULUM, chosen.dt, *weights, options)
+    return settle(network, system, chosen.dt, *weights, options)
 
 
 def test_evaluations_come_on_time_and_at_the_end_and_change_nothing(short):
@@ -59,14 +58,14 @@ def test_the_share_is_that_of_the_evaluation_and_needs_a_policy_that_stabilises(
     assert _settle(backwards, options).settled == 0
 
 
-def test_a_plant_without_initial_states_is_monitored_without_a_simulation(short, monkeypatch):
-    monkeypatch.delitem(INITIAL_STATES, "pendulum")
-    trainer = Trainer(PENDULUM, short)
+def test_a_plant_without_initial_states_is_monitored_without_a_simulation(short):
+    system = replace(PENDULUM, name="a_pendulum_of_my_own")
+    trainer = Trainer(system, short)
     trainer.monitor()
     row = trainer.monitored[0]
     assert math.isnan(row.settled) and math.isnan(row.cost) and row.offset > 0 and row.curvature > 0
     with pytest.raises(InputError, match="box of initial states"):
-        _settle(trainer.sac.actor.network())
+        _settle(trainer.sac.actor.network(), system=system)
 
 
 def test_the_command_shows_and_writes_them_and_a_resumed_run_writes_the_same(tmp_path):

@@ -12,7 +12,7 @@ import scipy.stats
 import torch
 
 from certify.systems import get_system
-from controllers.options import PRESETS, preset
+from controllers.options import available_plants, preset
 from controllers.sac import SAC, Actor, Critic, Interface, Replay, squashed_log_likelihood
 
 K = torch.tensor([[1.76, 0.59]])
@@ -59,7 +59,7 @@ def test_likelihood_is_finite_far_out_and_sums_over_inputs():
     torch.testing.assert_close(both, single[0] + single[1])
 
 
-@pytest.mark.parametrize("plant", PRESETS)
+@pytest.mark.parametrize("plant", available_plants())
 @pytest.mark.parametrize("centre", ["preactivation", "output"])
 def test_jacobian_at_the_origin_is_that_of_the_exported_policy(centre, plant):
     actor, u_eq = _actor(centre, plant=plant), get_system(plant).exact_u_eq()

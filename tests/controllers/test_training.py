@@ -16,8 +16,9 @@ from certify.errors import InputError
 from certify.policies import load_policy, save_policy
 from certify.systems import get_system
 from controllers.evaluate import EvaluationOptions, discrete_linearisation, evaluate
+from controllers.logs import Episode, Log
 from controllers.options import TrainingOptions, preset
-from controllers.training import Episode, Log, Trainer, train
+from controllers.training import Trainer, train
 
 POLICIES = Path(__file__).parents[2] / "examples" / "policies"
 SHIPPED = POLICIES / "pendulum.pt"
@@ -187,11 +188,19 @@ def test_the_log_holds_every_episode_once_also_after_a_resume(short, whole, tmp_
 
 @pytest.mark.parametrize(
     "change, name",
-    [({"steps": 0}, "steps"), ({"gamma": 1.0}, "gamma"), ({"tau": 0.0}, "tau"), ({"dt": float("nan")}, "dt"),
-     ({"penalty": float("inf")}, "penalty"), ({"actor": ()}, "actor"), ({"centre": "nowhere"}, "centre"),
-     ({"identification": "always"}, "identification"),
-     ({"input_weights": (0.0,)}, "input_weights"), ({"seed": -1}, "seed")],
-)  # fmt: skip
+    [
+        ({"steps": 0}, "steps"),
+        ({"gamma": 1.0}, "gamma"),
+        ({"tau": 0.0}, "tau"),
+        ({"dt": float("nan")}, "dt"),
+        ({"penalty": float("inf")}, "penalty"),
+        ({"actor": ()}, "actor"),
+        ({"centre": "nowhere"}, "centre"),
+        ({"identification": "always"}, "identification"),
+        ({"input_weights": (0.0,)}, "input_weights"),
+        ({"seed": -1}, "seed"),
+    ],
+)
 def test_options_out_of_range_are_refused_by_name(short, change, name):
     with pytest.raises(InputError, match=f"`{name}`"):
         replace(short, **change)

@@ -9,26 +9,25 @@ import numpy as np
 import pytest
 import torch
 
-from certify.closed_loop import ClosedLoop
 from certify.engines import local
-from certify.engines.bounds.search import LEAF, Budget, prove_outwards
+from certify.engines.base import Budget
+from certify.engines.bounds.partition import LEAF
+from certify.engines.bounds.search import prove_outwards
 from certify.engines.falsify import Witness, confirm, falsify
 from certify.engines.local import local_margin, paths, prove_local
 from certify.errors import InputError
-from certify.lyapunov import diagonalising_coordinates, domain_limit, solve_lyapunov
-from certify.policies import TanhNetwork, load_policy
+from certify.lyapunov import domain_limit
+from certify.lyapunov.function import Quadratic
+from certify.policies import TanhNetwork, bounded_by_form, load_policy
+from certify.rigorous import evaluate_policy, evaluate_vdot
+from certify.running import ThreadRunner
 from certify.systems import System, get_system
+from certify.verdict import Stop
+from tests.support.cases import Case, case_of
 from tests.support.loops import chain, pendulum_network, scalar_tanh
 
-CPU = torch.device("cpu")
+RUNNER = ThreadRunner()
 POLICIES = Path(__file__).parents[2] / "examples" / "policies"
-
-
-def case_of(system: System, network: TanhNetwork) -> Case:
-    loop = ClosedLoop(system, network)
-    A, _, _ = loop.linearise()
-    P = solve_lyapunov(A, np.eye(system.n))
-    return Case(loop, P, diagonalising_coordinates(P, A))
 
 
 def vdot(case: Case, x: np.ndarray) -> np.ndarray:
@@ -58,13 +57,13 @@ def leaves(tree: bytes, root: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarr
     assert not stack
 
 
-@pytest.mark.parametrize("case", ["scalar", "pendulum", "chain"])
-def test_the_local_proof_holds_on_samples_of_every_smaller_level(case: str) -> None:
+@pytest.mark.parametrize("name", ["scalar", "pendulum", "chain"])
+def test_the_local_proof_holds_on_samples_of_every_smaller_level(name: str) -> None:
     system, network = {
         "scalar": scalar_tanh(),
         "pendulum": (get_system("pendulum"), pendulum_network()),
         "chain": chain(4, [-1, -2, -3, -4]),
-    }[case]
+    }[name]
     case = case_of(system, network)
     level = prove_local(case.problem, case.T, domain_limit(case.P, system.domain))
     assert level is not None and local_margin(case.problem, case.T, level, paths(case.problem, case.T)) > 0
@@ -86,7 +85,8 @@ def test_the_local_proof_knows_the_scalar_plant() -> None:
 def test_the_local_proof_uses_signs_and_directions() -> None:
     """Twelve states, five layers: sums of magnitudes and one number a remainder reach 2.0e-6 here."""
     policy = load_policy(POLICIES / "quadrotor3d.pt")
-    level = prove_local(case_of(get_system("quadrotor3d"), policy.network), 1.0)
+    case = case_of(get_system("quadrotor3d"), policy.network)
+    level = prove_local(case.problem, case.T, 1.0)
     assert level is not None and 4e-4 < level < 0.043  # the falsifier's limit
 
 
@@ -103,8 +103,8 @@ def test_the_ring_covers_and_holds(pendulum: System) -> None:
     limit = domain_limit(case.P, pendulum.domain) * (1 - 1e-9)
     inner = prove_local(case.problem, case.T, limit)
     assert inner is not None
-    proof = prove_outwards(case.problem, case.T, inner, limit, Budget(), CPU)
-    assert (proof.level, proof.reason) == (limit, "requested")
+    proof = prove_outwards(case.problem, case.T, inner, limit, Budget(), RUNNER)
+    assert (proof.outer, proof.stop) == (limit, Stop.REQUESTED)
     boxes = list(leaves(proof.tree, proof.root))
     assert len(boxes) == proof.leaves
     volume = sum(np.prod(hi - lo) for lo, hi in boxes)
@@ -115,27 +115,27 @@ def test_the_ring_covers_and_holds(pendulum: System) -> None:
 
 def test_the_ring_is_deterministic(pendulum: System) -> None:
     case = case_of(pendulum, pendulum_network((8, 8)))
-    first, second = (prove_outwards(case.problem, case.T, 1e-4, 0.2, Budget(), CPU) for _ in range(2))
-    assert first.tree == second.tree and first.level == second.level
+    first, second = (prove_outwards(case.problem, case.T, 1e-4, 0.2, Budget(), RUNNER) for _ in range(2))
+    assert first.tree == second.tree and first.outer == second.outer
 
 
 def test_budgets_stop_the_pass_with_what_is_proved_so_far(pendulum: System) -> None:
     case = case_of(pendulum, pendulum_network())
-    small = prove_outwards(case.problem, case.T, 1e-6, 6.0, Budget(boxes=60, batch=16), CPU)
-    assert small.reason == "boxes" and 1e-6 <= small.level < 6.0
-    large = prove_outwards(case.problem, case.T, 1e-6, 6.0, Budget(boxes=10_000, batch=16), CPU)
-    assert large.reason == "requested" and large.level == 6.0
-    timed = prove_outwards(case.problem, case.T, 1e-6, 6.0, Budget(seconds=1e-9, batch=4), CPU)
-    assert timed.reason == "time" and timed.level < 6.0
-    nothing = prove_outwards(case.problem, case.T, 1.0, 6.0, Budget(seconds=1e-9), CPU)
-    assert (nothing.reason, nothing.level, nothing.tree, nothing.leaves) == ("time", 1.0, bytes([LEAF]), 1)
+    small = prove_outwards(case.problem, case.T, 1e-6, 6.0, Budget(boxes=60, batch=16), RUNNER)
+    assert small.stop is Stop.BOXES and 1e-6 <= small.outer < 6.0
+    large = prove_outwards(case.problem, case.T, 1e-6, 6.0, Budget(boxes=10_000, batch=16), RUNNER)
+    assert large.stop is Stop.REQUESTED and large.outer == 6.0
+    timed = prove_outwards(case.problem, case.T, 1e-6, 6.0, Budget(seconds=1e-9, batch=4), RUNNER)
+    assert timed.stop is Stop.TIME and timed.outer < 6.0
+    nothing = prove_outwards(case.problem, case.T, 1.0, 6.0, Budget(seconds=1e-9), RUNNER)
+    assert (nothing.stop, nothing.outer, nothing.tree, nothing.leaves) == (Stop.TIME, 1.0, bytes([LEAF]), 1)
 
 
 def test_a_level_beyond_the_truth_is_capped_by_a_witness() -> None:
     case = case_of(*scalar_tanh())
-    proof = prove_outwards(case.problem, case.T, 0.5, 8.0, Budget(), CPU)
-    assert proof.reason in ("witness", "boxes")
-    assert 0.9 * 1.915008**2 < proof.level < 1.9150081**2
+    proof = prove_outwards(case.problem, case.T, 0.5, 8.0, Budget(), RUNNER)
+    assert proof.stop in (Stop.WITNESS, Stop.BOXES)
+    assert 0.9 * 1.915008**2 < proof.outer < 1.9150081**2
 
 
 def test_the_falsifier_finds_the_known_limit() -> None:
@@ -157,7 +157,7 @@ def test_a_wrong_witness_is_not_confirmed() -> None:
 def test_inputs_that_leave_their_bounds_are_found(pendulum: System) -> None:
     """Centred at the output, the input can pass 6 N m."""
     case = case_of(pendulum, pendulum_network(centre="output"))
-    assert not case.inputs_bounded_by_form
+    assert not bounded_by_form(case.loop.network, pendulum.input_bounds)
     witness = falsify(case.problem, case.T, domain_limit(case.P, pendulum.domain))
     assert witness is not None and confirm(case.problem, witness)
     if witness.kind == "input":  # just outside 6 N m, too close for binary64 to tell
@@ -196,8 +196,8 @@ def _check_planted(seed: int) -> bool:
         return False  # nothing false was planted: this seed does not count
     inner = prove_local(case.problem, case.T, level)
     if inner is not None:
-        proof = prove_outwards(case.problem, case.T, inner, min(1.5 * level, limit), Budget(boxes=20_000), CPU)
-        assert proof.level < level
+        proof = prove_outwards(case.problem, case.T, inner, min(1.5 * level, limit), Budget(boxes=20_000), RUNNER)
+        assert proof.outer < level
     return True
 
 
@@ -210,16 +210,15 @@ def test_many_planted_counterexamples_are_never_proved() -> None:
     assert sum(_check_planted(seed) for seed in range(24, 450)) >= 200
 
 
-def test_an_asymmetric_P_is_named(pendulum: System) -> None:
-    loop = ClosedLoop(pendulum, pendulum_network())
+def test_an_asymmetric_P_is_named() -> None:
     with pytest.raises(InputError, match=r"P\[0, 1\] = 0.25 but P\[1, 0\] = 0.26"):
-        Case(loop, np.array([[1.0, 0.25], [0.26, 1.0]]), np.eye(2))
+        Quadratic(np.array([[1.0, 0.25], [0.26, 1.0]]))
 
 
 def test_every_tensor_of_the_ring_says_where_it_lives(pendulum: System) -> None:
     """One made without a device would land on `meta` and meet the others with an error: none is."""
     case = case_of(pendulum, pendulum_network(centre="output"))
-    plain = prove_outwards(case.problem, case.T, 1e-3, 0.5, Budget(), CPU)
+    plain = prove_outwards(case.problem, case.T, 1e-3, 0.5, Budget(), RUNNER)
     with torch.device("meta"):
-        proof = prove_outwards(case.problem, case.T, 1e-3, 0.5, Budget(), CPU)
-    assert proof.level == 0.5 and proof.tree == plain.tree
+        proof = prove_outwards(case.problem, case.T, 1e-3, 0.5, Budget(), RUNNER)
+    assert proof.outer == 0.5 and proof.tree == plain.tree

@@ -7,16 +7,16 @@ from functools import cache
 import numpy as np
 import pytest
 import torch
+from certify.obligations import Case
 
 from certify.engines.bounds.search import Budget, prove_outwards
 from certify.engines.dreal.backend import Backend, decide, find_backend
 from certify.engines.falsify import Witness, confirm, falsify
 from certify.errors import BackendError
 from certify.lyapunov import domain_limit
-from certify.obligations import Case, ring_query
 from certify.systems import get_system
-from tests.support.cases import Case, case_of
 from tests.support import codac_prover
+from tests.support.cases import Case, case_of
 from tests.support.loops import chain, pendulum_network, scalar_tanh
 
 INNER = 0.05  # share of the limit below which the local proof speaks, and not these engines

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from certify.obligations import Query
 
 from certify.certificate import read_certificate
 from certify.cli import _run
@@ -21,13 +22,12 @@ from certify.engines import dreal, dreal_proof
 from certify.engines.dreal.backend import Answer, Backend, decide, find_backend
 from certify.engines.dreal.proof import DrealOptions, prove_with_dreal
 from certify.errors import BackendError, SoundnessError
-from certify.obligations import Query, local_query, ring_query
 from certify.policies import Policy, TanhNetwork, save_policy
 from certify.report import render_html
 from certify.roa import RoaOptions, certify_roa, run_checker
 from certify.systems import System, get_system
 from certify.verdict import Verdict
-from tests.support.cases import Case, case_of
+from tests.support.cases import case_of
 from tests.support.certificates import encode
 from tests.support.loops import pendulum_network, scalar_tanh
 
@@ -320,8 +320,8 @@ def test_real_dreal_on_the_scalar_plant(real: Backend, tmp_path: Path) -> None:
     system, network = scalar_tanh()
     truth = 1.915008**2
     found = certify_roa(system, network, tmp_path, RoaOptions(engine="dreal"))
-    assert found.verdict is Verdict.PROVED and found.levels["roa"] is not None
-    assert 0.95 * truth < found.levels["roa"] < truth
+    assert found.verdict is Verdict.PROVED and found.levels.roa is not None
+    assert 0.95 * truth < found.levels.roa < truth
     beyond = certify_roa(system, network, tmp_path, RoaOptions(engine="dreal", level=2.2**2))
     assert beyond.verdict is Verdict.REFUTED
 

@@ -14,7 +14,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from certify.engines.bounds.partition import _HANDFUL, LEAF, Frontier, Partition
+from certify.engines.bounds.frontier import _HANDFUL, Frontier
+from certify.engines.bounds.partition import LEAF, Partition
 from tests.engines.test_bounds import leaves
 
 CPU = torch.device("cpu")
@@ -151,21 +152,24 @@ def test_the_lowest_comes_back_before_many_a_hair_above_it() -> None:
 
 
 HARD = """
-import resource, torch, numpy as np
-from certify.engines import branch_and_bound as engine
+import resource, torch
+from certify.engines.base import Budget
 from certify.engines.bounds.rule import BoxBounds, VdotBound
-from tests.support.cases import Case, case_of
+from certify.engines.bounds.search import prove_outwards
+from certify.running import ThreadRunner
+from tests.support.cases import case_of
 from tests.support.loops import chain
 
 class Undecided(VdotBound):
     def __call__(self, lo, hi, inner, outer):
         none = torch.zeros(lo.shape[1], dtype=torch.bool)
-        return BoxBounds(none, torch.ones(lo.shape[1], dtype=lo.dtype), hi - lo, none)
+        return BoxBounds(none, torch.ones(lo.shape[1], dtype=lo.dtype), hi - lo, none, ~none)
 
 case = case_of(*chain(4, [-1, -2, -3, -4]))
-budget = engine.Budget(boxes=10**9, seconds=3000.0, batch=32768, least_width=0.0)
-proof = engine.prove_outwards(case.problem, case.T, 1e-9, 1e-2, budget, torch.device("cpu"), rule=Undecided(case, torch.device("cpu")))
-print(proof.reason, len(proof.tree), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
+budget = Budget(boxes=10**9, seconds=3000.0, batch=32768, least_width=0.0)
+rule = Undecided(case.problem, case.T, torch.device("cpu"))
+proof = prove_outwards(case.problem, case.T, 1e-9, 1e-2, budget, ThreadRunner(), rule=rule)
+print(proof.stop.value, len(proof.tree), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 """
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from certify.engines.bounds.search import _threaded
 from certify.engines.bounds.rule import VdotBound
+from certify.running import ThreadRunner
 from certify.systems import get_system
 from tests.engines.test_bounds import vdot
 from tests.support.cases import Case, case_of
@@ -17,7 +17,7 @@ CPU = torch.device("cpu")
 INNER, OUTER = 0.02, 0.5
 
 
-def cartpole_claims() -> Case:
+def cartpole_case() -> Case:
     system = get_system("cartpole")
     K = lqr_gain(system, np.eye(4), 0.1 * np.eye(1))
     return case_of(system, saturated_lqr(K, 30.0, 0.0, [1.0, 0.5, 1.5, 2.0], (24, 24), "preactivation", 0))
@@ -26,8 +26,13 @@ def cartpole_claims() -> Case:
 CASES = {
     "scalar": lambda: case_of(*scalar_tanh()),
     "pendulum": lambda: case_of(get_system("pendulum"), pendulum_network()),
-    "cartpole": cartpole_claims,
+    "cartpole": cartpole_case,
 }
+
+
+def scalar_rule() -> VdotBound:
+    case = CASES["scalar"]()
+    return VdotBound(case.problem, case.T, CPU)
 
 
 def boxes(n: int, count: int, size: float, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -39,10 +44,10 @@ def boxes(n: int, count: int, size: float, seed: int = 0) -> tuple[torch.Tensor,
     return torch.tensor(centre - radius), torch.tensor(centre + radius)
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("size", [0.5, 0.1, 1e-3])
-def test_the_bound_holds_wherever_a_box_meets_the_ring(case: str, size: float) -> None:
-    case = CASES[case]()
+def test_the_bound_holds_wherever_a_box_meets_the_ring(name: str, size: float) -> None:
+    case = CASES[name]()
     n = case.loop.system.n
     lo, hi = boxes(n, 300, size)
     found = VdotBound(case.problem, case.T, CPU)(lo, hi, INNER, OUTER)
@@ -60,10 +65,10 @@ def test_the_bound_holds_wherever_a_box_meets_the_ring(case: str, size: float) -
     assert torch.equal(found.proved, found.bound < 0)
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_the_bound_is_of_second_order(case: str) -> None:
+@pytest.mark.parametrize("name", CASES)
+def test_the_bound_is_of_second_order(name: str) -> None:
     """Bound less the sampled maximum, at halved sizes, away from the ring's edges."""
-    case = CASES[case]()
+    case = CASES[name]()
     n = case.loop.system.n
     rule = VdotBound(case.problem, case.T, CPU)
     corners = np.stack(np.meshgrid(*[[-1.0, 0.0, 1.0]] * n, indexing="ij"), -1).reshape(-1, n)
@@ -80,7 +85,7 @@ def test_the_bound_is_of_second_order(case: str) -> None:
 
 def test_multipliers_decide_boxes_that_stick_out_of_the_ring() -> None:
     """xdot = x/2 - tanh x: the box [1.9, 1.93] holds a violation at 1.915008, beyond V = 1.914^2."""
-    rule = VdotBound(CASES["scalar"](), CPU)
+    rule = scalar_rule()
     scale = float(rule.T[0, 0])
     lo, hi = (torch.tensor([[v / scale]], dtype=torch.float64) for v in (1.9, 1.93))
     below, above = ((v / scale) ** 2 for v in (1.914, 1.916))
@@ -92,7 +97,7 @@ def test_multipliers_decide_boxes_that_stick_out_of_the_ring() -> None:
 
 
 def test_a_violation_at_the_centre_is_seen() -> None:
-    rule = VdotBound(CASES["scalar"](), CPU)
+    rule = scalar_rule()
     scale = float(rule.T[0, 0])
     lo, hi = (torch.tensor([[v / scale, u / scale]], dtype=torch.float64) for v, u in ((2.0, 1.0), (2.1, 1.1)))
     assert rule(lo, hi, 1e-3, 1e3).violated.tolist() == [True, False]
@@ -105,7 +110,7 @@ def test_threads_do_not_change_the_bounds() -> None:
     threads = torch.get_num_threads()
     torch.set_num_threads(2)
     try:
-        with _threaded(rule, CPU) as bound:
+        with ThreadRunner(CPU).start(rule) as bound:
             pieces = bound(lo, hi, INNER, OUTER)
         assert torch.get_num_threads() == 2
     finally:

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import io
 import json
 import math
+import os
+import re
 import subprocess
 import sys
+import threading
+import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -23,27 +28,40 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from certify.certificate import Certificate, PartitionTree, read_certificate, write_certificate
+from certify.certificate import (
+    Certificate,
+    PartitionTree,
+    TrustedSolver,
+    leaves,
+    parse_certificate,
+    read_certificate,
+    read_raw,
+    run_checker,
+    write_atomically,
+)
+from certify.claims import CLAIMS as KINDS
+from certify.claims import Asymptotic, Practical
 from certify.closed_loop import ClosedLoop
-from certify.errors import CertificateFormatError, InputError
-from certify.lyapunov import solve_lyapunov, volume
+from certify.errors import CertificateFormatError, InputError, SoundnessError
+from certify.lyapunov import domain_limit, solve_lyapunov, volume
+from certify.lyapunov.function import Quadratic
 from certify.policies import TanhNetwork
-from certify.report import figures as figures_module
 from certify.report import render_html, simulated_roa_fraction, summary
 from certify.report.figures import draw
-from certify.report.html import status_of
-from certify.report.partition import rebuild_leaves
+from certify.report.figures.geometry import PARTS, ellipse, refine, shadow
+from certify.report.page import status_of
 from certify.report.sampling import (
     Flow,
     domain_bounds,
     quadratic,
-    rk4_step,
     simulate,
     time_scales,
 )
-from certify.report.words import below, label, number, symbol, units_of
-from certify.roa import certify_roa, run_checker
+from certify.report.words import CLAIMS, above, below, kept_apart, label, limited_by, number, symbol
+from certify.roa import certify_roa
 from certify.systems import System, get_system
+from certify.systems.ode import rk4_step
+from certify.verdict import Verdict
 from tests.support.loops import box, chain, pendulum_network, scalar_tanh
 
 ONE_LEAF = PartitionTree(np.eye(2), np.ones(2), bytes([255]))
@@ -58,14 +76,43 @@ class Case:
     result: dict[str, Any]
     path: Path
 
+    @property
+    def raw(self) -> bytes:
+        return self.path.read_bytes()
+
+    @property
+    def sha256(self) -> str:
+        return hashlib.sha256(self.raw).hexdigest()
+
     def page(self) -> str:
-        return render_html(self.certificate, self.answer, self.result, self.path)
+        raw = self.raw
+        return render_html(self.certificate, self.answer, self.result, self.path, sha256=self.sha256, size=len(raw))
 
 
 def certified(system: System, network: TanhNetwork, folder: Path) -> Case:
     result = certify_roa(system, network, folder, provenance={"numpy": "1.2.3-test"})
     assert result.certificate is not None and result.checker is not None
     return Case(read_certificate(result.certificate), dict(result.checker), result.to_dict(), result.certificate)
+
+
+def claimed(P: np.ndarray, local: float, roa: float) -> tuple[Quadratic, Asymptotic]:
+    return Quadratic(P), Asymptotic(roa=roa, local=local)
+
+
+def with_level(certificate: Certificate, roa: float) -> Certificate:
+    return replace(certificate, claim=replace(certificate.claim, roa=roa))
+
+
+def raw(certificate: Certificate) -> bytes:
+    return certificate.to_json().encode()
+
+
+def named(system: System) -> dict[str, Any]:
+    """Names and units of states and inputs, as a result gives them."""
+    return {
+        key: [{"name": s.name, "unit": system.units.get(s.name, "")} for s in symbols]
+        for key, symbols in (("states", system.states), ("inputs", system.inputs))
+    }
 
 
 @pytest.fixture(scope="module")
@@ -90,6 +137,7 @@ class Page(HTMLParser):
         super().__init__()
         self.tags: list[tuple[str, dict[str, str | None]]] = []
         self.pieces: list[str] = []
+        self.rows: list[list[str]] = []  # of tables
         self._styles = 0
         self.feed(html)
         self.close()
@@ -97,13 +145,21 @@ class Page(HTMLParser):
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.tags.append((tag, dict(attrs)))
         self._styles += tag == "style"
+        if tag == "tr":
+            self.rows.append([])
+        elif tag in ("td", "th") and self.rows:
+            self.rows[-1].append("")
 
     def handle_endtag(self, tag: str) -> None:
         self._styles -= tag == "style"
+        if tag == "table":
+            self.rows.append([])
 
     def handle_data(self, data: str) -> None:
         if not self._styles:
             self.pieces.append(data)
+        if self.rows and self.rows[-1] and data.strip():
+            self.rows[-1][-1] += data
 
     @property
     def text(self) -> str:
@@ -135,13 +191,13 @@ def trees(draw: Any) -> tuple[bytes, np.ndarray]:
 
 def recursive_leaves(tree: bytes, root: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     """The rule of the format, word for word."""
-    leaves: list[tuple[np.ndarray, np.ndarray]] = []
+    found: list[tuple[np.ndarray, np.ndarray]] = []
     nodes = iter(tree)
 
     def visit(lower: np.ndarray, upper: np.ndarray) -> None:
         axis = next(nodes)
         if axis == 255:
-            leaves.append((lower, upper))
+            found.append((lower, upper))
             return
         middle = 0.5 * lower[axis] + 0.5 * upper[axis]
         below, above = upper.copy(), lower.copy()
@@ -150,27 +206,27 @@ def recursive_leaves(tree: bytes, root: np.ndarray) -> list[tuple[np.ndarray, np
         visit(above, upper)
 
     visit(-root, root)
-    return leaves
+    return found
 
 
 @given(trees())
 def test_leaves_cover_the_root_box_exactly(case: tuple[bytes, np.ndarray]) -> None:
     tree, root = case
-    leaves = rebuild_leaves(tree, root)
+    lo, hi = leaves(tree, root)
     volumes = [
         math.prod(Fraction(float(b)) - Fraction(float(a)) for a, b in zip(lower, upper, strict=True))
-        for lower, upper in zip(leaves.lower, leaves.upper, strict=True)
+        for lower, upper in zip(lo, hi, strict=True)
     ]
     assert sum(volumes) == math.prod(2 * Fraction(float(b)) for b in root)  # exact: no gap, given no overlap
     assert all(v > 0 for v in volumes)
-    for (lower, upper), a, b in zip(recursive_leaves(tree, root), leaves.lower, leaves.upper, strict=True):
+    for (lower, upper), a, b in zip(recursive_leaves(tree, root), lo, hi, strict=True):
         assert np.array_equal(lower, a) and np.array_equal(upper, b)
 
 
 def test_lower_half_first() -> None:
-    leaves = rebuild_leaves(bytes([1, 255, 0, 255, 255]), np.array([2.0, 4.0]))
-    assert leaves.lower.tolist() == [[-2, -4], [-2, 0], [0, 0]]
-    assert leaves.upper.tolist() == [[2, 0], [0, 4], [2, 4]]
+    lo, hi = leaves(bytes([1, 255, 0, 255, 255]), np.array([2.0, 4.0]))
+    assert lo.tolist() == [[-2, -4], [-2, 0], [0, 0]]
+    assert hi.tolist() == [[2, 0], [0, 4], [2, 4]]
 
 
 @pytest.mark.parametrize(
@@ -184,16 +240,16 @@ def test_lower_half_first() -> None:
 )
 def test_broken_trees_are_refused(tree: bytes, message: str) -> None:
     with pytest.raises(CertificateFormatError, match=message):
-        rebuild_leaves(tree, np.ones(2))
+        leaves(tree, np.ones(2))
 
 
 def test_leaves_of_a_real_certificate(pendulum_case: Case) -> None:
     certificate = pendulum_case.certificate
     evidence = certificate.evidence
     assert isinstance(evidence, PartitionTree)
-    leaves = rebuild_leaves(evidence.tree, evidence.root)
-    assert len(leaves) == pendulum_case.answer["leaves"]
-    total = np.prod(leaves.upper - leaves.lower, axis=1).sum()
+    lo, hi = leaves(evidence.tree, evidence.root)
+    assert len(lo) == pendulum_case.answer["leaves"]
+    total = np.prod(hi - lo, axis=1).sum()
     assert total == pytest.approx(np.prod(2 * evidence.root), rel=1e-12)
 
 
@@ -207,25 +263,25 @@ def test_drawn_ellipses_lie_on_the_level(seed: int, level: float) -> None:
     P = M @ M.T + 0.1 * np.eye(4)
     i, j = 1, 3
     section = np.zeros((241, 4))
-    section[:, i], section[:, j] = figures_module._ellipse(P, (i, j), level)
+    section[:, i], section[:, j] = ellipse(P, (i, j), level)
     assert np.allclose(quadratic(P, section), level, rtol=1e-9)
     # The projection: through each of its points passes a point of the level set, and none reaches further.
     inverse = np.linalg.inv(P)[np.ix_((i, j), (i, j))]
-    shadow = np.stack(figures_module._shadow(P, (i, j), level), -1)
-    assert np.allclose(quadratic(np.linalg.inv(inverse), shadow), level, rtol=1e-6)
-    assert np.max(np.abs(shadow[:, 0])) <= math.sqrt(level * inverse[0, 0]) * (1 + 1e-9)
-    assert np.max(np.abs(shadow[:, 0])) >= math.sqrt(level * inverse[0, 0]) * (1 - 1e-3)
+    projected = np.stack(shadow(P, (i, j), level), -1)
+    assert np.allclose(quadratic(np.linalg.inv(inverse), projected), level, rtol=1e-6)
+    assert np.max(np.abs(projected[:, 0])) <= math.sqrt(level * inverse[0, 0]) * (1 + 1e-9)
+    assert np.max(np.abs(projected[:, 0])) >= math.sqrt(level * inverse[0, 0]) * (1 - 1e-3)
 
 
 def test_refined_paths_keep_their_points_and_follow_the_flow() -> None:
     system, network = chain(2, [-1.0, -3.0])
-    flow = Flow.of(ClosedLoop(system, network))
+    flow = Flow.of(system, network)
     errors = []
     for step in (0.2, 0.1):
         coarse = simulate(flow, np.array([[0.5, -0.2]]), step, 5)
-        fine = figures_module._refine(coarse, flow.field, step)
-        assert np.array_equal(fine[:: figures_module._PARTS], coarse)
-        pieces = 8 * figures_module._PARTS  # of each step: exact enough
+        fine = refine(coarse, flow.field, step)
+        assert np.array_equal(fine[::PARTS], coarse)
+        pieces = 8 * PARTS  # of each step: exact enough
         exact = simulate(flow, coarse[0], step / pieces, 5 * pieces)[::8]
         errors.append(float(np.max(np.abs(fine - exact))))
     assert errors[1] < errors[0] / 8 and errors[1] < 1e-4  # of fourth order
@@ -297,7 +353,7 @@ def test_bad_options_are_refused(wrong: dict[str, Any]) -> None:
 
 def test_paths_end_where_they_leave_the_domain() -> None:
     system, network = scalar_tanh()
-    flow = Flow.of(ClosedLoop(system, network))
+    flow = Flow.of(system, network)
     path = simulate(flow, np.array([[2.9], [1.0]]), 0.5, 40)
     lo, hi = domain_bounds(system)
     assert np.isnan(path[-1, 0, 0]) and abs(path[-1, 1, 0]) < 0.1
@@ -309,7 +365,7 @@ def test_the_step_resolves_a_plant_that_is_stiff_away_from_the_origin() -> None:
     x, u = sympy.symbols("x u")
     system = System("cubic", (x,), (u,), {}, (-x - x**3 + u,), (sympy.Integer(0),), box(10), box(1))
     network = TanhNetwork((np.zeros((1, 1)),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
-    step, _ = time_scales(Flow.of(ClosedLoop(system, network)))
+    step, _ = time_scales(Flow.of(system, network))
     assert 1 / 301 <= step < 2 / 301  # the Jacobian is -301 at the domain's edge, -1 at the origin
     assert simulated_roa_fraction(system, network, np.eye(1), 1.0).attracted.all()
 
@@ -340,7 +396,7 @@ def test_the_page_loads_nothing_and_runs_nothing(pendulum_case: Case) -> None:
 
 def test_numbers_on_the_page_are_the_certificates(pendulum_case: Case) -> None:
     certificate, text = pendulum_case.certificate, Page(pendulum_case.page()).text
-    assert repr(certificate.local) in text and repr(certificate.roa) in text
+    assert repr(certificate.inner) in text and repr(certificate.roa) in text
     for value in certificate.P.ravel():
         assert repr(float(value)) in text
     assert certificate.network.sha256() in text
@@ -387,7 +443,7 @@ def test_the_simulated_share_is_the_sampled_one(pendulum_case: Case) -> None:
 
 
 def test_a_set_beyond_the_simulated_roa_is_pointed_out(scalar_case: Case) -> None:
-    wider = replace(scalar_case.certificate, roa=2.5**2 * float(scalar_case.certificate.P[0, 0]))
+    wider = with_level(scalar_case.certificate, 2.5**2 * float(scalar_case.certificate.P[0, 0]))
     text = Page(render_html(wider, None, None, scalar_case.path)).text
     assert "grid points of the set did not settle in the simulation" in text
 
@@ -406,27 +462,103 @@ def test_rejected_is_on_the_page_and_nothing_is_called_proved(pendulum_case: Cas
     assert "certified" not in text and "Shown on" not in text
 
 
-@pytest.mark.parametrize("change", ["none", "policy", "level", "odd"])
+@pytest.mark.parametrize("change", ["none", "odd"])
 def test_only_an_answer_about_this_certificate_counts(pendulum_case: Case, change: str) -> None:
     answer: dict[str, Any] | None = dict(pendulum_case.answer)
-    assert status_of(pendulum_case.certificate, answer).accepted
+    assert status_of(pendulum_case.certificate, pendulum_case.sha256, answer).accepted
     assert answer is not None
     if change == "none":
         answer = None
+    else:
+        answer["result"] = "accepted"
+    assert status_of(pendulum_case.certificate, pendulum_case.sha256, answer).kind == "NOT CHECKED"
+    text = Page(render_html(pendulum_case.certificate, answer, None, pendulum_case.path)).text
+    assert "NOT CHECKED" in text and "What was proved" not in text
+
+
+@pytest.mark.parametrize("verdict", ["ACCEPTED", "TRUSTED"])
+@pytest.mark.parametrize("change", ["bytes", "no bytes", "policy", "level", "no levels"])
+def test_an_answer_about_something_else_is_an_error(pendulum_case: Case, change: str, verdict: str) -> None:
+    answer = dict(pendulum_case.answer) | {"result": verdict}
+    if change == "bytes":
+        answer["certificate_sha256"] = "0" * 64
+    elif change == "no bytes":
+        del answer["certificate_sha256"]
     elif change == "policy":
         answer["policy_sha256"] = "0" * 64
     elif change == "level":
         answer["levels"] = {**answer["levels"], "roa": math.nextafter(answer["levels"]["roa"], 0.0)}
     else:
-        answer["result"] = "accepted"
-    assert status_of(pendulum_case.certificate, answer).kind == "NOT CHECKED"
-    text = Page(render_html(pendulum_case.certificate, answer, None, pendulum_case.path)).text
-    assert "NOT CHECKED" in text and "What was proved" not in text
+        answer["levels"] = None
+    with pytest.raises(SoundnessError, match="must be about the certificate that the report shows"):
+        replace(pendulum_case, answer=answer).page()
+    with pytest.raises(SoundnessError):  # nor is it taken for another solver's word
+        status_of(pendulum_case.certificate, pendulum_case.sha256, dict(pendulum_case.answer) | {"result": "TRUSTED"})
+
+
+def test_a_file_that_gives_other_bytes_at_each_read_gets_no_page(pendulum_case: Case, tmp_path: Path) -> None:
+    """A pipe gives the reader an unstable plant and the checker a proved one; the old call must not merge them."""
+    unstable = replace(
+        pendulum_case.certificate.system, dynamics=tuple(-e for e in pendulum_case.certificate.system.dynamics)
+    )
+    shown = tmp_path / "shown.json"
+    write_atomically(shown, raw(replace(pendulum_case.certificate, system=unstable)))
+    pipe = tmp_path / "certificate.json"
+    os.mkfifo(pipe)
+
+    def write() -> None:
+        for raw in (shown.read_bytes(), pendulum_case.raw):
+            pipe.write_bytes(raw)
+            time.sleep(0.3)  # the reader has to see the end before the next one writes
+
+    writer = threading.Thread(target=write, daemon=True)
+    writer.start()
+    read = read_certificate(pipe)
+    answer = run_checker(pipe)
+    writer.join()
+    assert answer["result"] == "ACCEPTED"
+    with pytest.raises(SoundnessError, match="sha256"):
+        render_html(read, answer, None, pipe)
+
+
+def test_one_read_is_enough(pendulum_case: Case, tmp_path: Path) -> None:
+    """From the bytes of a pipe, read once: what is drawn is what was checked, in whatever layout the file has."""
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    raw = json.dumps(json.loads(pendulum_case.raw), indent=2).encode()
+    threading.Thread(target=pipe.write_bytes, args=(raw,), daemon=True).start()
+    read = read_raw(pipe)
+    private = tmp_path / "private.json"
+    private.write_bytes(read)
+    sha256, answer = hashlib.sha256(read).hexdigest(), run_checker(private)
+    html = render_html(parse_certificate(read, str(pipe)), answer, None, pipe, sha256=sha256, size=len(read))
+    assert "PROVED · ACCEPTED" in html and sha256 in html and f"{len(raw):,} bytes" in html
+    with pytest.raises(SoundnessError):  # without the hash it is taken for a file that certify wrote, which it is not
+        render_html(parse_certificate(read, str(pipe)), answer, None, pipe)
+
+
+def test_the_run_must_be_the_certificates(pendulum_case: Case) -> None:
+    for key, other in (("policy", {"sha256": "0" * 64, "layers": [2, 1]}), ("levels", {"roa": 1.0})):
+        with pytest.raises(InputError, match="`result` must be of the run"):
+            replace(pendulum_case, result={**pendulum_case.result, key: other}).page()
+
+
+def test_leaves_that_were_not_asked_are_not_called_shown(chain_case: Case) -> None:
+    assert chain_case.certificate.inner == chain_case.certificate.roa
+    page = Page(chain_case.page())
+    assert "As c₁ = c₂, the local part covers the whole set." in page.text
+    assert "the checker showed" not in page.text and "Shown on" not in page.text
+
+
+def test_a_page_reads_no_file(pendulum_case: Case) -> None:
+    elsewhere = Path("/nowhere/at/all/certificate.json")
+    c = pendulum_case
+    assert render_html(c.certificate, c.answer, c.result, elsewhere, sha256=c.sha256, size=len(c.raw)) == c.page()
 
 
 def test_a_tampered_file_is_reported_as_rejected(pendulum_case: Case, tmp_path: Path) -> None:
     path = tmp_path / "certificate.json"
-    write_certificate(path, replace(pendulum_case.certificate, roa=pendulum_case.certificate.roa * 1.5))
+    write_atomically(path, raw(with_level(pendulum_case.certificate, pendulum_case.certificate.roa * 1.5)))
     text = Page(render_html(read_certificate(path), run_checker(path), None, path)).text
     assert "REJECTED" in text and "PROVED" not in text
 
@@ -444,7 +576,7 @@ def hostile_certificate() -> Certificate:
     for field, value in hostile.items():
         object.__setattr__(system, field, value)
     network = TanhNetwork((np.array([[0.1, 0.2]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
-    return Certificate(system, network, np.eye(2), 0.1, 0.5, ONE_LEAF, {HOSTILE: HOSTILE})
+    return Certificate(system, network, *claimed(np.eye(2), 0.1, 0.5), ONE_LEAF, {HOSTILE: HOSTILE})
 
 
 def test_hostile_names_are_text(tmp_path: Path) -> None:
@@ -467,10 +599,10 @@ def test_hostile_names_are_text(tmp_path: Path) -> None:
     "change",
     [
         {"evidence": replace(ONE_LEAF, tree=bytes([0, 255]))},
-        {"P": -np.eye(2)},
-        {"P": np.zeros((2, 2))},
-        {"roa": -1.0},
-        {"local": math.inf},
+        {"V": Quadratic(-np.eye(2))},
+        {"V": Quadratic(np.zeros((2, 2)))},
+        {"claim": Asymptotic(roa=-1.0, local=0.1)},
+        {"claim": Asymptotic(roa=0.5, local=math.inf)},
     ],
     ids=["tree", "negative", "zero", "level", "infinite"],
 )
@@ -484,7 +616,7 @@ def test_a_rejected_file_that_cannot_be_drawn_still_has_a_page(change: dict[str,
 def test_an_accepted_certificate_that_cannot_be_drawn_is_an_error(pendulum_case: Case) -> None:
     broken = replace(pendulum_case.certificate, evidence=replace(ONE_LEAF, tree=b""))
     with pytest.raises(CertificateFormatError):
-        render_html(broken, pendulum_case.answer, None, pendulum_case.path)
+        render_html(broken, pendulum_case.answer, None, pendulum_case.path, sha256=pendulum_case.sha256)
 
 
 @pytest.mark.parametrize("name", ["scalar_case", "chain_case"])
@@ -507,7 +639,7 @@ def test_many_leaves_are_rasterised() -> None:
     tree = b"\xff"
     for k in range(depth):
         tree = bytes([k % 2]) + tree + tree
-    certificate = Certificate(system, network, P, 1e-3, 0.5, PartitionTree(np.eye(2), np.ones(2), tree))
+    certificate = Certificate(system, network, *claimed(P, 1e-3, 0.5), PartitionTree(np.eye(2), np.ones(2), tree))
     picture = next(p for p in draw(certificate, accepted=False)[0] if p.title == "The leaf partition")
     assert "4,096 leaves" in picture.caption and "data:image/png" in picture.svg
     assert len(picture.svg) < 500_000
@@ -527,7 +659,7 @@ def test_a_pole_in_the_domain_does_no_harm() -> None:
     x, y, u = sympy.symbols("x y u")
     system = System("pole", (x, y), (u,), {}, (-x, -y + x**2 / (1 - x) + u), (sympy.Integer(0),), box(2, 2), box(2))
     network = TanhNetwork((np.array([[0.1, 0.2]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
-    certificate = Certificate(system, network, np.eye(2), 0.01, 0.02, ONE_LEAF)
+    certificate = Certificate(system, network, *claimed(np.eye(2), 0.01, 0.02), ONE_LEAF)
     pictures, roa = draw(certificate, accepted=False)
     assert len(pictures) == 5 and roa is not None and roa.contradictions == 0
 
@@ -538,16 +670,50 @@ def test_a_pole_in_the_domain_does_no_harm() -> None:
 def test_symbols_and_units(pendulum_case: Case) -> None:
     assert symbol("theta_dot") == "θ\u0307" and symbol("x12") == "x₁₂" and symbol("_") == "_"
     assert label("v", "m/s^2") == "v (m/s²)"
-    assert units_of(pendulum_case.certificate.system)["theta_dot"] == "rad/s"
-    assert units_of(replace(pendulum_case.certificate.system, name="elsewhere")) == {}
+    assert pendulum_case.certificate.system.units["theta_dot"] == "rad/s"
 
 
-@given(st.floats(1e-12, 1e12))
-def test_levels_are_rounded_down(value: float) -> None:
-    mantissa, _, power = below(value).partition(" \N{MULTIPLICATION SIGN} 10")
+def exactly(text: str) -> Fraction:
+    """The decimal that a text shows."""
+    mantissa, _, power = text.replace("\N{MINUS SIGN}", "-").partition(" \N{MULTIPLICATION SIGN} 10")
     exponent = int(power.translate(str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-"))) if power else 0
-    shown = float(f"{mantissa}e{exponent}")
-    assert value * (1 - 2e-5) < shown <= value
+    return Fraction(mantissa) * Fraction(10) ** exponent
+
+
+@given(
+    st.floats(allow_nan=False, allow_infinity=False) | st.fractions() | st.integers(-9, 9).map(lambda k: 10.0**k),
+    st.integers(1, 17),
+)
+def test_rounded_texts_keep_their_direction(value: float | Fraction, digits: int) -> None:
+    down, up, exact = exactly(below(value, digits)), exactly(above(value, digits)), Fraction(value)
+    assert down <= exact <= up
+    assert up - down <= abs(exact) * Fraction(10) ** (1 - digits)
+
+
+@given(st.floats(1e-3, 1e3), st.floats(1e-12, 1))
+def test_what_is_smaller_is_shown_smaller(value: float, gap: float) -> None:
+    limit = Fraction(value) * (1 + Fraction(gap))
+    shown, less_than = map(exactly, kept_apart(value, limit).split(" < "))
+    assert Fraction(value) <= shown < less_than <= limit
+
+
+def test_numbers_on_the_page_are_rounded_to_the_safe_side() -> None:
+    """Of a set whose P has condition 1e14, against exact arithmetic."""
+    system, network = chain(2, [-1.0, -3.0])
+    d = 2.0**-45
+    P = np.array([[1.0, 1.0], [1.0, 1.0 + d]])  # its inverse is ((1 + 1/d, -1/d), (-1/d, 1/d))
+    c2 = 0.7 * d
+    page = Page(
+        render_html(Certificate(system, network, *claimed(P, c2 / 2, c2), ONE_LEAF), None, None, Path("c.json"))
+    )
+    first = next(row for row in page.rows if row and row[0] == "x₁")
+    axis, extent = exactly(first[1]) ** 2, exactly(first[2]) ** 2
+    assert axis <= Fraction(c2) < axis * (1 + Fraction(1, 10**4))
+    reached = Fraction(c2) * (1 + 1 / Fraction(d))
+    assert reached <= extent < reached * (1 + Fraction(1, 10**4))
+    area = next(exactly(row[1]) for row in page.rows if row and row[0] == "area")
+    pi = Fraction(31415926535897932384626433832795, 10**31)
+    assert area**2 <= pi**2 * Fraction(c2) ** 2 / Fraction(d) < area**2 * (1 + Fraction(1, 10**4))
 
 
 # The terminal
@@ -567,9 +733,224 @@ def test_summary_of_a_proof(pendulum_case: Case) -> None:
     assert text.startswith("PROVED  pendulum")
     for shown in (below(result["levels"]["roa"]), below(result["levels"]["local"]), below(result["volume"]),
                   result["policy"]["sha256"], "2-16-16-1", f"{result['leaves']:,} leaves", "ACCEPTED", "rad/s",
-                  number(result["extents"][1]), number(result["semi_axes"][0])):  # fmt: skip
+                  above(result["extents"][1]), below(result["semi_axes"][0])):  # fmt: skip
         assert shown in text
     assert all(stage in text for stage in ("candidate", "local", "ring", "write", "check"))
+
+
+def test_units_are_the_certificates_own(tmp_path: Path) -> None:
+    """A plant that bears the name of another: nothing of the other's appears."""
+    x, v, u = sympy.symbols("range speed u")
+    units = {"range": "km", "speed": "<b>kn</b>", "u": "kN"}
+    plant = System("pendulum", (x, v), (u,), {}, (-x + u, -v), (sympy.Integer(0),), box(1, 1), box(2), units=units)
+    network = TanhNetwork((np.array([[0.1, 0.2]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
+    path = tmp_path / "certificate.json"
+    write_atomically(
+        path, raw(Certificate(plant, network, *claimed(np.eye(2), 0.1, 0.5), ONE_LEAF, {"policy": "p.pt"}))
+    )
+    read = read_certificate(path)
+    assert dict(read.system.units) == units and read.provenance == {"policy": "p.pt"}
+    assert read.to_json() == path.read_text()
+    html = render_html(read, None, None, path)
+    page = Page(html)
+    assert "range (km)" in page.text and "kN" in page.text and "<b>kn</b>" in page.text and "<b>kn" not in html
+    for shown in (page.text, *page.drawings()):
+        assert not re.search(r"\brad\b", shown)
+
+
+def test_a_certificate_without_units_gets_none(pendulum_case: Case) -> None:
+    data = json.loads(pendulum_case.raw)
+    assert data["provenance"].pop("units") == {"theta": "rad", "theta_dot": "rad/s", "u": "N m"}
+    read = parse_certificate(json.dumps(data).encode(), "edited")
+    page = Page(render_html(read, None, None, pendulum_case.path))
+    for shown in (page.text, *page.drawings()):
+        assert not re.search(r"\brad\b", shown)
+
+
+def test_the_summary_looks_no_plant_up(pendulum_case: Case) -> None:
+    result = {**pendulum_case.result, "states": [{"name": "range", "unit": "km"}, {"name": "speed", "unit": "kn"}]}
+    text = rendered(result)
+    assert "range (km)" in text and "speed (kn)" in text and "km · kn" in text and "rad" not in text
+    old = {k: v for k, v in pendulum_case.result.items() if k not in ("states", "inputs")}
+    assert "rad" not in rendered(old) and "θ" not in rendered(old) and "x₁" in rendered(old)
+
+
+@pytest.mark.parametrize(
+    "provenance",
+    [
+        [],
+        "text",
+        None,
+        {"units": []},
+        {"units": "rad"},
+        {"units": {"theta": 1}},
+        {"units": {"theta": "r" * 41}},
+        {"units": {"nobody": "rad"}},
+        {"units": {"theta": "a\u0000b"}},
+        {"units": {"theta": "\ud800"}},
+        {"units": {"theta": None}, "half": "\ud800", "deep": [[{}]]},
+    ],
+)
+def test_a_provenance_of_any_kind_does_no_harm(pendulum_case: Case, provenance: Any) -> None:
+    data = json.loads(pendulum_case.raw)
+    data["provenance"] = provenance
+    read = parse_certificate(json.dumps(data).encode(), "edited")
+    assert dict(read.system.units) == {}
+    render_html(read, None, None, pendulum_case.path).encode("utf-8")
+
+
+# Another solver's word
+
+
+@pytest.fixture(scope="module")
+def trusted_case(pendulum_case: Case, tmp_path_factory: pytest.TempPathFactory) -> Case:
+    """What a run of an engine leaves whose answers nobody can replay, 4 deltas below the domain's limit."""
+    path = tmp_path_factory.mktemp("trusted") / "certificate.json"
+    c = pendulum_case.certificate
+    limit = domain_limit(c.P, c.system.domain)
+    level = limit * (1 - 4e-3)
+    evidence = TrustedSolver("dreal", "4.21.06", 1e-3, (("local-0.1", "unsat"), ("ring-7", "unsat")))
+    write_atomically(path, raw(replace(with_level(c, level), evidence=evidence)))
+    query = {"query": "ring", "level": 7.0, "answer": "unsat", "seconds": 1.0, "detail": ""}
+    result = {
+        **pendulum_case.result,
+        "verdict": "PROVED",
+        "checked": "TRUSTED",
+        "reason": "domain",
+        "levels": {"local": c.inner, "roa": level, "domain_limit": limit, "sampled_limit": None},
+        "solver": {"solver": "dreal", "version": "4.21.06", "precision": 1e-3, "queries": [query]},
+        "boxes": 0,
+        "leaves": 0,
+    }
+    return Case(read_certificate(path), run_checker(path), result, path)
+
+
+def test_a_trusted_page_is_about_answers_and_not_about_leaves(trusted_case: Case) -> None:
+    assert trusted_case.answer["result"] == "TRUSTED"
+    page = Page(trusted_case.page())
+    text = page.text
+    assert "TRUSTED" in text and "PROVED" not in text and "ACCEPTED" not in text and "What was proved" not in text
+    captions = [a.get("alt") or "" for _, a in page.tags]
+    for shown in (text, *page.drawings(), *captions):
+        assert not re.search(r"\blea(f|ves)\b|partition|linearisation and a bound|certified", shown)
+    assert text.count("Not checked: dreal's word.") == 4 and text.count("Checked in exact arithmetic.") == 2
+    assert "dreal 4.21.06, delta 0.001" in text and ["its answer to ring-7", "unsat"] in page.rows
+
+
+def test_a_trusted_summary_says_so_first(trusted_case: Case) -> None:
+    for verdict in ("PROVED", "TRUSTED"):
+        text = rendered({**trusted_case.result, "verdict": verdict})
+        assert text.startswith("TRUSTED  pendulum") and "PROVED" not in text
+        assert "if the solver is right" in " ".join(text.split())
+    assert rendered({**trusted_case.result, "checked": None}).startswith("UNKNOWN")
+
+
+def test_what_limits_is_the_margin_and_not_the_domain(trusted_case: Case) -> None:
+    words = limited_by(trusted_case.result)
+    assert words.startswith("the precision of dreal (delta 0.001), which stops 0.4 % below the domain's limit 7.")
+    page = Page(trusted_case.page())
+    assert words in page.text and words in " ".join(rendered(trusted_case.result, 400).split())
+    assert any(row[0] == "domain's limit" and "of which c₂ is 99.6" in row[1] for row in page.rows if len(row) > 1)
+    levels = trusted_case.result["levels"]
+    close = {**trusted_case.result, "levels": {**levels, "roa": levels["domain_limit"] * (1 - 1e-9)}}
+    assert limited_by(close) == "the domain"
+
+
+def test_trusted_is_a_verdict_of_its_own() -> None:
+    assert Verdict.TRUSTED.exit_status == Verdict.UNKNOWN.exit_status == 3
+    assert Verdict("TRUSTED") is not Verdict.PROVED
+
+
+# The practical claim
+
+
+@pytest.fixture(scope="module")
+def practical_case(tmp_path_factory: pytest.TempPathFactory) -> Case:
+    """x' = 1/4 - x + u and y' = -y with u = tanh(x)/10: no equilibrium at 0, but V = x^2 + y^2 falls for V >= 1/3."""
+    x, y, u = sympy.symbols("x y u")
+    f = (sympy.Rational(1, 4) - x + u, -y)
+    system = System("drifting", (x, y), (u,), {}, f, (sympy.Integer(0),), box(2, 2), box(1))
+    network = TanhNetwork((np.array([[1.0, 0.0]]),), (np.zeros(1),), np.full(1, 0.1), np.zeros(1), "tanh", "none")
+    path = tmp_path_factory.mktemp("practical") / "certificate.json"
+    write_atomically(
+        path, raw(Certificate(system, network, Quadratic(np.eye(2)), Practical(roa=1.7, floor=1 / 3), ONE_LEAF))
+    )
+    answer = {
+        "result": "ACCEPTED",
+        "certificate_sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+        "policy_sha256": network.sha256(),
+        "levels": {"floor": 1 / 3, "roa": 1.7},
+        "leaves": 9,
+        "ring_leaves": 8,
+        "margins": {"local": None, "ring": 0.0123456},
+    }
+    result = {
+        "verdict": "PROVED",
+        "reason": "requested",
+        "system": "drifting",
+        "claim": {"kind": "practical"},
+        "policy": {"sha256": network.sha256(), "layers": [2, 1]},
+        "levels": {"local": None, "floor": 1 / 3, "roa": 1.7, "sampled_limit": None, "domain_limit": 4.0},
+        "checked": "ACCEPTED",
+        "volume": 5.0,
+        "semi_axes": [1.3, 1.3],
+        "extents": [1.3, 1.3],
+        "seconds": {"total": 1.0},
+        "boxes": 9,
+        "leaves": 9,
+        **named(system),
+    }
+    return Case(read_certificate(path), answer, result, path)
+
+
+def test_the_practical_claim_survives_the_file(practical_case: Case) -> None:
+    data, read = json.loads(practical_case.raw), practical_case.certificate
+    assert data["claim"] == {"kind": "practical"} and set(data["levels"]) == {"floor", "roa"}
+    assert (read.kind, read.inner, read.to_json()) == ("practical", 1 / 3, practical_case.raw.decode())
+    for kind in ("other", ["practical"], None):
+        data["claim"]["kind"] = kind
+        with pytest.raises(CertificateFormatError, match=r"asymptotic, practical|unhashable"):
+            parse_certificate(json.dumps(data).encode(), "edited")
+
+
+MISREAD = re.compile(r"asymptotic|attract|converge|local set|c₁|\(local\)|[Rr]egion of attraction|settle")
+
+
+def test_a_practical_page_cannot_be_misread(practical_case: Case) -> None:
+    page = Page(practical_case.page())
+    text = page.text
+    assert "PROVED · ACCEPTED" in text and "Practical stability of drifting" in text
+    assert f"enters the smaller set {{V(x) ≤ {above(1 / 3)}}} in finite time" in text
+    assert f"starts in the set {{V(x) ≤ {below(1.7)}}}" in text
+    excluded = "The origin need not attract them, and need not be an equilibrium at all."
+    assert "Anything inside {V ≤ c₀}." in text and excluded in text
+    for shown in (text.replace(excluded, ""), *page.drawings(), *(a.get("alt") or "" for _, a in page.tags)):
+        assert MISREAD.search(shown) is None, MISREAD.search(shown)
+    assert "Equilibrium." not in text and "Local." not in text and "has 5 parts" in text
+    assert ["c₀, floor", repr(1 / 3)] in page.rows
+    assert "inner set, V = 0.334" in page.drawings()[0]
+
+
+def test_a_practical_summary_cannot_be_misread(practical_case: Case) -> None:
+    text = " ".join(rendered(practical_case.result, 200).split())
+    assert text.startswith("PROVED drifting: from {V <= 1.69999} every trajectory enters {V <= 0.333334} and stays")
+    assert "floor c0 0.333334, enlarged c2 1.69999" in text and "nothing is said of the origin" in text
+    assert MISREAD.search(text) is None
+
+
+def test_runs_of_the_practical_claim_count_when_they_enter_the_inner_set(practical_case: Case) -> None:
+    pictures, roa = draw(practical_case.certificate, accepted=True)
+    assert roa is not None and roa.contradictions == 0 and roa.attracted.any() and len(pictures) == 5
+    # near the origin none of them stays: the equilibrium is at x = 0.278
+    c = practical_case.certificate
+    assert not simulated_roa_fraction(c.system, c.network, c.P, c.roa).attracted.all()
+
+
+def test_every_claim_has_all_its_words() -> None:
+    assert set(CLAIMS) == set(KINDS)
+    for kind, words in CLAIMS.items():
+        assert words.inner_word == KINDS[kind].inner_name
+        assert {"Equations", "Domain", "Ring", "Inputs"} <= {name for name, _, _ in words.parts}
 
 
 def test_summary_without_a_proof() -> None:

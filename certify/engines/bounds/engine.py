@@ -13,7 +13,7 @@ from certify.certificate import PartitionTree
 from certify.claims import Asymptotic, Practical
 from certify.engines.base import Budget, Proof, Report, Task
 from certify.engines.bounds.search import RingProof, prove_inwards, prove_outwards
-from certify.engines.falsify import survey
+from certify.engines.falsify import Band, survey
 from certify.engines.local import prove_local
 from certify.running import Runner
 from certify.verdict import Stop
@@ -48,16 +48,15 @@ class BoundsEngine:
     def _practical(self, task: Task, budget: Budget, report: Report | None) -> Proof:
         start = time.perf_counter()
         found = survey(task.problem, self.T, task.target)
-        if found is None or (task.exactly and found[2] < task.target):
+        if found is None or (task.exactly and found.top < task.target):
             near = "around any level" if found is None else "near the level that was asked for"
             why = f"Vdot >= 0 or an input out of bounds was sampled {near}"
             return Proof(None, None, Stop.FLOOR, why, seconds={"ring": time.perf_counter() - start})
-        below, floor, top = found
-        outer = top
+        outer, stop = task.target, Stop.REQUESTED
         if not task.exactly:
-            outer = self._outer_level(task, floor, top, replace(budget, seconds=_SHARE * budget.seconds), report)
-        left = budget.seconds - (time.perf_counter() - start)
-        ring = prove_inwards(task.problem, self.T, below, outer, replace(budget, seconds=left), self.runner, report)
+            outer, stop = self._outer_level(task, found, replace(budget, seconds=_SHARE * budget.seconds), report)
+        left = replace(budget, seconds=budget.seconds - (time.perf_counter() - start))
+        ring = prove_inwards(task.problem, self.T, found.below, outer, left, self.runner, report)
         seconds = {"ring": time.perf_counter() - start}
         if not ring.inner < ring.outer:
             why = f"no ring below V = {outer:.6g} is proved"
@@ -66,18 +65,18 @@ class BoundsEngine:
             why = f"F and its inputs are not enclosed on all of V <= {ring.inner:.6g}"
             return Proof(None, None, Stop.SMOOTH, why, boxes=ring.boxes, seconds=seconds)
         proof = self._proof(ring, Practical(roa=ring.outer, floor=ring.inner), seconds)
-        return replace(proof, stop=Stop.REQUESTED if ring.outer >= task.target else Stop.WITNESS)
+        return replace(proof, stop=stop)
 
-    def _outer_level(self, task: Task, floor: float, top: float, budget: Budget, report: Report | None) -> float:
-        """The largest c2 that a ring from somewhat above the floor reaches."""
-        inner, best = min(4 * floor, math.sqrt(floor * top)), floor
+    def _outer_level(self, task: Task, band: Band, budget: Budget, report: Report | None) -> tuple[float, Stop]:
+        """The largest c2 that a ring from somewhat above the floor reaches, and what stopped it."""
+        inner = min(4 * band.floor, math.sqrt(band.floor * band.top))
+        part = replace(budget, seconds=budget.seconds / _TRIES)
         for _ in range(_TRIES):
-            part = replace(budget, seconds=budget.seconds / _TRIES)
-            best = max(best, prove_outwards(task.problem, self.T, inner, top, part, self.runner, report).outer)
-            if best > inner:
+            ring = prove_outwards(task.problem, self.T, inner, band.above, part, self.runner, report)
+            if ring.outer > inner:
                 break
-            inner = math.sqrt(inner * top)
-        return best
+            inner = math.sqrt(inner * band.top)
+        return ring.outer, ring.stop
 
     def _proof(self, ring: RingProof, claim: Asymptotic | Practical, seconds: dict[str, float]) -> Proof:
         return Proof(

@@ -1,47 +1,18 @@
-"""The commands `controllers train-baseline` and `controllers compare`: arguments and printing, no mathematics.
-
-`controllers.cli` registers them; what they share with its own commands they take from there when they are called.
-"""
+"""`controllers compare`."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Annotated, Any
 
 import typer
 
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
-Plant = Annotated[str, typer.Argument(help="The plant, for instance pendulum.")]
-Steps = Annotated[int | None, typer.Option("--steps", help="Environment steps of a run; default: the preset's.")]
-
-
-def train_baseline(
-    algorithm: Annotated[str, typer.Argument(help="ppo or sac, of stable-baselines3.")],
-    plant: Plant,
-    out: Annotated[Path, typer.Option("--out", help="The zip file to write.")],
-    seed: Annotated[int, typer.Option(help="Seed of everything random.")] = 0,
-    steps: Steps = None,
-    as_json: Json = False,
-) -> None:
-    """Train PPO or SAC of stable-baselines3 on a plant, for comparison."""
-    from controllers import cli
-
-    with cli._errors(as_json):
-        options = _options(plant, seed, steps)
-        from certify.systems import get_system
-        from controllers.baselines import Algorithm, train_reference
-
-        cli._require_writable(out)
-        system = get_system(plant)
-        made = train_reference(cast(Algorithm, algorithm), system, options, out)
-        result = {"baseline": str(out), "algorithm": algorithm, "system": plant, "steps": made, "seed": seed}
-        cli._emit(result, as_json)
+from controllers.commands.shared import Json, PlantName, Steps, emit, errors, options_of
 
 
 def compare(
-    plant: Plant,
+    plant: PlantName,
     runs: Annotated[Path, typer.Option("--runs", help="Folder of trained runs; missing ones are trained into it.")],
     out: Annotated[Path, typer.Option("--out", help="Folder for the figures and the table.")],
     seeds: Annotated[int, typer.Option("--seeds", help="Runs of each method, with the seeds 0, 1, ...")] = 5,
@@ -57,10 +28,8 @@ def compare(
     as_json: Json = False,
 ) -> None:
     """Compare our policy with SAC without the gain and with SAC and PPO of stable-baselines3: figures and a table."""
-    from controllers import cli
-
-    with cli._errors(as_json):
-        training = _options(plant, 0, steps)
+    with errors(as_json):
+        training = options_of(plant, seed=0, steps=steps)
         from certify.systems import get_system
         from controllers.compare import compare as run
         from controllers.responses import ABLATIONS, BASELINES, CompareOptions, remaining
@@ -69,10 +38,10 @@ def compare(
         options = CompareOptions(methods=methods, seeds=seeds, duration=duration, states=states)
         result = run(get_system(plant), training, runs, out, options, lambda line: typer.echo(line, err=True))
         if as_json:
-            cli._emit(result, as_json)
+            emit(result, as_json)
             return
         typer.echo(_table(result["rows"]))
-        cli._emit(result["files"], as_json)
+        emit(result["files"], as_json)
 
 
 def _table(rows: Sequence[dict[str, Any]]) -> str:
@@ -99,10 +68,3 @@ def _table(rows: Sequence[dict[str, Any]]) -> str:
         lines.append((row["method"], seed, str(row["steps"]), *counts, floor, f"{lower} {median} {upper}"))
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return "\n".join("  ".join(f"{cell:<{w}}" for cell, w in zip(line, widths, strict=True)).rstrip() for line in lines)
-
-
-def _options(plant: str, seed: int, steps: int | None) -> Any:
-    from controllers.options import preset
-
-    options = replace(preset(plant), seed=seed)
-    return options if steps is None else replace(options, steps=steps)

@@ -40,7 +40,14 @@ def cartpole() -> System:
         input_bounds=((exact(-30), exact(30)),),
         positive=frozenset({"mc", "mp", "l", "g"}),
         units={
-            "p": "m", "theta": "rad", "p_dot": "m/s", "theta_dot": "rad/s", "u": "N",
-            "mc": "kg", "mp": "kg", "l": "m", "g": "m/s^2",
+            "p": "m",
+            "theta": "rad",
+            "p_dot": "m/s",
+            "theta_dot": "rad/s",
+            "u": "N",
+            "mc": "kg",
+            "mp": "kg",
+            "l": "m",
+            "g": "m/s^2",
         },
-    )  # fmt: skip
+    )

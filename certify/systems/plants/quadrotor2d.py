@@ -40,7 +40,17 @@ def quadrotor2d() -> System:
         input_bounds=((exact(0), exact(6)), (exact(0), exact(6))),
         positive=frozenset({"m", "l", "I", "g"}),
         units={
-            "x": "m", "y": "m", "theta": "rad", "x_dot": "m/s", "y_dot": "m/s", "theta_dot": "rad/s",
-            "u1": "N", "u2": "N", "m": "kg", "l": "m", "I": "kg m^2", "g": "m/s^2",
+            "x": "m",
+            "y": "m",
+            "theta": "rad",
+            "x_dot": "m/s",
+            "y_dot": "m/s",
+            "theta_dot": "rad/s",
+            "u1": "N",
+            "u2": "N",
+            "m": "kg",
+            "l": "m",
+            "I": "kg m^2",
+            "g": "m/s^2",
         },
-    )  # fmt: skip
+    )

@@ -31,11 +31,15 @@ def quadrotor3d() -> System:
     lift = (u1 + u2 + u3 + u4) / m
     turn = sin(phi) * q + cos(phi) * r
     names = {
-        **dict.fromkeys(("x", "y", "z", "a", "k"), "m"), **dict.fromkeys(("phi", "theta", "psi"), "rad"),
-        **dict.fromkeys(("vx", "vy", "vz"), "m/s"), **dict.fromkeys(("p", "q", "r"), "rad/s"),
-        **dict.fromkeys(("u1", "u2", "u3", "u4"), "N"), **dict.fromkeys(("Ix", "Iy", "Iz"), "kg m^2"),
-        "m": "kg", "g": "m/s^2",
-    }  # fmt: skip
+        **dict.fromkeys(("x", "y", "z", "a", "k"), "m"),
+        **dict.fromkeys(("phi", "theta", "psi"), "rad"),
+        **dict.fromkeys(("vx", "vy", "vz"), "m/s"),
+        **dict.fromkeys(("p", "q", "r"), "rad/s"),
+        **dict.fromkeys(("u1", "u2", "u3", "u4"), "N"),
+        **dict.fromkeys(("Ix", "Iy", "Iz"), "kg m^2"),
+        "m": "kg",
+        "g": "m/s^2",
+    }
 
     def within(half: str) -> tuple[sympy.Expr, sympy.Expr]:
         return exact("-" + half), exact(half)
@@ -46,8 +50,13 @@ def quadrotor3d() -> System:
         states=states,
         inputs=inputs,
         parameters={
-            "m": exact("0.486"), "a": exact("0.225"), "k": exact("11/290"),
-            "Ix": exact("4.9e-3"), "Iy": exact("4.9e-3"), "Iz": exact("8.8e-3"), "g": exact("9.81"),
+            "m": exact("0.486"),
+            "a": exact("0.225"),
+            "k": exact("11/290"),
+            "Ix": exact("4.9e-3"),
+            "Iy": exact("4.9e-3"),
+            "Iz": exact("8.8e-3"),
+            "g": exact("9.81"),
         },
         dynamics=(
             vx,
@@ -68,4 +77,4 @@ def quadrotor3d() -> System:
         input_bounds=((exact(0), exact("3.6")),) * 4,
         positive=frozenset({"m", "a", "k", "Ix", "Iy", "Iz", "g"}),
         units=names,
-    )  # fmt: skip
+    )

@@ -1,0 +1,101 @@
+"""What a certificate can hold, as the format's page says; a plant or policy beyond it is named before any work is done.
+
+The checkers have these limits so that no file can take their time or memory; `tests` compare the two.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from fractions import Fraction
+
+import numpy as np
+import sympy
+
+from certify.errors import InputError
+from certify.expressions import Tree, to_tree
+from certify.policies import TanhNetwork
+from certify.systems import System
+
+MOST_STATES, MOST_LAYERS, MOST_ROWS = 64, 64, 2**14
+MOST_NODES, MOST_DEPTH, MOST_EXPONENT, MOST_DIGITS = 20_000, 200, 64, 1201
+MOST_NUMBERS = 2**25  # operations times n^2, under the rule `local`
+MOST_MATRIX_BITS = 2**15  # of the longest number of P, times n
+
+
+def require_within_limits(system: System, network: TanhNetwork) -> None:
+    """Refuse a closed loop that no certificate can hold.
+
+    Raises
+    ------
+    InputError : a limit of the format is exceeded; the message names it.
+    """
+    dynamics = system.exact_dynamics()
+    trees = [to_tree(e) for e in dynamics]
+    nodes = [node for tree in trees for node in _nodes(tree, 0)]
+    numbers = [q for pair in (*system.domain, *system.input_bounds) for q in pair] + list(system.exact_u_eq())
+    digits = [len(part) for q in (*numbers, *(Fraction(n) for n, _ in nodes if _is_number(n))) for part in _parts(q)]
+    exponents = [abs(int(p.exp)) for e in dynamics for p in sympy.preorder_traversal(e) if p.is_Pow]
+    for what, found, most in (
+        ("states", system.n, MOST_STATES),
+        ("inputs", system.m, MOST_STATES),
+        ("layers of the policy", len(network.weights), MOST_LAYERS),
+        ("units in a layer", max(len(W) for W in network.weights), MOST_ROWS),
+        ("nodes in the equations", len(nodes), MOST_NODES),
+        ("levels of nesting in an equation", max(depth for _, depth in nodes), MOST_DEPTH),
+        ("as the largest exponent in an equation", max(exponents, default=1), MOST_EXPONENT),
+        ("digits in the parts of a rational", max(digits), MOST_DIGITS),
+        ("operations in the equations, times the square of the number of states,", _size(system), MOST_NUMBERS),
+    ):
+        if found > most:
+            raise InputError(
+                f"{system.name} with this policy is too large for a certificate: at most {most} {what}; found {found}."
+            )
+
+
+def require_short(P: np.ndarray) -> None:
+    """Refuse a P whose exact inverse takes too long.
+
+    Raises
+    ------
+    InputError : n times the bits of its longest number exceed the format's limit.
+    """
+    parts = [abs(part) for v in P.ravel() for part in Fraction(float(v)).as_integer_ratio()]
+    bits = len(P) * max(part.bit_length() for part in parts)
+    if bits > MOST_MATRIX_BITS:
+        raise InputError(
+            f"`P` has entries of too different magnitude for an exact inverse: at most {MOST_MATRIX_BITS} bits times "
+            f"states; found {bits}. Scale the states, or try another candidate."
+        )
+
+
+def _size(system: System) -> int:
+    """Operations, each counted once however often it stands in the equations, times n^2; an upper bound."""
+    seen = {node for e in system.exact_dynamics() for node in sympy.preorder_traversal(e)}
+    return sum(_operations(node) for node in seen) * system.n**2
+
+
+def _operations(node: sympy.Expr) -> int:
+    if node.is_Add or node.is_Mul:
+        return len(node.args) - 1
+    if node.is_Pow:
+        return 2 * abs(int(node.exp)).bit_length()
+    return 4 if isinstance(node, sympy.tan) else 1
+
+
+def _nodes(tree: Tree, depth: int) -> Iterator[tuple[Tree, int]]:
+    """Every node of a tree with its depth, without recursion."""
+    waiting = [(tree, depth)]
+    while waiting:
+        node, depth = waiting.pop()
+        yield (node if isinstance(node, str) else node[0]), depth
+        if not isinstance(node, str):
+            operands = node[1:2] if node[0] == "**" else node[1:]
+            waiting += [(operand, depth + 1) for operand in operands]
+
+
+def _is_number(text: str) -> bool:
+    return text[0].isdigit() or (text[0] == "-" and len(text) > 1)
+
+
+def _parts(q: Fraction) -> tuple[str, str]:
+    return str(abs(q.numerator)), str(q.denominator)

@@ -1,0 +1,37 @@
+"""V along trajectories."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.report.figures.geometry import PARTS
+from certify.report.figures.scene import PATH_STEP, Scene
+from certify.report.figures.style import INNER, SET, SIMULATED, Picture, figure_of, plain_powers, to_svg
+from certify.report.sampling import quadratic
+
+
+def decay(scene: Scene, paths: NDArray[np.float64]) -> Picture:
+    """V over time on a logarithmic axis, with both levels."""
+    V = quadratic(scene.P, paths)
+    time = PATH_STEP * scene.step * np.arange(len(V)) / PARTS
+    figure, axes = figure_of(4.2, 3.6)
+    axes.semilogy(time, np.maximum(V, 1e-300), color=SIMULATED, lw=0.8)
+    axes.axhline(scene.outer, color=SET, lw=1.4)
+    axes.axhline(scene.inner, color=INNER, lw=1.4)
+    apart = scene.inner < 0.5 * scene.outer
+    for level, name, colour in ((scene.outer, "c₂", SET), (scene.inner, scene.words.inner, INNER))[: 1 + apart]:
+        axes.annotate(name, (time[-1], level), (2, 2), textcoords="offset points", color=colour, fontsize=9)
+    lowest = float(np.nanmin(V[-1])) if np.any(np.isfinite(V[-1])) else scene.inner
+    axes.set_ylim(max(min(lowest, scene.inner / 10), 1e-14 * scene.outer), scene.outer * 4)
+    axes.set_xlim(0, time[-1])
+    plain_powers(axes)
+    axes.set_xlabel("time (s)")
+    axes.set_ylabel("V(x(t))")
+    return Picture(
+        "V along trajectories",
+        f"V from starting points on and in the {scene.word} set: simulated, not proved. "
+        + scene.words.decay.format(word=scene.proved),
+        to_svg(figure),
+        simulated=True,
+    )

@@ -1,0 +1,55 @@
+"""Vdot along the one state."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from certify.report.figures.scene import Scene
+from certify.report.figures.style import (
+    GROWTH_FILL,
+    INK,
+    INNER_FILL,
+    LEAVING,
+    MUTED,
+    RASTER_FROM,
+    SET,
+    SET_FILL,
+    Picture,
+    figure_of,
+    legend_beside,
+    to_svg,
+)
+from certify.report.sampling import SimulatedRoa
+
+
+def line_figure(scene: Scene, roa: SimulatedRoa | None) -> Picture:
+    """Vdot over the domain, the two intervals, and where runs settle."""
+    x = np.linspace(scene.lo[0], scene.hi[0], 601)[:, None]
+    outer, inner = scene.reach[0], scene.inner_reach[0]
+    figure, axes = figure_of(7.6, 3.4, right=2.1)
+    vdot = scene.vdot(x)
+    axes.axhline(0, color=MUTED, lw=0.7)
+    axes.axvspan(-outer, outer, color=SET_FILL, lw=0, label=f"{scene.word} set")
+    axes.axvspan(-inner, inner, color=INNER_FILL, lw=0, label=scene.words.inner_set)
+    axes.plot(x[:, 0], vdot, color=INK, label="V̇ (float64, not proved)")
+    axes.fill_between(x[:, 0], 0, vdot, where=vdot >= 0, color=GROWTH_FILL, lw=0, label="V̇ ≥ 0 (not proved)")
+    if roa is not None:
+        inside = roa.axes[0][roa.attracted]
+        if inside.size:
+            ends = [float(inside.min()), float(inside.max())]
+            axes.plot(ends, [0, 0], color=LEAVING, lw=2.4, label="simulated region (not proved)")
+    if scene.leaves is not None and len(scene.leaves[0]) <= RASTER_FROM:
+        edges = scene.leaves[0][:, 0] * scene.T[0, 0]
+        axes.plot(edges, np.zeros_like(edges), "|", ms=5, color=SET, label="leaves")
+    axes.set_xlim(scene.lo[0], scene.hi[0])
+    axes.set_xlabel(scene.labels[0])
+    axes.set_ylabel("V̇")
+    legend_beside(axes)
+    return Picture(
+        "V̇ along the state",
+        f"Shaded: the {scene.word} interval, {scene.meaning}. The curve of V̇ and the interval of the runs that "
+        f"{scene.words.settles} come from floating point and simulation; they are not proved.",
+        to_svg(figure),
+        simulated=True,
+        wide=True,
+    )

@@ -1,0 +1,43 @@
+"""The inner set and what lies around it, for two states."""
+
+from __future__ import annotations
+
+from certify.report.figures.geometry import Box, circle, ellipse, on_level, thin
+from certify.report.figures.partition import add_leaves
+from certify.report.figures.scene import Scene
+from certify.report.figures.style import INK, INNER, INNER_FILL, SET, SIMULATED, Picture, figure_of, to_svg
+from certify.report.words import inner_level
+
+
+def near_origin(scene: Scene) -> Picture:
+    """The inner set, the innermost leaves where there are any, and trajectories that come in."""
+    from matplotlib.collections import LineCollection
+
+    figure, axes = figure_of(4.2, 3.6)
+    reach = 2.6 * scene.inner_reach
+    if scene.leaves is not None:
+        add_leaves(axes, scene, scene.leaves, (0, 1), within=reach)
+    paths = scene.simulate(on_level(scene.P, circle(14), min(9 * scene.inner, 0.999 * scene.outer)), steps=60)
+    lines = [thin(paths[:, k], Box(-reach, reach), (0, 1)) for k in range(paths.shape[1])]
+    axes.add_collection(LineCollection(lines, colors=SIMULATED, linewidths=0.8, zorder=3))
+    axes.fill(*ellipse(scene.P, (0, 1), scene.inner), facecolor=INNER_FILL, edgecolor=INNER, lw=1.6, zorder=2)
+    axes.plot(*ellipse(scene.P, (0, 1), scene.outer), color=SET, lw=1.6, zorder=4)
+    axes.plot(0, 0, "o", ms=3, color=INK, zorder=5)
+    axes.set_xlim(-reach[0], reach[0])
+    axes.set_ylim(-reach[1], reach[1])
+    axes.ticklabel_format(style="sci", scilimits=(-2, 3))
+    axes.set_xlabel(scene.labels[0])
+    axes.set_ylabel(scene.labels[1])
+    around = "" if scene.leaves is None else " Around it the innermost leaves (blue)."
+    inner = f"{{V ≤ {inner_level(scene.kind, scene.inner, 3)}}}"
+    green = {
+        "asymptotic": f"Green: the local set {inner}, {scene.word} at all radii at once.",
+        "practical": f"Green: the inner set {inner}, which trajectories enter and do not leave; the dot marks the "
+        "origin, of which nothing is said.",
+    }[scene.kind]
+    return Picture(
+        "Near the origin",
+        f"{green}{around} Grey trajectories are simulated, not proved.",
+        to_svg(figure),
+        simulated=True,
+    )

@@ -1,0 +1,429 @@
+"""One self-contained HTML page for a certificate: figures inline, no script, nothing loaded from anywhere.
+
+The page says that something was proved only if the checker's answer says ACCEPTED *and* is about the very bytes that
+the page is drawn from: by their hash, and for good measure by the policy and the levels. An answer about anything else
+is an error, not a page. Every text that comes from a file passes through jinja2's escaping.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import sympy
+
+from certify.certificate import Certificate, PartitionTree, TrustedSolver
+from certify.closed_loop import ClosedLoop
+from certify.errors import CertifyError, InputError, SoundnessError
+from certify.lyapunov import domain_limit, extents, semi_axes, volume
+from certify.report.figures import Picture, draw
+from certify.report.figures.scene import is_ellipsoid
+from certify.report.sampling import SimulatedRoa
+from certify.report.words import (
+    ABSENT,
+    CHECKED_ALWAYS,
+    MINUS,
+    TIMES,
+    Words,
+    above,
+    below,
+    inner_level,
+    kept_apart,
+    label,
+    limited_by,
+    number,
+    pretty_unit,
+    seconds,
+    symbol,
+    volume_name,
+    volume_unit,
+    words_for,
+)
+
+_LONG = 10**6  # numerators and denominators beyond it are shown rounded
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """What may be said of a certificate: kind is ACCEPTED, TRUSTED, REJECTED or NOT CHECKED; note says why."""
+
+    kind: str
+    note: str
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the page may speak of a proof."""
+        return self.kind == "ACCEPTED"
+
+
+def status_of(certificate: Certificate, sha256: str, answer: Mapping[str, Any] | None) -> Status:
+    """What the checker's answer lets be said of the certificate whose bytes have this hash.
+
+    Raises
+    ------
+    SoundnessError : the answer accepts, or trusts, something else than this certificate.
+    """
+    if answer is None:
+        return Status("NOT CHECKED", "The checker was not asked. Until it accepts the file, nothing here is proved.")
+    kind = answer.get("result")
+    if kind == "REJECTED":
+        where = f"rule {answer.get('rule', '?')} at {answer.get('at', '?')}"
+        detail = f": {answer['detail']}" if answer.get("detail") else ""
+        return Status("REJECTED", f"The checker refuses the certificate by {where}{detail}. Nothing here is proved.")
+    if kind not in ("ACCEPTED", "TRUSTED"):
+        return Status("NOT CHECKED", "The checker gave no verdict. Nothing here is proved.")
+    levels = answer.get("levels")
+    given = levels if isinstance(levels, Mapping) else {}
+    inner, outer = given.get(certificate.claim.inner_name), given.get("roa")
+    for what, found, wanted in (
+        ("bytes with sha256", answer.get("certificate_sha256"), sha256),
+        ("policy with sha256", answer.get("policy_sha256"), certificate.network.sha256()),
+        ("levels", (inner, outer), (certificate.inner, certificate.roa)),
+        ("evidence to replay", kind == "ACCEPTED", isinstance(certificate.evidence, PartitionTree)),
+    ):
+        if found != wanted:
+            raise SoundnessError(
+                f"the checker's answer must be about the certificate that the report shows; {what}: the answer has "
+                f"{found}, the certificate {wanted}. Read the file once and check the bytes that were read."
+            )
+    if isinstance(certificate.evidence, TrustedSolver):
+        solver = f"{certificate.evidence.solver} {certificate.evidence.version}"
+        return Status(
+            "TRUSTED",
+            f"The checker checked what is exact: {_checked(certificate.kind)}. All else, above all that V̇ "
+            f"is negative, is the word of {solver}, which nothing here can check. It is not a proof.",
+        )
+    return Status("ACCEPTED", "The independent checker accepted the certificate.")
+
+
+def _checked(kind: str) -> str:
+    """What is checked whatever the evidence is."""
+    names = {"Lyapunov function": "P", "Equilibrium": "P, the equilibrium", "Domain": "the domain"}
+    return ", ".join(names[name] for name, _, _ in words_for(kind).parts if name in CHECKED_ALWAYS)
+
+
+def render_html(
+    certificate: Certificate,
+    answer: Mapping[str, Any] | None,
+    result: Mapping[str, Any] | None,
+    certificate_path: Path,
+    *,
+    sha256: str | None = None,
+    size: int | None = None,
+) -> str:
+    """The report as one HTML document.
+
+    Read the file once, with `read_raw`; take the certificate from these bytes with `parse_certificate`, their sha256
+    and size, and the answer of `certify.roa.run_checker` about a private file that holds them.
+
+    Parameters
+    ----------
+    certificate : what is shown.
+    answer : what the checker said; None if it was not run.
+    result : `RoaResult.to_dict()` of the run that made the certificate; None if there is none.
+    certificate_path : for its name alone; nothing is read from it.
+    sha256, size : of the bytes that the certificate was parsed from. Without them, those of the bytes that
+        `write_certificate` writes for it: the answer must then be about exactly such a file.
+
+    Raises
+    ------
+    SoundnessError : the answer is not about these bytes.
+    InputError : the result is not of the run that made the certificate.
+    """
+    import jinja2
+
+    if sha256 is None:
+        raw = certificate.to_json().encode("utf-8")
+        sha256, size = hashlib.sha256(raw).hexdigest(), len(raw)
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
+    source = resources.files("certify.report").joinpath("template.html").read_text(encoding="utf-8")
+    status = status_of(certificate, sha256, answer)
+    if result is not None and (result["policy"]["sha256"], result["levels"].get("roa")) != (
+        certificate.network.sha256(),
+        certificate.roa,
+    ):
+        raise InputError("`result` must be of the run that made the certificate; its policy or level is another.")
+    words = words_for(certificate.kind)
+    pictures: list[Picture] = []
+    roa, trouble = None, ""
+    try:
+        pictures, roa = draw(certificate, status.accepted)
+    except np.linalg.LinAlgError as error:
+        trouble = f"There are no figures: floating point cannot draw them: {error}"
+    except (CertifyError, ValueError, ArithmeticError) as error:
+        if status.accepted:
+            raise
+        trouble = f"There are no figures: {error}"  # a rejected file need not make sense
+    page = environment.from_string(source).render(
+        status=status,
+        words=words,
+        replayed=isinstance(certificate.evidence, PartitionTree),
+        pictures=pictures,
+        trouble=trouble,
+        claim=_claim(certificate, answer if status.accepted else None),
+        plant=_plant(certificate),
+        tables=_tables(certificate, status, answer, result, sha256, size),
+        matrix=[[repr(float(v)) for v in row] for row in certificate.P],
+        roa=None if roa is None else _simulated(roa, certificate),
+        provenance=sorted((str(k), str(v)) for k, v in certificate.provenance.items()),
+        file=certificate_path.name,
+        not_proved=_not_proved(certificate, words),
+    )
+    return str(page).encode("utf-8", "replace").decode("utf-8")  # a file's text may hold half a surrogate pair
+
+
+def _plant(certificate: Certificate) -> dict[str, Any]:
+    system, units = certificate.system, certificate.system.units
+    expressions = system.exact_dynamics()
+
+    def interval(name: str, bounds: tuple[Fraction, Fraction]) -> str:
+        lo, hi = bounds
+        return f"{symbol(name)} ∈ [{below(lo)}, {above(hi)}] {pretty_unit(units.get(name, ''))}".rstrip()
+
+    names = system.states + system.inputs
+    equilibrium = zip(system.inputs, system.exact_u_eq(), strict=True)
+    return {
+        "name": system.name,
+        "equations": [_equation(s, e, names) for s, e in zip(system.states, expressions, strict=True)],
+        "rounded": any(_is_long(v) for e in expressions for v in e.atoms(sympy.Rational)),
+        "domain": [interval(s.name, b) for s, b in zip(system.states, system.domain, strict=True)],
+        "inputs": [interval(s.name, b) for s, b in zip(system.inputs, system.input_bounds, strict=True)],
+        "u_eq": ", ".join(f"{symbol(s.name)} = {u}" for s, u in equilibrium),
+    }
+
+
+def _equation(state: sympy.Symbol, expression: sympy.Expr, names: Sequence[sympy.Symbol]) -> Any:
+    """`state' = expression` as MathML, which browsers typeset without help."""
+    from markupsafe import Markup
+    from sympy.printing.mathml import MathMLPresentationPrinter
+
+    # Markers first: a pretty name may be the plain name of another symbol.
+    markers = {s: sympy.Symbol(f"NAME{k}NAME") for k, s in enumerate(names)}
+    long = {v: sympy.Float(v, 8) for v in expression.atoms(sympy.Rational) if _is_long(v)}
+    text = MathMLPresentationPrinter().doprint(expression.xreplace(long).xreplace(markers))
+    for k, s in enumerate(names):
+        text = text.replace(f"<mi>NAME{k}NAME</mi>", _identifier(s.name))
+    text = text.replace("<mo>-</mo>", f"<mo>{MINUS}</mo>")
+    text = text.replace("<mo>&InvisibleTimes;</mo>", '<mspace width="0.15em"/>')
+    left = f"<mfrac><mrow><mi>d</mi>{_identifier(state.name)}</mrow><mrow><mi>d</mi><mi>t</mi></mrow></mfrac>"
+    inner = text.removeprefix("<math>").removesuffix("</math>")
+    return Markup(f'<math display="block">{left}<mo>=</mo>{inner}</math>')
+
+
+def _identifier(name: str) -> str:
+    """A name in MathML; the dot of a derivative is set above."""
+    base = name.removesuffix("_dot")
+    if base and base != name:
+        return f"<mover>{_identifier(base)}<mo>˙</mo></mover>"
+    return f"<mi>{_escape(symbol(name))}</mi>"
+
+
+def _escape(text: str) -> str:
+    from markupsafe import escape
+
+    return str(escape(text))
+
+
+def _is_long(value: sympy.Rational) -> bool:
+    return max(abs(int(value.p)), int(value.q)) > _LONG
+
+
+def _claim(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict[str, Any]:
+    """The claim of FORMAT.md in words and numbers, and what the checker showed of each part.
+
+    Of a solver's word the checker shows only the exact parts; the others say whose word they are.
+    """
+    system, words, evidence = certificate.system, words_for(certificate.kind), certificate.evidence
+    units = {s.name: pretty_unit(system.units.get(s.name, "")) for s in (*system.states, *system.inputs)}
+    drawable = is_ellipsoid(certificate)
+    reach = extents(certificate.P, certificate.roa) if drawable else [math.nan] * system.n
+    sides = [
+        f"|{symbol(s.name)}| ≤ {kept_apart(float(e), min(-lo, hi))} {units[s.name]}".rstrip()
+        for s, e, (lo, hi) in zip(system.states, reach, system.domain, strict=True)
+    ]
+    bounds = [
+        f"{below(lo)} ≤ {symbol(s.name)} ≤ {above(hi)} {units[s.name]}".rstrip()
+        for s, (lo, hi) in zip(system.inputs, system.input_bounds, strict=True)
+    ]
+    margins = answer.get("margins", {}) if answer else {}
+    local, ring = margins.get("local"), margins.get("ring")
+    notes = {"Domain": "; ".join(sides) + "." if drawable else "", "Inputs": "; ".join(bounds) + "."}
+    if local:
+        notes["Local"] = f"Margin of the linear part over the remainder: {below(100 * local, 3)} %."
+    if answer and certificate.kind == "asymptotic" and certificate.inner == certificate.roa:
+        notes["Ring"] = "As c₁ = c₂, the local part covers the whole set."
+    elif answer:
+        shown = f"Shown on {answer.get('ring_leaves', 0):,} of {answer.get('leaves', 0):,} leaves"
+        notes["Ring"] = f"{shown}; the smallest bound on {MINUS}V̇ is {below(ring, 3)}." if ring is not None else shown
+    parts = []
+    for name, condition, shown_by in words.parts:
+        note = notes.get(name, "")
+        if isinstance(evidence, TrustedSolver):
+            text = f"{condition.rstrip('.')}."
+            by = "Checked in exact arithmetic." if name in CHECKED_ALWAYS else f"Not checked: {evidence.solver}'s word."
+            note = f"{by} {note}".rstrip()
+        else:
+            text = f"{condition}, {shown_by}." if shown_by else condition
+        parts.append((name, text, note))
+    inner, outer = inner_level(certificate.kind, certificate.inner), below(certificate.roa)
+    return {
+        "statement": words.statement.format(inner=inner, outer=outer),
+        "level": outer,
+        "inner": inner,
+        "bounds": bounds,
+        "parts": parts,
+    }
+
+
+def _not_proved(certificate: Certificate, words: Words) -> list[tuple[str, str]]:
+    items = [
+        *words.excluded[:-1],
+        (
+            "Anything outside the set.",
+            "The true set may be larger: what starts outside {V ≤ c₂} may do the same or not.",
+        ),
+        (
+            "Any other plant.",
+            "The claim is about the equations above with exactly these numbers: no other mass, no friction, "
+            "flexibility or actuator lag that is not in them.",
+        ),
+        ("Disturbances.", "No wind, no sensor noise, no estimation error, no delay."),
+        (
+            "A sampled controller.",
+            "u = π(x) acts in continuous time. An action that is held between samples is another closed loop.",
+        ),
+        (
+            "Rounding in the controller.",
+            "The policy is evaluated in exact real arithmetic on its binary64 numbers; an embedded float32 evaluation "
+            "differs by its rounding errors.",
+        ),
+        *words.excluded[-1:],
+        ("Wrapped angles.", "States are real numbers: an angle of a full turn is not the origin."),
+        (
+            "Simulated figures.",
+            "Trajectories, grids and the share of the simulated region are illustrations in floating point.",
+        ),
+    ]
+    if certificate.system.n > 2:
+        items.append(
+            (
+                "The sections as wholes.",
+                "A section shows two states with all others 0; the claim is about all states together.",
+            )
+        )
+    return items
+
+
+def _tables(
+    certificate: Certificate,
+    status: Status,
+    answer: Mapping[str, Any] | None,
+    result: Mapping[str, Any] | None,
+    sha256: str,
+    size: int | None,
+) -> dict[str, Any]:
+    system, P, network, words = certificate.system, certificate.P, certificate.network, words_for(certificate.kind)
+    state_units = [system.units.get(s.name, "") for s in system.states]
+    levels = [(f"{words.inner}, {words.inner_word}", repr(certificate.inner)), ("c₂, enlarged", repr(certificate.roa))]
+    reach: list[tuple[str, str, str, str]] = []
+    size_of_set: list[tuple[str, str]] = []
+    if is_ellipsoid(certificate):
+        limit = domain_limit(P, system.domain)
+        share = below(100 * Fraction(certificate.roa) / Fraction(limit), 4) if limit > 0 else "?"
+        levels.append(("domain's limit", f"{below(limit, 10)}, of which c₂ is {share} %"))
+        size_of_set.append(
+            (volume_name(system.n), f"{below(volume(P, certificate.roa))} {volume_unit(state_units)}".rstrip())
+        )
+        columns = (state_units, semi_axes(P, certificate.roa), extents(P, certificate.roa), system.domain)
+        reach = [
+            (label(s.name, unit), below(float(axis)), above(float(extent)), f"[{below(lo)}, {above(hi)}]")
+            for s, unit, axis, extent, (lo, hi) in zip(system.states, *columns, strict=True)
+        ]
+    if result is not None:
+        levels.append(("limited by", limited_by(result)))
+        sampled = result["levels"].get("sampled_limit")
+        if sampled is not None:
+            levels.append(("lowest V of a violation found", number(sampled, 10)))
+    geometry: list[tuple[str, str]] = []
+    if np.all(np.isfinite(P)):
+        geometry.append(("eigenvalues of P", ", ".join(number(float(v)) for v in np.linalg.eigvalsh(P))))
+    if certificate.kind == "asymptotic":  # elsewhere the origin need not be an equilibrium
+        geometry.append(("eigenvalues of the closed loop", _eigenvalues(certificate)))
+    evidence = [
+        ("policy", f"{'-'.join(map(str, network.layers))} tanh, squash {network.squash}, centre {network.centre}"),
+        ("policy sha256", network.sha256()),
+        ("certificate sha256", sha256),
+    ]
+    if size is not None:
+        evidence.append(("certificate size", f"{size:,} bytes"))
+    if isinstance(certificate.evidence, TrustedSolver):
+        solver = certificate.evidence
+        evidence.append(("solver", f"{solver.solver} {solver.version}, delta {number(solver.precision)}"))
+        evidence += [(f"its answer to {name}", said) for name, said in solver.queries]
+    elif answer is not None and status.accepted:
+        leaves = f"{answer.get('leaves', 0):,}, of which {answer.get('ring_leaves', 0):,} in the ring"
+        evidence.append(("leaves", leaves))
+    run: list[tuple[str, str]] = []
+    if result is not None:
+        if result.get("boxes"):
+            run.append(("boxes examined", f"{result['boxes']:,}"))
+        run += [(f"{k}", seconds(v)) for k, v in result["seconds"].items() if v is not None]
+        asked = result.get("solver") or {}
+        for q in asked.get("queries", []):
+            about = f"{asked['solver']} {asked['version']} on {q['query']}, V <= {number(q['level'])}"
+            run.append((about, f"{q['answer']}, {seconds(q['seconds'])}"))
+    unit = volume_unit(state_units)
+    candidates = [
+        (
+            row["candidate"],
+            below(row["level"]),
+            f"{below(row['volume'])} {unit}".rstrip(),
+            "the domain" if row["limited_by"] == "domain" else "a violation found",
+            "the one of this certificate" if row["proved"] else "",
+        )
+        for row in (result or {}).get("candidates", [])
+    ]
+    return {
+        "levels": levels,
+        "size": size_of_set,
+        "geometry": geometry,
+        "reach": reach,
+        "evidence": evidence,
+        "run": run,
+        "candidates": candidates,
+    }
+
+
+def _simulated(roa: SimulatedRoa, certificate: Certificate) -> dict[str, str]:
+    return {
+        "fraction": ABSENT if np.isnan(roa.fraction) else f"{100 * roa.fraction:.1f} %",
+        "grid": f" {TIMES} ".join(str(len(a)) for a in roa.axes),
+        "attracted": f"{int(roa.attracted.sum()):,} of {roa.attracted.size:,}",
+        "step": f"{number(roa.step, 3)} s",
+        "horizon": f"{number(roa.horizon, 3)} s",
+        "undecided": f"{roa.undecided:,}",
+        "contradictions": f"{roa.contradictions:,}" if roa.contradictions else "",
+        "of": volume_name(certificate.system.n),
+        "who": words_for(certificate.kind).simulated,
+    }
+
+
+def _eigenvalues(certificate: Certificate) -> str:
+    try:
+        A, _, _ = ClosedLoop(certificate.system, certificate.network).linearise()
+    except CertifyError as error:
+        return str(error)
+    return ", ".join(_complex(complex(v)) for v in sorted(np.linalg.eigvals(A), key=lambda v: (v.real, v.imag)))
+
+
+def _complex(value: complex) -> str:
+    if value.imag == 0:
+        return number(value.real, 5)
+    return f"{number(value.real, 5)} {'+' if value.imag > 0 else MINUS} {number(abs(value.imag), 5)}i"

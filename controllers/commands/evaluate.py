@@ -1,0 +1,52 @@
+"""`controllers evaluate`."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from controllers.commands.shared import Json, emit, errors
+
+if TYPE_CHECKING:
+    from controllers.evaluate import Evaluation, Settling
+
+
+def evaluate(
+    policy: Annotated[Path, typer.Argument(help="The policy file.")],
+    states: Annotated[int, typer.Option(help="Number of initial states.")] = 1000,
+    seed: Annotated[int, typer.Option(help="Seed of the initial states.")] = 0,
+    as_json: Json = False,
+) -> None:
+    """Simulate a policy from random initial states and compare it with its learned gain."""
+    with errors(as_json):
+        from certify.policies import load_policy
+        from controllers.evaluate import EvaluationOptions
+        from controllers.evaluate import evaluate as judge
+
+        options = EvaluationOptions(states=states, seed=seed)
+        result = judge(load_policy(policy), options)
+        emit(result.as_json() if as_json else _table(result), as_json)
+
+
+def _table(result: Evaluation) -> dict[str, Any]:
+    def settling(s: Settling) -> str:
+        return (
+            f"{s.settled} of {s.states} settled (step {s.step:.4g} s), {s.left_domain} left the domain, "
+            f"largest final norm {s.largest:.1e}, median cost {s.cost:.4g}"
+        )
+
+    A_error, B_error = 100 * result.A_relative_error, 100 * result.B_relative_error
+    learned = not math.isnan(result.gain_relative)
+    return {
+        "system": result.system,
+        "sha256": result.sha256,
+        "||J+K||/||K||": f"{100 * result.gain_relative:.3g} %" if learned else None,
+        "learned A, B": f"off by {A_error:.2g} % and {B_error:.2g} %" if learned else None,
+        "curvature": None if math.isnan(result.curvature) else f"{result.curvature:.4g}",
+        "eigenvalues": ", ".join(f"{e:.4g}" for e in result.eigenvalues),
+        "continuous": settling(result.continuous),
+        "held": settling(result.held),
+    }

@@ -1,0 +1,49 @@
+"""What the commands share: the arguments they all have, how they print, and how bad input ends."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Annotated, Any
+
+import typer
+
+from certify.errors import CertifyError
+from controllers.options import TrainingOptions, preset
+
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
+PlantName = Annotated[str, typer.Argument(help="The plant, for instance pendulum.")]
+Steps = Annotated[int | None, typer.Option("--steps", help="Environment steps of a run; default: the preset's.")]
+
+
+def options_of(plant: str, **chosen: Any) -> TrainingOptions:
+    """The options that `plant` trains with, those replaced that were chosen; None means not chosen.
+
+    Raises
+    ------
+    InputError : no such plant, or a chosen value is out of its range.
+    """
+    return replace(preset(plant), **{name: value for name, value in chosen.items() if value is not None})
+
+
+@contextmanager
+def errors(as_json: bool) -> Iterator[None]:
+    """Bad input ends in one sentence and exit status 2."""
+    try:
+        yield
+    except (CertifyError, OSError) as error:
+        if as_json:
+            typer.echo(json.dumps({"error": str(error)}))
+        typer.echo(f"Error: {error}", err=True)
+        raise typer.Exit(2) from error
+
+
+def emit(result: dict[str, Any], as_json: bool) -> None:
+    if as_json:
+        typer.echo(json.dumps(result))
+        return
+    width = max(map(len, result))
+    for name, value in result.items():
+        typer.echo(f"{name:<{width}}  {'-' if value is None else value}")

@@ -1,0 +1,177 @@
+"""`controllers train`: its options are the fields of `TrainingOptions`, so that none can exist in one place only."""
+
+from __future__ import annotations
+
+import inspect
+import math
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import fields
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin, get_type_hints
+
+import typer
+
+from certify.errors import InputError
+from controllers.commands.shared import Json, PlantName, emit, errors, options_of
+from controllers.files import make_folder, read, require_writable
+from controllers.options import TrainingOptions
+
+if TYPE_CHECKING:
+    from certify.policies import Policy
+    from controllers.training import Trainer
+
+
+def train(
+    plant: PlantName,
+    out: Annotated[Path, typer.Option("--out", help="The policy file to write.")],
+    log: Annotated[Path | None, typer.Option("--log", help="CSV file of episodes and returns.")] = None,
+    checkpoint_dir: Annotated[
+        Path | None, typer.Option("--checkpoint-dir", help="Folder that keeps checkpoint.pt.")
+    ] = None,
+    checkpoint_every: Annotated[int, typer.Option("--checkpoint-every", help="Steps between checkpoints.")] = 10_000,
+    evaluations: Annotated[
+        Path | None, typer.Option("--evaluations", help="CSV file of the evaluations during the run.")
+    ] = None,
+    evaluate_every: Annotated[
+        int, typer.Option("--evaluate-every", help="Steps between evaluations during the run; 0 means none.")
+    ] = 10_000,
+    device: Annotated[str, typer.Option("--device", help="Where the networks live: cpu or cuda.")] = "cpu",
+    resume: Annotated[bool, typer.Option("--resume", help="Go on from checkpoint.pt in --checkpoint-dir.")] = False,
+    as_json: Json = False,
+    **chosen: Any,  # one optional value for each field of TrainingOptions; the signature below names them
+) -> None:
+    """Train a policy: soft actor-critic tied to a learned LQR gain.
+
+    Options that are not given take the plant's preset; the policy file records them all.
+    """
+    with errors(as_json):
+        options = options_of(plant, **_given(chosen))
+        from certify.policies import save_policy
+        from certify.systems import get_system
+        from controllers.logs import Episode, Log, Monitored
+        from controllers.sac import find_device
+        from controllers.training import Trainer
+        from controllers.training import train as run
+
+        if checkpoint_every < 1:
+            raise InputError(f"`checkpoint_every` must be positive; found {checkpoint_every}.")
+        if evaluate_every < 0:
+            raise InputError(f"`evaluate_every` must be at least 0; found {evaluate_every}.")
+        if evaluations is not None and not evaluate_every:
+            raise InputError("`--evaluations` needs an `--evaluate-every` above 0.")
+        for path in filter(None, (out, log, evaluations)):
+            require_writable(path)
+        trainer = Trainer(get_system(plant), options, find_device(device))
+        checkpoint = _checkpoint(checkpoint_dir, resume)
+        if resume and checkpoint is not None:
+            trainer.restore(read(checkpoint))
+        with ExitStack() as stack:
+            episodes = None if log is None else stack.enter_context(Log(log, Episode))
+            rows = None if evaluations is None else stack.enter_context(Log(evaluations, Monitored))
+            show = stack.enter_context(_progress(trainer))
+
+            def report(trainer: Trainer) -> None:
+                if episodes is not None:
+                    episodes.extend(trainer.episodes)
+                if rows is not None:
+                    rows.extend(trainer.monitored)
+                show(trainer)
+
+            policy = run(trainer, report, checkpoint, checkpoint_every, evaluate_every)
+        save_policy(out, policy)
+        emit(_trained(policy, out), as_json)
+
+
+def _signature() -> inspect.Signature:
+    own = inspect.signature(train, eval_str=True).parameters.values()
+    parameters = [p for p in own if p.kind is not inspect.Parameter.VAR_KEYWORD]
+    hints = get_type_hints(TrainingOptions, include_extras=True)
+    for option in fields(TrainingOptions):
+        kind, text = get_args(hints[option.name])
+        plain: Any = kind if kind in (int, float) else str  # tuples and choices are text here
+        flag = typer.Option("--" + option.name.replace("_", "-"), help=text)
+        annotation = Annotated[plain | None, flag]
+        parameters.append(
+            inspect.Parameter(option.name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
+        )
+    return inspect.Signature(parameters)
+
+
+def _given(chosen: dict[str, Any]) -> dict[str, Any]:
+    """The options that were given, tuples parsed from text such as `1,0.5`."""
+    hints = get_type_hints(TrainingOptions)
+    values = {name: value for name, value in chosen.items() if value is not None}
+    for name, value in values.items():
+        if get_origin(hints[name]) is tuple:
+            number = get_args(hints[name])[0]
+            try:
+                values[name] = tuple(number(part) for part in value.split(","))
+            except ValueError as error:
+                raise InputError(
+                    f"`{name}` must be numbers separated by commas, such as 1,2; found {value!r}."
+                ) from error
+    return values
+
+
+def _checkpoint(folder: Path | None, resume: bool) -> Path | None:
+    if folder is None:
+        if resume:
+            raise InputError("`--resume` needs `--checkpoint-dir`, the folder that holds checkpoint.pt.")
+        return None
+    path = folder / "checkpoint.pt"
+    if resume and not path.is_file():
+        raise InputError(f"there is no checkpoint {path} to resume from; begin without `--resume`.")
+    make_folder(folder)
+    require_writable(path)
+    return path
+
+
+@contextmanager
+def _progress(trainer: Trainer) -> Iterator[Callable[[Trainer], None]]:
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        TextColumn("return {task.fields[mean]}  |J+K| {task.fields[distance]}  settled {task.fields[settled]}"),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+        steps = trainer.options.steps
+        task = progress.add_task("", total=steps, completed=trainer.steps_done, mean="-", distance="-", settled="-")
+
+        def show(trainer: Trainer) -> None:
+            if trainer.steps_done % 200 and trainer.steps_done != steps:
+                return
+            totals = [e.total for e in trainer.episodes if e.kind == "training"][-10:]
+            mean = f"{sum(totals) / len(totals):.1f}" if totals else "-"
+            last = trainer.monitored[-1].settled if trainer.monitored else math.nan
+            progress.update(
+                task,
+                completed=trainer.steps_done,
+                mean=mean,
+                distance=f"{trainer.distance()[0]:.1e}",
+                settled="-" if math.isnan(last) else f"{last:.0%}",
+            )
+
+        yield show
+
+
+def _trained(policy: Policy, out: Path) -> dict[str, Any]:
+    training = policy.training
+    return {
+        "policy": str(out),
+        "sha256": policy.network.sha256(),
+        "layers": list(policy.network.layers),
+        "steps": training["steps"],
+        "seed": training["seed"],
+        "K": training.get("K"),
+        "distance": training.get("distance"),
+        "curvature": training["curvature"],
+    }
+
+
+train.__signature__ = _signature()  # type: ignore[attr-defined]
+train.__annotations__ = {}
