@@ -26,6 +26,7 @@ import numpy as np
 import pytest
 import sympy
 import torch
+from certify.systems.trees import to_tree
 from flint import arb, ctx
 from numpy.typing import NDArray
 
@@ -40,7 +41,6 @@ from certify.enclosures import taylor as producer_taylor
 from certify.policies import TanhNetwork
 from certify.policies.network import Centre, Squash
 from certify.systems import System, get_system
-from certify.systems.trees import to_tree
 from tests.support.certificates import make, parse
 from tests.support.loops import box
 from tests.support.oracle import Array, awkward, policies_in_arb, policy_in_arb, value_of

@@ -224,7 +224,8 @@ class _Writer:
         for monomial, c in value.items():
             term = ball(c)
             for atom, k in monomial:
-                term *= self._balls[atom] ** k
+                for _ in range(k):
+                    term *= self._balls[atom]
             total += term
         return total
 
