@@ -125,9 +125,8 @@ def test_domain_queries_are_satisfied_beyond_the_limit_only() -> None:
         level = half**2 / inverse[k, k]
         touching[k] = half
         for outer, expected in ((0.999 * level, False), (1.001 * level, True)):
-            above = {c.name: query(c, case.problem) for c in domain_conditions(case.problem, outer)}[
-                f"domain-x{k + 1}-above"
-            ]
+            sides = {c.name: query(c, case.problem) for c in domain_conditions(case.problem, outer)}
+            above = sides[f"domain-x{k + 1}-above"]
             assert holds(above, touching) is expected
 
 

@@ -5,6 +5,7 @@ Most tests put a script in the place of the `dreal` binary or of single answers,
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -368,10 +369,8 @@ def test_a_module_of_the_same_name_in_the_folder_is_never_imported(
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.setenv("PATH", "")
-    try:
+    with contextlib.suppress(BackendError):
         assert find_backend().version != "planted"
-    except BackendError:
-        pass
     child = Backend("module", (sys.executable, "-I", str(Path(dreal.__file__).with_name("child.py"))), "")
     decide(child, query(ring_condition(0.5, 1.0), case_of(*scalar_tanh()).problem), 1e-3, 1, 30.0)
     assert not marker.exists()
@@ -383,12 +382,9 @@ def test_the_child_refuses_a_number_that_binary64_does_not_hold(tmp_path: Path) 
     child = Path(dreal.__file__).with_name("child.py")
     stated = {"variables": [], "definitions": [["t.0", "3/20"]], "constraints": [], "precision": 1e-3, "jobs": 1}
     command = [sys.executable, "-c", f"import runpy; runpy.run_path({str(child)!r}, run_name='__main__')"]
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path)}
     done = subprocess.run(
-        command,
-        input=json.dumps(stated),
-        capture_output=True,
-        text=True,
-        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        command, input=json.dumps(stated), capture_output=True, text=True, env=environment, check=False
     )
     assert done.returncode != 0 and "3/20 is no binary64 number" in done.stderr
 
