@@ -61,7 +61,7 @@ def by_bounds(case: Case, inner: float, outer: float) -> str:
     if witness is not None and witness.kind == "vdot" and inner <= witness.level <= outer:
         return "REFUTED"
     proof = prove_outwards(case.problem, case.T, inner, outer, Budget(boxes=50_000), ThreadRunner())
-    return "PROVED" if proof.level >= outer else "UNKNOWN"
+    return "PROVED" if proof.outer >= outer else "UNKNOWN"
 
 
 def by_codac(case: Case, inner: float, outer: float) -> str:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import random
 import shutil
 import stat
 import subprocess
@@ -396,7 +397,7 @@ def sums_of_like_terms() -> list[Query]:
     """Each holds everywhere on [1, 2]; rounded coefficients say that it holds nowhere."""
     x, between = "x", (("x", Fraction(1), Fraction(2)),)
     tenth, fifth, third = (str(Fraction(v)) for v in (0.1, 0.2, 0.3))  # binary64: 0.1 + 0.2 > 0.3 by less than a unit
-    rationals = ["-", ["+", ["/", x, "10"], ["/", x, "5"]], ["/", ["*", "3", x], "10"]]
+    rationals = ["-", ["+", ["*", "1/10", x], ["*", "1/5", x]], ["*", "3/10", x]]
     doubles = ["-", ["*", "3", ["*", tenth, x]], ["*", str(3 * Fraction(0.1)), x]]
     squares = ["-", ["*", tenth, ["*", tenth, x]], ["*", str(Fraction(0.1) ** 2), x]]
     shifted = ["-", ["+", ["*", tenth, ["+", x, "1"]], ["*", fifth, ["+", x, "1"]]], ["*", third, ["+", x, "1"]]]
@@ -408,6 +409,33 @@ def sums_of_like_terms() -> list[Query]:
         Query("squares", between, (), ((squares, ">=", "0"), (squares, "<=", "0"))),
         Query("shifted", between, (("s", shifted),), (("s", ">=", str(2 * gap)), ("s", "<=", str(3 * gap)))),
     ]
+
+
+def nearly_nothing(seed: int) -> Query:
+    """A sum that comes to hardly more than 0, asked to have the very value that it has at some point of its box."""
+    generator = random.Random(seed)
+    x, y = (Fraction(generator.randint(101, 199), 100) for _ in range(2))
+    known = {"x": x, "y": y, "xy": x * y, "xx": x**2, "x/(x+y+1)": x / (x + y + 1), "x+y": x + y}
+    trees = {
+        "x": "x",
+        "y": "y",
+        "xy": ["*", "x", "y"],
+        "xx": ["**", "x", 2],
+        "x/(x+y+1)": ["/", "x", ["+", "x", "y", "1"]],
+    }
+    trees["x+y"] = ["+", "x", "y"]
+    terms, value = [], Fraction(0)
+    for name in generator.sample(sorted(known), generator.randint(1, 3)):
+        numbers = [Fraction(generator.uniform(-1, 1)) for _ in range(2)]
+        numbers.append(Fraction(generator.randint(-9, 9), generator.randint(1, 12)))
+        numbers.append(-Fraction(float(sum(numbers))))
+        for c in numbers:
+            k = generator.choice([Fraction(1), Fraction(3, 7), Fraction(generator.uniform(0.5, 2))])
+            terms.append(["*", str(k), ["*", str(c / k), trees[name]]])
+        value += sum(numbers) * known[name]
+    generator.shuffle(terms)
+    box = (("x", Fraction(1), Fraction(2)), ("y", Fraction(1), Fraction(2)))
+    return Query(f"seed {seed}", box, (("s", ["+", *terms]),), (("s", ">=", str(value)), ("s", "<=", str(value))))
 
 
 def genuine_violation(case: Case, x: np.ndarray) -> bool:
@@ -467,6 +495,9 @@ def test_real_dreal_on_the_pendulum(real: Backend, tmp_path: Path) -> None:
 
 def test_real_dreal_rounds_no_sum_of_like_terms(real: Backend) -> None:
     for asked in sums_of_like_terms():
+        assert decide(real, asked, 1e-3, 1, 60.0).status == "delta-sat", asked.name
+    for seed in range(20):
+        asked = nearly_nothing(seed)
         assert decide(real, asked, 1e-3, 1, 60.0).status == "delta-sat", asked.name
     never = Query("never", (("x", Fraction(1), Fraction(2)),), (), (("x", "<=", "1/2"),))
     assert decide(real, never, 1e-3, 1, 60.0).status == "unsat"
