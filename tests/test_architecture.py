@@ -1,33 +1,49 @@
-"""The arrows of the design: who may import whom, and what start-up loads."""
+"""The arrows of the design: who imports whom, and what start-up loads."""
 
 from __future__ import annotations
 
 import ast
 import subprocess
 import sys
+from collections.abc import Callable
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
 
 ROOT = Path(__file__).parent.parent
-ARROWS = {  # package -> what of the project it may import, besides errors and verdict
-    "certify.systems": set(),
-    "certify.policies": set(),
-    "certify.closed_loop": {"certify.systems", "certify.policies"},
-    "certify.obligations": {"certify.closed_loop", "certify.systems"},
-    "certify.lyapunov": {"certify.closed_loop", "certify.systems", "certify.policies"},
-    "certify.enclosures": {"certify.closed_loop", "certify.systems", "certify.policies"},
-    "certify.engines": {
-        "certify.obligations", "certify.lyapunov", "certify.enclosures", "certify.closed_loop", "certify.systems",
-        "certify.policies",
-    },
-    "certify.certificate": {"certify.obligations", "certify.lyapunov", "certify.systems", "certify.policies"},
-    "certify.report": {
-        "certify.certificate", "certify.lyapunov", "certify.closed_loop", "certify.systems", "certify.policies",
-        "certify.obligations",
-    },
-    "controllers": {"certify.systems", "certify.policies"},
-}  # fmt: skip
+LEAVES = {"errors", "verdict"}  # anybody may import these, and they import nothing
+ENTRY = {"cli", "__main__"}  # these may import anything of certify
+EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows that exist
+    "arguments": "policies systems",
+    "certificate": "claims expressions lyapunov policies systems",
+    "claims": "closed_loop expressions lyapunov policies",
+    "closed_loop": "expressions policies systems",
+    "enclosures": "closed_loop expressions rigorous",
+    "engines": "certificate claims enclosures expressions policies rigorous running systems",
+    "lyapunov": "closed_loop",
+    "report": "certificate closed_loop lyapunov policies systems",
+    "results": "claims engines lyapunov policies systems",
+    "rigorous": "closed_loop expressions policies",
+    "roa": "certificate claims closed_loop engines lyapunov policies results rigorous running systems",
+    "systems": "expressions",
+    "controllers": "policies systems",
+}
+
+
+def unit(module: str) -> str:
+    """The module or package just below `certify` that a module belongs to; `controllers` is one unit."""
+    parts = module.split(".")
+    return parts[0] if parts[0] == "controllers" else ".".join(parts[1:2]) or "certify"
+
+
+def units() -> dict[str, list[Path]]:
+    """Every unit with its files."""
+    found: dict[str, list[Path]] = {}
+    for path in [*ROOT.glob("certify/**/*.py"), *ROOT.glob("controllers/**/*.py")]:
+        name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        found.setdefault(unit(name), []).append(path)
+    return found
 
 
 def imports(path: Path) -> set[str]:
@@ -48,13 +64,44 @@ def modules(name: str) -> list[Path]:
     return sorted(place.rglob("*.py")) if place.is_dir() else [place.with_suffix(".py")]
 
 
-@pytest.mark.parametrize("name", sorted(ARROWS))
-def test_arrows(name: str) -> None:
-    allowed = {name, "certify.errors", "certify.verdict", *ARROWS[name]}
-    for path in modules(name):
-        for imported in imports(path):
-            if imported.split(".")[0] in ("certify", "controllers"):
-                assert any(imported == a or imported.startswith(a + ".") for a in allowed), f"{path}: {imported}"
+def arrows() -> dict[str, set[str]]:
+    """Unit to the units of the project that it imports, at any depth of the code."""
+    found = {}
+    for name, paths in units().items():
+        names = {i for path in paths for i in imports(path) if i.split(".")[0] in ("certify", "controllers")}
+        found[name] = {unit(i) for i in names} - {name}
+    return found
+
+
+def test_the_arrows_are_exactly_these() -> None:
+    found = {name: " ".join(sorted(to - LEAVES)) for name, to in arrows().items() if name not in ENTRY | {"__init__"}}
+    assert {name: to for name, to in found.items() if to} == EDGES
+
+
+def module_arrows() -> dict[str, set[str]]:
+    """Module to the modules of the project that it imports when it is loaded or run; not what only types need."""
+    paths = {path for found in units().values() for path in found}
+    names = {".".join(p.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): p for p in paths}
+    found = {}
+    for name, path in names.items():
+        tree = ast.parse(path.read_text())
+        hidden = {id(n) for block in ast.walk(tree) if _for_types_only(block) for n in ast.walk(block)}
+        wanted = set()
+        for node in ast.walk(tree):
+            if isinstance(node, ast.ImportFrom) and node.module and id(node) not in hidden and not node.level:
+                inner = [f"{node.module}.{alias.name}" for alias in node.names]
+                wanted |= {i if i in names else node.module for i in inner}
+        found[name] = (wanted & names.keys()) - {name}
+    return found
+
+
+def _for_types_only(node: ast.AST) -> bool:
+    return isinstance(node, ast.If) and isinstance(node.test, ast.Name) and node.test.id == "TYPE_CHECKING"
+
+
+@pytest.mark.parametrize("graph", [arrows, module_arrows])
+def test_there_are_no_circles(graph: Callable[[], dict[str, set[str]]]) -> None:
+    tuple(TopologicalSorter(graph()).static_order())  # raises CycleError, which names one
 
 
 def test_the_checker_stands_alone() -> None:
@@ -65,10 +112,21 @@ def test_the_checker_stands_alone() -> None:
             assert not imported.startswith("certify") or imported.startswith("certify.checker"), f"{path}: {imported}"
 
 
-def test_nobody_imports_the_checker() -> None:
+def test_the_reference_stands_alone() -> None:
+    """The second checker shares nothing with the first, and has no floats but the numbers of a file."""
+    found = modules("certify.reference")
+    assert len(found) > 5
+    for path in found:
+        for imported in imports(path):
+            assert imported.split(".")[0] in sys.stdlib_module_names | {"flint", "certify"}, f"{path}: {imported}"
+            assert not imported.startswith("certify") or imported.startswith("certify.reference"), f"{path}: {imported}"
+
+
+@pytest.mark.parametrize("name", ["checker", "reference"])
+def test_nobody_imports_the_checkers(name: str) -> None:
     for path in [*ROOT.glob("certify/**/*.py"), *ROOT.glob("controllers/**/*.py")]:
-        if "checker" not in path.parts:
-            assert not any(i.startswith("certify.checker") for i in imports(path)), path
+        if name not in path.parts:
+            assert not any(i.startswith(f"certify.{name}") for i in imports(path)), path
 
 
 def test_certify_never_imports_controllers() -> None:
@@ -82,6 +140,7 @@ def test_certify_never_imports_controllers() -> None:
         ("import certify", ["torch", "sympy", "scipy", "numpy", "matplotlib"]),
         ("import certify.cli", ["torch", "sympy", "scipy", "matplotlib"]),
         ("import certify.checker.rules, certify.checker.__main__", ["torch", "sympy", "scipy", "matplotlib"]),
+        ("import certify.reference.__main__", ["torch", "sympy", "scipy", "matplotlib", "numpy", "certify.checker"]),
         ("import certify.systems", ["torch", "scipy", "matplotlib"]),
         ("import certify.report", ["matplotlib", "jinja2"]),
     ],

@@ -2,6 +2,6 @@
 
 It imports nothing from the rest of the project (numpy and python-flint only), searches for nothing and
 trusts nothing in the file. Run it as `python -I -m certify.checker FILE`. The format, the claim and the
-reason why each rule implies it stand in FORMAT.md. Reading order: errors, document, expression, exact,
-float64, taylor, network, local, rules.
+reason why each rule implies it stand in FORMAT.md. Reading order: errors, strict, schema, document, expression,
+exact, float64, elementary, network, case, rules, jets, local, taylor, ring, words.
 """

@@ -9,6 +9,9 @@ import numpy as np
 from flint import fmpq, fmpq_mat
 from numpy.typing import NDArray
 
+from .document import Policy
+from .expression import Functions
+
 Matrix = list[list[Fraction]]
 MAX_BITS = 2**14  # of a number on the tape
 MAX_MATRIX_BITS = 2**15  # of a number in a matrix, times the matrix's size: beyond, an inverse takes minutes
@@ -57,7 +60,7 @@ class Undecided(Exception):
 
 
 @dataclass(frozen=True)
-class Exact:
+class Exact(Functions):
     """A rational on the tape; sin and cos only of exact 0, no division by zero."""
 
     value: Fraction
@@ -71,24 +74,35 @@ class Exact:
     def __mul__(self, other: Exact) -> Exact:
         return Exact(self.small() * other.small())
 
-    def inv(self) -> Exact:
-        if self.value == 0:
-            raise Undecided("division by zero")
-        return Exact(1 / self.value)
-
-    def sin(self) -> Exact:
-        return Exact(self._at_zero("sin", Fraction(0)))
-
-    def cos(self) -> Exact:
-        return Exact(self._at_zero("cos", Fraction(1)))
-
-    def _at_zero(self, name: str, result: Fraction) -> Fraction:
-        if self.value != 0:
-            raise Undecided(f"{name} of a number that is not 0")
-        return result
+    def function(self, name: str) -> Exact:
+        if name == "inv" and self.value != 0:
+            return Exact(1 / self.value)
+        if name == "inv" or self.value != 0:
+            raise Undecided("division by zero" if name == "inv" else f"{name} of a number that is not 0")
+        return Exact(Fraction(int(name == "cos")))
 
     def small(self) -> Fraction:
         """The value itself; powers of powers could grow without end."""
         if max(self.value.numerator.bit_length(), self.value.denominator.bit_length()) > MAX_BITS:
             raise Undecided(f"a number of more than {MAX_BITS} bits")
         return self.value
+
+
+def raw_at_origin(policy: Policy) -> list[Fraction | None]:
+    """raw(0), None where it is not known: tanh is known at exact 0 alone, and 0 times an unknown number is 0."""
+
+    def affine(W: NDArray[np.float64], b: NDArray[np.float64], h: list[Fraction | None]) -> list[Fraction | None]:
+        result: list[Fraction | None] = []
+        for row, bias in zip(W.tolist(), b.tolist(), strict=True):
+            used = [(w, v) for w, v in zip(row, h, strict=True) if w != 0]
+            known = [Fraction(w) * v for w, v in used if v is not None]
+            result.append(sum(known, Fraction(bias)) if len(known) == len(used) else None)
+        return result
+
+    def tanh(h: list[Fraction | None]) -> list[Fraction | None]:
+        return [Fraction(0) if v == 0 else None for v in h]
+
+    h: list[Fraction | None] = [Fraction(0)] * policy.weights[0].shape[1]
+    for k, (W, b) in enumerate(zip(policy.weights, policy.biases, strict=True)):
+        h = affine(W, b, tanh(h) if k else h)
+    return affine(np.diag(policy.scale), policy.offset, tanh(h) if policy.squash == "tanh" else h)

@@ -11,9 +11,10 @@ import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any, TypeVar
+from functools import reduce
+from typing import Any, Self, TypeVar
 
-from .errors import Rejected
+from . import schema, strict
 
 MAX_OPERATIONS, MAX_DEPTH, MAX_EXPONENT = 20_000, 200, 64
 Operation = tuple[Any, ...]  # ("const", q) | ("var", i) | (name, operand indices ...)
@@ -24,13 +25,29 @@ _METHODS: dict[str, Callable[..., Any]] = {
 V = TypeVar("V")
 
 
+class Functions:
+    """The functions of an arithmetic, all by one method of its own: `function("inv")`, `"sin"`, `"cos"`."""
+
+    def function(self, name: str) -> Self:
+        raise NotImplementedError
+
+    def inv(self) -> Self:
+        return self.function("inv")
+
+    def sin(self) -> Self:
+        return self.function("sin")
+
+    def cos(self) -> Self:
+        return self.function("cos")
+
+
 @dataclass(frozen=True)
 class Tape:
-    """`operations` in order of evaluation; `outputs` index the n components of f; `text` is for people."""
+    """`operations` in order of evaluation; `outputs` index the n components of f; `trees` are for people."""
 
     operations: tuple[Operation, ...]
     outputs: tuple[int, ...]
-    text: tuple[str, ...]
+    trees: tuple[Any, ...]
 
 
 def evaluate(tape: Tape, constant: Callable[[Fraction], V], variables: Sequence[V]) -> list[V]:
@@ -51,22 +68,18 @@ def evaluate(tape: Tape, constant: Callable[[Fraction], V], variables: Sequence[
     return [values[i] for i in tape.outputs]
 
 
-def parse_dynamics(trees: list[Any], names: Sequence[str], rational: Callable[[Any, str], Fraction]) -> Tape:
+def parse_dynamics(trees: Sequence[Any], names: Sequence[str]) -> Tape:
     """Compile n trees over `names`; raises `Rejected` under rule `format`."""
-    builder = _Builder({name: i for i, name in enumerate(names)}, rational)
-    outputs, text = [], []
-    for i, tree in enumerate(trees):
-        index, words = builder.build(tree, f"plant.dynamics[{i}]", 0)
-        outputs.append(index)
-        text.append(words)
-    return Tape(tuple(builder.operations), tuple(outputs), tuple(text))
+    builder = _Builder({name: i for i, name in enumerate(names)})
+    outputs = tuple(builder.build(tree, f"plant.dynamics[{i}]", 0) for i, tree in enumerate(trees))
+    return Tape(tuple(builder.operations), outputs, tuple(trees))
 
 
 class _Builder:
     """Appends operations; an operation that already stands on the tape is shared."""
 
-    def __init__(self, names: dict[str, int], rational: Callable[[Any, str], Fraction]) -> None:
-        self.names, self.rational = names, rational
+    def __init__(self, names: dict[str, int]) -> None:
+        self.names = names
         self.operations: list[Operation] = []
         self.known: dict[str, int] = {}
         self.visited = 0
@@ -75,49 +88,47 @@ class _Builder:
         key = " ".join(map(str, operation))  # strings, whose hashes nobody can predict
         if key not in self.known:
             if len(self.operations) >= MAX_OPERATIONS:
-                raise Rejected("format", "plant.dynamics", f"more than {MAX_OPERATIONS} operations")
+                strict.fail("plant.dynamics", f"more than {MAX_OPERATIONS} operations")
             self.known[key] = len(self.operations)
             self.operations.append(operation)
         return self.known[key]
 
-    def build(self, tree: Any, at: str, depth: int) -> tuple[int, str]:
-        """Index of the tree's value on the tape, and the tree in words."""
+    def build(self, tree: Any, at: str, depth: int) -> int:
+        """Index of the tree's value on the tape."""
         self.visited += 1
         if depth > MAX_DEPTH or self.visited > MAX_OPERATIONS:
-            raise Rejected("format", at, f"deeper than {MAX_DEPTH} or more than {MAX_OPERATIONS} nodes")
+            strict.fail(at, f"deeper than {MAX_DEPTH} or more than {MAX_OPERATIONS} nodes")
         if isinstance(tree, str):
             if tree in self.names:
-                return self.push("var", self.names[tree]), tree
-            q = self.rational(tree, at)
-            return self.push("const", q), str(q) if q >= 0 and q.denominator == 1 else f"({q})"
+                return self.push("var", self.names[tree])
+            return self.push("const", schema.rational(tree, at, {}))
         if not isinstance(tree, list) or len(tree) < 2 or not isinstance(tree[0], str):
-            raise Rejected("format", at, "a node must be a list: an operator and its operands")
-        name, arguments = tree[0], tree[1:]
+            strict.fail(at, "a node must be a list: an operator and its operands")
+        name, *arguments = tree
         if name == "**" and len(arguments) == 2:
-            base, words = self.build(arguments[0], at, depth + 1)
-            return self.power(base, arguments[1], at), f"({words}**{arguments[1]})"
-        indices, words_of = zip(*(self.build(a, at, depth + 1) for a in arguments), strict=True)
-        if name in ("+", "*"):
-            result = indices[0]
-            for index in indices[1:]:
-                result = self.push("add" if name == "+" else "mul", result, index)
-            return result, "(" + f" {name} ".join(words_of) + ")"
-        if name == "-" and len(indices) == 1:
-            return self.push("neg", indices[0]), f"(-{words_of[0]})"
-        if name == "-" and len(indices) == 2:
-            return self.push("add", indices[0], self.push("neg", indices[1])), f"({words_of[0]} - {words_of[1]})"
-        if name == "/" and len(indices) == 2:
-            return self.push("mul", indices[0], self.push("inv", indices[1])), f"({words_of[0]} / {words_of[1]})"
-        if name in ("sin", "cos") and len(indices) == 1:
-            return self.push(name, indices[0]), f"{name}({words_of[0]})"
-        if name == "tan" and len(indices) == 1:
-            sine, cosine = self.push("sin", indices[0]), self.push("cos", indices[0])
-            return self.push("mul", sine, self.push("inv", cosine)), f"tan({words_of[0]})"
-        raise Rejected("format", at, f"operator {name[:20]!a} with {len(indices)} operands is not in the grammar")
+            return self.power(self.build(arguments[0], at, depth + 1), arguments[1], at)
+        operands = [self.build(a, at, depth + 1) for a in arguments]
+        match name, operands:
+            case "+", _:
+                return reduce(lambda a, b: self.push("add", a, b), operands)
+            case "*", _:
+                return reduce(lambda a, b: self.push("mul", a, b), operands)
+            case "-", [a]:
+                return self.push("neg", a)
+            case "-", [a, b]:
+                return self.push("add", a, self.push("neg", b))
+            case "/", [a, b]:
+                return self.push("mul", a, self.push("inv", b))
+            case (("sin" | "cos"), [a]):
+                return self.push(name, a)
+            case "tan", [a]:
+                sine, cosine = self.push("sin", a), self.push("cos", a)
+                return self.push("mul", sine, self.push("inv", cosine))
+        strict.fail(at, f"operator {name[:20]!a} with {len(operands)} operands is not in the grammar")
 
     def power(self, base: int, exponent: Any, at: str) -> int:
         if type(exponent) is not int or not 0 < abs(exponent) <= MAX_EXPONENT:
-            raise Rejected("format", at, f"an exponent must be a nonzero integer up to {MAX_EXPONENT}")
+            strict.fail(at, f"an exponent must be a nonzero integer up to {MAX_EXPONENT}")
         result = base
         for bit in bin(abs(exponent))[3:]:
             result = self.push("mul", result, result)

@@ -6,8 +6,12 @@ u = 2^-53 is the unit roundoff. A computed value comes with a bound on its error
 in binary64, so `up` is applied to every bound: it covers the roundings made while the bound was formed.
 `up(b) = b (1 + 2^-40) + 2^-960` is safe for non-negative operands with fewer than 2^11 roundings in a row
 (2^11 u < 2^-41, and the last two roundings are those of `up` itself); longer sums go through `total`. Its
-absolute term covers underflow, at most 2^-1022 a product, for up to 2^60 products; a bound that is multiplied by a
-large number later on gets an `up` of its own before.
+absolute term covers underflow, at most 2^-1022 a product, for up to 2^60 products, as long as nothing large multiplies
+afterwards what has underflowed. So there is one order of factors for all bounds, in which only numbers up to 1 do:
+
+- what stands in one `up` is a sum of products of two factors: numbers of which there is no doubt, or results of `up`;
+- EPS, gamma and other constants below 1 multiply the product: `EPS * (a * b)`, never `EPS * a * b`;
+- a product of three is `a * up(b * c)`, or `k * b * b` with k from `up`: where k b underflows, b is below 1.
 
 Sums and matrix products are bounded for any order of summation and with or without fused multiply-add:
 |fl(AB) - AB| <= gamma_k |A||B| with gamma_k = k u / (1 - k u) (Higham 2002, section 3.5), and
@@ -27,9 +31,8 @@ from typing import Any
 
 import numpy as np
 from flint import arb, ctx, fmpq
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+Array = Any  # of binary64; numpy's own types say nothing of shapes
 U = 2.0**-53
 EPS = 2.0**-50  # covers up to eight roundings of one coefficient
 TINY = 2.0**-960
@@ -58,6 +61,11 @@ def norm(array: Any, axis: int) -> Any:
     return up(np.sqrt(total(array * array, axis)))
 
 
+def frobenius(G: Any) -> Any:
+    """An upper bound of ||G||_F, G (..., n, n)."""
+    return norm(norm(G, -1), -1)
+
+
 def ends(centre: Array, radius: Array) -> tuple[Array, Array]:
     """(lo, hi), an interval around the one of that centre and radius."""
     radius = up(radius + EPS * np.abs(centre))
@@ -71,6 +79,14 @@ def float_with_error(q: Fraction) -> tuple[float, float]:
         return value, 0.0 if Fraction(value) == q else up(float(abs(Fraction(value) - q)))
     except OverflowError:
         return np.inf, np.inf
+
+
+def within(bounds: tuple[Fraction, Fraction], mid: Any, radius: Any) -> Any:
+    """Elementwise: [mid - radius, mid + radius] certainly lies in the bounds."""
+    (lo, lo_error), (hi, hi_error) = map(float_with_error, bounds)
+    reach = up(radius + EPS * np.abs(mid))
+    least, most = lo + up(lo_error + EPS * abs(lo)), hi - up(hi_error + EPS * abs(hi))
+    return (mid - reach >= least) & (mid + reach <= most)
 
 
 def arb_with_error(x: arb) -> tuple[float, float]:

@@ -10,40 +10,37 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .arithmetic import Number, lesser, maximum, sin_cos, total, up
-from .float64 import EPS, float_with_error, gamma
+from .elementary import elementary
+from .expression import Functions
+from .float64 import EPS, Array, float_with_error, gamma, total, up
 
 
 @dataclass(frozen=True)
-class Taylor:
+class Taylor(Functions):
     """`c` (B,), `g` (N, B), `Q` (N, N, B) and remainder `r` (B,), r >= 0."""
 
-    c: Number
-    g: Number
-    Q: Number
-    r: Number
+    c: Array
+    g: Array
+    Q: Array
+    r: Array
 
     @property
-    def linear(self) -> Number:
+    def linear(self) -> Array:
         """Upper bound of the linear part on the box."""
         return total(np.abs(self.g), 0)
 
     @property
-    def quadratic(self) -> Number:
+    def quadratic(self) -> Array:
         """Upper bound of the quadratic part on the box."""
         return total(total(np.abs(self.Q), 0), 0)
 
     @property
-    def radius(self) -> Number:
-        """Upper bound of |v - c| on the box."""
-        return up(self.linear + self.quadratic + self.r)
-
-    @property
-    def size(self) -> Number:
+    def size(self) -> Array:
         """Upper bound of |c| + G + Q."""
         return up(np.abs(self.c) + self.linear + self.quadratic)
 
@@ -51,11 +48,11 @@ class Taylor:
         """The models of some members of the batch."""
         return Taylor(self.c[index], self.g[:, index], self.Q[:, :, index], self.r[index])
 
-    def scaled(self, value: Number, error: Number) -> Taylor:
+    def scaled(self, value: Any, error: Any) -> Taylor:
         """Product with a constant in value +- error; `value` may differ over the batch (B,)."""
         size, k = self.size, np.abs(value)
         return Taylor(
-            value * self.c, value * self.g, value * self.Q, up(k * self.r + error * (size + self.r) + EPS * k * size)
+            value * self.c, value * self.g, value * self.Q, up(k * self.r + error * (size + self.r) + EPS * (k * size))
         )
 
     def __add__(self, other: Taylor) -> Taylor:
@@ -78,45 +75,26 @@ class Taylor:
         Q = a.c * b.Q + b.c * a.Q + a.g[:, None] * b.g[None, :]
         return Taylor(a.c * b.c, a.c * b.g + b.c * a.g, Q, up(r))
 
-    def _compose(self, f0: Number, f1: Number, f2: Number, third: Number, error: Number) -> Taylor:
-        """phi(v) from phi(c), phi'(c), phi''(c)/2 (each within `error`) and `third`, as sup |phi'''|/6.
+    def function(self, name: str) -> Taylor:
+        """phi(v) for a function phi that elementary.py knows: f0 + f1 D + f2 D^2 + R, v = c + D, |R| <= third |D|^3.
 
-        With v = c + D, |D| <= rho = G + Q + r: `phi(v) = f0 + f1 D + f2 D^2 + R`, and `third` is any number with
-        |R| <= third rho^3. D^2 differs from (g.d)^2 by at most 2 G q + q^2, q = Q + r.
+        |D| <= rho = G + Q + r, and D^2 differs from (g.d)^2 by at most 2 G q + q^2, q = Q + r.
         """
         G, q = self.linear, up(self.quadratic + self.r)
         rho = up(G + q)
+        (f0, f1, f2), (e0, e1, e2), third = elementary(name, self.c, 0.0, rho)
         r = (
             np.abs(f1) * self.r
-            + np.abs(f2) * (2 * G * q + q * q)
+            + np.abs(f2) * up(2 * G * q + q * q)
             + third * rho * rho * rho
-            + error * (1 + rho + rho * rho)
-            + EPS * (np.abs(f0) + np.abs(f1) * rho + np.abs(f2) * G * G)
-        )
+            + e0 + e1 * rho + e2 * rho * rho
+            + EPS * (np.abs(f0) + np.abs(f1) * rho + np.abs(f2) * up(G * G))
+        )  # fmt: skip
         Q = f1 * self.Q + f2 * (self.g[:, None] * self.g[None, :])
         return Taylor(f0, f1 * self.g, Q, up(r))
 
-    def inv(self) -> Taylor:
-        """1/v; NaN unless the range of v certainly excludes 0."""
-        least = np.abs(self.c) - self.radius
-        least = np.where(least > 0, least * (1 - 2.0**-40), np.nan)
-        f0 = 1 / self.c
-        f1, f2 = -f0 * f0, f0 * f0 * f0
-        third = up(up(np.abs(f2)) / least)  # R = -D^3 / (c^3 v) exactly
-        return self._compose(f0, f1, f2, third, EPS * (np.abs(f0) + np.abs(f1) + np.abs(f2)))
 
-    def sin(self) -> Taylor:
-        s, c, s_error, c_error = sin_cos(self.c)
-        third = up(lesser(np.abs(c) + c_error + self.radius, 1.0) / 6)
-        return self._compose(s, c, -s / 2, third, up(s_error + c_error))
-
-    def cos(self) -> Taylor:
-        s, c, s_error, c_error = sin_cos(self.c)
-        third = up(lesser(np.abs(s) + s_error + self.radius, 1.0) / 6)
-        return self._compose(c, -s, -c / 2, third, up(s_error + c_error))
-
-
-def affine(c: Number, g: Number) -> Taylor:
+def affine(c: Array, g: Array) -> Taylor:
     """The exact affine function c + g.d, c (B,), g (N, B)."""
     symbols, batch = g.shape
     return Taylor(c, g, np.zeros((symbols, symbols, batch)), np.zeros(batch))
@@ -129,7 +107,7 @@ def constant(q: Fraction, symbols: int, batch: int) -> Taylor:
     return Taylor(model.c, model.g, model.Q, np.full(batch, error))
 
 
-def upper_bound(model: Taylor) -> Number:
+def upper_bound(model: Taylor) -> Array:
     """An upper bound of the model over the box, shape (B,); the separable part is maximised exactly.
 
     max over |t| <= 1 of `g t + q t^2` is at most g^2 / (-4q) if q < 0, and at most max(|g|, -2q) + q; the first is the
@@ -140,7 +118,7 @@ def upper_bound(model: Taylor) -> Number:
     q = np.array([model.Q[i, i] for i in range(N)])
     inside = (q < 0) & (g < -2 * q)
     ratio = g / np.where(inside, -q, 1.0)  # below 2; squaring g first could underflow, and 4 q overflow
-    axes = np.where(inside, 0.25 * (g * ratio), maximum(g, -2 * q) + q)
+    axes = np.where(inside, 0.25 * (g * ratio), np.maximum(g, -2 * q) + q)
     cross = np.zeros_like(model.c)
     for i in range(N):
         for j in range(i):

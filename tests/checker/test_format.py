@@ -23,12 +23,12 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from certify.checker import document, rules
+from certify.checker import document, rules, schema, strict, words
 from certify.checker.__main__ import main
-from certify.checker.document import MAX_BYTES
 from certify.checker.errors import Rejected, Unreadable
 from certify.checker.exact import Exact, Undecided
 from certify.checker.expression import evaluate, parse_dynamics
+from certify.checker.strict import MAX_BYTES
 from tests.support.certificates import Document, dump, edited, encode, grow, make, rehash, write
 
 
@@ -128,7 +128,7 @@ def test_a_file_beyond_the_limit_is_rejected_unread(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not os.path.exists("/dev/zero"), reason="needs an endless file")
 def test_an_endless_file_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(document, "MAX_BYTES", 2**16)
+    monkeypatch.setattr(strict, "MAX_BYTES", 2**16)
     with pytest.raises(Rejected, match="larger than"):
         document.read("/dev/zero")
 
@@ -196,7 +196,7 @@ def test_hex_floats_are_strict(value: Any, tmp_path: Path) -> None:
 @example(-0.0)
 @example(float(np.finfo(float).max))
 def test_hex_floats_are_read_exactly(value: float) -> None:
-    read = document._hex_float(value.hex(), "levels.local")
+    read = schema.binary64(value.hex(), "levels.local", {})
     assert read == value and np.signbit(read) == np.signbit(value)
 
 
@@ -213,7 +213,7 @@ def test_the_tree_is_strict(value: Any, tmp_path: Path) -> None:
 
 def test_arrays_are_little_endian_and_in_row_order() -> None:
     raw = bytes.fromhex("000000000000f03f0000000000000040000000000000084000000000000010c0")
-    read = document._array(base64.b64encode(raw).decode(), "lyapunov.P", (2, 2))
+    read = schema.array("n", "n")(base64.b64encode(raw).decode(), "lyapunov.P", {"n": 2})
     assert read.tolist() == [[1.0, 2.0], [3.0, -4.0]]
 
 
@@ -321,7 +321,7 @@ def test_depth_and_size_of_the_equations_are_limited(tmp_path: Path) -> None:
 @pytest.mark.parametrize("exponent", [*range(1, 20), 31, 32, 33, 63, 64])
 def test_powers_mean_what_they_say(exponent: int) -> None:
 
-    tape = parse_dynamics([["**", "x", exponent], ["**", "x", -exponent]], ["x"], document._rational)
+    tape = parse_dynamics([["**", "x", exponent], ["**", "x", -exponent]], ["x"])
     values = evaluate(tape, Exact, [Exact(Fraction(-3, 2))])
     assert [v.value for v in values] == [Fraction(-3, 2) ** k for k in (exponent, -exponent)]
 
@@ -350,8 +350,8 @@ def expressions() -> st.SearchStrategy[Any]:
 @example(["**", "-3/7", 2])
 def test_the_printed_equations_are_the_parsed_ones(tree: Any) -> None:
     """The text, read as Python over the rationals, and the tape have the same values."""
-    tape = parse_dynamics([tree], ["x", "u"], document._rational)
-    exact_text = re.sub(r"(?<![\w*])\d+", lambda m: f"Fraction({m[0]})", tape.text[0])
+    tape = parse_dynamics([tree], ["x", "u"])
+    exact_text = re.sub(r"(?<![\w*])\d+", lambda m: f"Fraction({m[0]})", words.expression(tape.trees[0]))
     x, u = Fraction(7, 5), Fraction(-2, 3)
     try:
         value = evaluate(tape, Exact, [Exact(x), Exact(u)])[0].value
@@ -389,7 +389,7 @@ def test_accepted_as_json_is_one_strict_object(tmp_path: Path) -> None:
         assert answer["policy_sha256"] == json.loads(data)["policy"]["sha256"]
         assert answer["levels"]["roa"] == float.fromhex(json.loads(data)["levels"]["roa"])
         assert answer["rules"]["local"] == 1 and answer["rules"]["tree"] == answer["leaves"] >= 1
-        assert answer["rules"]["ring"] == answer["ring_leaves"] and answer["arithmetic"] == "float64"
+        assert answer["rules"]["ring"] == answer["ring_leaves"]
         assert 0 < answer["margins"]["local"] < 1 and set(answer["seconds"]) == {"start", "check"}
         assert done.stdout.count("\n") == 1
 
@@ -412,7 +412,7 @@ def test_not_json_is_rejected_rule_format(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "arguments",
-    [[], ["a", "b"], ["-x"], ["--json"], ["--JSON", "a"], ["--js", "a"], ["--arithmetic", "float32", "a"]],
+    [[], ["a", "b"], ["-x"], ["--json"], ["--JSON", "a"], ["--js", "a"], ["--arithmetic", "arb", "a"]],
 )
 def test_usage(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(arguments) == 2
@@ -470,3 +470,39 @@ def test_the_checker_loads_nothing_of_the_project(tmp_path: Path) -> None:
     done = subprocess.run([sys.executable, "-I", "-c", code], capture_output=True, text=True, check=False, cwd=tmp_path)
     assert done.returncode == 0
     assert all(m == "certify" or m.startswith("certify.checker") for m in done.stderr.split())
+
+
+def test_a_file_whose_name_looks_like_an_option(tmp_path: Path) -> None:
+    for name in ("--help", "--json", "-x"):
+        (tmp_path / name).write_bytes(dump(good()))
+        for path in (f"./{name}", name):
+            done = run("--", path, cwd=tmp_path)
+            assert done.returncode == 0 and "ACCEPTED" in done.stdout, done.stderr
+
+
+def test_a_practical_claim_is_printed_for_what_it_is(tmp_path: Path) -> None:
+    data = grow(make(
+        [["+", ["/", "x", "2"], "u", "1/100"]], [([[1.0]], [0.25])], [[1.0]], (0.04, 3.0), claim="practical",
+    ))  # fmt: skip
+    path = write(data, tmp_path)
+    lines = run(path).stdout.splitlines()
+    said = next(line for line in lines if line.startswith("claim: "))
+    assert said == (
+        "claim: every trajectory of the closed loop that starts in V <= 3.0 stays there, enters V <= 0.04 in finite "
+        "time and stays there from then on; nothing is claimed about what happens inside V <= 0.04, and the origin "
+        "need not be an equilibrium; u stays in its bounds"
+    )
+    assert lines[-1].startswith("ACCEPTED c0=0.04 c2=3.0 ") and not any("asymptotic" in line for line in lines)
+    answer = json.loads(run("--json", path).stdout)
+    assert answer["claim"] == "practical" and answer["levels"] == {"floor": 0.04, "roa": 3.0}
+    assert answer["margins"]["local"] is None and answer["margins"]["ring"] > 0
+    assert answer["rules"]["equilibrium"] == answer["rules"]["local"] == 0
+
+
+def test_a_practical_claim_with_one_level_asks_the_leaves(tmp_path: Path) -> None:
+    """c0 = c2: the ring is a surface, and leaves are not skipped."""
+    stable = make([["-", "x"]], [([[1.0]], [0.0])], [[1.0]], (1.0, 1.0), claim="practical")
+    assert outcome(dump(grow(stable)), tmp_path) == "ACCEPTED"
+    for wrong in ("x", ["*", "-1", "x", ["/", "x", "x"]]):
+        assert outcome(dump(grow(edited(stable, "plant.dynamics.0", wrong), max_leaves=50)), tmp_path) == "ring"
+    assert outcome(dump(edited(stable, "evidence.tree", "AA==")), tmp_path) == "tree"

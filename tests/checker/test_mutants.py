@@ -2,7 +2,7 @@
 
 A mutant counts if `claim_oracle.py`, which shares no code with the checker, finds that it is malformed, that an exact
 rule fails, that the claim is false at a point, or that a leaf or the local ball cannot support it; or, where points
-show nothing, if the naive checker finds the evidence incomplete. Each that counts must be refused, by the rule named
+show nothing, if the reference finds the evidence incomplete. Each that counts must be refused, by the rule named
 beforehand. The others may be accepted.
 """
 
@@ -22,8 +22,19 @@ from certify.checker import document, rules
 from certify.checker.errors import Rejected
 from tests.support.ablation import checker_without
 from tests.support.claim_oracle import EXACT, faults, read
-from tests.support.mutants import BASES, FAMILIES, Mutant, base, dump, family, true_edits
-from tests.support.naive_checker import judge
+from tests.support.mutants import (
+    BASES,
+    FAMILIES,
+    PRACTICAL,
+    Mutant,
+    base,
+    dump,
+    family,
+    practical,
+    practical_base,
+    true_edits,
+)
+from tests.support.reference import judge
 
 ORDER = ("format", "hash", "levels", "lyapunov", "equilibrium", "domain", "coordinates", "root", "centring", "local",
          "tree", "ring", "inputs")  # fmt: skip
@@ -83,7 +94,7 @@ def judged(one: Mutant, path: Path) -> Judged:
     found = faults(path, one.hints)
     if not found and verdict not in ("ACCEPTED", "TRUSTED"):
         rule = judge(read(path))
-        found = {rule: "the naive checker"} if rule not in (None, "TRUSTED") else {}
+        found = {rule: "the reference"} if rule not in (None, "TRUSTED") else {}
     return Judged(verdict, found)
 
 
@@ -126,7 +137,7 @@ def test_mutants_that_count_are_refused_by_the_expected_rule(name: str, tmp_path
     assert not wrong, "\n".join([f"{len(wrong)} of {len(refused_by)}", *wrong])
     assert len(refused_by) >= least
     assert set(refused_by) >= set(met)
-    # what was accepted is true at every point that was looked at; the naive checker sees a few of them through
+    # what was accepted is true at every point that was looked at; the reference sees a few of them through
     chosen = np.random.default_rng(0).permutation(len(accepted))[:4]
     assert [accepted[k].name for k in chosen if judge(read(accepted[k].write(path))) is not None] == []
 
@@ -138,7 +149,7 @@ def test_names_are_used_once() -> None:
 
 @pytest.mark.parametrize("name", BASES)
 def test_true_edits_are_accepted(name: str, tmp_path: Path) -> None:
-    """What is true and fully evidenced, by the oracle and the naive checker, stays accepted."""
+    """What is true and fully evidenced, by the oracle and the reference, stays accepted."""
     edits = [one for one in true_edits() if one.name.startswith(f"{name}: ")]
     assert len(edits) >= 18
     path = tmp_path / "edit.json"
@@ -166,6 +177,38 @@ def test_no_size_takes_a_gigabyte(tmp_path: Path) -> None:
     )
     done = subprocess.run([sys.executable, "-I", "-c", code, *paths], capture_output=True, text=True, check=True)
     assert int(done.stdout.split()[-1]) < 2**20  # KiB
+
+
+# ------------------------------------------------------------------------------------------------------ another claim
+
+
+@pytest.mark.parametrize("name", PRACTICAL)
+def test_honest_practical_certificates_are_accepted(name: str, tmp_path: Path) -> None:
+    """The origin is no equilibrium of any of them."""
+    path = Mutant(name, practical_base(name), frozenset()).write(tmp_path / "certificate.json")
+    assert (verdict_on(path), faults(path)) == ("ACCEPTED", {})
+    tally = rules.check(document.read(str(path)))
+    assert tally.rules["equilibrium"] == tally.rules["local"] == 0 and tally.local_margin is None
+    assert tally.rules["tree"] >= tally.rules["ring"] > 0
+    kind, floor = practical_base(name)["claim"]["kind"], practical_base(name)["levels"]["floor"]
+    asymptotic = {**practical_base(name), "claim": {"kind": "asymptotic"}}
+    asymptotic["levels"] = {"local": floor, "roa": asymptotic["levels"]["roa"]}
+    assert kind == "practical"
+    assert verdict_on(Mutant(name, asymptotic, frozenset()).write(path)) in ("equilibrium", "centring")
+
+
+def test_forged_practical_certificates_are_refused_by_the_expected_rule(tmp_path: Path) -> None:
+    """Each is shown to be false, malformed or incomplete without the checker."""
+    path, wrong, met, count = tmp_path / "mutant.json", [], set(), 0
+    for one in practical():
+        verdict, found = verdict_on(one.write(path)), faults(path, one.hints)
+        count += 1
+        met.add(verdict)
+        if verdict not in one.rules or not found:
+            wrong.append(f"{one.name}: {verdict} in place of {sorted(one.rules)}; {found}")
+    assert not wrong, "\n".join([f"{len(wrong)} of {count}", *wrong])
+    assert count >= 100
+    assert met == set(ORDER) - {"equilibrium", "local"}
 
 
 # ------------------------------------------------------------------------------------- each rule is there for a reason
@@ -206,7 +249,7 @@ def accepted_by(package: ModuleType, path: Path) -> bool:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FAMILIES)
-def test_the_naive_checker_refuses_what_counts_and_accepts_what_is_accepted(name: str, tmp_path: Path) -> None:
+def test_the_reference_refuses_what_counts_and_accepts_what_is_accepted(name: str, tmp_path: Path) -> None:
     path = tmp_path / "mutant.json"
     against = []
     for one in family(name):
@@ -215,9 +258,9 @@ def test_the_naive_checker_refuses_what_counts_and_accepts_what_is_accepted(name
             continue  # most are no document at all
         rule = judge(read(path))
         if result.found and rule is None:
-            against.append(f"{one.name}: {result.found}, the naive checker accepts it")
+            against.append(f"{one.name}: {result.found}, the reference accepts it")
         if result.verdict == "ACCEPTED" and rule is not None:
-            against.append(f"{one.name}: accepted, the naive checker refuses it by {rule}")
+            against.append(f"{one.name}: accepted, the reference refuses it by {rule}")
     assert not against, "\n".join(against)
 
 

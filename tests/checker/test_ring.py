@@ -11,8 +11,11 @@ from flint import arb, ctx
 from hypothesis import given
 from hypothesis import strategies as st
 
-from certify.checker import rules
+from certify.checker import ring as checker_ring
+from certify.checker.case import Case
+from certify.checker.exact import congruence, rational
 from certify.checker.network import enclose_on_boxes
+from certify.checker.ring import Ring, multiplier
 from certify.checker.taylor import Taylor, upper_bound
 from tests.checker.test_rules import honest, scalar_claim
 from tests.support.certificates import grow, parse, verdict
@@ -23,15 +26,14 @@ CASES = ("scalar", "linear", "rotor", "rotor, preactivation")
 
 
 @cache
-def ring_of(name: str) -> rules._Ring:
-    c = parse(honest(name))
-    S = rules.congruence(rules.rational(c.evidence.T), rules.rational(c.P))
-    return rules._Ring(c, c.evidence.T, rules.fold(c.policy, c.u_eq), S, rules._inputs_bounded_by_form(c))
+def ring_of(name: str) -> Ring:
+    case = Case(parse(honest(name)))
+    return Ring(case.c, case.T, case.net, case.S)
 
 
-def vdot_on(ring: rules._Ring, centre: Array, radius: Array) -> Taylor:
-    x, error = ring._states(centre, radius)
-    return ring._vdot(x, error, *enclose_on_boxes(ring.net, x, error))
+def vdot_on(ring: Ring, centre: Array, radius: Array) -> Taylor:
+    x, error = ring.states(centre, radius)
+    return ring.vdot(*ring.dynamics(x, error, *enclose_on_boxes(ring.net, x, error)))
 
 
 def ends(model: Taylor, index: int, d: list[Fraction]) -> tuple[Fraction, Fraction]:
@@ -51,12 +53,12 @@ def test_the_gap_contains_what_it_stands_for(name: str, seed: int, magnitude: fl
     """sign (level - V) with V = z'Sz in fractions, at points centre + radius d."""
     ring = ring_of(name)
     n = ring.n
-    S = rules.congruence(rules.rational(ring.T), rules.rational(ring.c.P))
+    S = congruence(rational(ring.T), rational(ring.c.P))
     generator = np.random.default_rng(seed)
     centre = generator.standard_normal((n, 3)) * 10.0**magnitude
     radius = np.abs(generator.standard_normal((n, 3))) * 10.0 ** generator.uniform(-14, 6)
     level = float(10.0 ** generator.uniform(-9, 6))
-    model = ring._gap(centre, radius, level, sign)
+    model = ring.gap(centre, radius, level, sign)
     assert not np.any(model.g[n:]) and not np.any(model.Q[n:]) and not np.any(model.Q[:, n:])
     for index in range(3):
         for _ in range(3):
@@ -74,7 +76,7 @@ def test_the_multiplier_is_not_negative_and_no_other_is_better(seed: int) -> Non
     b[generator.random((4, 50)) < 0.2] = 0
     c = np.abs(b).sum(0) * generator.uniform(-1, 1, 50)  # so that the sum is bounded from below
     with np.errstate(divide="ignore", invalid="ignore"):
-        k = rules._multiplier(a, b, c)
+        k = multiplier(a, b, c)
 
     def value(k: Array) -> Array:
         return np.asarray(c * k + np.abs(a + k * b).sum(0))
@@ -88,7 +90,7 @@ def test_a_multiplier_that_is_no_number_proves_nothing() -> None:
     ring = ring_of("rotor")
     centre, radius = np.full((2, 1), 0.1), np.full((2, 1), 1e-3)
     vdot = vdot_on(ring, centre, radius)
-    gap = ring._gap(centre, radius, ring.c.c2, 1.0)
+    gap = ring.gap(centre, radius, ring.c.c2, 1.0)
     with np.errstate(all="ignore"):
         for k in (np.nan, np.inf):
             assert not upper_bound(vdot + gap.scaled(np.array([k]), 0.0))[0] < 0
@@ -110,7 +112,7 @@ def test_the_bound_holds_wherever_a_box_meets_the_ring(name: str) -> None:
     )
     vdot = vdot_on(ring, centre, radius)
     with np.errstate(divide="ignore", invalid="ignore"):
-        bound = ring._bound(vdot, centre, radius)
+        bound = ring.bound(vdot, centre, radius)
     assert np.all(bound <= upper_bound(vdot))
     assert np.sum((bound < 0) & (upper_bound(vdot) >= 0)) >= 2  # the multipliers decide some boxes
     ctx.prec = 128
@@ -127,7 +129,7 @@ def test_the_bound_holds_wherever_a_box_meets_the_ring(name: str) -> None:
     assert met > 100
 
 
-def vdots(ring: rules._Ring, x: Array) -> list[arb]:
+def vdots(ring: Ring, x: Array) -> list[arb]:
     """Vdot = 2 x'P f(x, pi(x)) in Arb at states (k, n)."""
     if not len(x):
         return []
@@ -157,5 +159,5 @@ def test_a_negative_multiplier_would_accept_what_is_false(monkeypatch: pytest.Mo
     false = scalar_claim(c2=2.2**2, bias=0.0)
     grown = grow(false, max_leaves=400, depth=12)
     assert verdict(grown) == "ring"
-    monkeypatch.setattr(rules, "_multiplier", lambda a, b, c: np.full_like(c, -1e9))
+    monkeypatch.setattr(checker_ring, "multiplier", lambda a, b, c: np.full_like(c, -1e9))
     assert verdict(grown) == "ACCEPTED"

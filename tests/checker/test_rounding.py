@@ -30,10 +30,11 @@ from certify.systems.trees import to_tree
 from flint import arb, ctx
 from numpy.typing import NDArray
 
-from certify.checker import float64, rules, taylor
+from certify.checker import float64, taylor
 from certify.checker import network as checker
 from certify.checker.document import Certificate, Policy
 from certify.checker.exact import congruence, rational
+from certify.checker.ring import Ring
 from certify.closed_loop import ClosedLoop
 from certify.enclosures import PolicyEnclosure
 from certify.enclosures import policy as producer
@@ -598,7 +599,7 @@ def plant(name: str) -> tuple[System, list[Any]]:
 PLANTS = ["pendulum", "cartpole", "quadrotor2d", "crooked", "integrator"]
 
 
-def random_ring(generator: Generator, name: str, squash: Squash, centre: Centre) -> rules._Ring:
+def random_ring(generator: Generator, name: str, squash: Squash, centre: Centre) -> Ring:
     """The leaf rule for a plant, a policy, P and T that are random; half of the T nearly annihilate (1, ..., 1)."""
     system, trees = plant(name)
     n, u_eq = system.n, system.exact_u_eq()
@@ -628,19 +629,19 @@ def random_ring(generator: Generator, name: str, squash: Squash, centre: Centre)
         T=T,
         root=np.ones(n),
     ))  # fmt: skip
-    return rules._Ring(
-        c, c.evidence.T, checker.fold(c.policy, c.u_eq), congruence(rational(c.evidence.T), rational(c.P)), False
+    return Ring(
+        c, c.evidence.T, checker.fold(c.policy, c.u_eq), congruence(rational(c.evidence.T), rational(c.P))
     )
 
 
-def vdot_bounds(ring: rules._Ring, lo: Array, hi: Array) -> tuple[Array, Array, Array]:
+def vdot_bounds(ring: Ring, lo: Array, hi: Array) -> tuple[Array, Array, Array]:
     """Lower and upper bound of Vdot on boxes, and its upper bound on the part of each box that lies in the ring."""
     centre = 0.5 * lo + 0.5 * hi
     radius = float64.up(np.maximum(hi - centre, centre - lo))
-    x, error = ring._states(centre, radius)
-    model = ring._vdot(x, error, *checker.enclose_on_boxes(ring.net, x, error))
+    x, error = ring.states(centre, radius)
+    model = ring.vdot(*ring.dynamics(x, error, *checker.enclose_on_boxes(ring.net, x, error)))
     negated = taylor.Taylor(-model.c, -model.g, -model.Q, model.r)
-    return -taylor.upper_bound(negated), taylor.upper_bound(model), ring._bound(model, centre, radius)
+    return -taylor.upper_bound(negated), taylor.upper_bound(model), ring.bound(model, centre, radius)
 
 
 def states_in_arb(T: Array, z: Array) -> list[list[arb]]:
@@ -692,7 +693,7 @@ def test_vdot_on_boxes(first: int, second: int, report: Report) -> None:
         z = np.where(share == 1, hi[:, None], z).reshape(n, -1).T
         truth = levels_and_vdots(name, ring.c, z)
         c1, c2 = np.quantile([float(V) for V, _ in truth], [0.2, 0.8]).tolist()
-        ring.c = replace(ring.c, c1=c1, c2=c2)
+        ring.c = replace(ring.c, levels={"local": c1, "roa": c2})
 
         def residual(
             row: int, low: float, high: float, name: str = name, c: Certificate = ring.c, z: Array = z,

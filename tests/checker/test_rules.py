@@ -13,10 +13,11 @@ from __future__ import annotations
 import json
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from fractions import Fraction
 from functools import cache
 from pathlib import Path
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -27,8 +28,12 @@ from hypothesis import strategies as st
 
 import certify.checker
 from certify.checker import network, rules
+from certify.checker.case import Case
 from certify.checker.document import Policy
 from certify.checker.errors import Rejected
+from certify.checker.exact import raw_at_origin
+from certify.checker.float64 import within
+from certify.checker.ring import Ring, batches
 from certify.checker.rules import Tally
 from tests.support.ablation import checker_without
 from tests.support.certificates import (
@@ -538,9 +543,10 @@ def test_leaves_cover_the_root_box(marks: list[int], seed: int) -> None:
             break
     generator = np.random.default_rng(seed)
     root = 2.0 ** generator.uniform(-1074, 1023, 2)
-    batches = list(rules._leaves(bytes(nodes), root, 7))
-    lo, hi = np.concatenate([b[1] for b in batches]), np.concatenate([b[2] for b in batches])
-    assert [b[0] for b in batches] == list(range(0, len(lo), 7)) and len(lo) == nodes.count(LEAF)
+    found = list(batches(SimpleNamespace(batch=7), bytes(nodes), root))
+    lo, hi = np.concatenate([b.lo.T for b in found]), np.concatenate([b.hi.T for b in found])
+    assert [b.first for b in found] == list(range(0, len(lo), 7)) and len(lo) == nodes.count(LEAF)
+    assert not any(b.broken for b in found)
     points = np.concatenate([generator.uniform(-1, 1, (50, 2)) * root, lo, hi, np.stack([lo[:, 0], hi[:, 1]], 1)])
     for p in points:
         assert np.any(np.all((lo <= p) & (p <= hi), axis=1))
@@ -555,13 +561,12 @@ def test_a_leaf_is_missed_only_if_it_lies_outside_the_ring(exponent: int) -> Non
         S = [[Fraction(float(v)) for v in row] for row in [[2.0**exponent, 0.0], [0.0, 2.0**exponent]]]
         S[0][1] = S[1][0] = Fraction(float(generator.uniform(-0.9, 0.9))) * Fraction(2) ** exponent
         levels = sorted(generator.uniform(0.1, 2, 2) * 2.0 ** (exponent + 2))
-        object.__setattr__(c, "c1", float(levels[0]))
-        object.__setattr__(c, "c2", float(levels[1]))
+        c = replace(c, levels={"local": float(levels[0]), "roa": float(levels[1])})
         with np.errstate(all="ignore"):
-            ring = rules._Ring(c, c.evidence.T, network.fold(c.policy, c.u_eq), S, True)
+            ring = Ring(c, c.evidence.T, network.fold(c.policy, c.u_eq), S)
             lo = generator.uniform(-3, 3, (2, 40))
             hi = lo + generator.uniform(0, 1, (2, 40))
-            result = ring._misses(lo, hi)
+            result = np.logical_or(*ring.misses(lo, hi))
         missed, kept = missed + int(result.sum()), kept + int((~result).sum())
         for box in np.flatnonzero(result):
             t = np.concatenate([generator.uniform(0, 1, (15, 2)), [[0, 0], [0, 1], [1, 0], [1, 1]]])
@@ -572,25 +577,43 @@ def test_a_leaf_is_missed_only_if_it_lies_outside_the_ring(exponent: int) -> Non
     assert missed > 50 and kept > 50
 
 
+def test_a_lower_bound_of_V_that_overflows_puts_no_leaf_outside() -> None:
+    """V computed is infinite, V itself is below c2, the largest binary64 number."""
+    c = replace(parse(scalar_claim()), levels={"local": 1.0, "roa": float(np.finfo(float).max)})
+    generator, met = np.random.default_rng(0), 0
+    for s in (1 + generator.random(600)).tolist():
+        near = float(np.sqrt(2.0**1023 / s) * np.sqrt(2.0))
+        for _ in range(3):
+            with np.errstate(all="ignore"):
+                ring = Ring(c, np.eye(1), network.fold(c.policy, c.u_eq), [[Fraction(s)]])
+                overflows = not np.isfinite(s * near * near)
+                outside, _ = ring.misses(np.array([[near]]), np.array([[1.001 * near]]))
+            if overflows and Fraction(s) * Fraction(near) ** 2 < Fraction(c.c2):
+                met += 1
+                assert not outside[0]
+            near = float(np.nextafter(near, 0.0))
+    assert met > 3
+
+
 @given(st.fractions(-5, 5), st.fractions(-5, 5), st.floats(-5, 5), st.floats(0, 5))
 def test_input_bounds_are_compared_in_the_safe_direction(p: Fraction, q: Fraction, mid: float, radius: float) -> None:
     lo, hi = sorted((p, q))
-    if rules._within((lo, hi), np.array(mid), np.array(radius)):
+    if within((lo, hi), np.array(mid), np.array(radius)):
         assert lo <= Fraction(mid) - Fraction(radius) and Fraction(mid) + Fraction(radius) <= hi
 
 
 def test_input_bounds_beyond_binary64_hold_nothing_and_harm_nothing() -> None:
     huge = Fraction(10) ** 400
-    assert not rules._within((-huge, huge), np.array(0.0), np.array(1.0))
-    assert not rules._within((huge, 2 * huge), np.array(1e308), np.array(0.0))
-    assert not rules._within((Fraction(-1), Fraction(1)), np.array(np.nan), np.array(0.0))
+    assert not within((-huge, huge), np.array(0.0), np.array(1.0))
+    assert not within((huge, 2 * huge), np.array(1e308), np.array(0.0))
+    assert not within((Fraction(-1), Fraction(1)), np.array(np.nan), np.array(0.0))
 
 
 # ------------------------------------------------------------------------------------- each rule is there for a reason
 
 
 def accepted_by(package: ModuleType, data: Document) -> bool:
-    certificate = package.document._certificate(json.loads(dump(data)), "0" * 64)
+    certificate = package.document.certificate(json.loads(dump(data)), "0" * 64)
     package.rules.check(certificate)
     return True
 
@@ -661,12 +684,12 @@ def test_without_centring_the_equilibrium_is_decided_exactly(
         (np.ones((1, 1)), np.full((1, 1), weight)), (np.full(1, hidden), np.full(1, last)), np.full(1, 3.0),
         np.full(1, offset), squash, "none",
     )  # fmt: skip
+    case = Case(replace(parse(scalar_claim()), policy=policy, u_eq=(u_eq,)))
+    failures = list(dict(rules.STATED)["centring"](case))
     if known:
-        assert network.fold(policy, (u_eq,)).offset is policy.offset
+        assert not failures and network.fold(policy, (u_eq,)).offset is policy.offset
     else:
-        with pytest.raises(Rejected) as no:
-            network.fold(policy, (u_eq,))
-        assert no.value.rule == "centring"
+        assert [at for at, _ in failures] == ["policy.centre"] and raw_at_origin(policy) != [u_eq]
 
 
 def test_a_leaf_that_overflows_is_never_accepted() -> None:
@@ -693,3 +716,14 @@ def test_tally_counts_a_leaf_once() -> None:
 
     tally = rules.check(parse(with_tree(honest("linear"), uniform(6))))
     assert tally.rules["tree"] == 64 > tally.rules["ring"] > 0
+
+
+def test_a_decay_below_every_binary64_number_is_not_accepted() -> None:
+    """The scaling in the local rule underflows: this decay is less than any binary64 number."""
+    far = "1" + "0" * 400
+    data = make(
+        [["+", "u", ["-", ["tan", "x1"]]], ["-", ["+", ["**", "x2", 3], "x2"]]], [([[1.0, 1.0]], [0.0])], np.eye(2),
+        (2.0**-1020, 2.0**-1018), states=("x1", "x2"), domain=[(f"-{far}", far)] * 2, input_bounds=[("-1000", "1000")],
+        centre="none", scale=(-4.9e-91,), T=np.eye(2) * 8.9e-308, root=[6.8e153, 6.8e153],
+    )  # fmt: skip
+    assert verdict(data) == "local"

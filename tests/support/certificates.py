@@ -20,12 +20,15 @@ from typing import Any
 import numpy as np
 
 from certify.checker import document, exact, network, rules
+from certify.checker.case import Case
 from certify.checker.document import Certificate
 from certify.checker.errors import Rejected
-from certify.checker.float64 import total, up
+from certify.checker.float64 import total, up, within
+from certify.checker.ring import Ring
 
 Document = dict[str, Any]
 LEAF = 255
+INNER = {"asymptotic": "local", "practical": "floor"}  # the name of the inner level
 
 
 def encode(array: Any) -> str:
@@ -73,6 +76,7 @@ def make(
     T: Any = None,
     root: Any = None,
     tree: bytes = bytes([LEAF]),
+    claim: str = "asymptotic",
 ) -> Document:
     """A certificate's document; the root box is the least one that binary64 can name, unless it is given."""
     P = np.atleast_2d(np.asarray(P, dtype=np.float64))
@@ -82,7 +86,7 @@ def make(
     arrays = [(np.atleast_2d(np.asarray(W, dtype=np.float64)), np.atleast_1d(b)) for W, b in layers]
     return rehash({
         "schema": "certify-certificate/2",
-        "claim": {"kind": "asymptotic"},
+        "claim": {"kind": claim},
         "plant": {
             "name": "plant",
             "states": list(states),
@@ -101,7 +105,7 @@ def make(
             "sha256": "",
         },
         "lyapunov": {"kind": "quadratic", "P": encode(P)},
-        "levels": {"local": float(levels[0]).hex(), "roa": float(levels[1]).hex()},
+        "levels": {INNER[claim]: float(levels[0]).hex(), "roa": float(levels[1]).hex()},
         "evidence": {
             "kind": "partition-tree",
             "T": encode(T),
@@ -134,7 +138,7 @@ def dump(data: Document) -> bytes:
 
 def parse(data: Document) -> Certificate:
     """The document as the checker reads it, through JSON text."""
-    return document._certificate(json.loads(dump(data)), "0" * 64)
+    return document.certificate(json.loads(dump(data)), "0" * 64)
 
 
 def verdict(data: Document) -> str:
@@ -152,15 +156,16 @@ def grow(data: Document, max_leaves: int = 5000, depth: int = 40) -> Document:
     Leaves that are still not accepted at `depth` or at `max_leaves` stay, and the certificate is then rejected.
     """
     c = parse(data)
-    S = exact.congruence(exact.rational(c.evidence.T), exact.rational(c.P))
     axes: dict[tuple[int, ...], int] = {}  # path from the root (0 lower, 1 upper) -> axis of the split
     with np.errstate(all="ignore"):
-        ring = rules._Ring(c, c.evidence.T, network.fold(c.policy, c.u_eq), S, rules._inputs_bounded_by_form(c))
+        case = Case(c)
+        ring = Ring(c, case.T, case.net, case.S)
         boxes = [((), -c.evidence.root, c.evidence.root.copy())]
         for _ in range(depth):
             if not boxes or len(axes) + len(boxes) > max_leaves:
                 break
-            good = passes(ring, np.stack([lo for _, lo, _ in boxes], 1), np.stack([hi for _, _, hi in boxes], 1))
+            lows, highs = (np.stack([box[k] for box in boxes], 1) for k in (1, 2))
+            good = passes(ring, case.bounded, lows, highs)
             halves = []
             for (path, lo, hi), done in zip(boxes, good, strict=True):
                 if not done:
@@ -179,17 +184,21 @@ def grow(data: Document, max_leaves: int = 5000, depth: int = 40) -> Document:
     return with_tree(data, bytes(tree))
 
 
-def passes(ring: rules._Ring, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
+def passes(ring: Ring, bounded: bool, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
     """The rule for a leaf, box by box, lo and hi (n, B)."""
     centre = 0.5 * lo + 0.5 * hi
     radius = up(np.maximum(hi - centre, centre - lo))
-    x, error = ring._states(centre, radius)
+    x, error = ring.states(centre, radius)
     mid, slopes, wide = network.enclose_on_boxes(ring.net, x, error)
-    good = ring._bound(ring._vdot(x, error, mid, slopes, wide), centre, radius) < 0
-    if not ring.bounded:
+    states, F = ring.dynamics(x, error, mid, slopes, wide)
+    good = ring.bound(ring.vdot(states, F), centre, radius) < 0
+    outside, inside = ring.misses(lo, hi)
+    if ring.c.claim == "practical":
+        good |= inside & np.all([np.isfinite(f.size + f.r) for f in F], axis=0)
+    if not bounded:
         for j, bounds in enumerate(ring.c.input_bounds):
-            good &= rules._within(bounds, mid[j], up(total(np.abs(slopes[j]), 0) + wide[j]))
-    return good | ring._misses(lo, hi)
+            good &= within(bounds, mid[j], up(total(np.abs(slopes[j]), 0) + wide[j]))
+    return good | outside | (inside & (ring.c.claim == "asymptotic"))
 
 
 def tree_of(data: Document) -> bytes:

@@ -36,6 +36,17 @@ Matrix = list[list[Fraction]]
 LARGEST_FILE = 256 * 2**20
 EXACT = ("format", "hash", "levels", "lyapunov", "equilibrium", "domain", "coordinates", "root", "centring", "tree")
 PRECISION = 160
+INNER = {"asymptotic": "local", "practical": "floor"}
+
+
+def is_practical(data: Document) -> bool:
+    """Whether nothing is claimed about {V < c0}, of a document or of what it claims."""
+    return "floor" in data["levels"]
+
+
+def ring_of(data: Document) -> tuple[float, float]:
+    """Both levels, the inner one first."""
+    return tuple(float.fromhex(data["levels"][k]) for k in ("floor" if is_practical(data) else "local", "roa"))
 
 
 class Malformed(Exception):
@@ -202,12 +213,13 @@ def _shape(data: Any) -> None:
     _array(policy["offset"], m)
 
     _section(data["claim"], "kind")
-    _need(data["claim"]["kind"] == "asymptotic", "claim")
+    _need(data["claim"]["kind"] in tuple(INNER), "claim")
     _section(data["lyapunov"], "kind", "P")
     _need(data["lyapunov"]["kind"] == "quadratic", "lyapunov")
     _array(data["lyapunov"]["P"], n, n)
-    _section(data["levels"], "local", "roa")
-    _binary64(data["levels"]["local"])
+    inner = INNER[data["claim"]["kind"]]
+    _section(data["levels"], inner, "roa")
+    _binary64(data["levels"][inner])
     _binary64(data["levels"]["roa"])
     if isinstance(evidence, dict) and evidence.get("kind") == "trusted-solver":
         _section(evidence, "kind", "solver", "version", "precision", "queries")
@@ -336,7 +348,7 @@ def exact_faults(data: Document) -> dict[str, str]:
     n, m = len(plant["states"]), len(plant["inputs"])
     if policy["sha256"] != policy_hash(policy):
         faults["hash"] = "sha256"
-    c1, c2 = (Fraction(float.fromhex(data["levels"][k])) for k in ("local", "roa"))
+    c1, c2 = map(Fraction, ring_of(data))
     if not 0 < c1 <= c2:
         faults["levels"] = "0 < c1 <= c2"
     P = _matrix(_array(data["lyapunov"]["P"], n, n))
@@ -346,7 +358,7 @@ def exact_faults(data: Document) -> dict[str, str]:
     u_eq = _rationals(plant["u_eq"], m)
     names = dict(zip(plant["states"] + plant["inputs"], [Fraction(0)] * n + u_eq, strict=True))
     value = [_at_equilibrium(node, names) for node in plant["dynamics"]]
-    if any(v is None or v != 0 for v in value):
+    if not is_practical(data) and any(v is None or v != 0 for v in value):
         faults["equilibrium"] = f"component {[v is not None and v == 0 for v in value].index(False)}"
     domain = [_rationals(pair, 2) for pair in plant["domain"]]
     for i, (lo, hi) in enumerate(domain):
@@ -356,7 +368,7 @@ def exact_faults(data: Document) -> dict[str, str]:
         pairs = zip(_array(policy["scale"], m).tolist(), _array(policy["offset"], m).tolist(), u_eq, strict=True)
         if not all(-1 < (q - Fraction(o)) / Fraction(s) < 1 for s, o, q in pairs):
             faults["centring"] = "u_eq out of reach"
-    elif policy["centre"] == "none":
+    elif policy["centre"] == "none" and not is_practical(data):
         reached = _raw_at_0(policy, n)
         if any(v is None or v != q for v, q in zip(reached, u_eq, strict=True)):
             faults["centring"] = "raw(0)"
@@ -411,7 +423,7 @@ class Loop:
         self.u_eq = _rationals(plant["u_eq"], self.m)
         self.bounds = [_rationals(pair, 2) for pair in plant["input_bounds"]]
         self.P = _array(data["lyapunov"]["P"], self.n, self.n)
-        self.c1, self.c2 = (float.fromhex(data["levels"][key]) for key in ("local", "roa"))
+        (self.c1, self.c2), self.practical = ring_of(data), is_practical(data)
 
     # in binary64: to find points, never to judge them
 
@@ -577,7 +589,8 @@ def _refutation(claim: str, hints: Points) -> str | None:
     if x.shape[1]:
         V, vdot, u = loop.sampled(x)
         with np.errstate(all="ignore"):
-            ranks = [vdot / V, vdot]
+            worst = np.where(loop.c1 <= V, vdot, -np.inf) if loop.practical else vdot
+            ranks = [worst / V, worst]
             for j, (lo, hi) in enumerate(loop.bounds):
                 ranks += [u[j] - _near(hi), _near(lo) - u[j]]
         for values in ranks:
@@ -607,10 +620,10 @@ def _refuted_at(loop: Loop, point: tuple[float, ...]) -> str | None:
             for j, (lo, hi) in enumerate(loop.bounds):
                 if u[j] < _ball(lo) or u[j] > _ball(hi):
                     return f"{loop.plant['inputs'][j]} leaves its bounds"
-            if vdot >= 0:
-                return "Vdot >= 0"
-            if vdot < 0:
+            if vdot < 0 or (loop.practical and arb(loop.c1) > V):
                 return None
+            if vdot >= 0 and (not loop.practical or arb(loop.c1) <= V):
+                return "Vdot >= 0"
     return None
 
 
@@ -799,7 +812,8 @@ def sampled_faults(data: Document, hints: Points = ()) -> dict[str, str]:
         return {"claim": refuted}
     if data["evidence"]["kind"] != "partition-tree":
         return {}
-    found = local_fault(data)
-    if not found and data["levels"]["local"] != data["levels"]["roa"]:
+    practical, (inner, outer) = is_practical(data), ring_of(data)
+    found = None if practical else local_fault(data)
+    if not found and (practical or inner != outer):
         found = leaf_fault(data)
     return dict([found]) if found else {}

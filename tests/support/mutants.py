@@ -984,6 +984,94 @@ FAMILIES: dict[str, Callable[[], Iterator[Mutant]]] = {
 }  # fmt: skip
 
 
+# ----------------------------------------------------------------------------------- another claim: practical stability
+
+DRIFT = "1/100"  # no equilibrium at the origin
+
+
+@cache
+def practical_base(name: str) -> Document:
+    """Honest practical certificates, of loops whose origin is no equilibrium."""
+    if name == "scalar":
+        data = scalar_claim(0.02, 3.0, claim="practical")
+    elif name == "linear":
+        data = linear_claim(0.5, 3.0, claim="practical", offset=[1 / 64])
+    else:
+        data = rotor_claim(0.02, 0.2 if "pre" in name else 0.3, name.removeprefix("rotor, "), claim="practical")
+    drift = lambda trees: [*trees[:-1], ["+", trees[-1], DRIFT]]  # noqa: E731
+    return grow(edited(data, "plant.dynamics", drift))
+
+
+PRACTICAL = ("scalar", "linear", "rotor, output", "rotor, preactivation")
+
+
+def asymptotic_levels(data: Document) -> dict[str, str]:
+    return {"local": data["levels"]["floor"], "roa": data["levels"]["roa"]}
+
+
+def practical() -> Iterator[Mutant]:
+    """Forgeries of practical certificates; those of what lies inside of the ring have no counterpart elsewhere."""
+    for name in PRACTICAL:
+        data, last = practical_base(name), len(practical_base(name)["plant"]["states"]) - 1
+        tree, n = tree_of(data), last + 1
+        c0, c2 = (float.fromhex(data["levels"][k]) for k in ("floor", "roa"))
+        state = data["plant"]["states"][last]
+        width = np.sqrt(c0 / decode(data["lyapunov"]["P"])[-1])  # of {V <= c0} along the last axis
+
+        def with_pole(at: float, data: Document = data, state: str = state, last: int = last) -> Document:
+            pole = ["/", "1/1000000000", ["-", state, str(Fraction(at))]]
+            return grow(edited(data, f"plant.dynamics.{last}", lambda e: ["+", e, pole]), max_leaves=600, depth=14)
+
+        for rule, what, new, *hints in (
+            ("format", "claim asymptotic", edited(data, "claim.kind", "asymptotic")),
+            ("format", "claim in capitals", edited(data, "claim.kind", "Practical")),
+            ("format", "claim of nothing", edited(data, "claim", {})),
+            ("format", "local in place of floor", edited(data, "levels", asymptotic_levels(data))),
+            ("format", "local as well", edited(data, "levels", lambda v: {**v, "local": v["floor"]})),
+            ("format", "floor missing", edited(data, "levels", lambda v: {"roa": v["roa"]})),
+            ("hash", "bit of a weight", array(data, "policy.layers.0.weight", at_index(0, lambda v: flipped(v, 3)))),
+            ("levels", "floor 0", with_level(data, "floor", 0.0)),
+            ("levels", "floor -0", with_level(data, "floor", -0.0)),
+            ("levels", "floor above roa", with_level(data, "floor", float(np.nextafter(c2, 9)))),
+            ("lyapunov", "P negative", array(data, "lyapunov.P", lambda a: -a)),
+            ("domain", "roa up", with_level(data, "roa", 1e4 * c2)),
+            ("domain", "shrunk", edited(data, "plant.domain.0", ["-1/1000", "3"])),
+            ("coordinates", "T of 0", array(data, "evidence.T", lambda a: 0 * a)),
+            ("root", "less by a hundredth", array(data, "evidence.root", lambda a: 0.99 * a)),
+            ("root", "roa up by a hundredth", with_level(data, "roa", 1.01 * c2)),
+            ("tree", "cut", with_tree(data, tree[:-1])),
+            ("tree", "leaf behind", with_tree(data, tree + b"\xff")),
+            ("tree", "no such axis", with_tree(data, bytes([n]) + tree)),
+            ("tree", "lower half alone", with_tree(data, bytes([0]) + tree)),
+            ("ring", "floor far below the drift", with_level(data, "floor", 1e-9), (1e-4,) if n == 1 else None),
+            ("ring", "drift times 1000", edited(data, f"plant.dynamics.{last}.2", "10")),
+            ("ring", "other sign", edited(data, "plant.dynamics", lambda d: [["-", e] for e in d])),
+            *[
+                ("ring", f"pole inside, at {share}", with_pole(at), (0.0,) * last + (at,))
+                for share in (0.75, 0.5, -0.25, -0.75)
+                for at in (float(Fraction(round(share * width * 2**12), 2**12)),)
+            ],
+            ("ring", "pole in the ring", with_pole(at := 1.5 * 2.0 ** np.floor(np.log2(width))), (0.0,) * last + (at,)),
+        ):  # fmt: skip
+            yield mutant(f"practical {name}: {what}", new, rule, hints=tuple(h for h in hints if h))
+        if name != "linear":
+            out = rehash(array(data, "policy.scale", lambda a: a * 0 + 2.0**-20))
+            out = edited(out, "plant.u_eq", ["3/4"])
+            if "pre" in name:
+                yield mutant(f"practical {name}: u_eq out of reach", out, "centring")
+    for name in ("linear", "rotor, output", "rotor, preactivation"):
+        data = practical_base(name)
+        n, (lo, hi) = len(data["plant"]["states"]), map(Fraction, data["plant"]["input_bounds"][0])
+        u = Loop(data).inputs(np.zeros((n, 1)))[0, 0]  # at the origin, which only what lies inside contains
+        close = tuple([2.0**-60] * n)
+        for what, pair in {
+            "lower bound above pi(0)": (Fraction(u) + Fraction(1, 10**6), hi),
+            "upper bound below pi(0)": (lo, Fraction(u) - Fraction(1, 10**6)),
+        }.items():
+            new = edited(data, "plant.input_bounds", [[str(v) for v in pair]])
+            yield mutant(f"practical {name}: {what}", new, "inputs", hints=(close,))
+
+
 # ------------------------------------------------------------------------------------ edits that leave the claim true
 
 

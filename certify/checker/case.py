@@ -1,0 +1,67 @@
+"""A certificate under examination: what several rules need of it, each computed when it is first asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import cached_property
+
+from .document import Array, Certificate, Partition
+from .exact import Matrix, congruence, gershgorin_lower, inverse_diagonal, rational
+from .network import Folded, fold
+
+Failures = Generator[tuple[str, str], None, int]  # what a rule makes: each failure's (place, detail); how much it met
+
+
+@dataclass(frozen=True)
+class Case:
+    """The empty list stands for the inverse of a matrix that is not positive definite: no rule can use it."""
+
+    c: Certificate
+
+    @property
+    def partition(self) -> Partition:
+        """The evidence, of a certificate that has a tree."""
+        if not isinstance(self.c.evidence, Partition):
+            raise TypeError("this rule is about a partition tree")
+        return self.c.evidence
+
+    @property
+    def T(self) -> Array:
+        return self.partition.T
+
+    @cached_property
+    def P_inverse(self) -> list[Fraction]:
+        """The diagonal of P^-1."""
+        return inverse_diagonal(rational(self.c.P)) or []
+
+    @cached_property
+    def S(self) -> Matrix:
+        """T'PT."""
+        return congruence(rational(self.T), rational(self.c.P))
+
+    @cached_property
+    def S_inverse(self) -> list[Fraction]:
+        """The diagonal of S^-1."""
+        return inverse_diagonal(self.S) or []
+
+    @cached_property
+    def least(self) -> Fraction:
+        """A lower bound of the least eigenvalue of S."""
+        return gershgorin_lower(self.S)
+
+    @cached_property
+    def net(self) -> Folded:
+        """The policy with its centring folded in."""
+        return fold(self.c.policy, self.c.u_eq)
+
+    @cached_property
+    def bounded(self) -> bool:
+        """True if `offset +- scale` lies in the input bounds and the centring keeps the input there."""
+        policy = self.c.policy
+        each = zip(policy.offset.tolist(), policy.scale.tolist(), self.c.input_bounds, strict=True)
+        return (policy.squash == "tanh" and policy.centre != "output") and all(
+            lo <= Fraction(offset) - abs(Fraction(scale)) and Fraction(offset) + abs(Fraction(scale)) <= hi
+            for offset, scale, (lo, hi) in each
+        )

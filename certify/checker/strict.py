@@ -1,0 +1,61 @@
+"""From bytes to plain JSON data. The limits keep the memory that a file can ask for below a gigabyte.
+
+Decimal numbers, NaN, infinities, long integers and duplicate keys are refused wherever they stand.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from typing import Any, NoReturn
+
+from .errors import Rejected, Unreadable
+
+MAX_BYTES = 256 * 2**20
+MAX_WIDE_BYTES = 2**24  # with a character beyond ASCII: each may take four bytes
+MAX_VALUES = 1_000_000  # each takes up to 100 bytes of memory; numbers come as base64, never as lists
+MAX_DIGITS = 10
+
+
+def fail(at: str, detail: str) -> NoReturn:
+    """The only place from which rule `format` says no."""
+    raise Rejected("format", at or "file", detail)
+
+
+def load(path: str) -> tuple[Any, str]:
+    """The JSON value in the file at `path`, and the sha256 of its bytes; raises `Unreadable` or `Rejected`."""
+    try:
+        with open(path, "rb") as stream:
+            size = os.fstat(stream.fileno()).st_size
+            raw = b"" if size > MAX_BYTES else stream.read(MAX_BYTES + 1)
+    except OSError as error:
+        raise Unreadable(f"{path} cannot be read: {error.strerror}") from error
+    if size > MAX_BYTES or len(raw) > MAX_BYTES:
+        fail("file", f"larger than {MAX_BYTES} bytes")
+    if len(raw) > MAX_WIDE_BYTES and not raw.isascii():
+        fail("file", f"larger than {MAX_WIDE_BYTES} bytes and not ASCII")
+    if sum(map(raw.count, (b",", b"[", b"{"))) > MAX_VALUES:
+        fail("file", f"more than {MAX_VALUES} commas and brackets")
+    refuse: dict[str, Any] = {
+        "parse_float": lambda text: fail("file", f"decimal number {text[:40]}"),
+        "parse_constant": lambda text: fail("file", f"number {text}"),
+    }
+    try:
+        data = json.loads(raw.decode("utf-8"), object_pairs_hook=_object, parse_int=_integer, **refuse)
+    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
+        raise Rejected("format", "file", f"not a JSON document: {type(error).__name__}") from error
+    return data, hashlib.sha256(raw).hexdigest()
+
+
+def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    result = dict(pairs)
+    if len(result) != len(pairs):
+        fail("file", "duplicate key")
+    return result
+
+
+def _integer(text: str) -> int:
+    if len(text) > MAX_DIGITS:
+        fail("file", f"integer {text[:20]}... is too long")
+    return int(text)

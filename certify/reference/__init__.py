@@ -1,0 +1,13 @@
+"""The reference: a second checker of certificates, written from `checker/FORMAT.md` alone, plain and slow.
+
+Two programs that share no line can only be wrong together where that page is wrong, or where their authors made the
+same mistake. So nothing here was taken from `certify.checker`, nothing of the project is imported, and no bound
+comes from a float: what is rational is decided in flint's fractions, all else in balls whose comparisons count only
+when they are certain.
+
+The page leaves choices: the two lines around a tanh, the multiplier k, how a spectral norm is bounded, how the error of
+a tanh reaches the tanhs behind it. They are made here independently, so on a leaf or a local ball that is close to its
+limit the two verdicts may differ, either way.
+
+`python -I -m certify.reference FILE` prints the claim and the verdict.
+"""

@@ -1,0 +1,131 @@
+"""The command line: `python -I -m certify.reference FILE [--json]`.
+
+The claim in words and the verdict. Exit status 0 accepted, 1 rejected, 2 usage or an unreadable file, 3 trusted,
+70 an error of this program.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import stat
+import sys
+import time
+from collections.abc import Sequence
+from typing import Any
+
+from .document import MAX_BYTES, Certificate
+from .rules import Verdict, judge
+
+STATUS = {"ACCEPTED": 0, "REJECTED": 1, "TRUSTED": 3}
+UNUSABLE, INTERNAL = 2, 70
+
+
+def read_once(path: str) -> bytes:
+    """The bytes of a regular file, one more than are allowed at most; raises OSError."""
+    descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))  # a pipe must not keep us waiting
+    with os.fdopen(descriptor, "rb") as stream:
+        if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+            raise OSError(0, "it is not a regular file")
+        return stream.read(MAX_BYTES + 1)
+
+
+def in_words(c: Certificate) -> str:
+    bounds = f"{', '.join(c.plant.inputs)} within the input bounds"
+    if c.claim == "practical":
+        return (
+            f"{c.plant.name}, policy {c.policy.sha256}: every trajectory that starts in V <= {c.outer!r} stays there, "
+            f"enters V <= {c.inner!r} in finite time and stays in that set from then on, with {bounds}"
+        )
+    return (
+        f"{c.plant.name}, policy {c.policy.sha256}: every trajectory that starts in V <= {c.outer!r} stays there and "
+        f"converges to the origin, which is asymptotically stable, with {bounds}"
+    )
+
+
+def level_names(c: Certificate) -> tuple[tuple[str, str, float], ...]:
+    """Key in the file, letter, value."""
+    inner = ("local", "c1", c.inner) if c.claim == "asymptotic" else ("floor", "c0", c.inner)
+    return inner, ("roa", "c2", c.outer)
+
+
+def line(verdict: Verdict) -> str:
+    sha256, c = verdict.certificate_sha256, verdict.certificate
+    if c is None or verdict.result == "REJECTED":
+        return f"REJECTED rule={verdict.rule} at={verdict.at}: {verdict.detail}"
+    levels = " ".join(f"{letter}={value!r}" for _, letter, value in level_names(c))
+    return f"{verdict.result} {levels} sha256={sha256}" + (f": {verdict.detail}" if verdict.detail else "")
+
+
+def as_json(verdict: Verdict, seconds: float) -> dict[str, Any]:
+    c = verdict.certificate
+    return {
+        "result": verdict.result,
+        "rule": verdict.rule,
+        "at": verdict.at,
+        "detail": verdict.detail,
+        "claim": c and c.claim,
+        "certificate_sha256": verdict.certificate_sha256,
+        "policy_sha256": c and c.policy.sha256,
+        "levels": c and {key: value for key, _, value in level_names(c)},
+        "leaves": verdict.leaves,
+        "seconds": {"check": seconds},
+        "text": [*([in_words(c)] if c and verdict.result != "REJECTED" else []), line(verdict)],
+    }
+
+
+def say(text: str) -> None:
+    sys.stdout.buffer.write(text.encode("ascii", "backslashreplace") + b"\n")
+    sys.stdout.flush()
+
+
+class _Parser(argparse.ArgumentParser):
+    """One object on standard output with `--json`, for a wrong command too."""
+
+    json = False
+
+    def error(self, message: str) -> Any:
+        if self.json:
+            say(json.dumps({"error": message}))
+        else:
+            sys.stderr.write(f"{self.format_usage()}{message}\n")
+        self.exit(UNUSABLE)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    parser = _Parser(prog="python -I -m certify.reference", description="Check one certificate, a second time.")
+    parser.json = "--json" in given
+    parser.add_argument("file", metavar="FILE")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    options = parser.parse_args(given)
+
+    def failed(message: str, status: int) -> int:
+        if options.json:
+            say(json.dumps({"error": message}))
+        else:
+            sys.stderr.write(message.encode("ascii", "backslashreplace").decode() + "\n")
+        return status
+
+    start = time.perf_counter()
+    try:
+        raw = read_once(options.file)
+    except (OSError, ValueError) as error:
+        return failed(f"{options.file} cannot be read: {getattr(error, 'strerror', None) or error}", UNUSABLE)
+    try:
+        verdict = judge(raw)
+    except Exception as error:  # whatever it is, it must not look like a verdict
+        return failed(f"internal error: {type(error).__name__}: {error}", INTERNAL)
+    seconds = time.perf_counter() - start
+    if options.json:
+        say(json.dumps(as_json(verdict, seconds)))
+    else:
+        if verdict.certificate is not None:
+            say(f"claim: {in_words(verdict.certificate)}")
+        say(line(verdict))
+    return STATUS[verdict.result]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

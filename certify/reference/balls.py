@@ -1,0 +1,101 @@
+"""Balls of Arb: what the local rule and the leaves share.
+
+Traps that this module is there for: a comparison of balls is True only if it is certain, so a condition is written such
+that True is needed to go on; `min`, `max` and `sorted` of Python compare midpoints at best, so balls have methods for
+that; and a number that is not finite is compared with nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+
+from flint import arb, arb_mat
+
+from .document import Certificate, Policy, exact
+
+PRECISION = 128  # bits; single operations of flint cost about the same with 64
+ZERO, ONE = arb(0), arb(1)
+
+
+def total(terms: Iterable[arb]) -> arb:
+    return sum(terms, ZERO)
+
+
+def absolute(A: arb_mat) -> arb_mat:
+    return arb_mat(A.nrows(), A.ncols(), [abs(v) for v in A.entries()])
+
+
+def columns_scaled(A: arb_mat, factors: Sequence[arb]) -> arb_mat:
+    """A times a diagonal matrix."""
+    scale = list(factors) * A.nrows()
+    return arb_mat(A.nrows(), A.ncols(), [a * s for a, s in zip(A.entries(), scale, strict=True)])
+
+
+def finite(values: Iterable[arb]) -> bool:
+    return all(v.is_finite() for v in values)
+
+
+def norm(values: Iterable[arb]) -> arb:
+    """The largest 2-norm of a vector of balls."""
+    return total(arb(v.abs_upper()) ** 2 for v in values).sqrt()
+
+
+def identity(n: int) -> arb_mat:
+    return arb_mat(n, n, [int(i == j) for i in range(n) for j in range(n)])
+
+
+def spectral(A: arb_mat) -> arb:
+    """A bound of the largest singular value: the root of ||(AA')^(2^k)||_F, at most n^(1/2^(k+2)) too large."""
+    result, squared = norm(A.entries()), A * A.transpose()
+    for k in range(30):
+        bound = norm(squared.entries())
+        for _ in range(k + 1):
+            bound = bound.sqrt()
+        result, squared = bound if bound < result else result, squared * squared
+    return result
+
+
+def derivatives(name: str, y: arb) -> tuple[arb, arb, arb, arb]:
+    """phi, phi', phi'', phi''' on a ball."""
+    if name == "1/":
+        p = 1 / y
+        return p, -(p * p), 2 * p * p * p, -6 * p * p * p * p
+    s, k = y.sin(), y.cos()
+    return (s, k, -s, -k) if name == "sin" else (k, -s, -k, s)
+
+
+def third(name: str, at: arb, y: arb, reach: arb) -> arb | None:
+    """A bound of |phi'''| on |v - y| <= reach, its value at y being `at`; None where 1/v may be undefined.
+
+    A division by a ball that holds 0 must be refused here, and not left to what becomes of its result: 0 times it is 0.
+    """
+    if name == "1/":
+        least = abs(y) - reach
+        return 6 / least**4 if least > 0 else None
+    return (abs(at) + reach).min(ONE)
+
+
+def weights(policy: Policy) -> list[arb_mat]:
+    return [arb_mat(layer.rows, layer.columns, [arb(w) for w in layer.weight]) for layer in policy.layers]
+
+
+def beta(c: Certificate) -> list[arb]:
+    """atanh((u_eq - offset) / scale)."""
+    each = zip(c.plant.u_eq, c.policy.scale, c.policy.offset, strict=True)
+    return [arb((q - exact(b)) / exact(s)).atanh() for q, s, b in each]
+
+
+def within_bounds(c: Certificate, ranges: Sequence[tuple[arb, arb]]) -> bool:
+    """Whether every input, given by centre and radius, certainly lies in its bounds."""
+    return all(
+        centre - radius >= arb(lo) and centre + radius <= arb(hi)
+        for (centre, radius), (lo, hi) in zip(ranges, c.plant.input_bounds, strict=True)
+    )
+
+
+def bounded_by_form(c: Certificate) -> bool:
+    """Whether `offset +- scale` lies in the bounds and the centring keeps the input there."""
+    if c.policy.centre == "output" or c.policy.squash != "tanh":
+        return False
+    each = zip(c.policy.scale, c.policy.offset, c.plant.input_bounds, strict=True)
+    return all(lo <= exact(b) - abs(exact(s)) and exact(b) + abs(exact(s)) <= hi for s, b, (lo, hi) in each)

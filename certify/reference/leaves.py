@@ -1,0 +1,347 @@
+"""Rules `tree`, `ring` and `inputs`: the leaves of the partition.
+
+The weights meet several leaves at a time: a layer is one product of matrices of balls whose columns are the centres and
+the half-widths of all leaves of a batch. What is left to Python is a few operations for each tanh of each leaf.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import islice
+
+from flint import arb, arb_mat, fmpq_mat
+
+from .balls import (
+    ONE,
+    ZERO,
+    absolute,
+    beta,
+    bounded_by_form,
+    columns_scaled,
+    total,
+    weights,
+    within_bounds,
+)
+from .document import Certificate, Tree
+from .refusal import Refused, require
+from .taylor import Taylor, pairs
+
+LEAF = 255
+MAX_WAITING = 4096  # boxes of the tree beside the one in hand
+BATCH = 2**14  # tanhs of a layer, over all leaves of a batch
+
+
+def structure(tree: bytes, n: int) -> int:
+    """Rule `tree`: one binary tree in preorder, and nothing behind it; the number of its leaves."""
+    waiting = 1
+    for position, byte in enumerate(tree):
+        require(waiting > 0, "tree", f"byte {position}", "bytes stand behind the tree")
+        waiting -= 1  # the box in hand
+        require(waiting <= MAX_WAITING, "tree", f"byte {position}", f"more than {MAX_WAITING} boxes wait")
+        if byte != LEAF:
+            require(byte < n, "tree", f"byte {position}", "neither an axis nor a leaf")
+            waiting += 2
+    require(waiting == 0, "tree", f"byte {len(tree)}", "the tree ends too early")
+    return tree.count(LEAF)
+
+
+@dataclass(frozen=True)
+class Box:
+    number: int
+    lo: list[float]
+    hi: list[float]
+
+    def largest(self) -> list[float]:
+        """max|z_i|."""
+        return [max(abs(a), abs(b)) for a, b in zip(self.lo, self.hi, strict=True)]
+
+    def least(self) -> list[float]:
+        """min|z_i|."""
+        return [0.0 if a <= 0 <= b else min(abs(a), abs(b)) for a, b in zip(self.lo, self.hi, strict=True)]
+
+
+def boxes(evidence: Tree) -> Iterator[Box]:
+    """The leaves' boxes of a tree whose structure is sound."""
+    waiting, number = [([-b for b in evidence.root], list(evidence.root))], 0
+    for axis in evidence.tree:
+        lo, hi = waiting.pop()
+        if axis == LEAF:
+            yield Box(number, lo, hi)
+            number += 1
+            continue
+        middle = 0.5 * lo[axis] + 0.5 * hi[axis]
+        below, above = list(hi), list(lo)
+        below[axis] = above[axis] = middle
+        waiting += [(above, hi), (lo, below)]  # the lower half is next
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """A box as z = centre + radius d with what is affine in d: x, 2 P x, and the inputs within an error.
+
+    `x` and `gradient` are lists [constant, coefficients of d]; `u` has (constant, coefficients of d, error).
+    """
+
+    box: Box
+    centre: list[arb]
+    radius: list[arb]
+    x: list[list[arb]]
+    gradient: list[list[arb]]
+    u: list[tuple[arb, list[arb], arb]]
+
+    def ranges(self) -> list[tuple[arb, arb]]:
+        """The centre and the radius of each input's enclosure."""
+        return [(mid, total(abs(v) for v in slopes) + error) for mid, slopes, error in self.u]
+
+
+class Leaves:
+    """What all leaves of a certificate share."""
+
+    def __init__(self, c: Certificate, T: fmpq_mat, S: fmpq_mat) -> None:
+        self.c, self.n, self.symbols = c, c.n, c.n + c.m
+        self.T, self.PT2 = arb_mat(T), arb_mat(2 * (c.P * T))
+        self.S = [arb(S[i, i]) for i in range(c.n)]
+        self.cross = [(i, j, arb(2 * abs(S[i, j]))) for j in range(c.n) for i in range(j) if S[i, j] != 0]
+        self.inner, self.outer = arb(c.inner), arb(c.outer)
+        self.weights = weights(c.policy)
+        self.absolute = [absolute(W) for W in self.weights]
+        self.net_at_0 = self.at_0()
+        self.beta = beta(c) if c.policy.centre == "preactivation" else []
+
+    def at_0(self) -> list[arb]:
+        """net(0)."""
+        h = arb_mat(self.n, 1)
+        for k, (W, layer) in enumerate(zip(self.weights, self.c.policy.layers, strict=True)):
+            h = arb_mat(h.nrows(), 1, [v.tanh() for v in h.entries()]) if k else h
+            h = W * h + arb_mat(layer.rows, 1, [arb(b) for b in layer.bias])
+        return list(h.entries())
+
+    # ------------------------------------------------------------------------------------------------- which leaves
+
+    def diagonal_part(self, ends: Sequence[float]) -> arb:
+        return total(s * arb(z) ** 2 for s, z in zip(self.S, ends, strict=True))
+
+    def cross_part(self, box: Box) -> arb:
+        """sum_{i != j} |S_ij| max|z_i| max|z_j|."""
+        most = [arb(z) for z in box.largest()]
+        return total(s * most[i] * most[j] for i, j, s in self.cross)
+
+    def is_outside(self, box: Box) -> bool:
+        """Whether V > c2 on all of the box, certainly."""
+        return bool(self.diagonal_part(box.least()) - self.cross_part(box) > self.outer)
+
+    def is_inside(self, box: Box) -> bool:
+        """Whether V is below the inner level on all of the box, certainly."""
+        return bool(self.diagonal_part(box.largest()) + self.cross_part(box) < self.inner)
+
+    # --------------------------------------------------------------------------------------------------- the policy
+
+    def enclose(self, batch: Sequence[Box]) -> list[Leaf]:
+        """Each leaf with its models of x, 2 P x and the policy."""
+        n, stride = self.n, self.n + 1
+        centres = [[(arb(a) + arb(b)) / 2 for a, b in zip(box.lo, box.hi, strict=True)] for box in batch]
+        radii = [[(arb(b) - arb(a)) / 2 for a, b in zip(box.lo, box.hi, strict=True)] for box in batch]
+        entries = []
+        for i in range(n):
+            for centre, radius in zip(centres, radii, strict=True):
+                entries += [centre[i], *(radius[i] if j == i else ZERO for j in range(n))]
+        z = arb_mat(n, stride * len(batch), entries)
+        x = self.T * z
+        u = self.policy(x, len(batch))
+        states, gradients, at = x.tolist(), (self.PT2 * z).tolist(), range(0, stride * len(batch), stride)
+        return [
+            Leaf(
+                box,
+                centres[b],
+                radii[b],
+                [row[k : k + stride] for row in states],
+                [row[k : k + stride] for row in gradients],
+                [row[b] for row in u],
+            )
+            for b, (box, k) in enumerate(zip(batch, at, strict=True))
+        ]
+
+    def policy(self, forms: arb_mat, count: int) -> list[list[Affine]]:
+        """For each input and each leaf, given x on the leaves.
+
+        Each tanh lies in slope y + shift +- gap. The output sees the gaps through products of weights and slopes, taken
+        backwards. The tanhs between see them through such products too, but with one slope for all leaves of the
+        batch, that of its first, so that a product is shared; by what a leaf's own slope differs from it, the error of
+        y goes into a `rest` that spreads by absolute weights. That takes far more leaves than absolute weights alone
+        where there are three layers of tanhs or more.
+        """
+        policy, last = self.c.policy, len(self.weights) - 1
+        slopes, gaps = list[list[list[arb]]](), list[list[list[arb]]]()
+        ways, rest = list[arb_mat](), None
+        for k, (W, layer) in enumerate(zip(self.weights, policy.layers, strict=True)):
+            preactivations = (W * forms).tolist()
+            if k == last:
+                break
+            if k:  # the way of each earlier layer's gaps to this layer's y
+                ways = [columns_scaled(W, [slope[0] for slope in slopes[-1]]) * way for way in ways] + [W]
+            seen = arb_mat(layer.rows, count)
+            for way, gap in zip(ways, gaps, strict=True):
+                seen += absolute(way) * arb_mat(gap)
+            beyond = self.absolute[k] * rest if rest is not None else arb_mat(layer.rows, count)
+            entries, left = [], []
+            slopes.append([])
+            gaps.append([])
+            for row, bias, near, far in zip(
+                preactivations, map(arb, layer.bias), seen.tolist(), beyond.tolist(), strict=True
+            ):
+                reached = [v + w for v, w in zip(near, far, strict=True)]
+                lined = [tanh((row[b] + bias, row[b + 1 : b + self.n + 1], error)) for b, error in self.places(reached)]
+                entries += [v for (mid, slope, _), _, _ in lined for v in (mid, *slope)]
+                own = [slope for _, slope, _ in lined]
+                left += [abs(s - own[0]) * v + s * w for s, v, w in zip(own, near, far, strict=True)]
+                slopes[k].append(own)
+                gaps[k].append([gap for _, _, gap in lined])
+            forms, rest = arb_mat(layer.rows, len(row), entries), arb_mat(layer.rows, count, left)
+        behind = self.backwards(slopes, gaps, count)
+        result = []
+        for j, row in enumerate(preactivations):
+            bias = arb(policy.layers[last].bias[j])
+            nets = [(row[b] + bias, row[b + 1 : b + self.n + 1], e) for b, e in self.places(behind[j])]
+            result.append([self.output(j, net) for net in nets])
+        return result
+
+    def places(self, errors: Sequence[arb]) -> Iterator[tuple[int, arb]]:
+        """The column at which each leaf begins, with the leaf's error."""
+        return zip(range(0, (self.n + 1) * len(errors), self.n + 1), errors, strict=True)
+
+    def backwards(self, slopes: list[list[list[arb]]], gaps: list[list[list[arb]]], count: int) -> list[list[arb]]:
+        """The error of each net output on each leaf: each gap times the magnitude of its way to the output."""
+        m, last = self.c.m, len(self.weights) - 1
+        errors = [[ZERO] * count for _ in range(m)]
+        ways = [[w for w in column for _ in range(count)] for column in zip(*self.weights[last].tolist(), strict=True)]
+        for k in reversed(range(last)):  # ways[i] is from tanh i of layer k to output 0 on all leaves, to output 1, ...
+            for way, gap in zip(ways, gaps[k], strict=True):
+                for j in range(m):
+                    errors[j] = [
+                        e + abs(w) * g
+                        for e, w, g in zip(errors[j], way[j * count : (j + 1) * count], gap, strict=True)
+                    ]
+            if k:
+                scaled = [w * s for way, slope in zip(ways, slopes[k], strict=True)
+                          for w, s in zip(way, slope * m, strict=True)]  # fmt: skip
+                ways = (self.weights[k].transpose() * arb_mat(len(ways), m * count, scaled)).tolist()
+        return errors
+
+    def output(self, j: int, net: Affine) -> Affine:
+        """Input j from its net output."""
+        policy, (mid, slopes, error), at_0 = self.c.policy, net, self.net_at_0[j]
+        if policy.centre == "preactivation":
+            mid += self.beta[j] - at_0
+        if policy.squash == "tanh":
+            (mid, slopes, error), _, _ = tanh((mid, slopes, error))
+            at_0 = at_0.tanh()
+        scale = arb(policy.scale[j])
+        shift = arb(self.c.plant.u_eq[j]) - scale * at_0 if policy.centre == "output" else arb(policy.offset[j])
+        return scale * mid + shift, [scale * v for v in slopes], abs(scale) * error
+
+    # ----------------------------------------------------------------------------------------------------- the ring
+
+    def F(self, leaf: Leaf) -> list[Taylor]:
+        """Models of f(x, pi(x)), all of them finite."""
+        n, place = self.n, f"leaf {leaf.box.number}"
+        pad = [ZERO] * (self.symbols - n)
+        names = {
+            name: Taylor(row[0], row[1:] + pad) for name, row in zip(self.c.plant.states, leaf.x, strict=True)
+        }
+        for j, (name, (mid, slopes, error)) in enumerate(zip(self.c.plant.inputs, leaf.u, strict=True)):
+            own = [error if i == j else ZERO for i in range(self.c.m)]  # the error is a symbol
+            names[name] = Taylor(mid, slopes + own)
+        try:
+            result = self.c.plant.dynamics.evaluate(names, lambda q: Taylor(arb(q)))
+        except Refused as no:
+            raise Refused(no.rule, place, no.detail) from None
+        require(all(f.is_finite() for f in result), "ring", place, "F has no finite model")
+        return result
+
+    def Vdot(self, leaf: Leaf) -> Taylor:
+        """(2 P x)'F."""
+        pad, result = [ZERO] * (self.symbols - self.n), Taylor(ZERO)
+        for row, f in zip(leaf.gradient, self.F(leaf), strict=True):
+            result += Taylor(row[0], row[1:] + pad) * f
+        return result
+
+    def V(self, leaf: Leaf) -> Taylor:
+        """z'Sz, the off-diagonal part in the remainder."""
+        each = list(zip(self.S, leaf.centre, leaf.radius, strict=True))
+        c = total(s * z * z for s, z, _ in each)
+        g = [2 * s * z * r for s, z, r in each] + [ZERO] * (self.symbols - self.n)
+        diagonal = [s * r * r for s, _, r in each]
+        Q = [diagonal[i] if i == j and i < self.n else ZERO for i, j in pairs(self.symbols)]
+        return Taylor(c, g, Q, self.cross_part(leaf.box))
+
+    def decreases(self, leaf: Leaf) -> bool:
+        """Whether Vdot, Vdot + k (c2 - V) or Vdot + k (V - inner) is certainly negative on the leaf, for some k >= 0.
+
+        The first-order part of the bound is piecewise linear in k: each of its kinks is tried. Any number may be k; one
+        that is not finite makes the bound so, and that is negative for no comparison.
+        """
+        Vdot, V = self.Vdot(leaf), self.V(leaf)
+        if Vdot.bound() < 0:
+            return True
+        for slack in (Taylor(self.outer) + -V, V + Taylor(-self.inner)):
+            for g, w in zip(Vdot.g or (), slack.g or (), strict=Vdot.g is not None):
+                k = -(g / w).mid()
+                if k > 0 and (Vdot + slack.scaled(k)).bound() < 0:
+                    return True
+        return False
+
+
+Affine = tuple[arb, list[arb], arb]  # mid + slopes.d within an error
+
+
+def tanh(y: Affine) -> tuple[Affine, arb, arb]:
+    """Of an affine form: another, the slope of the two lines, and half the gap between them."""
+    mid, coefficients, error = y
+    reach = total(abs(v) for v in coefficients) + error
+    slope, shift, gap = lines(arb((mid - reach).lower()), arb((mid + reach).upper()))
+    return (slope * mid + shift, [slope * v for v in coefficients], slope * error + gap), slope, gap
+
+
+def lines(lo: arb, hi: arb) -> tuple[arb, arb, arb]:
+    """slope, shift, gap with |tanh(y) - slope y - shift| <= gap on [lo, hi]; the slope is near the chord's.
+
+    The extrema of tanh(y) - slope y are at the ends or where tanh(y)^2 = 1 - slope; a point that may lie in [lo, hi]
+    counts, and one that does not lie there can only make the gap too wide.
+    """
+    at_lo, at_hi = lo.tanh(), hi.tanh()
+    slope = (((at_hi - at_lo) / (hi - lo)) if lo < hi else 1 - at_lo * at_lo).mid()
+    slope = ONE if slope > 1 else slope if slope > 1e-30 else ZERO  # at 0 there is no critical point
+    top, bottom = at_lo - slope * lo, at_hi - slope * hi
+    top, bottom = top.max(bottom), top.min(bottom)
+    if slope > 0:
+        t = (1 - slope).sqrt()
+        y = t.atanh()
+        value = t - slope * y
+        if not (y < lo or y > hi):
+            top, bottom = top.max(value), bottom.min(value)
+        if not (-y < lo or -y > hi):
+            top, bottom = top.max(-value), bottom.min(-value)
+    return slope, (top + bottom) / 2, (top - bottom) / 2
+
+
+def check_leaves(leaves: Leaves, evidence: Tree) -> None:
+    """Rules `inputs` and `ring`; in each batch of leaves the inputs come first.
+
+    An inside leaf has been covered by rule `local` under `asymptotic`. Under `practical` by nothing: there the inputs
+    are asked, and that F has a finite model.
+    """
+    c, bounded = leaves.c, bounded_by_form(leaves.c)
+    size = max(1, BATCH // max(layer.rows for layer in c.policy.layers))
+    passing = c.claim == "asymptotic"
+    asked = (box for box in boxes(evidence) if not (leaves.is_outside(box) or (passing and leaves.is_inside(box))))
+    while batch := list(islice(asked, size)):
+        enclosed = leaves.enclose(batch)
+        for leaf in enclosed:
+            good = bounded or within_bounds(c, leaf.ranges())
+            require(good, "inputs", f"leaf {leaf.box.number}", "an input is not certain to stay in its bounds")
+        for leaf in enclosed:
+            if leaves.is_inside(leaf.box):
+                leaves.F(leaf)
+                continue
+            require(leaves.decreases(leaf), "ring", f"leaf {leaf.box.number}", "no bound of Vdot is certainly negative")

@@ -1,0 +1,131 @@
+"""The rules that are decided in rationals, from `levels` to `centring`."""
+
+from __future__ import annotations
+
+from array import array
+from dataclasses import dataclass
+
+from flint import fmpq, fmpq_mat
+
+from .document import Certificate, Policy, Tree, exact
+from .refusal import require
+
+MAX_BITS = 2**14  # of a numerator or denominator on the way to f(0, u_eq)
+ZERO = fmpq(0)
+
+
+def levels(c: Certificate) -> None:
+    require(0 < c.inner <= c.outer, "levels", "levels", f"0 < {c.inner!r} <= {c.outer!r} does not hold")
+
+
+def inverse_diagonal(A: fmpq_mat, rule: str) -> list[fmpq]:
+    """The diagonal of A^-1, by cofactors, if A = A' and every leading principal minor is positive."""
+    n = A.nrows()
+    symmetric = A.transpose() == A
+    require(symmetric, rule, "symmetry", "the matrix differs from its transpose")
+    for k in range(1, n + 1):
+        require(bool(minor(A, range(k)) > 0), rule, f"minor {k}", "a leading principal minor is not positive")
+    return [minor(A, [k for k in range(n) if k != i]) / A.det() for i in range(n)]
+
+
+def minor(A: fmpq_mat, kept: range | list[int]) -> fmpq:
+    """The determinant of the kept rows and columns; that of none is 1."""
+    return fmpq_mat(len(kept), len(kept), [A[i, j] for i in kept for j in kept]).det() if kept else fmpq(1)
+
+
+def discs(A: fmpq_mat) -> fmpq:
+    """Gershgorin's lower bound min_i (A_ii - sum_j |A_ij|) on the eigenvalues of a symmetric matrix."""
+    return min(row[i] - sum((abs(v) for j, v in enumerate(row) if j != i), ZERO) for i, row in enumerate(A.tolist()))
+
+
+def domain(c: Certificate, inverse: list[fmpq]) -> None:
+    """The largest x_i^2 on {V <= c2} is c2 (P^-1)_ii."""
+    for (lo, hi), s, name in zip(c.plant.domain, inverse, c.plant.states, strict=True):
+        require(bool(lo < 0) and bool(hi > 0), "domain", name, "the domain must contain 0 in its interior")
+        inside = bool(exact(c.outer) * s < min(-lo, hi) ** 2)
+        require(inside, "domain", name, "the ellipsoid {V <= c2} leaves the interior of the domain")
+
+
+def coordinates(c: Certificate, tree: Tree) -> tuple[fmpq_mat, list[fmpq]]:
+    """S = T'PT and the diagonal of its inverse."""
+    S = tree.T.transpose() * c.P * tree.T
+    inverse = inverse_diagonal(S, "coordinates")
+    require(bool(discs(S) > 0), "coordinates", "rows", "S_ii > sum_j |S_ij| does not hold")
+    return S, inverse
+
+
+def root(c: Certificate, tree: Tree, inverse: list[fmpq]) -> None:
+    for i, (b, s) in enumerate(zip(tree.root, inverse, strict=True)):
+        large = b > 0 and bool(exact(c.outer) * s <= exact(b) ** 2)
+        require(large, "root", f"axis {i}", "the root box does not contain {V <= c2}")
+
+
+@dataclass(frozen=True)
+class Exact:
+    """A rational number on the way to f(0, u_eq)."""
+
+    value: fmpq
+
+    def __post_init__(self) -> None:
+        require(
+            self.value.height_bits() <= MAX_BITS, "equilibrium", "dynamics", f"a number of more than {MAX_BITS} bits"
+        )
+
+    def __add__(self, other: Exact) -> Exact:
+        return Exact(self.value + other.value)
+
+    def __mul__(self, other: Exact) -> Exact:
+        return Exact(self.value * other.value)
+
+    def __neg__(self) -> Exact:
+        return Exact(-self.value)
+
+    def function(self, name: str) -> Exact:
+        known = (self.value == 0) != (name == "1/")
+        require(known, "equilibrium", "dynamics", "a division by 0" if name == "1/" else f"{name} of what is not 0")
+        return Exact(1 / self.value if name == "1/" else fmpq(name == "cos"))
+
+
+def equilibrium(c: Certificate) -> None:
+    """f(0, u_eq) = 0."""
+    names = {name: Exact(ZERO) for name in c.plant.states}
+    names.update(zip(c.plant.inputs, map(Exact, c.plant.u_eq), strict=True))
+    for i, component in enumerate(c.plant.dynamics.evaluate(names, Exact)):
+        require(bool(component.value == 0), "equilibrium", f"dynamics.{i}", "f(0, u_eq) is not 0")
+
+
+def centring(c: Certificate) -> None:
+    policy = c.policy
+    each = list(zip(c.plant.u_eq, map(exact, policy.scale), map(exact, policy.offset), strict=True))
+    if policy.centre == "preactivation":
+        for j, (q, scale, offset) in enumerate(each):
+            within = bool(abs((q - offset) / scale) < 1)
+            require(within, "centring", c.plant.inputs[j], "u_eq is not a value of scale * tanh + offset")
+    if policy.centre == "none" and c.claim == "asymptotic":
+        for j, (y, (q, scale, offset)) in enumerate(zip(squashed_at_0(policy), each, strict=True)):
+            holds = y is not None and bool(scale * y + offset == q)
+            require(holds, "centring", c.plant.inputs[j], "raw(0) = u_eq does not hold by its form")
+
+
+def squashed_at_0(policy: Policy) -> list[fmpq | None]:
+    """The squash of net(0); None is a value that is not known to be rational, and a weight of exact 0 ignores it."""
+    h: list[fmpq | None] = [ZERO] * policy.layers[0].columns
+    for k, layer in enumerate(policy.layers):
+        h = [tanh(v) for v in h] if k else h
+        h = [affine(layer.row(i), b, h) for i, b in enumerate(layer.bias)]
+    return [tanh(v) for v in h] if policy.squash == "tanh" else h
+
+
+def tanh(value: fmpq | None) -> fmpq | None:
+    """Of rational numbers, 0 alone has a rational tanh."""
+    return ZERO if value is not None and value == 0 else None
+
+
+def affine(weights: array[float], bias: float, h: list[fmpq | None]) -> fmpq | None:
+    result = exact(bias)
+    for w, v in zip(weights, h, strict=True):
+        if w != 0:
+            if v is None:
+                return None
+            result += exact(w) * v
+    return result

@@ -1,0 +1,78 @@
+"""All rules in their order, and the verdict on the bytes of a file."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+
+from flint import ctx
+
+from . import rational
+from .balls import PRECISION
+from .document import Certificate, Trusted, read
+from .leaves import Leaves, check_leaves, structure
+from .local import local
+from .refusal import Refused, require
+
+MAX_WORK = 2**22  # numbers of a model times operations of the plant; entries of the matrices of a network
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """`result` is ACCEPTED, REJECTED (with rule, at and detail) or TRUSTED (with detail)."""
+
+    result: str
+    certificate_sha256: str
+    rule: str | None = None
+    at: str | None = None
+    detail: str | None = None
+    certificate: Certificate | None = None
+    leaves: int | None = None
+
+
+def judge(raw: bytes) -> Verdict:
+    """The verdict on a file; its hash is taken over the very bytes that are judged."""
+    sha256, c, leaves = hashlib.sha256(raw).hexdigest(), None, None
+    try:
+        with ctx.workprec(PRECISION):
+            c = read(raw)
+            leaves = check(c)
+    except Refused as no:
+        return Verdict("REJECTED", sha256, no.rule, no.at, no.detail, c)
+    if isinstance(c.evidence, Trusted):
+        detail = f"the word of {c.evidence.solver} {c.evidence.version}"
+        return Verdict("TRUSTED", sha256, detail=detail, certificate=c)
+    return Verdict("ACCEPTED", sha256, certificate=c, leaves=leaves)
+
+
+def check(c: Certificate) -> int | None:
+    """Every rule in its order; the number of leaves, or None where the evidence cannot be replayed."""
+    rational.levels(c)
+    inverse = rational.inverse_diagonal(c.P, "lyapunov")
+    if c.claim == "asymptotic":
+        rational.equilibrium(c)
+    rational.domain(c, inverse)
+    if isinstance(c.evidence, Trusted):
+        rational.centring(c)
+        return None
+    S, inverse = rational.coordinates(c, c.evidence)
+    rational.root(c, c.evidence, inverse)
+    rational.centring(c)
+    bearable(c, "local" if c.claim == "asymptotic" else "ring")
+    if c.claim == "asymptotic":
+        local(c, c.evidence.T, S)
+    leaves = structure(c.evidence.tree, c.n)
+    if c.inner < c.outer or c.claim == "practical":  # no local ball stands in for the leaves
+        check_leaves(Leaves(c, c.evidence.T, S), c.evidence)
+    return leaves
+
+
+def bearable(c: Certificate, rule: str) -> None:
+    """Refuses what would fill the memory before it is decided."""
+    plant = len(c.plant.dynamics.steps) * (c.n + c.m) ** 2
+    require(plant <= MAX_WORK, rule, "plant", "the equations are too large for this checker")
+    before, network = 0, 0
+    for layer in c.policy.layers:
+        network += layer.rows * (layer.columns + before + c.n**2)
+        before += layer.rows
+    require(network <= MAX_WORK, rule, "policy", "the network is too large for this checker")
