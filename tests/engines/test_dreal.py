@@ -32,7 +32,7 @@ from certify.engines.dreal import proof as dreal_proof
 from certify.engines.dreal.backend import Answer, Backend, decide, find_backend
 from certify.engines.dreal.proof import DrealEngine
 from certify.engines.falsify import Witness, confirm
-from certify.errors import BackendError, SoundnessError
+from certify.errors import BackendError, InputError, SoundnessError
 from certify.policies import Policy, TanhNetwork, save_policy
 from certify.report import render_html
 from certify.roa import RoaOptions, certify_roa, run_checker
@@ -347,6 +347,15 @@ def test_the_margin_to_the_domain_is_named(monkeypatch: pytest.MonkeyPatch) -> N
     proof = attempt(monkeypatch, case_of(*scalar_tanh()), 0.1, 8.99)
     assert proof.claim is not None and 0.99 * 8.99 < proof.claim.roa < 8.99
     assert proof.stop is Stop.MARGIN and "0.996" in proof.detail
+
+
+def test_another_claim_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Practical stability needs a smooth F inside the floor, of which no query speaks."""
+    asked = answering(monkeypatch, unsat)
+    case = case_of(*scalar_tanh())
+    with pytest.raises(InputError, match=r"asymptotic only, not practical\. Use engine bounds"):
+        DrealEngine(case.T, 1e-3, 1).prove(Task(case.problem, "practical", 1.0), Budget())
+    assert not asked
 
 
 def test_a_delta_sat_is_said_to_touch_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
