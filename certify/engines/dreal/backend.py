@@ -37,7 +37,7 @@ _MEANING: Mapping[Status, str] = {
     "failed": "no answer",
 }
 _EXACT = Context(prec=2000, Emax=10**6, Emin=-(10**6))
-_INLINED = 2**24  # characters of a file without definitions
+_INLINED = 2**22  # characters of a file without definitions
 _CHILD = Path(__file__).with_name("child.py")
 _INSTALL = (
     "The wheel dreal==4.21.6.2 (Python 3.10 and 3.11) needs the shared library of IBEX 2.7.4 (libibex.so), which comes "
