@@ -1,4 +1,4 @@
-"""The same conditions to every engine: bounds, codac, and dReal where it is; never PROVED or TRUSTED against REFUTED."""
+"""The same conditions to every engine, dReal where it is: never PROVED or TRUSTED against REFUTED."""
 
 from __future__ import annotations
 
