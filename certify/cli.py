@@ -114,7 +114,7 @@ def roa(
     if result.notice is not None:
         _tell(result.notice)
     if result.certificate is not None:
-        data["candidates"] = _candidates(result, options, compare)
+        data["candidates"] = _candidates(result, options, compare) if claim == "asymptotic" else []
         _write(folder / "report.html", _page(result, data))
     if as_json:
         _out(json.dumps(data))

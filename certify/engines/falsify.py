@@ -68,8 +68,8 @@ def falsify(problem: Problem, T: Array, limit: float, samples: int = 20_000, see
     return best
 
 
-def survey(problem: Problem, T: Array, limit: float, samples: int = 512, seed: int = 0) -> Band | None:
-    """The widest band of levels up to `limit` on which no violation was found; None if there is none."""
+def survey(problem: Problem, T: Array, limit: float, samples: int = 512, seed: int = 0) -> list[Band]:
+    """The bands of levels up to `limit` on which no violation was found, the highest first."""
     search = _Search(problem, T)
     generator = np.random.default_rng(seed)
     direction = generator.standard_normal((samples, problem.loop.system.n))
@@ -86,11 +86,8 @@ def survey(problem: Problem, T: Array, limit: float, samples: int = 512, seed: i
         levels.append(levels[-1] / _RATIO**8)
         found.append(good(levels[-1]))
     runs = [list(run) for ok, run in itertools.groupby(range(len(levels)), key=found.__getitem__) if ok]
-    if not runs:
-        return None
-    best = max(runs, key=lambda run: levels[run[0]] / levels[run[-1]])
-    below, above = min(best[-1] + 1, len(levels) - 1), max(best[0] - 1, 0)
-    return Band(levels[below], levels[best[-1]], levels[best[0]], levels[above])
+    last = len(levels) - 1
+    return [Band(levels[min(k[-1] + 1, last)], levels[k[-1]], levels[k[0]], levels[max(k[0] - 1, 0)]) for k in runs]
 
 
 def descend(problem: Problem, T: Array, z: Array) -> Witness | None:

@@ -9,6 +9,7 @@ import sympy
 
 from certify.errors import InputError
 from certify.expressions.evaluate import Algebra, evaluate
+from certify.expressions.tree import AT_ZERO
 
 _MOST_BITS = 2**14  # of a number on the way: powers of powers grow without end
 
@@ -33,7 +34,7 @@ class _Rational(Algebra[Fraction]):
     def function(self, name: str, value: Fraction) -> Fraction:
         if value != 0:
             raise InputError(f"{name} of {value} has no exact value")
-        return Fraction(1 if name == "cos" else 0)
+        return Fraction(AT_ZERO[name])
 
 
 def evaluate_exactly(expression: sympy.Expr, values: Mapping[sympy.Symbol, Fraction]) -> Fraction:

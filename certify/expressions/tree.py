@@ -10,6 +10,7 @@ import sympy
 from certify.errors import CertificateFormatError, InputError
 
 FUNCTIONS: Mapping[str, Any] = {"sin": sympy.sin, "cos": sympy.cos, "tan": sympy.tan}
+AT_ZERO: Mapping[str, int] = {"sin": 0, "cos": 1, "tan": 0}  # the only values that are used exactly
 Tree = Any  # nested lists: a name, an exact fraction as text, or an operator with its operands
 
 

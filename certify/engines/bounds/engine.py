@@ -46,26 +46,36 @@ class BoundsEngine:
         return self._proof(ring, Asymptotic(roa=ring.outer, local=inner), seconds)
 
     def _practical(self, task: Task, budget: Budget, report: Report | None) -> Proof:
+        """The bands of a survey in turn, the highest first, until one holds a proof."""
         start = time.perf_counter()
-        found = survey(task.problem, self.T, task.target)
-        if found is None or (task.exactly and found.top < task.target):
-            near = "around any level" if found is None else "near the level that was asked for"
-            why = f"Vdot >= 0 or an input out of bounds was sampled {near}"
-            return Proof(None, None, Stop.FLOOR, why, seconds={"ring": time.perf_counter() - start})
+        bands = survey(task.problem, self.T, task.target)
+        if task.exactly:
+            bands = [band for band in bands if band.top >= task.target]
+        why = f"Vdot >= 0 or an input out of bounds was sampled {'near' if task.exactly else 'around'} every level"
+        found = Proof(None, None, Stop.FLOOR, why)
+        for k, band in enumerate(bands):
+            left = budget.seconds - (time.perf_counter() - start)
+            share = left if k == len(bands) - 1 else left / 2
+            proof = self._in_band(task, band, replace(budget, seconds=share), report)
+            found = proof if k == 0 or proof.claim is not None else found
+            if proof.claim is not None:
+                break
+        return replace(found, seconds={"ring": time.perf_counter() - start})
+
+    def _in_band(self, task: Task, band: Band, budget: Budget, report: Report | None) -> Proof:
+        """The largest c2, then the smallest c0 for it, from levels between which no violation was sampled."""
+        start = time.perf_counter()
         outer, stop = task.target, Stop.REQUESTED
         if not task.exactly:
-            outer, stop = self._outer_level(task, found, replace(budget, seconds=_SHARE * budget.seconds), report)
+            outer, stop = self._outer_level(task, band, replace(budget, seconds=_SHARE * budget.seconds), report)
         left = replace(budget, seconds=budget.seconds - (time.perf_counter() - start))
-        ring = prove_inwards(task.problem, self.T, found.below, outer, left, self.runner, report)
-        seconds = {"ring": time.perf_counter() - start}
+        ring = prove_inwards(task.problem, self.T, band.below, outer, left, self.runner, report)
         if not ring.inner < ring.outer:
-            why = f"no ring below V = {outer:.6g} is proved"
-            return Proof(None, None, Stop.FLOOR, why, boxes=ring.boxes, seconds=seconds)
+            return Proof(None, None, Stop.FLOOR, f"no ring below V = {outer:.6g} is proved", boxes=ring.boxes)
         if not ring.covered:
             why = f"F and its inputs are not enclosed on all of V <= {ring.inner:.6g}"
-            return Proof(None, None, Stop.SMOOTH, why, boxes=ring.boxes, seconds=seconds)
-        proof = self._proof(ring, Practical(roa=ring.outer, floor=ring.inner), seconds)
-        return replace(proof, stop=stop)
+            return Proof(None, None, Stop.SMOOTH, why, boxes=ring.boxes)
+        return replace(self._proof(ring, Practical(roa=ring.outer, floor=ring.inner), {}), stop=stop)
 
     def _outer_level(self, task: Task, band: Band, budget: Budget, report: Report | None) -> tuple[float, Stop]:
         """The largest c2 that a ring from somewhat above the floor reaches, and what stopped it."""

@@ -1,0 +1,190 @@
+"""Practical stability: what is proved is so, what is false is never proved, and nothing is forgotten inside c0."""
+
+from __future__ import annotations
+
+import dataclasses
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+import sympy
+
+from certify.certificate import run_checker
+from certify.claims import Practical
+from certify.engines.base import Budget, Proof, Task
+from certify.engines.bounds.engine import BoundsEngine
+from certify.engines.bounds.search import prove_inwards
+from certify.engines.falsify import survey
+from certify.errors import InputError
+from certify.lyapunov import domain_limit
+from certify.policies import TanhNetwork, load_policy
+from certify.rigorous import evaluate_vdot
+from certify.roa import RoaOptions, certify_roa
+from certify.running import ThreadRunner
+from certify.systems import System, get_system
+from certify.verdict import Stop, Verdict
+from tests.engines.test_bounds import planted, vdot
+from tests.support.cases import Case, case_of
+from tests.support.loops import box, pendulum_network, scalar_tanh
+
+POLICIES = Path(__file__).parents[2] / "examples" / "policies"
+PRACTICAL = RoaOptions(claim="practical")
+
+
+def prove(case: Case, budget: Budget | None = None, exactly: float | None = None) -> Proof:
+    limit = domain_limit(case.P, case.loop.system.domain) * (1 - 1e-9)
+    task = Task(case.problem, "practical", exactly or limit, exactly is not None)
+    return BoundsEngine(case.T, ThreadRunner()).prove(task, budget or Budget(seconds=20))
+
+
+def uncentred(seed: int = 0) -> tuple[System, TanhNetwork]:
+    return get_system("pendulum"), dataclasses.replace(pendulum_network(seed=seed), centre="none")
+
+
+def off_the_origin(shift: Fraction) -> tuple[System, TanhNetwork]:
+    """xdot = -x + shift: every trajectory converges to `shift`, so c0 cannot lie below shift^2 with V = x^2."""
+    x, u = sympy.symbols("x u")
+    drift = sympy.Rational(shift.numerator, shift.denominator)
+    system = System("off", (x,), (u,), {}, (u + drift,), (sympy.Integer(0),), box(3), box(9))
+    return system, TanhNetwork((np.array([[-1.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+
+
+def test_the_floor_of_a_known_plant() -> None:
+    case = case_of(*off_the_origin(Fraction(1, 4)))
+    proof = prove(case)
+    assert isinstance(proof.claim, Practical) and proof.stop is Stop.REQUESTED
+    known = float(case.P[0, 0]) / 16
+    assert known < proof.claim.floor < 1.01 * known
+    assert proof.claim.roa == domain_limit(case.P, box(3)) * (1 - 1e-9)
+
+
+def test_the_bounds_hold_on_samples_and_the_floor_is_near_a_violation() -> None:
+    case = case_of(*uncentred())
+    proof = prove(case)
+    assert isinstance(proof.claim, Practical)
+    z = np.random.default_rng(0).standard_normal((4000, 2))
+    z /= np.linalg.norm(z, axis=1, keepdims=True)
+    for level in np.geomspace(proof.claim.floor, proof.claim.roa, 40):
+        assert np.max(vdot(case, np.sqrt(level) * z @ case.T.T)) < 0
+    below = [np.max(vdot(case, np.sqrt(proof.claim.floor * s) * z @ case.T.T)) for s in (0.99, 0.95, 0.9)]
+    assert max(below) >= 0
+
+
+def test_a_survey_finds_the_band_of_a_known_plant() -> None:
+    case = case_of(*scalar_tanh())
+    (band,) = survey(case.problem, case.T, 9.0)
+    assert band.top < 1.915008**2 <= band.above
+    shifted = case_of(*off_the_origin(Fraction(1, 4)))
+    (band,) = survey(shifted.problem, shifted.T, 1.0)
+    known = float(shifted.P[0, 0]) / 16
+    assert band.below <= known < band.floor and band.top == band.above == 1.0
+
+
+@pytest.mark.parametrize("claim", ["practical", "asymptotic"])
+def test_the_shipped_pendulum_without_its_centring(claim: str, tmp_path: Path) -> None:
+    """pi(0) is 2e-5 N m away from 0: no theorem about the origin, but one about a set of a micro-radian."""
+    policy = load_policy(POLICIES / "pendulum.pt")
+    network = dataclasses.replace(policy.network, centre="none")
+    system = get_system("pendulum").with_parameters(policy.parameters)
+    if claim == "asymptotic":
+        with pytest.raises(InputError, match="claim practical stability"):
+            certify_roa(system, network, tmp_path)
+        return
+    result = certify_roa(system, network, tmp_path, PRACTICAL)
+    assert result.verdict is Verdict.PROVED and result.stop is Stop.DOMAIN and result.certificate is not None
+    assert result.levels.floor is not None and result.levels.roa is not None and result.levels.local is None
+    assert result.levels.floor < 1e-8 * result.levels.roa
+    assert run_checker(result.certificate)["claim"] == "practical"
+    assert run_checker(result.certificate, "reference")["result"] == "ACCEPTED"
+    data = result.to_dict()
+    assert data["claim"] == {"kind": "practical"} and data["levels"]["floor"] == result.levels.floor
+
+
+def test_a_policy_trained_without_the_gain(tmp_path: Path) -> None:
+    policy = load_policy(POLICIES / "without_gain" / "pendulum.pt")
+    options = RoaOptions(claim="practical", candidate="lqr")
+    result = certify_roa(get_system("pendulum").with_parameters(policy.parameters), policy.network, tmp_path, options)
+    assert result.verdict is Verdict.PROVED and result.problem is not None and result.certificate is not None
+    rest = np.array([-0.084302068, 0.0])  # where it comes to rest in simulation
+    assert result.levels.floor is not None
+    assert result.problem.V(rest) < result.levels.floor < 2 * result.problem.V(rest)
+    assert run_checker(result.certificate, "reference")["result"] == "ACCEPTED"
+
+
+def _check_planted(seed: int) -> bool:
+    try:
+        case, place = planted(seed)
+    except InputError:
+        return False
+    case = case_of(case.loop.system, dataclasses.replace(case.loop.network, centre="none"), case.P)
+    if not evaluate_vdot(case.loop, case.P, place) > 0:
+        return False
+    claim = prove(case, Budget(boxes=20_000, seconds=60)).claim
+    level = case.problem.V.exactly(place)
+    assert claim is None or not claim.inner <= level <= claim.roa, f"{claim} has a violation at {level}"
+    inside = level <= Fraction(domain_limit(case.P, case.loop.system.domain))
+    if inside and claim is not None and level < claim.inner:  # asked for around the violation, it is refused too
+        task = Task(case.problem, "practical", claim.roa, True)
+        again = BoundsEngine(case.T, ThreadRunner()).prove(task, Budget(boxes=20_000, seconds=60)).claim
+        assert again is None or again.inner > level
+    return inside
+
+
+def test_planted_violations_between_the_levels_are_never_proved() -> None:
+    assert sum(_check_planted(seed) for seed in range(16)) >= 8
+
+
+@pytest.mark.slow
+def test_fifty_planted_violations_are_never_proved() -> None:
+    assert sum(_check_planted(seed) for seed in range(100)) >= 50
+
+
+def with_pole() -> tuple[System, TanhNetwork]:
+    """xdot = -x (1 + 1e-9 / (x - 1/100)): well behaved far out, with a pole inside."""
+    x, u = sympy.symbols("x u")
+    pole = sympy.Rational(1, 10**9) / (x - sympy.Rational(1, 100))
+    system = System("pole", (x,), (u,), {}, (u - x * pole,), (sympy.Integer(0),), box(3), box(9))
+    return system, TanhNetwork((np.array([[-1.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+
+
+def test_a_pole_inside_the_floor_is_not_forgotten(tmp_path: Path) -> None:
+    """Far out Vdot < 0, and trajectories run into the pole: levels above it are no claim, those below it are one."""
+    case = case_of(*with_pole())
+    at_pole = case.problem.V.exactly(np.array([0.01]))
+    proof = prove(case, Budget(boxes=5_000, seconds=20))
+    assert proof.claim is not None and proof.claim.roa < at_pole
+    above = prove(case, Budget(boxes=5_000, seconds=20), exactly=1.0)
+    assert above.claim is None and above.stop is Stop.SMOOTH
+    result = certify_roa(*with_pole(), tmp_path, RoaOptions(claim="practical", level=1.0, max_boxes=5_000))
+    assert result.verdict is Verdict.UNKNOWN and not list(tmp_path.iterdir())
+
+
+def test_input_bounds_hold_inside_the_floor_too() -> None:
+    """The bounds are broken near the origin only: the policy's steep tanhs rise there and cancel further out."""
+    x, u = sympy.symbols("x u")
+    system = System("bump", (x,), (u,), {}, (u - 2 * x,), (sympy.Integer(0),), box(3), box(4))
+    first, bias = np.array([[40.0], [40.0], [0.1]]), np.array([12.0, -12.0, 0.0])
+    weights, biases = (first, np.array([[3.0, -3.0, -1.0]])), (bias, np.zeros(1))
+    network = TanhNetwork(weights, biases, np.ones(1), np.zeros(1), "identity", "none")
+    case = case_of(system, network)
+    assert float(case.loop.policy(np.zeros((1, 1)))[0, 0]) > 4
+    assert prove(case, Budget(boxes=5000, seconds=20)).claim is None
+
+
+def test_budgets_leave_a_floor_that_is_proved(tmp_path: Path) -> None:
+    case = case_of(*uncentred())
+    best = prove(case).claim
+    assert isinstance(best, Practical)
+    for boxes in (60, 120):
+        claim = prove(case, Budget(boxes=boxes, batch=16)).claim
+        assert claim is None or (claim.inner >= 0.999 * best.floor and claim.roa <= best.roa)
+    ring = prove_inwards(case.problem, case.T, 1e-12, best.roa, Budget(boxes=300, batch=16), ThreadRunner())
+    assert ring.inner >= 0.999 * best.floor
+
+
+def test_an_exact_level(tmp_path: Path) -> None:
+    result = certify_roa(*uncentred(), tmp_path, RoaOptions(claim="practical", level=2.0))
+    assert result.verdict is Verdict.PROVED and result.levels.roa == 2.0
+    outside = certify_roa(*uncentred(), tmp_path, RoaOptions(claim="practical", level=1e6))
+    assert outside.verdict is Verdict.REFUTED and outside.stop is Stop.DOMAIN
