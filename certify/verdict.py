@@ -38,6 +38,7 @@ class Stop(Enum):
 
     REQUESTED = "requested"
     DOMAIN = "domain"
+    MARGIN = "margin to the domain"
     WITNESS = "witness"
     INPUTS = "inputs"
     TIME = "time"

@@ -7,20 +7,20 @@ from fractions import Fraction
 import flint
 import numpy as np
 import pytest
-from certify.obligations import (
-    Case,
-    Query,
-    decay,
-    domain_queries,
-    input_queries,
-    queries,
-    ring_query,
-)
 
-from certify.engines.dreal.backend import to_smt2
+from certify.claims.conditions import (
+    Asymptotic,
+    conditions,
+    domain_conditions,
+    input_conditions,
+    local_condition,
+    ring_condition,
+)
+from certify.claims.queries import Query, decay, query
 from certify.engines.local import prove_local
 from certify.errors import InputError
 from certify.policies import TanhNetwork
+from certify.rigorous import evaluate_policy, evaluate_vdot
 from certify.systems import System, get_system
 from tests.support.cases import Case, case_of
 from tests.support.loops import chain, lqr_gain, pendulum_network, saturated_lqr, scalar_tanh
@@ -43,19 +43,19 @@ CASES = {
 }
 
 
-def values(query: Query, x: np.ndarray) -> dict[str, flint.arb]:
+def values(asked: Query, x: np.ndarray) -> dict[str, flint.arb]:
     """Every definition of a query at a state, in Arb."""
     flint.ctx.prec = 200
-    names = {name: flint.arb(float(v)) for (name, _, _), v in zip(query.variables, x, strict=True)}
-    for name, tree in query.definitions:
+    names = {name: flint.arb(float(v)) for (name, _, _), v in zip(asked.variables, x, strict=True)}
+    for name, tree in asked.definitions:
         assert name not in names
         names[name] = value_of(tree, names)
     return names
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_definitions_are_the_closed_loop(case: str) -> None:
-    case = case_of(*CASES[case]())
+@pytest.mark.parametrize("name", CASES)
+def test_definitions_are_the_closed_loop(name: str) -> None:
+    case = case_of(*CASES[name]())
     loop, n = case.loop, case.loop.system.n
     A, _, _ = loop.linearise()
     ring, local = query(ring_condition(0.1, 1.0), case.problem), query(local_condition(0.1), case.problem)
@@ -63,7 +63,7 @@ def test_definitions_are_the_closed_loop(case: str) -> None:
     for x in 0.3 * generator.standard_normal((4, n)):
         names = values(ring, x)
         assert names["Vdot."].overlaps(evaluate_vdot(loop, case.P, x))
-        for symbol, u in zip(loop.system.inputs, loop.evaluate_policy(x), strict=True):
+        for symbol, u in zip(loop.system.inputs, evaluate_policy(loop, x), strict=True):
             assert names[symbol.name].overlaps(u)
         V = sum((Fraction(float(x[i])) * Fraction(float(case.P[i, j])) * Fraction(float(x[j]))
                  for i in range(n) for j in range(n)), Fraction(0))  # fmt: skip
@@ -84,9 +84,9 @@ def test_definitions_are_the_closed_loop(case: str) -> None:
             assert abs(origin[f"Dg.{i}.{j}"]) < 1e-9 * (1 + np.abs(A).max())
 
 
-@pytest.mark.parametrize("case", CASES)
-def test_decay_is_below_the_smallest_eigenvalue(case: str) -> None:
-    case = case_of(*CASES[case]())
+@pytest.mark.parametrize("name", CASES)
+def test_decay_is_below_the_smallest_eigenvalue(name: str) -> None:
+    case = case_of(*CASES[name]())
     A, _, _ = case.loop.linearise()
     smallest = np.linalg.eigvalsh(-(A.T @ case.P + case.P @ A))[0]
     r = decay(case.P, A)
@@ -98,23 +98,23 @@ def test_decay_refuses_what_does_not_decay() -> None:
         decay(np.eye(2), np.array([[0.0, 1.0], [-1.0, 0.0]]))
 
 
-def holds(query: Query, x: np.ndarray) -> bool:
+def holds(asked: Query, x: np.ndarray) -> bool:
     """The constraints of a query at a state, in Arb; what is not certain counts as false."""
-    names = values(query, x)
-    found = [(value_of(a, names), relation, value_of(b, names)) for a, relation, b in query.constraints]
-    compare = {">=": lambda a, b: a >= b, "<=": lambda a, b: a <= b, ">": lambda a, b: a > b}
+    names = values(asked, x)
+    found = [(value_of(a, names), relation, value_of(b, names)) for a, relation, b in asked.constraints]
+    compare = {">=": lambda a, b: a >= b, "<=": lambda a, b: a <= b, ">": lambda a, b: a > b, "<": lambda a, b: a < b}
     return all(bool(compare[relation](a, b)) for a, relation, b in found)
 
 
 def test_the_ring_query_is_satisfied_by_violations_only() -> None:
     """xdot = x/2 - tanh x, whose region of attraction is |x| < 1.915008."""
     case = case_of(*scalar_tanh())
-    query = query(ring_condition(0.5, 2.0**2), case.problem)
+    asked = query(ring_condition(0.5, 2.0**2), case.problem)
     level = float(case.P[0, 0])
     assert level == 1.0
-    assert holds(query, np.array([1.9151])) and holds(query, np.array([-1.99]))
+    assert holds(asked, np.array([1.9151])) and holds(asked, np.array([-1.99]))
     for x in (1.914, 0.9, 2.01, 0.0):
-        assert not holds(query, np.array([x]))
+        assert not holds(asked, np.array([x]))
 
 
 def test_domain_queries_are_satisfied_beyond_the_limit_only() -> None:
@@ -125,13 +125,14 @@ def test_domain_queries_are_satisfied_beyond_the_limit_only() -> None:
         level = half**2 / inverse[k, k]
         touching[k] = half
         for outer, expected in ((0.999 * level, False), (1.001 * level, True)):
-            above = {q.name: q for q in domain_queries(case, outer)}[f"domain-x{k + 1}-above"]
+            sides = {c.name: query(c, case.problem) for c in domain_conditions(case.problem, outer)}
+            above = sides[f"domain-x{k + 1}-above"]
             assert holds(above, touching) is expected
 
 
 def test_input_queries_name_what_is_exceeded() -> None:
     case = case_of(get_system("pendulum"), pendulum_network(centre="output"))
-    found = {q.name: q for q in input_queries(case, 1e3)}
+    found = {c.name: query(c, case.problem) for c in input_conditions(case.problem, 1e3)}
     assert set(found) == {"inputs-u-below", "inputs-u-above"}
     grid = np.stack(np.meshgrid(np.linspace(-3, 3, 25), np.linspace(-15, 15, 25)), -1).reshape(-1, 2)
     u = case.loop.policy(grid)[:, 0]
@@ -142,10 +143,16 @@ def test_input_queries_name_what_is_exceeded() -> None:
 def test_one_query_a_claim() -> None:
     pendulum = get_system("pendulum")
     bounded, free = (case_of(pendulum, pendulum_network(centre=c)) for c in ("preactivation", "output"))
+
+    def names(case: Case, inner: float, outer: float) -> list[str]:
+        found = conditions(Asymptotic(roa=outer, local=inner), case.problem)
+        assert [query(c, case.problem).name for c in found] == [c.name for c in found]
+        return [c.name for c in found]
+
     sides = [f"domain-{s}-{side}" for s in ("theta", "theta_dot") for side in ("below", "above")]
-    assert [q.name for q in queries(bounded, 0.1, 1.0)] == [*sides, "local", "ring"]
-    assert [q.name for q in queries(bounded, 1.0, 1.0)] == [*sides, "local"]
-    assert [q.name for q in queries(free, 0.1, 1.0)] == [*sides, "local", "ring", "inputs-u-below", "inputs-u-above"]
+    assert names(bounded, 0.1, 1.0) == [*sides, "local", "ring"]
+    assert names(bounded, 1.0, 1.0) == [*sides, "local"]
+    assert names(free, 0.1, 1.0) == [*sides, "local", "ring", "inputs-u-below", "inputs-u-above"]
 
 
 def test_the_local_query_agrees_with_the_local_proof() -> None:
@@ -156,15 +163,6 @@ def test_the_local_query_agrees_with_the_local_proof() -> None:
     generator = np.random.default_rng(0)
     z = generator.standard_normal((20, 2))
     z *= np.sqrt(level * generator.random((20, 1))) / np.linalg.norm(z, axis=1, keepdims=True)
-    query = query(local_condition(level), case.problem)
-    assert not any(holds(query, x) for x in z @ case.T.T)
+    asked = query(local_condition(level), case.problem)
+    assert not any(holds(asked, x) for x in z @ case.T.T)
     assert any(holds(query(local_condition(4.0), case.problem), x) for x in 10 * z @ case.T.T * np.sqrt(0.04 / level))
-
-
-def test_smt2_is_balanced_and_exact() -> None:
-    text = to_smt2(ring_query(case_of(*quadrotor()), 0.01, 0.02), "unsat")
-    assert text.count("(") == text.count(")")
-    assert text.startswith("; ring") and "; expected: unsat" in text and "(set-logic QF_NRA)" in text
-    assert "(/ 243.0 500.0)" in text or "(/ 500.0 243.0)" in text  # m = 0.486, never rounded
-    assert "." not in "".join(line for line in text.splitlines() if "declare" in line)
-    assert text.rstrip().endswith("(check-sat)\n(exit)")

@@ -1,7 +1,9 @@
 """Answers one query with the dReal module, in a process of its own that can be killed.
 
-Reads one JSON object from standard input (the fields of `Query`, `precision`, `jobs`), writes one to standard output:
+Reads one JSON object from standard input (the fields of `Formula`, `precision`, `jobs`), writes one to standard output:
 `{"answer": "unsat" | "delta-sat", "box": {name: [lo, hi]}, "version": text, "seconds": s}`, s of the solver alone.
+Run by its path in isolated mode, so that nothing of the folder it is started in is imported; it imports nothing of the
+project either. Numbers that binary64 does not hold are refused: dReal would round them.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ from fractions import Fraction
 from typing import Any
 
 _RELATIONS = {">=": operator.ge, "<=": operator.le, ">": operator.gt, "<": operator.lt}
+_OPERATORS = {"+": operator.add, "-": operator.sub, "*": operator.mul, "/": operator.truediv}
 
 
 def main() -> None:
@@ -22,22 +25,23 @@ def main() -> None:
     import dreal
 
     query = json.load(sys.stdin)
+    config = dreal.Config()
+    config.precision = query["precision"]
+    config.number_of_jobs = query["jobs"]
+    context = dreal.Context()
+    context.config = config
     values: dict[str, Any] = {}
-    constraints = []
     variables = {name: dreal.Variable(name) for name, _, _ in query["variables"]}
     for name, lo, hi in query["variables"]:
-        values[name] = variables[name]
-        constraints += [_number(dreal, lo) <= values[name], values[name] <= _number(dreal, hi)]
+        context.DeclareVariable(variables[name], dreal.Expression(lo), dreal.Expression(hi))
+        values[name] = dreal.Expression(variables[name])
     for name, tree in query["definitions"]:
         values[name] = _expression(dreal, tree, values)
     for left, relation, right in query["constraints"]:
         a, b = _expression(dreal, left, values), _expression(dreal, right, values)
-        constraints.append(_RELATIONS[relation](a, b))
-    config = dreal.Config()
-    config.precision = query["precision"]
-    config.number_of_jobs = query["jobs"]
+        context.Assert(_RELATIONS[relation](a, b))
     start = time.perf_counter()
-    box = dreal.CheckSatisfiability(dreal.And(*constraints), config)
+    box = context.CheckSat()
     seconds = time.perf_counter() - start
     found = {} if box is None else {name: [box[v].lb(), box[v].ub()] for name, v in variables.items()}
     answer = "unsat" if box is None else "delta-sat"
@@ -45,36 +49,28 @@ def main() -> None:
     json.dump({"answer": answer, "box": found, "version": version, "seconds": seconds}, sys.stdout)
 
 
-def _number(dreal: Any, text: str) -> Any:
-    """An exact fraction; dReal itself encloses the quotient of two integers, or takes a binary64 number as it is."""
-    q = Fraction(text)
-    if Fraction(float(q)) == q:
-        return dreal.Expression(float(q))
-    return dreal.Expression(float(q.numerator)) / dreal.Expression(float(q.denominator))
-
-
 def _expression(dreal: Any, tree: Any, values: Mapping[str, Any]) -> Any:
     if isinstance(tree, str):
-        return values[tree] if tree in values else _number(dreal, tree)
-    operator, *rest = tree
-    if operator == "**":
+        return values[tree] if tree in values else dreal.Expression(_number(tree))
+    name, *rest = tree
+    if name == "**":
         return dreal.pow(_expression(dreal, rest[0], values), int(rest[1]))
     arguments = [_expression(dreal, t, values) for t in rest]
-    if operator in ("sin", "cos", "tan", "tanh", "log"):
-        return getattr(dreal, operator)(arguments[0])
-    if operator == "-" and len(arguments) == 1:
+    if name in ("sin", "cos", "tan", "tanh", "log"):
+        return getattr(dreal, name)(arguments[0])
+    if name == "-" and len(arguments) == 1:
         return -arguments[0]
     result = arguments[0]
     for a in arguments[1:]:
-        if operator == "+":
-            result = result + a
-        elif operator == "-":
-            result = result - a
-        elif operator == "*":
-            result = result * a
-        else:
-            result = result / a
+        result = _OPERATORS[name](result, a)
     return result
+
+
+def _number(text: str) -> float:
+    q = Fraction(text)
+    if Fraction(float(q)) != q:
+        raise ValueError(f"{text} is no binary64 number")
+    return float(q)
 
 
 if __name__ == "__main__":

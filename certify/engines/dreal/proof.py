@@ -30,6 +30,8 @@ from certify.verdict import Stop
 Array = NDArray[np.float64]
 _LOCAL_RATIO, _RING_RATIO = 1.05, 1.002  # at which bisection stops
 _BELOW_WITNESS = 1e-3
+_LEAST = 1e-12  # of the guess, below which no local level is looked for
+_MARGIN = 4  # dReal's deltas that a set keeps from the domain
 _LOCAL_SHARE = 0.3  # of the time, after which a local level that is there will do
 
 
@@ -80,9 +82,7 @@ class DrealEngine:
         seconds = {"local": local, "ring": time.perf_counter() - start - local}
         reached = {} if inner is None else {"local": inner} | ({} if level is None else {"roa": level})
         record = record_of(backend.version, options, session.asked)
-        proof = Proof(
-            None, None, stop, detail, session.witness, partial=reached, solver=record, seconds=seconds
-        )
+        proof = Proof(None, None, stop, detail, session.witness, partial=reached, solver=record, seconds=seconds)
         if inner is None or level is None:
             return proof
         answers = tuple((f"{a.name}-{a.level!r}", a.answer.status) for a in session.asked)
@@ -107,6 +107,7 @@ def record_of(version: str, options: DrealOptions, asked: Sequence[Asked]) -> di
             "query": a.name,
             "level": a.level,
             "answer": a.answer.status,
+            "meaning": a.answer.meaning,
             "seconds": a.answer.seconds,
             "detail": a.answer.detail,
         }
@@ -130,18 +131,22 @@ class _Session:
     def levels(self, guess: float, target: float) -> tuple[float | None, float | None, Stop, str]:
         """(local level, largest level, what stopped it, details)."""
         inner = self.local(guess, target)
+        if inner is None and self.left() <= 0:
+            return None, None, Stop.TIME, "dReal confirmed no local level until then"
         if inner is None:
             return None, None, Stop.LOCAL, "dReal confirms no local level"
-        top = target
+        top, share = target, 1 - _MARGIN * self.options.precision
         if not self.all_unsat(domain_conditions(self.problem, top)):
-            # A set that touches the domain is delta-sat; the checker decides it exactly.
-            top *= 1 - 4 * self.options.precision
+            top *= share  # a set that touches the domain is delta-sat; the checker decides it exactly
         inner = min(inner, top)
         # The local query is about Vdot alone, and the ring may add nothing to it.
         if not self.all_unsat(input_conditions(self.problem, inner)):
             return inner, None, Stop.INPUTS, "dReal does not confirm their bounds on the local level"
         level, stop, detail = self.ring(inner, top)
-        return (inner, level, Stop.REQUESTED, "") if level >= target else (inner, level, stop, detail)
+        if level < target and stop is Stop.REQUESTED:
+            detail = f"dReal does not tell close to the domain from beyond it; asked up to {share:.12g} of its level"
+            return inner, level, Stop.MARGIN, detail
+        return inner, level, stop, detail
 
     def left(self) -> float:
         return self.deadline - time.monotonic()
@@ -164,10 +169,11 @@ class _Session:
         return all(self.ask(c, c.guards[-1].level) for c in wanted)
 
     def local(self, guess: float, target: float) -> float | None:
-        """Geometric bisection from the guess."""
+        """Geometric bisection from the guess, which may be as far below the target as it likes."""
         low, high = None, None
         level = min(guess, target)
-        while level > 1e-12 * target:
+        least = _LEAST * level
+        while level > least:
             enough = low is not None and self.left() < (1 - _LOCAL_SHARE) * self.options.seconds
             if self.left() <= 0 or enough:
                 break
