@@ -19,7 +19,19 @@ from tests.reference.test_practical import scalar
 from tests.support.certificates import dump, edited, write
 
 TRUSTED = {"kind": "trusted-solver", "solver": "dReal", "version": "4", "precision": (0.5).hex(), "queries": []}
-KEYS = ["result", "rule", "at", "detail", "claim", "certificate_sha256", "policy_sha256", "levels", "leaves", "seconds"]
+KEYS = [
+    "result",
+    "rule",
+    "at",
+    "detail",
+    "claim",
+    "certificate_sha256",
+    "policy_sha256",
+    "levels",
+    "leaves",
+    "seconds",
+    "text",
+]
 
 
 def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
