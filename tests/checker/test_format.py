@@ -402,6 +402,7 @@ def test_rejected(tmp_path: Path) -> None:
     done = run(path, "--json", cwd=tmp_path)
     assert done.returncode == 1 and json.loads(done.stdout) == {
         "result": "REJECTED", "rule": "levels", "at": "levels", "detail": "must satisfy 0 < local <= roa",
+        "text": ["REJECTED rule=levels at=levels: must satisfy 0 < local <= roa"],
     }  # fmt: skip
 
 
@@ -450,7 +451,7 @@ def test_an_internal_error_accepts_nothing(
     assert main([str(write(good(), tmp_path)), *json_flag]) == 70
     printed = capsys.readouterr()
     assert "ACCEPTED" not in printed.out + printed.err and "no such machine" in printed.out + printed.err
-    assert not json_flag or list(json.loads(printed.out)) == ["error"]
+    assert not json_flag or list(json.loads(printed.out)) == ["error", "text"]
 
 
 def test_huge_rationals_in_a_claim_are_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -26,7 +26,6 @@ import numpy as np
 import pytest
 import sympy
 import torch
-from certify.systems.trees import to_tree
 from flint import arb, ctx
 from numpy.typing import NDArray
 
@@ -39,6 +38,7 @@ from certify.closed_loop import ClosedLoop
 from certify.enclosures import PolicyEnclosure
 from certify.enclosures import policy as producer
 from certify.enclosures import taylor as producer_taylor
+from certify.expressions import to_tree
 from certify.policies import TanhNetwork
 from certify.policies.network import Centre, Squash
 from certify.systems import System, get_system
