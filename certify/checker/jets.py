@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from .elementary import elementary
-from .expression import Functions
 from .float64 import EPS, float_with_error, frobenius, norm, total, up
 
 
@@ -39,7 +38,7 @@ def outer(a: Any, b: Any) -> Any:
 
 
 @dataclass(frozen=True)
-class Jet(Functions):
+class Jet:
     """`c` +- `error`, gradient `a` (n,) +- `slack`, half the Hessian `Q` (n, n), remainder `E` (n, n); or a batch."""
 
     c: Any

@@ -16,12 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .elementary import elementary
-from .expression import Functions
 from .float64 import EPS, Array, float_with_error, gamma, total, up
 
 
 @dataclass(frozen=True)
-class Taylor(Functions):
+class Taylor:
     """`c` (B,), `g` (N, B), `Q` (N, N, B) and remainder `r` (B,), r >= 0."""
 
     c: Array

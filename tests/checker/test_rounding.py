@@ -310,7 +310,7 @@ def model_residual(function: Callable[[arb], arb]) -> Callable[..., arb]:
 
 def checker_model(name: str) -> Callable[[Columns], Any]:
     def function(parts: Columns) -> Any:
-        result = getattr(taylor.Taylor(*parts), name)()
+        result = taylor.Taylor(*parts).function(name)
         return result.c, result.g, result.Q, result.r
 
     return function

@@ -42,7 +42,7 @@ def checker_without(rule: str, folder: Path) -> Iterator[ModuleType]:
         if rule == "format":
             package.strict.fail = lambda at, detail: None
         elif rule == "hash":
-            package.document.hash_of_the_policy = lambda stated, policy: []
+            package.document.check_hash = lambda policy, stated: None
         else:
             assert removed > 0
         if rule == "lyapunov":  # the symmetric part in place of an asymmetric matrix
