@@ -47,7 +47,7 @@ class Taylor:
         """The models of some members of the batch."""
         return Taylor(self.c[index], self.g[:, index], self.Q[:, :, index], self.r[index])
 
-    def scaled(self, value: Any, error: Any) -> Taylor:
+    def scaled(self, value: Any, error: Any = 0.0) -> Taylor:
         """Product with a constant in value +- error; `value` may differ over the batch (B,)."""
         size, k = self.size, np.abs(value)
         return Taylor(
@@ -93,17 +93,15 @@ class Taylor:
         return Taylor(f0, f1 * self.g, Q, up(r))
 
 
-def affine(c: Array, g: Array) -> Taylor:
-    """The exact affine function c + g.d, c (B,), g (N, B)."""
-    symbols, batch = g.shape
-    return Taylor(c, g, np.zeros((symbols, symbols, batch)), np.zeros(batch))
+def affine(c: Array, g: Array, r: Array | float = 0.0) -> Taylor:
+    """c + g.d within r, c (B,), g (N, B)."""
+    return Taylor(c, g, np.zeros((len(g), *g.shape)), r + np.zeros_like(c))
 
 
 def constant(q: Fraction, symbols: int, batch: int) -> Taylor:
     """A rational, the same over the batch."""
     value, error = float_with_error(q)
-    model = affine(np.full(batch, value), np.zeros((symbols, batch)))
-    return Taylor(model.c, model.g, model.Q, np.full(batch, error))
+    return affine(np.full(batch, value), np.zeros((symbols, batch)), error)
 
 
 def upper_bound(model: Taylor) -> Array:

@@ -31,8 +31,8 @@ from numpy.typing import NDArray
 
 from certify.checker import float64, taylor
 from certify.checker import network as checker
+from certify.checker.case import Case
 from certify.checker.document import Certificate, Policy
-from certify.checker.exact import congruence, rational
 from certify.checker.ring import Ring
 from certify.closed_loop import ClosedLoop
 from certify.enclosures import PolicyEnclosure
@@ -629,9 +629,7 @@ def random_ring(generator: Generator, name: str, squash: Squash, centre: Centre)
         T=T,
         root=np.ones(n),
     ))  # fmt: skip
-    return Ring(
-        c, c.evidence.T, checker.fold(c.policy, c.u_eq), congruence(rational(c.evidence.T), rational(c.P))
-    )
+    return Ring(Case(c))
 
 
 def vdot_bounds(ring: Ring, lo: Array, hi: Array) -> tuple[Array, Array, Array]:
@@ -639,7 +637,7 @@ def vdot_bounds(ring: Ring, lo: Array, hi: Array) -> tuple[Array, Array, Array]:
     centre = 0.5 * lo + 0.5 * hi
     radius = float64.up(np.maximum(hi - centre, centre - lo))
     x, error = ring.states(centre, radius)
-    model = ring.vdot(*ring.dynamics(x, error, *checker.enclose_on_boxes(ring.net, x, error)))
+    model, _ = ring.models(x, error, *checker.enclose_on_boxes(ring.net, x, error))
     negated = taylor.Taylor(-model.c, -model.g, -model.Q, model.r)
     return -taylor.upper_bound(negated), taylor.upper_bound(model), ring.bound(model, centre, radius)
 
