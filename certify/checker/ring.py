@@ -39,11 +39,11 @@ class Ring:
     """The bounds on boxes, lo and hi (n, B) in the coordinates z, that the rules for a leaf ask for."""
 
     def __init__(self, case: Case) -> None:
-        self.case, self.c, self.T, self.net = case, case.c, case.T, case.net
+        self.case, self.c, self.T, self.net = case, case.c, case.partition.T, case.net
         self.n, self.m = len(case.c.states), len(case.c.inputs)
         value, error = np.moveaxis(np.array([[float_with_error(v) for v in row] for row in case.S]), 2, 0)
-        self.S, self.S_error = np.diag(value)[:, None], np.diag(error)[:, None]  # of the diagonal, (n, 1)
-        self.S_cross = up((np.abs(value) + error) * (1 - np.eye(self.n)))
+        self.S = np.diag(value)[:, None]  # the diagonal, (n, 1)
+        self.S_rest = up(np.abs(value - np.diag(self.S[:, 0])) + error)  # bounds what S is beside it
 
     @property
     def batch(self) -> int:
@@ -76,7 +76,7 @@ class Ring:
         """
         far = np.maximum(np.abs(lo), np.abs(hi))
         near = np.where((lo <= 0) & (hi >= 0), 0.0, np.minimum(np.abs(lo), np.abs(hi)))  # corners are exact
-        cross = up(self.cross(far) + total(self.S_error * far * far, 0))
+        cross = self.cross(far)
         least = np.sum(self.S * near * near, axis=0) * (1 - gamma(self.n + 4)) - cross - 2.0**-960
         most = up(total(self.S * far * far, 0) + cross)
         least = least - EPS * np.abs(least) - EPS * cross
@@ -122,12 +122,12 @@ class Ring:
         g = np.concatenate([-2 * sign * self.S * centre * radius, zeros])
         q = np.concatenate([-sign * self.S * radius * radius, zeros])
         c = sign * (level - np.sum(self.S * centre * centre, axis=0))
-        r = up(self.cross(far) + total(self.S_error * far * far, 0) + gamma(self.n + 8) * size)
+        r = up(self.cross(far) + gamma(self.n + 8) * size)
         return Taylor(c, g, np.eye(len(q))[:, :, None] * q, r)
 
     def cross(self, far: Array) -> Array:
-        """Upper bound of what the off-diagonal part of S adds to V in magnitude where |z| <= far."""
-        return total(far * total(self.S_cross[:, :, None] * far[None, :], 1), 0)
+        """Upper bound of what S beside its diagonal adds to V in magnitude where |z| <= far."""
+        return total(far * total(self.S_rest[:, :, None] * far[None, :], 1), 0)
 
 
 def multiplier(a: Array, b: Array, c: Array) -> Array:

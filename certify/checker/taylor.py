@@ -13,7 +13,6 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .elementary import elementary
 from .float64 import EPS, Array, float_with_error, gamma, total, up
@@ -43,16 +42,14 @@ class Taylor:
         """Upper bound of |c| + G + Q."""
         return up(np.abs(self.c) + self.linear + self.quadratic)
 
-    def at(self, index: NDArray[np.intp]) -> Taylor:
+    def at(self, index: Array) -> Taylor:
         """The models of some members of the batch."""
         return Taylor(self.c[index], self.g[:, index], self.Q[:, :, index], self.r[index])
 
-    def scaled(self, value: Any, error: Any = 0.0) -> Taylor:
-        """Product with a constant in value +- error; `value` may differ over the batch (B,)."""
-        size, k = self.size, np.abs(value)
-        return Taylor(
-            value * self.c, value * self.g, value * self.Q, up(k * self.r + error * (size + self.r) + EPS * (k * size))
-        )
+    def scaled(self, k: Any) -> Taylor:
+        """Product with a number, or with one for each member of the batch (B,)."""
+        r = up(np.abs(k) * self.r + EPS * (np.abs(k) * self.size))
+        return Taylor(k * self.c, k * self.g, k * self.Q, r)
 
     def __add__(self, other: Taylor) -> Taylor:
         r = up(self.r + other.r + EPS * (self.size + other.size))

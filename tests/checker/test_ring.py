@@ -93,7 +93,7 @@ def test_a_multiplier_that_is_no_number_proves_nothing() -> None:
     gap = ring.gap(centre, radius, ring.c.c2, 1.0)
     with np.errstate(all="ignore"):
         for k in (np.nan, np.inf):
-            assert not upper_bound(vdot + gap.scaled(np.array([k]), 0.0))[0] < 0
+            assert not upper_bound(vdot + gap.scaled(np.array([k])))[0] < 0
 
 
 @pytest.mark.parametrize("name", CASES)
