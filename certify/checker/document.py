@@ -135,20 +135,19 @@ def _plant(plant: Value) -> dict[str, Any]:
 
 def _policy(value: Value, n: int, m: int) -> Policy:
     layers, squash, centre, scale, offset, sha256 = value.keys("layers squash centre scale offset sha256")
-    weights: list[Array] = []
-    biases: list[Array] = []
+    read: list[tuple[Array, Array]] = []
     columns = n  # of a layer: the rows of the layer before
     for shape, weight, bias in layers.listed(lambda layer: layer.keys("shape weight bias"), 1, MAX_LAYERS):
         rows, stated = shape.listed(lambda size: size.raw, 2)
         fits = type(rows) is type(stated) is int and 1 <= rows <= MAX_WIDTH and stated == columns
         shape.must(fits, f"[out, {columns}] with out at most {MAX_WIDTH}")
-        weights.append(weight.array(rows, columns))
-        biases.append(bias.array(rows))
+        read.append((weight.array(rows, columns), bias.array(rows)))
         columns = rows
     layers.must(columns == m, f"a network with {m} outputs")
     words = squash.choice("tanh", "identity"), centre.choice("output", "preactivation", "none")
     centre.must(words != ("identity", "preactivation"), "another where squash is not 'tanh'")
-    policy = Policy(tuple(weights), tuple(biases), scale.array(m), offset.array(m), *words)
+    weights, biases = zip(*read, strict=True)
+    policy = Policy(weights, biases, scale.array(m), offset.array(m), *words)
     scale.must(bool(np.all(policy.scale != 0)), "nonzero")
     check_hash(policy, sha256.raw)
     return policy

@@ -41,6 +41,7 @@ from certify.enclosures import taylor as producer_taylor
 from certify.expressions import to_tree
 from certify.policies import TanhNetwork
 from certify.policies.network import Centre, Squash
+from certify.rigorous import evaluate_policy
 from certify.systems import System, get_system
 from tests.support.certificates import make, parse
 from tests.support.loops import box
@@ -546,7 +547,7 @@ def test_the_oracle_agrees_with_the_closed_loops_own() -> None:
         for b in range(3):
             x = s.x[:, 0, b]
             for u, v in zip(
-                policy_in_arb(s.policy, s.u_eq, [arb(t) for t in x.tolist()]), loop.evaluate_policy(x), strict=True
+                policy_in_arb(s.policy, s.u_eq, [arb(t) for t in x.tolist()]), evaluate_policy(loop, x), strict=True
             ):
                 assert u.overlaps(v) and u.rad() < 1e-30 and v.rad() < 1e-30
 

@@ -711,6 +711,13 @@ def test_rejections_name_the_first_failing_leaf() -> None:
     assert str(no.value).startswith("REJECTED rule=ring at=leaf 0: ")
 
 
+def test_the_whole_tree_is_read_before_its_leaves() -> None:
+    """The first leaf fails the ring's rule, and the tree is broken behind it."""
+    assert verdict(with_tree(honest("scalar"), bytes([LEAF]))) == "ring"
+    assert verdict(with_tree(honest("scalar"), bytes([LEAF, LEAF]))) == "tree"
+    assert verdict(with_tree(honest("scalar"), bytes([0, LEAF]))) == "tree"
+
+
 def test_tally_counts_a_leaf_once() -> None:
     """A uniform tree of 64 leaves: those in the corners of the root box miss the ring."""
     assert Tally().rules["tree"] == 0
