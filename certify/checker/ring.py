@@ -160,11 +160,12 @@ def is_whole(case: Case) -> Failures:
 def keeps_inputs(leaves: Leaves) -> Failures:
     """`inputs`: by form, or the policy's enclosure lies in the bounds."""
     c = leaves.ring.c
-    if not leaves.ring.case.bounded:
-        for name, bounds, mid, reach in zip(c.inputs, c.input_bounds, leaves.mid, leaves.reach, strict=True):
-            hold = within(bounds, mid, reach)
-            if not np.all(hold):
-                yield f"leaf {leaves.numbers[np.argmin(hold)]}", f"{name} may leave its bounds"
+    if leaves.ring.case.bounded:
+        return 0
+    for name, bounds, mid, reach in zip(c.inputs, c.input_bounds, leaves.mid, leaves.reach, strict=True):
+        hold = within(bounds, mid, reach)
+        if not np.all(hold):
+            yield f"leaf {leaves.numbers[np.argmin(hold)]}", f"{name} may leave its bounds"
     return int(leaves.mid.size)
 
 

@@ -135,6 +135,8 @@ def test_honest_certificates_are_accepted(name: str) -> None:
     tally = rules.check(parse(data))
     assert tally.rules["tree"] == tree_of(data).count(LEAF)
     assert 0 < tally.local_margin <= 1
+    if name == "scalar":  # bounded by form: no leaf is asked for its inputs
+        assert tally.rules["inputs"] == 1
     if name == "local only":
         assert tally.rules["ring"] == 0 and tally.ring_margin is None
     else:
