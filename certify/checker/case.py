@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
 
-from .document import Array, Certificate, Partition
+from .document import Certificate, Partition
 from .exact import Matrix, congruence, gershgorin_lower, inverse_diagonal, rational
 from .network import Folded, fold
 
@@ -27,10 +27,6 @@ class Case:
             raise TypeError("this rule is about a partition tree")
         return self.c.evidence
 
-    @property
-    def T(self) -> Array:
-        return self.partition.T
-
     @cached_property
     def P_inverse(self) -> list[Fraction]:
         """The diagonal of P^-1."""
@@ -39,7 +35,7 @@ class Case:
     @cached_property
     def S(self) -> Matrix:
         """T'PT."""
-        return congruence(rational(self.T), rational(self.c.P))
+        return congruence(rational(self.partition.T), rational(self.c.P))
 
     @cached_property
     def S_inverse(self) -> list[Fraction]:
@@ -60,8 +56,7 @@ class Case:
     def bounded(self) -> bool:
         """True if `offset +- scale` lies in the input bounds and the centring keeps the input there."""
         policy = self.c.policy
-        each = zip(policy.offset.tolist(), policy.scale.tolist(), self.c.input_bounds, strict=True)
-        return (policy.squash == "tanh" and policy.centre != "output") and all(
-            lo <= Fraction(offset) - abs(Fraction(scale)) and Fraction(offset) + abs(Fraction(scale)) <= hi
-            for offset, scale, (lo, hi) in each
-        )
+        offset, scale = ([Fraction(v) for v in numbers.tolist()] for numbers in (policy.offset, policy.scale))
+        each = zip(offset, map(abs, scale), self.c.input_bounds, strict=True)
+        by_form = policy.squash == "tanh" and policy.centre != "output"
+        return by_form and all(lo <= middle - reach and middle + reach <= hi for middle, reach, (lo, hi) in each)

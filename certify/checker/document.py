@@ -1,4 +1,4 @@
-"""The document of a certificate: what FORMAT.md calls sections, declared, and the plain data that they become."""
+"""The document of a certificate: what FORMAT.md calls sections, read into plain data."""
 
 from __future__ import annotations
 
@@ -11,18 +11,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from . import schema as s
-from . import strict
 from .errors import Rejected
 from .expression import Tape, parse_dynamics
-from .schema import Known
+from .schema import Value
+from .strict import MAX_VALUES, load
 
-LEVELS = {
-    "asymptotic": s.section(local=s.binary64, roa=s.binary64),
-    "practical": s.section(floor=s.binary64, roa=s.binary64),
-}
 MAX_STATES, MAX_LAYERS, MAX_WIDTH = 64, 64, 2**14
 Array = NDArray[np.float64]
+Intervals = tuple[tuple[Fraction, Fraction], ...]
 
 
 @dataclass(frozen=True)
@@ -38,10 +34,9 @@ class Policy:
 
     def sha256(self) -> str:
         """Hash of squash, centre, then shape and little-endian numbers of each array (FORMAT.md)."""
-        digest = hashlib.sha256(b"certify-policy/1\0")
-        digest.update(f"{self.squash}\0{self.centre}\0".encode())
-        pairs = [a for pair in zip(self.weights, self.biases, strict=True) for a in pair]
-        for numbers in (*pairs, self.scale, self.offset):
+        digest = hashlib.sha256(f"certify-policy/1\0{self.squash}\0{self.centre}\0".encode())
+        layers = [array for layer in zip(self.weights, self.biases, strict=True) for array in layer]
+        for numbers in (*layers, self.scale, self.offset):
             digest.update(struct.pack(f"<{1 + numbers.ndim}Q", numbers.ndim, *numbers.shape))
             digest.update(numbers.astype("<f8").tobytes())
         return digest.hexdigest()
@@ -62,7 +57,7 @@ class Trusted:
 
     solver: str
     version: str
-    queries: tuple[tuple[str, str], ...]
+    queries: tuple[tuple[str, ...], ...]
 
 
 @dataclass(frozen=True)
@@ -73,14 +68,13 @@ class Certificate:
     """
 
     claim: str
-
     name: str
     states: tuple[str, ...]
     inputs: tuple[str, ...]
     dynamics: Tape
     u_eq: tuple[Fraction, ...]
-    domain: tuple[tuple[Fraction, Fraction], ...]
-    input_bounds: tuple[tuple[Fraction, Fraction], ...]
+    domain: Intervals
+    input_bounds: Intervals
     policy: Policy
     P: Array
     levels: dict[str, float]
@@ -88,121 +82,90 @@ class Certificate:
     sha256: str
 
     @property
+    def practical(self) -> bool:
+        return self.claim == "practical"
+
+    @property
     def c1(self) -> float:
         """The ring's inner edge: c1, or c0 of a practical claim."""
-        return self.levels["floor" if self.claim == "practical" else "local"]
+        return self.levels["floor" if self.practical else "local"]
 
     @property
     def c2(self) -> float:
         return self.levels["roa"]
 
 
-def _plant(stated: dict[str, Any], at: str, known: Known) -> dict[str, Any]:
-    names = stated["states"] + stated["inputs"]
-    if len(set(names)) != len(names):
-        strict.fail(f"{at}.states", "names must differ")
-    return stated | {"dynamics": parse_dynamics(stated["dynamics"], names)}
-
-
-def _shape(value: Any, at: str, known: Known) -> None:
-    """[rows, columns] of a layer: the columns are the rows of the layer before, the first ones the states."""
-    rows, columns = s.listed(s.anything, 2)(value, at, known)
-    if not (type(rows) is type(columns) is int and 1 <= rows <= MAX_WIDTH and columns == known.get("rows", known["n"])):
-        strict.fail(at, f"must be [out, {known.get('rows', known['n'])}] with out at most {MAX_WIDTH}")
-    known |= {"rows": rows, "columns": columns}
-
-
-def _policy(stated: dict[str, Any], at: str, known: Known) -> Policy:
-    if known["rows"] != known["m"]:
-        strict.fail(f"{at}.layers", f"must end in {known['m']} outputs")
-    if not np.all(stated["scale"] != 0):
-        strict.fail(f"{at}.scale", "must be nonzero")
-    if stated["centre"] == "preactivation" and stated["squash"] != "tanh":
-        strict.fail(f"{at}.centre", "'preactivation' needs squash 'tanh'")
-    weights, biases = (tuple(layer[key] for layer in stated["layers"]) for key in ("weight", "bias"))
-    policy = Policy(weights, biases, *(stated[key] for key in ("scale", "offset", "squash", "centre")))
-    for failure in hash_of_the_policy(stated["sha256"], policy):
-        raise Rejected("hash", *failure)
-    return policy
-
-
-def hash_of_the_policy(stated: Any, policy: Policy) -> list[tuple[str, str]]:
-    """Rule `hash`: what is wrong, as (place, detail)."""
-    return [] if stated == policy.sha256() else [("policy.sha256", "does not match the layers in the file")]
-
-
-def _trusted(stated: dict[str, Any], at: str, known: Known) -> Trusted:
-    if not stated["precision"] > 0:
-        strict.fail(f"{at}.precision", "must be positive")
-    return Trusted(stated["solver"], stated["version"], stated["queries"])
-
-
-_DOCUMENT = s.section(
-    schema=s.choice("certify-certificate/2"),
-    claim=s.then(
-        s.section(kind=s.choice(*LEVELS)), lambda stated, at, known: known.setdefault("claim", stated["kind"])
-    ),
-    plant=s.then(
-        s.section(
-            name=s.name,
-            states=s.listed(s.name, "n", 1, MAX_STATES),
-            inputs=s.listed(s.name, "m", 1, MAX_STATES),
-            dynamics=s.listed(s.anything, "n"),
-            u_eq=s.listed(s.rational, "m"),
-            domain=s.listed(s.interval, "n"),
-            input_bounds=s.listed(s.interval, "m"),
-        ),
-        _plant,
-    ),
-    policy=s.then(
-        s.section(
-            squash=s.choice("tanh", "identity"),
-            centre=s.choice("output", "preactivation", "none"),
-            layers=s.listed(
-                s.section(shape=_shape, weight=s.array("rows", "columns"), bias=s.array("rows")), "", 1, MAX_LAYERS
-            ),
-            scale=s.array("m"),
-            offset=s.array("m"),
-            sha256=s.anything,
-        ),
-        _policy,
-    ),
-    lyapunov=s.section(kind=s.choice("quadratic"), P=s.array("n", "n")),
-    levels=lambda value, at, known: LEVELS[known["claim"]](value, at, known),
-    evidence=s.by_kind(
-        partition_tree=s.then(
-            s.section(kind=s.anything, T=s.array("n", "n"), root=s.array("n"), tree=s.base64_bytes),
-            lambda stated, at, known: Partition(stated["T"], stated["root"], stated["tree"]),
-        ),
-        trusted_solver=s.then(
-            s.section(
-                kind=s.anything,
-                solver=s.word,
-                version=s.word,
-                precision=s.binary64,
-                queries=s.listed(s.listed(s.word, 2)),
-            ),
-            _trusted,
-        ),
-    ),
-    provenance=s.mapping,
-)
-
-
 def read(path: str) -> Certificate:
     """Read and validate the file at `path`; raises `Unreadable`, or `Rejected` under rule `format` or `hash`."""
-    return certificate(*strict.load(path))
+    return certificate(*load(path))
 
 
 def certificate(data: Any, sha256: str) -> Certificate:
     """A JSON value as a certificate."""
-    top = _DOCUMENT(data, "", {})
-    return Certificate(
-        claim=top["claim"],
-        **top["plant"],
-        policy=top["policy"],
-        P=top["lyapunov"]["P"],
-        levels=top["levels"],
-        evidence=top["evidence"],
-        sha256=sha256,
-    )
+    keys = "schema claim plant policy lyapunov levels evidence provenance"
+    schema, claim, plant, policy, lyapunov, levels, evidence, provenance = Value(data).keys(keys)
+    schema.choice("certify-certificate/2")
+    kind = claim.keys("kind")[0].choice("asymptotic", "practical")
+    stated = _plant(plant)
+    n, m = len(stated["states"]), len(stated["inputs"])
+    stated["policy"] = _policy(policy, n, m)
+    form, P = lyapunov.keys("kind P")
+    form.choice("quadratic")
+    edges = ("floor" if kind == "practical" else "local", "roa")
+    numbers = {edge: level.binary64() for edge, level in zip(edges, levels.keys(" ".join(edges)), strict=True)}
+    provenance.must(isinstance(provenance.raw, dict), "an object")
+    return Certificate(kind, **stated, P=P.array(n, n), levels=numbers, evidence=_evidence(evidence, n), sha256=sha256)
+
+
+def _plant(plant: Value) -> dict[str, Any]:
+    name, *names, dynamics, u_eq, domain, bounds = plant.keys("name states inputs dynamics u_eq domain input_bounds")
+    states, inputs = (value.listed(Value.name, 1, MAX_STATES) for value in names)
+    n, m = len(states), len(inputs)
+    plant.must(len({*states, *inputs}) == n + m, "a plant whose states and inputs have different names")
+    return {
+        "name": name.name(),
+        "states": states,
+        "inputs": inputs,
+        "dynamics": parse_dynamics(dynamics.listed(lambda tree: tree.raw, n), states + inputs),
+        "u_eq": u_eq.listed(Value.rational, m),
+        "domain": domain.listed(Value.interval, n),
+        "input_bounds": bounds.listed(Value.interval, m),
+    }
+
+
+def _policy(value: Value, n: int, m: int) -> Policy:
+    layers, squash, centre, scale, offset, sha256 = value.keys("layers squash centre scale offset sha256")
+    read: list[tuple[Array, Array]] = []
+    columns = n  # of a layer: the rows of the layer before
+    for shape, weight, bias in layers.listed(lambda layer: layer.keys("shape weight bias"), 1, MAX_LAYERS):
+        rows, stated = shape.listed(lambda size: size.raw, 2)
+        fits = type(rows) is type(stated) is int and 1 <= rows <= MAX_WIDTH and stated == columns
+        shape.must(fits, f"[out, {columns}] with out at most {MAX_WIDTH}")
+        read.append((weight.array(rows, columns), bias.array(rows)))
+        columns = rows
+    layers.must(columns == m, f"a network with {m} outputs")
+    words = squash.choice("tanh", "identity"), centre.choice("output", "preactivation", "none")
+    centre.must(words != ("identity", "preactivation"), "another where squash is not 'tanh'")
+    weights, biases = zip(*read, strict=True)
+    policy = Policy(weights, biases, scale.array(m), offset.array(m), *words)
+    scale.must(bool(np.all(policy.scale != 0)), "nonzero")
+    check_hash(policy, sha256.raw)
+    return policy
+
+
+def check_hash(policy: Policy, stated: Any) -> None:
+    """Rule `hash`."""
+    if stated != policy.sha256():
+        raise Rejected("hash", "policy.sha256", "does not match the layers in the file")
+
+
+def _evidence(value: Value, n: int) -> Partition | Trusted:
+    known = isinstance(value.raw, dict) and value.raw.get("kind") in ("partition-tree", "trusted-solver")
+    value.must(known, "an object of kind partition-tree or trusted-solver")
+    if value.raw["kind"] == "partition-tree":
+        _, T, root, tree = value.keys("kind T root tree")
+        return Partition(T.array(n, n), root.array(n), tree.octets())
+    _, solver, version, precision, queries = value.keys("kind solver version precision queries")
+    precision.must(precision.binary64() > 0, "positive")
+    answers = queries.listed(lambda pair: pair.listed(Value.word, 2), 0, MAX_VALUES)
+    return Trusted(solver.word(), version.word(), answers)

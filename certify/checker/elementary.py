@@ -28,11 +28,8 @@ def elementary(name: str, c: Any, error: Any, radius: Any) -> tuple[Triple, Trip
         slope = 1 - t * t
         wrong = up(2 * e * (1 + e) + EPS)
         half = -t * slope
-        return (
-            (t, slope, half),
-            (e, wrong, up(e * up(slope + wrong) + np.abs(t) * wrong + EPS * np.abs(half))),
-            up(1 / 3),
-        )
+        bent = up(e * up(slope + wrong) + np.abs(t) * wrong + EPS * np.abs(half))
+        return (t, slope, half), (e, wrong, bent), up(1 / 3)
     if name == "inv":
         # the least magnitude of v, then that of v0; NaN for both if v may vanish
         least = _rounded_down(np.abs(c) - up(error + radius))

@@ -10,7 +10,6 @@ from flint import fmpq, fmpq_mat
 from numpy.typing import NDArray
 
 from .document import Policy
-from .expression import Functions
 
 Matrix = list[list[Fraction]]
 MAX_BITS = 2**14  # of a number on the tape
@@ -60,7 +59,7 @@ class Undecided(Exception):
 
 
 @dataclass(frozen=True)
-class Exact(Functions):
+class Exact:
     """A rational on the tape; sin and cos only of exact 0, no division by zero."""
 
     value: Fraction
@@ -90,19 +89,16 @@ class Exact(Functions):
 
 def raw_at_origin(policy: Policy) -> list[Fraction | None]:
     """raw(0), None where it is not known: tanh is known at exact 0 alone, and 0 times an unknown number is 0."""
-
-    def affine(W: NDArray[np.float64], b: NDArray[np.float64], h: list[Fraction | None]) -> list[Fraction | None]:
-        result: list[Fraction | None] = []
-        for row, bias in zip(W.tolist(), b.tolist(), strict=True):
-            used = [(w, v) for w, v in zip(row, h, strict=True) if w != 0]
-            known = [Fraction(w) * v for w, v in used if v is not None]
-            result.append(sum(known, Fraction(bias)) if len(known) == len(used) else None)
-        return result
-
-    def tanh(h: list[Fraction | None]) -> list[Fraction | None]:
-        return [Fraction(0) if v == 0 else None for v in h]
-
+    layers = [*zip(policy.weights, policy.biases, strict=True), (np.diag(policy.scale), policy.offset)]
     h: list[Fraction | None] = [Fraction(0)] * policy.weights[0].shape[1]
-    for k, (W, b) in enumerate(zip(policy.weights, policy.biases, strict=True)):
-        h = affine(W, b, tanh(h) if k else h)
-    return affine(np.diag(policy.scale), policy.offset, tanh(h) if policy.squash == "tanh" else h)
+    for k, (W, b) in enumerate(layers):
+        if 0 < k < len(policy.weights) or (k > 0 and policy.squash == "tanh"):
+            h = [Fraction(0) if v == 0 else None for v in h]
+        h = [_affine(row, bias, h) for row, bias in zip(W.tolist(), b.tolist(), strict=True)]
+    return h
+
+
+def _affine(row: list[float], bias: float, h: list[Fraction | None]) -> Fraction | None:
+    terms = [None if v is None else Fraction(w) * v for w, v in zip(row, h, strict=True) if w != 0]
+    known = [v for v in terms if v is not None]
+    return sum(known, Fraction(bias)) if len(known) == len(terms) else None

@@ -26,6 +26,7 @@ theorem, and Taylor polynomials on |d| <= h/2 = 2^-6. No libm value is trusted.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from fractions import Fraction
 from typing import Any
 
@@ -66,9 +67,9 @@ def frobenius(G: Any) -> Any:
     return norm(norm(G, -1), -1)
 
 
-def ends(centre: Array, radius: Array) -> tuple[Array, Array]:
+def ends(centre: Any, radius: Any) -> tuple[Any, Any]:
     """(lo, hi), an interval around the one of that centre and radius."""
-    radius = up(radius + EPS * np.abs(centre))
+    radius = up(radius + EPS * abs(centre))
     return centre - radius, centre + radius
 
 
@@ -83,10 +84,9 @@ def float_with_error(q: Fraction) -> tuple[float, float]:
 
 def within(bounds: tuple[Fraction, Fraction], mid: Any, radius: Any) -> Any:
     """Elementwise: [mid - radius, mid + radius] certainly lies in the bounds."""
-    (lo, lo_error), (hi, hi_error) = map(float_with_error, bounds)
-    reach = up(radius + EPS * np.abs(mid))
-    least, most = lo + up(lo_error + EPS * abs(lo)), hi - up(hi_error + EPS * abs(hi))
-    return (mid - reach >= least) & (mid + reach <= most)
+    (_, least), (most, _) = (ends(*float_with_error(q)) for q in bounds)
+    lo, hi = ends(mid, radius)
+    return (lo >= least) & (hi <= most)
 
 
 def arb_with_error(x: arb) -> tuple[float, float]:
@@ -100,30 +100,20 @@ def atanh_with_error(q: Fraction) -> tuple[float, float]:
     return arb_with_error(arb(fmpq(q.numerator, q.denominator)).atanh())
 
 
-def _table(function: str, end: float) -> tuple[Array, ...]:
-    """Binary64 numbers nearest to function(k h), k = 0 .. end/h; for tanh, 1 - tanh^2 as well."""
-    points = [arb(k) / 32 for k in range(int(end / _STEP) + 1)]
-    if function == "tanh":
-        values = [x.tanh() for x in points]
-        columns = [values, [1 - t * t for t in values]]
-    else:
-        columns = [[x.sin() for x in points], [x.cos() for x in points]]
-    result = []
-    for column in columns:
-        pairs = [arb_with_error(x) for x in column]
-        # At 128 bits the midpoint rounds to within u |value| (1 + 2^-50) of the ball.
-        if any(error > U * abs(value) * (1 + 2.0**-20) + 4 * TINY for value, error in pairs):
-            raise ArithmeticError("a table entry is not accurate to one rounding")
-        result.append(np.array([value for value, _ in pairs]))
-    return tuple(result)
+def _table(values: Iterable[arb]) -> Array:
+    """The binary64 numbers nearest to these values."""
+    pairs = [arb_with_error(x) for x in values]
+    # At 128 bits the midpoint rounds to within u |value| (1 + 2^-50) of the ball.
+    if any(error > U * abs(value) * (1 + 2.0**-20) + 4 * TINY for value, error in pairs):
+        raise ArithmeticError("a table entry is not accurate to one rounding")
+    return np.array([value for value, _ in pairs])
 
 
-def _tables() -> tuple[Array, ...]:
-    ctx.prec = 128
-    return (*_table("tanh", _TANH_END), *_table("sin", _ANGLE_END))
-
-
-_TANH, _SECH2, _SIN, _COS = _tables()
+ctx.prec = 128
+_GRID = [arb(k) * _STEP for k in range(int(_ANGLE_END / _STEP) + 1)]
+_TANHS = [x.tanh() for x in _GRID[: int(_TANH_END / _STEP) + 1]]
+_TANH, _SECH2 = _table(_TANHS), _table(1 - t * t for t in _TANHS)
+_SIN, _COS = _table(x.sin() for x in _GRID), _table(x.cos() for x in _GRID)
 
 
 def _split(y: Array, end: float) -> tuple[Any, Array]:
@@ -189,15 +179,14 @@ def spectral_norm(W: Array) -> float:
     G = W if W.shape[0] >= W.shape[1] else W.T
     steps: list[tuple[float, float]] = []
     for _ in range(6):
-        frobenius = float(norm(norm(G, 0), 0))
-        if not frobenius < np.inf:
+        size = float(frobenius(G))
+        if not size < np.inf:
             return np.inf
-        scale = math.ldexp(1.0, math.frexp(frobenius)[1])
+        scale = math.ldexp(1.0, math.frexp(size)[1])
         G = G / scale
-        error = up(gamma(G.shape[0]) * up((frobenius / scale) ** 2)) + G.size * TINY
+        steps.append((scale, up(gamma(G.shape[0]) * up((size / scale) ** 2)) + G.size * TINY))
         G = G.T @ G
-        steps.append((scale, error))
-    bound = float(norm(norm(G, 0), 0))
+    bound = float(frobenius(G))
     for scale, error in reversed(steps):
         bound = float(up(scale * up(np.sqrt(up(bound + error)))))
     return bound
@@ -211,8 +200,11 @@ def self_test() -> None:
     ArithmeticError : a rounding mode other than nearest, flushed subnormals, or a matrix product whose
         error exceeds its bound.
     """
-    one = np.full(64, 1.0)
-    least = np.full(64, 2.0**-1022)
+    one, least = np.full(64, 1.0), np.full(64, 2.0**-1022)
+    integers = np.array([k * 0x9E3779B97F4A7C15 % 2**54 - 2**53 for k in range(288)], dtype=object).reshape(2, 12, 12)
+    A, B = integers.astype(np.float64)
+    bounds = gamma(12) * norm(A, 1)[:, None] * norm(B, 0)[None, :]
+    products = zip((A @ B).ravel(), (integers[0] @ integers[1]).ravel(), bounds.ravel(), strict=True)
     good = (
         np.all(one + U == 1.0)
         and np.all(one + 3 * U == 1.0 + 4 * U)
@@ -221,13 +213,7 @@ def self_test() -> None:
         and np.all((least * 0.5) * 2 == least)
         and np.all(np.sqrt(one * 2) == float.fromhex("0x1.6a09e667f3bcdp+0"))
         and np.all(one / 3 == float.fromhex("0x1.5555555555555p-2"))
+        and all(abs(int(product) - exact) <= bound for product, exact, bound in products)
     )
-    integers = [k * 0x9E3779B97F4A7C15 % 2**54 - 2**53 for k in range(288)]
-    A, B = np.array(integers, dtype=np.float64).reshape(2, 12, 12)
-    product, bound = A @ B, gamma(12) * norm(A, 1)[:, None] * norm(B, 0)[None, :]
-    for i, row in enumerate(A.astype(np.int64).tolist()):
-        for j, column in enumerate(B.T.astype(np.int64).tolist()):
-            exact = sum(x * y for x, y in zip(row, column, strict=True))
-            good = good and abs(int(product[i, j]) - exact) <= bound[i, j]
     if not good:
         raise ArithmeticError("this machine's binary64 arithmetic is not IEEE round-to-nearest with subnormals")

@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from .elementary import elementary
-from .expression import Functions
 from .float64 import EPS, float_with_error, frobenius, norm, total, up
 
 
@@ -39,7 +38,7 @@ def outer(a: Any, b: Any) -> Any:
 
 
 @dataclass(frozen=True)
-class Jet(Functions):
+class Jet:
     """`c` +- `error`, gradient `a` (n,) +- `slack`, half the Hessian `Q` (n, n), remainder `E` (n, n); or a batch."""
 
     c: Any
@@ -88,10 +87,8 @@ class Jet(Functions):
         x, y = self, other
         c = x.c * y.c
         error = up(x.size * y.error + y.size * x.error + EPS * abs(c))
-        slack = up(
-            x.size * y.slack + x.error * y.slope + y.size * x.slack + y.error * x.slope
-            + EPS * (x.size * y.slope + y.size * x.slope)
-        )  # fmt: skip
+        slack = x.size * y.slack + x.error * y.slope + y.size * x.slack + y.error * x.slope
+        slack = up(slack + EPS * (x.size * y.slope + y.size * x.slope))
         ab = outer(x.a, y.a)
         Q = x.c * y.Q + y.c * x.Q + (ab + ab.T) / 2
         # (x.a.d) s_y + (y.a.d) s_x + s_x s_y, s what each adds to its linearisation: |s| <= d'(bend I + E)d

@@ -36,7 +36,7 @@ class Ball:
     @cached_property
     def J(self) -> tuple[Array, float]:
         """x = J d, J (n, n), and a bound of its rounding error in the 2-norm."""
-        J = self.rho * self.case.T
+        J = self.rho * self.case.partition.T
         return J, float(up(EPS * frobenius(J)))
 
     @cached_property
@@ -54,7 +54,7 @@ class Ball:
         Take any diagonal D > 0 and d = D e. With N = D (-(B + B')/2 - E) D and the n x n^2 matrix W of all D C_j D,
         d'G is at most -e'N e + ||W||_2 ||e||^2, and e'N e >= (1 - ||I - N||_2) ||e||^2.
         """
-        n, T, P, (J, slack) = len(self.c.states), self.case.T, self.c.P, self.J
+        n, T, P, (J, slack) = len(self.c.states), self.case.partition.T, self.c.P, self.J
         nothing = np.zeros((n, n))
         states = [Jet(np.float64(0), 0.0, row, slack, nothing, nothing) for row in J]
         F = evaluate(self.c.dynamics, lambda q: constant(q, n), [*states, *self.inputs])

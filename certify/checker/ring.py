@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property, reduce
+from functools import reduce
+from itertools import islice
 from operator import add
 
 import numpy as np
-from numpy.typing import NDArray
 
-from .case import Failures
-from .document import Certificate
-from .exact import Matrix
+from .case import Case, Failures
 from .expression import evaluate
 from .float64 import EPS, Array, float_with_error, gamma, norm, total, up, within
-from .network import Folded, enclose_on_boxes
+from .network import enclose_on_boxes
 from .taylor import Taylor, affine, constant, upper_bound
 
 LEAF = 255
@@ -23,15 +21,29 @@ MAX_DEPTH = 4096
 _BATCH_NUMBERS = 4_000_000  # in the largest array of a batch
 
 
+@dataclass(frozen=True)
+class Leaves:
+    """The leaves of a batch of which something is asked: those that may meet the ring and, under a practical claim,
+    those inside of it as well, which no other rule covers then."""
+
+    ring: Ring
+    numbers: Array  # in the tree
+    meet: Array  # which of them may meet the ring
+    mid: Array  # (m, B): the inputs lie within `reach` of this
+    reach: Array
+    bound: Array  # of Vdot
+    hold: Array  # where Vdot < 0, or inside of the ring where every component of F has a finite model
+
+
 class Ring:
     """The bounds on boxes, lo and hi (n, B) in the coordinates z, that the rules for a leaf ask for."""
 
-    def __init__(self, c: Certificate, T: Array, net: Folded, S: Matrix) -> None:
-        self.c, self.T, self.net = c, T, net
-        self.n, self.m = len(c.states), len(c.inputs)
-        value, error = np.moveaxis(np.array([[float_with_error(v) for v in row] for row in S]), 2, 0)
-        self.S, self.S_error = np.diag(value)[:, None], np.diag(error)[:, None]  # of the diagonal, (n, 1)
-        self.S_cross = up((np.abs(value) + error) * (1 - np.eye(self.n)))
+    def __init__(self, case: Case) -> None:
+        self.case, self.c, self.T, self.net = case, case.c, case.partition.T, case.net
+        self.n, self.m = len(case.c.states), len(case.c.inputs)
+        value, error = np.moveaxis(np.array([[float_with_error(v) for v in row] for row in case.S]), 2, 0)
+        self.S = np.diag(value)[:, None]  # the diagonal, (n, 1)
+        self.S_rest = up(np.abs(value - np.diag(self.S[:, 0])) + error)  # bounds what S is beside it
 
     @property
     def batch(self) -> int:
@@ -41,6 +53,22 @@ class Ring:
         numbers = max(width * (symbols + 4), symbols * symbols * (len(self.c.dynamics.operations) + 4))
         return int(max(1, min(4096, _BATCH_NUMBERS // numbers)))
 
+    def examine(self, first: int, lo: Array, hi: Array) -> Leaves:
+        """The leaves with these corners, numbered from `first`."""
+        outside, inside = self.misses(lo, hi)
+        met = np.flatnonzero(np.logical_not(outside if self.c.practical else outside | inside))
+        lo, hi, meet = lo[:, met], hi[:, met], np.logical_not(inside[met])
+        centre = 0.5 * lo + 0.5 * hi
+        radius = up(np.maximum(hi - centre, centre - lo))
+        x, error = self.states(centre, radius)
+        mid, slopes, wide = enclose_on_boxes(self.net, x, error)
+        vdot, F = self.models(x, error, mid, slopes, wide)
+        bound = self.bound(vdot, centre, radius)
+        hold = bound < 0
+        if not np.all(meet):  # what divides by a range that holds 0 has no finite model
+            hold = np.where(meet, hold, np.all([np.isfinite(f.size + f.r) for f in F], axis=0))
+        return Leaves(self, first + met, meet, mid, up(total(np.abs(slopes), 1) + wide), bound, hold)
+
     def misses(self, lo: Array, hi: Array) -> tuple[Array, Array]:
         """Where the box certainly has V > c2 everywhere, and where it certainly has V < c1 everywhere.
 
@@ -48,7 +76,7 @@ class Ring:
         """
         far = np.maximum(np.abs(lo), np.abs(hi))
         near = np.where((lo <= 0) & (hi >= 0), 0.0, np.minimum(np.abs(lo), np.abs(hi)))  # corners are exact
-        cross = up(self.cross(far) + total(self.S_error * far * far, 0))
+        cross = self.cross(far)
         least = np.sum(self.S * near * near, axis=0) * (1 - gamma(self.n + 4)) - cross - 2.0**-960
         most = up(total(self.S * far * far, 0) + cross)
         least = least - EPS * np.abs(least) - EPS * cross
@@ -61,21 +89,15 @@ class Ring:
         error = gamma(self.n) * (norm(self.T, 1)[:, None] * norm(centre, 0)) + EPS * total(np.abs(slopes), 1)
         return x, up(error)
 
-    def dynamics(
-        self, x: Array, error: Array, mid: Array, slopes: Array, wide: Array
-    ) -> tuple[list[Taylor], list[Taylor]]:
-        """The states and F on the boxes; symbols: n box coordinates, m input errors."""
-        n, m, batch = self.n, self.m, x.shape[2]
-        plain = [affine(x[i, 0], np.concatenate([x[i, 1:], np.zeros((m, batch))])) for i in range(n)]
-        states = [Taylor(model.c, model.g, model.Q, error[i]) for i, model in enumerate(plain)]
-        unit = np.eye(m)[:, :, None]
-        inputs = [affine(mid[j], np.concatenate([slopes[j], unit[j] * wide[j]])) for j in range(m)]
-        return states, evaluate(self.c.dynamics, lambda q: constant(q, n + m, batch), [*states, *inputs])
-
-    def vdot(self, states: list[Taylor], F: list[Taylor]) -> Taylor:
-        """(2 P x)'F."""
-        rows = [[x.scaled(2 * p, 0.0) for p, x in zip(row, states, strict=True)] for row in self.c.P.tolist()]
-        return reduce(add, [reduce(add, row) * f for row, f in zip(rows, F, strict=True)])
+    def models(self, x: Array, error: Array, mid: Array, slopes: Array, wide: Array) -> tuple[Taylor, list[Taylor]]:
+        """Vdot = (2 P x)'F, and F, on the boxes; symbols: n box coordinates, m input errors."""
+        zeros, errors = np.zeros_like(wide), np.eye(self.m)[:, :, None] * wide[:, None]
+        states = [affine(v[0], np.concatenate([v[1:], zeros]), e) for v, e in zip(x, error, strict=True)]
+        parts = zip(mid, slopes, errors, strict=True)
+        inputs = [affine(v, np.concatenate([slope, own])) for v, slope, own in parts]
+        F = evaluate(self.c.dynamics, lambda q: constant(q, self.n + self.m, len(zeros.T)), [*states, *inputs])
+        rows = [[v.scaled(2 * p) for p, v in zip(row, states, strict=True)] for row in self.c.P.tolist()]
+        return reduce(add, [reduce(add, row) * f for row, f in zip(rows, F, strict=True)]), F
 
     def bound(self, vdot: Taylor, centre: Array, radius: Array) -> Array:
         """Upper bound of Vdot on the part of each box that lies in the ring.
@@ -88,7 +110,7 @@ class Ring:
             left = np.flatnonzero(np.logical_not(bound < 0))
             gap, part = self.gap(centre[:, left], radius[:, left], level, sign), vdot.at(left)
             k = multiplier(part.g[: self.n], gap.g[: self.n], gap.c)
-            other = upper_bound(part + gap.scaled(k, 0.0))
+            other = upper_bound(part + gap.scaled(k))
             bound[left] = np.where(other < bound[left], other, bound[left])
         return bound
 
@@ -100,12 +122,12 @@ class Ring:
         g = np.concatenate([-2 * sign * self.S * centre * radius, zeros])
         q = np.concatenate([-sign * self.S * radius * radius, zeros])
         c = sign * (level - np.sum(self.S * centre * centre, axis=0))
-        r = up(self.cross(far) + total(self.S_error * far * far, 0) + gamma(self.n + 8) * size)
+        r = up(self.cross(far) + gamma(self.n + 8) * size)
         return Taylor(c, g, np.eye(len(q))[:, :, None] * q, r)
 
     def cross(self, far: Array) -> Array:
-        """Upper bound of what the off-diagonal part of S adds to V in magnitude where |z| <= far."""
-        return total(far * total(self.S_cross[:, :, None] * far[None, :], 1), 0)
+        """Upper bound of what S beside its diagonal adds to V in magnitude where |z| <= far."""
+        return total(far * total(self.S_rest[:, :, None] * far[None, :], 1), 0)
 
 
 def multiplier(a: Array, b: Array, c: Array) -> Array:
@@ -119,132 +141,61 @@ def multiplier(a: Array, b: Array, c: Array) -> Array:
     return np.asarray(np.take_along_axis(k, best[None], 0)[0])
 
 
-@dataclass(frozen=True)
-class Leaves:
-    """A batch of leaves: the number of the first one, their corners (n, B), and in what the tree breaks after them."""
-
-    ring: Ring
-    first: int
-    lo: Array
-    hi: Array
-    broken: tuple[str, str] | None
-
-    @cached_property
-    def misses(self) -> tuple[Array, Array]:
-        """Which lie outside of the ring, and which inside of it."""
-        return self.ring.misses(self.lo, self.hi)
-
-    @cached_property
-    def met(self) -> NDArray[np.intp]:
-        """The leaves of which something is asked: those that may meet the ring and, under a practical claim, those
-        inside of it as well, which no other rule covers then."""
-        outside, inside = self.misses
-        return np.flatnonzero(np.logical_not(outside if self.ring.c.claim == "practical" else outside | inside))
-
-    @property
-    def met_ring(self) -> Array:
-        """Which of these may meet the ring."""
-        return np.logical_not(self.misses[1][self.met])
-
-    @cached_property
-    def boxes(self) -> tuple[Array, Array]:
-        """Their centres and radii."""
-        lo, hi = self.lo[:, self.met], self.hi[:, self.met]
-        centre = 0.5 * lo + 0.5 * hi
-        return centre, up(np.maximum(hi - centre, centre - lo))
-
-    @cached_property
-    def policy(self) -> tuple[Array, Array, Array, Array, Array]:
-        """States and their error, the policy's enclosure and its error, on these."""
-        x, error = self.ring.states(*self.boxes)
-        return (x, error, *enclose_on_boxes(self.ring.net, x, error))
-
-    @cached_property
-    def dynamics(self) -> tuple[list[Taylor], list[Taylor]]:
-        """The states and F, on these."""
-        return self.ring.dynamics(*self.policy)
-
-    @cached_property
-    def bound(self) -> Array:
-        """Of Vdot, on these."""
-        return self.ring.bound(self.ring.vdot(*self.dynamics), *self.boxes)
-
-    @property
-    def defined(self) -> Array:
-        """On which of these every component of F has a finite model; what divides by a range that holds 0 has none."""
-        return np.logical_and.reduce([np.isfinite(f.size + f.r) for f in self.dynamics[1]])
-
-    def place(self, holds: Array) -> str:
-        """The first of these for which something does not hold."""
-        return f"leaf {self.first + int(self.met[np.argmin(holds)])}"
-
-
-def is_whole(leaves: Leaves) -> Failures:
-    """`tree`: the bytes are a tree of leaves and splits, and nothing else."""
-    if leaves.broken:
-        yield leaves.broken
-    return int(leaves.lo.shape[1])
+def is_whole(case: Case) -> Failures:
+    """`tree`: the bytes are a tree of leaves and splits in preorder, and nothing else."""
+    boxes, n, tree = 1, len(case.c.states), case.partition.tree
+    for position, axis in enumerate(tree):
+        if not boxes:
+            yield f"byte {position}", "the tree goes on after its last leaf"
+        if axis >= n and axis != LEAF:
+            yield f"byte {position}", f"must be an axis below {n} or {LEAF}"
+        boxes += -1 if axis == LEAF else 1
+        if boxes > MAX_DEPTH + 1:
+            yield f"byte {position}", f"deeper than {MAX_DEPTH}"
+    if boxes:
+        yield "end", f"the tree ends with {boxes} boxes open"
+    return tree.count(LEAF)
 
 
 def keeps_inputs(leaves: Leaves) -> Failures:
-    """`inputs`: the policy's enclosure lies in the bounds."""
-    _, _, mid, slopes, wide = leaves.policy
-    for j, (name, bounds) in enumerate(zip(leaves.ring.c.inputs, leaves.ring.c.input_bounds, strict=True)):
-        holds = within(bounds, mid[j], up(total(np.abs(slopes[j]), 0) + wide[j]))
-        if not np.all(holds):
-            yield leaves.place(holds), f"{name} may leave its bounds"
-    return int(mid.size)
+    """`inputs`: by form, or the policy's enclosure lies in the bounds."""
+    c = leaves.ring.c
+    if leaves.ring.case.bounded:
+        return 0
+    for name, bounds, mid, reach in zip(c.inputs, c.input_bounds, leaves.mid, leaves.reach, strict=True):
+        hold = within(bounds, mid, reach)
+        if not np.all(hold):
+            yield f"leaf {leaves.numbers[np.argmin(hold)]}", f"{name} may leave its bounds"
+    return int(leaves.mid.size)
 
 
 def decreases(leaves: Leaves) -> Failures:
     """`ring`: Vdot < 0 on leaves that may meet the ring; on others of which anything is asked, F is smooth."""
-    holds = leaves.bound < 0
-    if not np.all(leaves.met_ring):
-        holds = np.where(leaves.met_ring, holds, leaves.defined)
-    if not np.all(holds):
-        worst = np.argmin(holds)
-        smooth = f"Vdot < 0 is not shown: {leaves.bound[worst]:.3g}"
-        yield leaves.place(holds), smooth if leaves.met_ring[worst] else "F may be undefined"
-    return int(np.sum(leaves.met_ring))
+    if not np.all(leaves.hold):
+        first = np.argmin(leaves.hold)
+        smooth = f"Vdot < 0 is not shown: {leaves.bound[first]:.3g}"
+        yield f"leaf {leaves.numbers[first]}", smooth if leaves.meet[first] else "F may be undefined"
+    return int(np.sum(leaves.meet))
 
 
-def batches(ring: Ring, tree: bytes, root: Array) -> Iterator[Leaves]:
-    """The leaves of the partition tree in preorder.
-
-    A byte below n splits the current box at the middle of that axis, lower half first; 255 is a leaf. Both children
-    share the same binary64 midpoint, so the leaves cover the root box.
-    """
-    count, lows, highs = 0, [], []
-    for low, high, broken in _walk(tree, root.tolist()):
-        if broken is None:
-            lows.append(low)
-            highs.append(high)
-        if broken or len(lows) == ring.batch:
-            lo, hi = (np.array(corners).reshape(-1, len(root)).T for corners in (lows, highs))
-            yield Leaves(ring, count, lo, hi, broken)
-            count, lows, highs = count + len(lows), [], []
-    if lows:
-        yield Leaves(ring, count, np.array(lows).T, np.array(highs).T, None)
+def batches(tree: bytes, root: Array, size: int) -> Iterator[tuple[int, Array, Array]]:
+    """The leaves of a whole tree in preorder: the number of the first of each batch, and their corners (n, B)."""
+    first, leaves = 0, _walk(tree, root.tolist())
+    while corners := list(islice(leaves, size)):
+        lo, hi = np.array(corners).transpose(1, 2, 0)
+        yield first, lo, hi
+        first += len(corners)
 
 
-def _walk(tree: bytes, half: list[float]) -> Iterator[tuple[list[float], list[float], tuple[str, str] | None]]:
-    """Corner by corner the leaves, and at the end what is wrong with the tree, if anything is."""
-    n, stack = len(half), [([-b for b in half], half)]
-    for position, axis in enumerate(tree):
-        if not stack:
-            return (yield [], [], (f"byte {position}", "the tree goes on after its last leaf"))
+def _walk(tree: bytes, half: list[float]) -> Iterator[tuple[list[float], list[float]]]:
+    """A byte splits the current box at the middle of that axis, lower half first, or says that it is a leaf. Both
+    halves share the same binary64 midpoint, so the leaves cover the root box."""
+    stack = [([-b for b in half], half)]
+    for axis in tree:
         lo, hi = stack.pop()
         if axis == LEAF:
-            yield lo, hi, None
-        elif axis >= n:
-            return (yield [], [], (f"byte {position}", f"must be an axis below {n} or {LEAF}"))
-        elif len(stack) >= MAX_DEPTH:
-            return (yield [], [], (f"byte {position}", f"deeper than {MAX_DEPTH}"))
-        else:
-            middle = 0.5 * lo[axis] + 0.5 * hi[axis]
-            left, right = hi.copy(), lo.copy()
-            left[axis] = right[axis] = middle
-            stack.append((right, hi))
-            stack.append((lo, left))
-    if stack:
-        yield [], [], ("end", f"the tree ends with {len(stack)} boxes open")
+            yield lo, hi
+            continue
+        left, right = hi.copy(), lo.copy()
+        left[axis] = right[axis] = 0.5 * lo[axis] + 0.5 * hi[axis]
+        stack += [(right, hi), (lo, left)]

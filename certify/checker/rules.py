@@ -86,21 +86,14 @@ def centring(case: Case) -> Failures:
 Subject = TypeVar("Subject")
 Table = Sequence[tuple[str, Callable[[Subject], Failures]]]
 
-STATED: Table[Case] = (
-    ("levels", levels),
-    ("lyapunov", lyapunov),
-    ("equilibrium", equilibrium),
-    ("domain", domain),
-    ("coordinates", coordinates),
-    ("root", root),
-    ("centring", centring),
+STATED: Table[Case] = tuple(
+    (rule.__name__, rule) for rule in (levels, lyapunov, equilibrium, domain, coordinates, root, centring)
 )
 ON_THE_BALL: Table[local.Ball] = (("local", local.fits), ("inputs", local.keeps_inputs), ("local", local.decreases))
-ON_LEAVES: Table[ring.Leaves] = (("tree", ring.is_whole), ("inputs", ring.keeps_inputs), ("ring", ring.decreases))
-OF_THE_TREE = {"coordinates", "root"}  # not asked of a solver's word
-OF_THE_ORIGIN = {"equilibrium"}  # nor this of a practical claim
+OF_THE_TREE: Table[Case] = (("tree", ring.is_whole),)
+ON_LEAVES: Table[ring.Leaves] = (("inputs", ring.keeps_inputs), ("ring", ring.decreases))
 READ = {"format": 1, "hash": 1}  # rules of document.py, which have held
-RULES = (*READ, *dict.fromkeys(name for table in (STATED, ON_THE_BALL, ON_LEAVES) for name, _ in table))
+RULES = (*READ, *dict.fromkeys(name for table in (STATED, ON_THE_BALL, OF_THE_TREE, ON_LEAVES) for name, _ in table))
 
 
 @dataclass
@@ -111,17 +104,16 @@ class Tally:
     ring_margin: float | None = None  # smallest -Vdot bound over the ring's leaves
     local_margin: float | None = None  # 1 - the remainder's largest part of the decay
 
-    def hold(self, table: Table[Subject], subject: Subject, but: frozenset[str] = frozenset()) -> None:
+    def hold(self, table: Table[Subject], subject: Subject) -> None:
         """Raise `Rejected` at the first failure of the first rule that fails; count what the rules have looked at."""
         for name, rule in table:
-            if name not in but:
-                failures = rule(subject)
-                try:
-                    at, detail = next(failures)
-                except StopIteration as done:
-                    self.rules[name] += done.value
-                else:
-                    raise Rejected(name, at, detail)
+            failures = rule(subject)
+            try:
+                at, detail = next(failures)
+            except StopIteration as done:
+                self.rules[name] += done.value
+            else:
+                raise Rejected(name, at, detail)
 
 
 def check(c: Certificate) -> Tally:
@@ -131,24 +123,23 @@ def check(c: Certificate) -> Tally:
     and the caller must not say ACCEPTED.
     """
     self_test()
+    replayed = isinstance(c.evidence, Partition)
+    spared = {"equilibrium": c.practical, "coordinates": not replayed, "root": not replayed}
     with np.errstate(all="ignore"):  # overflow becomes infinity or NaN, and every test then fails
-        tally, case, practical = Tally(), Case(c), c.claim == "practical"
-        origin = frozenset(OF_THE_ORIGIN if practical else ())
-        if not isinstance(c.evidence, Partition):
-            tally.hold(STATED, case, origin | OF_THE_TREE)
+        tally, case = Tally(), Case(c)
+        tally.hold([(name, rule) for name, rule in STATED if not spared.get(name)], case)
+        if not replayed:
             return tally
-        tally.hold(STATED, case, origin)
-        if not practical:
+        if not c.practical:
             ball = local.Ball(case)
             tally.hold(ON_THE_BALL, ball)
             tally.local_margin = 1 - ball.remainder
-        bounds = ring.Ring(c, case.T, case.net, case.S)
-        skipped = frozenset(
-            {"ring", "inputs"} if c.c1 == c.c2 and not practical else {"inputs"} if case.bounded else ()
-        )
-        for leaves in ring.batches(bounds, c.evidence.tree, c.evidence.root):
-            tally.hold(ON_LEAVES, leaves, skipped)
-            if "ring" not in skipped and np.any(leaves.met_ring):
-                margin = float(np.min(-leaves.bound[leaves.met_ring]))
-                tally.ring_margin = margin if tally.ring_margin is None else min(tally.ring_margin, margin)
+        tally.hold(OF_THE_TREE, case)
+        if c.practical or c.c1 != c.c2:
+            bounds, margin = ring.Ring(case), np.inf
+            for batch in ring.batches(case.partition.tree, case.partition.root, bounds.batch):
+                leaves = bounds.examine(*batch)
+                tally.hold(ON_LEAVES, leaves)
+                margin = min(margin, float(np.min(-leaves.bound[leaves.meet], initial=np.inf)))
+            tally.ring_margin = margin if margin < np.inf else None
     return tally

@@ -1,151 +1,95 @@
-"""What a value of a document may be: readers, from which document.py builds the whole document.
-
-A reader takes a value, its place, and what has been learnt so far (`known`: counts of states, inputs, rows, ...), and
-returns what the value means or fails under rule `format`. Numbers arrive as hex floats, exact fractions or raw
-little-endian bytes; none passes through decimal.
+"""What a value of a document may be. Numbers arrive as hex floats, exact fractions or raw little-endian bytes; none
+passes through decimal.
 """
 
 from __future__ import annotations
 
 import base64
-import binascii
 import math
 import re
 from collections.abc import Callable
+from dataclasses import dataclass
 from fractions import Fraction
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from . import strict
 
-Known = dict[str, Any]
-Read = Callable[[Any, str, Known], Any]
+T = TypeVar("T")
 
 
-def section(**readers: Read) -> Read:
-    """An object with exactly these keys, read in this order."""
+@dataclass(frozen=True, slots=True)
+class Value:
+    """A JSON value and its place. Each method returns what the value means, or fails under rule `format`."""
 
-    def read(value: Any, at: str, known: Known) -> dict[str, Any]:
-        if not isinstance(value, dict) or set(value) != set(readers):
-            strict.fail(at, f"must be an object with exactly the keys: {' '.join(readers)}")
-        return {key: reader(value[key], f"{at}.{key}".lstrip("."), known) for key, reader in readers.items()}
+    raw: Any
+    at: str = ""
 
-    return read
+    def must(self, holds: bool, be: str) -> None:
+        if not holds:
+            strict.fail(self.at, f"must be {be}")
 
+    def keys(self, names: str) -> list[Value]:
+        """The entries of an object that has exactly these keys."""
+        keys = names.split()
+        self.must(
+            isinstance(self.raw, dict) and set(self.raw) == set(keys), f"an object with exactly the keys: {names}"
+        )
+        return [Value(self.raw[key], f"{self.at}.{key}".lstrip(".")) for key in keys]
 
-def by_kind(**sections: Read) -> Read:
-    """An object whose `kind` names the section that it is; a kind `a_b` is written `a-b`."""
-    kinds = {name.replace("_", "-"): read for name, read in sections.items()}
+    def listed(self, read: Callable[[Value], T], least: int, most: int | None = None) -> tuple[T, ...]:
+        """The entries of a list, each as `read` has it; `least` of them, or up to `most`."""
+        most = least if most is None else most
+        self.must(isinstance(self.raw, list) and least <= len(self.raw) <= most, f"a list of {least} to {most} entries")
+        return tuple(read(Value(entry, f"{self.at}[{i}]")) for i, entry in enumerate(self.raw))
 
-    def read(value: Any, at: str, known: Known) -> Any:
-        kind = choice(*kinds)(value.get("kind") if isinstance(value, dict) else None, f"{at}.kind", known)
-        return kinds[kind](value, at, known)
+    def text(self, pattern: str, what: str) -> str:
+        """A string that matches the whole pattern."""
+        self.must(isinstance(self.raw, str) and bool(re.fullmatch(pattern, self.raw, re.ASCII)), what)
+        return str(self.raw)
 
-    return read
+    def choice(self, *words: str) -> str:
+        return self.text("|".join(words), " or ".join(words))
 
+    def name(self) -> str:
+        return self.text(r"[A-Za-z_][A-Za-z0-9_]{0,63}", "an identifier")
 
-def listed(reader: Read, count: int | str = "", least: int = 0, most: int = strict.MAX_VALUES) -> Read:
-    """A list; all that are given the same letter as a count have as many entries as the first of them."""
+    def word(self) -> str:
+        return self.text(r"[A-Za-z0-9_.+-]{1,80}", "a word of at most 80 letters, digits and _.+-")
 
-    def read(value: Any, at: str, known: Known) -> tuple[Any, ...]:
-        if not isinstance(value, list) or not least <= len(value) <= most:
-            strict.fail(at, f"must be a list of {least} to {most} entries")
-        wanted = known.setdefault(count, len(value)) if count and isinstance(count, str) else count or len(value)
-        if len(value) != wanted:
-            strict.fail(at, f"must be a list of {wanted}")
-        return tuple(reader(entry, f"{at}[{i}]", known) for i, entry in enumerate(value))
+    def rational(self) -> Fraction:
+        return Fraction(self.text(r"-?(0|[1-9]\d{0,1200})(/[1-9]\d{0,1200})?", 'an exact fraction such as "3/20"'))
 
-    return read
+    def interval(self) -> tuple[Fraction, Fraction]:
+        lo, hi = self.listed(Value.rational, 2)
+        self.must(lo < hi, "lower, then upper end")
+        return lo, hi
 
+    def binary64(self) -> float:
+        """A C99 hex float in canonical form."""
+        what = 'a canonical hex float such as "0x1.8000000000000p+1"'
+        try:
+            number = float.fromhex(self.text(r"-?0x[01]\.[0-9a-f]{1,13}p[+-]\d{1,4}", what))
+        except OverflowError:
+            number = math.inf
+        self.must(number.hex() == self.raw, what)
+        return number
 
-def then(reader: Read, build: Callable[[Any, str, Known], Any]) -> Read:
-    """What `build` makes of what `reader` has read."""
-    return lambda value, at, known: build(reader(value, at, known), at, known)
+    def octets(self) -> bytes:
+        """Canonical base64."""
+        try:
+            raw = base64.b64decode(self.raw, validate=True)
+        except (TypeError, ValueError):
+            raw = b""
+        self.must(base64.b64encode(raw).decode() == self.raw, "canonical base64 text")
+        return raw
 
-
-def choice(*words: str) -> Read:
-    """One of these words."""
-
-    def read(value: Any, at: str, known: Known) -> str:
-        if not isinstance(value, str) or value not in words:
-            strict.fail(at, f"must be {' or '.join(map(repr, words))}")
-        return value
-
-    return read
-
-
-def text(pattern: str, what: str) -> Read:
-    """A string that matches the whole pattern."""
-
-    def read(value: Any, at: str, known: Known) -> str:
-        if not isinstance(value, str) or not re.fullmatch(pattern, value, re.ASCII):
-            strict.fail(at, f"must be {what}")
-        return value
-
-    return read
-
-
-name = text(r"[A-Za-z_][A-Za-z0-9_]{0,63}", "an identifier")
-word = text(r"[A-Za-z0-9_.+-]{1,80}", "a word of at most 80 letters, digits and _.+-")
-rational = then(
-    text(r"-?(0|[1-9][0-9]{0,1200})(/[1-9][0-9]{0,1200})?", 'an exact fraction such as "3/20"'),
-    lambda value, at, known: Fraction(value),
-)
-_hex = text(r"-?0x[01]\.[0-9a-f]{1,13}p[+-][0-9]{1,4}", 'a hex float such as "0x1.8000000000000p+1"')
-
-
-def anything(value: Any, at: str, known: Known) -> Any:
-    """Read elsewhere, or by nobody."""
-    return value
-
-
-def mapping(value: Any, at: str, known: Known) -> None:
-    """Any object; nothing may depend on what is in it."""
-    if not isinstance(value, dict):
-        strict.fail(at, "must be an object")
-
-
-def interval(value: Any, at: str, known: Known) -> tuple[Fraction, Fraction]:
-    lo, hi = listed(rational, 2)(value, at, known)
-    if not lo < hi:
-        strict.fail(at, "must satisfy lo < hi")
-    return lo, hi
-
-
-def binary64(value: Any, at: str, known: Known) -> float:
-    """A C99 hex float in canonical form."""
-    try:
-        number = float.fromhex(_hex(value, at, known))
-    except OverflowError:
-        strict.fail(at, "is out of range")
-    if number.hex() != value:
-        strict.fail(at, f"must be written canonically, {number.hex()}")
-    return number
-
-
-def base64_bytes(value: Any, at: str, known: Known) -> bytes:
-    """Canonical base64."""
-    try:
-        raw = base64.b64decode(value.encode("ascii") if isinstance(value, str) else b"?", validate=True)
-    except (UnicodeEncodeError, binascii.Error):
-        strict.fail(at, "must be base64 text")
-    if base64.b64encode(raw).decode("ascii") != value:
-        strict.fail(at, "must be canonical base64 text")
-    return raw
-
-
-def array(*axes: str) -> Read:
-    """Finite little-endian binary64 in row order, of the shape that `known` tells."""
-
-    def read(value: Any, at: str, known: Known) -> NDArray[np.float64]:
-        raw, shape = base64_bytes(value, at, known), tuple(known[axis] for axis in axes)
-        if len(raw) != 8 * math.prod(shape):
-            strict.fail(at, f"must hold {math.prod(shape)} little-endian binary64 numbers")
+    def array(self, *shape: int) -> NDArray[np.float64]:
+        """Finite little-endian binary64 in row order."""
+        raw, count = self.octets(), math.prod(shape)
+        self.must(len(raw) == 8 * count, f"{count} little-endian binary64 numbers")
         numbers = np.frombuffer(raw, dtype="<f8").astype(np.float64).reshape(shape)
-        if not np.all(np.isfinite(numbers)):
-            strict.fail(at, "must be finite")
+        self.must(bool(np.all(np.isfinite(numbers))), "finite")
         return numbers
-
-    return read

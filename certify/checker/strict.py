@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
+import re
 from typing import Any, NoReturn
 
 from .errors import Rejected, Unreadable
@@ -27,25 +27,20 @@ def load(path: str) -> tuple[Any, str]:
     """The JSON value in the file at `path`, and the sha256 of its bytes; raises `Unreadable` or `Rejected`."""
     try:
         with open(path, "rb") as stream:
-            size = os.fstat(stream.fileno()).st_size
-            raw = b"" if size > MAX_BYTES else stream.read(MAX_BYTES + 1)
+            raw = stream.read(MAX_BYTES + 1)
     except OSError as error:
         raise Unreadable(f"{path} cannot be read: {error.strerror}") from error
-    if size > MAX_BYTES or len(raw) > MAX_BYTES:
+    if len(raw) > MAX_BYTES:
         fail("file", f"larger than {MAX_BYTES} bytes")
     if len(raw) > MAX_WIDE_BYTES and not raw.isascii():
         fail("file", f"larger than {MAX_WIDE_BYTES} bytes and not ASCII")
     if sum(map(raw.count, (b",", b"[", b"{"))) > MAX_VALUES:
         fail("file", f"more than {MAX_VALUES} commas and brackets")
-    refuse: dict[str, Any] = {
-        "parse_float": lambda text: fail("file", f"decimal number {text[:40]}"),
-        "parse_constant": lambda text: fail("file", f"number {text}"),
-    }
     try:
-        data = json.loads(raw.decode("utf-8"), object_pairs_hook=_object, parse_int=_integer, **refuse)
+        numbers: dict[str, Any] = dict.fromkeys(("parse_int", "parse_float", "parse_constant"), _integer)
+        return json.loads(raw.decode(), object_pairs_hook=_object, **numbers), hashlib.sha256(raw).hexdigest()
     except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
         raise Rejected("format", "file", f"not a JSON document: {type(error).__name__}") from error
-    return data, hashlib.sha256(raw).hexdigest()
 
 
 def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -56,6 +51,6 @@ def _object(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 
 
 def _integer(text: str) -> int:
-    if len(text) > MAX_DIGITS:
-        fail("file", f"integer {text[:20]}... is too long")
+    if len(text) > MAX_DIGITS or not re.fullmatch("-?[0-9]+", text):
+        fail("file", f"number {text[:40]} is not an integer, or too long")
     return int(text)

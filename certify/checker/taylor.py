@@ -13,15 +13,13 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from .elementary import elementary
-from .expression import Functions
 from .float64 import EPS, Array, float_with_error, gamma, total, up
 
 
 @dataclass(frozen=True)
-class Taylor(Functions):
+class Taylor:
     """`c` (B,), `g` (N, B), `Q` (N, N, B) and remainder `r` (B,), r >= 0."""
 
     c: Array
@@ -44,16 +42,14 @@ class Taylor(Functions):
         """Upper bound of |c| + G + Q."""
         return up(np.abs(self.c) + self.linear + self.quadratic)
 
-    def at(self, index: NDArray[np.intp]) -> Taylor:
+    def at(self, index: Array) -> Taylor:
         """The models of some members of the batch."""
         return Taylor(self.c[index], self.g[:, index], self.Q[:, :, index], self.r[index])
 
-    def scaled(self, value: Any, error: Any) -> Taylor:
-        """Product with a constant in value +- error; `value` may differ over the batch (B,)."""
-        size, k = self.size, np.abs(value)
-        return Taylor(
-            value * self.c, value * self.g, value * self.Q, up(k * self.r + error * (size + self.r) + EPS * (k * size))
-        )
+    def scaled(self, k: Any) -> Taylor:
+        """Product with a number, or with one for each member of the batch (B,)."""
+        r = up(np.abs(k) * self.r + EPS * (np.abs(k) * self.size))
+        return Taylor(k * self.c, k * self.g, k * self.Q, r)
 
     def __add__(self, other: Taylor) -> Taylor:
         r = up(self.r + other.r + EPS * (self.size + other.size))
@@ -94,17 +90,15 @@ class Taylor(Functions):
         return Taylor(f0, f1 * self.g, Q, up(r))
 
 
-def affine(c: Array, g: Array) -> Taylor:
-    """The exact affine function c + g.d, c (B,), g (N, B)."""
-    symbols, batch = g.shape
-    return Taylor(c, g, np.zeros((symbols, symbols, batch)), np.zeros(batch))
+def affine(c: Array, g: Array, r: Array | float = 0.0) -> Taylor:
+    """c + g.d within r, c (B,), g (N, B)."""
+    return Taylor(c, g, np.zeros((len(g), *g.shape)), r + np.zeros_like(c))
 
 
 def constant(q: Fraction, symbols: int, batch: int) -> Taylor:
     """A rational, the same over the batch."""
     value, error = float_with_error(q)
-    model = affine(np.full(batch, value), np.zeros((symbols, batch)))
-    return Taylor(model.c, model.g, model.Q, np.full(batch, error))
+    return affine(np.full(batch, value), np.zeros((symbols, batch)), error)
 
 
 def upper_bound(model: Taylor) -> Array:

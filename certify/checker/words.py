@@ -1,4 +1,4 @@
-"""The claim in words and numbers; what is printed is what was parsed."""
+"""The claim and the verdict in words and numbers; what is printed is what was parsed."""
 
 from __future__ import annotations
 
@@ -16,10 +16,18 @@ CLAIMS = {
 }
 
 
-def claim(c: Certificate) -> list[str]:
-    """The plant, the policy, V, and what is claimed of them, line by line."""
+def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
+    """The plant, the policy, V, what is claimed of them, what held, and the verdict, line by line."""
     widths = [len(c.states), *map(len, c.policy.weights)]
     inputs = zip(c.inputs, c.input_bounds, c.u_eq, strict=True)
+    if answer["result"] == "TRUSTED":
+        rest = f"not checked, the solver's word: {', '.join(answer['answers'])}"
+        verdict = f"TRUSTED {answer['solver']} {answer['version']}"
+    else:
+        local, ring = answer["margins"]["local"], answer["margins"]["ring"]
+        margins = [] if local is None else [f"local {local:.1%}"]
+        margins += [] if ring is None else [f"smallest bound of -Vdot on a ring's leaf {ring:.3g}"]
+        rest, verdict = f"margins: {'; '.join(margins)}", "ACCEPTED"
     return [
         f"plant {c.name}: xdot = f(x, u), states ({', '.join(c.states)}), inputs ({', '.join(c.inputs)})",
         *(f"  {name}' = {expression(tree)}" for name, tree in zip(c.states, c.dynamics.trees, strict=True)),
@@ -27,23 +35,21 @@ def claim(c: Certificate) -> list[str]:
         *(f"  input {name} in {_interval(pair)}, u_eq = {_number(u)}" for name, pair, u in inputs),
         f"policy {'-'.join(map(str, widths))} tanh, squash {c.policy.squash}, centred by {c.policy.centre}, "
         f"sha256 {c.policy.sha256()}",
-        "V(x) = x'Px with P = " + "; ".join(" ".join(repr(float(v)) for v in row) for row in c.P),
+        "V(x) = x'Px with P = " + "; ".join(" ".join(map(repr, row)) for row in c.P.tolist()),
         f"claim: {CLAIMS[c.claim].format(c=c)}; u stays in its bounds",
+        "rules that held: " + ", ".join(f"{rule} {count}" for rule, count in answer["rules"].items()),
+        rest,
+        f"{verdict} {'c0' if c.practical else 'c1'}={c.c1!r} c2={c.c2!r} sha256={c.sha256}",
     ]
 
 
 def expression(tree: Any) -> str:
     """A tree of the grammar, with all its brackets."""
-    if isinstance(tree, str):
-        if tree[0].isalpha() or tree[0] == "_":
-            return tree
-        q = Fraction(tree)
-        return str(q) if q >= 0 and q.denominator == 1 else f"({q})"
-    name, *rest = tree
-    if name == "**":
-        return f"({expression(rest[0])}**{rest[1]})"
-    words = [expression(operand) for operand in rest]
-    if name in ("sin", "cos", "tan"):
+    if not isinstance(tree, list):
+        return str(tree) if str(tree).isidentifier() or str(tree).isdecimal() else f"({tree})"
+    name, *operands = tree
+    words = [expression(operand) for operand in operands]
+    if name.isalpha():
         return f"{name}({words[0]})"
     return f"(-{words[0]})" if name == "-" and len(words) == 1 else f"({f' {name} '.join(words)})"
 

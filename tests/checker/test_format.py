@@ -23,11 +23,12 @@ import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from certify.checker import document, rules, schema, strict, words
+from certify.checker import document, rules, strict, words
 from certify.checker.__main__ import main
 from certify.checker.errors import Rejected, Unreadable
 from certify.checker.exact import Exact, Undecided
 from certify.checker.expression import evaluate, parse_dynamics
+from certify.checker.schema import Value
 from certify.checker.strict import MAX_BYTES
 from tests.support.certificates import Document, dump, edited, encode, grow, make, rehash, write
 
@@ -117,7 +118,7 @@ def test_the_file_they_are_made_from_is_accepted(tmp_path: Path) -> None:
     assert outcome(dump(good()), tmp_path) == "ACCEPTED"
 
 
-def test_a_file_beyond_the_limit_is_rejected_unread(tmp_path: Path) -> None:
+def test_a_file_beyond_the_limit_is_rejected(tmp_path: Path) -> None:
     path = write(b"", tmp_path)
     with path.open("r+b") as stream:
         stream.truncate(MAX_BYTES + 1)  # sparse
@@ -196,7 +197,7 @@ def test_hex_floats_are_strict(value: Any, tmp_path: Path) -> None:
 @example(-0.0)
 @example(float(np.finfo(float).max))
 def test_hex_floats_are_read_exactly(value: float) -> None:
-    read = schema.binary64(value.hex(), "levels.local", {})
+    read = Value(value.hex()).binary64()
     assert read == value and np.signbit(read) == np.signbit(value)
 
 
@@ -213,7 +214,7 @@ def test_the_tree_is_strict(value: Any, tmp_path: Path) -> None:
 
 def test_arrays_are_little_endian_and_in_row_order() -> None:
     raw = bytes.fromhex("000000000000f03f0000000000000040000000000000084000000000000010c0")
-    read = schema.array("n", "n")(base64.b64encode(raw).decode(), "lyapunov.P", {"n": 2})
+    read = Value(base64.b64encode(raw).decode()).array(2, 2)
     assert read.tolist() == [[1.0, 2.0], [3.0, -4.0]]
 
 
@@ -402,6 +403,7 @@ def test_rejected(tmp_path: Path) -> None:
     done = run(path, "--json", cwd=tmp_path)
     assert done.returncode == 1 and json.loads(done.stdout) == {
         "result": "REJECTED", "rule": "levels", "at": "levels", "detail": "must satisfy 0 < local <= roa",
+        "text": ["REJECTED rule=levels at=levels: must satisfy 0 < local <= roa"],
     }  # fmt: skip
 
 
@@ -450,7 +452,7 @@ def test_an_internal_error_accepts_nothing(
     assert main([str(write(good(), tmp_path)), *json_flag]) == 70
     printed = capsys.readouterr()
     assert "ACCEPTED" not in printed.out + printed.err and "no such machine" in printed.out + printed.err
-    assert not json_flag or list(json.loads(printed.out)) == ["error"]
+    assert not json_flag or list(json.loads(printed.out)) == ["error", "text"]
 
 
 def test_huge_rationals_in_a_claim_are_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -26,21 +26,22 @@ import numpy as np
 import pytest
 import sympy
 import torch
-from certify.systems.trees import to_tree
 from flint import arb, ctx
 from numpy.typing import NDArray
 
 from certify.checker import float64, taylor
 from certify.checker import network as checker
+from certify.checker.case import Case
 from certify.checker.document import Certificate, Policy
-from certify.checker.exact import congruence, rational
 from certify.checker.ring import Ring
 from certify.closed_loop import ClosedLoop
 from certify.enclosures import PolicyEnclosure
 from certify.enclosures import policy as producer
 from certify.enclosures import taylor as producer_taylor
+from certify.expressions import to_tree
 from certify.policies import TanhNetwork
 from certify.policies.network import Centre, Squash
+from certify.rigorous import evaluate_policy
 from certify.systems import System, get_system
 from tests.support.certificates import make, parse
 from tests.support.loops import box
@@ -310,7 +311,7 @@ def model_residual(function: Callable[[arb], arb]) -> Callable[..., arb]:
 
 def checker_model(name: str) -> Callable[[Columns], Any]:
     def function(parts: Columns) -> Any:
-        result = getattr(taylor.Taylor(*parts), name)()
+        result = taylor.Taylor(*parts).function(name)
         return result.c, result.g, result.Q, result.r
 
     return function
@@ -546,7 +547,7 @@ def test_the_oracle_agrees_with_the_closed_loops_own() -> None:
         for b in range(3):
             x = s.x[:, 0, b]
             for u, v in zip(
-                policy_in_arb(s.policy, s.u_eq, [arb(t) for t in x.tolist()]), loop.evaluate_policy(x), strict=True
+                policy_in_arb(s.policy, s.u_eq, [arb(t) for t in x.tolist()]), evaluate_policy(loop, x), strict=True
             ):
                 assert u.overlaps(v) and u.rad() < 1e-30 and v.rad() < 1e-30
 
@@ -629,9 +630,7 @@ def random_ring(generator: Generator, name: str, squash: Squash, centre: Centre)
         T=T,
         root=np.ones(n),
     ))  # fmt: skip
-    return Ring(
-        c, c.evidence.T, checker.fold(c.policy, c.u_eq), congruence(rational(c.evidence.T), rational(c.P))
-    )
+    return Ring(Case(c))
 
 
 def vdot_bounds(ring: Ring, lo: Array, hi: Array) -> tuple[Array, Array, Array]:
@@ -639,7 +638,7 @@ def vdot_bounds(ring: Ring, lo: Array, hi: Array) -> tuple[Array, Array, Array]:
     centre = 0.5 * lo + 0.5 * hi
     radius = float64.up(np.maximum(hi - centre, centre - lo))
     x, error = ring.states(centre, radius)
-    model = ring.vdot(*ring.dynamics(x, error, *checker.enclose_on_boxes(ring.net, x, error)))
+    model, _ = ring.models(x, error, *checker.enclose_on_boxes(ring.net, x, error))
     negated = taylor.Taylor(-model.c, -model.g, -model.Q, model.r)
     return -taylor.upper_bound(negated), taylor.upper_bound(model), ring.bound(model, centre, radius)
 

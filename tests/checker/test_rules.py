@@ -17,7 +17,7 @@ from dataclasses import replace
 from fractions import Fraction
 from functools import cache
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -33,7 +33,7 @@ from certify.checker.document import Policy
 from certify.checker.errors import Rejected
 from certify.checker.exact import raw_at_origin
 from certify.checker.float64 import within
-from certify.checker.ring import Ring, batches
+from certify.checker.ring import Ring, batches, is_whole
 from certify.checker.rules import Tally
 from tests.support.ablation import checker_without
 from tests.support.certificates import (
@@ -135,6 +135,8 @@ def test_honest_certificates_are_accepted(name: str) -> None:
     tally = rules.check(parse(data))
     assert tally.rules["tree"] == tree_of(data).count(LEAF)
     assert 0 < tally.local_margin <= 1
+    if name == "scalar":  # bounded by form: no leaf is asked for its inputs
+        assert tally.rules["inputs"] == 1
     if name == "local only":
         assert tally.rules["ring"] == 0 and tally.ring_margin is None
     else:
@@ -543,10 +545,13 @@ def test_leaves_cover_the_root_box(marks: list[int], seed: int) -> None:
             break
     generator = np.random.default_rng(seed)
     root = 2.0 ** generator.uniform(-1074, 1023, 2)
-    found = list(batches(SimpleNamespace(batch=7), bytes(nodes), root))
-    lo, hi = np.concatenate([b.lo.T for b in found]), np.concatenate([b.hi.T for b in found])
-    assert [b.first for b in found] == list(range(0, len(lo), 7)) and len(lo) == nodes.count(LEAF)
-    assert not any(b.broken for b in found)
+    found = list(batches(bytes(nodes), root, 7))
+    lo, hi = (np.concatenate([batch[k].T for batch in found]) for k in (1, 2))
+    assert [first for first, _, _ in found] == list(range(0, len(lo), 7)) and len(lo) == nodes.count(LEAF)
+    whole = is_whole(Case(parse(with_tree(honest("linear"), bytes(nodes)))))
+    with pytest.raises(StopIteration) as done:
+        next(whole)
+    assert done.value.value == len(lo)
     points = np.concatenate([generator.uniform(-1, 1, (50, 2)) * root, lo, hi, np.stack([lo[:, 0], hi[:, 1]], 1)])
     for p in points:
         assert np.any(np.all((lo <= p) & (p <= hi), axis=1))
@@ -563,7 +568,8 @@ def test_a_leaf_is_missed_only_if_it_lies_outside_the_ring(exponent: int) -> Non
         levels = sorted(generator.uniform(0.1, 2, 2) * 2.0 ** (exponent + 2))
         c = replace(c, levels={"local": float(levels[0]), "roa": float(levels[1])})
         with np.errstate(all="ignore"):
-            ring = Ring(c, c.evidence.T, network.fold(c.policy, c.u_eq), S)
+            P = np.array([[float(v) for v in row] for row in S])
+            ring = Ring(Case(replace(c, P=P, evidence=replace(c.evidence, T=np.eye(2)))))
             lo = generator.uniform(-3, 3, (2, 40))
             hi = lo + generator.uniform(0, 1, (2, 40))
             result = np.logical_or(*ring.misses(lo, hi))
@@ -585,7 +591,7 @@ def test_a_lower_bound_of_V_that_overflows_puts_no_leaf_outside() -> None:
         near = float(np.sqrt(2.0**1023 / s) * np.sqrt(2.0))
         for _ in range(3):
             with np.errstate(all="ignore"):
-                ring = Ring(c, np.eye(1), network.fold(c.policy, c.u_eq), [[Fraction(s)]])
+                ring = Ring(Case(replace(c, P=np.array([[s]]))))
                 overflows = not np.isfinite(s * near * near)
                 outside, _ = ring.misses(np.array([[near]]), np.array([[1.001 * near]]))
             if overflows and Fraction(s) * Fraction(near) ** 2 < Fraction(c.c2):
@@ -705,6 +711,13 @@ def test_rejections_name_the_first_failing_leaf() -> None:
         rules.check(parse(with_tree(data, bytes([LEAF]))))
     assert (no.value.rule, no.value.at) == ("ring", "leaf 0")
     assert str(no.value).startswith("REJECTED rule=ring at=leaf 0: ")
+
+
+def test_the_whole_tree_is_read_before_its_leaves() -> None:
+    """The first leaf fails the ring's rule, and the tree is broken behind it."""
+    assert verdict(with_tree(honest("scalar"), bytes([LEAF]))) == "ring"
+    assert verdict(with_tree(honest("scalar"), bytes([LEAF, LEAF]))) == "tree"
+    assert verdict(with_tree(honest("scalar"), bytes([0, LEAF]))) == "tree"
 
 
 def test_tally_counts_a_leaf_once() -> None:

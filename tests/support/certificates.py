@@ -19,11 +19,11 @@ from typing import Any
 
 import numpy as np
 
-from certify.checker import document, exact, network, rules
+from certify.checker import document, exact, rules
 from certify.checker.case import Case
 from certify.checker.document import Certificate
 from certify.checker.errors import Rejected
-from certify.checker.float64 import total, up, within
+from certify.checker.float64 import within
 from certify.checker.ring import Ring
 
 Document = dict[str, Any]
@@ -158,14 +158,13 @@ def grow(data: Document, max_leaves: int = 5000, depth: int = 40) -> Document:
     c = parse(data)
     axes: dict[tuple[int, ...], int] = {}  # path from the root (0 lower, 1 upper) -> axis of the split
     with np.errstate(all="ignore"):
-        case = Case(c)
-        ring = Ring(c, case.T, case.net, case.S)
+        ring = Ring(Case(c))
         boxes = [((), -c.evidence.root, c.evidence.root.copy())]
         for _ in range(depth):
             if not boxes or len(axes) + len(boxes) > max_leaves:
                 break
             lows, highs = (np.stack([box[k] for box in boxes], 1) for k in (1, 2))
-            good = passes(ring, case.bounded, lows, highs)
+            good = passes(ring, lows, highs)
             halves = []
             for (path, lo, hi), done in zip(boxes, good, strict=True):
                 if not done:
@@ -184,21 +183,15 @@ def grow(data: Document, max_leaves: int = 5000, depth: int = 40) -> Document:
     return with_tree(data, bytes(tree))
 
 
-def passes(ring: Ring, bounded: bool, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
-    """The rule for a leaf, box by box, lo and hi (n, B)."""
-    centre = 0.5 * lo + 0.5 * hi
-    radius = up(np.maximum(hi - centre, centre - lo))
-    x, error = ring.states(centre, radius)
-    mid, slopes, wide = network.enclose_on_boxes(ring.net, x, error)
-    states, F = ring.dynamics(x, error, mid, slopes, wide)
-    good = ring.bound(ring.vdot(states, F), centre, radius) < 0
-    outside, inside = ring.misses(lo, hi)
-    if ring.c.claim == "practical":
-        good |= inside & np.all([np.isfinite(f.size + f.r) for f in F], axis=0)
-    if not bounded:
-        for j, bounds in enumerate(ring.c.input_bounds):
-            good &= within(bounds, mid[j], up(total(np.abs(slopes[j]), 0) + wide[j]))
-    return good | outside | (inside & (ring.c.claim == "asymptotic"))
+def passes(ring: Ring, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
+    """The rules for a leaf, box by box, lo and hi (n, B)."""
+    leaves = ring.examine(0, lo, hi)
+    good = np.ones(lo.shape[1], dtype=bool)
+    good[leaves.numbers] = leaves.hold
+    if not ring.case.bounded:
+        for bounds, mid, reach in zip(ring.c.input_bounds, leaves.mid, leaves.reach, strict=True):
+            good[leaves.numbers] &= within(bounds, mid, reach)
+    return good
 
 
 def tree_of(data: Document) -> bytes:
