@@ -41,6 +41,8 @@ def elementary(name: str, c: Any, error: Any, radius: Any) -> tuple[Triple, Trip
         moved = (square, 2 * cube, 3 * up(cube / nearest))  # |phi'|, |phi''|, |phi'''|/2 where v0 may be
         e0, e1, e2 = (up(EPS * np.abs(v) + error * most) for v, most in zip(f, moved, strict=True))
         return f, (e0, e1, e2), up(cube / least)
+    if name not in ("sin", "cos"):
+        raise ValueError(f"nothing is known of {name}")
     s, c, s_error, c_error = sin_cos(c)
     if name == "cos":  # the sine of v + pi/2
         s, c, s_error, c_error = c, -s, c_error, s_error

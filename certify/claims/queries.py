@@ -18,6 +18,7 @@ from certify.claims.conditions import Condition, OfState, Vdot
 from certify.closed_loop import ClosedLoop
 from certify.errors import InputError
 from certify.expressions import Tree, to_tree
+from certify.policies.exact import centring, squash, squash_slope
 
 Array = NDArray[np.float64]
 
@@ -158,22 +159,46 @@ def _policy(loop: ClosedLoop) -> list[tuple[str, Tree]]:
     result = _neurons(loop, "h", [s.name for s in system.states])
     if network.centre != "none":
         result += _neurons(loop, "o", [])  # the same network at the origin
-    squash = network.squash == "tanh"
+    at_0 = [_Term(f"o.{last}.{j}") for j in range(network.m)]
+    shift, offset = centring(network, loop.u_eq, at_0, _TERMS)
     for j, symbol in enumerate(system.inputs):
-        net: Tree = f"h.{last}.{j}"
-        origin = f"o.{last}.{j}"
-        scale, offset, u_eq = exact(network.scale[j]), exact(network.offset[j]), str(loop.u_eq[j])
-        if network.centre == "preactivation":
-            ratio = network.ratios(loop.u_eq)[j]
-            # atanh(q) = log((1 + q) / (1 - q)) / 2
-            beta: Tree = "0" if ratio == 0 else ["/", ["log", str((1 + ratio) / (1 - ratio))], "2"]
-            net = ["+", ["-", net, origin], beta]
-        result.append((f"s.{j}", ["tanh", net] if squash else net))
-        value: Tree = ["+", ["*", scale, f"s.{j}"], offset]
-        if network.centre == "output":
-            value = ["+", ["*", scale, ["-", f"s.{j}", ["tanh", origin] if squash else origin]], u_eq]
-        result.append((symbol.name, value))
+        entering = shift[j] + _Term(f"h.{last}.{j}")
+        result.append((f"s.{j}", squash(network, entering, _TERMS).tree))
+        result.append((symbol.name, (_Term(exact(network.scale[j])) * _Term(f"s.{j}") + offset[j]).tree))
     return result
+
+
+@dataclass(frozen=True, slots=True)
+class _Term:
+    """A tree with operators; what adds nothing is left out."""
+
+    tree: Tree
+
+    def __add__(self, other: _Term) -> _Term:
+        if "0" in (self.tree, other.tree):
+            return other if self.tree == "0" else self
+        return _Term(["+", self.tree, other.tree])
+
+    def __sub__(self, other: _Term) -> _Term:
+        return _Term(["-", self.tree, other.tree])
+
+    def __mul__(self, other: _Term) -> _Term:
+        return _Term(["*", self.tree, other.tree])
+
+
+class _Terms:
+    def number(self, q: Fraction) -> _Term:
+        return _Term(str(q))
+
+    def atanh(self, q: Fraction) -> _Term:
+        """`log((1 + q) / (1 - q)) / 2`."""
+        return _Term("0" if q == 0 else ["/", ["log", str((1 + q) / (1 - q))], "2"])
+
+    def tanh(self, v: _Term) -> _Term:
+        return _Term(["tanh", v.tree])
+
+
+_TERMS = _Terms()
 
 
 def _neurons(loop: ClosedLoop, prefix: str, inputs: list[Tree]) -> list[tuple[str, Tree]]:
@@ -202,10 +227,8 @@ def _policy_jacobian(loop: ClosedLoop) -> list[tuple[str, Tree]]:
                 result.append((names[i][j], product if last else ["*", slope, product]))
         before = names
     for i in range(network.m):
-        scale: Tree = exact(network.scale[i])
-        if network.squash == "tanh":
-            scale = ["*", scale, ["-", "1", ["**", f"s.{i}", 2]]]
-        result += [(f"Du.{i}.{j}", ["*", scale, before[i][j]]) for j in range(n)]
+        scale = _Term(exact(network.scale[i])) * squash_slope(network, _Term(f"s.{i}"), _TERMS)
+        result += [(f"Du.{i}.{j}", (scale * _Term(before[i][j])).tree) for j in range(n)]
     return result
 
 

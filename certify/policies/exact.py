@@ -41,6 +41,12 @@ def squash(network: TanhNetwork, y: V, arithmetic: Arithmetic[V]) -> V:
     return arithmetic.tanh(y) if network.squash == "tanh" else y
 
 
+def squash_slope(network: TanhNetwork, squashed: V, arithmetic: Arithmetic[V]) -> V:
+    """The derivative of the squash where its value is `squashed`."""
+    one = arithmetic.number(Fraction(1))
+    return _difference(one, _product(squashed, squashed)) if network.squash == "tanh" else one
+
+
 def centring(
     network: TanhNetwork, u_eq: Sequence[Fraction], at_0: Sequence[V], arithmetic: Arithmetic[V]
 ) -> tuple[list[V], list[V]]:

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from certify.policies.exact import centring
+from certify.policies.exact import centring, squash, squash_slope
 
 Squash = Literal["tanh", "identity"]
 Centre = Literal["output", "preactivation", "none"]
@@ -135,14 +135,17 @@ class TanhNetwork:
         """pi(x) in float64, shape (..., n) to (..., m); for simulation and search, not for proofs."""
         if self.centre != "none":
             return self.folded(u_eq)(x, u_eq)
-        y = self.net(x)
-        return _like(self.scale, x) * (_tanh(y) if self.squash == "tanh" else y) + _like(self.offset, x)
+        return _like(self.scale, x) * self.squashed(self.net(x)) + _like(self.offset, x)
+
+    def squashed(self, y: Any) -> Any:
+        """The squash of the last layer's values, in the arithmetic of y (numpy array or torch tensor)."""
+        return squash(self, y, _ARRAYS)
 
     def folded(self, u_eq: Sequence[Fraction]) -> TanhNetwork:
         """A network without centring that is pi up to rounding: for search and simulation."""
         if self.centre == "none":
             return self
-        shift, offset = centring(self, u_eq, self.net(np.zeros(self.n)).tolist(), _Floats())
+        shift, offset = centring(self, u_eq, self.net(np.zeros(self.n)).tolist(), _ARRAYS)
         biases = (*self.biases[:-1], self.biases[-1] + np.array(shift))
         return TanhNetwork(self.weights, biases, self.scale, np.array(offset), self.squash, "none")
 
@@ -159,10 +162,8 @@ class TanhNetwork:
                 x = np.tanh(x)
                 jacobian = (1 - x**2)[:, None] * jacobian
             x, jacobian = weight @ x + bias, weight @ jacobian
-        if self.squash == "tanh":
-            last = np.tanh(self.squashed_at_origin(x, u_eq))
-            jacobian = (1 - last**2)[:, None] * jacobian
-        return np.asarray(self.scale[:, None] * jacobian)
+        slope = squash_slope(self, self.squashed(self.squashed_at_origin(x, u_eq)), _ARRAYS)
+        return np.asarray(self.scale[:, None] * ((slope * np.ones(self.m))[:, None] * jacobian))
 
     def sha256(self) -> str:
         """Hash of the canonical bytes: squash, centre, then each array's shape and little-endian binary64.
@@ -179,15 +180,20 @@ class TanhNetwork:
         return digest.hexdigest()
 
 
-class _Floats:
-    def number(self, q: Fraction) -> float:
+class _Arrays:
+    """Numbers, numpy arrays and torch tensors."""
+
+    def number(self, q: Fraction) -> Any:
         return float(q)
 
-    def atanh(self, q: Fraction) -> float:
+    def atanh(self, q: Fraction) -> Any:
         return float(np.arctanh(float(q)))
 
-    def tanh(self, v: float) -> float:
-        return float(np.tanh(v))
+    def tanh(self, v: Any) -> Any:
+        return _tanh(v)
+
+
+_ARRAYS = _Arrays()
 
 
 def _frozen(array: Any, name: str) -> Array:
@@ -199,7 +205,7 @@ def _frozen(array: Any, name: str) -> Array:
 
 
 def _tanh(x: Any) -> Any:
-    return np.tanh(x) if isinstance(x, np.ndarray) else x.tanh()
+    return np.tanh(x) if isinstance(x, np.ndarray | float) else x.tanh()
 
 
 def _like(array: Array, x: Any) -> Any:

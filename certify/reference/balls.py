@@ -72,6 +72,8 @@ def third(name: str, at: arb, y: arb, reach: arb) -> arb | None:
     if name == "1/":
         least = abs(y) - reach
         return 6 / least**4 if least > 0 else None
+    if name not in ("sin", "cos"):
+        raise ValueError(f"nothing is known of {name}")
     return (abs(at) + reach).min(ONE)
 
 
