@@ -64,8 +64,11 @@ def fit_policy(system: System, widths: tuple[int, ...], spread: Array, steps: in
     return TanhNetwork(
         tuple(layer.weight.detach().double().numpy() for layer in layers),
         tuple(layer.bias.detach().double().numpy() for layer in layers),
-        scale.double().numpy(), offset.double().numpy(), "tanh", "preactivation",
-    )  # fmt: skip
+        scale.double().numpy(),
+        offset.double().numpy(),
+        "tanh",
+        "preactivation",
+    )
 
 
 def lqr_gain(system: System) -> Array:
@@ -84,9 +87,15 @@ def chain(n: int) -> System:
     u = sympy.Symbol("u")
     wide = (exact(-4), exact(4))
     return System(
-        name=f"chain{n}", states=x, inputs=(u,), parameters={}, dynamics=(*x[1:], sympy.sin(x[0]) + u),
-        u_eq=(sympy.Integer(0),), domain=(wide,) * n, input_bounds=((exact(-20), exact(20)),),
-    )  # fmt: skip
+        name=f"chain{n}",
+        states=x,
+        inputs=(u,),
+        parameters={},
+        dynamics=(*x[1:], sympy.sin(x[0]) + u),
+        u_eq=(sympy.Integer(0),),
+        domain=(wide,) * n,
+        input_bounds=((exact(-20), exact(20)),),
+    )
 
 
 def spread_of(system: System) -> Array:

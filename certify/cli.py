@@ -104,9 +104,14 @@ def roa(
     progress = ProgressLine()
     try:
         result = certify_roa(
-            plant, stored.network, folder, options,
-            load_seconds=time.perf_counter() - start, provenance=_provenance(policy), progress=progress,
-        )  # fmt: skip
+            plant,
+            stored.network,
+            folder,
+            options,
+            load_seconds=time.perf_counter() - start,
+            provenance=_provenance(policy),
+            progress=progress,
+        )
     finally:
         progress.close()
     data = result.to_dict()

@@ -219,9 +219,13 @@ class _Run:
         """The verdict on what the engine says, the only place that gives one after the search."""
         witness = _lowest(task.witness, proof.witness)
         result = replace(
-            _with_levels(result, proof.partial, witness), stop=proof.stop, detail=proof.detail, witness=witness,
-            boxes=proof.boxes, solver=proof.solver,
-        )  # fmt: skip
+            _with_levels(result, proof.partial, witness),
+            stop=proof.stop,
+            detail=proof.detail,
+            witness=witness,
+            boxes=proof.boxes,
+            solver=proof.solver,
+        )
         claim = proof.claim
         if claim is None or (task.exactly and claim.roa < task.target):
             if task.exactly and _refuted(task, witness):
@@ -238,9 +242,14 @@ class _Run:
         if not trusted and self.options.engine == "both":
             result = replace(result, solver=self._confirm(task.problem, claim))
         return replace(
-            _with_levels(result, claim.levels, witness), verdict=Verdict.TRUSTED if trusted else Verdict.PROVED,
-            stop=_limit(proof.stop, task, witness), leaves=proof.leaves, certificate=path, raw=data, checker=answer,
-        )  # fmt: skip
+            _with_levels(result, claim.levels, witness),
+            verdict=Verdict.TRUSTED if trusted else Verdict.PROVED,
+            stop=_limit(proof.stop, task, witness),
+            leaves=proof.leaves,
+            certificate=path,
+            raw=data,
+            checker=answer,
+        )
 
     def _write_and_check(self, certificate: Certificate) -> tuple[Path, bytes, dict[str, Any]]:
         """The certificate's path, its bytes and the checker's answer, without which it does not get its name.
@@ -312,9 +321,7 @@ def _with_witness(result: RoaResult, task: Task, witness: Witness | None) -> Roa
         return result
     detail = witness.describe(result.system)
     levels = replace(result.levels, sampled_limit=witness.level)
-    return replace(
-        result, verdict=Verdict.REFUTED, stop=Stop.WITNESS, detail=detail, witness=witness, levels=levels
-    )
+    return replace(result, verdict=Verdict.REFUTED, stop=Stop.WITNESS, detail=detail, witness=witness, levels=levels)
 
 
 def _with_levels(result: RoaResult, levels: Mapping[str, float], witness: Witness | None) -> RoaResult:

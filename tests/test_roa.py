@@ -248,7 +248,7 @@ def test_the_checker_beside_the_running_package_is_meant(tmp_path: Path, monkeyp
     folder = tmp_path / "elsewhere" / "checker"
     folder.mkdir(parents=True)
     (folder / "__init__.py").write_text("")
-    (folder / "__main__.py").write_text("def main(arguments):\n    print('{\"error\": \"another\"}')\n    return 70\n")
+    (folder / "__main__.py").write_text('def main(arguments):\n    print(\'{"error": "another"}\')\n    return 70\n')
     monkeypatch.setattr(checking, "__file__", str(tmp_path / "elsewhere" / "certificate" / "checking.py"))
     assert checking.ask(tmp_path) == (70, {"error": "another"})
 

@@ -63,11 +63,15 @@ class Taylor:
         Ga, Gb, Qa, Qb = a.linear, b.linear, a.quadratic, b.quadratic
         ca, cb = np.abs(a.c), np.abs(b.c)
         r = (
-            ca * b.r + cb * a.r  # constant times remainder
-            + Ga * Qb + Gb * Qa + Qa * Qb  # third and fourth order
-            + a.r * (Gb + Qb + b.r) + b.r * (Ga + Qa)
+            ca * b.r
+            + cb * a.r  # constant times remainder
+            + Ga * Qb
+            + Gb * Qa
+            + Qa * Qb  # third and fourth order
+            + a.r * (Gb + Qb + b.r)
+            + b.r * (Ga + Qa)
             + EPS * ((ca + Ga + Qa) * (cb + Gb + Qb))  # rounding of all coefficients; infinite if one overflows
-        )  # fmt: skip
+        )
         Q = a.c * b.Q + b.c * a.Q + a.g[:, None] * b.g[None, :]
         return Taylor(a.c * b.c, a.c * b.g + b.c * a.g, Q, up(r))
 
@@ -83,9 +87,11 @@ class Taylor:
             np.abs(f1) * self.r
             + np.abs(f2) * up(2 * G * q + q * q)
             + third * rho * rho * rho
-            + e0 + e1 * rho + e2 * rho * rho
+            + e0
+            + e1 * rho
+            + e2 * rho * rho
             + EPS * (np.abs(f0) + np.abs(f1) * rho + np.abs(f2) * up(G * G))
-        )  # fmt: skip
+        )
         Q = f1 * self.Q + f2 * (self.g[:, None] * self.g[None, :])
         return Taylor(f0, f1 * self.g, Q, up(r))
 

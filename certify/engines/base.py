@@ -82,6 +82,3 @@ class Engine(Protocol):
 
     def prove(self, task: Task, budget: Budget, report: Report | None = None) -> Proof:
         """The best claim of the task's kind that the budget allows."""
-
-
-

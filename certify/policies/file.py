@@ -52,7 +52,6 @@ class Policy:
         object.__setattr__(self, "parameters", MappingProxyType(dict(self.parameters)))
         object.__setattr__(self, "training", MappingProxyType(dict(self.training)))
 
-
     def beta_shift(self, u_eq: Sequence[Fraction]) -> float:
         """What reading the stored beta as the real number changes in u at the origin, in the input's units.
 

@@ -17,8 +17,15 @@ from .refusal import require
 
 MAX_NESTING, MAX_NODES = 200, 20_000  # of lists; of lists, names and numbers in all equations
 RATIONAL = re.compile(r"-?(0|[1-9][0-9]{0,1200})(/[1-9][0-9]{0,1200})?")
-OPERANDS = {"+": (1, MAX_NODES), "*": (1, MAX_NODES), "-": (1, 2), "/": (2, 2), "sin": (1, 1), "cos": (1, 1),
-            "tan": (1, 1)}  # fmt: skip
+OPERANDS = {
+    "+": (1, MAX_NODES),
+    "*": (1, MAX_NODES),
+    "-": (1, 2),
+    "/": (2, 2),
+    "sin": (1, 1),
+    "cos": (1, 1),
+    "tan": (1, 1),
+}
 
 Step = tuple[Any, ...]  # ("name", str), ("rational", fmpq), or a name and the numbers of earlier steps
 

@@ -219,12 +219,14 @@ class Leaves:
             for way, gap in zip(ways, gaps[k], strict=True):
                 for j in range(m):
                     errors[j] = [
-                        e + abs(w) * g
-                        for e, w, g in zip(errors[j], way[j * count : (j + 1) * count], gap, strict=True)
+                        e + abs(w) * g for e, w, g in zip(errors[j], way[j * count : (j + 1) * count], gap, strict=True)
                     ]
             if k:
-                scaled = [w * s for way, slope in zip(ways, slopes[k], strict=True)
-                          for w, s in zip(way, slope * m, strict=True)]  # fmt: skip
+                scaled = [
+                    w * s
+                    for way, slope in zip(ways, slopes[k], strict=True)
+                    for w, s in zip(way, slope * m, strict=True)
+                ]
                 ways = (self.weights[k].transpose() * arb_mat(len(ways), m * count, scaled)).tolist()
         return errors
 
@@ -246,9 +248,7 @@ class Leaves:
         """Models of f(x, pi(x)), all of them finite."""
         n, place = self.n, f"leaf {leaf.box.number}"
         pad = [ZERO] * (self.symbols - n)
-        names = {
-            name: Taylor(row[0], row[1:] + pad) for name, row in zip(self.c.plant.states, leaf.x, strict=True)
-        }
+        names = {name: Taylor(row[0], row[1:] + pad) for name, row in zip(self.c.plant.states, leaf.x, strict=True)}
         for j, (name, (mid, slopes, error)) in enumerate(zip(self.c.plant.inputs, leaf.u, strict=True)):
             own = [error if i == j else ZERO for i in range(self.c.m)]  # the error is a symbol
             names[name] = Taylor(mid, slopes + own)

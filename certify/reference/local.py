@@ -181,5 +181,3 @@ def local_vdot(
     C = [sum((PT[i, j] * f.Q for i, f in enumerate(F)), zero) for j in range(n)]
     E = sum((norm(row) * f.E for row, f in zip(PT.tolist(), F, strict=True)), zero)
     return B, C, E
-
-

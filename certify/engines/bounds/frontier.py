@@ -101,7 +101,8 @@ class Frontier:
         number = np.concatenate([w[:k] for (_, w), k in zip(self._away, split, strict=True)]).astype(np.int64)
         self._away = [
             (v[k:].copy(), w[k:].copy()) if k else (v, w)
-            for (v, w), k in zip(self._away, split, strict=True) if k < len(v)
-        ]  # fmt: skip
+            for (v, w), k in zip(self._away, split, strict=True)
+            if k < len(v)
+        ]
         lo, hi = self.partition.corners(number)
         self.add(*(torch.tensor(a, device=self.device) for a in (lo, hi, lowest, number)))

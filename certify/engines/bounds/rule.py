@@ -133,9 +133,16 @@ class VdotBound:
         return result
 
     def _within_ring(
-        self, bound: Tensor, vdot: Taylor, lo: Tensor, hi: Tensor, centre: Tensor, radius: Tensor,
-        inner: float, outer: float,
-    ) -> Tensor:  # fmt: skip
+        self,
+        bound: Tensor,
+        vdot: Taylor,
+        lo: Tensor,
+        hi: Tensor,
+        centre: Tensor,
+        radius: Tensor,
+        inner: float,
+        outer: float,
+    ) -> Tensor:
         """The bound, made tighter by the S-procedure where it is not negative and the box sticks out of the ring."""
         n = len(centre)
         lowest, highest = self.levels(lo, hi)
@@ -151,8 +158,12 @@ class VdotBound:
             g[:n] = -2 * sign * self.S_diagonal * z * r
             torch.diagonal(Q, dim1=0, dim2=1)[:, :n] = -sign * (self.S_diagonal * r * r).T
             size = (self.S_diagonal * far * far).sum(0)
-            gap = Taylor(sign * (level - (self.S_diagonal * z * z).sum(0)), g, Q,
-                         (far * (self.S_cross @ far)).sum(0) + n * EPS * (size + level) + TINY)  # fmt: skip
+            gap = Taylor(
+                sign * (level - (self.S_diagonal * z * z).sum(0)),
+                g,
+                Q,
+                (far * (self.S_cross @ far)).sum(0) + n * EPS * (size + level) + TINY,
+            )
             here = Taylor(vdot.c[index], vdot.g[:, index], vdot.Q[:, :, index], vdot.r[index])
             k = _multiplier(here.g[:n], g[:n], gap.c)
             scaled = Taylor(k * gap.c, k * g, k * Q, k * (gap.r + EPS * size) + EPS * k * gap.c.abs() + TINY)
