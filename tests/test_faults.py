@@ -1,0 +1,78 @@
+"""Small plants on which a run ends wrongly; each test states what should happen."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+import pytest
+import sympy
+
+from certify.policies import TanhNetwork
+from certify.reference.rules import judge
+from certify.roa import RoaOptions, certify_roa
+from certify.systems import System
+from certify.systems.toml import parse_expression
+from certify.verdict import Verdict
+from tests.support.certificates import dump, grow, make, verdict
+
+
+def plant(dynamics: dict[str, str], half: float = 2, bound: int = 6) -> System:
+    names = {name: sympy.Symbol(name) for name in (*dynamics, "u")}
+    return System(
+        name="p",
+        states=tuple(names[s] for s in dynamics),
+        inputs=(names["u"],),
+        parameters={},
+        dynamics=tuple(parse_expression(e, names) for e in dynamics.values()),
+        u_eq=(sympy.Integer(0),),
+        domain=((Fraction(-half), Fraction(half)),) * len(dynamics),
+        input_bounds=((Fraction(-bound), Fraction(bound)),),
+    )
+
+
+def gain(*row: float) -> TanhNetwork:
+    """u = tanh(row x)."""
+    return TanhNetwork((np.array([row]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
+
+
+@pytest.mark.parametrize("bias, size", [(0.3, 1.0), (0.1, 2.0)])
+def test_what_was_proved_with_an_earlier_floor_is_accepted_with_the_last(
+    tmp_path: Path, bias: float, size: float
+) -> None:
+    weights = np.array([[size, 0.5], [-0.5, size]]), np.array([[-0.5, -0.5]])
+    network = TanhNetwork(
+        weights, (np.array([bias, -bias]), np.array([bias / 2])), np.ones(1), np.zeros(1), "tanh", "none"
+    )
+    options = RoaOptions(claim="practical", level=0.3, max_boxes=20_000)
+    result = certify_roa(plant({"x": "y", "y": "-x - 2*y + 1/20 + u"}), network, tmp_path, options)
+    assert result.verdict is Verdict.PROVED
+
+
+def test_progress_survives_a_level_that_falls_below_zero(tmp_path: Path) -> None:
+    options = RoaOptions(claim="practical", time_limit=20)
+    system = plant({"x": "-x + u + tan(x)/100"}, half=3, bound=10)
+    certify_roa(system, gain(-1.0), tmp_path, options, progress=lambda stage, state: None)
+
+
+def test_a_constant_sine_in_an_equation(tmp_path: Path) -> None:
+    system = plant({"x": "-x + u + sin(1)/100"}, bound=10)
+    assert certify_roa(system, gain(-1.0), tmp_path, RoaOptions(claim="practical")).verdict is Verdict.PROVED
+
+
+def test_a_bump_of_V_inside_an_attracted_set_does_not_refute_the_claim(tmp_path: Path) -> None:
+    """With W = x^2 + y^2: W' = -2 W + 2 y tanh(-y/1000) < 0 on W = 1, so {W <= 1} is invariant, y decays, and then x.
+
+    In between V grows for a while, which says something about V and nothing about the trajectories.
+    """
+    system = plant({"x": "-x + 20*y*(x**2 + y**2)*(1 - x**2 - y**2)", "y": "-y + u"}, bound=10)
+    options = RoaOptions(P=np.eye(2), level=1.0)
+    assert certify_roa(system, gain(0.0, -1e-3), tmp_path, options).verdict is Verdict.UNKNOWN
+
+
+def test_the_reference_accepts_a_quotient_that_the_checker_accepts() -> None:
+    dynamics = [["+", ["*", "-2", "x"], ["/", "1/100", ["+", "x", "11/20"]], "u"]]
+    data = grow(make(dynamics, [([[1.0]], [0.0])], 1.0, (0.01, 0.25), claim="practical", centre="none"))
+    assert verdict(data) == "ACCEPTED"
+    assert judge(dump(data)).result == "ACCEPTED"
