@@ -86,7 +86,12 @@ class ClosedLoop:
         at_zero |= {
             s: sympy.Rational(u.numerator, u.denominator) for s, u in zip(system.inputs, self.u_eq, strict=True)
         }
-        return f.jacobian(list(system.states)).subs(at_zero), f.jacobian(list(system.inputs)).subs(at_zero)
+        found = f.jacobian(list(system.states)).subs(at_zero), f.jacobian(list(system.inputs)).subs(at_zero)
+        if any(M.has(sympy.zoo, sympy.nan, sympy.oo) for M in found):
+            raise InputError(
+                f"the equations of {system.name} have no derivative at the origin: they divide by 0 there."
+            )
+        return found
 
 
 def _to_float(matrix: sympy.Matrix) -> Array:

@@ -50,6 +50,7 @@ Report = Callable[[Literal["ring", "check"], Progress | None], None]
 _SMALL_NETWORK = 10_000  # weights
 _BELOW = 1e-9  # relative distance from a limit that is itself out of reach (the domain's open condition)
 _BELOW_WITNESS = 1e-3
+_SMALLEST = 1e-120  # of levels: squares of states and products of bounds must not underflow
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,6 +189,11 @@ class _Run:
             detail = f"{{V <= {options.level:g}}} leaves the domain, whose limit is {limit:.12g}"
             return replace(result, verdict=Verdict.REFUTED, stop=Stop.DOMAIN, detail=detail)
 
+        if not _SMALLEST < (options.level or limit) < 1 / _SMALLEST:
+            raise InputError(
+                f"levels of V must lie between {_SMALLEST:g} and {1 / _SMALLEST:g}; found {options.level or limit:g}. "
+                "Scale the states or P."
+            )
         task = Task(problem, options.claim, options.level or limit * (1 - _BELOW), options.level is not None)
         if options.claim == "asymptotic":
             with self._stage("ring"):

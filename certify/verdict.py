@@ -15,7 +15,8 @@ class Verdict(Enum):
 
     PROVED: an independent checker accepted the written certificate.
     TRUSTED: a solver says so, and nobody can replay its word.
-    REFUTED: the claim is false for this V and level, shown in rigorous arithmetic.
+    REFUTED: a condition of the claim fails for this V and level, shown in rigorous arithmetic; trajectories may behave
+        all the same, and another V may show it.
     UNKNOWN: none of these; the accompanying reason says what ran out.
     """
 

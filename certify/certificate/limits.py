@@ -19,6 +19,7 @@ from certify.systems import System
 MOST_STATES, MOST_LAYERS, MOST_ROWS = 64, 64, 2**14
 MOST_NODES, MOST_DEPTH, MOST_EXPONENT, MOST_DIGITS = 20_000, 200, 64, 1201
 MOST_NUMBERS = 2**25  # operations times n^2, under the rule `local`
+_LARGEST = Fraction(2) ** 1000
 MOST_MATRIX_BITS = 2**15  # of the longest number of P, times n
 
 
@@ -34,6 +35,11 @@ def require_within_limits(system: System, network: TanhNetwork) -> None:
     nodes = [node for tree in trees for node in _nodes(tree, 0)]
     numbers = [q for pair in (*system.domain, *system.input_bounds) for q in pair] + list(system.exact_u_eq())
     digits = [len(part) for q in (*numbers, *(Fraction(n) for n, _ in nodes if _is_number(n))) for part in _parts(q)]
+    for q in (*numbers, *(Fraction(n) for n, _ in nodes if _is_number(n))):
+        if not abs(q) < _LARGEST:
+            raise InputError(
+                f"numbers of {system.name} must lie within the range of binary64; one has {len(str(q))} digits."
+            )
     exponents = [abs(int(p.exp)) for e in dynamics for p in sympy.preorder_traversal(e) if p.is_Pow]
     for what, found, most in (
         ("states", system.n, MOST_STATES),

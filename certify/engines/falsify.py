@@ -107,7 +107,7 @@ def confirm(problem: Problem, witness: Witness) -> bool:
 
 
 def refutes(problem: Problem, witness: Witness, level: float) -> bool:
-    """True if the witness shows that no asymptotic claim holds on {V <= level}.
+    """True if the witness shows that a condition of the asymptotic claim fails on {V <= level}.
 
     The violation is shown in Arb, and `V(x) <= level` is decided in rationals: a point that lies above the level by
     less than a rounding says nothing about it.

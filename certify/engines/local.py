@@ -23,6 +23,7 @@ from certify.policies import bounded_by_form
 
 Array = NDArray[np.float64]
 _MOST_NUMBERS, _MOST_PRODUCTS = 2**25, 2**33  # of the sums over paths: the checker refuses more
+_LEAST = 1e-280  # a level, below which binary64 holds nothing more
 _MARGIN = 1e-3  # share of the decay that is left to the checker's rounding
 
 
@@ -190,7 +191,7 @@ def prove_local(problem: Problem, T: Array, limit: float) -> float | None:
     high, low = limit, limit
     while not good(low):
         high, low = low, low * 1e-2
-        if low < 1e-30 * limit:
+        if low <= 1e-30 * limit or low < _LEAST:
             return None
     while high > 1.02 * low:
         middle = math.sqrt(low * high)

@@ -67,11 +67,14 @@ def derivatives(name: str, y: arb) -> tuple[arb, arb, arb, arb]:
 def third(name: str, at: arb, y: arb, reach: arb) -> arb | None:
     """A bound of |phi'''| on |v - y| <= reach, its value at y being `at`; None where 1/v may be undefined.
 
+    For 1/v it is six times the remainder's own factor: 1/v is its parabola at y less D^3 / (y^3 v), D = v - y.
+
     A division by a ball that holds 0 must be refused here, and not left to what becomes of its result: 0 times it is 0.
     """
     if name == "1/":
         least = abs(y) - reach
-        return 6 / least**4 if least > 0 else None
+        size = abs(y)
+        return 6 / (size * size * size * least) if least > 0 else None
     if name not in ("sin", "cos"):
         raise ValueError(f"nothing is known of {name}")
     return (abs(at) + reach).min(ONE)

@@ -86,7 +86,7 @@ def _headline(result: Mapping[str, Any], verdict: str) -> str:
         word = ", if the solver is right: nothing checked its answers" if verdict == "TRUSTED" else ""
         return f"{name}: {stated}{word}"
     if verdict == "REFUTED":
-        return f"{name}: the claim is false for this V"
+        return f"{name}: a condition of the claim fails for this V and level; another V may show what this one cannot"
     return f"{name}: nothing was proved"
 
 

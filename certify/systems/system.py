@@ -171,7 +171,9 @@ class System:
             stack, broadcast = torch.stack, torch.broadcast_tensors
         else:
             raise InputError(f"`module` must be 'numpy' or 'torch'; found {module!r}.")
-        raw = sympy.lambdify([*self.states, *self.inputs], list(self.exact_dynamics()), modules=module, cse=True)
+        # torch has no sine of a plain number
+        rounded = [e.replace(_is_constant_function, lambda c: c.evalf(17)) for e in self.exact_dynamics()]
+        raw = sympy.lambdify([*self.states, *self.inputs], rounded, modules=module, cse=True)
         n, m = self.n, self.m
 
         def f(x: Any, u: Any) -> Any:
@@ -187,6 +189,10 @@ class System:
         if result.has(sympy.zoo, sympy.nan, sympy.oo):
             raise InputError(f"an equation of {self.name} divides by zero with the parameters {dict(self.parameters)}.")
         return result
+
+
+def _is_constant_function(node: sympy.Expr) -> bool:
+    return bool(node.is_Function and node.is_number)
 
 
 def symbols(names: Sequence[str]) -> tuple[sympy.Symbol, ...]:

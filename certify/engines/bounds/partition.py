@@ -38,6 +38,12 @@ class Partition:
         self._calls.append(self.splits)
         return np.arange(2 * first + 1, 2 * self.splits + 1)
 
+    def leaves(self) -> Numbers:
+        """The numbers of the boxes that are not split, ascending."""
+        whole = np.ones(2 * self.splits + 1, dtype=bool)
+        whole[self._parents[: self.splits]] = False
+        return np.flatnonzero(whole)
+
     def corners(self, boxes: Numbers) -> tuple[Array, Array]:
         """Lower and upper corners (n, B), by the midpoints that made them."""
         count = len(boxes)

@@ -24,7 +24,7 @@ from certify.engines.bounds.frontier import Frontier
 from certify.engines.bounds.partition import LEAF, Partition
 from certify.engines.bounds.rule import BoxBounds, VdotBound
 from certify.engines.falsify import Witness, descend
-from certify.running import Runner
+from certify.running import Bound, Runner
 from certify.verdict import Stop
 
 Array = NDArray[np.float64]
@@ -110,11 +110,17 @@ def _root(problem: Problem, T: Array, level: float) -> Array:
 
 
 class _Sweep(ABC):
-    """The moving level of a pass: `inner` or `outer` gives way to what cannot be proved."""
+    """The moving level of a pass: `inner` or `outer` gives way to what cannot be proved.
+
+    `looks_again` says that boxes proved with earlier levels are bounded once more with the last ones.
+    """
+
+    looks_again = False
 
     def __init__(self, problem: Problem, T: Array, inner: float, outer: float) -> None:
         self.problem, self.T = problem, T
         self.inner, self.outer = inner, outer
+        self.bounded_with = (inner, outer)  # with which all boxes that are not open are proved
         self.witness: Witness | None = None
 
     @abstractmethod
@@ -152,8 +158,8 @@ class _Sweep(ABC):
     def share(self, a: float, b: float) -> float:
         """The volume of `a <= V <= b` as a share of the ring's."""
         power = len(self.T) / 2
-        whole = self.outer**power - self.inner**power
-        return float(min(1.0, max(0.0, (b**power - a**power) / whole))) if whole > 0 else 1.0
+        a, b, inner, outer = (max(0.0, v) ** power for v in (a, b, self.inner, self.outer))
+        return min(1.0, max(0.0, (b - a) / (outer - inner))) if outer > inner else 1.0
 
 
 class _Outwards(_Sweep):
@@ -197,6 +203,8 @@ class _Outwards(_Sweep):
 
 
 class _Inwards(_Sweep):
+    looks_again = True
+
     def key(self, lowest: Tensor, highest: Tensor) -> Tensor:
         return -highest
 
@@ -247,7 +255,7 @@ def _run(
     boxes, most, seconds = 0, budget.boxes, budget.seconds
     stop, covered, settled = Stop.REQUESTED, True, False
     with runner.start(rule) as bound:
-        while len(frontier):
+        while len(frontier) or _reopen(sweep, partition, frontier, rule, bound, budget.batch):
             full = boxes >= most or partition.splits + 3 * budget.batch > _MOST_SPLITS
             if full or time.monotonic() - start > seconds:
                 stop = Stop.BOXES if full else Stop.TIME
@@ -279,6 +287,27 @@ def _run(
     tree = partition.preorder()
     leaves = tree.count(bytes([LEAF]))
     return RingProof(sweep.inner, sweep.outer, stop, tree, root, boxes, leaves, sweep.witness, covered)
+
+
+def _reopen(sweep: _Sweep, partition: Partition, frontier: Frontier, rule: VdotBound, bound: Bound, batch: int) -> bool:
+    """Open the boxes again that were proved with earlier levels and are not with those of now; True if there are any.
+
+    A box that meets the inner level may be proved with a multiplier of V less that level only; when the level moves,
+    another multiplier is best, and its bound may be the weaker one.
+    """
+    now = (sweep.inner, sweep.outer)
+    if not sweep.looks_again or sweep.bounded_with == now or not sweep.inner < sweep.outer:
+        return False
+    sweep.bounded_with = now
+    numbers = partition.leaves()
+    for part in np.array_split(numbers, range(batch, len(numbers), batch)):
+        lo, hi = (torch.tensor(a, device=rule.T.device) for a in partition.corners(part))
+        lowest, highest = rule.levels(lo, hi)
+        open_ = sweep.wanted(lowest, highest)
+        open_[open_.clone()] = ~bound(lo[:, open_], hi[:, open_], *now).proved
+        number = torch.tensor(part, device=lo.device)
+        frontier.add(lo[:, open_], hi[:, open_], sweep.key(lowest, highest)[open_], number[open_])
+    return len(frontier) > 0
 
 
 def _split(

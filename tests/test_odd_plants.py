@@ -1,16 +1,21 @@
-"""Small plants on which a run ends wrongly; each test states what should happen."""
+"""Small plants that are odd in one way each: what a run must make of them."""
 
 from __future__ import annotations
 
+import dataclasses
+import io
 from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
 import pytest
 import sympy
+from rich.console import Console
 
+from certify.errors import InputError
 from certify.policies import TanhNetwork
 from certify.reference.rules import judge
+from certify.report import summary
 from certify.roa import RoaOptions, certify_roa
 from certify.systems import System
 from certify.systems.toml import parse_expression
@@ -61,14 +66,19 @@ def test_a_constant_sine_in_an_equation(tmp_path: Path) -> None:
     assert certify_roa(system, gain(-1.0), tmp_path, RoaOptions(claim="practical")).verdict is Verdict.PROVED
 
 
-def test_a_bump_of_V_inside_an_attracted_set_does_not_refute_the_claim(tmp_path: Path) -> None:
+def test_a_refutation_speaks_of_V_and_not_of_trajectories(tmp_path: Path) -> None:
     """With W = x^2 + y^2: W' = -2 W + 2 y tanh(-y/1000) < 0 on W = 1, so {W <= 1} is invariant, y decays, and then x.
 
-    In between V grows for a while, which says something about V and nothing about the trajectories.
+    In between V grows for a while: that is a condition of the claim, and its failure says nothing about trajectories.
     """
     system = plant({"x": "-x + 20*y*(x**2 + y**2)*(1 - x**2 - y**2)", "y": "-y + u"}, bound=10)
     options = RoaOptions(P=np.eye(2), level=1.0)
-    assert certify_roa(system, gain(0.0, -1e-3), tmp_path, options).verdict is Verdict.UNKNOWN
+    result = certify_roa(system, gain(0.0, -1e-3), tmp_path, options)
+    assert result.verdict is Verdict.REFUTED and result.witness is not None
+    console = Console(width=200, file=io.StringIO())
+    console.print(summary(result.to_dict()))
+    text = console.file.getvalue()
+    assert "condition of the claim fails" in text and "another V may" in text and "false" not in text
 
 
 def test_the_reference_accepts_a_quotient_that_the_checker_accepts() -> None:
@@ -76,3 +86,31 @@ def test_the_reference_accepts_a_quotient_that_the_checker_accepts() -> None:
     data = grow(make(dynamics, [([[1.0]], [0.0])], 1.0, (0.01, 0.25), claim="practical", centre="none"))
     assert verdict(data) == "ACCEPTED"
     assert judge(dump(data)).result == "ACCEPTED"
+
+
+@pytest.mark.parametrize("claim", ["asymptotic", "practical"])
+@pytest.mark.parametrize("half", [Fraction(1, 10**170), Fraction(10**170)])
+def test_domains_of_extreme_size_are_named(tmp_path: Path, claim: str, half: Fraction) -> None:
+    system = dataclasses.replace(plant({"x": "-x + u"}), domain=((-half, half),))
+    with pytest.raises(InputError, match="Scale the states"):
+        certify_roa(system, gain(-1.0), tmp_path, RoaOptions(claim=claim))  # type: ignore[arg-type]
+
+
+def test_levels_of_extreme_size_are_named(tmp_path: Path) -> None:
+    for claim in ("asymptotic", "practical"):
+        with pytest.raises(InputError, match="levels of V must lie between"):
+            certify_roa(plant({"x": "-x + u"}), gain(-1.0), tmp_path, RoaOptions(claim=claim, level=1e-320))  # type: ignore[arg-type]
+
+
+def test_a_pole_at_the_origin_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"divide(s)? by (0|zero)"):
+        certify_roa(plant({"x": "1/x + u"}), gain(-1.0), tmp_path, RoaOptions(claim="practical"))
+
+
+def test_numbers_beyond_binary64_are_named(tmp_path: Path) -> None:
+    for system in (
+        plant({"x": f"-x + u + {10**400}*x**3"}),
+        dataclasses.replace(plant({"x": "-x + u"}), input_bounds=((Fraction(-(10**400)), Fraction(10**400)),)),
+    ):
+        with pytest.raises(InputError, match="range of binary64"):
+            certify_roa(system, gain(-1.0), tmp_path, RoaOptions(claim="practical"))
