@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import signal
@@ -378,3 +379,17 @@ def test_both_checkers_refuse_a_level_that_was_not_proved(
         assert status == 1 and json.loads(out)["result"] == "REJECTED"
         status, out, err = run(capsys, "check", tmp_path / "missing.json", *program)
         assert (status, out) == (2, "") and "cannot be read" in err
+
+
+def test_a_report_is_about_the_bytes_that_were_checked(
+    tmp_path: Path, policy_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A pipe gives each reader other bytes: there is one reader, and the page names what it read."""
+    raw, pipe, page = certified(tmp_path, policy_file, capsys).read_bytes(), tmp_path / "pipe", tmp_path / "page.html"
+    os.mkfifo(pipe)
+    writer = threading.Thread(target=pipe.write_bytes, args=(raw,), daemon=True)
+    writer.start()
+    status, out, _ = run(capsys, "report", pipe, "--out", page)
+    writer.join(timeout=10)
+    assert status == 0 and out.startswith("ACCEPTED")
+    assert hashlib.sha256(raw).hexdigest() in page.read_text() and "PROVED" in page.read_text()
