@@ -19,7 +19,6 @@ from numpy.typing import NDArray
 from certify.closed_loop import ClosedLoop
 from certify.expressions import Algebra, evaluate
 from certify.policies import TanhNetwork
-from certify.policies.exact import centring, squash, squash_slope
 
 Array = NDArray[np.float64]
 _PRECISION = 200  # bits
@@ -60,7 +59,7 @@ def evaluate_policy(loop: ClosedLoop, x: Array) -> Balls:
         y = _net(network, _points(x))
         shift, offset = _centring(loop)
         return [
-            flint.arb(float(s)) * squash(network, v + d, _NUMBERS) + o
+            flint.arb(float(s)) * network.squashed(v + d, _NUMBERS) + o
             for v, d, s, o in zip(y, shift, network.scale, offset, strict=True)
         ]
 
@@ -114,8 +113,8 @@ def _jacobian(loop: ClosedLoop) -> flint.arb_mat:
             y, J = _through_tanh(y, J)
         y, J = _affine(W, b, y), _matrix(W) * J
     shift, _ = _centring(loop)
-    squashed = [squash(network, v + d, _NUMBERS) for v, d in zip(y, shift, strict=True)]
-    slopes = [squash_slope(network, v, _NUMBERS) for v in squashed]
+    squashed = [network.squashed(v + d, _NUMBERS) for v, d in zip(y, shift, strict=True)]
+    slopes = [network.squash_slope(v, _NUMBERS) for v in squashed]
     scale = [flint.arb(float(s)) * slope for s, slope in zip(network.scale, slopes, strict=True)]
     gain = flint.arb_mat([[scale[i] * J[i, j] for j in range(network.n)] for i in range(network.m)])
     A, B = (
@@ -141,7 +140,7 @@ _NUMBERS = _Numbers()
 
 def _centring(loop: ClosedLoop) -> tuple[Balls, Balls]:
     at_0 = _net(loop.network, [flint.arb(0)] * loop.network.n)
-    return centring(loop.network, loop.u_eq, at_0, _NUMBERS)
+    return loop.network.centring(loop.u_eq, at_0, _NUMBERS)
 
 
 def _net(network: TanhNetwork, h: Balls) -> Balls:

@@ -18,7 +18,6 @@ from certify.claims.conditions import Condition, OfState, Vdot
 from certify.closed_loop import ClosedLoop
 from certify.errors import InputError
 from certify.expressions import Tree, to_tree
-from certify.policies.exact import centring, squash, squash_slope
 
 Array = NDArray[np.float64]
 
@@ -160,10 +159,10 @@ def _policy(loop: ClosedLoop) -> list[tuple[str, Tree]]:
     if network.centre != "none":
         result += _neurons(loop, "o", [])  # the same network at the origin
     at_0 = [_Term(f"o.{last}.{j}") for j in range(network.m)]
-    shift, offset = centring(network, loop.u_eq, at_0, _TERMS)
+    shift, offset = network.centring(loop.u_eq, at_0, _TERMS)
     for j, symbol in enumerate(system.inputs):
         entering = shift[j] + _Term(f"h.{last}.{j}")
-        result.append((f"s.{j}", squash(network, entering, _TERMS).tree))
+        result.append((f"s.{j}", network.squashed(entering, _TERMS).tree))
         result.append((symbol.name, (_Term(exact(network.scale[j])) * _Term(f"s.{j}") + offset[j]).tree))
     return result
 
@@ -227,7 +226,7 @@ def _policy_jacobian(loop: ClosedLoop) -> list[tuple[str, Tree]]:
                 result.append((names[i][j], product if last else ["*", slope, product]))
         before = names
     for i in range(network.m):
-        scale = _Term(exact(network.scale[i])) * squash_slope(network, _Term(f"s.{i}"), _TERMS)
+        scale = _Term(exact(network.scale[i])) * network.squash_slope(_Term(f"s.{i}"), _TERMS)
         result += [(f"Du.{i}.{j}", (scale * _Term(before[i][j])).tree) for j in range(n)]
     return result
 

@@ -1,79 +1,12 @@
-"""Squash and centring, once for every arithmetic, and what follows from them exactly.
-
-A centred policy is `scale * squash(net(x) + shift) + offset'`, and shift and offset' are numbers:
-
-- `preactivation`: `shift = atanh((u_eq - offset) / scale) - net(0)`, `offset' = offset`;
-- `output`: `shift = 0`, `offset' = u_eq - scale * squash(net(0))`;
-- `none`: `shift = 0`, `offset' = offset`.
-
-Floats, Arb balls and the terms of formulas put their own numbers into these lines.
-"""
+"""What follows exactly from a policy's form: the bounds of its inputs, and pi(0). Decided in rationals."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from certify.errors import InputError
-
-if TYPE_CHECKING:
-    from certify.policies.network import TanhNetwork
-
-V = TypeVar("V")
-
-
-class Arithmetic(Protocol[V]):
-    """Numbers of an arithmetic; its values have `-` and `*`."""
-
-    def number(self, q: Fraction) -> V:
-        """An exact number."""
-
-    def atanh(self, q: Fraction) -> V:
-        """atanh of an exact number in (-1, 1)."""
-
-    def tanh(self, v: V) -> V:
-        """tanh of a value."""
-
-
-def squash(network: TanhNetwork, y: V, arithmetic: Arithmetic[V]) -> V:
-    """What the policy does to the last layer's value before scale and offset."""
-    return arithmetic.tanh(y) if network.squash == "tanh" else y
-
-
-def squash_slope(network: TanhNetwork, squashed: V, arithmetic: Arithmetic[V]) -> V:
-    """The derivative of the squash where its value is `squashed`."""
-    one = arithmetic.number(Fraction(1))
-    return _difference(one, _product(squashed, squashed)) if network.squash == "tanh" else one
-
-
-def centring(
-    network: TanhNetwork, u_eq: Sequence[Fraction], at_0: Sequence[V], arithmetic: Arithmetic[V]
-) -> tuple[list[V], list[V]]:
-    """(shift, offset'), (m,) each, from net(0); see the module's docstring.
-
-    Raises
-    ------
-    InputError : u_eq does not lie strictly inside `offset +- scale` (centre `preactivation`).
-    """
-    number = arithmetic.number
-    shift = [number(Fraction(0)) for _ in at_0]
-    offset = [number(Fraction(float(o))) for o in network.offset]
-    if network.centre == "preactivation":
-        shift = [_difference(arithmetic.atanh(q), v) for q, v in zip(network.ratios(u_eq), at_0, strict=True)]
-    if network.centre == "output":
-        scale = [number(Fraction(float(s))) for s in network.scale]
-        moved = [_product(s, squash(network, v, arithmetic)) for s, v in zip(scale, at_0, strict=True)]
-        offset = [_difference(number(u), v) for u, v in zip(u_eq, moved, strict=True)]
-    return shift, offset
-
-
-def _difference(a: Any, b: Any) -> Any:
-    return a - b
-
-
-def _product(a: Any, b: Any) -> Any:
-    return a * b
+from certify.policies.network import TanhNetwork
 
 
 def bounded_by_form(network: TanhNetwork, bounds: Sequence[tuple[Fraction, Fraction]]) -> bool:

@@ -6,7 +6,10 @@
 - `output`: `pi(x) = raw(x) - raw(0) + u_eq` (the paper's step 4);
 - `preactivation`: `pi(x) = scale * tanh(net(x) - net(0) + beta) + offset` with the real number
   `beta = atanh((u_eq - offset) / scale)`; the input never leaves `offset +- scale`;
-- `none`: pi = raw, usable only if raw(0) = u_eq holds exactly.
+- `none`: pi = raw.
+
+So `pi(x) = scale * squash(net(x) + shift) + offset'` with numbers shift and offset', which `centring` gives in any
+arithmetic: floats, Arb balls and the terms of formulas put their own numbers into the same lines.
 """
 
 from __future__ import annotations
@@ -22,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from certify.policies.exact import centring, squash, squash_slope
+from certify.policies.arithmetic import Arithmetic
 
 Squash = Literal["tanh", "identity"]
 Centre = Literal["output", "preactivation", "none"]
@@ -137,15 +140,39 @@ class TanhNetwork:
             return self.folded(u_eq)(x, u_eq)
         return _like(self.scale, x) * self.squashed(self.net(x)) + _like(self.offset, x)
 
-    def squashed(self, y: Any) -> Any:
-        """The squash of the last layer's values, in the arithmetic of y (numpy array or torch tensor)."""
-        return squash(self, y, _ARRAYS)
+    def squashed(self, y: Any, arithmetic: Arithmetic[Any] | None = None) -> Any:
+        """What the policy does to the last layer's values before scale and offset; numpy or torch if none is given."""
+        return (arithmetic or _ARRAYS).tanh(y) if self.squash == "tanh" else y
+
+    def squash_slope(self, squashed: Any, arithmetic: Arithmetic[Any] | None = None) -> Any:
+        """The derivative of the squash where its value is `squashed`."""
+        one = (arithmetic or _ARRAYS).number(Fraction(1))
+        return one - squashed * squashed if self.squash == "tanh" else one
+
+    def centring(
+        self, u_eq: Sequence[Fraction], at_0: Sequence[Any], arithmetic: Arithmetic[Any]
+    ) -> tuple[list[Any], list[Any]]:
+        """(shift, offset'), (m,) each, from net(0): pi = scale * squash(net(x) + shift) + offset'.
+
+        Raises
+        ------
+        InputError : u_eq does not lie strictly inside `offset +- scale` (centre `preactivation`).
+        """
+        number = arithmetic.number
+        shift = [number(Fraction(0)) for _ in at_0]
+        offset = [number(Fraction(float(o))) for o in self.offset]
+        if self.centre == "preactivation":
+            shift = [arithmetic.atanh(q) - v for q, v in zip(self.ratios(u_eq), at_0, strict=True)]
+        if self.centre == "output":
+            each = zip(u_eq, self.scale, at_0, strict=True)
+            offset = [number(u) - number(Fraction(float(s))) * self.squashed(v, arithmetic) for u, s, v in each]
+        return shift, offset
 
     def folded(self, u_eq: Sequence[Fraction]) -> TanhNetwork:
         """A network without centring that is pi up to rounding: for search and simulation."""
         if self.centre == "none":
             return self
-        shift, offset = centring(self, u_eq, self.net(np.zeros(self.n)).tolist(), _ARRAYS)
+        shift, offset = self.centring(u_eq, self.net(np.zeros(self.n)).tolist(), _ARRAYS)
         biases = (*self.biases[:-1], self.biases[-1] + np.array(shift))
         return TanhNetwork(self.weights, biases, self.scale, np.array(offset), self.squash, "none")
 
@@ -162,7 +189,7 @@ class TanhNetwork:
                 x = np.tanh(x)
                 jacobian = (1 - x**2)[:, None] * jacobian
             x, jacobian = weight @ x + bias, weight @ jacobian
-        slope = squash_slope(self, self.squashed(self.squashed_at_origin(x, u_eq)), _ARRAYS)
+        slope = self.squash_slope(self.squashed(self.squashed_at_origin(x, u_eq)))
         return np.asarray(self.scale[:, None] * ((slope * np.ones(self.m))[:, None] * jacobian))
 
     def sha256(self) -> str:

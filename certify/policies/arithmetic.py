@@ -1,0 +1,21 @@
+"""What an arithmetic must offer for a policy's squash and centring: floats, balls and the terms of formulas do."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import Any, Protocol, TypeVar
+
+V = TypeVar("V", bound=Any)
+
+
+class Arithmetic(Protocol[V]):
+    """Numbers of an arithmetic; its values have `-` and `*`."""
+
+    def number(self, q: Fraction) -> V:
+        """An exact number."""
+
+    def atanh(self, q: Fraction) -> V:
+        """atanh of an exact number in (-1, 1)."""
+
+    def tanh(self, v: V) -> V:
+        """tanh of a value."""
