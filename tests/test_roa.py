@@ -8,8 +8,10 @@ from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
 
+import flint
 import numpy as np
 import pytest
+import scipy.linalg
 import sympy
 
 from certify.certificate import Certificate, checking, run_checker, sole_writer
@@ -253,20 +255,18 @@ def test_the_checker_beside_the_running_package_is_meant(tmp_path: Path, monkeyp
     assert checking.ask(tmp_path) == (70, {"error": "another"})
 
 
-ILL = np.array([[1.0, 1.0 - 2.0**-40], [1.0 - 2.0**-40, 1.0]])
-
-
 def test_the_domain_is_decided_in_rationals() -> None:
-    """A float inverse of this P is off by more than the level's distance from the limit."""
-    domain = box(1, 1)
-    a, b = Fraction(ILL[0, 0]), Fraction(ILL[0, 1])
-    limit = (a * a - b * b) / a  # 1 / (P^-1)_11
-    level = float(limit)
-    while Fraction(level) >= limit:
-        level = float(np.nextafter(level, 0))
-    assert not leaves_domain(ILL, level, domain)
-    assert leaves_domain(ILL, float(np.nextafter(np.nextafter(level, 1), 1)), domain)
-    assert domain_limit(ILL, domain) <= float(limit)
+    """A float inverse of this P is off by more than the slack of 1e-9 that was once left for it."""
+    P = scipy.linalg.hilbert(9)
+    exact = flint.fmpq_mat(9, 9, [flint.fmpq(*v.as_integer_ratio()) for v in P.ravel().tolist()]).inv()
+    limit = min(1 / Fraction(int(exact[i, i].p), int(exact[i, i].q)) for i in range(9))
+    assert abs(1 / np.max(np.diag(np.linalg.inv(P))) / float(limit) - 1) > 1e-9
+    domain = box(*[1] * 9)
+    level = domain_limit(P, domain)
+    assert 0 <= float(limit) - level < 1e-15 * level and Fraction(level) <= limit
+    assert leaves_domain(P, level, domain) is (Fraction(level) == limit)
+    assert not leaves_domain(P, float(np.nextafter(level, 0)), domain)
+    assert leaves_domain(P, float(np.nextafter(level, 1)), domain)
 
 
 def test_a_witness_above_the_level_refutes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
