@@ -20,7 +20,8 @@ _PUBLIC = {
     "save_policy": "certify.policies",
     "ClosedLoop": "certify.closed_loop",
     "certify_roa": "certify.roa",
-    "RoaOptions": "certify.roa",
+    "RoaResult": "certify.results",
+    "RoaOptions": "certify.options",
 }
 
 __version__ = "0.1.0"

@@ -306,7 +306,7 @@ def _candidates(result: RoaResult, options: RoaOptions, compare: bool) -> list[d
     """The volumes within reach of the other candidates, sampled, beside the one that was proved."""
     from dataclasses import asdict
 
-    from certify.roa import compare_candidates
+    from certify.candidates import compare_candidates
 
     known = {} if result.candidate is None or result.problem is None else {result.candidate: result.problem.V.P}
     names: list[Candidate] = ["lyapunov", "lqr"]

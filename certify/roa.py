@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,13 +27,13 @@ from certify.certificate import (
     write_beside,
 )
 from certify.claims import Asymptotic, Claim, Problem
-from certify.claims.claim import Kind
 from certify.closed_loop import ClosedLoop
 from certify.engines.base import Budget, Engine, Progress, Proof, Task
 from certify.engines.falsify import Witness, falsify, refutes
 from certify.errors import BackendError, InputError, SoundnessError
-from certify.lyapunov import Candidate, choose_candidate, diagonalising_coordinates, domain_limit, leaves_domain, volume
+from certify.lyapunov import choose_candidate, diagonalising_coordinates, domain_limit, leaves_domain
 from certify.lyapunov.function import Quadratic
+from certify.options import RoaOptions
 from certify.policies import TanhNetwork
 from certify.results import Levels, RoaResult
 from certify.rigorous import eigenvalues
@@ -45,55 +44,12 @@ if TYPE_CHECKING:
     from certify.engines.dreal.proof import DrealOptions
 
 Array = NDArray[np.float64]
-EngineName = Literal["bounds", "dreal", "both"]
+__all__ = ["RoaOptions", "RoaResult", "certify_roa"]
 Report = Callable[[Literal["ring", "check"], Progress | None], None]
 _SMALL_NETWORK = 10_000  # weights
 _BELOW = 1e-9  # relative distance from a limit that is itself out of reach (the domain's open condition)
 _BELOW_WITNESS = 1e-3
 _SMALLEST = 1e-120  # of levels: squares of states and products of bounds must not underflow
-
-
-@dataclass(frozen=True, slots=True)
-class RoaOptions:
-    """How to certify.
-
-    Parameters
-    ----------
-    claim : `asymptotic`, or `practical`, which asks for no equilibrium at the origin.
-    candidate : where P comes from, see `choose_candidate`.
-    Q, R : diagonals of the weights, shapes (n,) and (m,); None means ones.
-    P : a Lyapunov matrix of one's own, (n, n); overrides the candidate.
-    level : prove exactly this level; None finds the largest.
-    engine : `bounds`, `dreal` (its word is trusted, not checked), or `both`: bounds prove, dReal is asked as well.
-    dreal_precision, jobs : dReal's delta and threads.
-    device : where boxes are bounded, `cpu` or `cuda`.
-    time_limit : seconds for the ring, the falsifier included.
-    max_boxes : boxes for the ring.
-    """
-
-    claim: Kind = "asymptotic"
-    candidate: Candidate = "lyapunov"
-    Q: tuple[float, ...] | None = None
-    R: tuple[float, ...] | None = None
-    P: Array | None = None
-    level: float | None = None
-    engine: EngineName = "bounds"
-    dreal_precision: float = 1e-3
-    jobs: int = 1
-    device: str = "cpu"
-    time_limit: float = 600.0
-    max_boxes: int = 4_000_000
-
-    def __post_init__(self) -> None:
-        for name, known in (("claim", Kind), ("candidate", Candidate), ("engine", EngineName)):
-            if getattr(self, name) not in get_args(known):
-                raise InputError(f"`{name}` must be one of {get_args(known)}; found {getattr(self, name)!r}.")
-        if not 0 < self.dreal_precision < 1 or self.jobs < 1:
-            raise InputError("`dreal_precision` must lie between 0 and 1, and `jobs` be at least 1.")
-        if self.level is not None and not (math.isfinite(self.level) and self.level > 0):
-            raise InputError(f"`level` must be a positive number; found {self.level}.")
-        if not self.time_limit > 0 or not self.max_boxes > 0:
-            raise InputError("`time_limit` and `max_boxes` must be positive.")
 
 
 def certify_roa(
@@ -371,32 +327,3 @@ def _candidate(loop: ClosedLoop, options: RoaOptions) -> tuple[Quadratic, str, s
     if V.n != n or not np.all(np.linalg.eigvalsh(V.P) > 0):
         raise InputError(f"`P` must be a symmetric positive definite matrix of shape ({n}, {n}).")
     return V, "given", None
-
-
-@dataclass(frozen=True, slots=True)
-class CandidateVolume:
-    """What a candidate could give at most: `level` is the smaller of the domain's limit and the lowest violation found.
-
-    Sampled, not proved, unless the candidate is the one that was proved.
-    """
-
-    candidate: str
-    level: float
-    limited_by: Literal["domain", "sampled"]
-    volume: float
-
-
-def compare_candidates(
-    system: System, network: TanhNetwork, options: RoaOptions, known: Mapping[str, Array], names: Sequence[Candidate]
-) -> tuple[CandidateVolume, ...]:
-    """The volumes within reach of several candidates; `known` has those whose P is there already."""
-    loop = ClosedLoop(system, network)
-    A, _, _ = loop.linearise()
-    result = []
-    for name in names:
-        P = known[name] if name in known else choose_candidate(loop, name, options.Q, options.R).P
-        limit = domain_limit(P, system.domain)
-        witness = falsify(Problem(loop, Quadratic(P)), diagonalising_coordinates(P, A), limit, samples=4000)
-        level = limit if witness is None else witness.level
-        result.append(CandidateVolume(name, level, "domain" if witness is None else "sampled", volume(P, level)))
-    return tuple(result)

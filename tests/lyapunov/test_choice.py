@@ -8,12 +8,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from certify.candidates import compare_candidates
 from certify.cli import _run
 from certify.closed_loop import ClosedLoop
 from certify.errors import BackendError, InputError
 from certify.lyapunov import choice, choose_candidate, domain_limit, volume
 from certify.policies import Policy, save_policy
-from certify.roa import RoaOptions, certify_roa, compare_candidates
+from certify.roa import RoaOptions, certify_roa
 from certify.systems import System
 from tests.support.loops import chain, pendulum_network
 

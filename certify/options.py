@@ -1,0 +1,60 @@
+"""What a run is asked for; the fields are the command line's options."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.claims.claim import Kind
+from certify.errors import InputError
+from certify.lyapunov import Candidate
+
+Array = NDArray[np.float64]
+EngineName = Literal["bounds", "dreal", "both"]
+
+
+@dataclass(frozen=True, slots=True)
+class RoaOptions:
+    """How to certify.
+
+    Parameters
+    ----------
+    claim : `asymptotic`, or `practical`, which asks for no equilibrium at the origin.
+    candidate : where P comes from, see `choose_candidate`.
+    Q, R : diagonals of the weights, shapes (n,) and (m,); None means ones.
+    P : a Lyapunov matrix of one's own, (n, n); overrides the candidate.
+    level : prove exactly this level; None finds the largest.
+    engine : `bounds`, `dreal` (its word is trusted, not checked), or `both`: bounds prove, dReal is asked as well.
+    dreal_precision, jobs : dReal's delta and threads.
+    device : where boxes are bounded, `cpu` or `cuda`.
+    time_limit : seconds for the ring, the falsifier included.
+    max_boxes : boxes for the ring.
+    """
+
+    claim: Kind = "asymptotic"
+    candidate: Candidate = "lyapunov"
+    Q: tuple[float, ...] | None = None
+    R: tuple[float, ...] | None = None
+    P: Array | None = None
+    level: float | None = None
+    engine: EngineName = "bounds"
+    dreal_precision: float = 1e-3
+    jobs: int = 1
+    device: str = "cpu"
+    time_limit: float = 600.0
+    max_boxes: int = 4_000_000
+
+    def __post_init__(self) -> None:
+        for name, known in (("claim", Kind), ("candidate", Candidate), ("engine", EngineName)):
+            if getattr(self, name) not in get_args(known):
+                raise InputError(f"`{name}` must be one of {get_args(known)}; found {getattr(self, name)!r}.")
+        if not 0 < self.dreal_precision < 1 or self.jobs < 1:
+            raise InputError("`dreal_precision` must lie between 0 and 1, and `jobs` be at least 1.")
+        if self.level is not None and not (math.isfinite(self.level) and self.level > 0):
+            raise InputError(f"`level` must be a positive number; found {self.level}.")
+        if not self.time_limit > 0 or not self.max_boxes > 0:
+            raise InputError("`time_limit` and `max_boxes` must be positive.")
