@@ -22,6 +22,10 @@ class Guard:
     side: Literal["inside", "outside"]
     level: float
 
+    def holds(self, V: Fraction) -> bool:
+        """Decided in rationals."""
+        return Fraction(self.level) >= V if self.side == "inside" else Fraction(self.level) <= V
+
 
 @dataclass(frozen=True, slots=True)
 class Vdot:

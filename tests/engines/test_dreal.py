@@ -23,16 +23,19 @@ import pytest
 import sympy
 
 from certify.certificate import read_certificate
+from certify.claims import Practical, Problem
 from certify.claims.conditions import local_condition, ring_condition
 from certify.claims.queries import Query, query
 from certify.cli import _run
+from certify.closed_loop import ClosedLoop
 from certify.engines.base import Budget, Proof, Task
 from certify.engines.dreal import backend as dreal
 from certify.engines.dreal import proof as dreal_proof
 from certify.engines.dreal.backend import Answer, Backend, decide, find_backend
-from certify.engines.dreal.proof import DrealEngine
+from certify.engines.dreal.proof import DrealEngine, DrealOptions, confirm_with_dreal
 from certify.engines.falsify import Witness, confirm
 from certify.errors import BackendError, InputError, SoundnessError
+from certify.lyapunov.function import Quadratic
 from certify.policies import Policy, TanhNetwork, save_policy
 from certify.report import render_html
 from certify.roa import RoaOptions, certify_roa, run_checker
@@ -532,3 +535,18 @@ def test_real_dreal_reads_the_smt2_files(tmp_path: Path) -> None:
     assert decide(solver, query(local_condition(1e-3), case.problem), 1e-3, 1, 60.0).status == "unsat"
     for asked in sums_of_like_terms():
         assert decide(solver, asked, 1e-3, 1, 60.0).status == "delta-sat", asked.name
+
+
+@pytest.mark.parametrize(("at", "contradicts"), [(0.9, False), (1.1, True)])
+def test_a_violation_contradicts_only_where_the_guards_hold(
+    at: float, contradicts: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """xdot = 2x: Vdot > 0 everywhere, but a practical claim speaks of nothing below its floor."""
+    x, u = sympy.symbols("x u")
+    system = System("away", (x,), (u,), {}, (3 * x + u,), (sympy.Integer(0),), box(3), box(9))
+    network = TanhNetwork((np.array([[-1.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    problem = Problem(ClosedLoop(system, network), Quadratic(np.eye(1)))
+    answer = Answer("delta-sat", 0.1, "fake", {"x": (at, at)})
+    monkeypatch.setattr("certify.engines.dreal.proof.decide", lambda *_: answer)
+    _, witness = confirm_with_dreal(problem, Practical(roa=4.0, floor=1.0), FAKE, DrealOptions())
+    assert (witness is not None) is contradicts

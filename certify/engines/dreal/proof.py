@@ -11,13 +11,14 @@ import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
+from fractions import Fraction
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from certify.certificate import TrustedSolver
-from certify.claims import Asymptotic, Claim, Condition, Problem, conditions
+from certify.claims import Asymptotic, Claim, Condition, OfState, Problem, Vdot, conditions
 from certify.claims.conditions import domain_conditions, input_conditions, local_condition, ring_condition
 from certify.claims.queries import query
 from certify.engines.base import Budget, Proof, Report, Task
@@ -94,7 +95,7 @@ def confirm_with_dreal(
     problem: Problem, claim: Claim, backend: Backend, options: DrealOptions
 ) -> tuple[tuple[Asked, ...], Witness | None]:
     """Ask dReal for every condition of a claim that was proved otherwise; a witness contradicts that proof."""
-    session = _Session(problem, backend, options, None)
+    session = _Session(problem, backend, options, None, floor=0.0 if claim.at_rest else claim.inner)
     for condition in conditions(claim, problem):
         session.ask(condition, claim.inner if condition.name == "local" else claim.roa)
     return tuple(session.asked), session.witness
@@ -124,6 +125,7 @@ class _Session:
     progress: Callable[[str, float], None] | None
     asked: list[Asked] = field(default_factory=list)
     witness: Witness | None = None
+    floor: float = 0.0  # the level below which nothing is claimed
 
     def __post_init__(self) -> None:
         self.deadline = time.monotonic() + self.options.seconds
@@ -161,8 +163,8 @@ class _Session:
         asked = query(condition, self.problem)
         answer = decide(self.backend, asked, self.options.precision, self.options.jobs, allowed)
         self.asked.append(Asked(condition.name, level, answer))
-        if answer.status == "delta-sat" and (condition.name == "ring" or condition.name.startswith("inputs")):
-            self._look(answer, "vdot" if condition.name == "ring" else "input", level)
+        if answer.status == "delta-sat" and not condition.punctured and not isinstance(condition.margin, OfState):
+            self._look(answer, condition)
         return answer.status == "unsat"
 
     def all_unsat(self, wanted: Sequence[Condition]) -> bool:
@@ -209,8 +211,13 @@ class _Session:
             return low, Stop.WITNESS, ""
         return low, Stop.SOLVER, "dReal gives no answer above"
 
-    def _look(self, answer: Answer, kind: Literal["vdot", "input"], level: float) -> None:
-        """Points of the answer's box, in Arb: a genuine violation below the level becomes the witness."""
+    def _look(self, answer: Answer, condition: Condition) -> None:
+        """Points of the answer's box, in rationals and in Arb: a violation that the claim forbids is the witness.
+
+        Below a ring lies the local level, where Vdot >= 0 contradicts an asymptotic claim too; where nothing is claimed,
+        `floor` says so.
+        """
+        kind: Literal["vdot", "input"] = "vdot" if isinstance(condition.margin, Vdot) else "input"
         names = [s.name for s in self.problem.loop.system.states]
         box = np.array([answer.box.get(name, (math.nan, math.nan)) for name in names])
         if not np.all(np.isfinite(box)):
@@ -221,5 +228,7 @@ class _Session:
             V = float(self.problem.V(x))
             witness = Witness(x, V, kind)
             lower = self.witness is None or self.witness.level > V
-            if level >= V and lower and confirm(self.problem, witness):
+            exact = self.problem.V.exactly(x)
+            inside = all(guard.holds(exact) for guard in condition.guards if guard.side == "inside")
+            if lower and inside and exact >= Fraction(self.floor) and confirm(self.problem, witness):
                 self.witness = witness
