@@ -214,8 +214,8 @@ class _Session:
     def _look(self, answer: Answer, condition: Condition) -> None:
         """Points of the answer's box, in rationals and in Arb: a violation that the claim forbids is the witness.
 
-        Below a ring lies the local level, where Vdot >= 0 contradicts an asymptotic claim too; `floor` is the level below
-        which nothing is claimed.
+        Below a ring lies the local level, where Vdot >= 0 contradicts an asymptotic claim too; `floor` is the level
+        below which nothing is claimed.
         """
         kind: Literal["vdot", "input"] = "vdot" if isinstance(condition.margin, Vdot) else "input"
         names = [s.name for s in self.problem.loop.system.states]
