@@ -13,7 +13,12 @@ import numpy as np
 import pytest
 import sympy
 
-from certify.certificate import read_certificate, run_checker
+from certify.certificate import limits, read_certificate, run_checker
+from certify.checker import document as checker_document
+from certify.checker import exact as checker_exact
+from certify.checker import expression as checker_expression
+from certify.checker import local as checker_local
+from certify.engines import local as producer_local
 from certify.errors import CertificateFormatError
 from certify.expressions import from_tree, to_tree
 from certify.roa import certify_roa
@@ -202,3 +207,22 @@ def test_bytes_that_are_no_certificate(
     got = run_checker(tmp_path / "c.json")
     assert (got["result"], got["rule"]) == ("REJECTED", "format")
     assert any(word in got["detail"] for word in detail.split("|")), got
+
+
+def test_the_limits_are_the_checker_s() -> None:
+    """The producer names what the checker would refuse; the two share no line, so the numbers are compared."""
+    assert (limits.MOST_STATES, limits.MOST_LAYERS, limits.MOST_ROWS) == (
+        checker_document.MAX_STATES,
+        checker_document.MAX_LAYERS,
+        checker_document.MAX_WIDTH,
+    )
+    assert (limits.MOST_NODES, limits.MOST_DEPTH, limits.MOST_EXPONENT) == (
+        checker_expression.MAX_OPERATIONS,
+        checker_expression.MAX_DEPTH,
+        checker_expression.MAX_EXPONENT,
+    )
+    assert limits.MOST_MATRIX_BITS == checker_exact.MAX_MATRIX_BITS
+    assert limits.MOST_NUMBERS == checker_local._MOST_NUMBERS == producer_local._MOST_NUMBERS
+    assert producer_local._MOST_PRODUCTS == checker_local._MOST_PRODUCTS
+    page = (Path(checker_document.__file__).parent / "FORMAT.md").read_text()
+    assert f"at most {limits.MOST_DIGITS:,} digits" in page and f"at most {limits.MOST_NODES:,} nodes" in page

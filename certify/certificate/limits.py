@@ -1,6 +1,6 @@
 """What a certificate can hold, as the format's page says; a plant or policy beyond it is named before any work is done.
 
-The checkers have these limits so that no file can take their time or memory; `tests` compare the two.
+The checkers have these limits so that no file can take their time or memory; a test compares the numbers.
 """
 
 from __future__ import annotations
