@@ -117,9 +117,10 @@ def roa(
     data = result.to_dict()
     if result.notice is not None:
         tell(result.notice)
-    if result.certificate is not None:
+    if result.certificate is not None and result.raw is not None:
         data["candidates"] = _candidates(result, options, compare) if claim == "asymptotic" else []
-        _write(folder / "report.html", _page(result, data))
+        answer = None if result.checker is None else dict(result.checker)
+        _write(folder / "report.html", _page(result.raw, result.certificate, answer, data))
     if as_json:
         say(json.dumps(data))
     else:
@@ -204,21 +205,17 @@ def report(
     as_json: Json = False,
 ) -> None:
     """Check a certificate and draw its report."""
-    import hashlib
     import tempfile
 
-    from certify.certificate import parse_certificate, read_raw, run_checker
-    from certify.report import render_html
+    from certify.certificate import read_raw, run_checker
 
     target = out if out is not None else certificate.parent / "report.html"
     raw = read_raw(certificate)
-    read = parse_certificate(raw, str(certificate))
     with tempfile.TemporaryDirectory() as folder:  # what is checked is what is drawn, whatever happens to the path
         private = Path(folder) / "certificate.json"
         private.write_bytes(raw)
         answer = run_checker(private)
-    page = render_html(read, answer, None, certificate, sha256=hashlib.sha256(raw).hexdigest(), size=len(raw))
-    _write(target, page)
+    _write(target, _page(raw, certificate, answer, None))
     stated = {"report": str(target), "result": answer["result"]}
     say(json.dumps(stated) if as_json else f"{answer['result']}  {target}")
     raise typer.Exit({"ACCEPTED": 0, "TRUSTED": 3}.get(answer["result"], 1))
@@ -288,18 +285,15 @@ def _fail(as_json: bool, message: str, status: int) -> int:
     return status
 
 
-def _page(result: RoaResult, data: dict[str, Any]) -> str:
-    """The report of a run, about the very bytes that its checker read."""
+def _page(raw: bytes, path: Path, answer: dict[str, Any] | None, data: dict[str, Any] | None) -> str:
+    """The report on a certificate's bytes, with the checker's answer about them and what the run says, if there are."""
     import hashlib
 
     from certify.certificate import parse_certificate
     from certify.report import render_html
 
-    if result.certificate is None or result.raw is None:
-        raise InputError("there is no certificate to report on.")
-    raw, answer = result.raw, None if result.checker is None else dict(result.checker)
-    read, sha256 = parse_certificate(raw, str(result.certificate)), hashlib.sha256(raw).hexdigest()
-    return render_html(read, answer, data, result.certificate, sha256=sha256, size=len(raw))
+    read, sha256 = parse_certificate(raw, str(path)), hashlib.sha256(raw).hexdigest()
+    return render_html(read, answer, data, path, sha256=sha256, size=len(raw))
 
 
 def _candidates(result: RoaResult, options: RoaOptions, compare: bool) -> list[dict[str, Any]]:
