@@ -31,7 +31,13 @@ from certify.closed_loop import ClosedLoop
 from certify.engines.base import Budget, Engine, Progress, Proof, Task
 from certify.engines.falsify import Witness, falsify, refutes
 from certify.errors import BackendError, InputError, SoundnessError
-from certify.lyapunov import choose_candidate, diagonalising_coordinates, domain_limit, leaves_domain
+from certify.lyapunov import (
+    choose_candidate,
+    diagonalising_coordinates,
+    domain_limit,
+    is_positive_definite,
+    leaves_domain,
+)
 from certify.lyapunov.function import Quadratic
 from certify.options import RoaOptions
 from certify.policies import TanhNetwork
@@ -324,6 +330,6 @@ def _candidate(loop: ClosedLoop, options: RoaOptions) -> tuple[Quadratic, str, s
         chosen = choose_candidate(loop, options.candidate, options.Q, options.R)
         return Quadratic(chosen.P), chosen.name, chosen.notice
     n, V = loop.system.n, Quadratic(options.P)
-    if V.n != n or not np.all(np.linalg.eigvalsh(V.P) > 0):
+    if V.n != n or not is_positive_definite(V.P):
         raise InputError(f"`P` must be a symmetric positive definite matrix of shape ({n}, {n}).")
     return V, "given", None

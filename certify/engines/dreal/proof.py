@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any, Literal
@@ -77,7 +77,7 @@ class DrealEngine:
         guess = prove_local(task.problem, self.T, task.target)
         local = time.perf_counter() - start
         options = DrealOptions(self.precision, self.jobs, budget.seconds - local)
-        session = _Session(task.problem, backend, options, None)
+        session = _Session(task.problem, backend, options)
         first = 16 * guess if guess is not None else 1e-4 * task.target
         inner, level, stop, detail = session.levels(first, task.target)
         seconds = {"local": local, "ring": time.perf_counter() - start - local}
@@ -95,7 +95,7 @@ def confirm_with_dreal(
     problem: Problem, claim: Claim, backend: Backend, options: DrealOptions
 ) -> tuple[tuple[Asked, ...], Witness | None]:
     """Ask dReal for every condition of a claim that was proved otherwise; a witness contradicts that proof."""
-    session = _Session(problem, backend, options, None, floor=0.0 if claim.at_rest else claim.inner)
+    session = _Session(problem, backend, options, floor=0.0 if claim.at_rest else claim.inner)
     for condition in conditions(claim, problem):
         session.ask(condition, claim.inner if condition.name == "local" else claim.roa)
     return tuple(session.asked), session.witness
@@ -122,7 +122,6 @@ class _Session:
     problem: Problem
     backend: Backend
     options: DrealOptions
-    progress: Callable[[str, float], None] | None
     asked: list[Asked] = field(default_factory=list)
     witness: Witness | None = None
     floor: float = 0.0  # the level below which nothing is claimed
@@ -155,8 +154,6 @@ class _Session:
 
     def ask(self, condition: Condition, level: float) -> bool:
         """True only for "unsat"."""
-        if self.progress is not None:
-            self.progress(condition.name, level)
         if self.left() <= 0:
             return False
         allowed = min(self.left(), 0.5 * _LOCAL_SHARE * self.options.seconds if condition.name == "local" else math.inf)
@@ -230,5 +227,6 @@ class _Session:
             lower = self.witness is None or self.witness.level > V
             exact = self.problem.V.exactly(x)
             inside = all(guard.holds(exact) for guard in condition.guards if guard.side == "inside")
-            if lower and inside and exact >= Fraction(self.floor) and confirm(self.problem, witness):
+            claimed = inside and (kind == "input" or exact >= Fraction(self.floor))
+            if lower and claimed and confirm(self.problem, witness):
                 self.witness = witness
