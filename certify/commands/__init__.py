@@ -1,0 +1,1 @@
+"""The commands of `certify`, one file each, and what they share."""

@@ -1,0 +1,50 @@
+"""`certify export-smt2`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from certify.commands.arguments import plant_of
+from certify.commands.shared import Json, write
+from certify.commands.terminal import say
+from certify.errors import InputError
+
+
+def export_smt2(
+    policy: Annotated[Path, typer.Option(help="Policy file (certify-policy/1, .pt).")],
+    out: Annotated[Path, typer.Option(help="Folder for the files, one a claim.")],
+    system: Annotated[str | None, typer.Option(help="Plant; default: what the policy file says.")] = None,
+    param: Annotated[list[str] | None, typer.Option(help="Parameter of the plant, NAME=VALUE; repeatable.")] = None,
+    domain: Annotated[list[str] | None, typer.Option(help="Half-width NAME=D or interval NAME=LO:HI.")] = None,
+    candidate: Annotated[str, typer.Option(help="Lyapunov candidate: lyapunov, lqr or optimised.")] = "lyapunov",
+    level: Annotated[float | None, typer.Option(help="c2; default: 0.99 of the largest that is proved.")] = None,
+    time_limit: Annotated[float, typer.Option(help="Seconds for the ring.")] = 600.0,
+    as_json: Json = False,
+) -> None:
+    """Prove levels with the bounds engine and write its claims as SMT-LIB 2 for another solver."""
+    from certify.claims import Asymptotic, conditions
+    from certify.claims.queries import query
+    from certify.engines.dreal.backend import to_smt2
+    from certify.policies import load_policy
+    from certify.roa import RoaOptions, certify_roa
+    from certify.verdict import Verdict
+
+    stored = load_policy(policy)
+    plant = plant_of(stored, system, param or [], domain or [])
+    options = RoaOptions(candidate=candidate, level=level, time_limit=time_limit)  # type: ignore[arg-type]
+    result = certify_roa(plant, stored.network, out, options)
+    inner, outer = result.levels.local, result.levels.roa
+    if result.verdict is not Verdict.PROVED or result.problem is None or inner is None or outer is None:
+        raise InputError(f"there are no levels to export; {result.verdict.value}: {result.reason}")
+    outer = outer if level is not None else max(inner, 0.99 * outer)
+    written = []
+    for condition in conditions(Asymptotic(roa=outer, local=inner), result.problem):
+        path = out / f"{condition.name}.smt2"
+        text = to_smt2(query(condition, result.problem), "unsat (proved by the bounds engine, accepted by the checker)")
+        write(path, text)
+        written.append(str(path))
+    say(json.dumps({"files": written}) if as_json else "\n".join(written))

@@ -1,0 +1,160 @@
+"""`certify roa`."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from certify.commands.arguments import numbers, plant_of
+from certify.commands.shared import Json, page_of, write
+from certify.commands.terminal import ProgressLine, say, show, tell
+from certify.errors import BackendError, InputError
+
+if TYPE_CHECKING:
+    from certify.lyapunov import Candidate
+    from certify.policies import Policy
+    from certify.results import RoaResult
+    from certify.roa import RoaOptions
+    from certify.systems import System
+
+
+def roa(
+    context: typer.Context,
+    policy: Annotated[Path, typer.Option(help="Policy file (certify-policy/1, .pt).")],
+    system: Annotated[
+        str | None, typer.Option(help="Plant: a name or a .toml file; default: what the policy file says.")
+    ] = None,
+    param: Annotated[list[str] | None, typer.Option(help="Parameter of the plant, NAME=VALUE; repeatable.")] = None,
+    domain: Annotated[
+        list[str] | None, typer.Option(help="Half-width NAME=D or interval NAME=LO:HI of a state; repeatable.")
+    ] = None,
+    claim: Annotated[
+        str,
+        typer.Option(help="asymptotic (converges to the origin) or practical (enters a small set and stays there)."),
+    ] = "asymptotic",
+    candidate: Annotated[str, typer.Option(help="Lyapunov candidate: lyapunov, lqr or optimised.")] = "lyapunov",
+    compare: Annotated[
+        bool, typer.Option("--compare", help="Compare with the optimised candidate too; takes its time.")
+    ] = False,
+    q: Annotated[str | None, typer.Option("--Q", help="Diagonal of Q, as in 1,1.")] = None,
+    r: Annotated[str | None, typer.Option("--R", help="Diagonal of R (candidate lqr), as in 1.")] = None,
+    level: Annotated[float | None, typer.Option(help="Prove exactly this level; less is not PROVED.")] = None,
+    engine: Annotated[
+        str, typer.Option(envvar="CERTIFY_ENGINE", help="bounds, dreal (trusted, not checked), or both.")
+    ] = "bounds",
+    precision: Annotated[float, typer.Option(help="dReal's delta.")] = 1e-3,
+    jobs: Annotated[int, typer.Option(help="dReal's threads.")] = 1,
+    device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
+    time_limit: Annotated[float, typer.Option(help="Seconds for the ring.")] = 600.0,
+    max_boxes: Annotated[int, typer.Option(help="Boxes for the ring.")] = 4_000_000,
+    out: Annotated[Path | None, typer.Option(help="Folder for the results; default: out/POLICY.")] = None,
+    as_json: Json = False,
+) -> None:
+    """Certify a region of attraction: prove, write a certificate, have it checked, report."""
+    from certify.policies import load_policy
+    from certify.report import summary
+    from certify.roa import RoaOptions, certify_roa
+
+    start = time.perf_counter()
+    stored = load_policy(policy)
+    plant = plant_of(stored, system, param or [], domain or [])
+    tell(_plant_line(stored, plant, system is not None))
+    shift = stored.beta_shift(plant.exact_u_eq())
+    if shift:
+        tell(f"the file's rounded beta is read as the real number; this shifts u(0) by {shift:.3g}")
+    options = RoaOptions(
+        claim=claim,  # type: ignore[arg-type]
+        candidate=candidate,  # type: ignore[arg-type]
+        Q=numbers(q, "--Q"),
+        R=numbers(r, "--R"),
+        level=level,
+        engine=_engine(context, engine),  # type: ignore[arg-type]
+        dreal_precision=precision,
+        jobs=jobs,
+        device=_device(device),
+        time_limit=time_limit,
+        max_boxes=max_boxes,
+    )
+    folder = out if out is not None else Path("out") / policy.stem
+    progress = ProgressLine()
+    try:
+        result = certify_roa(
+            plant,
+            stored.network,
+            folder,
+            options,
+            load_seconds=time.perf_counter() - start,
+            provenance=_provenance(policy),
+            progress=progress,
+        )
+    finally:
+        progress.close()
+    data = result.to_dict()
+    if result.notice is not None:
+        tell(result.notice)
+    if result.certificate is not None and result.raw is not None:
+        data["candidates"] = _candidates(result, options, compare) if claim == "asymptotic" else []
+        answer = None if result.checker is None else dict(result.checker)
+        write(folder / "report.html", page_of(result.raw, result.certificate, answer, data))
+    if as_json:
+        say(json.dumps(data))
+    else:
+        show(summary(data))
+        if result.certificate is not None:
+            say(f"certificate  {result.certificate}\nreport       {folder / 'report.html'}")
+    raise typer.Exit(result.verdict.exit_status)
+
+
+def _candidates(result: RoaResult, options: RoaOptions, compare: bool) -> list[dict[str, Any]]:
+    """The volumes within reach of the other candidates, sampled, beside the one that was proved."""
+    from dataclasses import asdict
+
+    from certify.candidates import compare_candidates
+
+    known = {} if result.candidate is None or result.problem is None else {result.candidate: result.problem.V.P}
+    names: list[Candidate] = ["lyapunov", "lqr"]
+    if compare or "optimised" in known:
+        names.append("optimised")
+    rows = compare_candidates(result.system, result.network, options, known, names)
+    return [{**asdict(row), "proved": row.candidate in known} for row in rows]
+
+
+def _device(name: str) -> str:
+    import torch
+
+    if name == "cpu" or (name.startswith("cuda") and torch.cuda.is_available()):
+        return name
+    raise InputError(f"--device must be cpu, or cuda on a machine that has it; found {name!r}.")
+
+
+def _engine(context: typer.Context, name: str) -> str:
+    """The engine; without dReal, one that only the environment names falls back to bounds with a notice."""
+    from certify.engines.dreal.backend import find_backend
+
+    source = context.get_parameter_source("engine")
+    if name in ("dreal", "both") and source is not None and source.name == "ENVIRONMENT":
+        try:
+            find_backend()
+        except BackendError as error:
+            tell(f"engine bounds in the place of {name}: {error}")
+            return "bounds"
+    return name
+
+
+def _plant_line(stored: Policy, plant: System, overridden: bool) -> str:
+    values = ", ".join(f"{name} = {float(q):g}" for name, q in plant.parameters.items())
+    source = "from the command line" if overridden else "from the policy file"
+    layers = "-".join(map(str, stored.network.layers))
+    return f"plant {plant.name} ({source}) with {values or 'no parameters'}; policy {layers}"
+
+
+def _provenance(policy: Path) -> dict[str, Any]:
+    from importlib.metadata import version
+
+    packages = ("certify", "torch", "numpy", "scipy", "sympy", "python-flint")
+    return {"policy": policy.name, "python": sys.version.split()[0], **{p: version(p) for p in packages}}
