@@ -103,15 +103,16 @@ class Ring:
         """Upper bound of Vdot on the part of each box that lies in the ring.
 
         There c2 - V and V - c1 are not negative, so Vdot is at most Vdot + k (c2 - V), and at most Vdot + k (V - c1),
-        for any k >= 0.
+        for any k >= 0. A k that proves a leaf proves it for a lower c2 and a higher c1 too, and is tried again then.
         """
         bound = upper_bound(vdot)
         for level, sign in ((self.c.c2, 1.0), (self.c.c1, -1.0)):
             left = np.flatnonzero(np.logical_not(bound < 0))
             gap, part = self.gap(centre[:, left], radius[:, left], level, sign), vdot.at(left)
-            k = multiplier(part.g[: self.n], gap.g[: self.n], gap.c)
-            other = upper_bound(part + gap.scaled(k))
-            bound[left] = np.where(other < bound[left], other, bound[left])
+            for k in multipliers(part.g[: self.n], gap.g[: self.n], gap.c):
+                still = np.flatnonzero(np.logical_not(bound[left] < 0))
+                other = upper_bound(part.at(still) + gap.at(still).scaled(k[still]))
+                bound[left[still]] = np.fmin(bound[left[still]], other)
         return bound
 
     def gap(self, centre: Array, radius: Array, level: float, sign: float) -> Taylor:
@@ -130,15 +131,14 @@ class Ring:
         return total(far * total(self.S_rest[:, :, None] * far[None, :], 1), 0)
 
 
-def multiplier(a: Array, b: Array, c: Array) -> Array:
-    """The k >= 0 that minimises `c k + sum_i |a_i + k b_i|`, shape (B,): it is 0 or lies where a term vanishes.
+def multipliers(a: Array, b: Array, c: Array) -> Array:
+    """The k at which a term of `c k + sum_i |a_i + k b_i|` vanishes, or 0 if that is negative: (n, B), the best first.
 
     Any number k >= 0 would do for the proof; an infinite one or NaN makes the bound NaN.
     """
     k = np.maximum(np.where(b != 0, -a / b, 0.0), 0.0)
     value = c * k + np.sum(np.abs(a[:, None] + k * b[:, None]), axis=0)
-    best = np.argmin(value, axis=0)
-    return np.asarray(np.take_along_axis(k, best[None], 0)[0])
+    return np.take_along_axis(k, np.argsort(value, axis=0, kind="stable"), 0)
 
 
 def is_whole(case: Case) -> Failures:

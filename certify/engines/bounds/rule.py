@@ -164,16 +164,20 @@ class VdotBound:
                 Q,
                 (far * (self.S_cross @ far)).sum(0) + n * EPS * (size + level) + TINY,
             )
-            here = Taylor(vdot.c[index], vdot.g[:, index], vdot.Q[:, :, index], vdot.r[index])
-            k = _multiplier(here.g[:n], g[:n], gap.c)
-            scaled = Taylor(k * gap.c, k * g, k * Q, k * (gap.r + EPS * size) + EPS * k * gap.c.abs() + TINY)
-            tighter, _ = upper_bound(here + scaled)
-            bound = bound.index_put((index,), torch.fmin(bound[index], tighter))
+            scale = gap.r + EPS * size
+            for each in _multipliers(vdot.g[:n, index], g[:n], gap.c):
+                left = torch.nonzero(~(bound[index] < 0) & (each > 0))[:, 0]
+                k, still = each[left], index[left]
+                c = k * gap.c[left]
+                added = Taylor(c, k * g[:, left], k * Q[:, :, left], k * scale[left] + EPS * c.abs() + TINY)
+                here = Taylor(vdot.c[still], vdot.g[:, still], vdot.Q[:, :, still], vdot.r[still])
+                tighter, _ = upper_bound(here + added)
+                bound = bound.index_put((still,), torch.fmin(bound[still], tighter))
         return bound
 
 
-def _multiplier(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
-    """The k >= 0 that minimises `c k + sum_i |a_i + k b_i|` (B,); it is 0 or lies where a term vanishes."""
+def _multipliers(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
+    """The k at which a term of `c k + sum_i |a_i + k b_i|` vanishes, or 0 where it is negative: (n, B), best first."""
     k = torch.nan_to_num(torch.where(b != 0, -a / b, 0.0), 0.0, 0.0, 0.0).clamp(min=0.0)
     value = c * k + (a[:, None] + k * b[:, None]).abs().sum(0)
-    return k.gather(0, value.argmin(0, keepdim=True))[0]
+    return k.gather(0, value.argsort(dim=0, stable=True))
