@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -15,13 +16,14 @@ from certify.verdict import Stop
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    """What a proof may use: seconds on the wall from the engine's start, boxes, boxes at once, and the width of the
-    smallest box relative to the root box."""
+    """What a proof may use: seconds on the wall, of which `check` are left for each leaf's check; boxes, boxes at once, and
+    the width of the smallest box relative to the root box."""
 
     seconds: float = 600.0
     boxes: int = 4_000_000
     batch: int = 2048
     least_width: float = 2.0**-24
+    check: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,8 +79,50 @@ class Proof:
 Report = Callable[[Progress], None]
 
 
-class Engine(Protocol):
+class Attempt(Protocol):
+    """A proof in the making: it can be asked at any time for what it has, and go on."""
+
+    @property
+    def done(self) -> bool:
+        """Whether more time would gain nothing."""
+
+    def advance(self, budget: Budget, report: Report | None = None) -> None:
+        """Work for as long as the budget allows."""
+
+    def proof(self) -> Proof:
+        """The best claim of the task's kind so far."""
+
+
+class Engine(ABC):
     """A way to prove claims."""
+
+    @abstractmethod
+    def begin(self, task: Task) -> Attempt:
+        """An attempt at the task that has not been worked on."""
 
     def prove(self, task: Task, budget: Budget, report: Report | None = None) -> Proof:
         """The best claim of the task's kind that the budget allows."""
+        attempt = self.begin(task)
+        attempt.advance(budget, report)
+        return attempt.proof()
+
+
+@dataclass
+class Once:
+    """An attempt that cannot be interrupted: all its work is done the first time that it is given any."""
+
+    prove: Callable[[Budget, Report | None], Proof]
+    found: Proof | None = None
+
+    @property
+    def done(self) -> bool:
+        """Whether it has been worked on."""
+        return self.found is not None
+
+    def advance(self, budget: Budget, report: Report | None = None) -> None:
+        """Work once."""
+        self.found = self.found or self.prove(budget, report)
+
+    def proof(self) -> Proof:
+        """What was found."""
+        return self.found or Proof(None, None, Stop.TIME)

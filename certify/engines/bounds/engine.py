@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from certify.certificate import PartitionTree
 from certify.claims import Asymptotic, Practical
-from certify.engines.base import Budget, Proof, Report, Task
-from certify.engines.bounds.search import RingProof, prove_inwards, prove_outwards
+from certify.engines.base import Attempt, Budget, Engine, Once, Proof, Report, Task
+from certify.engines.bounds.search import Pass, RingProof, empty_ring, outwards, prove_inwards, prove_outwards
 from certify.engines.falsify import Band, survey
 from certify.engines.local import prove_local
 from certify.running import Runner
@@ -23,27 +23,17 @@ _SHARE = 0.4  # of the time, for finding c2 before c0
 _TRIES = 4  # inner levels from which c2 is looked for
 
 
-class BoundsEngine:
+class BoundsEngine(Engine):
     """Branch and bound in the coordinates `x = T z`, T (n, n), on a runner."""
 
     def __init__(self, T: Array, runner: Runner) -> None:
         self.T, self.runner = T, runner
 
-    def prove(self, task: Task, budget: Budget, report: Report | None = None) -> Proof:
-        """The largest c2 up to the task's target; with claim `practical`, the smallest c0 for it."""
-        prove = self._asymptotic if task.kind == "asymptotic" else self._practical
-        return prove(task, budget, report)
-
-    def _asymptotic(self, task: Task, budget: Budget, report: Report | None) -> Proof:
-        start = time.perf_counter()
-        inner = prove_local(task.problem, self.T, task.target)
-        local = time.perf_counter() - start
-        if inner is None:
-            why = "the linearisation does not dominate on any ball; try another --Q"
-            return Proof(None, None, Stop.LOCAL, why, seconds={"local": local})
-        ring = prove_outwards(task.problem, self.T, inner, task.target, budget, self.runner, report)
-        seconds = {"local": local, "ring": time.perf_counter() - start - local}
-        return self._proof(ring, Asymptotic(roa=ring.outer, local=inner), seconds)
+    def begin(self, task: Task) -> Attempt:
+        """An attempt at the largest c2 up to the task's target; with claim `practical`, at the smallest c0 for it."""
+        if task.kind == "asymptotic":
+            return _Outwards(self, task)
+        return Once(lambda budget, report: self._practical(task, budget, report))
 
     def _practical(self, task: Task, budget: Budget, report: Report | None) -> Proof:
         """The bands of a survey in turn, the highest first, until one holds a proof."""
@@ -75,7 +65,7 @@ class BoundsEngine:
         if not ring.covered:
             why = f"F and its inputs are not enclosed on all of V <= {ring.inner:.6g}"
             return Proof(None, None, Stop.SMOOTH, why, boxes=ring.boxes)
-        return replace(self._proof(ring, Practical(roa=ring.outer, floor=ring.inner), {}), stop=stop)
+        return replace(self.stated(ring, Practical(roa=ring.outer, floor=ring.inner), {}), stop=stop)
 
     def _outer_level(self, task: Task, band: Band, budget: Budget, report: Report | None) -> tuple[float, Stop]:
         """The largest c2 that a ring from somewhat above the floor reaches, and what stopped it."""
@@ -88,7 +78,8 @@ class BoundsEngine:
             inner = math.sqrt(inner * band.top)
         return ring.outer, ring.stop
 
-    def _proof(self, ring: RingProof, claim: Asymptotic | Practical, seconds: dict[str, float]) -> Proof:
+    def stated(self, ring: RingProof, claim: Asymptotic | Practical, seconds: dict[str, float]) -> Proof:
+        """The proof of a claim from a ring's."""
         return Proof(
             claim,
             PartitionTree(self.T, ring.root, ring.tree),
@@ -98,3 +89,37 @@ class BoundsEngine:
             leaves=ring.leaves,
             seconds=seconds,
         )
+
+
+class _Outwards:
+    """The local proof, and a ring that grows from it."""
+
+    def __init__(self, engine: BoundsEngine, task: Task) -> None:
+        start = time.perf_counter()
+        self.engine, self.task = engine, task
+        self.inner = prove_local(task.problem, engine.T, task.target)
+        self.seconds = {"local": time.perf_counter() - start, "ring": 0.0}
+        self.ring: Pass | None = None
+        self.stop: Stop | None = None
+        if self.inner is not None and self.inner < task.target:
+            self.ring = outwards(task.problem, engine.T, self.inner, task.target, engine.runner)
+
+    @property
+    def done(self) -> bool:
+        return self.ring is None or self.ring.done
+
+    def advance(self, budget: Budget, report: Report | None = None) -> None:
+        start = time.perf_counter()
+        if self.ring is not None:
+            self.stop = self.ring.advance(budget, report)
+        self.seconds["ring"] += time.perf_counter() - start
+
+    def proof(self) -> Proof:
+        if self.inner is None:
+            why = "the linearisation does not dominate on any ball; try another --Q"
+            return Proof(None, None, Stop.LOCAL, why, seconds=self.seconds)
+        if self.ring is None:
+            ring = empty_ring(self.task.problem, self.engine.T, self.inner)
+        else:
+            ring = self.ring.proof(self.stop)
+        return self.engine.stated(ring, Asymptotic(roa=ring.outer, local=self.inner), dict(self.seconds))

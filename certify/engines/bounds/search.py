@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import time
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -77,11 +77,23 @@ def prove_outwards(
     -----
     Deterministic for a machine and a number of threads, unless `budget.seconds` stops the pass.
     """
-    root = _root(problem, T, target)
-    if inner >= target:  # the ring is empty
-        return RingProof(target, target, Stop.REQUESTED, bytes([LEAF]), root, 0, 1, None)
+    if inner >= target:
+        return empty_ring(problem, T, target)
+    ring = outwards(problem, T, inner, target, runner, rule)
+    return ring.proof(ring.advance(budget, report))
+
+
+def outwards(
+    problem: Problem, T: Array, inner: float, target: float, runner: Runner, rule: VdotBound | None = None
+) -> Pass:
+    """The pass of `prove_outwards` before its first box."""
     sweep = _Outwards(problem, T, inner, target)
-    return _run(sweep, root, budget, runner, report, rule or VdotBound(problem, T, runner.device))
+    return Pass(sweep, _root(problem, T, target), runner, rule or VdotBound(problem, T, runner.device))
+
+
+def empty_ring(problem: Problem, T: Array, level: float) -> RingProof:
+    """The ring from a level to itself, of which nothing has to be proved."""
+    return RingProof(level, level, Stop.REQUESTED, bytes([LEAF]), _root(problem, T, level), 0, 1, None)
 
 
 def prove_inwards(
@@ -98,9 +110,13 @@ def prove_inwards(
     Parameters are those of `prove_outwards`. On {V < level} every leaf of the tree has a finite enclosure of F
     and inputs in their bounds; if the budget ends before, the proof is not `covered`.
     """
-    sweep = _Inwards(problem, T, floor, outer)
     rule = VdotBound(problem, T, runner.device, inside=True)
-    return _run(sweep, _root(problem, T, outer), budget, runner, report, rule)
+    ring = Pass(_Inwards(problem, T, floor, outer), _root(problem, T, outer), runner, rule)
+    stop = ring.advance(budget, report)
+    if stop is not None:
+        ring.settle()
+        ring.advance(budget, report)
+    return ring.proof(stop)
 
 
 def _root(problem: Problem, T: Array, level: float) -> Array:
@@ -112,15 +128,12 @@ def _root(problem: Problem, T: Array, level: float) -> Array:
 class _Sweep(ABC):
     """The moving level of a pass: `inner` or `outer` gives way to what cannot be proved.
 
-    `looks_again` says that boxes proved with earlier levels are bounded once more with the last ones.
+    Boxes proved before it moved stay proved: the ring only shrinks, and the rule's multipliers do not depend on it.
     """
-
-    looks_again = False
 
     def __init__(self, problem: Problem, T: Array, inner: float, outer: float) -> None:
         self.problem, self.T = problem, T
         self.inner, self.outer = inner, outer
-        self.bounded_with = (inner, outer)  # with which all boxes that are not open are proved
         self.witness: Witness | None = None
 
     @abstractmethod
@@ -148,8 +161,8 @@ class _Sweep(ABC):
         """Move the level off boxes that are too small to halve; True if it moved."""
 
     @abstractmethod
-    def settle(self, least: float) -> bool:
-        """Take what is proved when the budget ends, `least` the smallest open key; True if open boxes still matter."""
+    def reached(self, least: float) -> tuple[float, float]:
+        """(inner, outer) between which all is proved, `least` being the smallest open key; maybe nothing is."""
 
     @abstractmethod
     def stand(self, least: float) -> tuple[float, float, float]:
@@ -193,9 +206,8 @@ class _Outwards(_Sweep):
         self.outer = bottom * (1 - _SLACK)
         return True
 
-    def settle(self, least: float) -> bool:
-        self.outer = least * (1 - 2 * _SLACK)
-        return False
+    def reached(self, least: float) -> tuple[float, float]:
+        return self.inner, min(self.outer, least * (1 - 2 * _SLACK))
 
     def stand(self, least: float) -> tuple[float, float, float]:
         level = max(self.inner, min(least, self.outer))
@@ -203,8 +215,6 @@ class _Outwards(_Sweep):
 
 
 class _Inwards(_Sweep):
-    looks_again = True
-
     def key(self, lowest: Tensor, highest: Tensor) -> Tensor:
         return -highest
 
@@ -231,83 +241,87 @@ class _Inwards(_Sweep):
         self.inner = top * (1 + 2 * _SLACK)
         return True
 
-    def settle(self, least: float) -> bool:
-        self.inner = max(self.inner, -least * (1 + 2 * _SLACK))
-        return True
+    def reached(self, least: float) -> tuple[float, float]:
+        return max(self.inner, -least * (1 + 2 * _SLACK)), self.outer
 
     def stand(self, least: float) -> tuple[float, float, float]:
         level = max(self.inner, min(-least, self.outer))
         return level, self.inner, self.share(level, self.outer)
 
 
-def _run(
-    sweep: _Sweep, root: Array, budget: Budget, runner: Runner, report: Report | None, rule: VdotBound
-) -> RingProof:
-    """The pass: take boxes, bound them, give way to violations, halve what is undecided."""
-    start = time.monotonic()
-    device = runner.device
-    partition = Partition(root)
-    frontier = Frontier(partition, device)
-    half = torch.tensor(root, device=device)[:, None]
-    first = torch.zeros(1, dtype=torch.int64, device=device)
-    frontier.add(-half, half, sweep.key(*rule.levels(-half, half)), first)
-    clock = _Clock()
-    boxes, most, seconds = 0, budget.boxes, budget.seconds
-    stop, covered, settled = Stop.REQUESTED, True, False
-    with runner.start(rule) as bound:
-        while len(frontier) or _reopen(sweep, partition, frontier, rule, bound, budget.batch):
-            full = boxes >= most or partition.splits + 3 * budget.batch > _MOST_SPLITS
-            if full or time.monotonic() - start > seconds:
-                stop = Stop.BOXES if full else Stop.TIME
-                if settled or not sweep.settle(frontier.least()):
-                    covered = not settled
-                    break
-                settled, most, seconds = True, 2 * most, 2 * seconds  # what is open lies inside and needs one look each
-                continue
-            lo, hi, number = frontier.take(min(budget.batch, most - boxes), sweep.reach(frontier.least()))
-            boxes += lo.shape[1]
-            found = bound(lo, hi, sweep.inner, sweep.outer)
-            centres = 0.5 * lo + 0.5 * hi
-            if sweep.violated(centres, torch.where(found.violated, rule.levels_at(centres), math.inf)):
-                stop = Stop.WITNESS
-            halves_lo, halves_hi, halves, small = _split(partition, lo, hi, number, found, budget.least_width * half)
-            if bool(small.any()):
-                covered = covered and bool(found.smooth[small].all())
-                if sweep.stuck(*rule.levels(lo[:, small], hi[:, small])):
-                    stop = Stop.BOXES
-            lowest, highest = rule.levels(halves_lo, halves_hi)
-            keep = sweep.wanted(lowest, highest)
-            frontier.add(halves_lo[:, keep], halves_hi[:, keep], sweep.key(lowest, highest)[keep], halves[keep])
-            frontier.drop_above(sweep.last())
-            if report is not None:
-                report(clock.read(*sweep.stand(frontier.least()), boxes, len(frontier)))
-    del frontier
-    if sweep.outer <= sweep.inner:  # nothing beyond the inner level
-        return RingProof(sweep.inner, sweep.inner, stop, bytes([LEAF]), root, boxes, 1, sweep.witness, covered)
-    tree = partition.preorder()
-    leaves = tree.count(bytes([LEAF]))
-    return RingProof(sweep.inner, sweep.outer, stop, tree, root, boxes, leaves, sweep.witness, covered)
+class Pass:
+    """A pass that can be asked at any time for what it has proved, and go on."""
 
+    def __init__(self, sweep: _Sweep, root: Array, runner: Runner, rule: VdotBound) -> None:
+        self.sweep, self.root, self.runner, self.rule = sweep, root, runner, rule
+        self.partition = Partition(root)
+        self.frontier = Frontier(self.partition, runner.device)
+        self.half = torch.tensor(root, device=runner.device)[:, None]
+        self.boxes = 0
+        self.covered = True
+        self._stop = Stop.REQUESTED
+        self._clock = _Clock()
+        first = torch.zeros(1, dtype=torch.int64, device=runner.device)
+        self.frontier.add(-self.half, self.half, sweep.key(*rule.levels(-self.half, self.half)), first)
 
-def _reopen(sweep: _Sweep, partition: Partition, frontier: Frontier, rule: VdotBound, bound: Bound, batch: int) -> bool:
-    """Open the boxes again that were proved with earlier levels and are not with those of now; True if there are any.
+    @property
+    def done(self) -> bool:
+        """Whether no box is open: the pass has nothing left to gain."""
+        return not len(self.frontier)
 
-    A box that meets the inner level may be proved with a multiplier of V less that level only; when the level moves,
-    another multiplier is best, and its bound may be the weaker one.
-    """
-    now = (sweep.inner, sweep.outer)
-    if not sweep.looks_again or sweep.bounded_with == now or not sweep.inner < sweep.outer:
-        return False
-    sweep.bounded_with = now
-    numbers = partition.leaves()
-    for part in np.array_split(numbers, range(batch, len(numbers), batch)):
-        lo, hi = (torch.tensor(a, device=rule.T.device) for a in partition.corners(part))
-        lowest, highest = rule.levels(lo, hi)
-        open_ = sweep.wanted(lowest, highest)
-        open_[open_.clone()] = ~bound(lo[:, open_], hi[:, open_], *now).proved
-        number = torch.tensor(part, device=lo.device)
-        frontier.add(lo[:, open_], hi[:, open_], sweep.key(lowest, highest)[open_], number[open_])
-    return len(frontier) > 0
+    @property
+    def leaves(self) -> int:
+        """Leaves of the tree, the open ones included."""
+        return self.partition.splits + 1
+
+    def advance(self, budget: Budget, report: Report | None = None) -> Stop | None:
+        """Take boxes, bound them, give way to violations, halve what is undecided; what ran out, or None if done."""
+        most = self.boxes + budget.boxes
+        with self._clock, self.runner.start(self.rule) as bound:
+            while not self.done:
+                if self.boxes >= most or self.partition.splits + 3 * budget.batch > _MOST_SPLITS:
+                    return Stop.BOXES
+                if self._clock.spent + self.leaves * budget.check > budget.seconds:
+                    return Stop.TIME
+                self._step(bound, min(budget.batch, most - self.boxes), budget.least_width)
+                if report is not None:
+                    stand = self.sweep.stand(self.frontier.least())
+                    report(self._clock.read(*stand, self.boxes, len(self.frontier)))
+        return None
+
+    def _step(self, bound: Bound, count: int, least_width: float) -> None:
+        sweep, rule = self.sweep, self.rule
+        lo, hi, number = self.frontier.take(count, sweep.reach(self.frontier.least()))
+        self.boxes += lo.shape[1]
+        found = bound(lo, hi, sweep.inner, sweep.outer)
+        centres = 0.5 * lo + 0.5 * hi
+        if sweep.violated(centres, torch.where(found.violated, rule.levels_at(centres), math.inf)):
+            self._stop = Stop.WITNESS
+        halves_lo, halves_hi, halves, small = _split(self.partition, lo, hi, number, found, least_width * self.half)
+        if bool(small.any()):
+            self.covered = self.covered and bool(found.smooth[small].all())
+            if sweep.stuck(*rule.levels(lo[:, small], hi[:, small])):
+                self._stop = Stop.BOXES
+        lowest, highest = rule.levels(halves_lo, halves_hi)
+        keep = sweep.wanted(lowest, highest)
+        self.frontier.add(halves_lo[:, keep], halves_hi[:, keep], sweep.key(lowest, highest)[keep], halves[keep])
+        self.frontier.drop_above(sweep.last())
+
+    def settle(self) -> None:
+        """Take the levels that are proved for good: what is open lies outside of them, and needs at most one look."""
+        self.sweep.inner, self.sweep.outer = self.sweep.reached(self.frontier.least())
+
+    def proof(self, stop: Stop | None = None) -> RingProof:
+        """What is proved, `stop` being what ran out."""
+        stop = stop or self._stop
+        inner, outer = self.sweep.reached(self.frontier.least())
+        witness, covered = self.sweep.witness, self.covered and self.done
+        if outer <= inner:  # nothing beyond the inner level
+            empty = empty_ring(self.sweep.problem, self.sweep.T, inner)
+            return replace(empty, stop=stop, boxes=self.boxes, witness=witness, covered=covered)
+        tree = self.partition.preorder()
+        leaves = tree.count(bytes([LEAF]))
+        return RingProof(inner, outer, stop, tree, self.root, self.boxes, leaves, witness, covered)
 
 
 def _split(
@@ -360,14 +374,26 @@ def _halve(partition: Partition, lo: Tensor, hi: Tensor, number: Tensor, axis: T
 
 
 class _Clock:
-    """Extrapolates how long a pass still takes: seconds grow about as a power of the volume that is done."""
+    """The seconds of a pass while it runs, and an extrapolation of how many are left: they grow about as a power of the
+    volume that is done."""
 
     def __init__(self) -> None:
-        self.start = time.monotonic()
+        self.before = self.start = 0.0
         self.history: list[tuple[float, float]] = []
 
+    def __enter__(self) -> None:
+        self.start = time.monotonic()
+
+    def __exit__(self, *_: object) -> None:
+        self.before += self.spent
+
+    @property
+    def spent(self) -> float:
+        """Seconds since the pass was last set going."""
+        return time.monotonic() - self.start
+
     def read(self, level: float, target: float, share: float, boxes: int, open_: int) -> Progress:
-        seconds = time.monotonic() - self.start
+        seconds = self.before + self.spent
         self.history.append((seconds, share))
         earlier = next((s for t, s in reversed(self.history) if t <= seconds / 2), share)
         left = None

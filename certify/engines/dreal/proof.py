@@ -21,7 +21,7 @@ from certify.certificate import TrustedSolver
 from certify.claims import Asymptotic, Claim, Condition, OfState, Problem, Vdot, conditions
 from certify.claims.conditions import domain_conditions, input_conditions, local_condition, ring_condition
 from certify.claims.queries import query
-from certify.engines.base import Budget, Proof, Report, Task
+from certify.engines.base import Attempt, Budget, Engine, Once, Proof, Task
 from certify.engines.dreal.backend import Answer, Backend, decide, find_backend
 from certify.engines.falsify import Witness, confirm
 from certify.engines.local import prove_local
@@ -54,14 +54,14 @@ class Asked:
     answer: Answer
 
 
-class DrealEngine:
+class DrealEngine(Engine):
     """The claim `asymptotic` by queries; T (n, n) gives the coordinates in which the first local level is guessed."""
 
     def __init__(self, T: Array, precision: float, jobs: int) -> None:
         self.T, self.precision, self.jobs = T, precision, jobs
 
-    def prove(self, task: Task, budget: Budget, report: Report | None = None) -> Proof:
-        """A local level near the largest, and the largest level up to the target with every query unsatisfiable.
+    def begin(self, task: Task) -> Attempt:
+        """An attempt at a local level near the largest, and the largest one up to the target, by queries.
 
         Raises
         ------
@@ -69,6 +69,9 @@ class DrealEngine:
         """
         if task.kind != "asymptotic":
             raise InputError(f"engine dreal proves the claim asymptotic only, not {task.kind}. Use engine bounds.")
+        return Once(lambda budget, _: self._ask(task, budget))
+
+    def _ask(self, task: Task, budget: Budget) -> Proof:
         start = time.perf_counter()
         try:
             backend = find_backend()
