@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from certify.claims.claim import Kind
 from certify.errors import InputError
-from certify.lyapunov import Candidate
+from certify.lyapunov import Candidate, Named
 
 Array = NDArray[np.float64]
 EngineName = Literal["bounds", "dreal", "both"]
@@ -24,19 +24,20 @@ class RoaOptions:
     Parameters
     ----------
     claim : `asymptotic`, or `practical`, which asks for no equilibrium at the origin.
-    candidate : where P comes from, see `choose_candidate`.
+    candidate : where P comes from, see `choose_candidate`; `auto` tries several and keeps the one with which the
+        largest volume is proved. With Q, R or a level it is `lyapunov`, or `lqr` if R is given.
     Q, R : diagonals of the weights, shapes (n,) and (m,); None means ones.
     P : a Lyapunov matrix of one's own, (n, n); overrides the candidate.
     level : prove exactly this level; None finds the largest.
     engine : `bounds`, `dreal` (its word is trusted, not checked), or `both`: bounds prove, dReal is asked as well.
     dreal_precision, jobs : dReal's delta and threads.
     device : where boxes are bounded, `cpu` or `cuda`.
-    time_limit : seconds for the ring, the falsifier included.
+    time_limit : seconds for everything up to the verdict, the check included.
     max_boxes : boxes for the ring.
     """
 
     claim: Kind = "asymptotic"
-    candidate: Candidate = "lyapunov"
+    candidate: Candidate = "auto"
     Q: tuple[float, ...] | None = None
     R: tuple[float, ...] | None = None
     P: Array | None = None
@@ -45,8 +46,15 @@ class RoaOptions:
     dreal_precision: float = 1e-3
     jobs: int = 1
     device: str = "cpu"
-    time_limit: float = 600.0
+    time_limit: float = 50.0
     max_boxes: int = 4_000_000
+
+    @property
+    def only(self) -> Named | None:
+        """The one candidate that is asked for, if P is not given; None if several are tried."""
+        if self.candidate != "auto":
+            return self.candidate
+        return "lqr" if self.R is not None else "lyapunov" if self.Q is not None or self.level is not None else None
 
     def __post_init__(self) -> None:
         for name, known in (("claim", Kind), ("candidate", Candidate), ("engine", EngineName)):

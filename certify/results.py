@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -43,12 +43,28 @@ class Levels:
 
 
 @dataclass(frozen=True, slots=True)
+class Tried:
+    """A candidate that was tried.
+
+    `level` and `volume` are the most within its reach, sampled, ended by `limited_by`; `proved` says that the result is
+    about this one, `proved_volume` what the search had proved with it, None if nothing.
+    """
+
+    candidate: str
+    level: float
+    limited_by: str
+    volume: float
+    proved: bool
+    proved_volume: float | None
+
+
+@dataclass(frozen=True, slots=True)
 class RoaResult:
     """What was proved. `stop` and `detail` say what limits the level, or why nothing was proved.
 
-    `candidate` is where P came from, `notice` why that is not what was asked for. `checker` is what the checker said,
-    None if it was not reached, about `raw`, the certificate's bytes; `solver` has dReal's version and every query with
-    its answer, None if it was not asked.
+    `candidate` is where P came from, `tried` all that were tried, `notice` what is not as it was asked for. `checker`
+    is what the checker said, None if it was not reached, about `raw`, the certificate's bytes; `solver` has dReal's
+    version and every query with its answer, None if it was not asked.
     """
 
     verdict: Verdict
@@ -59,6 +75,7 @@ class RoaResult:
     detail: str = ""
     problem: Problem | None = None
     candidate: str | None = None
+    tried: tuple[Tried, ...] = ()
     notice: str | None = None
     levels: Levels = field(default_factory=Levels)
     witness: Witness | None = None
@@ -115,6 +132,7 @@ class RoaResult:
         return {
             **stated,
             **geometry,
+            "candidates": [asdict(one) for one in self.tried],
             "engine": self.engine,
             "solver": None if self.solver is None else dict(self.solver),
             "boxes": self.boxes,

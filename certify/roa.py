@@ -1,12 +1,15 @@
-"""`certify_roa`: choose a candidate, falsify, prove, have it checked. One pipeline for every claim and engine.
+"""`certify_roa`: choose candidates, falsify, prove, have it checked. One pipeline for every claim and engine.
 
 Nothing is PROVED before the checker, run as a process of its own, has accepted the very bytes that were written.
+Whatever the checker refuses, the run ends with what it accepts: a refused leaf is split again, or the level lowered.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
+import math
+import re
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -15,12 +18,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from certify.certificate import (
     Certificate,
+    PartitionTree,
     TrustedSolver,
-    require_short,
     require_within_limits,
     run_checker,
     sole_writer,
@@ -28,34 +30,38 @@ from certify.certificate import (
 )
 from certify.claims import Asymptotic, Claim, Problem
 from certify.closed_loop import ClosedLoop
-from certify.engines.base import Budget, Engine, Progress, Proof, Task
-from certify.engines.falsify import Witness, falsify, refutes
-from certify.errors import BackendError, InputError, SoundnessError
-from certify.lyapunov import (
-    choose_candidate,
-    diagonalising_coordinates,
-    domain_limit,
-    is_positive_definite,
-    leaves_domain,
-)
-from certify.lyapunov.function import Quadratic
+from certify.engines.base import Attempt, Budget, Progress, Task
+from certify.engines.falsify import Witness, refutes
+from certify.errors import BackendError, SoundnessError
+from certify.lyapunov import leaves_domain
 from certify.options import RoaOptions
 from certify.policies import TanhNetwork
-from certify.results import Levels, RoaResult
+from certify.race import Contender, Race
+from certify.results import Levels, RoaResult, Tried
 from certify.rigorous import eigenvalues
 from certify.systems import System
+from certify.trials import Trial, blends, by_reach, corrected, named, optimised, solved
 from certify.verdict import Stop, Verdict
 
 if TYPE_CHECKING:
     from certify.engines.dreal.proof import DrealOptions
 
-Array = NDArray[np.float64]
 __all__ = ["RoaOptions", "RoaResult", "certify_roa"]
-Report = Callable[[Literal["ring", "check"], Progress | None], None]
+Stage = Literal["candidate", "ring", "check"]
+Report = Callable[[Stage, Progress | None], None]
 _SMALL_NETWORK = 10_000  # weights
-_BELOW = 1e-9  # relative distance from a limit that is itself out of reach (the domain's open condition)
-_BELOW_WITNESS = 1e-3
-_SMALLEST = 1e-120  # of levels: squares of states and products of bounds must not underflow
+# Shares of the time limit:
+_HEAT = 0.04  # a candidate's first heat
+_PATIENCE = 0.1  # for a ring that gains nothing
+_SEARCH = 0.6  # for a search that cannot be interrupted, the rest being its check's
+_KEPT = 0.03  # for what comes after the search: writing, the checker's start
+_HOPE = 0.05  # share of boxes that must be proved to go on with a ring that gains nothing
+_CORRECTIONS = 6  # of an optimised candidate by the violations that its proof comes upon
+_MISLED = 0.9  # of its reach: a violation below it is one that the samples missed
+_SAMPLE = 2000  # leaves whose check is timed
+_START = 0.2  # seconds that a checker takes to start
+_CAUTION = 1.2  # on the time that a check is expected to take
+_SPLITS, _LOWERINGS = 3, 9  # of what the checker refuses
 
 
 def certify_roa(
@@ -77,7 +83,8 @@ def certify_roa(
     options : see `RoaOptions`.
     load_seconds : time already spent on reading, for the report.
     provenance : entries for the certificate that the checker ignores.
-    progress : called with ("ring", where the pass stands) after every batch, and with ("check", None).
+    progress : called with ("candidate", None), with ("ring", where the pass stands) after every batch, and with
+        ("check", None).
 
     Returns
     -------
@@ -87,7 +94,7 @@ def certify_roa(
     ------
     InputError : the closed loop or an option cannot be used, or `out` cannot be written or is another run's.
     BackendError : the checker process failed.
-    SoundnessError : the checker rejects what the engine proved.
+    SoundnessError : the checker rejects what the engine proved, and no smaller set mends it.
     """
     with _threads_for(network), sole_writer(out):
         return _Run(system, network, out, options or RoaOptions(), load_seconds, provenance or {}, progress).result()
@@ -119,12 +126,20 @@ class _Run:
     provenance: Mapping[str, Any]
     progress: Report | None
     seconds: dict[str, float] = field(default_factory=dict)
+    start: float = field(default_factory=time.perf_counter)
 
     def result(self) -> RoaResult:
-        start = time.perf_counter()
         result = self._decide()
-        total = self.load + time.perf_counter() - start
-        return replace(result, seconds={"load": self.load, **self.seconds, "total": total})
+        return replace(result, seconds={"load": self.load, **self.seconds, "total": self.spent})
+
+    @property
+    def spent(self) -> float:
+        """Seconds since the run began, reading included."""
+        return self.load + time.perf_counter() - self.start
+
+    def left(self) -> float:
+        """Seconds that the search may still take."""
+        return (1 - _KEPT) * self.options.time_limit - self.spent
 
     def _decide(self) -> RoaResult:
         """Choose, falsify, prove, check."""
@@ -133,119 +148,247 @@ class _Run:
         result = RoaResult(
             Verdict.UNKNOWN, Stop.REQUESTED, self.system, self.network, options.claim, engine=options.engine
         )
-        with self._stage("candidate"):
-            if options.claim == "asymptotic":
+        if options.claim == "asymptotic":
+            with self._stage("candidate"):
                 loop.require_rest()
                 unstable = _unstable(loop)
-                if unstable is not None:
-                    verdict, stop, shown = unstable
-                    detail = f"eigenvalues {', '.join(shown)}" + (" touch the axis" if stop is Stop.SPECTRUM else "")
-                    return replace(result, verdict=verdict, stop=stop, detail=detail, eigenvalues=shown)
-            V, name, notice = _candidate(loop, options)
-            require_short(V.P)
-            problem = Problem(loop, V)
-            T = diagonalising_coordinates(V.P, loop.linearise()[0])
-            limit = domain_limit(V.P, self.system.domain)
-        result = replace(result, problem=problem, candidate=name, notice=notice, levels=Levels(domain_limit=limit))
-        if options.level is not None and leaves_domain(V.P, options.level, self.system.domain):
-            detail = f"{{V <= {options.level:g}}} leaves the domain, whose limit is {limit:.12g}"
-            return replace(result, verdict=Verdict.REFUTED, stop=Stop.DOMAIN, detail=detail)
+            if unstable is not None:
+                verdict, stop, shown = unstable
+                detail = f"eigenvalues {', '.join(shown)}" + (" touch the axis" if stop is Stop.SPECTRUM else "")
+                return replace(result, verdict=verdict, stop=stop, detail=detail, eigenvalues=shown)
+        if options.P is None and options.only is None:
+            race = self._race(loop)
+        else:
+            with self._stage("candidate"):
+                one = named(loop, options)
+            refuted = _refuted_at_once(result, one)
+            if refuted is not None:
+                return refuted
+            race = self._contest()
+            race.enter([one], self._heat())
+        self._finish(race)
+        return self._conclude(result, race)
 
-        if not _SMALLEST < (options.level or limit) < 1 / _SMALLEST:
-            raise InputError(
-                f"levels of V must lie between {_SMALLEST:g} and {1 / _SMALLEST:g}; found {options.level or limit:g}. "
-                "Scale the states or P."
+    def _race(self, loop: ClosedLoop) -> Race:
+        """Every candidate for a little time, and more for the better ones."""
+        heat, options = self._heat(), self.options
+        self._tell("candidate")
+        with self._stage("candidate"):
+            trials = solved(loop, options)
+            large = optimised(loop, options) if self.interruptible else None
+            trials += [] if large is None else [large]
+        race = self._contest()
+        if not self.interruptible:
+            race.enter(by_reach(trials)[:1], heat)
+            return race
+        race.enter(trials, heat)
+        self._correct(race, loop, heat)
+        unproved = [c for c in race.open if c.trial.name == "optimised"]
+        others = [c for c in race.contenders if c.trial.name != "optimised" and c.proved]
+        if unproved and others:
+            with self._stage("candidate"):
+                best = max(others, key=lambda c: c.proved).trial
+                between = list(blends(loop, unproved[0].trial, best, options))
+            race.enter(between, heat)
+        race.knock_out(heat)
+        return race
+
+    def _correct(self, race: Race, loop: ClosedLoop, heat: float) -> None:
+        """An optimised candidate whose proof came upon a violation far below its reach is optimised again with it."""
+        witnesses: list[Witness] = []
+        for _ in range(_CORRECTIONS):
+            last = [c for c in race.contenders if c.trial.name == "optimised"][-1:]
+            found = last[0].attempt.proof().witness if last and last[0].attempt.done else None
+            if found is None or found.level > _MISLED * last[0].trial.task.target or self.left() < 0:
+                return
+            witnesses.append(found)
+            with self._stage("candidate"):
+                known = np.array([w.x for w in witnesses])
+                again = corrected(loop, last[0].trial, known, self.options, self.left())
+            if again is None:
+                return
+            race.enter([again], heat)
+
+    @property
+    def interruptible(self) -> bool:
+        """Whether attempts can be worked on a little at a time."""
+        return self.options.claim == "asymptotic" and self.options.engine != "dreal"
+
+    def _heat(self) -> float:
+        """Seconds of a candidate's first heat, which for some is the only one."""
+        if self.interruptible:
+            return _HEAT * self.options.time_limit
+        return (1.0 if self.options.engine == "dreal" else _SEARCH) * self.left()
+
+    def _contest(self) -> Race:
+        report = None if self.progress is None else self._report
+        return Race(self._begin, self.left, self.options.max_boxes, report)
+
+    def _report(self, state: Progress) -> None:
+        if self.progress is not None:
+            known = state.seconds_left
+            self.progress(
+                "ring", replace(state, seconds_left=self.left() if known is None else min(known, self.left()))
             )
-        task = Task(problem, options.claim, options.level or limit * (1 - _BELOW), options.level is not None)
-        if options.claim == "asymptotic":
-            with self._stage("ring"):
-                task = replace(task, witness=falsify(problem, T, task.target))
-            if task.witness is not None and not task.exactly:
-                task = replace(task, target=task.witness.level * (1 - _BELOW_WITNESS))
-        if task.exactly and _refuted(task, task.witness):
-            return _with_witness(result, task, task.witness)
-        budget = Budget(max(1e-3, options.time_limit - self.seconds.get("ring", 0.0)), options.max_boxes)
-        on_ring = None if self.progress is None else lambda state: self.progress("ring", state)  # type: ignore[misc]
-        proof = self._engine(T).prove(task, budget, on_ring)
-        for stage, spent in proof.seconds.items():
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + spent
-        return self._conclude(result, task, proof)
 
-    def _engine(self, T: Array) -> Engine:
+    def _tell(self, stage: Stage) -> None:
+        if self.progress is not None:
+            self.progress(stage, None)
+
+    def _begin(self, trial: Trial) -> Attempt:
         if self.options.engine == "dreal":
             from certify.engines.dreal.proof import DrealEngine
 
-            return DrealEngine(T, self.options.dreal_precision, self.options.jobs)
+            return DrealEngine(trial.T, self.options.dreal_precision, self.options.jobs).begin(trial.task)
         import torch
 
         from certify.engines.bounds.engine import BoundsEngine
         from certify.running import ThreadRunner
 
-        return BoundsEngine(T, ThreadRunner(torch.device(self.options.device)))
+        return BoundsEngine(trial.T, ThreadRunner(torch.device(self.options.device))).begin(trial.task)
 
-    def _conclude(self, result: RoaResult, task: Task, proof: Proof) -> RoaResult:
+    def _finish(self, race: Race) -> None:
+        """What is left of the time for the best contender, less what the check of its proof will take."""
+        if not race.open:
+            return
+        winner, report = race.open[0], race.report
+        boxes = self.options.max_boxes
+        while not (winner.attempt.gained or winner.attempt.done) and self.left() > 0:
+            winner.advance(Budget(self._within(_PATIENCE * self.options.time_limit), boxes), report)
+            if winner.attempt.hope < _HOPE:
+                break
+        if winner.attempt.done or not winner.attempt.gained or not self.interruptible:
+            return
+        each = self._seconds_of_a_leaf(winner)
+        winner.advance(Budget(self._within(math.inf), boxes, check=_CAUTION * each), report)
+
+    def _within(self, seconds: float) -> float:
+        return max(1e-3, min(seconds, self.left()))
+
+    def _seconds_of_a_leaf(self, contender: Contender) -> float:
+        """What the check of a leaf takes here and now, from a certificate with some of what is proved already.
+
+        The certificate is a good one, and stays if the run is interrupted.
+        """
+        proof, problem = contender.attempt.proof(), contender.trial.task.problem
+        if proof.claim is None or not isinstance(proof.evidence, PartitionTree):
+            return 0.0
+        from certify.engines.bounds.mend import leaves_that_meet, level_with_leaves
+
+        level = level_with_leaves(problem, proof.evidence, proof.claim, _SAMPLE)
+        claim = replace(proof.claim, roa=level)
+        count = leaves_that_meet(problem, proof.evidence, claim)
+        before = self.seconds.get("check", 0.0)
+        self._ask(Certificate(self.system, self.network, problem.V, claim, proof.evidence, self.provenance))
+        return max(0.0, self.seconds["check"] - before - _START) / max(1, count)
+
+    def _conclude(self, result: RoaResult, race: Race) -> RoaResult:
         """The verdict on what the engine says, the only place that gives one after the search."""
+        best = race.best
+        task, proof = best.trial.task, best.attempt.proof()
+        for stage in ("local", "ring"):
+            self.seconds[stage] = sum(c.attempt.proof().seconds.get(stage, 0.0) for c in race.contenders)
         witness = _lowest(task.witness, proof.witness)
+        result = replace(_about(result, best.trial), tried=tuple(_row(c, best) for c in race.contenders))
         result = replace(
             _with_levels(result, proof.partial, witness),
             stop=proof.stop,
             detail=proof.detail,
             witness=witness,
-            boxes=proof.boxes,
+            boxes=sum(c.attempt.proof().boxes for c in race.contenders),
             solver=proof.solver,
         )
+        if proof.stop is Stop.TIME and proof.claim is not None and not best.attempt.gained:
+            result = replace(
+                result, stop=Stop.STALLED, detail=f"{proof.boxes:,} boxes added nothing to the local level"
+            )
         claim = proof.claim
         if claim is None or (task.exactly and claim.roa < task.target):
             if task.exactly and _refuted(task, witness):
                 return _with_witness(result, task, witness)
-            if claim is None:
-                return result
-            if isinstance(claim, Asymptotic):
-                result = replace(result, levels=replace(result.levels, local=claim.local))
-            missed = f"proved only up to V <= {claim.roa:.12g}, not {task.target:g}"
-            return replace(result, detail=f"{proof.detail}; {missed}" if proof.detail else missed)
+            return result if claim is None else _missed(result, task, claim)
         certificate = Certificate(self.system, self.network, task.problem.V, claim, proof.evidence, self.provenance)  # type: ignore[arg-type]
-        path, data, answer = self._write_and_check(certificate)
+        certificate, path, data, answer, notice = self._accepted(certificate, task)
+        result = replace(result, notice=notice or result.notice)
+        if task.exactly and certificate.roa < task.target:
+            return _missed(replace(result, stop=Stop.REFUSED, detail=notice or ""), task, certificate.claim)
         trusted = isinstance(proof.evidence, TrustedSolver)
         if not trusted and self.options.engine == "both":
-            result = replace(result, solver=self._confirm(task.problem, claim))
+            result = replace(result, solver=self._confirm(task.problem, certificate.claim))
         return replace(
-            _with_levels(result, claim.levels, witness),
+            _with_levels(result, certificate.claim.levels, witness),
             verdict=Verdict.TRUSTED if trusted else Verdict.PROVED,
-            stop=_limit(proof.stop, task, witness),
+            stop=Stop.REFUSED if certificate.roa < claim.roa else _limit(result.stop, task, witness),
             leaves=proof.leaves,
             certificate=path,
             raw=data,
             checker=answer,
         )
 
-    def _write_and_check(self, certificate: Certificate) -> tuple[Path, bytes, dict[str, Any]]:
-        """The certificate's path, its bytes and the checker's answer, without which it does not get its name.
+    def _accepted(
+        self, certificate: Certificate, task: Task
+    ) -> tuple[Certificate, Path, bytes, dict[str, Any], str | None]:
+        """A certificate that the checker accepts: this one, or one with a refused leaf split again or a lower level.
+
+        Returns
+        -------
+        The certificate, its path and bytes, the checker's answer, and what was mended.
 
         Raises
         ------
-        SoundnessError : the checker says something else, or speaks of other bytes.
+        SoundnessError : the checker refuses what cannot be mended so.
+        """
+        splits = lowerings = 0
+        notice, first = None, certificate
+        while True:
+            path, data, answer = self._ask(certificate)
+            if answer["result"] == ("TRUSTED" if isinstance(certificate.evidence, TrustedSolver) else "ACCEPTED"):
+                return certificate, path, data, answer, notice
+            leaf = _leaf_of(answer)
+            evidence, problem = certificate.evidence, task.problem
+            if leaf is not None and isinstance(evidence, PartitionTree) and splits < _SPLITS and self.left() > 0:
+                from certify.engines.bounds.mend import split_again
+
+                splits += 1
+                certificate = replace(certificate, evidence=split_again(problem, evidence, certificate.claim, leaf))
+            elif (lower := _lowered(certificate, leaf, problem, lowerings)) is not None and lowerings < _LOWERINGS:
+                lowerings += 1
+                certificate = lower
+            else:
+                reproduces = write_beside(self.out / "certificate.json", first.to_json().encode(), ".unchecked.json")
+                raise SoundnessError(
+                    f"the checker rejects what the engine proved: {answer}. The certificate {reproduces} reproduces it."
+                )
+            notice = f"the checker refused {answer.get('at')} (rule {answer.get('rule')}): " + (
+                f"the level is {certificate.roa:.6g} in the place of {first.roa:.6g}"
+                if lowerings
+                else "split again, it is accepted"
+            )
+
+    def _ask(self, certificate: Certificate) -> tuple[Path, bytes, dict[str, Any]]:
+        """The certificate's path, its bytes and the checker's answer; it gets its name only if that is not a refusal.
+
+        Raises
+        ------
+        SoundnessError : the checker speaks of other bytes.
         """
         path = self.out / "certificate.json"
-        wanted = "TRUSTED" if isinstance(certificate.evidence, TrustedSolver) else "ACCEPTED"
         with self._stage("write"):
             data = certificate.to_json().encode()
             unchecked = write_beside(path, data, ".unchecked.json")
-        if self.progress is not None:
-            self.progress("check", None)
+        self._tell("check")
         try:
             with self._stage("check"):
                 answer = run_checker(unchecked)
-        except (KeyboardInterrupt, BackendError):
-            unchecked.unlink()
-            raise
-        if answer["result"] != wanted:
-            raise SoundnessError(
-                f"the checker rejects what the engine proved: {answer}. The certificate {unchecked} reproduces it."
-            )
-        if answer["certificate_sha256"] != hashlib.sha256(data).hexdigest():
-            raise SoundnessError(f"the checker's answer is about other bytes than those of {unchecked}: {answer}.")
-        unchecked.replace(path)
+            wanted = "TRUSTED" if isinstance(certificate.evidence, TrustedSolver) else "ACCEPTED"
+            if answer["result"] == wanted:
+                if answer["certificate_sha256"] != hashlib.sha256(data).hexdigest():
+                    raise SoundnessError(
+                        f"the checker's answer is about other bytes than those of {unchecked}: {answer}."
+                    )
+                unchecked.replace(path)
+        finally:
+            unchecked.unlink(missing_ok=True)
         return path, data, answer
 
     def _confirm(self, problem: Problem, claim: Claim) -> dict[str, Any]:
@@ -278,6 +421,67 @@ class _Run:
             yield
         finally:
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
+
+
+def _about(result: RoaResult, trial: Trial) -> RoaResult:
+    """The result with the candidate that it is about."""
+    levels = Levels(domain_limit=trial.limit)
+    return replace(result, problem=trial.task.problem, candidate=trial.name, notice=trial.notice, levels=levels)
+
+
+def _row(contender: Contender, best: Contender) -> Tried:
+    trial = contender.trial
+    return Tried(
+        trial.name, trial.task.target, trial.limited_by, trial.volume, contender is best, contender.proved or None
+    )
+
+
+def _refuted_at_once(result: RoaResult, trial: Trial) -> RoaResult | None:
+    """REFUTED where the level that was asked for leaves the domain or holds a witness."""
+    task, result = trial.task, _about(result, trial)
+    if not task.exactly:
+        return None
+    if leaves_domain(trial.P, task.target, result.system.domain):
+        detail = f"{{V <= {task.target:g}}} leaves the domain, whose limit is {trial.limit:.12g}"
+        return replace(result, verdict=Verdict.REFUTED, stop=Stop.DOMAIN, detail=detail)
+    return _with_witness(result, task, task.witness) if _refuted(task, task.witness) else None
+
+
+def _missed(result: RoaResult, task: Task, claim: Claim) -> RoaResult:
+    """UNKNOWN, because only a lower level than the one asked for is proved."""
+    if isinstance(claim, Asymptotic):
+        result = replace(result, levels=replace(result.levels, local=claim.local))
+    missed = f"proved only up to V <= {claim.roa:.12g}, not {task.target:g}"
+    return replace(result, detail=f"{result.detail}; {missed}" if result.detail else missed)
+
+
+def _leaf_of(answer: Mapping[str, Any]) -> int | None:
+    """The number of the leaf that the checker refuses; None if it refuses something else."""
+    found = re.fullmatch(r"leaf (\d+)", str(answer.get("at", "")))
+    return int(found[1]) if found and answer.get("rule") in ("ring", "inputs") else None
+
+
+def _lowered(certificate: Certificate, leaf: int | None, problem: Problem, tries: int) -> Certificate | None:
+    """The certificate with a lower level: below the refused leaf at first, then halfway to the inner level, then at it,
+    and then an inner level that is lower itself; None if there is nothing to lower."""
+    claim, evidence = certificate.claim, certificate.evidence
+    if not isinstance(evidence, PartitionTree):
+        return None
+    if leaf is None or claim.inner == claim.roa:
+        if not isinstance(claim, Asymptotic):
+            return None
+        return _local_only(certificate, claim.local / (2 if claim.inner == claim.roa else 1))
+    from certify.engines.bounds.mend import below_leaf
+
+    level = below_leaf(problem, evidence, leaf) if tries < 2 else math.sqrt(claim.inner * claim.roa)
+    if claim.inner < level < claim.roa and tries < 5:
+        return replace(certificate, claim=replace(claim, roa=level))
+    return _local_only(certificate, claim.local) if isinstance(claim, Asymptotic) else None
+
+
+def _local_only(certificate: Certificate, level: float) -> Certificate:
+    """A claim of the local set alone, of which no leaf is asked."""
+    return replace(certificate, claim=Asymptotic(roa=level, local=level))
 
 
 def _refuted(task: Task, witness: Witness | None) -> bool:
@@ -322,14 +526,3 @@ def _unstable(loop: ClosedLoop) -> tuple[Verdict, Stop, tuple[str, ...]] | None:
     if not all(v.real < 0 for v in enclosures):
         return Verdict.UNKNOWN, Stop.SPECTRUM, shown
     return None
-
-
-def _candidate(loop: ClosedLoop, options: RoaOptions) -> tuple[Quadratic, str, str | None]:
-    """V, where its P comes from, and a notice."""
-    if options.P is None:
-        chosen = choose_candidate(loop, options.candidate, options.Q, options.R)
-        return Quadratic(chosen.P), chosen.name, chosen.notice
-    n, V = loop.system.n, Quadratic(options.P)
-    if V.n != n or not is_positive_definite(V.P):
-        raise InputError(f"`P` must be a symmetric positive definite matrix of shape ({n}, {n}).")
-    return V, "given", None

@@ -43,6 +43,8 @@ class Stop(Enum):
     WITNESS = "witness"
     INPUTS = "inputs"
     TIME = "time"
+    STALLED = "nothing gained"
+    REFUSED = "refused by the checker"
     BOXES = "boxes"
     LOCAL = "local"
     FLOOR = "floor"

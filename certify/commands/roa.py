@@ -16,10 +16,7 @@ from certify.commands.terminal import ProgressLine, say, show, tell
 from certify.errors import BackendError, InputError
 
 if TYPE_CHECKING:
-    from certify.lyapunov import Candidate
     from certify.policies import Policy
-    from certify.results import RoaResult
-    from certify.roa import RoaOptions
     from certify.systems import System
 
 
@@ -37,10 +34,12 @@ def roa(
         str,
         typer.Option(help="asymptotic (converges to the origin) or practical (enters a small set and stays there)."),
     ] = "asymptotic",
-    candidate: Annotated[str, typer.Option(help="Lyapunov candidate: lyapunov, lqr or optimised.")] = "lyapunov",
-    compare: Annotated[
-        bool, typer.Option("--compare", help="Compare with the optimised candidate too; takes its time.")
-    ] = False,
+    candidate: Annotated[
+        str,
+        typer.Option(
+            help="Lyapunov candidate: auto (of several, the largest proved), lyapunov, scaled, lqr or optimised."
+        ),
+    ] = "auto",
     q: Annotated[str | None, typer.Option("--Q", help="Diagonal of Q, as in 1,1.")] = None,
     r: Annotated[str | None, typer.Option("--R", help="Diagonal of R (candidate lqr), as in 1.")] = None,
     level: Annotated[float | None, typer.Option(help="Prove exactly this level; less is not PROVED.")] = None,
@@ -50,9 +49,10 @@ def roa(
     precision: Annotated[float, typer.Option(help="dReal's delta.")] = 1e-3,
     jobs: Annotated[int, typer.Option(help="dReal's threads.")] = 1,
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
-    time_limit: Annotated[float, typer.Option(help="Seconds for the ring.")] = 600.0,
+    time_limit: Annotated[float, typer.Option(help="Seconds for everything up to the verdict.")] = 50.0,
     max_boxes: Annotated[int, typer.Option(help="Boxes for the ring.")] = 4_000_000,
     out: Annotated[Path | None, typer.Option(help="Folder for the results; default: out/POLICY.")] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress and no notices, errors only.")] = False,
     as_json: Json = False,
 ) -> None:
     """Certify a region of attraction: prove, write a certificate, have it checked, report."""
@@ -63,10 +63,11 @@ def roa(
     start = time.perf_counter()
     stored = load_policy(policy)
     plant = plant_of(stored, system, param or [], domain or [])
-    tell(_plant_line(stored, plant, system is not None))
+    note = (lambda _: None) if quiet else tell
+    note(_plant_line(stored, plant, system is not None))
     shift = stored.beta_shift(plant.exact_u_eq())
     if shift:
-        tell(f"the file's rounded beta is read as the real number; this shifts u(0) by {shift:.3g}")
+        note(f"the file's rounded beta is read as the real number; this shifts u(0) by {shift:.3g}")
     options = RoaOptions(
         claim=claim,  # type: ignore[arg-type]
         candidate=candidate,  # type: ignore[arg-type]
@@ -81,7 +82,7 @@ def roa(
         max_boxes=max_boxes,
     )
     folder = out if out is not None else Path("out") / policy.stem
-    progress = ProgressLine()
+    progress = None if quiet else ProgressLine()
     try:
         result = certify_roa(
             plant,
@@ -93,12 +94,12 @@ def roa(
             progress=progress,
         )
     finally:
-        progress.close()
+        if progress is not None:
+            progress.close()
     data = result.to_dict()
     if result.notice is not None:
-        tell(result.notice)
+        note(result.notice)
     if result.certificate is not None and result.raw is not None:
-        data["candidates"] = _candidates(result, options, compare) if claim == "asymptotic" else []
         answer = None if result.checker is None else dict(result.checker)
         write(folder / "report.html", page_of(result.raw, result.certificate, answer, data))
     if as_json:
@@ -108,20 +109,6 @@ def roa(
         if result.certificate is not None:
             say(f"certificate  {result.certificate}\nreport       {folder / 'report.html'}")
     raise typer.Exit(result.verdict.exit_status)
-
-
-def _candidates(result: RoaResult, options: RoaOptions, compare: bool) -> list[dict[str, Any]]:
-    """The volumes within reach of the other candidates, sampled, beside the one that was proved."""
-    from dataclasses import asdict
-
-    from certify.candidates import compare_candidates
-
-    known = {} if result.candidate is None or result.problem is None else {result.candidate: result.problem.V.P}
-    names: list[Candidate] = ["lyapunov", "lqr"]
-    if compare or "optimised" in known:
-        names.append("optimised")
-    rows = compare_candidates(result.system, result.network, options, known, names)
-    return [{**asdict(row), "proved": row.candidate in known} for row in rows]
 
 
 def _device(name: str) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 import sys
 import threading
 import time
@@ -47,19 +48,25 @@ def tell(line: str) -> None:
 
 
 def _ring_line(state: Progress) -> str:
-    left = "" if state.seconds_left is None else f", about {state.seconds_left:.0f} s left"
+    left = "" if state.seconds_left is None else f", at most {state.seconds_left:.0f} s left"
     return (
-        f"ring: proved to V = {state.level:.4g} of {state.target:.4g} ({state.proved:.1%} of the volume), "
+        f"{state.name}: proved to V = {state.level:.4g} of {state.target:.4g} ({state.proved:.1%} of the volume), "
         f"{state.boxes} boxes, {state.open} open{left}"
     )
 
 
+_STAGES = {"candidate": "choosing candidates", "ring": "proving", "check": "checking"}
+
+
 class ProgressLine:
-    """A line on standard error, at most five times a second, only on a terminal."""
+    """A line on standard error that moves, at most five times a second; where that is no terminal, a line every ten
+    seconds."""
 
     def __init__(self) -> None:
-        self.last = 0.0
-        self.shown = False
+        self.terminal = sys.stderr.isatty()
+        self.every = 0.2 if self.terminal else 10.0
+        self.last = time.monotonic() - (self.every if self.terminal else 0.0)
+        self.shown = 0
 
     def __call__(self, stage: str, state: Progress | None) -> None:
         if stage == "check":  # the checker works in a process of its own: load the drawing libraries meanwhile
@@ -67,10 +74,17 @@ class ProgressLine:
 
             threading.Thread(target=warm_up, daemon=True).start()
         now = time.monotonic()
-        if sys.stderr.isatty() and now - self.last > 0.2:
-            self.last, self.shown = now, True
-            sys.stderr.write(f"\r{_ring_line(state) if state is not None else 'checking'}\x1b[K")
-            sys.stderr.flush()
+        if now - self.last < self.every:
+            return
+        self.last = now
+        line = _ring_line(state) if state is not None else _STAGES[stage]
+        if self.terminal:
+            line = line[: shutil.get_terminal_size().columns - 1]
+            self.shown = len(line)
+            sys.stderr.write(f"\r{line}\x1b[K")
+        else:
+            sys.stderr.write(line + "\n")
+        sys.stderr.flush()
 
     def close(self) -> None:
         """Wipe the line."""

@@ -16,8 +16,8 @@ from certify.verdict import Stop
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    """What a proof may use: seconds on the wall, of which `check` are left for each leaf's check; boxes, boxes at once, and
-    the width of the smallest box relative to the root box."""
+    """What a proof may use: seconds on the wall, of which `check` are left for the check of each proved box; boxes,
+    boxes at once, and the width of the smallest box relative to the root box."""
 
     seconds: float = 600.0
     boxes: int = 4_000_000
@@ -44,7 +44,8 @@ class Task:
 class Progress:
     """Where a proof stands: `level` is proved, `target` aimed at, `boxes` were bounded and `open` wait.
 
-    `proved` is the share of the ring's volume that is done; `seconds_left` is extrapolated, None at first.
+    `proved` is the share of the ring's volume that is done; `seconds_left` is extrapolated, None at first; `name` is
+    the candidate's.
     """
 
     level: float
@@ -53,6 +54,7 @@ class Progress:
     open: int
     proved: float
     seconds_left: float | None
+    name: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,6 +88,18 @@ class Attempt(Protocol):
     def done(self) -> bool:
         """Whether more time would gain nothing."""
 
+    @property
+    def level(self) -> float | None:
+        """The c2 that is proved so far; None if there is none."""
+
+    @property
+    def gained(self) -> bool:
+        """Whether the search has added anything to what was there at its beginning."""
+
+    @property
+    def hope(self) -> float:
+        """Share of the boxes bounded last that were proved: where it stays 0, boxes only make more boxes. 1 at first."""
+
     def advance(self, budget: Budget, report: Report | None = None) -> None:
         """Work for as long as the budget allows."""
 
@@ -118,6 +132,21 @@ class Once:
     def done(self) -> bool:
         """Whether it has been worked on."""
         return self.found is not None
+
+    @property
+    def level(self) -> float | None:
+        """The c2 that was proved."""
+        return None if self.found is None or self.found.claim is None else self.found.claim.roa
+
+    @property
+    def gained(self) -> bool:
+        """Whether anything was proved."""
+        return self.level is not None
+
+    @property
+    def hope(self) -> float:
+        """None: there is no going on."""
+        return 0.0
 
     def advance(self, budget: Budget, report: Report | None = None) -> None:
         """Work once."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from certify.lyapunov.candidates import solve_lyapunov
-from certify.lyapunov.choice import Candidate, Chosen, choose_candidate
+from certify.lyapunov.choice import SOLVED, Candidate, Chosen, Named, choose_candidate
 from certify.lyapunov.level_sets import (
     diagonalising_coordinates,
     domain_limit,
@@ -14,11 +14,13 @@ from certify.lyapunov.level_sets import (
     semi_axes,
     volume,
 )
-from certify.lyapunov.optimised import optimise_candidate
+from certify.lyapunov.optimised import optimise_candidate, optimise_repeatedly
 
 __all__ = [
+    "SOLVED",
     "Candidate",
     "Chosen",
+    "Named",
     "choose_candidate",
     "diagonalising_coordinates",
     "domain_limit",
@@ -27,6 +29,7 @@ __all__ = [
     "is_positive_definite",
     "leaves_domain",
     "optimise_candidate",
+    "optimise_repeatedly",
     "semi_axes",
     "solve_lyapunov",
     "volume",

@@ -1,7 +1,8 @@
-"""Which P is tried: the three candidates by name, and what happens when the optimised one is not to be had."""
+"""Which P is tried: the candidates by name, and what happens when the optimised one is not to be had."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -11,10 +12,13 @@ from numpy.typing import NDArray
 from certify.closed_loop import ClosedLoop
 from certify.errors import BackendError, InputError
 from certify.lyapunov.candidates import solve_lyapunov
-from certify.lyapunov.optimised import optimise_candidate
+from certify.lyapunov.optimised import largest_sampled, optimise_repeatedly
 
 Array = NDArray[np.float64]
-Candidate = Literal["lyapunov", "lqr", "optimised"]
+Named = Literal["lyapunov", "scaled", "lqr", "optimised"]
+Candidate = Literal["auto", "lyapunov", "scaled", "lqr", "optimised"]
+SOLVED: tuple[Named, ...] = ("lyapunov", "scaled", "lqr")
+"""The candidates that solve a Lyapunov equation."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -22,20 +26,26 @@ class Chosen:
     """P (n, n), the candidate that it comes from, and a notice if that is not the one that was asked for."""
 
     P: Array
-    name: Candidate
+    name: Named
     notice: str | None = None
 
 
 def choose_candidate(
-    loop: ClosedLoop, name: Candidate, Q: tuple[float, ...] | None = None, R: tuple[float, ...] | None = None
+    loop: ClosedLoop,
+    name: Named,
+    Q: tuple[float, ...] | None = None,
+    R: tuple[float, ...] | None = None,
+    seconds: float = math.inf,
 ) -> Chosen:
     """The candidate `name` for the closed loop.
 
     Parameters
     ----------
-    name : `lyapunov` solves `A'P + PA = -Q`; `lqr` has `Q + K'RK` in the place of Q, K = -J_pi(0); `optimised` starts
-        at `lyapunov` and enlarges the sampled set, and falls back to it with a notice.
+    name : `lyapunov` solves `A'P + PA = -Q`; `scaled` has the Q that weighs each state by its domain, `1 / d_i^2`;
+        `lqr` has `Q + K'RK`, K = -J_pi(0); `optimised` starts at the one of these whose sampled set is largest, or at
+        `lyapunov` if Q is given, and enlarges it; it falls back to `lyapunov` with a notice.
     Q, R : diagonals, (n,) and (m,); None means ones.
+    seconds : after which `optimised` takes what it has.
 
     Raises
     ------
@@ -46,11 +56,15 @@ def choose_candidate(
     if name == "lqr":
         M = K.T @ _weight(R, K.shape[0], "R") @ K
         return Chosen(solve_lyapunov(A, weight + (M + M.T) / 2), "lqr")
+    if name == "scaled":
+        nearer = np.array([min(-float(lo), float(hi)) for lo, hi in loop.system.domain])
+        return Chosen(solve_lyapunov(A, np.diag(nearer**-2)), "scaled")
     P = solve_lyapunov(A, weight)
     if name == "lyapunov":
         return Chosen(P, "lyapunov")
     try:
-        return Chosen(optimise_candidate(loop, P), "optimised")
+        start = P if Q is not None else largest_sampled(loop, [choose_candidate(loop, one).P for one in SOLVED])
+        return Chosen(optimise_repeatedly(loop, start, seconds), "optimised")
     except BackendError as error:
         return Chosen(P, "lyapunov", f"candidate lyapunov in the place of optimised: {error}")
 

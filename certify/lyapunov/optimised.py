@@ -13,7 +13,9 @@ The margin alpha is asked for, not only the sign, because a proof needs many box
 from __future__ import annotations
 
 import math
+import time
 import warnings
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +31,7 @@ _FRESH, _NEAR = 400, 300  # new rays of a search: in any direction, and near tho
 _KEEP = 200  # rays of a search that are remembered for their crossing, and for their worst state
 _ROWS = 500  # states that each margin hands to the solver
 _ROUNDS = 30
+_REPEATS, _WORTH = 8, 0.05  # of the whole search, and growth of the log of the volume that is worth another
 _SMALL = 0.01  # growth of the log of the volume, or trust radius, at which to stop
 _STEP = 1e-4  # relative, of the difference quotient along a ray
 _TOLERANCE = 1e-6  # of the solver
@@ -36,7 +39,14 @@ _SLACK = 1e-4  # by which a state may violate its row: the next search rescales 
 _LINEAR, _SCORED = 1.3, 0.5  # shares of alpha: what the linearisation must keep, and what a sample must
 
 
-def optimise_candidate(loop: ClosedLoop, start: Array, decays: tuple[float, ...] = (0.2, 0.02), seed: int = 0) -> Array:
+def optimise_candidate(
+    loop: ClosedLoop,
+    start: Array,
+    decays: tuple[float, ...] = (0.2, 0.02),
+    seed: int = 0,
+    seconds: float = math.inf,
+    known: Array | None = None,
+) -> Array:
     """Choose P for a large sampled set `{x'Px <= 1}` inside the domain with `Vdot <= -alpha V` (and inputs in bounds).
 
     Parameters
@@ -44,7 +54,9 @@ def optimise_candidate(loop: ClosedLoop, start: Array, decays: tuple[float, ...]
     loop : the closed loop; its linearisation A is Hurwitz.
     start : (n, n), symmetric positive definite with `A'P + PA < 0`, such as a solution of the Lyapunov equation.
     decays : alpha over the slowest decay rate of A, each between 0 and 0.7; the first that beats `start` is taken.
-    seed : of the samples; equal seeds give equal results.
+    seed : of the samples; equal seeds give equal results, unless the time ends the search.
+    seconds : after which the present P is taken.
+    known : (N, n), states that sampling may miss, such as violations that a proof came upon.
 
     Returns
     -------
@@ -62,9 +74,12 @@ def optimise_candidate(loop: ClosedLoop, start: Array, decays: tuple[float, ...]
     A, _, _ = loop.linearise()
     slowest = -float(np.max(np.linalg.eigvals(A).real))
     found = given = 0.0
+    end = time.monotonic() + seconds
     for decay in decays:
         samples = _Samples(loop, 1e-3 * decay * slowest, np.random.default_rng(seed))
-        P = _enlarge(samples, A, start, decay * slowest)
+        if known is not None:
+            samples.remember(known)
+        P = _enlarge(samples, A, start, decay * slowest, end)
         if not (np.all(np.linalg.eigvalsh(P) > 0) and np.all(np.linalg.eigvalsh(A.T @ P + P @ A) < 0)):
             raise BackendError("the optimised P must satisfy P > 0 and A'P + PA < 0; it does not. Use 'lyapunov'.")
         found, given = (volume(samples.fit(candidate, 0.0), 1.0) for candidate in (P, start))
@@ -76,7 +91,42 @@ def optimise_candidate(loop: ClosedLoop, start: Array, decays: tuple[float, ...]
     )
 
 
-def _enlarge(samples: _Samples, A: Array, start: Array, alpha: float) -> Array:
+def optimise_repeatedly(loop: ClosedLoop, start: Array, seconds: float = math.inf, known: Array | None = None) -> Array:
+    """`optimise_candidate` from its own result again, with other samples, as long as that gains volume and time is left.
+
+    A trust region that has shrunk around one optimum opens again: on an external planar quadrotor three rounds
+    enlarge the sampled set of the first 30-fold.
+
+    Raises
+    ------
+    BackendError : of the first round.
+    """
+    end = time.monotonic() + seconds
+    P = optimise_candidate(loop, start, seconds=seconds, known=known)
+    for seed in range(1, _REPEATS):
+        if time.monotonic() > end:
+            break
+        try:
+            new = optimise_candidate(loop, P, (0.2, 0.02), seed, end - time.monotonic(), known)
+        except BackendError:  # no larger one
+            break
+        grown = (_log_det(P) - _log_det(new)) / 2  # both are scaled to their sampled limit
+        if not grown > 0:
+            break
+        P = new
+        if grown < _WORTH:
+            break
+    return P
+
+
+def largest_sampled(loop: ClosedLoop, candidates: Sequence[Array], seed: int = 0) -> Array:
+    """The P, (n, n), of those given whose set inside the domain without a sampled violation has the largest volume."""
+    slowest = -float(np.max(np.linalg.eigvals(loop.linearise()[0]).real))
+    samples = _Samples(loop, 1e-3 * slowest, np.random.default_rng(seed))
+    return max(candidates, key=lambda P: volume(samples.fit(P, 0.0), 1.0))
+
+
+def _enlarge(samples: _Samples, A: Array, start: Array, alpha: float, end: float) -> Array:
     """Rounds of sampling and solving, from `start` to P with its margin."""
     Q = -(A.T @ start + start @ A)
     # The linearisation of this P keeps `Vdot <= -2 lambda V`: its equation is the one of A + lambda I.
@@ -84,6 +134,8 @@ def _enlarge(samples: _Samples, A: Array, start: Array, alpha: float) -> Array:
     P = samples.fit(P, _SCORED * alpha)
     radius, answers = 0.4, 0
     for _ in range(_ROUNDS):
+        if answers and time.monotonic() > end:
+            break
         new = _solve(samples, P, A, alpha, radius)
         if new is None:
             radius /= 2

@@ -257,7 +257,7 @@ class Pass:
         self.partition = Partition(root)
         self.frontier = Frontier(self.partition, runner.device)
         self.half = torch.tensor(root, device=runner.device)[:, None]
-        self.boxes = 0
+        self.boxes = self.proved = 0
         self.covered = True
         self._stop = Stop.REQUESTED
         self._clock = _Clock()
@@ -270,9 +270,10 @@ class Pass:
         return not len(self.frontier)
 
     @property
-    def leaves(self) -> int:
-        """Leaves of the tree, the open ones included."""
-        return self.partition.splits + 1
+    def levels(self) -> tuple[float, float]:
+        """(inner, outer) between which all is proved; equal if nothing is."""
+        inner, outer = self.sweep.reached(self.frontier.least())
+        return inner, max(inner, outer)
 
     def advance(self, budget: Budget, report: Report | None = None) -> Stop | None:
         """Take boxes, bound them, give way to violations, halve what is undecided; what ran out, or None if done."""
@@ -281,7 +282,7 @@ class Pass:
             while not self.done:
                 if self.boxes >= most or self.partition.splits + 3 * budget.batch > _MOST_SPLITS:
                     return Stop.BOXES
-                if self._clock.spent + self.leaves * budget.check > budget.seconds:
+                if self._clock.spent + self.proved * budget.check > budget.seconds:
                     return Stop.TIME
                 self._step(bound, min(budget.batch, most - self.boxes), budget.least_width)
                 if report is not None:
@@ -294,6 +295,7 @@ class Pass:
         lo, hi, number = self.frontier.take(count, sweep.reach(self.frontier.least()))
         self.boxes += lo.shape[1]
         found = bound(lo, hi, sweep.inner, sweep.outer)
+        self.proved += int(found.proved.sum())
         centres = 0.5 * lo + 0.5 * hi
         if sweep.violated(centres, torch.where(found.violated, rule.levels_at(centres), math.inf)):
             self._stop = Stop.WITNESS
@@ -314,8 +316,7 @@ class Pass:
     def proof(self, stop: Stop | None = None) -> RingProof:
         """What is proved, `stop` being what ran out."""
         stop = stop or self._stop
-        inner, outer = self.sweep.reached(self.frontier.least())
-        witness, covered = self.sweep.witness, self.covered and self.done
+        (inner, outer), witness, covered = self.levels, self.sweep.witness, self.covered and self.done
         if outer <= inner:  # nothing beyond the inner level
             empty = empty_ring(self.sweep.problem, self.sweep.T, inner)
             return replace(empty, stop=stop, boxes=self.boxes, witness=witness, covered=covered)

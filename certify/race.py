@@ -1,0 +1,84 @@
+"""Which candidate is proved: each gets a little time, the better half of them more, and the best what is left.
+
+A candidate is judged by the volume that is proved with it in the time, not by the volume within its reach: the largest
+sampled set is of no use if its proof takes a week.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+
+from certify.engines.base import Attempt, Budget, Progress
+from certify.lyapunov import volume
+from certify.trials import Trial, by_reach
+
+_WORTH = 1.02  # of the best proved volume: what a candidate's reach must exceed to be given time
+
+
+@dataclass
+class Contender:
+    """A trial, its attempt, and the volume that is proved so far."""
+
+    trial: Trial
+    attempt: Attempt
+    proved: float = 0.0
+
+    def advance(self, budget: Budget, report: Callable[[Progress], None] | None) -> None:
+        """Work on the proof for as long as the budget allows."""
+        name = self.trial.name
+        self.attempt.advance(budget, None if report is None else lambda state: report(replace(state, name=name)))
+        level = self.attempt.level
+        self.proved = 0.0 if level is None else volume(self.trial.P, level)
+
+
+@dataclass
+class Race:
+    """Contenders for the largest proved volume.
+
+    Parameters
+    ----------
+    begin : makes the attempt of a trial.
+    left : seconds that the search may still take.
+    boxes : that a heat may bound.
+    """
+
+    begin: Callable[[Trial], Attempt]
+    left: Callable[[], float]
+    boxes: int
+    report: Callable[[Progress], None] | None = None
+    contenders: list[Contender] = field(default_factory=list)
+
+    @property
+    def best(self) -> Contender:
+        """The one with the largest proved volume; of those with none, the one that came first."""
+        return max(self.contenders, key=lambda c: c.proved)
+
+    @property
+    def open(self) -> list[Contender]:
+        """Those that more time could make the best, the largest proved volume first."""
+        most = self.best.proved
+        can = [c for c in self.contenders if c is self.best or c.trial.volume > _WORTH * most]
+        return sorted((c for c in can if not c.attempt.done), key=lambda c: -c.proved)
+
+    def enter(self, trials: Iterable[Trial], seconds: float) -> None:
+        """A heat of so many seconds for each trial within whose reach lies more than is proved already."""
+        for trial in by_reach(list(trials)):
+            if self.contenders and trial.volume <= _WORTH * self.best.proved:
+                continue
+            self.contenders.append(Contender(trial, self.begin(trial)))
+            self._heat(self.contenders[-1], seconds)
+
+    def knock_out(self, seconds: float) -> None:
+        """Heats among the better half, each round twice as long as the one before, until one is left."""
+        contenders = self.open
+        while len(contenders) > 1:
+            contenders, seconds = contenders[: (len(contenders) + 1) // 2], 2 * seconds
+            if len(contenders) == 1:
+                break
+            for contender in contenders:
+                self._heat(contender, seconds)
+            contenders = [c for c in self.open if c in contenders]
+
+    def _heat(self, contender: Contender, seconds: float) -> None:
+        contender.advance(Budget(max(1e-3, min(seconds, self.left())), self.boxes), self.report)

@@ -1,0 +1,146 @@
+"""Candidates for V, each with what it could give at most: whether it is worth a proof, and which one first."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.certificate import require_short
+from certify.claims import Problem
+from certify.closed_loop import ClosedLoop
+from certify.engines.base import Task
+from certify.engines.falsify import falsify, survey
+from certify.errors import BackendError, InputError
+from certify.lyapunov import (
+    SOLVED,
+    choose_candidate,
+    diagonalising_coordinates,
+    domain_limit,
+    is_positive_definite,
+    leaves_domain,
+    optimise_repeatedly,
+    volume,
+)
+from certify.lyapunov.function import Quadratic
+from certify.options import RoaOptions
+
+Array = NDArray[np.float64]
+_BELOW = 1e-9  # relative distance from a limit that is itself out of reach (the domain's open condition)
+_BELOW_WITNESS = 1e-3
+_SMALLEST = 1e-120  # of levels: squares of states and products of bounds must not underflow
+_BLENDS = (0.05, 0.15, 0.3)
+_OPTIMISING = 0.2  # share of the time that the optimised candidate may take
+_SAMPLES = 4000  # of a search for violations; the proof itself finds others
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """A candidate and what is asked for with it.
+
+    Parameters
+    ----------
+    name : where P comes from.
+    task : the problem, and the largest level within reach: below the domain's limit and the lowest violation found.
+    T : (n, n), the coordinates x = T z of its proof.
+    limit : the domain's limit of V.
+    limited_by : what its reach ends at.
+    volume : of the largest set within reach; sampled, not proved.
+    notice : why it is not the candidate that was asked for.
+    """
+
+    name: str
+    task: Task
+    T: Array
+    limit: float
+    limited_by: Literal["domain", "sampled"]
+    volume: float
+    notice: str | None = None
+
+    @property
+    def P(self) -> Array:
+        """The matrix of V, (n, n)."""
+        return self.task.problem.V.P
+
+    @property
+    def unit(self) -> Array:
+        """P scaled so that the largest set within reach is {V <= 1}."""
+        return self.P / self.task.target
+
+
+def trial(loop: ClosedLoop, P: Array, name: str, options: RoaOptions, notice: str | None = None) -> Trial:
+    """Sample what V = x'Px could give.
+
+    Raises
+    ------
+    InputError : P is not positive definite, too long for a certificate, or its levels are too small or too large.
+    """
+    n = loop.system.n
+    if P.shape != (n, n) or not is_positive_definite(P):
+        raise InputError(f"`P` must be a symmetric positive definite matrix of shape ({n}, {n}).")
+    require_short(P)
+    problem, T = Problem(loop, Quadratic(P)), diagonalising_coordinates(P, loop.linearise()[0])
+    limit = domain_limit(P, loop.system.domain)
+    level = options.level or limit * (1 - _BELOW)
+    if not _SMALLEST < level < 1 / _SMALLEST:
+        raise InputError(
+            f"levels of V must lie between {_SMALLEST:g} and {1 / _SMALLEST:g}; found {level:g}. Scale the states or P."
+        )
+    task = Task(problem, options.claim, level, options.level is not None)
+    if options.level is not None and leaves_domain(P, options.level, loop.system.domain):
+        return Trial(name, task, T, limit, "domain", volume(P, limit), notice)
+    if options.claim == "practical":
+        bands = survey(problem, T, level)
+        reach = bands[0].above if bands else 0.0
+        return Trial(name, task, T, limit, "sampled" if reach < level else "domain", volume(P, reach), notice)
+    witness = falsify(problem, T, level, *([] if options.only or options.P is not None else [_SAMPLES]))
+    below = level if witness is None or task.exactly else witness.level * (1 - _BELOW_WITNESS)
+    task = Task(problem, options.claim, below, task.exactly, witness)
+    return Trial(name, task, T, limit, "domain" if witness is None else "sampled", volume(P, below), notice)
+
+
+def named(loop: ClosedLoop, options: RoaOptions) -> Trial:
+    """The one candidate that the options ask for."""
+    if options.P is not None:
+        return trial(loop, options.P, "given", options)
+    name = options.only or "lyapunov"
+    chosen = choose_candidate(loop, name, options.Q, options.R, _OPTIMISING * options.time_limit)
+    return trial(loop, chosen.P, chosen.name, options, chosen.notice)
+
+
+def solved(loop: ClosedLoop, options: RoaOptions) -> list[Trial]:
+    """The candidates that solve a Lyapunov equation."""
+    return [trial(loop, choose_candidate(loop, name, options.Q, options.R).P, name, options) for name in SOLVED]
+
+
+def optimised(loop: ClosedLoop, options: RoaOptions) -> Trial | None:
+    """The candidate of the largest sampled set, or None if it is not to be had."""
+    try:
+        chosen = choose_candidate(loop, "optimised", options.Q, options.R, _OPTIMISING * options.time_limit)
+    except BackendError:
+        return None
+    return trial(loop, chosen.P, chosen.name, options) if chosen.notice is None else None
+
+
+def corrected(loop: ClosedLoop, misled: Trial, witnesses: Array, options: RoaOptions, seconds: float) -> Trial | None:
+    """The optimised candidate once more, with violations (N, n) that its samples had missed; None if there is none."""
+    try:
+        P = optimise_repeatedly(loop, misled.P, min(seconds, _OPTIMISING * options.time_limit), witnesses)
+    except BackendError:
+        return None
+    return trial(loop, P, misled.name, options)
+
+
+def blends(loop: ClosedLoop, large: Trial, provable: Trial, options: RoaOptions) -> Iterator[Trial]:
+    """Between a candidate whose set is large and one that is easier to prove, where what can be proved is largest."""
+    for share in _BLENDS:
+        P = (1 - share) * large.unit + share * provable.unit
+        yield trial(loop, (P + P.T) / 2, f"{large.name} with {share:.0%} of {provable.name}", options)
+
+
+def by_reach(trials: Sequence[Trial]) -> list[Trial]:
+    """The largest volume within reach first."""
+    return sorted(trials, key=lambda t: -t.volume)
