@@ -59,6 +59,66 @@ class Tried:
 
 
 @dataclass(frozen=True, slots=True)
+class Step:
+    """What to try next: options to add to the command (none if no option helps), and why."""
+
+    options: tuple[tuple[str, str], ...]
+    why: str
+
+
+@dataclass(frozen=True, slots=True)
+class Share:
+    """How far the set reaches along a state, and that as a share of the nearer side of its domain."""
+
+    state: str
+    unit: str
+    extent: float
+    share: float
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosis:
+    """What binds and where.
+
+    Parameters
+    ----------
+    binds : in words, with the names of states and inputs.
+    kind : `domain`, `vdot`, `input`, or the name of the stop.
+    name, side : the state or input that binds and which side, None where neither does.
+    point : a state at which it binds, (n,), None if there is none.
+    shares : one a state; empty without a set.
+    fastest, slowest : real parts of the closed loop's eigenvalues at the origin, 1/s.
+    hurts : weights of the states, (n,), the largest 1: the direction in which the proof had most to do.
+    next : what to try.
+    """
+
+    binds: str
+    kind: str
+    name: str | None
+    side: str | None
+    point: tuple[float, ...] | None
+    shares: tuple[Share, ...]
+    fastest: float | None
+    slowest: float | None
+    hurts: tuple[tuple[str, float], ...]
+    next: Step
+
+    @property
+    def stiffness(self) -> float | None:
+        """How many times faster the fastest mode decays than the slowest; None unless all decay."""
+        if self.fastest is None or self.slowest is None or not self.slowest < 0:
+            return None
+        return self.fastest / self.slowest
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON: the fields, and `stiffness`; `hurts` by state."""
+        stated = asdict(self)
+        stated |= {"stiffness": self.stiffness, "hurts": dict(self.hurts)}
+        stated["next"] = {"options": dict(self.next.options), "why": self.next.why}
+        return stated
+
+
+@dataclass(frozen=True, slots=True)
 class RoaResult:
     """What was proved. `stop` and `detail` say what limits the level, or why nothing was proved.
 
@@ -88,6 +148,7 @@ class RoaResult:
     checker: Mapping[str, Any] | None = None
     engine: str = "bounds"
     solver: Mapping[str, Any] | None = None
+    diagnosis: Diagnosis | None = None
 
     @property
     def P(self) -> Array | None:
@@ -135,6 +196,7 @@ class RoaResult:
             "candidates": [asdict(one) for one in self.tried],
             "engine": self.engine,
             "solver": None if self.solver is None else dict(self.solver),
+            "diagnosis": None if self.diagnosis is None else self.diagnosis.to_dict(),
             "boxes": self.boxes,
             "leaves": self.leaves,
             "seconds": {name: self.seconds.get(name) for name in _STAGES},

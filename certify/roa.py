@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -30,7 +31,8 @@ from certify.certificate import (
 )
 from certify.claims import Asymptotic, Claim, Problem
 from certify.closed_loop import ClosedLoop
-from certify.engines.base import Attempt, Budget, Progress, Task
+from certify.diagnosis import diagnose
+from certify.engines.base import Attempt, Budget, Progress, Proof, Task
 from certify.engines.falsify import Witness, refutes
 from certify.errors import BackendError, SoundnessError
 from certify.lyapunov import leaves_domain
@@ -40,7 +42,7 @@ from certify.race import Contender, Race
 from certify.results import Levels, RoaResult, Tried
 from certify.rigorous import eigenvalues
 from certify.systems import System
-from certify.trials import Trial, blends, by_reach, corrected, named, optimised, solved
+from certify.trials import OPTIMISING, Trial, blends, by_reach, corrected, named, optimised, solved
 from certify.verdict import Stop, Verdict
 
 if TYPE_CHECKING:
@@ -56,7 +58,8 @@ _PATIENCE = 0.1  # for a ring that gains nothing
 _SEARCH = 0.6  # for a search that cannot be interrupted, the rest being its check's
 _KEPT = 0.03  # for what comes after the search: writing, the checker's start
 _HOPE = 0.05  # share of boxes that must be proved to go on with a ring that gains nothing
-_CORRECTIONS = 6  # of an optimised candidate by the violations that its proof comes upon
+_FOR_PROOF = 0.4  # of the time limit, that no further candidate is optimised in
+_WORTH = 1.05  # growth of a volume that another candidate must promise
 _MISLED = 0.9  # of its reach: a violation below it is one that the samples missed
 _SAMPLE = 2000  # leaves whose check is timed
 _START = 0.2  # seconds that a checker takes to start
@@ -127,10 +130,13 @@ class _Run:
     progress: Report | None
     seconds: dict[str, float] = field(default_factory=dict)
     start: float = field(default_factory=time.perf_counter)
+    proof: Proof | None = None
+    cut_short: bool = False
 
     def result(self) -> RoaResult:
         result = self._decide()
-        return replace(result, seconds={"load": self.load, **self.seconds, "total": self.spent})
+        result = replace(result, seconds={"load": self.load, **self.seconds, "total": self.spent})
+        return replace(result, diagnosis=diagnose(result, self.options, self.proof))
 
     @property
     def spent(self) -> float:
@@ -175,14 +181,14 @@ class _Run:
         self._tell("candidate")
         with self._stage("candidate"):
             trials = solved(loop, options)
-            large = optimised(loop, options) if self.interruptible else None
-            trials += [] if large is None else [large]
+        large = self._optimised(partial(optimised, loop, options)) if self.interruptible else None
+        trials += [] if large is None else [large]
         race = self._contest()
         if not self.interruptible:
             race.enter(by_reach(trials)[:1], heat)
             return race
         race.enter(trials, heat)
-        self._correct(race, loop, heat)
+        self._improve(race, loop, heat)
         unproved = [c for c in race.open if c.trial.name == "optimised"]
         others = [c for c in race.contenders if c.trial.name != "optimised" and c.proved]
         if unproved and others:
@@ -193,21 +199,34 @@ class _Run:
         race.knock_out(heat)
         return race
 
-    def _correct(self, race: Race, loop: ClosedLoop, heat: float) -> None:
-        """An optimised candidate whose proof came upon a violation far below its reach is optimised again with it."""
+    def _improve(self, race: Race, loop: ClosedLoop, heat: float) -> None:
+        """The optimised candidate again, from where it is, as long as its proofs reach as far as its samples do.
+
+        A proof that comes upon a violation far below its candidate's reach tells the next round of it.
+        """
         witnesses: list[Witness] = []
-        for _ in range(_CORRECTIONS):
+        while self.left() > _FOR_PROOF * self.options.time_limit:
             last = [c for c in race.contenders if c.trial.name == "optimised"][-1:]
-            found = last[0].attempt.proof().witness if last and last[0].attempt.done else None
-            if found is None or found.level > _MISLED * last[0].trial.task.target or self.left() < 0:
+            if not last or not last[0].attempt.done:
                 return
-            witnesses.append(found)
-            with self._stage("candidate"):
-                known = np.array([w.x for w in witnesses])
-                again = corrected(loop, last[0].trial, known, self.options, self.left())
-            if again is None:
+            found = last[0].attempt.proof().witness
+            misled = found is not None and found.level < _MISLED * last[0].trial.task.target
+            if found is not None and misled:
+                witnesses.append(found)
+            elif not self.cut_short:
+                return
+            again = self._optimised(partial(corrected, loop, last[0].trial, witnesses, self.options))
+            if again is None or (not misled and again.volume <= _WORTH * race.best.proved):
                 return
             race.enter([again], heat)
+
+    def _optimised(self, make: Callable[[], Trial | None]) -> Trial | None:
+        """A trial that has its share of the time to be made in; `cut_short` says whether that ended it."""
+        begin = time.perf_counter()
+        with self._stage("candidate"):
+            made = make()
+        self.cut_short = time.perf_counter() - begin >= OPTIMISING * self.options.time_limit
+        return made
 
     @property
     def interruptible(self) -> bool:
@@ -286,6 +305,7 @@ class _Run:
         """The verdict on what the engine says, the only place that gives one after the search."""
         best = race.best
         task, proof = best.trial.task, best.attempt.proof()
+        self.proof = proof
         for stage in ("local", "ring"):
             self.seconds[stage] = sum(c.attempt.proof().seconds.get(stage, 0.0) for c in race.contenders)
         witness = _lowest(task.witness, proof.witness)

@@ -13,7 +13,7 @@ from certify.certificate import require_short
 from certify.claims import Problem
 from certify.closed_loop import ClosedLoop
 from certify.engines.base import Task
-from certify.engines.falsify import falsify, survey
+from certify.engines.falsify import Witness, falsify, survey
 from certify.errors import BackendError, InputError
 from certify.lyapunov import (
     SOLVED,
@@ -33,7 +33,7 @@ _BELOW = 1e-9  # relative distance from a limit that is itself out of reach (the
 _BELOW_WITNESS = 1e-3
 _SMALLEST = 1e-120  # of levels: squares of states and products of bounds must not underflow
 _BLENDS = (0.05, 0.15, 0.3)
-_OPTIMISING = 0.2  # share of the time that the optimised candidate may take
+OPTIMISING = 0.2  # share of the time that the optimised candidate may take
 _SAMPLES = 4000  # of a search for violations; the proof itself finds others
 
 
@@ -107,7 +107,7 @@ def named(loop: ClosedLoop, options: RoaOptions) -> Trial:
     if options.P is not None:
         return trial(loop, options.P, "given", options)
     name = options.only or "lyapunov"
-    chosen = choose_candidate(loop, name, options.Q, options.R, _OPTIMISING * options.time_limit)
+    chosen = choose_candidate(loop, name, options.Q, options.R, OPTIMISING * options.time_limit)
     return trial(loop, chosen.P, chosen.name, options, chosen.notice)
 
 
@@ -119,19 +119,20 @@ def solved(loop: ClosedLoop, options: RoaOptions) -> list[Trial]:
 def optimised(loop: ClosedLoop, options: RoaOptions) -> Trial | None:
     """The candidate of the largest sampled set, or None if it is not to be had."""
     try:
-        chosen = choose_candidate(loop, "optimised", options.Q, options.R, _OPTIMISING * options.time_limit)
+        chosen = choose_candidate(loop, "optimised", options.Q, options.R, OPTIMISING * options.time_limit)
     except BackendError:
         return None
     return trial(loop, chosen.P, chosen.name, options) if chosen.notice is None else None
 
 
-def corrected(loop: ClosedLoop, misled: Trial, witnesses: Array, options: RoaOptions, seconds: float) -> Trial | None:
-    """The optimised candidate once more, with violations (N, n) that its samples had missed; None if there is none."""
+def corrected(loop: ClosedLoop, last: Trial, witnesses: Sequence[Witness], options: RoaOptions) -> Trial | None:
+    """An optimised candidate once more, with violations that its samples had missed; None if there is none larger."""
+    known = np.array([w.x for w in witnesses]) if witnesses else None
     try:
-        P = optimise_repeatedly(loop, misled.P, min(seconds, _OPTIMISING * options.time_limit), witnesses)
+        P = optimise_repeatedly(loop, last.P, OPTIMISING * options.time_limit, known)
     except BackendError:
         return None
-    return trial(loop, P, misled.name, options)
+    return trial(loop, P, last.name, options)
 
 
 def blends(loop: ClosedLoop, large: Trial, provable: Trial, options: RoaOptions) -> Iterator[Trial]:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import shlex
 import sys
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -97,6 +99,8 @@ def roa(
         if progress is not None:
             progress.close()
     data = result.to_dict()
+    if data["diagnosis"] is not None and data["diagnosis"]["next"]["options"]:
+        data["diagnosis"]["next"]["command"] = _command(context, data["diagnosis"]["next"]["options"])
     if result.notice is not None:
         note(result.notice)
     if result.certificate is not None and result.raw is not None:
@@ -109,6 +113,22 @@ def roa(
         if result.certificate is not None:
             say(f"certificate  {result.certificate}\nreport       {folder / 'report.html'}")
     raise typer.Exit(result.verdict.exit_status)
+
+
+def _command(context: typer.Context, changed: Mapping[str, str]) -> str:
+    """The command that was given, with these options in the place of what it had."""
+    parts = ["certify", "roa"]
+    for option in context.command.params:
+        source = context.get_parameter_source(option.name or "")
+        name, value = max(option.opts, key=len), context.params[option.name or ""]
+        if source is None or source.name != "COMMANDLINE" or (name in changed and not option.multiple):
+            continue
+        values = list(value) if isinstance(value, list | tuple) else [value]
+        if name in changed:  # NAME=VALUE options replace those of the same name
+            values = [v for v in values if v.partition("=")[0] != changed[name].partition("=")[0]]
+        for each in values:
+            parts += [name] if each is True else [name, str(each)]
+    return shlex.join([*parts, *(part for pair in changed.items() for part in pair)])
 
 
 def _device(name: str) -> str:

@@ -63,7 +63,8 @@ class Proof:
 
     `stop` and `detail` say what limits the level; `witness` is the lowest violation met on the way; `partial` are
     levels that were reached without making a claim; `solver` is the record of a solver's answers; `seconds` the
-    stages `local` and `ring`.
+    stages `local` and `ring`; `direction`, (n,), is that in which boxes had to be halved most, and `seconds_left` how
+    long the search would still take, both None where unknown.
     """
 
     claim: Claim | None
@@ -76,6 +77,8 @@ class Proof:
     partial: Mapping[str, float] = field(default_factory=dict)
     solver: Mapping[str, Any] | None = None
     seconds: Mapping[str, float] = field(default_factory=dict)
+    direction: tuple[float, ...] | None = None
+    seconds_left: float | None = None
 
 
 Report = Callable[[Progress], None]
@@ -98,7 +101,7 @@ class Attempt(Protocol):
 
     @property
     def hope(self) -> float:
-        """Share of the boxes bounded last that were proved: where it stays 0, boxes only make more boxes. 1 at first."""
+        """Share of the boxes bounded last that were proved; where it stays 0, boxes only make boxes. 1 at first."""
 
     def advance(self, budget: Budget, report: Report | None = None) -> None:
         """Work for as long as the budget allows."""

@@ -31,7 +31,8 @@ _FRESH, _NEAR = 400, 300  # new rays of a search: in any direction, and near tho
 _KEEP = 200  # rays of a search that are remembered for their crossing, and for their worst state
 _ROWS = 500  # states that each margin hands to the solver
 _ROUNDS = 30
-_REPEATS, _WORTH = 8, 0.05  # of the whole search, and growth of the log of the volume that is worth another
+DECAYS = (0.2, 0.02)
+_REPEATS, _WORTH = 12, 1.05  # of the whole search, and growth of the volume that is worth another
 _SMALL = 0.01  # growth of the log of the volume, or trust radius, at which to stop
 _STEP = 1e-4  # relative, of the difference quotient along a ray
 _TOLERANCE = 1e-6  # of the solver
@@ -42,7 +43,7 @@ _LINEAR, _SCORED = 1.3, 0.5  # shares of alpha: what the linearisation must keep
 def optimise_candidate(
     loop: ClosedLoop,
     start: Array,
-    decays: tuple[float, ...] = (0.2, 0.02),
+    decays: tuple[float, ...] = DECAYS,
     seed: int = 0,
     seconds: float = math.inf,
     known: Array | None = None,
@@ -71,6 +72,13 @@ def optimise_candidate(
     A local optimum. Boyd, El Ghaoui, Feron, Balakrishnan, Linear Matrix Inequalities in System and Control Theory, SIAM
     1994: section 2.6.3 (S-procedure), chapter 5 (invariant ellipsoids of extreme volume).
     """
+    return _optimise(loop, start, decays, seed, seconds, known)[0]
+
+
+def _optimise(
+    loop: ClosedLoop, start: Array, decays: tuple[float, ...], seed: int, seconds: float, known: Array | None
+) -> tuple[Array, float]:
+    """P, and the ratio of its sampled volume and the start's."""
     A, _, _ = loop.linearise()
     slowest = -float(np.max(np.linalg.eigvals(A).real))
     found = given = 0.0
@@ -84,7 +92,7 @@ def optimise_candidate(
             raise BackendError("the optimised P must satisfy P > 0 and A'P + PA < 0; it does not. Use 'lyapunov'.")
         found, given = (volume(samples.fit(candidate, 0.0), 1.0) for candidate in (P, start))
         if found > given:
-            return P
+            return P, found / given
     raise BackendError(
         f"the optimised candidate must be larger than its start; sampled, its volume is {found:.6g} and the "
         f"start's {given:.6g}. Use the candidate 'lyapunov'."
@@ -92,29 +100,25 @@ def optimise_candidate(
 
 
 def optimise_repeatedly(loop: ClosedLoop, start: Array, seconds: float = math.inf, known: Array | None = None) -> Array:
-    """`optimise_candidate` from its own result again, with other samples, as long as that gains volume and time is left.
+    """`optimise_candidate` from its own result again, with other samples, while that gains volume in the time.
 
-    A trust region that has shrunk around one optimum opens again: on an external planar quadrotor three rounds
-    enlarge the sampled set of the first 30-fold.
+    A trust region that has shrunk around one optimum opens again: on a planar quadrotor three rounds enlarge the
+    sampled set of the first 30-fold.
 
     Raises
     ------
     BackendError : of the first round.
     """
     end = time.monotonic() + seconds
-    P = optimise_candidate(loop, start, seconds=seconds, known=known)
+    P, _ = _optimise(loop, start, DECAYS, 0, seconds, known)
     for seed in range(1, _REPEATS):
         if time.monotonic() > end:
             break
         try:
-            new = optimise_candidate(loop, P, (0.2, 0.02), seed, end - time.monotonic(), known)
+            P, growth = _optimise(loop, P, DECAYS, seed, end - time.monotonic(), known)
         except BackendError:  # no larger one
             break
-        grown = (_log_det(P) - _log_det(new)) / 2  # both are scaled to their sampled limit
-        if not grown > 0:
-            break
-        P = new
-        if grown < _WORTH:
+        if growth < _WORTH:
             break
     return P
 

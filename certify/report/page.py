@@ -386,6 +386,7 @@ def _tables(
             below(row["level"]),
             f"{below(row['volume'])} {unit}".rstrip(),
             "the domain" if row["limited_by"] == "domain" else "a violation found",
+            f"{below(row['proved_volume'])} {unit}".rstrip() if row.get("proved_volume") else ABSENT,
             "the one of this certificate" if row["proved"] else "",
         )
         for row in (result or {}).get("candidates", [])

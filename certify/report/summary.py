@@ -15,6 +15,7 @@ from certify.report.words import (
     inner_level,
     label,
     limited_by,
+    number,
     pretty_unit,
     seconds,
     volume_name,
@@ -94,6 +95,8 @@ def _rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
     levels, rows = result["levels"], []
     if shown:
         rows.append(("limited by", limited_by(result)))
+        if result.get("diagnosis"):
+            rows.append(("binds", str(result["diagnosis"]["binds"])))
     else:
         rows.append(("reason", str(result["reason"])))
     kind, inner = _kind(result), _inner(result)
@@ -113,8 +116,14 @@ def _rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
         rows.append((volume_name(len(units)), f"{below(result['volume'])} {unit}".rstrip()))
     if len(result.get("candidates", [])) > 1:
         unit = volume_unit(units)
-        volumes = [f"{c['candidate']} {below(c['volume'])}" for c in result["candidates"]]
-        rows.append(("candidates", f"{', '.join(volumes)} {unit}".rstrip() + " (sampled, at most)"))
+        tried = [
+            f"{c['candidate']} {below(c.get('proved_volume') or 0.0, 3)} of {number(c['volume'], 3)}"
+            for c in result["candidates"]
+        ]
+        rows.append(
+            ("candidates", f"{', '.join(tried)} {unit}".rstrip() + " (proved in the time, of what sampling allows)")
+        )
+    rows += _diagnosis_rows(result)
     rows.append(("policy", "-".join(map(str, result["policy"]["layers"]))))
     rows.append(("its sha256", str(result["policy"]["sha256"])))
     if result.get("eigenvalues"):
@@ -130,6 +139,22 @@ def _rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
     rows.append(("time", _times(result["seconds"])))
     rows.append(("checker", result["checked"] or "not reached"))
     return rows
+
+
+def _diagnosis_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """How stiff the loop is, where the proof had most to do, and what to try next."""
+    found, rows = result.get("diagnosis"), []
+    if not found:
+        return []
+    if found.get("stiffness"):
+        fast, slow = number(found["fastest"], 3), number(found["slowest"], 3)
+        rows.append(("modes", f"from {fast} to {slow} per second, a stiffness of {number(found['stiffness'], 2)}"))
+    if found["hurts"]:
+        weights = ", ".join(f"{name} {number(weight, 2)}" for name, weight in found["hurts"].items())
+        rows.append(("hurts most", f"{weights} (shares of the domain, the largest 1)"))
+    step = found["next"]
+    command = f"{step['command']}  ({step['why']})" if step.get("command") else step["why"]
+    return [*rows, ("try next", command)]
 
 
 def _level(value: float | None) -> str:
@@ -150,10 +175,14 @@ def _reach(result: Mapping[str, Any]) -> RenderableType:
     table.add_column("state")
     table.add_column("on its axis, +-", justify="right")
     table.add_column("largest in the set, +-", justify="right")
+    shares = [one["share"] for one in (result.get("diagnosis") or {}).get("shares", [])]
+    if shares:
+        table.add_column("of its domain", justify="right")
     columns = zip(_state_names(result), _state_units(result), result["semi_axes"], result["extents"], strict=True)
-    for name, unit, semi_axis, extent in columns:
+    for k, (name, unit, semi_axis, extent) in enumerate(columns):
         title = label(name, unit) if name.isascii() else f"{name} {pretty_unit(unit)}"
-        table.add_row(Text(title), Text(below(semi_axis)), Text(above(extent)))
+        cells = [title, below(semi_axis), above(extent)] + ([f"{100 * shares[k]:.3g} %"] if shares else [])
+        table.add_row(*map(Text, cells))
     return table
 
 

@@ -268,6 +268,7 @@ _LIMITS = {
     "inputs": "the input bounds: beyond it the policy asks for more than the actuator gives",
     "witness": "a point where Vdot >= 0",
     "time": "the time limit: more may be provable",
+    "refused by the checker": "the checker, which refuses some of what was found",
     "boxes": "the limit on boxes: more may be provable",
     "requested": "the level that was asked for",
 }

@@ -89,6 +89,8 @@ class BoundsEngine(Engine):
             boxes=ring.boxes,
             leaves=ring.leaves,
             seconds=seconds,
+            direction=ring.direction,
+            seconds_left=ring.seconds_left,
         )
 
 

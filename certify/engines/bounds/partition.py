@@ -38,6 +38,10 @@ class Partition:
         self._calls.append(self.splits)
         return np.arange(2 * first + 1, 2 * self.splits + 1)
 
+    def halvings(self) -> Numbers:
+        """How often each axis was halved, (n,)."""
+        return np.bincount(self._axes[: self.splits], minlength=len(self.root))
+
     def leaves(self) -> Numbers:
         """The numbers of the boxes that are not split, ascending."""
         whole = np.ones(2 * self.splits + 1, dtype=bool)

@@ -39,6 +39,7 @@ class RingProof:
     """Vdot < 0 is proved for `inner <= V <= outer` (equal if the ring is empty); `stop` says what ended the pass.
 
     `tree` is the partition in preorder: an axis for a split, 255 for a leaf; `root` its half-widths (n,) in z.
+    `direction` and `seconds_left` are those of `Proof`.
     `witness` is the lowest violation found along the way. `covered` is False if a pass inwards left boxes inside
     the inner level on which F could not be enclosed.
     """
@@ -52,6 +53,8 @@ class RingProof:
     leaves: int
     witness: Witness | None
     covered: bool = True
+    direction: tuple[float, ...] | None = None
+    seconds_left: float | None = None
 
 
 def prove_outwards(
@@ -319,10 +322,19 @@ class Pass:
         (inner, outer), witness, covered = self.levels, self.sweep.witness, self.covered and self.done
         if outer <= inner:  # nothing beyond the inner level
             empty = empty_ring(self.sweep.problem, self.sweep.T, inner)
-            return replace(empty, stop=stop, boxes=self.boxes, witness=witness, covered=covered)
+            found = replace(empty, stop=stop, boxes=self.boxes, witness=witness, covered=covered)
+            return replace(found, direction=self._direction())
         tree = self.partition.preorder()
         leaves = tree.count(bytes([LEAF]))
-        return RingProof(inner, outer, stop, tree, self.root, self.boxes, leaves, witness, covered)
+        found = RingProof(inner, outer, stop, tree, self.root, self.boxes, leaves, witness, covered)
+        return replace(found, direction=self._direction(), seconds_left=None if self.done else self._clock.left)
+
+    def _direction(self) -> tuple[float, ...] | None:
+        """The coordinate that was halved most often, in the states, as long as the root box in it; None at first."""
+        if not self.partition.splits:
+            return None
+        axis = int(np.argmax(self.partition.halvings()))
+        return tuple((self.sweep.T[:, axis] * self.root[axis]).tolist())
 
 
 def _split(
@@ -380,6 +392,7 @@ class _Clock:
 
     def __init__(self) -> None:
         self.before = self.start = 0.0
+        self.left: float | None = None
         self.history: list[tuple[float, float]] = []
 
     def __enter__(self) -> None:
@@ -397,8 +410,8 @@ class _Clock:
         seconds = self.before + self.spent
         self.history.append((seconds, share))
         earlier = next((s for t, s in reversed(self.history) if t <= seconds / 2), share)
-        left = None
+        self.left = None
         if 0 < earlier < share:
             growth = math.log(2) / math.log(share / earlier)
-            left = seconds * math.expm1(min(700.0, -growth * math.log(share)))
-        return Progress(level, target, boxes, open_, share, left)
+            self.left = seconds * math.expm1(min(700.0, -growth * math.log(share)))
+        return Progress(level, target, boxes, open_, share, self.left)

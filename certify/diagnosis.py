@@ -1,0 +1,183 @@
+"""What limits a result, in the plant's own names, and what to try next: computed from the run, in floats, for people.
+
+Nothing here is part of a proof. The next step is worked out: a longer limit from how the proof grew, a wider domain
+from what sampling finds beyond it, another candidate only if others were left untried.
+"""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.claims import Problem
+from certify.closed_loop import ClosedLoop
+from certify.engines.base import Proof
+from certify.engines.falsify import falsify
+from certify.errors import InputError
+from certify.lyapunov import diagonalising_coordinates, domain_limit, extents, volume
+from certify.options import RoaOptions
+from certify.results import Diagnosis, RoaResult, Share, Step
+from certify.verdict import Stop
+
+Array = NDArray[np.float64]
+_WIDER = Fraction(3, 2)  # of the side of the domain that binds
+_WORTH = 1.1  # growth of the volume that makes a wider domain worth a word
+_LONGEST = 86_400.0  # seconds that may be suggested
+_TOUCHES = 1e-6  # relative distance from the domain's limit
+
+
+def diagnose(result: RoaResult, options: RoaOptions, proof: Proof | None) -> Diagnosis:
+    """What limits `result`, `proof` being what its engine found."""
+    system = result.system
+    loop = ClosedLoop(system, result.network)
+    fastest, slowest = _modes(loop)
+    binds, kind, name, side, point = _binding(result)
+    scale = np.array([min(-float(lo), float(hi)) for lo, hi in system.domain])
+    direction = _direction(result, proof, point, loop)
+    weights = np.zeros(system.n) if direction is None else np.abs(direction) / scale
+    weights = weights / (weights.max() or 1.0)
+    hurts = sorted(zip((s.name for s in system.states), weights.tolist(), strict=True), key=lambda pair: -pair[1])
+    shares: tuple[Share, ...] = ()
+    if result.P is not None and result.levels.roa is not None:
+        reach = extents(result.P, result.levels.roa)
+        each = zip(system.states, reach.tolist(), scale.tolist(), strict=True)
+        shares = tuple(Share(s.name, system.units.get(s.name, ""), e, e / d) for s, e, d in each)
+    return Diagnosis(
+        binds,
+        kind,
+        name,
+        side,
+        None if point is None else tuple(point.tolist()),
+        shares,
+        fastest,
+        slowest,
+        tuple(pair for pair in hurts if pair[1] >= 0.1),
+        _next(result, options, proof, name),
+    )
+
+
+def _modes(loop: ClosedLoop) -> tuple[float | None, float | None]:
+    """Real parts of the fastest and the slowest eigenvalue at the origin."""
+    try:
+        real = np.linalg.eigvals(loop.linearise()[0]).real
+    except InputError:
+        return None, None
+    return float(np.min(real)), float(np.max(real))
+
+
+def _binding(result: RoaResult) -> tuple[str, str, str | None, str | None, Array | None]:
+    """Words, kind, name, side and point of what limits the level."""
+    system, P, level, witness = result.system, result.P, result.levels.roa, result.witness
+    limit = result.levels.domain_limit
+    if result.stop in (Stop.DOMAIN, Stop.MARGIN) and P is not None and limit is not None:
+        columns = np.asarray(np.linalg.inv(P), dtype=np.float64)
+        share = [columns[i, i] / min(-float(lo), float(hi)) ** 2 for i, (lo, hi) in enumerate(system.domain)]
+        i = int(np.argmax(share))
+        lo, hi = system.domain[i]
+        side = "lower" if -lo < hi else "upper"
+        sign = -1.0 if side == "lower" else 1.0
+        point = sign * columns[:, i] * math.sqrt((level or limit) / columns[i, i])
+        name = str(system.states[i].name)
+        value, unit = float(lo if side == "lower" else hi), system.units.get(name, "")
+        return f"the {side} side of the domain in {name}, {value:g} {unit}".rstrip(), "domain", name, side, point
+    if witness is not None and result.stop in (Stop.WITNESS, Stop.INPUTS):
+        where = ", ".join(f"{s.name} = {v:.4g}" for s, v in zip(system.states, witness.x, strict=True))
+        if witness.kind == "input":
+            found = _input_out_of_bounds(result, witness.x)
+            if found is not None:
+                name, side, value = found
+                return f"{name} leaves its {side} bound {value:g} at {where}", "input", name, side, witness.x
+        return f"Vdot = 0 near {where}", "vdot", None, None, witness.x
+    return result.reason, result.stop.name.lower(), None, None, None
+
+
+def _input_out_of_bounds(result: RoaResult, x: Array) -> tuple[str, str, float] | None:
+    system = result.system
+    u = ClosedLoop(system, result.network).policy(x[None])[0]
+    for symbol, value, (lo, hi) in zip(system.inputs, u.tolist(), system.input_bounds, strict=True):
+        if value < lo or value > hi:
+            return (symbol.name, "lower", float(lo)) if value < lo else (symbol.name, "upper", float(hi))
+    return None
+
+
+def _direction(result: RoaResult, proof: Proof | None, point: Array | None, loop: ClosedLoop) -> Array | None:
+    """A direction (n,) of states: of the point that binds, else along which boxes had to be halved most, else of the
+    eigenvector that decays least."""
+    if point is not None:
+        return point
+    if proof is not None and proof.direction is not None:
+        return np.array(proof.direction)
+    try:
+        values, vectors = np.linalg.eig(loop.linearise()[0])
+    except InputError:
+        return None
+    return np.asarray(np.abs(vectors[:, np.argmax(values.real)]))
+
+
+def _next(result: RoaResult, options: RoaOptions, proof: Proof | None, name: str | None) -> Step:
+    if result.stop is Stop.DOMAIN and name is not None and options.level is None:
+        return _wider_domain(result, name)
+    if result.stop in (Stop.TIME, Stop.BOXES):
+        return _longer(result, options, proof)
+    if options.claim == "asymptotic" and options.only is not None and options.P is None and options.level is None:
+        return Step((("--candidate", "auto"),), f"only the candidate {options.only} was tried")
+    if result.stop is Stop.STALLED:
+        worst = ", ".join(one for one, _ in _hurting(result, proof)[:3])
+        why = f"the bounds are too wide between the local set and beyond, most of all along {worst}; "
+        return Step((), why + "a policy with less curvature there helps (controllers train --curvature-weight)")
+    if result.stop in (Stop.WITNESS, Stop.INPUTS):
+        tried = max((t.volume for t in result.tried), default=0.0)
+        reached = max((t.proved_volume or 0.0 for t in result.tried), default=0.0)
+        if reached and tried > _WORTH * reached:
+            return Step((("--time-limit", _round(4 * options.time_limit)),), "another candidate reaches further")
+        return Step((), "what this V can show is proved; a larger set needs another policy or another kind of V")
+    return Step((), result.reason)
+
+
+def _hurting(result: RoaResult, proof: Proof | None) -> list[tuple[str, float]]:
+    direction = _direction(result, proof, None, ClosedLoop(result.system, result.network))
+    names = [s.name for s in result.system.states]
+    if direction is None:
+        return [(name, 0.0) for name in names]
+    scale = np.array([min(-float(lo), float(hi)) for lo, hi in result.system.domain])
+    return sorted(zip(names, (np.abs(direction) / scale).tolist(), strict=True), key=lambda pair: -pair[1])
+
+
+def _longer(result: RoaResult, options: RoaOptions, proof: Proof | None) -> Step:
+    """A time after which the ring is done, as the growth so far says, or ten times as long."""
+    left = None if proof is None else proof.seconds_left
+    if result.stop is Stop.BOXES and options.max_boxes <= result.boxes:
+        return Step((("--max-boxes", f"{10 * options.max_boxes}"),), "the limit on boxes ended the search")
+    if left is not None and 2 * left + options.time_limit < _LONGEST:
+        longer = 2 * left + options.time_limit  # the check grows with the tree
+        return Step((("--time-limit", _round(longer)),), f"at this pace the ring needs about {left:.0f} s more")
+    return Step((("--time-limit", _round(10 * options.time_limit)),), "the set still grew when the time ended")
+
+
+def _wider_domain(result: RoaResult, name: str) -> Step:
+    """Whether the same V reaches further in a domain that is wider in the state that binds."""
+    system, problem, level = result.system, result.problem, result.levels.roa
+    i = [s.name for s in system.states].index(name)
+    lo, hi = (_WIDER * side for side in system.domain[i])
+    wider = system.with_domain({name: (lo, hi)})
+    if problem is None or level is None:
+        return Step((), result.reason)
+    P = problem.V.P
+    loop = ClosedLoop(wider, result.network)
+    limit = domain_limit(P, wider.domain)
+    witness = falsify(Problem(loop, problem.V), diagonalising_coordinates(P, loop.linearise()[0]), limit, samples=4000)
+    reach = volume(P, limit if witness is None else min(limit, witness.level))
+    grown = reach / volume(P, level)
+    if grown < _WORTH:
+        return Step((), f"the domain binds in {name}, and a wider one would soon be bound by something else")
+    side = f"{name}={float(hi):g}" if lo == -hi else f"{name}={float(lo):g}:{float(hi):g}"
+    return Step((("--domain", side),), f"if the equations hold there, this V reaches {grown:.3g} times the volume")
+
+
+def _round(seconds: float) -> str:
+    """Seconds with two digits, rounded up."""
+    unit = 10.0 ** (math.floor(math.log10(seconds)) - 1)
+    return f"{math.ceil(seconds / unit) * unit:.0f}"
