@@ -25,8 +25,8 @@ class Contender:
     proved: float = 0.0
 
     def advance(self, budget: Budget, report: Callable[[Progress], None] | None) -> None:
-        """Work on the proof for as long as the budget allows."""
-        name = self.trial.name
+        """Work on the proof for as long as the budget allows, whose boxes are those of the whole attempt."""
+        name, budget = self.trial.name, replace(budget, boxes=budget.boxes - self.attempt.boxes)
         self.attempt.advance(budget, None if report is None else lambda state: report(replace(state, name=name)))
         level = self.attempt.level
         self.proved = 0.0 if level is None else volume(self.trial.P, level)
@@ -40,7 +40,7 @@ class Race:
     ----------
     begin : makes the attempt of a trial.
     left : seconds that the search may still take.
-    boxes : that a heat may bound.
+    boxes : that an attempt may bound.
     """
 
     begin: Callable[[Trial], Attempt]

@@ -290,7 +290,7 @@ class _Run:
         The certificate is a good one, and stays if the run is interrupted.
         """
         proof, problem = contender.attempt.proof(), contender.trial.task.problem
-        if proof.claim is None or not isinstance(proof.evidence, PartitionTree):
+        if proof.claim is None or not isinstance(proof.evidence, PartitionTree) or contender.trial.task.exactly:
             return 0.0
         from certify.engines.bounds.mend import leaves_that_meet, level_with_leaves
 
@@ -405,6 +405,10 @@ class _Run:
                 if answer["certificate_sha256"] != hashlib.sha256(data).hexdigest():
                     raise SoundnessError(
                         f"the checker's answer is about other bytes than those of {unchecked}: {answer}."
+                    )
+                if answer["levels"] != dict(certificate.claim.levels):
+                    raise SoundnessError(
+                        f"the checker's answer is about other levels than {certificate.claim}: {answer}."
                     )
                 unchecked.replace(path)
         finally:

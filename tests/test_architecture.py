@@ -15,19 +15,21 @@ ROOT = Path(__file__).parent.parent
 LEAVES = {"errors", "verdict"}  # anybody may import these, and they import nothing
 ENTRY = {"cli", "commands", "__main__"}  # these may import anything of certify
 EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows that exist
-    "candidates": "claims closed_loop engines lyapunov options policies systems",
     "certificate": "claims expressions lyapunov policies systems",
     "claims": "closed_loop expressions lyapunov policies",
     "closed_loop": "expressions policies systems",
+    "diagnosis": "claims closed_loop engines lyapunov options results",
     "enclosures": "closed_loop expressions rigorous",
     "engines": "certificate claims enclosures expressions policies rigorous running systems",
     "lyapunov": "closed_loop",
     "options": "claims lyapunov",
+    "race": "engines lyapunov trials",
     "report": "certificate closed_loop lyapunov policies systems",
     "results": "claims engines lyapunov policies systems",
     "rigorous": "closed_loop expressions policies",
-    "roa": "certificate claims closed_loop engines lyapunov options policies results rigorous running systems",
+    "roa": "certificate claims closed_loop diagnosis engines lyapunov options policies race results rigorous running systems trials",
     "systems": "expressions",
+    "trials": "certificate claims closed_loop engines lyapunov options",
     "controllers": "policies systems",
 }
 

@@ -13,10 +13,12 @@ import numpy as np
 import pytest
 import scipy.linalg
 import sympy
+from torch import Tensor
 
 from certify.certificate import Certificate, checking, run_checker, sole_writer
 from certify.claims import Problem
 from certify.closed_loop import ClosedLoop
+from certify.engines.bounds.rule import BoxBounds, VdotBound
 from certify.engines.falsify import Witness, refutes
 from certify.errors import BackendError, InputError, SoundnessError
 from certify.lyapunov import domain_limit, leaves_domain, solve_lyapunov
@@ -49,7 +51,7 @@ def test_linear_plants_reach_their_domain(tmp_path: Path, n: int) -> None:
 
 def test_P_of_a_linear_plant_in_exact_rationals(tmp_path: Path) -> None:
     system, network = chain(2, [-1.0, -2.0])
-    result = certify_roa(system, network, tmp_path)
+    result = certify_roa(system, network, tmp_path, RoaOptions(candidate="lyapunov"))
     np.testing.assert_allclose(result.P, [[1.25, 0.25], [0.25, 0.25]], rtol=1e-14)
 
 
@@ -139,7 +141,7 @@ def test_input_bounds_limit_the_level(tmp_path: Path) -> None:
     x, u = sympy.symbols("x u")
     system = System("s", (x,), (u,), {}, (x / 2 + u,), (sympy.Integer(0),), box(3), box(1))
     network = TanhNetwork((np.array([[-1.5]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
-    result = certify_roa(system, network, tmp_path)
+    result = certify_roa(system, network, tmp_path, RoaOptions(candidate="lyapunov"))
     assert result.verdict is Verdict.PROVED and result.reason == "inputs"
     level = result.levels.roa
     assert level is not None and 0.99 * (4 / 9) / 2 < level < (4 / 9) / 2
@@ -152,8 +154,8 @@ def test_an_exact_level_is_unknown_when_the_budget_runs_out(tmp_path: Path, pend
 
 
 def test_the_largest_level_within_a_budget_is_still_proved(tmp_path: Path, pendulum: System) -> None:
-    result = certify_roa(pendulum, pendulum_network(), tmp_path, RoaOptions(max_boxes=150))
-    full = certify_roa(pendulum, pendulum_network(), tmp_path)
+    result = certify_roa(pendulum, pendulum_network(), tmp_path, RoaOptions(candidate="lyapunov", max_boxes=150))
+    full = certify_roa(pendulum, pendulum_network(), tmp_path, RoaOptions(candidate="lyapunov"))
     assert result.verdict is Verdict.PROVED and result.reason == "boxes"
     local, level, best = result.levels.local, result.levels.roa, full.levels.roa
     assert local is not None and level is not None and best is not None
@@ -181,8 +183,10 @@ def test_equal_runs_write_equal_certificates(tmp_path: Path, pendulum: System) -
     assert (tmp_path / "a" / "certificate.json").read_bytes() == (tmp_path / "b" / "certificate.json").read_bytes()
 
 
-def test_a_rejection_is_a_soundness_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """If the engine claims too much, the run ends loudly and never in PROVED."""
+def test_a_file_that_says_more_than_was_meant_is_a_soundness_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """If the certificate that is accepted in the end states other levels than the result, the run ends loudly."""
     honest = Certificate.to_json
 
     def exaggerate(certificate: Certificate) -> str:
@@ -190,8 +194,42 @@ def test_a_rejection_is_a_soundness_error(tmp_path: Path, monkeypatch: pytest.Mo
         return honest(dataclasses.replace(certificate, claim=claim))
 
     monkeypatch.setattr(Certificate, "to_json", exaggerate)
-    with pytest.raises(SoundnessError, match="rejects"):
-        certify_roa(*scalar_tanh(), tmp_path)
+    with pytest.raises(SoundnessError, match="other levels"):
+        certify_roa(*scalar_tanh(), tmp_path, RoaOptions(candidate="lyapunov"))
+    assert not (tmp_path / "certificate.json").exists()
+
+
+@pytest.mark.parametrize("trust", [0.1, 1e6])
+def test_whatever_the_checker_refuses_a_run_ends_with_what_it_accepts(
+    tmp_path: Path, pendulum: System, monkeypatch: pytest.MonkeyPatch, trust: float
+) -> None:
+    """An engine that takes bounds for negative that are not: barely so, where leaves are split again, or at all."""
+    honest = VdotBound.__call__
+
+    def careless(self: VdotBound, lo: Tensor, hi: Tensor, inner: float, outer: float) -> BoxBounds:
+        found = honest(self, lo, hi, inner, outer)
+        return found._replace(proved=found.bound < trust)
+
+    options = RoaOptions(candidate="lyapunov")
+    network = pendulum_network()
+    true = certify_roa(pendulum, network, tmp_path / "true", options).levels
+    monkeypatch.setattr(VdotBound, "__call__", careless)
+    result = certify_roa(pendulum, network, tmp_path / "careless", options)
+    assert result.verdict is Verdict.PROVED and result.checker is not None
+    assert result.notice is not None and "the checker refused leaf" in result.notice
+    assert result.levels.roa is not None and true.roa is not None and true.local is not None
+    assert true.local <= result.levels.roa <= true.roa * (1 + 1e-9)
+    assert result.checker["levels"] == {"local": result.levels.local, "roa": result.levels.roa}
+    assert run_checker(tmp_path / "careless" / "certificate.json")["result"] == "ACCEPTED"
+    assert not list((tmp_path / "careless").glob("*.unchecked.json"))
+
+
+def test_what_cannot_be_mended_is_a_soundness_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("certify.roa.run_checker", lambda _: {"result": "REJECTED", "rule": "hash", "at": "policy"})
+    with pytest.raises(SoundnessError, match=r"rejects what the engine proved.*unchecked\.json reproduces"):
+        certify_roa(*scalar_tanh(), tmp_path, RoaOptions(candidate="lyapunov"))
+    assert not (tmp_path / "certificate.json").exists()
+    assert len(list(tmp_path.glob("*.unchecked.json"))) == 1
 
 
 def test_a_checker_that_cannot_run_is_a_backend_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -281,7 +319,7 @@ def test_a_witness_above_the_level_refutes_nothing(tmp_path: Path, monkeypatch: 
     while Fraction(below) >= exact:
         below = float(np.nextafter(below, 0))
     assert refutes(problem, witness, above) and not refutes(problem, witness, below)
-    monkeypatch.setattr("certify.roa.falsify", lambda *_: witness)
+    monkeypatch.setattr("certify.trials.falsify", lambda *_: witness)
     result = certify_roa(*scalar_tanh(), tmp_path, RoaOptions(level=3.0))
     assert result.verdict is Verdict.PROVED and result.levels.roa == 3.0
 

@@ -92,6 +92,10 @@ class Attempt(Protocol):
         """Whether more time would gain nothing."""
 
     @property
+    def boxes(self) -> int:
+        """Boxes bounded so far."""
+
+    @property
     def level(self) -> float | None:
         """The c2 that is proved so far; None if there is none."""
 
@@ -135,6 +139,11 @@ class Once:
     def done(self) -> bool:
         """Whether it has been worked on."""
         return self.found is not None
+
+    @property
+    def boxes(self) -> int:
+        """Boxes bounded."""
+        return 0 if self.found is None else self.found.boxes
 
     @property
     def level(self) -> float | None:

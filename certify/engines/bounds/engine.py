@@ -113,6 +113,10 @@ class _Outwards:
         return self.ring is None or self.ring.done
 
     @property
+    def boxes(self) -> int:
+        return 0 if self.ring is None else self.ring.boxes
+
+    @property
     def level(self) -> float | None:
         return self.inner if self.ring is None else self.ring.levels[1]
 
