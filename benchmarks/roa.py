@@ -102,7 +102,7 @@ def main() -> None:
     parser.add_argument("policies", nargs="*", type=Path, default=sorted(POLICIES.glob("*.pt")))
     parser.add_argument("--runs", type=int, default=5)
     parser.add_argument("--threads", type=int, default=2)
-    parser.add_argument("--candidate", default="lyapunov", choices=("lyapunov", "lqr", "optimised"))
+    parser.add_argument("--candidate", default="lyapunov", choices=("auto", "lyapunov", "scaled", "lqr", "optimised"))
     parser.add_argument("--time-limit", type=float, default=100.0, help="seconds for a ring")
     options = parser.parse_args()
     torch.set_num_threads(options.threads)

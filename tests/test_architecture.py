@@ -27,7 +27,10 @@ EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows th
     "report": "certificate closed_loop lyapunov policies systems",
     "results": "claims engines lyapunov policies systems",
     "rigorous": "closed_loop expressions policies",
-    "roa": "certificate claims closed_loop diagnosis engines lyapunov options policies race results rigorous running systems trials",
+    "roa": (
+        "certificate claims closed_loop diagnosis engines lyapunov options policies race results rigorous running "
+        "systems trials"
+    ),
     "systems": "expressions",
     "trials": "certificate claims closed_loop engines lyapunov options",
     "controllers": "policies systems",

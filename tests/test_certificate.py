@@ -21,7 +21,7 @@ from certify.checker import local as checker_local
 from certify.engines import local as producer_local
 from certify.errors import CertificateFormatError
 from certify.expressions import from_tree, to_tree
-from certify.roa import certify_roa
+from certify.roa import RoaOptions, certify_roa
 from certify.systems import available_systems, get_system
 from tests.support.loops import pendulum_network
 
@@ -32,7 +32,9 @@ Document = dict[str, Any]
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A pendulum whose input may leave its bounds (centred at the output), so that every rule has work to do."""
     folder = tmp_path_factory.mktemp("certificate")
-    result = certify_roa(get_system("pendulum"), pendulum_network(centre="output"), folder)
+    result = certify_roa(
+        get_system("pendulum"), pendulum_network(centre="output"), folder, RoaOptions(candidate="lyapunov")
+    )
     assert result.certificate is not None and result.checker is not None
     return result.certificate
 

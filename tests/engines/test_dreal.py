@@ -212,7 +212,7 @@ def test_what_dreal_confirms_is_written_as_trusted(
     pendulum: System, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     answering(monkeypatch, unsat)
-    result = certify_roa(pendulum, pendulum_network(), tmp_path, RoaOptions(engine="dreal"))
+    result = certify_roa(pendulum, pendulum_network(), tmp_path, RoaOptions(engine="dreal", candidate="lyapunov"))
     assert result.verdict is Verdict.TRUSTED and result.to_dict()["checked"] == "TRUSTED"
     assert result.to_dict()["engine"] == "dreal" and result.reason == "domain"
     assert result.solver is not None and {q["query"] for q in result.solver["queries"]} >= {"local"}
@@ -241,7 +241,7 @@ def test_what_can_be_checked_is_checked(
     change: dict[str, dict[str, object]], rule: str, pendulum: System, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     answering(monkeypatch, unsat)
-    certify_roa(pendulum, pendulum_network(), tmp_path, RoaOptions(engine="dreal"))
+    certify_roa(pendulum, pendulum_network(), tmp_path, RoaOptions(engine="dreal", candidate="lyapunov"))
     path = tmp_path / "certificate.json"
     data = json.loads(path.read_text())
     for section, fields in change.items():
@@ -288,7 +288,7 @@ def test_missing_dreal_is_unknown_when_named_and_a_notice_when_not(
 
 def test_both_engines_agree_or_say_so(pendulum: System, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked = answering(monkeypatch, unsat)
-    result = certify_roa(pendulum, pendulum_network(), tmp_path, RoaOptions(engine="both"))
+    result = certify_roa(pendulum, pendulum_network(), tmp_path, RoaOptions(engine="both", candidate="lyapunov"))
     assert result.to_dict()["checked"] == "ACCEPTED" and {"local", "ring"} <= set(asked)
     assert result.solver is not None and all(q["answer"] == "unsat" for q in result.solver["queries"])
     assert result.certificate is not None
@@ -300,7 +300,7 @@ def test_the_report_does_not_call_trusted_a_proof(
     pendulum: System, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     answering(monkeypatch, unsat)
-    result = certify_roa(pendulum, pendulum_network((8, 8)), tmp_path, RoaOptions(engine="dreal"))
+    result = certify_roa(pendulum, pendulum_network((8, 8)), tmp_path, RoaOptions(engine="dreal", candidate="lyapunov"))
     assert result.certificate is not None
     page = render_html(read_certificate(result.certificate), result.checker, result.to_dict(), result.certificate)
     assert "TRUSTED" in page and "ACCEPTED" not in page.split("<h2>How to check")[0].split("</style>")[1]
@@ -314,10 +314,13 @@ def test_a_contradiction_is_an_error_with_a_reproduction(tmp_path: Path, monkeyp
         monkeypatch,
         lambda q, name: Answer("delta-sat", 0.1, "", {"x": (1.0, 1.0)}) if name == "ring" else unsat(),
     )
-    assert certify_roa(system, network, tmp_path, RoaOptions(engine="both")).verdict is Verdict.PROVED
+    assert (
+        certify_roa(system, network, tmp_path, RoaOptions(engine="both", candidate="lyapunov")).verdict
+        is Verdict.PROVED
+    )
     monkeypatch.setattr(dreal_proof, "confirm", lambda case, witness: True)
     with pytest.raises(SoundnessError, match=r"contradiction\.json"):
-        certify_roa(system, network, tmp_path, RoaOptions(engine="both"))
+        certify_roa(system, network, tmp_path, RoaOptions(engine="both", candidate="lyapunov"))
     stated = json.loads((tmp_path / "contradiction.json").read_text())
     assert float.fromhex(stated["witness"]["x"][0]) == 1.0
 
@@ -364,7 +367,7 @@ def test_another_claim_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_delta_sat_is_said_to_touch_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     touches = Answer("delta-sat", 0.1, "", {"x": (1.0, 1.0)})
     answering(monkeypatch, lambda q, name: touches if name == "ring" else unsat())
-    result = certify_roa(*scalar_tanh(), tmp_path, RoaOptions(engine="both"))
+    result = certify_roa(*scalar_tanh(), tmp_path, RoaOptions(engine="both", candidate="lyapunov"))
     assert result.verdict is Verdict.PROVED and result.solver is not None
     (ring,) = (row for row in result.solver["queries"] if row["query"] == "ring")
     assert ring["answer"] == "delta-sat" and "no violation was shown" in ring["meaning"]
@@ -488,7 +491,7 @@ def test_real_dreal_on_the_scalar_plant(real: Backend, tmp_path: Path) -> None:
     """Levels below the truth are confirmed, a level beyond it is refuted with a witness in Arb."""
     system, network = scalar_tanh()
     truth = 1.915008**2
-    found = certify_roa(system, network, tmp_path, RoaOptions(engine="dreal"))
+    found = certify_roa(system, network, tmp_path, RoaOptions(engine="dreal", candidate="lyapunov"))
     assert found.verdict is Verdict.TRUSTED and found.levels.roa is not None
     assert 0.95 * truth < found.levels.roa < truth
     beyond = certify_roa(system, network, tmp_path, RoaOptions(engine="dreal", level=2.2**2))

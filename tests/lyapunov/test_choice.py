@@ -3,20 +3,25 @@
 from __future__ import annotations
 
 import json
+import shlex
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from certify.candidates import compare_candidates
 from certify.cli import _run
 from certify.closed_loop import ClosedLoop
 from certify.errors import BackendError, InputError
-from certify.lyapunov import choice, choose_candidate, domain_limit, volume
-from certify.policies import Policy, save_policy
+from certify.lyapunov import choice, choose_candidate, domain_limit, solve_lyapunov, volume
+from certify.policies import Policy, load_policy, save_policy
 from certify.roa import RoaOptions, certify_roa
-from certify.systems import System
+from certify.systems import System, get_system
+from certify.trials import blends, trial
+from certify.verdict import Verdict
 from tests.support.loops import chain, pendulum_network
+
+SHIPPED = Path(__file__).parent.parent.parent / "examples" / "policies"
 
 
 def test_each_candidate_solves_its_equation(pendulum: System) -> None:
@@ -44,34 +49,93 @@ def test_the_optimised_candidate_falls_back_with_a_notice(
     def fail(*_: object) -> None:
         raise BackendError("cvxpy is not installed.")
 
-    monkeypatch.setattr(choice, "optimise_candidate", fail)
+    monkeypatch.setattr(choice, "optimise_repeatedly", fail)
     result = certify_roa(pendulum, pendulum_network(), tmp_path, RoaOptions(candidate="optimised"))
     assert result.verdict.value == "PROVED" and result.candidate == "lyapunov"
     assert result.notice is not None and "cvxpy is not installed" in result.notice
     assert result.to_dict()["lyapunov"]["candidate"] == "lyapunov"
-    plain = certify_roa(pendulum, pendulum_network(), tmp_path, RoaOptions())
+    plain = certify_roa(pendulum, pendulum_network(), tmp_path, RoaOptions(candidate="lyapunov"))
     assert plain.P is not None and result.P is not None and np.array_equal(plain.P, result.P)
 
 
-def test_volumes_side_by_side() -> None:
-    """A linear plant: only the domain limits a level, and a P that is known is not computed again."""
+def test_a_trial_knows_its_reach() -> None:
+    """A linear plant: only the domain limits a level."""
     system, network = chain(2, [-1, -2])
-    known = np.array([[2.0, 0.5], [0.5, 1.0]])
-    rows = compare_candidates(system, network, RoaOptions(), {"lyapunov": known}, ["lyapunov", "lqr"])
-    assert [row.candidate for row in rows] == ["lyapunov", "lqr"]
-    assert all(row.limited_by == "domain" for row in rows)
-    level = domain_limit(known, system.domain)
-    assert (rows[0].level, rows[0].volume) == (level, volume(known, level))
+    P = np.array([[2.0, 0.5], [0.5, 1.0]])
+    found = trial(ClosedLoop(system, network), P, "mine", RoaOptions())
+    limit = domain_limit(P, system.domain)
+    assert found.limited_by == "domain" and found.limit == limit
+    assert found.task.target == limit * (1 - 1e-9) and found.volume == volume(P, found.task.target)
+    np.testing.assert_allclose(found.unit, P / found.task.target)
 
 
-def test_the_command_compares(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_blends_lie_between() -> None:
+    loop = ClosedLoop(*chain(2, [-1, -2]))
+    A = loop.linearise()[0]
+    weights = {"a": np.eye(2), "b": np.diag([9.0, 1.0])}
+    large, small = (trial(loop, solve_lyapunov(A, Q), name, RoaOptions()) for name, Q in weights.items())
+    between = list(blends(loop, large, small, RoaOptions()))
+    assert len(between) == 3
+    for one in between:
+        ends = np.sort([large.unit[0, 0], small.unit[0, 0]])
+        assert ends[0] <= one.P[0, 0] <= ends[1] and "a with" in one.name and one.name.endswith("of b")
+
+
+def test_several_are_tried_and_the_largest_proved_volume_counts(tmp_path: Path) -> None:
+    """With Q = I a violation comes far earlier than with the LQR cost, and with the optimised P later still."""
+    policy = load_policy(SHIPPED / "cartpole.pt")
+    system = get_system("cartpole").with_parameters(policy.parameters)
+    volumes = {}
+    for name in ("lyapunov", "lqr", "auto"):
+        options = RoaOptions(candidate=name, max_boxes=20_000)  # type: ignore[arg-type]
+        result = certify_roa(system, policy.network, tmp_path / name, options)
+        volumes[name] = result.to_dict()["volume"]
+    assert result.verdict is Verdict.PROVED
+    assert volumes["auto"] > 3 * volumes["lqr"] > 30 * volumes["lyapunov"]
+    (best,) = (row for row in result.tried if row.proved)
+    assert best.candidate == result.candidate
+    assert best.proved_volume == volumes["auto"] == max(row.proved_volume or 0.0 for row in result.tried)
+    data = result.to_dict()
+    assert [row["proved"] for row in data["candidates"]].count(True) == 1
+
+
+@pytest.mark.parametrize(
+    ("options", "name"), [({"Q": (1.0, 2.0)}, "lyapunov"), ({"R": (2.0,)}, "lqr"), ({"level": 0.1}, "lyapunov")]
+)
+def test_a_weight_or_a_level_is_about_one_candidate(options: dict[str, Any], name: str) -> None:
+    assert RoaOptions(**options).only == name and RoaOptions().only is None
+
+
+def test_the_command_says_what_to_try_next(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "policy.pt"
     save_policy(path, Policy(pendulum_network((8, 8)), "pendulum", {"m": "0.15"}))
-    assert _run(["roa", "--policy", str(path), "--out", str(tmp_path), "--json", "--compare"], True) == 0
-    data = json.loads(capsys.readouterr().out)
-    rows = {row["candidate"]: row for row in data["candidates"]}
-    assert list(rows) == ["lyapunov", "lqr", "optimised"]
-    assert [row["proved"] for row in rows.values()] == [True, False, False]
-    assert data["volume"] <= rows["lyapunov"]["volume"]
-    page = (tmp_path / "report.html").read_text()
-    assert "Lyapunov candidates" in page and "--compare" not in page
+    command = [
+        "roa",
+        "--policy",
+        str(path),
+        "--out",
+        str(tmp_path),
+        "--json",
+        "--candidate",
+        "lqr",
+        "--max-boxes",
+        "20",
+    ]
+    assert _run(command, True) == 0
+    told = json.loads(capsys.readouterr().out)["diagnosis"]
+    assert told["kind"] == "boxes" and told["next"]["options"] == {"--max-boxes": "200"}
+    assert told["next"]["command"].startswith("certify roa --policy") and told["next"]["command"].endswith(
+        "--max-boxes 200"
+    )
+    assert told["next"]["command"].count("--max-boxes") == 1 and "--candidate lqr" in told["next"]["command"]
+    assert _run([*shlex.split(told["next"]["command"])[1:], "--quiet"], True) == 0
+    again = json.loads(capsys.readouterr().out)
+    assert again["boxes"] > 20
+
+
+def test_quiet_says_nothing_but_the_result(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "policy.pt"
+    save_policy(path, Policy(pendulum_network((8, 8)), "pendulum", {"m": "0.15"}))
+    assert _run(["roa", "--policy", str(path), "--out", str(tmp_path), "--candidate", "lqr", "--quiet"], False) == 0
+    captured = capsys.readouterr()
+    assert captured.err == "" and "PROVED" in captured.out

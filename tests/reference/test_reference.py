@@ -29,7 +29,7 @@ from certify.reference import balls, leaves, local, rational
 from certify.reference.document import Certificate, Tree, exact
 from certify.reference.document import read as read_certificate
 from certify.reference.refusal import Refused
-from certify.roa import certify_roa
+from certify.roa import RoaOptions, certify_roa
 from certify.systems import get_system
 from certify.verdict import Verdict
 from tests.checker.test_format import NOT_A_HEX_FLOAT, NOT_A_RATIONAL, NOT_BASE64, NOT_IN_THE_GRAMMAR, RAW, SHAPES
@@ -86,7 +86,7 @@ def shipped(tmp_path_factory: pytest.TempPathFactory) -> Document:
     """The certificate of the policy that ships."""
     policy = load_policy(SHIPPED)
     system = get_system("pendulum").with_parameters(policy.parameters)
-    result = certify_roa(system, policy.network, tmp_path_factory.mktemp("shipped"))
+    result = certify_roa(system, policy.network, tmp_path_factory.mktemp("shipped"), RoaOptions(candidate="lyapunov"))
     assert result.verdict is Verdict.PROVED and result.certificate is not None
     return json.loads(result.certificate.read_text())
 

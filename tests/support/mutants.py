@@ -86,12 +86,17 @@ def base(name: str) -> Document:
 def produced(name: str) -> Document:
     """The certificate of a shipped policy, by the bounds engine."""
     from certify.policies import load_policy
-    from certify.roa import certify_roa
+    from certify.roa import RoaOptions, certify_roa
     from certify.systems import get_system
 
     policy = load_policy(POLICIES / f"{name}.pt")
     with tempfile.TemporaryDirectory() as folder:
-        result = certify_roa(get_system(name).with_parameters(policy.parameters), policy.network, Path(folder))
+        result = certify_roa(
+            get_system(name).with_parameters(policy.parameters),
+            policy.network,
+            Path(folder),
+            RoaOptions(candidate="lyapunov"),
+        )
         assert result.certificate is not None
         return json.loads(result.certificate.read_bytes())
 
