@@ -98,6 +98,15 @@ def raw_at_origin(policy: Policy) -> list[Fraction | None]:
     return h
 
 
+def policy_at_origin(policy: Policy) -> list[Fraction | None]:
+    """pi(0) without centring: raw(0), clipped."""
+    raw = raw_at_origin(policy)
+    if policy.clip is None:
+        return raw
+    ends = ([Fraction(v) for v in end.tolist()] for end in policy.clip)
+    return [None if v is None else min(max(v, lo), hi) for v, lo, hi in zip(raw, *ends, strict=True)]
+
+
 def _affine(row: list[float], bias: float, h: list[Fraction | None]) -> Fraction | None:
     terms = [None if v is None else Fraction(w) * v for w, v in zip(row, h, strict=True) if w != 0]
     known = [v for v in terms if v is not None]

@@ -155,6 +155,10 @@ def local_margin(problem: Problem, T: Array, level: float, known: Paths) -> floa
     states = [_Jet(0.0, row, nothing, nothing) for row in rho * T]
     each = zip(loop.u_eq, loop.network.scale, *_policy(known, rho, n), strict=True)
     inputs = [_Jet(float(u), float(s) * a, float(s) * Q, abs(float(s)) * E) for u, s, a, Q, E in each]
+    if loop.network.clip is not None:  # which has no second derivative at its corners
+        for jet, lo, hi in zip(inputs, *loop.network.clip, strict=True):
+            if not (lo < jet.c - (1 + _MARGIN) * jet.radius and jet.c + (1 + _MARGIN) * jet.radius < hi):
+                return -math.inf
     if not bounded_by_form(loop.network, system.input_bounds):
         for jet, (lo, hi) in zip(inputs, system.input_bounds, strict=True):
             if not (float(lo) < jet.c - jet.radius and jet.c + jet.radius < float(hi)):

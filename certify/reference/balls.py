@@ -99,8 +99,13 @@ def within_bounds(c: Certificate, ranges: Sequence[tuple[arb, arb]]) -> bool:
 
 
 def bounded_by_form(c: Certificate) -> bool:
-    """Whether `offset +- scale` lies in the bounds and the centring keeps the input there."""
-    if c.policy.centre == "output" or c.policy.squash != "tanh":
-        return False
+    """Whether for each input its clip lies in the bounds, or `offset +- scale` does and the centring keeps it there."""
+    squashed = c.policy.centre != "output" and c.policy.squash == "tanh"
     each = zip(c.policy.scale, c.policy.offset, c.plant.input_bounds, strict=True)
-    return all(lo <= exact(b) - abs(exact(s)) and exact(b) + abs(exact(s)) <= hi for s, b, (lo, hi) in each)
+    for j, (s, b, (lo, hi)) in enumerate(each):
+        limits = c.policy.limits(j)
+        by_clip = limits is not None and bool(lo <= limits[0]) and bool(limits[1] <= hi)
+        by_squash = lo <= exact(b) - abs(exact(s)) and exact(b) + abs(exact(s)) <= hi
+        if not (by_clip or (squashed and by_squash)):
+            return False
+    return True

@@ -77,6 +77,8 @@ def expression(codac: Any, tree: Any, values: Mapping[str, Any]) -> Any:
     arguments = [expression(codac, t, values) for t in rest]
     if operator in ("sin", "cos", "tan", "tanh", "log"):
         return getattr(codac, operator)(arguments[0])
+    if operator in ("min", "max"):
+        return getattr(codac, operator)(*arguments)
     result = -arguments[0] if operator == "-" and len(arguments) == 1 else arguments[0]
     for a in arguments[1:]:
         if operator == "+":

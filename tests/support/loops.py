@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from fractions import Fraction
 
 import numpy as np
@@ -32,6 +33,15 @@ def scalar_tanh() -> tuple[System, TanhNetwork]:
     )
     network = TanhNetwork((np.array([[-1.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
     return system, network
+
+
+def scalar_clip() -> tuple[System, TanhNetwork]:
+    """xdot = x/2 - 2 clip(x, -1/2, 1/2): the origin attracts exactly |x| < 2, and the clip acts for |x| > 1/2."""
+    system, _ = scalar_tanh()
+    x, u = system.states[0], system.inputs[0]
+    ends = np.array([-0.5]), np.array([0.5])
+    network = TanhNetwork((np.array([[1.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none", ends)
+    return dataclasses.replace(system, name="saturated", dynamics=(x / 2 - 2 * u,)), network
 
 
 def chain(n: int, poles: list[float]) -> tuple[System, TanhNetwork]:
