@@ -16,6 +16,7 @@ import typer
 
 from certify.commands.check import check
 from certify.commands.export_smt2 import export_smt2
+from certify.commands.plant import plant
 from certify.commands.report import report
 from certify.commands.roa import roa
 from certify.commands.systems import systems
@@ -32,6 +33,7 @@ app = typer.Typer(
 app.command("roa")(roa)
 app.command("check")(check)
 app.command("report")(report)
+app.command("plant")(plant)
 app.command("systems")(systems)
 app.command("export-smt2")(export_smt2)
 
