@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
@@ -27,11 +28,27 @@ def plant_of(stored: Policy, name: str | None, params: list[str], bounds: list[s
             f"file, as in --system {stored.system if stored.system.isidentifier() else 'plant'}.toml."
         )
     plant = shipped_system(stored.system) if name is None else chosen_system(name)
-    if name is None or name == stored.system:
-        plant = plant.with_parameters(stored.parameters)
-    elif notice := _other_plant(stored, plant):
+    shipped = name is None or name == stored.system
+    plant = with_params(plant.with_parameters(stored.parameters) if shipped else plant, params)
+    if not shipped and (notice := _other_plant(stored, plant)):
         tell(notice)
-    return with_domains(with_params(plant, params), bounds)
+    return _where_valid(stored, with_domains(plant, bounds))
+
+
+def _where_valid(stored: Policy, plant: System) -> System:
+    """The plant on the part of its domain where the policy's network is what it was made from; says what was cut."""
+    if stored.valid is None:
+        return plant
+    if len(stored.valid) != plant.n:
+        raise InputError(f"the policy is valid for {len(stored.valid)} states; {plant.name} has {plant.n}.")
+    cut: dict[str, tuple[Fraction, Fraction]] = {}
+    for symbol, (lo, hi), (low, high) in zip(plant.states, plant.domain, stored.valid.tolist(), strict=True):
+        ends = (max(lo, Fraction(low)) if low > -math.inf else lo, min(hi, Fraction(high)) if high < math.inf else hi)
+        if ends != (lo, hi):
+            cut[symbol.name] = ends
+    for name, (lo, hi) in cut.items():
+        tell(f"the domain of {name} is cut to [{float(lo):.6g}, {float(hi):.6g}]: there its observation is not clipped")
+    return plant.with_domain(cut)
 
 
 def with_params(plant: System, params: list[str]) -> System:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from certify.commands.arguments import numbers, plant_of
+from certify.commands.importing import policy_of
 from certify.commands.shared import Json, page_of, write
 from certify.commands.terminal import ProgressLine, say, show, tell
 from certify.errors import BackendError, InputError
@@ -18,6 +19,7 @@ from certify.errors import BackendError, InputError
 if TYPE_CHECKING:
     from certify.lyapunov import Candidate
     from certify.policies import Policy
+    from certify.policies.importers import ImportOptions
     from certify.results import RoaResult
     from certify.roa import RoaOptions
     from certify.systems import System
@@ -25,7 +27,8 @@ if TYPE_CHECKING:
 
 def roa(
     context: typer.Context,
-    policy: Annotated[Path, typer.Option(help="Policy file (certify-policy/1 or /2, .pt).")],
+    policy: Annotated[Path, typer.Option(help="Policy file (.pt), or another program's (see certify import).")],
+    importing: ImportOptions,
     system: Annotated[
         str | None, typer.Option(help="Plant: a name or a .toml file; default: what the policy file says.")
     ] = None,
@@ -56,12 +59,11 @@ def roa(
     as_json: Json = False,
 ) -> None:
     """Certify a region of attraction: prove, write a certificate, have it checked, report."""
-    from certify.policies import load_policy
     from certify.report import summary
     from certify.roa import RoaOptions, certify_roa
 
     start = time.perf_counter()
-    stored = load_policy(policy)
+    stored = policy_of(policy, importing, system, param or [])
     plant = plant_of(stored, system, param or [], domain or [])
     tell(_plant_line(stored, plant, system is not None))
     shift = stored.beta_shift(plant.exact_u_eq())

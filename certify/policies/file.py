@@ -1,4 +1,4 @@
-"""The policy file `certify-policy/1`, or with a clip `certify-policy/2`: torch, plain tensors only.
+"""The policy file `certify-policy/1`, or with a clip or bounds of validity `certify-policy/2`: plain tensors only.
 
 Nothing in a file is executed (`weights_only=True`), and equal policies give equal bytes: the archive is
 written through memory, so that neither a file name nor a clock enters it.
@@ -23,9 +23,10 @@ from certify.errors import InputError
 from certify.policies.network import Array, Centre, Squash, TanhNetwork
 
 FORMAT = "certify-policy/1"
-CLIPPED = "certify-policy/2"  # the same with `output.clip`, a pair of tensors; files without a clip stay version 1
+# The same with `output.clip`, a pair of tensors, or `valid`, a tensor (n, 2), or both; others stay version 1.
+SECOND = "certify-policy/2"
 _KEYS = {"format", "activation", "weights", "biases", "output", "centre", "system", "training"}
-_OPTIONAL = {"beta"}
+_OPTIONAL = {"beta", "valid"}
 _BETA_ROUNDING = 2.0**-20  # of tanh(beta): a few operations in single precision
 
 
@@ -41,6 +42,13 @@ class Policy:
     training : how it was made (seed, steps, versions, A, B, K ...); never trusted, may be empty.
     beta : rounded `atanh((u_eq - offset) / scale)` stored by another program, shape (m,), or None;
         the proof uses the real number and reports the shift.
+    valid : bounds of each state, shape (n, 2), infinite where there is none, or None: only between them is the network
+        what it was made from, because there no observation is clipped. A plant's domain must be cut to them before
+        anything is proved; `certify roa` does so.
+
+    Raises
+    ------
+    InputError : the bounds are not n pairs lo < 0 < hi, or bound nothing.
     """
 
     network: TanhNetwork
@@ -48,10 +56,22 @@ class Policy:
     parameters: Mapping[str, float | int | str] = field(default_factory=dict)
     training: Mapping[str, Any] = field(default_factory=dict)
     beta: Array | None = None
+    valid: Array | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "parameters", MappingProxyType(dict(self.parameters)))
         object.__setattr__(self, "training", MappingProxyType(dict(self.training)))
+        if self.valid is not None:
+            valid = np.array(self.valid, dtype=np.float64)
+            if valid.shape != (self.network.n, 2) or np.all(np.isinf(valid)):
+                raise InputError(f"`valid` must be bounds of shape ({self.network.n}, 2); found {valid.tolist()}.")
+            if not (np.all(valid[:, 0] < 0) and np.all(valid[:, 1] > 0)):
+                raise InputError(
+                    "the states where no observation is clipped must surround the origin; "
+                    f"found the bounds {valid.tolist()}."
+                )
+            valid.setflags(write=False)
+            object.__setattr__(self, "valid", valid)
 
     def beta_shift(self, u_eq: Sequence[Fraction]) -> float:
         """What reading the stored beta as the real number changes in u at the origin, in the input's units.
@@ -92,7 +112,7 @@ def save_policy(path: str | Path, policy: Policy) -> None:
         return torch.tensor(array, dtype=torch.float32 if single else torch.float64)
 
     data: dict[str, Any] = {
-        "format": FORMAT if network.clip is None else CLIPPED,
+        "format": FORMAT if network.clip is None and policy.valid is None else SECOND,
         "activation": "tanh",
         "weights": [tensor(w) for w in network.weights],
         "biases": [tensor(b) for b in network.biases],
@@ -103,6 +123,8 @@ def save_policy(path: str | Path, policy: Policy) -> None:
     }
     if network.clip is not None:
         data["output"]["clip"] = [tensor(end) for end in network.clip]
+    if policy.valid is not None:
+        data["valid"] = torch.tensor(policy.valid, dtype=torch.float64)
     if policy.beta is not None:
         data["beta"] = torch.tensor(policy.beta, dtype=torch.float64)
     buffer = io.BytesIO()
@@ -159,16 +181,20 @@ def load_policy(path: str | Path) -> Policy:
 
 def _policy(data: Any) -> Policy:
     found = data.get("format") if isinstance(data, dict) else type(data).__name__
-    if not isinstance(data, dict) or found not in (FORMAT, CLIPPED):
-        raise InputError(f"`format` must be {FORMAT!r} or {CLIPPED!r}; found {found!r}.")
-    parts = {"squash", "scale", "offset"} | ({"clip"} if found == CLIPPED else set())
-    keys = set(data)
+    if not isinstance(data, dict) or found not in (FORMAT, SECOND):
+        raise InputError(f"`format` must be {FORMAT!r} or {SECOND!r}; found {found!r}.")
+    keys, output = set(data), data.get("output")
+    parts = {"squash", "scale", "offset"}
+    if found == SECOND and isinstance(output, dict) and ("clip" in output or "valid" not in keys):
+        parts |= {"clip"}  # one of the two is what makes a file version 2
+    if found == FORMAT and "valid" in keys:
+        raise InputError(f"`valid` must go with format {SECOND!r}; found {FORMAT!r}.")
     if not _KEYS - {"training"} <= keys <= _KEYS | _OPTIONAL:
         odd = sorted(map(str, keys - _KEYS - _OPTIONAL))
         raise InputError(f"missing keys {sorted(_KEYS - {'training'} - keys)}, unknown keys {odd}.")
     if data["activation"] != "tanh":
         raise InputError(f"`activation` must be 'tanh'; found {data['activation']!r}. Only tanh networks are proved.")
-    output, system, training = data["output"], data["system"], data.get("training", {})
+    system, training = data["system"], data.get("training", {})
     if not isinstance(output, dict) or set(output) != parts:
         raise InputError(f"`output` of {found} must be a dictionary with exactly {', '.join(sorted(parts))}.")
     clip = output.get("clip", ())
@@ -192,7 +218,8 @@ def _policy(data: Any) -> Policy:
     beta = _array(data["beta"], "beta") if "beta" in data else None
     if beta is not None and (beta.shape != (network.m,) or network.centre != "preactivation"):
         raise InputError(f"`beta` must have shape ({network.m},) and goes with centre 'preactivation'.")
-    return Policy(network, system["name"], system["parameters"], training, beta)
+    valid = _array(data["valid"], "valid") if "valid" in data else None
+    return Policy(network, system["name"], system["parameters"], training, beta, valid)
 
 
 def _array(value: Any, name: str) -> Array:
