@@ -17,6 +17,7 @@ from certify.policies.importers.pickles import Call, Name, brief
 
 _KINDS = {"f2", "f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "b1"}
 _MAX_NUMBERS = 2**24
+_BYTES = (Name("__builtin__", "bytes"), Name("builtins", "bytes"))
 _NUMPY_PARTS = ("numpy.core", "numpy._core")
 
 Numbers = NDArray[Any]
@@ -83,6 +84,8 @@ def _bytes(node: Any, what: str) -> bytes:
     """Bytes as they are, or as the old protocols write them: text to be encoded as Latin-1."""
     if isinstance(node, bytes | bytearray):
         return bytes(node)
+    if isinstance(node, Call) and node.function in _BYTES and node.arguments == ():
+        return b""
     if (
         isinstance(node, Call)
         and node.function == Name("_codecs", "encode")

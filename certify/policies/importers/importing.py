@@ -213,7 +213,7 @@ def _require_answers(kind: Content, reading: Reading, options: ImportOptions, pl
     if options.normaliser is None and reading.normaliser is None and kind != "two-stage":
         wanted.append("--normaliser FILE or none (what was done to observations)")
     if options.action_scale is None and reading.action != plant.input_bounds:
-        wanted.append("--action-scale (u = scale * action + offset in the plant's units; 1 if they are the same)")
+        wanted.append("--action-scale (u = scale * action + offset in the plant's units: 1 if they are the same)")
     if options.observes is None and any(plant.exact_x_eq()):
         wanted.append(f"--observes absolute or deviation (the operating point of {plant.name} is not 0)")
     if wanted:

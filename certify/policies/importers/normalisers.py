@@ -61,8 +61,7 @@ def _vec_normalize(root: Any, what: str) -> Normaliser:
         raise InputError(
             f"the mean and variance in {what} must be two vectors of one size; found {mean.shape}, {var.shape}."
         )
-    epsilon = exactly(array_of(state.get("epsilon"), "epsilon"))[0]
-    limit = exactly(array_of(state.get("clip_obs"), "clip_obs"))[0]
+    epsilon, limit = (_one(state.get(name), name) for name in ("epsilon", "clip_obs"))
     return Normalise(exactly(mean), tuple(v + epsilon for v in exactly(var)), limit)
 
 
@@ -80,6 +79,13 @@ def rsl_normaliser(tensors: Mapping[str, Numbers], epsilon: Fraction | None) -> 
         raise InputError("a normaliser must have as many means as standard deviations, and these must be positive.")
     pairs = zip(mean, divisors, strict=True)
     return Diagonal(tuple(1 / d for d in divisors), tuple(-m / d for m, d in pairs))
+
+
+def _one(node: Any, name: str) -> Fraction:
+    values = exactly(array_of(node, name))
+    if len(values) != 1:
+        raise InputError(f"{name} must be one number; found {len(values)}.")
+    return values[0]
 
 
 def _state(node: Call, what: str) -> dict[Any, Any]:

@@ -87,7 +87,8 @@ def read_state_dict(tensors: Mapping[str, Numbers], options: ImportOptions, n: i
             f"the policy must read {n} states and command {m} inputs; {prefix} is {widths(layers)}. "
             "Name the states that it reads with --states."
         )
-    double = any(tensors[k].dtype == np.float64 for k in tensors if k.startswith(f"{prefix}."))
+    names = [f"{_dot(prefix)}{k}.weight" for k in _numbers(tensors, prefix)]
+    double = any(tensors[name].dtype == np.float64 for name in names)
     squash: Output = "identity" if options.squash is None else options.squash
     return Reading(
         words=f"state_dict {prefix} {widths(layers)}",

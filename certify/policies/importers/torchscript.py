@@ -27,6 +27,7 @@ _MAX_OPERATIONS = 1000
 _MAX_DEPTH = 40
 _MAX_TEXT = 2**20
 _KNOWN = "linear, addmm, matmul, add, sub, rsub, mul, div, neg, clamp, hardtanh, relu and tanh"
+_RESERVED = ("torch", "CONSTANTS", "getattr")
 _DEFAULTS: dict[str, tuple[Any, ...]] = {"hardtanh": (-1.0, 1.0), "clamp": (None, None)}
 
 
@@ -116,10 +117,12 @@ def _forward(program: _Program, module: Any, given: _Value, depth: int) -> _Valu
     if len(forward) != 1 or len(forward[0].args.args) != 2 or forward[0].decorator_list:
         raise InputError(f"{module.function} in {what} must have one forward of one observation.")
     names = [argument.arg for argument in forward[0].args.args]
+    if len(set(names)) != 2 or any(name in _RESERVED for name in names):
+        raise InputError(f"forward of {module.function} in {what} must not rename {', '.join(_RESERVED)}.")
     values: dict[str, Any] = {names[0]: module, names[1]: given}
     for statement in forward[0].body:
         match statement:
-            case ast.Assign(targets=[ast.Name(id=name)]):
+            case ast.Assign(targets=[ast.Name(id=name)]) if name not in _RESERVED:
                 values[name] = _evaluate(program, statement.value, values, depth)
             case ast.Return(value=ast.expr() as expression):
                 result = _evaluate(program, expression, values, depth)
@@ -153,7 +156,7 @@ def _evaluate(program: _Program, node: ast.expr, values: dict[str, Any], depth: 
             return _attribute(program, _evaluate(program, inner, values, depth), attr)
         case ast.Call(func=ast.Name(id="getattr"), args=[inner, ast.Constant(value=str() as attr)], keywords=[]):
             return _attribute(program, _evaluate(program, inner, values, depth), attr)
-        case ast.Call(func=ast.Attribute(value=ast.Name(id="torch"), attr=name)) if "torch" not in values:
+        case ast.Call(func=ast.Attribute(value=ast.Name(id="torch"), attr=name)):
             arguments = [_evaluate(program, argument, values, depth) for argument in node.args]
             return _operation(program, name, arguments, node)
         case ast.Call(func=ast.Attribute(value=inner, attr="forward"), args=[argument], keywords=[]):
