@@ -186,11 +186,8 @@ def _constant(tensor: Any, what: str) -> Numbers:
 
     if tensor.data_location == onnx.TensorProto.EXTERNAL or tensor.external_data:
         raise InputError(f"tensor {tensor.name} of {what} must lie in the file itself; it lies in another one.")
-    widths = {onnx.TensorProto.FLOAT: 4, onnx.TensorProto.DOUBLE: 8, onnx.TensorProto.FLOAT16: 2}
-    if tensor.data_type not in widths:
-        raise InputError(
-            f"tensor {tensor.name} of {what} must hold floating-point numbers (float16, float32, float64)."
-        )
+    if tensor.data_type not in (onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE):
+        raise InputError(f"tensor {tensor.name} of {what} must hold floating-point numbers (float32 or float64).")
     if any(size < 0 for size in tensor.dims):
         raise InputError(f"the shape of tensor {tensor.name} of {what} must have no negative size.")
     try:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from certify.errors import InputError
 from certify.policies.importers.options import Output
 from certify.policies.importers.steps import Affine, Diagonal, Normalise, Step, Tanh
 from certify.policies.network import Array
@@ -35,6 +36,10 @@ class Reading:
     beta : stored `atanh((u_eq - offset) / scale)` of a policy that is centred inside its squash, shape (m,).
     equilibrium : the state at which a policy of that kind is centred, shape (n,).
     double : whether the file itself asks for double precision.
+
+    Raises
+    ------
+    InputError : there is no layer among the steps.
     """
 
     words: str
@@ -45,6 +50,10 @@ class Reading:
     beta: Array | None = None
     equilibrium: Array | None = None
     double: bool = False
+
+    def __post_init__(self) -> None:
+        if not any(isinstance(step, Affine) for step in self.steps):
+            raise InputError("a policy must have a layer; the file has none.")
 
     @property
     def n(self) -> int:
