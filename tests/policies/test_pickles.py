@@ -224,6 +224,7 @@ def torch_file(
     storage: tuple[Any, ...] = STORAGE,
     function: str = "torch._utils _rebuild_tensor_v2",
     members: dict[str, bytes] | None = None,
+    behind: tuple[Any, ...] = (),
 ) -> bytes:
     """A file of torch whose one tensor `w` is described by hand."""
 
@@ -236,7 +237,11 @@ def torch_file(
         return pickle.dumps(value, 2)[2:-1]
 
     arguments = (
-        b"(" + globals_in(storage) + b"Q" + b"".join(globals_in(v) for v in (offset, size, stride, False, {})) + b"t"
+        b"("
+        + globals_in(storage)
+        + b"Q"
+        + b"".join(globals_in(v) for v in (offset, size, stride, False, {}, *behind))
+        + b"t"
     )
     program = b"\x80\x02}" + globals_in("w") + globals_in(function) + arguments + b"Rs."
     buffer = io.BytesIO()
@@ -258,6 +263,7 @@ def test_the_file_by_hand_is_read() -> None:
 @pytest.mark.parametrize(
     "file",
     [
+        torch_file(behind=({"neg": True},)),  # torch would give the numbers negated
         torch_file(offset=1),
         torch_file(offset=-1),
         torch_file(offset=0.0),
@@ -291,6 +297,15 @@ def test_the_file_by_hand_is_read() -> None:
 def test_hostile_tensors_are_refused(file: bytes) -> None:
     with pytest.raises(InputError):
         load_tensors(file, "f")
+
+
+def test_a_tensor_that_is_to_be_negated_is_refused() -> None:
+    buffer = io.BytesIO()
+    negated = torch.ones(2, dtype=torch.complex64).conj().imag
+    assert negated.is_neg()
+    torch.save({"w": negated}, buffer)
+    with pytest.raises(InputError):
+        load_tensors(buffer.getvalue(), "f")
 
 
 @pytest.mark.parametrize("name", ["_rebuild_qtensor", "_rebuild_sparse_tensor", "_rebuild_from_type_v2"])

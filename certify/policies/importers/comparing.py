@@ -116,8 +116,11 @@ def _run(steps: Sequence[Step], x: Array, error: Array, unit: float) -> tuple[Ar
 
 
 def _floats(values: Sequence[Any]) -> Array:
-    return np.array([float(v) for v in values])
+    try:
+        return np.array([float(v) for v in values])
+    except OverflowError as error:
+        raise InputError("the constants of a policy must lie in the range of binary64; one is larger.") from error
 
 
 def _ends(values: Sequence[Any], nothing: float) -> Array:
-    return np.array([nothing if v is None else float(v) for v in values])
+    return _floats([nothing if v is None else v for v in values])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -17,6 +18,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from certify.errors import InputError
+from certify.policies.exact import require_centred
 from certify.policies.file import Policy
 from certify.policies.importers.archives import MAX_BYTES, Archive
 from certify.policies.importers.comparing import SAMPLES, Difference, apply, compare, rounding, rounding_centred
@@ -134,16 +136,6 @@ def _import(raw: bytes, name: str, plant: System, options: ImportOptions) -> Imp
             f"the policy must read the {len(states)} states {', '.join(states)} and command the {plant.m} inputs of "
             f"{plant.name}; it reads {reading.n} and commands {reading.m}. Name what it reads with --states."
         )
-    x_eq = [plant.exact_x_eq()[i] for i in index]
-    shift = _shift(x_eq, options)
-    normaliser = _normaliser(reading, options, len(states))
-    before = (*shift, *normaliser)
-    _require_equilibrium(reading, x_eq if shift else [Fraction(0)] * len(states))
-    after = _action(options, plant.m)
-    steps = (*before, *reading.steps, *after)
-    folded = fold(steps, len(states))
-    network, valid = _network(folded, index, plant.n, reading, options)
-    u_eq = plant.exact_u_eq()
     record: dict[str, Any] = {
         "file": name,
         "sha256": hashlib.sha256(raw).hexdigest(),
@@ -153,6 +145,20 @@ def _import(raw: bytes, name: str, plant: System, options: ImportOptions) -> Imp
         "plant_states": [s.name for s in plant.states],
         "options": options.given,
     }
+    x_eq = [plant.exact_x_eq()[i] for i in index]
+    shift = _shift(x_eq, options)
+    normaliser = _normaliser(reading, options, len(states))
+    if isinstance(options.normaliser, Path):
+        record["normaliser_sha256"] = hashlib.sha256(read_bytes(options.normaliser)).hexdigest()
+    before = (*shift, *normaliser)
+    _require_equilibrium(reading, x_eq if shift else [Fraction(0)] * len(states))
+    after = _action(options, plant.m)
+    steps = (*before, *reading.steps, *after)
+    folded = fold(steps, len(states))
+    network, valid = _network(folded, index, plant.n, reading, options)
+    u_eq = plant.exact_u_eq()
+    if network.centre != "none":
+        require_centred(network, u_eq)
     # It refuses another plant's beta, before the comparison does with less to say.
     Policy(network, plant.name, beta=reading.beta, valid=valid).beta_shift(u_eq)
     x = _sample(plant, valid)
@@ -261,6 +267,8 @@ def _require_equilibrium(reading: Reading, x_eq: list[Fraction]) -> None:
 def _normaliser(reading: Reading, options: ImportOptions, n: int) -> tuple[Step, ...]:
     if options.normaliser is None:
         found: Normalise | Diagonal | None = reading.normaliser
+    elif reading.normaliser is not None:
+        raise InputError("--normaliser must be left out: the file holds the normaliser of its policy.")
     elif options.normaliser == "none":
         found = None
     else:
@@ -302,7 +310,10 @@ def _network(
 
 
 def _inwards(bounds: Bounds) -> tuple[float, float]:
-    lo, hi = bounds
+    largest = Fraction(sys.float_info.max)
+    lo, hi = (None if v is not None and abs(v) > largest else v for v in bounds)
+    if (lo, hi) != bounds:
+        raise InputError("what a normaliser clips to must lie in the range of binary64.")
     low, high = -math.inf if lo is None else float(lo), math.inf if hi is None else float(hi)
     if lo is not None and Fraction(low) < lo:
         low = math.nextafter(low, math.inf)
@@ -327,8 +338,12 @@ def _sample(plant: System, valid: Array | None) -> Array:
                 f"the domain of {state} must have a part where its observation is not clipped, [{lo:.6g}, {hi:.6g}]; "
                 "it has none."
             )
-    x = np.random.default_rng(0).uniform(box[:, 0], box[:, 1], (SAMPLES, plant.n)).astype(np.float32)
-    return np.asarray(np.clip(x.astype(np.float64), box[:, 0], box[:, 1]).astype(np.float32), dtype=np.float64)
+    lo, hi = box.T
+    # Single precision must not round a state out of the box, where a clip begins to act.
+    margin = 1e-6 * np.maximum(hi - lo, np.maximum(np.abs(lo), np.abs(hi)))
+    inner = np.where(2 * margin < hi - lo, margin, 0)
+    x = np.random.default_rng(0).uniform(lo + inner, hi - inner, (SAMPLES, plant.n))
+    return x.astype(np.float32).astype(np.float64)
 
 
 def _compare(

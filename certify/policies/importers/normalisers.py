@@ -6,6 +6,7 @@ clip. It computes `clip((o - mean) / sqrt(var + epsilon), -clip, clip)`; rsl_rl 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from fractions import Fraction
 from pathlib import Path
@@ -61,7 +62,8 @@ def _vec_normalize(root: Any, what: str) -> Normaliser:
         raise InputError(
             f"the mean and variance in {what} must be two vectors of one size; found {mean.shape}, {var.shape}."
         )
-    epsilon, limit = (_one(state.get(name), name) for name in ("epsilon", "clip_obs"))
+    epsilon = _one(state.get("epsilon"), "epsilon")
+    limit = None if state.get("clip_obs") == math.inf else _one(state.get("clip_obs"), "clip_obs")
     return Normalise(exactly(mean), tuple(v + epsilon for v in exactly(var)), limit)
 
 

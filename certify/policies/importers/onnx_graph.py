@@ -99,6 +99,8 @@ def _walk(graph_: Any, name: str, output: str, what: str) -> Chain:
         if node.output[0] in chains or node.output[0] in constants:
             raise InputError(f"{what} must name each value once; {node.output[0]} stands there twice.")
         flags = {a.name: a for a in node.attribute}
+        if len(flags) != len(node.attribute):
+            raise InputError(f"{at} in {what} must have each attribute once.")
         unknown = sorted(set(flags) - _FLAGS.get(node.op_type, set()))
         if unknown:
             raise InputError(

@@ -86,7 +86,11 @@ class TorchFile:
         if not isinstance(given, tuple) or len(given) < 6 or not isinstance(given[0], Persistent):
             raise InputError(f"tensor {what} is damaged.")
         _, offset, size, stride = given[:4]
-        dtype = given[6] if node.function.name == "_rebuild_tensor_v3" and len(given) > 6 else None
+        typed = node.function.name == "_rebuild_tensor_v3"
+        dtype = given[6] if typed and len(given) > 6 else None
+        # What may stand behind says that the numbers are meant negated or conjugated, or what shape lies behind them.
+        if any(given[7 if typed else 6 :]):
+            raise InputError(f"tensor {what} must be plain numbers; something is said of how to read them.")
         flat = self._storage(given[0].reference, dtype, what, folder)
         count = product(size, what)
         if type(offset) is not int or offset < 0:
@@ -119,7 +123,7 @@ class TorchFile:
             raise InputError(f"tensor {what} must name a storage of the file; it names something else.")
         _, kind, key, _, count = reference
         code = _DTYPES.get(dtype.name) if isinstance(dtype, Name) and dtype.module == "torch" else None
-        if code is None and dtype is None and isinstance(kind, Name) and kind.module in ("torch", "torch.storage"):
+        if code is None and dtype is None and isinstance(kind, Name) and kind.module in ("torch", "torch.cuda"):
             code = _TYPES.get(kind.name.removesuffix("Storage"))
         if code is None:
             raise InputError(f"tensor {what} must hold plain real numbers; its storage is {brief(kind)}.")

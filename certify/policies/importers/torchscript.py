@@ -92,7 +92,7 @@ def _classes(file: TorchFile) -> dict[Name, ast.ClassDef]:
         if len(raw) > _MAX_TEXT:
             raise InputError(f"{member} in {file.what} must be at most 1 MiB of code; it has {len(raw)} bytes.")
         try:
-            tree = ast.parse(raw.decode("utf-8"))
+            tree = ast.parse(raw.decode("ascii"))
         except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
             raise InputError(f"{member} in {file.what} is no code that can be read: {error}.") from error
         module = member.removeprefix(start).removesuffix(".py").replace("/", ".")
@@ -170,14 +170,31 @@ def _evaluate(program: _Program, node: ast.expr, values: dict[str, Any], depth: 
 
 def _attribute(program: _Program, module: Any, name: str) -> Any:
     state = module.states[0] if isinstance(module, Call) and len(module.states) == 1 else None
-    if not isinstance(state, dict) or name not in state:
-        raise InputError(f"a module of {program.file.what} has no {name}.")
+    fixed = _fixed(program, module, name)
+    if not isinstance(state, dict) or (name in state) == (fixed is not None):
+        found = "has no" if fixed is None else "says twice what is its"
+        raise InputError(f"a module of {program.file.what} {found} {name}.")
+    if fixed is not None:
+        return fixed
     value = state[name]
     if is_tensor(value):
         return _tensor(program, value, name, "data")
     if isinstance(value, Call | float | int) or value is None:
         return value
     raise InputError(f"{name} in {program.file.what} must be a module or a number; found {brief(value)}.")
+
+
+def _fixed(program: _Program, module: Any, name: str) -> float | None:
+    """The number that a module's class gives to an attribute, as it does to constants; None if it gives none."""
+    definition = program.classes.get(module.function) if isinstance(module, Call) else None
+    for node in [] if definition is None else definition.body:
+        match node:
+            case ast.AnnAssign(target=ast.Name(id=found), value=ast.expr() as value) if found == name:
+                number = _evaluate(program, value, {}, 0)
+                if isinstance(number, int | float) and not isinstance(number, bool):
+                    return float(number)
+                raise InputError(f"{name} in {program.file.what} must be a number; found {_text(value)}.")
+    return None
 
 
 def _tensor(program: _Program, node: Any, name: str, folder: str) -> Numbers:

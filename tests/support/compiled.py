@@ -1,6 +1,8 @@
-"""A module whose method runs when torch loads it; its annotations are no strings, because torch compiles them."""
+"""Modules whose annotations torch compiles, so that they must not be strings."""
 
 import torch
+
+from tests.support.foreign import mlp
 
 
 class SetsItsState(torch.nn.Module):
@@ -24,3 +26,14 @@ class SetsItsState(torch.nn.Module):
     def __setstate__(self, state: tuple[torch.Tensor, bool]) -> None:
         print("executed")  # noqa: T201
         self.k, self.training = state[0], state[1]
+
+
+class Constant(torch.nn.Module):
+    gain: torch.jit.Final[float]
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.net, self.gain = mlp(), 2.5
+
+    def forward(self, x: torch.Tensor) -> torch.Tensor:
+        return self.net(x) * self.gain
