@@ -66,7 +66,7 @@ class ClosedLoop:
                     f"{wanted}; {symbol}' = {float(value):.6g} at the origin. Shift the states or correct u_eq, "
                     "or claim practical stability, which does not need it."
                 )
-        require_centred(self.network, self.u_eq)
+        require_centred(self.network, self.u_eq, [s.name for s in system.inputs])
 
     def policy(self, x: Any) -> Any:
         """pi(x) in float64, (..., n) to (..., m)."""
