@@ -214,6 +214,8 @@ LINES = {line: k for k, line in enumerate(TANK.splitlines(), 1)}
         ("level**3", "sin", 'level = "flow - level**3"', ["sin must have its argument in brackets"]),
         ("level**3", "tau(level)", 'level = "flow - level**3"', ["tau*(...)"]),
         ("level**3", "level**0.5", 'level = "flow - level**3"', ["exponent", "integer", "1/2"]),
+        ("level**3", "level # **3", 'level = "flow - level**3"', ["# begins no comment"]),
+        ("level**3", "2(level)", 'level = "flow - level**3"', ["2 is no function", "2*(...)"]),
         ("level**3", "level % 3", 'level = "flow - level**3"', ["'level % 3'"]),
         ("level**3", "level/0", 'level = "flow - level**3"', ["divides by 0"]),
         ("level**3", "0x10*level", 'level = "flow - level**3"', ["'0x10'"]),
@@ -339,6 +341,18 @@ def test_names_for_shared_expressions(tmp_path: Path) -> None:
         assert part in str(found.value) and ", line " in str(found.value)
 
 
+def test_shared_expressions_that_double_are_refused_before_they_are_written_out(tmp_path: Path) -> None:
+    lines = ["a0 = 'level'"] + [f"a{k + 1} = 'sin(a{k}) + cos(a{k})'" for k in range(60)]
+    where = "[where]\n" + "\n".join(lines) + "\n\n"
+    with pytest.raises(InputError, match=r"where\.a1[0-9]: .* at most 20,000 terms"):
+        load_system(write(tmp_path, TANK.replace("[dynamics]", f"{where}[dynamics]")))
+
+
+def test_an_equation_may_go_over_lines(tmp_path: Path) -> None:
+    text = TANK.replace('"flow - level**3"', '"""\n  flow\n  - level**3\n"""')
+    assert load_system(write(tmp_path, text)) == load_system(write(tmp_path, TANK, "plain.toml"))
+
+
 def test_the_table_of_the_training_is_the_trainer_s(tmp_path: Path) -> None:
     assert load_system(write(tmp_path, TANK + '\n[training]\nanything = "goes"\n')).name == "tank"
 
@@ -360,6 +374,10 @@ def make():
 def broken():
     return 1 / 0
 
+def leaves():
+    print("{}")
+    raise SystemExit(0)
+
 def off():
     zero = (sympy.Integer(0),)
     return System("off", (x,), (u,), {}, (u - x + 1,), zero, ((-1, 1),), ((-2, 2),), x_eq=(h0,))
@@ -377,12 +395,22 @@ def test_a_plant_in_python(tmp_path: Path) -> None:
     assert not list(tmp_path.glob("__pycache__"))
 
 
+def test_a_python_plant_that_exits_gives_no_verdict(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = write(tmp_path, PYTHON, "my_plant.py")
+    save_policy(tmp_path / "p.pt", Policy(gain(chosen_system(f"{path}:plant"), (-1.0,)), "mine"))
+    arguments = ["roa", "--policy", str(tmp_path / "p.pt"), "--system", f"{path}:leaves", "--json"]
+    assert _run([*arguments, "--out", str(tmp_path / "o")], True) == 2
+    out, err = capsys.readouterr()
+    assert list(json.loads(out)) == ["error"] and "{}" in err
+
+
 @pytest.mark.parametrize(
     ("name", "message"),
     [
         ("plan", r"my_plant\.py has no 'plan'; did you mean 'plant'\?"),
         ("number", r"`number` in .*my_plant\.py must be a System or a function .* it gives int"),
         ("broken", r"my_plant\.py, line 16: running it raises ZeroDivisionError: division by zero"),
+        ("leaves", r"my_plant\.py, line 20: running it raises SystemExit: 0"),
         ("off", r"`off` in .*my_plant\.py: x_eq of off must be an equilibrium.*x' = 1 "),
     ],
 )
