@@ -51,7 +51,7 @@ class ClosedLoop:
 
         Raises
         ------
-        InputError : one of the two fails, or is not decided in rationals (a sin, cos or tan at another point than 0).
+        InputError : one of the two fails, or is not decided in rationals (a function at another point than 0).
         """
         system = self.system
         at_zero = dict.fromkeys(system.states, Fraction(0)) | dict(zip(system.inputs, self.u_eq, strict=True))

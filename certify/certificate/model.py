@@ -31,7 +31,7 @@ from certify.policies import TanhNetwork
 from certify.systems import System
 
 Array = NDArray[np.float64]
-SCHEMA = "certify-certificate/2"
+SCHEMA = "certify-certificate/3"
 """Of each claim's kind, what the file calls the inner level."""
 MAX_BYTES = 256 * 2**20
 _LONGEST_UNIT = 40
@@ -120,6 +120,7 @@ class Certificate:
                 "centre": network.centre,
                 "scale": _encode(network.scale),
                 "offset": _encode(network.offset),
+                "clip": None if network.clip is None else [_encode(end) for end in network.clip],
                 "sha256": network.sha256(),
             },
             "lyapunov": {"kind": "quadratic", "P": _encode(self.V.P)},
@@ -201,6 +202,7 @@ def parse_certificate(raw: bytes, name: str) -> Certificate:
             offset=_decode(policy["offset"], (m,)),
             squash=policy["squash"],
             centre=policy["centre"],
+            clip=_read_clip(policy["clip"], m),
         )
         return Certificate(
             system=system,
@@ -270,6 +272,13 @@ def _read_evidence(data: Mapping[str, Any], n: int) -> PartitionTree | TrustedSo
         return PartitionTree(_decode(data["T"], (n, n)), root, base64.b64decode(data["tree"]))
     queries = tuple((str(name), str(answer)) for name, answer in data["queries"])
     return TrustedSolver(str(data["solver"]), str(data["version"]), float.fromhex(data["precision"]), queries)
+
+
+def _read_clip(data: Any, m: int) -> tuple[Array, Array] | None:
+    if data is None:
+        return None
+    lo, hi = data
+    return _decode(lo, (m,)), _decode(hi, (m,))
 
 
 def _encode(array: Array) -> str:

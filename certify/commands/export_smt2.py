@@ -15,7 +15,7 @@ from certify.errors import InputError
 
 
 def export_smt2(
-    policy: Annotated[Path, typer.Option(help="Policy file (certify-policy/1, .pt).")],
+    policy: Annotated[Path, typer.Option(help="Policy file (certify-policy/1 or /2, .pt).")],
     out: Annotated[Path, typer.Option(help="Folder for the files, one a claim.")],
     system: Annotated[str | None, typer.Option(help="Plant, as for roa; default: what the policy file says.")] = None,
     param: Annotated[list[str] | None, typer.Option(help="Parameter of the plant, NAME=VALUE; repeatable.")] = None,

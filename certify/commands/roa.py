@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 def roa(
     context: typer.Context,
-    policy: Annotated[Path, typer.Option(help="Policy file (certify-policy/1, .pt).")],
+    policy: Annotated[Path, typer.Option(help="Policy file (certify-policy/1 or /2, .pt).")],
     system: Annotated[
         str | None,
         typer.Option(

@@ -1,4 +1,4 @@
-"""The policy file `certify-policy/1`: written and read with torch, plain tensors only.
+"""The policy file `certify-policy/1`, or with a clip `certify-policy/2`: torch, plain tensors only.
 
 Nothing in a file is executed (`weights_only=True`), and equal policies give equal bytes: the archive is
 written through memory, so that neither a file name nor a clock enters it.
@@ -23,6 +23,7 @@ from certify.errors import InputError
 from certify.policies.network import Array, Centre, Squash, TanhNetwork
 
 FORMAT = "certify-policy/1"
+CLIPPED = "certify-policy/2"  # the same with `output.clip`, a pair of tensors; files without a clip stay version 1
 _KEYS = {"format", "activation", "weights", "biases", "output", "centre", "system", "training"}
 _OPTIONAL = {"beta"}
 _BETA_ROUNDING = 2.0**-20  # of tanh(beta): a few operations in single precision
@@ -84,14 +85,14 @@ def save_policy(path: str | Path, policy: Policy) -> None:
 
     network = policy.network
     # float32 where that loses nothing: the file is smaller, the numbers are the same.
-    arrays = (*network.weights, *network.biases, network.scale, network.offset)
+    arrays = (*network.weights, *network.biases, network.scale, network.offset, *(network.clip or ()))
     single = all(np.array_equal(a.astype(np.float32).astype(np.float64), a) for a in arrays)
 
     def tensor(array: Array) -> torch.Tensor:
         return torch.tensor(array, dtype=torch.float32 if single else torch.float64)
 
     data: dict[str, Any] = {
-        "format": FORMAT,
+        "format": FORMAT if network.clip is None else CLIPPED,
         "activation": "tanh",
         "weights": [tensor(w) for w in network.weights],
         "biases": [tensor(b) for b in network.biases],
@@ -100,6 +101,8 @@ def save_policy(path: str | Path, policy: Policy) -> None:
         "system": {"name": policy.system, "parameters": dict(policy.parameters)},
         "training": dict(policy.training),
     }
+    if network.clip is not None:
+        data["output"]["clip"] = [tensor(end) for end in network.clip]
     if policy.beta is not None:
         data["beta"] = torch.tensor(policy.beta, dtype=torch.float64)
     buffer = io.BytesIO()
@@ -130,7 +133,7 @@ def load_policy(path: str | Path) -> Policy:
     Raises
     ------
     InputError : the file is missing, is not an archive of plain tensors, or does not follow
-        `certify-policy/1`.
+        `certify-policy/1` or `certify-policy/2`.
     """
     import torch
 
@@ -155,9 +158,10 @@ def load_policy(path: str | Path) -> Policy:
 
 
 def _policy(data: Any) -> Policy:
-    if not isinstance(data, dict) or data.get("format") != FORMAT:
-        found = data.get("format") if isinstance(data, dict) else type(data).__name__
-        raise InputError(f"`format` must be {FORMAT!r}; found {found!r}.")
+    found = data.get("format") if isinstance(data, dict) else type(data).__name__
+    if not isinstance(data, dict) or found not in (FORMAT, CLIPPED):
+        raise InputError(f"`format` must be {FORMAT!r} or {CLIPPED!r}; found {found!r}.")
+    parts = {"squash", "scale", "offset"} | ({"clip"} if found == CLIPPED else set())
     keys = set(data)
     if not _KEYS - {"training"} <= keys <= _KEYS | _OPTIONAL:
         odd = sorted(map(str, keys - _KEYS - _OPTIONAL))
@@ -165,8 +169,11 @@ def _policy(data: Any) -> Policy:
     if data["activation"] != "tanh":
         raise InputError(f"`activation` must be 'tanh'; found {data['activation']!r}. Only tanh networks are proved.")
     output, system, training = data["output"], data["system"], data.get("training", {})
-    if not isinstance(output, dict) or set(output) != {"squash", "scale", "offset"}:
-        raise InputError("`output` must be a dictionary with squash, scale and offset.")
+    if not isinstance(output, dict) or set(output) != parts:
+        raise InputError(f"`output` of {found} must be a dictionary with exactly {', '.join(sorted(parts))}.")
+    clip = output.get("clip", ())
+    if not isinstance(clip, list | tuple) or len(clip) != (2 if "clip" in parts else 0):
+        raise InputError("`output.clip` must be a list of two tensors, lo and hi.")
     if not isinstance(system, dict) or set(system) != {"name", "parameters"} or not isinstance(system["name"], str):
         raise InputError("`system` must be a dictionary with name and parameters.")
     if not isinstance(system["parameters"], dict) or not isinstance(training, dict):
@@ -180,6 +187,7 @@ def _policy(data: Any) -> Policy:
         offset=_array(output["offset"], "output.offset"),
         squash=cast(Squash, output["squash"]),
         centre=cast(Centre, data["centre"]),
+        clip=cast(Any, tuple(_array(end, "output.clip") for end in clip) or None),
     )
     beta = _array(data["beta"], "beta") if "beta" in data else None
     if beta is not None and (beta.shape != (network.m,) or network.centre != "preactivation"):

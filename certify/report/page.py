@@ -368,6 +368,7 @@ def _tables(
         geometry.append(("eigenvalues of the closed loop", _eigenvalues(certificate)))
     evidence = [
         ("policy", f"{'-'.join(map(str, network.layers))} tanh, squash {network.squash}, centre {network.centre}"),
+        *(() if network.clip is None else (("clipped to", _clip(certificate)),)),
         ("policy sha256", network.sha256()),
         ("certificate sha256", sha256),
     ]
@@ -423,6 +424,13 @@ def _simulated(roa: SimulatedRoa, certificate: Certificate) -> dict[str, str]:
         "of": volume_name(certificate.system.n),
         "who": words_for(certificate.kind).simulated,
     }
+
+
+def _clip(certificate: Certificate) -> str:
+    """Each input's limits, in its unit."""
+    inputs, clip = certificate.system.inputs, certificate.network.clip or ()
+    each = zip(inputs, *clip, strict=True)
+    return ", ".join(f"{s.name} in [{number(float(lo), 10)}, {number(float(hi), 10)}]" for s, lo, hi in each)
 
 
 def _eigenvalues(certificate: Certificate) -> str:

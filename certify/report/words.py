@@ -195,7 +195,7 @@ class Words:
     excluded: tuple[tuple[str, str], ...]
 
 
-SMOOTH = ("Equations", "The closed loop is twice continuously differentiable on {V ≤ c₂}.", "")
+SMOOTH = ("Equations", "The closed loop is locally Lipschitz on {V ≤ c₂}: solutions exist and are unique.", "")
 DEFINITE = ("Lyapunov function", "P is symmetric positive definite, so that {V ≤ c₂} is compact.", "")
 DOMAIN = ("Domain", "{V ≤ c₂} lies strictly inside the domain.", "")
 INPUTS = ("Inputs", "On {V ≤ c₂} the input stays in its bounds, so that an actuator that clips changes nothing.", "")

@@ -784,7 +784,9 @@ def structure() -> Iterator[Mutant]:
             yield mutant(
                 f"{name}: {path or 'file'}, unknown key", edited(data, path, unknown) if path else unknown, "format"
             )
-        typed = [p for p in places(data) if p != "policy.sha256" and not p.startswith("provenance")]
+        typed = [
+            p for p in places(data) if p not in ("policy.sha256", "policy.clip") and not p.startswith("provenance")
+        ]
         for path in generator.choice(typed, 25, replace=False):
             value = values[int(generator.integers(len(values)))]
             yield mutant(f"{name}: {path} = {value!r}", edited(data, str(path), value), "format")
@@ -798,7 +800,7 @@ def structure() -> Iterator[Mutant]:
             ("inverted domain", "plant.domain", lambda d: [pair[::-1] for pair in d]),
             ("inverted bounds", "plant.input_bounds", lambda d: [pair[::-1] for pair in d]),
             ("unknown name", "plant.dynamics.0", lambda e: ["+", e, "wind"]),
-            ("unknown operator", "plant.dynamics.0", lambda e: ["exp", e]),
+            ("unknown operator", "plant.dynamics.0", lambda e: ["log", e]),
             ("no operand", "plant.dynamics.0", lambda e: ["+"]),
             ("power 0", "plant.dynamics.0", lambda e: ["**", e, 0]),
             ("power 65", "plant.dynamics.0", lambda e: ["**", e, 65]),
@@ -812,7 +814,7 @@ def structure() -> Iterator[Mutant]:
             ("negative shape", "policy.layers.0.shape", lambda s: [-s[0], s[1]]),
             ("shape of booleans", "policy.layers.0.shape", lambda s: [True, True]),
             ("squash", "policy.squash", lambda s: "relu"), ("centre", "policy.centre", lambda s: "input"),
-            ("schema", "schema", lambda s: "certify-certificate/1"), ("kind", "evidence.kind", lambda s: "trust-me"),
+            ("schema", "schema", lambda s: "certify-certificate/2"), ("kind", "evidence.kind", lambda s: "trust-me"),
             ("zero scale", "policy.scale", lambda s: encode([0.0])),
             ("scale -0", "policy.scale", lambda s: encode([-0.0])),
             ("kind of a solver", "evidence.kind", lambda s: "trusted-solver"),
