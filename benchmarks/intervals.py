@@ -107,4 +107,6 @@ class Intervals(Algebra[Interval]):
     def function(self, name: str, value: Interval) -> Interval:
         if name == "tan":
             return super().function(name, value)
+        if name in ("tanh", "exp", "atan", "sqrt"):  # they rise; the root of a negative number is NaN
+            return getattr(value[0], name)(), getattr(value[1], name)()
         return cosine((value[0] - torch.pi / 2, value[1] - torch.pi / 2) if name == "sin" else value)

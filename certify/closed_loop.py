@@ -51,7 +51,7 @@ class ClosedLoop:
 
         Raises
         ------
-        InputError : one of the two fails, or is not decided in rationals (a sin, cos or tan at another point than 0).
+        InputError : one of the two fails, or is not decided in rationals (a function at another point than 0).
         """
         system = self.system
         at_zero = dict.fromkeys(system.states, Fraction(0)) | dict(zip(system.inputs, self.u_eq, strict=True))
@@ -66,7 +66,7 @@ class ClosedLoop:
                     f"{wanted}; {symbol}' = {float(value):.6g} at the origin. Shift the states or correct u_eq, "
                     "or claim practical stability, which does not need it."
                 )
-        require_centred(self.network, self.u_eq)
+        require_centred(self.network, self.u_eq, [s.name for s in system.inputs])
 
     def policy(self, x: Any) -> Any:
         """pi(x) in float64, (..., n) to (..., m)."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from certify.claims.claim import CLAIMS, Asymptotic, Claim, Practical, Problem
-from certify.claims.conditions import BeforeClip, Condition, Guard, OfInput, OfState, Vdot, conditions
+from certify.claims.conditions import BeforeClip, Condition, Guard, OfInput, OfState, Radicand, Vdot, conditions
 
 __all__ = [
     "CLAIMS",
@@ -16,6 +16,7 @@ __all__ = [
     "OfState",
     "Practical",
     "Problem",
+    "Radicand",
     "Vdot",
     "conditions",
 ]

@@ -11,7 +11,10 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Literal
 
+import sympy
+
 from certify.claims.claim import Asymptotic, Claim, Problem
+from certify.expressions import as_power
 from certify.policies import bounded_by_form
 
 
@@ -60,6 +63,13 @@ class BeforeClip:
 
 
 @dataclass(frozen=True, slots=True)
+class Radicand:
+    """The margin `-v`, v the index-th of the equations' `radicands`: what a square root is taken of is positive."""
+
+    index: int
+
+
+@dataclass(frozen=True, slots=True)
 class Condition:
     """For all x in the domain box where every guard holds, `margin < 0` (`strict`) or `margin <= 0`.
 
@@ -68,13 +78,13 @@ class Condition:
 
     name: str
     guards: tuple[Guard, ...]
-    margin: Vdot | OfState | OfInput | BeforeClip
+    margin: Vdot | OfState | OfInput | BeforeClip | Radicand
     strict: bool = True
     punctured: bool = False
 
 
 def conditions(claim: Claim, problem: Problem) -> tuple[Condition, ...]:
-    """Everything that has to be shown for `claim`: domain, clip, local, ring, inputs.
+    """Everything that has to be shown for `claim`: domain, clip, local, ring, roots, inputs.
 
     The domain's conditions are about the box itself: {V <= c2} is connected and holds the origin, so it leaves the
     interior of the box only through a side.
@@ -84,7 +94,7 @@ def conditions(claim: Claim, problem: Problem) -> tuple[Condition, ...]:
         found += (*clip_conditions(problem, claim.local), local_condition(claim.local))
     if claim.inner < claim.roa or not isinstance(claim, Asymptotic):
         found += (ring_condition(claim.inner, claim.roa),)
-    return found + input_conditions(problem, claim.roa)
+    return found + root_conditions(problem, claim.roa) + input_conditions(problem, claim.roa)
 
 
 def domain_conditions(problem: Problem, level: float) -> tuple[Condition, ...]:
@@ -118,6 +128,26 @@ def clip_conditions(problem: Problem, level: float) -> tuple[Condition, ...]:
 def ring_condition(inner: float, outer: float) -> Condition:
     """Vdot < 0 for inner <= V <= outer."""
     return Condition("ring", (Guard("outside", inner), Guard("inside", outer)), Vdot())
+
+
+def root_conditions(problem: Problem, level: float) -> tuple[Condition, ...]:
+    """What square roots in the equations are taken of is positive on {V <= level}, one condition a root.
+
+    What bounds F on boxes shows it along the way; a solver may look only where the roots are defined.
+    """
+    count = len(radicands(problem))
+    return tuple(Condition(f"root-{k}", (Guard("inside", level),), Radicand(k)) for k in range(count))
+
+
+def radicands(problem: Problem) -> tuple[sympy.Expr, ...]:
+    """What the equations take square roots of, inner roots before outer ones."""
+    found: dict[sympy.Expr, None] = {}
+    for expression in problem.loop.system.exact_dynamics():
+        for node in sympy.postorder_traversal(expression):
+            power = as_power(node)
+            if power is not None and power[1] > 0 and node.free_symbols:
+                found[power[0]] = None
+    return tuple(found)
 
 
 def input_conditions(problem: Problem, level: float) -> tuple[Condition, ...]:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.claims.claim import Problem
-from certify.claims.conditions import BeforeClip, Condition, OfState, Vdot
+from certify.claims.conditions import BeforeClip, Condition, OfState, Radicand, Vdot, radicands
 from certify.closed_loop import ClosedLoop
 from certify.errors import InputError
 from certify.expressions import Tree, to_tree
@@ -57,6 +57,9 @@ def query(condition: Condition, problem: Problem) -> Query:
     elif isinstance(margin, Vdot):
         definitions += [*_policy(problem.loop), *_vdot(problem)]
         constraints.append(("Vdot.", ">=", "0"))
+    elif isinstance(margin, Radicand):
+        definitions += [*_policy(problem.loop), ("r.", to_tree(radicands(problem)[margin.index]))]
+        constraints.append(("r.", "<=", "0"))
     else:
         symbols = system.states if isinstance(margin, OfState) else system.inputs
         name = f"{BEFORE_CLIP}{margin.index}" if isinstance(margin, BeforeClip) else symbols[margin.index].name

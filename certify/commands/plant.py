@@ -84,7 +84,7 @@ def _facts(s: System, eigenvalues: Sequence[complex], reach: Controllability) ->
     how = (
         "exact rank of [B, AB, ...] in rationals"
         if reach.exact
-        else f"rank in floats: the smallest singular value of [B, AB, ...], columns scaled to 1: {reach.smallest:.3g}"
+        else f"rank in floats: the smallest singular value of [B, AB, ...] over the largest: {reach.smallest:.3g}"
     )
     word_reach = "controllable" if reach.rank == s.n else "NOT controllable"
     rows = [

@@ -30,7 +30,10 @@ def roa(
     policy: Annotated[Path, typer.Option(help="Policy file (.pt), or another program's (see certify import).")],
     importing: ImportOptions,
     system: Annotated[
-        str | None, typer.Option(help="Plant: a name or a .toml file; default: what the policy file says.")
+        str | None,
+        typer.Option(
+            help="Plant: a name, FILE.toml, or FILE.py:NAME, whose code is run; default: what the policy file says."
+        ),
     ] = None,
     param: Annotated[list[str] | None, typer.Option(help="Parameter of the plant, NAME=VALUE; repeatable.")] = None,
     domain: Annotated[

@@ -36,6 +36,7 @@ class Witness:
     def describe(self, system: System) -> str:
         """The violation in words."""
         names = ", ".join(f"{s} = {v:.6g}" for s, v in zip(system.states, self.x, strict=True))
+        names += ", in deviations from x_eq," if system.operating_point() else ""
         what = "Vdot >= 0" if self.kind == "vdot" else "the input leaves its bounds"
         return f"{what} at {names} with V = {self.level:.12g} (shown in Arb)"
 

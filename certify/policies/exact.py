@@ -49,8 +49,8 @@ def at_origin(network: TanhNetwork) -> tuple[Fraction | None, ...]:
     return tuple(None if v is None else min(max(v, lo), hi) for v, lo, hi in zip(raw, *ends, strict=True))
 
 
-def require_centred(network: TanhNetwork, u_eq: Sequence[Fraction]) -> None:
-    """Refuse a policy whose `pi(0) = u_eq` does not hold exactly.
+def require_centred(network: TanhNetwork, u_eq: Sequence[Fraction], names: Sequence[str] = ()) -> None:
+    """Refuse a policy whose `pi(0) = u_eq` does not hold exactly; `names` are what the message calls its inputs.
 
     Raises
     ------
@@ -64,9 +64,10 @@ def require_centred(network: TanhNetwork, u_eq: Sequence[Fraction]) -> None:
         return
     for j, (value, u) in enumerate(zip(at_origin(network), u_eq, strict=True)):
         if value != u:
+            named = f"input {names[j]}" if names else f"input {j}"
             found = "not a rational number" if value is None else f"{float(value)!r}, exactly {_short(value)}"
             raise InputError(
-                f"the policy is not centred: pi(0) must be exactly u_eq = {float(u)!r}; input {j} of it is {found}. "
+                f"the policy is not centred: pi(0) must be exactly u_eq = {float(u)!r}; its {named} is {found}. "
                 "Use centre 'output' or 'preactivation', or claim practical stability, which does not need it."
             )
 

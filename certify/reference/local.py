@@ -76,7 +76,11 @@ class Local:
         at = derivatives(name, self.v)
         most = third(name, at[3], self.v, self.radius)
         if most is None:
-            raise Refused("local", "ball", "a division by what may be 0")
+            raise Refused(
+                "local",
+                "ball",
+                "a root of what may not be positive" if name == "sqrt" else "a division by what may be 0",
+            )
         H, R = self.beyond_tangent(at[2] / 2, most)
         return Local(at[0], at[1] * self.a, at[1] * self.Q + H, abs(at[1]) * self.E + R)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from array import array
 from dataclasses import dataclass
 
@@ -81,9 +82,15 @@ class Exact:
         return Exact(-self.value)
 
     def function(self, name: str) -> Exact:
+        if name == "sqrt":
+            numerator, denominator = int(self.value.p), int(self.value.q)
+            roots = math.isqrt(max(numerator, 0)), math.isqrt(denominator)
+            square = numerator > 0 and roots[0] ** 2 == numerator and roots[1] ** 2 == denominator
+            require(square, "equilibrium", "dynamics", "sqrt of what is not the square of a positive rational")
+            return Exact(fmpq(*roots))
         known = (self.value == 0) != (name == "1/")
         require(known, "equilibrium", "dynamics", "a division by 0" if name == "1/" else f"{name} of what is not 0")
-        return Exact(1 / self.value if name == "1/" else fmpq(name == "cos"))
+        return Exact(1 / self.value if name == "1/" else fmpq(name in ("cos", "exp")))
 
 
 def equilibrium(c: Certificate) -> None:

@@ -18,6 +18,7 @@ from certify.expressions import FUNCTIONS
 from certify.systems.system import exact
 
 _MAX_EXPONENT = 64
+_MOST_NODES = 20_000  # a certificate holds no more (FORMAT.md)
 _OPERATORS = "+ - * /, integer powers with **"
 
 
@@ -35,18 +36,30 @@ def parse_expression(
     ------
     InputError : the text is no equation over them; the message names the symbol.
     """
-    source = str(text).strip()
+    source = " ".join(str(text).split())  # a long equation may go over several lines
+    if "#" in source:  # Python would leave out what follows, and the plant would be another
+        raise InputError(f"equation {source!r}: # begins no comment here; put comments outside the text.")
     try:
         tree = ast.parse(source, mode="eval")
         if any(isinstance(node, ast.BitXor) for node in ast.walk(tree)):
             raise InputError(f"equation {source!r}: `^` is no power here; write ** as in x**2.")
-        return _Reader(source, names, known).read(tree.body)
+        found = _Reader(source, names, known).read(tree.body)
     except (SyntaxError, RecursionError, ValueError, MemoryError) as error:
         if isinstance(error, InputError):
             raise
         hint = "; for a power write **, not ^" if "^" in source else ""
         reason = error.msg if isinstance(error, SyntaxError) else str(error)
         raise InputError(f"equation {source!r} cannot be read: {reason}{hint}.") from error
+    if _size(found, {}) > _MOST_NODES:
+        raise InputError(f"equation {source!r}: written out it must have at most {_MOST_NODES:,} terms; it has more.")
+    return found
+
+
+def _size(expression: sympy.Expr, known: dict[sympy.Expr, int]) -> int:
+    """Nodes of the tree, which may be many more than those of the names that it is written with."""
+    if expression not in known:
+        known[expression] = 1 + sum(_size(a, known) for a in expression.args)
+    return known[expression]
 
 
 def nearest(name: str, known: Iterable[str]) -> str:
@@ -113,7 +126,8 @@ class _Reader:
     def _call(self, node: ast.Call) -> sympy.Expr:
         name = self._text(node.func)
         if not isinstance(node.func, ast.Name) or name not in FUNCTIONS:
-            what = f"{name} is a name; for a product write {name}*(...)" if name in self.names else ""
+            product = name in self.names or not isinstance(node.func, ast.Name)
+            what = f"{name} is no function; for a product write {name}*(...)" if product else ""
             raise self._refuse(what or f"the function {name} is not supported; supported are {', '.join(FUNCTIONS)}")
         if node.keywords or len(node.args) != 1:
             raise self._refuse(f"{name} takes one argument; found {self._text(node)!r}")

@@ -31,6 +31,9 @@ def linearise(system: System) -> tuple[sympy.Matrix, sympy.Matrix]:
     return found
 
 
+_NOISE = 1e-11  # of singular values over the largest: below it they are rounding
+
+
 @dataclass(frozen=True, slots=True)
 class Controllability:
     """Rank of [B, AB, ..., A^(n-1) B].
@@ -39,7 +42,7 @@ class Controllability:
     ----------
     rank : of n directions of the state space, how many the inputs reach.
     exact : whether it was computed in rationals.
-    smallest : where it was not, the smallest singular value of the matrix, its columns' norms scaled to 1.
+    smallest : where it was not, the smallest singular value over the largest, of the matrix with A divided by its norm.
     """
 
     rank: int
@@ -64,11 +67,10 @@ def controllability(A: sympy.Matrix, B: sympy.Matrix) -> Controllability:
             blocks.append(A * blocks[-1])
         return Controllability(int(sympy.Matrix.hstack(*blocks).rank()), True, None)
     a, b = (np.array(M.evalf(17).tolist(), dtype=np.float64) for M in (A, B))
+    size = float(np.linalg.norm(a, 2)) or 1.0
     columns = [b]
     for _ in range(n - 1):
-        columns.append(a @ columns[-1])
-    matrix = np.hstack(columns)
-    norms = np.linalg.norm(matrix, axis=0)
-    values = np.linalg.svd(matrix[:, norms > 0] / norms[norms > 0], compute_uv=False)
-    rank = int((values > 1e-9).sum())
-    return Controllability(rank, False, float(values[n - 1]) if len(values) >= n else 0.0)
+        columns.append(a @ columns[-1] / size)  # columns are not scaled: one that is rounding alone must stay small
+    values = np.linalg.svd(np.hstack(columns), compute_uv=False)
+    values = values / (values[0] or 1.0)
+    return Controllability(int((values > _NOISE).sum()), False, float(values[-1]))

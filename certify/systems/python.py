@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from contextlib import redirect_stdout
 from pathlib import Path
 
 from certify.errors import CertifyError, InputError
@@ -32,12 +33,13 @@ def load_python_system(path: Path, name: str) -> System:
     sys.modules[spec.name] = module  # dataclasses look their module up
     writes, sys.dont_write_bytecode = sys.dont_write_bytecode, True  # somebody's folder stays as it is
     try:
-        spec.loader.exec_module(module)
-        found = getattr(module, name, None)
-        made = found() if callable(found) and not isinstance(found, System) else found
+        with redirect_stdout(sys.stderr):  # standard output is for results
+            spec.loader.exec_module(module)
+            found = getattr(module, name, None)
+            made = found() if callable(found) and not isinstance(found, System) else found
     except CertifyError as error:
         raise InputError(f"{path}: {error}") from error
-    except Exception as error:  # another's code may raise anything
+    except (Exception, SystemExit) as error:  # another's code may raise anything, and its exit status is no verdict
         line = _line(error, path)
         raise InputError(f"{path}{line}: running it raises {type(error).__name__}: {error}.") from error
     finally:
@@ -57,7 +59,7 @@ def load_python_system(path: Path, name: str) -> System:
     return made
 
 
-def _line(error: Exception, path: Path) -> str:
+def _line(error: BaseException, path: Path) -> str:
     """`, line N` of the file where the error arose, if it is in the file at all."""
     if isinstance(error, SyntaxError):
         return f", line {error.lineno}" if error.lineno else ""

@@ -23,7 +23,7 @@ from typing import Any
 import sympy
 
 from certify.errors import InputError
-from certify.expressions import FUNCTIONS, evaluate_exactly
+from certify.expressions import GRAMMAR, evaluate_exactly, has_tree
 
 Interval = tuple[Fraction, Fraction]
 
@@ -56,7 +56,7 @@ class System:
     inputs : m symbols, in the order of u.
     parameters : exact value of each parameter symbol.
     dynamics : n expressions in states, inputs and parameters, built from `+ - * /`, integer constant
-        powers, sin, cos and tan.
+        powers, sin, cos, tan, tanh, exp, atan and sqrt.
     u_eq : m expressions in the parameters; `f(0, u_eq) = 0` is proved later, not assumed.
     domain : n intervals `(lo, hi)` with `lo < 0 < hi`, in the units of the states.
     input_bounds : m intervals `(lo, hi)` with `lo < hi`, in the units of the inputs.
@@ -257,7 +257,7 @@ def _by_symbol(parameters: Mapping[str, Fraction]) -> list[tuple[sympy.Symbol, F
 
 
 def _is_constant_function(node: sympy.Expr) -> bool:
-    return bool(node.is_Function and node.is_number)
+    return bool(node.is_number and not node.is_Rational and (node.is_Function or node.is_Pow or not node.args))
 
 
 def in_deviations(
@@ -280,17 +280,10 @@ def symbols(names: Sequence[str]) -> tuple[sympy.Symbol, ...]:
 
 def _check_grammar(expression: sympy.Expr, allowed: set[sympy.Symbol], system: str) -> None:
     for node in sympy.preorder_traversal(expression):
-        if node.is_Rational or node in allowed or node.is_Add or node.is_Mul:
-            continue
-        if node.is_Pow and node.exp.is_Integer:
-            continue
-        if isinstance(node, tuple(FUNCTIONS.values())):
+        if node in allowed or (has_tree(node) and not node.is_Symbol):
             continue
         if node.is_Float:
             raise InputError(f"an equation of {system} holds the rounded number {node}; write it as a fraction.")
         if node.is_Symbol:
             raise InputError(f"an equation of {system} uses {node}, which is no state, input or parameter.")
-        raise InputError(
-            f"an equation of {system} uses {node}; "
-            f"allowed are + - * /, integer powers, {', '.join(FUNCTIONS)} and exact numbers."
-        )
+        raise InputError(f"an equation of {system} uses {node}; allowed are {GRAMMAR} and exact numbers.")

@@ -48,6 +48,10 @@ def build_system(file: PlantFile) -> System:
     states, inputs = _names(file, "states"), _names(file, "inputs")
     parameters = {p: _number(file, value, "parameters", p) for p, value in file.table("parameters").items()}
     everything = [*states, *inputs, *parameters]
+    for key, names in (("states", states), ("inputs", inputs), ("parameters", list(parameters))):
+        twice = next((name for name in names if everything.count(name) > 1), None)
+        if twice is not None:
+            raise file.refuse(f"names of states, inputs and parameters must differ; found {twice!r} twice.", key)
     file.require_known("units", everything, "state, input or parameter")
     for table, names, what in (
         ("dynamics", states, "state"),

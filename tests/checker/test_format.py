@@ -272,7 +272,7 @@ def test_layers_must_fit_each_other_and_the_plant(tmp_path: Path) -> None:
 # ------------------------------------------------------------------------------------------------------- the equations
 
 NOT_IN_THE_GRAMMAR: dict[str, Any] = {
-    "unknown operator": ["exp", "x"],
+    "unknown operator": ["log", "x"],
     "operator of another type": [1, "x"],
     "list as an operator": [["+"], "x", "x"],
     "surrogate as an operator": ["\ud800", "x"],
@@ -284,6 +284,12 @@ NOT_IN_THE_GRAMMAR: dict[str, Any] = {
     "object": {"op": "+"},
     "unknown name": ["+", "x", "y"],
     "sine of two": ["sin", "x", "x"],
+    "root of two": ["sqrt", "x", "x"],
+    "exponential of nothing": ["exp"],
+    "function in capitals": ["Exp", "x"],
+    "inverse by its name": ["inv", "x"],
+    "negation by its name": ["neg", "x"],
+    "inverse by its sign": ["1/", "x"],
     "difference of three": ["-", "x", "x", "x"],
     "quotient of one": ["/", "x"],
     "quotient of three": ["/", "x", "1", "2"],

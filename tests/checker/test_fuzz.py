@@ -294,12 +294,17 @@ def _nodes(inner: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
     return st.one_of(
         st.tuples(st.sampled_from("+*"), inner, inner).map(list),
         st.tuples(st.sampled_from("-/"), inner, inner).map(list),
-        st.tuples(st.sampled_from(["-", "sin", "cos", "tan"]), inner).map(list),
+        st.tuples(st.sampled_from(["-", "sin", "cos", "tan", "tanh", "exp", "atan", "sqrt"]), inner).map(list),
         st.tuples(st.just("**"), inner, st.sampled_from([1, 2, 3, 7, 63, 64, -1, -2, -64])).map(list),
         st.tuples(st.sampled_from("+*"), inner, inner, inner).map(list),
         st.builds(_tower, inner, st.lists(st.sampled_from([2, 3, 64, -1, -64]), min_size=2, max_size=12)),
         st.builds(_shared, st.sampled_from("+*-/"), inner, st.integers(1, 7)),
-        st.builds(_nested, st.sampled_from(["-", "sin", "cos", "tan"]), inner, st.sampled_from([1, 5, 50, 190, 201])),
+        st.builds(
+            _nested,
+            st.sampled_from(["-", "sin", "cos", "tan", "tanh", "exp", "atan", "sqrt"]),
+            inner,
+            st.sampled_from([1, 5, 50, 190, 201]),
+        ),
     )
 
 
@@ -328,7 +333,7 @@ def _depth(tree: Any) -> int:
 _names = st.sampled_from(["x", "x", "x", "u", "u"])
 _wrong = st.one_of(
     junk,
-    st.sampled_from([["exp", "x"], ["**", "x", 65], ["**", "x", 0], ["**", "x", "2"], ["**", "x", True], ["+"], ["sin"],
+    st.sampled_from([["log", "x"], ["**", "x", 65], ["**", "x", 0], ["**", "x", "2"], ["**", "x", True], ["+"], ["sin"],
                      [], ["sin", "x", "x"], ["-", "x", "x", "x"], "y", "X", "x ", {"+": ["x", "x"]}, ["x", "+", "x"]]),
 )  # fmt: skip
 right_trees = st.recursive(_names | rationals, _nodes, max_leaves=8)

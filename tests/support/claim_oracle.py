@@ -151,7 +151,7 @@ def _words(value: Any, most: int) -> list[str]:
     return value
 
 
-UNARY = ("sin", "cos", "tan")
+UNARY = ("sin", "cos", "tan", "tanh", "exp", "atan", "sqrt")
 
 
 def _expression(node: Any, names: set[str]) -> None:
@@ -298,7 +298,10 @@ def _at_equilibrium(node: Any, names: dict[str, Fraction]) -> Fraction | None:
     ):
         return None
     if name in UNARY:
-        return Fraction(int(name == "cos")) if values[0] == 0 else None
+        if name == "sqrt":
+            root = Fraction(math.isqrt(max(values[0].numerator, 0)), math.isqrt(values[0].denominator))
+            return root if values[0] > 0 and root**2 == values[0] else None
+        return Fraction(int(name in ("cos", "exp"))) if values[0] == 0 else None
     if name == "**":
         return None if rest[1] < 0 and values[0] == 0 else values[0] ** rest[1]
     if name == "+":

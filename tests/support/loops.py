@@ -44,6 +44,44 @@ def scalar_clip() -> tuple[System, TanhNetwork]:
     return dataclasses.replace(system, name="saturated", dynamics=(x / 2 - 2 * u,)), network
 
 
+def tank() -> tuple[System, TanhNetwork]:
+    """xdot = x/9 + u - sqrt(16 + x), u = 4: the origin attracts, and x > -16 leaves it from x = 9 on."""
+    x, u = sympy.symbols("x u")
+    system = System(
+        name="tank",
+        states=(x,),
+        inputs=(u,),
+        parameters={},
+        dynamics=(x / 9 + u - sympy.sqrt(16 + x),),
+        u_eq=(sympy.Integer(4),),
+        domain=box(15),
+        input_bounds=box(5),
+    )
+    network = TanhNetwork((np.zeros((1, 1)),), (np.array([4.0]),), np.ones(1), np.zeros(1), "identity", "none")
+    return system, network
+
+
+def valve() -> tuple[System, TanhNetwork]:
+    """Two states and every function of equations beside sin, cos and tan, at points where they are known exactly."""
+    x, y, u = sympy.symbols("x y u")
+    system = System(
+        name="valve",
+        states=(x, y),
+        inputs=(u,),
+        parameters={},
+        dynamics=(
+            y * sympy.exp(-x / 4) + sympy.tanh(x * y) / 3,
+            u - sympy.sqrt(4 + x + y / 2) - sympy.atan(y) / 2 + sympy.pi * x * y / 20 + x**2 / sympy.sqrt(3 + y),
+        ),
+        u_eq=(sympy.Integer(2),),
+        domain=box("3/2", "3/2"),
+        input_bounds=box(9),
+    )
+    gain = np.array([[-1.5, -1.0]])
+    network = TanhNetwork((gain,), (np.zeros(1),), np.full(1, 2.0), np.array([1.0]), "tanh", "preactivation")
+    return system, network
+
+
 def chain(n: int, poles: list[float]) -> tuple[System, TanhNetwork]:
     """An integrator chain of n states under linear feedback that places `poles` exactly (up to integers)."""
     coefficients = np.poly(poles)[:0:-1].real.round(9)  # of s^0 .. s^(n-1)

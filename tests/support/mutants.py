@@ -800,7 +800,7 @@ def structure() -> Iterator[Mutant]:
             ("inverted domain", "plant.domain", lambda d: [pair[::-1] for pair in d]),
             ("inverted bounds", "plant.input_bounds", lambda d: [pair[::-1] for pair in d]),
             ("unknown name", "plant.dynamics.0", lambda e: ["+", e, "wind"]),
-            ("unknown operator", "plant.dynamics.0", lambda e: ["exp", e]),
+            ("unknown operator", "plant.dynamics.0", lambda e: ["log", e]),
             ("no operand", "plant.dynamics.0", lambda e: ["+"]),
             ("power 0", "plant.dynamics.0", lambda e: ["**", e, 0]),
             ("power 65", "plant.dynamics.0", lambda e: ["**", e, 65]),

@@ -40,7 +40,16 @@ Monomial = tuple[tuple[str, int], ...]  # atoms with their exponents >= 1, sorte
 Sum = Mapping[Monomial, Fraction]  # without zeros
 _PRIME = 2**127 - 1
 _PRECISION = 200  # bits
-_KNOWN = {"sin": (0, 0), "tan": (0, 0), "tanh": (0, 0), "cos": (0, 1), "log": (1, 0)}  # f(a) = b, exactly
+_KNOWN = {  # f(a) = b, exactly
+    "sin": (0, 0),
+    "tan": (0, 0),
+    "tanh": (0, 0),
+    "cos": (0, 1),
+    "exp": (0, 1),
+    "atan": (0, 0),
+    "sqrt": (1, 1),
+    "log": (1, 0),
+}
 _OF_TWO = ("min", "max")
 
 

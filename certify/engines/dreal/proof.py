@@ -25,6 +25,7 @@ from certify.claims.conditions import (
     input_conditions,
     local_condition,
     ring_condition,
+    root_conditions,
 )
 from certify.claims.queries import query
 from certify.engines.base import Budget, Proof, Report, Task
@@ -147,6 +148,8 @@ class _Session:
             top *= share  # a set that touches the domain is delta-sat; the checker decides it exactly
         inner = min(inner, top)
         # The local query is about Vdot alone, and the ring may add nothing to it.
+        if not self.all_unsat(root_conditions(self.problem, inner)):
+            return inner, None, Stop.SOLVER, "dReal does not confirm that the equations' roots are defined there"
         if not self.all_unsat(input_conditions(self.problem, inner)):
             return inner, None, Stop.INPUTS, "dReal does not confirm their bounds on the local level"
         level, stop, detail = self.ring(inner, top)
@@ -202,7 +205,8 @@ class _Session:
             if self.left() <= 0:
                 return low, Stop.TIME, ""
             ring = level <= low or self.ask(ring_condition(low, level), level)
-            if ring and self.all_unsat(input_conditions(self.problem, level)):
+            rest = (*root_conditions(self.problem, level), *input_conditions(self.problem, level))
+            if ring and self.all_unsat(rest):
                 low = level
                 if level >= target:
                     return level, Stop.REQUESTED, ""
