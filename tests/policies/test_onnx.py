@@ -136,6 +136,11 @@ def own_operator(made: Any) -> Any:
     return made
 
 
+def no_operator_set(made: Any) -> Any:
+    made.ClearField("opset_import")
+    return made
+
+
 def twice(made: Any) -> Any:
     made.graph.initializer.append(made.graph.initializer[0])
     return made
@@ -156,6 +161,7 @@ REFUSED = {
     "a shape that lies": (shape_that_lies(model(chain(*MLP))), "damaged"),
     "an operator of its own": (own_operator(model(chain(*MLP))), "standard operators"),
     "a function that redefines tanh": (function(model(chain(*MLP))), "standard operators"),
+    "no set of operators": (no_operator_set(model(chain(*MLP))), "evaluator of the onnx package"),
     "a tensor twice": (twice(model(chain(*MLP))), "once"),
     "a branch": (model([*chain(*TWO), node("Add", "h0", "u", out="v")]), "must join one value|one value"),
     "integers": (model(chain(*MLP), {**CONSTANTS, "W1": np.ones((2, 6), np.int64)}), "floating-point"),

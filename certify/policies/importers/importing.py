@@ -365,7 +365,7 @@ def _against(
     given = given if double else given.astype(np.float32)
     try:
         theirs = apply(after, np.asarray(reading.evaluate(given, double), dtype=np.float64))
-    except (RuntimeError, ValueError, TypeError, IndexError) as error:
+    except (RuntimeError, ValueError, TypeError, LookupError, AttributeError) as error:
         raise InputError(f"the framework cannot evaluate the policy itself: {error}.") from error
     if reading.beta is None:
         return compare(ours, theirs, rounding((*before, *reading.steps, *after), observed, double))

@@ -45,7 +45,10 @@ def read_onnx(raw: bytes, what: str) -> Reading:
     name, output = _ends(model.graph, what)
     steps = _walk(model.graph, name, output, what)
     double = any(t.data_type == onnx.TensorProto.DOUBLE for t in model.graph.initializer)
-    evaluators = {False: ReferenceEvaluator(model), True: ReferenceEvaluator(_doubled(model))}
+    try:
+        evaluators = {False: ReferenceEvaluator(model), True: ReferenceEvaluator(_doubled(model))}
+    except (RuntimeError, TypeError, ValueError, KeyError, AttributeError) as error:
+        raise InputError(f"the evaluator of the onnx package cannot read {what}: {error}.") from error
 
     def evaluate(x: Observations, double: bool) -> Values:
         given = x.astype(np.float64 if double else np.float32)
