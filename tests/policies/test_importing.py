@@ -449,6 +449,8 @@ def test_loading_torchscript_runs_code_and_reading_it_does_not(
         ("    return torch.mul(x, True)\n", "must join"),
         ("    return torch.mul(x, 1e999)\n", "finite"),
         ("    y = torch.add(x, 1.0)\n", "must return its action"),
+        ("    return self" + ".a" * 20_000 + "\n", "no code|too deep|has no"),
+        ("    return torch.mul(x, " + "9" * 400 + ")\n", "real numbers"),
         ("    return [x for x in x]\n", "expression"),
         ("    return torch.linear(x, self.weight, \n", "no code"),
         ("    return " + "(" * 500 + "x" + ")" * 500 + "\n", "no code|expression"),
@@ -554,6 +556,21 @@ def test_version_1_has_no_bounds_and_version_2_has_something(tmp_path: Path) -> 
 
 
 # ---------------------------------------------------------------------------------------------- recognising, refusing
+
+
+def test_parts_of_a_two_stage_policy_under_different_prefixes_are_none(tmp_path: Path) -> None:
+    state = {f"a.controller.layers.{k}": v for k, v in STATE.items()}
+    state |= {"b.controller.x_equilibrium": torch.zeros(2), "a.controller.b": torch.zeros(1)}
+    path = saved(tmp_path, state)
+    assert content_of(path.read_bytes(), path.name) == "state-dict"
+
+
+def test_a_format_that_holds_itself_is_no_format(tmp_path: Path) -> None:
+    deep: Any = ()
+    for _ in range(60):
+        deep = (deep, deep)
+    path = saved(tmp_path, {"format": deep, **STATE})
+    assert content_of(path.read_bytes(), path.name) == "state-dict"  # at once, not after 2^60 steps
 
 
 def test_what_a_file_is_follows_from_its_bytes(tmp_path: Path) -> None:

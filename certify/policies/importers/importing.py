@@ -77,7 +77,8 @@ def content_of(raw: bytes, name: str) -> Content | None:
         if is_torchscript(file):
             return "torchscript"
         root = file.pickle("data.pkl")
-        if isinstance(root, dict) and str(root.get("format", "")).startswith(_OWN):
+        said = root.get("format") if isinstance(root, dict) else None
+        if isinstance(said, str) and said.startswith(_OWN):
             return "policy"
         return "two-stage" if is_two_stage(load_tensors(raw, name, file)) else "state-dict"
     if name.endswith(".onnx"):

@@ -20,6 +20,7 @@ from certify.policies.importers.reading import Observations, Reading, Values, be
 from certify.policies.importers.steps import Affine, Clip, Step, Tanh, linear
 
 _KEY = re.compile(r"(?:(?P<prefix>.*)\.)?(?P<number>[0-9]{1,4})\.(?P<rest>.*)", re.DOTALL)
+_PARTS = ("controller.x_equilibrium", "controller.layers.0.weight", "controller.b")
 _OTHERS = ("critic", "value", "vf", "v_net", "q_net", "qf", "q1", "q2", "lyapunov", "target")
 _ENDS: dict[Output, tuple[Step, ...]] = {
     "identity": (),
@@ -31,8 +32,7 @@ Layers = list[Affine]
 
 def is_two_stage(tensors: Mapping[str, Numbers]) -> bool:
     """Whether a file holds the policy of a two-stage checkpoint: its layers, and what it is centred at."""
-    names = ("controller.layers.0.weight", "controller.x_equilibrium", "controller.b")
-    return _inner(tensors, names[1]) is not None and all(any(k.endswith(n) for k in tensors) for n in names)
+    return _root(tensors) is not None
 
 
 def read_two_stage(tensors: Mapping[str, Numbers], options: ImportOptions) -> Reading:
@@ -42,9 +42,9 @@ def read_two_stage(tensors: Mapping[str, Numbers], options: ImportOptions) -> Re
     ------
     InputError : a tensor is missing or has another shape.
     """
-    root = _inner(tensors, "controller.x_equilibrium")
+    root = _root(tensors)
     if root is None:
-        raise InputError("a two-stage file must hold controller.x_equilibrium; this one has none.")
+        raise InputError(f"a two-stage file must hold {', '.join(_PARTS)} under one prefix; this one does not.")
     layers = _layers(tensors, f"{root}controller.layers")
     squash: Output = "tanh" if options.squash is None else options.squash
     if squash == "identity":
@@ -159,10 +159,12 @@ def _numbers(tensors: Mapping[str, Numbers], prefix: str) -> list[int]:
     return sorted(numbers)
 
 
-def _inner(tensors: Mapping[str, Numbers], name: str) -> str | None:
-    """What stands before `name` in the one key that ends with it."""
-    roots = [key.removesuffix(name) for key in tensors if key == name or key.endswith(f".{name}")]
-    return roots[0] if len(roots) == 1 else None
+def _root(tensors: Mapping[str, Numbers]) -> str | None:
+    """What stands before the names of a two-stage policy, where that is one thing for all of them."""
+    roots = [key.removesuffix(_PARTS[0]) for key in tensors if key.endswith(_PARTS[0])]
+    if len(roots) != 1 or not all(roots[0] + part in tensors for part in _PARTS):
+        return None
+    return roots[0]
 
 
 def _dot(prefix: str) -> str:

@@ -63,7 +63,10 @@ def read_torchscript(file: TorchFile) -> Reading:
     """
     constants = file.pickle("constants.pkl") if file.holds("constants.pkl") else ()
     program = _Program(file, _classes(file), constants if isinstance(constants, tuple) else ())
-    value = _forward(program, file.pickle("data.pkl"), _Value(), 0)
+    try:
+        value = _forward(program, file.pickle("data.pkl"), _Value(), 0)
+    except RecursionError as error:
+        raise InputError(f"the code of {file.what} nests too deep to be read.") from error
     operations = value.operations
     own = any(a.dtype == np.float64 and a.ndim for _, given in operations for a in given if _is_array(a))
 
@@ -184,7 +187,7 @@ def _attribute(program: _Program, module: Any, name: str) -> Any:
     raise InputError(f"{name} in {program.file.what} must be a module or a number; found {brief(value)}.")
 
 
-def _fixed(program: _Program, module: Any, name: str) -> float | None:
+def _fixed(program: _Program, module: Any, name: str) -> int | float | None:
     """The number that a module's class gives to an attribute, as it does to constants; None if it gives none."""
     definition = program.classes.get(module.function) if isinstance(module, Call) else None
     for node in [] if definition is None else definition.body:
@@ -192,7 +195,7 @@ def _fixed(program: _Program, module: Any, name: str) -> float | None:
             case ast.AnnAssign(target=ast.Name(id=found), value=ast.expr() as value) if found == name:
                 number = _evaluate(program, value, {}, 0)
                 if isinstance(number, int | float) and not isinstance(number, bool):
-                    return float(number)
+                    return number
                 raise InputError(f"{name} in {program.file.what} must be a number; found {_text(value)}.")
     return None
 
