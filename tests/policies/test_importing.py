@@ -289,6 +289,34 @@ def test_a_normaliser_that_the_file_holds_is_not_left_out(tmp_path: Path) -> Non
             import_policy(rsl(tmp_path), plant(), replace(LAYERS, normaliser=given))  # type: ignore[arg-type]
 
 
+HOSTILE = {
+    "norm_obs": (np.bool_(False), "true or false"),
+    "epsilon": (np.array([1.0, 2.0]), "must be one number"),
+    "clip_obs": ("10", "must be a number"),
+    "obs_rms": ({"a": 1}, "must hold obs_rms of one array"),
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_normalisers_that_say_something_else_are_refused(name: str, tmp_path: Path) -> None:
+    value, message = HOSTILE[name]
+    _, environment, path, normaliser = sb3("PPO", tmp_path)
+    setattr(environment, name, value)
+    environment.save(str(normaliser))
+    with pytest.raises(InputError, match=message):
+        import_policy(path, plant(), ImportOptions(states=("x0", "x1"), normaliser=normaliser))
+
+
+@pytest.mark.parametrize("change", [{"var": -1.0}, {"var": np.nan}, {"mean": np.inf}, {"mean": "zeros"}])
+def test_statistics_that_are_no_statistics_are_refused(change: dict[str, Any], tmp_path: Path) -> None:
+    _, environment, path, normaliser = sb3("PPO", tmp_path)
+    for name, value in change.items():
+        setattr(environment.obs_rms, name, np.zeros((2, 1)) if value == "zeros" else np.full(2, value))
+    environment.save(str(normaliser))
+    with pytest.raises(InputError, match="positive|finite|two vectors"):
+        import_policy(path, plant(), ImportOptions(states=("x0", "x1"), normaliser=normaliser))
+
+
 @pytest.mark.parametrize(("clip", "norm"), [(np.inf, True), (10.0, False)])
 def test_normalisers_without_a_clip_or_without_effect(clip: float, norm: bool, tmp_path: Path) -> None:
     _, environment, path, normaliser = sb3("PPO", tmp_path)

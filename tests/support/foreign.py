@@ -15,13 +15,13 @@ import torch
 
 from certify.systems import System
 
-SHARED = Path(__file__).resolve().parents[3].parent / "shared" / "external"
-OUTSIDE = (SHARED, Path(__file__).resolve().parents[3] / "shared" / "external")
+ROOT = Path(__file__).parents[2]
+PLACES = tuple(folder / "shared" / "external" for folder in (ROOT.parent, ROOT.parent.parent))  # beside the project
 
 
 def external(*parts: str) -> Path | None:
     """A file that somebody else trained, if the folder with such files is there."""
-    return next((f.joinpath(*parts) for f in OUTSIDE if f.joinpath(*parts).is_file()), None)
+    return next((f.joinpath(*parts) for f in PLACES if f.joinpath(*parts).is_file()), None)
 
 
 def plant(n: int = 2, bound: float = 6, x_eq: tuple[int, ...] = ()) -> System:

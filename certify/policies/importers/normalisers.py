@@ -49,7 +49,10 @@ def _vec_normalize(root: Any, what: str) -> Normaliser:
     if not isinstance(root, Call) or not isinstance(root.function, Name) or root.function.name != "VecNormalize":
         raise InputError(f"{what} must be a pickle of VecNormalize; found {brief(root)}.")
     state = _state(root, what)
-    if state.get("norm_obs") is False:
+    normalises = state.get("norm_obs", True)
+    if not isinstance(normalises, bool):
+        raise InputError(f"norm_obs in {what} must be true or false; found {brief(normalises)}.")
+    if not normalises:
         return Diagonal((Fraction(1),), (Fraction(0),))
     statistics = state.get("obs_rms")
     if not isinstance(statistics, Call) or not isinstance(statistics.function, Name):
