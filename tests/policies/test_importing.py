@@ -289,6 +289,23 @@ def test_a_normaliser_that_the_file_holds_is_not_left_out(tmp_path: Path) -> Non
             import_policy(rsl(tmp_path), plant(), replace(LAYERS, normaliser=given))  # type: ignore[arg-type]
 
 
+def test_order_operating_point_and_normaliser_together(tmp_path: Path) -> None:
+    """The network reads (x1, x0) as absolute values through VecNormalize; the policy reads deviations (x0, x1)."""
+    model, environment, path, normaliser = sb3("PPO", tmp_path)
+    environment.obs_rms.mean, environment.obs_rms.var = np.array([-2.5, 1.25]), np.array([0.01, 0.09])
+    environment.save(str(normaliser))
+    options = ImportOptions(states=("x1", "x0"), normaliser=normaliser, observes="absolute")
+    policy = import_policy(path, plant(x_eq=(1, -2)), options).policy
+    reach = 10 * np.sqrt(environment.obs_rms.var + 1e-8)
+    lows, highs = environment.obs_rms.mean - reach, environment.obs_rms.mean + reach
+    expected = [[lows[1] - 1, highs[1] - 1], [lows[0] + 2, highs[0] + 2]]
+    assert policy.valid is not None
+    np.testing.assert_allclose(policy.valid, expected, rtol=1e-14)
+    x = np.random.default_rng(0).uniform(policy.valid[:, 0], policy.valid[:, 1], (1000, 2))
+    theirs, _ = model.predict(environment.normalize_obs((x + [1, -2])[:, ::-1]), deterministic=True)
+    assert np.max(np.abs(policy.network(x, U_EQ) - theirs)) < 1e-5
+
+
 HOSTILE = {
     "norm_obs": (np.bool_(False), "true or false"),
     "epsilon": (np.array([1.0, 2.0]), "must be one number"),
@@ -313,7 +330,7 @@ def test_statistics_that_are_no_statistics_are_refused(change: dict[str, Any], t
     for name, value in change.items():
         setattr(environment.obs_rms, name, np.zeros((2, 1)) if value == "zeros" else np.full(2, value))
     environment.save(str(normaliser))
-    with pytest.raises(InputError, match="positive|finite|two vectors"):
+    with pytest.raises(InputError, match=r"positive|finite|two vectors"):
         import_policy(path, plant(), ImportOptions(states=("x0", "x1"), normaliser=normaliser))
 
 
