@@ -302,7 +302,7 @@ def test_order_operating_point_and_normaliser_together(tmp_path: Path) -> None:
     assert policy.valid is not None
     np.testing.assert_allclose(policy.valid, expected, rtol=1e-14)
     x = np.random.default_rng(0).uniform(policy.valid[:, 0], policy.valid[:, 1], (1000, 2))
-    theirs, _ = model.predict(environment.normalize_obs((x + [1, -2])[:, ::-1]), deterministic=True)
+    theirs, _ = model.predict(environment.normalize_obs(np.add(x, (1, -2))[:, ::-1]), deterministic=True)
     assert np.max(np.abs(policy.network(x, U_EQ) - theirs)) < 1e-5
 
 

@@ -398,7 +398,8 @@ def _formula(normaliser: tuple[Step, ...], network: TanhNetwork, folded: Folded,
     if reading.beta is not None:
         net = "net(x) - net(x_eq) + beta"
     inner = f"tanh({net})" if network.squash == "tanh" else net
-    scaled = f"{_short(folded.scale)} * {inner} + {_short(folded.offset)}"
+    scaled = inner if np.all(folded.scale == 1) else f"{_short(folded.scale)} * {inner}"
+    scaled = scaled if not np.any(folded.offset) else f"{scaled} + {_short(folded.offset)}"
     if folded.clip is None:
         return f"u = {scaled}"
     return f"u = clip({scaled}, {_short(folded.clip[0])}, {_short(folded.clip[1])})"
