@@ -18,7 +18,7 @@ from certify.policies import Policy, TanhNetwork, load_policy, save_policy
 from certify.policies.importers import Clip, Imported, ImportOptions, content_of, import_policy
 from certify.systems import System, get_system
 from tests.support.compiled import Constant, SetsItsState
-from tests.support.foreign import external, mlp, plant, sb3, values
+from tests.support.foreign import Odd, external, mlp, plant, sb3, values
 
 U_EQ = (Fraction(0),)
 X = np.random.default_rng(3).uniform(-1.5, 1.5, (500, 2)).astype(np.float32).astype(np.float64)
@@ -304,6 +304,19 @@ def test_order_operating_point_and_normaliser_together(tmp_path: Path) -> None:
     x = np.random.default_rng(0).uniform(policy.valid[:, 0], policy.valid[:, 1], (1000, 2))
     theirs, _ = model.predict(environment.normalize_obs(np.add(x, (1, -2))[:, ::-1]), deterministic=True)
     assert np.max(np.abs(policy.network(x, U_EQ) - theirs)) < 1e-5
+
+
+@pytest.mark.parametrize("kind", ["PPO", "SAC"])
+def test_spaces_in_double_precision(kind: str, tmp_path: Path) -> None:
+    given = {"activation_fn": torch.nn.Tanh, "net_arch": [8]} if kind == "SAC" else {}
+    model, _, path, _ = sb3(kind, tmp_path, Odd, **given)
+    imported = import_policy(path, plant(), SAID)
+    theirs, _ = model.predict(X, deterministic=True)
+    assert gap(imported, theirs) < 1e-6 and imported.difference.in_double < TIGHT
+    network = imported.policy.network
+    if kind == "SAC":  # half of the exact difference and sum of the two numbers, rounded once
+        lo, hi = Fraction(-0.1), Fraction(0.3)
+        assert (network.scale[0], network.offset[0]) == (float((hi - lo) / 2), float((hi + lo) / 2))
 
 
 HOSTILE = {

@@ -76,14 +76,21 @@ class Toy(gymnasium.Env[np.ndarray, np.ndarray]):
         return self.x, 0.0, False, False, {}
 
 
-def sb3(kind: str, folder: Path, **policy: Any) -> tuple[Any, Any, Path, Path]:
+class Odd(Toy):
+    """Spaces in double precision, whose bounds single precision does not hold."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+    action_space = gymnasium.spaces.Box(-0.1, 0.3, (1,), np.float64)
+
+
+def sb3(kind: str, folder: Path, world: type[Toy] = Toy, **policy: Any) -> tuple[Any, Any, Path, Path]:
     """(model, normaliser, file of the model, file of the normaliser) of stable-baselines3, untrained."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         import stable_baselines3
         from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-        environment = VecNormalize(DummyVecEnv([Toy]))
+        environment = VecNormalize(DummyVecEnv([world]))
         algorithm = vars(stable_baselines3)[kind]
         model = algorithm("MlpPolicy", environment, policy_kwargs=policy or None, seed=1, device="cpu")
         environment.reset()

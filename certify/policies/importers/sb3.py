@@ -83,7 +83,8 @@ def read_sb3(archive: Archive, what: str) -> Reading:
 
     def evaluate(x: Observations, double: bool) -> Values:
         y = net(x, double)
-        lower, upper = low.astype(y.dtype), high.astype(y.dtype)
+        kind = np.result_type(y, low)
+        lower, upper = low.astype(kind), high.astype(kind)
         clipped: Values = np.clip(y, lower, upper)
         unscaled: Values = lower + 0.5 * (y + 1) * (upper - lower)
         return clipped if policy == _ON_POLICY else unscaled
@@ -127,7 +128,7 @@ def _require_tanh(policy: Name, given: Any, what: str) -> None:
 
 
 def _spaces(data: Mapping[str, Any], what: str) -> tuple[int, Numbers]:
-    """The number of observations, and low and high of the actions, (2, m) in single precision."""
+    """The number of observations, and low and high of the actions, (2, m)."""
     observation, action = (
         _box(_value(data, f"{name}_space"), f"{name}_space of {what}") for name in ("observation", "action")
     )
@@ -141,8 +142,8 @@ def _box(space: Any, what: str) -> dict[str, Numbers]:
         raise InputError(f"{what} must be a box; found {brief(space)}.")
     state = space.states[0] if len(space.states) == 1 and isinstance(space.states[0], dict) else {}
     found = {name: array_of(state.get(name), f"{name} of {what}") for name in ("low", "high")}
-    if any(a.dtype != np.float32 for a in found.values()):
-        raise InputError(f"{what} must be of single precision; found {found['low'].dtype}.")
+    if any(a.dtype.kind != "f" or a.dtype.itemsize < 4 for a in found.values()):
+        raise InputError(f"{what} must be of single or double precision; found {found['low'].dtype}.")
     return found
 
 
