@@ -152,6 +152,9 @@ def _with_table(plant: Plant, file: PlantFile) -> Plant:
         if name not in _BOX:
             chosen[name] = _value(value, hints[name], file, name)
     box: dict[str, Any] = {}
+    if "start" in chosen:  # simulations start where episodes do
+        share = chosen["start"] / plant.preset.start
+        box["initial_states"] = tuple(share * width for width in plant.initial_states)
     if "initial_states" in table:
         box["initial_states"] = _value(table["initial_states"], tuple[float, ...], file, "initial_states")
     if "positions" in table:

@@ -52,8 +52,16 @@ def test_a_policy_belongs_to_its_plant(path: Path) -> None:
     assert {name: policy.training[name] for name in wanted} == wanted
 
 
-def test_there_are_six() -> None:
-    assert [p.stem for p in PLANTS] == ["bicycle", "furuta", "maglev", "satellite", "two_machines", "van_der_pol"]
+def test_there_are_seven() -> None:
+    assert [p.stem for p in PLANTS] == [
+        "bicycle",
+        "furuta",
+        "maglev",
+        "satellite",
+        "two_machines",
+        "two_tanks",
+        "van_der_pol",
+    ]
 
 
 def test_van_der_pol_runs_backwards() -> None:
@@ -128,12 +136,22 @@ def test_the_magnet_s_force_falls_with_the_square_of_the_gap() -> None:
     np.testing.assert_allclose(change, np.stack([x[:, 1], 9.81 - force], -1), rtol=1e-12, atol=1e-12)
 
 
+def test_the_tanks_empty_as_torricelli_says() -> None:
+    """h' = -a sqrt(h) has the solution (sqrt(h0) - a t / 2)^2, and what leaves one tank enters the other."""
+    x, u, change = states("two_tanks")
+    h = 1e-6
+    emptied = ((np.sqrt(x[:, 0]) - 0.5 * h / 2) ** 2 - (np.sqrt(x[:, 0]) + 0.5 * h / 2) ** 2) / (2 * h)
+    np.testing.assert_allclose(change[:, 0], emptied + 0.4 * u[:, 0], atol=1e-7)
+    np.testing.assert_allclose(change.sum(1), 0.4 * u[:, 0] - 0.5 * np.sqrt(x[:, 1]), atol=1e-12)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "volume"),
     [
         ("van_der_pol", 7.3),
-        ("two_machines", 2.5),
+        ("two_machines", 5.6),
+        ("two_tanks", 1.0),
         ("maglev", 5.0e-3),
         ("bicycle", 5.1),
         ("furuta", 1.0),

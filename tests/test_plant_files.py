@@ -314,6 +314,11 @@ def test_an_irrational_operating_point_is_refused_with_a_sentence(tmp_path: Path
     message = refused(tmp_path, {'level = "rest"': 'level = "sin(rest)"'})
     assert f"line {TANK.splitlines().index('[x_eq]') + 2}: x_eq.level" in message
     assert "must be rational" in message and "sin(1/3)" in message
+    message = refused(tmp_path, {'u = "rest**3"': 'u = "sqrt(tau)"'})
+    assert f"line {TANK.splitlines().index('[u_eq]') + 2}: u_eq.u" in message and "found sqrt(2)" in message
+    assert load_system(write(tmp_path, TANK.replace('u = "rest**3"', 'u = "sqrt(rest**6)"'))).exact_u_eq() == (
+        Fraction(1, 27),
+    )
     x, u, a = sympy.symbols("x u a")
     with pytest.raises(InputError, match=r"x_eq of x in s must be rational.*sin\(1\)"):
         System("s", (x,), (u,), {"a": Fraction(1)}, (u,), (sympy.Integer(0),), box(1), box(1), x_eq=(sympy.sin(a),))

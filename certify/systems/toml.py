@@ -68,6 +68,9 @@ def build_system(file: PlantFile) -> System:
         shorthand = _shorthand(file, symbol)
         known = "state, input or parameter" + (", and not defined in [where] above" if shorthand else "")
         dynamics = [_equation(file, "dynamics", s, symbol | shorthand, known) for s in states]
+        u_eq = [_equation(file, "u_eq", s, constants, "parameter") for s in inputs]
+        for s, e in zip(inputs, u_eq, strict=True):
+            _at_rest(file, "u_eq", s, e, parameters)
         system = System(
             name=name,
             description=description,
@@ -76,7 +79,7 @@ def build_system(file: PlantFile) -> System:
             parameters=parameters,
             positive=frozenset(_list(file, "positive")),
             dynamics=in_deviations(dynamics, [symbol[s] for s in states], x_eq),
-            u_eq=tuple(_equation(file, "u_eq", s, constants, "parameter") for s in inputs),
+            u_eq=tuple(u_eq),
             domain=tuple(_domain(file, s, e, parameters) for s, e in zip(states, x_eq, strict=True)),
             input_bounds=tuple(_interval(file, "input_bounds", s) for s in inputs),
             units={name: _unit(file, name) for name in file.table("units")},
@@ -145,16 +148,7 @@ def _equation(
 def _domain(file: PlantFile, name: str, x_eq: sympy.Expr, parameters: Mapping[str, Fraction]) -> Interval:
     """The interval of a state's values as one of deviations."""
     lo, hi = _interval(file, "domain", name)
-    values = {sympy.Symbol(p): sympy.Rational(q.numerator, q.denominator) for p, q in parameters.items()}
-    point = x_eq.subs(values)
-    if not point.is_Rational:
-        raise file.refuse(
-            f"the operating point must be rational, because the equilibrium is decided in rationals; found {point}. "
-            "Choose parameters for which it is, or make it a parameter itself.",
-            "x_eq",
-            name,
-        )
-    at = Fraction(int(point.p), int(point.q))
+    at = _at_rest(file, "x_eq", name, x_eq, parameters)
     if not lo < at < hi:
         raise file.refuse(
             f"the domain must have the operating point {name} = {float(at):g} in its interior; "
@@ -163,6 +157,22 @@ def _domain(file: PlantFile, name: str, x_eq: sympy.Expr, parameters: Mapping[st
             name,
         )
     return lo - at, hi - at
+
+
+def _at_rest(
+    file: PlantFile, table: str, name: str, expression: sympy.Expr, parameters: Mapping[str, Fraction]
+) -> Fraction:
+    """The value of an entry of x_eq or u_eq."""
+    values = {sympy.Symbol(p): sympy.Rational(q.numerator, q.denominator) for p, q in parameters.items()}
+    point = expression.subs(values)
+    if not point.is_Rational:
+        raise file.refuse(
+            f"the operating point must be rational, because the equilibrium is decided in rationals; found {point}. "
+            "Choose parameters for which it is, or make it a parameter itself.",
+            table,
+            name,
+        )
+    return Fraction(int(point.p), int(point.q))
 
 
 def _interval(file: PlantFile, table: str, name: str) -> Interval:

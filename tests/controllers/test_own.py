@@ -105,6 +105,8 @@ def test_the_table_of_the_file_chooses_and_the_command_line_overrides(tmp_path):
         default_plant(load_system(path)).preset, steps=300, start=0.25, actor=(8, 8), centre="output", learning_rate=1.0
     )
     assert plant.initial_states == (0.1, 0.2) and plant.positions == ("x",)
+    _, plant = chosen_plant(str(_write(tmp_path, TEXT + "\n[training]\nstart = 0.25\n")))
+    assert plant.initial_states == (0.25, 0.5)
 
 
 @pytest.mark.parametrize(
