@@ -16,6 +16,9 @@ import typer
 
 from certify.commands.check import check
 from certify.commands.export_smt2 import export_smt2
+from certify.commands.import_ import import_
+from certify.commands.importing import takes_import_options
+from certify.commands.plant import plant
 from certify.commands.report import report
 from certify.commands.roa import roa
 from certify.commands.systems import systems
@@ -29,9 +32,11 @@ app = typer.Typer(
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
-app.command("roa")(roa)
+app.command("roa")(takes_import_options(roa))
 app.command("check")(check)
 app.command("report")(report)
+app.command("import")(takes_import_options(import_))
+app.command("plant")(plant)
 app.command("systems")(systems)
 app.command("export-smt2")(export_smt2)
 

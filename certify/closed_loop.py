@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from certify.errors import InputError
 from certify.expressions import evaluate_exactly
 from certify.policies import TanhNetwork, require_centred
-from certify.systems import System
+from certify.systems import System, linearise
 
 Array = NDArray[np.float64]
 
@@ -51,7 +51,7 @@ class ClosedLoop:
 
         Raises
         ------
-        InputError : one of the two fails, or is not decided in rationals (a sin, cos or tan at another point than 0).
+        InputError : one of the two fails, or is not decided in rationals (a function at another point than 0).
         """
         system = self.system
         at_zero = dict.fromkeys(system.states, Fraction(0)) | dict(zip(system.inputs, self.u_eq, strict=True))
@@ -66,7 +66,7 @@ class ClosedLoop:
                     f"{wanted}; {symbol}' = {float(value):.6g} at the origin. Shift the states or correct u_eq, "
                     "or claim practical stability, which does not need it."
                 )
-        require_centred(self.network, self.u_eq)
+        require_centred(self.network, self.u_eq, [s.name for s in system.inputs])
 
     def policy(self, x: Any) -> Any:
         """pi(x) in float64, (..., n) to (..., m)."""
@@ -80,18 +80,7 @@ class ClosedLoop:
 
     def plant_jacobians(self) -> tuple[sympy.Matrix, sympy.Matrix]:
         """(df/dx, df/du) at the origin and u_eq, exact."""
-        system = self.system
-        f = sympy.Matrix(system.exact_dynamics())
-        at_zero = dict.fromkeys(system.states, sympy.Integer(0))
-        at_zero |= {
-            s: sympy.Rational(u.numerator, u.denominator) for s, u in zip(system.inputs, self.u_eq, strict=True)
-        }
-        found = f.jacobian(list(system.states)).subs(at_zero), f.jacobian(list(system.inputs)).subs(at_zero)
-        if any(M.has(sympy.zoo, sympy.nan, sympy.oo) for M in found):
-            raise InputError(
-                f"the equations of {system.name} have no derivative at the origin: they divide by 0 there."
-            )
-        return found
+        return linearise(self.system)
 
 
 def _to_float(matrix: sympy.Matrix) -> Array:

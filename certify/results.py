@@ -177,6 +177,7 @@ class RoaResult:
             "system": system.name,
             "parameters": {name: str(q) for name, q in system.parameters.items()},
             "states": [{"name": s.name, "unit": system.units.get(s.name, "")} for s in system.states],
+            "operating_point": {name: str(q) for name, q in system.operating_point().items()},
             "inputs": [{"name": s.name, "unit": system.units.get(s.name, "")} for s in system.inputs],
             "policy": {"sha256": network.sha256(), "layers": list(network.layers)},
             "lyapunov": {

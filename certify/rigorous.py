@@ -58,10 +58,11 @@ def evaluate_policy(loop: ClosedLoop, x: Array) -> Balls:
         network = loop.network
         y = _net(network, _points(x))
         shift, offset = _centring(loop)
-        return [
+        u = [
             flint.arb(float(s)) * network.squashed(v + d, _NUMBERS) + o
             for v, d, s, o in zip(y, shift, network.scale, offset, strict=True)
         ]
+        return list(network.clipped(u, _NUMBERS))
 
 
 def centring_with_errors(loop: ClosedLoop) -> tuple[Array, Array, Array, Array]:
@@ -95,8 +96,13 @@ def evaluate_vdot(loop: ClosedLoop, P: Array, x: Array) -> flint.arb:
 
 
 def eigenvalues(loop: ClosedLoop) -> list[flint.acb] | None:
-    """Rigorous enclosures of the eigenvalues of the closed loop's Jacobian at 0; None if Arb cannot isolate them."""
+    """Rigorous enclosures of the eigenvalues of the closed loop's Jacobian at 0.
+
+    None if Arb cannot isolate them, or the clip is not certain to be inactive at the origin.
+    """
     with _precision():
+        if not _unclipped(loop):
+            return None
         try:
             return list(flint.acb_mat(_jacobian(loop)).eig(multiple=True))
         except (ValueError, ArithmeticError):
@@ -124,6 +130,18 @@ def _jacobian(loop: ClosedLoop) -> flint.arb_mat:
     return A + B * gain
 
 
+def _unclipped(loop: ClosedLoop) -> bool:
+    """Whether every input at the origin, before the clip, lies certainly and strictly inside it."""
+    network = loop.network
+    if network.clip is None:
+        return True
+    shift, offset = _centring(loop)
+    y = _net(network, [flint.arb(0)] * network.n)
+    parts = zip(y, shift, network.scale, offset, *network.clip, strict=True)
+    each = ((flint.arb(float(s)) * network.squashed(v + d, _NUMBERS) + o, lo, hi) for v, d, s, o, lo, hi in parts)
+    return all(bool(u > float(lo)) and bool(u < float(hi)) for u, lo, hi in each)
+
+
 class _Numbers:
     def number(self, q: Fraction) -> flint.arb:
         return ball(q)
@@ -133,6 +151,9 @@ class _Numbers:
 
     def tanh(self, v: flint.arb) -> flint.arb:
         return v.tanh()
+
+    def clip(self, v: flint.arb, lo: Fraction, hi: Fraction) -> flint.arb:
+        return v.max(ball(lo)).min(ball(hi))
 
 
 _NUMBERS = _Numbers()

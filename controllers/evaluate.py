@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 
 from certify.errors import InputError
 from certify.policies import Policy, TanhNetwork
-from certify.systems import System, get_system
+from certify.systems import System, shipped_system
 from controllers.environments import Stepper
+from controllers.options import Plant
 from controllers.simulation import Loop, continuous_loop, held_loop, initial_states, mean_action
 
 Array = NDArray[np.float64]
@@ -117,8 +118,10 @@ class Evaluation:
         }
 
 
-def evaluate(policy: Policy, options: EvaluationOptions | None = None) -> Evaluation:
-    """Simulate `policy` on the plant that it names and compare it with its learned gain.
+def evaluate(
+    policy: Policy, options: EvaluationOptions | None = None, own: tuple[System, Plant] | None = None
+) -> Evaluation:
+    """Simulate `policy` on the plant that it names, or on `own` with its box, and compare it with its learned gain.
 
     Raises
     ------
@@ -126,14 +129,17 @@ def evaluate(policy: Policy, options: EvaluationOptions | None = None) -> Evalua
         or the record lacks what the held simulation needs (`dt`, weights).
     """
     options = options or EvaluationOptions()
-    system = get_system(policy.system).with_parameters(policy.parameters)
+    if own is None:
+        system, plant = shipped_system(policy.system).with_parameters(policy.parameters), None
+    else:
+        system, plant = own
     network = policy.network
     if (network.n, network.m) != (system.n, system.m):
         raise InputError(
             f"the policy must map {system.n} states to {system.m} inputs for {system.name}; "
             f"it maps {network.n} to {network.m}."
         )
-    x0 = initial_states(system, options.states, options.seed)
+    x0 = initial_states(system, options.states, options.seed, plant)
     dt = _recorded(policy, "dt", ())
     if not dt > 0:
         raise InputError(f"`training.dt` of the policy must be positive; found {dt}.")
@@ -144,7 +150,7 @@ def evaluate(policy: Policy, options: EvaluationOptions | None = None) -> Evalua
     fastest = float(np.abs(eigenvalues).max())
     h = min(dt, options.resolution / fastest) if fastest > 0 else dt
     continuous = _settling(continuous_loop(system, h, mean_action(network, system), Q, R), system, x0, options)
-    held = settle(network, system, dt, Q, R, options)
+    held = settle(network, system, dt, Q, R, options, plant)
 
     distance = relative = A_error = B_error = math.nan
     if {"A", "B", "K"} <= set(policy.training):
@@ -170,20 +176,27 @@ def evaluate(policy: Policy, options: EvaluationOptions | None = None) -> Evalua
 
 
 def settle(
-    network: TanhNetwork, system: System, dt: float, Q: Array, R: Array, options: EvaluationOptions = MONITORING
+    network: TanhNetwork,
+    system: System,
+    dt: float,
+    Q: Array,
+    R: Array,
+    options: EvaluationOptions = MONITORING,
+    plant: Plant | None = None,
 ) -> Settling:
     """Simulate `network` with its action held over dt from the plant's initial states, all of them at once.
 
     Parameters
     ----------
     Q, R : diagonals of the cost's weights, shapes (n,) and (m,).
+    plant : whose box the initial states come from; default: the plant that ships under the system's name.
 
     Raises
     ------
     InputError : the plant has no box of initial states.
     """
     loop = held_loop(system, dt, mean_action(network, system), Q, R)
-    return _settling(loop, system, initial_states(system, options.states, options.seed), options)
+    return _settling(loop, system, initial_states(system, options.states, options.seed, plant), options)
 
 
 def curvature(network: TanhNetwork, system: System, radius: float, points: int = 256) -> float:

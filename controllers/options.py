@@ -12,7 +12,8 @@ from __future__ import annotations
 import importlib
 import math
 import pkgutil
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 from certify.errors import InputError
@@ -185,6 +186,11 @@ def get_plant(name: str) -> Plant:
     if not isinstance(plant, Plant):
         raise InputError(f"{module.__file__} must define `PLANT`, a Plant; found {type(plant).__name__}.")
     return plant
+
+
+def overridden(options: TrainingOptions, chosen: Mapping[str, Any]) -> TrainingOptions:
+    """The options with those replaced that were chosen; None means not chosen."""
+    return replace(options, **{name: value for name, value in chosen.items() if value is not None})
 
 
 def preset(name: str) -> TrainingOptions:

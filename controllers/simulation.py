@@ -18,7 +18,7 @@ from certify.policies import TanhNetwork
 from certify.systems import System
 from certify.systems.ode import rk4_step
 from controllers.environments import Stepper
-from controllers.options import get_plant
+from controllers.options import Plant, get_plant
 
 Array = NDArray[np.float64]
 Action = Callable[[Array], Array]
@@ -90,14 +90,14 @@ def mean_action(network: TanhNetwork, system: System) -> Action:
     return lambda x: np.asarray(folded(torch.from_numpy(x), u_eq))
 
 
-def initial_states(system: System, count: int, seed: int) -> Array:
-    """States (count, n), uniform in the box that the plant's file gives.
+def initial_states(system: System, count: int, seed: int, plant: Plant | None = None) -> Array:
+    """States (count, n), uniform in the box of `plant`, by default the plant that ships under the system's name.
 
     Raises
     ------
-    InputError : the plant has no such file, or it does not fit the plant's states.
+    InputError : no such plant ships, or it does not fit the system's states.
     """
-    plant = get_plant(system.name)
+    plant = get_plant(system.name) if plant is None else plant
     plant.check(system)
     half_widths = np.array(plant.initial_states)
     return np.random.default_rng(seed).uniform(-half_widths, half_widths, (count, system.n))

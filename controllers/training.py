@@ -35,7 +35,7 @@ from controllers.evaluate import curvature, settle
 from controllers.files import write_atomically
 from controllers.logs import Episode, Monitored
 from controllers.lqr import GainLearner, Identified, Phase
-from controllers.options import TrainingOptions, available_plants
+from controllers.options import Plant, TrainingOptions, available_plants
 from controllers.sac import CPU, SAC, Interface, Replay
 
 Array = NDArray[np.float64]
@@ -51,15 +51,19 @@ class Trainer:
     system : the plant; only the environment reads its equations.
     options : everything else.
     device : where the networks and the replay table live; of no account for checkpoints and policies.
+    plant : where the evaluations during the run start; default: the plant that ships under the system's name, and no
+        evaluations if there is none.
 
     Raises
     ------
     InputError : weights do not fit the plant.
     """
 
-    def __init__(self, system: System, options: TrainingOptions, device: torch.device = CPU) -> None:
+    def __init__(
+        self, system: System, options: TrainingOptions, device: torch.device = CPU, plant: Plant | None = None
+    ) -> None:
         options.check_sizes(system)
-        self.system, self.options = system, options
+        self.system, self.options, self.plant = system, options, plant
         self.environment = PlantEnvironment(system, options)
         self.interface = Interface(system)
         Q_c, R_c = np.diag(options.state_weights), np.diag(options.input_weights)
@@ -119,9 +123,9 @@ class Trainer:
         """Judge the policy as it is, in a second or so; draws none of the run's random numbers."""
         network, options = self.sac.actor.network(), self.options
         settled = cost = float("nan")
-        if self.system.name in available_plants():
+        if self.plant is not None or self.system.name in available_plants():
             Q, R = np.array(options.state_weights), np.array(options.input_weights)
-            found = settle(network, self.system, options.dt, Q, R)
+            found = settle(network, self.system, options.dt, Q, R, plant=self.plant)
             settled, cost = found.settled / found.states, found.cost
         bend = curvature(network, self.system, options.eta)
         self.monitored.append(Monitored(self.steps_done, *self.distance(), bend, settled, cost))

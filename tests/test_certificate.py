@@ -129,7 +129,7 @@ TAMPERED: dict[str, tuple[Callable[[Document], None], str]] = {
     "weights": (scaled("policy", "layers", 2, "weight", by=-1.0), "hash"),
     "scale": (scaled("policy", "scale", by=1.25), "hash"),
     "centring": (replaced("policy", "centre", to="none"), "hash"),
-    "schema": (replaced("schema", to="certify-certificate/1"), "format"),
+    "schema": (replaced("schema", to="certify-certificate/2"), "format"),
     "a key too many": (replaced("extra", to=1), "format"),
     "NaN": (replaced("levels", "roa", to=float("nan")), "format"),
     "a decimal": (replaced("levels", "roa", to=0.5), "format"),
@@ -165,7 +165,7 @@ def test_reading_gives_back_what_was_written(written: Path) -> None:
     assert read.network.sha256() == pendulum_network(centre="output").sha256()
 
 
-@pytest.mark.parametrize("text", ["", "[]", "{}", '{"schema": "certify-certificate/2"}', "\xff", "[" * 100_000])
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"schema": "certify-certificate/3"}', "\xff", "[" * 100_000])
 def test_unreadable_certificates(tmp_path: Path, text: str) -> None:
     (tmp_path / "c.json").write_text(text)
     with pytest.raises(CertificateFormatError):

@@ -132,6 +132,10 @@ EXPRESSIONS = [
     (X + Y) / (2 + sympy.sin(X) ** 2),
     (3 + X**2) ** -2 * Y,
     sympy.Rational(1, 7) * X * sympy.sin(X * Y) - sympy.cos(X),
+    sympy.tanh(X + Y) * sympy.exp(-X),
+    sympy.atan(2 * X * Y - X) + sympy.pi * Y - sympy.E,
+    sympy.sqrt(2 + X) - (3 + Y) ** sympy.Rational(-3, 2),
+    (2 + X) ** sympy.Rational(1, 4) * sympy.exp(sympy.sqrt(2) * Y),
 ]
 
 
@@ -191,7 +195,8 @@ def test_taylor_remainder_is_of_third_order(expression: sympy.Expr) -> None:
 
 
 def test_a_pole_in_reach_is_never_bounded() -> None:
-    for expression, centre in ((1 / X, 0.05), (sympy.tan(X), 1.5), (X**-2, 0.0)):
+    roots = ((sympy.sqrt(X), 0.05), (sympy.sqrt(X), -3.0), (X * sympy.sqrt(X), 0.1), (sympy.exp(X), 64.0))
+    for expression, centre in ((1 / X, 0.05), (sympy.tan(X), 1.5), (X**-2, 0.0), *roots):
         result = on_models(expression, model(centre, [0.1, 0.0]), model(0.0, [0.0, 0.0]))
         assert not bool(upper_bound(result)[0][0] < float("inf"))
 

@@ -131,11 +131,14 @@ def test_domain_must_surround_the_origin(pendulum: System) -> None:
 @pytest.mark.parametrize(
     ("build", "message"),
     [
-        (lambda x, u: sympy.exp(x) + u, "exp"),
+        (lambda x, u: sympy.log(2 + x) + u, "log"),
         (lambda x, u: 0.5 * x + u, "rounded number"),
-        (lambda x, u: x ** sympy.Rational(1, 2) + u, "allowed"),
+        (lambda x, u: x ** sympy.Rational(1, 3) + u, "allowed"),
+        (lambda x, u: x**x + u, "allowed"),
+        (lambda x, u: sympy.sqrt(-2) * x + u, "allowed"),
+        (lambda x, u: sympy.sqrt(x + sympy.Float("0.1")) + u, "rounded number"),
         (lambda x, u: sympy.Symbol("y") + u, "no state, input or parameter"),
-        (lambda x, u: sympy.pi * x + u, "allowed"),
+        (lambda x, u: sympy.EulerGamma * x + u, "allowed"),
     ],
 )
 def test_the_grammar_is_closed(build: object, message: str) -> None:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -30,7 +31,7 @@ from certify.policies import TanhNetwork
 from certify.systems import System
 
 Array = NDArray[np.float64]
-SCHEMA = "certify-certificate/2"
+SCHEMA = "certify-certificate/3"
 """Of each claim's kind, what the file calls the inner level."""
 MAX_BYTES = 256 * 2**20
 _LONGEST_UNIT = 40
@@ -119,12 +120,13 @@ class Certificate:
                 "centre": network.centre,
                 "scale": _encode(network.scale),
                 "offset": _encode(network.offset),
+                "clip": None if network.clip is None else [_encode(end) for end in network.clip],
                 "sha256": network.sha256(),
             },
             "lyapunov": {"kind": "quadratic", "P": _encode(self.V.P)},
             "levels": {name: float(level).hex() for name, level in self.claim.levels.items()},
             "evidence": _evidence(self.evidence),
-            "provenance": {k: str(v) for k, v in self.provenance.items()} | _units(system),
+            "provenance": {k: str(v) for k, v in self.provenance.items()} | _for_people(system),
         }
         lines = [f"{json.dumps(k)}: {json.dumps(v)}" for k, v in sections.items()]
         return "{\n" + ",\n".join(lines) + "\n}\n"
@@ -180,7 +182,7 @@ def parse_certificate(raw: bytes, name: str) -> Certificate:
         states, inputs = (tuple(sympy.Symbol(s) for s in plant[k]) for k in ("states", "inputs"))
         names = {s.name: s for s in (*states, *inputs)}
         n, m = len(states), len(inputs)
-        provenance, units = _read_provenance(data["provenance"], names)
+        provenance, units, x_eq = _read_provenance(data["provenance"], names)
         system = System(
             name=plant["name"],
             states=states,
@@ -191,6 +193,7 @@ def parse_certificate(raw: bytes, name: str) -> Certificate:
             domain=tuple((Fraction(lo), Fraction(hi)) for lo, hi in plant["domain"]),
             input_bounds=tuple((Fraction(lo), Fraction(hi)) for lo, hi in plant["input_bounds"]),
             units=units,
+            x_eq=tuple(sympy.Rational(x_eq.get(s.name, "0")) for s in states),
         )
         network = TanhNetwork(
             weights=tuple(_decode(x["weight"], tuple(x["shape"])) for x in policy["layers"]),
@@ -199,6 +202,7 @@ def parse_certificate(raw: bytes, name: str) -> Certificate:
             offset=_decode(policy["offset"], (m,)),
             squash=policy["squash"],
             centre=policy["centre"],
+            clip=_read_clip(policy["clip"], m),
         )
         return Certificate(
             system=system,
@@ -214,20 +218,31 @@ def parse_certificate(raw: bytes, name: str) -> Certificate:
         raise CertificateFormatError(f"{name} is not a certificate: {type(error).__name__}: {error}.") from error
 
 
-def _units(system: System) -> dict[str, dict[str, str]]:
-    """The provenance's entry for units of states and inputs; none if the plant has none."""
+def _for_people(system: System) -> dict[str, dict[str, str]]:
+    """The provenance's entries for units of states and inputs, and for the operating point; none where there are none.
+
+    The plant of a certificate is in deviations from x_eq, so that nothing that is checked depends on either.
+    """
     names = [s.name for s in (*system.states, *system.inputs)]
     units = {name: system.units[name] for name in names if name in system.units}
-    return {"units": units} if units else {}
+    x_eq = {name: str(q) for name, q in system.operating_point().items()}
+    return {key: entry for key, entry in (("units", units), ("x_eq", x_eq)) if entry}
 
 
-def _read_provenance(data: Any, names: Mapping[str, Any]) -> tuple[dict[str, str], dict[str, str]]:
-    """The provenance as text, and the units in it; it is for people, so what cannot be used is passed over."""
+def _read_provenance(data: Any, names: Mapping[str, Any]) -> tuple[dict[str, str], dict[str, str], dict[str, str]]:
+    """The provenance as text, and units and operating point in it; it is for people, so what is odd is passed over."""
     found = data if isinstance(data, dict) else {}
-    units = found.get("units")
-    if not isinstance(units, dict) or not all(k in names and _is_unit(v) for k, v in units.items()):
-        return {k: str(v) for k, v in found.items()}, {}
-    return {k: str(v) for k, v in found.items() if k != "units"}, units
+    read = {}
+    for key, is_one in (("units", _is_unit), ("x_eq", _is_value)):
+        entry = found.get(key)
+        usable = isinstance(entry, dict) and all(k in names and is_one(v) for k, v in entry.items())
+        read[key] = entry if usable and isinstance(entry, dict) else {}
+    text = {k: str(v) for k, v in found.items() if not read.get(k)}
+    return text, read["units"], read["x_eq"]
+
+
+def _is_value(value: Any) -> bool:
+    return isinstance(value, str) and re.fullmatch(r"-?[0-9]{1,200}(/[1-9][0-9]{0,199})?", value) is not None
 
 
 def _is_unit(value: Any) -> bool:
@@ -257,6 +272,13 @@ def _read_evidence(data: Mapping[str, Any], n: int) -> PartitionTree | TrustedSo
         return PartitionTree(_decode(data["T"], (n, n)), root, base64.b64decode(data["tree"]))
     queries = tuple((str(name), str(answer)) for name, answer in data["queries"])
     return TrustedSolver(str(data["solver"]), str(data["version"]), float.fromhex(data["precision"]), queries)
+
+
+def _read_clip(data: Any, m: int) -> tuple[Array, Array] | None:
+    if data is None:
+        return None
+    lo, hi = data
+    return _decode(lo, (m,)), _decode(hi, (m,))
 
 
 def _encode(array: Array) -> str:

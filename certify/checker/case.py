@@ -54,9 +54,13 @@ class Case:
 
     @cached_property
     def bounded(self) -> bool:
-        """True if `offset +- scale` lies in the input bounds and the centring keeps the input there."""
-        policy = self.c.policy
+        """True if for each input the clip lies in the input bounds, or `offset +- scale` does and the centring keeps
+        the input there."""
+        policy, each = self.c.policy, range(len(self.c.inputs))
         offset, scale = ([Fraction(v) for v in numbers.tolist()] for numbers in (policy.offset, policy.scale))
-        each = zip(offset, map(abs, scale), self.c.input_bounds, strict=True)
-        by_form = policy.squash == "tanh" and policy.centre != "output"
-        return by_form and all(lo <= middle - reach and middle + reach <= hi for middle, reach, (lo, hi) in each)
+        known = [policy.clip] if policy.clip else []  # pairs of the least and the largest values, by form
+        ranges = [[(Fraction(lo[j]), Fraction(hi[j])) for lo, hi in known] for j in each]
+        if policy.squash == "tanh" and policy.centre != "output":
+            ranges = [[*ranges[j], (offset[j] - abs(scale[j]), offset[j] + abs(scale[j]))] for j in each]
+        bounds = zip(ranges, self.c.input_bounds, strict=True)
+        return all(any(lo <= low and high <= hi for low, high in pairs) for pairs, (lo, hi) in bounds)

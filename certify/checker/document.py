@@ -31,12 +31,13 @@ class Policy:
     offset: Array
     squash: str
     centre: str
+    clip: tuple[Array, Array] | None = None  # lo, hi
 
     def sha256(self) -> str:
         """Hash of squash, centre, then shape and little-endian numbers of each array (FORMAT.md)."""
         digest = hashlib.sha256(f"certify-policy/1\0{self.squash}\0{self.centre}\0".encode())
         layers = [array for layer in zip(self.weights, self.biases, strict=True) for array in layer]
-        for numbers in (*layers, self.scale, self.offset):
+        for numbers in (*layers, self.scale, self.offset, *(self.clip or ())):
             digest.update(struct.pack(f"<{1 + numbers.ndim}Q", numbers.ndim, *numbers.shape))
             digest.update(numbers.astype("<f8").tobytes())
         return digest.hexdigest()
@@ -104,7 +105,7 @@ def certificate(data: Any, sha256: str) -> Certificate:
     """A JSON value as a certificate."""
     keys = "schema claim plant policy lyapunov levels evidence provenance"
     schema, claim, plant, policy, lyapunov, levels, evidence, provenance = Value(data).keys(keys)
-    schema.choice("certify-certificate/2")
+    schema.choice("certify-certificate/3")
     kind = claim.keys("kind")[0].choice("asymptotic", "practical")
     stated = _plant(plant)
     n, m = len(stated["states"]), len(stated["inputs"])
@@ -134,7 +135,7 @@ def _plant(plant: Value) -> dict[str, Any]:
 
 
 def _policy(value: Value, n: int, m: int) -> Policy:
-    layers, squash, centre, scale, offset, sha256 = value.keys("layers squash centre scale offset sha256")
+    layers, squash, centre, scale, offset, clip, sha256 = value.keys("layers squash centre scale offset clip sha256")
     read: list[tuple[Array, Array]] = []
     columns = n  # of a layer: the rows of the layer before
     for shape, weight, bias in layers.listed(lambda layer: layer.keys("shape weight bias"), 1, MAX_LAYERS):
@@ -147,10 +148,18 @@ def _policy(value: Value, n: int, m: int) -> Policy:
     words = squash.choice("tanh", "identity"), centre.choice("output", "preactivation", "none")
     centre.must(words != ("identity", "preactivation"), "another where squash is not 'tanh'")
     weights, biases = zip(*read, strict=True)
-    policy = Policy(weights, biases, scale.array(m), offset.array(m), *words)
+    policy = Policy(weights, biases, scale.array(m), offset.array(m), *words, _clip(clip, m))
     scale.must(bool(np.all(policy.scale != 0)), "nonzero")
     check_hash(policy, sha256.raw)
     return policy
+
+
+def _clip(value: Value, m: int) -> tuple[Array, Array] | None:
+    if value.raw is None:
+        return None
+    lo, hi = value.listed(lambda end: end.array(m), 2)
+    value.must(bool(np.all(lo < hi)), "lower, then upper ends")
+    return lo, hi
 
 
 def check_hash(policy: Policy, stated: Any) -> None:

@@ -1,4 +1,4 @@
-"""The functions of one variable, expanded to second order: the one place that knows sin, cos, 1/v and tanh.
+"""The functions of one variable, expanded to second order: the one place that knows what they are.
 
 Taylor models and jets ask the same question. v lies within `radius` of a number v0 which is itself only known to lie
 within `error` of c. What are phi, phi' and phi''/2 at v0, and how far is phi(v) from the parabola that they make?
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from .float64 import EPS, sin_cos, tanh, up
+from .float64 import EPS, atan, exp, sin_cos, tanh, up
 
 Triple = tuple[Any, Any, Any]
 
@@ -20,7 +20,8 @@ def elementary(name: str, c: Any, error: Any, radius: Any) -> tuple[Triple, Trip
     |phi(v) - phi(v0) - phi'(v0) D - phi''(v0)/2 D^2| <= third |D|^3, D = v - v0.
 
     NaN where phi may be undefined or c is not finite. sin and cos have no derivative above 1; `third` bounds
-    |phi'''|/6, as 2/6 does for tanh, but for 1/v what is left is exactly -D^3 / (v0^3 v).
+    |phi'''|/6, as 2/6 does for tanh and atan and exp(v)/6 for exp, but for 1/v what is left is exactly -D^3 / (v0^3 v),
+    and for the square root, with s^2 = v0 and w^2 = v, exactly D^3 (3 s + w) / (8 s^3 (s + w)^3).
     """
     if name == "tanh":
         t, e = tanh(c)
@@ -41,6 +42,31 @@ def elementary(name: str, c: Any, error: Any, radius: Any) -> tuple[Triple, Trip
         moved = (square, 2 * cube, 3 * up(cube / nearest))  # |phi'|, |phi''|, |phi'''|/2 where v0 may be
         e0, e1, e2 = (up(EPS * np.abs(v) + error * most) for v, most in zip(f, moved, strict=True))
         return f, (e0, e1, e2), up(cube / least)
+    if name == "exp":
+        most = c + up(error + radius)
+        f, e = exp(c)
+        worst, more = exp(most + EPS * np.abs(most))
+        e = up(e + error * up(worst + more))
+        return (f, f, f / 2), (e, e, e), up(up(worst + more) / 6)
+    if name == "atan":
+        f0, e0 = atan(c)
+        slope = np.where(np.isfinite(c), 1 / (1 + c * c), np.nan)
+        half = -(c * slope) * slope
+        # |phi'| and |phi'''|/2 are at most 1, and |phi''| at most 0.65
+        e1, e2 = (up(2 * EPS * np.abs(v) + error) for v in (slope, half))
+        return (f0, slope, half), (up(e0 + error), e1, e2), up(1 / 3)
+    if name == "sqrt":
+        # the least that v may be, then v0; NaN for both if v may not be positive
+        least = _rounded_down(c - up(error + radius))
+        nearest = np.where(least > 0, _rounded_down(c - error), np.nan)
+        s = np.sqrt(c)
+        f = (s, 0.5 / s, -0.125 / (s * s * s))
+        p = up(1 / _rounded_down(np.sqrt(nearest)))  # 1/s where it is largest, and 1/(s + w)
+        q = up(1 / _rounded_down(np.sqrt(nearest) + np.sqrt(least)))
+        cube = up(p * up(p * p))
+        moved = (p / 2, cube / 4, 0.1875 * up(cube * up(p * p)))  # |phi'|, |phi''|, |phi'''|/2 where v0 may be
+        e0, e1, e2 = (up(EPS * np.abs(v) + error * most) for v, most in zip(f, moved, strict=True))
+        return f, (e0, e1, e2), up(up(up(p * q) * up(p * q)) * up(2 * q + p) / 8)
     if name not in ("sin", "cos"):
         raise ValueError(f"nothing is known of {name}")
     s, c, s_error, c_error = sin_cos(c)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from fractions import Fraction
+from math import isqrt
 
 import numpy as np
 from flint import fmpq, fmpq_mat
@@ -60,7 +61,7 @@ class Undecided(Exception):
 
 @dataclass(frozen=True)
 class Exact:
-    """A rational on the tape; sin and cos only of exact 0, no division by zero."""
+    """A rational on the tape; functions only of exact 0, roots only of squares, no division by zero."""
 
     value: Fraction
 
@@ -76,9 +77,15 @@ class Exact:
     def function(self, name: str) -> Exact:
         if name == "inv" and self.value != 0:
             return Exact(1 / self.value)
+        if name == "sqrt":
+            value = self.small()
+            root = Fraction(isqrt(max(value.numerator, 0)), isqrt(value.denominator))
+            if not (value > 0 and root * root == value):
+                raise Undecided("the root of what is not the square of a positive rational")
+            return Exact(root)
         if name == "inv" or self.value != 0:
             raise Undecided("division by zero" if name == "inv" else f"{name} of a number that is not 0")
-        return Exact(Fraction(int(name == "cos")))
+        return Exact(Fraction(int(name in ("cos", "exp"))))
 
     def small(self) -> Fraction:
         """The value itself; powers of powers could grow without end."""
@@ -96,6 +103,15 @@ def raw_at_origin(policy: Policy) -> list[Fraction | None]:
             h = [Fraction(0) if v == 0 else None for v in h]
         h = [_affine(row, bias, h) for row, bias in zip(W.tolist(), b.tolist(), strict=True)]
     return h
+
+
+def policy_at_origin(policy: Policy) -> list[Fraction | None]:
+    """pi(0) without centring: raw(0), clipped."""
+    raw = raw_at_origin(policy)
+    if policy.clip is None:
+        return raw
+    ends = ([Fraction(v) for v in end.tolist()] for end in policy.clip)
+    return [None if v is None else min(max(v, lo), hi) for v, lo, hi in zip(raw, *ends, strict=True)]
 
 
 def _affine(row: list[float], bias: float, h: list[Fraction | None]) -> Fraction | None:

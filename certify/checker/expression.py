@@ -1,8 +1,8 @@
 """The plant's equations: a JSON tree becomes a tape of operations, each evaluated once.
 
 A leaf is a name or an exact fraction; a node is `["+", a, b, ...]`, `["*", a, b, ...]`, `["-", a]`,
-`["-", a, b]`, `["/", a, b]`, `["**", a, k]` with an integer k, `["sin", a]`, `["cos", a]` or `["tan", a]`.
-Powers and tan are expanded here, so that an arithmetic needs only +, *, unary -, and `function` for inv, sin and cos.
+`["-", a, b]`, `["/", a, b]`, `["**", a, k]` with an integer k, or `[f, a]` with a function f.
+Powers and tan are expanded here, so that an arithmetic needs only +, *, unary -, and `function` for inv and the others.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ class _Builder:
                 return self.push("+", a, self.push("neg", b))
             case "/", [a, b]:
                 return self.push("*", a, self.push("inv", b))
-            case (("sin" | "cos"), [a]):
+            case (("sin" | "cos" | "tanh" | "exp" | "atan" | "sqrt"), [a]):
                 return self.push(name, a)
             case "tan", [a]:
                 return self.push("*", self.push("sin", a), self.push("inv", self.push("cos", a)))

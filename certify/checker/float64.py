@@ -19,8 +19,8 @@ Sums and matrix products are bounded for any order of summation and with or with
 
 Overflow never helps: it makes a bound infinite or NaN, and a comparison that has to hold is then False.
 
-tanh, sin and cos use a table of values on a grid of step h = 2^-5, which Arb computes at start-up, an addition
-theorem, and Taylor polynomials on |d| <= h/2 = 2^-6. No libm value is trusted.
+tanh, sin, cos, exp and atan use a table of values on a grid of step h = 2^-5, which Arb computes at start-up, an
+addition theorem, and Taylor polynomials on |d| <= h/2 = 2^-6. No libm value is trusted; the square root is IEEE's own.
 """
 
 from __future__ import annotations
@@ -40,6 +40,7 @@ TINY = 2.0**-960
 _STEP = 2.0**-5
 _TANH_END = 20.0  # 1 - tanh(20) < 2^-56
 _ANGLE_END = 64.0  # beyond, sin and cos are only known to lie in [-1, 1]
+_EXP_END = 64.0  # beyond, nothing is known of exp; below -64 it lies between 0 and 2^-92
 
 
 def up(bound: Any) -> Any:
@@ -114,6 +115,8 @@ _GRID = [arb(k) * _STEP for k in range(int(_ANGLE_END / _STEP) + 1)]
 _TANHS = [x.tanh() for x in _GRID[: int(_TANH_END / _STEP) + 1]]
 _TANH, _SECH2 = _table(_TANHS), _table(1 - t * t for t in _TANHS)
 _SIN, _COS = _table(x.sin() for x in _GRID), _table(x.cos() for x in _GRID)
+_EXP, _ATAN = _table(x.exp() for x in _GRID), _table(x.atan() for x in _GRID[: int(1 / _STEP) + 1])
+_RIGHT_ANGLE, _ = arb_with_error(arb.pi() / 2)
 
 
 def _split(y: Array, end: float) -> tuple[Any, Array]:
@@ -167,6 +170,50 @@ def sin_cos(y: Array) -> tuple[Array, Array, Array, Array]:
     c_error = 5 * U * (np.abs(C) + np.abs(S * sd)) + TINY
     pairs = ((s, 0.0), (c, 0.0), (s_error, 1.0), (c_error, 1.0))
     return tuple(np.where(finite, np.where(near, v, far), np.nan) for v, far in pairs)  # type: ignore[return-value]
+
+
+def exp(y: Array) -> tuple[Array, Array]:
+    """(v, e) with |exp(y) - v| <= e for finite y up to 64; NaN where y is larger or not finite.
+
+    exp(kh + d) = E p, E = exp(kh), p = exp(d), for |y|, and its inverse for y < 0. The Taylor polynomial of degree 8
+    leaves out less than 1.1 |d|^9 / 9!, |d| <= h: below 2^-63 and so 0.001u. What Horner's rule adds to 1 is below
+    |d| (1 + h) and within 4u of itself, so p is within 1.2u of itself. E comes with u, the product adds u and the
+    inverse another: v is within 4.3u of itself, and the claim is 6u. For y < -64: v = 0, e = 2^-92 > exp(-64).
+    """
+    with_table = np.abs(y) <= _EXP_END
+    k, d = _split(np.where(with_table, np.abs(y), 0.0), _EXP_END)
+    p = 1 / 5040 + d * (1 / 40320)
+    for coefficient in (1 / 720, 1 / 120, 1 / 24, 1 / 6, 1 / 2, 1.0, 1.0):
+        p = coefficient + d * p
+    v = _EXP[k] * p
+    v = np.where(y < 0, 1 / v, v)
+    beyond = np.isfinite(y) & (y < 0)
+    v, error = (
+        np.where(with_table, near, np.where(beyond, far, np.nan)) for near, far in ((v, 0.0), (6 * U * v, 2.0**-92))
+    )
+    return v, error
+
+
+def atan(y: Array) -> tuple[Array, Array]:
+    """(v, e) with |atan(y) - v| <= e for every finite y; NaN where y is not finite.
+
+    For |y| <= 1, atan(y) = A + atan(q), A = atan(kh), q = d / (1 + kh y), y = kh + d as in `_split`. q comes with 3.1u,
+    or is d if k = 0. The Taylor polynomial of degree 11 leaves out less than |q|^13 / 13, |q| <= h: below 0.001u |q|;
+    what Horner's rule adds to q is below |q|/3000. So atan(q) is within 4.2u of itself; A comes with u, and the last
+    addition adds u (A + |q|): the claim is 3u A + 8u |q|. For |y| > 1, atan(|y|) = pi/2 - atan(1/|y|), where 1/|y| <= 1
+    comes with u of itself, pi/2 with 2u, and the subtraction adds 2u: the claim is 6u more.
+    """
+    finite, size = np.isfinite(y), np.abs(y)
+    large = size > 1
+    w = np.where(finite, np.where(large, 1 / np.where(large, size, 1.0), size), 0.0)
+    k, d = _split(w, 1.0)
+    q = d / (1 + k * _STEP * w)
+    s = q * q
+    v = q + q * (s * (-1 / 3 + s * (1 / 5 + s * (-1 / 7 + s * (1 / 9 + s * (-1 / 11))))))
+    A = _ATAN[k]
+    v, error = A + v, 3 * U * A + 8 * U * np.abs(q) + TINY
+    v, error = np.where(large, _RIGHT_ANGLE - v, v), np.where(large, error + 6 * U, error)
+    return np.where(finite, np.copysign(v, y), np.nan), np.where(finite, error, np.nan)
 
 
 def spectral_norm(W: Array) -> float:

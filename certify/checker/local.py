@@ -13,7 +13,7 @@ import numpy as np
 from .case import Case, Failures
 from .elementary import elementary
 from .expression import evaluate
-from .float64 import EPS, Array, float_with_error, frobenius, gamma, norm, spectral_norm, total, up, within
+from .float64 import EPS, Array, ends, float_with_error, frobenius, gamma, norm, spectral_norm, total, up, within
 from .jets import Jet, constant, widen
 from .network import Folded
 
@@ -41,7 +41,7 @@ class Ball:
 
     @cached_property
     def inputs(self) -> list[Jet]:
-        """pi(x) on the ball."""
+        """pi(x) on the ball, before it is clipped."""
         gradient, slack, Q, E = enclose_at_origin(self.case.net, *self.J)
         parts = zip(self.c.u_eq, self.case.net.scale, gradient, slack, Q, E, strict=True)
         return [input_jet(*part) for part in parts]
@@ -89,6 +89,16 @@ def keeps_inputs(ball: Ball) -> Failures:
             if not within(bounds, u.c, up(u.error + u.radius)):
                 yield "local ball", f"{name} may leave its bounds"
     return len(ball.c.inputs)
+
+
+def is_not_clipped(ball: Ball) -> Failures:
+    """`local`: every input lies strictly inside the policy's clip, so that the jets of what is clipped are its own."""
+    clip = ball.case.net.clip
+    for name, u, *limits in zip(ball.c.inputs, ball.inputs, *clip, strict=True) if clip else ():
+        low, high = ends(u.c, up(u.error + u.radius))
+        if not limits[0] < low <= high < limits[1]:
+            yield "policy.clip", f"{name} may be clipped on the local ball"
+    return 0
 
 
 def decreases(ball: Ball) -> Failures:

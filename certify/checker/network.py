@@ -43,13 +43,15 @@ class Layer:
 
 @dataclass(frozen=True)
 class Folded:
-    """`u = scale * h + offset`, h the last layer's value (through tanh if `squash`), the centring folded in."""
+    """`u = scale * h + offset`, h the last layer's value (through tanh if `squash`), the centring folded in; `clip`
+    (lo, hi) is applied to that."""
 
     layers: tuple[Layer, ...]
     squash: bool
     scale: Array
     offset: Array
     offset_error: Array
+    clip: tuple[Array, Array] | None = None
 
 
 def fold(policy: Policy, u_eq: tuple[Fraction, ...]) -> Folded:
@@ -57,7 +59,7 @@ def fold(policy: Policy, u_eq: tuple[Fraction, ...]) -> Folded:
     zeros, ones = np.zeros_like(policy.offset), np.ones_like(policy.offset)
     pairs = zip(policy.weights, policy.biases, strict=True)
     layers = tuple(Layer(W, b, np.zeros_like(b), spectral_norm(W)) for W, b in pairs)
-    plain = Folded(layers, policy.squash == "tanh", policy.scale, policy.offset, zeros)
+    plain = Folded(layers, policy.squash == "tanh", policy.scale, policy.offset, zeros, policy.clip)
     if policy.centre == "none":
         return plain
     if policy.centre == "preactivation":
@@ -155,7 +157,35 @@ def enclose_on_boxes(net: Folded, x: Array, x_error: Array) -> tuple[Array, Arra
     through, slopes = net.scale[:, None] * h[:, 0], net.scale[:, None, None] * h[:, 1:]
     mid = through + net.offset[:, None]
     rounding = EPS * (np.abs(through) + np.abs(net.offset)[:, None] + np.abs(mid) + total(np.abs(slopes), 1))
-    return mid, slopes, up(rounding + net.offset_error[:, None] + _error_backwards(net.scale, passed, x_error))
+    error = up(rounding + net.offset_error[:, None] + _error_backwards(net.scale, passed, x_error))
+    return clipped(mid, slopes, error, *net.clip) if net.clip else (mid, slopes, error)
+
+
+def clipped(mid: Array, slopes: Array, error: Array, least: Array, most: Array) -> tuple[Array, Array, Array]:
+    """`min(max(v, least), most)` of the affine forms v = mid + slopes.d within error, again as affine forms; least and
+    most (m,).
+
+    Nothing changes where v certainly stays between them. Elsewhere clip(v) - s v is linear between the corners of clip,
+    so that its extremes over the range of v lie at the range's ends or at corners in it; s is *any* number in [0, 1],
+    here near the chord's slope.
+    """
+    least, most, spread = least[:, None], most[:, None], total(np.abs(slopes), 1)
+    lo, hi = ends(mid, up(spread + error))
+    inside = (lo >= least) & (hi <= most)
+    width = np.clip(hi, least, most) - np.clip(lo, least, most)
+    s = np.clip(width / (hi - lo), 0.0, 1.0)
+    v = np.array([lo, hi, np.clip(least, lo, hi), np.clip(most, lo, hi)])
+    u = np.clip(v, least, most)
+    away = u - s * v
+    upper, lower = np.max(away, axis=0), np.min(away, axis=0)
+    slack = np.max(up(EPS * (np.abs(u) + s * np.abs(v))), axis=0)
+    shift, gap = (upper + lower) / 2, up((upper - lower) / 2 + slack + EPS * (np.abs(upper) + np.abs(lower)))
+    wide = up(s * error + gap + EPS * (s * (np.abs(mid) + spread) + np.abs(shift)))
+    return (
+        np.where(inside, mid, s * mid + shift),
+        np.where(inside[:, None], slopes, s[:, None] * slopes),
+        np.where(inside, error, wide),
+    )
 
 
 def _error_backwards(scale: Array, passed: list[tuple[Array, Array, Array]], x_error: Array) -> Array:

@@ -19,7 +19,7 @@ from . import local, ring
 from .case import Case, Failures
 from .document import Certificate, Partition
 from .errors import Rejected
-from .exact import Exact, Undecided, raw_at_origin
+from .exact import Exact, Undecided, policy_at_origin
 from .expression import evaluate
 from .float64 import self_test
 from .network import reaches
@@ -78,7 +78,11 @@ def centring(case: Case) -> Failures:
     policy, u_eq = case.c.policy, case.c.u_eq
     if policy.centre == "preactivation" and not all(-1 < q < 1 for q in reaches(policy, u_eq)):
         yield "policy.offset", "u_eq must lie strictly inside offset +- scale"
-    if policy.centre == "none" and case.c.claim != "practical" and raw_at_origin(policy) != list(u_eq):
+    if policy.centre != "none" and policy.clip:
+        limits = zip(*(end.tolist() for end in policy.clip), u_eq, strict=True)
+        if not all(Fraction(lo) < u < Fraction(hi) for lo, hi, u in limits):
+            yield "policy.clip", "u_eq must lie strictly inside the clip"
+    if policy.centre == "none" and case.c.claim != "practical" and policy_at_origin(policy) != list(u_eq):
         yield "policy.centre", "pi(0) = u_eq cannot be shown exactly without centring"
     return 1
 
@@ -89,7 +93,12 @@ Table = Sequence[tuple[str, Callable[[Subject], Failures]]]
 STATED: Table[Case] = tuple(
     (rule.__name__, rule) for rule in (levels, lyapunov, equilibrium, domain, coordinates, root, centring)
 )
-ON_THE_BALL: Table[local.Ball] = (("local", local.fits), ("inputs", local.keeps_inputs), ("local", local.decreases))
+ON_THE_BALL: Table[local.Ball] = (
+    ("local", local.fits),
+    ("inputs", local.keeps_inputs),
+    ("local", local.is_not_clipped),
+    ("local", local.decreases),
+)
 OF_THE_TREE: Table[Case] = (("tree", ring.is_whole),)
 ON_LEAVES: Table[ring.Leaves] = (("inputs", ring.keeps_inputs), ("ring", ring.decreases))
 READ = {"format": 1, "hash": 1}  # rules of document.py, which have held

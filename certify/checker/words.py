@@ -5,7 +5,7 @@ from __future__ import annotations
 from fractions import Fraction
 from typing import Any
 
-from .document import Certificate
+from .document import Certificate, Policy
 
 CLAIMS = {
     "asymptotic": "the origin is asymptotically stable, and every trajectory of the closed loop that starts in "
@@ -34,6 +34,7 @@ def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
         *(f"  domain {name} in {_interval(pair)}" for name, pair in zip(c.states, c.domain, strict=True)),
         *(f"  input {name} in {_interval(pair)}, u_eq = {_number(u)}" for name, pair, u in inputs),
         f"policy {'-'.join(map(str, widths))} tanh, squash {c.policy.squash}, centred by {c.policy.centre}, "
+        f"{_clip(c.policy)}"
         f"sha256 {c.policy.sha256()}",
         "V(x) = x'Px with P = " + "; ".join(" ".join(map(repr, row)) for row in c.P.tolist()),
         f"claim: {CLAIMS[c.claim].format(c=c)}; u stays in its bounds",
@@ -52,6 +53,13 @@ def expression(tree: Any) -> str:
     if name.isalpha():
         return f"{name}({words[0]})"
     return f"(-{words[0]})" if name == "-" and len(words) == 1 else f"({f' {name} '.join(words)})"
+
+
+def _clip(policy: Policy) -> str:
+    if policy.clip is None:
+        return ""
+    ends = zip(*(end.tolist() for end in policy.clip), strict=True)
+    return f"clipped to {', '.join(f'[{lo!r}, {hi!r}]' for lo, hi in ends)}, "
 
 
 def _interval(pair: tuple[Fraction, Fraction]) -> str:

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from certify.claims.claim import CLAIMS, Asymptotic, Claim, Practical, Problem
-from certify.claims.conditions import Condition, Guard, OfInput, OfState, Vdot, conditions
+from certify.claims.conditions import BeforeClip, Condition, Guard, OfInput, OfState, Radicand, Vdot, conditions
 
 __all__ = [
     "CLAIMS",
     "Asymptotic",
+    "BeforeClip",
     "Claim",
     "Condition",
     "Guard",
@@ -15,6 +16,7 @@ __all__ = [
     "OfState",
     "Practical",
     "Problem",
+    "Radicand",
     "Vdot",
     "conditions",
 ]

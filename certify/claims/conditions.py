@@ -2,7 +2,7 @@
 
 The bounds engine proves the ring and the inputs box by box, a solver of formulas is asked for a point at which a
 condition fails, and the checker has a rule for each. Two conditions have no margin and are shown along the way: P is
-positive definite (in rationals), and F is smooth on {V <= c2} (whatever encloses F there has no pole).
+positive definite (in rationals), and F is locally Lipschitz on {V <= c2} (whatever encloses F there has no pole).
 """
 
 from __future__ import annotations
@@ -11,7 +11,10 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Literal
 
+import sympy
+
 from certify.claims.claim import Asymptotic, Claim, Problem
+from certify.expressions import as_power
 from certify.policies import bounded_by_form
 
 
@@ -51,6 +54,22 @@ class OfInput:
 
 
 @dataclass(frozen=True, slots=True)
+class BeforeClip:
+    """The margin `v_index - bound` (side `above`), or `bound - v_index` (side `below`), v = pi before its clip."""
+
+    index: int
+    side: Literal["below", "above"]
+    bound: Fraction
+
+
+@dataclass(frozen=True, slots=True)
+class Radicand:
+    """The margin `-v`, v the index-th of the equations' `radicands`: what a square root is taken of is positive."""
+
+    index: int
+
+
+@dataclass(frozen=True, slots=True)
 class Condition:
     """For all x in the domain box where every guard holds, `margin < 0` (`strict`) or `margin <= 0`.
 
@@ -59,23 +78,23 @@ class Condition:
 
     name: str
     guards: tuple[Guard, ...]
-    margin: Vdot | OfState | OfInput
+    margin: Vdot | OfState | OfInput | BeforeClip | Radicand
     strict: bool = True
     punctured: bool = False
 
 
 def conditions(claim: Claim, problem: Problem) -> tuple[Condition, ...]:
-    """Everything that has to be shown for `claim`: domain, local, ring, inputs.
+    """Everything that has to be shown for `claim`: domain, clip, local, ring, roots, inputs.
 
     The domain's conditions are about the box itself: {V <= c2} is connected and holds the origin, so it leaves the
     interior of the box only through a side.
     """
     found = domain_conditions(problem, claim.roa)
     if isinstance(claim, Asymptotic):
-        found += (local_condition(claim.local),)
+        found += (*clip_conditions(problem, claim.local), local_condition(claim.local))
     if claim.inner < claim.roa or not isinstance(claim, Asymptotic):
         found += (ring_condition(claim.inner, claim.roa),)
-    return found + input_conditions(problem, claim.roa)
+    return found + root_conditions(problem, claim.roa) + input_conditions(problem, claim.roa)
 
 
 def domain_conditions(problem: Problem, level: float) -> tuple[Condition, ...]:
@@ -93,9 +112,42 @@ def local_condition(level: float) -> Condition:
     return Condition("local", (Guard("inside", level),), Vdot(), punctured=True)
 
 
+def clip_conditions(problem: Problem, level: float) -> tuple[Condition, ...]:
+    """The policy's clip does nothing on {V <= level}, as the local condition needs; none without a clip."""
+    clip = problem.loop.network.clip
+    if clip is None:
+        return ()
+    ends = zip(problem.loop.system.inputs, *clip, strict=True)
+    return tuple(
+        Condition(f"clip-{symbol.name}-{side}", (Guard("inside", level),), BeforeClip(j, side, bound))
+        for j, (symbol, lo, hi) in enumerate(ends)
+        for side, bound in _sides(Fraction(float(lo)), Fraction(float(hi)))
+    )
+
+
 def ring_condition(inner: float, outer: float) -> Condition:
     """Vdot < 0 for inner <= V <= outer."""
     return Condition("ring", (Guard("outside", inner), Guard("inside", outer)), Vdot())
+
+
+def root_conditions(problem: Problem, level: float) -> tuple[Condition, ...]:
+    """What square roots in the equations are taken of is positive on {V <= level}, one condition a root.
+
+    What bounds F on boxes shows it along the way; a solver may look only where the roots are defined.
+    """
+    count = len(radicands(problem))
+    return tuple(Condition(f"root-{k}", (Guard("inside", level),), Radicand(k)) for k in range(count))
+
+
+def radicands(problem: Problem) -> tuple[sympy.Expr, ...]:
+    """What the equations take square roots of, inner roots before outer ones."""
+    found: dict[sympy.Expr, None] = {}
+    for expression in problem.loop.system.exact_dynamics():
+        for node in sympy.postorder_traversal(expression):
+            power = as_power(node)
+            if power is not None and power[1] > 0 and node.free_symbols:
+                found[power[0]] = None
+    return tuple(found)
 
 
 def input_conditions(problem: Problem, level: float) -> tuple[Condition, ...]:

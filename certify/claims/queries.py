@@ -14,12 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.claims.claim import Problem
-from certify.claims.conditions import Condition, OfState, Vdot
+from certify.claims.conditions import BeforeClip, Condition, OfState, Radicand, Vdot, radicands
 from certify.closed_loop import ClosedLoop
 from certify.errors import InputError
 from certify.expressions import Tree, to_tree
 
 Array = NDArray[np.float64]
+BEFORE_CLIP = "b."  # and the input's number
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +29,7 @@ class Query:
 
     `variables` are names with their exact bounds; `definitions` are names with trees, each over what comes before
     it; `constraints` are relations (tree, ">=" or "<=" or ">", tree) that hold together. Beside the operators of the
-    plant's trees, `tanh` and `log` occur.
+    plant's trees, `tanh`, `log`, `min` and `max` occur.
     """
 
     name: str
@@ -56,11 +57,15 @@ def query(condition: Condition, problem: Problem) -> Query:
     elif isinstance(margin, Vdot):
         definitions += [*_policy(problem.loop), *_vdot(problem)]
         constraints.append(("Vdot.", ">=", "0"))
+    elif isinstance(margin, Radicand):
+        definitions += [*_policy(problem.loop), ("r.", to_tree(radicands(problem)[margin.index]))]
+        constraints.append(("r.", "<=", "0"))
     else:
-        names = system.states if isinstance(margin, OfState) else system.inputs
+        symbols = system.states if isinstance(margin, OfState) else system.inputs
+        name = f"{BEFORE_CLIP}{margin.index}" if isinstance(margin, BeforeClip) else symbols[margin.index].name
         definitions += [] if isinstance(margin, OfState) else _policy(problem.loop)
         fails = {("above", True): ">=", ("below", True): "<=", ("above", False): ">", ("below", False): "<"}
-        constraints.append((names[margin.index].name, fails[margin.side, condition.strict], exact(margin.bound)))
+        constraints.append((name, fails[margin.side, condition.strict], exact(margin.bound)))
     variables = tuple((s.name, lo, hi) for s, (lo, hi) in zip(system.states, system.domain, strict=True))
     return Query(condition.name, variables, tuple(definitions), tuple(constraints))
 
@@ -70,7 +75,8 @@ def _local(problem: Problem) -> tuple[list[tuple[str, Tree]], tuple[Tree, str, T
 
     `Vdot = x'(A'P + PA)x + 2 x'P g(x)`, g(0) = 0, and g(x) is the mean of Dg(t x) x over 0 <= t <= 1; so if there is no
     such state, Vdot < 0 for 0 < V <= c1. A is a binary64 matrix and r is shown in rationals. The query of LyZNet
-    (Liu, Meng, Fitzsimmons, Zhou 2024).
+    (Liu, Meng, Fitzsimmons, Zhou 2024). Dg is that of the policy before its clip: `clip_conditions` say that it is the
+    same on {V <= c1}.
     """
     P, n = problem.V.P, problem.loop.system.n
     A, _, _ = problem.loop.linearise()
@@ -152,7 +158,8 @@ def _vdot(o: Problem) -> list[tuple[str, Tree]]:
 
 
 def _policy(loop: ClosedLoop) -> list[tuple[str, Tree]]:
-    """Definitions of the neurons `h.k.i`, of the squashed outputs `s.j`, and of the inputs under their own names."""
+    """Definitions of the neurons `h.k.i`, of the squashed outputs `s.j`, with a clip of what it is given, `b.j`, and of
+    the inputs under their own names."""
     network, system = loop.network, loop.system
     last = len(network.weights)
     result = _neurons(loop, "h", [s.name for s in system.states])
@@ -163,7 +170,11 @@ def _policy(loop: ClosedLoop) -> list[tuple[str, Tree]]:
     for j, symbol in enumerate(system.inputs):
         entering = shift[j] + _Term(f"h.{last}.{j}")
         result.append((f"s.{j}", network.squashed(entering, _TERMS).tree))
-        result.append((symbol.name, (_Term(exact(network.scale[j])) * _Term(f"s.{j}") + offset[j]).tree))
+        name = symbol.name if network.clip is None else f"{BEFORE_CLIP}{j}"
+        result.append((name, (_Term(exact(network.scale[j])) * _Term(f"s.{j}") + offset[j]).tree))
+    if network.clip is not None:
+        inputs = network.clipped([_Term(f"{BEFORE_CLIP}{j}") for j in range(network.m)], _TERMS)
+        result += [(symbol.name, u.tree) for symbol, u in zip(system.inputs, inputs, strict=True)]
     return result
 
 
@@ -195,6 +206,9 @@ class _Terms:
 
     def tanh(self, v: _Term) -> _Term:
         return _Term(["tanh", v.tree])
+
+    def clip(self, v: _Term, lo: Fraction, hi: Fraction) -> _Term:
+        return _Term(["min", ["max", v.tree, str(lo)], str(hi)])
 
 
 _TERMS = _Terms()

@@ -15,9 +15,9 @@ from certify.errors import InputError
 
 
 def export_smt2(
-    policy: Annotated[Path, typer.Option(help="Policy file (certify-policy/1, .pt).")],
+    policy: Annotated[Path, typer.Option(help="Policy file (certify-policy/1 or /2, .pt).")],
     out: Annotated[Path, typer.Option(help="Folder for the files, one a claim.")],
-    system: Annotated[str | None, typer.Option(help="Plant; default: what the policy file says.")] = None,
+    system: Annotated[str | None, typer.Option(help="Plant, as for roa; default: what the policy file says.")] = None,
     param: Annotated[list[str] | None, typer.Option(help="Parameter of the plant, NAME=VALUE; repeatable.")] = None,
     domain: Annotated[list[str] | None, typer.Option(help="Half-width NAME=D or interval NAME=LO:HI.")] = None,
     candidate: Annotated[str, typer.Option(help="Lyapunov candidate: lyapunov, lqr or optimised.")] = "lyapunov",

@@ -13,20 +13,26 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from certify.commands.arguments import numbers, plant_of
+from certify.commands.importing import policy_of
 from certify.commands.shared import Json, page_of, write
 from certify.commands.terminal import ProgressLine, say, show, tell
 from certify.errors import BackendError, InputError
 
 if TYPE_CHECKING:
     from certify.policies import Policy
+    from certify.policies.importers import ImportOptions
     from certify.systems import System
 
 
 def roa(
     context: typer.Context,
-    policy: Annotated[Path, typer.Option(help="Policy file (certify-policy/1, .pt).")],
+    policy: Annotated[Path, typer.Option(help="Policy file (.pt), or another program's (see certify import).")],
+    importing: ImportOptions,
     system: Annotated[
-        str | None, typer.Option(help="Plant: a name or a .toml file; default: what the policy file says.")
+        str | None,
+        typer.Option(
+            help="Plant: a name, FILE.toml, or FILE.py:NAME, whose code is run; default: what the policy file says."
+        ),
     ] = None,
     param: Annotated[list[str] | None, typer.Option(help="Parameter of the plant, NAME=VALUE; repeatable.")] = None,
     domain: Annotated[
@@ -58,12 +64,11 @@ def roa(
     as_json: Json = False,
 ) -> None:
     """Certify a region of attraction: prove, write a certificate, have it checked, report."""
-    from certify.policies import load_policy
     from certify.report import summary
     from certify.roa import RoaOptions, certify_roa
 
     start = time.perf_counter()
-    stored = load_policy(policy)
+    stored = policy_of(policy, importing, system, param or [])
     plant = plant_of(stored, system, param or [], domain or [])
     note = (lambda _: None) if quiet else tell
     note(_plant_line(stored, plant, system is not None))

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+
+if TYPE_CHECKING:
+    from certify.systems import System
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
 
@@ -19,6 +22,24 @@ def page_of(raw: bytes, path: Path, answer: dict[str, Any] | None, data: dict[st
 
     read, sha256 = parse_certificate(raw, str(path)), hashlib.sha256(raw).hexdigest()
     return render_html(read, answer, data, path, sha256=sha256, size=len(raw))
+
+
+def describe(s: System) -> dict[str, Any]:
+    """A plant as plain values; equations, operating point and domain are those of the states' values."""
+    domain, x_eq, u_eq = s.domain_of_values(), s.exact_x_eq(), s.exact_u_eq()
+    return {
+        "name": s.name,
+        "description": s.description,
+        "states": [x.name for x in s.states],
+        "inputs": [u.name for u in s.inputs],
+        "parameters": {name: str(q) for name, q in s.parameters.items()},
+        "domain": {x.name: [str(lo), str(hi)] for x, (lo, hi) in zip(s.states, domain, strict=True)},
+        "input_bounds": {u.name: [str(lo), str(hi)] for u, (lo, hi) in zip(s.inputs, s.input_bounds, strict=True)},
+        "dynamics": {x.name: str(e) for x, e in zip(s.states, s.dynamics_of_values(), strict=True)},
+        "x_eq": {x.name: str(q) for x, q in zip(s.states, x_eq, strict=True)},
+        "u_eq": {u.name: str(q) for u, q in zip(s.inputs, u_eq, strict=True)},
+        "units": dict(s.units),
+    }
 
 
 def write(path: Path, text: str) -> None:

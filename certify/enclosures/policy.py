@@ -4,7 +4,8 @@ Each layer is an affine form in d plus the errors made so far. tanh is relaxed b
 forwards to give the next layer's range: the newest through |W|, the older ones through |W| or by their 2-norm through
 ||W||_2, whichever is less; for four layers of 256 this saves tenfold in boxes, at the price of one more column, where
 a backward pass for every hidden neuron would cost a hundred. One backward pass for the outputs then sums each layer's
-fresh error times the magnitude of its weight, so that errors cancel through W as they do in truth.
+fresh error times the magnitude of its weight, so that errors cancel through W as they do in truth. A clip comes last,
+by two parallel lines as well; where it certainly does nothing, nothing changes.
 """
 
 from __future__ import annotations
@@ -40,6 +41,7 @@ class PolicyEnclosure:
         self.biases[-1], self.offset = bias + shift, offset
         self.bias_error = torch.where(shift == 0, 0.0, shift_error + EPS * (bias.abs() + shift.abs()))
         self.offset_error = offset_error
+        self.clip = None if network.clip is None else tuple(tensor(end)[:, None] for end in network.clip)
 
     def __call__(self, x: Tensor, x_error: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Enclose the policy for states `x[:, 0] + x[:, 1:] d` within x_error.
@@ -91,7 +93,10 @@ class PolicyEnclosure:
         mid, slopes = through + self.offset[:, None], self.scale[:, None, None] * h[:, 1:]
         rounding = 4 * EPS * (through.abs() + self.offset.abs()[:, None] + slopes.abs().sum(1)) + TINY
         rounding = rounding + self.offset_error[:, None]
-        return mid, slopes, (rounding + self._error_backwards(passed, x_error)) * (1 + 1e-12), share
+        error = (rounding + self._error_backwards(passed, x_error)) * (1 + 1e-12)
+        if self.clip is not None:
+            mid, slopes, error = clipped(mid, slopes, error, *self.clip)
+        return mid, slopes, error, share
 
     def _error_backwards(self, passed: list[tuple[Tensor, Tensor | None, Tensor]], x_error: Tensor) -> Tensor:
         m, batch = len(self.scale), x_error.shape[1]
@@ -129,3 +134,33 @@ def relax_tanh(centre: Tensor, radius: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     lower = -supremum(-hi, -lo, -t_hi, -t_lo)
     gap = (upper - lower) / 2 + EPS * (upper.abs() + lower.abs() + slope * (centre.abs() + radius)) + TINY
     return slope, (upper + lower) / 2, gap
+
+
+def clipped(mid: Tensor, slopes: Tensor, error: Tensor, least: Tensor, most: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """`min(max(v, least), most)` of affine forms v = mid + slopes.d within error, again as affine forms.
+
+    Between its corners clip(v) - s v is linear, so that its extremes lie at the ends of v's range or at the corners in
+    it; s is the chord's slope.
+    """
+    spread = slopes.abs().sum(1)
+    reach = (spread + error) * (1 + 8 * EPS * (1 + slopes.shape[1])) + EPS * mid.abs() + TINY
+    lo, hi = mid - reach, mid + reach
+    inside = (lo >= least) & (hi <= most)
+
+    def clip(v: Tensor) -> Tensor:
+        return torch.minimum(torch.maximum(v, least), most)
+
+    slope = ((clip(hi) - clip(lo)) / (hi - lo)).clamp(0.0, 1.0)
+    points = torch.stack(
+        [lo, hi, torch.minimum(torch.maximum(least, lo), hi), torch.minimum(torch.maximum(most, lo), hi)]
+    )
+    above = clip(points) - slope * points
+    size = (clip(points).abs() + slope * points.abs()).amax(0)
+    upper, lower = above.amax(0), above.amin(0)
+    shift, gap = (upper + lower) / 2, (upper - lower) / 2
+    wide = slope * error + gap + 4 * EPS * (size + slope * (mid.abs() + spread)) + TINY
+    return (
+        torch.where(inside, mid, slope * mid + shift),
+        torch.where(inside[:, None], slopes, slope[:, None] * slopes),
+        torch.where(inside, error, wide * (1 + EPS)),
+    )

@@ -19,6 +19,7 @@ from certify.expressions import Algebra
 
 EPS = 2.0**-50
 TINY = 2.0**-900
+EXP_END = 64.0  # of the exponent, beyond which the checker knows nothing of exp
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +78,33 @@ class Taylor:
         f0 = 1 / self.c
         f2 = f0 * f0 * f0
         return self.compose(f0, -f0 * f0, f2, f2.abs() / least * (1 + EPS) + TINY)
+
+    def sqrt(self) -> Taylor:
+        """The square root; the remainder is NaN where the range of v may reach 0.
+
+        With s and w the roots of c and of the range's lower end, the remainder is at most |v - c|^3 times
+        (3 s + w) / (8 s^3 (s + w)^3), which is exact at the lower end.
+        """
+        least = self.c - self.radius()
+        least = torch.where(least > 0, least, torch.nan)
+        s, w = self.c.sqrt(), least.sqrt()
+        p, q = 1 / s, 1 / (s + w)
+        third = p * p * q * q * (2 * q + p) / 8
+        return self.compose(s, p / 2, -p * p * p / 8, third * (1 + 32 * EPS) + TINY)
+
+    def exp(self) -> Taylor:
+        e, most = self.c.exp(), self.c + self.radius()
+        third = torch.where(most < EXP_END, most.exp() / 6 * (1 + 128 * EPS) + TINY, torch.nan)
+        return self.compose(e, e, e / 2, third)
+
+    def tanh(self) -> Taylor:
+        t = self.c.tanh()
+        slope = 1 - t * t
+        return self.compose(t, slope, -t * slope, torch.full_like(t, 1 / 3 + EPS))
+
+    def atan(self) -> Taylor:
+        slope = 1 / (1 + self.c * self.c)
+        return self.compose(self.c.atan(), slope, -self.c * slope * slope, torch.full_like(slope, 1 / 3 + EPS))
 
     def sin(self) -> Taylor:
         s, c = self.c.sin(), self.c.cos()

@@ -36,6 +36,7 @@ class Witness:
     def describe(self, system: System) -> str:
         """The violation in words."""
         names = ", ".join(f"{s} = {v:.6g}" for s, v in zip(system.states, self.x, strict=True))
+        names += ", in deviations from x_eq," if system.operating_point() else ""
         what = "Vdot >= 0" if self.kind == "vdot" else "the input leaves its bounds"
         return f"{what} at {names} with V = {self.level:.12g} (shown in Arb)"
 
@@ -124,7 +125,7 @@ class _Search:
         self.layers = [
             (torch.tensor(W.T.copy()), torch.tensor(b)) for W, b in zip(network.weights, network.biases, strict=True)
         ]
-        self.squashed = network.squashed
+        self.squashed, self.clipped = network.squashed, network.clipped
         self.scale, self.offset = torch.tensor(network.scale), torch.tensor(network.offset)
         self.P, self.T = (torch.tensor(a, dtype=torch.float64) for a in (problem.V.P, T))
         bounds = self.loop.system.input_bounds
@@ -138,7 +139,7 @@ class _Search:
         h = x
         for k, (W, b) in enumerate(self.layers):
             h = torch.addmm(b, h.tanh() if k else h, W)
-        u = self.scale * self.squashed(h) + self.offset
+        u = self.clipped(self.scale * self.squashed(h) + self.offset)
         vdot = 2 * ((x @ self.P) * self.f(x, u)).sum(-1)
         return vdot, torch.maximum(self.lo - u, u - self.hi).amax(-1)
 

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.claims import Problem
+from certify.enclosures.taylor import EXP_END
 from certify.errors import InputError
 from certify.expressions import Algebra, evaluate
 from certify.policies import bounded_by_form
@@ -72,6 +73,28 @@ class _Jet:
         if not least > 0:
             return _Jet(math.nan, self.a, self.Q, self.E + math.inf)
         return self.compose(1 / self.c, -1 / self.c**2, 2 / self.c**3, 6 / least**4)
+
+    def sqrt(self) -> _Jet:
+        least = self.c - self.radius
+        if not least > 0:
+            return _Jet(math.nan, self.a, self.Q, self.E + math.inf)
+        s, w = math.sqrt(self.c), math.sqrt(least)
+        third = 6 * (3 * s + w) / (8 * s**3 * (s + w) ** 3)  # the remainder's own factor, as for 1/v
+        return self.compose(s, 1 / (2 * s), -1 / (4 * s**3), third)
+
+    def exp(self) -> _Jet:
+        if not self.c + self.radius < EXP_END:
+            return _Jet(math.nan, self.a, self.Q, self.E + math.inf)
+        e = math.exp(self.c)
+        return self.compose(e, e, e, math.exp(self.c + self.radius))
+
+    def tanh(self) -> _Jet:
+        t = math.tanh(self.c)
+        return self.compose(t, 1 - t * t, -2 * t * (1 - t * t), 2.0)
+
+    def atan(self) -> _Jet:
+        slope = 1 / (1 + self.c**2)
+        return self.compose(math.atan(self.c), slope, -2 * self.c * slope**2, 2.0)
 
     def sin(self) -> _Jet:
         s, c = math.sin(self.c), math.cos(self.c)
@@ -155,6 +178,10 @@ def local_margin(problem: Problem, T: Array, level: float, known: Paths) -> floa
     states = [_Jet(0.0, row, nothing, nothing) for row in rho * T]
     each = zip(loop.u_eq, loop.network.scale, *_policy(known, rho, n), strict=True)
     inputs = [_Jet(float(u), float(s) * a, float(s) * Q, abs(float(s)) * E) for u, s, a, Q, E in each]
+    if loop.network.clip is not None:  # which has no second derivative at its corners
+        for jet, lo, hi in zip(inputs, *loop.network.clip, strict=True):
+            if not (lo < jet.c - (1 + _MARGIN) * jet.radius and jet.c + (1 + _MARGIN) * jet.radius < hi):
+                return -math.inf
     if not bounded_by_form(loop.network, system.input_bounds):
         for jet, (lo, hi) in zip(inputs, system.input_bounds, strict=True):
             if not (float(lo) < jet.c - jet.radius and jet.c + jet.radius < float(hi)):

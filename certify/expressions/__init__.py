@@ -4,6 +4,17 @@ from __future__ import annotations
 
 from certify.expressions.evaluate import Algebra, evaluate
 from certify.expressions.rational import evaluate_exactly
-from certify.expressions.tree import FUNCTIONS, Tree, from_tree, to_tree
+from certify.expressions.tree import FUNCTIONS, GRAMMAR, Tree, as_power, from_tree, has_tree, to_tree
 
-__all__ = ["FUNCTIONS", "Algebra", "Tree", "evaluate", "evaluate_exactly", "from_tree", "to_tree"]
+__all__ = [
+    "FUNCTIONS",
+    "GRAMMAR",
+    "Algebra",
+    "Tree",
+    "as_power",
+    "evaluate",
+    "evaluate_exactly",
+    "from_tree",
+    "has_tree",
+    "to_tree",
+]

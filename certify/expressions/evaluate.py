@@ -1,7 +1,7 @@
 """One walk over an expression for every arithmetic: rationals, Arb balls, Taylor models, jets.
 
 An arithmetic says what a constant is and how constants enter sums and products; everything else follows from its
-values' own `+`, `*`, `inverse`, `sin` and `cos`. What the walk does not know it refuses: a node that slipped through
+values' own `+`, `*`, `inverse` and functions. What the walk does not know it refuses: a node that slipped through
 as something else would be a proof about another plant.
 """
 
@@ -16,7 +16,7 @@ from typing import Any, Generic, TypeVar
 import sympy
 
 from certify.errors import InputError
-from certify.expressions.tree import FUNCTIONS
+from certify.expressions.tree import CONSTANTS, GRAMMAR, as_function, as_power
 
 V = TypeVar("V")
 
@@ -94,9 +94,15 @@ def _evaluate(
         return variables[expression]
     if expression.is_Rational:
         return algebra.constant(_fraction(expression))
-    if expression.is_Pow and expression.exp.is_Integer:
-        exponent = int(expression.exp)
-        result = algebra.power(evaluate(expression.base, variables, algebra, known), abs(exponent))
+    if expression in CONSTANTS:
+        multiple, name = CONSTANTS[expression]
+        return algebra.product(Fraction(multiple), [algebra.function(name, algebra.constant(Fraction(1)))])
+    if (power := as_power(expression)) is not None:
+        base, roots, exponent = power
+        result = evaluate(base, variables, algebra, known)
+        for _ in range(roots):
+            result = algebra.function("sqrt", result)
+        result = algebra.power(result, abs(exponent))
         return result if exponent > 0 else algebra.inverse(result)
     if expression.is_Add or expression.is_Mul:
         numbers = [_fraction(a) for a in expression.args if a.is_Rational]
@@ -104,11 +110,10 @@ def _evaluate(
         if expression.is_Add:
             return algebra.total(sum(numbers, Fraction(0)) if numbers else None, others)
         return algebra.product(reduce(lambda a, b: a * b, numbers) if numbers else None, others)
-    for name, function in FUNCTIONS.items():
-        if isinstance(expression, function):
-            return algebra.function(name, evaluate(expression.args[0], variables, algebra, known))
-    known_names = ", ".join(FUNCTIONS)
-    raise InputError(f"{expression} is outside the grammar; allowed are + - * /, integer powers, {known_names}.")
+    if (function := as_function(expression)) is not None:
+        name, argument = function
+        return algebra.function(name, evaluate(argument, variables, algebra, known))
+    raise InputError(f"{expression} is outside the grammar; allowed are {GRAMMAR}.")
 
 
 def _fraction(q: sympy.Rational) -> Fraction:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from fractions import Fraction
 
@@ -15,7 +16,7 @@ _MOST_BITS = 2**14  # of a number on the way: powers of powers grow without end
 
 
 class _Rational(Algebra[Fraction]):
-    """sin, cos and tan have a rational value at exact 0 only, and only that is used."""
+    """Functions have a rational value at exact 0 only, square roots at squares of rationals; only these are used."""
 
     def constant(self, q: Fraction) -> Fraction:
         return q
@@ -32,6 +33,11 @@ class _Rational(Algebra[Fraction]):
         return 1 / value
 
     def function(self, name: str, value: Fraction) -> Fraction:
+        if name == "sqrt":
+            root = Fraction(math.isqrt(max(value.numerator, 0)), math.isqrt(value.denominator))
+            if not (value > 0 and root * root == value):
+                raise InputError(f"sqrt of {value}, which is not the square of a positive rational, has no exact value")
+            return root
         if value != 0:
             raise InputError(f"{name} of {value} has no exact value")
         return Fraction(AT_ZERO[name])
@@ -42,7 +48,8 @@ def evaluate_exactly(expression: sympy.Expr, values: Mapping[sympy.Symbol, Fract
 
     Raises
     ------
-    InputError : it divides by 0, a function stands at another point than 0, or a number grows too long.
+    InputError : it divides by 0, a function stands at another point than 0 (a square root at a number that is not the
+        square of a positive rational), or a number grows too long.
     """
     return evaluate(expression, values, _Rational())
 

@@ -1,4 +1,4 @@
-"""What an arithmetic must offer for a policy's squash and centring: floats, balls and the terms of formulas do."""
+"""What an arithmetic must offer for a policy's squash, centring and clip; floats, balls, terms of formulas do."""
 
 from __future__ import annotations
 
@@ -19,3 +19,6 @@ class Arithmetic(Protocol[V]):
 
     def tanh(self, v: V) -> V:
         """tanh of a value."""
+
+    def clip(self, v: V, lo: Fraction, hi: Fraction) -> V:
+        """`min(max(v, lo), hi)` of a value and exact numbers."""

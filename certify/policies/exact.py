@@ -10,12 +10,17 @@ from certify.policies.network import TanhNetwork
 
 
 def bounded_by_form(network: TanhNetwork, bounds: Sequence[tuple[Fraction, Fraction]]) -> bool:
-    """True if squash and centring alone keep every input in its bounds `(lo, hi)`, whatever the state."""
-    if network.squash != "tanh" or network.centre == "output":
-        return False
+    """True if the clip, or else squash and centring, keeps every input in its bounds `(lo, hi)`, whatever the state."""
+    ranges: list[list[tuple[Fraction, Fraction]]] = [[] for _ in bounds]
+    if network.squash == "tanh" and network.centre != "output":
+        for known, o, s in zip(ranges, network.offset, network.scale, strict=True):
+            middle, reach = Fraction(float(o)), abs(Fraction(float(s)))
+            known.append((middle - reach, middle + reach))
+    if network.clip is not None:
+        for known, low, high in zip(ranges, *network.clip, strict=True):
+            known.append((Fraction(float(low)), Fraction(float(high))))
     return all(
-        lo <= Fraction(float(o)) - abs(Fraction(float(s))) and Fraction(float(o)) + abs(Fraction(float(s))) <= hi
-        for o, s, (lo, hi) in zip(network.offset, network.scale, bounds, strict=True)
+        any(lo <= low and high <= hi for low, high in known) for known, (lo, hi) in zip(ranges, bounds, strict=True)
     )
 
 
@@ -35,23 +40,34 @@ def raw_at_origin(network: TanhNetwork) -> tuple[Fraction | None, ...]:
     )
 
 
-def require_centred(network: TanhNetwork, u_eq: Sequence[Fraction]) -> None:
-    """Refuse a policy whose `pi(0) = u_eq` does not hold exactly.
+def at_origin(network: TanhNetwork) -> tuple[Fraction | None, ...]:
+    """pi(0) of a policy without centring as rationals, (m,); None where raw(0) is not known."""
+    raw = raw_at_origin(network)
+    if network.clip is None:
+        return raw
+    ends = ([Fraction(float(v)) for v in end] for end in network.clip)
+    return tuple(None if v is None else min(max(v, lo), hi) for v, lo, hi in zip(raw, *ends, strict=True))
+
+
+def require_centred(network: TanhNetwork, u_eq: Sequence[Fraction], names: Sequence[str] = ()) -> None:
+    """Refuse a policy whose `pi(0) = u_eq` does not hold exactly; `names` are what the message calls its inputs.
 
     Raises
     ------
-    InputError : u_eq lies outside the squash's range (centre `preactivation`), or raw(0) is another number or not a
-        rational (centre `none`).
+    InputError : u_eq lies outside the squash's range (centre `preactivation`) or not strictly inside the clip, or
+        pi(0) is another number or not a rational (centre `none`).
     """
     if network.centre == "preactivation":
         network.ratios(u_eq)
     if network.centre != "none":
+        network.require_unclipped(u_eq)
         return
-    for j, (value, u) in enumerate(zip(raw_at_origin(network), u_eq, strict=True)):
+    for j, (value, u) in enumerate(zip(at_origin(network), u_eq, strict=True)):
         if value != u:
+            named = f"input {names[j]}" if names else f"input {j}"
             found = "not a rational number" if value is None else f"{float(value)!r}, exactly {_short(value)}"
             raise InputError(
-                f"the policy is not centred: pi(0) must be exactly u_eq = {float(u)!r}; input {j} of it is {found}. "
+                f"the policy is not centred: pi(0) must be exactly u_eq = {float(u)!r}; its {named} is {found}. "
                 "Use centre 'output' or 'preactivation', or claim practical stability, which does not need it."
             )
 

@@ -1,4 +1,4 @@
-"""The policy file `certify-policy/1`: written and read with torch, plain tensors only.
+"""The policy file `certify-policy/1`, or with a clip or bounds of validity `certify-policy/2`: plain tensors only.
 
 Nothing in a file is executed (`weights_only=True`), and equal policies give equal bytes: the archive is
 written through memory, so that neither a file name nor a clock enters it.
@@ -23,8 +23,10 @@ from certify.errors import InputError
 from certify.policies.network import Array, Centre, Squash, TanhNetwork
 
 FORMAT = "certify-policy/1"
+# The same with `output.clip`, a pair of tensors, or `valid`, a tensor (n, 2), or both; others stay version 1.
+SECOND = "certify-policy/2"
 _KEYS = {"format", "activation", "weights", "biases", "output", "centre", "system", "training"}
-_OPTIONAL = {"beta"}
+_OPTIONAL = {"beta", "valid"}
 _BETA_ROUNDING = 2.0**-20  # of tanh(beta): a few operations in single precision
 
 
@@ -40,6 +42,13 @@ class Policy:
     training : how it was made (seed, steps, versions, A, B, K ...); never trusted, may be empty.
     beta : rounded `atanh((u_eq - offset) / scale)` stored by another program, shape (m,), or None;
         the proof uses the real number and reports the shift.
+    valid : bounds of each state, shape (n, 2), infinite where there is none, or None: only between them is the network
+        what it was made from, because there no observation is clipped. A plant's domain must be cut to them before
+        anything is proved; `certify roa` does so.
+
+    Raises
+    ------
+    InputError : the bounds are not n pairs lo < 0 < hi, or bound nothing.
     """
 
     network: TanhNetwork
@@ -47,10 +56,22 @@ class Policy:
     parameters: Mapping[str, float | int | str] = field(default_factory=dict)
     training: Mapping[str, Any] = field(default_factory=dict)
     beta: Array | None = None
+    valid: Array | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "parameters", MappingProxyType(dict(self.parameters)))
         object.__setattr__(self, "training", MappingProxyType(dict(self.training)))
+        if self.valid is not None:
+            valid = np.array(self.valid, dtype=np.float64)
+            if valid.shape != (self.network.n, 2) or np.all(np.isinf(valid)):
+                raise InputError(f"`valid` must be bounds of shape ({self.network.n}, 2); found {valid.tolist()}.")
+            if not (np.all(valid[:, 0] < 0) and np.all(valid[:, 1] > 0)):
+                raise InputError(
+                    "the states where no observation is clipped must surround the origin; "
+                    f"found the bounds {valid.tolist()}."
+                )
+            valid.setflags(write=False)
+            object.__setattr__(self, "valid", valid)
 
     def beta_shift(self, u_eq: Sequence[Fraction]) -> float:
         """What reading the stored beta as the real number changes in u at the origin, in the input's units.
@@ -84,14 +105,14 @@ def save_policy(path: str | Path, policy: Policy) -> None:
 
     network = policy.network
     # float32 where that loses nothing: the file is smaller, the numbers are the same.
-    arrays = (*network.weights, *network.biases, network.scale, network.offset)
+    arrays = (*network.weights, *network.biases, network.scale, network.offset, *(network.clip or ()))
     single = all(np.array_equal(a.astype(np.float32).astype(np.float64), a) for a in arrays)
 
     def tensor(array: Array) -> torch.Tensor:
         return torch.tensor(array, dtype=torch.float32 if single else torch.float64)
 
     data: dict[str, Any] = {
-        "format": FORMAT,
+        "format": FORMAT if network.clip is None and policy.valid is None else SECOND,
         "activation": "tanh",
         "weights": [tensor(w) for w in network.weights],
         "biases": [tensor(b) for b in network.biases],
@@ -100,6 +121,10 @@ def save_policy(path: str | Path, policy: Policy) -> None:
         "system": {"name": policy.system, "parameters": dict(policy.parameters)},
         "training": dict(policy.training),
     }
+    if network.clip is not None:
+        data["output"]["clip"] = [tensor(end) for end in network.clip]
+    if policy.valid is not None:
+        data["valid"] = torch.tensor(policy.valid, dtype=torch.float64)
     if policy.beta is not None:
         data["beta"] = torch.tensor(policy.beta, dtype=torch.float64)
     buffer = io.BytesIO()
@@ -130,7 +155,7 @@ def load_policy(path: str | Path) -> Policy:
     Raises
     ------
     InputError : the file is missing, is not an archive of plain tensors, or does not follow
-        `certify-policy/1`.
+        `certify-policy/1` or `certify-policy/2`.
     """
     import torch
 
@@ -155,18 +180,26 @@ def load_policy(path: str | Path) -> Policy:
 
 
 def _policy(data: Any) -> Policy:
-    if not isinstance(data, dict) or data.get("format") != FORMAT:
-        found = data.get("format") if isinstance(data, dict) else type(data).__name__
-        raise InputError(f"`format` must be {FORMAT!r}; found {found!r}.")
-    keys = set(data)
+    found = data.get("format") if isinstance(data, dict) else type(data).__name__
+    if not isinstance(data, dict) or found not in (FORMAT, SECOND):
+        raise InputError(f"`format` must be {FORMAT!r} or {SECOND!r}; found {found!r}.")
+    keys, output = set(data), data.get("output")
+    parts = {"squash", "scale", "offset"}
+    if found == SECOND and isinstance(output, dict) and ("clip" in output or "valid" not in keys):
+        parts |= {"clip"}  # one of the two is what makes a file version 2
+    if found == FORMAT and "valid" in keys:
+        raise InputError(f"`valid` must go with format {SECOND!r}; found {FORMAT!r}.")
     if not _KEYS - {"training"} <= keys <= _KEYS | _OPTIONAL:
         odd = sorted(map(str, keys - _KEYS - _OPTIONAL))
         raise InputError(f"missing keys {sorted(_KEYS - {'training'} - keys)}, unknown keys {odd}.")
     if data["activation"] != "tanh":
         raise InputError(f"`activation` must be 'tanh'; found {data['activation']!r}. Only tanh networks are proved.")
-    output, system, training = data["output"], data["system"], data.get("training", {})
-    if not isinstance(output, dict) or set(output) != {"squash", "scale", "offset"}:
-        raise InputError("`output` must be a dictionary with squash, scale and offset.")
+    system, training = data["system"], data.get("training", {})
+    if not isinstance(output, dict) or set(output) != parts:
+        raise InputError(f"`output` of {found} must be a dictionary with exactly {', '.join(sorted(parts))}.")
+    clip = output.get("clip", ())
+    if not isinstance(clip, list | tuple) or len(clip) != (2 if "clip" in parts else 0):
+        raise InputError("`output.clip` must be a list of two tensors, lo and hi.")
     if not isinstance(system, dict) or set(system) != {"name", "parameters"} or not isinstance(system["name"], str):
         raise InputError("`system` must be a dictionary with name and parameters.")
     if not isinstance(system["parameters"], dict) or not isinstance(training, dict):
@@ -180,11 +213,13 @@ def _policy(data: Any) -> Policy:
         offset=_array(output["offset"], "output.offset"),
         squash=cast(Squash, output["squash"]),
         centre=cast(Centre, data["centre"]),
+        clip=cast(Any, tuple(_array(end, "output.clip") for end in clip) or None),
     )
     beta = _array(data["beta"], "beta") if "beta" in data else None
     if beta is not None and (beta.shape != (network.m,) or network.centre != "preactivation"):
         raise InputError(f"`beta` must have shape ({network.m},) and goes with centre 'preactivation'.")
-    return Policy(network, system["name"], system["parameters"], training, beta)
+    valid = _array(data["valid"], "valid") if "valid" in data else None
+    return Policy(network, system["name"], system["parameters"], training, beta, valid)
 
 
 def _array(value: Any, name: str) -> Array:

@@ -9,7 +9,8 @@
 - `none`: pi = raw.
 
 So `pi(x) = scale * squash(net(x) + shift) + offset'` with numbers shift and offset', which `centring` gives in any
-arithmetic: floats, Arb balls and the terms of formulas put their own numbers into the same lines.
+arithmetic: floats, Arb balls and the terms of formulas put their own numbers into the same lines. With a `clip` (lo,
+hi) the policy is `min(max(., lo), hi)` of that: the last step, behind the centring, which it must leave as it is at 0.
 """
 
 from __future__ import annotations
@@ -42,6 +43,7 @@ class TanhNetwork:
     biases : arrays of shape (out,).
     squash, centre : see the module's docstring.
     scale, offset : arrays of shape (m,), in the input's units; scale is nonzero.
+    clip : (lo, hi), arrays of shape (m,) in the input's units with lo < hi, between which each input is kept; or None.
 
     Raises
     ------
@@ -54,6 +56,7 @@ class TanhNetwork:
     offset: Array
     squash: Squash = "tanh"
     centre: Centre = "preactivation"
+    clip: tuple[Array, Array] | None = None
 
     def __post_init__(self) -> None:
         for name in ("weights", "biases"):
@@ -88,6 +91,8 @@ class TanhNetwork:
             )
         if np.any(self.scale == 0):
             raise InputError("`scale` must be nonzero.")
+        if self.clip is not None:
+            object.__setattr__(self, "clip", _limits(self.clip, self.m))
 
     @property
     def n(self) -> int:
@@ -138,7 +143,7 @@ class TanhNetwork:
         """pi(x) in float64, shape (..., n) to (..., m); for simulation and search, not for proofs."""
         if self.centre != "none":
             return self.folded(u_eq)(x, u_eq)
-        return _like(self.scale, x) * self.squashed(self.net(x)) + _like(self.offset, x)
+        return self.clipped(_like(self.scale, x) * self.squashed(self.net(x)) + _like(self.offset, x))
 
     def squashed(self, y: Any, arithmetic: Arithmetic[Any] | None = None) -> Any:
         """What the policy does to the last layer's values before scale and offset; numpy or torch if none is given."""
@@ -148,6 +153,31 @@ class TanhNetwork:
         """The derivative of the squash where its value is `squashed`."""
         one = (arithmetic or _ARRAYS).number(Fraction(1))
         return one - squashed * squashed if self.squash == "tanh" else one
+
+    def clipped(self, u: Any, arithmetic: Arithmetic[Any] | None = None) -> Any:
+        """`min(max(u, lo), hi)` of the m inputs: a list in an arithmetic, or if none is given an array (..., m)."""
+        if self.clip is None:
+            return u
+        if arithmetic is None:
+            return _clip(u, *(_like(end, u) for end in self.clip))
+        ends = ([Fraction(float(v)) for v in end] for end in self.clip)
+        return [arithmetic.clip(v, lo, hi) for v, lo, hi in zip(u, *ends, strict=True)]
+
+    def require_unclipped(self, at_0: Sequence[Fraction | float]) -> None:
+        """Refuse a clip that may act where the policy without it is `at_0`, its m values at the origin.
+
+        Raises
+        ------
+        InputError : a value does not lie strictly inside the clip.
+        """
+        if self.clip is None:
+            return
+        for j, (value, lo, hi) in enumerate(zip(at_0, *self.clip, strict=True)):
+            if not Fraction(float(lo)) < value < Fraction(float(hi)):
+                raise InputError(
+                    f"the clip must not act at the origin: there input {j} must lie strictly inside [{lo}, {hi}]; it "
+                    f"is {float(value)!r} before the clip. Widen the clip."
+                )
 
     def centring(
         self, u_eq: Sequence[Fraction], at_0: Sequence[Any], arithmetic: Arithmetic[Any]
@@ -174,14 +204,19 @@ class TanhNetwork:
             return self
         shift, offset = self.centring(u_eq, self.net(np.zeros(self.n)).tolist(), _ARRAYS)
         biases = (*self.biases[:-1], self.biases[-1] + np.array(shift))
-        return TanhNetwork(self.weights, biases, self.scale, np.array(offset), self.squash, "none")
+        return TanhNetwork(self.weights, biases, self.scale, np.array(offset), self.squash, "none", self.clip)
 
     def squashed_at_origin(self, at_0: Array, u_eq: Sequence[Fraction]) -> Array:
         """What enters the last tanh at the origin, (m,), given net(0)."""
         return self.beta(u_eq) if self.centre == "preactivation" else at_0
 
     def jacobian_at_origin(self, u_eq: Sequence[Fraction]) -> Array:
-        """`d pi / d x` at 0 in float64, shape (m, n)."""
+        """`d pi / d x` at 0 in float64, shape (m, n).
+
+        Raises
+        ------
+        InputError : the clip may act at the origin.
+        """
         x = np.zeros(self.n)
         jacobian = np.eye(self.n)
         for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
@@ -189,19 +224,21 @@ class TanhNetwork:
                 x = np.tanh(x)
                 jacobian = (1 - x**2)[:, None] * jacobian
             x, jacobian = weight @ x + bias, weight @ jacobian
-        slope = self.squash_slope(self.squashed(self.squashed_at_origin(x, u_eq)))
+        squashed = self.squashed(self.squashed_at_origin(x, u_eq))
+        self.require_unclipped(u_eq if self.centre != "none" else (self.scale * squashed + self.offset).tolist())
+        slope = self.squash_slope(squashed)
         return np.asarray(self.scale[:, None] * ((slope * np.ones(self.m))[:, None] * jacobian))
 
     def sha256(self) -> str:
         """Hash of the canonical bytes: squash, centre, then each array's shape and little-endian binary64.
 
-        Every array (layers in order as weight, bias; then scale; then offset) contributes its number
+        Every array (layers in order as weight, bias; scale; offset; with a clip lo and hi) contributes its number
         of axes and its axes as unsigned 64-bit little-endian integers, then its numbers in row order.
         """
         digest = hashlib.sha256(b"certify-policy/1\0")
         digest.update(f"{self.squash}\0{self.centre}\0".encode())
         pairs = [a for pair in zip(self.weights, self.biases, strict=True) for a in pair]
-        for array in (*pairs, self.scale, self.offset):
+        for array in (*pairs, self.scale, self.offset, *(self.clip or ())):
             digest.update(struct.pack(f"<{1 + array.ndim}Q", array.ndim, *array.shape))
             digest.update(np.ascontiguousarray(array, dtype="<f8").tobytes())
         return digest.hexdigest()
@@ -219,6 +256,9 @@ class _Arrays:
     def tanh(self, v: Any) -> Any:
         return _tanh(v)
 
+    def clip(self, v: Any, lo: Fraction, hi: Fraction) -> Any:
+        return _clip(v, float(lo), float(hi))
+
 
 _ARRAYS = _Arrays()
 
@@ -229,6 +269,24 @@ def _frozen(array: Any, name: str) -> Array:
         raise InputError(f"`{name}` of the policy must be finite; found NaN or infinity.")
     result.setflags(write=False)
     return result
+
+
+def _limits(clip: Any, m: int) -> tuple[Array, Array]:
+    if not isinstance(clip, tuple | list) or len(clip) != 2:
+        raise InputError(f"`clip` must be a pair (lo, hi) of arrays of shape ({m},), or None; found {clip!r}.")
+    lo, hi = (_frozen(end, "clip") for end in clip)
+    if lo.shape != (m,) or hi.shape != (m,):
+        raise InputError(f"`clip` must be two arrays of shape ({m},); found {lo.shape} and {hi.shape}.")
+    if not np.all(lo < hi):
+        j = int(np.argmin(lo < hi))
+        raise InputError(f"`clip` must satisfy lo < hi; found [{lo[j]}, {hi[j]}] for input {j}.")
+    return lo, hi
+
+
+def _clip(x: Any, lo: Any, hi: Any) -> Any:
+    if isinstance(x, np.ndarray | float):
+        return np.minimum(np.maximum(x, lo), hi)
+    return x.clamp(lo, hi)
 
 
 def _tanh(x: Any) -> Any:

@@ -60,21 +60,50 @@ def derivatives(name: str, y: arb) -> tuple[arb, arb, arb, arb]:
     if name == "1/":
         p = 1 / y
         return p, -(p * p), 2 * p * p * p, -6 * p * p * p * p
+    if name == "tanh":
+        t = y.tanh()
+        slope = 1 - t * t
+        return t, slope, -2 * t * slope, (6 * t * t - 2) * slope
+    if name == "exp":
+        e = y.exp()
+        return e, e, e, e
+    if name == "atan":
+        p = 1 / (1 + y * y)
+        return y.atan(), p, -2 * y * p * p, (6 * y * y - 2) * p * p * p
+    if name == "sqrt":
+        root = y.sqrt()
+        p = 1 / root
+        return root, p / 2, -p * p * p / 4, 3 * p * p * p * p * p / 8
+    if name not in ("sin", "cos"):
+        raise ValueError(f"nothing is known of {name}")
     s, k = y.sin(), y.cos()
     return (s, k, -s, -k) if name == "sin" else (k, -s, -k, s)
 
 
 def third(name: str, at: arb, y: arb, reach: arb) -> arb | None:
-    """A bound of |phi'''| on |v - y| <= reach, its value at y being `at`; None where 1/v may be undefined.
+    """A bound of |phi'''| on |v - y| <= reach, its value at y being `at`; None where phi may be undefined.
 
-    For 1/v it is six times the remainder's own factor: 1/v is its parabola at y less D^3 / (y^3 v), D = v - y.
+    For 1/v and sqrt it is six times the remainder's own factor. 1/v is its parabola at y less D^3 / (y^3 v), D = v - y.
+    The root w of v is its parabola at y and D^3 (3 s + w) / (8 s^3 (s + w)^3), s the root of y, most where w is least.
+    For tanh and atan |phi'''| is largest at 0.
 
-    A division by a ball that holds 0 must be refused here, and not left to what becomes of its result: 0 times it is 0.
+    A division by a ball that holds 0, or a root of one that holds what is not positive, must be refused here, and not
+    left to what becomes of its result: 0 times it is 0.
     """
     if name == "1/":
         least = abs(y) - reach
         size = abs(y)
         return 6 / (size * size * size * least) if least > 0 else None
+    if name == "sqrt":
+        least = arb((y - reach).lower())
+        if not (least > 0 and y > 0):
+            return None
+        s, w = y.sqrt(), least.sqrt()
+        return 6 * (3 * s + w) / (8 * s * s * s * (s + w) * (s + w) * (s + w))
+    if name in ("tanh", "atan"):
+        return arb(2)
+    if name == "exp":
+        return (y + reach).exp()
     if name not in ("sin", "cos"):
         raise ValueError(f"nothing is known of {name}")
     return (abs(at) + reach).min(ONE)
@@ -99,8 +128,13 @@ def within_bounds(c: Certificate, ranges: Sequence[tuple[arb, arb]]) -> bool:
 
 
 def bounded_by_form(c: Certificate) -> bool:
-    """Whether `offset +- scale` lies in the bounds and the centring keeps the input there."""
-    if c.policy.centre == "output" or c.policy.squash != "tanh":
-        return False
+    """Whether for each input its clip lies in the bounds, or `offset +- scale` does and the centring keeps it there."""
+    squashed = c.policy.centre != "output" and c.policy.squash == "tanh"
     each = zip(c.policy.scale, c.policy.offset, c.plant.input_bounds, strict=True)
-    return all(lo <= exact(b) - abs(exact(s)) and exact(b) + abs(exact(s)) <= hi for s, b, (lo, hi) in each)
+    for j, (s, b, (lo, hi)) in enumerate(each):
+        limits = c.policy.limits(j)
+        by_clip = limits is not None and bool(lo <= limits[0]) and bool(limits[1] <= hi)
+        by_squash = lo <= exact(b) - abs(exact(s)) and exact(b) + abs(exact(s)) <= hi
+        if not (by_clip or (squashed and by_squash)):
+            return False
+    return True

@@ -62,7 +62,12 @@ class Policy:
     centre: str
     scale: array[float]
     offset: array[float]
+    clip: tuple[array[float], array[float]] | None
     sha256: str
+
+    def limits(self, j: int) -> tuple[fmpq, fmpq] | None:
+        """Between which input j is kept."""
+        return None if self.clip is None else (exact(self.clip[0][j]), exact(self.clip[1][j]))
 
 
 @dataclass(frozen=True)
@@ -107,7 +112,7 @@ def read(raw: bytes) -> Certificate:
     """The certificate in the bytes of a file, in the order of FORMAT.md's sections."""
     sections = ("schema", "claim", "plant", "policy", "lyapunov", "levels", "evidence", "provenance")
     data = keys(parsed(raw), "file", *sections)
-    require(data["schema"] == "certify-certificate/2", "format", "schema", "'certify-certificate/2' was expected")
+    require(data["schema"] == "certify-certificate/3", "format", "schema", "'certify-certificate/3' was expected")
     require(isinstance(data["provenance"], dict), "format", "provenance", "an object was expected")
     claim = keys(data["claim"], "claim", "kind")["kind"]
     require(claim in ("asymptotic", "practical"), "format", "claim.kind", "'asymptotic' or 'practical' was expected")
@@ -187,7 +192,7 @@ def intervals(value: Any, at: str, count: int) -> tuple[Interval, ...]:
 
 def read_policy(value: Any, n: int, m: int) -> Policy:
     """The hash is taken over the very bytes that were decoded."""
-    policy = keys(value, "policy", "layers", "squash", "centre", "scale", "offset", "sha256")
+    policy = keys(value, "policy", "layers", "squash", "centre", "scale", "offset", "clip", "sha256")
     squash, centre = policy["squash"], policy["centre"]
     require(squash in ("tanh", "identity"), "format", "policy.squash", "'tanh' or 'identity' was expected")
     require(centre in ("output", "preactivation", "none"), "format", "policy.centre", "an unknown centring")
@@ -211,11 +216,20 @@ def read_policy(value: Any, n: int, m: int) -> Policy:
     require(width == m, "format", "policy.layers", f"the last layer must have {m} rows")
     scale, offset = numbers(policy["scale"], "policy.scale", m), numbers(policy["offset"], "policy.offset", m)
     require(all(s != 0 for s in scale), "format", "policy.scale", "must not be 0")
-    for values in (scale, offset):
+    clip = read_clip(policy["clip"], m)
+    for values in (scale, offset, *(clip or ())):
         digest.update(struct.pack("<2Q", 1, m) + little_endian(values))
     sha256 = digest.hexdigest()
     require(policy["sha256"] == sha256, "hash", "policy.sha256", f"the policy's hash is {sha256}")
-    return Policy(tuple(layers), squash, centre, scale, offset, sha256)
+    return Policy(tuple(layers), squash, centre, scale, offset, clip, sha256)
+
+
+def read_clip(value: Any, m: int) -> tuple[array[float], array[float]] | None:
+    if value is None:
+        return None
+    lo, hi = (numbers(end, "policy.clip", m) for end in entries(value, "policy.clip", 2))
+    require(all(a < b for a, b in zip(lo, hi, strict=True)), "format", "policy.clip", "lo < hi must hold")
+    return lo, hi
 
 
 def read_evidence(value: Any, n: int) -> Tree | Trusted:

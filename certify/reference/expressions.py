@@ -25,7 +25,12 @@ OPERANDS = {
     "sin": (1, 1),
     "cos": (1, 1),
     "tan": (1, 1),
+    "tanh": (1, 1),
+    "exp": (1, 1),
+    "atan": (1, 1),
+    "sqrt": (1, 1),
 }
+PLAIN = ("sin", "cos", "tanh", "exp", "atan", "sqrt")  # functions that are one operation
 
 Step = tuple[Any, ...]  # ("name", str), ("rational", fmpq), or a name and the numbers of earlier steps
 
@@ -101,7 +106,7 @@ class _Compiler:
         least, most = OPERANDS.get(name, (1, 0))
         require(least <= len(rest) <= most, "format", at, "an operator with its number of operands was expected")
         first, *others = [self.compile(operand, at, depth + 1) for operand in rest]
-        if name in ("sin", "cos"):
+        if name in PLAIN:
             return self.step(name, first)
         if name == "tan":
             return self.step("*", self.step("sin", first), self.step("1/", self.step("cos", first)))

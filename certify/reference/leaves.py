@@ -240,7 +240,9 @@ class Leaves:
             at_0 = at_0.tanh()
         scale = arb(policy.scale[j])
         shift = arb(self.c.plant.u_eq[j]) - scale * at_0 if policy.centre == "output" else arb(policy.offset[j])
-        return scale * mid + shift, [scale * v for v in slopes], abs(scale) * error
+        u = scale * mid + shift, [scale * v for v in slopes], abs(scale) * error
+        limits = policy.limits(j)
+        return u if limits is None else clip(u, arb(limits[0]), arb(limits[1]))
 
     # ----------------------------------------------------------------------------------------------------- the ring
 
@@ -323,6 +325,30 @@ def lines(lo: arb, hi: arb) -> tuple[arb, arb, arb]:
         if not (-y < lo or -y > hi):
             top, bottom = top.max(-value), bottom.min(-value)
     return slope, (top + bottom) / 2, (top - bottom) / 2
+
+
+def clip(y: Affine, lo: arb, hi: arb) -> Affine:
+    """min(max(y, lo), hi) of an affine form.
+
+    It is y where y certainly lies between them. Else it lies between two lines of a slope from 0 to 1: clip(y) - slope
+    y rises between lo and hi and falls elsewhere, so it is least and greatest at the ends of the range of y, at lo or
+    at hi; a corner that is certain to lie outside of the range does not count.
+    """
+    mid, coefficients, error = y
+    reach = total(abs(v) for v in coefficients) + error
+    first, last = arb((mid - reach).lower()), arb((mid + reach).upper())
+    if first >= lo and last <= hi:
+        return y
+    ends = first.max(lo).min(hi), last.max(lo).min(hi)
+    slope = ((ends[1] - ends[0]) / (last - first)).mid() if first < last else ZERO
+    slope = ZERO if slope < 0 else ONE if slope > 1 else slope
+    away = [ends[0] - slope * first, ends[1] - slope * last]
+    away += [(1 - slope) * corner for corner in (lo, hi) if not (corner < first or corner > last)]
+    top = bottom = away[0]
+    for v in away[1:]:
+        top, bottom = top.max(v), bottom.min(v)
+    shift, gap = (top + bottom) / 2, (top - bottom) / 2
+    return slope * mid + shift, [slope * v for v in coefficients], slope * error + gap
 
 
 def check_leaves(leaves: Leaves, evidence: Tree) -> None:

@@ -76,7 +76,11 @@ class Local:
         at = derivatives(name, self.v)
         most = third(name, at[3], self.v, self.radius)
         if most is None:
-            raise Refused("local", "ball", "a division by what may be 0")
+            raise Refused(
+                "local",
+                "ball",
+                "a root of what may not be positive" if name == "sqrt" else "a division by what may be 0",
+            )
         H, R = self.beyond_tangent(at[2] / 2, most)
         return Local(at[0], at[1] * self.a, at[1] * self.Q + H, abs(at[1]) * self.E + R)
 
@@ -103,6 +107,11 @@ def local(c: Certificate, T: fmpq_mat, S: fmpq_mat) -> None:
     u = local_policy(c, states)
     bounded = bounded_by_form(c) or within_bounds(c, [(v.v, v.radius) for v in u])
     require(bounded, "inputs", "ball", "an input is not certain to stay in its bounds")
+    for j, v in enumerate(u):
+        lo, hi = c.policy.limits(j) or (None, None)
+        alone = lo is None or bool(v.v - v.radius > arb(lo))
+        alone = alone and (hi is None or bool(v.v + v.radius < arb(hi)))
+        require(alone, "local", "ball", f"{c.plant.inputs[j]} is not certain to be left alone by the clip")
     B, C, E = local_vdot(c, T, states, u)
     require(all(finite(A.entries()) for A in (B, E, *C)), "local", "ball", "F has no finite model")
     diagonal = [-B[i, i] for i in range(c.n)]
@@ -120,7 +129,7 @@ def local_states(T: fmpq_mat, rho: arb) -> list[Local]:
 
 
 def local_policy(c: Certificate, states: Sequence[Local]) -> list[Local]:
-    """The policy: y(d) = y(0) + J d + L A(d), where A_q(d) is d'H_q d within d'R_q d for each tanh q before y.
+    """The policy before its clip: y(d) = y(0) + J d + L A(d), A_q(d) being d'H_q d within d'R_q d for each tanh q.
 
     `bends` holds, for each layer before, its block of L, and H and R with one row for each of its tanhs.
     """

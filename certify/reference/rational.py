@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from array import array
 from dataclasses import dataclass
 
@@ -81,9 +82,15 @@ class Exact:
         return Exact(-self.value)
 
     def function(self, name: str) -> Exact:
+        if name == "sqrt":
+            numerator, denominator = int(self.value.p), int(self.value.q)
+            roots = math.isqrt(max(numerator, 0)), math.isqrt(denominator)
+            square = numerator > 0 and roots[0] ** 2 == numerator and roots[1] ** 2 == denominator
+            require(square, "equilibrium", "dynamics", "sqrt of what is not the square of a positive rational")
+            return Exact(fmpq(*roots))
         known = (self.value == 0) != (name == "1/")
         require(known, "equilibrium", "dynamics", "a division by 0" if name == "1/" else f"{name} of what is not 0")
-        return Exact(1 / self.value if name == "1/" else fmpq(name == "cos"))
+        return Exact(1 / self.value if name == "1/" else fmpq(name in ("cos", "exp")))
 
 
 def equilibrium(c: Certificate) -> None:
@@ -101,10 +108,22 @@ def centring(c: Certificate) -> None:
         for j, (q, scale, offset) in enumerate(each):
             within = bool(abs((q - offset) / scale) < 1)
             require(within, "centring", c.plant.inputs[j], "u_eq is not a value of scale * tanh + offset")
+    for j, q in enumerate(c.plant.u_eq):
+        limits = policy.limits(j)
+        if limits is not None and policy.centre != "none":
+            inside = bool(limits[0] < q) and bool(q < limits[1])
+            require(inside, "centring", c.plant.inputs[j], "u_eq does not lie strictly inside the clip")
     if policy.centre == "none" and c.claim == "asymptotic":
         for j, (y, (q, scale, offset)) in enumerate(zip(squashed_at_0(policy), each, strict=True)):
-            holds = y is not None and bool(scale * y + offset == q)
+            holds = y is not None and bool(clip(scale * y + offset, policy.limits(j)) == q)
             require(holds, "centring", c.plant.inputs[j], "raw(0) = u_eq does not hold by its form")
+
+
+def clip(value: fmpq, limits: tuple[fmpq, fmpq] | None) -> fmpq:
+    if limits is None:
+        return value
+    lo, hi = limits
+    return lo if value < lo else hi if value > hi else value
 
 
 def squashed_at_0(policy: Policy) -> list[fmpq | None]:

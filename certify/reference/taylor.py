@@ -88,7 +88,11 @@ class Taylor:
         reach, at = self.first + rest, derivatives(name, self.c)
         most = third(name, at[3], self.c, reach)
         if most is None:
-            raise Refused("ring", "leaf", "a division by what may be 0")
+            raise Refused(
+                "ring",
+                "leaf",
+                "a root of what may not be positive" if name == "sqrt" else "a division by what may be 0",
+            )
         half = at[2] / 2
         r = abs(at[1]) * self.r + abs(half) * (2 * self.first * rest + rest * rest) + most * reach**3 / 6
         Q = mix(at[1], self.Q, half, square(self.g, self.g))

@@ -33,10 +33,11 @@ from certify.report.words import (
     TIMES,
     Words,
     above,
+    at_rest,
     below,
+    deviation,
     inner_level,
     kept_apart,
-    label,
     limited_by,
     number,
     pretty_unit,
@@ -195,6 +196,9 @@ def _plant(certificate: Certificate) -> dict[str, Any]:
         "rounded": any(_is_long(v) for e in expressions for v in e.atoms(sympy.Rational)),
         "domain": [interval(s.name, b) for s, b in zip(system.states, system.domain, strict=True)],
         "inputs": [interval(s.name, b) for s, b in zip(system.inputs, system.input_bounds, strict=True)],
+        "at": at_rest(
+            [s.name for s in system.states], system.exact_x_eq(), [units.get(s.name, "") for s in system.states]
+        ),
         "u_eq": ", ".join(f"{symbol(s.name)} = {u}" for s, u in equilibrium),
     }
 
@@ -341,10 +345,16 @@ def _tables(
         size_of_set.append(
             (volume_name(system.n), f"{below(volume(P, certificate.roa))} {volume_unit(state_units)}".rstrip())
         )
-        columns = (state_units, semi_axes(P, certificate.roa), extents(P, certificate.roa), system.domain)
+        columns = (
+            system.exact_x_eq(),
+            state_units,
+            semi_axes(P, certificate.roa),
+            extents(P, certificate.roa),
+            system.domain,
+        )
         reach = [
-            (label(s.name, unit), below(float(axis)), above(float(extent)), f"[{below(lo)}, {above(hi)}]")
-            for s, unit, axis, extent, (lo, hi) in zip(system.states, *columns, strict=True)
+            (deviation(s.name, q, unit), below(float(axis)), above(float(extent)), f"[{below(lo)}, {above(hi)}]")
+            for s, q, unit, axis, extent, (lo, hi) in zip(system.states, *columns, strict=True)
         ]
     if result is not None:
         levels.append(("limited by", limited_by(result)))
@@ -358,6 +368,7 @@ def _tables(
         geometry.append(("eigenvalues of the closed loop", _eigenvalues(certificate)))
     evidence = [
         ("policy", f"{'-'.join(map(str, network.layers))} tanh, squash {network.squash}, centre {network.centre}"),
+        *(() if network.clip is None else (("clipped to", _clip(certificate)),)),
         ("policy sha256", network.sha256()),
         ("certificate sha256", sha256),
     ]
@@ -414,6 +425,13 @@ def _simulated(roa: SimulatedRoa, certificate: Certificate) -> dict[str, str]:
         "of": volume_name(certificate.system.n),
         "who": words_for(certificate.kind).simulated,
     }
+
+
+def _clip(certificate: Certificate) -> str:
+    """Each input's limits, in its unit."""
+    inputs, clip = certificate.system.inputs, certificate.network.clip or ()
+    each = zip(inputs, *clip, strict=True)
+    return ", ".join(f"{s.name} in [{number(float(lo), 10)}, {number(float(hi), 10)}]" for s, lo, hi in each)
 
 
 def _eigenvalues(certificate: Certificate) -> str:

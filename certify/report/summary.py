@@ -6,11 +6,13 @@ Everything comes from the result: names and units too, because a plant of one's 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 from unicodedata import normalize
 
 from certify.report.words import (
     above,
+    at_rest,
     below,
     inner_level,
     label,
@@ -35,8 +37,9 @@ def summary(result: Mapping[str, Any]) -> RenderableType:
 
     Parameters
     ----------
-    result : the object that `certify roa --json` prints. Of its keys `states` and `inputs` (lists of `{name, unit}`)
-        and `claim` (`{kind}`) may be absent: then there are no units, and the claim is the asymptotic one.
+    result : the object that `certify roa --json` prints. Of its keys `states` and `inputs` (lists of `{name, unit}`),
+        `operating_point` (values by state) and `claim` (`{kind}`) may be absent: then there are no units, the
+        operating point is 0, and the claim is the asymptotic one.
 
     Returns
     -------
@@ -123,6 +126,11 @@ def _rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
         rows.append(
             ("candidates", f"{', '.join(tried)} {unit}".rstrip() + " (proved in the time, of what sampling allows)")
         )
+    at = result.get("operating_point") or {}
+    if at:
+        names = _state_names(result)
+        point = at_rest(names, [Fraction(at.get(name, 0)) for name in names], units)
+        rows.append(("operating point", f"{point}; the set lies around it, in deviations from it"))
     rows += _diagnosis_rows(result)
     rows.append(("policy", "-".join(map(str, result["policy"]["layers"]))))
     rows.append(("its sha256", str(result["policy"]["sha256"])))

@@ -45,6 +45,27 @@ def label(name: str, unit: str) -> str:
     return f"{symbol(name)} ({pretty_unit(unit)})" if unit else symbol(name)
 
 
+def deviation(name: str, x_eq: Fraction, unit: str) -> str:
+    """Symbol and unit of an axis along which a state's deviation from its operating point is drawn.
+
+    >>> deviation("h", Fraction(1, 100), "m"), deviation("h", Fraction(0), "m")
+    ('h − 0.01 (m)', 'h (m)')
+    """
+    if not x_eq:
+        return label(name, unit)
+    value = number(float(abs(x_eq)))
+    shifted = f"{symbol(name)} {MINUS if x_eq > 0 else '+'} {value}"
+    return f"{shifted} ({pretty_unit(unit)})" if unit else shifted
+
+
+def at_rest(names: Sequence[str], x_eq: Sequence[Fraction], units: Sequence[str]) -> str:
+    """The operating point in words, such as `h = 0.01 m, v = 0 m/s`; nothing where it is 0 in all states."""
+    if not any(x_eq):
+        return ""
+    each = zip(names, x_eq, units, strict=True)
+    return ", ".join(f"{symbol(name)} = {number(float(q))} {pretty_unit(unit)}".rstrip() for name, q, unit in each)
+
+
 def pretty_unit(unit: str) -> str:
     """`m/s^2` as `m/s²`."""
     return re.sub(r"\^(-?\d+)", lambda match: match.group(1).translate(_SUPERSCRIPTS), unit)
@@ -174,7 +195,7 @@ class Words:
     excluded: tuple[tuple[str, str], ...]
 
 
-SMOOTH = ("Equations", "The closed loop is twice continuously differentiable on {V ≤ c₂}.", "")
+SMOOTH = ("Equations", "The closed loop is locally Lipschitz on {V ≤ c₂}: solutions exist and are unique.", "")
 DEFINITE = ("Lyapunov function", "P is symmetric positive definite, so that {V ≤ c₂} is compact.", "")
 DOMAIN = ("Domain", "{V ≤ c₂} lies strictly inside the domain.", "")
 INPUTS = ("Inputs", "On {V ≤ c₂} the input stays in its bounds, so that an actuator that clips changes nothing.", "")

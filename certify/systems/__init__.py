@@ -2,8 +2,21 @@
 
 from __future__ import annotations
 
-from certify.systems.registry import available_systems, get_system
-from certify.systems.system import System, exact
+from certify.systems.linear import Controllability, controllability, linearise
+from certify.systems.registry import available_systems, chosen_system, get_system, shipped_system
+from certify.systems.system import System, exact, in_deviations
 from certify.systems.toml import load_system
 
-__all__ = ["System", "available_systems", "exact", "get_system", "load_system"]
+__all__ = [
+    "Controllability",
+    "System",
+    "available_systems",
+    "chosen_system",
+    "controllability",
+    "exact",
+    "get_system",
+    "in_deviations",
+    "linearise",
+    "load_system",
+    "shipped_system",
+]

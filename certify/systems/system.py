@@ -3,6 +3,10 @@
 Numbers are exact because the proof is about *this* plant: `m = 0.15` written as text is 3/20, while a
 Python float stands for its binary value. sympy never folds floats here; an expression that contains
 one is refused.
+
+Everything works in deviations from the operating point x_eq: the claims, the certificate and the policy are about
+`x - x_eq`, whose equilibrium is the origin. So no rule of the checkers knows of x_eq; it is a name for people, and
+`in_deviations` is the one place that moves equations there.
 """
 
 from __future__ import annotations
@@ -19,7 +23,7 @@ from typing import Any
 import sympy
 
 from certify.errors import InputError
-from certify.expressions import FUNCTIONS
+from certify.expressions import GRAMMAR, evaluate_exactly, has_tree
 
 Interval = tuple[Fraction, Fraction]
 
@@ -42,6 +46,9 @@ def exact(value: Fraction | float | int | str | Decimal, name: str = "value") ->
 class System:
     """A plant `xdot = f(x, u)` on a box domain, with an equilibrium at the origin.
 
+    x are deviations from the operating point `x_eq`: where that is not 0, the value of a state is x_eq + x, and a
+    policy reads x.
+
     Parameters
     ----------
     name : identifier of the plant.
@@ -49,18 +56,21 @@ class System:
     inputs : m symbols, in the order of u.
     parameters : exact value of each parameter symbol.
     dynamics : n expressions in states, inputs and parameters, built from `+ - * /`, integer constant
-        powers, sin, cos and tan.
+        powers, sin, cos, tan, tanh, exp, atan and sqrt.
     u_eq : m expressions in the parameters; `f(0, u_eq) = 0` is proved later, not assumed.
     domain : n intervals `(lo, hi)` with `lo < 0 < hi`, in the units of the states.
     input_bounds : m intervals `(lo, hi)` with `lo < hi`, in the units of the inputs.
     positive : names of parameters that must be positive (masses, lengths, ...).
     units : unit of each state, input and parameter by name.
     description : one line for people.
+    x_eq : n expressions in the parameters, with rational values; empty means zeros. `dynamics` and `domain` are in
+        deviations from it already (`in_deviations` brings equations there), so that nothing of what is proved depends
+        on it.
 
     Raises
     ------
     InputError : counts do not match, a domain does not contain 0 in its interior, a parameter that
-        must be positive is not, or an expression uses something outside the grammar.
+        must be positive is not, an expression uses something outside the grammar, or x_eq is irrational.
     """
 
     name: str
@@ -74,16 +84,19 @@ class System:
     positive: frozenset[str] = frozenset()
     units: Mapping[str, str] = field(default_factory=dict)
     description: str = ""
+    x_eq: tuple[sympy.Expr, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "parameters", MappingProxyType(dict(self.parameters)))
         object.__setattr__(self, "units", MappingProxyType(dict(self.units)))
         n, m = len(self.states), len(self.inputs)
+        object.__setattr__(self, "x_eq", tuple(self.x_eq) or (sympy.Integer(0),) * n)
         for label, found, wanted in (
             ("dynamics", len(self.dynamics), n),
             ("domain", len(self.domain), n),
             ("u_eq", len(self.u_eq), m),
             ("input_bounds", len(self.input_bounds), m),
+            ("x_eq", len(self.x_eq), n),
         ):
             if found != wanted:
                 raise InputError(f"`{label}` of {self.name} must have {wanted} entries; found {found}.")
@@ -98,19 +111,24 @@ class System:
         for symbol, (lo, hi) in zip(self.states, self.domain, strict=True):
             if not lo < 0 < hi:
                 raise InputError(
-                    f"the domain of {symbol} must contain 0 in its interior; found [{float(lo)}, {float(hi)}]."
+                    f"the domain of {symbol} must contain 0 in its interior, as a deviation from x_eq; "
+                    f"found [{float(lo)}, {float(hi)}]."
                 )
         for symbol, (lo, hi) in zip(self.inputs, self.input_bounds, strict=True):
             if not lo < hi:
                 raise InputError(f"the bounds of {symbol} must satisfy lo < hi; found [{float(lo)}, {float(hi)}].")
         for name in sorted(self.positive):
+            if name not in self.parameters:
+                known = ", ".join(self.parameters) or "none"
+                raise InputError(f"`positive` of {self.name} must name parameters, {known}; found {name!r}.")
             if not self.parameters[name] > 0:
                 raise InputError(f"parameter {name} of {self.name} must be positive; found {self.parameters[name]}.")
         parameters = {sympy.Symbol(p) for p in self.parameters}
         for expression in self.dynamics:
             _check_grammar(expression, {*self.states, *self.inputs, *parameters}, self.name)
-        for expression in self.u_eq:
+        for expression in (*self.u_eq, *self.x_eq):
             _check_grammar(expression, parameters, self.name)
+        self.exact_x_eq()
 
     @property
     def n(self) -> int:
@@ -123,13 +141,19 @@ class System:
         return len(self.inputs)
 
     def with_parameters(self, values: Mapping[str, Fraction | float | int | str]) -> System:
-        """The same plant with some parameters replaced; unknown names are refused."""
+        """The same plant with some parameters replaced; unknown names are refused.
+
+        Where x_eq moves with them, the domain keeps its place and its deviations move.
+        """
         for name in values:
             if name not in self.parameters:
                 known = ", ".join(self.parameters) or "none"
                 raise InputError(f"{self.name} has no parameter {name!r}; it has: {known}.")
-        exact_values = {name: exact(value, name) for name, value in values.items()}
-        return replace(self, parameters={**self.parameters, **exact_values})
+        parameters = {**self.parameters, **{name: exact(value, name) for name, value in values.items()}}
+        moved = [self._rational(e, f"x_eq of {s}", parameters) for s, e in zip(self.states, self.x_eq, strict=True)]
+        shifts = [old - new for old, new in zip(self.exact_x_eq(), moved, strict=True)]
+        domain = tuple((lo + shift, hi + shift) for (lo, hi), shift in zip(self.domain, shifts, strict=True))
+        return replace(self, parameters=parameters, domain=domain)
 
     def with_domain(self, bounds: Mapping[str, Interval]) -> System:
         """The same plant on another box; unknown state names are refused."""
@@ -146,13 +170,38 @@ class System:
 
     def exact_u_eq(self) -> tuple[Fraction, ...]:
         """The equilibrium input as exact rationals, shape (m,)."""
-        values = []
-        for name, expression in zip(self.inputs, self.u_eq, strict=True):
-            value = self._substitute(expression)
-            if not value.is_Rational:
-                raise InputError(f"u_eq of {name} must be rational; found {value}.")
-            values.append(Fraction(int(value.p), int(value.q)))
-        return tuple(values)
+        return tuple(self._rational(e, f"u_eq of {s}") for s, e in zip(self.inputs, self.u_eq, strict=True))
+
+    def exact_x_eq(self) -> tuple[Fraction, ...]:
+        """The operating point as exact rationals, shape (n,): what the states are deviations from."""
+        return tuple(self._rational(e, f"x_eq of {s}") for s, e in zip(self.states, self.x_eq, strict=True))
+
+    def operating_point(self) -> dict[str, Fraction]:
+        """x_eq by the names of the states; empty where it is 0 in all of them, which needs no words."""
+        values = self.exact_x_eq()
+        return {s.name: q for s, q in zip(self.states, values, strict=True)} if any(values) else {}
+
+    def dynamics_of_values(self) -> tuple[sympy.Expr, ...]:
+        """f over the states' values x_eq + x, as people write it, with the parameters by name."""
+        return in_deviations(self.dynamics, self.states, [-e for e in self.x_eq])
+
+    def domain_of_values(self) -> tuple[Interval, ...]:
+        """The domain's intervals of the states' values x_eq + x."""
+        return tuple((lo + q, hi + q) for (lo, hi), q in zip(self.domain, self.exact_x_eq(), strict=True))
+
+    def residuals(self) -> dict[str, Fraction | float]:
+        """Each state's f(0, u_eq): exact, or rounded where a function stands at another point than 0."""
+        at_rest: dict[sympy.Symbol, Fraction] = dict.fromkeys(self.states, Fraction(0))
+        at_rest |= dict(zip(self.inputs, self.exact_u_eq(), strict=True))
+        found: dict[str, Fraction | float] = {}
+        for symbol, expression in zip(self.states, self.exact_dynamics(), strict=True):
+            try:
+                found[symbol.name] = evaluate_exactly(expression, at_rest)
+            except InputError:
+                values = {s: sympy.Rational(q.numerator, q.denominator) for s, q in at_rest.items()}
+                value = expression.subs(values).evalf(30, chop=True)
+                found[symbol.name] = float(value) if value.is_real else math.nan
+        return found
 
     def function(self, module: str = "numpy") -> Callable[[Any, Any], Any]:
         """Floating-point f: arrays x (..., n) and u (..., m) to xdot (..., n); `module` numpy or torch.
@@ -183,16 +232,45 @@ class System:
 
         return f
 
-    def _substitute(self, expression: sympy.Expr) -> sympy.Expr:
-        values = {sympy.Symbol(name): sympy.Rational(q.numerator, q.denominator) for name, q in self.parameters.items()}
-        result = expression.subs(values)
+    def _substitute(self, expression: sympy.Expr, parameters: Mapping[str, Fraction] | None = None) -> sympy.Expr:
+        parameters = self.parameters if parameters is None else parameters
+        result = expression.subs({s: sympy.Rational(q.numerator, q.denominator) for s, q in _by_symbol(parameters)})
         if result.has(sympy.zoo, sympy.nan, sympy.oo):
-            raise InputError(f"an equation of {self.name} divides by zero with the parameters {dict(self.parameters)}.")
+            shown = ", ".join(f"{name} = {q}" for name, q in parameters.items()) or "none"
+            raise InputError(f"an equation of {self.name} divides by zero with the parameters {shown}.")
         return result
+
+    def _rational(
+        self, expression: sympy.Expr, what: str, parameters: Mapping[str, Fraction] | None = None
+    ) -> Fraction:
+        value = self._substitute(expression, parameters)
+        if not value.is_Rational:
+            raise InputError(
+                f"{what} in {self.name} must be rational, because the equilibrium is decided in rationals; "
+                f"found {value}. Choose parameters for which it is, or make it a parameter itself."
+            )
+        return Fraction(int(value.p), int(value.q))
+
+
+def _by_symbol(parameters: Mapping[str, Fraction]) -> list[tuple[sympy.Symbol, Fraction]]:
+    return [(sympy.Symbol(name), q) for name, q in parameters.items()]
 
 
 def _is_constant_function(node: sympy.Expr) -> bool:
-    return bool(node.is_Function and node.is_number)
+    return bool(node.is_number and not node.is_Rational and (node.is_Function or node.is_Pow or not node.args))
+
+
+def in_deviations(
+    expressions: Sequence[sympy.Expr], states: Sequence[sympy.Symbol], x_eq: Sequence[sympy.Expr]
+) -> tuple[sympy.Expr, ...]:
+    """Equations in the states' values as equations in deviations from x_eq: each state s becomes `x_eq_s + s`.
+
+    >>> h, h0 = symbols(["h", "h0"])
+    >>> in_deviations([1 - h0 / h], [h], [h0])
+    (-h0/(h + h0) + 1,)
+    """
+    values = {state: point + state for state, point in zip(states, x_eq, strict=True)}
+    return tuple(sympy.sympify(e).subs(values, simultaneous=True) for e in expressions)
 
 
 def symbols(names: Sequence[str]) -> tuple[sympy.Symbol, ...]:
@@ -202,17 +280,10 @@ def symbols(names: Sequence[str]) -> tuple[sympy.Symbol, ...]:
 
 def _check_grammar(expression: sympy.Expr, allowed: set[sympy.Symbol], system: str) -> None:
     for node in sympy.preorder_traversal(expression):
-        if node.is_Rational or node in allowed or node.is_Add or node.is_Mul:
-            continue
-        if node.is_Pow and node.exp.is_Integer:
-            continue
-        if isinstance(node, tuple(FUNCTIONS.values())):
+        if node in allowed or (has_tree(node) and not node.is_Symbol):
             continue
         if node.is_Float:
             raise InputError(f"an equation of {system} holds the rounded number {node}; write it as a fraction.")
         if node.is_Symbol:
             raise InputError(f"an equation of {system} uses {node}, which is no state, input or parameter.")
-        raise InputError(
-            f"an equation of {system} uses {node}; "
-            f"allowed are + - * /, integer powers, {', '.join(FUNCTIONS)} and exact numbers."
-        )
+        raise InputError(f"an equation of {system} uses {node}; allowed are {GRAMMAR} and exact numbers.")

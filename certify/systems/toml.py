@@ -1,14 +1,12 @@
-"""A plant of one's own, described in TOML.
+"""A plant of one's own, described in TOML. See `examples/plants`.
 
-Equations are text over names, read by a small parser on Python's `ast`: nothing in the file is
-executed, and `0.15` is 3/20, because numbers are read as text. See `examples/van_der_pol.toml`.
+The file speaks of values as people measure them: equations, operating point and domain are in absolute states, and it
+is here that they become deviations from x_eq. Every error says the line, the entry and what is expected there.
 """
 
 from __future__ import annotations
 
-import ast
-import tomllib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -17,120 +15,213 @@ import sympy
 
 from certify.errors import InputError
 from certify.expressions import FUNCTIONS
-from certify.systems.system import Interval, System, exact, symbols
+from certify.systems.equations import nearest, parse_expression
+from certify.systems.source import PlantFile, read_plant_file
+from certify.systems.system import Interval, System, exact, in_deviations, symbols
 
-_KEYS = {
-    "name",
-    "description",
-    "states",
-    "inputs",
-    "parameters",
-    "positive",
-    "dynamics",
-    "u_eq",
-    "domain",
-    "input_bounds",
-    "units",
-}
-_REQUIRED = {"name", "states", "inputs", "dynamics", "u_eq", "domain", "input_bounds"}
-_MAX_EXPONENT = 64
+_REQUIRED = ("name", "states", "inputs", "dynamics", "u_eq", "domain", "input_bounds")
+_KEYS = (*_REQUIRED, "description", "parameters", "positive", "where", "x_eq", "units", "training")
+_ROUNDED = 1e-12  # of a residual with functions at other points than 0, which rationals do not decide
 
 
 def load_system(path: Path) -> System:
-    """Read a plant from a TOML file.
+    """Read a plant from a TOML file. Its table `training` is the trainer's, and not looked at.
 
     Raises
     ------
-    InputError : the file is missing or not TOML, a key is unknown or absent, or an equation is
-        outside the grammar.
+    InputError : the file is missing or not TOML, a key is unknown or absent, an equation is outside the grammar, or
+        x_eq is no equilibrium. The message names file, line and entry.
     """
+    return build_system(read_plant_file(path))
+
+
+def build_system(file: PlantFile) -> System:
+    """The plant of a file that was read; raises as `load_system` does."""
+    for key in file.data:
+        if key not in _KEYS:
+            close = nearest(key, _KEYS) or f"; known are {', '.join(_KEYS)}."
+            raise file.refuse(f"unknown keys are refused: {key!r} is none of a plant's{close}", key)
+    missing = [key for key in _REQUIRED if key not in file.data]
+    if missing:
+        raise file.refuse(f"missing keys: a plant must have {', '.join(missing)}.")
+    name, description = _text(file, "name"), _text(file, "description")
+    states, inputs = _names(file, "states"), _names(file, "inputs")
+    parameters = {p: _number(file, value, "parameters", p) for p, value in file.table("parameters").items()}
+    everything = [*states, *inputs, *parameters]
+    for key, names in (("states", states), ("inputs", inputs), ("parameters", list(parameters))):
+        twice = next((name for name in names if everything.count(name) > 1), None)
+        if twice is not None:
+            raise file.refuse(f"names of states, inputs and parameters must differ; found {twice!r} twice.", key)
+    file.require_known("units", everything, "state, input or parameter")
+    for table, names, what in (
+        ("dynamics", states, "state"),
+        ("domain", states, "state"),
+        ("x_eq", states, "state"),
+        ("u_eq", inputs, "input"),
+        ("input_bounds", inputs, "input"),
+    ):
+        file.require_known(table, names, what)
     try:
-        text = path.read_text(encoding="utf-8")
-        # Decimal text goes to Fraction unrounded; a literal like 1e999999 must not become an integer.
-        data = tomllib.loads(text, parse_float=_decimal)
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"system file {path} cannot be read: {error}.") from error
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"system file {path} is not valid TOML: {error}.") from error
-    unknown, missing = sorted(set(data) - _KEYS), sorted(_REQUIRED - set(data))
-    if unknown or missing:
-        raise InputError(f"system file {path}: unknown keys {unknown}, missing keys {missing}.")
-    try:
-        return _build(data)
-    except (TypeError, AttributeError, KeyError) as error:
-        raise InputError(f"system file {path} has an entry of the wrong type: {error}.") from error
-
-
-def _build(data: Mapping[str, Any]) -> System:
-    states, inputs = symbols(data["states"]), symbols(data["inputs"])
-    parameters = {name: exact(value, name) for name, value in data.get("parameters", {}).items()}
-    names = {s.name: s for s in (*states, *inputs, *symbols(list(parameters)))}
-    return System(
-        name=data["name"],
-        description=data.get("description", ""),
-        states=states,
-        inputs=inputs,
-        parameters=parameters,
-        positive=frozenset(data.get("positive", ())),
-        dynamics=tuple(parse_expression(data["dynamics"][s.name], names) for s in states),
-        u_eq=tuple(parse_expression(data["u_eq"][s.name], names) for s in inputs),
-        domain=tuple(_interval(data["domain"][s.name], s.name) for s in states),
-        input_bounds=tuple(_interval(data["input_bounds"][s.name], s.name) for s in inputs),
-        units=data.get("units", {}),
-    )
-
-
-def parse_expression(text: str | int | Fraction, names: Mapping[str, sympy.Symbol]) -> sympy.Expr:
-    """A sympy expression from text such as `(g/l)*sin(theta) - b/(m*l**2)*theta_dot`; `^` is refused."""
-    source = str(text)
-    try:
-        tree = ast.parse(source, mode="eval")
-        return _convert(tree.body, source, names)
-    except (SyntaxError, RecursionError, ValueError, MemoryError) as error:
-        if isinstance(error, InputError):
+        symbol = dict(zip(everything, symbols(everything), strict=True))
+        constants = {p: symbol[p] for p in parameters}
+        x_eq = [_equation(file, "x_eq", s, constants, "parameter", 0) for s in states]
+        shorthand = _shorthand(file, symbol)
+        known = "state, input or parameter" + (", and not defined in [where] above" if shorthand else "")
+        dynamics = [_equation(file, "dynamics", s, symbol | shorthand, known) for s in states]
+        u_eq = [_equation(file, "u_eq", s, constants, "parameter") for s in inputs]
+        for s, e in zip(inputs, u_eq, strict=True):
+            _at_rest(file, "u_eq", s, e, parameters)
+        system = System(
+            name=name,
+            description=description,
+            states=tuple(symbol[s] for s in states),
+            inputs=tuple(symbol[s] for s in inputs),
+            parameters=parameters,
+            positive=frozenset(_list(file, "positive")),
+            dynamics=in_deviations(dynamics, [symbol[s] for s in states], x_eq),
+            u_eq=tuple(u_eq),
+            domain=tuple(_domain(file, s, e, parameters) for s, e in zip(states, x_eq, strict=True)),
+            input_bounds=tuple(_interval(file, "input_bounds", s) for s in inputs),
+            units={name: _unit(file, name) for name in file.table("units")},
+            x_eq=tuple(x_eq),
+        )
+    except InputError as error:
+        if str(file.path) in str(error):
             raise
-        raise InputError(f"equation {source!r} cannot be read: {error}.") from error
+        raise file.refuse(str(error)) from error
+    if "x_eq" in file.data:
+        require_equilibrium(system, lambda message: file.refuse(message, "x_eq"))
+    return system
 
 
-def _convert(node: ast.expr, source: str, names: Mapping[str, sympy.Symbol]) -> sympy.Expr:
-    if isinstance(node, ast.Constant) and isinstance(node.value, int | float) and not isinstance(node.value, bool):
-        literal = _decimal(ast.get_source_segment(source, node) or "")
-        return sympy.Rational(literal.numerator, literal.denominator)
-    if isinstance(node, ast.Name) and node.id in names:
-        return names[node.id]
-    if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.UAdd):
-        operand = _convert(node.operand, source, names)
-        return -operand if isinstance(node.op, ast.USub) else operand
-    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and not node.keywords and len(node.args) == 1:
-        function = FUNCTIONS.get(node.func.id)
-        if function is not None:
-            return function(_convert(node.args[0], source, names))
-    if isinstance(node, ast.BinOp):
-        left, right = _convert(node.left, source, names), _convert(node.right, source, names)
-        if isinstance(node.op, ast.Add):
-            return left + right
-        if isinstance(node.op, ast.Sub):
-            return left - right
-        if isinstance(node.op, ast.Mult):
-            return left * right
-        if isinstance(node.op, ast.Div) and right != 0:
-            return left / right
-        if isinstance(node.op, ast.Pow) and right.is_Integer and abs(right) <= _MAX_EXPONENT:
-            return left**right
-    raise InputError(
-        f"equation {source!r}: {ast.get_source_segment(source, node)!r} is not allowed; use the plant's names, "
-        f"numbers, + - * /, integer powers up to {_MAX_EXPONENT}, {', '.join(FUNCTIONS)}."
-    )
+def require_equilibrium(system: System, refuse: Callable[[str], InputError] = InputError) -> None:
+    """Refuse a plant that does not rest at its operating point; `refuse` makes the error of a message.
+
+    Raises
+    ------
+    InputError : f(x_eq, u_eq) is not 0; the message has the residual of each state by its name.
+    """
+    off = {name: r for name, r in system.residuals().items() if _is_off(r)}
+    if off:
+        shown = ", ".join(_residual(name, r, system.units.get(name, "")) for name, r in off.items())
+        raise refuse(
+            f"x_eq of {system.name} must be an equilibrium, f(x_eq, u_eq) = 0; found {shown}. Correct x_eq or u_eq."
+        )
 
 
-def _decimal(text: str) -> Fraction:
-    exponent = text.lower().replace("_", "").partition("e")[2]
-    if exponent and abs(int(exponent)) > 400:
-        raise InputError(f"number {text} is out of range.")
-    return exact(text.replace("_", ""))
+def _is_off(residual: Fraction | float) -> bool:
+    return residual != 0 if isinstance(residual, Fraction) else not abs(residual) <= _ROUNDED
 
 
-def _interval(value: Any, name: str) -> Interval:
+def _residual(name: str, residual: Fraction | float, unit: str) -> str:
+    exactly = f" (exactly {residual})" if isinstance(residual, Fraction) and len(str(residual)) <= 40 else ""
+    return f"{name}' = {float(residual):.6g}{exactly}" + (f" in {unit} per second" if unit else "")
+
+
+def _shorthand(file: PlantFile, symbol: Mapping[str, sympy.Symbol]) -> dict[str, sympy.Expr]:
+    """The table `where`: names for expressions that equations share, each over the plant's names and those above."""
+    found: dict[str, sympy.Expr] = {}
+    for name in file.table("where"):
+        if name in symbol or name in FUNCTIONS or not name.isidentifier():
+            raise file.refuse("must be a new name, and no state, input, parameter or function.", "where", name)
+        found[name] = _equation(file, "where", name, {**symbol, **found}, "name of the plant or of a line above")
+    return found
+
+
+def _equation(
+    file: PlantFile, table: str, name: str, symbol: Mapping[str, sympy.Expr], known: str, default: int | None = None
+) -> sympy.Expr:
+    entries = file.table(table)
+    if name not in entries:
+        if default is not None:
+            return sympy.Integer(default)
+        raise file.refuse(f'there must be an equation for {name}; none was found. Write {name} = "...".', table)
+    value = entries[name]
+    if isinstance(value, bool) or not isinstance(value, str | int | Fraction):
+        raise file.refuse(f"must be an equation as text, or a number; found {value!r}.", table, name)
+    try:
+        return parse_expression(value, symbol, known)
+    except InputError as error:
+        raise file.refuse(str(error), table, name) from error
+
+
+def _domain(file: PlantFile, name: str, x_eq: sympy.Expr, parameters: Mapping[str, Fraction]) -> Interval:
+    """The interval of a state's values as one of deviations."""
+    lo, hi = _interval(file, "domain", name)
+    at = _at_rest(file, "x_eq", name, x_eq, parameters)
+    if not lo < at < hi:
+        raise file.refuse(
+            f"the domain must have the operating point {name} = {float(at):g} in its interior; "
+            f"found [{float(lo):g}, {float(hi):g}].",
+            "domain",
+            name,
+        )
+    return lo - at, hi - at
+
+
+def _at_rest(
+    file: PlantFile, table: str, name: str, expression: sympy.Expr, parameters: Mapping[str, Fraction]
+) -> Fraction:
+    """The value of an entry of x_eq or u_eq."""
+    values = {sympy.Symbol(p): sympy.Rational(q.numerator, q.denominator) for p, q in parameters.items()}
+    point = expression.subs(values)
+    if not point.is_Rational:
+        raise file.refuse(
+            f"the operating point must be rational, because the equilibrium is decided in rationals; found {point}. "
+            "Choose parameters for which it is, or make it a parameter itself.",
+            table,
+            name,
+        )
+    return Fraction(int(point.p), int(point.q))
+
+
+def _interval(file: PlantFile, table: str, name: str) -> Interval:
+    value = file.table(table).get(name)
+    if name not in file.table(table):
+        raise file.refuse(f"there must be bounds of {name}; none were found. Write {name} = [lo, hi].", table)
     if not isinstance(value, list) or len(value) != 2:
-        raise InputError(f"the bounds of {name} must be a pair [lo, hi]; found {value!r}.")
-    return exact(value[0], name), exact(value[1], name)
+        raise file.refuse(f"the bounds of {name} must be a pair [lo, hi]; found {value!r}.", table, name)
+    lo, hi = (_number(file, end, table, name) for end in value)
+    if not lo < hi:
+        where = "interior: the bounds" if table == "domain" else "bounds"
+        raise file.refuse(
+            f"the {where} of {name} must satisfy lo < hi; found [{float(lo):g}, {float(hi):g}].", table, name
+        )
+    return lo, hi
+
+
+def _number(file: PlantFile, value: Any, *keys: str) -> Fraction:
+    if isinstance(value, bool) or not isinstance(value, int | str | Fraction):
+        raise file.refuse(f"must be a number such as 0.15 or the text '3/20'; found {value!r}.", *keys)
+    try:
+        return exact(value, keys[-1])
+    except InputError as error:
+        raise file.refuse(str(error), *keys) from error
+
+
+def _text(file: PlantFile, key: str) -> str:
+    value = file.data.get(key, "")
+    if not isinstance(value, str):
+        raise file.refuse(f"must be text; found {value!r}.", key)
+    return value
+
+
+def _unit(file: PlantFile, name: str) -> str:
+    value = file.table("units")[name]
+    if not isinstance(value, str):
+        raise file.refuse(f"must be a unit as text, such as 'rad/s'; found {value!r}.", "units", name)
+    return value
+
+
+def _names(file: PlantFile, key: str) -> list[str]:
+    names = _list(file, key)
+    if not names:
+        raise file.refuse("must name at least one; found none.", key)
+    return names
+
+
+def _list(file: PlantFile, key: str) -> list[str]:
+    value = file.data.get(key, [])
+    if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
+        raise file.refuse(f'must be a list of names, as in ["x1", "x2"]; found {value!r}.', key)
+    return value

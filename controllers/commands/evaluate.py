@@ -18,6 +18,9 @@ def evaluate(
     policy: Annotated[Path, typer.Argument(help="The policy file.")],
     states: Annotated[int, typer.Option(help="Number of initial states.")] = 1000,
     seed: Annotated[int, typer.Option(help="Seed of the initial states.")] = 0,
+    system: Annotated[
+        str | None, typer.Option(help="A plant of your own, FILE.toml or FILE.py:NAME; default: what the policy says.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Simulate a policy from random initial states and compare it with its learned gain."""
@@ -25,9 +28,10 @@ def evaluate(
         from certify.policies import load_policy
         from controllers.evaluate import EvaluationOptions
         from controllers.evaluate import evaluate as judge
+        from controllers.own import chosen_plant
 
         options = EvaluationOptions(states=states, seed=seed)
-        result = judge(load_policy(policy), options)
+        result = judge(load_policy(policy), options, None if system is None else chosen_plant(system))
         emit(result.as_json() if as_json else _table(result), as_json)
 
 

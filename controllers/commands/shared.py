@@ -5,13 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from typing import Annotated, Any
 
 import typer
 
 from certify.errors import CertifyError
-from controllers.options import TrainingOptions, preset
+from controllers.options import TrainingOptions, overridden, preset
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
 PlantName = Annotated[str, typer.Argument(help="The plant, for instance pendulum.")]
@@ -25,7 +24,7 @@ def options_of(plant: str, **chosen: Any) -> TrainingOptions:
     ------
     InputError : no such plant, or a chosen value is out of its range.
     """
-    return replace(preset(plant), **{name: value for name, value in chosen.items() if value is not None})
+    return overridden(preset(plant), chosen)
 
 
 @contextmanager

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin, get_type
 import typer
 
 from certify.errors import InputError
-from controllers.commands.shared import Json, PlantName, emit, errors, options_of
+from controllers.commands.shared import Json, emit, errors
 from controllers.files import make_folder, read, require_writable
-from controllers.options import TrainingOptions
+from controllers.options import TrainingOptions, overridden
 
 if TYPE_CHECKING:
     from certify.policies import Policy
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def train(
-    plant: PlantName,
+    plant: Annotated[str, typer.Argument(help="A plant that ships, FILE.toml, or FILE.py:NAME, whose code is run.")],
     out: Annotated[Path, typer.Option("--out", help="The policy file to write.")],
     log: Annotated[Path | None, typer.Option("--log", help="CSV file of episodes and returns.")] = None,
     checkpoint_dir: Annotated[
@@ -43,12 +43,15 @@ def train(
 ) -> None:
     """Train a policy: soft actor-critic tied to a learned LQR gain.
 
-    Options that are not given take the plant's preset; the policy file records them all.
+    Options that are not given take the plant's preset; for a plant of one's own they come from the table [training] of
+    its file, and else from its domain and input bounds. The policy file records them all, and the plant's name.
     """
     with errors(as_json):
-        options = options_of(plant, **_given(chosen))
+        from controllers.own import chosen_plant
+
+        system, own = chosen_plant(plant)
+        options = overridden(own.preset, _given(chosen))
         from certify.policies import save_policy
-        from certify.systems import get_system
         from controllers.logs import Episode, Log, Monitored
         from controllers.sac import find_device
         from controllers.training import Trainer
@@ -62,7 +65,7 @@ def train(
             raise InputError("`--evaluations` needs an `--evaluate-every` above 0.")
         for path in filter(None, (out, log, evaluations)):
             require_writable(path)
-        trainer = Trainer(get_system(plant), options, find_device(device))
+        trainer = Trainer(system, options, find_device(device), own)
         checkpoint = _checkpoint(checkpoint_dir, resume)
         if resume and checkpoint is not None:
             trainer.restore(read(checkpoint))

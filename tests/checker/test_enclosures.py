@@ -95,6 +95,19 @@ def test_sin_cos() -> None:
         assert_sin_cos_enclose(drawn(10_000, 64.0, 2))
 
 
+@pytest.mark.parametrize(("name", "end"), [("exp", 64.0), ("atan", 4.0)])
+def test_exp_and_atan(name: str, end: float) -> None:
+    points = np.concatenate([awkward(end), drawn(10_000, end, 6), [-745.0, -1e9, -64.1, 64.0, -64.0, 1e16, 2.0**53]])
+    values, errors = getattr(float64, name)(points)
+    known = np.isfinite(errors)
+    assert np.array_equal(known, np.isfinite(points) & (points <= 64.0) if name == "exp" else np.isfinite(points))
+    with ctx.workprec(200):
+        for y, value, error in zip(*(v[known].tolist() for v in (points, values, errors)), strict=True):
+            assert certainly_within(getattr(arb(y), name)(), value, error), y.hex()
+    inside = known & (np.abs(points) <= 64)
+    assert np.all(errors[inside] <= 14 * 2.0**-53 * np.abs(values[inside]) + 2.0**-900)  # relative, also near 0
+
+
 def test_elementary_functions_are_narrow() -> None:
     y = drawn(10_000, 20.0, 3)
     t, e = tanh(y)
@@ -107,7 +120,8 @@ def test_elementary_functions_are_narrow() -> None:
 
 @pytest.mark.parametrize("y", [np.nan, np.inf, -np.inf])
 def test_elementary_functions_know_nothing_of_what_is_not_finite(y: float) -> None:
-    assert all(np.isnan(v).all() for v in (*tanh(np.array([y])), *sin_cos(np.array([y]))))
+    functions = (tanh, sin_cos, float64.exp, float64.atan)
+    assert all(np.isnan(v).all() for function in functions for v in function(np.array([y])))
 
 
 def test_tanh_is_odd_in_every_bit() -> None:
@@ -347,6 +361,34 @@ def test_taylor_sine_and_cosine_contain(spread: int) -> None:
     assert assert_contains(a.function("cos"), [a], lambda x: x.cos(), generator) == 60
 
 
+@pytest.mark.parametrize("spread", [-40, -6, -2, 0, 3])
+@pytest.mark.parametrize("name", ["tanh", "exp", "atan", "sqrt"])
+def test_other_taylor_functions_contain(name: str, spread: int) -> None:
+    generator = np.random.default_rng(spread + 3500)
+    a = models(generator, 2, 60, spread, spread)
+    centre = generator.uniform(0.01, 20, 60) if name == "sqrt" else generator.uniform(-70, 30, 60)
+    a = Taylor(centre, a.g, a.Q, a.r)
+    finite = assert_contains(a.function(name), [a], lambda x: getattr(x, name)(), generator)
+    assert finite == 60 or (name == "sqrt" and (finite > 40 or spread >= 0)) or (name == "exp" and spread == 3)
+
+
+def test_a_root_of_what_may_not_be_positive_gives_nothing() -> None:
+    c = np.array([1.0, 1.0, 0.0, -1.0, 5e-324, 1.0])
+    g = np.array([[1.0, 0.5, 0.0, 0.25, 0.0, -1.0]])
+    r = np.array([0.0, 0.5, 0.0, 0.5, 5e-324, 2.0**-1000])
+    result = Taylor(c, g, np.zeros((1, 1, 6)), r).function("sqrt")
+    assert np.isnan(result.r).all()
+    assert np.isnan((result * affine(np.zeros(6), np.zeros((1, 6)))).r).all()  # 0 times it is still unknown
+    assert not np.any(upper_bound(result) < 0)
+
+
+def test_exp_of_what_may_be_too_large_gives_nothing() -> None:
+    c = np.array([64.5, 60.0, 1e300, 0.0])
+    g = np.array([[0.0, 4.5, 0.0, 1e300]])
+    result = Taylor(c, g, np.zeros((1, 1, 4)), np.zeros(4)).function("exp")
+    assert np.isnan(result.r).all() and not np.any(upper_bound(result) < 0)
+
+
 @given(st.integers(-(10**30), 10**30), st.integers(1, 10**30))
 def test_taylor_constants_contain(numerator: int, denominator: int) -> None:
     q = Fraction(numerator, denominator)
@@ -365,7 +407,7 @@ def test_a_divisor_that_may_vanish_gives_nothing() -> None:
     assert not np.any(upper_bound(result) < 0)
 
 
-@pytest.mark.parametrize("operation", ["mul", "inv", "sin", "cos"])
+@pytest.mark.parametrize("operation", ["mul", "inv", "sin", "cos", "tanh", "exp", "atan", "sqrt"])
 def test_taylor_remainders_are_of_third_order(operation: str) -> None:
     generator = np.random.default_rng(7)
     c, g, Q = generator.uniform(0.5, 1, 8), generator.uniform(-1, 1, (2, 8)), generator.uniform(-1, 1, (2, 2, 8))
@@ -538,6 +580,33 @@ def test_jets_of_sine_and_cosine_contain(spread: int) -> None:
             v, points = Member(x, generator), points_in_the_ball(generator, 2)
             assert assert_jet(x.function("sin"), lambda d, v=v: v(d).sin(), [v.c.cos() * p for p in v.a], points)
             assert assert_jet(x.function("cos"), lambda d, v=v: v(d).cos(), [-v.c.sin() * p for p in v.a], points)
+
+
+@pytest.mark.parametrize("spread", [-30, -8, -3, 0])
+def test_jets_of_other_functions_contain(spread: int) -> None:
+    generator, roots = np.random.default_rng(spread + 9700), 0
+    with ctx.workprec(1600):
+        for _ in range(40):
+            x = jets(generator, 2, spread)
+            centre = np.float64(generator.choice([0.0, 1.0, 20.0]) * generator.standard_normal())
+            x = Jet(centre, x.error, x.a, x.slack, x.Q, x.E)
+            v, points = Member(x, generator), points_in_the_ball(generator, 2)
+            slopes = {"exp": v.c.exp(), "atan": 1 / (1 + v.c * v.c), "tanh": 1 - v.c.tanh() ** 2}
+            for name, slope in slopes.items():
+                gradient = [slope * p for p in v.a]
+                found = assert_jet(x.function(name), lambda d, v=v, f=name: getattr(v(d), f)(), gradient, points)
+                assert found or (name == "exp" and centre + x.radius > 60)
+            positive = [p / (2 * v.c.sqrt()) for p in v.a]
+            roots += assert_jet(x.function("sqrt"), lambda d, v=v: v(d).sqrt(), positive, points)
+    assert roots > 5 or spread == 0
+
+
+def test_a_jet_of_a_root_that_may_not_be_defined_gives_nothing() -> None:
+    nothing = np.zeros((1, 1))
+    for c, error, slope in ((1.0, 0.0, 1.0), (0.0, 0.0, 0.0), (1.0, 1.0, 0.0), (-4.0, 0.0, 0.5), (1.0, 0.5, 0.5)):
+        x = Jet(np.float64(c), error, np.full(1, slope), 0.0, nothing, nothing)
+        with np.errstate(all="ignore"):
+            assert np.isnan(x.function("sqrt").E) and np.isnan(x.function("sqrt").slack)
 
 
 def test_a_jet_of_a_divisor_that_may_vanish_gives_nothing() -> None:
@@ -854,7 +923,7 @@ def test_products_of_far_corners_in_the_off_diagonal_part_of_V_are_not_lost(expo
 # ------------------------------------------------------------------------------------------------- what is no number
 
 
-@pytest.mark.parametrize("name", ["sin", "cos", "inv", "tanh"])
+@pytest.mark.parametrize("name", ["sin", "cos", "inv", "tanh", "exp", "atan", "sqrt"])
 def test_nothing_is_known_of_a_function_where_nothing_is_known_of_its_argument(name: str) -> None:
     radii = (0.0, 1.0, 1e300, np.inf, np.nan)
     wrong = [(c, 0.0) for c in (np.nan, np.inf, -np.inf)] + [(1.0, np.nan), (np.nan, np.nan), (np.inf, np.inf)]
@@ -862,7 +931,7 @@ def test_nothing_is_known_of_a_function_where_nothing_is_known_of_its_argument(n
         _, errors, _ = elementary(name, np.array([c]), error, np.array([radius]))
         assert not np.isfinite([float(np.ravel(e)[0]) for e in errors]).any(), (c, error, radius)
     for c, error, radius in ((1.0, 0.0, np.nan), (1.0, 0.0, np.inf), (0.0, 0.0, 1.0), (-0.0, 0.0, 0.0), (1.0, 1.0, 0)):
-        if name == "inv":
+        if name in ("inv", "sqrt"):
             _, errors, third = elementary(name, np.array([c]), error, np.array([radius]))
             assert all(np.isnan(np.ravel(v)[0]) for v in (*errors, third)), (c, error, radius)
 
@@ -876,7 +945,8 @@ def test_what_is_not_finite_never_ends_in_a_negative_bound(value: float, where: 
     parts[where].flat[0] = value
     m, one = Taylor(*parts), affine(np.array([-1.0]), np.zeros((2, 1)))
     zero = one.scaled(0.0)
-    unary = (-m, *map(m.function, ("sin", "cos", "inv")), *(m.scaled(k) for k in (1.0, 0.0, 5e-324)))
-    unknown = (m.function(name) * zero + one for name in ("sin", "inv"))
+    functions = ("sin", "cos", "inv", "tanh", "exp", "atan", "sqrt")
+    unary = (-m, *map(m.function, functions), *(m.scaled(k) for k in (1.0, 0.0, 5e-324)))
+    unknown = (m.function(name) * zero + one for name in functions)
     for result in (*unary, m + one, m * one, one * m, m * zero, *unknown):
         assert not np.isfinite((result.size + result.r)[0]) and not upper_bound(result)[0] < 0

@@ -125,7 +125,7 @@ def text(node: Any) -> str:
 TOKENS = [
     "{", "}", "[", "]", ",", ":", '"', "\\", "\\u", "\\ud800", "\\u0000", "null", "true", "false", "NaN", "Infinity",
     "-Infinity", "0", "-0", "1", "-", "1e9", "1E400", "0.5", "1234567890", "12345678901", "9" * 5000, '"a"', '""',
-    '"schema"', '"certify-certificate/2"', '"plant"', '"x"', '"0x1.0000000000000p+0"', "0x10", "//", "/*", "'a'", " ",
+    '"schema"', '"certify-certificate/3"', '"plant"', '"x"', '"0x1.0000000000000p+0"', "0x10", "//", "/*", "'a'", " ",
     "\n", "\t", "\x00", "\x1f", "\x7f", "\u0661", "\u2028", "\ufeff", "\U0001f600", "\ud800", "\udfff", "[" * 500,
     '{"a":' * 500, "[" * 2000 + "]" * 2000,
 ]  # fmt: skip
@@ -259,7 +259,7 @@ json_edits = st.lists(
 
 @st.composite
 def edited_json(draw: st.DrawFn) -> bytes:
-    top = {"": edited(SEEDS[draw(seeds)](), "schema", "certify-certificate/2")}  # a deep copy
+    top = {"": edited(SEEDS[draw(seeds)](), "schema", "certify-certificate/3")}  # a deep copy
     for kind, position, other, value in draw(json_edits):
         found = places(top)
         if not found:
@@ -294,12 +294,17 @@ def _nodes(inner: st.SearchStrategy[Any]) -> st.SearchStrategy[Any]:
     return st.one_of(
         st.tuples(st.sampled_from("+*"), inner, inner).map(list),
         st.tuples(st.sampled_from("-/"), inner, inner).map(list),
-        st.tuples(st.sampled_from(["-", "sin", "cos", "tan"]), inner).map(list),
+        st.tuples(st.sampled_from(["-", "sin", "cos", "tan", "tanh", "exp", "atan", "sqrt"]), inner).map(list),
         st.tuples(st.just("**"), inner, st.sampled_from([1, 2, 3, 7, 63, 64, -1, -2, -64])).map(list),
         st.tuples(st.sampled_from("+*"), inner, inner, inner).map(list),
         st.builds(_tower, inner, st.lists(st.sampled_from([2, 3, 64, -1, -64]), min_size=2, max_size=12)),
         st.builds(_shared, st.sampled_from("+*-/"), inner, st.integers(1, 7)),
-        st.builds(_nested, st.sampled_from(["-", "sin", "cos", "tan"]), inner, st.sampled_from([1, 5, 50, 190, 201])),
+        st.builds(
+            _nested,
+            st.sampled_from(["-", "sin", "cos", "tan", "tanh", "exp", "atan", "sqrt"]),
+            inner,
+            st.sampled_from([1, 5, 50, 190, 201]),
+        ),
     )
 
 
@@ -328,7 +333,7 @@ def _depth(tree: Any) -> int:
 _names = st.sampled_from(["x", "x", "x", "u", "u"])
 _wrong = st.one_of(
     junk,
-    st.sampled_from([["exp", "x"], ["**", "x", 65], ["**", "x", 0], ["**", "x", "2"], ["**", "x", True], ["+"], ["sin"],
+    st.sampled_from([["log", "x"], ["**", "x", 65], ["**", "x", 0], ["**", "x", "2"], ["**", "x", True], ["+"], ["sin"],
                      [], ["sin", "x", "x"], ["-", "x", "x", "x"], "y", "X", "x ", {"+": ["x", "x"]}, ["x", "+", "x"]]),
 )  # fmt: skip
 right_trees = st.recursive(_names | rationals, _nodes, max_leaves=8)

@@ -330,7 +330,9 @@ def sine(y: float, s: float) -> arb:
 
 
 TANH_END, ANGLE_END = float64._TANH_END, float64._ANGLE_END
+EXP_END = float64._EXP_END
 INVERSE, SINE, COSINE = (model_residual(f) for f in (lambda v: 1 / v, lambda v: v.sin(), lambda v: v.cos()))
+TANH, EXP, ATAN, SQRT = (model_residual(f) for f in (arb.tanh, arb.exp, arb.atan, arb.sqrt))
 ELEMENTARY = {
     "checker tanh": Elementary(
         TANH_END, value_claim(float64.tanh, 0, 1), lambda y, t: arb(y).tanh() - arb(t), 1.0
@@ -339,9 +341,19 @@ ELEMENTARY = {
     "checker cos": Elementary(
         ANGLE_END, value_claim(float64.sin_cos, 1, 3), lambda y, c: arb(y).cos() - arb(c), 1.0
     ),
+    "checker exp": Elementary(EXP_END, value_claim(float64.exp, 0, 1), lambda y, v: arb(y).exp() - arb(v), 0.7),
+    "checker atan": Elementary(8.0, value_claim(float64.atan, 0, 1), lambda y, v: arb(y).atan() - arb(v), 1.0),
     "checker relax_tanh": Elementary(TANH_END, line_claim(checker.relax_tanh), line_residual, 0.9),
     "checker model of 1/v": Elementary(ANGLE_END, model_claim(checker_model("inv")), INVERSE, 0.5),
     "checker model of sin": Elementary(ANGLE_END, model_claim(checker_model("sin")), SINE, 0.7),
+    "checker model of tanh": Elementary(TANH_END, model_claim(checker_model("tanh")), TANH, 0.7),
+    "checker model of exp": Elementary(EXP_END, model_claim(checker_model("exp")), EXP, 0.3),
+    "checker model of atan": Elementary(8.0, model_claim(checker_model("atan")), ATAN, 0.7),
+    "checker model of sqrt": Elementary(8.0, model_claim(checker_model("sqrt")), SQRT, 0.2),
+    "producer model of tanh": Elementary(TANH_END, model_claim(producer_model("tanh")), TANH, 0.7),
+    "producer model of exp": Elementary(EXP_END, model_claim(producer_model("exp")), EXP, 0.3),
+    "producer model of atan": Elementary(8.0, model_claim(producer_model("atan")), ATAN, 0.7),
+    "producer model of sqrt": Elementary(8.0, model_claim(producer_model("sqrt")), SQRT, 0.2),
     "checker model of cos": Elementary(ANGLE_END, model_claim(checker_model("cos")), COSINE, 0.7),
     "producer relax_tanh": Elementary(TANH_END, line_claim(producer_relax), line_residual, 0.9),
     "producer model of 1/v": Elementary(ANGLE_END, model_claim(producer_model("inverse")), INVERSE, 0.5),

@@ -23,7 +23,7 @@ from certify.policies import TanhNetwork
 from certify.rigorous import evaluate_policy, evaluate_vdot
 from certify.systems import System, get_system
 from tests.support.cases import Case, case_of
-from tests.support.loops import chain, lqr_gain, pendulum_network, saturated_lqr, scalar_tanh
+from tests.support.loops import chain, lqr_gain, pendulum_network, saturated_lqr, scalar_clip, scalar_tanh, tank, valve
 from tests.support.oracle import value_of
 
 
@@ -36,6 +36,9 @@ def quadrotor() -> tuple[System, TanhNetwork]:
 
 CASES = {
     "scalar": scalar_tanh,
+    "scalar, clipped": scalar_clip,
+    "tank": tank,
+    "valve": valve,
     "pendulum": lambda: (get_system("pendulum"), pendulum_network()),
     "pendulum, output": lambda: (get_system("pendulum"), pendulum_network((16, 16), centre="output")),
     "chain": lambda: chain(3, [-1, -2, -3]),

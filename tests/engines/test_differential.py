@@ -19,11 +19,14 @@ from certify.running import ThreadRunner
 from certify.systems import get_system
 from tests.support import codac_prover
 from tests.support.cases import Case, case_of
-from tests.support.loops import chain, pendulum_network, scalar_tanh
+from tests.support.loops import chain, pendulum_network, scalar_clip, scalar_tanh, tank, valve
 
 INNER = 0.05  # share of the limit below which the local proof speaks, and not these engines
 CASES = {
     "scalar": scalar_tanh,
+    "scalar, clipped": scalar_clip,
+    "tank": tank,
+    "valve": valve,
     "chain": lambda: chain(2, [-1, -2]),
     "pendulum 2-6-6-1": lambda: (get_system("pendulum"), pendulum_network((6, 6), seed=1)),
     "pendulum 2-16-1": lambda: (get_system("pendulum"), pendulum_network((16,))),

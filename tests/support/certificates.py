@@ -47,8 +47,8 @@ def policy_hash(policy: Document) -> str:
         rows, columns = layer["shape"]
         digest.update(struct.pack("<3Q", 2, rows, columns) + base64.b64decode(layer["weight"]))
         digest.update(struct.pack("<2Q", 1, rows) + base64.b64decode(layer["bias"]))
-    for name in ("scale", "offset"):
-        raw = base64.b64decode(policy[name])
+    for text in (policy["scale"], policy["offset"], *(policy["clip"] or ())):
+        raw = base64.b64decode(text)
         digest.update(struct.pack("<2Q", 1, len(raw) // 8) + raw)
     return digest.hexdigest()
 
@@ -73,6 +73,7 @@ def make(
     centre: str = "preactivation",
     scale: Sequence[float] = (-1.0,),
     offset: Sequence[float] = (0.0,),
+    clip: tuple[Sequence[float], Sequence[float]] | None = None,
     T: Any = None,
     root: Any = None,
     tree: bytes = bytes([LEAF]),
@@ -85,7 +86,7 @@ def make(
         root = least_root(P, T, levels[1])
     arrays = [(np.atleast_2d(np.asarray(W, dtype=np.float64)), np.atleast_1d(b)) for W, b in layers]
     return rehash({
-        "schema": "certify-certificate/2",
+        "schema": "certify-certificate/3",
         "claim": {"kind": claim},
         "plant": {
             "name": "plant",
@@ -102,6 +103,7 @@ def make(
             "centre": centre,
             "scale": encode(scale),
             "offset": encode(offset),
+            "clip": clip and [encode(end) for end in clip],
             "sha256": "",
         },
         "lyapunov": {"kind": "quadratic", "P": encode(P)},

@@ -151,7 +151,7 @@ def _words(value: Any, most: int) -> list[str]:
     return value
 
 
-UNARY = ("sin", "cos", "tan")
+UNARY = ("sin", "cos", "tan", "tanh", "exp", "atan", "sqrt")
 
 
 def _expression(node: Any, names: set[str]) -> None:
@@ -176,7 +176,7 @@ def _expression(node: Any, names: set[str]) -> None:
 def _shape(data: Any) -> None:
     """Every section, key, count and number."""
     _section(data, "schema", "claim", "plant", "policy", "lyapunov", "levels", "evidence", "provenance")
-    _need(data["schema"] == "certify-certificate/2", "schema")
+    _need(data["schema"] == "certify-certificate/3", "schema")
     _need(isinstance(data["provenance"], dict), "provenance")
     plant, policy, evidence = data["plant"], data["policy"], data["evidence"]
     _section(plant, "name", "states", "inputs", "dynamics", "u_eq", "domain", "input_bounds")
@@ -194,7 +194,7 @@ def _shape(data: Any) -> None:
             lo, hi = _rationals(pair, 2)
             _need(lo < hi, "lo < hi")
 
-    _section(policy, "layers", "squash", "centre", "scale", "offset", "sha256")
+    _section(policy, "layers", "squash", "centre", "scale", "offset", "clip", "sha256")
     squash, centre = policy["squash"], policy["centre"]
     _need(squash in ("tanh", "identity") and centre in ("output", "preactivation", "none"), "squash and centre")
     _need(centre != "preactivation" or squash == "tanh", "preactivation without tanh")
@@ -211,6 +211,9 @@ def _shape(data: Any) -> None:
     _need(width == m, "m outputs")
     _need(np.all(_array(policy["scale"], m) != 0), "nonzero scale")
     _array(policy["offset"], m)
+    if policy["clip"] is not None:
+        _need(isinstance(policy["clip"], list) and len(policy["clip"]) == 2, "clip")
+        _need(np.all(_array(policy["clip"][0], m) < _array(policy["clip"][1], m)), "clip: lo < hi")
 
     _section(data["claim"], "kind")
     _need(data["claim"]["kind"] in tuple(INNER), "claim")
@@ -295,7 +298,10 @@ def _at_equilibrium(node: Any, names: dict[str, Fraction]) -> Fraction | None:
     ):
         return None
     if name in UNARY:
-        return Fraction(int(name == "cos")) if values[0] == 0 else None
+        if name == "sqrt":
+            root = Fraction(math.isqrt(max(values[0].numerator, 0)), math.isqrt(values[0].denominator))
+            return root if values[0] > 0 and root**2 == values[0] else None
+        return Fraction(int(name in ("cos", "exp"))) if values[0] == 0 else None
     if name == "**":
         return None if rest[1] < 0 and values[0] == 0 else values[0] ** rest[1]
     if name == "+":
@@ -327,12 +333,19 @@ def _raw_at_0(policy: Document, n: int) -> list[Fraction | None]:
     return [None if v is None else Fraction(s) * v + Fraction(o) for v, s, o in zip(h, scale, offset, strict=True)]
 
 
+def _limits(policy: Document, m: int) -> list[tuple[Any, Any]]:
+    """Between which each input is kept."""
+    if policy["clip"] is None:
+        return [(-math.inf, math.inf)] * m
+    lo, hi = (_array(end, m).tolist() for end in policy["clip"])
+    return [(Fraction(a), Fraction(b)) for a, b in zip(lo, hi, strict=True)]
+
+
 def policy_hash(policy: Document) -> str:
     text = b"certify-policy/1\0%s\0%s\0" % (policy["squash"].encode(), policy["centre"].encode())
     arrays = [(layer[key], layer["shape"][:axes]) for layer in policy["layers"] for key, axes in _AXES]
-    for name in ("scale", "offset"):
-        raw = base64.b64decode(policy[name])
-        arrays.append((policy[name], [len(raw) // 8]))
+    for numbers in (policy["scale"], policy["offset"], *(policy["clip"] or ())):
+        arrays.append((numbers, [len(base64.b64decode(numbers)) // 8]))
     for encoded, shape in arrays:
         text += b"".join(k.to_bytes(8, "little") for k in (len(shape), *shape)) + base64.b64decode(encoded)
     return hashlib.sha256(text).hexdigest()
@@ -369,9 +382,15 @@ def exact_faults(data: Document) -> dict[str, str]:
         if not all(-1 < (q - Fraction(o)) / Fraction(s) < 1 for s, o, q in pairs):
             faults["centring"] = "u_eq out of reach"
     elif policy["centre"] == "none" and not is_practical(data):
-        reached = _raw_at_0(policy, n)
+        limits = _limits(policy, m)
+        raw = zip(_raw_at_0(policy, n), limits, strict=True)
+        reached = [None if v is None else sorted((lo, v, hi))[1] for v, (lo, hi) in raw]
         if any(v is None or v != q for v, q in zip(reached, u_eq, strict=True)):
             faults["centring"] = "raw(0)"
+    if policy["centre"] != "none" and not all(
+        lo < q < hi for q, (lo, hi) in zip(u_eq, _limits(policy, m), strict=True)
+    ):
+        faults["centring"] = "u_eq against the clip"
     if evidence["kind"] == "partition-tree":
         S = _congruence(_matrix(_array(evidence["T"], n, n)), P)
         if _row_surplus(S) <= 0:
@@ -420,6 +439,7 @@ class Loop:
             for layer in policy["layers"]
         ]
         self.scale, self.offset = (_array(policy[key], self.m) for key in ("scale", "offset"))
+        self.limits = [(float(lo), float(hi)) for lo, hi in _limits(policy, self.m)]
         self.u_eq = _rationals(plant["u_eq"], self.m)
         self.bounds = [_rationals(pair, 2) for pair in plant["input_bounds"]]
         self.P = _array(data["lyapunov"]["P"], self.n, self.n)
@@ -429,6 +449,11 @@ class Loop:
 
     def inputs(self, x: Array) -> Array:
         """pi at x (n, B)."""
+        lo, hi = np.array(self.limits).T[:, :, None]
+        return np.asarray(np.clip(self.before_clip(x), lo, hi))
+
+    def before_clip(self, x: Array) -> Array:
+        """What pi clips, at x (n, B)."""
         h = np.concatenate([x, np.zeros((self.n, 1))], axis=1)
         for k, (W, b) in enumerate(self.layers):
             h = W @ (np.tanh(h) if k else h) + b[:, None]
@@ -487,6 +512,9 @@ class Loop:
                     u.append(scale * (y - at_0) + eq)
                 else:
                     u.append(scale * y + offset)
+                if self.policy["clip"] is not None:
+                    lo, hi = map(arb, self.limits[j])
+                    u[j] = u[j].max(lo).min(hi)
             values = dict(zip(self.names, [*x, *u], strict=True))
             F = [_evaluate(node, values, lambda text: _ball(_rational(text)), None) for node in self.plant["dynamics"]]
             result.append((u, F))
@@ -684,7 +712,8 @@ def bounded_by_form(loop: Loop, j: int) -> bool:
     lo, hi = loop.bounds[j]
     reach, middle = abs(Fraction(loop.scale[j])), Fraction(loop.offset[j])
     form = loop.policy["squash"] == "tanh" and loop.policy["centre"] != "output"
-    return bool(form and lo <= middle - reach and middle + reach <= hi)
+    least, most = loop.limits[j]
+    return bool((form and lo <= middle - reach and middle + reach <= hi) or lo <= least < most <= hi)
 
 
 def _mapped(T: Array, z: Sequence[arb]) -> list[arb]:
@@ -772,6 +801,9 @@ def _local_fault(claim: str, encoded: str) -> tuple[str, str] | None:
         for j, (lo, hi) in enumerate(loop.bounds):
             if not bounded_by_form(loop, j) and any(u[j] < _ball(lo) or u[j] > _ball(hi) for u, _ in values):
                 return "inputs", f"{loop.plant['inputs'][j]} on the local ball"
+        for j, (lo, hi) in enumerate(loop.limits):
+            if math.isfinite(lo) and any(not (u[j] > lo and u[j] < hi) for u, _ in values):
+                return "local", f"{loop.plant['inputs'][j]} is clipped on the local ball"
         TP = [[_ball(v) for v in row] for row in _times(_matrix(T.T), P)]
         G = [[sum((p * f for p, f in zip(row, F, strict=True)), arb(0)) for row in TP] for _, F in values]
         B = [[(G[j][i] - G[n + j][i]) / (2 * step) for j in range(n)] for i in range(n)]

@@ -75,8 +75,10 @@ def expression(codac: Any, tree: Any, values: Mapping[str, Any]) -> Any:
     if operator == "**":
         return codac.pow(expression(codac, rest[0], values), codac.Interval(int(rest[1])))
     arguments = [expression(codac, t, values) for t in rest]
-    if operator in ("sin", "cos", "tan", "tanh", "log"):
+    if operator in ("sin", "cos", "tan", "tanh", "exp", "atan", "sqrt", "log"):
         return getattr(codac, operator)(arguments[0])
+    if operator in ("min", "max"):
+        return getattr(codac, operator)(*arguments)
     result = -arguments[0] if operator == "-" and len(arguments) == 1 else arguments[0]
     for a in arguments[1:]:
         if operator == "+":

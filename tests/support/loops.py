@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from fractions import Fraction
 
 import numpy as np
@@ -31,6 +32,53 @@ def scalar_tanh() -> tuple[System, TanhNetwork]:
         input_bounds=box(1),
     )
     network = TanhNetwork((np.array([[-1.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
+    return system, network
+
+
+def scalar_clip() -> tuple[System, TanhNetwork]:
+    """xdot = x/2 - 2 clip(x, -1/2, 1/2): the origin attracts exactly |x| < 2, and the clip acts for |x| > 1/2."""
+    system, _ = scalar_tanh()
+    x, u = system.states[0], system.inputs[0]
+    ends = np.array([-0.5]), np.array([0.5])
+    network = TanhNetwork((np.array([[1.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none", ends)
+    return dataclasses.replace(system, name="saturated", dynamics=(x / 2 - 2 * u,)), network
+
+
+def tank() -> tuple[System, TanhNetwork]:
+    """xdot = x/9 + u - sqrt(16 + x), u = 4: the origin attracts, and x > -16 leaves it from x = 9 on."""
+    x, u = sympy.symbols("x u")
+    system = System(
+        name="tank",
+        states=(x,),
+        inputs=(u,),
+        parameters={},
+        dynamics=(x / 9 + u - sympy.sqrt(16 + x),),
+        u_eq=(sympy.Integer(4),),
+        domain=box(15),
+        input_bounds=box(5),
+    )
+    network = TanhNetwork((np.zeros((1, 1)),), (np.array([4.0]),), np.ones(1), np.zeros(1), "identity", "none")
+    return system, network
+
+
+def valve() -> tuple[System, TanhNetwork]:
+    """Two states and every function of equations beside sin, cos and tan, at points where they are known exactly."""
+    x, y, u = sympy.symbols("x y u")
+    system = System(
+        name="valve",
+        states=(x, y),
+        inputs=(u,),
+        parameters={},
+        dynamics=(
+            y * sympy.exp(-x / 4) + sympy.tanh(x * y) / 3,
+            u - sympy.sqrt(4 + x + y / 2) - sympy.atan(y) / 2 + x**2 / sympy.sqrt(4 + y) ** 3,
+        ),
+        u_eq=(sympy.Integer(2),),
+        domain=box("3/2", "3/2"),
+        input_bounds=box(9),
+    )
+    gain = np.array([[-1.5, -1.0]])
+    network = TanhNetwork((gain,), (np.zeros(1),), np.full(1, 2.0), np.array([1.0]), "tanh", "preactivation")
     return system, network
 
 

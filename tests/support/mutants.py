@@ -38,7 +38,7 @@ from tests.support.certificates import (
 from tests.support.claim_oracle import EXACT, LARGEST_FILE, Loop, bounded_by_form, exact_faults, local_fault
 
 POLICIES = Path(__file__).parents[2] / "examples" / "policies"
-BASES = ("pendulum", "rotor", "rotor, preactivation", "linear", "local only", "scalar")
+BASES = ("pendulum", "rotor", "rotor, preactivation", "linear", "local only", "scalar", "clipped rotor")
 BY_FORM = ("pendulum", "scalar")  # offset +- scale lies in the input bounds
 NETWORKS = ("pendulum", "rotor", "rotor, preactivation")
 
@@ -116,7 +116,8 @@ def array(data: Document, path: str, change: Callable[[np.ndarray], Any]) -> Doc
 
 def policy_arrays(data: Document) -> list[str]:
     layers = [f"policy.layers.{k}.{part}" for k in range(len(data["policy"]["layers"])) for part in ("weight", "bias")]
-    return [*layers, "policy.scale", "policy.offset"]
+    ends = [] if data["policy"]["clip"] is None else ["policy.clip.0", "policy.clip.1"]
+    return [*layers, "policy.scale", "policy.offset", *ends]
 
 
 def at_index(index: int, value: Callable[[float], float]) -> Callable[[np.ndarray], np.ndarray]:
@@ -308,6 +309,45 @@ def centring() -> Iterator[Mutant]:
             for value in (q - offset, offset - q, (q - offset) / 2, 5e-324):
                 new = rehash(array(data, "policy.scale", lambda a, v=value: 0 * a + v))
                 yield mutant(f"{name}: scale {value}", new, "centring")
+
+
+def clips() -> Iterator[Mutant]:
+    """The clip left out, narrowed, moved and turned round, by somebody who hashes again or does not."""
+    for name in ("clipped", "clipped rotor"):
+        data = base(name)
+        lo, hi = (float(decode(end)[0]) for end in data["policy"]["clip"])
+        u_eq = float(Fraction(data["plant"]["u_eq"][0]))
+        yield mutant(f"{name}: no clip, hash kept", edited(data, "policy.clip", None), "hash")
+        open_bounds = edited(data, "plant.input_bounds", [[str(Fraction(lo)), str(Fraction(hi))]])
+        yield mutant(f"{name}: bounds that only the clip keeps, no clip", clipped(open_bounds, None), "inputs")
+        narrow = [(u_eq + s * (lo - u_eq), u_eq + t * (hi - u_eq)) for s in (1, 0.6, 0.3, 0.01) for t in (1, 0.6, 0.01)]
+        for a, b in narrow[1:]:
+            yield predicted(f"{name}: clip [{a}, {b}]", clipped(data, (a, b)))
+            yield mutant(f"{name}: clip [{a}, {b}], hash kept", unhashed(data, (a, b)), "hash")
+        for a, b in ((u_eq, hi), (lo, u_eq), (u_eq + 2.0**-40, hi), (lo, u_eq - 2.0**-40), (-9e300, lo), (hi, 9e300)):
+            yield mutant(f"{name}: clip [{a}, {b}] without u_eq", clipped(data, (a, b)), "centring")
+        for a, b in (
+            (hi, lo),
+            (lo, lo),
+            (hi, hi),
+            (lo, np.nan),
+            (np.nan, hi),
+            (-np.inf, hi),
+            (lo, np.inf),
+            (0.0, -0.0),
+        ):
+            yield mutant(f"{name}: clip [{a}, {b}]", clipped(data, (a, b)), "format")
+    for name in BASES:
+        if base(name)["policy"]["clip"] is None:
+            yield mutant(f"{name}: clip far out, hash kept", unhashed(base(name), (-1e9, 1e9)), "hash")
+
+
+def unhashed(data: Document, clip: tuple[float, float] | None) -> Document:
+    return edited(data, "policy.clip", clip and [encode([v]) for v in clip])
+
+
+def clipped(data: Document, clip: tuple[float, float] | None) -> Document:
+    return rehash(unhashed(data, clip))
 
 
 # --------------------------------------------------------------------------------------------------- levels, P, T, root
@@ -789,7 +829,9 @@ def structure() -> Iterator[Mutant]:
             yield mutant(
                 f"{name}: {path or 'file'}, unknown key", edited(data, path, unknown) if path else unknown, "format"
             )
-        typed = [p for p in places(data) if p != "policy.sha256" and not p.startswith("provenance")]
+        typed = [
+            p for p in places(data) if p not in ("policy.sha256", "policy.clip") and not p.startswith("provenance")
+        ]
         for path in generator.choice(typed, 25, replace=False):
             value = values[int(generator.integers(len(values)))]
             yield mutant(f"{name}: {path} = {value!r}", edited(data, str(path), value), "format")
@@ -803,7 +845,7 @@ def structure() -> Iterator[Mutant]:
             ("inverted domain", "plant.domain", lambda d: [pair[::-1] for pair in d]),
             ("inverted bounds", "plant.input_bounds", lambda d: [pair[::-1] for pair in d]),
             ("unknown name", "plant.dynamics.0", lambda e: ["+", e, "wind"]),
-            ("unknown operator", "plant.dynamics.0", lambda e: ["exp", e]),
+            ("unknown operator", "plant.dynamics.0", lambda e: ["log", e]),
             ("no operand", "plant.dynamics.0", lambda e: ["+"]),
             ("power 0", "plant.dynamics.0", lambda e: ["**", e, 0]),
             ("power 65", "plant.dynamics.0", lambda e: ["**", e, 65]),
@@ -817,7 +859,7 @@ def structure() -> Iterator[Mutant]:
             ("negative shape", "policy.layers.0.shape", lambda s: [-s[0], s[1]]),
             ("shape of booleans", "policy.layers.0.shape", lambda s: [True, True]),
             ("squash", "policy.squash", lambda s: "relu"), ("centre", "policy.centre", lambda s: "input"),
-            ("schema", "schema", lambda s: "certify-certificate/1"), ("kind", "evidence.kind", lambda s: "trust-me"),
+            ("schema", "schema", lambda s: "certify-certificate/2"), ("kind", "evidence.kind", lambda s: "trust-me"),
             ("zero scale", "policy.scale", lambda s: encode([0.0])),
             ("scale -0", "policy.scale", lambda s: encode([-0.0])),
             ("kind of a solver", "evidence.kind", lambda s: "trusted-solver"),
@@ -984,7 +1026,7 @@ FAMILIES: dict[str, Callable[[], Iterator[Mutant]]] = {
         bits_of_the_policy, hash_of_the_policy, bits_of_the_policy_hashed, policies_rebuilt, centring, level_values,
         claims_too_strong, lyapunov, other_lyapunov_functions, coordinates, skewed_coordinates, other_coordinates,
         root_boxes, trees, coarser_trees, plants, domains, input_bounds, numbers, structure, raw_bytes, sizes, solvers,
-        holes, grown_for_false_claims,
+        holes, grown_for_false_claims, clips,
     )
 }  # fmt: skip
 

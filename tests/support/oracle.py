@@ -58,6 +58,8 @@ def value_of(node: Any, names: Mapping[str, arb]) -> arb:
         return math.prod(values[1:], start=values[0])
     if name == "-":
         return -values[0] if len(values) == 1 else values[0] - values[1]
+    if name in ("min", "max"):
+        return getattr(values[0], name)(values[1])
     return values[0] / values[1] if name == "/" else getattr(values[0], name)()
 
 
@@ -88,6 +90,9 @@ def policies_in_arb(policy: Policy, u_eq: Sequence[Fraction], states: Sequence[S
             result.append([scale * (y - at_0) + eq for y in values])
         else:
             result.append([scale * y + offset for y in values])
+        if policy.clip is not None:
+            lo, hi = (arb(float(end[j])) for end in policy.clip)
+            result[-1] = [u.max(lo).min(hi) for u in result[-1]]
     return [list(u) for u in zip(*result, strict=True)]
 
 

@@ -143,7 +143,7 @@ def decide(backend: Backend, query: Query, precision: float, jobs: int, seconds:
 
 
 def to_smt2(query: Query, expected: str | None) -> str:
-    """The query as SMT-LIB 2 in QF_NRA with sin, cos, tanh and log; `expected` becomes a comment.
+    """The query as SMT-LIB 2 in QF_NRA with functions, min and max; `expected` becomes a comment.
 
     Every number is one of binary64. Where the condition has another, a variable lies between its two neighbours, and a
     comment says what it stands for: "unsat" is about the condition, "sat" only about numbers that close to it.

@@ -56,8 +56,10 @@ def _expression(dreal: Any, tree: Any, values: Mapping[str, Any]) -> Any:
     if name == "**":
         return dreal.pow(_expression(dreal, rest[0], values), int(rest[1]))
     arguments = [_expression(dreal, t, values) for t in rest]
-    if name in ("sin", "cos", "tan", "tanh", "log"):
+    if name in ("sin", "cos", "tan", "tanh", "exp", "atan", "sqrt", "log"):
         return getattr(dreal, name)(arguments[0])
+    if name in ("min", "max"):
+        return getattr(dreal, name.capitalize())(*arguments)
     if name == "-" and len(arguments) == 1:
         return -arguments[0]
     result = arguments[0]

@@ -40,7 +40,17 @@ Monomial = tuple[tuple[str, int], ...]  # atoms with their exponents >= 1, sorte
 Sum = Mapping[Monomial, Fraction]  # without zeros
 _PRIME = 2**127 - 1
 _PRECISION = 200  # bits
-_KNOWN = {"sin": (0, 0), "tan": (0, 0), "tanh": (0, 0), "cos": (0, 1), "log": (1, 0)}  # f(a) = b, exactly
+_KNOWN = {  # f(a) = b, exactly
+    "sin": (0, 0),
+    "tan": (0, 0),
+    "tanh": (0, 0),
+    "cos": (0, 1),
+    "exp": (0, 1),
+    "atan": (0, 0),
+    "sqrt": (1, 1),
+    "log": (1, 0),
+}
+_OF_TWO = ("min", "max")
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,7 +163,10 @@ class _Writer:
             return result
         if operator in _KNOWN and len(parts) == 1:
             return self.function(operator, parts[0])
-        raise InputError(f"{operator!r} is no operator of a query; allowed are + - * / ** sin cos tan tanh log.")
+        if operator in _OF_TWO and len(parts) == 2:
+            return self.extreme(operator, parts[0], parts[1])
+        allowed = " ".join((*_KNOWN, *_OF_TWO))
+        raise InputError(f"{operator!r} is no operator of a query; allowed are + - * / ** {allowed}.")
 
     def product(self, a: Sum, b: Sum) -> Sum:
         """A constant times a sum is distributed as long as binary64 holds the coefficients."""
@@ -203,6 +216,17 @@ class _Writer:
             return {((self.constant((name, frozenset(argument.items())), ball), 1),): Fraction(1)}
         residues = [_hashed(name, r) for r in self.value(argument)]
         atom = self.atom((name, frozenset(argument.items())), lambda: [name, self.write(argument)], residues)
+        return {((atom, 1),): Fraction(1)}
+
+    def extreme(self, name: str, a: Sum, b: Sum) -> Sum:
+        """An atom `min` or `max` of two sums, unless both are constants."""
+        if all(self.fixed(m) for value in (a, b) for m in value):
+            key = (name, frozenset(a.items()), frozenset(b.items()))
+            return {((self.constant(key, getattr(self.ball(a), name)(self.ball(b))), 1),): Fraction(1)}
+        first, second = zip(self.value(a), self.value(b), strict=True)
+        residues = [_hashed(f"{name} {v}", w) for v, w in (first, second)]
+        key = (name, frozenset(a.items()), frozenset(b.items()))
+        atom = self.atom(key, lambda: [name, self.write(a), self.write(b)], residues)
         return {((atom, 1),): Fraction(1)}
 
     def factor(self, value: Sum) -> tuple[Monomial, Fraction]:

@@ -18,8 +18,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.certificate import TrustedSolver
-from certify.claims import Asymptotic, Claim, Condition, OfState, Problem, Vdot, conditions
-from certify.claims.conditions import domain_conditions, input_conditions, local_condition, ring_condition
+from certify.claims import Asymptotic, Claim, Condition, OfInput, Problem, Vdot, conditions
+from certify.claims.conditions import (
+    clip_conditions,
+    domain_conditions,
+    input_conditions,
+    local_condition,
+    ring_condition,
+    root_conditions,
+)
 from certify.claims.queries import query
 from certify.engines.base import Attempt, Budget, Engine, Once, Proof, Task
 from certify.engines.dreal.backend import Answer, Backend, decide, find_backend
@@ -100,7 +107,7 @@ def confirm_with_dreal(
     """Ask dReal for every condition of a claim that was proved otherwise; a witness contradicts that proof."""
     session = _Session(problem, backend, options, floor=0.0 if claim.at_rest else claim.inner)
     for condition in conditions(claim, problem):
-        session.ask(condition, claim.inner if condition.name == "local" else claim.roa)
+        session.ask(condition, condition.guards[-1].level)
     return tuple(session.asked), session.witness
 
 
@@ -144,6 +151,8 @@ class _Session:
             top *= share  # a set that touches the domain is delta-sat; the checker decides it exactly
         inner = min(inner, top)
         # The local query is about Vdot alone, and the ring may add nothing to it.
+        if not self.all_unsat(root_conditions(self.problem, inner)):
+            return inner, None, Stop.SOLVER, "dReal does not confirm that the equations' roots are defined there"
         if not self.all_unsat(input_conditions(self.problem, inner)):
             return inner, None, Stop.INPUTS, "dReal does not confirm their bounds on the local level"
         level, stop, detail = self.ring(inner, top)
@@ -163,7 +172,7 @@ class _Session:
         asked = query(condition, self.problem)
         answer = decide(self.backend, asked, self.options.precision, self.options.jobs, allowed)
         self.asked.append(Asked(condition.name, level, answer))
-        if answer.status == "delta-sat" and not condition.punctured and not isinstance(condition.margin, OfState):
+        if answer.status == "delta-sat" and not condition.punctured and isinstance(condition.margin, Vdot | OfInput):
             self._look(answer, condition)
         return answer.status == "unsat"
 
@@ -179,7 +188,8 @@ class _Session:
             enough = low is not None and self.left() < (1 - _LOCAL_SHARE) * self.options.seconds
             if self.left() <= 0 or enough:
                 break
-            if self.ask(local_condition(level), level):
+            wanted = clip_conditions(self.problem, level)
+            if self.ask(local_condition(level), level) and self.all_unsat(wanted):
                 low = level
                 if level >= target:
                     break
@@ -198,7 +208,8 @@ class _Session:
             if self.left() <= 0:
                 return low, Stop.TIME, ""
             ring = level <= low or self.ask(ring_condition(low, level), level)
-            if ring and self.all_unsat(input_conditions(self.problem, level)):
+            rest = (*root_conditions(self.problem, level), *input_conditions(self.problem, level))
+            if ring and self.all_unsat(rest):
                 low = level
                 if level >= target:
                     return level, Stop.REQUESTED, ""

@@ -13,7 +13,7 @@ from certify.errors import CertificateFormatError
 from certify.lyapunov import extents, is_positive_definite
 from certify.report.figures.geometry import circle, on_level, refine
 from certify.report.sampling import SETTLED, Flow, quadratic, simulate, time_scales
-from certify.report.words import label, words_for
+from certify.report.words import deviation, label, words_for
 
 Array = NDArray[np.float64]
 Leaves = tuple[Array, Array]
@@ -54,7 +54,8 @@ class Scene:
         self.lo, self.hi = self.flow.lo, self.flow.hi
         self.step, self.horizon = time_scales(self.flow)
         units = self.system.units
-        self.labels = [label(s.name, units.get(s.name, "")) for s in self.system.states]
+        points = zip(self.system.states, self.system.exact_x_eq(), strict=True)
+        self.labels = [deviation(s.name, q, units.get(s.name, "")) for s, q in points]
         self.input_labels = [label(s.name, units.get(s.name, "")) for s in self.system.inputs]
         # Another solver's word has no leaves; a partition in z, x = T z, is drawn only if it is small enough.
         evidence = certificate.evidence

@@ -1,0 +1,192 @@
+"""Policy files of other programs on the command line: their options, declared once for all commands that take them."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable
+from fractions import Fraction
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+
+import typer
+
+from certify.commands.arguments import with_params
+from certify.commands.terminal import tell
+from certify.errors import InputError
+
+if TYPE_CHECKING:
+    from certify.policies import Policy
+    from certify.policies.importers import Imported, ImportOptions
+
+_PANEL = "Policies of other programs"
+
+
+def _option(help_: str, *names: str) -> Any:
+    return Annotated[str | None, typer.Option(*names, help=help_, rich_help_panel=_PANEL)]
+
+
+_OPTIONS: dict[str, Any] = {
+    "kind": _option("state-dict, torchscript, onnx, sb3, safetensors or two-stage; auto looks at the file.", "--from"),
+    "states": _option("The plant's states in the order in which the network reads them, as in x,theta."),
+    "prefix": _option("Keys of a state_dict's layers up to their numbers, as in actor.pi_net.fcs."),
+    "activation": _option("Between the layers of a state_dict: tanh."),
+    "squash": _option("After the last layer of a state_dict: identity, tanh or relu-tanh."),
+    "normaliser": _option("File of the observations' normaliser (VecNormalize, rsl_rl), or none."),
+    "epsilon": _option("What rsl_rl's normaliser adds to the standard deviation; 0.01 if nothing is said."),
+    "action_scale": _option("u = scale * action + offset: one number or one for each input."),
+    "action_offset": _option("See --action-scale."),
+    "clip": _option("Bounds LO:HI of the action before scale and offset, one pair or one for each input."),
+    "centre": _option("Make pi(0) = u_eq: output or preactivation; nothing is centred unless this asks for it."),
+    "observes": _option("Whether the network reads absolute states or their deviation from the operating point."),
+}
+
+
+def takes_import_options(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command the options of policy files of other programs; it receives them as `importing`."""
+    hints = get_type_hints(command, localns={"ImportOptions": object}, include_extras=True)
+    own = inspect.signature(command)
+    kept = [p.replace(annotation=hints[name]) for name, p in own.parameters.items() if name != "importing"]
+    kind = inspect.Parameter.KEYWORD_ONLY
+    added = [inspect.Parameter(name, kind, default=None, annotation=option) for name, option in _OPTIONS.items()]
+
+    @functools.wraps(command)
+    def wrapped(**given: Any) -> None:
+        texts = {name: given.pop(name) for name in _OPTIONS}
+        command(**given, importing=_parsed(texts))
+
+    parameters = [*(p.replace(kind=kind) for p in kept), *added]
+    wrapped.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]
+    wrapped.__annotations__ = {p.name: p.annotation for p in parameters}
+    return wrapped
+
+
+def policy_of(path: Path, importing: ImportOptions, system: str | None, params: list[str]) -> Policy:
+    """The policy in a file of this program, or of another one for the plant that `system` names.
+
+    Raises
+    ------
+    InputError : the file cannot be read or imported, or is another program's and `system` is None.
+    """
+    from certify.policies import load_policy
+
+    if _is_own(path, importing):
+        return load_policy(path)
+    imported = imported_policy(path, importing, system, params)
+    for line in lines(imported):
+        tell(line)
+    return imported.policy
+
+
+def imported_policy(path: Path, importing: ImportOptions, system: str | None, params: list[str]) -> Imported:
+    """The policy in a file of another program, for the plant that `system` names."""
+    from certify.policies.importers import import_policy
+    from certify.systems import chosen_system
+
+    if system is None:
+        raise InputError(
+            f"policy file {path} is another program's and does not say what it controls: name the plant with --system."
+        )
+    return import_policy(path, with_params(chosen_system(system), params), importing)
+
+
+def lines(imported: Imported) -> list[str]:
+    """What an import found, for people."""
+    found, difference = imported, imported.difference
+    policy = found.policy
+    origin, target = _row(found.at_origin), _row(found.u_eq)
+    said = [
+        f"read     {found.words}; sha256 {policy.training['imported']['sha256']}",
+        f"policy   {found.formula}; o = ({policy.training['imported']['states']})",
+        f"compared with the framework's own evaluation at {difference.states:,} states: largest difference "
+        f"{difference.largest:.3g} (its rounding explains up to {difference.explained:.3g} there), "
+        f"{difference.in_double:.3g} where it works in double precision",
+        f"pi(0)    {origin}; u_eq {target}",
+        f"centring {_centring(found)}",
+    ]
+    if policy.valid is not None:
+        said.append(f"valid    where no observation is clipped: {_box(found)}")
+    said.append(
+        "proved   is the folded policy: it differs from the file's real-number policy by the rounding of folded "
+        "numbers, half a unit in the last place of each at most"
+    )
+    return said
+
+
+def _centring(found: Imported) -> str:
+    centre = found.policy.network.centre
+    if found.policy.beta is not None:
+        return "the file's own, inside the squash"
+    changes = [f"{name} changes u by up to {value:.3g}" for name, value in found.centring.items()]
+    if centre != "none":
+        return f"{centre}, as asked for, which changes u by up to {found.centring[centre]:.3g}"
+    return f"none; {', '.join(f'--centre {c}' for c in changes) or 'u_eq is out of reach of any'}"
+
+
+def _box(found: Imported) -> str:
+    states, valid = found.policy.training["imported"]["plant_states"], found.policy.valid
+    pairs = zip(states, valid if valid is not None else (), strict=True)
+    return ", ".join(f"{name} in [{lo:.6g}, {hi:.6g}]" for name, (lo, hi) in pairs)
+
+
+def _row(values: Any) -> str:
+    return ", ".join(f"{v:.9g}" for v in values)
+
+
+def _is_own(path: Path, importing: ImportOptions) -> bool:
+    """Whether a file is to be read as this program's own: also one that nobody can read, whose reader says why."""
+    from certify.policies.importers import content_of, read_bytes
+
+    raw = read_bytes(path)
+    try:
+        content = content_of(raw, path.name)
+    except InputError:
+        if importing.given:
+            raise
+        return True
+    if content == "policy" and importing.given:
+        raise InputError(
+            f"{', '.join(importing.given)} must be left out: {path} is a policy file of this program and says all."
+        )
+    foreign_pickle = content is None and raw[:1] == b"\x80"
+    return content == "policy" or (content is None and not importing.given and not foreign_pickle)
+
+
+def _parsed(texts: dict[str, str | None]) -> ImportOptions:
+    from certify.policies.importers import ImportOptions
+    from certify.systems import exact
+
+    def rationals(name: str, option: str) -> tuple[Fraction, ...] | None:
+        text = texts[name]
+        return None if text is None else tuple(exact(part.strip(), option) for part in text.split(","))
+
+    states, normaliser, epsilon = texts["states"], texts["normaliser"], rationals("epsilon", "--epsilon")
+    if epsilon is not None and len(epsilon) != 1:
+        raise InputError(f"--epsilon takes one number; found {texts['epsilon']!r}.")
+    return ImportOptions(
+        kind=texts["kind"] or "auto",  # type: ignore[arg-type]
+        prefix=texts["prefix"],
+        activation=texts["activation"],
+        squash=texts["squash"],  # type: ignore[arg-type]
+        states=None if states is None else tuple(name.strip() for name in states.split(",")),
+        normaliser=None if normaliser is None else "none" if normaliser == "none" else Path(normaliser),
+        epsilon=None if epsilon is None else epsilon[0],
+        action_scale=rationals("action_scale", "--action-scale"),
+        action_offset=rationals("action_offset", "--action-offset"),
+        clip=_clip(texts["clip"]),
+        centre=texts["centre"],  # type: ignore[arg-type]
+        observes=texts["observes"],  # type: ignore[arg-type]
+    )
+
+
+def _clip(text: str | None) -> Any:
+    from certify.policies.importers import Clip
+    from certify.systems import exact
+
+    if text is None:
+        return None
+    pairs = [part.split(":") for part in text.split(",")]
+    if any(len(pair) != 2 for pair in pairs):
+        raise InputError(f"--clip takes LO:HI, or LO:HI,LO:HI with a pair for each input; found {text!r}.")
+    lo, hi = ([exact(pair[k].strip(), "--clip") for pair in pairs] for k in (0, 1))
+    return Clip(tuple(lo), tuple(hi))

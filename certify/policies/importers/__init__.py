@@ -1,0 +1,9 @@
+"""Policies of other programs: read without executing anything, folded exactly, compared with the framework."""
+
+from __future__ import annotations
+
+from certify.policies.importers.importing import Imported, content_of, import_policy, read_bytes
+from certify.policies.importers.options import ImportOptions
+from certify.policies.importers.steps import Clip
+
+__all__ = ["Clip", "ImportOptions", "Imported", "content_of", "import_policy", "read_bytes"]

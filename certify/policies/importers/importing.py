@@ -1,0 +1,410 @@
+"""A policy file of another program as a policy of this one: read, ask for what is missing, fold, compare, and say so.
+
+The bytes decide what a file is; nothing in it is executed. What is proved afterwards is the folded policy: it differs
+from the file's real-number policy by the rounding of each folded number, half a unit in the last place at most.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from certify.errors import InputError
+from certify.policies.exact import require_centred
+from certify.policies.file import Policy
+from certify.policies.importers.archives import MAX_BYTES, Archive
+from certify.policies.importers.comparing import SAMPLES, Difference, apply, compare, rounding, rounding_centred
+from certify.policies.importers.folding import Bounds, Folded, fold
+from certify.policies.importers.normalisers import load_normaliser
+from certify.policies.importers.onnx_graph import read_onnx
+from certify.policies.importers.options import ImportOptions
+from certify.policies.importers.reading import Reading
+from certify.policies.importers.sb3 import read_sb3
+from certify.policies.importers.state_dict import is_two_stage, read_state_dict, read_two_stage
+from certify.policies.importers.steps import Clip, Diagonal, Normalise, Step, Tanh, spread
+from certify.policies.importers.tensors import load_safetensors, load_tensors
+from certify.policies.importers.torchfile import TorchFile
+from certify.policies.importers.torchscript import is_torchscript, read_torchscript
+from certify.policies.network import Array, Centre, TanhNetwork
+
+if TYPE_CHECKING:
+    from certify.systems import System
+
+Content = Literal["state-dict", "torchscript", "onnx", "sb3", "safetensors", "two-stage", "policy"]
+_OWN = "certify-policy/"
+_ONE, _ZERO = (Fraction(1),), (Fraction(0),)
+
+
+@dataclass(frozen=True, slots=True)
+class Imported:
+    """A policy with what its import found.
+
+    Parameters
+    ----------
+    policy : the policy, with the record of its origin in `training`.
+    words : the kind of file and of policy.
+    formula : what the file's policy is, for people.
+    difference : how far it is from the framework's own evaluation.
+    at_origin : pi(0), shape (m,).
+    u_eq : the plant's equilibrium input, shape (m,).
+    centring : for each centring that is possible the largest change of u over the states compared.
+    """
+
+    policy: Policy
+    words: str
+    formula: str
+    difference: Difference
+    at_origin: Array
+    u_eq: Array
+    centring: Mapping[Centre, float]
+
+
+def content_of(raw: bytes, name: str) -> Content | None:
+    """What a file is by its bytes and, for ONNX, by its name; None if it is nothing that is read here."""
+    if raw.startswith(b"PK"):
+        archive = Archive(raw, name)
+        if "policy.pth" in archive and "data" in archive:
+            return "sb3"
+        file = TorchFile(raw, name, archive)
+        if is_torchscript(file):
+            return "torchscript"
+        root = file.pickle("data.pkl")
+        said = root.get("format") if isinstance(root, dict) else None
+        if isinstance(said, str) and said.startswith(_OWN):
+            return "policy"
+        return "two-stage" if is_two_stage(load_tensors(raw, name, file)) else "state-dict"
+    if name.endswith(".onnx"):
+        return "onnx"
+    if name.endswith(".safetensors") or raw[8:9] == b"{":
+        return "safetensors"
+    return None
+
+
+def import_policy(path: Path, plant: System, options: ImportOptions | None = None) -> Imported:
+    """Read a policy of another program for a plant.
+
+    Parameters
+    ----------
+    path : the file.
+    plant : the plant that it controls: its states, inputs, domain and u_eq.
+    options : what the file cannot say.
+
+    Raises
+    ------
+    InputError : the file is of no kind that is read, does not say enough and the options do not either, holds what is
+        not proved, or differs from the framework's own evaluation by more than rounding.
+    """
+    options = options if options is not None else ImportOptions()
+    raw = read_bytes(path)
+    try:
+        return _import(raw, path.name, plant, options)
+    except InputError as error:
+        raise InputError(f"policy file {path}: {error}") from error
+
+
+def read_bytes(path: Path) -> bytes:
+    """The bytes of a policy file.
+
+    Raises
+    ------
+    InputError : it cannot be read, or is larger than any policy.
+    """
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise InputError(f"policy file {path} must have at most {MAX_BYTES >> 20} MiB; it has more.")
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"policy file {path} cannot be read: {error.strerror}.") from error
+
+
+def _import(raw: bytes, name: str, plant: System, options: ImportOptions) -> Imported:
+    kind = _kind(raw, name, options)
+    n = plant.n if options.states is None else len(options.states)
+    reading = _read(kind, raw, name, options, n, plant.m)
+    _require_answers(kind, reading, options, plant)
+    states = options.states if options.states is not None else tuple(s.name for s in plant.states)
+    index = _index(states, plant)
+    if (reading.n, reading.m) != (len(states), plant.m):
+        raise InputError(
+            f"the policy must read the {len(states)} states {', '.join(states)} and command the {plant.m} inputs of "
+            f"{plant.name}; it reads {reading.n} and commands {reading.m}. Name what it reads with --states."
+        )
+    record: dict[str, Any] = {
+        "file": name,
+        "sha256": hashlib.sha256(raw).hexdigest(),
+        "kind": kind,
+        "policy": reading.words,
+        "states": ", ".join(states),
+        "plant_states": [s.name for s in plant.states],
+        "options": options.given,
+    }
+    x_eq = [plant.exact_x_eq()[i] for i in index]
+    shift = _shift(x_eq, options)
+    normaliser = _normaliser(reading, options, len(states))
+    if isinstance(options.normaliser, Path):
+        record["normaliser_sha256"] = hashlib.sha256(read_bytes(options.normaliser)).hexdigest()
+    before = (*shift, *normaliser)
+    _require_equilibrium(reading, x_eq if shift else [Fraction(0)] * len(states))
+    after = _action(options, plant.m)
+    steps = (*before, *reading.steps, *after)
+    folded = fold(steps, len(states))
+    network, valid = _network(folded, index, plant.n, reading, options)
+    u_eq = plant.exact_u_eq()
+    if network.centre != "none":
+        require_centred(network, u_eq)
+    # It refuses another plant's beta, before the comparison does with less to say.
+    Policy(network, plant.name, beta=reading.beta, valid=valid).beta_shift(u_eq)
+    x = _sample(plant, valid)
+    bare = network if reading.beta is not None else replace(network, centre="none")
+    values = bare(x, u_eq)
+    difference = _compare(reading, before, after, x, index, values)
+    record["largest_difference"] = difference.largest
+    return Imported(
+        policy=Policy(network, plant.name, _parameters(plant), {"imported": record}, reading.beta, valid),
+        words=reading.words,
+        formula=_formula(normaliser, network, folded, reading),
+        difference=difference,
+        at_origin=np.asarray(bare(np.zeros(plant.n), u_eq)),
+        u_eq=np.array([float(u) for u in u_eq]),
+        centring={} if reading.beta is not None else _centrings(bare, u_eq, x, values),
+    )
+
+
+def _kind(raw: bytes, name: str, options: ImportOptions) -> Content:
+    kind = options.kind if options.kind in ("onnx", "safetensors") else content_of(raw, name)
+    if kind is None:
+        pickled = raw[:1] in (b"\x80", b"(")
+        found = "a bare pickle, or torch's format of before version 1.6" if pickled else "none of these"
+        raise InputError(
+            "it must be a file of torch.save, TorchScript, stable-baselines3, ONNX or safetensors; "
+            f"it is {found}. If you trust it, load it and write it again with torch.save."
+        )
+    if kind == "policy":
+        raise InputError("it is a policy file of this program already: use it with certify roa --policy.")
+    if options.kind not in ("auto", kind) and (options.kind, kind) != ("state-dict", "two-stage"):
+        raise InputError(f"it must be what --from says, {options.kind}; it is {kind}.")
+    return kind if options.kind == "auto" else options.kind
+
+
+def _read(kind: Content, raw: bytes, name: str, options: ImportOptions, n: int, m: int) -> Reading:
+    readers: dict[Content, Callable[[], Reading]] = {
+        "sb3": lambda: read_sb3(Archive(raw, name), name),
+        "torchscript": lambda: read_torchscript(TorchFile(raw, name)),
+        "onnx": lambda: read_onnx(raw, name),
+        "safetensors": lambda: read_state_dict(load_safetensors(raw, name), options, n, m),
+        "two-stage": lambda: read_two_stage(load_tensors(raw, name), options),
+        "state-dict": lambda: read_state_dict(load_tensors(raw, name), options, n, m),
+    }
+    return readers[kind]()
+
+
+def _require_answers(kind: Content, reading: Reading, options: ImportOptions, plant: System) -> None:
+    """Ask for everything that the file cannot say, in one sentence."""
+    wanted = []
+    order = ",".join(s.name for s in plant.states)
+    layers_only = kind in ("state-dict", "safetensors")
+    if options.states is None and plant.n > 1:
+        wanted.append(f"--states {order} (what the network reads, in its order)")
+    if options.activation is None and layers_only:
+        wanted.append("--activation tanh (between the layers)")
+    if options.squash is None and (layers_only or kind == "two-stage"):
+        wanted.append("--squash identity, tanh or relu-tanh (after the last layer)")
+    if options.normaliser is None and reading.normaliser is None and kind != "two-stage":
+        wanted.append("--normaliser FILE or none (what was done to observations)")
+    if options.action_scale is None and reading.action != plant.input_bounds:
+        wanted.append("--action-scale (u = scale * action + offset in the plant's units: 1 if they are the same)")
+    if options.observes is None and any(plant.exact_x_eq()):
+        wanted.append(f"--observes absolute or deviation (the operating point of {plant.name} is not 0)")
+    if wanted:
+        raise InputError(f"the file does not say all that its policy is; nothing is guessed. Give {'; '.join(wanted)}.")
+    for option, value, belongs in (
+        ("--activation", options.activation, layers_only),
+        ("--squash", options.squash, layers_only or kind == "two-stage"),
+        ("--prefix", options.prefix, layers_only),
+        ("--normaliser", options.normaliser, kind != "two-stage"),
+        ("--centre", options.centre, kind != "two-stage" or options.centre == "preactivation"),
+    ):
+        if value is not None and not belongs:
+            raise InputError(f"{option} must be left out: a file of {kind} says it itself.")
+
+
+def _index(states: tuple[str, ...], plant: System) -> list[int]:
+    """The plant's state for each number that the network reads."""
+    known = [s.name for s in plant.states]
+    for name in states:
+        if name not in known:
+            raise InputError(
+                f"the network must read states of {plant.name}, {', '.join(known)}; --states names {name!r}. "
+                "An observation that is a function of states, such as the cosine of an angle, is not proved."
+            )
+    return [known.index(name) for name in states]
+
+
+def _shift(x_eq: list[Fraction], options: ImportOptions) -> tuple[Step, ...]:
+    """From deviations, which policies here read, to the states' values, if that is what the network reads."""
+    return (Diagonal(_ONE, tuple(x_eq)),) if options.observes == "absolute" and any(x_eq) else ()
+
+
+def _require_equilibrium(reading: Reading, x_eq: list[Fraction]) -> None:
+    """Refuse a policy that is centred at another point than the plant's."""
+    if reading.equilibrium is None:
+        return
+    wanted = np.array([float(v) for v in x_eq])
+    if np.any(np.float32(wanted) != np.float32(reading.equilibrium)):
+        raise InputError(
+            f"a two-stage policy must be centred at the plant's operating point, {wanted.tolist()} as it observes it; "
+            f"its x_equilibrium is {reading.equilibrium.tolist()}."
+        )
+
+
+def _normaliser(reading: Reading, options: ImportOptions, n: int) -> tuple[Step, ...]:
+    if options.normaliser is None:
+        found: Normalise | Diagonal | None = reading.normaliser
+    elif reading.normaliser is not None:
+        raise InputError("--normaliser must be left out: the file holds the normaliser of its policy.")
+    elif options.normaliser == "none":
+        found = None
+    else:
+        found = load_normaliser(options.normaliser, options.epsilon)
+    if found is None:
+        if options.epsilon is not None:
+            raise InputError("--epsilon must go with a normaliser of rsl_rl; there is none.")
+        return ()
+    spread(found.mean if isinstance(found, Normalise) else found.offset, n)
+    return (found,)
+
+
+def _action(options: ImportOptions, m: int) -> tuple[Step, ...]:
+    """What becomes of the network's action on its way to the plant."""
+    scale = spread(options.action_scale or _ONE, m)
+    offset = spread(options.action_offset or _ZERO, m)
+    steps: list[Step] = []
+    if options.clip is not None:
+        steps.append(Clip(spread(options.clip.lo, m), spread(options.clip.hi, m)))
+    if any(v != 1 for v in scale) or any(offset):
+        steps.append(Diagonal(scale, offset))
+    return tuple(steps)
+
+
+def _network(
+    folded: Folded, index: list[int], n: int, reading: Reading, options: ImportOptions
+) -> tuple[TanhNetwork, Array | None]:
+    """The network over the plant's states, and the states where no observation is clipped, (n, 2), rounded inwards."""
+    first = np.zeros((len(folded.weights[0]), n))
+    first[:, index] = folded.weights[0]
+    centre: Centre = "preactivation" if reading.beta is not None else options.centre or "none"
+    network = TanhNetwork(
+        (first, *folded.weights[1:]), folded.biases, folded.scale, folded.offset, folded.squash, centre, folded.clip
+    )
+    valid = np.tile([-math.inf, math.inf], (n, 1))
+    for k, bounds in zip(index, folded.inactive, strict=True):
+        valid[k] = _inwards(bounds)
+    return network, None if np.all(np.isinf(valid)) else valid
+
+
+def _inwards(bounds: Bounds) -> tuple[float, float]:
+    largest = Fraction(sys.float_info.max)
+    lo, hi = (None if v is not None and abs(v) > largest else v for v in bounds)
+    if (lo, hi) != bounds:
+        raise InputError("what a normaliser clips to must lie in the range of binary64.")
+    low, high = -math.inf if lo is None else float(lo), math.inf if hi is None else float(hi)
+    if lo is not None and Fraction(low) < lo:
+        low = math.nextafter(low, math.inf)
+    if hi is not None and Fraction(high) > hi:
+        high = math.nextafter(high, -math.inf)
+    return low, high
+
+
+def _parameters(plant: System) -> dict[str, str]:
+    return {name: str(value) for name, value in plant.parameters.items()}
+
+
+def _sample(plant: System, valid: Array | None) -> Array:
+    """States in the domain where no observation is clipped, as numbers of single precision, (k, n)."""
+    box = np.array([[float(lo), float(hi)] for lo, hi in plant.domain])
+    if valid is not None:
+        box = np.stack([np.maximum(box[:, 0], valid[:, 0]), np.minimum(box[:, 1], valid[:, 1])], axis=1)
+        empty = np.flatnonzero(~(box[:, 0] < box[:, 1]))
+        if empty.size:
+            state, (lo, hi) = plant.states[empty[0]], valid[empty[0]]
+            raise InputError(
+                f"the domain of {state} must have a part where its observation is not clipped, [{lo:.6g}, {hi:.6g}]; "
+                "it has none."
+            )
+    lo, hi = box.T
+    # Single precision must not round a state out of the box, where a clip begins to act.
+    margin = 1e-6 * np.maximum(hi - lo, np.maximum(np.abs(lo), np.abs(hi)))
+    inner = np.where(2 * margin < hi - lo, margin, 0)
+    x = np.random.default_rng(0).uniform(lo + inner, hi - inner, (SAMPLES, plant.n))
+    return x.astype(np.float32).astype(np.float64)
+
+
+def _compare(
+    reading: Reading, before: tuple[Step, ...], after: tuple[Step, ...], x: Array, index: list[int], ours: Array
+) -> Difference:
+    """Compare with the framework in the file's precision, and with the same operations in double precision.
+
+    The first is what its users see; its rounding could hide a small mistake, which the second shows.
+    """
+    observed = x[:, index]
+    single, double = (_against(reading, before, after, observed, ours, twice) for twice in (reading.double, True))
+    return Difference(single.states, single.largest, single.explained, double.largest)
+
+
+def _against(
+    reading: Reading, before: tuple[Step, ...], after: tuple[Step, ...], observed: Array, ours: Array, double: bool
+) -> Difference:
+    given = apply(before, observed)
+    given = given if double else given.astype(np.float32)
+    try:
+        theirs = apply(after, np.asarray(reading.evaluate(given, double), dtype=np.float64))
+    except (RuntimeError, ValueError, TypeError, LookupError, AttributeError) as error:
+        raise InputError(f"the framework cannot evaluate the policy itself: {error}.") from error
+    if reading.beta is None:
+        return compare(ours, theirs, rounding((*before, *reading.steps, *after), observed, double))
+    end = max(k for k, step in enumerate(reading.steps) if isinstance(step, Tanh))
+    head, tail = (*before, *reading.steps[:end]), (*reading.steps[end:], *after)
+    return compare(ours, theirs, rounding_centred(head, tail, observed, reading.beta, double))
+
+
+def _centrings(bare: TanhNetwork, u_eq: tuple[Fraction, ...], x: Array, values: Array) -> dict[Centre, float]:
+    """How much each centring would change u, at most, over the states."""
+    changes: dict[Centre, float] = {}
+    centres: tuple[Centre, ...] = ("output", "preactivation")
+    for centre in centres:
+        try:
+            moved = replace(bare, centre=centre)(x, u_eq)
+        except InputError:
+            continue  # u_eq outside of the squash's range, or no squash to centre in
+        changes[centre] = float(np.max(np.abs(moved - values)))
+    return changes
+
+
+def _formula(normaliser: tuple[Step, ...], network: TanhNetwork, folded: Folded, reading: Reading) -> str:
+    """The file's policy in the plant's units."""
+    observation = "o"
+    if normaliser:
+        divisor = "sqrt(var + epsilon)" if isinstance(normaliser[0], Normalise) else "(std + epsilon)"
+        observation = f"(o - mean) / {divisor}"
+    net = f"net({observation})"
+    if reading.beta is not None:
+        net = "net(x) - net(x_eq) + beta"
+    inner = f"tanh({net})" if network.squash == "tanh" else net
+    scaled = inner if np.all(folded.scale == 1) else f"{_short(folded.scale)} * {inner}"
+    scaled = scaled if not np.any(folded.offset) else f"{scaled} + {_short(folded.offset)}"
+    if folded.clip is None:
+        return f"u = {scaled}"
+    return f"u = clip({scaled}, {_short(folded.clip[0])}, {_short(folded.clip[1])})"
+
+
+def _short(values: Any) -> str:
+    distinct = [f"{v:.6g}" for v in values]
+    return distinct[0] if len(set(distinct)) == 1 else f"[{', '.join(distinct)}]"

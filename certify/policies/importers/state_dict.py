@@ -1,0 +1,171 @@
+"""Multilayer perceptrons in a state_dict: `PREFIX.N.weight` and `PREFIX.N.bias`, whatever the prefix.
+
+A state_dict holds numbers and no functions. Which activation stands between the layers, what follows the last one, and
+what was done to observations and actions is not in it: each is asked for by the name of its option.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from fractions import Fraction
+
+import numpy as np
+
+from certify.errors import InputError
+from certify.policies.importers.arrays import Numbers
+from certify.policies.importers.normalisers import rsl_normaliser
+from certify.policies.importers.options import ImportOptions, Output
+from certify.policies.importers.reading import Observations, Reading, Values, between, perceptron, widths
+from certify.policies.importers.steps import Affine, Clip, Step, Tanh, linear
+
+_KEY = re.compile(r"(?:(?P<prefix>.*)\.)?(?P<number>[0-9]{1,4})\.(?P<rest>.*)", re.DOTALL)
+_PARTS = ("controller.x_equilibrium", "controller.layers.0.weight", "controller.b")
+_OTHERS = ("critic", "value", "vf", "v_net", "q_net", "qf", "q1", "q2", "lyapunov", "target")
+_ENDS: dict[Output, tuple[Step, ...]] = {
+    "identity": (),
+    "tanh": (Tanh(),),
+    "relu-tanh": (Tanh(), Clip((Fraction(0),), (None,))),
+}
+Layers = list[Affine]
+
+
+def is_two_stage(tensors: Mapping[str, Numbers]) -> bool:
+    """Whether a file holds the policy of a two-stage checkpoint: its layers, and what it is centred at."""
+    return _root(tensors) is not None
+
+
+def read_two_stage(tensors: Mapping[str, Numbers], options: ImportOptions) -> Reading:
+    """`u = scale * squash(net(x) - net(x_eq) + b)`, centred inside the squash, as the two-stage method writes it.
+
+    Raises
+    ------
+    InputError : a tensor is missing or has another shape.
+    """
+    root = _root(tensors)
+    if root is None:
+        raise InputError(f"a two-stage file must hold {', '.join(_PARTS)} under one prefix; this one does not.")
+    layers = _layers(tensors, f"{root}controller.layers")
+    squash: Output = "tanh" if options.squash is None else options.squash
+    if squash == "identity":
+        raise InputError("a two-stage policy is squashed: --squash must be tanh or relu-tanh; found identity.")
+    x_eq = np.asarray(tensors[f"{root}controller.x_equilibrium"]).reshape(-1)
+    b = np.asarray(tensors[f"{root}controller.b"]).reshape(-1)
+    if x_eq.shape != layers[0].weight.shape[1:] or b.shape != layers[-1].bias.shape:
+        raise InputError(
+            "controller.x_equilibrium and controller.b must have a number for each state and input; "
+            f"found {x_eq.shape} and {b.shape}."
+        )
+
+    net, relu = perceptron(layers), squash == "relu-tanh"
+
+    def evaluate(x: Observations, double: bool) -> Values:
+        squashed: Values = np.tanh(net(x, double) - net(x_eq[None], double) + b)
+        return np.maximum(squashed, 0) if relu else squashed
+
+    return Reading(
+        words=f"two-stage {widths(layers)}, centred inside the squash",
+        steps=(*between(layers), *_ENDS[squash]),
+        evaluate=evaluate,
+        beta=b.astype(np.float64),
+        equilibrium=x_eq.astype(np.float64),
+    )
+
+
+def read_state_dict(tensors: Mapping[str, Numbers], options: ImportOptions, n: int, m: int) -> Reading:
+    """The perceptron from n observations to m actions among the tensors of a file.
+
+    Raises
+    ------
+    InputError : there is none, there are several and `--prefix` does not say which, or a layer is of a kind that is
+        not proved.
+    """
+    prefix = options.prefix if options.prefix is not None else _only(tensors, n, m)
+    layers = _layers(tensors, prefix)
+    if (layers[0].weight.shape[1], layers[-1].weight.shape[0]) != (n, m):
+        raise InputError(
+            f"the policy must read {n} states and command {m} inputs; {prefix} is {widths(layers)}. "
+            "Name the states that it reads with --states."
+        )
+    names = [f"{_dot(prefix)}{k}.weight" for k in _numbers(tensors, prefix)]
+    double = any(tensors[name].dtype == np.float64 for name in names)
+    squash: Output = "identity" if options.squash is None else options.squash
+    return Reading(
+        words=f"state_dict {prefix} {widths(layers)}",
+        steps=(*between(layers), *_ENDS[squash]),
+        evaluate=perceptron(layers, squash),
+        normaliser=rsl_normaliser(tensors, options.epsilon),
+        double=double,
+    )
+
+
+def _groups(tensors: Mapping[str, Numbers]) -> list[str]:
+    """Prefixes under which numbered layers lie, in the file's order."""
+    found = {}
+    for name in tensors:
+        match = _KEY.fullmatch(name)
+        if match is not None and match["rest"] == "weight":
+            found[match["prefix"] or ""] = True
+    return list(found)
+
+
+def _only(tensors: Mapping[str, Numbers], n: int, m: int) -> str:
+    """The one prefix whose layers lead from n to m and that no name calls a critic."""
+    described = []
+    fitting = []
+    for prefix in _groups(tensors):
+        numbers = _numbers(tensors, prefix)
+        first, last = tensors[f"{_dot(prefix)}{numbers[0]}.weight"], tensors[f"{_dot(prefix)}{numbers[-1]}.weight"]
+        described.append(f"{prefix or 'no prefix'}: {first.shape[-1]} to {last.shape[0] if last.ndim else 0}")
+        other = any(part.startswith(_OTHERS) for part in prefix.split("."))
+        if first.shape[-1:] == (n,) and last.shape[:1] == (m,) and not other:
+            fitting.append(prefix)
+    if len(fitting) == 1:
+        return fitting[0]
+    listed = "; ".join(described) or "none (layers must be called PREFIX.NUMBER.weight and PREFIX.NUMBER.bias)"
+    raise InputError(
+        f"a file must hold one policy from {n} states to {m} inputs; it holds {len(fitting)}. "
+        f"Name its keys up to their numbers with --prefix, and its states with --states. Found {listed}."
+    )
+
+
+def _layers(tensors: Mapping[str, Numbers], prefix: str) -> Layers:
+    root, layers = _dot(prefix), []
+    for k in _numbers(tensors, prefix):
+        weight, bias = tensors[f"{root}{k}.weight"], tensors.get(f"{root}{k}.bias")
+        if weight.ndim != 2 or weight.dtype.kind != "f":
+            raise InputError(
+                f"layer {root}{k} must be affine, with a weight (out, in) of floating-point numbers; its weight has "
+                f"shape {weight.shape} (a normalisation layer has such a one, and is not proved)."
+            )
+        layers.append(linear(weight, bias))
+    return layers
+
+
+def _numbers(tensors: Mapping[str, Numbers], prefix: str) -> list[int]:
+    """The numbers of the layers under a prefix; whatever else lies under such a number is refused."""
+    root, numbers = _dot(prefix), set()
+    for name in tensors:
+        match = _KEY.fullmatch(name)
+        if match is None or (match["prefix"] or "") != prefix:
+            continue
+        if match["rest"] not in ("weight", "bias"):
+            raise InputError(
+                f"the layers of a policy must be affine, with weight and bias; {name} belongs to one of another kind."
+            )
+        numbers.add(int(match["number"]))
+    if not numbers or any(f"{root}{k}.weight" not in tensors for k in numbers):
+        raise InputError(f"there must be layers {root}0.weight and so on; found {', '.join(list(tensors)[:12])}.")
+    return sorted(numbers)
+
+
+def _root(tensors: Mapping[str, Numbers]) -> str | None:
+    """What stands before the names of a two-stage policy, where that is one thing for all of them."""
+    roots = [key.removesuffix(_PARTS[0]) for key in tensors if key.endswith(_PARTS[0])]
+    if len(roots) != 1 or not all(roots[0] + part in tensors for part in _PARTS):
+        return None
+    return roots[0]
+
+
+def _dot(prefix: str) -> str:
+    return f"{prefix}." if prefix else ""

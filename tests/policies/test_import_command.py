@@ -1,0 +1,169 @@
+"""`certify import`, and `certify roa --policy` with the file of another program."""
+
+from __future__ import annotations
+
+import json
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from certify.cli import _run
+from certify.policies import Policy, TanhNetwork, load_policy, save_policy
+from tests.support.foreign import mlp, sb3
+
+PLANT = """
+name = "chain"
+states = ["x0", "x1"]
+inputs = ["u"]
+[parameters]
+k = 2
+[dynamics]
+x0 = "x1"
+x1 = "-k*x0 - k*x1 + u/100"
+[u_eq]
+u = "0"
+[domain]
+x0 = [-50, 5]
+x1 = [-5, 5]
+[input_bounds]
+u = [-6, 6]
+"""
+SAID = (
+    "--states",
+    "x0,x1",
+    "--activation",
+    "tanh",
+    "--squash",
+    "identity",
+    "--normaliser",
+    "none",
+    "--action-scale",
+    "1",
+)
+Run = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Run:
+    monkeypatch.chdir(tmp_path)
+    Path("plant.toml").write_text(PLANT)
+    torch.save(mlp().state_dict(), "weights.pt")
+
+    def command(*arguments: Any) -> tuple[int, str, str]:
+        given = [str(a) for a in arguments]
+        status = _run(given, "--json" in given)
+        out, err = capsys.readouterr()
+        assert "Traceback" not in out + err
+        return status, out, err
+
+    return command
+
+
+def test_import_says_what_it_found_and_writes_a_policy(run: Run) -> None:
+    status, out, _ = run("import", "weights.pt", "--out", "p.pt", "--system", "plant.toml", *SAID)
+    assert status == 0
+    for words in (
+        "state_dict",
+        "10,000 states",
+        "pi(0)",
+        "u_eq 0",
+        "--centre output changes u by up to",
+        "p.pt",
+        "(x0, x1)",
+    ):
+        assert words in out
+    assert load_policy("p.pt").network.layers == (2, 7, 5, 1)
+
+
+def test_import_as_json(run: Run) -> None:
+    clip, centre = ("--clip", "-1:2"), ("--centre", "output", "--action-offset", "1/3", "--param", "k=3")
+    status, out, _ = run(
+        "import", "weights.pt", "--out", "p.pt", "--system", "plant.toml", *SAID, *clip, *centre, "--json"
+    )
+    assert status == 0 and out.count("\n") == 1
+    data = json.loads(out)
+    policy = load_policy("p.pt")
+    assert data["policy"]["sha256"] == policy.network.sha256() and policy.parameters == {"k": "3"}
+    assert policy.network.clip is not None and policy.network.clip[0][0] == float(-2 / 3)
+    assert data["compared"]["states"] == 10_000 and data["compared"]["in_double_precision"] < 1e-12
+    assert data["centre"] == "output" and data["centring_changes_u_by"]["output"] == pytest.approx(abs(data["pi_0"][0]))
+    assert data["imported"]["options"]["--action-offset"] == "1/3"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--system", "plant.toml"], "Give --states x0,x1"),
+        ([*SAID], "name the plant with --system"),
+        (["--system", "plant.toml", *SAID, "--clip", "1"], "--clip takes LO:HI"),
+        (["--system", "plant.toml", *SAID, "--clip", "2:1"], "lo < hi"),
+        (["--system", "plant.toml", *SAID, "--action-offset", "one"], "--action-offset"),
+        (["--system", "plant.toml", *SAID, "--epsilon", "1,2"], "--epsilon takes one number"),
+        (["--system", "plant.toml", *SAID[2:], "--states", "x0,cos_x1"], "cos_x1"),
+        (["--system", "plant.toml", *SAID, "--from", "sb3"], "--from says"),
+        (["--system", "plant.toml", *SAID[:2], "--activation", "relu"], "relu is not proved"),
+        (["--system", "plant.toml", *SAID, "--stats", "x"], "No such option"),
+    ],
+)
+def test_wrong_options_end_with_status_2_and_one_sentence(run: Run, arguments: list[str], message: str) -> None:
+    for last in ([], ["--json"]):
+        status, out, err = run("import", "weights.pt", "--out", "p.pt", *arguments, *last)
+        assert status == 2 and message in (json.loads(out)["error"] if last else err) and not Path("p.pt").exists()
+        given = ["roa", "--policy", "weights.pt", "--out", "o", *arguments, *last]
+        status, out, err = run(*given)
+        assert status == 2 and message in (json.loads(out)["error"] if last else err)
+
+
+def test_roa_reads_another_programs_file_and_keeps_to_where_no_observation_is_clipped(run: Run, tmp_path: Path) -> None:
+    sb3("PPO", tmp_path)
+    given = ("--system", "plant.toml", "--states", "x0,x1", "--normaliser", "normaliser.pkl", "--claim", "practical")
+    status, out, err = run("roa", "--policy", "PPO.zip", *given, "--out", "o", "--json")
+    assert status == 0 and json.loads(out)["verdict"] == "PROVED"
+    assert "the domain of x0 is cut to" in err and "largest difference" in err
+    certificate = json.loads(Path("o/certificate.json").read_text())
+    lo, hi = (eval_fraction(text) for text in certificate["plant"]["domain"][0])
+    valid = np.array([lo, hi])
+    state = pickle.loads(Path("normaliser.pkl").read_bytes())
+    reach = state.clip_obs * np.sqrt(state.obs_rms.var[0] + state.epsilon)
+    assert lo > state.obs_rms.mean[0] - reach - 1e-12 and hi <= min(5, state.obs_rms.mean[0] + reach + 1e-12)
+    assert np.max(np.abs(valid)) < 50
+    # the same through a policy file
+    assert run("import", "PPO.zip", *given[:6], "--out", "p.pt")[0] == 0
+    status, out, err = run(
+        "roa", "--policy", "p.pt", "--system", "plant.toml", "--claim", "practical", "--out", "q", "--json"
+    )
+    assert status == 0 and "is cut to" in err
+    again = json.loads(Path("q/certificate.json").read_text())
+    assert again["plant"] == certificate["plant"] and again["policy"] == certificate["policy"]
+    # a domain inside is left as it is; one beyond is cut
+    inside = run(
+        "roa", "--policy", "p.pt", "--system", "plant.toml", "--domain", "x0=0.05", "--claim", "practical", "--out", "r"
+    )
+    assert "the domain of x0 is cut" not in inside[2]
+
+
+def eval_fraction(text: str) -> float:
+    from fractions import Fraction
+
+    return float(Fraction(text))
+
+
+def test_options_of_other_programs_do_not_go_with_a_policy_file_of_this_one(run: Run) -> None:
+    network = TanhNetwork((np.ones((1, 2)),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
+    save_policy("own.pt", Policy(network, "chain"))
+    status, _, err = run("roa", "--policy", "own.pt", "--system", "plant.toml", "--states", "x0,x1", "--out", "o")
+    assert status == 2 and "--states must be left out" in err
+    status, _, err = run("import", "own.pt", "--out", "p.pt", "--system", "plant.toml")
+    assert status == 2 and "already" in err
+
+
+def test_bounds_for_another_number_of_states_are_refused(run: Run) -> None:
+    network = TanhNetwork((np.ones((1, 3)),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
+    save_policy("own.pt", Policy(network, "chain", valid=np.array([[-1.0, 1.0]] * 3)))
+    status, _, err = run("roa", "--policy", "own.pt", "--system", "plant.toml", "--out", "o")
+    assert status == 2 and "3 states" in err

@@ -1,0 +1,102 @@
+"""Policy files as other programs write them, and the plants that they control."""
+
+from __future__ import annotations
+
+import itertools
+import warnings
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import sympy
+import torch
+
+from certify.systems import System
+
+ROOT = Path(__file__).parents[2]
+PLACES = tuple(folder / "shared" / "external" for folder in (ROOT.parent, ROOT.parent.parent))  # beside the project
+
+
+def external(*parts: str) -> Path | None:
+    """A file that somebody else trained, if the folder with such files is there."""
+    return next((f.joinpath(*parts) for f in PLACES if f.joinpath(*parts).is_file()), None)
+
+
+def plant(n: int = 2, bound: float = 6, x_eq: tuple[int, ...] = ()) -> System:
+    """A chain of n integrators with a stable last one; its states are x0, x1, ..."""
+    states = tuple(sympy.Symbol(f"x{i}") for i in range(n))
+    u = sympy.Symbol("u")
+    return System(
+        name="chain",
+        states=states,
+        inputs=(u,),
+        parameters={},
+        dynamics=(*states[1:], -sum(states) * 2 - states[-1] + u / 100),
+        u_eq=(sympy.Integer(0),),
+        domain=((Fraction(-5), Fraction(5)),) * n,
+        input_bounds=((Fraction(-bound), Fraction(bound)),),
+        x_eq=tuple(sympy.Integer(v) for v in x_eq),
+    )
+
+
+def mlp(
+    widths: tuple[int, ...] = (2, 7, 5, 1), last: torch.nn.Module | None = None, seed: int = 0
+) -> torch.nn.Sequential:
+    """A perceptron with tanh between its layers."""
+    torch.manual_seed(seed)
+    modules: list[torch.nn.Module] = []
+    for i, o in itertools.pairwise(widths):
+        modules += [torch.nn.Linear(i, o), torch.nn.Tanh()]
+    return torch.nn.Sequential(*modules[:-1], *([] if last is None else [last]))
+
+
+def values(module: torch.nn.Module, x: np.ndarray) -> np.ndarray:
+    """A module's values at states (k, n), in double precision."""
+    with torch.no_grad():
+        result: np.ndarray = module.double()(torch.tensor(x, dtype=torch.float64)).numpy()
+    return result
+
+
+class Toy(gymnasium.Env[np.ndarray, np.ndarray]):
+    """Two states that decay; only the spaces matter."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float32)
+    action_space = gymnasium.spaces.Box(-6.0, 6.0, (1,), np.float32)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        self.x = np.array([1.5, -0.5], dtype=np.float32)
+        return self.x, {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        self.x = (0.9 * self.x + 0.1).astype(np.float32)
+        return self.x, 0.0, False, False, {}
+
+
+class Odd(Toy):
+    """Spaces in double precision, whose bounds single precision does not hold."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float64)
+    action_space = gymnasium.spaces.Box(-0.1, 0.3, (1,), np.float64)
+
+
+def sb3(kind: str, folder: Path, world: type[Toy] = Toy, **policy: Any) -> tuple[Any, Any, Path, Path]:
+    """(model, normaliser, file of the model, file of the normaliser) of stable-baselines3, untrained."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        import stable_baselines3
+        from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+        environment = VecNormalize(DummyVecEnv([world]))
+        algorithm = vars(stable_baselines3)[kind]
+        model = algorithm("MlpPolicy", environment, policy_kwargs=policy or None, seed=1, device="cpu")
+        environment.reset()
+        for _ in range(20):
+            environment.step(np.zeros((1, 1)))
+        environment.training = False
+        model.save(folder / f"{kind}.zip")
+        environment.save(str(folder / "normaliser.pkl"))
+    return model, environment, folder / f"{kind}.zip", folder / "normaliser.pkl"
