@@ -51,7 +51,11 @@ class PlainIntervals(VdotBound):
         if self.policy.squash:
             h = h[0].tanh(), h[1].tanh()
         ends = torch.stack([self.policy.scale[:, None] * h[0], self.policy.scale[:, None] * h[1]])
-        return ends.amin(0) + self.policy.offset[:, None], ends.amax(0) + self.policy.offset[:, None]
+        u = ends.amin(0) + self.policy.offset[:, None], ends.amax(0) + self.policy.offset[:, None]
+        if self.policy.clip is None:
+            return u
+        least, most = self.policy.clip
+        return u[0].clamp(least, most), u[1].clamp(least, most)
 
 
 def affine(W: Tensor, x: Interval) -> Interval:

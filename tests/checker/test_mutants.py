@@ -67,6 +67,7 @@ CAMPAIGN: dict[str, tuple[int, tuple[str, ...]]] = {
     "solvers": (20, ("format", "hash", "levels", "lyapunov", "equilibrium", "domain", "centring")),
     "holes": (20, ("root", "tree")),
     "grown_for_false_claims": (17, ("ring", "inputs")),
+    "clips": (60, ("format", "hash", "centring", *EVIDENCE)),
 }  # fmt: skip
 
 

@@ -71,7 +71,7 @@ def valve() -> tuple[System, TanhNetwork]:
         parameters={},
         dynamics=(
             y * sympy.exp(-x / 4) + sympy.tanh(x * y) / 3,
-            u - sympy.sqrt(4 + x + y / 2) - sympy.atan(y) / 2 + sympy.pi * x * y / 20 + x**2 / sympy.sqrt(3 + y),
+            u - sympy.sqrt(4 + x + y / 2) - sympy.atan(y) / 2 + x**2 / sympy.sqrt(4 + y) ** 3,
         ),
         u_eq=(sympy.Integer(2),),
         domain=box("3/2", "3/2"),

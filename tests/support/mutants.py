@@ -38,7 +38,7 @@ from tests.support.certificates import (
 from tests.support.claim_oracle import EXACT, LARGEST_FILE, Loop, bounded_by_form, exact_faults, local_fault
 
 POLICIES = Path(__file__).parents[2] / "examples" / "policies"
-BASES = ("pendulum", "rotor", "rotor, preactivation", "linear", "local only", "scalar")
+BASES = ("pendulum", "rotor", "rotor, preactivation", "linear", "local only", "scalar", "clipped rotor")
 BY_FORM = ("pendulum", "scalar")  # offset +- scale lies in the input bounds
 NETWORKS = ("pendulum", "rotor", "rotor, preactivation")
 
@@ -111,7 +111,8 @@ def array(data: Document, path: str, change: Callable[[np.ndarray], Any]) -> Doc
 
 def policy_arrays(data: Document) -> list[str]:
     layers = [f"policy.layers.{k}.{part}" for k in range(len(data["policy"]["layers"])) for part in ("weight", "bias")]
-    return [*layers, "policy.scale", "policy.offset"]
+    ends = [] if data["policy"]["clip"] is None else ["policy.clip.0", "policy.clip.1"]
+    return [*layers, "policy.scale", "policy.offset", *ends]
 
 
 def at_index(index: int, value: Callable[[float], float]) -> Callable[[np.ndarray], np.ndarray]:
@@ -303,6 +304,45 @@ def centring() -> Iterator[Mutant]:
             for value in (q - offset, offset - q, (q - offset) / 2, 5e-324):
                 new = rehash(array(data, "policy.scale", lambda a, v=value: 0 * a + v))
                 yield mutant(f"{name}: scale {value}", new, "centring")
+
+
+def clips() -> Iterator[Mutant]:
+    """The clip left out, narrowed, moved and turned round, by somebody who hashes again or does not."""
+    for name in ("clipped", "clipped rotor"):
+        data = base(name)
+        lo, hi = (float(decode(end)[0]) for end in data["policy"]["clip"])
+        u_eq = float(Fraction(data["plant"]["u_eq"][0]))
+        yield mutant(f"{name}: no clip, hash kept", edited(data, "policy.clip", None), "hash")
+        open_bounds = edited(data, "plant.input_bounds", [[str(Fraction(lo)), str(Fraction(hi))]])
+        yield mutant(f"{name}: bounds that only the clip keeps, no clip", clipped(open_bounds, None), "inputs")
+        narrow = [(u_eq + s * (lo - u_eq), u_eq + t * (hi - u_eq)) for s in (1, 0.6, 0.3, 0.01) for t in (1, 0.6, 0.01)]
+        for a, b in narrow[1:]:
+            yield predicted(f"{name}: clip [{a}, {b}]", clipped(data, (a, b)))
+            yield mutant(f"{name}: clip [{a}, {b}], hash kept", unhashed(data, (a, b)), "hash")
+        for a, b in ((u_eq, hi), (lo, u_eq), (u_eq + 2.0**-40, hi), (lo, u_eq - 2.0**-40), (-9e300, lo), (hi, 9e300)):
+            yield mutant(f"{name}: clip [{a}, {b}] without u_eq", clipped(data, (a, b)), "centring")
+        for a, b in (
+            (hi, lo),
+            (lo, lo),
+            (hi, hi),
+            (lo, np.nan),
+            (np.nan, hi),
+            (-np.inf, hi),
+            (lo, np.inf),
+            (0.0, -0.0),
+        ):
+            yield mutant(f"{name}: clip [{a}, {b}]", clipped(data, (a, b)), "format")
+    for name in BASES:
+        if base(name)["policy"]["clip"] is None:
+            yield mutant(f"{name}: clip far out, hash kept", unhashed(base(name), (-1e9, 1e9)), "hash")
+
+
+def unhashed(data: Document, clip: tuple[float, float] | None) -> Document:
+    return edited(data, "policy.clip", clip and [encode([v]) for v in clip])
+
+
+def clipped(data: Document, clip: tuple[float, float] | None) -> Document:
+    return rehash(unhashed(data, clip))
 
 
 # --------------------------------------------------------------------------------------------------- levels, P, T, root
@@ -981,7 +1021,7 @@ FAMILIES: dict[str, Callable[[], Iterator[Mutant]]] = {
         bits_of_the_policy, hash_of_the_policy, bits_of_the_policy_hashed, policies_rebuilt, centring, level_values,
         claims_too_strong, lyapunov, other_lyapunov_functions, coordinates, skewed_coordinates, other_coordinates,
         root_boxes, trees, coarser_trees, plants, domains, input_bounds, numbers, structure, raw_bytes, sizes, solvers,
-        holes, grown_for_false_claims,
+        holes, grown_for_false_claims, clips,
     )
 }  # fmt: skip
 
