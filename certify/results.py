@@ -15,6 +15,7 @@ from certify.claims.claim import Kind
 from certify.engines.falsify import Witness
 from certify.lyapunov import extents, semi_axes, volume
 from certify.policies import TanhNetwork
+from certify.rest import Rest
 from certify.systems import System
 from certify.verdict import Stop, Verdict
 
@@ -122,9 +123,10 @@ class Diagnosis:
 class RoaResult:
     """What was proved. `stop` and `detail` say what limits the level, or why nothing was proved.
 
-    `candidate` is where P came from, `tried` all that were tried, `notice` what is not as it was asked for. `checker`
-    is what the checker said, None if it was not reached, about `raw`, the certificate's bytes; `solver` has dReal's
-    version and every query with its answer, None if it was not asked.
+    `rest` is where the loop rests, if not at the origin. `candidate` is where P came from, `tried` all that were tried,
+    `notice` what is not as it was asked for. `checker` is what the checker said, None if it was not reached, about
+    `raw`, the certificate's bytes; `solver` has dReal's version and every query with its answer, None if it was not
+    asked.
     """
 
     verdict: Verdict
@@ -149,6 +151,7 @@ class RoaResult:
     engine: str = "bounds"
     solver: Mapping[str, Any] | None = None
     diagnosis: Diagnosis | None = None
+    rest: Rest | None = None
 
     @property
     def P(self) -> Array | None:
@@ -188,6 +191,7 @@ class RoaResult:
             "levels": {name: getattr(self.levels, name) for name in Levels.__slots__},
             "witness": None,
             "eigenvalues": list(self.eigenvalues),
+            "rest": None if self.rest is None else asdict(self.rest),
         }
         if witness is not None:
             stated["witness"] = {"x": witness.x.tolist(), "V": witness.level, "kind": witness.kind}

@@ -30,15 +30,17 @@ from certify.certificate import (
     write_beside,
 )
 from certify.claims import Asymptotic, Claim, Problem
+from certify.claims.claim import Kind
 from certify.closed_loop import ClosedLoop
 from certify.diagnosis import diagnose
 from certify.engines.base import Attempt, Budget, Progress, Proof, Task
 from certify.engines.falsify import Witness, refutes
-from certify.errors import BackendError, SoundnessError
+from certify.errors import BackendError, InputError, SoundnessError
 from certify.lyapunov import leaves_domain
 from certify.options import RoaOptions
 from certify.policies import TanhNetwork
 from certify.race import Contender, Race
+from certify.rest import find_rest
 from certify.results import Levels, RoaResult, Tried
 from certify.rigorous import eigenvalues
 from certify.systems import System
@@ -132,10 +134,13 @@ class _Run:
     start: float = field(default_factory=time.perf_counter)
     proof: Proof | None = None
     cut_short: bool = False
+    aside: str | None = None
 
     def result(self) -> RoaResult:
         result = self._decide()
         result = replace(result, seconds={"load": self.load, **self.seconds, "total": self.spent})
+        notices = [text for text in (self.aside, result.notice) if text is not None]
+        result = replace(result, notice="; ".join(notices) or None)
         return replace(result, diagnosis=diagnose(result, self.options, self.proof))
 
     @property
@@ -151,17 +156,20 @@ class _Run:
         """Choose, falsify, prove, check."""
         options, loop = self.options, ClosedLoop(self.system, self.network)
         require_within_limits(self.system, self.network)
-        result = RoaResult(
-            Verdict.UNKNOWN, Stop.REQUESTED, self.system, self.network, options.claim, engine=options.engine
-        )
-        if options.claim == "asymptotic":
+        with self._stage("candidate"):
+            self.options = options = replace(options, claim=self._claim(loop))
+        kind = _kind_of(options)
+        result = RoaResult(Verdict.UNKNOWN, Stop.REQUESTED, self.system, self.network, kind, engine=options.engine)
+        if kind == "asymptotic":
             with self._stage("candidate"):
-                loop.require_rest()
                 unstable = _unstable(loop)
             if unstable is not None:
                 verdict, stop, shown = unstable
                 detail = f"eigenvalues {', '.join(shown)}" + (" touch the axis" if stop is Stop.SPECTRUM else "")
                 return replace(result, verdict=verdict, stop=stop, detail=detail, eigenvalues=shown)
+        elif self.aside is not None:
+            with self._stage("candidate"):
+                result = replace(result, rest=find_rest(loop))
         if options.P is None and options.only is None:
             race = self._race(loop)
         else:
@@ -174,6 +182,24 @@ class _Run:
             race.enter([one], self._heat())
         self._finish(race)
         return self._conclude(result, race)
+
+    def _claim(self, loop: ClosedLoop) -> Kind:
+        """What is claimed: as asked, or by whether the loop rests at the origin; `aside` says why it is the weaker one.
+
+        Raises
+        ------
+        InputError : the claim `asymptotic` is asked for, and the loop does not rest at the origin.
+        """
+        if self.options.claim == "practical":
+            return "practical"
+        try:
+            loop.require_rest()
+        except InputError as error:
+            if self.options.claim == "asymptotic":
+                raise
+            self.aside = f"practical stability is claimed, because {_first_sentence(error)}"
+            return "practical"
+        return "asymptotic"
 
     def _race(self, loop: ClosedLoop) -> Race:
         """Every candidate for a little time, and more for the better ones."""
@@ -445,6 +471,14 @@ class _Run:
             yield
         finally:
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
+
+
+def _kind_of(options: RoaOptions) -> Kind:
+    return "practical" if options.claim == "practical" else "asymptotic"
+
+
+def _first_sentence(error: Exception) -> str:
+    return str(error).split(". ")[0].rstrip(".")
 
 
 def _about(result: RoaResult, trial: Trial) -> RoaResult:
