@@ -18,7 +18,7 @@ EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows th
     "certificate": "claims expressions lyapunov policies systems",
     "claims": "closed_loop expressions lyapunov policies",
     "closed_loop": "expressions policies systems",
-    "diagnosis": "claims closed_loop engines lyapunov options results",
+    "diagnosis": "claims closed_loop engines lyapunov options policies results",
     "enclosures": "closed_loop expressions rigorous",
     "engines": "certificate claims enclosures expressions policies rigorous running systems",
     "lyapunov": "closed_loop",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shlex
 from fractions import Fraction
 from pathlib import Path
 
@@ -10,6 +12,7 @@ import numpy as np
 import pytest
 import sympy
 
+from certify.cli import _run
 from certify.closed_loop import ClosedLoop
 from certify.errors import InputError
 from certify.policies import TanhNetwork, load_policy
@@ -86,6 +89,23 @@ def test_practical_stability_is_claimed_where_the_policy_is_not_centred(tmp_path
     assert rest @ result.P @ rest <= result.levels.floor  # what rests is inside the small set
     with pytest.raises(InputError, match="not centred"):
         certify_roa(system, policy.network, tmp_path, RoaOptions(claim="asymptotic"))
+
+
+def test_the_command_centres_on_request_and_says_what_that_changes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["roa", "--policy", str(PLAIN), "--candidate", "lqr", "--out", str(tmp_path), "--json"]
+    assert _run(command, True) == 0
+    further = json.loads(capsys.readouterr().out)["diagnosis"]["next"]
+    assert further["options"] == {"--centre": "preactivation"}
+    assert _run(shlex.split(further["command"])[1:], True) == 0
+    captured = capsys.readouterr()
+    assert json.loads(captured.out)["claim"] == {"kind": "asymptotic"}
+    assert "changes u by up to" in captured.err
+    assert _run([*command, "--squash", "tanh"], True) == 2 and "must be left out" in capsys.readouterr().out
+    shipped = str(PLAIN.parent.parent / "pendulum.pt")
+    assert _run(["roa", "--policy", shipped, "--centre", "output", "--out", str(tmp_path)], False) == 2
+    assert "must be left out" in capsys.readouterr().err
 
 
 def test_a_loop_that_rests_at_the_origin_gets_the_stronger_claim(tmp_path: Path) -> None:

@@ -5,13 +5,14 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Callable
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
-from certify.commands.arguments import with_params
+from certify.commands.arguments import plant_of, with_params
 from certify.commands.terminal import tell
 from certify.errors import InputError
 
@@ -71,11 +72,35 @@ def policy_of(path: Path, importing: ImportOptions, system: str | None, params: 
     from certify.policies import load_policy
 
     if _is_own(path, importing):
-        return load_policy(path)
+        stored = load_policy(path)
+        return stored if importing.centre is None else _centred(stored, importing, system, params)
     imported = imported_policy(path, importing, system, params)
     for line in lines(imported):
         tell(line)
     return imported.policy
+
+
+def _centred(stored: Policy, importing: ImportOptions, system: str | None, params: list[str]) -> Policy:
+    """A policy file of this program with the centring that is asked for; says by how much u changes.
+
+    Raises
+    ------
+    InputError : the file has another centring already, or this one cannot be had.
+    """
+    from certify.policies.importers import centring_changes
+
+    if importing.centre is None or stored.network.centre == importing.centre:
+        return stored
+    if stored.network.centre != "none":
+        raise InputError(
+            f"--centre {importing.centre} must be left out: the file's centring is {stored.network.centre}."
+        )
+    plant = plant_of(stored, system, params, [])
+    changes = centring_changes(stored.network, plant)
+    if importing.centre not in changes:
+        raise InputError(f"--centre {importing.centre} cannot be had: u_eq must lie within the policy's reach.")
+    tell(f"centred: --centre {importing.centre} changes u by up to {changes[importing.centre]:.3g} in the domain")
+    return replace(stored, network=replace(stored.network, centre=importing.centre))
 
 
 def imported_policy(path: Path, importing: ImportOptions, system: str | None, params: list[str]) -> Imported:
@@ -144,10 +169,9 @@ def _is_own(path: Path, importing: ImportOptions) -> bool:
         if importing.given:
             raise
         return True
-    if content == "policy" and importing.given:
-        raise InputError(
-            f"{', '.join(importing.given)} must be left out: {path} is a policy file of this program and says all."
-        )
+    others = [name for name in importing.given if name != "--centre"]
+    if content == "policy" and others:
+        raise InputError(f"{', '.join(others)} must be left out: {path} is a policy file of this program and says all.")
     foreign_pickle = content is None and raw[:1] == b"\x80"
     return content == "policy" or (content is None and not importing.given and not foreign_pickle)
 
