@@ -59,13 +59,14 @@ _HEAT = 0.04  # a candidate's first heat
 _PATIENCE = 0.1  # for a ring that gains nothing
 _SEARCH = 0.6  # for a search that cannot be interrupted, the rest being its check's
 _KEPT = 0.03  # for what comes after the search: writing, the checker's start
-_HOPE = 0.05  # share of boxes that must be proved to go on with a ring that gains nothing
 _FOR_PROOF = 0.4  # of the time limit, that no further candidate is optimised in
 _WORTH = 1.05  # growth of a volume that another candidate must promise
 _MISLED = 0.9  # of its reach: a violation below it is one that the samples missed
 _SAMPLE = 2000  # leaves whose check is timed
 _START = 0.2  # seconds that a checker takes to start
 _CAUTION = 1.2  # on the time that a check is expected to take
+_YEAR = 3.156e7  # seconds
+_YEAR = 3.156e7  # seconds
 _SPLITS, _LOWERINGS = 3, 9  # of what the checker refuses
 
 
@@ -221,7 +222,7 @@ class _Run:
             with self._stage("candidate"):
                 best = max(others, key=lambda c: c.proved).trial
                 between = list(blends(loop, unproved[0].trial, best, options))
-            race.enter(between, heat)
+            race.enter(between, heat if race.gained else 0.0)  # without a gain their local levels tell
         race.knock_out(heat)
         return race
 
@@ -298,10 +299,8 @@ class _Run:
             return
         winner, report = race.open[0], race.report
         boxes = self.options.max_boxes
-        while not (winner.attempt.gained or winner.attempt.done) and self.left() > 0:
+        while not (winner.attempt.gained or winner.attempt.done or winner.hopeless) and self.left() > 0:
             winner.advance(Budget(self._within(_PATIENCE * self.options.time_limit), boxes), report)
-            if winner.attempt.hope < _HOPE:
-                break
         if winner.attempt.done or not winner.attempt.gained or not self.interruptible:
             return
         each = self._seconds_of_a_leaf(winner)
@@ -344,10 +343,12 @@ class _Run:
             boxes=sum(c.attempt.proof().boxes for c in race.contenders),
             solver=proof.solver,
         )
-        if proof.stop is Stop.TIME and proof.claim is not None and not best.attempt.gained:
-            result = replace(
-                result, stop=Stop.STALLED, detail=f"{proof.boxes:,} boxes added nothing to the local level"
-            )
+        if proof.stop is Stop.TIME and proof.claim is not None and best.hopeless:
+            pace = proof.boxes / max(1e-3, proof.seconds.get("ring", 0.0))
+            years = best.attempt.expected / pace / _YEAR
+            needed = f"about {best.attempt.expected:.0e} are needed before anything is, {years:.0e} years at this pace"
+            detail = f"{proof.boxes:,} boxes added nothing to the local level, and {needed}"
+            result = replace(result, stop=Stop.STALLED, detail=detail)
         claim = proof.claim
         if claim is None or (task.exactly and claim.roa < task.target):
             if task.exactly and _refuted(task, witness):
