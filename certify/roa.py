@@ -66,7 +66,6 @@ _SAMPLE = 2000  # leaves whose check is timed
 _START = 0.2  # seconds that a checker takes to start
 _CAUTION = 1.2  # on the time that a check is expected to take
 _YEAR = 3.156e7  # seconds
-_YEAR = 3.156e7  # seconds
 _SPLITS, _LOWERINGS = 3, 9  # of what the checker refuses
 
 

@@ -43,7 +43,8 @@ def test_a_snapshot_is_a_proof() -> None:
 
     case = case_of(get_system("pendulum"), pendulum_network())
     ring = outwards(case.problem, case.T, 1e-6, 6.0, RUNNER)
-    ring.advance(Budget(boxes=200, batch=16))
+    while ring.levels[0] == ring.levels[1]:
+        ring.advance(Budget(boxes=50, batch=16))
     found = ring.proof(Stop.BOXES)
     assert found.inner < found.outer < 6.0
     lo, hi = (torch.tensor(a.T.copy()) for a in leaves(found.tree, found.root))
@@ -56,7 +57,7 @@ def test_the_time_that_the_check_will_take_is_left() -> None:
     case = case_of(get_system("pendulum"), pendulum_network())
     ring = outwards(case.problem, case.T, 1e-6, 6.0, RUNNER)
     assert ring.advance(Budget(seconds=100.0, batch=4, check=10.0)) is Stop.TIME
-    assert 10 < ring.proved < 30
+    assert 10 <= ring.proved < 30
 
 
 @pytest.mark.parametrize(("name", "hopeless"), [("cartpole", False), ("quadrotor2d", False), ("quadrotor3d", True)])
