@@ -6,10 +6,8 @@ Whatever the checker refuses, the run ends with what it accepts: a refused leaf 
 
 from __future__ import annotations
 
-import hashlib
 import json
 import math
-import re
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -20,14 +18,13 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from certify.acceptance import Clerk
 from certify.certificate import (
     Certificate,
     PartitionTree,
     TrustedSolver,
     require_within_limits,
-    run_checker,
     sole_writer,
-    write_beside,
 )
 from certify.claims import Asymptotic, Claim, Problem
 from certify.claims.claim import Kind
@@ -66,7 +63,6 @@ _SAMPLE = 2000  # leaves whose check is timed
 _START = 0.2  # seconds that a checker takes to start
 _CAUTION = 1.2  # on the time that a check is expected to take
 _YEAR = 3.156e7  # seconds
-_SPLITS, _LOWERINGS = 3, 9  # of what the checker refuses
 
 
 def certify_roa(
@@ -322,7 +318,7 @@ class _Run:
         claim = replace(proof.claim, roa=level)
         count = leaves_that_meet(problem, proof.evidence, claim)
         before = self.seconds.get("check", 0.0)
-        self._ask(Certificate(self.system, self.network, problem.V, claim, proof.evidence, self.provenance))
+        self._clerk().ask(Certificate(self.system, self.network, problem.V, claim, proof.evidence, self.provenance))
         return max(0.0, self.seconds["check"] - before - _START) / max(1, count)
 
     def _conclude(self, result: RoaResult, race: Race) -> RoaResult:
@@ -354,10 +350,11 @@ class _Run:
                 return _with_witness(result, task, witness)
             return result if claim is None else _missed(result, task, claim)
         certificate = Certificate(self.system, self.network, task.problem.V, claim, proof.evidence, self.provenance)  # type: ignore[arg-type]
-        certificate, path, data, answer, notice = self._accepted(certificate, task)
-        result = replace(result, notice=notice or result.notice)
+        accepted = self._clerk().accepted(certificate, task.problem)
+        certificate = accepted.certificate
+        result = replace(result, notice=accepted.mended or result.notice)
         if task.exactly and certificate.roa < task.target:
-            return _missed(replace(result, stop=Stop.REFUSED, detail=notice or ""), task, certificate.claim)
+            return _missed(replace(result, stop=Stop.REFUSED, detail=accepted.mended or ""), task, certificate.claim)
         trusted = isinstance(proof.evidence, TrustedSolver)
         if not trusted and self.options.engine == "both":
             result = replace(result, solver=self._confirm(task.problem, certificate.claim))
@@ -366,80 +363,13 @@ class _Run:
             verdict=Verdict.TRUSTED if trusted else Verdict.PROVED,
             stop=Stop.REFUSED if certificate.roa < claim.roa else _limit(result.stop, task, witness),
             leaves=proof.leaves,
-            certificate=path,
-            raw=data,
-            checker=answer,
+            certificate=accepted.path,
+            raw=accepted.data,
+            checker=accepted.answer,
         )
 
-    def _accepted(
-        self, certificate: Certificate, task: Task
-    ) -> tuple[Certificate, Path, bytes, dict[str, Any], str | None]:
-        """A certificate that the checker accepts: this one, or one with a refused leaf split again or a lower level.
-
-        Returns
-        -------
-        The certificate, its path and bytes, the checker's answer, and what was mended.
-
-        Raises
-        ------
-        SoundnessError : the checker refuses what cannot be mended so.
-        """
-        splits = lowerings = 0
-        notice, first = None, certificate
-        while True:
-            path, data, answer = self._ask(certificate)
-            if answer["result"] == ("TRUSTED" if isinstance(certificate.evidence, TrustedSolver) else "ACCEPTED"):
-                return certificate, path, data, answer, notice
-            leaf = _leaf_of(answer)
-            evidence, problem = certificate.evidence, task.problem
-            if leaf is not None and isinstance(evidence, PartitionTree) and splits < _SPLITS and self.left() > 0:
-                from certify.engines.bounds.mend import split_again
-
-                splits += 1
-                certificate = replace(certificate, evidence=split_again(problem, evidence, certificate.claim, leaf))
-            elif (lower := _lowered(certificate, leaf, problem, lowerings)) is not None and lowerings < _LOWERINGS:
-                lowerings += 1
-                certificate = lower
-            else:
-                reproduces = write_beside(self.out / "certificate.json", first.to_json().encode(), ".unchecked.json")
-                raise SoundnessError(
-                    f"the checker rejects what the engine proved: {answer}. The certificate {reproduces} reproduces it."
-                )
-            notice = f"the checker refused {answer.get('at')} (rule {answer.get('rule')}): " + (
-                f"the level is {certificate.roa:.6g} in the place of {first.roa:.6g}"
-                if lowerings
-                else "split again, it is accepted"
-            )
-
-    def _ask(self, certificate: Certificate) -> tuple[Path, bytes, dict[str, Any]]:
-        """The certificate's path, its bytes and the checker's answer; it gets its name only if that is not a refusal.
-
-        Raises
-        ------
-        SoundnessError : the checker speaks of other bytes.
-        """
-        path = self.out / "certificate.json"
-        with self._stage("write"):
-            data = certificate.to_json().encode()
-            unchecked = write_beside(path, data, ".unchecked.json")
-        self._tell("check")
-        try:
-            with self._stage("check"):
-                answer = run_checker(unchecked)
-            wanted = "TRUSTED" if isinstance(certificate.evidence, TrustedSolver) else "ACCEPTED"
-            if answer["result"] == wanted:
-                if answer["certificate_sha256"] != hashlib.sha256(data).hexdigest():
-                    raise SoundnessError(
-                        f"the checker's answer is about other bytes than those of {unchecked}: {answer}."
-                    )
-                if answer["levels"] != dict(certificate.claim.levels):
-                    raise SoundnessError(
-                        f"the checker's answer is about other levels than {certificate.claim}: {answer}."
-                    )
-                unchecked.replace(path)
-        finally:
-            unchecked.unlink(missing_ok=True)
-        return path, data, answer
+    def _clerk(self) -> Clerk:
+        return Clerk(self.out / "certificate.json", self.left, self._stage, lambda: self._tell("check"))
 
     def _confirm(self, problem: Problem, claim: Claim) -> dict[str, Any]:
         """dReal's answers about what the bounds engine proved.
@@ -511,35 +441,6 @@ def _missed(result: RoaResult, task: Task, claim: Claim) -> RoaResult:
         result = replace(result, levels=replace(result.levels, local=claim.local))
     missed = f"proved only up to V <= {claim.roa:.12g}, not {task.target:g}"
     return replace(result, detail=f"{result.detail}; {missed}" if result.detail else missed)
-
-
-def _leaf_of(answer: Mapping[str, Any]) -> int | None:
-    """The number of the leaf that the checker refuses; None if it refuses something else."""
-    found = re.fullmatch(r"leaf (\d+)", str(answer.get("at", "")))
-    return int(found[1]) if found and answer.get("rule") in ("ring", "inputs") else None
-
-
-def _lowered(certificate: Certificate, leaf: int | None, problem: Problem, tries: int) -> Certificate | None:
-    """The certificate with a lower level: below the refused leaf at first, then halfway to the inner level, then at it,
-    and then an inner level that is lower itself; None if there is nothing to lower."""
-    claim, evidence = certificate.claim, certificate.evidence
-    if not isinstance(evidence, PartitionTree):
-        return None
-    if leaf is None or claim.inner == claim.roa:
-        if not isinstance(claim, Asymptotic):
-            return None
-        return _local_only(certificate, claim.local / (2 if claim.inner == claim.roa else 1))
-    from certify.engines.bounds.mend import below_leaf
-
-    level = below_leaf(problem, evidence, leaf) if tries < 2 else math.sqrt(claim.inner * claim.roa)
-    if claim.inner < level < claim.roa and tries < 5:
-        return replace(certificate, claim=replace(claim, roa=level))
-    return _local_only(certificate, claim.local) if isinstance(claim, Asymptotic) else None
-
-
-def _local_only(certificate: Certificate, level: float) -> Certificate:
-    """A claim of the local set alone, of which no leaf is asked."""
-    return replace(certificate, claim=Asymptotic(roa=level, local=level))
 
 
 def _refuted(task: Task, witness: Witness | None) -> bool:

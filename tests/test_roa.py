@@ -110,11 +110,11 @@ def test_a_wrong_raw_equilibrium_is_centred(tmp_path: Path, pendulum: System, ce
 
 def test_uncentred_or_displaced_loops_are_refused(tmp_path: Path, pendulum: System) -> None:
     with pytest.raises(InputError, match="not centred"):
-        certify_roa(pendulum, pendulum_network(centre="none"), tmp_path)
+        certify_roa(pendulum, pendulum_network(centre="none"), tmp_path, RoaOptions(claim="asymptotic"))
     x, u = sympy.symbols("x u")
     displaced = System("s", (x,), (u,), {}, (u - x + 1,), (sympy.Integer(0),), box(1), box(1))
     with pytest.raises(InputError, match="must be exactly 0"):
-        certify_roa(displaced, scalar_tanh()[1], tmp_path)
+        certify_roa(displaced, scalar_tanh()[1], tmp_path, RoaOptions(claim="asymptotic"))
 
 
 def test_levels_scale_with_P(tmp_path: Path, pendulum: System) -> None:
@@ -225,7 +225,9 @@ def test_whatever_the_checker_refuses_a_run_ends_with_what_it_accepts(
 
 
 def test_what_cannot_be_mended_is_a_soundness_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("certify.roa.run_checker", lambda _: {"result": "REJECTED", "rule": "hash", "at": "policy"})
+    monkeypatch.setattr(
+        "certify.acceptance.run_checker", lambda _: {"result": "REJECTED", "rule": "hash", "at": "policy"}
+    )
     with pytest.raises(SoundnessError, match=r"rejects what the engine proved.*unchecked\.json reproduces"):
         certify_roa(*scalar_tanh(), tmp_path, RoaOptions(candidate="lyapunov"))
     assert not (tmp_path / "certificate.json").exists()
@@ -278,7 +280,7 @@ def test_an_answer_about_other_bytes_is_no_proof(tmp_path: Path, monkeypatch: py
     """Another run's certificate is accepted in the place of this one's."""
     other = certify_roa(*scalar_tanh(), tmp_path / "other", RoaOptions(level=1.0)).certificate
     assert other is not None
-    monkeypatch.setattr("certify.roa.run_checker", lambda _: run_checker(other))
+    monkeypatch.setattr("certify.acceptance.run_checker", lambda _: run_checker(other))
     with pytest.raises(SoundnessError, match="other bytes"):
         certify_roa(*scalar_tanh(), tmp_path / "mine", RoaOptions(level=2.0))
     assert not (tmp_path / "mine" / "certificate.json").exists()

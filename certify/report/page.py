@@ -122,7 +122,7 @@ def render_html(
     """The report as one HTML document.
 
     Read the file once, with `read_raw`; take the certificate from these bytes with `parse_certificate`, their sha256
-    and size, and the answer of `certify.roa.run_checker` about a private file that holds them.
+    and size, and the answer of `certify.certificate.run_checker` about a private file that holds them.
 
     Parameters
     ----------

@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 import sympy
 
-from certify.certificate import read_certificate
+from certify.certificate import read_certificate, run_checker
 from certify.claims import Practical, Problem
 from certify.claims.conditions import local_condition, ring_condition
 from certify.claims.queries import Query, query
@@ -38,7 +38,7 @@ from certify.errors import BackendError, InputError, SoundnessError
 from certify.lyapunov.function import Quadratic
 from certify.policies import Policy, TanhNetwork, save_policy
 from certify.report import render_html
-from certify.roa import RoaOptions, certify_roa, run_checker
+from certify.roa import RoaOptions, certify_roa
 from certify.systems import System, get_system
 from certify.verdict import Stop, Verdict
 from tests.support.cases import Case, case_of

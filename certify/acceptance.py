@@ -1,0 +1,140 @@
+"""Having a certificate accepted: written, checked, and mended where the checker refuses it.
+
+A certificate gets its name only once the checker, run as a process of its own, has accepted the very bytes that were
+written. Whatever it refuses, a run ends with what it accepts: a refused leaf is split again, or the level lowered.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import re
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from certify.certificate import Certificate, PartitionTree, TrustedSolver, run_checker, write_beside
+from certify.claims import Asymptotic, Problem
+from certify.engines.bounds.mend import below_leaf, split_again
+from certify.errors import SoundnessError
+
+_SPLITS, _LOWERINGS = 3, 9  # of what the checker refuses
+
+
+@dataclass(frozen=True, slots=True)
+class Accepted:
+    """A certificate that the checker accepts (or trusts), its path and bytes, the answer, and what was mended."""
+
+    certificate: Certificate
+    path: Path
+    data: bytes
+    answer: Mapping[str, Any]
+    mended: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Clerk:
+    """Writes certificates to `path` and has them checked.
+
+    Parameters
+    ----------
+    left : seconds that may still be spent on a leaf that was refused; after that only the level is lowered.
+    stage : times the stages `write` and `check`.
+    tell : called before each check.
+    """
+
+    path: Path
+    left: Callable[[], float]
+    stage: Callable[[str], AbstractContextManager[None]]
+    tell: Callable[[], None]
+
+    def accepted(self, certificate: Certificate, problem: Problem) -> Accepted:
+        """This certificate, or one with a refused leaf split again or a lower level.
+
+        Raises
+        ------
+        SoundnessError : the checker refuses what cannot be mended so.
+        """
+        splits = lowerings = 0
+        mended, first = None, certificate
+        while True:
+            data, answer = self.ask(certificate)
+            if answer["result"] == _wanted(certificate):
+                return Accepted(certificate, self.path, data, answer, mended)
+            leaf, evidence = _leaf_of(answer), certificate.evidence
+            if leaf is not None and isinstance(evidence, PartitionTree) and splits < _SPLITS and self.left() > 0:
+                splits += 1
+                certificate = replace(certificate, evidence=split_again(problem, evidence, certificate.claim, leaf))
+            elif (lower := _lowered(certificate, leaf, problem, lowerings)) is not None and lowerings < _LOWERINGS:
+                lowerings += 1
+                certificate = lower
+            else:
+                reproduces = write_beside(self.path, first.to_json().encode(), ".unchecked.json")
+                raise SoundnessError(
+                    f"the checker rejects what the engine proved: {answer}. The certificate {reproduces} reproduces it."
+                )
+            mended = f"the checker refused {answer.get('at')} (rule {answer.get('rule')}): " + (
+                f"the level is {certificate.roa:.6g} in the place of {first.roa:.6g}"
+                if lowerings
+                else "split again, it is accepted"
+            )
+
+    def ask(self, certificate: Certificate) -> tuple[bytes, Mapping[str, Any]]:
+        """The certificate's bytes and the checker's answer; the file gets its name only if that is not a refusal.
+
+        Raises
+        ------
+        SoundnessError : the checker speaks of other bytes or levels.
+        """
+        with self.stage("write"):
+            data = certificate.to_json().encode()
+            unchecked = write_beside(self.path, data, ".unchecked.json")
+        self.tell()
+        try:
+            with self.stage("check"):
+                answer = run_checker(unchecked)
+            if answer["result"] == _wanted(certificate):
+                for what, said, meant in (
+                    ("bytes", answer["certificate_sha256"], hashlib.sha256(data).hexdigest()),
+                    ("levels", answer["levels"], dict(certificate.claim.levels)),
+                ):
+                    if said != meant:
+                        raise SoundnessError(f"the checker's answer is about other {what} than {meant}: {answer}.")
+                unchecked.replace(self.path)
+        finally:
+            unchecked.unlink(missing_ok=True)
+        return data, answer
+
+
+def _wanted(certificate: Certificate) -> str:
+    return "TRUSTED" if isinstance(certificate.evidence, TrustedSolver) else "ACCEPTED"
+
+
+def _leaf_of(answer: Mapping[str, Any]) -> int | None:
+    """The number of the leaf that the checker refuses; None if it refuses something else."""
+    found = re.fullmatch(r"leaf (\d+)", str(answer.get("at", "")))
+    return int(found[1]) if found and answer.get("rule") in ("ring", "inputs") else None
+
+
+def _lowered(certificate: Certificate, leaf: int | None, problem: Problem, tries: int) -> Certificate | None:
+    """The certificate with a lower level: below the refused leaf at first, then halfway to the inner level, then at it,
+    and then an inner level that is lower itself; None if there is nothing to lower."""
+    claim, evidence = certificate.claim, certificate.evidence
+    if not isinstance(evidence, PartitionTree):
+        return None
+    if leaf is None or claim.inner == claim.roa:
+        if not isinstance(claim, Asymptotic):
+            return None
+        return _local_only(certificate, claim.local / (2 if claim.inner == claim.roa else 1))
+
+    level = below_leaf(problem, evidence, leaf) if tries < 2 else math.sqrt(claim.inner * claim.roa)
+    if claim.inner < level < claim.roa and tries < 5:
+        return replace(certificate, claim=replace(claim, roa=level))
+    return _local_only(certificate, claim.local) if isinstance(claim, Asymptotic) else None
+
+
+def _local_only(certificate: Certificate, level: float) -> Certificate:
+    """A claim of the local set alone, of which no leaf is asked."""
+    return replace(certificate, claim=Asymptotic(roa=level, local=level))
