@@ -21,6 +21,7 @@ EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows th
     "diagnosis": "claims closed_loop engines lyapunov options results",
     "enclosures": "closed_loop expressions rigorous",
     "engines": "certificate claims enclosures expressions policies rigorous running systems",
+    "inputs": "policies systems",
     "lyapunov": "closed_loop",
     "options": "claims lyapunov",
     "policies": "systems",
