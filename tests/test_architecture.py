@@ -15,6 +15,7 @@ ROOT = Path(__file__).parent.parent
 LEAVES = {"errors", "verdict"}  # anybody may import these, and they import nothing
 ENTRY = {"cli", "commands", "__main__"}  # these may import anything of certify
 EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows that exist
+    "api": "claims inputs installation lyapunov options policies results roa systems",
     "certificate": "claims expressions lyapunov policies systems",
     "claims": "closed_loop expressions lyapunov policies",
     "closed_loop": "expressions policies systems",
@@ -27,7 +28,7 @@ EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows th
     "policies": "systems",
     "race": "engines lyapunov trials",
     "report": "certificate closed_loop lyapunov policies systems",
-    "results": "claims engines lyapunov policies systems",
+    "results": "certificate claims engines lyapunov policies report systems",
     "rigorous": "closed_loop expressions policies",
     "roa": (
         "certificate claims closed_loop diagnosis engines lyapunov options policies race results rigorous running "
