@@ -185,7 +185,7 @@ class _Folder:
 
     def __init__(self) -> None:
         self.path = Path(tempfile.mkdtemp(prefix="certify-"))
-        weakref.finalize(self, _remove, self.path)  # type: ignore[no-untyped-call]
+        weakref.finalize(self, _remove, self.path)
 
 
 def _remove(path: Path) -> None:
@@ -203,15 +203,10 @@ def _options(options: RoaOptions | None, single: dict[str, Any]) -> RoaOptions:
                 "Put them into `options`."
             )
         return options
-    readers: dict[str, Callable[[Any, str], Any]] = {
-        "Q": _row,
-        "R": _row,
-        "P": _matrix,
-        "jobs": _count,
-        "max_boxes": _count,
-    }
-    readers |= dict.fromkeys(("level", "dreal_precision", "time_limit"), _number)
-    read = {name: readers.get(name, _text)(value, name) for name, value in single.items()}
+    numbers, whole = ("level", "dreal_precision", "time_limit"), ("jobs", "max_boxes")
+    readers: dict[str, Callable[[Any, str], Any]] = {name: _text for name in single}
+    readers |= {"Q": _row, "R": _row, "P": _matrix} | {n: _number for n in numbers} | {n: _count for n in whole}
+    read = {name: readers[name](value, name) for name, value in single.items()}
     if "device" in read:
         _require_device(read["device"])
     return RoaOptions(**read)
