@@ -204,8 +204,8 @@ def _options(options: RoaOptions | None, single: dict[str, Any]) -> RoaOptions:
             )
         return options
     numbers, whole = ("level", "dreal_precision", "time_limit"), ("jobs", "max_boxes")
-    readers: dict[str, Callable[[Any, str], Any]] = {name: _text for name in single}
-    readers |= {"Q": _row, "R": _row, "P": _matrix} | {n: _number for n in numbers} | {n: _count for n in whole}
+    readers: dict[str, Callable[[Any, str], Any]] = dict.fromkeys(single, _text)
+    readers |= {"Q": _row, "R": _row, "P": _matrix} | dict.fromkeys(numbers, _number) | dict.fromkeys(whole, _count)
     read = {name: readers[name](value, name) for name, value in single.items()}
     if "device" in read:
         _require_device(read["device"])

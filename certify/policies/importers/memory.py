@@ -93,12 +93,14 @@ def _traced(module: torch.nn.Module, n: int) -> bytes:
 
     dtype = next((p.dtype for p in module.parameters()), torch.float32)
     buffer = io.BytesIO()
-    with warnings.catch_warnings(), torch.no_grad():
-        warnings.simplefilter("ignore", DeprecationWarning)
-        # A branch, or a number that torch lost sight of:
-        warnings.simplefilter("error", torch.jit.TracerWarning)  # type: ignore[attr-defined]
+    # As errors the warnings would be raised in the midst of torch's C code, which loses them.
+    with warnings.catch_warnings(record=True) as told, torch.no_grad():
+        warnings.simplefilter("always")
         traced = torch.jit.trace(module, torch.zeros(1, n, dtype=dtype), check_trace=False)  # type: ignore[no-untyped-call]
         torch.jit.save(traced, buffer)
+    for warning in told:
+        if issubclass(warning.category, torch.jit.TracerWarning):  # type: ignore[attr-defined]
+            raise InputError(f"it branches, or hides a number from torch. {warning.message}")
     return buffer.getvalue()
 
 
