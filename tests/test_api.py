@@ -467,3 +467,19 @@ def test_public_names_are_there_and_listed() -> None:
 def test_loading_a_policy_by_hand_changes_nothing() -> None:
     by_hand = certify_roa(None, load_policy(SHIPPED), None, QUICK, provenance={})
     assert by_hand.raw == certify_roa(None, SHIPPED, None, QUICK, provenance={}).raw
+
+
+def test_what_the_readme_shows_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "examples").symlink_to(ROOT / "examples")
+    monkeypatch.chdir(tmp_path)
+    first, second = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    exec(first, {})
+    shown = capsys.readouterr().out.splitlines()
+    assert shown[0].startswith("RoaResult(PROVED; pendulum; V <= ") and shown[0].startswith(first.split("# ")[1][:30])
+    assert shown[1] == "True"
+    torch.manual_seed(0)
+    exec(second, {})
+    assert (tmp_path / "heavy.html").exists() and (tmp_path / "out" / "heavy" / "certificate.json").exists()
+    assert capsys.readouterr().out.startswith("RoaResult(")
