@@ -136,6 +136,10 @@ def certify_roa(
     notices: list[str] = []
     try:
         chosen = _options(options, {name: value for name, value in single.items() if value is not None})
+        _require_device(chosen.device)
+        seconds = _number(load_seconds, "load_seconds")
+        _require(provenance is None or isinstance(provenance, Mapping), "provenance", "a mapping", provenance)
+        _require(progress is None or callable(progress), "progress", "callable", progress)
         stored = _policy(policy, system, _importing(importing), notices.append)
         plant, network = _closed(stored, system, notices.append)
         folder = _Folder() if out is None else None
@@ -145,7 +149,7 @@ def certify_roa(
             network,
             place,
             chosen,
-            load_seconds=load_seconds + time.perf_counter() - start,
+            load_seconds=seconds + time.perf_counter() - start,
             provenance=_provenance(policy) if provenance is None else provenance,
             progress=progress,
         )
@@ -185,11 +189,13 @@ class _Folder:
 
     def __init__(self) -> None:
         self.path = Path(tempfile.mkdtemp(prefix="certify-"))
-        weakref.finalize(self, _remove, self.path)
+        weakref.finalize(self, _remove, self.path, os.getpid())
 
 
-def _remove(path: Path) -> None:
-    shutil.rmtree(path, ignore_errors=True)
+def _remove(path: Path, owner: int) -> None:
+    """Remove a folder, unless this is a fork of the process that made it and still uses it."""
+    if os.getpid() == owner:
+        shutil.rmtree(path, ignore_errors=True)
 
 
 def _options(options: RoaOptions | None, single: dict[str, Any]) -> RoaOptions:
@@ -207,8 +213,6 @@ def _options(options: RoaOptions | None, single: dict[str, Any]) -> RoaOptions:
     readers: dict[str, Callable[[Any, str], Any]] = dict.fromkeys(single, _text)
     readers |= {"Q": _row, "R": _row, "P": _matrix} | dict.fromkeys(numbers, _number) | dict.fromkeys(whole, _count)
     read = {name: readers[name](value, name) for name, value in single.items()}
-    if "device" in read:
-        _require_device(read["device"])
     return RoaOptions(**read)
 
 
@@ -376,6 +380,11 @@ def _require_device(name: str) -> None:
 
     if name != "cpu" and not (name.startswith("cuda") and torch.cuda.is_available()):
         raise InputError(f"`device` must be cpu, or cuda on a machine that has it; found {name!r}.")
+
+
+def _require(holds: bool, name: str, what: str, value: object) -> None:
+    if not holds:
+        raise InputError(f"`{name}` must be {what}; found {_kind(value)}.")
 
 
 def _kind(value: object) -> str:

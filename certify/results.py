@@ -280,8 +280,9 @@ class RoaResult:
     def _stated(self) -> list[tuple[str, str]]:
         """What is said of the result in a few rows, names and values."""
         rows = [("verdict", self.verdict.value), ("plant", self.system.name), ("claim", self.claim)]
-        level, size = self.levels.roa, self.volume
-        if level is not None and size is not None and self.verdict in (Verdict.PROVED, Verdict.TRUSTED):
+        shown = self.verdict in (Verdict.PROVED, Verdict.TRUSTED)
+        level, size = (self.levels.roa, self.volume) if shown else (None, None)
+        if level is not None and size is not None:
             unit = volume_unit([self.system.units.get(s.name, "") for s in self.system.states])
             rows.append(("set", f"V <= {below(level)}"))
             rows.append((volume_name(self.system.n), f"{below(size)} {unit}".rstrip()))

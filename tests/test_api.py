@@ -6,6 +6,7 @@ import dataclasses
 import gc
 import inspect
 import json
+import os
 import pydoc
 import re
 from fractions import Fraction
@@ -19,7 +20,7 @@ import torch
 
 import certify
 from certify import ImportOptions, InputError, Policy, RoaOptions, TanhNetwork, Verdict, certify_roa, get_system
-from certify.api import in_python
+from certify.api import _remove, in_python
 from certify.certificate import parse_certificate
 from certify.lyapunov import volume
 from certify.policies import load_policy, save_policy
@@ -157,6 +158,14 @@ def test_options_at_once_or_by_name() -> None:
         ({"policy": "missing.pt"}, "missing.pt cannot be read"),
         ({"policy": torch.zeros(2)}, "found a Tensor"),
         ({"policy": {"a.0.weight": 3}}, r"\['a.0.weight'\] must be a tensor"),
+        ({"policy": {3: torch.zeros(2, 2)}}, "the keys of the state_dict must be text; found 3, a int"),
+        ({"policy": {"0.weight": torch.zeros(2, 2, device="meta")}}, "cannot be read as a tensor"),
+        ({"policy": {"0.weight": np.zeros((2, 2), np.longdouble)}}, "cannot be read as a tensor"),
+        ({"policy": {"0.weight": np.zeros((2, 2), bool)}}, "an array of floats"),
+        ({"load_seconds": "1"}, "`load_seconds` must be a number"),
+        ({"provenance": "mine"}, "`provenance` must be a mapping; found a str"),
+        ({"progress": True}, "`progress` must be callable; found a bool"),
+        ({"options": RoaOptions(device="cuda:99x")}, "`device` must be cpu"),
         ({"out": 3}, "`out` must be a path"),
         ({"out": ""}, "`out` must be a path in text that is not empty"),
         ({"options": {"level": 1}}, "`options` must be a RoaOptions; found a dict"),
@@ -321,6 +330,15 @@ def test_without_out_the_certificate_lives_as_long_as_the_result() -> None:
     del again
     gc.collect()
     assert not path.exists() and not path.parent.exists()
+
+
+def test_a_fork_does_not_take_the_folder_away(tmp_path: Path) -> None:
+    folder = tmp_path / "of a result"
+    folder.mkdir()
+    _remove(folder, os.getpid() + 1)  # as in a child, which ends with copies of all results
+    assert folder.exists()
+    _remove(folder, os.getpid())
+    assert not folder.exists()
 
 
 def test_contains_is_decided_in_rationals(away: RoaResult) -> None:

@@ -118,7 +118,7 @@ def _torch() -> Finding:
 
 
 def _cvxpy() -> Finding:
-    """cvxpy with Clarabel, which candidate `optimised` asks; everything else works without them."""
+    """cvxpy with Clarabel, the solver that candidate `optimised` asks."""
     found = _package("cvxpy", "cvxpy")
     if found.state != "ok":
         return found

@@ -34,7 +34,7 @@ _INSTEAD = (
 
 
 def import_module(module: torch.nn.Module, plant: System, options: ImportOptions | None = None) -> Imported:
-    """A torch module as a policy of this program; the module is copied and stays as it is.
+    """A torch module in evaluation mode as a policy of this program; the module is copied and stays as it is.
 
     Parameters
     ----------
@@ -124,14 +124,19 @@ def _plain(node: Any, what: str) -> Any:
     import torch
 
     if isinstance(node, Mapping):
+        for key in node:
+            if not isinstance(key, str):
+                raise InputError(f"the keys of {what} must be text; found {key!r:.60}, a {type(key).__name__}.")
         return {key: _plain(value, f"{what}[{key!r}]") for key, value in node.items()}
-    if isinstance(node, np.ndarray) and node.dtype.kind in "fiub":
-        return torch.tensor(node)
-    if isinstance(node, torch.Tensor):
-        return node.detach().cpu().clone()
-    raise InputError(
-        f"{what} must be a tensor, an array of numbers or a mapping of these; it is {type(node).__name__}."
-    )
+    numbers = isinstance(node, np.ndarray) and node.dtype.kind == "f"
+    if not numbers and not isinstance(node, torch.Tensor):
+        raise InputError(
+            f"{what} must be a tensor, an array of floats or a mapping of these; it is a {type(node).__name__}."
+        )
+    try:
+        return torch.tensor(node) if numbers else node.detach().cpu().clone()
+    except (TypeError, ValueError, RuntimeError) as error:  # a precision that torch has not, a tensor without numbers
+        raise InputError(f"{what} cannot be read as a tensor: {_brief(error)}") from error
 
 
 def _brief(error: Exception) -> str:
