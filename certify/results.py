@@ -6,6 +6,7 @@ rationals, sizes are rounded down, and pictures are drawn from the very bytes th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from fractions import Fraction
@@ -22,10 +23,10 @@ from certify.claims import Problem
 from certify.claims.claim import Kind
 from certify.engines.falsify import Witness
 from certify.errors import InputError
-from certify.lyapunov import extents, semi_axes, volume
+from certify.lyapunov import are_inside, extents, semi_axes, volume
 from certify.policies import TanhNetwork
 from certify.report.words import below, volume_name, volume_unit
-from certify.systems import System, exact
+from certify.systems import System
 from certify.verdict import Stop, Verdict
 
 if TYPE_CHECKING:
@@ -211,16 +212,12 @@ class RoaResult:
         if states.ndim not in (1, 2) or states.shape[-1] != n:
             names = ", ".join(s.name for s in self.system.states)
             raise InputError(f"`x` must have shape ({n},) or (N, {n}) for the states {names}; found {states.shape}.")
-        x_eq = [Fraction(0)] * n if deviations else list(self.system.exact_x_eq())
-        V, level = self.problem.V, Fraction(self.levels.roa)
-
-        def inside(row: Array) -> bool:
-            each = zip(row, x_eq, self.system.states, strict=True)
-            return V.exactly([exact(value, f"x, {state}") - at for value, at, state in each]) <= level
-
-        if states.ndim == 1:
-            return inside(states)
-        return np.array([inside(row) for row in states], dtype=np.bool_)
+        shifts = [Fraction(0)] * n if deviations else list(self.system.exact_x_eq())
+        rows = states.reshape(-1, n).tolist()
+        if any(shifts):
+            rows = [[Fraction(v) - q for v, q in zip(row, shifts, strict=True)] for row in rows]
+        found = are_inside(self.problem.V.P, self.levels.roa, rows)
+        return found[0] if states.ndim == 1 else np.array(found, dtype=np.bool_)
 
     def report(self, path: str | PathLike[str] | None = None) -> Path:
         """Draw the report as one HTML page, from the bytes that were checked, and give its path.
@@ -350,6 +347,9 @@ def _entries(x: ArrayLike) -> NDArray[Any]:
     entries = found.astype(object)
     for index, value in np.ndenumerate(entries):
         entries[index] = value.item() if isinstance(value, np.generic) else value
-        if isinstance(entries[index], bool) or not isinstance(entries[index], int | float | Fraction):
-            raise InputError(f"{required}; found {value!r:.60}, a {type(value).__name__}, at {list(index)}.")
+        number = isinstance(entries[index], int | float | Fraction) and not isinstance(entries[index], bool)
+        if not number or (isinstance(entries[index], float) and not math.isfinite(entries[index])):
+            raise InputError(
+                f"{required}, all finite; found {value!r:.60}, a {type(value).__name__}, at {list(index)}."
+            )
     return entries

@@ -380,7 +380,7 @@ def test_contains_speaks_of_the_certificate(proved: RoaResult) -> None:
     ids=str,
 )  # fmt: skip
 def test_contains_refuses_what_is_no_state(proved: RoaResult, x: Any) -> None:
-    with pytest.raises(InputError, match=r"`x|x, theta"):
+    with pytest.raises(InputError, match="`x` must"):
         proved.contains(x)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -48,8 +47,8 @@ class Quadratic:
         """V in float64, shape (..., n) to (...)."""
         return np.asarray(x @ self.P @ x if x.ndim == 1 else ((x @ self.P) * x).sum(-1))
 
-    def exactly(self, x: Array | Sequence[Fraction]) -> Fraction:
-        """V at a point of binary64 numbers or of rationals, shape (n,), as a rational."""
-        exact = [v if isinstance(v, Fraction) else Fraction(float(v)) for v in x]
+    def exactly(self, x: Array) -> Fraction:
+        """V at a binary64 point, shape (n,), as a rational."""
+        exact = [Fraction(float(v)) for v in x]
         rows = (sum((Fraction(float(p)) * v for p, v in zip(row, exact, strict=True)), Fraction(0)) for row in self.P)
         return sum((v * r for v, r in zip(exact, rows, strict=True)), Fraction(0))
