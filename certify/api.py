@@ -23,12 +23,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from certify.claims.claim import Kind
 from certify.errors import InputError
-from certify.inputs import lines, named_plant, policy_in, tell_of_other, where_valid
+from certify.inputs import centred, lines, named_plant, policy_in, tell_of_other, where_valid
 from certify.installation import version_of
 from certify.lyapunov import Candidate
-from certify.options import EngineName, RoaOptions
+from certify.options import Asked, EngineName, RoaOptions
 from certify.policies import Policy, TanhNetwork
 from certify.policies.importers import Clip, ImportOptions, import_module, import_state_dict
 from certify.results import RoaResult
@@ -52,7 +51,7 @@ def certify_roa(
     options: RoaOptions | None = None,
     *,
     importing: ImportOptions | Mapping[str, Any] | None = None,
-    claim: Kind | None = None,
+    claim: Asked | None = None,
     candidate: Candidate | None = None,
     Q: Sequence[float] | None = None,
     R: Sequence[float] | None = None,
@@ -71,7 +70,8 @@ def certify_roa(
     """Prove a region of attraction of a plant under a policy, and have the proof checked.
 
     For `xdot = f(x, pi(x))` it looks for the largest set {x'Px <= c2} from which every trajectory converges to the
-    origin, writes the proof down as a certificate, and asks the independent checker, in a process of its own.
+    origin, writes the proof down as a certificate, and asks the independent checker, in a process of its own. A policy
+    that does not rest at the origin exactly gets another claim, practical stability: `result.claim` says which.
 
     Parameters
     ----------
@@ -86,7 +86,8 @@ def certify_roa(
     importing : what a policy that is not this program's own does not say: an `ImportOptions`, or a mapping with its
         names, such as `{"states": ["theta", "theta_dot"], "normaliser": "none", "action_scale": 6}`. What is missing
         is asked for by name; nothing is guessed. Text means its decimal value, a float its binary value.
-    claim : "asymptotic" (the default), or "practical", which asks for no equilibrium at the origin.
+    claim : "asymptotic"; "practical", which asks for no equilibrium at the origin; or "auto" (the default), the first
+        where the loop rests at the origin exactly and the second where it does not.
     candidate : where P comes from: "auto" (the default: of several the largest proved), "lyapunov", "scaled", "lqr"
         or "optimised".
     Q, R : diagonals of the weights, n and m positive numbers; ones by default.
@@ -221,12 +222,19 @@ def _policy(given: Any, system: Any, asked: ImportOptions, tell: Callable[[str],
     import torch
 
     if isinstance(given, Policy | TanhNetwork):
-        if asked.given:
-            raise InputError(f"`importing` must be left out: a {_kind(given)} says all itself.")
-        return given
+        others = set(asked.given) - ({"--centre"} if isinstance(given, Policy) else set())
+        if others:
+            raise InputError(f"{', '.join(sorted(others))} must be left out: a {type(given).__name__} says all itself.")
+        if isinstance(given, TanhNetwork) or asked.centre is None:
+            return given
+        return centred(given, asked.centre, _closed(given, system, lambda _: None)[0], tell)
     if isinstance(given, str | os.PathLike):
         return policy_in(
-            Path(_path(given, "policy")), asked, lambda: _plant(system, "a policy of another program"), tell
+            Path(_path(given, "policy")),
+            asked,
+            lambda: _plant(system, "a policy of another program"),
+            lambda stored: _closed(stored, system, lambda _: None)[0],
+            tell,
         )
     if isinstance(given, torch.nn.Module):
         imported = import_module(given, _plant(system, "a module"), asked)

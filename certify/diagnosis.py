@@ -7,6 +7,7 @@ from what sampling finds beyond it, another candidate only if others were left u
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -19,6 +20,7 @@ from certify.engines.falsify import falsify
 from certify.errors import InputError
 from certify.lyapunov import diagonalising_coordinates, domain_limit, extents, volume
 from certify.options import RoaOptions
+from certify.policies import Centre
 from certify.results import Diagnosis, RoaResult, Share, Step
 from certify.verdict import Stop
 
@@ -118,6 +120,8 @@ def _direction(result: RoaResult, proof: Proof | None, point: Array | None, loop
 
 
 def _next(result: RoaResult, options: RoaOptions, proof: Proof | None, name: str | None) -> Step:
+    if result.claim == "practical" and (centre := _centring(result)) is not None:
+        return Step((("--centre", centre),), "with pi(0) = u_eq it can be claimed that all converges to the origin")
     if result.stop is Stop.DOMAIN and name is not None and options.level is None:
         return _wider_domain(result, name)
     if result.stop in (Stop.TIME, Stop.BOXES):
@@ -135,6 +139,20 @@ def _next(result: RoaResult, options: RoaOptions, proof: Proof | None, name: str
             return Step((("--time-limit", _round(4 * options.time_limit)),), "another candidate reaches further")
         return Step((), "what this V can show is proved; a larger set needs another policy or another kind of V")
     return Step((), result.reason)
+
+
+def _centring(result: RoaResult) -> str | None:
+    """A centring with which the loop rests at the origin, exactly; None if it has one, or none can be had."""
+    if result.network.centre != "none":
+        return None
+    centres: tuple[Centre, ...] = ("preactivation", "output")
+    for centre in centres:
+        try:
+            ClosedLoop(result.system, replace(result.network, centre=centre)).require_rest()
+        except InputError:
+            continue
+        return centre
+    return None
 
 
 def _hurting(result: RoaResult, proof: Proof | None) -> list[tuple[str, float]]:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -17,29 +18,57 @@ from typing import TYPE_CHECKING, Any
 from certify.errors import InputError
 
 if TYPE_CHECKING:
-    from certify.policies import Policy
+    from certify.policies import Centre, Policy
     from certify.policies.importers import Imported, ImportOptions
     from certify.systems import System
 
 Tell = Callable[[str], None]
 
 
-def policy_in(path: Path, importing: ImportOptions, plant: Callable[[], System], tell: Tell) -> Policy:
-    """The policy in a file of this program, or of another one for the plant that `plant` gives, if it is asked.
+def policy_in(
+    path: Path, importing: ImportOptions, plant: Callable[[], System], own: Callable[[Policy], System], tell: Tell
+) -> Policy:
+    """The policy in a file of this program, or of another one.
+
+    Parameters
+    ----------
+    plant : gives the plant that a policy of another program is for.
+    own : gives the plant of a policy of this program, where a centring is asked for.
 
     Raises
     ------
-    InputError : the file cannot be read or imported.
+    InputError : the file cannot be read or imported, or the centring cannot be had.
     """
     from certify.policies import load_policy
     from certify.policies.importers import import_policy
 
     if is_own(path, importing):
-        return load_policy(path)
+        stored = load_policy(path)
+        return stored if importing.centre is None else centred(stored, importing.centre, own(stored), tell)
     imported = import_policy(path, plant(), importing)
     for line in lines(imported):
         tell(line)
     return imported.policy
+
+
+def centred(stored: Policy, centre: Centre, plant: System, tell: Tell) -> Policy:
+    """A policy of this program with the centring that is asked for; says by how much u changes.
+
+    Raises
+    ------
+    InputError : the policy has another centring already, or this one cannot be had.
+    """
+    from certify.policies.importers import centring_changes
+
+    if stored.network.centre == centre:
+        return stored
+    if stored.network.centre != "none":
+        raise InputError(f"--centre {centre} must be left out: the file's centring is {stored.network.centre}.")
+    changes = centring_changes(stored.network, plant)
+    if centre not in changes:
+        raise InputError(f"--centre {centre} cannot be had: u_eq must lie within the policy's reach.")
+    tell(f"centred: --centre {centre} changes u by up to {changes[centre]:.3g} in the domain")
+    return replace(stored, network=replace(stored.network, centre=centre))
 
 
 def named_plant(stored: Policy, name: str | None) -> tuple[System, bool]:
@@ -102,7 +131,7 @@ def is_own(path: Path, importing: ImportOptions) -> bool:
 
     Raises
     ------
-    InputError : options of other programs' files are given for one of this program.
+    InputError : options of other programs' files, other than a centring, are given for one of this program.
     """
     from certify.policies.importers import content_of, read_bytes
 
@@ -113,10 +142,9 @@ def is_own(path: Path, importing: ImportOptions) -> bool:
         if importing.given:
             raise
         return True
-    if content == "policy" and importing.given:
-        raise InputError(
-            f"{', '.join(importing.given)} must be left out: {path} is a policy file of this program and says all."
-        )
+    others = [name for name in importing.given if name != "--centre"]
+    if content == "policy" and others:
+        raise InputError(f"{', '.join(others)} must be left out: {path} is a policy file of this program and says all.")
     foreign_pickle = content is None and raw[:1] == b"\x80"
     return content == "policy" or (content is None and not importing.given and not foreign_pickle)
 

@@ -9,12 +9,12 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.claims.claim import Kind
 from certify.errors import InputError
 from certify.lyapunov import Candidate, Named
 
 Array = NDArray[np.float64]
 EngineName = Literal["bounds", "dreal", "both"]
+Asked = Literal["auto", "asymptotic", "practical"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,7 +23,8 @@ class RoaOptions:
 
     Parameters
     ----------
-    claim : `asymptotic`, or `practical`, which asks for no equilibrium at the origin.
+    claim : `asymptotic`, or `practical`, which asks for no equilibrium at the origin; `auto` is the first where the
+        loop rests at the origin exactly, and the second where it does not.
     candidate : where P comes from, see `choose_candidate`; `auto` tries several and keeps the one with which the
         largest volume is proved. With Q, R or a level it is `lyapunov`, or `lqr` if R is given.
     Q, R : diagonals of the weights, shapes (n,) and (m,); None means ones.
@@ -36,7 +37,7 @@ class RoaOptions:
     max_boxes : boxes for the ring.
     """
 
-    claim: Kind = "asymptotic"
+    claim: Asked = "auto"
     candidate: Candidate = "auto"
     Q: tuple[float, ...] | None = None
     R: tuple[float, ...] | None = None
@@ -57,7 +58,7 @@ class RoaOptions:
         return "lqr" if self.R is not None else "lyapunov" if self.Q is not None or self.level is not None else None
 
     def __post_init__(self) -> None:
-        for name, known in (("claim", Kind), ("candidate", Candidate), ("engine", EngineName)):
+        for name, known in (("claim", Asked), ("candidate", Candidate), ("engine", EngineName)):
             if getattr(self, name) not in get_args(known):
                 raise InputError(f"`{name}` must be one of {get_args(known)}; found {getattr(self, name)!r}.")
         if not 0 < self.dreal_precision < 1 or self.jobs < 1:

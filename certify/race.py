@@ -13,6 +13,8 @@ from certify.engines.base import Attempt, Budget, Progress
 from certify.lyapunov import volume
 from certify.trials import Trial, by_reach
 
+_FIRST_LOOK = 0.25  # of a heat, after which it may end
+_HOPELESS = 1e9  # boxes that a first gain may need, at a hundred thousand a second some hours
 _WORTH = 1.02  # of the best proved volume: what a candidate's reach must exceed to be given time
 
 
@@ -23,6 +25,11 @@ class Contender:
     trial: Trial
     attempt: Attempt
     proved: float = 0.0
+
+    @property
+    def hopeless(self) -> bool:
+        """Whether no time that anybody has would gain anything."""
+        return not self.attempt.gained and self.attempt.expected > _HOPELESS
 
     def advance(self, budget: Budget, report: Callable[[Progress], None] | None) -> None:
         """Work on the proof for as long as the budget allows, whose boxes are those of the whole attempt."""
@@ -69,9 +76,17 @@ class Race:
             self.contenders.append(Contender(trial, self.begin(trial)))
             self._heat(self.contenders[-1], seconds)
 
+    @property
+    def gained(self) -> bool:
+        """Whether any contender's search has added to what it began with."""
+        return any(c.attempt.gained for c in self.contenders)
+
     def knock_out(self, seconds: float) -> None:
-        """Heats among the better half, each round twice as long as the one before, until one is left."""
-        contenders = self.open
+        """Heats among the better half, each round twice as long as the one before, until one is left.
+
+        Those whose search has added nothing yet cannot be told apart by more of the same: they are out.
+        """
+        contenders = [c for c in self.open if c.attempt.gained]
         while len(contenders) > 1:
             contenders, seconds = contenders[: (len(contenders) + 1) // 2], 2 * seconds
             if len(contenders) == 1:
@@ -81,4 +96,7 @@ class Race:
             contenders = [c for c in self.open if c in contenders]
 
     def _heat(self, contender: Contender, seconds: float) -> None:
-        contender.advance(Budget(max(1e-3, min(seconds, self.left())), self.boxes), self.report)
+        for share in (_FIRST_LOOK, 1 - _FIRST_LOOK):
+            contender.advance(Budget(max(1e-3, min(share * seconds, self.left())), self.boxes), self.report)
+            if contender.hopeless:
+                return

@@ -26,6 +26,7 @@ from certify.errors import InputError
 from certify.lyapunov import are_inside, extents, semi_axes, volume
 from certify.policies import TanhNetwork
 from certify.report.words import below, volume_name, volume_unit
+from certify.rest import Rest
 from certify.systems import System
 from certify.verdict import Stop, Verdict
 
@@ -136,10 +137,11 @@ class Diagnosis:
 class RoaResult:
     """What was proved. `stop` and `detail` say what limits the level, or why nothing was proved.
 
-    `candidate` is where P came from, `tried` all that were tried, `notice` what is not as it was asked for. `checker`
-    is what the checker said, None if it was not reached, about `raw`, the certificate's bytes; `solver` has dReal's
-    version and every query with its answer, None if it was not asked. `notices` is what had to be known about plant and
-    policy before the run, such as a domain that was cut; `folder` keeps a temporary folder of the certificate alive.
+    `rest` is where the loop rests, if not at the origin. `candidate` is where P came from, `tried` all that were tried,
+    `notice` what is not as it was asked for. `checker` is what the checker said, None if it was not reached, about
+    `raw`, the certificate's bytes; `solver` has dReal's version and every query with its answer, None if it was not
+    asked. `notices` is what had to be known about plant and policy before the run, such as a domain that was cut;
+    `folder` keeps a temporary folder of the certificate alive.
 
     In Python: `contains`, `volume`, `plot`, `report`, `certificate` (the file's path), `to_dict`.
     """
@@ -166,6 +168,7 @@ class RoaResult:
     engine: str = "bounds"
     solver: Mapping[str, Any] | None = None
     diagnosis: Diagnosis | None = None
+    rest: Rest | None = None
     notices: tuple[str, ...] = ()
     folder: object | None = field(default=None, compare=False)
 
@@ -262,7 +265,8 @@ class RoaResult:
 
     def __repr__(self) -> str:
         said = dict(self._stated())
-        shown = [said[name] for name in ("verdict", "plant", "set") if name in said]
+        verdict = said["verdict"] if self.claim == "asymptotic" else f"{said['verdict']} {self.claim}"
+        shown = [verdict, *(said[name] for name in ("plant", "set") if name in said)]
         shown += [
             f"{name} {said[name]}" for name in ("length", "area", "volume", "limited by", "reason") if name in said
         ]
@@ -317,6 +321,7 @@ class RoaResult:
             "levels": {name: getattr(self.levels, name) for name in Levels.__slots__},
             "witness": None,
             "eigenvalues": list(self.eigenvalues),
+            "rest": None if self.rest is None else asdict(self.rest),
         }
         if witness is not None:
             stated["witness"] = {"x": witness.x.tolist(), "V": witness.level, "kind": witness.kind}

@@ -34,7 +34,8 @@ class _Balls(Algebra[flint.arb]):
 
 
 @contextmanager
-def _precision() -> Iterator[None]:
+def precision() -> Iterator[None]:
+    """Arb at the precision of this module."""
     before, flint.ctx.prec = flint.ctx.prec, _PRECISION
     try:
         yield
@@ -54,7 +55,7 @@ def evaluate_arb(expression: sympy.Expr, values: Mapping[sympy.Symbol, flint.arb
 
 def evaluate_policy(loop: ClosedLoop, x: Array) -> Balls:
     """pi(x) at a binary64 point (n,), as Arb balls."""
-    with _precision():
+    with precision():
         network = loop.network
         y = _net(network, _points(x))
         shift, offset = _centring(loop)
@@ -67,7 +68,7 @@ def evaluate_policy(loop: ClosedLoop, x: Array) -> Balls:
 
 def centring_with_errors(loop: ClosedLoop) -> tuple[Array, Array, Array, Array]:
     """`shift` and `offset` of the centring rounded to binary64, each followed by an upper bound of its error, (m,)."""
-    with _precision():
+    with precision():
         columns = []
         for balls in _centring(loop):
             middle = [float(b.mid()) for b in balls]
@@ -84,7 +85,7 @@ def _above(x: flint.arb) -> float:
 
 def evaluate_vdot(loop: ClosedLoop, P: Array, x: Array) -> flint.arb:
     """`Vdot = 2 x'P F(x)` at a binary64 point (n,), as an Arb ball."""
-    with _precision():
+    with precision():
         state = _points(x)
         values: dict[sympy.Symbol, flint.arb] = dict(zip(loop.system.states, state, strict=True))
         values |= zip(loop.system.inputs, evaluate_policy(loop, x), strict=True)
@@ -100,7 +101,7 @@ def eigenvalues(loop: ClosedLoop) -> list[flint.acb] | None:
 
     None if Arb cannot isolate them, or the clip is not certain to be inactive at the origin.
     """
-    with _precision():
+    with precision():
         if not _unclipped(loop):
             return None
         try:
@@ -109,20 +110,55 @@ def eigenvalues(loop: ClosedLoop) -> list[flint.acb] | None:
             return None
 
 
-def _jacobian(loop: ClosedLoop) -> flint.arb_mat:
-    """The closed loop's Jacobian at the origin."""
-    network = loop.network
-    y: Balls = [flint.arb(0)] * network.n
+def policy_on(loop: ClosedLoop, x: Balls) -> tuple[Balls, flint.arb_mat]:
+    """pi and its Jacobian (m, n) on balls x.
+
+    Where it is not certain on which side of a bound of the clip its argument lies, the slope is the ball of all slopes
+    between 0 and 1: good for mean values, and for nothing else.
+    """
+    network, y = loop.network, list(x)
     J = flint.arb_mat([[int(i == j) for j in range(network.n)] for i in range(network.n)])
     for k, (W, b) in enumerate(zip(network.weights, network.biases, strict=True)):
         if k:
             y, J = _through_tanh(y, J)
         y, J = _affine(W, b, y), _matrix(W) * J
-    shift, _ = _centring(loop)
+    shift, offset = _centring(loop)
     squashed = [network.squashed(v + d, _NUMBERS) for v, d in zip(y, shift, strict=True)]
     slopes = [network.squash_slope(v, _NUMBERS) for v in squashed]
-    scale = [flint.arb(float(s)) * slope for s, slope in zip(network.scale, slopes, strict=True)]
-    gain = flint.arb_mat([[scale[i] * J[i, j] for j in range(network.n)] for i in range(network.m)])
+    scale = [flint.arb(float(s)) for s in network.scale]
+    u = [s * v + o for s, v, o in zip(scale, squashed, offset, strict=True)]
+    slopes = [s * slope * clip for s, slope, clip in zip(scale, slopes, _clip_slopes(network, u), strict=True)]
+    gain = flint.arb_mat([[slopes[i] * J[i, j] for j in range(network.n)] for i in range(network.m)])
+    return list(network.clipped(u, _NUMBERS)), gain
+
+
+def _clip_slopes(network: TanhNetwork, u: Balls) -> Balls:
+    if network.clip is None:
+        return [flint.arb(1)] * len(u)
+    slopes = []
+    for v, lo, hi in zip(u, *network.clip, strict=True):
+        inside, outside = v > float(lo) and v < float(hi), v < float(lo) or v > float(hi)
+        slopes.append(flint.arb(1) if inside else flint.arb(0) if outside else flint.arb(0.5, 0.5))
+    return slopes
+
+
+def field_on(loop: ClosedLoop, x: Balls) -> tuple[Balls, flint.arb_mat]:
+    """F and its Jacobian (n, n) on balls x, the Jacobian as `policy_on` says."""
+    system = loop.system
+    u, gain = policy_on(loop, x)
+    values = dict(zip((*system.states, *system.inputs), (*x, *u), strict=True))
+    known: dict[Any, flint.arb] = {}
+    F = [evaluate(e, values, _Balls(), known) for e in system.exact_dynamics()]
+    A, B = (
+        flint.arb_mat([[evaluate(e.diff(s), values, _Balls(), known) for s in by] for e in system.exact_dynamics()])
+        for by in (system.states, system.inputs)
+    )
+    return F, A + B * gain
+
+
+def _jacobian(loop: ClosedLoop) -> flint.arb_mat:
+    """The closed loop's Jacobian at the origin and u_eq."""
+    _, gain = policy_on(loop, [flint.arb(0)] * loop.network.n)
     A, B = (
         flint.arb_mat([[evaluate_arb(M[i, j], {}) for j in range(M.shape[1])] for i in range(M.shape[0])])
         for M in loop.plant_jacobians()
@@ -135,11 +171,8 @@ def _unclipped(loop: ClosedLoop) -> bool:
     network = loop.network
     if network.clip is None:
         return True
-    shift, offset = _centring(loop)
-    y = _net(network, [flint.arb(0)] * network.n)
-    parts = zip(y, shift, network.scale, offset, *network.clip, strict=True)
-    each = ((flint.arb(float(s)) * network.squashed(v + d, _NUMBERS) + o, lo, hi) for v, d, s, o, lo, hi in parts)
-    return all(bool(u > float(lo)) and bool(u < float(hi)) for u, lo, hi in each)
+    u, _ = policy_on(loop, [flint.arb(0)] * network.n)
+    return all(bool(v > float(lo)) and bool(v < float(hi)) for v, lo, hi in zip(u, *network.clip, strict=True))
 
 
 class _Numbers:

@@ -30,15 +30,17 @@ from certify.certificate import (
     write_beside,
 )
 from certify.claims import Asymptotic, Claim, Problem
+from certify.claims.claim import Kind
 from certify.closed_loop import ClosedLoop
 from certify.diagnosis import diagnose
 from certify.engines.base import Attempt, Budget, Progress, Proof, Task
 from certify.engines.falsify import Witness, refutes
-from certify.errors import BackendError, SoundnessError
+from certify.errors import BackendError, InputError, SoundnessError
 from certify.lyapunov import leaves_domain
 from certify.options import RoaOptions
 from certify.policies import TanhNetwork
 from certify.race import Contender, Race
+from certify.rest import find_rest
 from certify.results import Levels, RoaResult, Tried
 from certify.rigorous import eigenvalues
 from certify.systems import System
@@ -57,13 +59,13 @@ _HEAT = 0.04  # a candidate's first heat
 _PATIENCE = 0.1  # for a ring that gains nothing
 _SEARCH = 0.6  # for a search that cannot be interrupted, the rest being its check's
 _KEPT = 0.03  # for what comes after the search: writing, the checker's start
-_HOPE = 0.05  # share of boxes that must be proved to go on with a ring that gains nothing
 _FOR_PROOF = 0.4  # of the time limit, that no further candidate is optimised in
 _WORTH = 1.05  # growth of a volume that another candidate must promise
 _MISLED = 0.9  # of its reach: a violation below it is one that the samples missed
 _SAMPLE = 2000  # leaves whose check is timed
 _START = 0.2  # seconds that a checker takes to start
 _CAUTION = 1.2  # on the time that a check is expected to take
+_YEAR = 3.156e7  # seconds
 _SPLITS, _LOWERINGS = 3, 9  # of what the checker refuses
 
 
@@ -132,10 +134,13 @@ class _Run:
     start: float = field(default_factory=time.perf_counter)
     proof: Proof | None = None
     cut_short: bool = False
+    aside: str | None = None
 
     def result(self) -> RoaResult:
         result = self._decide()
         result = replace(result, seconds={"load": self.load, **self.seconds, "total": self.spent})
+        notices = [text for text in (self.aside, result.notice) if text is not None]
+        result = replace(result, notice="; ".join(notices) or None)
         return replace(result, diagnosis=diagnose(result, self.options, self.proof))
 
     @property
@@ -151,17 +156,20 @@ class _Run:
         """Choose, falsify, prove, check."""
         options, loop = self.options, ClosedLoop(self.system, self.network)
         require_within_limits(self.system, self.network)
-        result = RoaResult(
-            Verdict.UNKNOWN, Stop.REQUESTED, self.system, self.network, options.claim, engine=options.engine
-        )
-        if options.claim == "asymptotic":
+        with self._stage("candidate"):
+            self.options = options = replace(options, claim=self._claim(loop))
+        kind = _kind_of(options)
+        result = RoaResult(Verdict.UNKNOWN, Stop.REQUESTED, self.system, self.network, kind, engine=options.engine)
+        if kind == "asymptotic":
             with self._stage("candidate"):
-                loop.require_rest()
                 unstable = _unstable(loop)
             if unstable is not None:
                 verdict, stop, shown = unstable
                 detail = f"eigenvalues {', '.join(shown)}" + (" touch the axis" if stop is Stop.SPECTRUM else "")
                 return replace(result, verdict=verdict, stop=stop, detail=detail, eigenvalues=shown)
+        elif self.aside is not None:
+            with self._stage("candidate"):
+                result = replace(result, rest=find_rest(loop))
         if options.P is None and options.only is None:
             race = self._race(loop)
         else:
@@ -174,6 +182,24 @@ class _Run:
             race.enter([one], self._heat())
         self._finish(race)
         return self._conclude(result, race)
+
+    def _claim(self, loop: ClosedLoop) -> Kind:
+        """What is claimed: as asked, or by whether the loop rests at the origin; `aside` says why it is the weaker one.
+
+        Raises
+        ------
+        InputError : the claim `asymptotic` is asked for, and the loop does not rest at the origin.
+        """
+        if self.options.claim == "practical":
+            return "practical"
+        try:
+            loop.require_rest()
+        except InputError as error:
+            if self.options.claim == "asymptotic":
+                raise
+            self.aside = f"practical stability is claimed, because {_first_sentence(error)}"
+            return "practical"
+        return "asymptotic"
 
     def _race(self, loop: ClosedLoop) -> Race:
         """Every candidate for a little time, and more for the better ones."""
@@ -195,7 +221,7 @@ class _Run:
             with self._stage("candidate"):
                 best = max(others, key=lambda c: c.proved).trial
                 between = list(blends(loop, unproved[0].trial, best, options))
-            race.enter(between, heat)
+            race.enter(between, heat if race.gained else 0.0)  # without a gain their local levels tell
         race.knock_out(heat)
         return race
 
@@ -272,10 +298,8 @@ class _Run:
             return
         winner, report = race.open[0], race.report
         boxes = self.options.max_boxes
-        while not (winner.attempt.gained or winner.attempt.done) and self.left() > 0:
+        while not (winner.attempt.gained or winner.attempt.done or winner.hopeless) and self.left() > 0:
             winner.advance(Budget(self._within(_PATIENCE * self.options.time_limit), boxes), report)
-            if winner.attempt.hope < _HOPE:
-                break
         if winner.attempt.done or not winner.attempt.gained or not self.interruptible:
             return
         each = self._seconds_of_a_leaf(winner)
@@ -318,10 +342,12 @@ class _Run:
             boxes=sum(c.attempt.proof().boxes for c in race.contenders),
             solver=proof.solver,
         )
-        if proof.stop is Stop.TIME and proof.claim is not None and not best.attempt.gained:
-            result = replace(
-                result, stop=Stop.STALLED, detail=f"{proof.boxes:,} boxes added nothing to the local level"
-            )
+        if proof.stop is Stop.TIME and proof.claim is not None and best.hopeless:
+            pace = proof.boxes / max(1e-3, proof.seconds.get("ring", 0.0))
+            years = best.attempt.expected / pace / _YEAR
+            needed = f"about {best.attempt.expected:.0e} are needed before anything is, {years:.0e} years at this pace"
+            detail = f"{proof.boxes:,} boxes added nothing to the local level, and {needed}"
+            result = replace(result, stop=Stop.STALLED, detail=detail)
         claim = proof.claim
         if claim is None or (task.exactly and claim.roa < task.target):
             if task.exactly and _refuted(task, witness):
@@ -445,6 +471,14 @@ class _Run:
             yield
         finally:
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
+
+
+def _kind_of(options: RoaOptions) -> Kind:
+    return "practical" if options.claim == "practical" else "asymptotic"
+
+
+def _first_sentence(error: Exception) -> str:
+    return str(error).split(". ")[0].rstrip(".")
 
 
 def _about(result: RoaResult, trial: Trial) -> RoaResult:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from certify.certificate import require_short
 from certify.claims import Problem
+from certify.claims.claim import Kind
 from certify.closed_loop import ClosedLoop
 from certify.engines.base import Task
 from certify.engines.falsify import Witness, falsify, survey
@@ -89,16 +90,17 @@ def trial(loop: ClosedLoop, P: Array, name: str, options: RoaOptions, notice: st
         raise InputError(
             f"levels of V must lie between {_SMALLEST:g} and {1 / _SMALLEST:g}; found {level:g}. Scale the states or P."
         )
-    task = Task(problem, options.claim, level, options.level is not None)
+    kind: Kind = "practical" if options.claim == "practical" else "asymptotic"
+    task = Task(problem, kind, level, options.level is not None)
     if options.level is not None and leaves_domain(P, options.level, loop.system.domain):
         return Trial(name, task, T, limit, "domain", volume(P, limit), notice)
-    if options.claim == "practical":
+    if kind == "practical":
         bands = survey(problem, T, level)
         reach = bands[0].above if bands else 0.0
         return Trial(name, task, T, limit, "sampled" if reach < level else "domain", volume(P, reach), notice)
     witness = falsify(problem, T, level, *([] if options.only or options.P is not None else [_SAMPLES]))
     below = level if witness is None or task.exactly else witness.level * (1 - _BELOW_WITNESS)
-    task = Task(problem, options.claim, below, task.exactly, witness)
+    task = Task(problem, kind, below, task.exactly, witness)
     return Trial(name, task, T, limit, "domain" if witness is None else "sampled", volume(P, below), notice)
 
 

@@ -314,6 +314,26 @@ def test_the_domain_is_cut_to_where_a_policy_is_valid() -> None:
         certify_roa(scalar_tanh()[0], policy)
 
 
+def test_a_policy_that_rests_beside_the_origin_gets_the_other_claim_and_says_so(tmp_path: Path) -> None:
+    uncentred = Policy(dataclasses.replace(small_pendulum(), centre="none"), "pendulum")
+    result = certify_roa("pendulum", uncentred, level=0.05)
+    assert result.claim == "practical" and " practical; " in repr(result) and "practical" in result._repr_html_()
+    save_policy(tmp_path / "p.pt", uncentred)
+    for given in (uncentred, tmp_path / "p.pt"):
+        mended = certify_roa("pendulum", given, None, QUICK, importing={"centre": "preactivation"})
+        assert mended.verdict is Verdict.PROVED and mended.claim == "asymptotic" and "changes u by" in mended.notices[0]
+        assert "--" not in mended.notices[0] and " practical" not in repr(mended)
+    with pytest.raises(InputError, match="`squash` must be left out"):
+        certify_roa("pendulum", uncentred, importing={"squash": "tanh", "centre": "output"})
+    with pytest.raises(InputError, match="the file's centring is preactivation"):
+        certify_roa("pendulum", Policy(small_pendulum(), "pendulum"), importing={"centre": "output"})
+
+
+def small_pendulum() -> TanhNetwork:
+    network = pendulum_network((4,))
+    return dataclasses.replace(network, biases=tuple(b + 1e-3 for b in network.biases))
+
+
 def test_a_beta_of_another_plant_is_refused() -> None:
     with pytest.raises(InputError, match="`beta` must be"):
         certify_roa("pendulum", Policy(pendulum_network((8, 8)), "pendulum", beta=np.array([0.3])))

@@ -328,7 +328,7 @@ def test_a_policy_that_is_nearly_centred_is_named_before_any_work(tmp_path: Path
     system, network = scalar_tanh()
     off = dataclasses.replace(network, biases=(np.array([1e-12]),))
     with pytest.raises(InputError, match=r"not centred.*practical"):
-        certify_roa(system, off, tmp_path)
+        certify_roa(system, off, tmp_path, RoaOptions(claim="asymptotic"))
 
 
 def test_an_equilibrium_that_is_not_decided_in_rationals_is_named(tmp_path: Path) -> None:
@@ -337,7 +337,7 @@ def test_an_equilibrium_that_is_not_decided_in_rationals_is_named(tmp_path: Path
     system = System("s", (x,), (u,), {}, dynamics, (sympy.Integer(0),), box(1), box(9))
     network = TanhNetwork((np.array([[-5.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
     with pytest.raises(InputError, match="not decided in rationals: sin of 1"):
-        certify_roa(system, network, tmp_path)
+        certify_roa(system, network, tmp_path, RoaOptions(claim="asymptotic"))
 
 
 def test_input_bounds_are_decided_in_rationals(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
-from certify.commands.arguments import with_params
+from certify.commands.arguments import plant_of, with_params
 from certify.commands.terminal import tell
 from certify.errors import InputError
 from certify.inputs import policy_in
@@ -70,7 +70,13 @@ def policy_of(path: Path, importing: ImportOptions, system: str | None, params: 
     ------
     InputError : the file cannot be read or imported, or is another program's and `system` is None.
     """
-    return policy_in(path, importing, lambda: _plant_for(path, system, params), tell)
+    return policy_in(
+        path,
+        importing,
+        lambda: _plant_for(path, system, params),
+        lambda stored: plant_of(stored, system, params, []),
+        tell,
+    )
 
 
 def imported_policy(path: Path, importing: ImportOptions, system: str | None, params: list[str]) -> Imported:

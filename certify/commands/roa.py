@@ -40,8 +40,11 @@ def roa(
     ] = None,
     claim: Annotated[
         str,
-        typer.Option(help="asymptotic (converges to the origin) or practical (enters a small set and stays there)."),
-    ] = "asymptotic",
+        typer.Option(
+            help="asymptotic (converges to the origin), practical (enters a small set and stays there), or auto: the "
+            "first if the loop rests at the origin exactly."
+        ),
+    ] = "auto",
     candidate: Annotated[
         str,
         typer.Option(

@@ -104,8 +104,8 @@ class Attempt(Protocol):
         """Whether the search has added anything to what was there at its beginning."""
 
     @property
-    def hope(self) -> float:
-        """Share of the boxes bounded last that were proved; where it stays 0, boxes only make boxes. 1 at first."""
+    def expected(self) -> float:
+        """Boxes that the search may need before it gains anything, a guess of its order of magnitude."""
 
     def advance(self, budget: Budget, report: Report | None = None) -> None:
         """Work for as long as the budget allows."""
@@ -156,7 +156,7 @@ class Once:
         return self.level is not None
 
     @property
-    def hope(self) -> float:
+    def expected(self) -> float:
         """None: there is no going on."""
         return 0.0
 

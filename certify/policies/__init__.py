@@ -4,6 +4,6 @@ from __future__ import annotations
 
 from certify.policies.exact import bounded_by_form, require_centred
 from certify.policies.file import Policy, load_policy, save_policy
-from certify.policies.network import TanhNetwork
+from certify.policies.network import Centre, TanhNetwork
 
-__all__ = ["Policy", "TanhNetwork", "bounded_by_form", "load_policy", "require_centred", "save_policy"]
+__all__ = ["Centre", "Policy", "TanhNetwork", "bounded_by_form", "load_policy", "require_centred", "save_policy"]

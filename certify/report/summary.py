@@ -134,6 +134,10 @@ def _rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
     rows += _diagnosis_rows(result)
     rows.append(("policy", "-".join(map(str, result["policy"]["layers"]))))
     rows.append(("its sha256", str(result["policy"]["sha256"])))
+    if result.get("rest"):
+        rest = result["rest"]
+        point = ", ".join(f"{name} = {value}" for name, value in zip(_state_names(result), rest["x"], strict=True))
+        rows.append(("rests at", f"{point}; eigenvalues there {', '.join(rest['eigenvalues']) or 'not enclosed'}"))
     if result.get("eigenvalues"):
         rows.append(("eigenvalues", ", ".join(map(str, result["eigenvalues"]))))
     if result.get("boxes"):

@@ -89,7 +89,7 @@ def test_the_shipped_pendulum_without_its_centring(claim: str, tmp_path: Path) -
     system = get_system("pendulum").with_parameters(policy.parameters)
     if claim == "asymptotic":
         with pytest.raises(InputError, match="claim practical stability"):
-            certify_roa(system, network, tmp_path)
+            certify_roa(system, network, tmp_path, RoaOptions(claim="asymptotic"))
         return
     result = certify_roa(system, network, tmp_path, PRACTICAL)
     assert result.verdict is Verdict.PROVED and result.stop is Stop.DOMAIN and result.certificate is not None

@@ -20,7 +20,6 @@ from certify.verdict import Stop
 
 Array = NDArray[np.float64]
 _SHARE = 0.4  # of the time, for finding c2 before c0
-_AT_FIRST = 8192  # boxes, which are too large for a proof to be expected
 _TRIES = 4  # inner levels from which c2 is looked for
 
 
@@ -104,7 +103,6 @@ class _Outwards:
         self.seconds = {"local": time.perf_counter() - start, "ring": 0.0}
         self.ring: Pass | None = None
         self.stop: Stop | None = None
-        self.hope = 1.0
         if self.inner is not None and self.inner < task.target:
             self.ring = outwards(task.problem, engine.T, self.inner, task.target, engine.runner)
 
@@ -117,6 +115,10 @@ class _Outwards:
         return 0 if self.ring is None else self.ring.boxes
 
     @property
+    def expected(self) -> float:
+        return 0.0 if self.ring is None else self.ring.expected
+
+    @property
     def level(self) -> float | None:
         return self.inner if self.ring is None else self.ring.levels[1]
 
@@ -127,10 +129,7 @@ class _Outwards:
     def advance(self, budget: Budget, report: Report | None = None) -> None:
         start = time.perf_counter()
         if self.ring is not None:
-            boxes, proved = self.ring.boxes, self.ring.proved
             self.stop = self.ring.advance(budget, report)
-            if self.ring.boxes >= _AT_FIRST:
-                self.hope = (self.ring.proved - proved) / max(1, self.ring.boxes - boxes)
         self.seconds["ring"] += time.perf_counter() - start
 
     def proof(self) -> Proof:

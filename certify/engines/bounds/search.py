@@ -262,6 +262,7 @@ class Pass:
         self.half = torch.tensor(root, device=runner.device)[:, None]
         self.boxes = self.proved = 0
         self.covered = True
+        self.halvings = 0.0
         self._stop = Stop.REQUESTED
         self._clock = _Clock()
         first = torch.zeros(1, dtype=torch.int64, device=runner.device)
@@ -299,6 +300,7 @@ class Pass:
         self.boxes += lo.shape[1]
         found = bound(lo, hi, sweep.inner, sweep.outer)
         self.proved += int(found.proved.sum())
+        self._expect(found)
         centres = 0.5 * lo + 0.5 * hi
         if sweep.violated(centres, torch.where(found.violated, rule.levels_at(centres), math.inf)):
             self._stop = Stop.WITNESS
@@ -311,6 +313,20 @@ class Pass:
         keep = sweep.wanted(lowest, highest)
         self.frontier.add(halves_lo[:, keep], halves_hi[:, keep], sweep.key(lowest, highest)[keep], halves[keep])
         self.frontier.drop_above(sweep.last())
+
+    def _expect(self, found: BoxBounds) -> None:
+        """How often a box of this batch that is not proved has to be halved, so that what its axes add to the bound is
+        less than the decay at its centre: a bound of second order falls fourfold when all n axes are halved once."""
+        excess = found.score.clamp(min=0.0).sum(0)
+        decay = excess - found.bound
+        share = (excess / decay)[~found.proved & (decay > 0) & torch.isfinite(decay)]
+        if len(share):
+            self.halvings = len(self.root) / 2 * math.log2(max(1.0, float(share.median())))
+
+    @property
+    def expected(self) -> float:
+        """Boxes that the search may need before it gains anything, by the last batch."""
+        return len(self.frontier) * math.exp2(min(1000.0, self.halvings))
 
     def settle(self) -> None:
         """Take the levels that are proved for good: what is open lies outside of them, and needs at most one look."""

@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
-from certify.policies.importers.importing import Imported, content_of, import_bytes, import_policy, read_bytes
+from certify.policies.importers.importing import (
+    Imported,
+    centring_changes,
+    content_of,
+    import_bytes,
+    import_policy,
+    read_bytes,
+)
 from certify.policies.importers.memory import import_module, import_state_dict
 from certify.policies.importers.options import ImportOptions
 from certify.policies.importers.steps import Clip
@@ -11,6 +18,7 @@ __all__ = [
     "Clip",
     "ImportOptions",
     "Imported",
+    "centring_changes",
     "content_of",
     "import_bytes",
     "import_module",

@@ -390,6 +390,13 @@ def _against(
     return compare(ours, theirs, rounding_centred(head, tail, observed, reading.beta, double))
 
 
+def centring_changes(network: TanhNetwork, plant: System) -> dict[Centre, float]:
+    """How much each centring that can be had would change u at most, over samples of the domain."""
+    x, u_eq = _sample(plant, None), plant.exact_u_eq()
+    bare = replace(network, centre="none")
+    return _centrings(bare, u_eq, x, bare(x, u_eq))
+
+
 def _centrings(bare: TanhNetwork, u_eq: tuple[Fraction, ...], x: Array, values: Array) -> dict[Centre, float]:
     """How much each centring would change u, at most, over the states."""
     changes: dict[Centre, float] = {}

@@ -1,0 +1,82 @@
+"""A pass that is asked on the way, and what it expects of itself."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from certify.engines.base import Budget, Task
+from certify.engines.bounds.engine import BoundsEngine
+from certify.engines.bounds.search import outwards, prove_outwards
+from certify.policies import load_policy
+from certify.roa import RoaOptions, certify_roa
+from certify.running import ThreadRunner
+from certify.systems import get_system
+from certify.verdict import Stop, Verdict
+from tests.support.cases import case_of
+from tests.support.loops import pendulum_network
+
+POLICIES = Path(__file__).parent.parent.parent / "examples" / "policies"
+RUNNER = ThreadRunner()
+
+
+def test_a_pass_in_pieces_is_the_pass_in_one() -> None:
+    case = case_of(get_system("pendulum"), pendulum_network())
+    whole = prove_outwards(case.problem, case.T, 1e-6, 6.0, Budget(batch=16), RUNNER)
+    pieces = outwards(case.problem, case.T, 1e-6, 6.0, RUNNER)
+    levels = []
+    while not pieces.done:
+        assert pieces.advance(Budget(boxes=50, batch=16)) in (Stop.BOXES, None)
+        levels.append(pieces.proof(Stop.BOXES).outer)
+    assert len(levels) > 3 and levels == sorted(levels)
+    found = pieces.proof()
+    assert found.outer == whole.outer and found.stop is whole.stop
+    assert found.leaves == found.tree.count(b"\xff") and pieces.levels == (1e-6, whole.outer)
+
+
+def test_a_snapshot_is_a_proof() -> None:
+    """On every leaf that meets the ring of a snapshot the bound is negative with the snapshot's own levels."""
+    from certify.certificate.tree import leaves
+
+    case = case_of(get_system("pendulum"), pendulum_network())
+    ring = outwards(case.problem, case.T, 1e-6, 6.0, RUNNER)
+    while ring.levels[0] == ring.levels[1]:
+        ring.advance(Budget(boxes=50, batch=16))
+    found = ring.proof(Stop.BOXES)
+    assert found.inner < found.outer < 6.0
+    lo, hi = (torch.tensor(a.T.copy()) for a in leaves(found.tree, found.root))
+    lowest, highest = ring.rule.levels(lo, hi)
+    meets = (lowest <= found.outer) & (highest >= found.inner)
+    assert int(meets.sum()) > 5 and bool(ring.rule(lo, hi, found.inner, found.outer).proved[meets].all())
+
+
+def test_the_time_that_the_check_will_take_is_left() -> None:
+    case = case_of(get_system("pendulum"), pendulum_network())
+    ring = outwards(case.problem, case.T, 1e-6, 6.0, RUNNER)
+    assert ring.advance(Budget(seconds=100.0, batch=4, check=10.0)) is Stop.TIME
+    assert 10 <= ring.proved < 30
+
+
+@pytest.mark.parametrize(("name", "hopeless"), [("cartpole", False), ("quadrotor2d", False), ("quadrotor3d", True)])
+def test_what_a_search_expects_tells_the_hopeless(name: str, hopeless: bool) -> None:
+    """Four and six states have gained within 40,000 boxes; twelve states would need 1e15."""
+    policy = load_policy(POLICIES / f"{name}.pt")
+    case = case_of(get_system(name).with_parameters(policy.parameters), policy.network)
+    attempt = BoundsEngine(case.T, RUNNER).begin(Task(case.problem, "asymptotic", 1e-2))
+    attempt.advance(Budget(boxes=600, batch=600))
+    assert (attempt.expected > 1e9) is hopeless
+    assert not (hopeless and attempt.gained)
+
+
+@pytest.mark.slow
+def test_a_run_that_gains_nothing_stops_early_and_says_so(tmp_path: Path) -> None:
+    policy = load_policy(POLICIES / "quadrotor3d.pt")
+    system = get_system("quadrotor3d").with_parameters(policy.parameters)
+    options = RoaOptions(candidate="lqr", time_limit=600.0)
+    result = certify_roa(system, policy.network, tmp_path, options)
+    assert result.verdict is Verdict.PROVED and result.stop is Stop.STALLED
+    assert result.seconds["total"] < 200 and "added nothing to the local level" in result.reason
+    assert result.levels.roa == result.levels.local and np.isfinite(result.levels.roa or np.nan)
