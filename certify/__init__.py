@@ -6,7 +6,18 @@
 from __future__ import annotations
 
 from importlib import import_module
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from certify.api import certify_roa
+    from certify.closed_loop import ClosedLoop
+    from certify.errors import CertifyError, InputError
+    from certify.options import RoaOptions
+    from certify.policies import Policy, TanhNetwork, load_policy, save_policy
+    from certify.policies.importers import ImportOptions
+    from certify.results import RoaResult
+    from certify.systems import System, get_system
+    from certify.verdict import Verdict
 
 _PUBLIC = {
     "CertifyError": "certify.errors",
@@ -19,16 +30,37 @@ _PUBLIC = {
     "load_policy": "certify.policies",
     "save_policy": "certify.policies",
     "ClosedLoop": "certify.closed_loop",
-    "certify_roa": "certify.roa",
+    "certify_roa": "certify.api",
     "RoaResult": "certify.results",
     "RoaOptions": "certify.options",
+    "ImportOptions": "certify.policies.importers",
 }
 
 __version__ = "0.1.0"
-__all__ = ["__version__", *_PUBLIC]  # noqa: PLE0604
+__all__ = [
+    "CertifyError",
+    "ClosedLoop",
+    "ImportOptions",
+    "InputError",
+    "Policy",
+    "RoaOptions",
+    "RoaResult",
+    "System",
+    "TanhNetwork",
+    "Verdict",
+    "__version__",
+    "certify_roa",
+    "get_system",
+    "load_policy",
+    "save_policy",
+]
 
 
 def __getattr__(name: str) -> Any:
     if name in _PUBLIC:
         return getattr(import_module(_PUBLIC[name]), name)
     raise AttributeError(f"module 'certify' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *_PUBLIC})

@@ -15,6 +15,7 @@ import sys
 import typer
 
 from certify.commands.check import check
+from certify.commands.doctor import doctor
 from certify.commands.export_smt2 import export_smt2
 from certify.commands.import_ import import_
 from certify.commands.importing import takes_import_options
@@ -23,15 +24,15 @@ from certify.commands.report import report
 from certify.commands.roa import roa
 from certify.commands.systems import systems
 from certify.commands.terminal import closed_pipe, say, tell
+from certify.commands.version import certify
 from certify.errors import BackendError, CertifyError, SoundnessError
 
 app = typer.Typer(
-    help="Regions of attraction of plants controlled by tanh networks, proved and independently checked.",
     no_args_is_help=True,
-    add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
+app.callback()(certify)
 app.command("roa")(takes_import_options(roa))
 app.command("check")(check)
 app.command("report")(report)
@@ -39,6 +40,7 @@ app.command("import")(takes_import_options(import_))
 app.command("plant")(plant)
 app.command("systems")(systems)
 app.command("export-smt2")(export_smt2)
+app.command("doctor")(doctor)
 
 _INTERRUPTED = 130  # as a shell reports SIGINT
 _STOPPED = "interrupted; nothing was left half-written."

@@ -1,23 +1,37 @@
-"""What a run found, as a typed value and as the JSON object of `certify roa --json`."""
+"""What a run found: as a typed value, as the JSON object of `certify roa --json`, and as what one asks it in Python.
+
+Whatever a result says of the certified set comes from the numbers that the checker accepted: membership is decided in
+rationals, sizes are rounded down, and pictures are drawn from the very bytes that were checked.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
+from fractions import Fraction
+from html import escape
+from os import PathLike
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
+from certify.certificate import parse_certificate, write_atomically
 from certify.claims import Problem
 from certify.claims.claim import Kind
 from certify.engines.falsify import Witness
-from certify.lyapunov import extents, semi_axes, volume
+from certify.errors import InputError
+from certify.lyapunov import are_inside, extents, semi_axes, volume
 from certify.policies import TanhNetwork
+from certify.report.words import below, volume_name, volume_unit
 from certify.rest import Rest
 from certify.systems import System
 from certify.verdict import Stop, Verdict
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
 _STAGES = ("load", "candidate", "local", "ring", "write", "check", "total")
@@ -119,14 +133,17 @@ class Diagnosis:
         return stated
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class RoaResult:
     """What was proved. `stop` and `detail` say what limits the level, or why nothing was proved.
 
     `rest` is where the loop rests, if not at the origin. `candidate` is where P came from, `tried` all that were tried,
     `notice` what is not as it was asked for. `checker` is what the checker said, None if it was not reached, about
     `raw`, the certificate's bytes; `solver` has dReal's version and every query with its answer, None if it was not
-    asked.
+    asked. `notices` is what had to be known about plant and policy before the run, such as a domain that was cut;
+    `folder` keeps a temporary folder of the certificate alive.
+
+    In Python: `contains`, `volume`, `plot`, `report`, `certificate` (the file's path), `to_dict`.
     """
 
     verdict: Verdict
@@ -152,6 +169,8 @@ class RoaResult:
     solver: Mapping[str, Any] | None = None
     diagnosis: Diagnosis | None = None
     rest: Rest | None = None
+    notices: tuple[str, ...] = ()
+    folder: object | None = field(default=None, compare=False)
 
     @property
     def P(self) -> Array | None:
@@ -163,6 +182,117 @@ class RoaResult:
         """What limits the level, or why nothing was proved, in words."""
         return self.stop.explain(self.detail)
 
+    @property
+    def volume(self) -> float | None:
+        """A certain lower bound of the volume of {V <= c2}, in the product of the states' units; None without a set."""
+        P, level = self.P, self.levels.roa
+        return None if P is None or level is None else volume(P, level)
+
+    def contains(self, x: ArrayLike, *, deviations: bool = False) -> bool | NDArray[np.bool_]:
+        """Whether states lie in the proved set {V <= c2}, decided in rationals: no state is let in by rounding.
+
+        Parameters
+        ----------
+        x : one state, (n,), or several, (N, n), in the states' units. A float means its binary value; whoever wants
+            0.1 to be a tenth gives Fraction(1, 10).
+        deviations : whether x are deviations from the operating point x_eq, in which the certificate speaks, and not
+            the states' values. Where x_eq is 0 the two are the same.
+
+        Returns
+        -------
+        bool for one state, an array (N,) of them for several.
+
+        Raises
+        ------
+        InputError : nothing was proved (a solver's word, TRUSTED, is no proof), x has another shape, or an entry is no
+            finite number.
+        """
+        if self.verdict is not Verdict.PROVED or self.problem is None or self.levels.roa is None:
+            raise InputError(
+                f"there must be a proved set to ask for; the verdict is {self.verdict.value} ({self.reason})."
+            )
+        states, n = _entries(x), self.system.n
+        if states.ndim not in (1, 2) or states.shape[-1] != n:
+            names = ", ".join(s.name for s in self.system.states)
+            raise InputError(f"`x` must have shape ({n},) or (N, {n}) for the states {names}; found {states.shape}.")
+        shifts = [Fraction(0)] * n if deviations else list(self.system.exact_x_eq())
+        rows = states.reshape(-1, n).tolist()
+        if any(shifts):
+            rows = [[Fraction(v) - q for v, q in zip(row, shifts, strict=True)] for row in rows]
+        found = are_inside(self.problem.V.P, self.levels.roa, rows)
+        return found[0] if states.ndim == 1 else np.array(found, dtype=np.bool_)
+
+    def report(self, path: str | PathLike[str] | None = None) -> Path:
+        """Draw the report as one HTML page, from the bytes that were checked, and give its path.
+
+        Parameters
+        ----------
+        path : the page; None is `report.html` beside the certificate, which a temporary folder takes with it.
+
+        Raises
+        ------
+        InputError : there is no certificate, or the page cannot be written.
+        """
+        from certify.report.drawn import page_of
+
+        raw, certificate = self._checked("report")
+        target = certificate.with_name("report.html") if path is None else Path(path)
+        page = page_of(raw, certificate, None if self.checker is None else dict(self.checker), self.to_dict())
+        write_atomically(target, page.encode())
+        return target
+
+    def plot(self) -> Figure:
+        """A figure of the proved set in its planes: the sections of {V <= c2} and of the inner set, the domain's box,
+        and with more than two states the projection.
+
+        It belongs to no window: save it with `savefig`, or let a notebook show it. Nothing in it is simulated.
+
+        Raises
+        ------
+        InputError : there is no certificate.
+        """
+        from certify.report.drawn import figure_of
+
+        raw, certificate = self._checked("plot")
+        return figure_of(parse_certificate(raw, str(certificate)), accepted=self.verdict is Verdict.PROVED)
+
+    def _checked(self, what: str) -> tuple[bytes, Path]:
+        if self.raw is None or self.certificate is None:
+            raise InputError(
+                f"there must be a certificate to {what}; the verdict is {self.verdict.value} ({self.reason})."
+            )
+        return self.raw, self.certificate
+
+    def __repr__(self) -> str:
+        said = dict(self._stated())
+        verdict = said["verdict"] if self.claim == "asymptotic" else f"{said['verdict']} {self.claim}"
+        shown = [verdict, *(said[name] for name in ("plant", "set") if name in said)]
+        shown += [
+            f"{name} {said[name]}" for name in ("length", "area", "volume", "limited by", "reason") if name in said
+        ]
+        return f"RoaResult({'; '.join(shown)})"
+
+    def _repr_html_(self) -> str:
+        """The result as a small table, for notebooks; every text is escaped."""
+        cell = "style='text-align:left'"
+        rows = (f"<tr><th {cell}>{escape(n)}</th><td {cell}>{escape(text)}</td></tr>" for n, text in self._stated())
+        return f"<table>{''.join(rows)}</table>"
+
+    def _stated(self) -> list[tuple[str, str]]:
+        """What is said of the result in a few rows, names and values."""
+        rows = [("verdict", self.verdict.value), ("plant", self.system.name), ("claim", self.claim)]
+        shown = self.verdict in (Verdict.PROVED, Verdict.TRUSTED)
+        level, size = (self.levels.roa, self.volume) if shown else (None, None)
+        if level is not None and size is not None:
+            unit = volume_unit([self.system.units.get(s.name, "") for s in self.system.states])
+            rows.append(("set", f"V <= {below(level)}"))
+            rows.append((volume_name(self.system.n), f"{below(size)} {unit}".rstrip()))
+            rows.append(("limited by", self.reason))
+        else:
+            rows.append(("reason", self.reason))
+        rows += [("certificate", str(self.certificate))] if self.certificate is not None else []
+        return rows + [("notice", text) for text in (self.notice, *self.notices) if text is not None]
+
     def to_dict(self) -> dict[str, Any]:
         """The JSON object of `certify roa --json`; lengths along the states are in their units."""
         system, network, witness = self.system, self.network, self.witness
@@ -170,7 +300,7 @@ class RoaResult:
         geometry: dict[str, Any] = dict.fromkeys(("volume", "semi_axes", "extents"))
         if P is not None and level is not None:
             axes, reach = semi_axes(P, level).tolist(), extents(P, level).tolist()
-            geometry = {"volume": volume(P, level), "semi_axes": axes, "extents": reach}
+            geometry = {"volume": self.volume, "semi_axes": axes, "extents": reach}
         stated = {
             "schema": "certify-roa/1",
             "verdict": self.verdict.value,
@@ -209,3 +339,22 @@ class RoaResult:
             "certificate_sha256": None if self.checker is None else self.checker.get("certificate_sha256"),
             "checked": None if self.checker is None else self.checker.get("result"),
         }
+
+
+def _entries(x: ArrayLike) -> NDArray[Any]:
+    """The numbers of an array-like as they are, none of them rounded."""
+    required = "`x` must be numbers of shape (n,) or (N, n): integers, floats or Fractions"
+    try:
+        # numpy would round an integer that stands beside a float in a list
+        found = np.asarray(x) if hasattr(x, "__array__") else np.asarray(x, dtype=object)
+    except (ValueError, TypeError, RuntimeError) as error:  # a tensor that does not give its numbers
+        raise InputError(f"{required}; found {type(x).__name__}: {error}.") from error
+    entries = found.astype(object)
+    for index, value in np.ndenumerate(entries):
+        entries[index] = value.item() if isinstance(value, np.generic) else value
+        number = isinstance(entries[index], int | float | Fraction) and not isinstance(entries[index], bool)
+        if not number or (isinstance(entries[index], float) and not math.isfinite(entries[index])):
+            raise InputError(
+                f"{required}, all finite; found {value!r:.60}, a {type(value).__name__}, at {list(index)}."
+            )
+    return entries

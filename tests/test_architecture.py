@@ -16,19 +16,21 @@ LEAVES = {"errors", "verdict"}  # anybody may import these, and they import noth
 ENTRY = {"cli", "commands", "__main__"}  # these may import anything of certify
 EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows that exist
     "acceptance": "certificate claims engines",
+    "api": "inputs installation lyapunov options policies results roa systems",
     "certificate": "claims expressions lyapunov policies systems",
     "claims": "closed_loop expressions lyapunov policies",
     "closed_loop": "expressions policies systems",
     "diagnosis": "claims closed_loop engines lyapunov options policies results",
     "enclosures": "closed_loop expressions rigorous",
     "engines": "certificate claims enclosures expressions policies rigorous running systems",
+    "inputs": "policies systems",
     "lyapunov": "closed_loop",
     "options": "lyapunov",
     "policies": "systems",
     "race": "engines lyapunov trials",
     "report": "certificate closed_loop lyapunov policies systems",
     "rest": "closed_loop rigorous",
-    "results": "claims engines lyapunov policies rest systems",
+    "results": "certificate claims engines lyapunov policies report rest systems",
     "rigorous": "closed_loop expressions policies",
     "roa": (
         "acceptance certificate claims closed_loop diagnosis engines lyapunov options policies race rest results "

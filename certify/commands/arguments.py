@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
 from certify.commands.terminal import tell
 from certify.errors import InputError
+from certify.inputs import named_plant, tell_of_other, where_valid
 
 if TYPE_CHECKING:
     from certify.policies import Policy
@@ -17,38 +17,13 @@ if TYPE_CHECKING:
 def plant_of(stored: Policy, name: str | None, params: list[str], bounds: list[str]) -> System:
     """The plant: the policy file's unless `name` says otherwise, with `--param` and `--domain` put in.
 
-    A policy file names a plant that ships, never a file: a plant of one's own is named with `--system` each time. What
-    is named there counts as it stands; where the policy was trained for other numbers, standard error says so.
+    What is named there counts as it stands; where the policy was trained for other numbers, standard error says so.
     """
-    from certify.systems import available_systems, chosen_system, shipped_system
-
-    if name is None and stored.system not in available_systems():
-        raise InputError(
-            f"unknown system {stored.system!r}: the policy was trained for a plant that does not ship here. Name its "
-            f"file, as in --system {stored.system if stored.system.isidentifier() else 'plant'}.toml."
-        )
-    plant = shipped_system(stored.system) if name is None else chosen_system(name)
-    shipped = name is None or name == stored.system
-    plant = with_params(plant.with_parameters(stored.parameters) if shipped else plant, params)
-    if not shipped and (notice := _other_plant(stored, plant)):
-        tell(notice)
-    return _where_valid(stored, with_domains(plant, bounds))
-
-
-def _where_valid(stored: Policy, plant: System) -> System:
-    """The plant on the part of its domain where the policy's network is what it was made from; says what was cut."""
-    if stored.valid is None:
-        return plant
-    if len(stored.valid) != plant.n:
-        raise InputError(f"the policy is valid for {len(stored.valid)} states; {plant.name} has {plant.n}.")
-    cut: dict[str, tuple[Fraction, Fraction]] = {}
-    for symbol, (lo, hi), (low, high) in zip(plant.states, plant.domain, stored.valid.tolist(), strict=True):
-        ends = (max(lo, Fraction(low)) if low > -math.inf else lo, min(hi, Fraction(high)) if high < math.inf else hi)
-        if ends != (lo, hi):
-            cut[symbol.name] = ends
-    for name, (lo, hi) in cut.items():
-        tell(f"the domain of {name} is cut to [{float(lo):.6g}, {float(hi):.6g}]: there its observation is not clipped")
-    return plant.with_domain(cut)
+    plant, own = named_plant(stored, name)
+    plant = with_params(plant, params)
+    if not own:
+        tell_of_other(stored, plant, tell)
+    return where_valid(stored, with_domains(plant, bounds), tell)
 
 
 def with_params(plant: System, params: list[str]) -> System:
@@ -69,17 +44,6 @@ def with_domains(plant: System, bounds: list[str]) -> System:
         ends = (exact(lo, state), exact(hi, state)) if lo else (-exact(hi, state), exact(hi, state))
         domain[state] = (ends[0] - shift, ends[1] - shift)
     return plant.with_domain(domain)
-
-
-def _other_plant(stored: Policy, plant: System) -> str | None:
-    """A notice if the policy says that it was trained for another plant than this one."""
-    if stored.system != plant.name:
-        return f"the policy was trained for {stored.system!r}; it is used with {plant.name}"
-    try:
-        off = [f"{p} = {v}" for p, v in stored.parameters.items() if plant.parameters.get(p) != Fraction(v)]
-    except (ValueError, TypeError, ArithmeticError):
-        off = [f"{p} = {v}" for p, v in stored.parameters.items()]
-    return f"the policy was trained with {', '.join(off)}; --system says otherwise, and counts" if off else None
 
 
 def numbers(text: str | None, option: str) -> tuple[float, ...] | None:

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from certify.commands.importing import imported_policy, lines
+from certify.commands.importing import imported_policy
 from certify.commands.shared import Json
 from certify.commands.terminal import say
+from certify.inputs import lines
 
 if TYPE_CHECKING:
     from certify.policies.importers import Imported, ImportOptions

@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Callable
-from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
@@ -15,10 +14,12 @@ import typer
 from certify.commands.arguments import plant_of, with_params
 from certify.commands.terminal import tell
 from certify.errors import InputError
+from certify.inputs import policy_in
 
 if TYPE_CHECKING:
     from certify.policies import Policy
     from certify.policies.importers import Imported, ImportOptions
+    from certify.systems import System
 
 _PANEL = "Policies of other programs"
 
@@ -69,111 +70,31 @@ def policy_of(path: Path, importing: ImportOptions, system: str | None, params: 
     ------
     InputError : the file cannot be read or imported, or is another program's and `system` is None.
     """
-    from certify.policies import load_policy
-
-    if _is_own(path, importing):
-        stored = load_policy(path)
-        return stored if importing.centre is None else _centred(stored, importing, system, params)
-    imported = imported_policy(path, importing, system, params)
-    for line in lines(imported):
-        tell(line)
-    return imported.policy
-
-
-def _centred(stored: Policy, importing: ImportOptions, system: str | None, params: list[str]) -> Policy:
-    """A policy file of this program with the centring that is asked for; says by how much u changes.
-
-    Raises
-    ------
-    InputError : the file has another centring already, or this one cannot be had.
-    """
-    from certify.policies.importers import centring_changes
-
-    if importing.centre is None or stored.network.centre == importing.centre:
-        return stored
-    if stored.network.centre != "none":
-        raise InputError(
-            f"--centre {importing.centre} must be left out: the file's centring is {stored.network.centre}."
-        )
-    plant = plant_of(stored, system, params, [])
-    changes = centring_changes(stored.network, plant)
-    if importing.centre not in changes:
-        raise InputError(f"--centre {importing.centre} cannot be had: u_eq must lie within the policy's reach.")
-    tell(f"centred: --centre {importing.centre} changes u by up to {changes[importing.centre]:.3g} in the domain")
-    return replace(stored, network=replace(stored.network, centre=importing.centre))
+    return policy_in(
+        path,
+        importing,
+        lambda: _plant_for(path, system, params),
+        lambda stored: plant_of(stored, system, params, []),
+        tell,
+    )
 
 
 def imported_policy(path: Path, importing: ImportOptions, system: str | None, params: list[str]) -> Imported:
     """The policy in a file of another program, for the plant that `system` names."""
     from certify.policies.importers import import_policy
+
+    return import_policy(path, _plant_for(path, system, params), importing)
+
+
+def _plant_for(path: Path, system: str | None, params: list[str]) -> System:
+    """The plant that a policy of another program controls."""
     from certify.systems import chosen_system
 
     if system is None:
         raise InputError(
             f"policy file {path} is another program's and does not say what it controls: name the plant with --system."
         )
-    return import_policy(path, with_params(chosen_system(system), params), importing)
-
-
-def lines(imported: Imported) -> list[str]:
-    """What an import found, for people."""
-    found, difference = imported, imported.difference
-    policy = found.policy
-    origin, target = _row(found.at_origin), _row(found.u_eq)
-    said = [
-        f"read     {found.words}; sha256 {policy.training['imported']['sha256']}",
-        f"policy   {found.formula}; o = ({policy.training['imported']['states']})",
-        f"compared with the framework's own evaluation at {difference.states:,} states: largest difference "
-        f"{difference.largest:.3g} (its rounding explains up to {difference.explained:.3g} there), "
-        f"{difference.in_double:.3g} where it works in double precision",
-        f"pi(0)    {origin}; u_eq {target}",
-        f"centring {_centring(found)}",
-    ]
-    if policy.valid is not None:
-        said.append(f"valid    where no observation is clipped: {_box(found)}")
-    said.append(
-        "proved   is the folded policy: it differs from the file's real-number policy by the rounding of folded "
-        "numbers, half a unit in the last place of each at most"
-    )
-    return said
-
-
-def _centring(found: Imported) -> str:
-    centre = found.policy.network.centre
-    if found.policy.beta is not None:
-        return "the file's own, inside the squash"
-    changes = [f"{name} changes u by up to {value:.3g}" for name, value in found.centring.items()]
-    if centre != "none":
-        return f"{centre}, as asked for, which changes u by up to {found.centring[centre]:.3g}"
-    return f"none; {', '.join(f'--centre {c}' for c in changes) or 'u_eq is out of reach of any'}"
-
-
-def _box(found: Imported) -> str:
-    states, valid = found.policy.training["imported"]["plant_states"], found.policy.valid
-    pairs = zip(states, valid if valid is not None else (), strict=True)
-    return ", ".join(f"{name} in [{lo:.6g}, {hi:.6g}]" for name, (lo, hi) in pairs)
-
-
-def _row(values: Any) -> str:
-    return ", ".join(f"{v:.9g}" for v in values)
-
-
-def _is_own(path: Path, importing: ImportOptions) -> bool:
-    """Whether a file is to be read as this program's own: also one that nobody can read, whose reader says why."""
-    from certify.policies.importers import content_of, read_bytes
-
-    raw = read_bytes(path)
-    try:
-        content = content_of(raw, path.name)
-    except InputError:
-        if importing.given:
-            raise
-        return True
-    others = [name for name in importing.given if name != "--centre"]
-    if content == "policy" and others:
-        raise InputError(f"{', '.join(others)} must be left out: {path} is a policy file of this program and says all.")
-    foreign_pickle = content is None and raw[:1] == b"\x80"
-    return content == "policy" or (content is None and not importing.given and not foreign_pickle)
+    return with_params(chosen_system(system), params)
 
 
 def _parsed(texts: dict[str, str | None]) -> ImportOptions:

@@ -15,13 +15,9 @@ Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instea
 
 def page_of(raw: bytes, path: Path, answer: dict[str, Any] | None, data: dict[str, Any] | None) -> str:
     """The report on a certificate's bytes, with the checker's answer about them and what the run says, if there are."""
-    import hashlib
+    from certify.report import drawn
 
-    from certify.certificate import parse_certificate
-    from certify.report import render_html
-
-    read, sha256 = parse_certificate(raw, str(path)), hashlib.sha256(raw).hexdigest()
-    return render_html(read, answer, data, path, sha256=sha256, size=len(raw))
+    return drawn.page_of(raw, path, answer, data)
 
 
 def describe(s: System) -> dict[str, Any]:

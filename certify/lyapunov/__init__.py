@@ -5,6 +5,7 @@ from __future__ import annotations
 from certify.lyapunov.candidates import solve_lyapunov
 from certify.lyapunov.choice import SOLVED, Candidate, Chosen, Named, choose_candidate
 from certify.lyapunov.level_sets import (
+    are_inside,
     diagonalising_coordinates,
     domain_limit,
     extents,
@@ -21,6 +22,7 @@ __all__ = [
     "Candidate",
     "Chosen",
     "Named",
+    "are_inside",
     "choose_candidate",
     "diagonalising_coordinates",
     "domain_limit",

@@ -8,7 +8,7 @@ contains the set is rounded up, what is claimed of it down. A matrix of 12 state
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from fractions import Fraction
 
 import flint
@@ -42,6 +42,20 @@ def leaves_domain(P: Array, level: float, domain: Sequence[tuple[Fraction, Fract
     InputError : P is not positive definite.
     """
     return Fraction(float(level)) >= _domain_limit(P, domain)
+
+
+def are_inside(P: Array, level: float, points: Iterable[Sequence[Fraction | float]]) -> list[bool]:
+    """Whether `x'Px <= level` at each of the points, decided in rationals; their entries are finite numbers, exact.
+
+    >>> are_inside(np.eye(2), 1.0, [(0.6, Fraction(4, 5)), (Fraction(3, 5), Fraction(4, 5)), (0.0, 2)])
+    [True, True, False]
+    """
+    c, rows = _rational(float(level)), _exact(P).tolist()
+
+    def value(x: Sequence[flint.fmpq]) -> flint.fmpq:
+        return sum(v * sum(p * w for p, w in zip(row, x, strict=True)) for v, row in zip(x, rows, strict=True))
+
+    return [bool(value([flint.fmpq(*v.as_integer_ratio()) for v in point]) <= c) for point in points]
 
 
 def semi_axes(P: Array, level: float) -> Array:

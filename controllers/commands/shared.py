@@ -27,16 +27,28 @@ def options_of(plant: str, **chosen: Any) -> TrainingOptions:
     return overridden(preset(plant), chosen)
 
 
+_EXTRA = ("gymnasium", "control")  # packages of the extra `controllers`
+
+
 @contextmanager
 def errors(as_json: bool) -> Iterator[None]:
-    """Bad input ends in one sentence and exit status 2."""
+    """Bad input, and an extra that is not installed, end in one sentence and exit status 2."""
     try:
         yield
+    except ModuleNotFoundError as error:
+        if error.name not in _EXTRA:
+            raise
+        said = f"{error.name} is not installed, and training needs it; `pip install 'certify[controllers]'` brings it."
+        raise _refused(said, as_json) from error
     except (CertifyError, OSError) as error:
-        if as_json:
-            typer.echo(json.dumps({"error": str(error)}))
-        typer.echo(f"Error: {error}", err=True)
-        raise typer.Exit(2) from error
+        raise _refused(str(error), as_json) from error
+
+
+def _refused(said: str, as_json: bool) -> typer.Exit:
+    if as_json:
+        typer.echo(json.dumps({"error": said}))
+    typer.echo(f"Error: {said}", err=True)
+    return typer.Exit(2)
 
 
 def emit(result: dict[str, Any], as_json: bool) -> None:

@@ -2,8 +2,27 @@
 
 from __future__ import annotations
 
-from certify.policies.importers.importing import Imported, centring_changes, content_of, import_policy, read_bytes
+from certify.policies.importers.importing import (
+    Imported,
+    centring_changes,
+    content_of,
+    import_bytes,
+    import_policy,
+    read_bytes,
+)
+from certify.policies.importers.memory import import_module, import_state_dict
 from certify.policies.importers.options import ImportOptions
 from certify.policies.importers.steps import Clip
 
-__all__ = ["Clip", "ImportOptions", "Imported", "centring_changes", "content_of", "import_policy", "read_bytes"]
+__all__ = [
+    "Clip",
+    "ImportOptions",
+    "Imported",
+    "centring_changes",
+    "content_of",
+    "import_bytes",
+    "import_module",
+    "import_policy",
+    "import_state_dict",
+    "read_bytes",
+]

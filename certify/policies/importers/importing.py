@@ -26,7 +26,7 @@ from certify.policies.importers.folding import Bounds, Folded, fold
 from certify.policies.importers.normalisers import load_normaliser
 from certify.policies.importers.onnx_graph import read_onnx
 from certify.policies.importers.options import ImportOptions
-from certify.policies.importers.reading import Reading
+from certify.policies.importers.reading import Evaluate, Reading
 from certify.policies.importers.sb3 import read_sb3
 from certify.policies.importers.state_dict import is_two_stage, read_state_dict, read_two_stage
 from certify.policies.importers.steps import Clip, Diagonal, Normalise, Step, Tanh, spread
@@ -105,7 +105,7 @@ def import_policy(path: Path, plant: System, options: ImportOptions | None = Non
     options = options if options is not None else ImportOptions()
     raw = read_bytes(path)
     try:
-        return _import(raw, path.name, plant, options)
+        return import_bytes(raw, path.name, plant, options)
     except InputError as error:
         raise InputError(f"policy file {path}: {error}") from error
 
@@ -125,10 +125,25 @@ def read_bytes(path: Path) -> bytes:
         raise InputError(f"policy file {path} cannot be read: {error.strerror}.") from error
 
 
-def _import(raw: bytes, name: str, plant: System, options: ImportOptions) -> Imported:
+def import_bytes(
+    raw: bytes, name: str, plant: System, options: ImportOptions, evaluate: Evaluate | None = None
+) -> Imported:
+    """The same for the bytes of such a file, called `name`.
+
+    Parameters
+    ----------
+    evaluate : what the policy is compared with, in the place of its framework's operations; where the policy itself is
+        at hand.
+
+    Raises
+    ------
+    InputError : as `import_policy`, without the name.
+    """
     kind = _kind(raw, name, options)
     n = plant.n if options.states is None else len(options.states)
     reading = _read(kind, raw, name, options, n, plant.m)
+    if evaluate is not None:
+        reading = replace(reading, evaluate=evaluate)
     _require_answers(kind, reading, options, plant)
     states = options.states if options.states is not None else tuple(s.name for s in plant.states)
     index = _index(states, plant)

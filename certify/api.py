@@ -1,0 +1,405 @@
+"""`certify.certify_roa`: the pipeline for whoever works in Python, with names and files in the place of objects.
+
+The command and this function obey the same rules (`certify.inputs`): which plant a policy belongs to, what is asked
+for that a file does not say, where a domain is cut. What the command prints on standard error a result keeps as
+`notices`. Nothing here decides anything: the pipeline is `certify.roa`.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import sys
+import tempfile
+import time
+import weakref
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields, replace
+from fractions import Fraction
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from certify.errors import InputError
+from certify.inputs import centred, lines, named_plant, policy_in, tell_of_other, where_valid
+from certify.installation import version_of
+from certify.lyapunov import Candidate
+from certify.options import Asked, EngineName, RoaOptions
+from certify.policies import Policy, TanhNetwork
+from certify.policies.importers import Clip, ImportOptions, import_module, import_state_dict
+from certify.results import RoaResult
+from certify.roa import Report
+from certify.roa import certify_roa as run
+from certify.systems import System, chosen_system, exact
+from certify.systems.equations import nearest
+
+if TYPE_CHECKING:
+    import torch
+
+_PACKAGES = ("certify", "torch", "numpy", "scipy", "sympy", "python-flint")
+_POLICY_FILES = (".pt", ".pth", ".zip", ".onnx", ".safetensors")
+_WORDS = {"--from": "kind", "--precision": "dreal_precision"}  # options that Python calls otherwise
+
+
+def certify_roa(
+    system: str | os.PathLike[str] | System | None,
+    policy: str | os.PathLike[str] | Policy | TanhNetwork | torch.nn.Module | Mapping[str, Any],
+    out: str | os.PathLike[str] | None = None,
+    options: RoaOptions | None = None,
+    *,
+    importing: ImportOptions | Mapping[str, Any] | None = None,
+    claim: Asked | None = None,
+    candidate: Candidate | None = None,
+    Q: Sequence[float] | None = None,
+    R: Sequence[float] | None = None,
+    P: ArrayLike | None = None,
+    level: float | None = None,
+    engine: EngineName | None = None,
+    dreal_precision: float | None = None,
+    jobs: int | None = None,
+    device: str | None = None,
+    time_limit: float | None = None,
+    max_boxes: int | None = None,
+    load_seconds: float = 0.0,
+    provenance: Mapping[str, Any] | None = None,
+    progress: Report | None = None,
+) -> RoaResult:
+    """Prove a region of attraction of a plant under a policy, and have the proof checked.
+
+    For `xdot = f(x, pi(x))` it looks for the largest set {x'Px <= c2} from which every trajectory converges to the
+    origin, writes the proof down as a certificate, and asks the independent checker, in a process of its own. A policy
+    that does not rest at the origin exactly gets another claim, practical stability: `result.claim` says which.
+
+    Parameters
+    ----------
+    system : the plant: the name of one that ships ("pendulum"; `certify systems` lists them), the path of a TOML file,
+        "FILE.py:NAME" (whose code is run), a `System`, or None for the plant that the policy names. For other
+        parameters or another domain: `get_system("pendulum").with_parameters({"m": "0.2"})`, `with_domain`.
+    policy : the path of a policy file, of this program or another's; a `Policy` or `TanhNetwork`; a torch module of
+        Linear and Tanh layers and constant scalings; or a state_dict of such layers.
+    out : folder for `certificate.json`, made if it is not there. None is a temporary folder that lives as long as the
+        result does: copy the certificate, or keep the result. No report is drawn until `result.report()` asks for it.
+    options : all of the options below in one `RoaOptions`, in their place.
+    importing : what a policy that is not this program's own does not say: an `ImportOptions`, or a mapping with its
+        names, such as `{"states": ["theta", "theta_dot"], "normaliser": "none", "action_scale": 6}`. What is missing
+        is asked for by name; nothing is guessed. Text means its decimal value, a float its binary value.
+    claim : "asymptotic"; "practical", which asks for no equilibrium at the origin; or "auto" (the default), the first
+        where the loop rests at the origin exactly and the second where it does not.
+    candidate : where P comes from: "auto" (the default: of several the largest proved), "lyapunov", "scaled", "lqr"
+        or "optimised".
+    Q, R : diagonals of the weights, n and m positive numbers; ones by default.
+    P : a Lyapunov matrix of one's own, (n, n), symmetric; overrides the candidate.
+    level : prove exactly this level; by default the largest is looked for.
+    engine : "bounds" (the default), "dreal" (its word is trusted, not checked), or "both".
+    dreal_precision, jobs : dReal's delta, 1e-3 by default, and its threads, 1.
+    device : where boxes are bounded: "cpu" (the default) or "cuda".
+    time_limit : seconds for everything up to the verdict, 50 by default.
+    max_boxes : boxes for the ring, 4,000,000 by default.
+    load_seconds : time already spent on reading, for the report.
+    provenance : entries for the certificate that the checkers ignore; by default the policy's name and versions.
+    progress : called with a stage ("candidate", "ring", "check") and where the search stands, or None.
+
+    Returns
+    -------
+    RoaResult : `result.verdict` is PROVED only if the checker accepted the file; compare it with `is`. Then
+        `result.contains(x)`, `.volume`, `.levels`, `.plot()`, `.report()`, `.certificate` (a path), `.to_dict()`.
+
+    Raises
+    ------
+    InputError : an argument is of another type or value than it must be, or the closed loop cannot be used.
+    BackendError : the checker process, or a solver that was asked for, is missing or failed.
+    SoundnessError : two rigorous results contradict each other.
+
+    Notes
+    -----
+    A policy reads deviations from the plant's operating point x_eq. Where a policy is valid on a part of the states
+    only (`Policy.valid`), the domain is cut to it, and `result.notices` says so. A `TanhNetwork` says nothing of that.
+
+    Examples
+    --------
+    >>> from certify import TanhNetwork, certify_roa, get_system
+    >>> K = [[8.0, 2.0]]
+    >>> law = TanhNetwork((-np.array(K),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
+    >>> system = get_system("pendulum")
+    >>> result = certify_roa(system, law, candidate="lyapunov", level=1e-3)
+    >>> result.verdict.value, result.contains([1e-3, 0.0]), result.contains([3.0, 0.0])
+    ('PROVED', True, False)
+    """
+    start = time.perf_counter()
+    single = {
+        "claim": claim, "candidate": candidate, "Q": Q, "R": R, "P": P, "level": level, "engine": engine,
+        "dreal_precision": dreal_precision, "jobs": jobs, "device": device, "time_limit": time_limit,
+        "max_boxes": max_boxes,
+    }  # fmt: skip
+    notices: list[str] = []
+    try:
+        chosen = _options(options, {name: value for name, value in single.items() if value is not None})
+        _require_device(chosen.device)
+        seconds = _number(load_seconds, "load_seconds")
+        _require(provenance is None or isinstance(provenance, Mapping), "provenance", "a mapping", provenance)
+        _require(progress is None or callable(progress), "progress", "callable", progress)
+        stored = _policy(policy, system, _importing(importing), notices.append)
+        plant, network = _closed(stored, system, notices.append)
+        folder = _Folder() if out is None else None
+        place = folder.path if folder is not None else Path(_path(out, "out"))
+        result = run(
+            plant,
+            network,
+            place,
+            chosen,
+            load_seconds=seconds + time.perf_counter() - start,
+            provenance=_provenance(policy) if provenance is None else provenance,
+            progress=progress,
+        )
+    except InputError as error:
+        said = in_python(str(error))
+        if said == str(error):
+            raise
+        raise InputError(said) from error
+    return replace(result, notices=tuple(map(in_python, notices)), folder=folder)
+
+
+def in_python(message: str) -> str:
+    """A message that names options of the command line with the names that they have here.
+
+    >>> in_python("Give --action-scale (u = scale * action); or another --Q.")
+    'Give `action_scale` (u = scale * action); or another `Q`. Say `action_scale` in `importing`, a mapping.'
+    """
+    theirs = {f.name for f in fields(ImportOptions)}
+    found: list[str] = []
+
+    def name(match: re.Match[str]) -> str:
+        option = match[0]
+        known = _WORDS.get(option, option.removeprefix("--").replace("-", "_"))
+        if known in theirs and known not in found:
+            found.append(known)
+        return f"`{known}`"
+
+    said = re.sub(r"--[A-Za-z][A-Za-z-]*[A-Za-z]|--[A-Za-z]", name, message)
+    named = ", ".join(f"`{n}`" for n in found)
+    return f"{said} Say {named} in `importing`, a mapping." if found else said
+
+
+class _Folder:
+    """A temporary folder that goes with the last result that keeps it."""
+
+    __slots__ = ("__weakref__", "path")
+
+    def __init__(self) -> None:
+        self.path = Path(tempfile.mkdtemp(prefix="certify-"))
+        weakref.finalize(self, _remove, self.path, os.getpid())
+
+
+def _remove(path: Path, owner: int) -> None:
+    """Remove a folder, unless this is a fork of the process that made it and still uses it."""
+    if os.getpid() == owner:
+        shutil.rmtree(path, ignore_errors=True)
+
+
+def _options(options: RoaOptions | None, single: dict[str, Any]) -> RoaOptions:
+    """The options, given at once or one by one."""
+    if options is not None:
+        if not isinstance(options, RoaOptions):
+            raise InputError(f"`options` must be a RoaOptions; found {_kind(options)}. Options go by name as well.")
+        if single:
+            raise InputError(
+                f"options must be given at once or one by one, not both; found `options` and {', '.join(single)}. "
+                "Put them into `options`."
+            )
+        return options
+    numbers, whole = ("level", "dreal_precision", "time_limit"), ("jobs", "max_boxes")
+    readers: dict[str, Callable[[Any, str], Any]] = dict.fromkeys(single, _text)
+    readers |= {"Q": _row, "R": _row, "P": _matrix} | dict.fromkeys(numbers, _number) | dict.fromkeys(whole, _count)
+    read = {name: readers[name](value, name) for name, value in single.items()}
+    return RoaOptions(**read)
+
+
+def _policy(given: Any, system: Any, asked: ImportOptions, tell: Callable[[str], None]) -> Policy | TanhNetwork:
+    """The policy, whatever it was given as."""
+    import torch
+
+    if isinstance(given, Policy | TanhNetwork):
+        others = set(asked.given) - ({"--centre"} if isinstance(given, Policy) else set())
+        if others:
+            raise InputError(f"{', '.join(sorted(others))} must be left out: a {type(given).__name__} says all itself.")
+        if isinstance(given, TanhNetwork) or asked.centre is None:
+            return given
+        return centred(given, asked.centre, _closed(given, system, lambda _: None)[0], tell)
+    if isinstance(given, str | os.PathLike):
+        return policy_in(
+            Path(_path(given, "policy")),
+            asked,
+            lambda: _plant(system, "a policy of another program"),
+            lambda stored: _closed(stored, system, lambda _: None)[0],
+            tell,
+        )
+    if isinstance(given, torch.nn.Module):
+        imported = import_module(given, _plant(system, "a module"), asked)
+    elif isinstance(given, Mapping):
+        imported = import_state_dict(given, _plant(system, "a state_dict"), asked)
+    else:
+        raise InputError(
+            "`policy` must be the path of a policy file, a Policy, a TanhNetwork, a torch.nn.Module or a state_dict; "
+            f"found {_kind(given)}."
+        )
+    for line in lines(imported):
+        tell(line)
+    return imported.policy
+
+
+def _closed(policy: Policy | TanhNetwork, system: Any, tell: Callable[[str], None]) -> tuple[System, TanhNetwork]:
+    """Plant and network; of a policy with what it says about itself taken at its word, or told."""
+    if isinstance(policy, TanhNetwork):
+        return _plant(system, "a TanhNetwork"), policy
+    if isinstance(system, System):
+        plant, own = system, False
+    else:
+        plant, own = named_plant(policy, None if system is None else _name(system))
+    if not own:
+        tell_of_other(policy, plant, tell)
+    plant = where_valid(policy, plant, tell)
+    if shift := policy.beta_shift(plant.exact_u_eq()):
+        tell(f"the file's rounded beta is read as the real number; this shifts u(0) by {shift:.3g}")
+    return plant, policy.network
+
+
+def _plant(system: Any, whose: str) -> System:
+    """The plant that somebody named, for a policy that names none itself."""
+    if system is None:
+        raise InputError(f"`system` must name the plant: {whose} does not say what it controls; found None.")
+    return system if isinstance(system, System) else chosen_system(_name(system))
+
+
+def _name(system: Any) -> str:
+    if not isinstance(system, str | os.PathLike):
+        raise InputError(
+            "`system` must be the name of a plant, the path of a TOML file, a System, or None for the policy's own; "
+            f"found {_kind(system)}."
+        )
+    name = _path(system, "system")
+    if isinstance(system, os.PathLike) and not name.endswith(".toml"):
+        raise InputError(f"a path for `system` must end with .toml; found {name}. A name, or FILE.py:NAME, is text.")
+    if name.endswith(_POLICY_FILES):
+        raise InputError(
+            f"`system` must be a plant; {name} looks like a policy file. The plant comes before the policy."
+        )
+    return name
+
+
+def _importing(given: ImportOptions | Mapping[str, Any] | None) -> ImportOptions:
+    """What is known of a policy of another program, with numbers where the fields take tuples of rationals."""
+    if given is None or isinstance(given, ImportOptions):
+        return given if given is not None else ImportOptions()
+    if not isinstance(given, Mapping):
+        raise InputError(f"`importing` must be an ImportOptions or a mapping with its names; found {_kind(given)}.")
+    known = [f.name for f in fields(ImportOptions)]
+    for name in given:
+        if name not in known:
+            close = nearest(str(name), known) or f"; known are {', '.join(known)}."
+            raise InputError(f"`importing` has no {name!r}{close}")
+    read: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
+    for name, value in read.items():
+        where = f"importing[{name!r}]"
+        if name == "states":
+            read[name] = tuple(
+                _text(v, where) for v in (value.split(",") if isinstance(value, str) else _list(value, where))
+            )
+        elif name in ("action_scale", "action_offset"):
+            read[name] = _rationals(value, where)
+        elif name == "epsilon":
+            read[name] = exact(value, where)
+        elif name == "normaliser":
+            read[name] = "none" if value == "none" else Path(_path(value, where))
+        elif name == "clip":
+            read[name] = value if isinstance(value, Clip) else _clip(value, where)
+        else:
+            _text(value, where)
+    return ImportOptions(**read)
+
+
+def _clip(value: Any, where: str) -> Clip:
+    ends = _list(value, where)
+    if len(ends) != 2:
+        raise InputError(f"`{where}` must be a pair (lo, hi) of numbers or of rows of numbers; found {value!r:.80}.")
+    lo, hi = (_rationals(end, where) for end in ends)
+    return Clip(lo, hi)
+
+
+def _rationals(value: Any, where: str) -> tuple[Fraction, ...]:
+    if isinstance(value, int | float | str | Fraction):
+        return (exact(value, where),)
+    return tuple(exact(v.item() if isinstance(v, np.generic) else v, where) for v in _list(value, where))
+
+
+def _list(value: Any, where: str) -> list[Any]:
+    if isinstance(value, str | Mapping) or not hasattr(value, "__iter__"):
+        raise InputError(f"`{where}` must be a sequence; found {_kind(value)}.")
+    return list(value)
+
+
+def _row(value: Any, name: str) -> tuple[float, ...]:
+    return tuple(_number(v, name) for v in _list(value, name))
+
+
+def _matrix(value: Any, name: str) -> Any:
+    try:
+        matrix = np.array(value, dtype=np.float64)
+    except (ValueError, TypeError) as error:
+        raise InputError(f"`{name}` must be a matrix of numbers, (n, n); found {_kind(value)}: {error}.") from error
+    if matrix.ndim != 2:
+        raise InputError(f"`{name}` must be a matrix of numbers, (n, n); found shape {matrix.shape}.")
+    return matrix
+
+
+def _number(value: Any, name: str) -> float:
+    value = value.item() if isinstance(value, np.generic) else value
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        raise InputError(f"`{name}` must be a number; found {value!r:.60}, {_kind(value)}.")
+    return float(value)
+
+
+def _count(value: Any, name: str) -> int:
+    value = value.item() if isinstance(value, np.generic) else value
+    if isinstance(value, bool) or not isinstance(value, int):
+        raise InputError(f"`{name}` must be a whole number; found {value!r:.60}, {_kind(value)}.")
+    return value
+
+
+def _text(value: Any, name: str) -> str:
+    if not isinstance(value, str):
+        raise InputError(f"`{name}` must be text; found {value!r:.60}, {_kind(value)}.")
+    return value.strip()
+
+
+def _path(value: Any, name: str) -> str:
+    if not isinstance(value, str | os.PathLike):
+        raise InputError(f"`{name}` must be a path: text or a Path; found {_kind(value)}.")
+    path = os.fspath(value)
+    if not isinstance(path, str) or not path:
+        raise InputError(f"`{name}` must be a path in text that is not empty; found {path!r}.")
+    return path
+
+
+def _require_device(name: str) -> None:
+    import torch
+
+    if name != "cpu" and not (name.startswith("cuda") and torch.cuda.is_available()):
+        raise InputError(f"`device` must be cpu, or cuda on a machine that has it; found {name!r}.")
+
+
+def _require(holds: bool, name: str, what: str, value: object) -> None:
+    if not holds:
+        raise InputError(f"`{name}` must be {what}; found {_kind(value)}.")
+
+
+def _kind(value: object) -> str:
+    return "None" if value is None else f"a {type(value).__name__}"
+
+
+def _provenance(policy: Any) -> dict[str, Any]:
+    name = Path(policy).name if isinstance(policy, str | os.PathLike) else f"in memory, {_kind(policy)}"
+    versions = {package: version for package in _PACKAGES if (version := version_of(package)) is not None}
+    return {"policy": name, "python": sys.version.split()[0], **versions}

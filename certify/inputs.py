@@ -1,0 +1,192 @@
+"""A plant and a policy, from what somebody names them by: the same rules for the command line and for Python.
+
+A policy file says which plant it was trained for, and by which numbers; whoever uses it may say otherwise, and what
+he says counts. What has to be known of that goes to `tell`, a line each: the command prints it on standard error, a
+result of Python keeps it. Where a policy's network is what it was made from only on a part of the states, the domain
+is cut to that part here, and nowhere is it left to the caller to remember.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from certify.errors import InputError
+
+if TYPE_CHECKING:
+    from certify.policies import Centre, Policy
+    from certify.policies.importers import Imported, ImportOptions
+    from certify.systems import System
+
+Tell = Callable[[str], None]
+
+
+def policy_in(
+    path: Path, importing: ImportOptions, plant: Callable[[], System], own: Callable[[Policy], System], tell: Tell
+) -> Policy:
+    """The policy in a file of this program, or of another one.
+
+    Parameters
+    ----------
+    plant : gives the plant that a policy of another program is for.
+    own : gives the plant of a policy of this program, where a centring is asked for.
+
+    Raises
+    ------
+    InputError : the file cannot be read or imported, or the centring cannot be had.
+    """
+    from certify.policies import load_policy
+    from certify.policies.importers import import_policy
+
+    if is_own(path, importing):
+        stored = load_policy(path)
+        return stored if importing.centre is None else centred(stored, importing.centre, own(stored), tell)
+    imported = import_policy(path, plant(), importing)
+    for line in lines(imported):
+        tell(line)
+    return imported.policy
+
+
+def centred(stored: Policy, centre: Centre, plant: System, tell: Tell) -> Policy:
+    """A policy of this program with the centring that is asked for; says by how much u changes.
+
+    Raises
+    ------
+    InputError : the policy has another centring already, or this one cannot be had.
+    """
+    from certify.policies.importers import centring_changes
+
+    if stored.network.centre == centre:
+        return stored
+    if stored.network.centre != "none":
+        raise InputError(f"--centre {centre} must be left out: the file's centring is {stored.network.centre}.")
+    changes = centring_changes(stored.network, plant)
+    if centre not in changes:
+        raise InputError(f"--centre {centre} cannot be had: u_eq must lie within the policy's reach.")
+    tell(f"centred: --centre {centre} changes u by up to {changes[centre]:.3g} in the domain")
+    return replace(stored, network=replace(stored.network, centre=centre))
+
+
+def named_plant(stored: Policy, name: str | None) -> tuple[System, bool]:
+    """The plant that `name` says, or else the policy; whether it is the policy's own, with the policy's parameters.
+
+    A policy file names a plant that ships, never a file: a plant of one's own is named each time.
+
+    Raises
+    ------
+    InputError : there is no such plant.
+    """
+    from certify.systems import available_systems, chosen_system, shipped_system
+
+    if name is None and stored.system not in available_systems():
+        raise InputError(
+            f"unknown system {stored.system!r}: the policy was trained for a plant that does not ship here. Name its "
+            f"file, as in --system {stored.system if stored.system.isidentifier() else 'plant'}.toml."
+        )
+    plant = shipped_system(stored.system) if name is None else chosen_system(name)
+    own = name is None or name == stored.system
+    return (plant.with_parameters(stored.parameters) if own else plant), own
+
+
+def tell_of_other(stored: Policy, plant: System, tell: Tell) -> None:
+    """Say so if the policy says that it was trained for another plant than this one."""
+    if stored.system != plant.name:
+        tell(f"the policy was trained for {stored.system!r}; it is used with {plant.name}")
+        return
+    try:
+        off = [f"{p} = {v}" for p, v in stored.parameters.items() if plant.parameters.get(p) != Fraction(v)]
+    except (ValueError, TypeError, ArithmeticError):
+        off = [f"{p} = {v}" for p, v in stored.parameters.items()]
+    if off:
+        tell(f"the policy was trained with {', '.join(off)}; --system says otherwise, and counts")
+
+
+def where_valid(stored: Policy, plant: System, tell: Tell) -> System:
+    """The plant on the part of its domain where the policy's network is what it was made from; says what was cut.
+
+    Raises
+    ------
+    InputError : the policy has bounds for another number of states.
+    """
+    if stored.valid is None:
+        return plant
+    if len(stored.valid) != plant.n:
+        raise InputError(f"the policy is valid for {len(stored.valid)} states; {plant.name} has {plant.n}.")
+    cut: dict[str, tuple[Fraction, Fraction]] = {}
+    for symbol, (lo, hi), (low, high) in zip(plant.states, plant.domain, stored.valid.tolist(), strict=True):
+        ends = (max(lo, Fraction(low)) if low > -math.inf else lo, min(hi, Fraction(high)) if high < math.inf else hi)
+        if ends != (lo, hi):
+            cut[symbol.name] = ends
+    for name, (lo, hi) in cut.items():
+        tell(f"the domain of {name} is cut to [{float(lo):.6g}, {float(hi):.6g}]: there its observation is not clipped")
+    return plant.with_domain(cut)
+
+
+def is_own(path: Path, importing: ImportOptions) -> bool:
+    """Whether a file is to be read as this program's own: also one that nobody can read, whose reader says why.
+
+    Raises
+    ------
+    InputError : options of other programs' files, other than a centring, are given for one of this program.
+    """
+    from certify.policies.importers import content_of, read_bytes
+
+    raw = read_bytes(path)
+    try:
+        content = content_of(raw, path.name)
+    except InputError:
+        if importing.given:
+            raise
+        return True
+    others = [name for name in importing.given if name != "--centre"]
+    if content == "policy" and others:
+        raise InputError(f"{', '.join(others)} must be left out: {path} is a policy file of this program and says all.")
+    foreign_pickle = content is None and raw[:1] == b"\x80"
+    return content == "policy" or (content is None and not importing.given and not foreign_pickle)
+
+
+def lines(imported: Imported) -> list[str]:
+    """What an import found, for people."""
+    found, difference = imported, imported.difference
+    policy = found.policy
+    origin, target = _row(found.at_origin), _row(found.u_eq)
+    said = [
+        f"read     {found.words}; sha256 {policy.training['imported']['sha256']}",
+        f"policy   {found.formula}; o = ({policy.training['imported']['states']})",
+        f"compared with the framework's own evaluation at {difference.states:,} states: largest difference "
+        f"{difference.largest:.3g} (its rounding explains up to {difference.explained:.3g} there), "
+        f"{difference.in_double:.3g} where it works in double precision",
+        f"pi(0)    {origin}; u_eq {target}",
+        f"centring {_centring(found)}",
+    ]
+    if policy.valid is not None:
+        said.append(f"valid    where no observation is clipped: {_box(found)}")
+    said.append(
+        "proved   is the folded policy: it differs from the file's real-number policy by the rounding of folded "
+        "numbers, half a unit in the last place of each at most"
+    )
+    return said
+
+
+def _centring(found: Imported) -> str:
+    centre = found.policy.network.centre
+    if found.policy.beta is not None:
+        return "the file's own, inside the squash"
+    changes = [f"{name} changes u by up to {value:.3g}" for name, value in found.centring.items()]
+    if centre != "none":
+        return f"{centre}, as asked for, which changes u by up to {found.centring[centre]:.3g}"
+    return f"none; {', '.join(f'--centre {c}' for c in changes) or 'u_eq is out of reach of any'}"
+
+
+def _box(found: Imported) -> str:
+    states, valid = found.policy.training["imported"]["plant_states"], found.policy.valid
+    pairs = zip(states, valid if valid is not None else (), strict=True)
+    return ", ".join(f"{name} in [{lo:.6g}, {hi:.6g}]" for name, (lo, hi) in pairs)
+
+
+def _row(values: Any) -> str:
+    return ", ".join(f"{v:.9g}" for v in values)
