@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from certify.report.figures.geometry import ellipse
 from certify.report.figures.scene import Leaves, Scene
-from certify.report.figures.style import RASTER_FROM, SET, SET_FILL, Picture, figure_of, to_svg
+from certify.report.figures.style import LEAF_EDGE, PAPER, RASTER_FROM, SET, SET_FILL, Picture, figure_of, to_svg
 from certify.report.words import symbol
 
 Array = NDArray[np.float64]
@@ -36,11 +36,8 @@ def partition(scene: Scene, leaves: Leaves) -> Picture:
         axes.set_xlabel(symbol(f"z{first + 1}"))
         axes.set_ylabel(symbol(f"z{last + 1}"))
         where = "cut by a plane through the origin of the coordinates x = T z"
-    if scene.local_is_enough:
-        asked = "As c₁ = c₂, the local part covers the whole set, and V̇ is not asked for on leaves."
-    else:
-        shown = "showed" if scene.proved == "proved" else "has to show"
-        asked = f"On each blue one the checker {shown} V̇ < 0; white ones lie outside the ring between the two levels."
+    shown = "showed" if scene.proved == "proved" else "has to show"
+    asked = f"On each blue one the checker {shown} V̇ < 0; the others lie outside the ring between the two levels."
     return Picture(
         "The leaf partition",
         f"The {_count(len(leaves[0]))} of the certificate, {where}. {asked}",
@@ -68,10 +65,10 @@ def add_leaves(axes: Any, scene: Scene, leaves: Leaves, pair: tuple[int, int], w
         visible = np.all((corners.min(axis=1) <= within) & (corners.max(axis=1) >= -within), axis=1)
         corners, ring = corners[visible], ring[visible]
     many = len(corners) > RASTER_FROM
-    for kind, face in ((~ring, "#ffffff"), (ring, SET_FILL)):
+    for kind, face in ((~ring, PAPER), (ring, SET_FILL)):
         if np.any(kind):
             width = 0.15 if many else 0.45
-            boxes = PolyCollection(list(corners[kind]), facecolors=face, edgecolors="#8fb0d3", linewidths=width)
+            boxes = PolyCollection(list(corners[kind]), facecolors=face, edgecolors=LEAF_EDGE, linewidths=width)
             boxes.set_zorder(1)
             boxes.set_rasterized(many)
             axes.add_collection(boxes)
