@@ -32,7 +32,7 @@ _MOST_LEAVES = 400_000
 _MOST_STEPS = 500
 _TANH = 30  # multiplications' worth
 _EQUATIONS = 500  # multiplications' worth of one evaluation, and of what surrounds it
-_GRIDS, _RUNS, _RATES = 2e9, 1.2e10, 5e8  # operations for grids, trajectories and the time scales
+_GRIDS, _RUNS, _RATES = 2e9, 1.8e10, 5e8  # operations for grids, trajectories and the time scales
 _SHARE = 0.6  # of the time, after which nothing is simulated any more: the rest is for drawing
 _VIEW = 1.3  # of the set's reach, in pictures of more than two states
 
