@@ -40,6 +40,7 @@ from certify.report.words import (
     deviation,
     inner_level,
     kept_apart,
+    limit_in_words,
     limited_by,
     number,
     pretty_unit,
@@ -177,6 +178,7 @@ def render_html(
         contents=_contents(status, limits),
         limits=limits,
         about_planes=_ABOUT_PLANES,
+        one_plane=certificate.system.n <= 2,
         status=status,
         words=words,
         replayed=isinstance(certificate.evidence, PartitionTree),
@@ -228,7 +230,7 @@ def _limits(certificate: Certificate, result: Mapping[str, Any] | None) -> dict[
     step: Mapping[str, Any] = found.get("next") or {}
     options = " ".join(f"{name} {value}" for name, value in (step.get("options") or {}).items())
     return {
-        "binds": found.get("binds", ""),
+        "binds": limit_in_words(str(found.get("binds", ""))),
         "modes": _modes(found),
         "shares": [
             {
@@ -480,7 +482,7 @@ def _tables(
             f"{below(row['volume'])} {unit}".rstrip(),
             "the domain" if row["limited_by"] == "domain" else "a violation found",
             f"{below(row['proved_volume'])} {unit}".rstrip() if row.get("proved_volume") else ABSENT,
-            "the one of this certificate" if row["proved"] else "",
+            "this one" if row["proved"] else "",
         )
         for row in (result or {}).get("candidates", [])
     ]

@@ -16,7 +16,7 @@ from certify.report.figures.near_origin import near_origin
 from certify.report.figures.pairs import Pair
 from certify.report.figures.partition import partition
 from certify.report.figures.policy import curves, surface
-from certify.report.figures.portrait import Region, portrait
+from certify.report.figures.portrait import Region, portraits
 from certify.report.figures.scene import Scene, starts
 from certify.report.figures.style import RC, Picture
 from certify.report.sampling import SimulatedRoa, edge_of, simulated_roa_fraction
@@ -70,7 +70,7 @@ def _on_the_line(scene: Scene, roa: SimulatedRoa | None) -> list[Picture]:
 
 def _in_planes(scene: Scene, roa: SimulatedRoa | None) -> list[Picture]:
     runs, region = scene.simulate(starts(scene)), region_of(scene, roa)
-    pictures = [portrait(scene, pair, runs, region) for pair in scene.pairs]
+    pictures = portraits(scene, runs, region)
     if scene.n == 2 and not scene.local_is_enough:
         pictures.append(near_origin(scene))
     if scene.leaves is not None and not scene.local_is_enough:

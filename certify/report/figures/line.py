@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from certify.report.figures.scene import Scene
@@ -24,9 +26,23 @@ from certify.report.sampling import SimulatedRoa
 
 def line_figure(scene: Scene, roa: SimulatedRoa | None) -> Picture:
     """Vdot over the domain, the two intervals, and where runs settle."""
+    figure, axes = figure_of(5.2, 3.4)
+    legend = draw_line(axes, scene, roa)
+    return Picture(
+        "V̇ along the state",
+        f"Shaded: the {scene.word} interval, {scene.meaning}. The curve of V̇ and the interval of the runs that "
+        f"{scene.words.settles} come from floating point and simulation; they are not proved.",
+        to_svg(figure),
+        simulated=True,
+        wide=True,
+        legend=legend,
+    )
+
+
+def draw_line(axes: Any, scene: Scene, roa: SimulatedRoa | None) -> tuple[Key, ...]:
+    """Fill the axes; their legend."""
     x = np.linspace(scene.lo[0], scene.hi[0], 601)[:, None]
     outer, inner = scene.reach[0], scene.inner_reach[0]
-    figure, axes = figure_of(5.2, 3.4)
     vdot = scene.vdot(x)
     keys = [
         Key(f"{scene.word} set", SET_FILL, 0, fill=SET_FILL),
@@ -52,12 +68,4 @@ def line_figure(scene: Scene, roa: SimulatedRoa | None) -> Picture:
     axes.set_xlim(scene.lo[0], scene.hi[0])
     axes.set_xlabel(scene.labels[0])
     axes.set_ylabel("V̇")
-    return Picture(
-        "V̇ along the state",
-        f"Shaded: the {scene.word} interval, {scene.meaning}. The curve of V̇ and the interval of the runs that "
-        f"{scene.words.settles} come from floating point and simulation; they are not proved.",
-        to_svg(figure),
-        simulated=True,
-        wide=True,
-        legend=tuple(keys),
-    )
+    return tuple(keys)

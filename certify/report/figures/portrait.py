@@ -42,35 +42,38 @@ Region = tuple[Array, Array, Array]
 """Axes (K,), (L,) of a plane and the share of a simulated region around each point, (K, L)."""
 
 
-def portrait(scene: Scene, pair: Pair, runs: Runs, region: Region | None) -> Picture:
-    """The plane of two states, with what all planes of the certificate have in their one legend."""
-    figure, axes = figure_of(5.2, 4.3) if scene.n == 2 else figure_of(4.2, 3.6)
-    sign = draw_plane(axes, scene, pair, runs, region)
-    star = f"*\N{NO-BREAK SPACE}Simulated or evaluated on a grid, not proved.{sign}"
-    if scene.n == 2:
-        title = "Phase portrait"
-        caption = f"Blue: the {scene.word} set, {scene.meaning}. {star}"
-    else:
-        title = ", ".join(symbol(scene.system.states[k].name) for k in pair)
-        shares = [f"{symbol(scene.system.states[k].name)} {number(100 * scene.shares[k], 3)} %" for k in pair]
-        caption = f"Of its domain the set takes {' and '.join(shares)}. {star}"
-    return Picture(title, caption, to_svg(figure), simulated=True, wide=scene.n == 2, legend=keys(scene, runs, region))
+def portraits(scene: Scene, runs: Runs, region: Region | None) -> list[Picture]:
+    """The planes of the scene's pairs, under one legend."""
+    drawn = []
+    for pair in scene.pairs:
+        figure, axes = figure_of(5.2, 4.3) if scene.n == 2 else figure_of(4.2, 3.6)
+        drawn.append((pair, draw_plane(axes, scene, pair, runs, region), to_svg(figure)))
+    legend = keys(scene, runs, region, any(growing for _, growing, _ in drawn))
+    title, meaning = "Phase portrait", f"Blue: the {scene.word} set, {scene.meaning}. "
+    pictures = []
+    for pair, growing, svg in drawn:
+        if scene.n > 2:
+            names = [symbol(scene.system.states[k].name) for k in pair]
+            title = ", ".join(names)
+            shares = [f"{number(100 * scene.shares[k], 3)} % in {name}" for name, k in zip(names, pair, strict=True)]
+            meaning = f"Of its domain the set takes {' and '.join(shares)}. "
+        sign = "" if growing else "V̇ < 0 at every grid point of the picture. "
+        caption = f"{meaning}{sign}*\N{NO-BREAK SPACE}Simulated or evaluated on a grid, not proved."
+        pictures.append(Picture(title, caption, svg, simulated=True, wide=scene.n == 2, legend=legend))
+    return pictures
 
 
-def keys(scene: Scene, runs: Runs, region: Region | None) -> tuple[Key, ...]:
-    """The legend of the planes."""
+def keys(scene: Scene, runs: Runs, region: Region | None, growing: bool) -> tuple[Key, ...]:
+    """The legend of the planes; `growing` says whether Vdot >= 0 somewhere in one of them."""
     outer = f"{scene.word} set, V = {below(scene.outer, 4)}"
     inner = f"{scene.words.inner_set}, V = {inner_level(scene.kind, scene.inner, 3)}"
     found = [Key(outer, SET, 1.8, fill=SET_FILL)]
     if scene.n > 2:
-        section = "its section through the origin, all other states 0"
-        found = [
-            Key(f"{outer}: its projection, all values in the set", SET, 1.2, "--"),
-            Key(section, SET, 1.6, fill=SET_FILL),
-        ]
+        found = [Key(f"{outer}: projection", SET, 1.2, "--"), Key("its section through the origin", SET, 1.6, fill=SET_FILL)]
     if not scene.local_is_enough:
-        found.append(Key(inner + (", section" if scene.n > 2 else ""), INNER, 1.4, fill=INNER_FILL))
-    found.append(Key("V̇ ≥ 0 on a grid*", GROWTH, 1.0, fill=GROWTH_FILL))
+        found.append(Key(inner + (": section" if scene.n > 2 else ""), INNER, 1.4, fill=INNER_FILL))
+    if growing:
+        found.append(Key("V̇ ≥ 0 on a grid*", GROWTH, 1.0, fill=GROWTH_FILL))
     found += [Key(text, colour, 1.4, style) for _, colour, style, text in _kinds(scene, runs)]
     if region is not None:
         found.append(Key("edge of the simulated region*", REGION, 1.4, "--"))
@@ -90,8 +93,8 @@ def _kinds(scene: Scene, runs: Runs) -> list[tuple[NDArray[np.bool_], str, Any, 
     return [kind for kind in kinds if np.any(kind[0])]
 
 
-def draw_plane(axes: Any, scene: Scene, pair: Pair, runs: Runs, region: Region | None) -> str:
-    """Everything in one plane; what is to be said of the sign of Vdot where no line shows it."""
+def draw_plane(axes: Any, scene: Scene, pair: Pair, runs: Runs, region: Region | None) -> bool:
+    """Everything in one plane; whether Vdot >= 0 at some grid point."""
     from matplotlib.collections import LineCollection
     from matplotlib.patches import Rectangle
 
@@ -99,15 +102,13 @@ def draw_plane(axes: Any, scene: Scene, pair: Pair, runs: Runs, region: Region |
     view = scene.view(pair)
     a, b, x = scene.plane(pair)
     vdot = scene.vdot(x)
-    sign = ""
     section = ellipse(scene.P, pair, scene.outer)
     axes.fill(*section, color=SET_FILL, lw=0, zorder=1)
     growing = (vdot >= 0) & np.any(x != 0, axis=-1)
-    if np.any(growing) and not np.all(growing):
+    if np.any(growing):
         axes.contourf(a, b, vdot, levels=[0, np.inf], colors=[GROWTH_FILL], zorder=0)
-        axes.contour(a, b, vdot, levels=[0.0], colors=[GROWTH], linewidths=1.0, zorder=3)
-    elif not np.any(growing):
-        sign = " V̇ < 0 at every grid point of the picture.*"
+        if np.any(vdot < 0):
+            axes.contour(a, b, vdot, levels=[0.0], colors=[GROWTH], linewidths=1.0, zorder=3)
     size = view.hi - view.lo
     for which, colour, style, _ in _kinds(scene, runs):
         lines = [thin(runs.path[:, k][:, [i, j]], size) for k in np.flatnonzero(which)]
@@ -135,7 +136,7 @@ def draw_plane(axes: Any, scene: Scene, pair: Pair, runs: Runs, region: Region |
     axes.set_ylabel(scene.labels[j])
     if scene.n == 2:
         axes.spines[["left", "bottom"]].set_visible(False)  # the domain's box is frame enough
-    return sign
+    return bool(np.any(growing))
 
 
 def _arrows(axes: Any, lines: Sequence[Array], colour: str, size: Array) -> None:
@@ -157,8 +158,9 @@ def _arrows(axes: Any, lines: Sequence[Array], colour: str, size: Array) -> None
             angles="uv",
             color=colour,
             pivot="mid",
-            scale=42,
-            width=0.0035,
+            units="inches",
+            scale=9.5,
+            width=0.0145,
             headwidth=4.5,
             headlength=5.5,
             headaxislength=5.0,
