@@ -55,8 +55,8 @@ _LONG = 10**6  # numerators and denominators beyond it are shown rounded
 _SECONDS, _SHARE = 10.0, 0.1  # the drawing takes no longer than the one, or than this share of the run
 _ABOUT_PLANES = (
     "Each picture shows two states. The section holds the states of the set in which all others are 0; the projection "
-    "holds the values that the two take anywhere in the set. Both are exact shapes. Trajectories start over the edge of "
-    "the projection, and are projected like it."
+    "holds the values that the two take anywhere in the set. Both are exact shapes. Trajectories start over the edge "
+    "of the projection, and are projected like it."
 )
 
 

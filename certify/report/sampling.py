@@ -130,14 +130,17 @@ class Flow:
         return cls(field, policy, *domain_bounds(system))
 
 
-def time_scales(flow: Flow, samples: int = _RATE_SAMPLES) -> tuple[float, float]:
+def time_scales(flow: Flow, samples: int = _RATE_SAMPLES, reach: Array | None = None) -> tuple[float, float]:
     """(step, horizon) in seconds: the fastest time constant, and 15 times the slowest at the origin.
+
+    Of `samples` states in the domain, or in the part of it where `|x_i| <= reach_i`.
 
     The fastest is taken over Jacobians at the origin and at sampled states of the domain, because a plant can be
     stiffer away from the origin; Runge-Kutta of order four is stable up to 2.8 of it. The horizon is cut at 3,000
     steps.
     """
-    x = np.random.default_rng(0).uniform(flow.lo, flow.hi, (samples, len(flow.lo)))
+    lo, hi = (flow.lo, flow.hi) if reach is None else (np.maximum(flow.lo, -reach), np.minimum(flow.hi, reach))
+    x = np.random.default_rng(0).uniform(lo, hi, (samples, len(lo)))
     rates = _eigenvalues(flow, np.concatenate([np.zeros((1, len(flow.lo))), x]))
     fastest = float(np.max(np.abs(rates), initial=0.0))
     slowest = float(np.min(np.abs(rates[:1].real), initial=math.inf))
@@ -234,8 +237,8 @@ def _fates(path: Array, begins: Mask, P: Array, level: float, target: float) -> 
     """Which runs settle and which leave, each (N,)."""
     V = quadratic(P, path)
     with np.errstate(invalid="ignore"):
-        settled = np.any(V <= target, axis=0)
-        left = np.any(np.isnan(V), axis=0) | (begins & np.any(V > _OUTSIDE * level, axis=0))
+        settled = np.any(target >= V, axis=0)
+        left = np.any(np.isnan(V), axis=0) | (begins & np.any(_OUTSIDE * level < V, axis=0))
     return settled & ~left, left
 
 
@@ -292,9 +295,9 @@ def simulated_roa_fraction(
     return SimulatedRoa(axes, attracted.reshape(shape), left.reshape(shape), certified.reshape(shape), step, reached)
 
 
-def _run(flow: Flow, x: Array, P: Array, target: float, step: float, horizon: float, deadline: float = math.inf) -> (
-    tuple[Mask, Mask, float]
-):
+def _run(
+    flow: Flow, x: Array, P: Array, target: float, step: float, horizon: float, deadline: float = math.inf
+) -> tuple[Mask, Mask, float]:
     """Which runs came to `V <= target`, which left the domain, and how many seconds were simulated."""
     attracted, left = np.zeros((2, len(x)), dtype=np.bool_)
     alive = np.arange(len(x))

@@ -41,7 +41,7 @@ class Browser:
         arguments = ["--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run",
                      "--hide-scrollbars", "--remote-debugging-pipe", f"--user-data-dir={folder}", "about:blank"]  # fmt: skip
         # The browser wants its ends at 3 and 4: a shell puts them there after the fork.
-        moved = f"exec 3<&{self._commands[0]} 4>&{self._answers[1]}; exec \"$0\" \"$@\""
+        moved = f'exec 3<&{self._commands[0]} 4>&{self._answers[1]}; exec "$0" "$@"'
         self._process = subprocess.Popen(
             ["/bin/bash", "-c", moved, program, *arguments],
             pass_fds=(self._commands[0], self._answers[1]),
@@ -58,7 +58,9 @@ class Browser:
         self.ask("Page.enable")
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
+    ) -> None:
         with contextlib.suppress(OSError, RuntimeError, TimeoutError):
             self._session = ""
             self.ask("Browser.close")
@@ -103,9 +105,7 @@ class Browser:
         """Open a file at a width in CSS pixels."""
         scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
         self.ask("Emulation.setEmulatedMedia", features=[scheme])
-        self.ask(
-            "Emulation.setDeviceMetricsOverride", width=width, height=900, deviceScaleFactor=1, mobile=width < 500
-        )
+        self.ask("Emulation.setDeviceMetricsOverride", width=width, height=900, deviceScaleFactor=1, mobile=width < 500)
         self._events.clear()
         self.ask("Page.navigate", url=page.resolve().as_uri())
         if "Page.loadEventFired" not in self._events:

@@ -85,7 +85,7 @@ def paper_figure(certificate: Certificate, accepted: bool, options: PaperOptions
         width = _WIDTHS[options.columns]
         panel = min(0.82 * width / across, 4.0)
         figure = Figure(figsize=(width, 1.0), layout="constrained")
-        panels = figure.subplots(down, across, squeeze=False).ravel()
+        panels = figure.subplots(down, across, squeeze=False).ravel().tolist()
         for spare in panels[count:]:
             spare.set_visible(False)
         legend = _draw(scene, panels[:count])

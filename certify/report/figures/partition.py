@@ -67,7 +67,7 @@ def add_leaves(axes: Any, scene: Scene, leaves: Leaves, pair: tuple[int, int], w
             boxes.set_rasterized(many)
             axes.add_collection(boxes)
     telling = corners[ring] if np.any(ring) else corners
-    return np.max(np.abs(telling), axis=(0, 1), initial=0.0)
+    return np.asarray(np.max(np.abs(telling), axis=(0, 1), initial=0.0))
 
 
 def _in_ring(scene: Scene, lower: Array, upper: Array) -> NDArray[np.bool_]:

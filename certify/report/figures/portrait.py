@@ -69,7 +69,10 @@ def keys(scene: Scene, runs: Runs, region: Region | None, growing: bool) -> tupl
     inner = f"{scene.words.inner_set}, V = {inner_level(scene.kind, scene.inner, 3)}"
     found = [Key(outer, SET, 1.8, fill=SET_FILL)]
     if scene.n > 2:
-        found = [Key(f"{outer}: projection", SET, 1.2, "--"), Key("its section through the origin", SET, 1.6, fill=SET_FILL)]
+        found = [
+            Key(f"{outer}: projection", SET, 1.2, "--"),
+            Key("its section through the origin", SET, 1.6, fill=SET_FILL),
+        ]
     if not scene.local_is_enough:
         found.append(Key(inner + (": section" if scene.n > 2 else ""), INNER, 1.4, fill=INNER_FILL))
     if growing:

@@ -20,7 +20,7 @@ from certify.lyapunov import extents, is_positive_definite
 from certify.policies import TanhNetwork
 from certify.report.figures.geometry import PARTS, Box, circle, over_level, refine
 from certify.report.figures.pairs import Pair, pairs_of
-from certify.report.sampling import SETTLED, Flow, Runs, quadratic, runs_of, time_scales
+from certify.report.sampling import SETTLED, Flow, Runs, runs_of, time_scales
 from certify.report.words import deviation, label, words_for
 
 Array = NDArray[np.float64]
@@ -108,7 +108,8 @@ class Scene:
         self.shares = self.reach / np.where(side > 0, side, np.nan)
         self.pairs = list(pairs) if pairs is not None else pairs_of(self.system, self.P, self.shares)
         self.effort = Effort.of(certificate.network, len(self.pairs))
-        self.step, self.horizon = time_scales(self.flow, self.effort.rates)
+        # With more than two states nothing is simulated from outside the set.
+        self.step, self.horizon = time_scales(self.flow, self.effort.rates, None if self.n <= 2 else self.reach)
         units = self.system.units
         points = zip(self.system.states, self.system.exact_x_eq(), strict=True)
         self.labels = [deviation(s.name, q, units.get(s.name, "")) for s, q in points]
