@@ -38,8 +38,17 @@ class Browser:
 
     def __init__(self, program: str, folder: Path) -> None:
         self._commands, self._answers = os.pipe(), os.pipe()
-        arguments = ["--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", "--no-first-run",
-                     "--hide-scrollbars", "--remote-debugging-pipe", f"--user-data-dir={folder}", "about:blank"]  # fmt: skip
+        arguments = [
+            "--headless=new",
+            "--no-sandbox",
+            "--disable-gpu",
+            "--disable-dev-shm-usage",
+            "--no-first-run",
+            "--hide-scrollbars",
+            "--remote-debugging-pipe",
+            f"--user-data-dir={folder}",
+            "about:blank",
+        ]
         # The browser wants its ends at 3 and 4: a shell puts them there after the fork.
         moved = f'exec 3<&{self._commands[0]} 4>&{self._answers[1]}; exec "$0" "$@"'
         self._process = subprocess.Popen(

@@ -24,14 +24,20 @@ MOST = 6
 
 
 def rates(system: System) -> list[Pair]:
-    """(coordinate, rate) by index, where the equation of the one is a multiple of the other."""
-    names = {symbol: k for k, symbol in enumerate(system.states)}
-    found = []
-    for i, expression in enumerate(system.exact_dynamics()):
-        _, factor = sympy.sympify(expression).as_coeff_Mul()
-        j = names.get(factor)
-        if j is not None and j != i:
-            found.append((i, j))
+    """(coordinate, rate) by index: the equation of the one has no input and, near the origin, only the other in it.
+
+    Each state is in one pair at most: in a chain of integrators the second is a rate, and no coordinate as well.
+    """
+    origin = dict.fromkeys(system.states, sympy.Integer(0))
+    inputs, taken, found = set(system.inputs), set(), []
+    for i, equation in enumerate(map(sympy.sympify, system.exact_dynamics())):
+        if i in taken or equation.free_symbols & inputs:
+            continue
+        slopes = [equation.diff(symbol).xreplace(origin) for symbol in system.states]
+        felt = [j for j, slope in enumerate(slopes) if slope != 0]
+        if len(felt) == 1 and felt[0] not in (i, *taken):
+            found.append((i, felt[0]))
+            taken |= {i, felt[0]}
     return found
 
 
