@@ -1,4 +1,4 @@
-"""What becomes of simulated runs: slow is not leaving, leaving is leaving, and nothing certified is drawn as leaving."""
+"""What becomes of simulated runs: slow is not leaving, and nothing certified is drawn as leaving."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -164,7 +165,7 @@ def test_a_deadline_ends_runs_early_and_keeps_what_there_is() -> None:
 def test_how_much_is_simulated_follows_from_the_policy_alone() -> None:
     def policy(width: int, layers: int) -> TanhNetwork:
         sizes = [6, *([width] * layers), 1]
-        weights = tuple(np.zeros((b, a)) for a, b in zip(sizes, sizes[1:], strict=False))
+        weights = tuple(np.zeros((b, a)) for a, b in pairwise(sizes))
         return TanhNetwork(weights, tuple(np.zeros(b) for b in sizes[1:]), np.ones(1), np.zeros(1), "tanh", "none")
 
     small, large, huge = Effort.of(policy(16, 2), 3), Effort.of(policy(256, 5), 3), Effort.of(policy(2048, 4), 3)

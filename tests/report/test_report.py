@@ -588,7 +588,8 @@ def test_hostile_names_are_text(tmp_path: Path) -> None:
     page = Page(html)
     known = {"html", "head", "meta", "title", "style", "body", "main", "h1", "h2", "h3", "p", "code", "div", "strong",
              "b", "span", "ol", "ul", "li", "figure", "img", "figcaption", "table", "thead", "tr", "th", "td", "pre",
-             "nav", "a", "i", "math", "mi", "mn", "mo", "mrow", "mfrac", "mover", "msup", "mspace", "mfenced"}  # fmt: skip
+             "nav", "a", "i", "math", "mi", "mn", "mo", "mrow", "mfrac", "mover", "msup", "mspace",
+             "mfenced"}  # fmt: skip
     assert {tag for tag, _ in page.tags} <= known
     assert not any(name.startswith("on") for _, attributes in page.tags for name in attributes)
     assert "alert('x')" in page.text and "{{ 7 * 7 }}" in page.text

@@ -26,7 +26,7 @@ from certify.report.sampling import SimulatedRoa
 
 def line_figure(scene: Scene, roa: SimulatedRoa | None) -> Picture:
     """Vdot over the domain, the two intervals, and where runs settle."""
-    figure, axes = figure_of(5.2, 3.4)
+    figure, axes = figure_of(5.0, 3.4)
     legend = draw_line(axes, scene, roa)
     return Picture(
         "V̇ along the state",

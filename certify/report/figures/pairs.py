@@ -29,7 +29,9 @@ def rates(system: System) -> list[Pair]:
     Each state is in one pair at most: in a chain of integrators the second is a rate, and no coordinate as well.
     """
     origin = dict.fromkeys(system.states, sympy.Integer(0))
-    inputs, taken, found = set(system.inputs), set(), []
+    inputs = set(system.inputs)
+    taken: set[int] = set()
+    found: list[Pair] = []
     for i, equation in enumerate(map(sympy.sympify, system.exact_dynamics())):
         if i in taken or equation.free_symbols & inputs:
             continue

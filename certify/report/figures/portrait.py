@@ -46,7 +46,7 @@ def portraits(scene: Scene, runs: Runs, region: Region | None) -> list[Picture]:
     """The planes of the scene's pairs, under one legend."""
     drawn = []
     for pair in scene.pairs:
-        figure, axes = figure_of(5.2, 4.3) if scene.n == 2 else figure_of(4.2, 3.6)
+        figure, axes = figure_of(5.0, 4.2) if scene.n == 2 else figure_of(4.2, 3.6)
         drawn.append((pair, draw_plane(axes, scene, pair, runs, region), to_svg(figure)))
     legend = keys(scene, runs, region, any(growing for _, growing, _ in drawn))
     title, meaning = "Phase portrait", f"Blue: the {scene.word} set, {scene.meaning}. "
