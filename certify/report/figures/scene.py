@@ -32,8 +32,9 @@ _MOST_LEAVES = 400_000
 _MOST_STEPS = 500
 _TANH = 30  # multiplications' worth
 _EQUATIONS = 500  # multiplications' worth of one evaluation, and of what surrounds it
-_GRIDS, _RUNS, _RATES = 2e9, 1.8e10, 5e8  # operations for grids, trajectories and the time scales
-_SHARE = 0.6  # of the time, after which nothing is simulated any more: the rest is for drawing
+_GRIDS, _RUNS, _RATES = 2e9, 1e10, 5e8  # operations for grids, trajectories and the time scales
+_SHARE = 0.45  # of the time, after which nothing is simulated any more: the rest is for drawing
+_LEAST = 25  # points along a grid
 _VIEW = 1.3  # of the set's reach, in pictures of more than two states
 
 
@@ -68,7 +69,7 @@ class Effort:
         steps = _RUNS / (4 * cost)  # of all trajectories together
         starts = int(min(max(steps / (_MOST_STEPS * planes), 4), ON_BOUNDARY if planes == 1 else 8))
         return cls(
-            grid=int(min(max(math.sqrt(_GRIDS / cost / (planes + 1)), 25), 101)),
+            grid=int(min(max(math.sqrt(_GRIDS / cost / (planes + 1)), _LEAST), 101)),
             starts=starts,
             steps=int(min(max(steps / (starts * planes), 120), _MOST_STEPS)),
             rates=int(min(max(_RATES / (2 * network.n * cost), 24), 200)),
@@ -162,7 +163,8 @@ class Scene:
 
     def plane(self, pair: Pair) -> tuple[Array, Array, Array]:
         """Grid coordinates along two states within the view and the domain, and the states (all others 0)."""
-        box, (i, j), points = self.view(pair), pair, self.effort.grid
+        box, (i, j) = self.view(pair), pair
+        points = self.effort.grid if time.monotonic() < self.deadline else _LEAST
         lo, hi = np.maximum(box.lo, self.lo[[i, j]]), np.minimum(box.hi, self.hi[[i, j]])
         a, b = np.linspace(lo[0], hi[0], points), np.linspace(lo[1], hi[1], points)
         x = np.zeros((points, points, self.n))
