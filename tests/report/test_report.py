@@ -631,7 +631,10 @@ def test_other_dimensions(name: str, request: pytest.FixtureRequest) -> None:
     assert len(page.drawings()) == {"scalar_case": 3, "chain_case": 6}[name]  # four planes, the policy, V
     if name == "chain_case":
         assert "x₁, x₂." in page.text and "all states together" in page.text
-        assert "its section through the origin" in page.text and "V = 0.9999: projection" in page.text
+        assert (
+            "its section through the origin" in page.text
+            and f"V = {below(case.certificate.roa, 4)}: projection" in page.text
+        )
         assert "By simulation" not in page.text
 
 
