@@ -20,6 +20,7 @@ from certify.commands.export_smt2 import export_smt2
 from certify.commands.import_ import import_
 from certify.commands.importing import takes_import_options
 from certify.commands.plant import plant
+from certify.commands.plot import plot
 from certify.commands.report import report
 from certify.commands.roa import roa
 from certify.commands.systems import systems
@@ -36,6 +37,7 @@ app.callback()(certify)
 app.command("roa")(takes_import_options(roa))
 app.command("check")(check)
 app.command("report")(report)
+app.command("plot")(plot)
 app.command("import")(takes_import_options(import_))
 app.command("plant")(plant)
 app.command("systems")(systems)

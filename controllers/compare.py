@@ -15,7 +15,7 @@ import csv
 import io
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import astuple, fields, replace
+from dataclasses import astuple, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -35,10 +35,10 @@ from controllers.baselines import (
     train_reference,
     without_gain,
 )
-from controllers.figures import draw_over_time, draw_positions
+from controllers.figures import draw_over_time, draw_states
 from controllers.files import make_folder, read, write_atomically
 from controllers.options import TrainingOptions
-from controllers.responses import CompareOptions, Response, Row, Run, table
+from controllers.responses import NAMES, CompareOptions, Response, Row, Run, table
 from controllers.simulation import Action, held_loop, initial_states
 from controllers.training import Trainer, train
 
@@ -54,6 +54,24 @@ _FILES: dict[Run, str] = {
 }
 
 
+@dataclass(frozen=True, slots=True)
+class Doing:
+    """What a comparison is doing.
+
+    Parameters
+    ----------
+    what : the run in words.
+    run, runs : its number, from 1 on, and how many there are.
+    done, steps : of its training; equal once it is trained.
+    """
+
+    what: str
+    run: int
+    runs: int
+    done: int
+    steps: int
+
+
 def compare(
     system: System,
     training: TrainingOptions,
@@ -61,13 +79,15 @@ def compare(
     out: Path,
     options: CompareOptions | None = None,
     say: Callable[[str], None] = lambda line: None,
+    watch: Callable[[Doing], None] = lambda doing: None,
 ) -> dict[str, Any]:
     """Train what is missing in `runs`, simulate all, write three figures and the table to `out`.
 
     Parameters
     ----------
     training : the plant's preset with the steps of every run; its seed is replaced.
-    say : takes a line of progress.
+    say : takes a line of progress, ten times in a run that is trained.
+    watch : is told of every step that is trained, and of every run that is there.
 
     Returns
     -------
@@ -85,9 +105,16 @@ def compare(
         require_stable_baselines()
     make_folder(out)
     responses = []
-    for run in dict.fromkeys(method.run for method in options.methods):
+    kinds = list(dict.fromkeys(method.run for method in options.methods))
+    for k, run in enumerate(kinds):
         for seed in range(options.seeds):
-            trained = obtain(run, system, replace(training, seed=seed), runs, say)
+            number, what = k * options.seeds + seed + 1, f"{NAMES[run]}, seed {seed}"
+
+            def tell(done: int, steps: int, number: int = number, what: str = what) -> None:
+                watch(Doing(what, number, len(kinds) * options.seeds, done, steps))
+
+            trained = obtain(run, system, replace(training, seed=seed), runs, say, tell)
+            tell(trained.steps, trained.steps)
             for method in options.methods:
                 if method.run == run:
                     act = _action(trained, method.sampled, options.start_seed)
@@ -97,7 +124,7 @@ def compare(
     drawings = {
         "cost": draw_over_time("cost", system, training.dt, responses, rows),
         "norm": draw_over_time("norm", system, training.dt, responses, rows),
-        "positions": draw_positions(system, training.dt, responses),
+        "states": draw_states(system, training.dt, responses),
     }
     ablations = {method.run for method in options.methods} & {"before", "uncentred"}
     stem = system.name + ("-ablations" if ablations else "")
@@ -120,7 +147,12 @@ def compare(
 
 
 def obtain(
-    run: Run, system: System, training: TrainingOptions, runs: Path, say: Callable[[str], None] = lambda line: None
+    run: Run,
+    system: System,
+    training: TrainingOptions,
+    runs: Path,
+    say: Callable[[str], None] = lambda line: None,
+    tell: Callable[[int, int], None] = lambda done, steps: None,
 ) -> Trained:
     """The run of `training.seed` from its file in `runs`, trained first if there is none.
 
@@ -134,7 +166,7 @@ def obtain(
     trained = _load(run, path, system, training) if path.is_file() else None
     if trained is None or (run == "sac" and trained.steps < steps and trained.seed == training.seed):
         make_folder(folder)
-        _train(run, system, training, path, _progress(what, steps, say))
+        _train(run, system, training, path, _progress(what, steps, say, tell))
         trained = _load(run, path, system, training)
     if (trained.steps, trained.seed) != (steps, training.seed):
         raise InputError(
@@ -205,11 +237,14 @@ def _train(run: Run, system: System, training: TrainingOptions, path: Path, repo
     checkpoint.unlink(missing_ok=True)
 
 
-def _progress(what: str, steps: int, say: Callable[[str], None]) -> Callable[[int], None]:
-    """Says ten times in a run how far it is."""
+def _progress(
+    what: str, steps: int, say: Callable[[str], None], tell: Callable[[int, int], None]
+) -> Callable[[int], None]:
+    """Tells of every step, and says ten times in a run how far it is."""
     every = max(1, steps // 10)
 
     def report(done: int) -> None:
+        tell(done, steps)
         if done % every == 0:
             say(f"{what}: {done} of {steps} steps")
 

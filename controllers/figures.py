@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from certify.systems import System
 from controllers.options import get_plant
-from controllers.responses import NAMES, OURS, Response, Row, Run, quartiles
+from controllers.responses import NAMES, OURS, Method, Response, Row, Run, quartiles
 
 Array = NDArray[np.float64]
 
@@ -94,40 +94,23 @@ def _draw_band(panel: Any, what: Literal["cost", "norm"], dt: float, responses: 
     panel.fill_between(time, _drawable(lower)[first:], _drawable(upper, median)[first:], color=colour, alpha=0.18, lw=0)
 
 
-def draw_positions(system: System, dt: float, responses: Sequence[Response]) -> bytes:
-    """Fifty trajectories at most of each position, one column a method, all of the first seed."""
+def draw_states(system: System, dt: float, responses: Sequence[Response]) -> bytes:
+    """Fifty trajectories at most of every state, positions first; one column a method, all of the first seed."""
     import matplotlib
     from matplotlib.figure import Figure
 
     names, seed = [symbol.name for symbol in system.states], responses[0].seed
     chosen = {response.method: response.x[:, :50] for response in responses if response.seed == seed}
-    positions, time = get_plant(system.name).positions, dt * np.arange(len(responses[0].x))
+    positions = get_plant(system.name).positions
+    shown = [*positions, *(name for name in names if name not in positions)]
+    time: Array = dt * np.arange(len(responses[0].x), dtype=np.float64)
     with matplotlib.rc_context(_STYLE):
-        figure = Figure(figsize=(15.0, 0.9 + 1.9 * len(positions)), layout="constrained")
-        panels = figure.subplots(len(positions), len(chosen), sharex=True, sharey="row", squeeze=False)
-        for position, line in zip(positions, panels, strict=True):
-            k = names.index(position)
-            bound = float(max(map(abs, system.domain[k])))
-            shown = np.concatenate([x[..., k].ravel() for x in chosen.values()])
-            reach = 1.05 * min(bound, float(np.nanmax(np.abs(shown))))
-            for panel, (method, x) in zip(line, chosen.items(), strict=True):
-                path = x[..., k]
-                panel.plot(time, np.clip(path, -10 * reach, 10 * reach), color=_COLOURS[method.run], lw=0.6, alpha=0.6)
-                outside = int((~(np.abs(path) <= reach)).any(axis=0).sum())
-                if outside:
-                    panel.text(
-                        0.98,
-                        0.03,
-                        f"{outside} leave the frame",
-                        transform=panel.transAxes,
-                        ha="right",
-                        fontsize=7.5,
-                        bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0},
-                    )
-            line[0].set_ylim(-reach, reach)
-            line[0].set_ylabel(f"{'θ' if position == 'theta' else position} ({system.units.get(position, '')})")
+        figure = Figure(figsize=(0.9 + 2.2 * len(chosen), 1.1 + 1.55 * len(shown)), layout="constrained")
+        panels = figure.subplots(len(shown), len(chosen), sharex=True, sharey="row", squeeze=False)
+        for name, line in zip(shown, panels, strict=True):
+            _draw_state(line, system, names.index(name), time, chosen)
         for panel, method in zip(panels[0], chosen, strict=True):
-            panel.set_title(method.label)
+            panel.set_title(method.label.replace(", ", ",\n"))  # a panel is narrower than some names
         for panel in panels[-1]:
             panel.set_xlabel("time (s)")
             panel.set_xlim(0, time[-1])
@@ -136,6 +119,34 @@ def draw_positions(system: System, dt: float, responses: Sequence[Response]) -> 
             f"{system.name}: {_count(number, 'trajectory', 'trajectories')}, held actions, seed {seed}", fontsize=10.0
         )
         return _png(figure)
+
+
+def _draw_state(panels: Sequence[Any], system: System, k: int, time: Array, chosen: Mapping[Method, Array]) -> None:
+    """One state in the panels of all methods, in a frame that most of what stays in the domain needs."""
+    name, bound = system.states[k].name, float(max(map(abs, system.domain[k])))
+    sizes = np.abs(np.concatenate([x[..., k].ravel() for x in chosen.values()]))
+    finite = sizes[np.isfinite(sizes)]
+    largest = float(finite.max()) if finite.size else bound
+    reach = 1.05 * (min(bound, largest) or bound)
+    for panel, (method, x) in zip(panels, chosen.items(), strict=True):
+        path = x[..., k]
+        panel.plot(time, np.clip(path, -10 * reach, 10 * reach), color=_COLOURS[method.run], lw=0.6, alpha=0.6)
+        panel.axhline(0, color="#6b7785", lw=0.5, zorder=0)
+        panel.locator_params(nbins=4)
+        outside = int((~(np.abs(path) <= reach)).any(axis=0).sum())
+        if outside:
+            panel.text(
+                0.98,
+                0.04,
+                f"{outside} leave the frame",
+                transform=panel.transAxes,
+                ha="right",
+                fontsize=8.0,
+                bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.0},
+            )
+    panels[0].set_ylim(-reach, reach)
+    unit = system.units.get(name, "")
+    panels[0].set_ylabel(f"{name} ({unit})" if unit else name)
 
 
 def _drawable(values: Array, otherwise: Array | None = None) -> Array:

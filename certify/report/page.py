@@ -13,6 +13,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from importlib import resources
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +26,7 @@ from certify.errors import CertifyError, InputError, SoundnessError
 from certify.lyapunov import domain_limit, extents, semi_axes, volume
 from certify.report.figures import Picture, draw
 from certify.report.figures.scene import is_ellipsoid
+from certify.report.figures.style import legend_style
 from certify.report.sampling import SimulatedRoa
 from certify.report.words import (
     ABSENT,
@@ -38,6 +40,7 @@ from certify.report.words import (
     deviation,
     inner_level,
     kept_apart,
+    limit_in_words,
     limited_by,
     number,
     pretty_unit,
@@ -49,6 +52,12 @@ from certify.report.words import (
 )
 
 _LONG = 10**6  # numerators and denominators beyond it are shown rounded
+_SECONDS, _SHARE = 10.0, 0.1  # the drawing takes no longer than the one, or than this share of the run
+_ABOUT_PLANES = (
+    "Each picture shows two states. The section holds the states of the set in which all others are 0; the projection "
+    "holds the values that the two take anywhere in the set. Both are exact shapes. Trajectories start over the edge "
+    "of the projection, and are projected like it."
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,6 +148,7 @@ def render_html(
     InputError : the result is not of the run that made the certificate.
     """
     import jinja2
+    from markupsafe import Markup
 
     if sha256 is None:
         raw = certificate.to_json().encode("utf-8")
@@ -155,18 +165,24 @@ def render_html(
     pictures: list[Picture] = []
     roa, trouble = None, ""
     try:
-        pictures, roa = draw(certificate, status.accepted)
+        pictures, roa = draw(certificate, status.accepted, seconds=_time_for(result))
     except np.linalg.LinAlgError as error:
         trouble = f"There are no figures: floating point cannot draw them: {error}"
     except (CertifyError, ValueError, ArithmeticError) as error:
         if status.accepted:
             raise
         trouble = f"There are no figures: {error}"  # a rejected file need not make sense
+    limits = _limits(certificate, result)
     page = environment.from_string(source).render(
+        legend_style=Markup(legend_style()),
+        contents=_contents(status, limits),
+        limits=limits,
+        about_planes=_ABOUT_PLANES,
+        one_plane=certificate.system.n <= 2,
         status=status,
         words=words,
         replayed=isinstance(certificate.evidence, PartitionTree),
-        pictures=pictures,
+        pictures=[(legend, list(members)) for legend, members in groupby(pictures, lambda p: p.legend)],
         trouble=trouble,
         claim=_claim(certificate, answer if status.accepted else None),
         plant=_plant(certificate),
@@ -178,6 +194,72 @@ def render_html(
         not_proved=_not_proved(certificate, words),
     )
     return str(page).encode("utf-8", "replace").decode("utf-8")  # a file's text may hold half a surrogate pair
+
+
+def _time_for(result: Mapping[str, Any] | None) -> float:
+    """Seconds that the figures may take."""
+    total = None if result is None else result["seconds"].get("total")
+    return max(_SECONDS, _SHARE * (total or 0.0))
+
+
+def _contents(status: Status, limits: Mapping[str, Any] | None) -> list[tuple[str, str]]:
+    """Targets and titles of the table of contents."""
+    found = [
+        ("claim", "What was proved" if status.accepted else "What is claimed"),
+        ("outside", "What was not proved" if status.accepted else "What lies outside the claim"),
+        ("figures", "Figures"),
+    ]
+    if limits is not None:
+        found.append(("limits", "What limits the set" if limits["binds"] else "Share of the domain"))
+    return [*found, ("numbers", "Numbers"), ("check", "How to check")]
+
+
+def _limits(certificate: Certificate, result: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    """How much of its domain the set takes, and what the run says of what limits it; None where there is no set.
+
+    The shares are the certificate's own; only words and the next step come from the run.
+    """
+    if not is_ellipsoid(certificate):
+        return None
+    system = certificate.system
+    reach = extents(certificate.P, certificate.roa)
+    sides = [min(-lo, hi) for lo, hi in system.domain]
+    shares = [float(Fraction(float(e)) / side) if side > 0 else math.inf for e, side in zip(reach, sides, strict=True)]
+    found: Mapping[str, Any] = (result or {}).get("diagnosis") or {}
+    names = {s.name: symbol(s.name) for s in system.states}
+    step: Mapping[str, Any] = found.get("next") or {}
+    options = " ".join(f"{name} {value}" for name, value in (step.get("options") or {}).items())
+    return {
+        "binds": limit_in_words(str(found.get("binds", ""))),
+        "modes": _modes(found),
+        "shares": [
+            {
+                "name": symbol(s.name),
+                "reach": f"{above(float(e), 4)} {pretty_unit(system.units.get(s.name, ''))}".rstrip(),
+                "share": f"{above(100 * share, 3)} %",
+                "width": f"{min(100.0, 100 * share):.1f}",
+                "binds": share == max(shares),
+            }
+            for s, e, share in zip(system.states, reach, shares, strict=True)
+        ],
+        "hurts": [
+            (names.get(name, name), f"{100 * weight:.1f}", number(weight, 2))
+            for name, weight in (found.get("hurts") or {}).items()
+        ],
+        "why": str(step.get("why", "")).rstrip("."),
+        "command": step.get("command") or options,
+    }
+
+
+def _modes(found: Mapping[str, Any]) -> str:
+    """How fast the closed loop is at the origin, in a sentence."""
+    if not found.get("stiffness"):
+        return ""
+    fast, slow = number(abs(found["fastest"]), 3), number(abs(found["slowest"]), 3)
+    return (
+        f"At the origin its slowest mode decays at {slow} per second, its fastest at {fast} per second: a stiffness of "
+        f"{number(found['stiffness'], 2)}."
+    )
 
 
 def _plant(certificate: Certificate) -> dict[str, Any]:
@@ -318,8 +400,9 @@ def _not_proved(certificate: Certificate, words: Words) -> list[tuple[str, str]]
     if certificate.system.n > 2:
         items.append(
             (
-                "The sections as wholes.",
-                "A section shows two states with all others 0; the claim is about all states together.",
+                "The pictures as wholes.",
+                "A section shows two states with all others 0, a projection two states whatever the others are; the "
+                "claim is about all states together.",
             )
         )
     return items
@@ -380,7 +463,8 @@ def _tables(
         evidence += [(f"its answer to {name}", said) for name, said in solver.queries]
     elif answer is not None and status.accepted:
         leaves = f"{answer.get('leaves', 0):,}, of which {answer.get('ring_leaves', 0):,} in the ring"
-        evidence.append(("leaves", leaves))
+        whole = certificate.kind == "asymptotic" and certificate.inner == certificate.roa
+        evidence.append(("leaves", "none needed: the local part covers the whole set" if whole else leaves))
     run: list[tuple[str, str]] = []
     if result is not None:
         if result.get("boxes"):
@@ -398,7 +482,7 @@ def _tables(
             f"{below(row['volume'])} {unit}".rstrip(),
             "the domain" if row["limited_by"] == "domain" else "a violation found",
             f"{below(row['proved_volume'])} {unit}".rstrip() if row.get("proved_volume") else ABSENT,
-            "the one of this certificate" if row["proved"] else "",
+            "this one" if row["proved"] else "",
         )
         for row in (result or {}).get("candidates", [])
     ]
@@ -421,7 +505,9 @@ def _simulated(roa: SimulatedRoa, certificate: Certificate) -> dict[str, str]:
         "step": f"{number(roa.step, 3)} s",
         "horizon": f"{number(roa.horizon, 3)} s",
         "undecided": f"{roa.undecided:,}",
+        "left": f"{int(roa.left.sum()):,}",
         "contradictions": f"{roa.contradictions:,}" if roa.contradictions else "",
+        "slow": f"{roa.slow:,}" if roa.slow else "",
         "of": volume_name(certificate.system.n),
         "who": words_for(certificate.kind).simulated,
     }

@@ -3,11 +3,15 @@
 The continuous closed loop is integrated by the classical Runge-Kutta method of order four with the policy evaluated at
 every stage, many initial states at a time. Runs leave the batch as soon as they are decided, which is
 what keeps a grid of a few thousand states well below a second.
+
+A run has one of three fates: it settles, it leaves, or it has done neither by the end. The third is a fate of its own:
+a slow run is no sign that anything leaves.
 """
 
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -29,6 +33,9 @@ _HORIZON = 15.0  # time constants of the slowest eigenvalue
 _MAX_STEPS = 3000
 _RATE_SAMPLES = 200
 _GRID = {1: 401, 2: 35}
+_FINER = 8  # of the step, in runs that are asked again because they contradict what is claimed
+_HALVINGS = 2  # of the grid's cells along the edge of the region
+_OUTSIDE = 1.01  # times the level: a run that starts below it and comes so high has left the set
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,17 +46,30 @@ class SimulatedRoa:
     ----------
     axes : grid coordinates along each state, the centres of equal cells.
     attracted : runs that stayed in the domain and came near the origin; shape of the grid.
+    left : runs that left the domain; shape of the grid. The others had not settled within the horizon, and count as
+        not attracted.
     certified : grid points in the certified set; shape of the grid.
-    undecided : runs that did neither settle nor leave within the horizon; they count as not attracted.
-    step, horizon : of the integration, in seconds.
+    step, horizon : of the integration, in seconds; the horizon is how far it came if it ran out of time.
     """
 
     axes: tuple[Array, ...]
     attracted: Mask
+    left: Mask
     certified: Mask
-    undecided: int
     step: float
     horizon: float
+
+    def __post_init__(self) -> None:
+        shape = tuple(len(a) for a in self.axes)
+        if not self.attracted.shape == self.left.shape == self.certified.shape == shape:
+            raise InputError(f"masks must have the shape {shape} of the grid; one has another.")
+        if np.any(self.attracted & self.left):
+            raise InputError("a run must not both settle and leave; one does.")
+
+    @property
+    def undecided(self) -> int:
+        """Runs that did neither settle nor leave within the horizon."""
+        return int((~self.attracted & ~self.left).sum())
 
     @property
     def fraction(self) -> float:
@@ -59,8 +79,13 @@ class SimulatedRoa:
 
     @property
     def contradictions(self) -> int:
-        """Certified grid points whose simulation did not settle; more than 0 calls for an explanation."""
-        return int((self.certified & ~self.attracted).sum())
+        """Certified grid points whose simulation left the domain; more than 0 calls for an explanation."""
+        return int((self.certified & self.left).sum())
+
+    @property
+    def slow(self) -> int:
+        """Certified grid points whose simulation had not settled within the horizon, which contradicts nothing."""
+        return int((self.certified & ~self.attracted & ~self.left).sum())
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,14 +130,17 @@ class Flow:
         return cls(field, policy, *domain_bounds(system))
 
 
-def time_scales(flow: Flow) -> tuple[float, float]:
+def time_scales(flow: Flow, samples: int = _RATE_SAMPLES, reach: Array | None = None) -> tuple[float, float]:
     """(step, horizon) in seconds: the fastest time constant, and 15 times the slowest at the origin.
+
+    Of `samples` states in the domain, or in the part of it where `|x_i| <= reach_i`.
 
     The fastest is taken over Jacobians at the origin and at sampled states of the domain, because a plant can be
     stiffer away from the origin; Runge-Kutta of order four is stable up to 2.8 of it. The horizon is cut at 3,000
     steps.
     """
-    x = np.random.default_rng(0).uniform(flow.lo, flow.hi, (_RATE_SAMPLES, len(flow.lo)))
+    lo, hi = (flow.lo, flow.hi) if reach is None else (np.maximum(flow.lo, -reach), np.minimum(flow.hi, reach))
+    x = np.random.default_rng(0).uniform(lo, hi, (samples, len(lo)))
     rates = _eigenvalues(flow, np.concatenate([np.zeros((1, len(flow.lo))), x]))
     fastest = float(np.max(np.abs(rates), initial=0.0))
     slowest = float(np.min(np.abs(rates[:1].real), initial=math.inf))
@@ -130,8 +158,11 @@ def _eigenvalues(flow: Flow, x: Array) -> NDArray[np.complex128]:
     return np.asarray(np.linalg.eigvals(J[np.all(np.isfinite(J), axis=(1, 2))]), dtype=np.complex128)
 
 
-def simulate(flow: Flow, starts: Array, step: float, steps: int) -> Array:
-    """Trajectories from `starts` (N, n), shape (steps + 1, N, n); NaN from the first step outside the domain on."""
+def simulate(flow: Flow, starts: Array, step: float, steps: int, deadline: float = math.inf) -> Array:
+    """Trajectories from `starts` (N, n), shape (steps + 1, N, n); NaN from the first step outside the domain on.
+
+    At `deadline`, a reading of `time.monotonic`, the trajectories end where they are, in fewer steps.
+    """
     x = np.array(starts, dtype=np.float64)
     path = np.full((steps + 1, *x.shape), math.nan)
     path[0] = x
@@ -140,11 +171,75 @@ def simulate(flow: Flow, starts: Array, step: float, steps: int) -> Array:
         for k in range(1, steps + 1):
             if not alive.size:
                 break
+            if k > 1 and time.monotonic() > deadline:
+                return path[:k]
             x = rk4_step(flow.field, x, step)
             inside = np.all((x >= flow.lo) & (x <= flow.hi), axis=-1)
             x, alive = x[inside], alive[inside]
             path[k, alive] = x
     return path
+
+
+@dataclass(frozen=True, slots=True)
+class Runs:
+    """Trajectories with their fates.
+
+    Parameters
+    ----------
+    path : states (T + 1, N, n) at equal steps; NaN after a run has left the domain.
+    step : between two states, in seconds.
+    settled, left : of each run (N,); a run of neither kind had not settled when the time was over.
+    """
+
+    path: Array
+    step: float
+    settled: Mask
+    left: Mask
+
+    def __post_init__(self) -> None:
+        if self.path.ndim != 3 or not self.settled.shape == self.left.shape == self.path.shape[1:2]:
+            raise InputError(f"`path` must be (T + 1, N, n) with N fates; found the shape {self.path.shape}.")
+        if np.any(self.settled & self.left):
+            raise InputError("a run must not both settle and leave; one does.")
+
+    @property
+    def seconds(self) -> float:
+        """How long was simulated."""
+        return self.step * (len(self.path) - 1)
+
+    @property
+    def unsettled(self) -> Mask:
+        """Runs that did neither settle nor leave, (N,)."""
+        return ~self.settled & ~self.left
+
+
+def runs_of(flow: Flow, starts: Array, P: Array, level: float, target: float, step: float, steps: int,
+            deadline: float = math.inf) -> Runs:  # fmt: skip
+    """Simulate and tell the fates.
+
+    A run settles if it comes to `V <= target`, and leaves if it leaves the domain, or rises well above `level` from a
+    start below it. Runs from below the level that seem to leave are simulated again in much smaller steps: the first
+    suspect is the integration.
+    """
+    path = simulate(flow, starts, step, steps, deadline)
+    begins = quadratic(P, path[0]) <= level
+    settled, left = _fates(path, begins, P, level, target)
+    suspects = np.flatnonzero(left & begins)
+    if suspects.size and time.monotonic() < deadline:
+        finer = simulate(flow, path[0, suspects], step / _FINER, _FINER * (len(path) - 1), deadline)[::_FINER]
+        if len(finer) == len(path):
+            path[:, suspects] = finer
+            settled, left = _fates(path, begins, P, level, target)
+    return Runs(path, step, settled, left)
+
+
+def _fates(path: Array, begins: Mask, P: Array, level: float, target: float) -> tuple[Mask, Mask]:
+    """Which runs settle and which leave, each (N,)."""
+    V = quadratic(P, path)
+    with np.errstate(invalid="ignore"):
+        settled = np.any(target >= V, axis=0)
+        left = np.any(np.isnan(V), axis=0) | (begins & np.any(_OUTSIDE * level < V, axis=0))
+    return settled & ~left, left
 
 
 def simulated_roa_fraction(
@@ -157,11 +252,12 @@ def simulated_roa_fraction(
     step: float | None = None,
     horizon: float | None = None,
     settled: float | None = None,
+    deadline: float = math.inf,
 ) -> SimulatedRoa:
     """Simulate the closed loop from a grid over the domain and compare with `{x'Px <= level}`.
 
     A grid point counts as attracted if its run stays inside the domain and comes to `V <= settled` within the
-    horizon.
+    horizon. A run from the certified set that leaves is simulated again in much smaller steps before it counts.
 
     Parameters
     ----------
@@ -170,6 +266,7 @@ def simulated_roa_fraction(
     points : grid points along each state; default 401 for one state, 35 for two.
     step, horizon : in seconds; defaults from the eigenvalues, see `time_scales`.
     settled : the level that a run has to reach; default `SETTLED * level`, near the origin.
+    deadline : a reading of `time.monotonic` at which the simulation ends wherever it is.
 
     Raises
     ------
@@ -189,27 +286,81 @@ def simulated_roa_fraction(
     x = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, system.n)
     certified = quadratic(P, x) <= level
     target = SETTLED * level if settled is None else settled
-    attracted, undecided = _run(flow, x, P, target, step, horizon)
+    attracted, left, reached = _run(flow, x, P, target, step, horizon, deadline)
+    suspects = np.flatnonzero(certified & left)
+    if suspects.size:
+        again, gone, _ = _run(flow, x[suspects], P, target, step / _FINER, reached, deadline)
+        attracted[suspects], left[suspects] = again, gone
     shape = (points,) * system.n
-    return SimulatedRoa(axes, attracted.reshape(shape), certified.reshape(shape), undecided, step, horizon)
+    return SimulatedRoa(axes, attracted.reshape(shape), left.reshape(shape), certified.reshape(shape), step, reached)
 
 
-def _run(flow: Flow, x: Array, P: Array, target: float, step: float, horizon: float) -> tuple[Mask, int]:
-    attracted = np.zeros(len(x), dtype=np.bool_)
+def _run(
+    flow: Flow, x: Array, P: Array, target: float, step: float, horizon: float, deadline: float = math.inf
+) -> tuple[Mask, Mask, float]:
+    """Which runs came to `V <= target`, which left the domain, and how many seconds were simulated."""
+    attracted, left = np.zeros((2, len(x)), dtype=np.bool_)
     alive = np.arange(len(x))
+    reached = horizon
     with np.errstate(all="ignore"):
-        for _ in range(math.ceil(horizon / step)):
+        for k in range(math.ceil(horizon / step)):
             near = quadratic(P, x) <= target
             attracted[alive[near]] = True
             x, alive = x[~near], alive[~near]
             if not alive.size:
                 break
+            if time.monotonic() > deadline:
+                reached = k * step
+                break
             x = rk4_step(flow.field, x, step)
             inside = np.all((x >= flow.lo) & (x <= flow.hi), axis=-1)  # False for NaN
+            left[alive[~inside]] = True
             x, alive = x[inside], alive[inside]
         near = quadratic(P, x) <= target
     attracted[alive[near]] = True
-    return attracted, int((~near).sum())
+    return attracted, left, reached
+
+
+def edge_of(
+    flow: Flow, roa: SimulatedRoa, P: Array, target: float, deadline: float = math.inf
+) -> tuple[Array, Array, Array]:
+    """The simulated region of a plane, four times finer along its edge: axes (K,), (L,) and a share in [0, 1], (K, L).
+
+    Between grid points that agree nothing is simulated; where neighbours differ their middle is, twice. What is left
+    of the steps is smoothed over one fine cell, so that the line at 1/2 is as smooth as the edge is known.
+
+    Raises
+    ------
+    InputError : the grid is not one of a plane.
+    """
+    from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
+
+    if len(roa.axes) != 2:
+        raise InputError(f"the edge of a region is drawn in a plane; the grid has {len(roa.axes)} axes.")
+    (a, b), mask = roa.axes, roa.attracted
+    for _ in range(_HALVINGS):
+        if min(mask.shape) < 2 or time.monotonic() > deadline:
+            break
+        # A new point takes a neighbour's answer, and is asked where the points around it differ.
+        near = np.minimum((np.arange(2 * mask.shape[0] - 1) + 1) // 2, mask.shape[0] - 1)
+        close = np.minimum((np.arange(2 * mask.shape[1] - 1) + 1) // 2, mask.shape[1] - 1)
+        fine = mask[np.ix_(near, close)]
+        known = np.zeros(fine.shape, dtype=np.bool_)
+        known[::2, ::2] = True
+        fine[::2, ::2] = mask
+        ask = ~known & (maximum_filter(fine, 3) != minimum_filter(fine, 3))
+        a, b = _halved(a), _halved(b)
+        points = np.stack(np.meshgrid(a, b, indexing="ij"), -1)[ask]
+        fine[ask] = _run(flow, points, P, target, roa.step, roa.horizon, deadline)[0]
+        mask = fine
+    return a, b, np.asarray(gaussian_filter(mask.astype(np.float64), 1.0, mode="nearest"))
+
+
+def _halved(axis: Array) -> Array:
+    """The points of an axis with their middles."""
+    fine = np.empty(2 * len(axis) - 1)
+    fine[::2], fine[1::2] = axis, (axis[:-1] + axis[1:]) / 2
+    return fine
 
 
 def quadratic(P: Array, x: Array) -> Array:

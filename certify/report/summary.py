@@ -140,7 +140,9 @@ def _rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
         rows.append(("rests at", f"{point}; eigenvalues there {', '.join(rest['eigenvalues']) or 'not enclosed'}"))
     if result.get("eigenvalues"):
         rows.append(("eigenvalues", ", ".join(map(str, result["eigenvalues"]))))
-    if result.get("boxes"):
+    if shown and kind == "asymptotic" and inner is not None and inner == levels.get("roa"):
+        rows.append(("work", f"{result['boxes']:,} boxes; the local part covers the whole set and no leaf is needed"))
+    elif result.get("boxes"):
         rows.append(("work", f"{result['boxes']:,} boxes, {result['leaves']:,} leaves"))
     solver = result.get("solver") or {}
     if "missing" in solver:

@@ -314,4 +314,13 @@ def limited_by(result: Mapping[str, Any]) -> str:
             if precision is None:
                 return f"a margin that the engine keeps: {apart}"
             return f"the precision of {solver['solver']} (delta {number(precision)}), which stops {apart}"
+    return limit_in_words(reason)
+
+
+def limit_in_words(reason: str) -> str:
+    """A reason that is a single word as a reader understands it; sentences stay as they are.
+
+    >>> limit_in_words("time")
+    'the time limit: more may be provable'
+    """
     return _LIMITS.get(reason, reason)

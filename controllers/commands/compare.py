@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from controllers.commands.shared import Json, PlantName, Steps, emit, errors, options_of
+
+if TYPE_CHECKING:
+    from controllers.compare import Doing
 
 
 def compare(
@@ -36,12 +40,45 @@ def compare(
 
         methods = remaining(ABLATIONS if ablations else BASELINES, without or [])
         options = CompareOptions(methods=methods, seeds=seeds, duration=duration, states=states)
-        result = run(get_system(plant), training, runs, out, options, lambda line: typer.echo(line, err=True))
+        with _progress() as (say, watch):
+            result = run(get_system(plant), training, runs, out, options, say, watch)
         if as_json:
             emit(result, as_json)
             return
         typer.echo(_table(result["rows"]))
         emit(result["files"], as_json)
+
+
+@contextmanager
+def _progress() -> Iterator[tuple[Callable[[str], None], Callable[[Doing], None]]]:
+    """Where progress goes: on a terminal a bar, with the time that is left, elsewhere lines on standard error."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    if not console.is_terminal:
+        yield lambda line: typer.echo(line, err=True), lambda doing: None
+        return
+    columns = (
+        TextColumn("run {task.fields[run]} of {task.fields[runs]}: {task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console) as progress:
+        task = progress.add_task("starting", total=None, run=1, runs="?")
+        shown = 0
+
+        def watch(doing: Doing) -> None:
+            nonlocal shown
+            if doing.run != shown:  # another run has a pace of its own
+                progress.reset(task)
+                shown = doing.run
+            progress.update(
+                task, description=doing.what, completed=doing.done, total=doing.steps, run=doing.run, runs=doing.runs
+            )
+
+        yield lambda line: None, watch
 
 
 def _table(rows: Sequence[dict[str, Any]]) -> str:

@@ -168,7 +168,7 @@ def test_a_comparison_trains_every_run_and_writes_figures_and_table(finished):
         "sb3-sac/seed-0/model.zip",
     ]
     assert "sac seed 0: 160 of 160 steps" in lines and "sb3-ppo seed 0: 16 of 160 steps" in lines
-    for name in ("cost", "norm", "positions"):
+    for name in ("cost", "norm", "states"):
         assert (out / f"pendulum-{name}.png").read_bytes().startswith(b"\x89PNG")
     assert json.loads((out / "pendulum-table.json").read_text())["rows"] == result["rows"]
     with (out / "pendulum-table.csv").open(newline="") as file:
@@ -257,6 +257,33 @@ def test_numbers_on_a_logarithmic_axis_are_readable(finished, pendulum_system, t
     assert powers and all(label.get_parse_math() for label in powers)
 
 
+def test_the_figure_of_the_states_shows_every_one_of_them(finished, pendulum_system, tmp_path, monkeypatch):
+    kept, png = [], figures._png
+    monkeypatch.setattr(figures, "_png", lambda figure: kept.append(figure) or png(figure))
+    compare.compare(pendulum_system, TINY, finished[0], tmp_path, SHORT)
+    panels = kept[-1].axes
+    assert len(panels) == 2 * len(BASELINES)
+    assert [axes.get_ylabel() for axes in panels if axes.get_ylabel()] == ["theta (rad)", "theta_dot (rad/s)"]
+    width, height = kept[-1].get_size_inches()
+    assert width / len(BASELINES) >= 2 and height / 2 >= 1.5  # inches a panel
+    for axes in panels:
+        title = axes.title.get_window_extent()
+        assert title.width <= axes.get_window_extent().width * 1.25, axes.get_title()
+
+
+def test_a_comparison_tells_how_far_it_is(pendulum_system, tmp_path):
+    told = []
+    options = replace(SHORT, methods=(OURS, SAC))
+    compare.compare(pendulum_system, TINY, tmp_path / "runs", tmp_path, options, watch=told.append)
+    assert next((d.run, d.runs) for d in told if d.done == d.steps) == (1, 2) and told[-1].run == 2
+    first = [d.done for d in told if d.run == 1]
+    assert first == sorted(first) and len(set(first)) == 160 and first[-1] == told[0].steps == 160
+    assert {d.what for d in told} == {"ours, seed 0", "SAC without gain, seed 0"}
+    again = []
+    compare.compare(pendulum_system, TINY, tmp_path / "runs", tmp_path, options, watch=again.append)
+    assert [(d.run, d.done, d.steps) for d in again] == [(1, 160, 160), (2, 160, 160)]  # nothing is trained twice
+
+
 def _compare(*arguments):
     return runner.invoke(app, ["compare", *map(str, arguments)])
 
@@ -320,7 +347,7 @@ def test_ablations_change_one_part_of_our_own_training(finished, pendulum_system
     assert list(rows) == ["ours", "sac mean", "before mean", "uncentred mean"]
     assert rows["ours"] == next(row for row in finished[2]["rows"] if row["method"] == "ours" and row["seed"] is None)
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
-        *(f"pendulum-ablations-{name}.png" for name in ("cost", "norm", "positions")),
+        *(f"pendulum-ablations-{name}.png" for name in ("cost", "norm", "states")),
         *(f"pendulum-ablations-table.{kind}" for kind in ("csv", "json")),
     }
     records = {

@@ -86,7 +86,7 @@ def test_a_new_plant_is_one_file_on_either_side(plant_file, tmp_path):
     without = ["--without", "sb3-sac", "--without", "sb3-ppo"]
     compared = runner.invoke(app, ["compare", "leak", *map(str, arguments), *without])
     assert compared.exit_code == 0, compared.stderr
-    assert (tmp_path / "out" / "leak-positions.png").is_file()
+    assert (tmp_path / "out" / "leak-states.png").is_file()
 
 
 @pytest.mark.parametrize(

@@ -7,54 +7,75 @@ One figure a file; `scene` has what they share, `geometry` their curves, `style`
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from certify.certificate import Certificate
 from certify.report.figures.decay import decay
 from certify.report.figures.line import line_figure
 from certify.report.figures.near_origin import near_origin
+from certify.report.figures.pairs import Pair
 from certify.report.figures.partition import partition
 from certify.report.figures.policy import curves, surface
-from certify.report.figures.portrait import portrait
-from certify.report.figures.scene import ON_BOUNDARY, Scene, planes, starts
+from certify.report.figures.portrait import Region, portraits
+from certify.report.figures.scene import Scene, starts
 from certify.report.figures.style import RC, Picture
-from certify.report.sampling import SimulatedRoa, simulated_roa_fraction
+from certify.report.sampling import SimulatedRoa, edge_of, simulated_roa_fraction
 
 __all__ = ["Picture", "draw"]
 
 
-def draw(certificate: Certificate, accepted: bool) -> tuple[list[Picture], SimulatedRoa | None]:
+def draw(
+    certificate: Certificate, accepted: bool, *, pairs: Sequence[Pair] | None = None, seconds: float = 10.0
+) -> tuple[list[Picture], SimulatedRoa | None]:
     """All figures of a certificate, and the simulated region of attraction where there is one (n <= 2).
 
     Parameters
     ----------
     accepted : whether the checker accepted it; if not, the captions speak of claims.
+    pairs : states that are drawn against each other, by index; chosen by what belongs together if None.
+    seconds : for all of it. Sets are always drawn; where the time runs out, less is simulated, and the captions say
+        how far.
     """
     import matplotlib
 
     with matplotlib.rc_context(RC):
-        scene = Scene(certificate, accepted)
-        roa = None
-        if scene.n <= 2:
-            roa = simulated_roa_fraction(
-                scene.system, certificate.network, scene.P, scene.outer, settled=scene.settling_level
-            )
+        scene = Scene(certificate, accepted, pairs, seconds)
+        roa = simulated_roa(scene)
         pictures = _on_the_line(scene, roa) if scene.n == 1 else _in_planes(scene, roa)
     return pictures, roa
+
+
+def simulated_roa(scene: Scene) -> SimulatedRoa | None:
+    """The simulated region of attraction where there is one (n <= 2)."""
+    if scene.n > 2:
+        return None
+    network = scene.certificate.network
+    settled, deadline = scene.settling_level, scene.deadline
+    return simulated_roa_fraction(scene.system, network, scene.P, scene.outer, settled=settled, deadline=deadline)
+
+
+def region_of(scene: Scene, roa: SimulatedRoa | None) -> Region | None:
+    """The simulated region of a plane, if it has an edge in the domain."""
+    if roa is None or len(roa.axes) != 2 or roa.attracted.all() or not roa.attracted.any():
+        return None
+    return edge_of(scene.flow, roa, scene.P, scene.settling_level, scene.deadline)
 
 
 def _on_the_line(scene: Scene, roa: SimulatedRoa | None) -> list[Picture]:
     reach = scene.reach[0]
     begin = [[share * reach] for share in (-0.999, -0.5, 0.5, 0.999)]
-    return [line_figure(scene, roa), curves(scene), decay(scene, scene.simulate(begin))]
+    runs = scene.simulate(begin)
+    return [line_figure(scene, roa), curves(scene), decay(scene, runs.path, runs.step)]
 
 
 def _in_planes(scene: Scene, roa: SimulatedRoa | None) -> list[Picture]:
-    pairs = planes(scene)
-    paths = scene.simulate(starts(scene, pairs))
-    pictures = [portrait(scene, pair, paths, roa, single=len(pairs) == 1) for pair in pairs]
-    if scene.n == 2:
+    runs, region = scene.simulate(starts(scene)), region_of(scene, roa)
+    pictures = portraits(scene, runs, region)
+    if scene.n == 2 and not scene.local_is_enough:
         pictures.append(near_origin(scene))
-    if scene.leaves is not None:
+    if scene.leaves is not None and not scene.local_is_enough:
         pictures.append(partition(scene, scene.leaves))
-    pictures.append(surface(scene, pairs[0]))
-    pictures.append(decay(scene, paths[:, :ON_BOUNDARY]))
+    pictures.append(surface(scene, scene.pairs[0]))
+    inside = len(scene.pairs) * scene.effort.starts  # what starts along the domain's edge comes after these
+    pictures.append(decay(scene, runs.path[:, :inside], runs.step))
     return pictures

@@ -5,16 +5,15 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.report.figures.geometry import PARTS
-from certify.report.figures.scene import PATH_STEP, Scene
+from certify.report.figures.scene import Scene
 from certify.report.figures.style import INNER, SET, SIMULATED, Picture, figure_of, plain_powers, to_svg
 from certify.report.sampling import quadratic
 
 
-def decay(scene: Scene, paths: NDArray[np.float64]) -> Picture:
-    """V over time on a logarithmic axis, with both levels."""
+def decay(scene: Scene, paths: NDArray[np.float64], step: float) -> Picture:
+    """V over time along paths (T + 1, N, n) with `step` seconds between states, on a logarithmic axis."""
     V = quadratic(scene.P, paths)
-    time = PATH_STEP * scene.step * np.arange(len(V)) / PARTS
+    time = step * np.arange(len(V))
     figure, axes = figure_of(4.2, 3.6)
     axes.semilogy(time, np.maximum(V, 1e-300), color=SIMULATED, lw=0.8)
     axes.axhline(scene.outer, color=SET, lw=1.4)

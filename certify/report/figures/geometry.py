@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,16 +13,6 @@ from certify.report.sampling import Field
 Array = NDArray[np.float64]
 PARTS = 3
 """Pieces that each step of a path is drawn in."""
-
-
-class Bounded(Protocol):
-    """What has a box."""
-
-    @property
-    def lo(self) -> Array: ...
-
-    @property
-    def hi(self) -> Array: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,6 +46,17 @@ def shadow(P: Array, pair: tuple[int, int], level: float) -> tuple[Array, Array]
     return ellipse(inverse(inverse(P)[np.ix_(pair, pair)]), (0, 1), level)
 
 
+def over_level(P: Array, pair: tuple[int, int], directions: Array, level: float) -> Array:
+    """States with `V = level` that lie over the outline of the projection, (N, n), for unit vectors (N, 2).
+
+    Over a point y of the outline V is least at `x = P^-1_{:,pair} (P^-1_pair)^-1 y`, where it is the level.
+    """
+    covariance = inverse(P)
+    block = covariance[np.ix_(pair, pair)]
+    y = on_level(inverse(block), directions, level)
+    return np.asarray(np.linalg.solve(block, y.T).T @ covariance[list(pair)])
+
+
 def refine(path: Array, field: Field, step: float) -> Array:
     """Each step in `PARTS` pieces by cubic Hermite interpolation, so that curves look as smooth as they are."""
     with np.errstate(all="ignore"):
@@ -71,12 +71,11 @@ def refine(path: Array, field: Field, step: float) -> Array:
     return fine
 
 
-def thin(path: Array, box: Bounded, pair: tuple[int, int]) -> Array:
-    """Drop points that lie closer together than 1/250 of the picture; the end is where NaN begins."""
+def thin(path: Array, size: Array) -> Array:
+    """Drop points that lie closer together than 1/250 of the picture's size (2,); the end is where NaN begins."""
     path = path[np.all(np.isfinite(path), axis=1)]
     if len(path) < 3:
         return path
-    scale = np.array([box.hi[k] - box.lo[k] for k in pair])
-    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0) / scale, axis=1))])
+    travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0) / size, axis=1))])
     _, first = np.unique(np.floor(travelled * 250), return_index=True)
     return np.asarray(path[np.unique(np.append(first, len(path) - 1))])

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from certify.report.figures.scene import Scene
@@ -9,14 +11,14 @@ from certify.report.figures.style import (
     GROWTH_FILL,
     INK,
     INNER_FILL,
-    LEAVING,
     MUTED,
     RASTER_FROM,
+    REGION,
     SET,
     SET_FILL,
+    Key,
     Picture,
     figure_of,
-    legend_beside,
     to_svg,
 )
 from certify.report.sampling import SimulatedRoa
@@ -24,27 +26,8 @@ from certify.report.sampling import SimulatedRoa
 
 def line_figure(scene: Scene, roa: SimulatedRoa | None) -> Picture:
     """Vdot over the domain, the two intervals, and where runs settle."""
-    x = np.linspace(scene.lo[0], scene.hi[0], 601)[:, None]
-    outer, inner = scene.reach[0], scene.inner_reach[0]
-    figure, axes = figure_of(7.6, 3.4, right=2.1)
-    vdot = scene.vdot(x)
-    axes.axhline(0, color=MUTED, lw=0.7)
-    axes.axvspan(-outer, outer, color=SET_FILL, lw=0, label=f"{scene.word} set")
-    axes.axvspan(-inner, inner, color=INNER_FILL, lw=0, label=scene.words.inner_set)
-    axes.plot(x[:, 0], vdot, color=INK, label="V̇ (float64, not proved)")
-    axes.fill_between(x[:, 0], 0, vdot, where=vdot >= 0, color=GROWTH_FILL, lw=0, label="V̇ ≥ 0 (not proved)")
-    if roa is not None:
-        inside = roa.axes[0][roa.attracted]
-        if inside.size:
-            ends = [float(inside.min()), float(inside.max())]
-            axes.plot(ends, [0, 0], color=LEAVING, lw=2.4, label="simulated region (not proved)")
-    if scene.leaves is not None and len(scene.leaves[0]) <= RASTER_FROM:
-        edges = scene.leaves[0][:, 0] * scene.T[0, 0]
-        axes.plot(edges, np.zeros_like(edges), "|", ms=5, color=SET, label="leaves")
-    axes.set_xlim(scene.lo[0], scene.hi[0])
-    axes.set_xlabel(scene.labels[0])
-    axes.set_ylabel("V̇")
-    legend_beside(axes)
+    figure, axes = figure_of(5.0, 3.4)
+    legend = draw_line(axes, scene, roa)
     return Picture(
         "V̇ along the state",
         f"Shaded: the {scene.word} interval, {scene.meaning}. The curve of V̇ and the interval of the runs that "
@@ -52,4 +35,37 @@ def line_figure(scene: Scene, roa: SimulatedRoa | None) -> Picture:
         to_svg(figure),
         simulated=True,
         wide=True,
+        legend=legend,
     )
+
+
+def draw_line(axes: Any, scene: Scene, roa: SimulatedRoa | None) -> tuple[Key, ...]:
+    """Fill the axes; their legend."""
+    x = np.linspace(scene.lo[0], scene.hi[0], 601)[:, None]
+    outer, inner = scene.reach[0], scene.inner_reach[0]
+    vdot = scene.vdot(x)
+    keys = [
+        Key(f"{scene.word} set", SET_FILL, 0, fill=SET_FILL),
+        Key(scene.words.inner_set, INNER_FILL, 0, fill=INNER_FILL),
+        Key("V̇ (float64, not proved)", INK),
+        Key("V̇ ≥ 0 (not proved)", GROWTH_FILL, 0, fill=GROWTH_FILL),
+    ]
+    axes.axhline(0, color=MUTED, lw=0.7)
+    axes.axvspan(-outer, outer, color=SET_FILL, lw=0)
+    axes.axvspan(-inner, inner, color=INNER_FILL, lw=0)
+    axes.plot(x[:, 0], vdot, color=INK)
+    axes.fill_between(x[:, 0], 0, vdot, where=vdot >= 0, color=GROWTH_FILL, lw=0)
+    if roa is not None:
+        inside = roa.axes[0][roa.attracted]
+        if inside.size:
+            ends = [float(inside.min()), float(inside.max())]
+            axes.plot(ends, [0, 0], color=REGION, lw=2.4)
+            keys.append(Key("simulated region (not proved)", REGION, 2.4))
+    if scene.leaves is not None and len(scene.leaves[0]) <= RASTER_FROM:
+        edges = scene.leaves[0][:, 0] * scene.T[0, 0]
+        axes.plot(edges, np.zeros_like(edges), "|", ms=5, color=SET)
+        keys.append(Key("leaves", SET, 1.0))
+    axes.set_xlim(scene.lo[0], scene.hi[0])
+    axes.set_xlabel(scene.labels[0])
+    axes.set_ylabel("V̇")
+    return tuple(keys)

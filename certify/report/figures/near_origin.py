@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from certify.report.figures.geometry import Box, circle, ellipse, on_level, thin
+from certify.report.figures.geometry import circle, ellipse, on_level, thin
 from certify.report.figures.partition import add_leaves
 from certify.report.figures.scene import Scene
 from certify.report.figures.style import INK, INNER, INNER_FILL, SET, SIMULATED, Picture, figure_of, to_svg
@@ -17,8 +17,9 @@ def near_origin(scene: Scene) -> Picture:
     reach = 2.6 * scene.inner_reach
     if scene.leaves is not None:
         add_leaves(axes, scene, scene.leaves, (0, 1), within=reach)
-    paths = scene.simulate(on_level(scene.P, circle(14), min(9 * scene.inner, 0.999 * scene.outer)), steps=60)
-    lines = [thin(paths[:, k], Box(-reach, reach), (0, 1)) for k in range(paths.shape[1])]
+    begin = on_level(scene.P, circle(scene.effort.starts), min(9 * scene.inner, 0.999 * scene.outer))
+    paths = scene.simulate(begin, steps=60).path
+    lines = [thin(paths[:, k], 2 * reach) for k in range(paths.shape[1])]
     axes.add_collection(LineCollection(lines, colors=SIMULATED, linewidths=0.8, zorder=3))
     axes.fill(*ellipse(scene.P, (0, 1), scene.inner), facecolor=INNER_FILL, edgecolor=INNER, lw=1.6, zorder=2)
     axes.plot(*ellipse(scene.P, (0, 1), scene.outer), color=SET, lw=1.6, zorder=4)

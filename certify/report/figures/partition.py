@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from certify.report.figures.geometry import ellipse
 from certify.report.figures.scene import Leaves, Scene
-from certify.report.figures.style import RASTER_FROM, SET, SET_FILL, Picture, figure_of, to_svg
+from certify.report.figures.style import LEAF_EDGE, PAPER, RASTER_FROM, SET, SET_FILL, Picture, figure_of, to_svg
 from certify.report.words import symbol
 
 Array = NDArray[np.float64]
@@ -18,29 +18,20 @@ Array = NDArray[np.float64]
 def partition(scene: Scene, leaves: Leaves) -> Picture:
     """The leaves, those in the ring in blue."""
     figure, axes = figure_of(4.2, 3.6)
+    pair = (0, scene.n - 1)
+    reach = add_leaves(axes, scene, leaves, pair, within=None)
     if scene.n == 2:
-        corners = add_leaves(axes, scene, leaves, (0, 1), within=None)
-        axes.plot(*ellipse(scene.P, (0, 1), scene.outer), color=SET, lw=1.6, zorder=4)
-        reach = np.max(np.abs(corners), axis=0) * 1.04
-        axes.set_xlim(-reach[0], reach[0])
-        axes.set_ylim(-reach[1], reach[1])
-        axes.set_xlabel(scene.labels[0])
-        axes.set_ylabel(scene.labels[1])
-        where = "in the plane of the states"
+        axes.plot(*ellipse(scene.P, pair, scene.outer), color=SET, lw=1.6, zorder=4)
+        labels, where = scene.labels, "in the plane of the states"
     else:
-        first, last = 0, scene.n - 1
-        add_leaves(axes, scene, leaves, (first, last), within=None)
-        reach = scene.root[[first, last]] * 1.04
-        axes.set_xlim(-reach[0], reach[0])
-        axes.set_ylim(-reach[1], reach[1])
-        axes.set_xlabel(symbol(f"z{first + 1}"))
-        axes.set_ylabel(symbol(f"z{last + 1}"))
+        labels = [symbol(f"z{k + 1}") for k in pair]
         where = "cut by a plane through the origin of the coordinates x = T z"
-    if scene.local_is_enough:
-        asked = "As c₁ = c₂, the local part covers the whole set, and V̇ is not asked for on leaves."
-    else:
-        shown = "showed" if scene.proved == "proved" else "has to show"
-        asked = f"On each blue one the checker {shown} V̇ < 0; white ones lie outside the ring between the two levels."
+    axes.set_xlim(-1.04 * reach[0], 1.04 * reach[0])
+    axes.set_ylim(-1.04 * reach[1], 1.04 * reach[1])
+    axes.set_xlabel(labels[0])
+    axes.set_ylabel(labels[1])
+    shown = "showed" if scene.proved == "proved" else "has to show"
+    asked = f"On each blue one the checker {shown} V̇ < 0; the others lie outside the ring between the two levels."
     return Picture(
         "The leaf partition",
         f"The {_count(len(leaves[0]))} of the certificate, {where}. {asked}",
@@ -50,7 +41,7 @@ def partition(scene: Scene, leaves: Leaves) -> Picture:
 
 
 def add_leaves(axes: Any, scene: Scene, leaves: Leaves, pair: tuple[int, int], within: Array | None) -> Array:
-    """Add the leaves (n = 2: as parallelograms in x; else a cut in z); the corners that were drawn, (N * 4, 2)."""
+    """Add the leaves (n = 2: as parallelograms in x; else a cut in z); how far those in the ring reach, (2,)."""
     from matplotlib.collections import PolyCollection
 
     i, j = pair
@@ -63,19 +54,20 @@ def add_leaves(axes: Any, scene: Scene, leaves: Leaves, pair: tuple[int, int], w
     )
     if scene.n == 2:
         corners = corners @ scene.T.T
-    ring = np.zeros(len(lower), dtype=np.bool_) if scene.local_is_enough else _in_ring(scene, lower, upper)
+    ring = _in_ring(scene, lower, upper)
     if within is not None:
         visible = np.all((corners.min(axis=1) <= within) & (corners.max(axis=1) >= -within), axis=1)
         corners, ring = corners[visible], ring[visible]
     many = len(corners) > RASTER_FROM
-    for kind, face in ((~ring, "#ffffff"), (ring, SET_FILL)):
+    for kind, face in ((~ring, PAPER), (ring, SET_FILL)):
         if np.any(kind):
             width = 0.15 if many else 0.45
-            boxes = PolyCollection(list(corners[kind]), facecolors=face, edgecolors="#8fb0d3", linewidths=width)
+            boxes = PolyCollection(list(corners[kind]), facecolors=face, edgecolors=LEAF_EDGE, linewidths=width)
             boxes.set_zorder(1)
             boxes.set_rasterized(many)
             axes.add_collection(boxes)
-    return np.asarray(corners.reshape(-1, 2))
+    telling = corners[ring] if np.any(ring) else corners
+    return np.asarray(np.max(np.abs(telling), axis=(0, 1), initial=0.0))
 
 
 def _in_ring(scene: Scene, lower: Array, upper: Array) -> NDArray[np.bool_]:

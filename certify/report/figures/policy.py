@@ -32,7 +32,7 @@ def surface(scene: Scene, pair: tuple[int, int]) -> Picture:
     shown = min(scene.system.m, 4)
     rows = (shown + 1) // 2
     figure = Figure(figsize=(4.2 * min(shown, 2), 3.6 * rows))
-    a, b, x = scene.plane(*pair)
+    a, b, x = scene.plane(pair)
     u = scene.flow.policy(x)
     colours = LinearSegmentedColormap.from_list("input", ["#2f5d8a", "#a9c4dd", "#f7f6f2", "#e5c08a", "#a4652a"])
     boundary = ellipse(scene.P, pair, scene.outer)
@@ -52,15 +52,18 @@ def surface(scene: Scene, pair: tuple[int, int]) -> Picture:
         )
         axes.contour(a, b, u[..., k], levels=11, colors=INK, linewidths=0.35, alpha=0.7, linestyles="solid")
         axes.plot(*boundary, color=SET, lw=1.6)
+        axes.set_xlim(a[0], a[-1])
+        axes.set_ylim(b[0], b[-1])
         bar = figure.colorbar(image, cax=add_axes(figure, left + 3.3, bottom + 0.52, 0.1, 2.96))
         bar.outline.set_visible(False)
         bar.set_label(scene.input_labels[k])
         axes.set_xlabel(scene.labels[pair[0]])
         axes.set_ylabel(scene.labels[pair[1]])
-    rest = "" if scene.n == 2 else " All other states are 0."
+    where = "over the domain" if scene.n == 2 else "around the set, all other states being 0,"
+    more = "" if shown == scene.system.m else f" The first {shown} of {scene.system.m} inputs."
     return Picture(
         "The policy's surface",
-        f"u = π(x) over the domain with the boundary of the {scene.word} set.{rest}",
+        f"u = π(x) {where} with the boundary of the {scene.word} set.{more}",
         to_svg(figure),
         simulated=False,
         wide=shown > 1,

@@ -1,4 +1,10 @@
-"""The phase portrait of a plane of two states: level sets, trajectories, the sign of Vdot."""
+"""A plane of two states: the set, trajectories, the sign of Vdot.
+
+With two states the plane is the whole space and the picture shows the domain. With more there are two exact shapes to
+tell apart: the section through the origin `{y: y'P_ij y <= c}`, the points of the plane that lie in the set, and the
+projection `{y: y'((P^-1)_ij)^-1 y <= c}`, all values that two states take anywhere in the set; the picture is zoomed
+to the latter.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.report.figures.geometry import ellipse, shadow, thin
-from certify.report.figures.scene import Scene, settled
+from certify.report.figures.pairs import Pair
+from certify.report.figures.scene import Scene
 from certify.report.figures.style import (
     GROWTH,
     GROWTH_FILL,
@@ -17,100 +24,130 @@ from certify.report.figures.style import (
     INNER,
     INNER_FILL,
     LEAVING,
+    REGION,
     SET,
     SET_FILL,
     SIMULATED,
+    UNSETTLED,
+    Key,
     Picture,
     figure_of,
-    legend_beside,
-    line,
     to_svg,
 )
-from certify.report.sampling import SimulatedRoa
-from certify.report.words import below, inner_level, symbol
+from certify.report.sampling import Runs
+from certify.report.words import below, inner_level, number, symbol
 
 Array = NDArray[np.float64]
+Region = tuple[Array, Array, Array]
+"""Axes (K,), (L,) of a plane and the share of a simulated region around each point, (K, L)."""
 
 
-def portrait(scene: Scene, pair: tuple[int, int], paths: Array, roa: SimulatedRoa | None, *, single: bool) -> Picture:
-    """The plane with everything in it; `single` makes it as wide as the page."""
+def portraits(scene: Scene, runs: Runs, region: Region | None) -> list[Picture]:
+    """The planes of the scene's pairs, under one legend."""
+    drawn = []
+    for pair in scene.pairs:
+        figure, axes = figure_of(5.0, 4.2) if scene.n == 2 else figure_of(4.2, 3.6)
+        drawn.append((pair, draw_plane(axes, scene, pair, runs, region), to_svg(figure)))
+    legend = keys(scene, runs, region, any(growing for _, growing, _ in drawn))
+    title, meaning = "Phase portrait", f"Blue: the {scene.word} set, {scene.meaning}. "
+    pictures = []
+    for pair, growing, svg in drawn:
+        if scene.n > 2:
+            names = [symbol(scene.system.states[k].name) for k in pair]
+            title = ", ".join(names)
+            shares = [f"{number(100 * scene.shares[k], 3)} % in {name}" for name, k in zip(names, pair, strict=True)]
+            meaning = f"Of its domain the set takes {' and '.join(shares)}. "
+        sign = "" if growing else "V̇ < 0 at every grid point of the picture. "
+        caption = f"{meaning}{sign}*\N{NO-BREAK SPACE}Simulated or evaluated on a grid, not proved."
+        pictures.append(Picture(title, caption, svg, simulated=True, wide=scene.n == 2, legend=legend))
+    return pictures
+
+
+def keys(scene: Scene, runs: Runs, region: Region | None, growing: bool) -> tuple[Key, ...]:
+    """The legend of the planes; `growing` says whether Vdot >= 0 somewhere in one of them."""
+    outer = f"{scene.word} set, V = {below(scene.outer, 4)}"
+    inner = f"{scene.words.inner_set}, V = {inner_level(scene.kind, scene.inner, 3)}"
+    found = [Key(outer, SET, 1.8, fill=SET_FILL)]
+    if scene.n > 2:
+        found = [
+            Key(f"{outer}: projection", SET, 1.2, "--"),
+            Key("its section through the origin", SET, 1.6, fill=SET_FILL),
+        ]
+    if not scene.local_is_enough:
+        found.append(Key(inner + (": section" if scene.n > 2 else ""), INNER, 1.4, fill=INNER_FILL))
+    if growing:
+        found.append(Key("V̇ ≥ 0 on a grid*", GROWTH, 1.0, fill=GROWTH_FILL))
+    found += [Key(text, colour, 1.4, style) for _, colour, style, text in _kinds(scene, runs)]
+    if region is not None:
+        found.append(Key("edge of the simulated region*", REGION, 1.4, "--"))
+    return (*found, Key("edge of the domain", INK, 1.0))
+
+
+def _kinds(scene: Scene, runs: Runs) -> list[tuple[NDArray[np.bool_], str, Any, str]]:
+    """Runs by their fates, those that there are: which, colour, style, text."""
+    leaving = "trajectories that leave the domain*"
+    if np.any(runs.left & ~np.any(np.isnan(runs.path[-1]), axis=-1)):
+        leaving = "trajectories that leave the domain or the set*"
+    kinds = (
+        (runs.settled, SIMULATED, "-", f"{scene.words.runs}*"),
+        (runs.unsettled, UNSETTLED, "--", f"trajectories not settled in {number(runs.seconds, 3)} s*"),
+        (runs.left, LEAVING, "-", leaving),
+    )
+    return [kind for kind in kinds if np.any(kind[0])]
+
+
+def draw_plane(axes: Any, scene: Scene, pair: Pair, runs: Runs, region: Region | None) -> bool:
+    """Everything in one plane; whether Vdot >= 0 at some grid point."""
     from matplotlib.collections import LineCollection
-    from matplotlib.patches import Patch, Rectangle
+    from matplotlib.patches import Rectangle
 
     i, j = pair
-    figure, axes = figure_of(7.6, 4.9, right=1.95) if single else figure_of(4.2, 4.4, bottom=1.35)
-    small = 0.8 if single else 0.6
-    a, b, x = scene.plane(i, j)
+    view = scene.view(pair)
+    a, b, x = scene.plane(pair)
     vdot = scene.vdot(x)
-    handles: list[Any] = []
-    sign = ""
-    boundary = ellipse(scene.P, pair, scene.outer)
-    axes.fill(*boundary, color=SET_FILL, lw=0, zorder=1)
+    section = ellipse(scene.P, pair, scene.outer)
+    axes.fill(*section, color=SET_FILL, lw=0, zorder=1)
     growing = (vdot >= 0) & np.any(x != 0, axis=-1)
-    if np.any(growing) and not np.all(growing):
+    if np.any(growing):
         axes.contourf(a, b, vdot, levels=[0, np.inf], colors=[GROWTH_FILL], zorder=0)
-        axes.contour(a, b, vdot, levels=[0.0], colors=[GROWTH], linewidths=1.0, zorder=3)
-        handles.append(Patch(facecolor=GROWTH_FILL, edgecolor=GROWTH, lw=1.0, label="V̇ ≥ 0 on a grid*"))
-    elif not np.any(growing):
-        sign = " V̇ < 0 at every grid point, so that no line V̇ = 0 appears.*"
-    calm = settled(scene, paths)
-    for keep, colour, text in (
-        (calm, SIMULATED, f"{scene.words.runs}*"),
-        (~calm, LEAVING, "other trajectories*"),
-    ):
-        lines = [thin(paths[:, k][:, [i, j]], scene, pair) for k in np.flatnonzero(keep)]
+        if np.any(vdot < 0):
+            axes.contour(a, b, vdot, levels=[0.0], colors=[GROWTH], linewidths=1.0, zorder=3)
+    size = view.hi - view.lo
+    for which, colour, style, _ in _kinds(scene, runs):
+        lines = [thin(runs.path[:, k][:, [i, j]], size) for k in np.flatnonzero(which)]
         lines = [path for path in lines if len(path) > 1]
-        if lines:
-            axes.add_collection(LineCollection(lines, colors=colour, linewidths=small, zorder=2))
-            _arrows(axes, lines, colour, scene, pair)
-            handles.append(line(colour, small, text))
-    if roa is not None and np.any(roa.attracted) and not np.all(roa.attracted):
-        attracted = roa.attracted.T.astype(np.float64)
-        axes.contour(*roa.axes, attracted, levels=[0.5], colors=[LEAVING], linewidths=1.2, linestyles="--", zorder=3)
-        handles.append(line(LEAVING, 1.2, "simulated region*", "--"))
-    axes.plot(*boundary, color=SET, lw=1.8, zorder=4)
-    handles.insert(0, line(SET, 1.8, f"{scene.word} set, V = {below(scene.outer, 4)}"))
+        axes.add_collection(
+            LineCollection(lines, colors=colour, linewidths=0.8, linestyles=style, zorder=2.5 if style == "--" else 2)
+        )
+        _arrows(axes, lines, colour, size)
+    if region is not None:
+        axes.contour(
+            region[0], region[1], region[2].T, levels=[0.5], colors=[REGION], linewidths=1.4, linestyles="--", zorder=3
+        )
+    axes.plot(*section, color=SET, lw=1.8 if scene.n == 2 else 1.5, zorder=4)
     if scene.n > 2:
-        axes.plot(*shadow(scene.P, pair, scene.outer), color=SET, lw=1.0, ls=":", zorder=4)
-        handles.insert(1, line(SET, 1.0, "its projection", ":"))
-    inner = ellipse(scene.P, pair, scene.inner)
-    axes.fill(*inner, color=INNER_FILL, lw=0, zorder=1.5)
-    axes.plot(*inner, color=INNER, lw=1.4, zorder=3.5)
-    handles.insert(1, line(INNER, 1.4, f"{scene.words.inner_set}, V = {inner_level(scene.kind, scene.inner, 3)}"))
-    width, height = scene.hi[i] - scene.lo[i], scene.hi[j] - scene.lo[j]
-    box = Rectangle((scene.lo[i], scene.lo[j]), width, height, fill=False, ec=INK, lw=1.0, zorder=4)
-    axes.add_patch(box)
-    handles.append(line(INK, 1.0, "domain"))
-    axes.set_xlim(scene.lo[i] - 0.03 * width, scene.hi[i] + 0.03 * width)
-    axes.set_ylim(scene.lo[j] - 0.03 * height, scene.hi[j] + 0.03 * height)
+        axes.plot(*shadow(scene.P, pair, scene.outer), color=SET, lw=1.2, ls="--", zorder=4)
+    if not scene.local_is_enough:
+        inner = ellipse(scene.P, pair, scene.inner)
+        axes.fill(*inner, color=INNER_FILL, lw=0, zorder=1.5)
+        axes.plot(*inner, color=INNER, lw=1.4, zorder=3.5)
+    corner, sides = scene.lo[[i, j]], scene.hi[[i, j]] - scene.lo[[i, j]]
+    axes.add_patch(Rectangle(tuple(corner), *sides, fill=False, ec=INK, lw=1.0, zorder=4))
+    axes.set_xlim(view.lo[0], view.hi[0])
+    axes.set_ylim(view.lo[1], view.hi[1])
     axes.set_xlabel(scene.labels[i])
     axes.set_ylabel(scene.labels[j])
-    axes.spines[["left", "bottom"]].set_visible(False)  # the domain's box is frame enough
-    if single:
-        legend_beside(axes, handles)
-    else:
-        axes.legend(handles=handles, loc="upper center", bbox_to_anchor=(0.5, -0.18), ncols=2)
-    what = (
-        f"Section through the origin, all states but {scene.labels[i]} and {scene.labels[j]} being 0; trajectories are "
-        "projected onto it. "
-    )
-    return Picture(
-        "Phase portrait" if scene.n == 2 else f"Section {_title(scene, pair)}",
-        f"{what if scene.n > 2 else ''}Blue: the {scene.word} set, {scene.meaning}. "
-        f"*\N{NO-BREAK SPACE}Simulated or evaluated on a grid, not proved.{sign}",
-        to_svg(figure),
-        simulated=True,
-        wide=single,
-    )
+    if scene.n == 2:
+        axes.spines[["left", "bottom"]].set_visible(False)  # the domain's box is frame enough
+    return bool(np.any(growing))
 
 
-def _arrows(axes: Any, lines: Sequence[Array], colour: str, scene: Scene, pair: tuple[int, int]) -> None:
+def _arrows(axes: Any, lines: Sequence[Array], colour: str, size: Array) -> None:
     """An arrow head a quarter of the way along each line."""
-    scale = np.array([scene.hi[k] - scene.lo[k] for k in pair])
     heads, directions = [], []
     for path in lines:
         k = max(1, len(path) // 4)
-        d = (path[k] - path[k - 1]) / scale
+        d = (path[k] - path[k - 1]) / size
         if np.any(d != 0):
             heads.append(path[k])
             directions.append(d / np.linalg.norm(d))
@@ -124,15 +161,12 @@ def _arrows(axes: Any, lines: Sequence[Array], colour: str, scene: Scene, pair: 
             angles="uv",
             color=colour,
             pivot="mid",
-            scale=42,
-            width=0.0035,
+            units="inches",
+            scale=9.5,
+            width=0.0145,
             headwidth=4.5,
             headlength=5.5,
             headaxislength=5.0,
             minlength=0,
             zorder=3,
         )
-
-
-def _title(scene: Scene, pair: tuple[int, int]) -> str:
-    return ", ".join(symbol(scene.system.states[k].name) for k in pair)

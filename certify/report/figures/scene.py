@@ -1,9 +1,15 @@
-"""What the figures of one certificate share: sets, labels, the flow, and trajectories."""
+"""What the figures of one certificate share: sets, labels, the flow, trajectories, and how much may be simulated.
+
+How many points are simulated follows from what one costs, counted in operations, so that equal certificates give equal
+pages on a fast machine and on a slow one. The clock is the last resort: where it runs out, runs end early and say so.
+"""
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Sequence
-from itertools import pairwise
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -11,8 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 from certify.certificate import Certificate, PartitionTree, leaves
 from certify.errors import CertificateFormatError
 from certify.lyapunov import extents, is_positive_definite
-from certify.report.figures.geometry import circle, on_level, refine
-from certify.report.sampling import SETTLED, Flow, quadratic, simulate, time_scales
+from certify.policies import TanhNetwork
+from certify.report.figures.geometry import PARTS, Box, circle, over_level, refine
+from certify.report.figures.pairs import Pair, pairs_of
+from certify.report.sampling import SETTLED, Flow, Runs, runs_of, time_scales
 from certify.report.words import deviation, label, words_for
 
 Array = NDArray[np.float64]
@@ -21,8 +29,13 @@ Leaves = tuple[Array, Array]
 ON_BOUNDARY = 14  # trajectories that start on the certified boundary, in each plane
 PATH_STEP = 0.6  # of the step of `time_scales`
 _MOST_LEAVES = 400_000
-_GRID = 101
 _MOST_STEPS = 500
+_TANH = 30  # multiplications' worth
+_EQUATIONS = 500  # multiplications' worth of one evaluation, and of what surrounds it
+_GRIDS, _RUNS, _RATES = 2e9, 1e10, 5e8  # operations for grids, trajectories and the time scales
+_SHARE = 0.45  # of the time, after which nothing is simulated any more: the rest is for drawing
+_LEAST = 25  # points along a grid
+_VIEW = 1.3  # of the set's reach, in pictures of more than two states
 
 
 def is_ellipsoid(certificate: Certificate) -> bool:
@@ -32,15 +45,55 @@ def is_ellipsoid(certificate: Certificate) -> bool:
     return ordered and bool(np.all(np.isfinite(P))) and is_positive_definite(P)
 
 
+@dataclass(frozen=True, slots=True)
+class Effort:
+    """How much is simulated.
+
+    Parameters
+    ----------
+    grid : points along each side of a grid, for one picture.
+    starts : trajectories from the boundary of the set, in each plane.
+    steps : of a trajectory.
+    rates : states at which the time scales are looked for.
+    """
+
+    grid: int
+    starts: int
+    steps: int
+    rates: int
+
+    @classmethod
+    def of(cls, network: TanhNetwork, planes: int) -> Effort:
+        """What a policy allows in as many planes."""
+        cost = _EQUATIONS + sum(w.size for w in network.weights) + _TANH * sum(b.size for b in network.biases)
+        steps = _RUNS / (4 * cost)  # of all trajectories together
+        starts = int(min(max(steps / (_MOST_STEPS * planes), 4), ON_BOUNDARY if planes == 1 else 8))
+        return cls(
+            grid=int(min(max(math.sqrt(_GRIDS / cost / (planes + 1)), _LEAST), 101)),
+            starts=starts,
+            steps=int(min(max(steps / (starts * planes), 120), _MOST_STEPS)),
+            rates=int(min(max(_RATES / (2 * network.n * cost), 24), 200)),
+        )
+
+
 class Scene:
     """What the figures of one certificate share.
+
+    Parameters
+    ----------
+    accepted : whether the checker accepted it; if not, the captions speak of claims.
+    pairs : states that are drawn against each other; a function of system, P and shares chooses them.
+    seconds : for all figures.
 
     Raises
     ------
     CertificateFormatError : there is no ellipsoid to draw, or the tree has no leaves.
     """
 
-    def __init__(self, certificate: Certificate, accepted: bool) -> None:
+    def __init__(
+        self, certificate: Certificate, accepted: bool, pairs: Sequence[Pair] | None = None, seconds: float = 10.0
+    ) -> None:
+        self.deadline = time.monotonic() + _SHARE * seconds
         if not is_ellipsoid(certificate):
             raise CertificateFormatError("P must be positive definite and the levels positive and in order.")
         self.certificate, self.kind, self.words = certificate, certificate.kind, words_for(certificate.kind)
@@ -52,7 +105,12 @@ class Scene:
         self.inner_reach = extents(self.P, self.inner)
         self.flow = Flow.of(self.system, certificate.network)
         self.lo, self.hi = self.flow.lo, self.flow.hi
-        self.step, self.horizon = time_scales(self.flow)
+        side = np.minimum(-self.lo, self.hi)  # not positive in files that the checker refuses
+        self.shares = self.reach / np.where(side > 0, side, np.nan)
+        self.pairs = list(pairs) if pairs is not None else pairs_of(self.system, self.P, self.shares)
+        self.effort = Effort.of(certificate.network, len(self.pairs))
+        # With more than two states nothing is simulated from outside the set.
+        self.step, self.horizon = time_scales(self.flow, self.effort.rates, None if self.n <= 2 else self.reach)
         units = self.system.units
         points = zip(self.system.states, self.system.exact_x_eq(), strict=True)
         self.labels = [deviation(s.name, q, units.get(s.name, "")) for s, q in points]
@@ -86,34 +144,38 @@ class Scene:
             value = 2 * np.einsum("...i,...i->...", x @ self.P, self.flow.field(x))
         return np.where(np.isfinite(value), value, np.nan)
 
-    def simulate(self, begin: ArrayLike, steps: int | None = None) -> Array:
-        """Trajectories for a picture, by default over half the horizon."""
+    def simulate(self, begin: ArrayLike, steps: int | None = None) -> Runs:
+        """Trajectories with their fates, by default over half the horizon; smooth for a picture."""
         step = PATH_STEP * self.step
-        count = steps or min(int(0.5 * self.horizon / step) + 1, _MOST_STEPS)
-        return refine(simulate(self.flow, np.asarray(begin, dtype=np.float64), step, count), self.flow.field, step)
+        count = steps or min(int(0.5 * self.horizon / step) + 1, self.effort.steps)
+        starts = np.asarray(begin, dtype=np.float64)
+        runs = runs_of(self.flow, starts, self.P, self.outer, self.settling_level, step, count, self.deadline)
+        return Runs(refine(runs.path, self.flow.field, step), step / PARTS, runs.settled, runs.left)
 
-    def plane(self, i: int, j: int, points: int = _GRID) -> tuple[Array, Array, Array]:
-        """Grid coordinates along states i and j, and the states themselves (all others 0)."""
-        a, b = (np.linspace(self.lo[k], self.hi[k], points) for k in (i, j))
+    def view(self, pair: Pair) -> Box:
+        """What a picture of two states shows: the domain of a plane, else the set with some room within the domain."""
+        lo, hi = self.lo[list(pair)], self.hi[list(pair)]
+        if self.n == 2:
+            margin = 0.03 * (hi - lo)
+            return Box(lo - margin, hi + margin)
+        reach = _VIEW * self.reach[list(pair)]
+        return Box(np.maximum(-reach, 1.06 * lo), np.minimum(reach, 1.06 * hi))
+
+    def plane(self, pair: Pair) -> tuple[Array, Array, Array]:
+        """Grid coordinates along two states within the view and the domain, and the states (all others 0)."""
+        box, (i, j) = self.view(pair), pair
+        points = self.effort.grid if time.monotonic() < self.deadline else _LEAST
+        lo, hi = np.maximum(box.lo, self.lo[[i, j]]), np.minimum(box.hi, self.hi[[i, j]])
+        a, b = np.linspace(lo[0], hi[0], points), np.linspace(lo[1], hi[1], points)
         x = np.zeros((points, points, self.n))
         x[..., i], x[..., j] = a[None, :], b[:, None]
         return a, b, x
 
 
-def planes(scene: Scene) -> list[tuple[int, int]]:
-    """Pairs of states to show: each position with its rate where names tell, else neighbours; three at most."""
-    names = [s.name for s in scene.system.states]
-    pairs = [(i, names.index(f"{name}_dot")) for i, name in enumerate(names) if f"{name}_dot" in names]
-    return (pairs or list(pairwise(range(scene.n)))[::2])[:3]
-
-
-def starts(scene: Scene, pairs: Sequence[tuple[int, int]]) -> Array:
-    """Starting points in the planes: around the certified boundary and, for two states, along the domain's edge."""
-    blocks = []
-    for pair in pairs:
-        block = np.zeros((ON_BOUNDARY, scene.n))
-        block[:, list(pair)] = on_level(scene.P[np.ix_(pair, pair)], circle(ON_BOUNDARY), 0.999 * scene.outer)
-        blocks.append(block)
+def starts(scene: Scene) -> Array:
+    """Starting points: around the outline of the set in each plane and, for two states, along the domain's edge."""
+    count = scene.effort.starts
+    blocks = [over_level(scene.P, pair, circle(count), 0.999 * scene.outer) for pair in scene.pairs]
     if scene.n == 2:
         edge = 2 * np.pi * (np.arange(22) + 0.25) / 22
         ring = np.stack([np.cos(edge), np.sin(edge)], -1)
@@ -121,10 +183,3 @@ def starts(scene: Scene, pairs: Sequence[tuple[int, int]]) -> Array:
         middle, half = (scene.lo + scene.hi) / 2, (scene.hi - scene.lo) / 2
         blocks.append(middle + 0.985 * half * ring)
     return np.concatenate(blocks)
-
-
-def settled(scene: Scene, paths: Array) -> NDArray[np.bool_]:
-    """Runs that end deep inside the certified set; under the practical claim, inside the inner one."""
-    target = scene.inner if scene.kind == "practical" else 0.1 * scene.outer
-    with np.errstate(invalid="ignore"):
-        return np.asarray(quadratic(scene.P, paths[-1]) <= target)

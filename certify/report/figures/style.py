@@ -1,12 +1,15 @@
-"""How figures look: colours, fonts, sizes in inches, and the drawing as SVG."""
+"""How figures look: colours, fonts, sizes in inches, legends, and the drawing as SVG.
+
+A drawing brings its own dark colours: an image in a page is not reached by the page's style sheet, but asks the same
+question of the reader's device. Print stays light.
+"""
 
 from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -14,13 +17,21 @@ INK, MUTED = "#1f2933", "#6b7785"
 SET, SET_FILL = "#1d5fa3", "#dbe8f5"
 INNER, INNER_FILL = "#14795a", "#bfe5d6"
 GROWTH, GROWTH_FILL = "#b03a48", "#f3d9db"
-SIMULATED, LEAVING = "#8a94a0", "#c9813a"
+SIMULATED, LEAVING, UNSETTLED, REGION = "#8a94a0", "#c9813a", "#8466ad", "#7a4c12"
+PAPER, LEAF_EDGE = "#ffffff", "#8fb0d3"
+_DARK = {
+    INK: "#e4e8ec", MUTED: "#a4adb8", SET: "#7db8f0", SET_FILL: "#1d3a57", INNER: "#5ccaa3", INNER_FILL: "#1c4d3f",
+    GROWTH: "#f08c99", GROWTH_FILL: "#4b2830", SIMULATED: "#87919c", LEAVING: "#e3a35f", UNSETTLED: "#bda2e4",
+    REGION: "#e8c48a", PAPER: "#161b20", LEAF_EDGE: "#41668c",
+}  # fmt: skip
 RASTER_FROM = 3000  # leaves, from which on they are drawn as an image
 _FONTS = "system-ui, -apple-system, &quot;Segoe UI&quot;, Helvetica, Arial, &quot;DejaVu Sans&quot;, sans-serif"
 RC: dict[str, Any] = {
     "font.family": "sans-serif",
     "font.sans-serif": ["DejaVu Sans"],
     "font.size": 9.0,
+    "figure.facecolor": "none",
+    "axes.facecolor": "none",
     "axes.edgecolor": MUTED,
     "axes.labelcolor": INK,
     "axes.linewidth": 0.7,
@@ -44,6 +55,40 @@ RC: dict[str, Any] = {
 
 
 @dataclass(frozen=True, slots=True)
+class Key:
+    """An entry of a legend.
+
+    Parameters
+    ----------
+    text : what it stands for; a star says simulated or on a grid.
+    colour : of the line, or of the area's edge.
+    width : of the line in points, 0 for none.
+    style : of the line, `-`, `--` or `:`.
+    fill : the area's colour; None for a line.
+    """
+
+    text: str
+    colour: str
+    width: float = 1.2
+    style: Literal["-", "--", ":"] = "-"
+    fill: str | None = None
+
+    @property
+    def border(self) -> str:
+        """The line's style as CSS names it."""
+        return {"-": "solid", "--": "dashed", ":": "dotted"}[self.style]
+
+    def handle(self) -> Any:
+        """For a legend inside a drawing."""
+        from matplotlib.lines import Line2D
+        from matplotlib.patches import Patch
+
+        if self.fill is not None:
+            return Patch(facecolor=self.fill, edgecolor=self.colour, lw=self.width, ls=self.style, label=self.text)
+        return Line2D([], [], color=self.colour, lw=self.width, ls=self.style, label=self.text)
+
+
+@dataclass(frozen=True, slots=True)
 class Picture:
     """One figure of a report.
 
@@ -53,6 +98,7 @@ class Picture:
     svg : the drawing.
     simulated : whether anything in it comes from simulation or a grid.
     wide : whether it takes the page's full width.
+    legend : of its colours; pictures that follow each other with the same one share it.
     """
 
     title: str
@@ -60,6 +106,7 @@ class Picture:
     svg: str
     simulated: bool
     wide: bool = False
+    legend: tuple[Key, ...] = ()
 
     @property
     def data_uri(self) -> str:
@@ -91,20 +138,28 @@ def to_svg(figure: Any) -> str:
     metadata = dict.fromkeys(("Creator", "Date", "Format", "Type"))
     FigureCanvasSVG(figure).print_svg(buffer, metadata=metadata)
     text = buffer.getvalue()
-    return text[text.index("<svg") :].replace("'DejaVu Sans', sans-serif", _FONTS)
+    text = text[text.index("<svg") :].replace("'DejaVu Sans', sans-serif", _FONTS)
+    head = text.index(">") + 1
+    return f"{text[:head]}\n <style>{dark_style()}</style>{text[head:]}"
 
 
-def legend_beside(axes: Any, handles: Sequence[Any] | None = None) -> None:
-    """The legend at the right of the axes."""
-    options: dict[str, Any] = {} if handles is None else {"handles": handles}
-    axes.legend(loc="upper left", bbox_to_anchor=(1.01, 1.0), handlelength=1.6, labelspacing=0.7, **options)
+def dark_style() -> str:
+    """The rules that give a drawing, and the samples of a legend, their dark colours."""
+    swaps = [
+        f'[style*="{what}: {light}"]{{{what}:{dark} !important}}'
+        for light, dark in _DARK.items()
+        for what in ("fill", "stroke")
+    ]
+    # Images of a partition or a surface hold no colours that could be named one by one.
+    turned = "image{filter:invert(.9) hue-rotate(180deg)}"
+    return f"@media screen and (prefers-color-scheme: dark){{{''.join(swaps)}{turned}}}"
 
 
-def line(colour: str, width: float, text: str, style: str = "-") -> Any:
-    """A legend's line."""
-    from matplotlib.lines import Line2D
-
-    return Line2D([], [], color=colour, lw=width, ls=style, label=text)
+def legend_style() -> str:
+    """The colours of legends as the page's style sheet gives them, light and dark, by the light colour's digits."""
+    light = "".join(f"--c{colour[1:]}:{colour};" for colour in _DARK)
+    dark = "".join(f"--c{colour[1:]}:{other};" for colour, other in _DARK.items())
+    return f":root{{{light}}}@media screen and (prefers-color-scheme: dark){{:root{{{dark}}}}}"
 
 
 def plain_powers(axes: Any) -> None:

@@ -1,0 +1,140 @@
+"""The figure for a paper: the certified set alone, one or two columns wide.
+
+A page of a journal has no room for a screen's captions: there is one legend below the panels, fonts have the size that
+they have in print, and what is simulated keeps its star.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from certify.certificate import Certificate
+from certify.errors import InputError
+from certify.report.figures import region_of, simulated_roa
+from certify.report.figures.line import draw_line
+from certify.report.figures.pairs import named_pairs
+from certify.report.figures.portrait import draw_plane, keys
+from certify.report.figures.scene import Scene, starts
+from certify.report.figures.style import RC, Key
+
+FORMATS = ("pdf", "svg", "png")
+_WIDTHS = {1: 3.4, 2: 7.0}  # inches
+_SMALL: dict[str, Any] = {
+    "font.size": 8.0,
+    "axes.labelsize": 8.0,
+    "xtick.labelsize": 7.0,
+    "ytick.labelsize": 7.0,
+    "legend.fontsize": 7.0,
+    "pdf.fonttype": 42,  # text stays text
+}
+_PNG_DPI = 300
+_STAR = "* simulated or on a grid, not proved"
+
+
+@dataclass(frozen=True, slots=True)
+class PaperOptions:
+    """What the figure looks like.
+
+    Parameters
+    ----------
+    columns : of the page that it takes, 1 or 2.
+    pairs : states to draw against each other, such as `x,x_dot`; those that belong together if there are none.
+    format : `pdf`, `svg` or `png`.
+    """
+
+    columns: Literal[1, 2] = 1
+    pairs: tuple[str, ...] = ()
+    format: str = "pdf"
+
+    def __post_init__(self) -> None:
+        if self.columns not in _WIDTHS:
+            raise InputError(f"`columns` must be 1 or 2; found {self.columns}.")
+        if self.format not in FORMATS:
+            raise InputError(f"a figure must be one of {', '.join(FORMATS)}; found {self.format!r}. Name the file so.")
+
+
+def paper_figure(certificate: Certificate, accepted: bool, options: PaperOptions | None = None) -> bytes:
+    """The certified set in each pair of states, as a file's bytes; equal certificates give equal bytes.
+
+    Parameters
+    ----------
+    accepted : whether the checker accepted the certificate; if not, the legend speaks of a claim.
+
+    Raises
+    ------
+    InputError : a pair is not two states of the plant, or a plant with one state is asked for pairs.
+    CertificateFormatError : there is no ellipsoid to draw.
+    """
+    import matplotlib
+    from matplotlib.figure import Figure
+
+    options = options or PaperOptions()
+    if options.pairs and certificate.system.n < 2:
+        raise InputError(f"pairs need two states or more; {certificate.system.name} has one. Leave --pairs out.")
+    pairs = named_pairs(certificate.system, options.pairs) or None
+    with matplotlib.rc_context({**RC, **_SMALL}):
+        scene = Scene(certificate, accepted, pairs)
+        count = 1 if scene.n == 1 else len(scene.pairs)
+        across = min(count, 2 * options.columns if count > 2 * options.columns or count % 2 == 0 else 3)
+        across = min(across, 2 if options.columns == 1 else 4)
+        down = math.ceil(count / across)
+        width = _WIDTHS[options.columns]
+        panel = min(0.82 * width / across, 4.0)
+        figure = Figure(figsize=(width, 1.0), layout="constrained")
+        panels = figure.subplots(down, across, squeeze=False).ravel().tolist()
+        for spare in panels[count:]:
+            spare.set_visible(False)
+        legend = _draw(scene, panels[:count])
+        _put_legend(figure, legend, down * panel)
+        return _bytes(figure, options.format)
+
+
+def _draw(scene: Scene, panels: Sequence[Any]) -> tuple[Key, ...]:
+    """Fill the panels; the legend of all of them."""
+    for axes in panels:
+        axes.locator_params(nbins=5)
+    roa = simulated_roa(scene)
+    if scene.n == 1:
+        return draw_line(panels[0], scene, roa)
+    runs, region = scene.simulate(starts(scene)), region_of(scene, roa)
+    growing = [draw_plane(axes, scene, pair, runs, region) for axes, pair in zip(panels, scene.pairs, strict=True)]
+    return keys(scene, runs, region, any(growing))
+
+
+def _put_legend(figure: Any, legend: Sequence[Key], height: float) -> None:
+    """The legend below the panels, in as many columns as fit; the figure's height in inches follows."""
+    width = figure.get_size_inches()[0]
+    for columns in range(min(len(legend), 4), 0, -1):
+        rows = math.ceil(len(legend) / columns)
+        figure.set_size_inches(width, height + 0.16 * (rows + 1) + 0.1)
+        placed = figure.legend(
+            handles=[key.handle() for key in legend],
+            loc="outside lower center",
+            ncols=columns,
+            handlelength=1.8,
+            columnspacing=1.2,
+            labelspacing=0.35,
+            title=_STAR,
+            title_fontsize=6.5,
+        )
+        figure.draw_without_rendering()
+        if columns == 1 or placed.get_window_extent().width <= width * figure.dpi:
+            return
+        placed.remove()
+
+
+def _bytes(figure: Any, kind: str) -> bytes:
+    """The figure as a file, without the date."""
+    buffer = io.BytesIO()
+    metadata: dict[str, Any] = {
+        "pdf": {"CreationDate": None, "Producer": None, "Creator": None},
+        "svg": dict.fromkeys(("Creator", "Date", "Format", "Type")),
+        "png": {"Software": None},
+    }[kind]
+    ground = {"facecolor": "white"} if kind == "png" else {}
+    figure.savefig(buffer, format=kind, dpi=_PNG_DPI, metadata=metadata, **ground)
+    return buffer.getvalue()

@@ -1,0 +1,151 @@
+"""How a page looks in a browser: narrow, wide, dark and printed. Facts are measured; the pictures are kept where
+`CERTIFY_SCREENSHOTS` says, for eyes.
+
+A Chromium must be installed (`apt-get install chromium`); without one these tests are skipped.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import unicodedata
+from collections.abc import Iterator
+from pathlib import Path
+
+import pypdf
+import pytest
+
+from certify.certificate import read_certificate
+from certify.policies import load_policy
+from certify.report import render_html
+from certify.roa import RoaOptions, certify_roa
+from certify.systems import get_system
+from tests.support.browser import Browser, find_browser
+from tests.support.loops import chain
+
+PROGRAM = find_browser()
+pytestmark = pytest.mark.skipif(PROGRAM is None, reason="no Chromium is installed (apt-get install chromium)")
+PENDULUM = Path(__file__).parent.parent.parent / "examples" / "policies" / "pendulum.pt"
+WIDTHS = (400, 800, 1400)
+
+CONTRAST = """(() => {
+  const light = c => { const v = c / 255; return v <= .04045 ? v / 12.92 : ((v + .055) / 1.055) ** 2.4; };
+  const parts = s => s.match(/[\\d.]+/g).map(Number);
+  const bright = p => .2126 * light(p[0]) + .7152 * light(p[1]) + .0722 * light(p[2]);
+  const ground = e => { for (; e; e = e.parentElement) { const p = parts(getComputedStyle(e).backgroundColor);
+    if (p.length < 4 || p[3] > 0) return p; } return [255, 255, 255]; };
+  const found = [];
+  for (const e of document.querySelectorAll('body *')) {
+    if (![...e.childNodes].some(n => n.nodeType === 3 && n.textContent.trim())) continue;
+    const a = bright(parts(getComputedStyle(e).color)), b = bright(ground(e));
+    found.push([(Math.max(a, b) + .05) / (Math.min(a, b) + .05), e.textContent.trim().slice(0, 60)]);
+  }
+  return JSON.stringify(found.sort((p, q) => p[0] - q[0]).slice(0, 3));
+})()"""
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    """A page of two states and one of four, as a run leaves them."""
+    found = {}
+    loops = {
+        "pendulum": (get_system("pendulum"), load_policy(PENDULUM).network),
+        "chain": chain(4, [-1.0, -2.0, -3.0, -4.0]),
+    }
+    for name, (system, network) in loops.items():
+        folder = tmp_path_factory.mktemp(name)
+        result = certify_roa(system, network, folder, RoaOptions(candidate="lyapunov"), provenance={"numpy": "1.2.3"})
+        assert result.certificate is not None and result.checker is not None
+        data = result.to_dict()
+        data["diagnosis"]["next"]["command"] = "certify roa --policy " + "a/very/long/path/" * 8 + "policy.pt"
+        html = render_html(read_certificate(result.certificate), dict(result.checker), data, result.certificate)
+        found[name] = folder / "report.html"
+        found[name].write_text(html)
+    return found
+
+
+@pytest.fixture(scope="module")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    assert PROGRAM is not None
+    with Browser(PROGRAM, tmp_path_factory.mktemp("profile")) as opened:
+        yield opened
+
+
+def keep(name: str, content: bytes) -> None:
+    """For eyes, if somebody said where."""
+    if folder := os.environ.get("CERTIFY_SCREENSHOTS"):
+        Path(folder).mkdir(parents=True, exist_ok=True)
+        (Path(folder) / name).write_bytes(content)
+
+
+@pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
+@pytest.mark.parametrize("width", WIDTHS)
+@pytest.mark.parametrize("name", ["pendulum", "chain"])
+def test_a_page_fits_and_can_be_read(
+    browser: Browser, pages: dict[str, Path], name: str, width: int, dark: bool
+) -> None:
+    browser.show(pages[name], width, dark=dark)
+    content = browser.picture()
+    keep(f"{name}-{width}-{'dark' if dark else 'light'}.png", content)
+    assert content.startswith(b"\x89PNG")
+    assert browser.evaluate("innerWidth") == width
+    assert browser.evaluate("document.documentElement.scrollWidth") <= width  # no horizontal scroll bar
+    worst = json.loads(browser.evaluate(CONTRAST))
+    assert worst[0][0] >= 4.5, worst  # WCAG 2, level AA
+    ground = browser.evaluate("getComputedStyle(document.querySelector('main')).backgroundColor")
+    assert (ground == "rgb(255, 255, 255)") == (not dark)
+    pictures = browser.evaluate("[...document.images].every(i => i.complete && i.naturalWidth > 0)")
+    assert pictures is True
+    # Text in a drawing is at least 8 pixels high: its points are fonts of 8 and more at the drawing's own width.
+    scale = "Math.min(...[...document.images].map(i => i.getBoundingClientRect().width / i.naturalWidth))"
+    assert browser.evaluate(scale) * 8 * 96 / 72 >= 7.9
+    overlapping = browser.evaluate(
+        "(() => { const a = document.querySelector('.toc').getBoundingClientRect(), "
+        "b = document.querySelector('#claim').getBoundingClientRect(); "
+        "return a.bottom > b.top && a.right > b.left; })()"
+    )
+    assert overlapping is False
+
+
+def test_drawings_turn_dark_with_the_page(browser: Browser, pages: dict[str, Path]) -> None:
+    """The corner of a drawing, read back through a canvas, is as dark as the page says: its text would not be seen."""
+    brightest = (
+        "(() => { const i = document.images[0], c = document.createElement('canvas'); c.width = i.naturalWidth; "
+        "c.height = i.naturalHeight; const x = c.getContext('2d'); x.drawImage(i, 0, 0); "
+        "const d = x.getImageData(0, 0, c.width, c.height).data; let top = 0, low = 255; "
+        "for (let k = 0; k < d.length; k += 4) if (d[k + 3] > 250) { const v = (d[k] + d[k + 1] + d[k + 2]) / 3; "
+        "top = Math.max(top, v); low = Math.min(low, v); } return [top, low].join(); })()"
+    )
+    found = {}
+    for dark in (False, True):
+        browser.show(pages["pendulum"], 800, dark=dark)
+        top, low = map(float, browser.evaluate(brightest).split(","))
+        found[dark] = top, low
+    assert found[False][1] < 60  # dark ink on the light page
+    assert found[True][0] > 200 and found[True][1] < 70  # light ink, dark areas
+
+
+def test_the_table_of_contents_leads_to_every_section(browser: Browser, pages: dict[str, Path]) -> None:
+    for page in pages.values():
+        browser.show(page, 800)
+        targets = browser.evaluate("[...document.querySelectorAll('.toc a')].map(a => a.getAttribute('href')).join()")
+        sections = browser.evaluate("[...document.querySelectorAll('h2')].map(h => '#' + h.id).join()")
+        assert targets == sections and "#," not in sections
+
+
+def test_a_pendulum_prints_on_two_or_three_pages(browser: Browser, pages: dict[str, Path]) -> None:
+    for name, page in pages.items():
+        browser.show(page, 800, dark=True)
+        headings = browser.evaluate("JSON.stringify([...document.querySelectorAll('h2, h3')].map(h => h.textContent))")
+        pdf = browser.pdf()
+        keep(f"{name}.pdf", pdf)
+        sheets = pypdf.PdfReader(io.BytesIO(pdf)).pages
+        printed = [unicodedata.normalize("NFKC", sheet.extract_text()) for sheet in sheets]  # without ligatures
+        assert 2 <= len(printed) <= 3
+        plain = {unicodedata.normalize("NFKC", " ".join(text.split())) for text in json.loads(headings)}
+        for text in printed:
+            lines = [" ".join(line.split()) for line in text.splitlines() if line.strip()]
+            assert lines[-1] not in plain, lines[-1]  # no orphaned heading
+        assert "What was not proved" in " ".join(printed[0].split())
+        assert "How to check the certificate" in printed[-1] and "python -I -m certify.checker" in printed[-1]
