@@ -1,12 +1,13 @@
 """Pages of the site that would go stale if they were written by hand: commands with their options, and public names.
 
-mkdocs calls `on_page_markdown` for each page; the places are marked with a comment in the page. What the package says of
+mkdocs calls the functions `on_...` for each page; the places are marked with a comment in the page. What the package says of
 itself when the site is built is what the page shows, so that a command or a name that is added needs no page of docs.
 """
 
 from __future__ import annotations
 
 import inspect
+import re
 from typing import Any
 
 import typer
@@ -14,6 +15,8 @@ import typer
 import certify
 from certify.cli import app
 
+# A bar of an absolute value is an infix operator to a browser unless it is told otherwise, and gets room on both sides.
+_BAR = re.compile(r'<mo stretchy="false">(&#x0007C;|&#x02016;)</mo>')
 COMMANDS, NAMES = "<!-- every command -->", "<!-- every public name -->"
 
 
@@ -24,6 +27,11 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
     if NAMES in markdown:
         markdown = markdown.replace(NAMES, public_names())
     return markdown
+
+
+def on_page_content(html: str, **_: Any) -> str:
+    """The page with bars that stand close to what they enclose."""
+    return _BAR.sub(r'<mo stretchy="false" lspace="0" rspace="0">\1</mo>', html)
 
 
 def commands() -> str:
