@@ -16,7 +16,7 @@ import certify
 from certify.cli import app
 
 # A bar of an absolute value is an infix operator to a browser unless it is told otherwise, and gets room on both sides.
-_BAR = re.compile(r'<mo stretchy="false">(&#x0007C;|&#x02016;)</mo>')
+_BAR = re.compile(r'<mo(?: stretchy="false")?>(&#x0007C;|&#x02016;)</mo>')
 COMMANDS, NAMES = "<!-- every command -->", "<!-- every public name -->"
 
 
