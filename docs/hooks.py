@@ -1,7 +1,7 @@
 """Pages of the site that would go stale if they were written by hand: commands with their options, and public names.
 
-mkdocs calls the functions `on_...` for each page; the places are marked with a comment in the page. What the package says of
-itself when the site is built is what the page shows, so that a command or a name that is added needs no page of docs.
+mkdocs calls the functions `on_...` for each page; the places are marked with a comment in the page. What the package
+says of itself when the site is built is what the page shows, so that a command or a name that is added needs no page.
 """
 
 from __future__ import annotations
@@ -39,7 +39,14 @@ def commands() -> str:
     group = typer.main.get_command(app)
     sections = []
     for name, command in getattr(group, "commands", {}).items():
-        lines = [f"## certify {name}", "", inspect.cleandoc(command.help or ""), "", "| option | what it says |", "|---|---|"]
+        lines = [
+            f"## certify {name}",
+            "",
+            inspect.cleandoc(command.help or ""),
+            "",
+            "| option | what it says |",
+            "|---|---|",
+        ]
         for parameter in command.params:
             names = ", ".join(f"`{text}`" for text in (*parameter.opts, *parameter.secondary_opts))
             if parameter.param_type_name == "argument":

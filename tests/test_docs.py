@@ -1,4 +1,4 @@
-"""The site: it builds without a warning and loads nothing from elsewhere, and what its pages tell a reader to run works.
+"""The site builds without a warning and loads nothing from elsewhere, and what its pages tell a reader to run works.
 
 Each fenced block of sh or python in docs/ carries a comment on the line above it, which the site does not show:
 
@@ -54,21 +54,28 @@ def named(page: Path) -> str:
 def run_page(page: Path, folder: Path, slow: bool) -> None:
     """Run a page's blocks in order; with `slow` all of them."""
     (folder / "examples").symlink_to(ROOT / "examples", target_is_directory=True)
-    environment = os.environ | {"PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}", "COLUMNS": "100"}
+    environment = os.environ | {
+        "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
+        "COLUMNS": "100",
+    }
     printed = None
     for block in blocks(page):
         if block.mark.startswith("file: "):
             (folder / block.mark.removeprefix("file: ")).write_text(block.code, "utf-8")
         elif block.mark == "prints" and printed is not None:
             pattern = ".*".join(re.escape(line.strip()).replace("…", ".*") for line in block.code.splitlines())
-            assert re.search(pattern, printed, re.S), f"{named(page)} says\n{block.code}\nwhere this was printed:\n{printed}"
+            assert re.search(pattern, printed, re.S), (
+                f"{named(page)} says\n{block.code}\nwhere this was printed:\n{printed}"
+            )
         elif block.is_run:
             printed = None
             if block.mark == "run slow" and not slow:
                 continue
             shell = ["bash", "-eu", "-o", "pipefail", "-c", block.code]
             command = shell if block.language == "sh" else [sys.executable, "-W", "error", "-c", block.code]
-            done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, timeout=900)
+            done = subprocess.run(
+                command, cwd=folder, env=environment, capture_output=True, text=True, timeout=900, check=False
+            )
             assert done.returncode == 0, f"{named(page)}\n{block.code}\n{done.stdout}\n{done.stderr}"
             printed = done.stdout
 
@@ -128,7 +135,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("site")
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(folder)]
     environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300)
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
     assert done.stdout + done.stderr == ""
     return folder
@@ -167,4 +174,12 @@ def test_the_reference_has_every_command_and_public_name(site: Path) -> None:
 
 def test_the_sites_packages_are_pinned() -> None:
     pinned = {line.split("==")[0] for line in (ROOT / "constraints.txt").read_text().splitlines() if "==" in line}
-    assert {"mkdocs", "mkdocs-material", "mkdocstrings", "mkdocstrings-python", "griffelib", "l2m4m", "latex2mathml"} <= pinned
+    assert {
+        "mkdocs",
+        "mkdocs-material",
+        "mkdocstrings",
+        "mkdocstrings-python",
+        "griffelib",
+        "l2m4m",
+        "latex2mathml",
+    } <= pinned

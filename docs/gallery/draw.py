@@ -1,8 +1,8 @@
 """Prove the gallery's plants, draw their certificates, and write the page's table: `make gallery`, ten minutes.
 
 The pictures and `proved.txt` are kept in the repository, so that building the site stays quick; what they show is read
-from certificates that the checker has accepted in this run. A certificate that `out/gallery` already has is checked again and not
-searched for again.
+from certificates that the checker has accepted in this run. A certificate that `out/gallery` already has is checked
+again and not searched for again.
 """
 
 from __future__ import annotations
@@ -48,7 +48,9 @@ ENTRIES = (
         "without_gain/pendulum",
         options=("--claim", "practical", "--candidate", "lqr"),
     ),
-    Entry("van_der_pol", "oscillator in reversed time, inside its limit cycle", "van_der_pol", "van_der_pol", OPTIMISED),
+    Entry(
+        "van_der_pol", "oscillator in reversed time, inside its limit cycle", "van_der_pol", "van_der_pol", OPTIMISED
+    ),
     Entry("two_machines", "swing equation of a power system", "two_machines", "two_machines", OPTIMISED),
     Entry("two_tanks", "Torricelli's law, an operating point", "two_tanks", "two_tanks", OPTIMISED),
     Entry("maglev", "a ball below a magnet", "maglev", "maglev", OPTIMISED),
@@ -97,22 +99,24 @@ def section(entry: Entry, certificate: Certificate) -> str:
         f"{symbol(s.name)} {below(v, 3)} {pretty_unit(system.units.get(s.name, ''))}".strip() for s, v in reach
     )
     practical = certificate.kind == "practical"
+    size = below(volume(certificate.P, certificate.roa), 3)
     inner = f"c₀ = {above(certificate.inner, 4)}" if practical else f"c₁ = {below(certificate.inner, 4)}"
-    return "\n".join([
-        f"## {entry.name}",
-        "",
-        f"{entry.shows[0].upper()}{entry.shows[1:]}. Policy {'-'.join(map(str, network.layers))}.",
-        "",
-        f"![The certified set of {entry.name}, section through the origin]({entry.name}.svg)",
-        "",
-        f"On the axes ± {axes}; {'area' if system.n == 2 else 'volume'} {below(volume(certificate.P, certificate.roa), 3)}; "
-        f"{inner}, c₂ = {below(certificate.roa)}.",
-        "",
-        "<!-- shown: by make gallery -->",
-        "```sh",
-        " ".join(entry.command),
-        "```",
-    ])
+    return "\n".join(
+        [
+            f"## {entry.name}",
+            "",
+            f"{entry.shows[0].upper()}{entry.shows[1:]}. Policy {'-'.join(map(str, network.layers))}.",
+            "",
+            f"![The certified set of {entry.name}, section through the origin]({entry.name}.svg)",
+            "",
+            f"On the axes ± {axes}; {'area' if system.n == 2 else 'volume'} {size}; {inner}, c₂ = {below(certificate.roa)}.",
+            "",
+            "<!-- shown: by make gallery -->",
+            "```sh",
+            " ".join(entry.command),
+            "```",
+        ]
+    )
 
 
 def main() -> None:
