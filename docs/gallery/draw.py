@@ -100,6 +100,7 @@ def section(entry: Entry, certificate: Certificate) -> str:
     )
     practical = certificate.kind == "practical"
     size = below(volume(certificate.P, certificate.roa), 3)
+    kind = "area" if system.n == 2 else "volume"
     inner = f"c₀ = {above(certificate.inner, 4)}" if practical else f"c₁ = {below(certificate.inner, 4)}"
     return "\n".join(
         [
@@ -109,7 +110,7 @@ def section(entry: Entry, certificate: Certificate) -> str:
             "",
             f"![The certified set of {entry.name}, section through the origin]({entry.name}.svg)",
             "",
-            f"On the axes ± {axes}; {'area' if system.n == 2 else 'volume'} {size}; {inner}, c₂ = {below(certificate.roa)}.",
+            f"On the axes ± {axes}; {kind} {size}; {inner}, c₂ = {below(certificate.roa)}.",
             "",
             "<!-- shown: by make gallery -->",
             "```sh",
