@@ -1,7 +1,7 @@
 """How this project writes docstrings, told to the parser of the site.
 
-Parameters stand as `name : what it is`, because types are annotations already; numpydoc takes what follows the colon for
-the type. Here each such line becomes a name and, below it, its description.
+Parameters stand as `name : what it is`, because types are annotations already; numpydoc takes what follows the colon
+for the type. Here each such line becomes a name and, below it, its description.
 """
 
 from __future__ import annotations

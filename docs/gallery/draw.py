@@ -95,9 +95,8 @@ def section(entry: Entry, certificate: Certificate) -> str:
     """What the page says of an entry; numbers are rounded down."""
     system, network = certificate.system, certificate.network
     reach = zip(system.states, semi_axes(certificate.P, certificate.roa).tolist(), strict=True)
-    axes = ", ".join(
-        f"{symbol(s.name)} {below(v, 3)} {pretty_unit(system.units.get(s.name, ''))}".strip() for s, v in reach
-    )
+    units = {name: "" if unit == "1" else pretty_unit(unit) for name, unit in system.units.items()}
+    axes = ", ".join(f"{symbol(s.name)} {below(v, 3)} {units.get(s.name, '')}".strip() for s, v in reach)
     practical = certificate.kind == "practical"
     size = below(volume(certificate.P, certificate.roa), 3)
     kind = "area" if system.n == 2 else "volume"
