@@ -1,10 +1,10 @@
-# Two commands: `make roa` proves and checks the shipped policy, `make test` runs the suite.
+# `make roa` proves and checks the shipped policy, `make test` runs the suite, `make docs` builds the site into build/site.
 PYTHON ?= python3.11
 # Where torch built for the CPU lies: the default build for Linux brings 4 GB of CUDA libraries along.
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 BIN := .venv/bin
 
-.PHONY: setup roa test lint clean
+.PHONY: setup roa test lint docs gallery clean
 
 setup: .venv/.installed
 
@@ -24,6 +24,12 @@ lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+
+docs: setup
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+
+gallery: setup
+	$(BIN)/python docs/gallery/draw.py
 
 clean:
 	rm -rf .venv out build *.egg-info

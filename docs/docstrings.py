@@ -1,0 +1,28 @@
+"""How this project writes docstrings, told to the parser of the site.
+
+Parameters stand as `name : what it is`, because types are annotations already; numpydoc takes what follows the colon
+for the type. Here each such line becomes a name and, below it, its description.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import griffe
+
+_SECTION = re.compile(r"^(Parameters|Raises|Attributes)\n-+\n(.*?)(?=\n\n\S|\Z)", re.M | re.S)
+_ENTRY = re.compile(r"^(\w[\w., *]*?) ?: (\S.*)$", re.M)
+
+
+def described(text: str) -> str:
+    """The docstring with descriptions where a parser of numpydoc looks for them."""
+    return _SECTION.sub(lambda section: _ENTRY.sub(r"\1\n    \2", section[0]), text)
+
+
+class Described(griffe.Extension):
+    """Applies `described` to every object's docstring as it is loaded."""
+
+    def on_object(self, *, obj: griffe.Object, **_: Any) -> None:
+        if obj.docstring is not None:
+            obj.docstring.value = described(obj.docstring.value)

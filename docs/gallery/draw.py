@@ -1,0 +1,134 @@
+"""Prove the gallery's plants, draw their certificates, and write the page's table: `make gallery`, ten minutes.
+
+The pictures and `proved.txt` are kept in the repository, so that building the site stays quick; what they show is read
+from certificates that the checker has accepted in this run. A certificate that `out/gallery` already has is checked
+again and not searched for again.
+"""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+from certify.certificate import Certificate, read_certificate, run_checker
+from certify.lyapunov import semi_axes, volume
+from certify.report.figures import draw
+from certify.report.words import above, below, pretty_unit, symbol
+
+ROOT = Path(__file__).parents[2]
+PAGE = Path(__file__).parent
+LARGEST = 80_000  # bytes of a picture
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A row: what it shows, and the options of `certify roa`; `plant` is a file of examples/plants."""
+
+    name: str
+    shows: str
+    policy: str
+    plant: str | None = None
+    options: tuple[str, ...] = ()
+
+    @property
+    def command(self) -> list[str]:
+        system = ["--system", f"examples/plants/{self.plant}.toml"] if self.plant else []
+        return ["certify", "roa", "--policy", f"examples/policies/{self.policy}.pt", *system, *self.options]
+
+
+OPTIMISED = ("--candidate", "optimised", "--time-limit", "60")
+ENTRIES = (
+    Entry("pendulum", "inverted pendulum, up to its domain", "pendulum"),
+    Entry(
+        "practical",
+        "the same plant under plain SAC, which rests beside the origin: practical stability",
+        "without_gain/pendulum",
+        options=("--claim", "practical", "--candidate", "lqr"),
+    ),
+    Entry(
+        "van_der_pol", "oscillator in reversed time, inside its limit cycle", "van_der_pol", "van_der_pol", OPTIMISED
+    ),
+    Entry("two_machines", "swing equation of a power system", "two_machines", "two_machines", OPTIMISED),
+    Entry("two_tanks", "Torricelli's law, an operating point", "two_tanks", "two_tanks", OPTIMISED),
+    Entry("maglev", "a ball below a magnet", "maglev", "maglev", OPTIMISED),
+    Entry("bicycle", "path following, three states", "bicycle", "bicycle", OPTIMISED),
+    Entry("furuta", "rotary pendulum, four states", "furuta", "furuta", OPTIMISED),
+    Entry("cartpole", "four states, 256 units a layer", "cartpole", options=("--candidate", "optimised")),
+    Entry("satellite", "attitude, six states and three inputs", "satellite", "satellite", OPTIMISED),
+    Entry("quadrotor2d", "six states, five layers of 256 units", "quadrotor2d", options=("--time-limit", "60")),
+    Entry("quadrotor3d", "twelve states on their true equations", "quadrotor3d", options=("--time-limit", "5")),
+)
+
+
+def proved(entry: Entry) -> Certificate:
+    """The entry's certificate, accepted by the checker."""
+    folder = ROOT / "out" / "gallery" / entry.name
+    path = folder / "certificate.json"
+    if not path.exists():
+        command = [str(Path(sys.executable).parent / "certify"), *entry.command[1:], "--out", str(folder), "--quiet"]
+        subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
+    answer = run_checker(path)
+    if answer["result"] != "ACCEPTED":
+        raise SystemExit(f"{path} must be accepted; the checker said {answer}. Remove the file and run this again.")
+    return read_certificate(path)
+
+
+def light(svg: str) -> str:
+    """The drawing with its paths in tenths of a point, which no eye sees."""
+    rounded = re.compile(r"-?\d+\.\d+")
+    return re.sub(r' d="[^"]*"', lambda path: rounded.sub(lambda v: f"{float(v[0]):.1f}", path[0]), svg)
+
+
+def picture(entry: Entry, certificate: Certificate) -> None:
+    """The first figure of the report, as a file."""
+    pictures, _ = draw(certificate, accepted=True)
+    svg = light(pictures[0].svg)
+    if len(svg.encode("utf-8")) > LARGEST:
+        raise SystemExit(f"the picture of {entry.name} must be below {LARGEST} bytes; it has {len(svg)}. Draw less.")
+    (PAGE / f"{entry.name}.svg").write_text(svg, "utf-8")
+
+
+def section(entry: Entry, certificate: Certificate) -> str:
+    """What the page says of an entry; numbers are rounded down."""
+    system, network = certificate.system, certificate.network
+    reach = zip(system.states, semi_axes(certificate.P, certificate.roa).tolist(), strict=True)
+    units = {name: "" if unit == "1" else pretty_unit(unit) for name, unit in system.units.items()}
+    axes = ", ".join(f"{symbol(s.name)} {below(v, 3)} {units.get(s.name, '')}".strip() for s, v in reach)
+    practical = certificate.kind == "practical"
+    size = below(volume(certificate.P, certificate.roa), 3)
+    kind = "area" if system.n == 2 else "volume"
+    inner = f"c₀ = {above(certificate.inner, 4)}" if practical else f"c₁ = {below(certificate.inner, 4)}"
+    return "\n".join(
+        [
+            f"## {entry.name}",
+            "",
+            f"{entry.shows[0].upper()}{entry.shows[1:]}. Policy {'-'.join(map(str, network.layers))}.",
+            "",
+            f"![The certified set of {entry.name}, section through the origin]({entry.name}.svg)",
+            "",
+            f"On the axes ± {axes}; {kind} {size}; {inner}, c₂ = {below(certificate.roa)}.",
+            "",
+            "<!-- shown: by make gallery -->",
+            "```sh",
+            " ".join(entry.command),
+            "```",
+        ]
+    )
+
+
+def main() -> None:
+    """All entries, in order."""
+    sections = []
+    for entry in ENTRIES:
+        certificate = proved(entry)
+        picture(entry, certificate)
+        sections.append(section(entry, certificate))
+        print(entry.name, (PAGE / f"{entry.name}.svg").stat().st_size)
+    (PAGE / "proved.txt").write_text("\n\n".join(sections) + "\n", "utf-8")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,185 @@
+"""The site builds without a warning and loads nothing from elsewhere, and what its pages tell a reader to run works.
+
+Each fenced block of sh or python in docs/ carries a comment on the line above it, which the site does not show:
+
+    <!-- run -->         it is run
+    <!-- run slow -->    it is run by the slow tests
+    <!-- shown: why -->  it is not run; commands of `certify` and `controllers` in it must exist with these options
+
+`<!-- file: NAME -->` above a block of any language writes it into the page's folder; `<!-- prints -->` above a block of
+text says what the block before prints: its lines in this order, an ellipsis standing for anything. The blocks of a page
+are run in order in one new folder that has `examples` in it.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+import typer
+
+ROOT = Path(__file__).parent.parent
+PAGES = sorted((ROOT / "docs").rglob("*.md"))
+_BLOCK = re.compile(r"(?:<!-- (?P<mark>[^\n]*?) -->\n)?^```(?P<language>[^\n]*)\n(?P<code>.*?)^```$", re.M | re.S)
+_OUTSIDE = re.compile(r"""<(?:script|link|img|iframe|source|object)\b[^>]*?(?:src|href|data)=["']?(?:https?:)?//""")
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block of a page, and the comment above it."""
+
+    mark: str
+    language: str
+    code: str
+
+    @property
+    def is_run(self) -> bool:
+        return self.mark in ("run", "run slow")
+
+
+def blocks(page: Path) -> list[Block]:
+    return [Block(m["mark"] or "", m["language"], m["code"]) for m in _BLOCK.finditer(page.read_text("utf-8"))]
+
+
+def named(page: Path) -> str:
+    return str(page.relative_to(ROOT / "docs"))
+
+
+def run_page(page: Path, folder: Path, slow: bool) -> None:
+    """Run a page's blocks in order; with `slow` all of them."""
+    (folder / "examples").symlink_to(ROOT / "examples", target_is_directory=True)
+    environment = os.environ | {
+        "PATH": f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}",
+        "COLUMNS": "100",
+    }
+    printed = None
+    for block in blocks(page):
+        if block.mark.startswith("file: "):
+            (folder / block.mark.removeprefix("file: ")).write_text(block.code, "utf-8")
+        elif block.mark == "prints" and printed is not None:
+            pattern = ".*".join(re.escape(line.strip()).replace("…", ".*") for line in block.code.splitlines())
+            assert re.search(pattern, printed, re.S), (
+                f"{named(page)} says\n{block.code}\nwhere this was printed:\n{printed}"
+            )
+        elif block.is_run:
+            printed = None
+            if block.mark == "run slow" and not slow:
+                continue
+            shell = ["bash", "-eu", "-o", "pipefail", "-c", block.code]
+            command = shell if block.language == "sh" else [sys.executable, "-W", "error", "-c", block.code]
+            done = subprocess.run(
+                command, cwd=folder, env=environment, capture_output=True, text=True, timeout=900, check=False
+            )
+            assert done.returncode == 0, f"{named(page)}\n{block.code}\n{done.stdout}\n{done.stderr}"
+            printed = done.stdout
+
+
+def test_the_pages_have_blocks_that_are_run() -> None:
+    run = {named(page): sum(block.is_run for block in blocks(page)) for page in PAGES}
+    assert run["tutorial.md"] >= 5 and sum(run.values()) >= 20
+
+
+@pytest.mark.parametrize("page", PAGES, ids=named)
+def test_every_block_says_whether_it_is_run(page: Path) -> None:
+    for block in blocks(page):
+        known = ("run", "run slow", "prints")
+        assert block.mark in ("", *known) or block.mark.startswith(("shown: ", "file: ")), block.mark
+        assert block.language != "", f"a block without a language: {block.code[:80]}"
+        if block.language in ("sh", "python"):
+            assert block.is_run or block.mark.startswith(("shown: ", "file: ")), block.code[:80]
+        if block.mark == "prints":
+            assert block.language == "text"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=named)
+def test_commands_exist_with_their_options(page: Path) -> None:
+    from certify.cli import app as certify
+    from controllers.cli import app as controllers
+
+    programs = {"certify": typer.main.get_command(certify), "controllers": typer.main.get_command(controllers)}
+    for block in blocks(page):
+        if block.language != "sh":
+            continue
+        for line in block.code.replace("\\\n", " ").splitlines():
+            words = shlex.split(line, comments=True)
+            if not words or words[0] not in programs:
+                continue
+            commands = getattr(programs[words[0]], "commands")  # noqa: B009
+            assert words[1] in commands, line
+            known = {name for parameter in commands[words[1]].params for name in parameter.opts}
+            until = next((k for k, word in enumerate(words) if word in ("|", "||", "&&", ">")), len(words))
+            given = {word for word in words[2:until] if word.startswith("--")}
+            assert given <= known | {"--help"}, f"{line}: {sorted(given - known)}"
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if any(b.mark == "run" for b in blocks(p))], ids=named)
+def test_what_a_page_runs_works(page: Path, tmp_path: Path) -> None:
+    run_page(page, tmp_path, slow=False)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [p for p in PAGES if any(b.mark == "run slow" for b in blocks(p))], ids=named)
+def test_all_that_a_page_runs_works(page: Path, tmp_path: Path) -> None:
+    run_page(page, tmp_path, slow=True)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The site, built as `make docs` builds it."""
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(folder)]
+    environment = os.environ | {"NO_MKDOCS_2_WARNING": "1"}
+    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert done.stdout + done.stderr == ""
+    return folder
+
+
+def test_the_site_is_whole_and_loads_nothing_from_elsewhere(site: Path) -> None:
+    html = {str(page.relative_to(site)): page.read_text("utf-8") for page in site.rglob("*.html")}
+    assert {str(page.relative_to(ROOT / "docs").with_suffix(".html")) for page in PAGES} <= set(html)
+    for name, text in html.items():
+        assert not _OUTSIDE.search(text), f"{name}: {_OUTSIDE.search(text)}"
+        assert 'class="mermaid"' not in text, name  # would be drawn by a program from elsewhere
+    for style in site.rglob("*.css"):
+        assert not re.search(r"""(?:@import|url\()\s*["']?(?:https?:)?//""", style.read_text("utf-8")), style
+    assert not list(site.rglob("*.py"))
+
+
+def test_formulas_become_mathml(site: Path) -> None:
+    for page in (site / "mathematics").glob("*.html"):
+        text = re.sub(r"<(code|pre|script|style)\b.*?</\1>", "", page.read_text("utf-8"), flags=re.S)
+        assert text.count("<math") > 5
+        plain = re.sub(r"<[^>]*>", "", text)
+        assert "$" not in plain and not re.search(r"\\[a-zA-Z]+", plain), page.name
+
+
+def test_the_reference_has_every_command_and_public_name(site: Path) -> None:
+    import certify
+    from certify.cli import app
+
+    commands = (site / "reference" / "commands.html").read_text("utf-8")
+    for name in getattr(typer.main.get_command(app), "commands"):  # noqa: B009
+        assert f">certify {name}<" in commands, name
+    python = (site / "reference" / "python.html").read_text("utf-8")
+    for name in certify.__all__:
+        assert name.startswith("_") or re.search(rf'id="[\w.]*\.{name}"', python), name
+
+
+def test_the_sites_packages_are_pinned() -> None:
+    pinned = {line.split("==")[0] for line in (ROOT / "constraints.txt").read_text().splitlines() if "==" in line}
+    assert {
+        "mkdocs",
+        "mkdocs-material",
+        "mkdocstrings",
+        "mkdocstrings-python",
+        "griffelib",
+        "l2m4m",
+        "latex2mathml",
+    } <= pinned
