@@ -473,7 +473,7 @@ def test_plot_draws_the_certified_set(proved: RoaResult, away: RoaResult, tmp_pa
 def test_a_set_of_four_states_is_drawn_in_planes() -> None:
     result = certify_roa("cartpole", ROOT / "examples/policies/cartpole.pt", candidate="lqr", level=1e-3)
     figure = result.plot()
-    assert len(figure.axes) == 2 and [a.get_xlabel()[:1] for a in figure.axes] == ["p", "θ"]
+    assert len(figure.axes) >= 2 and {a.get_xlabel()[:1] for a in figure.axes} >= {"p", "θ"}
     assert any("projection" in t.get_text() for t in figure.legends[0].get_texts())
 
 

@@ -21,7 +21,7 @@ def page_of(raw: bytes, path: Path, answer: dict[str, Any] | None, data: dict[st
 
 
 def figure_of(certificate: Certificate, accepted: bool) -> Figure:
-    """The sets of a certificate as a figure of matplotlib; see `certify.report.figures.sets`."""
-    from certify.report.figures.sets import sets
+    """The certified set as a figure of matplotlib, two columns of a paper wide."""
+    from certify.report.figures.paper import PaperOptions, set_figure
 
-    return sets(certificate, accepted)
+    return set_figure(certificate, accepted, PaperOptions(columns=2))

@@ -10,7 +10,7 @@ import io
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from certify.certificate import Certificate
 from certify.errors import InputError
@@ -20,6 +20,9 @@ from certify.report.figures.pairs import named_pairs
 from certify.report.figures.portrait import draw_plane, keys
 from certify.report.figures.scene import Scene, starts
 from certify.report.figures.style import RC, Key
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 FORMATS = ("pdf", "svg", "png")
 _WIDTHS = {1: 3.4, 2: 7.0}  # inches
@@ -70,6 +73,20 @@ def paper_figure(certificate: Certificate, accepted: bool, options: PaperOptions
     CertificateFormatError : there is no ellipsoid to draw.
     """
     import matplotlib
+
+    options = options or PaperOptions()
+    with matplotlib.rc_context({**RC, **_SMALL}):
+        return _bytes(set_figure(certificate, accepted, options), options.format)
+
+
+def set_figure(certificate: Certificate, accepted: bool, options: PaperOptions | None = None) -> Figure:
+    """The same as a figure of matplotlib, to be changed and saved by whoever asked for it.
+
+    Raises
+    ------
+    InputError, CertificateFormatError : as `paper_figure`.
+    """
+    import matplotlib
     from matplotlib.figure import Figure
 
     options = options or PaperOptions()
@@ -90,7 +107,7 @@ def paper_figure(certificate: Certificate, accepted: bool, options: PaperOptions
             spare.set_visible(False)
         legend = _draw(scene, panels[:count])
         _put_legend(figure, legend, down * panel)
-        return _bytes(figure, options.format)
+    return figure
 
 
 def _draw(scene: Scene, panels: Sequence[Any]) -> tuple[Key, ...]:
