@@ -1,7 +1,5 @@
 # `make roa` proves and checks the shipped policy, `make test` runs the suite, `make docs` builds the site into build/site.
 PYTHON ?= python3.11
-# Where torch built for the CPU lies: the default build for Linux brings 4 GB of CUDA libraries along.
-TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 BIN := .venv/bin
 
 .PHONY: setup roa test lint docs gallery clean
@@ -10,7 +8,7 @@ setup: .venv/.installed
 
 .venv/.installed: pyproject.toml constraints.txt
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install -q -c constraints.txt --extra-index-url $(TORCH_INDEX) torch
+	$(BIN)/pip install -q -c constraints.txt torch
 	$(BIN)/pip install -q -c constraints.txt -e '.[controllers,test]'
 	touch $@
 
