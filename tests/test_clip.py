@@ -380,3 +380,45 @@ def test_a_practical_claim_where_the_clip_acts_at_the_origin() -> None:
     assert verdict(document) == "ACCEPTED" and judge(document) is None
     too_low = edited(document, "levels.floor", (0.875).hex())
     assert verdict(too_low) == "ring" and judge(too_low) == "ring"
+
+
+# ------------------------------------------------------------------------------------------------- the inputs by form
+
+
+@pytest.mark.parametrize(
+    ("squash", "clip"), [("tanh", ([5.0], [6.0])), ("tanh", ([-6.0], [-5.0])), ("identity", ([5.0], [6.0]))]
+)
+def test_a_clip_beyond_the_range_of_the_squash_does_not_keep_the_input_there(squash: str, clip: Any) -> None:
+    """tanh(x) lies in [-2, 2], but clipped to [5, 6] the input is 5: condition 5 is false, whatever the squash."""
+    split = bytes([0, 255, 255])
+    data = make(
+        [["+", ["-", "x"], ["/", "u", "1000"]]], [([[1.0]], [0.0])], [[1.0]], (0.01, 1.0), claim="practical",
+        centre="none", squash=squash, scale=(1.0,), offset=(0.0,), clip=clip, input_bounds=(("-2", "2"),), tree=split,
+    )  # fmt: skip
+    data = grow(data, max_leaves=100)
+    assert verdict(data) == judge(data) == "inputs"
+    data["plant"]["input_bounds"] = [["-7", "7"]]
+    assert verdict(data) == "ACCEPTED" and judge(data) is None
+
+
+@given(
+    scale=st.floats(0.1, 4),
+    offset=st.floats(-4, 4),
+    low=st.floats(-6, 5),
+    width=st.floats(0.1, 4),
+    squash=st.booleans(),
+)
+def test_what_holds_by_form_holds_at_every_state(
+    scale: float, offset: float, low: float, width: float, squash: bool
+) -> None:
+    """Against the policy's values from one end of its range to the other, for bounds just wide enough and just not."""
+    network = TanhNetwork(
+        (np.array([[1.0]]),), (np.zeros(1),), np.array([scale]), np.array([offset]), "tanh" if squash else "identity",
+        "none", clip=(np.array([low]), np.array([low + width])),
+    )  # fmt: skip
+    values = network(np.linspace(-40, 40, 201)[:, None], (Fraction(0),))
+    least, most = Fraction(float(values.min())), Fraction(float(values.max()))
+    hair = Fraction(1, 10**9)
+    assert bounded_by_form(network, ((least - hair, most + hair),))
+    assert not bounded_by_form(network, ((least + hair, most + hair),))
+    assert not bounded_by_form(network, ((least - hair, most - hair),))

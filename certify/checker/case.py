@@ -54,13 +54,15 @@ class Case:
 
     @cached_property
     def bounded(self) -> bool:
-        """True if for each input the clip lies in the input bounds, or `offset +- scale` does and the centring keeps
-        the input there."""
-        policy, each = self.c.policy, range(len(self.c.inputs))
+        """True if each input lies in its bounds by form: what squash and centring leave of it, after the clip."""
+        policy, bounds = self.c.policy, self.c.input_bounds
+        known = policy.squash == "tanh" and policy.centre != "output"
         offset, scale = ([Fraction(v) for v in numbers.tolist()] for numbers in (policy.offset, policy.scale))
-        known = [policy.clip] if policy.clip else []  # pairs of the least and the largest values, by form
-        ranges = [[(Fraction(lo[j]), Fraction(hi[j])) for lo, hi in known] for j in each]
-        if policy.squash == "tanh" and policy.centre != "output":
-            ranges = [[*ranges[j], (offset[j] - abs(scale[j]), offset[j] + abs(scale[j]))] for j in each]
-        bounds = zip(ranges, self.c.input_bounds, strict=True)
-        return all(any(lo <= low and high <= hi for low, high in pairs) for pairs, (lo, hi) in bounds)
+        ranges = [(o - abs(s), o + abs(s)) for o, s in zip(offset, scale, strict=True)]
+        if policy.clip:
+            limits = list(zip(*([Fraction(v) for v in end.tolist()] for end in policy.clip), strict=True))
+            clipped = zip(ranges, limits, strict=True)
+            ranges = [(min(max(a, lo), hi), min(max(b, lo), hi)) for (a, b), (lo, hi) in clipped] if known else limits
+        elif not known:
+            return False
+        return all(lo <= a and b <= hi for (a, b), (lo, hi) in zip(ranges, bounds, strict=True))

@@ -10,18 +10,22 @@ from certify.policies.network import TanhNetwork
 
 
 def bounded_by_form(network: TanhNetwork, bounds: Sequence[tuple[Fraction, Fraction]]) -> bool:
-    """True if the clip, or else squash and centring, keeps every input in its bounds `(lo, hi)`, whatever the state."""
-    ranges: list[list[tuple[Fraction, Fraction]]] = [[] for _ in bounds]
-    if network.squash == "tanh" and network.centre != "output":
-        for known, o, s in zip(ranges, network.offset, network.scale, strict=True):
-            middle, reach = Fraction(float(o)), abs(Fraction(float(s)))
-            known.append((middle - reach, middle + reach))
+    """True if squash, centring and clip keep every input in its bounds `(lo, hi)`, whatever the state.
+
+    The clip comes last and is monotone: of a range [a, b] before it, it leaves the range between what it makes of a and
+    of b. That need not lie in [a, b], because the clip may lie elsewhere.
+    """
+    known = network.squash == "tanh" and network.centre != "output"
+    middles, reaches = ([Fraction(float(v)) for v in end] for end in (network.offset, network.scale))
+    ranges = [(o - abs(s), o + abs(s)) for o, s in zip(middles, reaches, strict=True)]
     if network.clip is not None:
-        for known, low, high in zip(ranges, *network.clip, strict=True):
-            known.append((Fraction(float(low)), Fraction(float(high))))
-    return all(
-        any(lo <= low and high <= hi for low, high in known) for known, (lo, hi) in zip(ranges, bounds, strict=True)
-    )
+        low, high = ([Fraction(float(v)) for v in end] for end in network.clip)
+        limits = list(zip(low, high, strict=True))
+        clipped = [tuple(min(max(v, lo), hi) for v in ends) for ends, (lo, hi) in zip(ranges, limits, strict=True)]
+        ranges = [(a, b) for a, b in clipped] if known else limits
+    elif not known:
+        return False
+    return all(lo <= a and b <= hi for (a, b), (lo, hi) in zip(ranges, bounds, strict=True))
 
 
 def raw_at_origin(network: TanhNetwork) -> tuple[Fraction | None, ...]:

@@ -128,13 +128,14 @@ def within_bounds(c: Certificate, ranges: Sequence[tuple[arb, arb]]) -> bool:
 
 
 def bounded_by_form(c: Certificate) -> bool:
-    """Whether for each input its clip lies in the bounds, or `offset +- scale` does and the centring keeps it there."""
+    """Whether each input lies in its bounds by form: what squash and centring leave of it, after the clip."""
     squashed = c.policy.centre != "output" and c.policy.squash == "tanh"
     each = zip(c.policy.scale, c.policy.offset, c.plant.input_bounds, strict=True)
     for j, (s, b, (lo, hi)) in enumerate(each):
         limits = c.policy.limits(j)
-        by_clip = limits is not None and bool(lo <= limits[0]) and bool(limits[1] <= hi)
-        by_squash = lo <= exact(b) - abs(exact(s)) and exact(b) + abs(exact(s)) <= hi
-        if not (by_clip or (squashed and by_squash)):
+        ends = (exact(b) - abs(exact(s)), exact(b) + abs(exact(s))) if squashed else limits
+        if ends is not None and limits is not None:
+            ends = (min(max(ends[0], limits[0]), limits[1]), min(max(ends[1], limits[0]), limits[1]))
+        if ends is None or not (lo <= ends[0] and ends[1] <= hi):
             return False
     return True
