@@ -38,7 +38,7 @@ _EXTRAS = {  # package: module, extra, what for
     "stable-baselines3": ("stable_baselines3", "baselines", "baselines of controllers compare; not needed to import"),
 }
 _OLDEST = (3, 11)
-_CPU = "choose Pip and CPU on PyTorch's installation page, and run the command that it shows"
+_CPU = "pip install torch, as PyTorch's installation page gives it for Pip and CPU"
 
 
 @dataclass(frozen=True, slots=True)
