@@ -10,7 +10,6 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import sys
 import tempfile
 import time
 import weakref
@@ -25,7 +24,7 @@ from numpy.typing import ArrayLike
 
 from certify.errors import InputError
 from certify.inputs import centred, lines, named_plant, policy_in, tell_of_other, where_valid
-from certify.installation import version_of
+from certify.installation import versions
 from certify.lyapunov import Candidate
 from certify.options import Asked, EngineName, RoaOptions
 from certify.policies import Policy, TanhNetwork
@@ -39,7 +38,6 @@ from certify.systems.equations import nearest
 if TYPE_CHECKING:
     import torch
 
-_PACKAGES = ("certify", "torch", "numpy", "scipy", "sympy", "python-flint")
 _POLICY_FILES = (".pt", ".pth", ".zip", ".onnx", ".safetensors")
 _WORDS = {"--from": "kind", "--precision": "dreal_precision"}  # options that Python calls otherwise
 
@@ -401,5 +399,4 @@ def _kind(value: object) -> str:
 
 def _provenance(policy: Any) -> dict[str, Any]:
     name = Path(policy).name if isinstance(policy, str | os.PathLike) else f"in memory, {_kind(policy)}"
-    versions = {package: version for package in _PACKAGES if (version := version_of(package)) is not None}
-    return {"policy": name, "python": sys.version.split()[0], **versions}
+    return {"policy": name, **versions()}

@@ -15,6 +15,7 @@ from typing import Literal
 
 Program = Literal["checker", "reference"]
 _HERE = Path(__file__).resolve().parent
+_PROVENANCE = ("certify", "torch", "numpy", "scipy", "sympy", "python-flint")
 
 
 def version_of(package: str) -> str | None:
@@ -23,6 +24,12 @@ def version_of(package: str) -> str | None:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
         return None
+
+
+def versions() -> dict[str, str]:
+    """Python's version and those of the packages that made a certificate, for its provenance."""
+    found = {package: version for package in _PROVENANCE if (version := version_of(package)) is not None}
+    return {"python": sys.version.split()[0], **found}
 
 
 def source_sha256(program: Program) -> str:

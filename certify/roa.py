@@ -312,11 +312,10 @@ class _Run:
         proof, problem = contender.attempt.proof(), contender.trial.task.problem
         if proof.claim is None or not isinstance(proof.evidence, PartitionTree) or contender.trial.task.exactly:
             return 0.0
-        from certify.engines.bounds.mend import leaves_that_meet, level_with_leaves
+        from certify.engines.bounds.mend import level_with_leaves
 
-        level = level_with_leaves(problem, proof.evidence, proof.claim, _SAMPLE)
+        level, count = level_with_leaves(problem, proof.evidence, proof.claim, _SAMPLE)
         claim = replace(proof.claim, roa=level)
-        count = leaves_that_meet(problem, proof.evidence, claim)
         before = self.seconds.get("check", 0.0)
         self._clerk().ask(Certificate(self.system, self.network, problem.V, claim, proof.evidence, self.provenance))
         return max(0.0, self.seconds["check"] - before - _START) / max(1, count)

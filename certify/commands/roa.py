@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import shlex
-import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -169,7 +168,6 @@ def _plant_line(stored: Policy, plant: System, overridden: bool) -> str:
 
 
 def _provenance(policy: Path) -> dict[str, Any]:
-    from importlib.metadata import version
+    from certify.installation import versions
 
-    packages = ("certify", "torch", "numpy", "scipy", "sympy", "python-flint")
-    return {"policy": policy.name, "python": sys.version.split()[0], **{p: version(p) for p in packages}}
+    return {"policy": policy.name, **versions()}

@@ -53,17 +53,13 @@ def below_leaf(problem: Problem, evidence: PartitionTree, leaf: int) -> float:
     return float(lowest[leaf]) * (1 - _SLACK)
 
 
-def level_with_leaves(problem: Problem, evidence: PartitionTree, claim: Claim, count: int) -> float:
-    """A level of the ring below which about so many leaves meet it: the whole ring's if there are no more."""
+def level_with_leaves(problem: Problem, evidence: PartitionTree, claim: Claim, count: int) -> tuple[float, int]:
+    """A level of the ring below which about so many leaves meet it, the whole ring's if there are no more, and how
+    many the checker has to bound for it."""
     lowest, highest = leaf_levels(problem, evidence)
     met = np.sort(lowest[(highest >= claim.inner) & (lowest <= claim.roa)])
-    return claim.roa if len(met) <= count else max(claim.inner, float(met[count]) * (1 - _SLACK))
-
-
-def leaves_that_meet(problem: Problem, evidence: PartitionTree, claim: Claim) -> int:
-    """How many leaves the checker has to bound."""
-    lowest, highest = leaf_levels(problem, evidence)
-    return int(np.sum((highest >= claim.inner) & (lowest <= claim.roa)))
+    level = claim.roa if len(met) <= count else max(claim.inner, float(met[count]) * (1 - _SLACK))
+    return level, int(np.sum(met <= level))
 
 
 def leaf_levels(problem: Problem, evidence: PartitionTree) -> tuple[Array, Array]:
