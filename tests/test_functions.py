@@ -104,7 +104,8 @@ def _in_balls(text: str) -> str:
     [
         ("tanh(x)", 0), ("exp(x)", 1), ("atan(x)", 0), ("sqrt(x + 4/9)", Fraction(2, 3)),
         ("1/sqrt(x + 4)", Fraction(1, 2)), ("sqrt(exp(x) + 3)", 2), ("sqrt(sqrt(16 + x))", 2),
-        ("tanh(x)*sqrt(1 + x)", 0),
+        ("tanh(x)*sqrt(1 + x)", 0), ("x*sqrt(x + 8)", 0), ("exp(1)*x", 0), ("x*exp(sqrt(2) + x)/cos(1)", 0),
+        ("sin(x)*sqrt(x**2 + 2) + 3", 3),
     ],
 )  # fmt: skip
 def test_exact_values(text: str, value: Fraction | int) -> None:
@@ -113,7 +114,8 @@ def test_exact_values(text: str, value: Fraction | int) -> None:
 
 @pytest.mark.parametrize(
     "text",
-    ["tanh(x + 1)", "exp(1 - x)", "atan(x + 1)", "sqrt(2 + x)", "sqrt(x)", "sqrt(x - 4)", "x*sqrt(x + 8)", "exp(1)*x"],
+    ["tanh(x + 1)", "exp(1 - x)", "atan(x + 1)", "sqrt(2 + x)", "sqrt(x)", "sqrt(x - 4)", "x*sqrt(x - 8)", "x*sqrt(x)",
+     "sqrt(2 + x) - sqrt(2)", "x + exp(1)", "x/sin(x)"],
 )  # fmt: skip
 def test_what_is_not_rational_is_not_decided(text: str) -> None:
     with pytest.raises(InputError):
@@ -316,6 +318,7 @@ HONEST: dict[str, Any] = {
     "exp": ["+", ["/", "x", "2"], ["exp", "u"], "-1"],
     "atan": ["+", ["/", "x", "2"], ["atan", "u"]],
     "sqrt": ["+", "u", ["-", ["sqrt", ["+", "4", "x"]], "2"]],
+    "drag": ["-", "u", ["*", "x", "1/10", ["sqrt", ["+", "2", ["**", "x", 2]]], ["exp", ["sin", "1"]]]],
 }
 
 
@@ -344,6 +347,14 @@ FORGED: list[tuple[str, str, Any]] = [  # rule, base, equation
     ("equilibrium", "sqrt", ["+", "u", ["*", "0", ["sqrt", "x"]]]),  # for half of the states undefined
     ("local", "sqrt", ["+", "u", ["*", "0", ["sqrt", ["+", "1/100000000", "x"]]]]),
     ("ring", "sqrt", ["+", "u", ["*", "0", ["sqrt", ["+", "1/4", "x"]]]]),  # undefined from -1/4 on
+    ("ring", "drag", ["+", "u", ["*", "0", ["sqrt", ["+", "1/3", "x"]]]]),  # and so with a root that is not rational
+    ("local", "drag", ["+", "u", ["*", "0", ["sqrt", ["+", "1/300000000", "x"]]]]),
+    ("local", "drag", ["+", "u", ["*", "x", ["/", "1", ["-", ["sqrt", "2"], ["sqrt", "2"]]]]]),  # 0/0 in disguise
+    ("local", "drag", ["+", "u", ["*", "0", ["sqrt", ["-", ["sin", "1"], "1"]]]]),
+    ("equilibrium", "drag", ["+", "u", ["*", "x", ["sqrt", ["+", "x", "-8"]]]]),
+    ("equilibrium", "drag", ["+", "u", ["*", "0", ["/", "1", "x"]]]),
+    ("equilibrium", "drag", ["+", "u", ["sqrt", "2"], ["-", ["sqrt", "2"]]]),
+    ("equilibrium", "drag", ["+", "u", ["*", "1/1000000", ["exp", "1"]]]),
     ("ring", "sqrt", ["+", "u", ["*", "0", ["sqrt", ["+", "1", "x"]]]]),  # not differentiable on the boundary alone
     ("ring", "sqrt", ["*", "u", ["sqrt", ["+", "1/4", "x"]]]),
     ("format", "sqrt", ["+", "u", ["sqrt", "x", "2"]]),

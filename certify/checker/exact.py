@@ -56,42 +56,47 @@ def _fraction(q: fmpq) -> Fraction:
 
 
 class Undecided(Exception):
-    """The value is not a rational that this arithmetic can name."""
+    """There is no value, or it is too long."""
 
 
 @dataclass(frozen=True)
 class Exact:
-    """A rational on the tape; functions only of exact 0, roots only of squares, no division by zero."""
+    """A number on the tape: a rational, or None for one that is none or is not known to be: functions are known at
+    exact 0, roots of squares. Exact 0 times None is 0, because rule `local` has shown that None is a number."""
 
-    value: Fraction
+    value: Fraction | None
+
+    def __post_init__(self) -> None:
+        """Powers of powers could grow without end."""
+        q = self.value
+        if q is not None and max(q.numerator.bit_length(), q.denominator.bit_length()) > MAX_BITS:
+            raise Undecided(f"a number of more than {MAX_BITS} bits")
 
     def __add__(self, other: Exact) -> Exact:
-        return Exact(self.small() + other.small())
+        return Exact(None if self.value is None or other.value is None else self.value + other.value)
 
     def __neg__(self) -> Exact:
-        return Exact(-self.value)
+        return Exact(None if self.value is None else -self.value)
 
     def __mul__(self, other: Exact) -> Exact:
-        return Exact(self.small() * other.small())
+        if self.value == 0 or other.value == 0:
+            return Exact(Fraction(0))
+        return Exact(None if self.value is None or other.value is None else self.value * other.value)
 
     def function(self, name: str) -> Exact:
-        if name == "inv" and self.value != 0:
-            return Exact(1 / self.value)
+        value = self.value
+        if value is None:
+            return self
+        if name == "inv":
+            if value == 0:
+                raise Undecided("a division by 0")
+            return Exact(1 / value)
         if name == "sqrt":
-            value = self.small()
-            root = Fraction(isqrt(max(value.numerator, 0)), isqrt(value.denominator))
-            if not (value > 0 and root * root == value):
-                raise Undecided("the root of what is not the square of a positive rational")
-            return Exact(root)
-        if name == "inv" or self.value != 0:
-            raise Undecided("division by zero" if name == "inv" else f"{name} of a number that is not 0")
-        return Exact(Fraction(int(name in ("cos", "exp"))))
-
-    def small(self) -> Fraction:
-        """The value itself; powers of powers could grow without end."""
-        if max(self.value.numerator.bit_length(), self.value.denominator.bit_length()) > MAX_BITS:
-            raise Undecided(f"a number of more than {MAX_BITS} bits")
-        return self.value
+            if value <= 0:
+                raise Undecided("the root of a number that is not positive")
+            root = Fraction(isqrt(value.numerator), isqrt(value.denominator))
+            return Exact(root if root * root == value else None)
+        return Exact(Fraction(int(name in ("cos", "exp"))) if value == 0 else None)
 
 
 def raw_at_origin(policy: Policy) -> list[Fraction | None]:

@@ -47,6 +47,8 @@ def equilibrium(case: Case) -> Failures:
         yield "plant.dynamics", f"f(0, u_eq) is not decided exactly: {error}"
     else:
         for name, f in zip(c.states, F, strict=True):
+            if f.value is None:
+                yield name, "f(0, u_eq) is not decided exactly: it is no number that rationals know"
             if f.value != 0:
                 yield name, "f(0, u_eq) must be 0"
     return len(c.states)

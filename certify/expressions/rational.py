@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
 
 import sympy
@@ -15,32 +16,58 @@ from certify.expressions.tree import AT_ZERO
 _MOST_BITS = 2**14  # of a number on the way: powers of powers grow without end
 
 
-class _Rational(Algebra[Fraction]):
-    """Functions have a rational value at exact 0 only, square roots at squares of rationals; only these are used."""
+@dataclass(frozen=True, slots=True)
+class _Unnamed:
+    """A number that rationals do not name, and what it is in words; nothing else is said of it."""
 
-    def constant(self, q: Fraction) -> Fraction:
+    words: str
+
+
+_Number = Fraction | _Unnamed
+
+
+class _Rational(Algebra[_Number]):
+    """Functions have a rational value at exact 0 only, square roots at squares of rationals.
+
+    Exact 0 times any other number is 0: that there is such a number is for the checkers' rule `local` to show.
+    """
+
+    def constant(self, q: Fraction) -> _Number:
         return q
 
-    def total(self, constant: Fraction | None, terms: object) -> Fraction:
-        return _small(super().total(constant, terms))  # type: ignore[arg-type]
+    def total(self, constant: Fraction | None, terms: Sequence[_Number]) -> _Number:
+        result = constant or Fraction(0)
+        for term in terms:
+            if isinstance(term, _Unnamed):
+                return term
+            result = _small(result + term)
+        return result
 
-    def product(self, constant: Fraction | None, factors: object) -> Fraction:
-        return _small(super().product(constant, factors))  # type: ignore[arg-type]
+    def product(self, constant: Fraction | None, factors: Sequence[_Number]) -> _Number:
+        factors = [Fraction(1) if constant is None else constant, *factors]
+        if Fraction(0) in factors:
+            return Fraction(0)
+        result = Fraction(1)
+        for factor in factors:
+            if isinstance(factor, _Unnamed):
+                return factor
+            result = _small(result * factor)
+        return result
 
-    def inverse(self, value: Fraction) -> Fraction:
+    def inverse(self, value: _Number) -> _Number:
         if value == 0:
             raise InputError("it divides by 0")
-        return 1 / value
+        return value if isinstance(value, _Unnamed) else 1 / value
 
-    def function(self, name: str, value: Fraction) -> Fraction:
+    def function(self, name: str, value: _Number) -> _Number:
+        if isinstance(value, _Unnamed):
+            return value
         if name == "sqrt":
-            root = Fraction(math.isqrt(max(value.numerator, 0)), math.isqrt(value.denominator))
-            if not (value > 0 and root * root == value):
-                raise InputError(f"sqrt of {value}, which is not the square of a positive rational, has no exact value")
-            return root
-        if value != 0:
-            raise InputError(f"{name} of {value} has no exact value")
-        return Fraction(AT_ZERO[name])
+            if value <= 0:
+                raise InputError(f"it takes the square root of {value}, and the root is smooth at positive numbers only")
+            root = Fraction(math.isqrt(value.numerator), math.isqrt(value.denominator))
+            return root if root * root == value else _Unnamed(f"sqrt of {value}, which is not the square of a rational")
+        return _Unnamed(f"{name} of {value}") if value != 0 else Fraction(AT_ZERO[name])
 
 
 def evaluate_exactly(expression: sympy.Expr, values: Mapping[sympy.Symbol, Fraction]) -> Fraction:
@@ -48,10 +75,13 @@ def evaluate_exactly(expression: sympy.Expr, values: Mapping[sympy.Symbol, Fract
 
     Raises
     ------
-    InputError : it divides by 0, a function stands at another point than 0 (a square root at a number that is not the
-        square of a positive rational), or a number grows too long.
+    InputError : it divides by 0, takes the root of a number that is not positive, or a number grows too long; or the
+        value is that of a function at another point than 0 (of a square root at a number that is no square).
     """
-    return evaluate(expression, values, _Rational())
+    value = evaluate(expression, values, _Rational())
+    if isinstance(value, _Unnamed):
+        raise InputError(f"{value.words} has no exact value")
+    return value
 
 
 def _small(q: Fraction) -> Fraction:

@@ -63,34 +63,45 @@ def root(c: Certificate, tree: Tree, inverse: list[fmpq]) -> None:
 
 @dataclass(frozen=True)
 class Exact:
-    """A rational number on the way to f(0, u_eq)."""
+    """A number on the way to f(0, u_eq); the rationals do not tell the value of one that is `UNTOLD`."""
 
-    value: fmpq
+    value: fmpq | None
 
     def __post_init__(self) -> None:
-        require(
-            self.value.height_bits() <= MAX_BITS, "equilibrium", "dynamics", f"a number of more than {MAX_BITS} bits"
-        )
+        short = self.value is None or self.value.height_bits() <= MAX_BITS
+        require(short, "equilibrium", "dynamics", f"a number of more than {MAX_BITS} bits")
 
     def __add__(self, other: Exact) -> Exact:
+        if self.value is None or other.value is None:
+            return UNTOLD
         return Exact(self.value + other.value)
 
     def __mul__(self, other: Exact) -> Exact:
+        if ZERO in (self.value, other.value):
+            return Exact(ZERO)
+        if self.value is None or other.value is None:
+            return UNTOLD
         return Exact(self.value * other.value)
 
     def __neg__(self) -> Exact:
-        return Exact(-self.value)
+        return UNTOLD if self.value is None else Exact(-self.value)
 
     def function(self, name: str) -> Exact:
+        if self.value is None:
+            return UNTOLD
+        if name == "1/":
+            require(bool(self.value != 0), "equilibrium", "dynamics", "a division by 0")
+            return Exact(1 / self.value)
         if name == "sqrt":
             numerator, denominator = int(self.value.p), int(self.value.q)
-            roots = math.isqrt(max(numerator, 0)), math.isqrt(denominator)
-            square = numerator > 0 and roots[0] ** 2 == numerator and roots[1] ** 2 == denominator
-            require(square, "equilibrium", "dynamics", "sqrt of what is not the square of a positive rational")
-            return Exact(fmpq(*roots))
-        known = (self.value == 0) != (name == "1/")
-        require(known, "equilibrium", "dynamics", "a division by 0" if name == "1/" else f"{name} of what is not 0")
-        return Exact(1 / self.value if name == "1/" else fmpq(name in ("cos", "exp")))
+            require(numerator > 0, "equilibrium", "dynamics", "sqrt of what is not positive")
+            roots = math.isqrt(numerator), math.isqrt(denominator)
+            square = roots[0] ** 2 == numerator and roots[1] ** 2 == denominator
+            return Exact(fmpq(*roots)) if square else UNTOLD
+        return UNTOLD if self.value != 0 else Exact(fmpq(name in ("cos", "exp")))
+
+
+UNTOLD = Exact(None)
 
 
 def equilibrium(c: Certificate) -> None:
@@ -98,7 +109,8 @@ def equilibrium(c: Certificate) -> None:
     names = {name: Exact(ZERO) for name in c.plant.states}
     names.update(zip(c.plant.inputs, map(Exact, c.plant.u_eq), strict=True))
     for i, component in enumerate(c.plant.dynamics.evaluate(names, Exact)):
-        require(bool(component.value == 0), "equilibrium", f"dynamics.{i}", "f(0, u_eq) is not 0")
+        zero = component.value is not None and bool(component.value == 0)
+        require(zero, "equilibrium", f"dynamics.{i}", "f(0, u_eq) is not 0, or the rationals do not tell")
 
 
 def centring(c: Certificate) -> None:
