@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 
-from certify.engines.base import Attempt, Budget, Progress
+from certify.engines.base import Attempt, Budget, Once, Progress
 from certify.lyapunov import volume
 from certify.trials import Trial, by_reach
 
@@ -96,7 +96,7 @@ class Race:
             contenders = [c for c in self.open if c in contenders]
 
     def _heat(self, contender: Contender, seconds: float) -> None:
-        for share in (_FIRST_LOOK, 1 - _FIRST_LOOK):
+        for share in (1.0,) if isinstance(contender.attempt, Once) else (_FIRST_LOOK, 1 - _FIRST_LOOK):
             contender.advance(Budget(max(1e-3, min(share * seconds, self.left())), self.boxes), self.report)
             if contender.hopeless:
                 return

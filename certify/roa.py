@@ -203,7 +203,7 @@ class _Run:
         self._tell("candidate")
         with self._stage("candidate"):
             trials = solved(loop, options)
-        large = self._optimised(partial(optimised, loop, options)) if self.interruptible else None
+        large = self._optimised(partial(optimised, loop, options)) if options.engine != "dreal" else None
         trials += [] if large is None else [large]
         race = self._contest()
         if not self.interruptible:

@@ -32,7 +32,9 @@ def test_text_is_decimal_and_a_float_is_binary() -> None:
     assert exact("1e-3") == Fraction(1, 1000)
 
 
-@pytest.mark.parametrize("value", ["", "abc", "1/0", "nan", "inf", float("nan"), float("inf")])
+@pytest.mark.parametrize(
+    "value", ["", "abc", "1/0", "nan", "inf", "1e999999999", "-1E-999999999", "1e", float("nan"), float("inf")]
+)
 def test_what_is_no_number_is_refused(value: object) -> None:
     with pytest.raises(InputError, match="mass"):
         exact(value, "mass")  # type: ignore[arg-type]

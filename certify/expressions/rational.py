@@ -64,7 +64,9 @@ class _Rational(Algebra[_Number]):
             return value
         if name == "sqrt":
             if value <= 0:
-                raise InputError(f"it takes the square root of {value}, and the root is smooth at positive numbers only")
+                raise InputError(
+                    f"it takes the square root of {value}, and the root is smooth at positive numbers only"
+                )
             root = Fraction(math.isqrt(value.numerator), math.isqrt(value.denominator))
             return root if root * root == value else _Unnamed(f"sqrt of {value}, which is not the square of a rational")
         return _Unnamed(f"{name} of {value}") if value != 0 else Fraction(AT_ZERO[name])

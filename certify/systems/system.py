@@ -15,7 +15,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from decimal import Decimal
+from decimal import Decimal, InvalidOperation
 from fractions import Fraction
 from types import MappingProxyType
 from typing import Any
@@ -27,6 +27,8 @@ from certify.expressions import GRAMMAR, evaluate_exactly, has_tree
 
 Interval = tuple[Fraction, Fraction]
 
+_MOST_DIGITS = 1000  # before or after the point: 1e999999999 would fill the memory
+
 
 def exact(value: Fraction | float | int | str | Decimal, name: str = "value") -> Fraction:
     """Exact rational of a number: text means its decimal value, a float its binary value.
@@ -37,8 +39,10 @@ def exact(value: Fraction | float | int | str | Decimal, name: str = "value") ->
     if isinstance(value, float) and not math.isfinite(value):
         raise InputError(f"`{name}` must be a finite number; found {value}.")
     try:
+        if isinstance(value, str) and "e" in value.lower() and abs(Decimal(value).adjusted()) > _MOST_DIGITS:
+            raise OverflowError(value)
         return Fraction(value)
-    except (ValueError, TypeError, OverflowError, ZeroDivisionError) as error:
+    except (ValueError, TypeError, OverflowError, ZeroDivisionError, InvalidOperation) as error:
         raise InputError(f"`{name}` must be a finite number such as 0.15 or 3/20; found {value!r}.") from error
 
 

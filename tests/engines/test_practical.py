@@ -12,6 +12,7 @@ import sympy
 
 from certify.certificate import run_checker
 from certify.claims import Practical
+from certify.closed_loop import ClosedLoop
 from certify.engines.base import Budget, Proof, Task
 from certify.engines.bounds.engine import BoundsEngine
 from certify.engines.bounds.search import prove_inwards
@@ -23,6 +24,7 @@ from certify.rigorous import evaluate_vdot
 from certify.roa import RoaOptions, certify_roa
 from certify.running import ThreadRunner
 from certify.systems import System, get_system
+from certify.trials import optimised
 from certify.verdict import Stop, Verdict
 from tests.engines.test_bounds import planted, vdot
 from tests.support.cases import Case, case_of
@@ -188,3 +190,23 @@ def test_an_exact_level(tmp_path: Path) -> None:
     assert result.verdict is Verdict.PROVED and result.levels.roa == 2.0
     outside = certify_roa(*uncentred(), tmp_path, RoaOptions(claim="practical", level=1e6))
     assert outside.verdict is Verdict.REFUTED and outside.stop is Stop.DOMAIN
+
+
+def test_the_point_that_ends_the_outer_level_is_told() -> None:
+    """u = -x leaves [-1, 1] at |x| = 1."""
+    system, network = off_the_origin(Fraction(1, 4))
+    case = case_of(dataclasses.replace(system, input_bounds=box(1)), network)
+    proof = prove(case)
+    assert isinstance(proof.claim, Practical) and proof.witness is not None
+    assert proof.witness.kind == "input" and proof.claim.roa <= proof.witness.level
+    assert abs(abs(proof.witness.x[0]) - 1) < 1e-6 and proof.claim.roa > 0.99 * float(case.P[0, 0])
+
+
+def test_the_optimised_candidate_is_that_of_the_centred_loop() -> None:
+    """Under the policy as it is no V decreases near the origin, and the optimiser finds nothing."""
+    system, network = uncentred()
+    loop, centred = (ClosedLoop(system, dataclasses.replace(network, centre=c)) for c in ("none", "output"))
+    found, known = optimised(loop, PRACTICAL), optimised(centred, RoaOptions(claim="asymptotic"))
+    assert found is not None and known is not None and np.array_equal(found.P, known.P)
+    assert found.task.kind == "practical" and found.task.problem.loop is loop
+    assert 0 < found.volume <= 1.01 * known.volume

@@ -13,14 +13,14 @@ from certify.certificate import PartitionTree
 from certify.claims import Asymptotic, Practical
 from certify.engines.base import Attempt, Budget, Engine, Once, Proof, Report, Task
 from certify.engines.bounds.search import Pass, RingProof, empty_ring, outwards, prove_inwards, prove_outwards
-from certify.engines.falsify import Band, survey
+from certify.engines.falsify import Band, Witness, survey
 from certify.engines.local import prove_local
 from certify.running import Runner
 from certify.verdict import Stop
 
 Array = NDArray[np.float64]
-_SHARE = 0.4  # of the time, for finding c2 before c0
-_TRIES = 4  # inner levels from which c2 is looked for
+_SHARE = 0.6  # of the time, for finding c2 before c0
+_TRIES = 4  # inner levels from which c2 is looked for, each with half of the time that is left for it
 
 
 class BoundsEngine(Engine):
@@ -55,9 +55,11 @@ class BoundsEngine(Engine):
     def _in_band(self, task: Task, band: Band, budget: Budget, report: Report | None) -> Proof:
         """The largest c2, then the smallest c0 for it, from levels between which no violation was sampled."""
         start = time.perf_counter()
-        outer, stop = task.target, Stop.REQUESTED
+        outer, stop, witness = task.target, Stop.REQUESTED, None
         if not task.exactly:
-            outer, stop = self._outer_level(task, band, replace(budget, seconds=_SHARE * budget.seconds), report)
+            outer, stop, witness = self._outer_level(
+                task, band, replace(budget, seconds=_SHARE * budget.seconds), report
+            )
         left = replace(budget, seconds=budget.seconds - (time.perf_counter() - start))
         ring = prove_inwards(task.problem, self.T, band.below, outer, left, self.runner, report)
         if not ring.inner < ring.outer:
@@ -65,18 +67,21 @@ class BoundsEngine(Engine):
         if not ring.covered:
             why = f"F and its inputs are not enclosed on all of V <= {ring.inner:.6g}"
             return Proof(None, None, Stop.SMOOTH, why, boxes=ring.boxes)
-        return replace(self.stated(ring, Practical(roa=ring.outer, floor=ring.inner), {}), stop=stop)
+        return replace(self.stated(ring, Practical(roa=ring.outer, floor=ring.inner), {}), stop=stop, witness=witness)
 
-    def _outer_level(self, task: Task, band: Band, budget: Budget, report: Report | None) -> tuple[float, Stop]:
+    def _outer_level(
+        self, task: Task, band: Band, budget: Budget, report: Report | None
+    ) -> tuple[float, Stop, Witness | None]:
         """The largest c2 that a ring from somewhat above the floor reaches, and what stopped it."""
         inner = min(4 * band.floor, math.sqrt(band.floor * band.top))
-        part = replace(budget, seconds=budget.seconds / _TRIES)
+        end = time.perf_counter() + budget.seconds
         for _ in range(_TRIES):
+            part = replace(budget, seconds=max(1e-3, (end - time.perf_counter()) / 2))
             ring = prove_outwards(task.problem, self.T, inner, band.above, part, self.runner, report)
             if ring.outer > inner:
                 break
             inner = math.sqrt(inner * band.top)
-        return ring.outer, ring.stop
+        return ring.outer, ring.stop, ring.witness
 
     def stated(self, ring: RingProof, claim: Asymptotic | Practical, seconds: dict[str, float]) -> Proof:
         """The proof of a claim from a ring's."""
