@@ -6,7 +6,9 @@ from certify.certificate.checking import run_checker
 from certify.certificate.limits import require_short, require_within_limits
 from certify.certificate.model import (
     Certificate,
+    LocalBall,
     PartitionTree,
+    Slab,
     TrustedSolver,
     parse_certificate,
     read_certificate,
@@ -17,7 +19,9 @@ from certify.certificate.writing import sole_writer, write_atomically, write_bes
 
 __all__ = [
     "Certificate",
+    "LocalBall",
     "PartitionTree",
+    "Slab",
     "TrustedSolver",
     "leaves",
     "parse_certificate",

@@ -23,7 +23,7 @@ import numpy as np
 import sympy
 from numpy.typing import NDArray
 
-from certify.claims import CLAIMS, Claim
+from certify.claims import CLAIMS, Claim, Enlarged
 from certify.errors import CertificateFormatError
 from certify.expressions import from_tree, to_tree
 from certify.lyapunov.function import Quadratic
@@ -31,20 +31,49 @@ from certify.policies import TanhNetwork
 from certify.systems import System
 
 Array = NDArray[np.float64]
-SCHEMA = "certify-certificate/3"
+SCHEMA = "certify-certificate/4"
 """Of each claim's kind, what the file calls the inner level."""
 MAX_BYTES = 256 * 2**20
 _LONGEST_UNIT = 40
 
 
 @dataclass(frozen=True, slots=True)
+class LocalBall:
+    """Evidence of the local proof: a ball x = J d, ||d|| <= 1, J (n, n), that contains {V <= c1}, and `multipliers`
+    (3, n) of the matrix inequality on it."""
+
+    J: Array
+    multipliers: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Slab:
+    """A piece of a tube: up to the ellipsoid {x'Px <= 1} of `end` (n, n), for `duration` units of time, on a ball J
+    (n, n) that contains it and the one before, with `multipliers` (3, n)."""
+
+    end: Array
+    duration: float
+    J: Array
+    multipliers: Array
+
+
+@dataclass(frozen=True, slots=True)
 class PartitionTree:
-    """Evidence that the checker replays: T (n, n) and root (n,), half-widths of the root box in z, x = T z; `tree` is
-    the partition in preorder, one byte a node."""
+    """Evidence that the checker replays.
+
+    Parameters
+    ----------
+    T, root : (n, n) and (n,), half-widths of the root box in z, x = T z.
+    tree : the partition in preorder, one byte a node.
+    local : of the local proof; None where the claim has none.
+    tube : the slabs, in their order, of a claim that is enlarged by a tube.
+    """
 
     T: Array
     root: Array
     tree: bytes
+    local: LocalBall | None = None
+    tube: tuple[Slab, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +130,7 @@ class Certificate:
         system, network = self.system, self.network
         sections: dict[str, Any] = {
             "schema": SCHEMA,
-            "claim": {"kind": self.claim.kind},
+            "claim": {"kind": self.claim.kind} | _start(self.claim),
             "plant": {
                 "name": system.name,
                 "states": [s.name for s in system.states],
@@ -208,7 +237,7 @@ def parse_certificate(raw: bytes, name: str) -> Certificate:
             system=system,
             network=network,
             V=Quadratic(_decode(data["lyapunov"]["P"], (n, n))),
-            claim=CLAIMS[data["claim"]["kind"]](**{k: float.fromhex(v) for k, v in data["levels"].items()}),
+            claim=_read_claim(data, n),
             evidence=_read_evidence(evidence, n),
             provenance=provenance,
         )
@@ -216,6 +245,13 @@ def parse_certificate(raw: bytes, name: str) -> Certificate:
         raise
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise CertificateFormatError(f"{name} is not a certificate: {type(error).__name__}: {error}.") from error
+
+
+def _read_claim(data: Mapping[str, Any], n: int) -> Claim:
+    levels = {k: float.fromhex(v) for k, v in data["levels"].items()}
+    if data["claim"]["kind"] == Enlarged.kind:
+        return Enlarged(**levels, start=Quadratic(_decode(data["claim"]["start"], (n, n))))
+    return CLAIMS[data["claim"]["kind"]](**levels)
 
 
 def _for_people(system: System) -> dict[str, dict[str, str]]:
@@ -256,6 +292,11 @@ def _evidence(evidence: PartitionTree | TrustedSolver) -> dict[str, Any]:
             "T": _encode(evidence.T),
             "root": _encode(evidence.root),
             "tree": base64.b64encode(evidence.tree).decode("ascii"),
+            "local": None if evidence.local is None else _ball(evidence.local),
+            "tube": [
+                {"end": _encode(slab.end), "duration": float(slab.duration).hex()} | _ball(slab)
+                for slab in evidence.tube
+            ],
         }
     return {
         "kind": "trusted-solver",
@@ -268,10 +309,31 @@ def _evidence(evidence: PartitionTree | TrustedSolver) -> dict[str, Any]:
 
 def _read_evidence(data: Mapping[str, Any], n: int) -> PartitionTree | TrustedSolver:
     if data["kind"] == "partition-tree":
-        root = _decode(data["root"], (n,))
-        return PartitionTree(_decode(data["T"], (n, n)), root, base64.b64decode(data["tree"]))
+        root, local = _decode(data["root"], (n,)), data["local"]
+        return PartitionTree(
+            _decode(data["T"], (n, n)),
+            root,
+            base64.b64decode(data["tree"]),
+            None if local is None else LocalBall(*_read_ball(local, n)),
+            tuple(
+                Slab(_decode(slab["end"], (n, n)), float.fromhex(slab["duration"]), *_read_ball(slab, n))
+                for slab in data["tube"]
+            ),
+        )
     queries = tuple((str(name), str(answer)) for name, answer in data["queries"])
     return TrustedSolver(str(data["solver"]), str(data["version"]), float.fromhex(data["precision"]), queries)
+
+
+def _ball(evidence: LocalBall | Slab) -> dict[str, str]:
+    return {"J": _encode(evidence.J), "multipliers": _encode(evidence.multipliers)}
+
+
+def _read_ball(data: Mapping[str, str], n: int) -> tuple[Array, Array]:
+    return _decode(data["J"], (n, n)), _decode(data["multipliers"], (3, n))
+
+
+def _start(claim: Claim) -> dict[str, str]:
+    return {"start": _encode(claim.start.P)} if isinstance(claim, Enlarged) else {}
 
 
 def _read_clip(data: Any, m: int) -> tuple[Array, Array] | None:

@@ -7,8 +7,11 @@ from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
 
-from .document import Certificate, Partition
-from .exact import Matrix, congruence, gershgorin_lower, inverse_diagonal, rational
+from flint import fmpq_mat
+
+from .document import Certificate, LocalBall, Partition, Slab
+from .exact import exactly, gershgorin_lower, inverse_diagonal
+from .float64 import Array
 from .network import Folded, fold
 
 Failures = Generator[tuple[str, str], None, int]  # what a rule makes: each failure's (place, detail); how much it met
@@ -27,20 +30,38 @@ class Case:
             raise TypeError("this rule is about a partition tree")
         return self.c.evidence
 
+    @property
+    def local(self) -> LocalBall:
+        """The evidence of rule `local`, of a certificate that has it."""
+        if self.partition.local is None:
+            raise TypeError("this rule is about a local ball")
+        return self.partition.local
+
+    @property
+    def tube(self) -> tuple[Slab, ...]:
+        """The slabs, none but for an enlarged claim."""
+        return self.partition.tube
+
+    @property
+    def nodes(self) -> list[Array]:
+        """P_0, ..., P_N of an enlarged claim; empty for the others."""
+        return [] if self.c.start is None else [self.c.start, *(slab.end for slab in self.tube)]
+
     @cached_property
     def P_inverse(self) -> list[Fraction]:
         """The diagonal of P^-1."""
-        return inverse_diagonal(rational(self.c.P)) or []
+        return inverse_diagonal(exactly(self.c.P))
 
     @cached_property
-    def S(self) -> Matrix:
+    def S(self) -> fmpq_mat:
         """T'PT."""
-        return congruence(rational(self.partition.T), rational(self.c.P))
+        T = exactly(self.partition.T)
+        return T.transpose() * exactly(self.c.P) * T
 
     @cached_property
     def S_inverse(self) -> list[Fraction]:
         """The diagonal of S^-1."""
-        return inverse_diagonal(self.S) or []
+        return inverse_diagonal(self.S)
 
     @cached_property
     def least(self) -> Fraction:

@@ -9,6 +9,7 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
+from flint import fmpq
 from numpy.typing import NDArray
 
 from .errors import Rejected
@@ -16,7 +17,8 @@ from .expression import Tape, parse_dynamics
 from .schema import Value
 from .strict import MAX_VALUES, load
 
-MAX_STATES, MAX_LAYERS, MAX_WIDTH = 64, 64, 2**14
+MAX_STATES, MAX_LAYERS, MAX_WIDTH, MAX_SLABS = 64, 64, 2**14, 10**4
+CLAIMS = ("asymptotic", "practical", "enlarged")
 Array = NDArray[np.float64]
 Intervals = tuple[tuple[Fraction, Fraction], ...]
 
@@ -44,12 +46,41 @@ class Policy:
 
 
 @dataclass(frozen=True)
+class Multipliers:
+    """alpha, beta and g of the inequality `decrease`, n of each."""
+
+    rest: tuple[fmpq, ...]
+    apart: tuple[fmpq, ...]
+    joint: tuple[fmpq, ...]
+
+
+@dataclass(frozen=True)
+class LocalBall:
+    """The ball x = J d, ||d|| <= 1, and multipliers on it."""
+
+    J: Array
+    multipliers: Multipliers
+
+
+@dataclass(frozen=True)
+class Slab:
+    """A piece of the tube up to the node `end`, in its time, with a ball that contains it and multipliers on it."""
+
+    end: Array
+    duration: float
+    J: Array
+    multipliers: Multipliers
+
+
+@dataclass(frozen=True)
 class Partition:
-    """Evidence that is replayed: a partition tree of the box |z| <= root, x = T z."""
+    """Evidence that is replayed: a partition tree of the box |z| <= root, x = T z; the local ball; the tube's slabs."""
 
     T: Array
     root: Array
     tree: bytes
+    local: LocalBall | None
+    tube: tuple[Slab, ...]
 
 
 @dataclass(frozen=True)
@@ -81,6 +112,7 @@ class Certificate:
     levels: dict[str, float]
     evidence: Partition | Trusted
     sha256: str
+    start: Array | None = None  # P_0 of an enlarged claim
 
     @property
     def practical(self) -> bool:
@@ -105,17 +137,28 @@ def certificate(data: Any, sha256: str) -> Certificate:
     """A JSON value as a certificate."""
     keys = "schema claim plant policy lyapunov levels evidence provenance"
     schema, claim, plant, policy, lyapunov, levels, evidence, provenance = Value(data).keys(keys)
-    schema.choice("certify-certificate/3")
-    kind = claim.keys("kind")[0].choice("asymptotic", "practical")
+    schema.choice("certify-certificate/4")
+    known = isinstance(claim.raw, dict) and claim.raw.get("kind") in CLAIMS
+    claim.must(known, f"an object of kind {' or '.join(CLAIMS)}")
+    kind = claim.raw["kind"]
     stated = _plant(plant)
     n, m = len(stated["states"]), len(stated["inputs"])
     stated["policy"] = _policy(policy, n, m)
+    start = claim.keys("kind start" if kind == "enlarged" else "kind")[1:]
     form, P = lyapunov.keys("kind P")
     form.choice("quadratic")
     edges = ("floor" if kind == "practical" else "local", "roa")
     numbers = {edge: level.binary64() for edge, level in zip(edges, levels.keys(" ".join(edges)), strict=True)}
     provenance.must(isinstance(provenance.raw, dict), "an object")
-    return Certificate(kind, **stated, P=P.array(n, n), levels=numbers, evidence=_evidence(evidence, n), sha256=sha256)
+    return Certificate(
+        kind,
+        **stated,
+        P=P.array(n, n),
+        levels=numbers,
+        evidence=_evidence(evidence, n, kind),
+        sha256=sha256,
+        start=start[0].array(n, n) if start else None,
+    )
 
 
 def _plant(plant: Value) -> dict[str, Any]:
@@ -154,6 +197,27 @@ def _policy(value: Value, n: int, m: int) -> Policy:
     return policy
 
 
+def _local(value: Value, n: int, claim: str) -> LocalBall | None:
+    if claim == "practical":
+        value.must(value.raw is None, "null under this claim")
+        return None
+    J, multipliers = value.keys("J multipliers")
+    return LocalBall(J.array(n, n), _multipliers(multipliers, n))
+
+
+def _slab(value: Value, n: int) -> Slab:
+    end, duration, J, multipliers = value.keys("end duration J multipliers")
+    return Slab(end.array(n, n), duration.binary64(), J.array(n, n), _multipliers(multipliers, n))
+
+
+def _multipliers(value: Value, n: int) -> Multipliers:
+    rows = value.array(3, n)
+    value.must(bool(np.all(rows >= 0)), "numbers that are not negative")
+    value.must(bool(np.all(rows[1] > 0) or np.all(rows[2] > 0)), "rows of which the second or the third is positive")
+    rest, apart, joint = (tuple(fmpq(*v.as_integer_ratio()) for v in row) for row in rows.tolist())
+    return Multipliers(rest, apart, joint)
+
+
 def _clip(value: Value, m: int) -> tuple[Array, Array] | None:
     if value.raw is None:
         return None
@@ -168,12 +232,14 @@ def check_hash(policy: Policy, stated: Any) -> None:
         raise Rejected("hash", "policy.sha256", "does not match the layers in the file")
 
 
-def _evidence(value: Value, n: int) -> Partition | Trusted:
-    known = isinstance(value.raw, dict) and value.raw.get("kind") in ("partition-tree", "trusted-solver")
-    value.must(known, "an object of kind partition-tree or trusted-solver")
+def _evidence(value: Value, n: int, claim: str) -> Partition | Trusted:
+    kinds = ("partition-tree", *(() if claim == "enlarged" else ("trusted-solver",)))
+    known = isinstance(value.raw, dict) and value.raw.get("kind") in kinds
+    value.must(known, f"an object of kind {' or '.join(kinds)}")
     if value.raw["kind"] == "partition-tree":
-        _, T, root, tree = value.keys("kind T root tree")
-        return Partition(T.array(n, n), root.array(n), tree.octets())
+        _, T, root, tree, local, tube = value.keys("kind T root tree local tube")
+        slabs = tube.listed(lambda slab: _slab(slab, n), *((1, MAX_SLABS) if claim == "enlarged" else (0, 0)))
+        return Partition(T.array(n, n), root.array(n), tree.octets(), _local(local, n, claim), slabs)
     _, solver, version, precision, queries = value.keys("kind solver version precision queries")
     precision.must(precision.binary64() > 0, "positive")
     answers = queries.listed(lambda pair: pair.listed(Value.word, 2), 0, MAX_VALUES)

@@ -12,46 +12,58 @@ from numpy.typing import NDArray
 
 from .document import Policy
 
-Matrix = list[list[Fraction]]
 MAX_BITS = 2**14  # of a number on the tape
 MAX_MATRIX_BITS = 2**15  # of a number in a matrix, times the matrix's size: beyond, an inverse takes minutes
 
 
-def rational(array: NDArray[np.float64]) -> Matrix:
-    """A binary64 matrix as exact fractions."""
-    return [[Fraction(float(v)) for v in row] for row in array]
+def exactly(array: NDArray[np.float64]) -> fmpq_mat:
+    """A finite binary64 matrix as it is."""
+    return fmpq_mat([[fmpq(*v.as_integer_ratio()) for v in row] for row in array.tolist()])
 
 
-def congruence(T: Matrix, P: Matrix) -> Matrix:
-    """`T' P T`."""
-    return [[_fraction(v) for v in row] for row in (_flint(T).transpose() * _flint(P) * _flint(T)).tolist()]
+def inverse_diagonal(A: fmpq_mat) -> list[Fraction]:
+    """Diagonal of `A^-1` for a symmetric positive definite A; empty if A is not (or too large to tell soon)."""
+    if A.transpose() != A or not is_definite(A):
+        return []
+    inverse = A.inv()
+    return [fraction(inverse[i, i]) for i in range(A.nrows())]
 
 
-def inverse_diagonal(A: Matrix) -> list[Fraction] | None:
-    """Diagonal of `A^-1` for a symmetric positive definite A; None if A is not (or too large to tell soon).
+def is_definite(A: fmpq_mat) -> bool:
+    """Whether d'A d > 0 for every d but 0; False as well if A is too large to tell soon.
 
-    A symmetric matrix is positive definite if and only if every leading principal minor is positive (Sylvester).
+    That is so if and only if every leading principal minor of the symmetric part is positive (Sylvester).
     """
-    n, exact = len(A), _flint(A)
-    bits = max(max(v.numerator.bit_length(), v.denominator.bit_length()) for row in A for v in row)
-    if exact != exact.transpose() or n * bits > MAX_MATRIX_BITS:
-        return None
-    if not all(_flint([row[:k] for row in A[:k]]).det() > 0 for k in range(1, n + 1)):
-        return None
-    inverse = exact.inv()
-    return [_fraction(inverse[i, i]) for i in range(n)]
+    n, S = A.nrows(), A + A.transpose()
+    if n * max(v.height_bits() for v in S.entries()) > MAX_MATRIX_BITS:
+        return False
+    rows = S.tolist()
+    return all(fmpq_mat([row[:k] for row in rows[:k]]).det() > 0 for k in range(1, n + 1))
 
 
-def gershgorin_lower(A: Matrix) -> Fraction:
+def contains_ball(J: fmpq_mat, P: fmpq_mat, level: Fraction) -> bool:
+    """Whether {x'Px <= level} lies in {J d : ||d|| <= 1}: J'PJ - level I is positive definite."""
+    n, c = J.nrows(), fmpq(level.numerator, level.denominator)
+    identity = fmpq_mat([[fmpq(int(i == j)) for j in range(n)] for i in range(n)])
+    return is_definite(J.transpose() * P * J - c * identity)
+
+
+def gershgorin_lower(A: fmpq_mat) -> Fraction:
     """A lower bound of the smallest eigenvalue of a symmetric matrix."""
-    return min(row[i] - sum((abs(v) for j, v in enumerate(row) if j != i), Fraction(0)) for i, row in enumerate(A))
+    rows = A.tolist()
+    return fraction(
+        min(row[i] - sum((abs(v) for j, v in enumerate(row) if j != i), fmpq(0)) for i, row in enumerate(rows))
+    )
 
 
-def _flint(A: Matrix) -> fmpq_mat:
-    return fmpq_mat([[fmpq(v.numerator, v.denominator) for v in row] for row in A])
+def root_above(q: fmpq) -> fmpq:
+    """A rational at or above the square root of q >= 0, within 2^-60 of itself."""
+    p, r = int(q.p), int(q.q)
+    shift = max(0, 64 + (r.bit_length() - p.bit_length()) // 2 + 1)
+    return fmpq(isqrt((p << 2 * shift) // r) + 1, 1 << shift) if p else fmpq(0)
 
 
-def _fraction(q: fmpq) -> Fraction:
+def fraction(q: fmpq) -> Fraction:
     return Fraction(int(q.p), int(q.q))
 
 

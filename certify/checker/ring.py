@@ -11,6 +11,7 @@ from operator import add
 import numpy as np
 
 from .case import Case, Failures
+from .exact import fraction
 from .expression import evaluate
 from .float64 import EPS, Array, float_with_error, gamma, norm, total, up, within
 from .network import enclose_on_boxes
@@ -41,7 +42,9 @@ class Ring:
     def __init__(self, case: Case) -> None:
         self.case, self.c, self.T, self.net = case, case.c, case.partition.T, case.net
         self.n, self.m = len(case.c.states), len(case.c.inputs)
-        value, error = np.moveaxis(np.array([[float_with_error(v) for v in row] for row in case.S]), 2, 0)
+        value, error = np.moveaxis(
+            np.array([[float_with_error(fraction(v)) for v in row] for row in case.S.tolist()]), 2, 0
+        )
         self.S = np.diag(value)[:, None]  # the diagonal, (n, 1)
         self.S_rest = up(np.abs(value - np.diag(self.S[:, 0])) + error)  # bounds what S is beside it
 

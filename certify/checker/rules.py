@@ -15,7 +15,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from . import local, ring
+from . import ball, local, ring, tube
 from .case import Case, Failures
 from .document import Certificate, Partition
 from .errors import Rejected
@@ -95,16 +95,26 @@ Table = Sequence[tuple[str, Callable[[Subject], Failures]]]
 STATED: Table[Case] = tuple(
     (rule.__name__, rule) for rule in (levels, lyapunov, equilibrium, domain, coordinates, root, centring)
 )
-ON_THE_BALL: Table[local.Ball] = (
+ON_THE_BALL: Table[local.Local] = (
     ("local", local.fits),
-    ("inputs", local.keeps_inputs),
-    ("local", local.is_not_clipped),
+    ("inputs", ball.keeps_inputs),
+    ("local", ball.is_not_clipped),
     ("local", local.decreases),
 )
 OF_THE_TREE: Table[Case] = (("tree", ring.is_whole),)
 ON_LEAVES: Table[ring.Leaves] = (("inputs", ring.keeps_inputs), ("ring", ring.decreases))
+OF_THE_TUBE: Table[Case] = (("tube", tube.lies_in_domain), ("tube", tube.ends_inside))
+ON_SLABS: Table[tube.Piece] = (
+    ("tube", tube.fits),
+    ("inputs", ball.keeps_inputs),
+    ("tube", ball.is_not_clipped),
+    ("tube", tube.decreases),
+)
 READ = {"format": 1, "hash": 1}  # rules of document.py, which have held
-RULES = (*READ, *dict.fromkeys(name for table in (STATED, ON_THE_BALL, OF_THE_TREE, ON_LEAVES) for name, _ in table))
+RULES = (
+    *READ,
+    *dict.fromkeys(name for table in (STATED, ON_THE_BALL, OF_THE_TREE, ON_LEAVES, OF_THE_TUBE) for name, _ in table),
+)
 
 
 @dataclass
@@ -142,9 +152,9 @@ def check(c: Certificate) -> Tally:
         if not replayed:
             return tally
         if not c.practical:
-            ball = local.Ball(case)
-            tally.hold(ON_THE_BALL, ball)
-            tally.local_margin = 1 - ball.remainder
+            origin = local.Local(case)
+            tally.hold(ON_THE_BALL, origin)
+            tally.local_margin = origin.margin
         tally.hold(OF_THE_TREE, case)
         if c.practical or c.c1 != c.c2:
             bounds, margin = ring.Ring(case), np.inf
@@ -153,4 +163,8 @@ def check(c: Certificate) -> Tally:
                 tally.hold(ON_LEAVES, leaves)
                 margin = min(margin, float(np.min(-leaves.bound[leaves.meet], initial=np.inf)))
             tally.ring_margin = margin if margin < np.inf else None
+        if c.start is not None:
+            tally.hold(OF_THE_TUBE, case)
+            for piece in tube.pieces(case):
+                tally.hold(ON_SLABS, piece)
     return tally

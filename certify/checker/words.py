@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import math
 from fractions import Fraction
 from typing import Any
 
-from .document import Certificate, Policy
+from .document import Array, Certificate, Partition, Policy
 
 CLAIMS = {
     "asymptotic": "the origin is asymptotically stable, and every trajectory of the closed loop that starts in "
     "V <= {c.c2!r} stays there and converges to the origin",
+    "enlarged": "the origin is asymptotically stable; every trajectory of the closed loop that starts in V <= {c.c2!r} "
+    "stays there and converges to the origin, and every one that starts in x'Sx <= 1 stays in the domain, is in "
+    "V <= {c.c2!r} after {time!r} units of time at the latest, and converges to the origin",
     "practical": "every trajectory of the closed loop that starts in V <= {c.c2!r} stays there, enters "
     "V <= {c.c1!r} in finite time and stays there from then on; nothing is claimed about what happens inside "
     "V <= {c.c1!r}, and the origin need not be an equilibrium",
@@ -36,12 +40,23 @@ def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
         f"policy {'-'.join(map(str, widths))} tanh, squash {c.policy.squash}, centred by {c.policy.centre}, "
         f"{_clip(c.policy)}"
         f"sha256 {c.policy.sha256()}",
-        "V(x) = x'Px with P = " + "; ".join(" ".join(map(repr, row)) for row in c.P.tolist()),
-        f"claim: {CLAIMS[c.claim].format(c=c)}; u stays in its bounds",
+        f"V(x) = x'Px with P = {_matrix(c.P)}",
+        *([] if c.start is None else [f"S = {_matrix(c.start)}"]),
+        f"claim: {CLAIMS[c.claim].format(c=c, time=_duration(c))}; u stays in its bounds",
         "rules that held: " + ", ".join(f"{rule} {count}" for rule, count in answer["rules"].items()),
         rest,
         f"{verdict} {'c0' if c.practical else 'c1'}={c.c1!r} c2={c.c2!r} sha256={c.sha256}",
     ]
+
+
+def _matrix(A: Array) -> str:
+    return "; ".join(" ".join(map(repr, row)) for row in A.tolist())
+
+
+def _duration(c: Certificate) -> float:
+    """Of the tube, rounded up."""
+    slabs = c.evidence.tube if isinstance(c.evidence, Partition) else ()
+    return math.nextafter(math.fsum(slab.duration for slab in slabs), math.inf)
 
 
 def expression(tree: Any) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from certify.claims.claim import CLAIMS, Asymptotic, Claim, Practical, Problem
+from certify.claims.claim import CLAIMS, Asymptotic, Claim, Enlarged, Practical, Problem
 from certify.claims.conditions import BeforeClip, Condition, Guard, OfInput, OfState, Radicand, Vdot, conditions
 
 __all__ = [
@@ -11,6 +11,7 @@ __all__ = [
     "BeforeClip",
     "Claim",
     "Condition",
+    "Enlarged",
     "Guard",
     "OfInput",
     "OfState",

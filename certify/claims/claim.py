@@ -39,7 +39,7 @@ class Problem:
 class Claim:
     """`roa` is c2: the claim is about every trajectory that starts in {V <= c2}."""
 
-    kind: ClassVar[Kind]
+    kind: ClassVar[Kind | Literal["enlarged"]]
     at_rest: ClassVar[bool]  # the origin must be an equilibrium, exactly
     inner_name: ClassVar[str]  # of the level from which the ring reaches outwards to c2
     roa: float
@@ -62,10 +62,18 @@ class Asymptotic(Claim):
     `local` is c1: below it Vdot < 0 is shown by the linearisation, above it by the ring.
     """
 
-    kind = "asymptotic"
+    kind: ClassVar[Kind | Literal["enlarged"]] = "asymptotic"
     at_rest = True
     inner_name = "local"
     local: float
+
+
+@dataclass(frozen=True, slots=True)
+class Enlarged(Asymptotic):
+    """The same, and every trajectory from {W <= 1}, W = `start`, reaches {V <= c2} and converges to the origin."""
+
+    kind = "enlarged"
+    start: Quadratic
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,4 +89,4 @@ class Practical(Claim):
     floor: float
 
 
-CLAIMS: Mapping[str, type[Asymptotic] | type[Practical]] = {c.kind: c for c in (Asymptotic, Practical)}
+CLAIMS: Mapping[str, type[Asymptotic] | type[Practical]] = {c.kind: c for c in (Asymptotic, Practical, Enlarged)}

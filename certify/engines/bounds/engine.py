@@ -10,11 +10,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.certificate import PartitionTree
-from certify.claims import Asymptotic, Practical
+from certify.claims import Asymptotic, Practical, Problem
 from certify.engines.base import Attempt, Budget, Engine, Once, Proof, Report, Task
 from certify.engines.bounds.search import Pass, RingProof, empty_ring, outwards, prove_inwards, prove_outwards
 from certify.engines.falsify import Band, Witness, survey
-from certify.engines.local import prove_local
+from certify.engines.local import local_ball, prove_local
 from certify.running import Runner
 from certify.verdict import Stop
 
@@ -67,7 +67,9 @@ class BoundsEngine(Engine):
         if not ring.covered:
             why = f"F and its inputs are not enclosed on all of V <= {ring.inner:.6g}"
             return Proof(None, None, Stop.SMOOTH, why, boxes=ring.boxes)
-        return replace(self.stated(ring, Practical(roa=ring.outer, floor=ring.inner), {}), stop=stop, witness=witness)
+        return replace(
+            self.stated(task.problem, ring, Practical(roa=ring.outer, floor=ring.inner), {}), stop=stop, witness=witness
+        )
 
     def _outer_level(
         self, task: Task, band: Band, budget: Budget, report: Report | None
@@ -83,11 +85,14 @@ class BoundsEngine(Engine):
             inner = math.sqrt(inner * band.top)
         return ring.outer, ring.stop, ring.witness
 
-    def stated(self, ring: RingProof, claim: Asymptotic | Practical, seconds: dict[str, float]) -> Proof:
+    def stated(
+        self, problem: Problem, ring: RingProof, claim: Asymptotic | Practical, seconds: dict[str, float]
+    ) -> Proof:
         """The proof of a claim from a ring's."""
+        local = local_ball(problem, self.T, claim.local) if isinstance(claim, Asymptotic) else None
         return Proof(
             claim,
-            PartitionTree(self.T, ring.root, ring.tree),
+            PartitionTree(self.T, ring.root, ring.tree, local),
             ring.stop,
             witness=ring.witness,
             boxes=ring.boxes,
@@ -145,4 +150,5 @@ class _Outwards:
             ring = empty_ring(self.task.problem, self.engine.T, self.inner)
         else:
             ring = self.ring.proof(self.stop)
-        return self.engine.stated(ring, Asymptotic(roa=ring.outer, local=self.inner), dict(self.seconds))
+        claim = Asymptotic(roa=ring.outer, local=self.inner)
+        return self.engine.stated(self.task.problem, ring, claim, dict(self.seconds))
