@@ -48,9 +48,16 @@ class LocalBall:
 
 @dataclass(frozen=True, slots=True)
 class Slab:
-    """A piece of a tube: up to the ellipsoid {x'Px <= 1} of `end` (n, n), for `duration` units of time, on a ball J
-    (n, n) that contains it and the one before, with `multipliers` (3, n)."""
+    """A piece of a tube, on which P(t) is a polynomial of degree 2 in Bernstein's form.
 
+    Parameters
+    ----------
+    middle, end : its coefficients after that of the slab before, (n, n); the piece ends at {x'Px <= 1}, P = `end`.
+    duration : units of time.
+    J, multipliers : a ball that contains it, (n, n), and what the matrix inequalities on it take, (3, n).
+    """
+
+    middle: Array
     end: Array
     duration: float
     J: Array
@@ -294,7 +301,8 @@ def _evidence(evidence: PartitionTree | TrustedSolver) -> dict[str, Any]:
             "tree": base64.b64encode(evidence.tree).decode("ascii"),
             "local": None if evidence.local is None else _ball(evidence.local),
             "tube": [
-                {"end": _encode(slab.end), "duration": float(slab.duration).hex()} | _ball(slab)
+                {"middle": _encode(slab.middle), "end": _encode(slab.end), "duration": float(slab.duration).hex()}
+                | _ball(slab)
                 for slab in evidence.tube
             ],
         }
@@ -316,7 +324,12 @@ def _read_evidence(data: Mapping[str, Any], n: int) -> PartitionTree | TrustedSo
             base64.b64decode(data["tree"]),
             None if local is None else LocalBall(*_read_ball(local, n)),
             tuple(
-                Slab(_decode(slab["end"], (n, n)), float.fromhex(slab["duration"]), *_read_ball(slab, n))
+                Slab(
+                    _decode(slab["middle"], (n, n)),
+                    _decode(slab["end"], (n, n)),
+                    float.fromhex(slab["duration"]),
+                    *_read_ball(slab, n),
+                )
                 for slab in data["tube"]
             ),
         )

@@ -11,7 +11,6 @@ from flint import fmpq_mat
 
 from .document import Certificate, LocalBall, Partition, Slab
 from .exact import exactly, gershgorin_lower, inverse_diagonal
-from .float64 import Array
 from .network import Folded, fold
 
 Failures = Generator[tuple[str, str], None, int]  # what a rule makes: each failure's (place, detail); how much it met
@@ -41,11 +40,6 @@ class Case:
     def tube(self) -> tuple[Slab, ...]:
         """The slabs, none but for an enlarged claim."""
         return self.partition.tube
-
-    @property
-    def nodes(self) -> list[Array]:
-        """P_0, ..., P_N of an enlarged claim; empty for the others."""
-        return [] if self.c.start is None else [self.c.start, *(slab.end for slab in self.tube)]
 
     @cached_property
     def P_inverse(self) -> list[Fraction]:

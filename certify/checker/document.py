@@ -66,6 +66,7 @@ class LocalBall:
 class Slab:
     """A piece of the tube up to the node `end`, in its time, with a ball that contains it and multipliers on it."""
 
+    middle: Array
     end: Array
     duration: float
     J: Array
@@ -206,8 +207,9 @@ def _local(value: Value, n: int, claim: str) -> LocalBall | None:
 
 
 def _slab(value: Value, n: int) -> Slab:
-    end, duration, J, multipliers = value.keys("end duration J multipliers")
-    return Slab(end.array(n, n), duration.binary64(), J.array(n, n), _multipliers(multipliers, n))
+    middle, end, duration, J, multipliers = value.keys("middle end duration J multipliers")
+    nodes = middle.array(n, n), end.array(n, n)
+    return Slab(*nodes, duration.binary64(), J.array(n, n), _multipliers(multipliers, n))
 
 
 def _multipliers(value: Value, n: int) -> Multipliers:

@@ -1,7 +1,7 @@
 """The matrix inequality of rules `local` and `tube`, in floats: which multipliers show it best, and by what margin.
 
-On the ball x = J d, `d'J'RJ d + 2 d'J'P F(J d) < 0` for 0 < ||d|| <= 1 if the decay -(J'RJ + B + B') dominates bounds of
-what the models of F add to their gradients (checker/FORMAT.md, `decrease`). An error kept apart keeps its direction;
+On the ball x = J d, `d'J'RJ d + 2 d'J'P F(J d) < 0` for 0 < ||d|| <= 1 if the decay -(J'RJ + B + B') dominates bounds
+of what the models of F add to their gradients (checker/FORMAT.md, `decrease`). An error kept apart keeps its direction;
 errors of several components taken jointly may cancel, as those of a plant's inputs do.
 """
 
@@ -18,6 +18,7 @@ from certify.engines.models import Models
 Array = NDArray[np.float64]
 _ROUNDS = 5  # of weights that look at the worst direction more and more
 _FOCUS, _LEAST_WEIGHT = 3.0, 1e-3
+_NEGLIGIBLE = 1e-9
 _SHORT = 5  # bits of a multiplier: the checker's rationals stay short
 
 
@@ -94,11 +95,13 @@ def multipliers_for(models: Models, b: Array, weight: Array) -> Array:
         beta = np.where(along > 0, np.sqrt(Q2 / along), 0.0)
     C = _joint(models, b, np.ones(len(b), dtype=bool))
     spread = np.einsum("jmk,kl,jml->m", C, weight, C, optimize=True)
-    diagonal = np.diag(weight)
-    if np.sum(np.sqrt(spread * diagonal)) <= np.sum(np.sqrt(Q2 * along)) or not np.all(np.isfinite(beta)):
-        beta = np.zeros_like(beta)
+    diagonal, apart_in_all = np.diag(weight), np.sum(np.sqrt(Q2 * along))
     g = np.sqrt(spread / diagonal)
-    g = np.maximum(g, max(1e-12 * float(np.max(g)), 1e-200))
+    least = _NEGLIGIBLE * max(float(np.max(g)), apart_in_all / np.trace(weight), 1e-200)
+    if np.sum(np.sqrt(spread * diagonal)) <= apart_in_all or not np.all(np.isfinite(beta)):
+        beta, g = np.zeros_like(beta), np.maximum(g, least)
+    else:  # what has no Q stays joint, at next to no cost
+        g = np.full_like(g, least)
     return np.array([_short(np.where(np.isfinite(alpha), alpha, 0.0)), _short(beta), _short(g)])
 
 

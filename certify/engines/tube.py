@@ -1,0 +1,164 @@
+"""A tube of ellipsoids from a large set into the certified one: the reachability-enlarged region, in any dimension.
+
+V(t, x) = x'P(t)x, P(t) of degree 2 in t on each slab, must decrease along every trajectory with V <= 1. P moves at the
+rate at which the closed loop moves the ellipsoid, and faster by what the models' remainders ask for: the matrix
+inequality of rule `local`, with P's rate in it. Errors keep their direction, so that an ellipsoid is widened only where
+the nonlinearity can widen it. The idea is set propagation with ellipsoids; no set is ever covered by many.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from certify.certificate import Slab
+from certify.engines.decrease import decay_of, multipliers_for, rest_of
+from certify.engines.models import Models, Paths
+from certify.lyapunov import leaves_domain
+
+Array = NDArray[np.float64]
+_WIDER = 1.05  # of a slab's ball, relative to the ellipsoid halfway: how far the ends may differ from that
+_FILLED = 0.9  # of what `_WIDER` allows, by the first guess of a slab's duration
+_LONGEST = 0.5  # units of time of a slab
+_SURPLUS = 1e-3  # decrease of V per unit of time that is left to the checker's rounding
+_CORRECTIONS, _SHORTENINGS = 5, 12  # of a slab's rate, of its duration
+_MOST_SLABS = 4000
+_GROWN = 8.0  # logarithm of a volume, relative to the start, at which a tube is given up
+_INSIDE = 1 - 1e-6  # of the goal, beyond all rounding
+
+
+@dataclass(frozen=True, slots=True)
+class Tube:
+    """From {x'Px <= 1}, P = `start` (n, n), through the slabs."""
+
+    start: Array
+    slabs: tuple[Slab, ...]
+
+    @property
+    def duration(self) -> float:
+        """Units of time."""
+        return math.fsum(slab.duration for slab in self.slabs)
+
+
+def find_tube(known: Paths, start: Array, goal: Array, seconds: float = math.inf) -> Tube | None:
+    """A tube from {x'Px <= 1}, P = start, into that of `goal`; None if there is none to be had in the time.
+
+    Parameters
+    ----------
+    known : the closed loop at the origin.
+    start, goal : (n, n), positive definite.
+    """
+    end = time.perf_counter() + seconds
+    slabs: list[Slab] = []
+    P, rate = start, None
+    begin, domain = np.linalg.slogdet(start)[1], known.loop.system.domain
+    with np.errstate(all="ignore"):  # what overflows is not shown
+        while not np.linalg.eigvalsh(P * _INSIDE - goal)[0] > 0 or not slabs:
+            if time.perf_counter() > end or len(slabs) == _MOST_SLABS or leaves_domain(P, 1.0, domain):
+                return None
+            made = _slab(known, P, rate, goal)
+            if made is None or begin - np.linalg.slogdet(made.end)[1] > 2 * _GROWN:
+                return None
+            slabs.append(made)
+            P, rate = made.end, 2 * (made.end - made.middle) / made.duration
+    return Tube(start, tuple(slabs))
+
+
+def _slab(known: Paths, P: Array, rate: Array | None, weight: Array) -> Slab | None:
+    """One slab from {x'Px <= 1} on; `rate` is a guess of that of P.
+
+    The multipliers are best where it counts, in the directions in which `weight` (n, n) is large.
+    """
+    if rate is None:
+        J = _WIDER * _root(P)
+        models = known.models(J)
+        if not (models.finite and models.admitted):
+            return None
+        rate = _back(-_growth(models, J, P, _multipliers(models, J, P, weight)), J)
+    duration = _first_duration(P, rate)
+    for _ in range(_SHORTENINGS):
+        middle = P + duration / 2 * rate
+        if _is_definite(middle):
+            J = _WIDER * _root(middle)
+            models = known.models(J)
+            if models.finite and models.admitted:
+                multipliers = _multipliers(models, J, P, weight)
+                nodes = _nodes(models, J, P, duration, multipliers)
+                if nodes is not None:
+                    return Slab(*nodes, duration, J, multipliers)
+        duration *= 0.6
+    return None
+
+
+def _nodes(models: Models, J: Array, P: Array, duration: float, multipliers: Array) -> tuple[Array, Array] | None:
+    """Middle and end after `duration`: V decreases on the slab, and its ball contains the three ellipsoids.
+
+    P leaves its start at the rate that decrease asks for there, and reaches its end at one that is enough there and,
+    with the first, halfway. To second order in the duration the two demands agree.
+    """
+    ball = J.T @ P @ J
+    surplus, first = _SURPLUS * ball, _growth(models, J, P, multipliers)
+    start_rate = -first - surplus
+    middle = _symmetric(P + duration / 2 * _back(start_rate, J))
+    if not (_contains(J, P) and _contains(J, middle)):
+        return None
+    halfway = _growth(models, J, middle, multipliers)
+    asked = 2 * halfway + start_rate
+    worst = asked
+    for _ in range(_CORRECTIONS):
+        end = _symmetric(middle + duration / 2 * _back(-worst - surplus, J))
+        if not _contains(J, end):
+            return None
+        last = _growth(models, J, end, multipliers)
+        rates = (2 * (middle - P), end - P, 2 * (end - middle))
+        growths = (first, halfway, last)
+        if all(np.linalg.eigvalsh(J.T @ r @ J / duration + g)[-1] < 0 for r, g in zip(rates, growths, strict=True)):
+            return middle, end
+        values, vectors = np.linalg.eigh(last - asked)  # the larger of both, in the sense of matrices
+        worst = asked + 1.05 * (vectors * np.maximum(values, 0)) @ vectors.T
+    return None
+
+
+def _growth(models: Models, J: Array, P: Array, multipliers: Array) -> Array:
+    """G (n, n) with 2 x'PF <= d'G d on the ball."""
+    b = P @ J
+    return rest_of(models, b, multipliers) - decay_of(models, J, b)
+
+
+def _multipliers(models: Models, J: Array, P: Array, weight: Array) -> Array:
+    return multipliers_for(models, P @ J, J.T @ weight @ J)
+
+
+def _first_duration(P: Array, rate: Array) -> float:
+    """After which the ends differ from the ellipsoid halfway by what a ball allows."""
+    fastest = float(np.max(np.abs(scipy.linalg.eigh(rate, P, eigvals_only=True))))
+    return min(_LONGEST, 2 * _FILLED * (1 - _WIDER**-2) / fastest) if fastest > 0 else _LONGEST
+
+
+def _back(G: Array, J: Array) -> Array:
+    """The matrix in x of the quadratic form d'G d, x = J d."""
+    inverse = np.linalg.inv(J)
+    return _symmetric(inverse.T @ G @ inverse)
+
+
+def _symmetric(X: Array) -> Array:
+    return np.asarray((X + X.T) / 2)
+
+
+def _contains(J: Array, P: Array) -> bool:
+    """Whether {x'Px <= 1} lies in {J d : ||d|| <= 1}."""
+    return bool(np.linalg.eigvalsh(J.T @ P @ J)[0] > _INSIDE**-1)
+
+
+def _root(P: Array) -> Array:
+    """L with L L' = P^-1: {x'Px <= 1} is {L d : ||d|| <= 1}."""
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(P)).T)
+
+
+def _is_definite(P: Array) -> bool:
+    return bool(np.linalg.eigvalsh(P)[0] > 0)
