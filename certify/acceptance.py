@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from certify.certificate import Certificate, PartitionTree, TrustedSolver, run_checker, write_beside
-from certify.claims import Asymptotic, Problem
+from certify.claims import Asymptotic, Enlarged, Problem
 from certify.engines.bounds.mend import below_leaf, split_again
 from certify.errors import SoundnessError
 
@@ -76,9 +76,7 @@ class Clerk:
                     f"the checker rejects what the engine proved: {answer}. The certificate {reproduces} reproduces it."
                 )
             mended = f"the checker refused {answer.get('at')} (rule {answer.get('rule')}): " + (
-                f"the level is {certificate.roa:.6g} in the place of {first.roa:.6g}"
-                if lowerings
-                else "split again, it is accepted"
+                _what_is_lower(first, certificate) if lowerings else "split again, it is accepted"
             )
 
     def ask(self, certificate: Certificate) -> tuple[bytes, Mapping[str, Any]]:
@@ -108,6 +106,11 @@ class Clerk:
         return data, answer
 
 
+def _what_is_lower(first: Certificate, certificate: Certificate) -> str:
+    tube = "without the tube, " if first.kind != certificate.kind else ""
+    return f"{tube}the level is {certificate.roa:.6g} in the place of {first.roa:.6g}"
+
+
 def _wanted(certificate: Certificate) -> str:
     return "TRUSTED" if isinstance(certificate.evidence, TrustedSolver) else "ACCEPTED"
 
@@ -124,6 +127,8 @@ def _lowered(certificate: Certificate, leaf: int | None, problem: Problem, tries
     claim, evidence = certificate.claim, certificate.evidence
     if not isinstance(evidence, PartitionTree):
         return None
+    if isinstance(claim, Enlarged):  # a tube ends in {V <= c2}: without it, what is refused may not be asked any more
+        return replace(certificate, claim=Asymptotic(claim.roa, claim.local), evidence=replace(evidence, tube=()))
     if leaf is None or claim.inner == claim.roa:
         if not isinstance(claim, Asymptotic):
             return None

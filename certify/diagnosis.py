@@ -43,8 +43,8 @@ def diagnose(result: RoaResult, options: RoaOptions, proof: Proof | None) -> Dia
     weights = weights / (weights.max() or 1.0)
     hurts = sorted(zip((s.name for s in system.states), weights.tolist(), strict=True), key=lambda pair: -pair[1])
     shares: tuple[Share, ...] = ()
-    if result.P is not None and result.levels.roa is not None:
-        reach = extents(result.P, result.levels.roa)
+    if result.ellipsoid is not None:
+        reach = extents(*result.ellipsoid)
         each = zip(system.states, reach.tolist(), scale.tolist(), strict=True)
         shares = tuple(Share(s.name, system.units.get(s.name, ""), e, e / d) for s, e, d in each)
     return Diagnosis(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Literal, get_args
 
@@ -33,6 +34,9 @@ class RoaOptions:
     engine : `bounds`, `dreal` (its word is trusted, not checked), or `both`: bounds prove, dReal is asked as well.
     dreal_precision, jobs : dReal's delta and threads.
     device : where boxes are bounded, `cpu` or `cuda`.
+    enlarge : look for a tube of ellipsoids from a larger set into the proved one.
+    box : half-widths by state; `enlarge` for the largest multiple of the ellipsoid with these half-axes. A state that
+        is not named gets the smallest share of its domain that a named one has.
     time_limit : seconds for everything up to the verdict, the check included.
     max_boxes : boxes for the ring.
     """
@@ -47,8 +51,15 @@ class RoaOptions:
     dreal_precision: float = 1e-3
     jobs: int = 1
     device: str = "cpu"
+    enlarge: bool = False
+    box: Mapping[str, float] | None = None
     time_limit: float = 50.0
     max_boxes: int = 4_000_000
+
+    @property
+    def enlarges(self) -> bool:
+        """Whether a tube is looked for."""
+        return self.enlarge or self.box is not None
 
     @property
     def only(self) -> Named | None:
@@ -65,5 +76,12 @@ class RoaOptions:
             raise InputError("`dreal_precision` must lie between 0 and 1, and `jobs` be at least 1.")
         if self.level is not None and not (math.isfinite(self.level) and self.level > 0):
             raise InputError(f"`level` must be a positive number; found {self.level}.")
+        if self.box is not None and not all(math.isfinite(v) and v > 0 for v in self.box.values()):
+            raise InputError(f"`box` must have positive half-widths; found {dict(self.box)}.")
+        if self.enlarges and (self.engine == "dreal" or self.claim == "practical"):
+            raise InputError(
+                "`enlarge` needs the engine bounds and a claim that is not practical: a tube ends in a set "
+                "that the checker can replay, and from which trajectories converge."
+            )
         if not self.time_limit > 0 or not self.max_boxes > 0:
             raise InputError("`time_limit` and `max_boxes` must be positive.")

@@ -13,7 +13,7 @@ from fractions import Fraction
 from html import escape
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
-_STAGES = ("load", "candidate", "local", "ring", "write", "check", "total")
+_STAGES = ("load", "candidate", "local", "ring", "tube", "write", "check", "total")
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,6 +79,23 @@ class Step:
 
     options: tuple[tuple[str, str], ...]
     why: str
+
+
+@dataclass(frozen=True, slots=True)
+class TubeFacts:
+    """A tube that enlarges the set: it starts at {x'Px <= 1}, P = `start` (n, n), of this `shape`, and leads
+    into {V <= c2} in `slabs` pieces, in `duration` units of time."""
+
+    start: Array
+    shape: str
+    slabs: int
+    duration: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON, with the size of the start along the states."""
+        sizes = {"semi_axes": semi_axes(self.start, 1.0).tolist(), "extents": extents(self.start, 1.0).tolist()}
+        stated = {"shape": self.shape, "slabs": self.slabs, "duration": self.duration, "start": self.start.tolist()}
+        return {**stated, "volume": volume(self.start, 1.0), **sizes}
 
 
 @dataclass(frozen=True, slots=True)
@@ -150,13 +167,14 @@ class RoaResult:
     stop: Stop
     system: System
     network: TanhNetwork
-    claim: Kind = "asymptotic"
+    claim: Kind | Literal[enlarged] = "asymptotic"
     detail: str = ""
     problem: Problem | None = None
     candidate: str | None = None
     tried: tuple[Tried, ...] = ()
     notice: str | None = None
     levels: Levels = field(default_factory=Levels)
+    tube: TubeFacts | None = None
     witness: Witness | None = None
     eigenvalues: tuple[str, ...] = ()
     boxes: int = 0
@@ -184,12 +202,26 @@ class RoaResult:
 
     @property
     def volume(self) -> float | None:
-        """A certain lower bound of the volume of {V <= c2}, in the product of the states' units; None without a set."""
-        P, level = self.P, self.levels.roa
-        return None if P is None or level is None else volume(P, level)
+        """A certain lower bound of the proved set's volume, in the product of the states' units; None without a set.
+
+        With a tube it is that of the larger one of {V <= c2} and the tube's start, of which the set is the union.
+        """
+        return None if self.ellipsoid is None else volume(*self.ellipsoid)
+
+    @property
+    def ellipsoid(self) -> tuple[Array, float] | None:
+        """(P, level) of the larger ellipsoid {x'Px <= level} of those that are proved: {V <= c2}, a tube's start."""
+        if self.P is None or self.levels.roa is None:
+            return None
+        inner = self.P, self.levels.roa
+        if self.tube is None or volume(self.tube.start, 1.0) < volume(*inner):
+            return inner
+        return self.tube.start, 1.0
 
     def contains(self, x: ArrayLike, *, deviations: bool = False) -> bool | NDArray[np.bool_]:
-        """Whether states lie in the proved set {V <= c2}, decided in rationals: no state is let in by rounding.
+        """Whether states lie in the proved set, decided in rationals: no state is let in by rounding.
+
+        The set is {V <= c2}, and with a tube the union of that and the tube's start.
 
         Parameters
         ----------
@@ -220,6 +252,8 @@ class RoaResult:
         if any(shifts):
             rows = [[Fraction(v) - q for v, q in zip(row, shifts, strict=True)] for row in rows]
         found = are_inside(self.problem.V.P, self.levels.roa, rows)
+        if self.tube is not None:
+            found = [a or b for a, b in zip(found, are_inside(self.tube.start, 1.0, rows), strict=True)]
         return found[0] if states.ndim == 1 else np.array(found, dtype=np.bool_)
 
     def report(self, path: str | PathLike[str] | None = None) -> Path:
@@ -285,7 +319,7 @@ class RoaResult:
         level, size = (self.levels.roa, self.volume) if shown else (None, None)
         if level is not None and size is not None:
             unit = volume_unit([self.system.units.get(s.name, "") for s in self.system.states])
-            rows.append(("set", f"V <= {below(level)}"))
+            rows.append(("set", f"V <= {below(level)}" + (", enlarged by a tube" if self.tube is not None else "")))
             rows.append((volume_name(self.system.n), f"{below(size)} {unit}".rstrip()))
             rows.append(("limited by", self.reason))
         else:
@@ -296,10 +330,10 @@ class RoaResult:
     def to_dict(self) -> dict[str, Any]:
         """The JSON object of `certify roa --json`; lengths along the states are in their units."""
         system, network, witness = self.system, self.network, self.witness
-        P, level = self.P, self.levels.roa
+        P = self.P
         geometry: dict[str, Any] = dict.fromkeys(("volume", "semi_axes", "extents"))
-        if P is not None and level is not None:
-            axes, reach = semi_axes(P, level).tolist(), extents(P, level).tolist()
+        if self.ellipsoid is not None:
+            axes, reach = semi_axes(*self.ellipsoid).tolist(), extents(*self.ellipsoid).tolist()
             geometry = {"volume": self.volume, "semi_axes": axes, "extents": reach}
         stated = {
             "schema": "certify-roa/1",
@@ -319,6 +353,7 @@ class RoaResult:
                 "notice": self.notice,
             },
             "levels": {name: getattr(self.levels, name) for name in Levels.__slots__},
+            "tube": None if self.tube is None else self.tube.to_dict(),
             "witness": None,
             "eigenvalues": list(self.eigenvalues),
             "rest": None if self.rest is None else asdict(self.rest),

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from certify.acceptance import Clerk
 from certify.certificate import (
@@ -26,19 +27,20 @@ from certify.certificate import (
     require_within_limits,
     sole_writer,
 )
-from certify.claims import Asymptotic, Claim, Problem
+from certify.claims import Asymptotic, Claim, Enlarged, Problem
 from certify.claims.claim import Kind
 from certify.closed_loop import ClosedLoop
 from certify.diagnosis import diagnose
 from certify.engines.base import Attempt, Budget, Progress, Proof, Task
 from certify.engines.falsify import Witness, refutes
 from certify.errors import BackendError, InputError, SoundnessError
-from certify.lyapunov import leaves_domain
+from certify.lyapunov import leaves_domain, volume
+from certify.lyapunov.function import Quadratic
 from certify.options import RoaOptions
 from certify.policies import TanhNetwork
 from certify.race import Contender, Race
 from certify.rest import find_rest
-from certify.results import Levels, RoaResult, Tried
+from certify.results import Levels, RoaResult, Tried, TubeFacts
 from certify.rigorous import eigenvalues
 from certify.systems import System
 from certify.trials import OPTIMISING, Trial, blends, by_reach, corrected, named, optimised, solved
@@ -48,7 +50,8 @@ if TYPE_CHECKING:
     from certify.engines.dreal.proof import DrealOptions
 
 __all__ = ["RoaOptions", "RoaResult", "certify_roa"]
-Stage = Literal["candidate", "ring", "check"]
+Array = NDArray[np.float64]
+Stage = Literal["candidate", "ring", "tube", "check"]
 Report = Callable[[Stage, Progress | None], None]
 _SMALL_NETWORK = 10_000  # weights
 # Shares of the time limit:
@@ -56,6 +59,8 @@ _HEAT = 0.04  # a candidate's first heat
 _PATIENCE = 0.1  # for a ring that gains nothing
 _SEARCH = 0.6  # for a search that cannot be interrupted, the rest being its check's
 _KEPT = 0.03  # for what comes after the search: writing, the checker's start
+_BEFORE_TUBE = 0.5  # for candidates and ring, where a tube is to be looked for
+_FOR_SEARCH = 0.5  # of what is left then, the rest being the tube's check
 _FOR_PROOF = 0.4  # of the time limit, that no further candidate is optimised in
 _WORTH = 1.05  # growth of a volume that another candidate must promise
 _MISLED = 0.9  # of its reach: a violation below it is one that the samples missed
@@ -131,6 +136,7 @@ class _Run:
     proof: Proof | None = None
     cut_short: bool = False
     aside: str | None = None
+    share: float = 1.0  # of the time, up to which a stage may go on
 
     def result(self) -> RoaResult:
         result = self._decide()
@@ -146,7 +152,7 @@ class _Run:
 
     def left(self) -> float:
         """Seconds that the search may still take."""
-        return (1 - _KEPT) * self.options.time_limit - self.spent
+        return self.share * (1 - _KEPT) * self.options.time_limit - self.spent
 
     def _decide(self) -> RoaResult:
         """Choose, falsify, prove, check."""
@@ -154,6 +160,7 @@ class _Run:
         require_within_limits(self.system, self.network)
         with self._stage("candidate"):
             self.options = options = replace(options, claim=self._claim(loop))
+        self.share = _BEFORE_TUBE if options.enlarges else 1.0
         kind = _kind_of(options)
         result = RoaResult(Verdict.UNKNOWN, Stop.REQUESTED, self.system, self.network, kind, engine=options.engine)
         if kind == "asymptotic":
@@ -348,10 +355,15 @@ class _Run:
             if task.exactly and _refuted(task, witness):
                 return _with_witness(result, task, witness)
             return result if claim is None else _missed(result, task, claim)
-        certificate = Certificate(self.system, self.network, task.problem.V, claim, proof.evidence, self.provenance)  # type: ignore[arg-type]
+        evidence, facts = proof.evidence, None
+        if self.options.enlarges and isinstance(claim, Asymptotic) and isinstance(evidence, PartitionTree):
+            facts, claim, evidence = self._enlarge(race, claim, evidence)
+        certificate = Certificate(self.system, self.network, task.problem.V, claim, evidence, self.provenance)  # type: ignore[arg-type]
         accepted = self._clerk().accepted(certificate, task.problem)
         certificate = accepted.certificate
         result = replace(result, notice=accepted.mended or result.notice)
+        if isinstance(certificate.claim, Enlarged):
+            result = replace(result, claim="enlarged", tube=facts)
         if task.exactly and certificate.roa < task.target:
             return _missed(replace(result, stop=Stop.REFUSED, detail=accepted.mended or ""), task, certificate.claim)
         trusted = isinstance(proof.evidence, TrustedSolver)
@@ -366,6 +378,34 @@ class _Run:
             raw=accepted.data,
             checker=accepted.answer,
         )
+
+    def _enlarge(
+        self, race: Race, claim: Asymptotic, evidence: PartitionTree
+    ) -> tuple[TubeFacts | None, Asymptotic, PartitionTree]:
+        """The claim and its evidence with the tube from the largest ellipsoid that there is time for."""
+        from certify.engines.enlarge import enlarge
+        from certify.engines.models import paths
+
+        self.share = 1.0
+        P = race.best.trial.P
+        shapes = {c.trial.name: c.trial.P for c in (race.best, *_by_proved(race))} | {
+            "domain": _ellipsoid_in(self.system)
+        }
+        if self.options.box is not None:
+            shapes = {"box": _ellipsoid_in(self.system, self.options.box)}
+        end = self.spent + _FOR_SEARCH * self.left()
+        with self._stage("tube"):
+            self._tell("tube")
+            known = paths(race.best.trial.task.problem.loop)
+            worth = volume(P, claim.roa) if self.options.box is None else 0.0
+            found = enlarge(known, P / claim.roa, shapes, lambda: end - self.spent, worth)
+        if found is None:
+            self.aside = "no tube leads into the proved set from a larger one, as far as there was time to look"
+            return None, claim, evidence
+        tube = found.tube
+        facts = TubeFacts(tube.start, found.shape, len(tube.slabs), tube.duration)
+        enlarged = Enlarged(roa=claim.roa, local=claim.local, start=Quadratic(tube.start))
+        return facts, enlarged, replace(evidence, tube=tube.slabs)
 
     def _clerk(self) -> Clerk:
         return Clerk(self.out / "certificate.json", self.left, self._stage, lambda: self._tell("check"))
@@ -400,6 +440,29 @@ class _Run:
             yield
         finally:
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
+
+
+def _by_proved(race: Race) -> list[Contender]:
+    """The contenders, the largest proved volume first."""
+    return sorted(race.contenders, key=lambda c: -c.proved)
+
+
+def _ellipsoid_in(system: System, box: Mapping[str, float] | None = None) -> Array:
+    """P (n, n) of the ellipsoid {x'Px <= 1} with these half-axes; default: the nearer sides of the domain.
+
+    Raises
+    ------
+    InputError : the box has no state, or one that the plant has not.
+    """
+    names = [s.name for s in system.states]
+    sides = {n: min(-float(lo), float(hi)) for n, (lo, hi) in zip(names, system.domain, strict=True)}
+    box = sides if box is None else box
+    if not box or not box.keys() <= sides.keys():
+        raise InputError(
+            f"`box` must name states of {system.name}, {', '.join(names)}; found {', '.join(box) or 'none'}."
+        )
+    least = min(width / sides[name] for name, width in box.items())
+    return np.diag([float(box.get(name, least * sides[name])) ** -2 for name in names])
 
 
 def _kind_of(options: RoaOptions) -> Kind:

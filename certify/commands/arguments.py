@@ -56,6 +56,19 @@ def numbers(text: str | None, option: str) -> tuple[float, ...] | None:
         raise InputError(f"{option} takes numbers separated by commas, as in 1,1; found {text!r}.") from error
 
 
+def widths(text: str | None, option: str) -> dict[str, float] | None:
+    """Numbers by name, separated by commas."""
+    if text is None:
+        return None
+    pairs = dict(_assignment(part, option) for part in text.split(","))
+    try:
+        return {name: float(value) for name, value in pairs.items()}
+    except ValueError as error:
+        raise InputError(
+            f"{option} takes NAME=NUMBER separated by commas, as in x=0.4,phi=0.2; found {text!r}."
+        ) from error
+
+
 def _assignment(text: str, option: str) -> tuple[str, str]:
     name, equals, value = text.partition("=")
     if not equals or not name or not value:

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from certify.commands.arguments import numbers, plant_of
+from certify.commands.arguments import numbers, plant_of, widths
 from certify.commands.importing import policy_of
 from certify.commands.shared import Json, page_of, write
 from certify.commands.terminal import ProgressLine, say, show, tell
@@ -59,6 +59,15 @@ def roa(
     precision: Annotated[float, typer.Option(help="dReal's delta.")] = 1e-3,
     jobs: Annotated[int, typer.Option(help="dReal's threads.")] = 1,
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
+    enlarge: Annotated[
+        bool, typer.Option("--enlarge", help="Look for a tube that leads from a larger set into the proved one.")
+    ] = False,
+    box: Annotated[
+        str | None,
+        typer.Option(
+            help="Enlarge for the largest multiple of an ellipsoid with these half-axes, as in x=0.4,phi=0.2."
+        ),
+    ] = None,
     time_limit: Annotated[float, typer.Option(help="Seconds for everything up to the verdict.")] = 50.0,
     max_boxes: Annotated[int, typer.Option(help="Boxes for the ring.")] = 4_000_000,
     out: Annotated[Path | None, typer.Option(help="Folder for the results; default: out/POLICY.")] = None,
@@ -87,6 +96,8 @@ def roa(
         dreal_precision=precision,
         jobs=jobs,
         device=_device(device),
+        enlarge=enlarge,
+        box=widths(box, "--box"),
         time_limit=time_limit,
         max_boxes=max_boxes,
     )
@@ -135,7 +146,7 @@ def _command(context: typer.Context, changed: Mapping[str, str]) -> str:
             values = [v for v in values if v.partition("=")[0] != changed[name].partition("=")[0]]
         for each in values:
             parts += [name] if each is True else [name, str(each)]
-    return shlex.join([*parts, *(part for pair in changed.items() for part in pair)])
+    return shlex.join([*parts, *(part for pair in changed.items() for part in pair if part)])
 
 
 def _device(name: str) -> str:

@@ -55,7 +55,7 @@ def _ring_line(state: Progress) -> str:
     )
 
 
-_STAGES = {"candidate": "choosing candidates", "ring": "proving", "check": "checking"}
+_STAGES = {"candidate": "choosing candidates", "ring": "proving", "tube": "looking for a tube", "check": "checking"}
 
 
 class ProgressLine:

@@ -21,6 +21,7 @@ import numpy as np
 import sympy
 
 from certify.certificate import Certificate, PartitionTree, TrustedSolver
+from certify.claims import Asymptotic
 from certify.closed_loop import ClosedLoop
 from certify.errors import CertifyError, InputError, SoundnessError
 from certify.lyapunov import domain_limit, extents, semi_axes, volume
@@ -343,7 +344,7 @@ def _claim(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict[s
     notes = {"Domain": "; ".join(sides) + "." if drawable else "", "Inputs": "; ".join(bounds) + "."}
     if local:
         notes["Local"] = f"Margin of the linear part over the remainder: {below(100 * local, 3)} %."
-    if answer and certificate.kind == "asymptotic" and certificate.inner == certificate.roa:
+    if answer and isinstance(certificate.claim, Asymptotic) and certificate.inner == certificate.roa:
         notes["Ring"] = "As c₁ = c₂, the local part covers the whole set."
     elif answer:
         shown = f"Shown on {answer.get('ring_leaves', 0):,} of {answer.get('leaves', 0):,} leaves"
@@ -447,7 +448,7 @@ def _tables(
     geometry: list[tuple[str, str]] = []
     if np.all(np.isfinite(P)):
         geometry.append(("eigenvalues of P", ", ".join(number(float(v)) for v in np.linalg.eigvalsh(P))))
-    if certificate.kind == "asymptotic":  # elsewhere the origin need not be an equilibrium
+    if isinstance(certificate.claim, Asymptotic):  # elsewhere the origin need not be an equilibrium
         geometry.append(("eigenvalues of the closed loop", _eigenvalues(certificate)))
     evidence = [
         ("policy", f"{'-'.join(map(str, network.layers))} tanh, squash {network.squash}, centre {network.centre}"),
@@ -463,7 +464,7 @@ def _tables(
         evidence += [(f"its answer to {name}", said) for name, said in solver.queries]
     elif answer is not None and status.accepted:
         leaves = f"{answer.get('leaves', 0):,}, of which {answer.get('ring_leaves', 0):,} in the ring"
-        whole = certificate.kind == "asymptotic" and certificate.inner == certificate.roa
+        whole = isinstance(certificate.claim, Asymptotic) and certificate.inner == certificate.roa
         evidence.append(("leaves", "none needed: the local part covers the whole set" if whole else leaves))
     run: list[tuple[str, str]] = []
     if result is not None:

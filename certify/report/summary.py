@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
 _COLOURS = {"PROVED": "bold green", "REFUTED": "bold red", "UNKNOWN": "bold yellow", "TRUSTED": "bold yellow"}
-_STAGES = ("load", "candidate", "local", "ring", "write", "check")
+_STAGES = ("load", "candidate", "local", "ring", "tube", "write", "check")
 
 
 def summary(result: Mapping[str, Any]) -> RenderableType:
@@ -114,6 +114,14 @@ def _rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
     if stated:
         rows.append(("levels of V", ", ".join(stated)))
     units = _state_units(result)
+    if result.get("tube"):
+        tube = result["tube"]
+        rows.append(
+            (
+                "tube",
+                f"from an ellipsoid of the shape {tube['shape']}, {tube['slabs']} slabs, {number(tube['duration'], 3)} s",
+            )
+        )
     if result.get("volume") is not None:
         unit = volume_unit(units)
         rows.append((volume_name(len(units)), f"{below(result['volume'])} {unit}".rstrip()))
@@ -140,7 +148,7 @@ def _rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
         rows.append(("rests at", f"{point}; eigenvalues there {', '.join(rest['eigenvalues']) or 'not enclosed'}"))
     if result.get("eigenvalues"):
         rows.append(("eigenvalues", ", ".join(map(str, result["eigenvalues"]))))
-    if shown and kind == "asymptotic" and inner is not None and inner == levels.get("roa"):
+    if shown and kind != "practical" and inner is not None and inner == levels.get("roa"):
         rows.append(("work", f"{result['boxes']:,} boxes; the local part covers the whole set and no leaf is needed"))
     elif result.get("boxes"):
         rows.append(("work", f"{result['boxes']:,} boxes, {result['leaves']:,} leaves"))

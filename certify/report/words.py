@@ -10,7 +10,7 @@ import math
 import re
 import unicodedata
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
@@ -262,6 +262,26 @@ CLAIMS: Mapping[str, Words] = {
                 "somewhere. The origin need not attract them, and need not be an equilibrium at all.",
             ),
             ("Speed and cost.", "The time to reach {V ≤ c₀} is finite; how long, and at what cost, is not stated."),
+        ),
+    ),
+}
+
+
+_ASYMPTOTIC = CLAIMS["asymptotic"]
+CLAIMS = {
+    **CLAIMS,
+    "enlarged": replace(
+        _ASYMPTOTIC,
+        statement=_ASYMPTOTIC.statement + " Every trajectory that starts in the ellipsoid {{x'P₀x ≤ 1}}, from which a "
+        "tube leads into that set, stays in the domain, reaches that set, and converges to the origin too.",
+        headline="{{V <= {outer}}} is invariant and attracted by the origin; so is every state of the tube's start",
+        parts=(
+            *_ASYMPTOTIC.parts,
+            (
+                "Tube",
+                "x'P(t)x falls along every trajectory in {x'P(t)x ≤ 1}, from P₀ until that set lies in {V ≤ c₂}",
+                "slab by slab of the time, by the linearisation and a bound on its remainder in every direction",
+            ),
         ),
     ),
 }

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from certify.certificate import Certificate, PartitionTree, leaves
+from certify.claims import Practical
 from certify.errors import CertificateFormatError
 from certify.lyapunov import extents, is_positive_definite
 from certify.policies import TanhNetwork
@@ -96,7 +97,8 @@ class Scene:
         self.deadline = time.monotonic() + _SHARE * seconds
         if not is_ellipsoid(certificate):
             raise CertificateFormatError("P must be positive definite and the levels positive and in order.")
-        self.certificate, self.kind, self.words = certificate, certificate.kind, words_for(certificate.kind)
+        self.certificate, self.words = certificate, words_for(certificate.kind)
+        self.kind = "practical" if isinstance(certificate.claim, Practical) else "asymptotic"
         self.word, self.proved = ("certified", "proved") if accepted else ("claimed", "claimed")
         self.system, self.P = certificate.system, certificate.P
         self.inner, self.outer = certificate.inner, certificate.roa
