@@ -286,6 +286,24 @@ def test_numbers_at_the_edge_of_the_tube_by_hand() -> None:
     assert judge(duration(0, lambda h: 1e300)(honest("decay"))) is None
 
 
+HARMLESS: list[tuple[str, str, Edit]] = [
+    ("swing", "a component taken jointly", rows("evidence.tube.2", lambda v: [v[0], [0, v[1, 1]], [1e-9, 1e-9]])),
+    ("swing", "all components taken jointly", rows("evidence.tube.2", lambda v: [v[0], [0, 0], [1e-9, 1e-9]])),
+    ("swing", "no component jointly, and a g of 0", rows("evidence.tube.2", with_row((2, 0), 0.0))),
+    ("swing", "J with another sign", array("evidence.tube.2.J", times(-1))),
+    ("swing", "J with other axes", array("evidence.tube.2.J", lambda v: v.reshape(2, 2) @ [[0.6, -0.8], [0.8, 0.6]])),
+    ("swing", "a smaller start", array("claim.start", times(1.01))),
+    ("decay", "a larger domain", at("plant.domain.0", ["-4", "5"])),
+    ("decay", "a start that is the last end", array("claim.start", lambda _: [1.0625])),
+    ("ring", "a longer duration", duration(3, lambda h: 2 * h)),
+]
+
+
+@pytest.mark.parametrize(("name", "edit"), [pytest.param(n, e, id=f"{n}: {what}") for n, what, e in HARMLESS])
+def test_harmless_edits(name: str, edit: Edit) -> None:
+    assert judge(edit(honest(name))) is None
+
+
 # ------------------------------------------------------------------------------------------------------ inputs, clips
 
 
@@ -390,6 +408,18 @@ MALFORMED: dict[str, Edit] = {
 @pytest.mark.parametrize("what", MALFORMED)
 def test_malformed_tubes(what: str) -> None:
     assert judge_bytes(dump(MALFORMED[what](honest("decay")))) == "format"
+
+
+PLACES = ["claim", "claim.kind", "claim.start", "evidence.local", "evidence.local.J", "evidence.local.multipliers"]
+PLACES += ["evidence.tube", "evidence.tube.1", *(f"evidence.tube.1.{key}" for key in ("end", "duration", "J"))]
+
+
+@pytest.mark.parametrize("path", PLACES)
+@pytest.mark.parametrize(
+    "value", [None, True, 0, -1, "", "a", "0x1p0", [], {}, [[]], [None], {"J": 1}, "AAAAAAAA8D8"], ids=repr
+)
+def test_odd_values(path: str, value: Any) -> None:
+    assert judge_bytes(dump(edited(honest("decay"), path, value))) == "format"
 
 
 def test_ten_thousand_slabs_are_read() -> None:
