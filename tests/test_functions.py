@@ -29,7 +29,7 @@ from certify.errors import InputError
 from certify.expressions import evaluate_exactly, from_tree, has_tree, to_tree
 from certify.policies import TanhNetwork
 from certify.reference import expressions as reference_expressions
-from certify.reference import local as reference_local
+from certify.reference import model as reference_model
 from certify.reference import rules as reference_rules
 from certify.reference import taylor as reference_taylor
 from certify.reference.refusal import Refused
@@ -202,11 +202,11 @@ def test_models_of_random_equations_contain_them(tree: Any, seed: int, size: flo
         jets = [checker_jets.Jet(np.float64(c), 0.0, a, 0.0, n, n) for c, a in zip(at_0, slopes, strict=True)]
         [jet] = checker_expression.evaluate(tape, lambda q: checker_jets.constant(q, 2), jets)
         models = {
-            name: reference_local.Local.affine(arb(float(c)), [arb(float(v)) for v in a])
+            name: reference_model.Model.affine(arb(float(c)), [arb(float(v)) for v in a])
             for name, c, a in zip("xy", at_0, slopes, strict=True)
         }
         try:
-            [model] = compiled.evaluate(models, lambda q: reference_local.Local.affine(arb(q), [arb(0)] * 2))
+            [model] = compiled.evaluate(models, lambda q: reference_model.Model.affine(arb(q), [arb(0)] * 2))
         except Refused:
             model = None
         finite = bool(np.isfinite([jet.size, jet.slack, *np.ravel(jet.a), *np.ravel(jet.Q), *np.ravel(jet.E)]).all())

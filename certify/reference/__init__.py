@@ -5,9 +5,9 @@ same mistake. So nothing here was taken from `certify.checker`, nothing of the p
 comes from a float: what is rational is decided in flint's fractions, all else in balls whose comparisons count only
 when they are certain.
 
-The page leaves choices: the two lines around a tanh, the multiplier k, how a spectral norm is bounded, how the error of
-a tanh reaches the tanhs behind it. They are made here independently, so on a leaf or a local ball that is close to its
-limit the two verdicts may differ, either way.
+The page leaves choices: the two lines around a tanh, the multiplier k, how the error of a tanh reaches the tanhs behind
+it, how tightly the models on a ball are bounded. They are made here independently, so on a leaf or a ball that is close
+to its limit the two verdicts may differ, either way.
 
 `python -I -m certify.reference FILE` prints the claim and the verdict.
 """

@@ -8,14 +8,17 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import os
 import stat
 import sys
 import time
 from collections.abc import Sequence
+from fractions import Fraction
 from typing import Any
 
 from .document import MAX_BYTES, Certificate
+from .evidence import Trusted
 from .rules import Verdict, judge
 
 STATUS = {"ACCEPTED": 0, "REJECTED": 1, "TRUSTED": 3}
@@ -38,15 +41,43 @@ def in_words(c: Certificate) -> str:
             f"{c.plant.name}, policy {c.policy.sha256}: every trajectory that starts in V <= {c.outer!r} stays there, "
             f"enters V <= {c.inner!r} in finite time and stays in that set from then on, with {bounds}"
         )
-    return (
+    stays = (
         f"{c.plant.name}, policy {c.policy.sha256}: every trajectory that starts in V <= {c.outer!r} stays there and "
         f"converges to the origin, which is asymptotically stable, with {bounds}"
     )
+    if c.start is None:
+        return stays
+    return (
+        f"{stays}; and every trajectory that starts in x'P_0 x <= 1 reaches V <= {c.outer!r} after the sum of the "
+        f"durations ({time_of_tube(c)}) at the latest, stays in the domain on the way, and converges to the origin, "
+        f"with {bounds}; "
+        f"P_0 = {start_rows(c)}"
+    )
+
+
+def start_rows(c: Certificate) -> list[list[float]] | None:
+    """P_0, whose numbers are binary64 and so exact here."""
+    if c.start is None:  # a matrix of zeros is false
+        return None
+    return [[int(v.p) / int(v.q) for v in row] for row in c.start.tolist()]
+
+
+def time_of_tube(c: Certificate) -> float | None:
+    """The sum of the durations, rounded upwards; None without a tube, and where no binary64 number is as large."""
+    if c.start is None or isinstance(c.evidence, Trusted):
+        return None
+    exactly = sum((Fraction(slab.duration) for slab in c.evidence.tube), Fraction(0))
+    try:
+        nearest = float(exactly)
+    except OverflowError:
+        return None
+    upwards = nearest if nearest >= exactly else math.nextafter(nearest, math.inf)
+    return upwards if math.isfinite(upwards) else None
 
 
 def level_names(c: Certificate) -> tuple[tuple[str, str, float], ...]:
     """Key in the file, letter, value."""
-    inner = ("local", "c1", c.inner) if c.claim == "asymptotic" else ("floor", "c0", c.inner)
+    inner = ("local", "c1", c.inner) if c.ends_at_origin else ("floor", "c0", c.inner)
     return inner, ("roa", "c2", c.outer)
 
 
@@ -69,6 +100,8 @@ def as_json(verdict: Verdict, seconds: float) -> dict[str, Any]:
         "certificate_sha256": verdict.certificate_sha256,
         "policy_sha256": c and c.policy.sha256,
         "levels": c and {key: value for key, _, value in level_names(c)},
+        "start": c and start_rows(c),
+        "time": c and time_of_tube(c),
         "leaves": verdict.leaves,
         "seconds": {"check": seconds},
         "text": [*([in_words(c)] if c and verdict.result != "REJECTED" else []), line(verdict)],

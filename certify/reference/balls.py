@@ -1,4 +1,4 @@
-"""Balls of Arb: what the local rule and the leaves share.
+"""Balls of Arb: what the rules on balls of states and the leaves share.
 
 Traps that this module is there for: a comparison of balls is True only if it is certain, so a condition is written such
 that True is needed to go on; `min`, `max` and `sorted` of Python compare midpoints at best, so balls have methods for
@@ -8,10 +8,12 @@ that; and a number that is not finite is compared with nothing.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from functools import cache
 
 from flint import arb, arb_mat
 
-from .document import Certificate, Policy, exact
+from .document import Certificate, Policy
+from .fields import exact
 
 PRECISION = 128  # bits; single operations of flint cost about the same with 64
 ZERO, ONE = arb(0), arb(1)
@@ -35,24 +37,34 @@ def finite(values: Iterable[arb]) -> bool:
     return all(v.is_finite() for v in values)
 
 
-def norm(values: Iterable[arb]) -> arb:
-    """The largest 2-norm of a vector of balls."""
-    return total(arb(v.abs_upper()) ** 2 for v in values).sqrt()
+def norm(values: Sequence[arb]) -> arb:
+    """The largest 2-norm of a vector of balls; no upper bound of a sum of squares is negative, so the root exists."""
+    row = arb_mat(1, len(values), list(values))
+    return arb((row * row.transpose())[0, 0].upper()).sqrt()
 
 
+@cache
 def identity(n: int) -> arb_mat:
+    """Shared by all who ask: nobody may change it."""
     return arb_mat(n, n, [int(i == j) for i in range(n) for j in range(n)])
 
 
-def spectral(A: arb_mat) -> arb:
-    """A bound of the largest singular value: the root of ||(AA')^(2^k)||_F, at most n^(1/2^(k+2)) too large."""
-    result, squared = norm(A.entries()), A * A.transpose()
-    for k in range(30):
-        bound = norm(squared.entries())
-        for _ in range(k + 1):
-            bound = bound.sqrt()
-        result, squared = bound if bound < result else result, squared * squared
-    return result
+def certainly_definite(A: arb_mat) -> bool:
+    """Whether every symmetric matrix in A is positive definite: each pivot of L diag L' is certainly positive.
+
+    Only what stands on and below the diagonal is looked at. A pivot that is not finite is no number: +inf > 0 is
+    certain, and says nothing.
+    """
+    rows = A.tolist()
+    for k, row in enumerate(rows):
+        pivot = row[k]
+        if not (pivot.is_finite() and pivot > 0):
+            return False
+        for i in range(k + 1, len(rows)):
+            factor = rows[i][k] / pivot
+            for j in range(k + 1, i + 1):
+                rows[i][j] -= factor * rows[j][k]
+    return True
 
 
 def derivatives(name: str, y: arb) -> tuple[arb, arb, arb, arb]:

@@ -5,27 +5,25 @@ Weights stay binary64 numbers in flat arrays until a rule asks for them: a file 
 
 from __future__ import annotations
 
-import base64
-import binascii
 import hashlib
 import json
-import math
 import re
 import struct
-import sys
 from array import array
 from dataclasses import dataclass
 from typing import Any
 
 from flint import fmpq, fmpq_mat
 
+from .evidence import Tree, Trusted, read_evidence
 from .expressions import Equations, equations, rational
+from .fields import binary64, entries, exact, keys, little_endian, numbers, square
 from .refusal import Refused, require
 
 MAX_BYTES, MAX_BYTES_BEYOND_ASCII = 256 * 2**20, 16 * 2**20
 MAX_TOKENS = 10**6  # commas and opening brackets
 MAX_NAMES, MAX_LAYERS, MAX_WIDTH = 64, 64, 2**14
-WORD = re.compile(r"[A-Za-z0-9_.+-]{1,80}")
+SCHEMA, CLAIMS = "certify-certificate/4", ("asymptotic", "practical", "enlarged")
 IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,63}")
 
 Interval = tuple[fmpq, fmpq]
@@ -71,27 +69,14 @@ class Policy:
 
 
 @dataclass(frozen=True)
-class Tree:
-    """Evidence that can be replayed."""
-
-    T: fmpq_mat
-    root: array[float]
-    tree: bytes
-
-
-@dataclass(frozen=True)
-class Trusted:
-    """Evidence that cannot."""
-
-    solver: str
-    version: str
-
-
-@dataclass(frozen=True)
 class Certificate:
-    """`inner` and `outer`, between which the leaves show Vdot < 0, are c1 (`practical`: c0) and c2."""
+    """`inner` and `outer`, between which the leaves show Vdot < 0, are c1 (`practical`: c0) and c2.
+
+    `start` is P_0 of an enlarged claim.
+    """
 
     claim: str
+    start: fmpq_mat | None
     plant: Plant
     policy: Policy
     P: fmpq_mat
@@ -107,25 +92,35 @@ class Certificate:
     def m(self) -> int:
         return len(self.plant.inputs)
 
+    @property
+    def ends_at_origin(self) -> bool:
+        """Whether the claim is about the equilibrium at the origin, so that a local ball covers {V <= c1}."""
+        return self.claim != "practical"
+
 
 def read(raw: bytes) -> Certificate:
     """The certificate in the bytes of a file, in the order of FORMAT.md's sections."""
     sections = ("schema", "claim", "plant", "policy", "lyapunov", "levels", "evidence", "provenance")
     data = keys(parsed(raw), "file", *sections)
-    require(data["schema"] == "certify-certificate/3", "format", "schema", "'certify-certificate/3' was expected")
+    require(data["schema"] == SCHEMA, "format", "schema", f"'{SCHEMA}' was expected")
     require(isinstance(data["provenance"], dict), "format", "provenance", "an object was expected")
-    claim = keys(data["claim"], "claim", "kind")["kind"]
-    require(claim in ("asymptotic", "practical"), "format", "claim.kind", "'asymptotic' or 'practical' was expected")
-    inner_name = "local" if claim == "asymptotic" else "floor"
+    said = data["claim"]
+    named = isinstance(said, dict) and said.get("kind") in CLAIMS
+    require(named, "format", "claim.kind", f"one of {', '.join(CLAIMS)} was expected")
+    claim = str(said["kind"])
+    said = keys(said, "claim", "kind", *(["start"] if claim == "enlarged" else []))
+    inner_name = "floor" if claim == "practical" else "local"
     plant = read_plant(data["plant"])
     n = len(plant.states)
+    start = square(said["start"], "claim.start", n) if claim == "enlarged" else None
     policy = read_policy(data["policy"], n, len(plant.inputs))
     lyapunov = keys(data["lyapunov"], "lyapunov", "kind", "P")
     require(lyapunov["kind"] == "quadratic", "format", "lyapunov.kind", "'quadratic' was expected")
-    P = numbers(lyapunov["P"], "lyapunov.P", n * n)
+    P = square(lyapunov["P"], "lyapunov.P", n)
     levels = keys(data["levels"], "levels", inner_name, "roa")
     inner, outer = binary64(levels[inner_name], f"levels.{inner_name}"), binary64(levels["roa"], "levels.roa")
-    return Certificate(claim, plant, policy, matrix(P, n), inner, outer, read_evidence(data["evidence"], n))
+    evidence = read_evidence(data["evidence"], n, claim)
+    return Certificate(claim, start, plant, policy, P, inner, outer, evidence)
 
 
 def parsed(raw: bytes) -> Any:
@@ -230,81 +225,3 @@ def read_clip(value: Any, m: int) -> tuple[array[float], array[float]] | None:
     lo, hi = (numbers(end, "policy.clip", m) for end in entries(value, "policy.clip", 2))
     require(all(a < b for a, b in zip(lo, hi, strict=True)), "format", "policy.clip", "lo < hi must hold")
     return lo, hi
-
-
-def read_evidence(value: Any, n: int) -> Tree | Trusted:
-    if isinstance(value, dict) and value.get("kind") == "trusted-solver":
-        evidence = keys(value, "evidence", "kind", "solver", "version", "precision", "queries")
-        positive = binary64(evidence["precision"], "evidence.precision") > 0
-        require(positive, "format", "evidence.precision", "must be positive")
-        queries = entries(evidence["queries"], "evidence.queries")
-        said = [word for pair in queries for word in entries(pair, "evidence.queries", 2)]
-        for word in (evidence["solver"], evidence["version"], *said):
-            good = isinstance(word, str) and WORD.fullmatch(word) is not None
-            require(good, "format", "evidence", "a word was expected")
-        return Trusted(evidence["solver"], evidence["version"])
-    evidence = keys(value, "evidence", "kind", "T", "root", "tree")
-    require(evidence["kind"] == "partition-tree", "format", "evidence.kind", "an unknown kind")
-    T, root = numbers(evidence["T"], "evidence.T", n * n), numbers(evidence["root"], "evidence.root", n)
-    return Tree(matrix(T, n), root, decoded(evidence["tree"], "evidence.tree"))
-
-
-# ------------------------------------------------------------------------------------------------------- single values
-
-
-def keys(value: Any, at: str, *names: str) -> dict[str, Any]:
-    good = isinstance(value, dict) and set(value) == set(names)
-    require(good, "format", at, f"an object with the keys {', '.join(names)} was expected")
-    return dict(value)
-
-
-def entries(value: Any, at: str, count: int | None = None) -> list[Any]:
-    good = isinstance(value, list) and count in (None, len(value))
-    require(good, "format", at, f"a list{'' if count is None else f' of {count}'} was expected")
-    return list(value)
-
-
-def binary64(text: Any, at: str) -> float:
-    try:
-        value = float.fromhex(text)
-    except (TypeError, ValueError, OverflowError):
-        raise Refused("format", at, "a hex float was expected") from None
-    canonical = math.isfinite(value) and value.hex() == text
-    require(canonical, "format", at, "a canonical finite hex float was expected")
-    return value
-
-
-def decoded(text: Any, at: str) -> bytes:
-    try:
-        raw = base64.b64decode(text, validate=True) if isinstance(text, str) else b""
-    except (binascii.Error, ValueError):
-        raise Refused("format", at, "base64 was expected") from None
-    canonical = isinstance(text, str) and base64.b64encode(raw).decode() == text
-    require(canonical, "format", at, "canonical base64 was expected")
-    return raw
-
-
-def numbers(text: Any, at: str, count: int) -> array[float]:
-    raw = decoded(text, at)
-    require(len(raw) == 8 * count, "format", at, f"{count} binary64 numbers were expected")
-    values = array("d")
-    values.frombytes(raw)
-    if sys.byteorder == "big":
-        values.byteswap()
-    require(all(map(math.isfinite, values)), "format", at, "finite numbers were expected")
-    return values
-
-
-def little_endian(values: array[float]) -> bytes:
-    if sys.byteorder == "big":
-        values = values[:]
-        values.byteswap()
-    return values.tobytes()
-
-
-def exact(value: float) -> fmpq:
-    return fmpq(*value.as_integer_ratio())
-
-
-def matrix(values: array[float], n: int) -> fmpq_mat:
-    return fmpq_mat(n, n, [exact(v) for v in values])

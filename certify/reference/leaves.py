@@ -23,7 +23,8 @@ from .balls import (
     weights,
     within_bounds,
 )
-from .document import Certificate, Tree
+from .document import Certificate
+from .evidence import Tree
 from .refusal import Refused, require
 from .taylor import Taylor, pairs
 
@@ -354,12 +355,12 @@ def clip(y: Affine, lo: arb, hi: arb) -> Affine:
 def check_leaves(leaves: Leaves, evidence: Tree) -> None:
     """Rules `inputs` and `ring`; in each batch of leaves the inputs come first.
 
-    An inside leaf has been covered by rule `local` under `asymptotic`. Under `practical` by nothing: there the inputs
-    are asked, and that F has a finite model.
+    An inside leaf has been covered by rule `local` where the claim is about the origin. Under `practical` by nothing:
+    there the inputs are asked, and that F has a finite model.
     """
     c, bounded = leaves.c, bounded_by_form(leaves.c)
     size = max(1, BATCH // max(layer.rows for layer in c.policy.layers))
-    passing = c.claim == "asymptotic"
+    passing = c.ends_at_origin
     asked = (box for box in boxes(evidence) if not (leaves.is_outside(box) or (passing and leaves.is_inside(box))))
     while batch := list(islice(asked, size)):
         enclosed = leaves.enclose(batch)

@@ -8,7 +8,9 @@ from dataclasses import dataclass
 
 from flint import fmpq, fmpq_mat
 
-from .document import Certificate, Policy, Tree, exact
+from .document import Certificate, Policy
+from .evidence import Tree
+from .fields import exact
 from .refusal import require
 
 MAX_BITS = 2**14  # of a numerator or denominator on the way to f(0, u_eq)
@@ -19,14 +21,24 @@ def levels(c: Certificate) -> None:
     require(0 < c.inner <= c.outer, "levels", "levels", f"0 < {c.inner!r} <= {c.outer!r} does not hold")
 
 
-def inverse_diagonal(A: fmpq_mat, rule: str) -> list[fmpq]:
+def inverse_diagonal(A: fmpq_mat, rule: str, at: str | None = None) -> list[fmpq]:
     """The diagonal of A^-1, by cofactors, if A = A' and every leading principal minor is positive."""
     n = A.nrows()
     symmetric = A.transpose() == A
-    require(symmetric, rule, "symmetry", "the matrix differs from its transpose")
+    require(symmetric, rule, at or "symmetry", "the matrix differs from its transpose")
     for k in range(1, n + 1):
-        require(bool(minor(A, range(k)) > 0), rule, f"minor {k}", "a leading principal minor is not positive")
-    return [minor(A, [k for k in range(n) if k != i]) / A.det() for i in range(n)]
+        require(bool(minor(A, range(k)) > 0), rule, at or f"minor {k}", "a leading principal minor is not positive")
+    whole = A.det()
+    return [minor(A, [k for k in range(n) if k != i]) / whole for i in range(n)]
+
+
+def positive_definite(A: fmpq_mat) -> bool:
+    """Whether A = A' and every leading principal minor is positive (Sylvester)."""
+    return bool(A.transpose() == A) and all(bool(minor(A, range(k)) > 0) for k in range(1, A.nrows() + 1))
+
+
+def identity(n: int) -> fmpq_mat:
+    return fmpq_mat(n, n, [int(i == j) for i in range(n) for j in range(n)])
 
 
 def minor(A: fmpq_mat, kept: range | list[int]) -> fmpq:
@@ -34,24 +46,26 @@ def minor(A: fmpq_mat, kept: range | list[int]) -> fmpq:
     return fmpq_mat(len(kept), len(kept), [A[i, j] for i in kept for j in kept]).det() if kept else fmpq(1)
 
 
-def discs(A: fmpq_mat) -> fmpq:
-    """Gershgorin's lower bound min_i (A_ii - sum_j |A_ij|) on the eigenvalues of a symmetric matrix."""
-    return min(row[i] - sum((abs(v) for j, v in enumerate(row) if j != i), ZERO) for i, row in enumerate(A.tolist()))
-
-
 def domain(c: Certificate, inverse: list[fmpq]) -> None:
     """The largest x_i^2 on {V <= c2} is c2 (P^-1)_ii."""
-    for (lo, hi), s, name in zip(c.plant.domain, inverse, c.plant.states, strict=True):
+    for (lo, hi), name in zip(c.plant.domain, c.plant.states, strict=True):
         require(bool(lo < 0) and bool(hi > 0), "domain", name, "the domain must contain 0 in its interior")
-        inside = bool(exact(c.outer) * s < min(-lo, hi) ** 2)
-        require(inside, "domain", name, "the ellipsoid {V <= c2} leaves the interior of the domain")
+    left = beyond_domain(c, [exact(c.outer) * s for s in inverse])
+    require(left is None, "domain", left or "", "the ellipsoid {V <= c2} leaves the interior of the domain")
+
+
+def beyond_domain(c: Certificate, largest: list[fmpq]) -> str | None:
+    """The first state that is not within its bounds where no x_i^2 exceeds `largest`; the domain holds 0 inside."""
+    each = zip(c.plant.domain, largest, c.plant.states, strict=True)
+    return next((name for (lo, hi), most, name in each if not most < min(-lo, hi) ** 2), None)
 
 
 def coordinates(c: Certificate, tree: Tree) -> tuple[fmpq_mat, list[fmpq]]:
     """S = T'PT and the diagonal of its inverse."""
     S = tree.T.transpose() * c.P * tree.T
     inverse = inverse_diagonal(S, "coordinates")
-    require(bool(discs(S) > 0), "coordinates", "rows", "S_ii > sum_j |S_ij| does not hold")
+    discs = (row[i] - sum((abs(v) for j, v in enumerate(row) if j != i), ZERO) for i, row in enumerate(S.tolist()))
+    require(all(bool(left > 0) for left in discs), "coordinates", "rows", "S_ii > sum_j |S_ij| does not hold")
     return S, inverse
 
 
@@ -125,7 +139,7 @@ def centring(c: Certificate) -> None:
         if limits is not None and policy.centre != "none":
             inside = bool(limits[0] < q) and bool(q < limits[1])
             require(inside, "centring", c.plant.inputs[j], "u_eq does not lie strictly inside the clip")
-    if policy.centre == "none" and c.claim == "asymptotic":
+    if policy.centre == "none" and c.ends_at_origin:
         for j, (y, (q, scale, offset)) in enumerate(zip(squashed_at_0(policy), each, strict=True)):
             holds = y is not None and bool(clip(scale * y + offset, policy.limits(j)) == q)
             require(holds, "centring", c.plant.inputs[j], "raw(0) = u_eq does not hold by its form")

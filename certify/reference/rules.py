@@ -9,10 +9,13 @@ from flint import ctx
 
 from . import rational
 from .balls import PRECISION
-from .document import Certificate, Trusted, read
+from .document import Certificate, read
+from .evidence import Trusted
 from .leaves import Leaves, check_leaves, structure
 from .local import local
+from .loop import Loop
 from .refusal import Refused, require
+from .tube import tube
 
 MAX_WORK = 2**22  # numbers of a model times operations of the plant; entries of the matrices of a network
 
@@ -49,21 +52,30 @@ def check(c: Certificate) -> int | None:
     """Every rule in its order; the number of leaves, or None where the evidence cannot be replayed."""
     rational.levels(c)
     inverse = rational.inverse_diagonal(c.P, "lyapunov")
-    if c.claim == "asymptotic":
+    if c.ends_at_origin:
         rational.equilibrium(c)
     rational.domain(c, inverse)
-    if isinstance(c.evidence, Trusted):
+    evidence = c.evidence
+    if isinstance(evidence, Trusted):
         rational.centring(c)
         return None
-    S, inverse = rational.coordinates(c, c.evidence)
-    rational.root(c, c.evidence, inverse)
+    S, inverse = rational.coordinates(c, evidence)
+    rational.root(c, evidence, inverse)
     rational.centring(c)
-    bearable(c, "local" if c.claim == "asymptotic" else "ring")
-    if c.claim == "asymptotic":
-        local(c, c.evidence.T, S)
-    leaves = structure(c.evidence.tree, c.n)
-    if c.inner < c.outer or c.claim == "practical":  # no local ball stands in for the leaves
-        check_leaves(Leaves(c, c.evidence.T, S), c.evidence)
+    bearable(c, "local" if c.ends_at_origin else "ring")
+    loop = None
+    if c.ends_at_origin:
+        if evidence.ball is None:
+            raise Refused("format", "evidence.local", "the claim needs a ball")
+        loop = Loop(c)
+        local(loop, evidence.ball)
+    leaves = structure(evidence.tree, c.n)
+    if c.inner < c.outer or loop is None:  # no local ball stands in for the leaves
+        check_leaves(Leaves(c, evidence.T, S), evidence)
+    if c.claim == "enlarged":
+        if loop is None or c.start is None:
+            raise Refused("format", "claim.start", "the claim needs a start")
+        tube(loop, c.start, evidence.tube)
     return leaves
 
 

@@ -1,0 +1,45 @@
+"""The closed loop on a ball x = J d, ||d|| <= 1: what the rules `local` and `tube` ask before anything decreases.
+
+The inputs within their bounds, no clip that acts, and a finite model of every component of F.
+"""
+
+from __future__ import annotations
+
+from flint import arb, arb_mat, fmpq, fmpq_mat
+
+from .balls import ZERO, bounded_by_form, finite, within_bounds
+from .document import Certificate
+from .model import Model
+from .network import Network
+from .refusal import Refused, require
+
+
+class Loop:
+    """F(x) = f(x, pi(x)) of a certificate, for as many balls as it has."""
+
+    def __init__(self, c: Certificate) -> None:
+        self.c, self.network, self.bounded = c, Network(c), bounded_by_form(c)
+
+    def on(self, J: fmpq_mat, rule: str, at: str) -> list[Model]:
+        """Models of F, or a refusal under `inputs` or under the rule that asks, at the place it names."""
+        c, n = self.c, self.c.n
+        u = self.network.on(J)
+        bounded = self.bounded or within_bounds(c, [(v.v, v.radius) for v in u])
+        require(bounded, "inputs", at, "an input is not certain to stay in its bounds")
+        for j, v in enumerate(u):
+            limits = c.policy.limits(j)
+            alone = limits is None or bool(v.v - v.radius > arb(limits[0]) and v.v + v.radius < arb(limits[1]))
+            require(alone, rule, at, f"{c.plant.inputs[j]} is not certain to be left alone by the clip")
+        states = [Model.affine(ZERO, row) for row in arb_mat(J).tolist()]
+        names = dict(zip(c.plant.states + c.plant.inputs, [*states, *u], strict=True))
+
+        def constant(q: fmpq) -> Model:
+            return Model.affine(arb(q), [ZERO] * n)
+
+        try:
+            F = c.plant.dynamics.evaluate(names, constant)
+        except Refused as no:
+            raise Refused(rule, at, no.detail) from None
+        known = all(finite([f.v, *f.a.entries(), *f.Q.entries(), *f.E.entries()]) for f in F)
+        require(known, rule, at, "F has no finite model")
+        return F

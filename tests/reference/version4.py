@@ -1,0 +1,131 @@
+"""Documents of version 4, on top of the builders of version 3.
+
+`upgraded` gives a document its ball, and `enlarge` a tube. J is the least ball around the ellipsoids, or nearly, and
+the multipliers are chosen from the models that the reference itself finds on that ball: they are hints, which only
+decide whether something is accepted and never whether it is true.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from flint import ctx, fmpq, fmpq_mat
+
+from certify.reference.balls import PRECISION
+from certify.reference.document import read
+from certify.reference.loop import Loop
+from certify.reference.refusal import Refused
+from tests.support import reference
+from tests.support.certificates import Document, decode, edited, encode
+
+SCHEMA, MARGIN, TINY = "certify-certificate/4", 1e-6, 2.0**-60
+
+
+def judge(data: Document) -> str | None:
+    """As `tests.support.reference.judge`, with a ball where the document has none."""
+    return reference.judge(upgraded(data))
+
+
+def upgraded(data: Document) -> Document:
+    """A document of version 3 in version 4; what is malformed stays so."""
+    evidence = data.get("evidence")
+    if data.get("schema") != "certify-certificate/3":
+        return data
+    data = edited(data, "schema", SCHEMA)
+    if not isinstance(evidence, dict) or evidence.get("kind") != "partition-tree":
+        return data
+    data["evidence"] |= {"local": None, "tube": []}
+    if "local" in data["levels"]:
+        data["evidence"]["local"] = local_ball(data)
+    return data
+
+
+def square(text: str) -> np.ndarray:
+    values = decode(text)
+    return values.reshape(2 * [int(len(values) ** 0.5)])
+
+
+def local_ball(data: Document) -> Document:
+    """The least ball around {V <= c1}, nearly; any ball where the document does not tell."""
+    n = len(data["plant"]["states"])
+    try:
+        P, c1 = square(data["lyapunov"]["P"]), float.fromhex(data["levels"]["local"])
+        with np.errstate(all="ignore"):
+            J = around(P / c1)
+    except (TypeError, ValueError, OverflowError, np.linalg.LinAlgError):
+        return ball(np.eye(n), ones(n))
+    if not np.isfinite(J).all():
+        return ball(np.eye(n), ones(n))
+    return ball(J, multipliers(edited(data, "evidence.local", ball(J, ones(n))), J, [P], np.zeros((n, n))))
+
+
+def around(*nodes: np.ndarray) -> np.ndarray:
+    """J of a ball that contains {x'Px <= 1} for one P or for both."""
+    least = nodes[0]
+    for other in nodes[1:]:
+        L = np.linalg.cholesky(least)
+        w, U = np.linalg.eigh(np.linalg.solve(L, np.linalg.solve(L, other).T))
+        least = L @ U @ np.diag(np.minimum(w, 1)) @ U.T @ L.T
+    result: np.ndarray = np.linalg.inv(np.linalg.cholesky((least + least.T) / 2)).T * (1 + MARGIN)
+    return result
+
+
+def ones(n: int) -> np.ndarray:
+    return np.ones((3, n))
+
+
+def ball(J: Any, rows: Any) -> Document:
+    return {"J": encode(J), "multipliers": encode(rows)}
+
+
+def exactly(A: np.ndarray) -> fmpq_mat:
+    return fmpq_mat([[fmpq(*float(v).as_integer_ratio()) for v in row] for row in A])
+
+
+def multipliers(data: Document, J: np.ndarray, nodes: Sequence[np.ndarray], R: np.ndarray) -> np.ndarray:
+    """Alpha and beta that balance the two sides of each inequality where the first-order part decreases; no joint part.
+
+    Ones where the reference finds no model, or nothing decreases.
+    """
+    n = len(J)
+    try:
+        with ctx.workprec(PRECISION):
+            F = Loop(read(json.dumps(data).encode())).on(exactly(J), "local", "ball")
+    except Refused:
+        return ones(n)
+    a, Q, E = (
+        np.array([[float(v) for v in getattr(f, part).entries()] for f in F]).reshape(n, *shape)
+        for part, shape in (("a", (n,)), ("Q", (n, n)), ("E", (n, n)))
+    )
+    P = sum(nodes[1:], nodes[0]) / len(nodes)
+    b = J.T @ P
+    left = -(J.T @ R @ J + b @ a + a.T @ b.T)
+    with np.errstate(all="ignore"):
+        if not (np.isfinite(left).all() and np.linalg.eigvalsh(left)[0] > 0):
+            return ones(n)
+        inverse = np.linalg.inv(left)
+        along = np.einsum("ji,jk,ki->i", b, inverse, b)
+        sizes = [np.sqrt(np.einsum("iab,bc,iac->i", A, inverse, A) / along) for A in (E, Q)]
+    alpha = np.where(E.any((1, 2)) & np.isfinite(sizes[0]), sizes[0], 0.0)
+    least = TINY / np.where(along > 0, along, 1.0)  # as good as nothing, and positive: no component is taken jointly
+    beta = np.where(Q.any((1, 2)) & np.isfinite(sizes[1]) & (sizes[1] > 0), sizes[1], least)
+    return np.stack([alpha, beta, np.ones(n)])
+
+
+def enlarge(data: Document, nodes: Sequence[np.ndarray], durations: Sequence[float]) -> Document:
+    """The enlarged claim from the first node, with a slab to each of the others."""
+    data = edited(upgraded(data), "claim", {"kind": "enlarged", "start": encode(nodes[0])})
+    slabs = []
+    data["evidence"]["tube"] = [
+        {"end": encode(nodes[-1]), "duration": (1.0).hex()} | ball(nodes[-1], ones(len(nodes[0])))
+    ]
+    for (before, after), h in zip(pairwise(nodes), durations, strict=True):
+        J = around(before, after)
+        hints = multipliers(data, J, [before, after], (after - before) / h)
+        slabs.append({"end": encode(after), "duration": float(h).hex()} | ball(J, hints))
+    data["evidence"]["tube"] = slabs
+    return data
