@@ -13,14 +13,13 @@ from fractions import Fraction
 from html import escape
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from certify.certificate import parse_certificate, write_atomically
 from certify.claims import Problem
-from certify.claims.claim import Kind
 from certify.engines.falsify import Witness
 from certify.errors import InputError
 from certify.lyapunov import are_inside, extents, semi_axes, volume
@@ -167,7 +166,7 @@ class RoaResult:
     stop: Stop
     system: System
     network: TanhNetwork
-    claim: Kind | Literal[enlarged] = "asymptotic"
+    claim: str = "asymptotic"
     detail: str = ""
     problem: Problem | None = None
     candidate: str | None = None

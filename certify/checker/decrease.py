@@ -29,6 +29,12 @@ class Models:
         self.E = [exactly(f.E) for f in F]
 
 
+def are_usable(by: Multipliers) -> bool:
+    """None is negative, and g is positive where it is used."""
+    signs = all(v >= 0 for row in (by.rest, by.apart, by.joint) for v in row)
+    return signs and (all(beta > 0 for beta in by.apart) or all(g > 0 for g in by.joint))
+
+
 def are_finite(F: Sequence[Jet]) -> bool:
     """Whether every component has a finite model."""
     return all(np.all(np.isfinite(part)) for f in F for part in (f.a, f.slack, f.Q, f.E))

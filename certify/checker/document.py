@@ -214,8 +214,6 @@ def _slab(value: Value, n: int) -> Slab:
 
 def _multipliers(value: Value, n: int) -> Multipliers:
     rows = value.array(3, n)
-    value.must(bool(np.all(rows >= 0)), "numbers that are not negative")
-    value.must(bool(np.all(rows[1] > 0) or np.all(rows[2] > 0)), "rows of which the second or the third is positive")
     rest, apart, joint = (tuple(fmpq(*v.as_integer_ratio()) for v in row) for row in rows.tolist())
     return Multipliers(rest, apart, joint)
 

@@ -11,7 +11,7 @@ from flint import fmpq_mat
 from . import ball
 from .ball import Ball
 from .case import Case, Failures
-from .decrease import Models, are_finite, sides
+from .decrease import Models, are_finite, are_usable, sides
 from .exact import contains_ball, exactly, fraction, is_definite
 
 
@@ -42,6 +42,8 @@ def fits(local: Local) -> Failures:
     """`local`: the ball contains {V <= c1}, and its jets take neither too much memory nor too much time."""
     if not contains_ball(exactly(local.J), exactly(local.case.c.P), Fraction(local.case.c.c1)):
         yield "levels.local", "the ball must contain {V <= c1}"
+    if not are_usable(local.case.local.multipliers):
+        yield "evidence.local", "no multiplier may be negative, none of g 0 where some beta is"
     yield from ball.fits(local)
     return 0
 

@@ -103,9 +103,8 @@ ON_THE_BALL: Table[local.Local] = (
 )
 OF_THE_TREE: Table[Case] = (("tree", ring.is_whole),)
 ON_LEAVES: Table[ring.Leaves] = (("inputs", ring.keeps_inputs), ("ring", ring.decreases))
-OF_THE_TUBE: Table[Case] = (("tube", tube.ends_inside),)
+OF_THE_TUBE: Table[Case] = (("tube", tube.nodes_are_sound),)
 ON_SLABS: Table[tube.Piece] = (
-    ("tube", tube.lies_in_domain),
     ("tube", tube.fits),
     ("inputs", ball.keeps_inputs),
     ("tube", ball.is_not_clipped),

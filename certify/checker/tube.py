@@ -16,7 +16,7 @@ from flint import fmpq, fmpq_mat
 from . import ball
 from .ball import Ball
 from .case import Case, Failures
-from .decrease import Models, are_finite, shows
+from .decrease import Models, are_finite, are_usable, shows
 from .document import Slab
 from .exact import contains_ball, exactly, inverse_diagonal, is_definite
 from .float64 import Array
@@ -50,21 +50,18 @@ def pieces(case: Case) -> Iterator[Piece]:
         node = slab.end
 
 
-def ends_inside(case: Case) -> Failures:
-    """`tube`: the last ellipsoid lies in {V <= c2}."""
+def nodes_are_sound(case: Case) -> Failures:
+    """`tube`: positive definite matrices, whose ellipsoids lie in the interior of the domain, the last in {V <= c2}."""
+    limits = [min(-lo, hi) ** 2 for lo, hi in case.c.domain]
+    start = [] if case.c.start is None else [("start", case.c.start)]
+    middles_and_ends = [(f"tube[{k}]", P) for k, slab in enumerate(case.tube) for P in (slab.middle, slab.end)]
+    for at, P in (*start, *middles_and_ends):
+        inverse = inverse_diagonal(exactly(P))
+        if not (inverse and all(p < limit for p, limit in zip(inverse, limits, strict=True))):
+            yield at, "P must be positive definite, and its ellipsoid lie in the interior of the domain"
     last, c2 = exactly(case.tube[-1].end), Fraction(case.c.c2)
     if not is_definite(last - exactly(case.c.P) / fmpq(c2.numerator, c2.denominator)):
         yield "tube", "the last ellipsoid must lie in {V <= c2}"
-    return 0
-
-
-def lies_in_domain(piece: Piece) -> Failures:
-    """`tube`: three positive definite matrices, whose ellipsoids lie in the interior of the domain."""
-    limits = [min(-lo, hi) ** 2 for lo, hi in piece.case.c.domain]
-    for P in piece.coefficients:
-        inverse = inverse_diagonal(P)
-        if not (inverse and all(p < limit for p, limit in zip(inverse, limits, strict=True))):
-            yield piece.at, "P must be positive definite, and its ellipsoid lie in the interior of the domain"
     return 0
 
 
@@ -75,6 +72,8 @@ def fits(piece: Piece) -> Failures:
         yield piece.at, "the duration must be positive"
     if not all(contains_ball(J, P, Fraction(1)) for P in piece.coefficients):
         yield piece.at, "the ball must contain the ellipsoids of start, middle and end"
+    if not are_usable(piece.slab.multipliers):
+        yield piece.at, "no multiplier may be negative, none of g 0 where some beta is"
     yield from ball.fits(piece)
     return 0
 

@@ -32,8 +32,9 @@ class Ball:
 
 @dataclass(frozen=True)
 class Slab:
-    """From one node of a tube to the next, `end`, in the time `duration`."""
+    """From one node of a tube by `middle` to the next, `end`, in the time `duration`."""
 
+    middle: fmpq_mat
     end: fmpq_mat
     duration: float
     ball: Ball
@@ -84,9 +85,10 @@ def read_ball(value: dict[str, Any], at: str, n: int) -> Ball:
 
 
 def read_slab(value: Any, at: str, n: int) -> Slab:
-    slab = keys(value, at, "end", "duration", "J", "multipliers")
+    slab = keys(value, at, "middle", "end", "duration", "J", "multipliers")
     duration = binary64(slab["duration"], f"{at}.duration")
-    return Slab(square(slab["end"], f"{at}.end", n), duration, read_ball(slab, at, n))
+    middle, end = (square(slab[key], f"{at}.{key}", n) for key in ("middle", "end"))
+    return Slab(middle, end, duration, read_ball(slab, at, n))
 
 
 def read_trusted(value: dict[str, Any]) -> Trusted:

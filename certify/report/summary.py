@@ -116,12 +116,8 @@ def _rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
     units = _state_units(result)
     if result.get("tube"):
         tube = result["tube"]
-        rows.append(
-            (
-                "tube",
-                f"from an ellipsoid of the shape {tube['shape']}, {tube['slabs']} slabs, {number(tube['duration'], 3)} s",
-            )
-        )
+        size = f"{tube['slabs']} slabs, {number(tube['duration'], 3)} units of time"
+        rows.append(("tube", f"from an ellipsoid of the shape {tube['shape']}, {size}"))
     if result.get("volume") is not None:
         unit = volume_unit(units)
         rows.append((volume_name(len(units)), f"{below(result['volume'])} {unit}".rstrip()))

@@ -116,16 +116,18 @@ def multipliers(data: Document, J: np.ndarray, nodes: Sequence[np.ndarray], R: n
     return np.stack([alpha, beta, np.ones(n)])
 
 
+def slab_of(middle: np.ndarray, end: np.ndarray, duration: float) -> Document:
+    return {"middle": encode(middle), "end": encode(end), "duration": float(duration).hex()}
+
+
 def enlarge(data: Document, nodes: Sequence[np.ndarray], durations: Sequence[float]) -> Document:
     """The enlarged claim from the first node, with a slab to each of the others."""
     data = edited(upgraded(data), "claim", {"kind": "enlarged", "start": encode(nodes[0])})
     slabs = []
-    data["evidence"]["tube"] = [
-        {"end": encode(nodes[-1]), "duration": (1.0).hex()} | ball(nodes[-1], ones(len(nodes[0])))
-    ]
+    data["evidence"]["tube"] = [slab_of(nodes[-1], nodes[-1], 1.0) | ball(nodes[-1], ones(len(nodes[0])))]
     for (before, after), h in zip(pairwise(nodes), durations, strict=True):
         J = around(before, after)
         hints = multipliers(data, J, [before, after], (after - before) / h)
-        slabs.append({"end": encode(after), "duration": float(h).hex()} | ball(J, hints))
+        slabs.append(slab_of((before + after) / 2, after, h) | ball(J, hints))
     data["evidence"]["tube"] = slabs
     return data
