@@ -1,8 +1,8 @@
 """Rule `tube`: ellipsoids {x'P(t)x <= 1} that no trajectory leaves, from `start` into {V <= c2}.
 
 On a slab P(s) = (1 - s)^2 A + 2 s (1 - s) M + s^2 B runs from node A to node B by the middle M, and x'P(t)x falls along
-every trajectory inside. What falls is for each x such a polynomial too, with three coefficients that are seen to be negative;
-x'P(s)x <= 1 puts x into the ellipsoid of A, M or B. So these three stand for all that lies between.
+every trajectory inside. What falls is for each x such a polynomial too, with three coefficients that are seen to be
+negative; x'P(s)x <= 1 puts x into the ellipsoid of A, M or B. So these three stand for all that lies between.
 """
 
 from __future__ import annotations
