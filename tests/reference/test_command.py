@@ -16,7 +16,7 @@ from certify.reference import __main__ as command
 from certify.reference.rules import judge
 from tests.checker.test_rules import honest as of_version_3
 from tests.reference.test_practical import scalar
-from tests.reference.version4 import upgraded
+from tests.support.balls import with_ball
 from tests.support.certificates import Document, dump, edited, write
 
 TRUSTED = {"kind": "trusted-solver", "solver": "dReal", "version": "4", "precision": (0.5).hex(), "queries": []}
@@ -38,7 +38,7 @@ KEYS = [
 
 
 def honest(name: str) -> Document:
-    return upgraded(of_version_3(name))
+    return with_ball(of_version_3(name))
 
 
 def run(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
@@ -56,7 +56,7 @@ def test_accepted(tmp_path: Path) -> None:
 
 
 def test_practical_in_words(tmp_path: Path) -> None:
-    done = run(write(upgraded(scalar(["-", "x"])), tmp_path))
+    done = run(write(with_ball(scalar(["-", "x"])), tmp_path))
     claim, verdict = done.stdout.splitlines()
     assert done.returncode == 0 and "enters V <= 0.04 in finite time" in claim
     assert verdict.startswith("ACCEPTED c0=0.04 c2=1.0 sha256=")

@@ -21,7 +21,7 @@ from certify.reference.evidence import Ball
 from certify.reference.model import Model
 from certify.reference.rational import positive_definite
 from certify.reference.refusal import Refused
-from tests.reference.version4 import exactly
+from tests.support.balls import exactly
 
 Rows = tuple[list[float], list[float], list[float]]
 

@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tests.reference.version4 import judge
 from tests.support.certificates import LEAF, Document, edited, make, rehash, with_tree
-from tests.support.reference import judge_bytes
+from tests.support.reference import judge, judge_bytes
 
 SPLIT = 0
 

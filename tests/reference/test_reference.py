@@ -52,7 +52,7 @@ from tests.checker.test_rules import (
     reordered,
     scalar_claim,
 )
-from tests.reference.version4 import ball, judge, upgraded
+from tests.support.balls import ball, with_ball
 from tests.support.certificates import (
     LEAF,
     Document,
@@ -69,7 +69,7 @@ from tests.support.certificates import (
     with_tree,
 )
 from tests.support.oracle import policy_in_arb, value_of
-from tests.support.reference import judge_bytes
+from tests.support.reference import judge, judge_bytes
 
 SHIPPED = Path(__file__).parents[2] / "examples" / "policies" / "pendulum.pt"
 
@@ -147,7 +147,7 @@ def test_two_inputs_and_three_states_are_accepted(centre: str, v: tuple[str, str
 
 @pytest.mark.parametrize("edit", HARMLESS)
 def test_harmless_edits_stay_accepted(edit: str) -> None:
-    assert judge_bytes(HARMLESS[edit](upgraded(honest("linear")))) is None
+    assert judge_bytes(HARMLESS[edit](with_ball(honest("linear")))) is None
 
 
 @pytest.mark.parametrize("exponent", [-200, 0, 200])
@@ -493,7 +493,7 @@ def test_the_remainder_of_a_function_is_the_least(name: str, at_0: float, parts:
 
 def local_inputs(data: Document, rho: float) -> list[Model]:
     """The policy on the ball x = T rho d, ||d|| <= 1."""
-    c = read_certificate(dump(upgraded(data)))
+    c = read_certificate(dump(with_ball(data)))
     return Network(c).on(exact(rho) * tree_evidence(c).T)
 
 
@@ -515,7 +515,7 @@ def test_the_local_ball_encloses_the_policy(name: str, rho: float) -> None:
     """At points of the ball, against ball arithmetic that shares nothing with it."""
     data = honest(name) if name == "rotor" else deep(*name.split())
     c, generator = parse(data), np.random.default_rng(1)
-    mine = read_certificate(dump(upgraded(data)))
+    mine = read_certificate(dump(with_ball(data)))
     T = tree_evidence(mine).T.tolist()
     with ctx.workprec(160):
         for direction in generator.standard_normal((40, mine.n)):
@@ -548,7 +548,7 @@ def test_the_local_model_is_sharp_on_a_small_ball(squash: str, what: str) -> Non
 @pytest.mark.parametrize("rho", [2.0**-20, 0.01])
 def test_the_ball_encloses_F(name: str, rho: float) -> None:
     data = crane("output", ("-3/2", "3/2")) if name == "crane" else honest(name)
-    c, mine, generator = parse(data), read_certificate(dump(upgraded(data))), np.random.default_rng(1)
+    c, mine, generator = parse(data), read_certificate(dump(with_ball(data))), np.random.default_rng(1)
     with ctx.workprec(160):
         J = exact(rho) * tree_evidence(mine).T
         F = Loop(mine).on(J, "local", "ball")
@@ -582,12 +582,12 @@ def test_the_limit_of_the_local_rule(power: int, states: str) -> None:
         data = make(dynamics, layers, 4 * np.eye(n), (c1, c1), states=states, domain=[("-3", "3")] * n, T=T)
         J = math.sqrt(c1 / 4) * (1 + 2.0**-40) * T
         rows = [[0.0] * n, [2.0**-60] * (n - 1) + [beta], [0.0] * n]
-        assert judge(edited(upgraded(data), "evidence.local", ball(J, rows))) == found
+        assert judge(edited(with_ball(data), "evidence.local", ball(J, rows))) == found
 
 
 def test_the_inputs_on_the_local_ball() -> None:
     data = honest("rotor")
-    data = upgraded(edited(data, "levels.roa", data["levels"]["local"]))
+    data = with_ball(edited(data, "levels.roa", data["levels"]["local"]))
     c = read_certificate(dump(data))
     with ctx.workprec(160):
         reach = [Fraction(float(u.radius)) for u in Network(c).on(ball_of(c).J)]
@@ -600,7 +600,7 @@ def test_the_inputs_on_the_local_ball() -> None:
 @pytest.mark.parametrize("what", ["a", "Q", "E"])
 @pytest.mark.parametrize("bad", ["nan", "inf", "-inf", "[0 +/- inf]"])
 def test_what_is_not_finite_is_not_accepted(monkeypatch: pytest.MonkeyPatch, what: str, bad: str) -> None:
-    c = read_certificate(dump(upgraded(honest("local only"))))
+    c = read_certificate(dump(with_ball(honest("local only"))))
     policy = Network.on
 
     def broken(*arguments: Any) -> list[Model]:
@@ -618,7 +618,7 @@ def test_what_is_not_finite_is_not_accepted(monkeypatch: pytest.MonkeyPatch, wha
 
 
 def leaves_of(data: Document) -> tuple[leaves.Leaves, list[leaves.Leaf]]:
-    c = read_certificate(dump(upgraded(data)))
+    c = read_certificate(dump(with_ball(data)))
     S, _ = rational.coordinates(c, tree_evidence(c))
     all_leaves = leaves.Leaves(c, tree_evidence(c).T, S)
     return all_leaves, all_leaves.enclose(list(leaves.boxes(tree_evidence(c))))

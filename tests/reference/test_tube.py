@@ -24,9 +24,9 @@ from scipy.linalg import expm
 from certify.reference import __main__ as command
 from certify.reference import decrease, rules, tube
 from certify.reference.loop import Loop
-from tests.reference.version4 import around, ball, enlarge, judge, square, upgraded
+from tests.support.balls import around, ball, enlarge, square, with_ball
 from tests.support.certificates import Document, decode, dump, edited, encode, grow, make, write
-from tests.support.reference import judge_bytes
+from tests.support.reference import judge, judge_bytes
 
 Edit = Callable[[Document], Document]
 NONE = 2.0**-60  # a beta of a component that has no Q
@@ -46,7 +46,7 @@ def slab(end: Any, duration: float, J: Any, rows: Any) -> Document:
 def decay() -> Document:
     """From |x| <= 2 into |x| <= 1 by |x| <= 4/3: (P_k - P_(k-1)) / h < 2 P_(k-1), with P_k = 1/4, 9/16, 17/16."""
     data = edited(
-        upgraded(still([["-", "x"]], 1.0, (1.0, 1.0))), "claim", {"kind": "enlarged", "start": encode([0.25])}
+        with_ball(still([["-", "x"]], 1.0, (1.0, 1.0))), "claim", {"kind": "enlarged", "start": encode([0.25])}
     )
     rows = [[0.0], [NONE], [0.0]]
     data["evidence"]["tube"] = [slab(0.5625, 0.75, 2.125, rows), slab(1.0625, 0.5, 1.375, rows)]

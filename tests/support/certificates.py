@@ -85,8 +85,10 @@ def make(
     if root is None:
         root = least_root(P, T, levels[1])
     arrays = [(np.atleast_2d(np.asarray(W, dtype=np.float64)), np.atleast_1d(b)) for W, b in layers]
-    return rehash({
-        "schema": "certify-certificate/3",
+    from tests.support.balls import with_ball
+
+    return with_ball(rehash({
+        "schema": "certify-certificate/4",
         "claim": {"kind": claim},
         "plant": {
             "name": "plant",
@@ -113,15 +115,18 @@ def make(
             "T": encode(T),
             "root": encode(root),
             "tree": base64.b64encode(tree).decode("ascii"),
+            "local": None,
+            "tube": [],
         },
         "provenance": {"tool": "written by hand"},
-    })  # fmt: skip
+    }))  # fmt: skip
 
 
 def least_root(P: np.ndarray, T: np.ndarray, level: float) -> np.ndarray:
     """Half-widths of the smallest binary64 box in z around {V <= level}."""
-    inverse = exact.inverse_diagonal(exact.congruence(exact.rational(T), exact.rational(P)))
-    if inverse is None:
+    S = exact.exactly(T).transpose() * exact.exactly(P) * exact.exactly(T)
+    inverse = exact.inverse_diagonal(S)
+    if not inverse:
         raise ValueError("T'PT must be positive definite")
     root = []
     for s in inverse:

@@ -176,7 +176,7 @@ def _expression(node: Any, names: set[str]) -> None:
 def _shape(data: Any) -> None:
     """Every section, key, count and number."""
     _section(data, "schema", "claim", "plant", "policy", "lyapunov", "levels", "evidence", "provenance")
-    _need(data["schema"] == "certify-certificate/3", "schema")
+    _need(data["schema"] == "certify-certificate/4", "schema")
     _need(isinstance(data["provenance"], dict), "provenance")
     plant, policy, evidence = data["plant"], data["policy"], data["evidence"]
     _section(plant, "name", "states", "inputs", "dynamics", "u_eq", "domain", "input_bounds")
@@ -233,11 +233,18 @@ def _shape(data: Any) -> None:
         words = [evidence["solver"], evidence["version"], *(word for pair in pairs for word in pair)]
         _need(all(isinstance(w, str) and w and not set(w) & set(" \n\t") for w in words), "words")
         return
-    _section(evidence, "kind", "T", "root", "tree")
+    _section(evidence, "kind", "T", "root", "tree", "local", "tube")
     _need(evidence["kind"] == "partition-tree", "kind")
     _array(evidence["T"], n, n)
     _array(evidence["root"], n)
     _bytes(evidence["tree"])
+    _need(evidence["tube"] == [], "no tube: this page knows of no enlarged claim")
+    if inner == "floor":
+        _need(evidence["local"] is None, "no ball")
+        return
+    _section(evidence["local"], "J", "multipliers")
+    _array(evidence["local"]["J"], n, n)
+    _array(evidence["local"]["multipliers"], 3, n)
 
 
 # --------------------------------------------------------------------------------------------------------- exact facts
@@ -403,10 +410,28 @@ def exact_faults(data: Document) -> dict[str, str]:
                 faults["coordinates"] = "T'PT"
             elif wrong:
                 faults["root"] = f"axis {wrong[0]}"
+        if not is_practical(data) and inverse is not None:
+            wrong = _ball_fault(evidence["local"], P, c1, n)
+            if wrong:
+                faults["local"] = wrong
         wrong_tree = tree_fault(_bytes(evidence["tree"]), n)
         if wrong_tree:
             faults["tree"] = wrong_tree
     return faults
+
+
+def _ball_fault(local: Any, P: Matrix, c1: Fraction, n: int) -> str | None:
+    """The ball must contain {V <= c1}, and no multiplier be negative, or 0 where it divides."""
+    J = _matrix(_array(local["J"], n, n))
+    around = _congruence(J, P)
+    for i in range(n):
+        around[i][i] -= c1
+    if _inverse(around) is None:
+        return "J'PJ - c1 I"
+    alpha, beta, g = _array(local["multipliers"], 3, n).tolist()
+    if any(v < 0 for v in (*alpha, *beta, *g)) or (0 in beta and 0 in g):
+        return "multipliers"
+    return None
 
 
 def tree_fault(tree: bytes, n: int) -> str | None:
@@ -771,29 +796,27 @@ def _without_multiplier(loop: Loop, T: Array, z: Array, V: Array, vdot: Array, m
 
 
 def local_fault(data: Document) -> tuple[str, str] | None:
-    """("local" or "inputs", why) if the local rule cannot hold on the ball that FORMAT.md prescribes; None otherwise.
+    """("local" or "inputs", why) if the local rule cannot hold on the ball of the document; None otherwise.
 
     The rule implies that -d'B d exceeds |d'G(d) - d'B d| everywhere on the ball; B is from central differences of step
     2^-150 in balls of 700 bits, and d is sampled.
     """
-    return _local_fault(json.dumps([data[k] for k in _CLAIM]), data["evidence"]["T"])
+    return _local_fault(json.dumps([data[k] for k in _CLAIM]), data["evidence"]["local"]["J"])
 
 
 @lru_cache(256)
 def _local_fault(claim: str, encoded: str) -> tuple[str, str] | None:
     loop = Loop(dict(zip(_CLAIM, json.loads(claim), strict=True)))
     n = loop.n
-    T, P = _array(encoded, n, n), _matrix(loop.P)
-    least = _row_surplus(_congruence(_matrix(T), P))
+    J, P = _array(encoded, n, n), _matrix(loop.P)
     directions = _directions(n)
     directions = directions[:, :: max(1, directions.shape[1] // 30)]
     d = np.concatenate([directions * r for r in (1 - 1e-9, 0.7, 0.3)], axis=1)
     with ctx.workprec(700):
-        rho = _ball(Fraction(loop.c1) / least).sqrt()
         step = arb(2) ** -150
         units = [[step * int(i == j) * sign for i in range(n)] for sign in (1, -1) for j in range(n)]
         samples = [[arb(v) for v in column] for column in d.T.tolist()]
-        states = [[rho * v for v in _mapped(T, s)] for s in (*units, *samples)]
+        states = [_mapped(J, s) for s in (*units, *samples)]
         try:
             values = loop.closed_loop(states)
         except Undefined:
@@ -804,7 +827,7 @@ def _local_fault(claim: str, encoded: str) -> tuple[str, str] | None:
         for j, (lo, hi) in enumerate(loop.limits):
             if math.isfinite(lo) and any(not (u[j] > lo and u[j] < hi) for u, _ in values):
                 return "local", f"{loop.plant['inputs'][j]} is clipped on the local ball"
-        TP = [[_ball(v) for v in row] for row in _times(_matrix(T.T), P)]
+        TP = [[_ball(v) for v in row] for row in _times(_matrix(J.T), P)]
         G = [[sum((p * f for p, f in zip(row, F, strict=True)), arb(0)) for row in TP] for _, F in values]
         B = [[(G[j][i] - G[n + j][i]) / (2 * step) for j in range(n)] for i in range(n)]
         slack = arb(2) ** -60  # covers the differences' error, of relative order 2^-300

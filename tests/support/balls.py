@@ -1,6 +1,6 @@
-"""Documents of version 4, on top of the builders of version 3.
+"""Balls and tubes for documents that are written by hand.
 
-`upgraded` gives a document its ball, and `enlarge` a tube. J is the least ball around the ellipsoids, or nearly, and
+`with_ball` gives a document its ball, and `enlarge` a tube. J is the least ball around the ellipsoids, or nearly, and
 the multipliers are chosen from the models that the reference itself finds on that ball: they are hints, which only
 decide whether something is accepted and never whether it is true.
 """
@@ -19,29 +19,16 @@ from certify.reference.balls import PRECISION
 from certify.reference.document import read
 from certify.reference.loop import Loop
 from certify.reference.refusal import Refused
-from tests.support import reference
 from tests.support.certificates import Document, decode, edited, encode
 
-SCHEMA, MARGIN, TINY = "certify-certificate/4", 1e-6, 2.0**-60
+MARGIN, TINY = 1e-6, 2.0**-60
 
 
-def judge(data: Document) -> str | None:
-    """As `tests.support.reference.judge`, with a ball where the document has none."""
-    return reference.judge(upgraded(data))
-
-
-def upgraded(data: Document) -> Document:
-    """A document of version 3 in version 4; what is malformed stays so."""
-    evidence = data.get("evidence")
-    if data.get("schema") != "certify-certificate/3":
+def with_ball(data: Document) -> Document:
+    """The document with a ball for its levels, P, plant and policy, where its claim has one."""
+    if "local" not in data["levels"]:
         return data
-    data = edited(data, "schema", SCHEMA)
-    if not isinstance(evidence, dict) or evidence.get("kind") != "partition-tree":
-        return data
-    data["evidence"] |= {"local": None, "tube": []}
-    if "local" in data["levels"]:
-        data["evidence"]["local"] = local_ball(data)
-    return data
+    return edited(data, "evidence.local", local_ball(data))
 
 
 def square(text: str) -> np.ndarray:
@@ -122,7 +109,7 @@ def slab_of(middle: np.ndarray, end: np.ndarray, duration: float) -> Document:
 
 def enlarge(data: Document, nodes: Sequence[np.ndarray], durations: Sequence[float]) -> Document:
     """The enlarged claim from the first node, with a slab to each of the others."""
-    data = edited(upgraded(data), "claim", {"kind": "enlarged", "start": encode(nodes[0])})
+    data = edited(data, "claim", {"kind": "enlarged", "start": encode(nodes[0])})
     slabs = []
     data["evidence"]["tube"] = [slab_of(nodes[-1], nodes[-1], 1.0) | ball(nodes[-1], ones(len(nodes[0])))]
     for (before, after), h in zip(pairwise(nodes), durations, strict=True):
