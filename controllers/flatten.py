@@ -133,10 +133,10 @@ class Flattened:
     seconds: float
 
     def as_json(self) -> dict[str, Any]:
-        """Plain values; a cost that is not finite becomes None."""
+        """Plain values; what is not finite becomes None."""
 
         def figures(found: Figures) -> dict[str, Any]:
-            return {**asdict(found), "cost": found.cost if math.isfinite(found.cost) else None}
+            return {name: _finite(value) for name, value in asdict(found).items()}
 
         return {
             "system": self.policy.system,
@@ -261,6 +261,8 @@ class _Run:
         states, wanted = self._data()
         for step in range(options.steps):
             if time.monotonic() - self.began > options.time_limit:
+                if step % every:  # not judged yet
+                    self._keep(self._exported(student))
                 return step, "time limit"
             for group, rate in zip(groups, rates, strict=True):
                 group["lr"] = rate * (1 - step / options.steps)

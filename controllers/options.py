@@ -13,7 +13,7 @@ import importlib
 import math
 import pkgutil
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import MISSING, dataclass, fields, replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 from certify.errors import InputError
@@ -127,8 +127,16 @@ class TrainingOptions:
 
     def record(self) -> dict[str, Any]:
         """All options as plain values, for the policy file and for checkpoints."""
-        values = {option.name: getattr(self, option.name) for option in fields(self)}
-        return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
+        return _plain({option.name: getattr(self, option.name) for option in fields(self)})
+
+
+def default_record() -> dict[str, Any]:
+    """The options that have a default, as `TrainingOptions.record` writes them."""
+    return _plain({option.name: option.default for option in fields(TrainingOptions) if option.default is not MISSING})
+
+
+def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
 
 def _finite(value: object) -> bool:

@@ -16,6 +16,7 @@ from certify.policies import Policy, TanhNetwork, load_policy, require_centred, 
 from certify.systems import get_system
 from controllers import flatten as module
 from controllers.cli import app
+from controllers.evaluate import EvaluationOptions, curvature, evaluate
 from controllers.flatten import FACTORS, FlattenOptions, bend, flatten
 from controllers.simulation import initial_states
 
@@ -98,6 +99,17 @@ def test_the_record_says_how_and_the_old_one_stays(result):
     assert flattened["sha256"] == curved().sha256()
     assert flattened["departure"] == [result.before.departure, result.after.departure]
     assert flattened["weight"] == 1.0 and flattened["box"] == list(module.get_plant("pendulum").initial_states)
+
+
+def test_what_the_record_says_of_the_numbers_is_said_of_the_new_ones():
+    K = [[5.5, 2.0]]
+    old = _record(K=K, eta=0.1, distance=-1.0, curvature=-1.0)
+    network = (found := flatten(Policy(curved(), "pendulum", training=old), replace(QUICK, steps=8)).policy).network
+    record = found.training
+    distance = np.linalg.norm(network.jacobian_at_origin(PENDULUM.exact_u_eq()) + np.array(K))
+    assert record["distance"] == pytest.approx(distance) and record["K"] == K
+    assert record["curvature"] == curvature(network, PENDULUM, 0.1) < curvature(curved(), PENDULUM, 0.1)
+    assert evaluate(found, EvaluationOptions(states=2, duration=1.0)).curvature == record["curvature"]
 
 
 def test_the_same_seed_gives_the_same_policy(result):
