@@ -70,8 +70,8 @@ def departure(weights: Sequence[Tensor], biases: Sequence[Tensor], box: Tensor) 
 
     Returns
     -------
-    A number without unit, 0 for an affine network; it can be differentiated, the range of the linear part counting as a
-    constant: larger gains are no way to lower it.
+    A number without unit, 0 for an affine network; it can be differentiated. The last layer's scale makes no difference
+    to it, so that doing less is no way to lower it.
 
     Notes
     -----
@@ -85,7 +85,7 @@ def departure(weights: Sequence[Tensor], biases: Sequence[Tensor], box: Tensor) 
         v, t = J.abs() @ half_widths, torch.tanh(y)
         above, below = (torch.tanh(y + end) - t - (1 - t * t) * end for end in (v, -v))
         total = total + (C.abs() @ ((above.abs() + below.abs()) / 2)).sum()
-    linear = (at_0.jacobians[-1].abs() @ half_widths).sum().detach()
+    linear = (at_0.jacobians[-1].abs() @ half_widths).sum()
     return total / linear.clamp_min(_LEAST)
 
 
