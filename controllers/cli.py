@@ -12,6 +12,7 @@ import typer
 
 from controllers.commands.compare import compare
 from controllers.commands.evaluate import evaluate
+from controllers.commands.flatten import flatten
 from controllers.commands.train import train
 from controllers.commands.train_baseline import train_baseline
 
@@ -22,6 +23,7 @@ app = typer.Typer(
     add_completion=False,
 )
 app.command("train")(train)
+app.command("flatten")(flatten)
 app.command("evaluate")(evaluate)
 app.command("train-baseline")(train_baseline)
 app.command("compare")(compare)

@@ -13,7 +13,7 @@ import importlib
 import math
 import pkgutil
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import MISSING, dataclass, fields, replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
 from certify.errors import InputError
@@ -66,6 +66,14 @@ class TrainingOptions:
     rest_weight: Annotated[
         float, "Weight of the hidden units' norms at the origin, summed over layers, in the actor's loss; 0 drops it."
     ] = 0.0
+    proof_weight: Annotated[
+        float,
+        "Weight of what the hidden units may add to the linear part on a box, as bounds see it, in the actor's loss; "
+        "0 drops the term.",
+    ] = 0.0
+    proof_box: Annotated[
+        tuple[float, ...], "Half-widths of that box, one a state; none means the states in which episodes start."
+    ] = ()
     # The stabilising part
     identification: Annotated[
         Identification, "When A and B are learned: during the run, once before the warm-up, or never (plain SAC)."
@@ -84,7 +92,7 @@ class TrainingOptions:
             self._require(name, getattr(self, name) > 0, "positive")
         for name in ("critic_scale", "eta", "n_A", "n_B", "refresh"):
             self._require(name, getattr(self, name) > 0, "positive")
-        for name in ("seed", "penalty", "gain_weight", "curvature_weight", "rest_weight", "warm_up"):
+        for name in ("seed", "penalty", "gain_weight", "curvature_weight", "rest_weight", "proof_weight", "warm_up"):
             self._require(name, getattr(self, name) >= 0, "at least 0")
         self._require("seed", self.seed < 2**63, "below 2^63")
         for name in ("gamma", "anneal"):
@@ -96,7 +104,8 @@ class TrainingOptions:
             self._require(name, bool(widths) and all(w > 0 for w in widths), "positive widths, at least one")
         for name in ("reward_weights", "state_weights"):
             self._require(name, all(w >= 0 for w in getattr(self, name)), "at least 0")
-        self._require("input_weights", all(w > 0 for w in self.input_weights), "positive")
+        for name in ("input_weights", "proof_box"):
+            self._require(name, all(w > 0 for w in getattr(self, name)), "positive")
         for name, choices in (("centre", get_args(Centre)), ("identification", get_args(Identification))):
             self._require(name, getattr(self, name) in choices, f"one of {choices}")
         for option in fields(self):
@@ -109,15 +118,25 @@ class TrainingOptions:
             raise InputError(f"`{name}` must be {requirement}; found {getattr(self, name)!r}.")
 
     def check_sizes(self, system: System) -> None:
-        """Raise InputError unless there is one weight a state and one an input."""
+        """Raise InputError unless there is one weight a state and one an input, and one half-width of a box a state."""
         sizes = {"reward_weights": system.n, "state_weights": system.n, "input_weights": system.m}
+        if self.proof_box:
+            sizes["proof_box"] = system.n
         for name, size in sizes.items():
             self._require(name, len(getattr(self, name)) == size, f"{size} numbers for {system.name}")
 
     def record(self) -> dict[str, Any]:
         """All options as plain values, for the policy file and for checkpoints."""
-        values = {option.name: getattr(self, option.name) for option in fields(self)}
-        return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
+        return _plain({option.name: getattr(self, option.name) for option in fields(self)})
+
+
+def default_record() -> dict[str, Any]:
+    """The options that have a default, as `TrainingOptions.record` writes them."""
+    return _plain({option.name: option.default for option in fields(TrainingOptions) if option.default is not MISSING})
+
+
+def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
 
 
 def _finite(value: object) -> bool:

@@ -9,8 +9,9 @@ with Stability Guarantees for Control of Unknown Nonlinear Systems" uses it. One
     actor:  log pi(u~|x) - min_i Q_i(x, u~)  +  weight * (||J_mu(0) + K|| + ||mu(0) - u_eq||)
 
 where the last term is there once a gain K is known, unless its weight is 0; mu is the mean action in
-physical units. Two more terms hold down the curvature near the origin, for the sake of proofs: `Actor.curvature_loss`
-lowers what it is, `Actor.rest_loss` what a bound of it sees. Everything is float32, as is the exported policy; the
+physical units. Three more terms are there for the sake of proofs. Two hold down the curvature near the origin:
+`Actor.curvature_loss` lowers what it is, `Actor.rest_loss` what a bound of it sees. `Actor.departure` is what a bound
+sees of the hidden units on the box where the policy is used. Everything is float32, as is the exported policy; the
 states' factors are powers of two, so that folding them into the first layer rounds nothing and the exported network is
 the trained one bit for bit.
 
@@ -33,6 +34,7 @@ from torch import Tensor, nn
 from certify.errors import InputError
 from certify.policies import TanhNetwork
 from certify.systems import System
+from controllers.departure import departure
 from controllers.options import Centre, TrainingOptions
 
 Array = NDArray[np.float64]
@@ -70,7 +72,7 @@ def squashed_log_likelihood(w: Tensor, mean: Tensor, log_std: Tensor, scale: Ten
 class Interface:
     """What the learner is told of the plant: its input bounds, u_eq and the ranges of its states.
 
-    `u = scale * tanh(w) + offset`; `state_factors` bring the states to order one.
+    `u = scale * tanh(w) + offset`; `state_factors` bring the states to order one, `reach` is how far each may go.
     """
 
     def __init__(self, system: System) -> None:
@@ -80,6 +82,7 @@ class Interface:
         if not np.all((u_lo < u_eq) & (u_eq < u_hi)):
             raise InputError(f"u_eq of {system.name} must lie inside the input bounds; found {u_eq}.")
         self.scale, self.offset, self.u_eq = (u_hi - u_lo) / 2, (u_hi + u_lo) / 2, u_eq
+        self.reach = np.minimum(-lo, hi)
         self.state_factors = 0.5 ** np.round(np.log2(np.maximum(-lo, hi)))
 
     def to_action(self, normalised: Array) -> Array:
@@ -189,6 +192,12 @@ class Actor(nn.Module):
             norms.append(torch.linalg.vector_norm(h))
         return torch.stack(norms).sum()
 
+    def departure(self, box: Tensor) -> Tensor:
+        """`departure.departure` of the mean on the box with half-widths (n,), in the states' units."""
+        layers = [*self._layers(), self.mean]
+        weights = [layer.weight for layer in layers]
+        return departure([weights[0] * self.factors, *weights[1:]], [layer.bias for layer in layers], box)
+
     def gain_loss(self, K: Tensor) -> Tensor:
         """`||J_mu(0) + K|| + ||mu(0) - u_eq||`, Frobenius norm; the sign is that of u = u_eq - K x."""
         mean, jacobian = self.at_origin()
@@ -290,6 +299,7 @@ class SAC:
         self.value_target = Critic(n, options.critic, 1, options.critic_scale).to(device)
         self.value_target.load_state_dict(self.value.state_dict())
         self.q = Critic(n + m, options.critic, 2, options.critic_scale).to(device)
+        self.box = torch.tensor(options.proof_box or options.start * interface.reach, device=device)
         self._actor_weights = list(self.actor.parameters())
         self._critic_weights = [*self.value.parameters(), *self.q.parameters()]
         self._fresh: list[Tensor] = list(self.value.parameters())
@@ -326,6 +336,8 @@ class SAC:
             actor_loss = actor_loss + options.rest_weight * self.actor.rest_loss()
         if options.curvature_weight > 0:
             actor_loss = actor_loss + options.curvature_weight * self.actor.curvature_loss(self._ball())
+        if options.proof_weight > 0:
+            actor_loss = actor_loss + options.proof_weight * self.actor.departure(self.box)
         actor_gradients = torch.autograd.grad(actor_loss, self._actor_weights)
 
         with torch.no_grad():

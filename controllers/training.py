@@ -35,7 +35,7 @@ from controllers.evaluate import curvature, settle
 from controllers.files import write_atomically
 from controllers.logs import Episode, Monitored
 from controllers.lqr import GainLearner, Identified, Phase
-from controllers.options import Plant, TrainingOptions, available_plants
+from controllers.options import Plant, TrainingOptions, available_plants, default_record
 from controllers.sac import CPU, SAC, Interface, Replay
 
 Array = NDArray[np.float64]
@@ -187,7 +187,8 @@ class Trainer:
         state = read_checkpoint(checkpoint)
         if state.get("system") != [self.system.name, _parameters(self.system)]:
             raise InputError(f"the checkpoint must be of {self.system.name}; it is of {state['system']}.")
-        mine, theirs = self.options.record(), state.get("options", {})
+        mine = self.options.record()
+        theirs = {**default_record(), **state.get("options", {})}  # a run had no options that came later
         changed = sorted(name for name in mine.keys() | theirs.keys() if mine.get(name) != theirs.get(name))
         if changed:
             name = changed[0]

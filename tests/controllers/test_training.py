@@ -109,6 +109,19 @@ def test_a_run_is_resumed_with_its_own_options_only(short, whole):
         Trainer(heavier, short).restore(whole[2][50])
 
 
+def test_an_option_that_came_later_had_its_default(short, whole):
+    state = torch.load(io.BytesIO(whole[2][50]), weights_only=True)
+    for name in ("proof_weight", "proof_box"):
+        del state["options"][name]
+    older = io.BytesIO()
+    torch.save(state, older)
+    trainer = _trainer(short)
+    trainer.restore(older.getvalue())
+    assert trainer.steps_done == 50
+    with pytest.raises(InputError, match=r"`proof_weight` was 0\.0, now it is 1\.0"):
+        _trainer(replace(short, proof_weight=1.0)).restore(older.getvalue())
+
+
 def test_a_damaged_checkpoint_is_refused(short, whole):
     for content in (b"", b"not a checkpoint", whole[2][50][:5000]):
         with pytest.raises(InputError, match="checkpoint"):

@@ -1,0 +1,134 @@
+"""`controllers flatten`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from certify.errors import InputError
+from controllers.commands.shared import Json, emit, errors
+from controllers.files import require_writable
+
+if TYPE_CHECKING:
+    from certify.policies import Policy
+    from certify.systems import System
+    from controllers.flatten import Figures, Flattened, FlattenOptions
+    from controllers.options import Plant
+
+
+def flatten(
+    policy: Annotated[Path, typer.Argument(help="The policy file to begin with; it is left as it is.")],
+    out: Annotated[Path, typer.Option("--out", help="The policy file to write.")],
+    weight: Annotated[
+        float, typer.Option("--weight", help="How much easier proofs count beside doing the same as before.")
+    ] = 1.0,
+    box: Annotated[
+        str | None,
+        typer.Option(
+            "--box",
+            help="Half-widths of states where the policy is used, as in x=0.4,phi=0.2; others: where runs start.",
+        ),
+    ] = None,
+    time_limit: Annotated[float, typer.Option("--time-limit", help="Seconds after which training ends.")] = 180.0,
+    steps: Annotated[int, typer.Option("--steps", help="Gradient steps at most.")] = 2000,
+    max_cost_change: Annotated[
+        float, typer.Option("--max-cost-change", help="By which share the median cost of a run may rise.")
+    ] = 0.05,
+    states: Annotated[int, typer.Option("--states", help="Initial states of the runs that judge a policy.")] = 200,
+    seed: Annotated[int, typer.Option("--seed", help="Seed of everything random.")] = 0,
+    system: Annotated[
+        str | None, typer.Option(help="A plant of your own, FILE.toml or FILE.py:NAME; default: what the policy says.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Fine-tune a policy so that it does the same and is easier to prove.
+
+    Layers, squash, centring, scale, offset and clip stay. Nothing is written unless as many runs settle as before, the
+    median cost stays within its bound, and what a proof must absorb of the hidden units is less than it was.
+    """
+    with errors(as_json):
+        from certify.policies import load_policy, save_policy
+        from controllers.flatten import FlattenOptions
+        from controllers.flatten import flatten as run
+        from controllers.own import chosen_plant
+
+        require_writable(out)
+        given = load_policy(policy)
+        own = None if system is None else chosen_plant(system)
+        options = FlattenOptions(
+            weight=weight,
+            box=None if box is None else _half_widths(box, given, own),
+            steps=steps,
+            time_limit=time_limit,
+            max_cost_change=max_cost_change,
+            states=states,
+            seed=seed,
+        )
+        with _progress(options) as report:
+            result = run(given, options, own, report)
+        save_policy(out, result.policy)
+        emit({"policy": str(out), **(result.as_json() if as_json else _table(result))}, as_json)
+
+
+def _half_widths(text: str, policy: Policy, own: tuple[System, Plant] | None) -> tuple[float, ...]:
+    """The box of initial states with the half-widths that `x=0.4,phi=0.2` names."""
+    from certify.systems import shipped_system
+    from controllers.options import get_plant
+
+    system, plant = own if own is not None else (shipped_system(policy.system), get_plant(policy.system))
+    names = [symbol.name for symbol in system.states]
+    widths = dict(zip(names, plant.initial_states, strict=True))
+    for part in text.split(","):
+        name, equals, number = (piece.strip() for piece in part.partition("="))
+        if name not in widths:
+            raise InputError(f"`--box` must name states of {system.name}, {', '.join(names)}; found {name!r}.")
+        try:
+            widths[name] = float(number if equals else "")
+        except ValueError as error:
+            raise InputError(f"`--box` must be NAME=HALF-WIDTH,...; found {part!r}.") from error
+    return tuple(widths.values())
+
+
+@contextmanager
+def _progress(options: FlattenOptions) -> Iterator[Callable[[int, float, float], None]]:
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+        TextColumn("change {task.fields[fit]}  departure {task.fields[departure]}"),
+    )
+    with Progress(*columns, console=Console(stderr=True)) as progress:
+        task = progress.add_task("", total=options.steps, fit="-", departure="-")
+
+        def report(step: int, fit: float, departure: float) -> None:
+            if step % 20 == 0:
+                progress.update(task, completed=step, fit=f"{math.sqrt(fit):.1%}", departure=f"{departure:.2g}")
+
+        yield report
+
+
+def _table(result: Flattened) -> dict[str, Any]:
+    def runs(found: Figures) -> str:
+        return f"{found.settled} of {found.states} settled, median cost {found.cost:.4g}"
+
+    before, after = result.before, result.after
+    rms, largest = (", ".join(f"{v:.3g}" for v in values) for values in (result.rms, result.largest))
+    return {
+        "system": result.policy.system,
+        "sha256": result.policy.network.sha256(),
+        "departure": f"{before.departure:.3g} before, {after.departure:.3g} after",
+        "bend on the box": f"{100 * before.bend:.3g} % before, {100 * after.bend:.3g} % after",
+        "runs before": runs(before),
+        "runs after": runs(after),
+        "change of inputs": f"rms {rms}; at most {largest}",
+        "change of J(0)": f"{100 * result.gain_change:.2g} %",
+        "trained": f"from factor {result.factor:g}, {result.steps} steps in {result.seconds:.0f} s ({result.ended})",
+    }

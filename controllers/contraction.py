@@ -1,0 +1,75 @@
+"""Policies between a policy and its own linearisation: one number says how much of the hidden units' curvature is left.
+
+A unit that ranges over a tenth of what it did, behind weights ten times as large, does the same to first order and a
+hundredth of what it did to third. Shrinking every hidden unit's range so, by the first layer, and making up for it in
+the last one leads from a network (factor 1) to its linearisation (factor 0), squash and centring untouched. Training
+would have to find that way through five layers step by step; it is a closed form.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.errors import InputError
+from certify.policies import TanhNetwork
+
+Array = NDArray[np.float64]
+
+
+def contracted(network: TanhNetwork, factor: float) -> TanhNetwork:
+    """The policy whose hidden units range, and rest at the origin, at `factor` times what they did.
+
+    Values before each tanh at the origin become `factor` times as large, and with them, to first order, what each
+    unit makes of the state; the next layer's weights take back the change of tanh's slope. So net(0) and the Jacobian
+    at the origin stay, up to the rounding to float32. Layers, squash, centring, scale, offset and clip are the same.
+
+    Parameters
+    ----------
+    factor : in (0, 1]; 1 gives the policy itself, its numbers rounded to float32.
+
+    Raises
+    ------
+    InputError : `factor` is out of its range.
+
+    Notes
+    -----
+    A unit at rest at 0 stays there exactly: a policy with pi(0) = u_eq by zero biases keeps it.
+    """
+    if not 0 < factor <= 1:
+        raise InputError(f"`factor` must be in (0, 1]; found {factor}.")
+    last = len(network.weights) - 1
+    weights, biases = [], []
+    h = shrunk = np.zeros(network.n)
+    slopes = np.ones(network.n)  # tanh' of the old unit over that of the new one
+    for k, (weight, bias) in enumerate(zip(network.weights, network.biases, strict=True)):
+        y = weight @ h + bias
+        stretch = (factor if k == 0 else 1.0) / (factor if k == last else 1.0)
+        weights.append(_single(weight * slopes * stretch))
+        if k == last:
+            biases.append(_last_bias(weights[-1], shrunk, y))
+            break
+        biases.append(_single(factor * y - weights[-1] @ shrunk))
+        h, shrunk = np.tanh(y), np.tanh(weights[-1] @ shrunk + biases[-1])
+        old, new = 1 - h**2, 1 - shrunk**2
+        slopes = np.divide(old, new, out=np.zeros(len(old)), where=old > 0)  # a saturated unit passes nothing on
+    return replace(network, weights=tuple(weights), biases=tuple(biases))
+
+
+def with_value_at_origin(network: TanhNetwork, value: Array) -> TanhNetwork:
+    """The network with the last bias that makes net(0) equal `value` (m,), up to rounding."""
+    h = np.zeros(network.n)
+    for weight, bias in zip(network.weights[:-1], network.biases[:-1], strict=True):
+        h = np.tanh(weight @ h + bias)
+    return replace(network, biases=(*network.biases[:-1], _last_bias(network.weights[-1], h, value)))
+
+
+def _last_bias(weight: Array, h: Array, wanted: Array) -> Array:
+    # Where nothing arrives the bias is the value itself: a file may hold it in double, and exactness may rest on it.
+    return _single(wanted - weight @ h) if np.any(h) else np.array(wanted)
+
+
+def _single(array: Array) -> Array:
+    return np.asarray(array.astype(np.float32), dtype=np.float64)
