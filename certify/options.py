@@ -26,8 +26,9 @@ class RoaOptions:
     ----------
     claim : `asymptotic`, or `practical`, which asks for no equilibrium at the origin; `auto` is the first where the
         loop rests at the origin exactly, and the second where it does not.
-    candidate : where P comes from, see `choose_candidate`; `auto` tries several and keeps the one with which the
-        largest volume is proved. With Q, R or a level it is `lyapunov`, or `lqr` if R is given.
+    candidate : where P comes from, see `choose_candidate`, or `robust`, which chooses P with the local rule's own
+        bounds; `auto` tries several and keeps the one with which the largest volume is proved. With Q, R or a level it
+        is `lyapunov`, or `lqr` if R is given.
     Q, R : diagonals of the weights, shapes (n,) and (m,); None means ones.
     P : a Lyapunov matrix of one's own, (n, n); overrides the candidate.
     level : prove exactly this level; None finds the largest.

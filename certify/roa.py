@@ -43,7 +43,7 @@ from certify.rest import find_rest
 from certify.results import Levels, RoaResult, Tried, TubeFacts
 from certify.rigorous import eigenvalues
 from certify.systems import System
-from certify.trials import OPTIMISING, Trial, blends, by_reach, corrected, named, optimised, solved
+from certify.trials import OPTIMISING, Trial, blends, by_reach, corrected, named, optimised, robust, solved
 from certify.verdict import Stop, Verdict
 
 if TYPE_CHECKING:
@@ -211,7 +211,8 @@ class _Run:
         with self._stage("candidate"):
             trials = solved(loop, options)
         large = self._optimised(partial(optimised, loop, options)) if options.engine != "dreal" else None
-        trials += [] if large is None else [large]
+        certain = self._optimised(partial(robust, loop, options)) if self.interruptible else None
+        trials += [one for one in (certain, large) if one is not None]
         race = self._contest()
         if not self.interruptible:
             race.enter(by_reach(trials)[:1], heat)

@@ -15,6 +15,7 @@ from certify.claims.claim import Kind
 from certify.closed_loop import ClosedLoop
 from certify.engines.base import Task
 from certify.engines.falsify import Witness, falsify, survey
+from certify.engines.robust import robust_candidate
 from certify.errors import BackendError, InputError
 from certify.lyapunov import (
     SOLVED,
@@ -109,6 +110,8 @@ def named(loop: ClosedLoop, options: RoaOptions) -> Trial:
     if options.P is not None:
         return trial(loop, options.P, "given", options)
     name = options.only or "lyapunov"
+    if name == "robust":
+        return trial(loop, robust_candidate(loop, OPTIMISING * options.time_limit), name, options)
     chosen = choose_candidate(loop, name, options.Q, options.R, OPTIMISING * options.time_limit)
     return trial(loop, chosen.P, chosen.name, options, chosen.notice)
 
@@ -130,6 +133,14 @@ def optimised(loop: ClosedLoop, options: RoaOptions) -> Trial | None:
     except (BackendError, InputError):
         return None
     return trial(loop, chosen.P, chosen.name, options) if chosen.notice is None else None
+
+
+def robust(loop: ClosedLoop, options: RoaOptions) -> Trial | None:
+    """The candidate that the local rule likes best, or None if it is not to be had."""
+    try:
+        return trial(loop, robust_candidate(loop, OPTIMISING * options.time_limit), "robust", options)
+    except (BackendError, InputError):
+        return None
 
 
 def _centred(loop: ClosedLoop) -> ClosedLoop:

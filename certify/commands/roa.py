@@ -47,7 +47,7 @@ def roa(
     candidate: Annotated[
         str,
         typer.Option(
-            help="Lyapunov candidate: auto (of several, the largest proved), lyapunov, scaled, lqr or optimised."
+            help="Lyapunov candidate: auto (of all, the largest proved), lyapunov, scaled, lqr, optimised, robust."
         ),
     ] = "auto",
     q: Annotated[str | None, typer.Option("--Q", help="Diagonal of Q, as in 1,1.")] = None,

@@ -15,9 +15,10 @@ from certify.lyapunov.candidates import solve_lyapunov
 from certify.lyapunov.optimised import largest_sampled, optimise_repeatedly
 
 Array = NDArray[np.float64]
-Named = Literal["lyapunov", "scaled", "lqr", "optimised"]
-Candidate = Literal["auto", "lyapunov", "scaled", "lqr", "optimised"]
-SOLVED: tuple[Named, ...] = ("lyapunov", "scaled", "lqr")
+Solved = Literal["lyapunov", "scaled", "lqr"]
+Named = Literal["lyapunov", "scaled", "lqr", "optimised", "robust"]
+Candidate = Literal["auto", "lyapunov", "scaled", "lqr", "optimised", "robust"]
+SOLVED: tuple[Solved, ...] = ("lyapunov", "scaled", "lqr")
 """The candidates that solve a Lyapunov equation."""
 
 
@@ -32,7 +33,7 @@ class Chosen:
 
 def choose_candidate(
     loop: ClosedLoop,
-    name: Named,
+    name: Literal["lyapunov", "scaled", "lqr", "optimised"],
     Q: tuple[float, ...] | None = None,
     R: tuple[float, ...] | None = None,
     seconds: float = math.inf,
