@@ -159,7 +159,11 @@ class _Run:
         options, loop = self.options, ClosedLoop(self.system, self.network)
         require_within_limits(self.system, self.network)
         with self._stage("candidate"):
-            self.options = options = replace(options, claim=self._claim(loop))
+            claim = self._claim(loop)
+            if claim == "practical" and options.enlarges:
+                self.aside = f"{self.aside}; a tube needs a set from which trajectories converge, and is not looked for"
+                options = replace(options, enlarge=False, box=None)
+            self.options = options = replace(options, claim=claim)
         self.share = _BEFORE_TUBE if options.enlarges else 1.0
         kind = _kind_of(options)
         result = RoaResult(Verdict.UNKNOWN, Stop.REQUESTED, self.system, self.network, kind, engine=options.engine)

@@ -1,0 +1,299 @@
+"""Tubes: what they claim holds along simulated runs, the checker accepts them, and none is found where none is."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from certify.certificate import PartitionTree, read_certificate
+from certify.claims import Enlarged, Problem
+from certify.closed_loop import ClosedLoop
+from certify.engines import tube as tubes
+from certify.engines.decrease import best_multipliers, decay_of, multipliers_for, rest_of
+from certify.engines.enlarge import enlarge
+from certify.engines.local import ball_around, local_margin, prove_local
+from certify.engines.models import paths
+from certify.engines.robust import robust_candidate
+from certify.engines.tube import Tube, find_tube
+from certify.errors import InputError
+from certify.lyapunov import SOLVED, choose_candidate, diagonalising_coordinates, domain_limit, volume
+from certify.lyapunov.function import Quadratic
+from certify.policies import load_policy
+from certify.results import RoaResult
+from certify.roa import RoaOptions, certify_roa
+from certify.systems import get_system
+from certify.systems.ode import rk4_step
+from certify.verdict import Stop, Verdict
+from tests.support.cases import Case, case_of
+from tests.support.loops import pendulum_network, scalar_tanh
+
+Array = NDArray[np.float64]
+POLICIES = Path(__file__).parents[2] / "examples" / "policies"
+
+
+@cache
+def pendulum() -> tuple[Case, Array]:
+    """The loop, and P / c1 of its local level."""
+    case = case_of(get_system("pendulum"), load_policy(POLICIES / "pendulum.pt").network)
+    level = prove_local(case.problem, case.T, domain_limit(case.P, case.loop.system.domain))
+    assert level is not None
+    return case, case.P / level
+
+
+@cache
+def enlarged() -> Tube:
+    case, goal = pendulum()
+    tube = find_tube(paths(case.loop), goal / 1.3**2, goal)
+    assert tube is not None
+    return tube
+
+
+def at(tube: Tube, k: int, s: float) -> Array:
+    """P(s) of slab k."""
+    start = tube.start if k == 0 else tube.slabs[k - 1].end
+    slab = tube.slabs[k]
+    return (1 - s) ** 2 * start + 2 * s * (1 - s) * slab.middle + s**2 * slab.end
+
+
+def test_a_tube_ends_inside_its_goal() -> None:
+    _, goal = pendulum()
+    tube = enlarged()
+    assert np.linalg.eigvalsh(tube.slabs[-1].end - goal)[0] > 0
+    assert np.linalg.eigvalsh(tube.start - goal)[0] < 0  # it starts outside
+    assert tube.duration == pytest.approx(sum(slab.duration for slab in tube.slabs)) and tube.duration > 0
+
+
+def test_w_falls_along_trajectories() -> None:
+    """W(t) = x'P(t)x of runs from the start's boundary falls from slab to slab, by a step that is small beside them."""
+    case, _ = pendulum()
+    tube, loop = enlarged(), case.loop
+    f = loop.system.function()
+    angles = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+    x = np.stack([np.cos(angles), np.sin(angles)], -1) @ np.linalg.inv(np.linalg.cholesky(tube.start))
+    W = np.einsum("ki,ij,kj->k", x, tube.start, x)
+    np.testing.assert_allclose(W, 1)
+    for k, slab in enumerate(tube.slabs):
+        for step in range(4):
+            x = rk4_step(lambda y: f(y, loop.policy(y)), x, slab.duration / 4)
+            P = at(tube, k, (step + 1) / 4)
+            now = np.einsum("ki,ij,kj->k", x, P, x)
+            assert np.all(now < W * (1 + 1e-9))
+            W = now
+
+
+def test_the_bound_of_a_slab_dominates_its_loop() -> None:
+    """On every ball of the tube, d'J'P'J d + 2 d'J'PF(Jd) < 0 at sampled points and times."""
+    case, _ = pendulum()
+    tube, loop, generator = enlarged(), case.loop, np.random.default_rng(0)
+    f = loop.system.function()
+    for k in range(0, len(tube.slabs), 5):
+        slab = tube.slabs[k]
+        start = tube.start if k == 0 else tube.slabs[k - 1].end
+        for s in (0.0, 0.3, 0.5, 1.0):
+            rate = 2 * ((1 - s) * (slab.middle - start) + s * (slab.end - slab.middle)) / slab.duration
+            P = at(tube, k, s)
+            assert np.linalg.eigvalsh(slab.J.T @ P @ slab.J)[0] > 1
+            d = generator.standard_normal((200, 2))
+            d *= generator.random((200, 1)) / np.linalg.norm(d, axis=1, keepdims=True)
+            x = d @ slab.J.T
+            F = f(x, loop.policy(x))
+            assert np.all(np.einsum("ki,ij,kj->k", x, rate, x) + 2 * np.einsum("ki,ij,kj->k", x, P, F) < 0)
+
+
+def test_none_is_found_from_beyond_what_settles() -> None:
+    """xdot = x/2 - tanh(x) rests at 0 and at 1.915: a start beyond that has no tube, one inside has."""
+    system, network = scalar_tanh()
+    loop = ClosedLoop(system, network)
+    known = paths(loop)
+    goal = np.array([[1 / 0.3**2]])
+    assert find_tube(known, np.array([[1 / 0.6**2]]), goal) is not None
+    for size in (1.92, 2.5, 4.0):
+        assert find_tube(known, np.array([[1 / size**2]]), goal) is None
+
+
+def test_a_start_that_leaves_the_domain_has_none() -> None:
+    case, goal = pendulum()
+    limit = domain_limit(goal, case.loop.system.domain)
+    assert find_tube(paths(case.loop), goal / (1.01 * limit), goal) is None
+
+
+def test_no_time_is_no_tube() -> None:
+    case, goal = pendulum()
+    assert find_tube(paths(case.loop), goal / 1.3**2, goal, seconds=0.0) is None
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_bounds_of_the_rest_hold(seed: int) -> None:
+    """2 sum (b_i.d)(d'Q_i d + r_i) <= d'S d for whatever |r_i| <= d'E_i d, and any multipliers."""
+    case, goal = pendulum()
+    generator = np.random.default_rng(seed)
+    J = np.linalg.inv(np.linalg.cholesky(goal)).T @ np.diag([1.0, 0.7])
+    models = paths(case.loop).models(J)
+    b = goal @ J
+    rows = [
+        multipliers_for(models, b, np.eye(2)),
+        np.abs(generator.standard_normal((3, 2))) + 0.01,
+        np.abs(generator.standard_normal((3, 2))) * [[0], [0], [1]] + [[0], [0], [0.01]],
+    ]
+    d = generator.standard_normal((500, 2))
+    d *= generator.random((500, 1)) / np.linalg.norm(d, axis=1, keepdims=True)
+    Q, E = (np.einsum("ki,mij,kj->km", d, part, d) for part in (models.Q, models.E))
+    for sign in (1, -1):
+        left = 2 * np.einsum("km,km->k", d @ b.T, Q) + 2 * np.einsum("km,km->k", np.abs(d @ b.T), E)
+        left = (
+            left if sign > 0 else -2 * np.einsum("km,km->k", d @ b.T, Q) + 2 * np.einsum("km,km->k", np.abs(d @ b.T), E)
+        )
+        for multipliers in rows:
+            S = rest_of(models, b, multipliers)
+            assert np.all(left <= np.einsum("ki,ij,kj->k", d, S, d) * (1 + 1e-9) + 1e-12)
+
+
+def test_the_best_multipliers_are_no_worse_than_the_first() -> None:
+    case, goal = pendulum()
+    J = np.linalg.inv(np.linalg.cholesky(goal)).T
+    models = paths(case.loop).models(J)
+    shown, b = best_multipliers(models, J, goal), goal @ J
+    decay = decay_of(models, J, b)
+    inverse = np.linalg.inv(np.linalg.cholesky(decay))
+
+    def margin(multipliers: Array) -> float:
+        return float(1 - np.linalg.eigvalsh(inverse @ rest_of(models, b, multipliers) @ inverse.T)[-1])
+
+    assert shown.margin == pytest.approx(margin(shown.multipliers))
+    assert shown.margin >= margin(multipliers_for(models, b, inverse.T @ inverse)) - 1e-12
+    assert np.all(shown.multipliers >= 0)
+
+
+def test_a_rate_takes_its_part_of_the_decay() -> None:
+    """x'Px must fall faster where P grows: R = tP leaves t less of the decay."""
+    case, goal = pendulum()
+    J = np.linalg.inv(np.linalg.cholesky(goal)).T
+    models = paths(case.loop).models(J)
+    without, with_rate = (decay_of(models, J, goal @ J, R) for R in (None, 0.3 * goal))
+    np.testing.assert_allclose(without - with_rate, 0.3 * J.T @ goal @ J, atol=1e-12)
+
+
+def test_enlarge_keeps_the_largest_of_the_shapes() -> None:
+    case, goal = pendulum()
+    seen: list[float] = []
+    shapes = {"round": np.diag([1.0, 0.02]), "goal": goal}
+    found = enlarge(paths(case.loop), goal, shapes, lambda: 20.0, report=lambda e: seen.append(e.volume))
+    assert found is not None and found.shape in shapes
+    assert seen == sorted(seen) and found.volume == seen[-1] > volume(goal, 1.0)
+
+
+def test_enlarge_asks_for_more_than_it_is_worth() -> None:
+    case, goal = pendulum()
+    assert enlarge(paths(case.loop), goal, {"goal": goal}, lambda: 20.0, worth=1e9) is None
+
+
+def test_robust_is_larger_than_what_it_starts_from() -> None:
+    """By the local rule, on the planar quadrotor, where Q = I and LQR are far from the best."""
+    system = get_system("quadrotor2d")
+    loop = ClosedLoop(system, load_policy(POLICIES / "quadrotor2d.pt").network)
+    known = paths(loop)
+
+    def local(P: Array) -> float:
+        T = diagonalising_coordinates(P, loop.linearise()[0])
+        level = prove_local(Problem(loop, Quadratic(P)), T, domain_limit(P, system.domain) * (1 - 1e-9), known)
+        return 0.0 if level is None else volume(P, level)
+
+    P = robust_candidate(loop)
+    T = diagonalising_coordinates(P, loop.linearise()[0])
+    assert np.array_equal(P, P.T) and local_margin(Problem(loop, Quadratic(P)), T, 1.0, known) > 0
+    assert volume(P, 1.0) > 4 * max(local(choose_candidate(loop, name).P) for name in SOLVED)
+
+
+def test_the_ball_contains_its_level_set() -> None:
+    case, _ = pendulum()
+    J = ball_around(case.problem, case.T, 0.3)
+    assert np.linalg.eigvalsh(J.T @ case.P @ J - 0.3 * np.eye(2))[0] > 0
+    known = paths(case.loop)
+    margins = [local_margin(case.problem, case.T, level, known) for level in (1e-4, 1e-3, 1e-2)]
+    assert margins == sorted(margins, reverse=True) and margins[0] > 0.9
+
+
+@pytest.fixture(scope="module")
+def result(tmp_path_factory: pytest.TempPathFactory) -> RoaResult:
+    """A pendulum whose ring is not given enough boxes to reach far, so that a tube is worth its while."""
+    options = RoaOptions(candidate="lqr", enlarge=True, max_boxes=1, time_limit=30)
+    policy = load_policy(POLICIES / "pendulum.pt")
+    return certify_roa(get_system("pendulum"), policy.network, tmp_path_factory.mktemp("tube"), options)
+
+
+def test_a_run_ends_with_an_enlarged_claim(result: RoaResult) -> None:
+    assert result.verdict is Verdict.PROVED and result.claim == "enlarged" and result.tube is not None
+    assert result.checker is not None and result.checker["rules"]["tube"] == result.tube.slabs
+    assert result.certificate is not None and result.P is not None and result.levels.roa is not None
+    read = read_certificate(result.certificate)
+    assert isinstance(read.claim, Enlarged) and isinstance(read.evidence, PartitionTree)
+    assert np.array_equal(read.claim.start.P, result.tube.start)
+    assert len(read.evidence.tube) == result.tube.slabs
+    assert result.volume == volume(result.tube.start, 1.0) > volume(result.P, result.levels.roa)
+    said = result.to_dict()
+    assert said["claim"] == {"kind": "enlarged"} and said["tube"]["slabs"] == result.tube.slabs
+    assert said["volume"] == said["tube"]["volume"] and said["seconds"]["tube"] > 0
+
+
+def test_the_set_is_the_union(result: RoaResult) -> None:
+    assert result.tube is not None and result.P is not None and result.levels.roa is not None
+    generator = np.random.default_rng(0)
+    x = generator.uniform(-1, 1, (400, 2)) * 1.2 / np.sqrt(np.diag(result.tube.start))
+    inside = np.einsum("ki,ij,kj->k", x, result.tube.start, x) <= 1
+    inside |= np.einsum("ki,ij,kj->k", x, result.P, x) <= result.levels.roa
+    assert np.array_equal(result.contains(x), inside) and 0 < inside.sum() < len(x)
+
+
+def test_a_box_asks_for_its_shape(tmp_path: Path) -> None:
+    options = RoaOptions(candidate="lqr", box={"theta": 1.0, "theta_dot": 4.0}, max_boxes=1, time_limit=30)
+    policy = load_policy(POLICIES / "pendulum.pt")
+    result = certify_roa(get_system("pendulum"), policy.network, tmp_path, options)
+    assert result.tube is not None and result.tube.shape == "box"
+    P = result.tube.start
+    np.testing.assert_allclose([P[0, 1], P[0, 0] / P[1, 1]], [0, 16], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"box": {"theta": 0.0}}, "positive half-widths"),
+        ({"box": {"theta": float("nan")}}, "positive half-widths"),
+        ({"enlarge": True, "claim": "practical"}, "needs the engine bounds"),
+        ({"enlarge": True, "engine": "dreal"}, "needs the engine bounds"),
+    ],
+)
+def test_options_that_cannot_be(change: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        dataclasses.replace(RoaOptions(), **change)  # type: ignore[arg-type]
+
+
+def test_a_box_must_name_states(tmp_path: Path) -> None:
+    options = RoaOptions(candidate="lqr", box={"thete": 1.0}, max_boxes=1)
+    with pytest.raises(InputError, match=r"must name states of pendulum, theta, theta_dot; found thete"):
+        certify_roa(get_system("pendulum"), load_policy(POLICIES / "pendulum.pt").network, tmp_path, options)
+
+
+def test_a_tube_that_the_checker_refuses_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A careless producer ends with what is proved without it."""
+    honest = tubes._slab
+
+    def careless(*arguments: object) -> object:
+        slab = honest(*arguments)  # type: ignore[arg-type]
+        return slab and dataclasses.replace(slab, duration=0.01 * slab.duration)
+
+    monkeypatch.setattr(tubes, "_slab", careless)
+    options = RoaOptions(candidate="lqr", enlarge=True, max_boxes=1, time_limit=20)
+    result = certify_roa(get_system("pendulum"), load_policy(POLICIES / "pendulum.pt").network, tmp_path, options)
+    assert result.verdict is Verdict.PROVED and result.claim == "asymptotic" and result.tube is None
+    assert result.stop is not Stop.STALLED and "without the tube" in (result.notice or "")
+
+
+def test_a_policy_that_is_not_centred_has_no_tube(tmp_path: Path) -> None:
+    network = dataclasses.replace(pendulum_network(), centre="none")
+    result = certify_roa(get_system("pendulum"), network, tmp_path, RoaOptions(enlarge=True, time_limit=10))
+    assert result.claim == "practical" and result.tube is None
