@@ -50,9 +50,15 @@ def best_multipliers(models: Models, J: Array, P: Array, R: Array | None = None)
     except np.linalg.LinAlgError:
         return NOT_SHOWN
     inverse = np.linalg.inv(root)
+    each = (_best_of_a_kind(models, b, inverse, joint) for joint in (True, False))
+    return max(each, key=lambda shown: shown.margin)
+
+
+def _best_of_a_kind(models: Models, b: Array, inverse: Array, joint: bool) -> Shown:
+    """`inverse` (n, n) is that of the decay's Cholesky factor."""
     weight, best = inverse.T @ inverse, NOT_SHOWN
     for _ in range(_ROUNDS):
-        multipliers = multipliers_for(models, b, weight)
+        multipliers = multipliers_for(models, b, weight, joint)
         values, vectors = np.linalg.eigh(inverse @ rest_of(models, b, multipliers) @ inverse.T)
         if 1 - values[-1] > best.margin:
             best = Shown(multipliers, float(1 - values[-1]))
@@ -83,8 +89,11 @@ def rest_of(models: Models, b: Array, multipliers: Array) -> Array:
     return (rest + rest.T) / 2
 
 
-def multipliers_for(models: Models, b: Array, weight: Array) -> Array:
-    """Those with the least trace of weight times the sum of the bounds; weight (n, n) is positive definite."""
+def multipliers_for(models: Models, b: Array, weight: Array, joint: bool | None = None) -> Array:
+    """Those with the least trace of weight times the sum of the bounds; weight (n, n) is positive definite.
+
+    `joint` says whether the Q of all components are taken jointly or all apart; None is what has the smaller trace.
+    """
     size = np.linalg.norm(b, axis=1)
     along = np.einsum("ij,jk,ik->i", b, weight, b)
     E2, Q2 = (np.einsum("ikj,jl,ikl->i", part, weight, part, optimize=True) for part in (models.E, models.Q))
@@ -98,7 +107,8 @@ def multipliers_for(models: Models, b: Array, weight: Array) -> Array:
     diagonal, apart_in_all = np.diag(weight), np.sum(np.sqrt(Q2 * along))
     g = np.sqrt(spread / diagonal)
     least = _NEGLIGIBLE * max(float(np.max(g)), apart_in_all / np.trace(weight), 1e-200)
-    if np.sum(np.sqrt(spread * diagonal)) <= apart_in_all or not np.all(np.isfinite(beta)):
+    joint = np.sum(np.sqrt(spread * diagonal)) <= apart_in_all if joint is None else joint
+    if joint or not np.all(np.isfinite(beta)):
         beta, g = np.zeros_like(beta), np.maximum(g, least)
     else:  # what has no Q stays joint, at next to no cost
         g = np.full_like(g, least)
