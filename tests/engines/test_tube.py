@@ -204,9 +204,8 @@ def test_robust_is_larger_than_what_it_starts_from() -> None:
         return 0.0 if level is None else volume(P, level)
 
     P = robust_candidate(loop)
-    T = diagonalising_coordinates(P, loop.linearise()[0])
-    assert np.array_equal(P, P.T) and local_margin(Problem(loop, Quadratic(P)), T, 0.97, known) > 0  # T is a new one
-    assert volume(P, 1.0) > 4 * max(local(choose_candidate(loop, name).P) for name in SOLVED)
+    assert np.array_equal(P, P.T) and volume(P, 1.0) == pytest.approx(local(P), rel=0.3)  # in other coordinates
+    assert local(P) > 4 * max(local(choose_candidate(loop, name).P) for name in SOLVED)
 
 
 def test_the_ball_contains_its_level_set() -> None:
