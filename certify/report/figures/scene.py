@@ -54,7 +54,7 @@ def start_of(certificate: Certificate) -> Array | None:
     if not isinstance(certificate.claim, Enlarged):
         return None
     P = certificate.claim.start.P
-    return P if bool(np.all(np.isfinite(P))) and is_positive_definite(P) else None
+    return P if is_positive_definite(P) else None
 
 
 def slabs_of(certificate: Certificate) -> tuple[Slab, ...]:

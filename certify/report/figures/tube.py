@@ -26,13 +26,15 @@ _POINTS = 240  # of the band's edge, about
 
 
 def tube(scene: Scene, runs: Runs) -> list[Picture]:
-    """A picture for each state, with `runs` from the tube's start; none without a tube.
+    """A picture for each state, with `runs` from the tube's start; none without a tube that can be drawn.
 
     Where there are more than `MOST` states, those that the start drives furthest into the domain.
     """
     if scene.start is None or scene.start_reach is None or not scene.slabs:
         return []
     time, half = shadow_over_time(scene.start, scene.slabs)
+    if not (np.all(np.isfinite(time)) and np.all(np.isfinite(half)) and np.all(np.diff(time) > 0)):
+        return []  # a rejected file's tube need not be one
     passed = int(np.searchsorted(runs.step * np.arange(len(runs.path)), time[-1], side="right")) + 1
     last = extents(scene.slabs[-1].end, 1.0)
     legend = _keys(scene, runs)
