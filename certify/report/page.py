@@ -19,14 +19,15 @@ from typing import Any
 
 import numpy as np
 import sympy
+from numpy.typing import NDArray
 
 from certify.certificate import Certificate, PartitionTree, TrustedSolver
-from certify.claims import Asymptotic
+from certify.claims import Asymptotic, Enlarged
 from certify.closed_loop import ClosedLoop
 from certify.errors import CertifyError, InputError, SoundnessError
 from certify.lyapunov import domain_limit, extents, semi_axes, volume
 from certify.report.figures import Picture, draw
-from certify.report.figures.scene import is_ellipsoid
+from certify.report.figures.scene import is_ellipsoid, slabs_of, start_of
 from certify.report.figures.style import legend_style
 from certify.report.sampling import SimulatedRoa
 from certify.report.words import (
@@ -54,11 +55,6 @@ from certify.report.words import (
 
 _LONG = 10**6  # numerators and denominators beyond it are shown rounded
 _SECONDS, _SHARE = 10.0, 0.1  # the drawing takes no longer than the one, or than this share of the run
-_ABOUT_PLANES = (
-    "Each picture shows two states. The section holds the states of the set in which all others are 0; the projection "
-    "holds the values that the two take anywhere in the set. Both are exact shapes. Trajectories start over the edge "
-    "of the projection, and are projected like it."
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,7 +174,6 @@ def render_html(
         legend_style=Markup(legend_style()),
         contents=_contents(status, limits),
         limits=limits,
-        about_planes=_ABOUT_PLANES,
         one_plane=certificate.system.n <= 2,
         status=status,
         words=words,
@@ -188,7 +183,7 @@ def render_html(
         claim=_claim(certificate, answer if status.accepted else None),
         plant=_plant(certificate),
         tables=_tables(certificate, status, answer, result, sha256, size),
-        matrix=[[repr(float(v)) for v in row] for row in certificate.P],
+        matrices=_matrices(certificate),
         roa=None if roa is None else _simulated(roa, certificate),
         provenance=sorted((str(k), str(v)) for k, v in certificate.provenance.items()),
         file=certificate_path.name,
@@ -215,6 +210,38 @@ def _contents(status: Status, limits: Mapping[str, Any] | None) -> list[tuple[st
     return [*found, ("numbers", "Numbers"), ("check", "How to check")]
 
 
+@dataclass(frozen=True, slots=True)
+class _Ellipsoid:
+    """{x'Px <= level}, of those that the certificate is about; `kind` is `start` for that of a tube, else `set`."""
+
+    kind: str
+    name: str
+    P: NDArray[np.float64]
+    level: float
+
+
+def _ellipsoids(certificate: Certificate) -> list[_Ellipsoid]:
+    """The start of a tube where there is one, and {V <= c2}."""
+    start = start_of(certificate)
+    inner = _Ellipsoid("set", "{V ≤ c₂}", certificate.P, certificate.roa)
+    return [inner] if start is None else [_Ellipsoid("start", "the start", start, 1.0), inner]
+
+
+def _shares(certificate: Certificate, lengths: NDArray[np.float64]) -> list[float]:
+    """Lengths along the states (n,) as shares of the nearer sides of the domain; infinite where that has none."""
+    sides = [min(-lo, hi) for lo, hi in certificate.system.domain]
+    each = zip(lengths, sides, strict=True)
+    return [float(Fraction(float(v)) / side) if side > 0 else math.inf for v, side in each]
+
+
+def _matrices(certificate: Certificate) -> list[tuple[str, list[list[str]]]]:
+    """Names and entries of what the quadratic forms are, as the file has them."""
+    named = [("P", certificate.P)]
+    if isinstance(certificate.claim, Enlarged):
+        named.append(("P₀ of the tube's start", certificate.claim.start.P))
+    return [(name, [[repr(float(v)) for v in row] for row in P]) for name, P in named]
+
+
 def _limits(certificate: Certificate, result: Mapping[str, Any] | None) -> dict[str, Any] | None:
     """How much of its domain the set takes, and what the run says of what limits it; None where there is no set.
 
@@ -223,9 +250,9 @@ def _limits(certificate: Certificate, result: Mapping[str, Any] | None) -> dict[
     if not is_ellipsoid(certificate):
         return None
     system = certificate.system
-    reach = extents(certificate.P, certificate.roa)
-    sides = [min(-lo, hi) for lo, hi in system.domain]
-    shares = [float(Fraction(float(e)) / side) if side > 0 else math.inf for e, side in zip(reach, sides, strict=True)]
+    sets = _ellipsoids(certificate)
+    reach = [extents(each.P, each.level) for each in sets]
+    shares = [_shares(certificate, e) for e in reach]
     found: Mapping[str, Any] = (result or {}).get("diagnosis") or {}
     names = {s.name: symbol(s.name) for s in system.states}
     step: Mapping[str, Any] = found.get("next") or {}
@@ -233,15 +260,19 @@ def _limits(certificate: Certificate, result: Mapping[str, Any] | None) -> dict[
     return {
         "binds": limit_in_words(str(found.get("binds", ""))),
         "modes": _modes(found),
+        "sets": len(sets),
         "shares": [
             {
-                "name": symbol(s.name),
-                "reach": f"{above(float(e), 4)} {pretty_unit(system.units.get(s.name, ''))}".rstrip(),
-                "share": f"{above(100 * share, 3)} %",
-                "width": f"{min(100.0, 100 * share):.1f}",
-                "binds": share == max(shares),
+                "name": symbol(s.name) if each is sets[0] else "",
+                "of": each.name,
+                "kind": each.kind,
+                "reach": f"{above(float(e[k]), 4)} {pretty_unit(system.units.get(s.name, ''))}".rstrip(),
+                "share": f"{above(100 * share[k], 3)} %",
+                "width": f"{min(100.0, 100 * share[k]):.1f}",
+                "binds": share[k] == max(share),
             }
-            for s, e, share in zip(system.states, reach, shares, strict=True)
+            for k, s in enumerate(system.states)
+            for each, e, share in zip(sets, reach, shares, strict=True)
         ],
         "hurts": [
             (names.get(name, name), f"{100 * weight:.1f}", number(weight, 2))
@@ -330,18 +361,16 @@ def _claim(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict[s
     system, words, evidence = certificate.system, words_for(certificate.kind), certificate.evidence
     units = {s.name: pretty_unit(system.units.get(s.name, "")) for s in (*system.states, *system.inputs)}
     drawable = is_ellipsoid(certificate)
-    reach = extents(certificate.P, certificate.roa) if drawable else [math.nan] * system.n
-    sides = [
-        f"|{symbol(s.name)}| ≤ {kept_apart(float(e), min(-lo, hi))} {units[s.name]}".rstrip()
-        for s, e, (lo, hi) in zip(system.states, reach, system.domain, strict=True)
-    ]
     bounds = [
         f"{below(lo)} ≤ {symbol(s.name)} ≤ {above(hi)} {units[s.name]}".rstrip()
         for s, (lo, hi) in zip(system.inputs, system.input_bounds, strict=True)
     ]
     margins = answer.get("margins", {}) if answer else {}
     local, ring = margins.get("local"), margins.get("ring")
-    notes = {"Domain": "; ".join(sides) + "." if drawable else "", "Inputs": "; ".join(bounds) + "."}
+    notes = {
+        "Domain": f"{_sides(certificate, certificate.P, certificate.roa)}." if drawable else "",
+        "Inputs": "; ".join(bounds) + ".",
+    }
     if local:
         notes["Local"] = f"Margin of the linear part over the remainder: {below(100 * local, 3)} %."
     if answer and isinstance(certificate.claim, Asymptotic) and certificate.inner == certificate.roa:
@@ -349,6 +378,7 @@ def _claim(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict[s
     elif answer:
         shown = f"Shown on {answer.get('ring_leaves', 0):,} of {answer.get('leaves', 0):,} leaves"
         notes["Ring"] = f"{shown}; the smallest bound on {MINUS}V̇ is {below(ring, 3)}." if ring is not None else shown
+    notes |= _tube_notes(certificate)
     parts = []
     for name, condition, shown_by in words.parts:
         note = notes.get(name, "")
@@ -361,7 +391,8 @@ def _claim(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict[s
         parts.append((name, text, note))
     inner, outer = inner_level(certificate.kind, certificate.inner), below(certificate.roa)
     return {
-        "statement": words.statement.format(inner=inner, outer=outer),
+        "statement": words.statement.format(inner=inner, outer=outer, duration=_duration(certificate)),
+        "enlarged": isinstance(certificate.claim, Enlarged),
         "level": outer,
         "inner": inner,
         "bounds": bounds,
@@ -369,12 +400,43 @@ def _claim(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict[s
     }
 
 
+def _sides(certificate: Certificate, P: NDArray[np.float64], level: float) -> str:
+    """How far {x'Px <= level} reaches along each state, and that this is less than the domain does."""
+    system = certificate.system
+    each = zip(system.states, extents(P, level), system.domain, strict=True)
+    units = {s.name: pretty_unit(system.units.get(s.name, "")) for s in system.states}
+    return "; ".join(
+        f"|{symbol(s.name)}| ≤ {kept_apart(float(e), min(-lo, hi))} {units[s.name]}".rstrip() for s, e, (lo, hi) in each
+    )
+
+
+def _duration(certificate: Certificate) -> str:
+    """Of the tube, rounded up; a dash where there is none, or a rejected file's is no number."""
+    each = [slab.duration for slab in slabs_of(certificate)]
+    return f"{above(sum(map(Fraction, each)))} s" if each and all(map(math.isfinite, each)) else ABSENT
+
+
+def _tube_notes(certificate: Certificate) -> dict[str, str]:
+    """Of the tube's part of the claim: how many slabs in what time, and how far its start reaches."""
+    start = start_of(certificate)
+    if start is None:
+        return {}
+    sides = _sides(certificate, start, 1.0)
+    count = len(slabs_of(certificate))
+    slabs = f"{count:,} slabs" if count != 1 else "One slab"
+    return {
+        "Tube": f"{slabs}, {_duration(certificate)} in all.",
+        "Along the tube": f"At the start {sides}.",
+    }
+
+
 def _not_proved(certificate: Certificate, words: Words) -> list[tuple[str, str]]:
+    sets = "{V ≤ c₂} and the tube's start" if isinstance(certificate.claim, Enlarged) else "{V ≤ c₂}"
     items = [
         *words.excluded[:-1],
         (
             "Anything outside the set.",
-            "The true set may be larger: what starts outside {V ≤ c₂} may do the same or not.",
+            f"The true set may be larger: what starts outside {sets} may do the same or not.",
         ),
         (
             "Any other plant.",
@@ -420,26 +482,22 @@ def _tables(
     system, P, network, words = certificate.system, certificate.P, certificate.network, words_for(certificate.kind)
     state_units = [system.units.get(s.name, "") for s in system.states]
     levels = [(f"{words.inner}, {words.inner_word}", repr(certificate.inner)), ("c₂, enlarged", repr(certificate.roa))]
-    reach: list[tuple[str, str, str, str]] = []
+    reach: list[tuple[str, ...]] = []
+    heads: list[str] = []
     size_of_set: list[tuple[str, str]] = []
     if is_ellipsoid(certificate):
         limit = domain_limit(P, system.domain)
         share = below(100 * Fraction(certificate.roa) / Fraction(limit), 4) if limit > 0 else "?"
         levels.append(("domain's limit", f"{below(limit, 10)}, of which c₂ is {share} %"))
-        size_of_set.append(
-            (volume_name(system.n), f"{below(volume(P, certificate.roa))} {volume_unit(state_units)}".rstrip())
-        )
-        columns = (
-            system.exact_x_eq(),
-            state_units,
-            semi_axes(P, certificate.roa),
-            extents(P, certificate.roa),
-            system.domain,
-        )
-        reach = [
-            (deviation(s.name, q, unit), below(float(axis)), above(float(extent)), f"[{below(lo)}, {above(hi)}]")
-            for s, q, unit, axis, extent, (lo, hi) in zip(system.states, *columns, strict=True)
-        ]
+        sets = _ellipsoids(certificate)
+        for each in sets:
+            named = volume_name(system.n) + (f" of {each.name}" if len(sets) > 1 else "")
+            size_of_set.append((named, f"{below(volume(each.P, each.level))} {volume_unit(state_units)}".rstrip()))
+        heads, columns = _lengths(certificate, sets)
+        points = zip(system.states, system.exact_x_eq(), state_units, strict=True)
+        names = [deviation(s.name, q, unit) for s, q, unit in points]
+        domain = [f"[{below(lo)}, {above(hi)}]" for lo, hi in system.domain]
+        reach = list(zip(names, *columns, domain, strict=True))
     if result is not None:
         levels.append(("limited by", limited_by(result)))
         sampled = result["levels"].get("sampled_limit")
@@ -450,6 +508,7 @@ def _tables(
         geometry.append(("eigenvalues of P", ", ".join(number(float(v)) for v in np.linalg.eigvalsh(P))))
     if isinstance(certificate.claim, Asymptotic):  # elsewhere the origin need not be an equilibrium
         geometry.append(("eigenvalues of the closed loop", _eigenvalues(certificate)))
+    slabs = slabs_of(certificate)
     evidence = [
         ("policy", f"{'-'.join(map(str, network.layers))} tanh, squash {network.squash}, centre {network.centre}"),
         *(() if network.clip is None else (("clipped to", _clip(certificate)),)),
@@ -458,6 +517,8 @@ def _tables(
     ]
     if size is not None:
         evidence.append(("certificate size", f"{size:,} bytes"))
+    if slabs:
+        evidence.append(("tube", f"{len(slabs):,} slabs, {_duration(certificate)}"))
     if isinstance(certificate.evidence, TrustedSolver):
         solver = certificate.evidence
         evidence.append(("solver", f"{solver.solver} {solver.version}, delta {number(solver.precision)}"))
@@ -492,10 +553,29 @@ def _tables(
         "size": size_of_set,
         "geometry": geometry,
         "reach": reach,
+        "reach_heads": heads,
+        "sets": "the set reaches" if len(heads) <= 2 else "each set reaches",
+        "measure": volume_name(system.n),
         "evidence": evidence,
         "run": run,
         "candidates": candidates,
     }
+
+
+def _lengths(certificate: Certificate, sets: Sequence[_Ellipsoid]) -> tuple[list[str], list[list[str]]]:
+    """Heads and columns of how far the sets reach along the states: on the axes, rounded down, and at all, up.
+
+    Where there are two sets, their sizes on the axes stand side by side, as shares of the domain too.
+    """
+    axes = [[below(float(v)) for v in semi_axes(each.P, each.level)] for each in sets]
+    most = [[above(float(v)) for v in extents(each.P, each.level)] for each in sets]
+    if len(sets) == 1:
+        return ["on its axis, ±", "largest in the set, ±"], [*axes, *most]
+    for column, each in zip(axes, sets, strict=True):
+        shares = _shares(certificate, semi_axes(each.P, each.level))
+        column[:] = [f"{v} ({below(100 * q, 3)} %)" for v, q in zip(column, shares, strict=True)]
+    heads = [f"{what} {each.name}, ±" for what in ("axis of", "largest in") for each in sets]
+    return heads, [*axes, *most]
 
 
 def _simulated(roa: SimulatedRoa, certificate: Certificate) -> dict[str, str]:

@@ -60,6 +60,8 @@ def summary(result: Mapping[str, Any]) -> RenderableType:
     parts: list[RenderableType] = [head, Text(), grid]
     if shown and result.get("extents"):
         parts += [Text(), _reach(result)]
+    if shown and result.get("tube"):
+        parts.append(Text(f"lengths{_of_which(result)}", style="dim"))
     return Group(*parts, Text())
 
 
@@ -120,7 +122,8 @@ def _rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
         rows.append(("tube", f"from an ellipsoid of the shape {tube['shape']}, {size}"))
     if result.get("volume") is not None:
         unit = volume_unit(units)
-        rows.append((volume_name(len(units)), f"{below(result['volume'])} {unit}".rstrip()))
+        size = f"{below(result['volume'])} {unit}".rstrip()
+        rows.append((volume_name(len(units)), size + _of_which(result)))
     if len(result.get("candidates", [])) > 1:
         unit = volume_unit(units)
         tried = [
@@ -182,6 +185,14 @@ def _level(value: float | None) -> str:
 def _times(spent: Mapping[str, float | None]) -> str:
     stages = [f"{stage} {seconds(spent[stage])}" for stage in _STAGES if spent.get(stage) is not None]
     return f"{seconds(spent.get('total'))}  ({', '.join(stages)})" if stages else seconds(spent.get("total"))
+
+
+def _of_which(result: Mapping[str, Any]) -> str:
+    """Of which of two sets the sizes are, those of the larger one; nothing where there is but one."""
+    tube = result.get("tube")
+    if not tube:
+        return ""
+    return ", of the tube's start" if tube["volume"] == result["volume"] else ", of {V <= c2}"
 
 
 def _reach(result: Mapping[str, Any]) -> RenderableType:

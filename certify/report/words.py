@@ -163,7 +163,8 @@ def seconds(value: float | None) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Words:
-    """One kind of claim in words. In texts, {inner} and {outer} stand for its levels in digits.
+    """One kind of claim in words. In texts, {inner} and {outer} stand for its levels in digits, {duration} for how long
+    its tube is.
 
     Parameters
     ----------
@@ -272,15 +273,38 @@ CLAIMS = {
     **CLAIMS,
     "enlarged": replace(
         _ASYMPTOTIC,
-        statement=_ASYMPTOTIC.statement + " Every trajectory that starts in the ellipsoid {{x'P₀x ≤ 1}}, from which a "
-        "tube leads into that set, stays in the domain, reaches that set, and converges to the origin too.",
-        headline="{{V <= {outer}}} is invariant and attracted by the origin; so is every state of the tube's start",
+        statement=_ASYMPTOTIC.statement + " Every trajectory that starts in the ellipsoid {{x′P₀x ≤ 1}}, the start of "
+        "a tube, stays in the domain, is in {{V(x) ≤ {outer}}} after {duration} at the latest, and converges to the "
+        "origin as well.",
+        headline="{{V <= {outer}}} is invariant and attracted by the origin, and every trajectory from the tube's "
+        "start enters it",
+        decay="That V is at most c₂ once the tube has ended, and falls to 0, is {word}; how fast from then on is not.",
         parts=(
             *_ASYMPTOTIC.parts,
             (
                 "Tube",
-                "x'P(t)x falls along every trajectory in {x'P(t)x ≤ 1}, from P₀ until that set lies in {V ≤ c₂}",
-                "slab by slab of the time, by the linearisation and a bound on its remainder in every direction",
+                "x′P(t)x falls along every trajectory in {x′P(t)x ≤ 1} but the origin; P(t) begins as P₀, and at its "
+                "end {x′P(t)x ≤ 1} lies in {V ≤ c₂}",
+                "one slab of time after the other, by the linearisation and a bound on its remainder that knows "
+                "directions",
+            ),
+            (
+                "Along the tube",
+                "Each ellipsoid {x′P(t)x ≤ 1} lies strictly inside the domain; on it the closed loop is twice "
+                "continuously differentiable, no clip acts, and the input stays in its bounds.",
+                "",
+            ),
+        ),
+        excluded=(
+            (
+                "Staying in the start.",
+                "A trajectory from the tube's start may leave that ellipsoid on its way: it stays in the tube, which "
+                "lies inside the domain.",
+            ),
+            (
+                "Speed and cost.",
+                "The tube says by when {V ≤ c₂} is reached; how fast trajectories converge from there, and at what "
+                "cost, is not part of the claim.",
             ),
         ),
     ),

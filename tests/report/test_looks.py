@@ -21,6 +21,7 @@ from certify.policies import load_policy
 from certify.report import render_html
 from certify.roa import RoaOptions, certify_roa
 from certify.systems import get_system
+from tests.report.test_tube import soft_spring
 from tests.support.browser import Browser, find_browser
 from tests.support.loops import chain
 
@@ -47,15 +48,17 @@ CONTRAST = """(() => {
 
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """A page of two states and one of four, as a run leaves them."""
+    """A page of two states, one of four and one with a tube, as a run leaves them."""
     found = {}
     loops = {
         "pendulum": (get_system("pendulum"), load_policy(PENDULUM).network),
         "chain": chain(4, [-1.0, -2.0, -3.0, -4.0]),
+        "tube": soft_spring(),
     }
     for name, (system, network) in loops.items():
         folder = tmp_path_factory.mktemp(name)
-        result = certify_roa(system, network, folder, RoaOptions(candidate="lyapunov"), provenance={"numpy": "1.2.3"})
+        options = RoaOptions(candidate="lyapunov", enlarge=name == "tube")
+        result = certify_roa(system, network, folder, options, provenance={"numpy": "1.2.3"})
         assert result.certificate is not None and result.checker is not None
         data = result.to_dict()
         data["diagnosis"]["next"]["command"] = "certify roa --policy " + "a/very/long/path/" * 8 + "policy.pt"
@@ -81,7 +84,7 @@ def keep(name: str, content: bytes) -> None:
 
 @pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
 @pytest.mark.parametrize("width", WIDTHS)
-@pytest.mark.parametrize("name", ["pendulum", "chain"])
+@pytest.mark.parametrize("name", ["pendulum", "chain", "tube"])
 def test_a_page_fits_and_can_be_read(
     browser: Browser, pages: dict[str, Path], name: str, width: int, dark: bool
 ) -> None:

@@ -8,6 +8,7 @@ One figure a file; `scene` has what they share, `geometry` their curves, `style`
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 from certify.certificate import Certificate
 from certify.report.figures.decay import decay
@@ -19,6 +20,7 @@ from certify.report.figures.policy import curves, surface
 from certify.report.figures.portrait import Region, portraits
 from certify.report.figures.scene import Scene, starts
 from certify.report.figures.style import RC, Picture
+from certify.report.figures.tube import tube
 from certify.report.sampling import SimulatedRoa, edge_of, simulated_roa_fraction
 
 __all__ = ["Picture", "draw"]
@@ -51,7 +53,10 @@ def simulated_roa(scene: Scene) -> SimulatedRoa | None:
         return None
     network = scene.certificate.network
     settled, deadline = scene.settling_level, scene.deadline
-    return simulated_roa_fraction(scene.system, network, scene.P, scene.outer, settled=settled, deadline=deadline)
+    P, start = scene.P, scene.start
+    return simulated_roa_fraction(
+        scene.system, network, P, scene.outer, settled=settled, deadline=deadline, start=start
+    )
 
 
 def region_of(scene: Scene, roa: SimulatedRoa | None) -> Region | None:
@@ -62,20 +67,21 @@ def region_of(scene: Scene, roa: SimulatedRoa | None) -> Region | None:
 
 
 def _on_the_line(scene: Scene, roa: SimulatedRoa | None) -> list[Picture]:
-    reach = scene.reach[0]
+    reach = scene.far[0]
     begin = [[share * reach] for share in (-0.999, -0.5, 0.5, 0.999)]
     runs = scene.simulate(begin)
-    return [line_figure(scene, roa), curves(scene), decay(scene, runs.path, runs.step)]
+    return [line_figure(scene, roa), *tube(scene, runs), curves(scene), decay(scene, runs.path, runs.step)]
 
 
 def _in_planes(scene: Scene, roa: SimulatedRoa | None) -> list[Picture]:
     runs, region = scene.simulate(starts(scene)), region_of(scene, roa)
-    pictures = portraits(scene, runs, region)
+    inside = len(scene.pairs) * scene.effort.starts  # what starts along the domain's edge comes after these
+    from_set = replace(runs, path=runs.path[:, :inside], settled=runs.settled[:inside], left=runs.left[:inside])
+    pictures = [*portraits(scene, runs, region), *tube(scene, from_set)]
     if scene.n == 2 and not scene.local_is_enough:
         pictures.append(near_origin(scene))
     if scene.leaves is not None and not scene.local_is_enough:
         pictures.append(partition(scene, scene.leaves))
     pictures.append(surface(scene, scene.pairs[0]))
-    inside = len(scene.pairs) * scene.effort.starts  # what starts along the domain's edge comes after these
-    pictures.append(decay(scene, runs.path[:, :inside], runs.step))
+    pictures.append(decay(scene, from_set.path, runs.step))
     return pictures

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.report.figures.scene import Scene
-from certify.report.figures.style import INNER, SET, SIMULATED, Picture, figure_of, plain_powers, to_svg
+from certify.report.figures.style import INNER, SET, SIMULATED, START, Picture, figure_of, plain_powers, to_svg
 from certify.report.sampling import quadratic
 
 
@@ -17,20 +17,34 @@ def decay(scene: Scene, paths: NDArray[np.float64], step: float) -> Picture:
     figure, axes = figure_of(4.2, 3.6)
     axes.semilogy(time, np.maximum(V, 1e-300), color=SIMULATED, lw=0.8)
     axes.axhline(scene.outer, color=SET, lw=1.4)
-    axes.axhline(scene.inner, color=INNER, lw=1.4)
+    if scene.inner < scene.outer:
+        axes.axhline(scene.inner, color=INNER, lw=1.4)
     apart = scene.inner < 0.5 * scene.outer
     for level, name, colour in ((scene.outer, "c₂", SET), (scene.inner, scene.words.inner, INNER))[: 1 + apart]:
         axes.annotate(name, (time[-1], level), (2, 2), textcoords="offset points", color=colour, fontsize=9)
+    highest = scene.outer
+    if scene.start is not None:
+        highest = max(highest, float(np.nanmax(V)))
+        axes.axvline(scene.duration, color=START, lw=1.4, ls="--")
+        axes.annotate(
+            "end of the tube",
+            (scene.duration, 1),
+            (3, -10),
+            xycoords=("data", "axes fraction"),
+            textcoords="offset points",
+            color=START,
+            fontsize=8,
+        )
     lowest = float(np.nanmin(V[-1])) if np.any(np.isfinite(V[-1])) else scene.inner
-    axes.set_ylim(max(min(lowest, scene.inner / 10), 1e-14 * scene.outer), scene.outer * 4)
+    axes.set_ylim(max(min(lowest, scene.inner / 10), 1e-14 * scene.outer), highest * 4)
     axes.set_xlim(0, time[-1])
     plain_powers(axes)
     axes.set_xlabel("time (s)")
     axes.set_ylabel("V(x(t))")
+    begin = f"on and in the {scene.word} set" if scene.start is None else "on the edge of the tube's start"
     return Picture(
         "V along trajectories",
-        f"V from starting points on and in the {scene.word} set: simulated, not proved. "
-        + scene.words.decay.format(word=scene.proved),
+        f"V from starting points {begin}: simulated, not proved. " + scene.words.decay.format(word=scene.proved),
         to_svg(figure),
         simulated=True,
     )

@@ -16,6 +16,7 @@ from certify.report.figures.style import (
     REGION,
     SET,
     SET_FILL,
+    START_FILL,
     Key,
     Picture,
     figure_of,
@@ -28,9 +29,10 @@ def line_figure(scene: Scene, roa: SimulatedRoa | None) -> Picture:
     """Vdot over the domain, the two intervals, and where runs settle."""
     figure, axes = figure_of(5.0, 3.4)
     legend = draw_line(axes, scene, roa)
+    wider = "" if scene.start is None else ", and around it the start of the tube that leads into it"
     return Picture(
         "V̇ along the state",
-        f"Shaded: the {scene.word} interval, {scene.meaning}. The curve of V̇ and the interval of the runs that "
+        f"Shaded: the {scene.word} interval, {scene.meaning}{wider}. The curve of V̇ and the interval of the runs that "
         f"{scene.words.settles} come from floating point and simulation; they are not proved.",
         to_svg(figure),
         simulated=True,
@@ -51,6 +53,9 @@ def draw_line(axes: Any, scene: Scene, roa: SimulatedRoa | None) -> tuple[Key, .
         Key("V̇ ≥ 0 (not proved)", GROWTH_FILL, 0, fill=GROWTH_FILL),
     ]
     axes.axhline(0, color=MUTED, lw=0.7)
+    if scene.start_reach is not None:
+        keys.insert(0, Key(f"{scene.word} start of the tube", START_FILL, 0, fill=START_FILL))
+        axes.axvspan(-scene.start_reach[0], scene.start_reach[0], color=START_FILL, lw=0)
     axes.axvspan(-outer, outer, color=SET_FILL, lw=0)
     axes.axvspan(-inner, inner, color=INNER_FILL, lw=0)
     axes.plot(x[:, 0], vdot, color=INK)

@@ -6,7 +6,19 @@ import numpy as np
 
 from certify.report.figures.geometry import ellipse
 from certify.report.figures.scene import Scene
-from certify.report.figures.style import GROWTH, INK, INNER, SET, SET_FILL, Picture, add_axes, figure_of, to_svg
+from certify.report.figures.style import (
+    GROWTH,
+    INK,
+    INNER,
+    SET,
+    SET_FILL,
+    START,
+    START_FILL,
+    Picture,
+    add_axes,
+    figure_of,
+    to_svg,
+)
 
 
 def curves(scene: Scene) -> Picture:
@@ -16,11 +28,14 @@ def curves(scene: Scene) -> Picture:
     u = scene.flow.policy(x)
     for k, name in enumerate(scene.input_labels):
         axes.plot(x[:, 0], u[:, k], color=(INK, SET, INNER, GROWTH)[k % 4], label=name)
+    if scene.start_reach is not None:
+        axes.axvspan(-scene.start_reach[0], scene.start_reach[0], color=START_FILL, lw=0, zorder=-1)
     axes.axvspan(-scene.reach[0], scene.reach[0], color=SET_FILL, lw=0, zorder=0)
     axes.set_xlim(scene.lo[0], scene.hi[0])
     axes.set_xlabel(scene.labels[0])
     axes.set_ylabel(", ".join(scene.input_labels))
-    caption = f"u = π(x) over the domain; shaded: the {scene.word} interval."
+    what = "interval" if scene.start is None else "interval (blue) and the start of its tube"
+    caption = f"u = π(x) over the domain; shaded: the {scene.word} {what}."
     return Picture("The policy", caption, to_svg(figure), simulated=False)
 
 
@@ -52,6 +67,8 @@ def surface(scene: Scene, pair: tuple[int, int]) -> Picture:
         )
         axes.contour(a, b, u[..., k], levels=11, colors=INK, linewidths=0.35, alpha=0.7, linestyles="solid")
         axes.plot(*boundary, color=SET, lw=1.6)
+        if scene.start is not None:
+            axes.plot(*ellipse(scene.start, pair, 1.0), color=START, lw=1.6)
         axes.set_xlim(a[0], a[-1])
         axes.set_ylim(b[0], b[-1])
         bar = figure.colorbar(image, cax=add_axes(figure, left + 3.3, bottom + 0.52, 0.1, 2.96))
@@ -60,10 +77,11 @@ def surface(scene: Scene, pair: tuple[int, int]) -> Picture:
         axes.set_xlabel(scene.labels[pair[0]])
         axes.set_ylabel(scene.labels[pair[1]])
     where = "over the domain" if scene.n == 2 else "around the set, all other states being 0,"
+    outline = "boundary" if scene.start is None else "boundaries of the start (magenta) and"
     more = "" if shown == scene.system.m else f" The first {shown} of {scene.system.m} inputs."
     return Picture(
         "The policy's surface",
-        f"u = π(x) {where} with the boundary of the {scene.word} set.{more}",
+        f"u = π(x) {where} with the {outline} of the {scene.word} set.{more}",
         to_svg(figure),
         simulated=False,
         wide=shown > 1,

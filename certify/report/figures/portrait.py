@@ -3,7 +3,7 @@
 With two states the plane is the whole space and the picture shows the domain. With more there are two exact shapes to
 tell apart: the section through the origin `{y: y'P_ij y <= c}`, the points of the plane that lie in the set, and the
 projection `{y: y'((P^-1)_ij)^-1 y <= c}`, all values that two states take anywhere in the set; the picture is zoomed
-to the latter.
+to the latter. The start of a tube has the same two, and then the picture is zoomed to whatever reaches further.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from certify.report.figures.style import (
     SET,
     SET_FILL,
     SIMULATED,
+    START,
     UNSETTLED,
     Key,
     Picture,
@@ -40,6 +41,11 @@ from certify.report.words import below, inner_level, number, symbol
 Array = NDArray[np.float64]
 Region = tuple[Array, Array, Array]
 """Axes (K,), (L,) of a plane and the share of a simulated region around each point, (K, L)."""
+_ABOUT = (
+    "Each picture shows two states. The section holds the states of the set in which all others are 0; the projection "
+    "holds the values that the two take anywhere in the set. Both are exact shapes. Trajectories start over the edge "
+    "of the projection, and are projected like it."
+)
 
 
 def portraits(scene: Scene, runs: Runs, region: Region | None) -> list[Picture]:
@@ -50,29 +56,47 @@ def portraits(scene: Scene, runs: Runs, region: Region | None) -> list[Picture]:
         drawn.append((pair, draw_plane(axes, scene, pair, runs, region), to_svg(figure)))
     legend = keys(scene, runs, region, any(growing for _, growing, _ in drawn))
     title, meaning = "Phase portrait", f"Blue: the {scene.word} set, {scene.meaning}. "
+    if scene.start is not None:
+        meaning += "Magenta: the start of the tube that leads into it. "
+    about = _ABOUT if len(scene.pairs) > 1 else ""
     pictures = []
     for pair, growing, svg in drawn:
         if scene.n > 2:
             names = [symbol(scene.system.states[k].name) for k in pair]
             title = ", ".join(names)
-            shares = [f"{number(100 * scene.shares[k], 3)} % in {name}" for name, k in zip(names, pair, strict=True)]
-            meaning = f"Of its domain the set takes {' and '.join(shares)}. "
+            meaning = f"Of its domain the set takes {_takes(scene.shares, names, pair)}. "
+            if scene.start_shares is not None:
+                both = _takes(scene.start_shares, names, pair), _takes(scene.shares, names, pair)
+                meaning = f"Of its domain the start takes {both[0]}, {{V ≤ c₂}} {both[1]}. "
         sign = "" if growing else "V̇ < 0 at every grid point of the picture. "
+        if growing and scene.start is not None:
+            sign = "V need not fall outside the blue set: along the tube another function does. "
         caption = f"{meaning}{sign}*\N{NO-BREAK SPACE}Simulated or evaluated on a grid, not proved."
-        pictures.append(Picture(title, caption, svg, simulated=True, wide=scene.n == 2, legend=legend))
+        pictures.append(Picture(title, caption, svg, simulated=True, wide=scene.n == 2, legend=legend, about=about))
     return pictures
+
+
+def _takes(shares: Array, names: Sequence[str], pair: Pair) -> str:
+    """Shares of the domain in words."""
+    return " and ".join(f"{number(100 * shares[k], 3)} % in {name}" for name, k in zip(names, pair, strict=True))
 
 
 def keys(scene: Scene, runs: Runs, region: Region | None, growing: bool) -> tuple[Key, ...]:
     """The legend of the planes; `growing` says whether Vdot >= 0 somewhere in one of them."""
     outer = f"{scene.word} set, V = {below(scene.outer, 4)}"
     inner = f"{scene.words.inner_set}, V = {inner_level(scene.kind, scene.inner, 3)}"
+    start = f"{scene.word} start of the tube"
     found = [Key(outer, SET, 1.8, fill=SET_FILL)]
     if scene.n > 2:
         found = [
             Key(f"{outer}: projection", SET, 1.2, "--"),
             Key("its section through the origin", SET, 1.6, fill=SET_FILL),
         ]
+    if scene.start is not None and scene.n > 2:
+        begin = Key(f"{start}: projection", START, 1.2, "--"), Key("section of the start", START, 1.6)
+        found = [*begin, *found]
+    elif scene.start is not None:
+        found = [Key(start, START, 1.8), *found]
     if not scene.local_is_enough:
         found.append(Key(inner + (": section" if scene.n > 2 else ""), INNER, 1.4, fill=INNER_FILL))
     if growing:
@@ -127,6 +151,10 @@ def draw_plane(axes: Any, scene: Scene, pair: Pair, runs: Runs, region: Region |
     axes.plot(*section, color=SET, lw=1.8 if scene.n == 2 else 1.5, zorder=4)
     if scene.n > 2:
         axes.plot(*shadow(scene.P, pair, scene.outer), color=SET, lw=1.2, ls="--", zorder=4)
+    if scene.start is not None:
+        axes.plot(*ellipse(scene.start, pair, 1.0), color=START, lw=1.8 if scene.n == 2 else 1.5, zorder=4)
+        if scene.n > 2:
+            axes.plot(*shadow(scene.start, pair, 1.0), color=START, lw=1.2, ls="--", zorder=4)
     if not scene.local_is_enough:
         inner = ellipse(scene.P, pair, scene.inner)
         axes.fill(*inner, color=INNER_FILL, lw=0, zorder=1.5)

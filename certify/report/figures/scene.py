@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from certify.certificate import Certificate, PartitionTree, leaves
-from certify.claims import Practical
+from certify.certificate import Certificate, PartitionTree, Slab, leaves
+from certify.claims import Enlarged, Practical
 from certify.errors import CertificateFormatError
 from certify.lyapunov import extents, is_positive_definite
 from certify.policies import TanhNetwork
@@ -44,6 +44,22 @@ def is_ellipsoid(certificate: Certificate) -> bool:
     P = certificate.P
     ordered = 0 < certificate.inner <= certificate.roa < np.inf
     return ordered and bool(np.all(np.isfinite(P))) and is_positive_definite(P)
+
+
+def start_of(certificate: Certificate) -> Array | None:
+    """P (n, n) of the ellipsoid {x'Px <= 1} from which a tube leads into {V <= c2}.
+
+    None where the claim has none, and where a rejected file has something else in its place.
+    """
+    if not isinstance(certificate.claim, Enlarged):
+        return None
+    P = certificate.claim.start.P
+    return P if is_positive_definite(P) else None
+
+
+def slabs_of(certificate: Certificate) -> tuple[Slab, ...]:
+    """The tube's slabs; none where the claim has no tube."""
+    return certificate.evidence.tube if isinstance(certificate.evidence, PartitionTree) else ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -105,14 +121,19 @@ class Scene:
         self.n = self.system.n
         self.reach = extents(self.P, self.outer)
         self.inner_reach = extents(self.P, self.inner)
+        self.start, self.slabs = start_of(certificate), slabs_of(certificate)
+        self.start_reach = None if self.start is None else extents(self.start, 1.0)
+        self.far = self.reach if self.start_reach is None else np.maximum(self.reach, self.start_reach)
         self.flow = Flow.of(self.system, certificate.network)
         self.lo, self.hi = self.flow.lo, self.flow.hi
         side = np.minimum(-self.lo, self.hi)  # not positive in files that the checker refuses
-        self.shares = self.reach / np.where(side > 0, side, np.nan)
-        self.pairs = list(pairs) if pairs is not None else pairs_of(self.system, self.P, self.shares)
+        side = np.where(side > 0, side, np.nan)
+        self.shares = self.reach / side
+        self.start_shares = None if self.start_reach is None else self.start_reach / side
+        self.pairs = list(pairs) if pairs is not None else pairs_of(self.system, self.P, self.far / side)
         self.effort = Effort.of(certificate.network, len(self.pairs))
-        # With more than two states nothing is simulated from outside the set.
-        self.step, self.horizon = time_scales(self.flow, self.effort.rates, None if self.n <= 2 else self.reach)
+        # With more than two states nothing is simulated from outside the sets.
+        self.step, self.horizon = time_scales(self.flow, self.effort.rates, None if self.n <= 2 else self.far)
         units = self.system.units
         points = zip(self.system.states, self.system.exact_x_eq(), strict=True)
         self.labels = [deviation(s.name, q, units.get(s.name, "")) for s, q in points]
@@ -131,6 +152,11 @@ class Scene:
         return self.inner if self.kind == "practical" else SETTLED * self.outer
 
     @property
+    def duration(self) -> float:
+        """Of the tube, in seconds; 0 without one."""
+        return math.fsum(slab.duration for slab in self.slabs)
+
+    @property
     def local_is_enough(self) -> bool:
         """Whether the local rule covers the whole set, so that leaves are not asked (FORMAT.md, local)."""
         return self.kind == "asymptotic" and self.inner == self.outer
@@ -147,20 +173,20 @@ class Scene:
         return np.where(np.isfinite(value), value, np.nan)
 
     def simulate(self, begin: ArrayLike, steps: int | None = None) -> Runs:
-        """Trajectories with their fates, by default over half the horizon; smooth for a picture."""
+        """Trajectories with their fates, by default over the tube and half the horizon; smooth for a picture."""
         step = PATH_STEP * self.step
-        count = steps or min(int(0.5 * self.horizon / step) + 1, self.effort.steps)
-        starts = np.asarray(begin, dtype=np.float64)
-        runs = runs_of(self.flow, starts, self.P, self.outer, self.settling_level, step, count, self.deadline)
+        count = steps or min(int((self.duration + 0.5 * self.horizon) / step) + 1, self.effort.steps)
+        starts, target = np.asarray(begin, dtype=np.float64), self.settling_level
+        runs = runs_of(self.flow, starts, self.P, self.outer, target, step, count, self.deadline, self.start)
         return Runs(refine(runs.path, self.flow.field, step), step / PARTS, runs.settled, runs.left)
 
     def view(self, pair: Pair) -> Box:
-        """What a picture of two states shows: the domain of a plane, else the set with some room within the domain."""
+        """What a picture of two states shows: the domain of a plane, else the sets with some room within the domain."""
         lo, hi = self.lo[list(pair)], self.hi[list(pair)]
         if self.n == 2:
             margin = 0.03 * (hi - lo)
             return Box(lo - margin, hi + margin)
-        reach = _VIEW * self.reach[list(pair)]
+        reach = _VIEW * self.far[list(pair)]
         return Box(np.maximum(-reach, 1.06 * lo), np.minimum(reach, 1.06 * hi))
 
     def plane(self, pair: Pair) -> tuple[Array, Array, Array]:
@@ -175,9 +201,13 @@ class Scene:
 
 
 def starts(scene: Scene) -> Array:
-    """Starting points: around the outline of the set in each plane and, for two states, along the domain's edge."""
+    """Starting points: around the outline of a set in each plane and, for two states, along the domain's edge.
+
+    The set is that of a tube's start if there is one, else {V <= c2}.
+    """
     count = scene.effort.starts
-    blocks = [over_level(scene.P, pair, circle(count), 0.999 * scene.outer) for pair in scene.pairs]
+    P, level = (scene.P, scene.outer) if scene.start is None else (scene.start, 1.0)
+    blocks = [over_level(P, pair, circle(count), 0.999 * level) for pair in scene.pairs]
     if scene.n == 2:
         edge = 2 * np.pi * (np.arange(22) + 0.25) / 22
         ring = np.stack([np.cos(edge), np.sin(edge)], -1)
