@@ -28,7 +28,7 @@ class Local(Ball):
         nothing = fmpq_mat(P.nrows(), P.nrows())
         return sides(Models(self.J, self.F), P, nothing, self.case.local.multipliers)
 
-    @property
+    @cached_property
     def margin(self) -> float:
         """1 - the largest share of the decay that the rest may take, in floats for people."""
         try:

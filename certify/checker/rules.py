@@ -154,7 +154,8 @@ def check(c: Certificate) -> Tally:
         if not c.practical:
             origin = local.Local(case)
             tally.hold(ON_THE_BALL, origin)
-            tally.local_margin = origin.margin
+            if np.isfinite(origin.margin):  # binary64 may not hold the sides of an inequality that rationals decide
+                tally.local_margin = origin.margin
         tally.hold(OF_THE_TREE, case)
         if c.practical or c.c1 != c.c2:
             bounds, margin = ring.Ring(case), np.inf

@@ -54,9 +54,12 @@ def _matrix(A: Array) -> str:
 
 
 def _duration(c: Certificate) -> float:
-    """Of the tube, rounded up."""
+    """Of the tube, rounded up; infinite where no binary64 number is as large."""
     slabs = c.evidence.tube if isinstance(c.evidence, Partition) else ()
-    return math.nextafter(math.fsum(slab.duration for slab in slabs), math.inf)
+    try:
+        return math.nextafter(math.fsum(slab.duration for slab in slabs), math.inf)
+    except OverflowError:
+        return math.inf
 
 
 def expression(tree: Any) -> str:
