@@ -14,14 +14,15 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-from flint import arb, ctx
+from flint import arb, ctx, fmpq, fmpq_mat
 from hypothesis import example, given
 from hypothesis import strategies as st
 
 from certify.checker import float64
+from certify.checker.ball import enclose_at_origin, input_jet, too_large
 from certify.checker.document import Policy
 from certify.checker.elementary import elementary
-from certify.checker.exact import gershgorin_lower, inverse_diagonal, rational
+from certify.checker.exact import contains_ball, gershgorin_lower, inverse_diagonal, is_definite, root_above
 from certify.checker.float64 import (
     arb_with_error,
     atanh_with_error,
@@ -37,7 +38,6 @@ from certify.checker.float64 import (
 )
 from certify.checker.jets import Jet, widen
 from certify.checker.jets import constant as constant_jet
-from certify.checker.local import enclose_at_origin, input_jet, too_large
 from certify.checker.network import Folded, enclose_on_boxes, fold, relax_tanh
 from certify.checker.ring import Ring
 from certify.checker.taylor import Taylor, affine, upper_bound
@@ -204,10 +204,32 @@ def test_self_test_passes_here_and_fails_closed(monkeypatch: pytest.MonkeyPatch)
         self_test()
 
 
-def is_semidefinite(A: list[list[Fraction]]) -> bool:
-    """Exact, by leading minors of A + t I for a t that changes no sign that matters here."""
+Matrix = list[list[Fraction]]
+
+
+def flint_of(A: Matrix) -> fmpq_mat:
+    return fmpq_mat([[fmpq(v.numerator, v.denominator) for v in row] for row in A])
+
+
+def pivots(A: Matrix) -> list[Fraction]:
+    """D of A = LDL', up to the first that is not positive; A is symmetric and definite if it has as many as rows.
+
+    By elimination, in fractions: what the checker decides by determinants.
+    """
+    rows, found = [list(row) for row in A], []
+    while rows:
+        pivot, *rest = rows[0]
+        if pivot <= 0:
+            break
+        found.append(pivot)
+        rows = [[v - row[0] * w / pivot for v, w in zip(row[1:], rest, strict=True)] for row in rows[1:]]
+    return found
+
+
+def is_semidefinite(A: Matrix) -> bool:
+    """Exact, by the pivots of A + t I for a t that changes no sign that matters here."""
     n, t = len(A), Fraction(1, 2**4000)
-    return inverse_diagonal([[A[i][j] + (t if i == j else 0) for j in range(n)] for i in range(n)]) is not None
+    return len(pivots([[A[i][j] + (t if i == j else 0) for j in range(n)] for i in range(n)])) == n
 
 
 @pytest.mark.parametrize("shape", [(1, 1), (2, 2), (1, 5), (5, 1), (3, 4), (6, 3), (5, 5)])
@@ -219,7 +241,7 @@ def test_spectral_norm_is_an_upper_bound(shape: tuple[int, int], exponent: int) 
     for W in (*kinds, graded):
         scaled = W * 2.0**exponent
         sigma = spectral_norm(scaled)
-        R = rational(scaled.T if shape[0] >= shape[1] else scaled)
+        R = [[Fraction(v) for v in row] for row in (scaled.T if shape[0] >= shape[1] else scaled).tolist()]
         gram = [[sum((x * y for x, y in zip(p, q, strict=True)), Fraction(0)) for q in R] for p in R]
         assert is_semidefinite([
             [(Fraction(sigma) ** 2 if i == j else Fraction(0)) - v for j, v in enumerate(row)]
@@ -244,14 +266,14 @@ def test_definiteness_is_decided_exactly(n: int, seed: int) -> None:
     D = [Fraction(int(v)) for v in generator.integers(-1, 4, n)]
     A = [[sum((L[i][k] * D[k] * L[j][k] for k in range(n)), Fraction(0)) for j in range(n)] for i in range(n)]
     exact_minors = [determinant([row[:k] for row in A[:k]]) for k in range(1, n + 1)]
-    diagonal = inverse_diagonal(A)
-    assert (diagonal is not None) == all(d > 0 for d in exact_minors)
-    if diagonal is not None:
+    diagonal, definite = inverse_diagonal(flint_of(A)), all(d > 0 for d in exact_minors)
+    assert bool(diagonal) == is_definite(flint_of(A)) == (len(pivots(A)) == n) == definite
+    if definite:
         for i, value in enumerate(diagonal):
             minor = [[A[r][c] for c in range(n) if c != i] for r in range(n) if r != i]
             assert value == (determinant(minor) if n > 1 else 1) / exact_minors[-1]
-    if gershgorin_lower(A) > 0:
-        assert diagonal is not None
+    if gershgorin_lower(flint_of(A)) > 0:
+        assert definite
 
 
 def determinant(A: list[list[Fraction]]) -> Fraction:
@@ -262,9 +284,73 @@ def determinant(A: list[list[Fraction]]) -> Fraction:
     return result
 
 
-def test_an_unsymmetric_matrix_is_not_definite() -> None:
-    A = [[Fraction(2), Fraction(1)], [Fraction(0), Fraction(2)]]
-    assert inverse_diagonal(A) is None
+@given(st.integers(1, 5), st.integers(0, 10**6), st.integers(0, 400))
+def test_definiteness_is_decided_up_to_its_edge(n: int, seed: int, digits: int) -> None:
+    """A matrix of rank n - 1, and what is added to its last entry: its sign alone decides."""
+    generator = np.random.default_rng(seed)
+    L = [[Fraction(int(v), 7) for v in row] for row in generator.integers(-9, 10, (n, n))]
+    L = [[v if j < i else Fraction(int(i == j)) for j, v in enumerate(row)] for i, row in enumerate(L)]
+    D = [*(Fraction(int(v)) for v in generator.integers(1, 5, n - 1)), Fraction(0)]
+    A = [[sum((L[i][k] * D[k] * L[j][k] for k in range(n)), Fraction(0)) for j in range(n)] for i in range(n)]
+    for added in (Fraction(0), Fraction(1, 2**digits), -Fraction(1, 2**digits)):
+        near = [[v + (added if i == j == n - 1 else 0) for j, v in enumerate(row)] for i, row in enumerate(A)]
+        assert is_definite(flint_of(near)) == (len(pivots(near)) == n) == (added > 0)
+        skew = [[v + (j - i) * Fraction(3, 8) for j, v in enumerate(row)] for i, row in enumerate(near)]
+        assert is_definite(flint_of(skew)) == (added > 0)  # the form d'A d knows the symmetric part alone
+        assert n == 1 or inverse_diagonal(flint_of(skew)) == []
+
+
+def test_an_unsymmetric_matrix_has_no_inverse_for_the_rules() -> None:
+    A = fmpq_mat([[2, 1], [0, 2]])
+    assert inverse_diagonal(A) == [] and is_definite(A) and not is_definite(fmpq_mat([[2, 5], [0, 2]]))
+
+
+def test_a_matrix_of_long_numbers_is_not_decided() -> None:
+    """Twice the symmetric part: two rows of numbers of 2^14 bits are the most."""
+    for bits, decided in ((2**14 - 2, True), (2**14, False)):
+        A = fmpq_mat([[fmpq(2**bits), 1], [1, 1]])
+        assert is_definite(A) is decided and bool(inverse_diagonal(A)) is decided
+
+
+@given(st.integers(0, 10**6))
+def test_a_ball_contains_an_ellipsoid_where_no_point_of_it_is_outside(seed: int) -> None:
+    """x'Px <= c at x = J d with ||d|| > 1 refutes it; J'PJ - c I has a kernel where the two touch."""
+    generator = np.random.default_rng(seed)
+    n = int(generator.integers(1, 4))
+    J = [[Fraction(int(v), 4) for v in row] for row in generator.integers(-8, 9, (n, n))]
+    B = generator.integers(-4, 5, (n, n))
+    P = [[Fraction(int(v)) for v in row] for row in B @ B.T]
+    level = Fraction(int(generator.integers(1, 60)), 16)
+    image = [[sum((J[k][i] * P[k][m] * J[m][j] for k in range(n) for m in range(n)), Fraction(0)) for j in range(n)]
+             for i in range(n)]  # fmt: skip
+    left = [[v - (level if i == j else 0) for j, v in enumerate(row)] for i, row in enumerate(image)]
+    answer = contains_ball(flint_of(J), flint_of(P), level)
+    assert answer == (len(pivots(left)) == n)
+    for d in generator.standard_normal((50, n)) * generator.uniform(1, 1.5, (50, 1)):
+        length, at = sum(Fraction(v) ** 2 for v in d.tolist()), [Fraction(v) for v in d.tolist()]
+        value = sum((p * image[i][j] * q for i, p in enumerate(at) for j, q in enumerate(at)), Fraction(0))
+        assert not (answer and length >= 1 and value <= level)
+
+
+@pytest.mark.parametrize(
+    ("radius", "inside"), [(1.0, False), (np.nextafter(1.0, 2.0), True), (-1.5, True), (0.0, False)]
+)
+def test_a_ball_that_touches_does_not_contain(radius: float, inside: bool) -> None:
+    J, P = fmpq_mat([[fmpq(*float(radius).as_integer_ratio()), 0], [0, 3]]), fmpq_mat([[1, 0], [0, 1]])
+    assert contains_ball(J, P, Fraction(1)) is inside
+
+
+@given(st.fractions(0, 10**9), st.integers(-3000, 3000))
+@example(Fraction(0), 0)
+@example(Fraction(1), 0)
+@example(Fraction(4), -2148)
+@example(Fraction(2**300 - 1), 0)
+@example(Fraction(1, 2**300 - 1), 0)
+def test_roots_from_above(q: Fraction, exponent: int) -> None:
+    scaled = q * Fraction(2) ** exponent
+    root = root_above(fmpq(scaled.numerator, scaled.denominator))
+    bound = Fraction(int(root.p), int(root.q))
+    assert scaled <= bound**2 <= scaled * (1 + Fraction(1, 2**60)) ** 2 and bound >= 0
 
 
 # ------------------------------------------------------------------------------------------------------- Taylor models
@@ -805,23 +891,21 @@ def test_the_policy_at_the_origin(radius: float) -> None:
     for widths, size, (squash, centre) in POLICIES:
         policy, u_eq = random_policy(generator, widths, size, squash, centre)
         n = widths[0]
-        J, slack = radius * generator.standard_normal((n, n)), radius * 1e-9
+        J = radius * generator.standard_normal((n, n))
         folded = fold(policy, u_eq)
-        gradient, u_slack, Q, E = enclose_at_origin(folded, J, slack)
-        if not np.isfinite([*u_slack, *np.ravel(E)]).all():
+        gradient, slack, Q, E = enclose_at_origin(folded, J)
+        if not np.isfinite([*slack, *np.ravel(E)]).all():
             continue
         finite += 1
-        shifted = [[arb(float(v)) for v in row] for row in J]
-        shifted[0][0] += arb(slack)  # a matrix within the slack in the 2-norm
         with ctx.workprec(3000):
             for d in points_in_the_ball(generator, n):
                 square = sum((arb(v) ** 2 for v in d), arb(0))
-                state = [sum((p * arb(v) for p, v in zip(row, d, strict=True)), arb(0)) for row in shifted]
+                state = [sum((arb(p) * arb(v) for p, v in zip(row, d, strict=True)), arb(0)) for row in J.tolist()]
                 for j, (u, q) in enumerate(zip(policy_in_arb(policy, u_eq, state), u_eq, strict=True)):
                     scale = arb(float(folded.scale[j]))
                     linear = sum((arb(float(g)) * arb(v) for g, v in zip(gradient[j], d, strict=True)), arb(0))
                     line = ball(q) + scale * linear
-                    bound = arb(float(u_slack[j])) * square.sqrt() + quadratic(E[j], d)
+                    bound = arb(float(slack[j])) * square.sqrt() + quadratic(E[j], d)
                     assert abs(u - line - scale * quadratic(Q[j], d)) <= abs(scale) * bound, (
                         widths,
                         size,
@@ -847,7 +931,7 @@ def test_what_is_too_large_for_the_local_rule_is_refused_at_once() -> None:
     assert next(too_large(folded([64, 1]), 10_000, 64))[0] == "plant.dynamics"
     small = folded([1, wide // 12, 1, wide // 12, 1])
     assert not list(too_large(small, 1, 1))
-    enclose_at_origin(small, np.ones((1, 1)), 0.0)
+    enclose_at_origin(small, np.ones((1, 1)))
 
 
 @pytest.mark.parametrize("seed", range(10))

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from certify.checker import ring as checker_ring
 from certify.checker.case import Case
-from certify.checker.exact import congruence, rational
+from certify.checker.exact import exactly, fraction
 from certify.checker.network import enclose_on_boxes
 from certify.checker.ring import Ring, multipliers
 from certify.checker.taylor import Taylor, upper_bound
@@ -53,7 +53,8 @@ def test_the_gap_contains_what_it_stands_for(name: str, seed: int, magnitude: fl
     """sign (level - V) with V = z'Sz in fractions, at points centre + radius d."""
     ring = ring_of(name)
     n = ring.n
-    S = congruence(rational(ring.T), rational(ring.c.P))
+    T = exactly(ring.T)
+    S = [[fraction(v) for v in row] for row in (T.transpose() * exactly(ring.c.P) * T).tolist()]
     generator = np.random.default_rng(seed)
     centre = generator.standard_normal((n, 3)) * 10.0**magnitude
     radius = np.abs(generator.standard_normal((n, 3))) * 10.0 ** generator.uniform(-14, 6)

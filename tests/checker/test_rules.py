@@ -1,8 +1,9 @@
 """Attacks on the checker: honest certificates are accepted, every tampered one is rejected by the rule it breaks.
 
 Three closed loops with small proofs: `scalar` is xdot = x/2 + u, u = -tanh(x), whose origin attracts exactly
-|x| < 1.915008...; `linear` is a double integrator under a linear policy; `rotor` is a pendulum under a random tanh
-network with output centring, u_eq = 1/2 and input bounds that only the leaves can show.
+|x| < 1.915008..., `enlarged` with a tube from |x| <= 7/10 into |x| <= 1/2; `linear` is a double integrator under a
+linear policy; `rotor` is a pendulum under a random tanh network with output centring, u_eq = 1/2 and input bounds that
+only the leaves can show.
 
 Where a certificate claims something false, an oracle in ball arithmetic, which shares no arithmetic with the checker,
 shows it first. The last section disables one rule at a time and shows that some certificate then gets through.
@@ -36,6 +37,7 @@ from certify.checker.float64 import within
 from certify.checker.ring import Ring, batches, is_whole
 from certify.checker.rules import Tally
 from tests.support.ablation import checker_without
+from tests.support.balls import enlarge, with_ball
 from tests.support.certificates import (
     LEAF,
     Document,
@@ -60,6 +62,11 @@ from tests.support.oracle import policy_in_arb, value_of
 
 def scalar_claim(c1: float = 0.01, c2: float = 3.5, bias: float = 0.25, **changes: Any) -> Document:
     return make([["+", ["/", "x", "2"], "u"]], [([[1.0]], [bias])], [[1.0]], (c1, c2), **changes)
+
+
+def enlarged_claim() -> Document:
+    nodes = [np.eye(1) / c for c in np.geomspace(0.49, 0.2499, 9)]
+    return enlarge(scalar_claim(c2=0.25), nodes, [0.25] * 8)
 
 
 def clipped_claim(c1: float = 0.2, c2: float = 1.9999**2, **changes: Any) -> Document:
@@ -137,6 +144,7 @@ HONEST: dict[str, Callable[[], Document]] = {
     "clipped": clipped_claim,
     "clipped, no centring": lambda: clipped_claim(centre="none"),
     "clipped rotor": lambda: rotor_claim(clip=([-0.75], [1.75])),
+    "enlarged": enlarged_claim,
     "practical, clipped": lambda: clipped_claim(c1=1.0, claim="practical", u_eq=["3/4"]),
 }
 
@@ -146,6 +154,7 @@ def test_honest_certificates_are_accepted(name: str) -> None:
     data = honest(name)
     tally = rules.check(parse(data))
     assert tally.rules["tree"] == tree_of(data).count(LEAF)
+    assert tally.rules["tube"] == len(data["evidence"]["tube"])
     assert (tally.local_margin is None) if name.startswith("practical") else 0 < tally.local_margin <= 1
     if name == "scalar":  # bounded by form: no leaf is asked for its inputs
         assert tally.rules["inputs"] == 1
@@ -196,6 +205,11 @@ def test_scaling_P_and_the_levels_together_changes_nothing() -> None:
         scaled = edited(data, "lyapunov.P", encode(decode(data["lyapunov"]["P"]) * 2.0**exponent))
         for level in ("local", "roa"):
             scaled = edited(scaled, f"levels.{level}", lambda v, e=exponent: (float.fromhex(v) * 2.0**e).hex())
+        rows = array(
+            "evidence.local.multipliers", lambda a, e=exponent: (a.reshape(3, -1).T * 2.0 ** np.array([-e, -e, e])).T
+        )
+        assert verdict(scaled) == "local", exponent  # the multipliers weigh P against the models, which stay
+        scaled = rows(scaled)
         assert verdict(scaled) == "ACCEPTED", exponent
 
 
@@ -259,6 +273,17 @@ def collapsed(name: str) -> bytes:
     raise AssertionError("no split of this tree is needed")
 
 
+def multipliers(where: str, place: tuple[int, int], value: float) -> Edit:
+    """One of the (3, n) multipliers of a ball."""
+
+    def change(a: np.ndarray) -> np.ndarray:
+        rows = a.reshape(3, -1)
+        rows[place] = value
+        return rows
+
+    return array(f"evidence.{where}.multipliers", change)
+
+
 MUTANTS: list[tuple[str, str, str, Edit]] = [  # rule, base, what, edit
     ("format", "scalar", "schema", at("schema", "certify-certificate/2")),
     ("format", "clipped", "clip of equal ends", rehashed("clip", [encode([1.0]), encode([1.0])])),
@@ -298,6 +323,22 @@ MUTANTS: list[tuple[str, str, str, Edit]] = [  # rule, base, what, edit
     ("format", "scalar", "T not finite", array("evidence.T", lambda a: a * np.nan)),
     ("format", "scalar", "root not finite", array("evidence.root", lambda a: a * np.inf)),
     ("format", "scalar", "tree not base64", at("evidence.tree", "AP8")),
+    ("format", "scalar", "no ball", at("evidence.local", None)),
+    ("format", "practical, clipped", "a ball", lambda d: edited(
+        d, "evidence.local", honest("scalar")["evidence"]["local"])),
+    ("format", "scalar", "J of another size", array("evidence.local.J", lambda a: np.ones(4))),
+    ("format", "scalar", "J not finite", array("evidence.local.J", lambda a: a * np.nan)),
+    ("format", "scalar", "two rows of multipliers", array("evidence.local.multipliers", lambda a: a[:2])),
+    ("format", "scalar", "multipliers not finite", array("evidence.local.multipliers", lambda a: a + np.inf)),
+    ("format", "scalar", "a tube", lambda d: edited(d, "evidence.tube", honest("enlarged")["evidence"]["tube"])),
+    ("format", "scalar", "enlarged without a start", at("claim.kind", "enlarged")),
+    ("format", "enlarged", "asymptotic with a start", at("claim.kind", "asymptotic")),
+    ("format", "enlarged", "no slabs", at("evidence.tube", [])),
+    ("format", "enlarged", "start of another size", array("claim.start", lambda a: np.ones(4))),
+    ("format", "enlarged", "start not finite", array("claim.start", lambda a: a * np.inf)),
+    ("format", "enlarged", "middle of another size", array("evidence.tube.1.middle", lambda a: np.ones(4))),
+    ("format", "enlarged", "end not finite", array("evidence.tube.1.end", lambda a: a * np.nan)),
+    ("format", "enlarged", "duration not finite", at("evidence.tube.1.duration", "inf")),
     ("hash", "scalar", "sha256", at("policy.sha256", "0" * 64)),
     ("hash", "scalar", "sha256 in capitals", at("policy.sha256", str.upper)),
     ("hash", "scalar", "sha256 of another type", at("policy.sha256", None)),
@@ -380,6 +421,52 @@ MUTANTS: list[tuple[str, str, str, Edit]] = [  # rule, base, what, edit
     ("local", "scalar", "hidden pole", at("plant.dynamics.0", lambda d: ["+", d, [
         "*", "0", ["-", ["tan", ["*", "40", "x"]], ["*", "40", "x"]]]])),
     ("local", "rotor", "gain removed", policy_array("layers.2.weight", lambda a: 0 * a)),
+    ("local", "scalar", "ball of zero", array("evidence.local.J", lambda a: 0 * a)),
+    ("local", "scalar", "ball too small", array("evidence.local.J", lambda a: 0.999 * a)),
+    ("local", "scalar", "ball that touches its set", both(
+        level("local", 2.0**-6), array("evidence.local.J", lambda a: 0 * a + 2.0**-3))),
+    ("local", "scalar", "ball too large", array("evidence.local.J", lambda a: 40 * a)),
+    ("local", "linear", "ball of rank one", array("evidence.local.J", lambda a: np.full(4, 9.0))),
+    ("local", "rotor", "negative alpha", multipliers("local", (0, 1), -(2.0**-1074))),
+    ("local", "rotor", "negative beta", multipliers("local", (1, 0), -1.0)),
+    ("local", "rotor", "negative g", multipliers("local", (2, 1), -1.0)),
+    ("local", "rotor", "g of 0 where it is used", both(
+        multipliers("local", (1, 1), 0.0), multipliers("local", (2, 0), 0.0))),
+    ("local", "rotor", "g of 0 where it may be used", both(
+        multipliers("local", (1, 0), 0.0), multipliers("local", (2, 0), 0.0))),
+    ("local", "rotor", "multipliers too large", array("evidence.local.multipliers", lambda a: 1e9 * a)),
+    ("local", "rotor", "multipliers too small", array("evidence.local.multipliers", lambda a: 1e-9 * a)),
+    ("tube", "enlarged", "larger start", array("claim.start", lambda a: 0.9 * a)),
+    ("tube", "enlarged", "start of zero", array("claim.start", lambda a: 0 * a)),
+    ("tube", "enlarged", "negative start", array("claim.start", lambda a: -a)),
+    ("tube", "enlarged", "negative middle", array("evidence.tube.3.middle", lambda a: -a)),
+    ("tube", "enlarged", "middle out of its ball", array("evidence.tube.3.middle", lambda a: 0.9 * a)),
+    ("tube", "enlarged", "middle too early", array("evidence.tube.3.middle", lambda a: 1.5 * a)),
+    ("tube", "enlarged", "end too early", array("evidence.tube.3.end", lambda a: 1.5 * a)),
+    ("tube", "enlarged", "end out of its ball", array("evidence.tube.3.end", lambda a: 0.5 * a)),
+    ("tube", "enlarged", "end of zero", array("evidence.tube.3.end", lambda a: 0 * a)),
+    ("tube", "enlarged", "last end on the edge of the set", array("evidence.tube.7.end", lambda a: 0 * a + 4.0)),
+    ("tube", "enlarged", "no last slab", at("evidence.tube", lambda t: t[:-1])),
+    ("tube", "enlarged", "no first slab", at("evidence.tube", lambda t: t[1:])),
+    ("tube", "enlarged", "slabs exchanged", at("evidence.tube", lambda t: [t[1], t[0], *t[2:]])),
+    ("tube", "enlarged", "duration of zero", at("evidence.tube.2.duration", (0.0).hex())),
+    ("tube", "enlarged", "duration of minus zero", at("evidence.tube.2.duration", (-0.0).hex())),
+    ("tube", "enlarged", "negative duration", at("evidence.tube.2.duration", (-0.25).hex())),
+    ("tube", "enlarged", "duration too short", at("evidence.tube.2.duration", (0.03).hex())),
+    ("tube", "enlarged", "ball too small", array("evidence.tube.2.J", lambda a: 0.99 * a)),
+    ("tube", "enlarged", "ball too large", array("evidence.tube.2.J", lambda a: 9 * a)),
+    ("tube", "enlarged", "negative alpha", multipliers("tube.2", (0, 0), -1.0)),
+    ("tube", "enlarged", "negative beta", multipliers("tube.2", (1, 0), -1.0)),
+    ("tube", "enlarged", "negative g", multipliers("tube.2", (2, 0), -1.0)),
+    ("tube", "enlarged", "g of 0 where it is used", both(
+        multipliers("tube.2", (1, 0), 0.0), multipliers("tube.2", (2, 0), 0.0))),
+    ("tube", "enlarged", "multipliers too large", array("evidence.tube.2.multipliers", lambda a: 1e9 * a)),
+    ("tube", "enlarged", "domain reached by the start alone", at("plant.domain", [["-69/100", "3"]])),
+    ("tube", "enlarged", "plant too strong for the tube alone", at("plant.dynamics.0", lambda d: ["+", d, [
+        "*", "2000", ["**", "x", 21]]])),
+    ("tube", "enlarged", "pole on a slab alone", at("plant.dynamics.0", lambda d: ["+", d, [
+        "*", "0", ["/", "1", ["-", "x", "7/10"]]]])),
+    ("inputs", "enlarged", "tight on a slab alone", at("plant.input_bounds", [["-11/20", "1"]])),
     ("tree", "scalar", "empty", tree(lambda t: b"")),
     ("tree", "scalar", "cut", tree(lambda t: t[:-1])),
     ("tree", "scalar", "no leaves", tree(lambda t: bytes([0]))),
@@ -395,8 +482,8 @@ MUTANTS: list[tuple[str, str, str, Edit]] = [  # rule, base, what, edit
     ("ring", "rotor", "a leaf in place of a split", lambda d: with_tree(d, collapsed("rotor"))),
     ("ring", "scalar", "stronger plant", at("plant.dynamics.0.1", ["*", "x", "52/100"])),
     ("ring", "scalar", "bounded policy too weak", policy_array("scale", lambda a: 0.9 * a)),
-    ("ring", "scalar", "pole in the ring", at("plant.dynamics.0", lambda d: ["+", d, [
-        "*", "x", "x", ["/", "1/1000000", ["-", "x", "3/2"]]]])),
+    ("ring", "scalar", "pole in the ring", both(at("plant.dynamics.0", lambda d: ["+", d, [
+        "*", "x", "x", ["/", "1/1000000", ["-", "x", "3/2"]]]]), with_ball)),
     ("ring", "scalar", "local lowered to nothing", level("local", 2.0**-500)),
     ("ring", "rotor", "sign of omega's equation at a distance", at("plant.dynamics.1", lambda d: [
         *d, ["*", "9", "theta", "theta", "theta"]])),
@@ -406,7 +493,7 @@ MUTANTS: list[tuple[str, str, str, Edit]] = [  # rule, base, what, edit
     ("inputs", "linear", "tight on the ring", at("plant.input_bounds", [["-20", "4"]])),
     ("inputs", "rotor", "tight on the ring", at("plant.input_bounds", [["-1/2", "5/2"]])),
     ("inputs", "rotor", "u_eq at the bound", at("plant.input_bounds", [["1/2", "5/2"]])),
-    ("inputs", "scalar", "offset", policy_array("offset", lambda a: a + 0.5)),
+    ("inputs", "scalar", "offset", both(policy_array("offset", lambda a: a + 0.5), with_ball)),
     ("inputs", "scalar", "scale", policy_array("scale", lambda a: 1.1 * a)),
 ]  # fmt: skip
 
@@ -422,12 +509,13 @@ def test_every_field_and_every_rule_has_a_mutant() -> None:
     format_page = (Path(certify.checker.__file__).parent / "FORMAT.md").read_text()
     table = format_page.split("| rule | inequality | gives |")[1].split("\n\n")[0]
     documented = {name for row in table.splitlines()[2:] for name in re.findall(r"`(\w+)`", row.split("|")[1])}
-    assert len(documented) == 13 and {rule for rule, *_ in MUTANTS} == documented
+    assert len(documented) == 14 and {rule for rule, *_ in MUTANTS} == documented
     touched = set()
     for _, base, _, edit in MUTANTS:
         before, after = dict(leaves_of(honest(base))), dict(leaves_of(edit(honest(base))))
         touched |= {general(path) for path in before.keys() | after.keys() if before.get(path) != after.get(path)}
-    assert {general(path) for path, _ in leaves_of(honest("rotor"))} - touched == {"provenance.tool"}
+    fields = {general(path) for base in ("rotor", "enlarged") for path, _ in leaves_of(honest(base))}
+    assert fields - touched == {"provenance.tool"}
 
 
 def leaves_of(value: Any, path: str = "") -> list[tuple[str, Any]]:
@@ -701,7 +789,7 @@ def skewed() -> Document:
 ABLATED: dict[str, Callable[[], Document]] = {
     "format": lambda: honest("scalar") | {"comment": "unknown key"},
     "hash": lambda: array("policy.layers.0.bias", nudged(0))(honest("scalar")),
-    "levels": lambda: level("local", 3.1)(honest("linear")),
+    "levels": lambda: with_ball(level("local", 3.1)(honest("linear"))),
     "lyapunov": lambda: unsymmetric(honest("linear")),
     "equilibrium": lambda: edited(honest("rotor"), "plant.dynamics.1.4", "-500000001/1000000000"),
     "centring": lambda: policy_array("layers.0.bias", lambda a: a + 1e-9)(honest("scalar, no centring")),
@@ -709,6 +797,7 @@ ABLATED: dict[str, Callable[[], Document]] = {
     "coordinates": skewed,
     "root": lambda: grow(scalar_claim(c2=4.0, root=[1.9])),
     "local": lambda: scalar_claim(4.0, 4.0),
+    "tube": lambda: array("claim.start", lambda a: 0.9 * a)(honest("enlarged")),
     "tree": lambda: scalar_claim(c2=4.0, tree=bytes([0])),
     "ring": lambda: scalar_claim(c2=4.0),
     "inputs": lambda: at("plant.input_bounds", [["-9/10", "1"]])(honest("scalar")),
@@ -791,12 +880,27 @@ def test_tally_counts_a_leaf_once() -> None:
     assert tally.rules["tree"] == 64 > tally.rules["ring"] > 0
 
 
-def test_a_decay_below_every_binary64_number_is_not_accepted() -> None:
-    """The scaling in the local rule underflows: this decay is less than any binary64 number."""
-    far = "1" + "0" * 400
-    data = make(
-        [["+", "u", ["-", ["tan", "x1"]]], ["-", ["+", ["**", "x2", 3], "x2"]]], [([[1.0, 1.0]], [0.0])], np.eye(2),
-        (2.0**-1020, 2.0**-1018), states=("x1", "x2"), domain=[(f"-{far}", far)] * 2, input_bounds=[("-1000", "1000")],
-        centre="none", scale=(-4.9e-91,), T=np.eye(2) * 8.9e-308, root=[6.8e153, 6.8e153],
-    )  # fmt: skip
-    assert verdict(data) == "local"
+@pytest.mark.parametrize(
+    ("second", "found"),
+    [
+        (["-", ["+", ["**", "x2", 3], "x2"]], ("ACCEPTED", "ring")),  # true, and a leaf's rule underflows
+        (["-", ["*", "0", ["**", "x2", 3]], ["/", "x2", "2"]], ("ACCEPTED", "ring")),
+        (["-", ["/", "x2", "2"], ["*", "0", ["**", "x2", 3]]], ("local", "local")),  # grows
+        (["**", "x2", 3], ("local", "local")),  # x2^3 underflows
+        (["-", ["**", "x2", 3]], ("local", "local")),  # true, but the rule is about a linear decay
+        (
+            ["-", ["*", str(2**1022), ["**", "x2", 3]], ["/", "x2", "2"]],
+            ("local", "local"),
+        ),  # grows where x2^2 > 2^-1023
+    ],
+)
+def test_a_decay_below_every_binary64_number(second: Any, found: tuple[str, str]) -> None:
+    """On the whole set it is less than any binary64 number, and so are the terms of third order."""
+    for levels, rule in zip(((2.0**-1018, 2.0**-1018), (2.0**-1020, 2.0**-1018)), found, strict=True):
+        far = "1" + "0" * 400
+        data = make(
+            [["+", "u", ["-", ["tan", "x1"]]], second], [([[1.0, 1.0]], [0.0])], np.eye(2), levels,
+            states=("x1", "x2"), domain=[(f"-{far}", far)] * 2, input_bounds=[("-1000", "1000")],
+            centre="none", scale=(-4.9e-91,), T=np.eye(2) * 8.9e-308, root=[6.8e153, 6.8e153],
+        )  # fmt: skip
+        assert verdict(data) == rule

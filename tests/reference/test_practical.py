@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tests.support.balls import with_ball
 from tests.support.certificates import LEAF, Document, edited, make, rehash, with_tree
 from tests.support.reference import judge, judge_bytes
 
@@ -16,7 +17,7 @@ SPLIT = 0
 def practical(data: Document, floor: float | None = None) -> Document:
     """The claim with c1 as c0, or with another c0."""
     result = edited(data, "claim", {"kind": "practical"})
-    levels = data["levels"]
+    result["evidence"]["local"], levels = None, data["levels"]
     result["levels"] = {"floor": levels["local"] if floor is None else floor.hex(), "roa": levels["roa"]}
     return result
 
@@ -38,7 +39,8 @@ def test_a_loop_without_an_equilibrium_at_the_origin() -> None:
     assert judge(scalar(loop)) is None
     asymptotic = edited(scalar(loop), "claim", {"kind": "asymptotic"})
     asymptotic["levels"] = {"local": (0.04).hex(), "roa": (1.0).hex()}
-    assert judge(asymptotic) == "equilibrium"
+    assert judge(asymptotic) == "format"  # a ball is missing
+    assert judge(with_ball(asymptotic)) == "equilibrium"
     assert judge(scalar(loop, (0.0004, 1.0), depth=9)) == "ring"  # below |x| = 1/21 V grows
     assert judge(scalar(["+", "x", "u"])) == "ring"
 

@@ -219,7 +219,8 @@ SABOTAGE: list[tuple[str, Edit]] = [
     ("root", number("evidence.T", lambda a: a * (1 - 2.0**-20))),
     ("coordinates", number("evidence.T", lambda a: a * [1, 0, 1, 0])),
     ("centring", number("policy.offset", lambda a: a - 6)),
-    ("local", scaled_level("local", 10)),
+    ("local", scaled_level("local", 2)),
+    ("local", lambda d: with_ball(scaled_level("local", 2)(d))),
     ("local", number("policy.layers.2.weight", lambda a: -a)),
     ("local", number("policy.scale", lambda a: a / 6)),
     ("tree", lambda d: with_tree(d, tree_of(d)[:-1])),
@@ -228,7 +229,7 @@ SABOTAGE: list[tuple[str, Edit]] = [
     ("ring", leaf_in_place_of(0)),
     ("ring", leaf_in_place_of(1)),
     ("ring", scaled_level("local", 1e-6)),
-    ("ring", lambda d: edited(d, "plant.dynamics.1", lambda f: [*f, ["**", ["/", "theta_dot", "8"], 9]])),
+    ("ring", lambda d: edited(d, "plant.dynamics.1", lambda f: [*f, ["**", ["/", "theta_dot", "8"], 15]])),
     ("ring", lambda d: edited(d, "plant.dynamics.1", lambda f: [*f, ["**", ["/", "theta", "2"], 9]])),
     ("inputs", lambda d: edited(d, "plant.input_bounds.0.1", "5")),
 ]

@@ -11,6 +11,7 @@ import itertools
 import json
 import math
 from collections.abc import Callable
+from fractions import Fraction
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from scipy.linalg import expm
 from certify.reference import __main__ as command
 from certify.reference import decrease, rules, tube
 from certify.reference.loop import Loop
-from tests.support.balls import around, ball, enlarge, square, with_ball
+from tests.support.balls import around, ball, enlarge, slab_of, square, with_ball
 from tests.support.certificates import Document, decode, dump, edited, encode, grow, make, write
 from tests.support.reference import judge, judge_bytes
 
@@ -39,8 +40,10 @@ def still(dynamics: list[Any], P: Any, levels: tuple[float, float], **more: Any)
     return make(dynamics, [(np.zeros((1, n)), [0.0])], P, levels, **options)
 
 
-def slab(end: Any, duration: float, J: Any, rows: Any) -> Document:
-    return {"end": encode(np.atleast_2d(end)), "duration": duration.hex()} | ball(np.atleast_2d(J), rows)
+def slab(before: Any, end: Any, duration: float, J: Any, rows: Any) -> Document:
+    """P(t) linear in t: the middle is the mean of the ends."""
+    start, end = np.atleast_2d(before), np.atleast_2d(end)
+    return slab_of((start + end) / 2, end, duration) | ball(np.atleast_2d(J), rows)
 
 
 def decay() -> Document:
@@ -49,7 +52,7 @@ def decay() -> Document:
         with_ball(still([["-", "x"]], 1.0, (1.0, 1.0))), "claim", {"kind": "enlarged", "start": encode([0.25])}
     )
     rows = [[0.0], [NONE], [0.0]]
-    data["evidence"]["tube"] = [slab(0.5625, 0.75, 2.125, rows), slab(1.0625, 0.5, 1.375, rows)]
+    data["evidence"]["tube"] = [slab(0.25, 0.5625, 0.75, 2.125, rows), slab(0.5625, 1.0625, 0.5, 1.375, rows)]
     return data
 
 
@@ -208,6 +211,17 @@ FORGERIES: list[tuple[str, str, str, str, Edit]] = [  # rule, place, base, what,
     ("tube", "node 0", "oscillator", "a start that is not symmetric", array("claim.start", asymmetric)),
     ("tube", "node 3", "oscillator", "an end that is not symmetric", array("evidence.tube.2.end", asymmetric)),
     ("tube", "node 3", "oscillator", "an end that is not definite", array("evidence.tube.2.end", indefinite)),
+    ("tube", "middle 1", "decay", "a middle of zeros", array("evidence.tube.0.middle", times(0))),
+    ("tube", "middle 1", "decay", "a negative middle", array("evidence.tube.0.middle", times(-1))),
+    ("tube", "middle 3", "oscillator", "a middle that is not symmetric", array("evidence.tube.2.middle", asymmetric)),
+    ("tube", "middle 3", "oscillator", "a middle that is not definite", array("evidence.tube.2.middle", indefinite)),
+    ("tube", "middle 2", "decay", "a middle leaves the domain", array("evidence.tube.1.middle", lambda _: [0.1])),
+    *(("tube", "slab 2", name, "a middle too early", array("evidence.tube.1.middle", times(2))) for name in NAMES),
+    *(
+        ("tube", "slab 2", name, "a middle outside the ball", array("evidence.tube.1.middle", times(0.9)))
+        for name in NAMES
+        if name != "decay"
+    ),
     ("tube", "slab 2", "decay", "a duration of 0", duration(1, lambda h: 0.0)),
     ("tube", "slab 2", "decay", "a duration of -0", duration(1, lambda h: -0.0)),
     ("tube", "slab 1", "decay", "a negative duration", duration(0, lambda h: -h)),
@@ -284,6 +298,38 @@ def test_numbers_at_the_edge_of_the_tube_by_hand() -> None:
         data = rows("evidence.tube.0", with_row(1, 5e-324))(honest("decay"))
         assert judge(edit(data)) is None
     assert judge(duration(0, lambda h: 1e300)(honest("decay"))) is None
+
+
+def test_a_middle_at_its_edges_by_hand() -> None:
+    """Slab 1 of `decay`, P_0 = 1/4, P_1 = 9/16, h = 3/4: the coefficients ask for M < (1 + h) P_0, 2 M > (P_1 - P_0)
+    / h and M > (1 - h) P_1, which is less, the ball for J^2 M > 1, a domain of 4 for M > 1/16."""
+    wide = at("plant.domain.0", ["-4", "5"])(honest("decay"))
+    widest = array("evidence.tube.0.J", lambda _: [8.0])
+    for P, J, place, detail in (
+        (0.4375, None, "slab 1", "the first coefficient"),
+        (math.nextafter(0.4375, 0), None, None, ""),
+        (math.nextafter(5 / 24, 0), widest, "slab 1", "the middle coefficient"),
+        (5 / 24, widest, None, ""),  # the float lies above
+        (0.25, array("evidence.tube.0.J", lambda _: [math.nextafter(2, 3)]), None, ""),
+        (math.nextafter(0.25, 0), array("evidence.tube.0.J", lambda _: [math.nextafter(2, 3)]), "slab 1", "its middle"),
+        (0.0625, widest, "middle 1", "the ellipsoid leaves the interior of the domain"),
+        (math.nextafter(0.0625, 1), widest, "slab 1", "the middle coefficient"),
+    ):
+        data = rows("evidence.tube.0", with_row(1, 5e-324))(array("evidence.tube.0.middle", lambda _, P=P: [P])(wide))
+        verdict = rules.judge(dump(data if J is None else J(data)))
+        assert (verdict.rule, verdict.at) == (place and "tube", place) and detail in str(verdict.detail), P
+    assert Fraction(math.nextafter(5 / 24, 0)) < Fraction(5, 24) < Fraction(5 / 24)
+
+
+def test_a_middle_lets_a_tube_bend() -> None:
+    """Not linear in t: the tube of `bent` with each middle moved towards its end or its start, as far as it goes."""
+    for share, found in ((0.4, None), (0.6, None), (0.01, "tube"), (0.99, "tube")):
+        data, before = honest("bent"), square(honest("bent")["claim"]["start"])
+        for k, each in enumerate(honest("bent")["evidence"]["tube"]):
+            end = square(each["end"])
+            data = edited(data, f"evidence.tube.{k}.middle", encode((1 - share) * before + share * end))
+            before = end
+        assert judge(data) == found, share
 
 
 HARMLESS: list[tuple[str, str, Edit]] = [
@@ -384,6 +430,9 @@ MALFORMED: dict[str, Edit] = {
     "a start that is not a number": at("claim.start", encode([math.nan])),
     "an end that is infinite": at("evidence.tube.0.end", encode([math.inf])),
     "an end of another size": at("evidence.tube.1.end", encode([1.0, 0.0, 0.0, 1.0])),
+    "a middle of another size": at("evidence.tube.0.middle", encode([1.0, 0.0, 0.0, 1.0])),
+    "a middle that is not a number": at("evidence.tube.0.middle", encode([math.nan])),
+    "no middle": without("evidence.tube.1", "middle"),
     "J of another size": at("evidence.tube.1.J", encode([1.0, 0.0])),
     "two rows of multipliers": at("evidence.tube.0.multipliers", encode([1.0, 1.0])),
     "four rows of multipliers": at("evidence.local.multipliers", encode([1.0] * 4)),
@@ -411,7 +460,11 @@ def test_malformed_tubes(what: str) -> None:
 
 
 PLACES = ["claim", "claim.kind", "claim.start", "evidence.local", "evidence.local.J", "evidence.local.multipliers"]
-PLACES += ["evidence.tube", "evidence.tube.1", *(f"evidence.tube.1.{key}" for key in ("end", "duration", "J"))]
+PLACES += [
+    "evidence.tube",
+    "evidence.tube.1",
+    *(f"evidence.tube.1.{key}" for key in ("middle", "end", "duration", "J")),
+]
 
 
 @pytest.mark.parametrize("path", PLACES)
@@ -445,7 +498,7 @@ def test_nothing_is_faster_than_the_flow(tube_of: list[tuple[float, float]], sta
     data["evidence"]["tube"], total = [], 0.0
     for end, h in tube_of:
         J = wide / math.sqrt(min(before, end))
-        data["evidence"]["tube"].append(slab(end, h, J, [[0.0], [NONE], [0.0]]))
+        data["evidence"]["tube"].append(slab(before, end, h, J, [[0.0], [NONE], [0.0]]))
         total, before = total + h, end
     if judge(data) is None:
         assert before > 1 and total >= math.log(before / start) / 2 * (1 - 1e-9)
@@ -532,28 +585,33 @@ def test_with_a_clause_disabled_a_forgery_gets_through(clause: str, monkeypatch:
     assert judge(data) is None
 
 
-@pytest.mark.parametrize("end", ["first", "last"])
-def test_both_ends_of_a_slab_are_asked(end: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A small slab of the oscillator in which x'P(t)x falls at one node and not at the other."""
+COEFFICIENTS = ["first", "middle", "last"]
+
+
+@pytest.mark.parametrize("which", COEFFICIENTS)
+def test_every_coefficient_of_a_slab_is_asked(which: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A slab of the oscillator in which two of the three coefficients of what x'P(t)x does are negative."""
     data, A = honest("oscillator"), np.array([[0.0, 1.0], [-2.0, -3.0]])
-    generator, h = np.random.default_rng(2), 0.25
+    generator, h, number = np.random.default_rng(2), 4.0, COEFFICIENTS.index(which)
     while True:
-        nodes = [30 * (np.eye(2) + B @ B.T) for B in generator.standard_normal((2, 2, 2))]
-        nodes = [(P + P.T) / 2 for P in nodes]
-        rate = (nodes[1] - nodes[0]) / h
-        worst = [float(np.linalg.eigvalsh(rate + A.T @ P + P @ A)[-1]) for P in nodes]
-        if (worst[0] > 1 and worst[1] < -1) if end == "first" else (worst[0] < -1 and worst[1] > 1):
+        shapes = generator.standard_normal((3, 2, 2))
+        start, middle, end = (30 * (np.eye(2) + B @ B.T) for B in shapes)
+        rates = (2 * (middle - start) / h, (end - start) / h, 2 * (end - middle) / h)
+        each = zip(rates, (start, middle, end), strict=True)
+        worst = [float(np.linalg.eigvalsh(rate + A.T @ P + P @ A)[-1]) for rate, P in each]
+        if worst.pop(number) > 1 and max(worst) < -1:
             break
-    one = slab(nodes[1], h, around(*nodes), [[0.0] * 2, [NONE] * 2, [0.0] * 2])
-    data = edited(edited(data, "claim.start", encode(nodes[0])), "evidence.tube", [one])
+    rows, J = [[0.0] * 2, [NONE] * 2, [0.0] * 2], around(start, middle, end)
+    one = slab_of(middle, end, h) | ball(J, rows)
+    data = edited(edited(data, "claim.start", encode(start)), "evidence.tube", [one])
     verdict = rules.judge(dump(data))
-    assert (verdict.rule, verdict.at) == ("tube", "slab 1") and f"its {end} node" in str(verdict.detail)
+    assert (verdict.rule, verdict.at) == ("tube", "slab 1") and f"the {which} coefficient" in str(verdict.detail)
     asked = itertools.count()
 
-    def one_end(*arguments: Any) -> bool:
-        return next(asked) == ["first", "last"].index(end) or decrease.decreases(*arguments)
+    def spared(*arguments: Any) -> bool:
+        return next(asked) == number or decrease.decreases(*arguments)
 
-    monkeypatch.setattr(tube, "decreases", one_end)
+    monkeypatch.setattr(tube, "decreases", spared)
     assert judge(data) is None
 
 

@@ -18,7 +18,7 @@ def checker_without(rule: str, folder: Path) -> Iterator[ModuleType]:
     """A copy of the checker in `folder`, loaded under another name, in which one rule never says no.
 
     Its rows are taken out of the tables. `format` and `hash` are rules of the reader: there, what says no is silenced.
-    `lyapunov` and `coordinates` also vouch for what later rules use; there the condition itself is taken out.
+    `lyapunov` also vouches for what later rules use; there the condition itself is taken out.
     """
     name = f"checker_without_{rule}"
     folder = folder / name
@@ -34,7 +34,7 @@ def checker_without(rule: str, folder: Path) -> Iterator[ModuleType]:
         for module in ("case", "document", "exact", "rules", "strict"):
             importlib.import_module(f"{name}.{module}")
         removed = 0
-        for table in ("STATED", "ON_THE_BALL", "OF_THE_TREE", "ON_LEAVES"):
+        for table in ("STATED", "ON_THE_BALL", "OF_THE_TREE", "ON_LEAVES", "OF_THE_TUBE", "ON_SLABS"):
             rows = getattr(package.rules, table)
             kept = tuple(row for row in rows if row[0] != rule)
             setattr(package.rules, table, kept)
@@ -47,12 +47,7 @@ def checker_without(rule: str, folder: Path) -> Iterator[ModuleType]:
             assert removed > 0
         if rule == "lyapunov":  # the symmetric part in place of an asymmetric matrix
             decide = package.exact.inverse_diagonal
-            package.case.inverse_diagonal = lambda A: decide(
-                [[(v + w) / 2 for v, w in zip(row, column, strict=True)]
-                 for row, column in zip(A, zip(*A, strict=True), strict=True)]
-            )  # fmt: skip
-        if rule == "coordinates":  # what remains is the ball's radius, taken from the diagonal
-            package.case.gershgorin_lower = lambda A: min(A[i][i] for i in range(len(A)))
+            package.case.inverse_diagonal = lambda A: decide((A + A.transpose()) / 2)
         yield package
     finally:
         for module in [m for m in sys.modules if m.split(".")[0] == name]:
