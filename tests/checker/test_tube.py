@@ -528,8 +528,9 @@ def random_loop(random: np.random.Generator) -> tuple[Document, np.ndarray]:
         else 1
     )
     data = make(
-        [random_tree(random, states + inputs, int(random.integers(1, 5))) for _ in states], layers, np.eye(n), (1.0, 1.0),
-        states=states, inputs=inputs, domain=[("-9", "9")] * n, input_bounds=[("-9", "9")] * m, squash=squash,
+        [random_tree(random, states + inputs, int(random.integers(1, 5))) for _ in states],
+        layers, np.eye(n), (1.0, 1.0), states=states, inputs=inputs, domain=[("-9", "9")] * n,
+        input_bounds=[("-9", "9")] * m, squash=squash,
         centre=centre, scale=scale, offset=[0.0] * m, root=[1.0] * n,
         u_eq=[str(Fraction(float(v)) * Fraction(random.integers(-9, 9).item(), 10)) for v in scale],
     )  # fmt: skip

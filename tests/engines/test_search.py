@@ -20,6 +20,7 @@ from tests.support.cases import case_of
 from tests.support.loops import pendulum_network
 
 POLICIES = Path(__file__).parent.parent.parent / "examples" / "policies"
+CURVED = Path(__file__).parents[1] / "data"  # quadrotors before they were flattened
 RUNNER = ThreadRunner()
 
 
@@ -63,7 +64,8 @@ def test_the_time_that_the_check_will_take_is_left() -> None:
 @pytest.mark.parametrize(("name", "hopeless"), [("cartpole", False), ("quadrotor2d", False), ("quadrotor3d", True)])
 def test_what_a_search_expects_tells_the_hopeless(name: str, hopeless: bool) -> None:
     """Four and six states have gained within 40,000 boxes; twelve states would need 1e15."""
-    policy = load_policy(POLICIES / f"{name}.pt")
+    path = POLICIES / "cartpole.pt" if name == "cartpole" else CURVED / f"{name}_curved.pt"
+    policy = load_policy(path)
     case = case_of(get_system(name).with_parameters(policy.parameters), policy.network)
     attempt = BoundsEngine(case.T, RUNNER).begin(Task(case.problem, "asymptotic", 1e-2))
     attempt.advance(Budget(boxes=600, batch=600))
@@ -73,7 +75,7 @@ def test_what_a_search_expects_tells_the_hopeless(name: str, hopeless: bool) -> 
 
 @pytest.mark.slow
 def test_a_run_that_gains_nothing_stops_early_and_says_so(tmp_path: Path) -> None:
-    policy = load_policy(POLICIES / "quadrotor3d.pt")
+    policy = load_policy(CURVED / "quadrotor3d_curved.pt")
     system = get_system("quadrotor3d").with_parameters(policy.parameters)
     options = RoaOptions(candidate="lqr", time_limit=600.0)
     result = certify_roa(system, policy.network, tmp_path, options)

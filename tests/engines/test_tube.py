@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
+import subprocess
+import sys
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +16,7 @@ from numpy.typing import NDArray
 from certify.certificate import PartitionTree, read_certificate
 from certify.claims import Enlarged, Problem
 from certify.closed_loop import ClosedLoop
-from certify.engines import tube as tubes
+from certify.engines import enlarge as enlarging
 from certify.engines.decrease import best_multipliers, decay_of, multipliers_for, rest_of
 from certify.engines.enlarge import enlarge
 from certify.engines.local import ball_around, local_margin, prove_local
@@ -34,6 +37,7 @@ from tests.support.loops import pendulum_network, scalar_tanh
 
 Array = NDArray[np.float64]
 POLICIES = Path(__file__).parents[2] / "examples" / "policies"
+CURVED = Path(__file__).parents[1] / "data"  # quadrotors before they were flattened
 
 
 @cache
@@ -195,7 +199,7 @@ def test_enlarge_asks_for_more_than_it_is_worth() -> None:
 def test_robust_is_larger_than_what_it_starts_from() -> None:
     """By the local rule, on the planar quadrotor, where Q = I and LQR are far from the best."""
     system = get_system("quadrotor2d")
-    loop = ClosedLoop(system, load_policy(POLICIES / "quadrotor2d.pt").network)
+    loop = ClosedLoop(system, load_policy(CURVED / "quadrotor2d_curved.pt").network)
     known = paths(loop)
 
     def local(P: Array) -> float:
@@ -268,7 +272,7 @@ def test_a_box_asks_for_its_shape(tmp_path: Path) -> None:
 )
 def test_options_that_cannot_be(change: dict[str, object], message: str) -> None:
     with pytest.raises(InputError, match=message):
-        dataclasses.replace(RoaOptions(), **change)  # type: ignore[arg-type]
+        replace(RoaOptions(), **change)  # type: ignore[arg-type]
 
 
 def test_a_box_must_name_states(tmp_path: Path) -> None:
@@ -279,13 +283,12 @@ def test_a_box_must_name_states(tmp_path: Path) -> None:
 
 def test_a_tube_that_the_checker_refuses_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A careless producer ends with what is proved without it."""
-    honest = tubes._slab
 
-    def careless(*arguments: object) -> object:
-        slab = honest(*arguments)  # type: ignore[arg-type]
-        return slab and dataclasses.replace(slab, duration=0.01 * slab.duration)
+    def careless(*arguments: Any) -> Tube | None:
+        tube = find_tube(*arguments)
+        return tube and Tube(tube.start, tuple(replace(slab, duration=slab.duration / 100) for slab in tube.slabs))
 
-    monkeypatch.setattr(tubes, "_slab", careless)
+    monkeypatch.setattr(enlarging, "find_tube", careless)
     options = RoaOptions(candidate="lqr", enlarge=True, max_boxes=1, time_limit=20)
     result = certify_roa(get_system("pendulum"), load_policy(POLICIES / "pendulum.pt").network, tmp_path, options)
     assert result.verdict is Verdict.PROVED and result.claim == "asymptotic" and result.tube is None
@@ -293,6 +296,41 @@ def test_a_tube_that_the_checker_refuses_is_left_out(tmp_path: Path, monkeypatch
 
 
 def test_a_policy_that_is_not_centred_has_no_tube(tmp_path: Path) -> None:
-    network = dataclasses.replace(pendulum_network(), centre="none")
+    network = replace(pendulum_network(), centre="none")
     result = certify_roa(get_system("pendulum"), network, tmp_path, RoaOptions(enlarge=True, time_limit=10))
     assert result.claim == "practical" and result.tube is None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "box", "seconds"),
+    [
+        (
+            "quadrotor2d",
+            dict(zip(("x", "y", "theta", "x_dot", "y_dot", "theta_dot"), (1, 1, 0.5, 1, 1, 1), strict=True)),
+            200,
+        ),
+        (
+            "quadrotor3d",
+            dict.fromkeys(("x", "y", "z", "vx", "vy", "vz"), 0.3)
+            | dict.fromkeys(("phi", "theta"), 0.12)
+            | {"psi": 0.12}
+            | dict.fromkeys(("p", "q", "r"), 0.6),
+            300,
+        ),
+    ],
+)
+def test_the_shipped_quadrotors_are_proved_where_they_fly(
+    name: str, box: dict[str, float], seconds: float, tmp_path: Path
+) -> None:
+    """All of the ellipsoid in this box, and both checkers say so."""
+    policy = load_policy(POLICIES / f"{name}.pt")
+    system = get_system(name).with_parameters(policy.parameters)
+    result = certify_roa(system, policy.network, tmp_path, RoaOptions(box=box, time_limit=seconds))
+    assert result.verdict is Verdict.PROVED and result.tube is not None and result.certificate is not None
+    for state, half in box.items():
+        x = np.zeros(system.n)
+        x[[s.name for s in system.states].index(state)] = half
+        assert result.contains(x) and result.contains(-x)
+    command = [sys.executable, "-I", "-m", "certify.reference", str(result.certificate)]
+    assert subprocess.run(command, capture_output=True, timeout=1500, check=False).returncode == 0
