@@ -311,7 +311,7 @@ def test_the_simulated_share_counts_the_start(proved: RoaResult) -> None:
     wanted = (quadratic(c.P, x) <= c.roa) | (quadratic(start_of(c), x) <= 1)
     assert np.array_equal(both.certified, wanted) and both.certified.sum() > alone.certified.sum()
     assert np.array_equal(both.attracted, alone.attracted) and both.contradictions == 0
-    assert f"covers {100 * both.fraction:.1f} % of the area" in page_of(proved).text
+    assert f"set with the start of its tube covers {100 * both.fraction:.1f} % of the area" in page_of(proved).text
 
 
 def test_the_figure_for_a_paper_shows_the_start(proved: RoaResult) -> None:
