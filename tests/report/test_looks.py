@@ -137,7 +137,9 @@ def test_the_table_of_contents_leads_to_every_section(browser: Browser, pages: d
         assert targets == sections and "#," not in sections
 
 
-def test_a_pendulum_prints_on_two_or_three_pages(browser: Browser, pages: dict[str, Path]) -> None:
+def test_a_pendulum_prints_on_two_or_three_pages_and_one_more_with_a_tube(
+    browser: Browser, pages: dict[str, Path]
+) -> None:
     for name, page in pages.items():
         browser.show(page, 800, dark=True)
         headings = browser.evaluate("JSON.stringify([...document.querySelectorAll('h2, h3')].map(h => h.textContent))")
@@ -145,7 +147,7 @@ def test_a_pendulum_prints_on_two_or_three_pages(browser: Browser, pages: dict[s
         keep(f"{name}.pdf", pdf)
         sheets = pypdf.PdfReader(io.BytesIO(pdf)).pages
         printed = [unicodedata.normalize("NFKC", sheet.extract_text()) for sheet in sheets]  # without ligatures
-        assert 2 <= len(printed) <= 3
+        assert 2 <= len(printed) <= 3 + (name == "tube")
         plain = {unicodedata.normalize("NFKC", " ".join(text.split())) for text in json.loads(headings)}
         for text in printed:
             lines = [" ".join(line.split()) for line in text.splitlines() if line.strip()]
