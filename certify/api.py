@@ -59,6 +59,8 @@ def certify_roa(
     dreal_precision: float | None = None,
     jobs: int | None = None,
     device: str | None = None,
+    enlarge: bool | None = None,
+    box: Mapping[str, float] | None = None,
     time_limit: float | None = None,
     max_boxes: int | None = None,
     load_seconds: float = 0.0,
@@ -94,6 +96,8 @@ def certify_roa(
     engine : "bounds" (the default), "dreal" (its word is trusted, not checked), or "both".
     dreal_precision, jobs : dReal's delta, 1e-3 by default, and its threads, 1.
     device : where boxes are bounded: "cpu" (the default) or "cuda".
+    enlarge : look for a tube of ellipsoids from a larger set into the proved one; not by default.
+    box : half-widths by state: `enlarge` for the largest multiple of the ellipsoid with these half-axes.
     time_limit : seconds for everything up to the verdict, 50 by default.
     max_boxes : boxes for the ring, 4,000,000 by default.
     load_seconds : time already spent on reading, for the report.
@@ -129,8 +133,8 @@ def certify_roa(
     start = time.perf_counter()
     single = {
         "claim": claim, "candidate": candidate, "Q": Q, "R": R, "P": P, "level": level, "engine": engine,
-        "dreal_precision": dreal_precision, "jobs": jobs, "device": device, "time_limit": time_limit,
-        "max_boxes": max_boxes,
+        "dreal_precision": dreal_precision, "jobs": jobs, "device": device, "enlarge": enlarge, "box": box,
+        "time_limit": time_limit, "max_boxes": max_boxes,
     }  # fmt: skip
     notices: list[str] = []
     try:
@@ -210,7 +214,8 @@ def _options(options: RoaOptions | None, single: dict[str, Any]) -> RoaOptions:
         return options
     numbers, whole = ("level", "dreal_precision", "time_limit"), ("jobs", "max_boxes")
     readers: dict[str, Callable[[Any, str], Any]] = dict.fromkeys(single, _text)
-    readers |= {"Q": _row, "R": _row, "P": _matrix} | dict.fromkeys(numbers, _number) | dict.fromkeys(whole, _count)
+    readers |= {"Q": _row, "R": _row, "P": _matrix, "enlarge": _flag, "box": _widths}
+    readers |= dict.fromkeys(numbers, _number) | dict.fromkeys(whole, _count)
     read = {name: readers[name](value, name) for name, value in single.items()}
     return RoaOptions(**read)
 
@@ -340,6 +345,18 @@ def _list(value: Any, where: str) -> list[Any]:
 
 def _row(value: Any, name: str) -> tuple[float, ...]:
     return tuple(_number(v, name) for v in _list(value, name))
+
+
+def _flag(value: Any, name: str) -> bool:
+    value = value.item() if isinstance(value, np.generic) else value
+    if not isinstance(value, bool):
+        raise InputError(f"`{name}` must be True or False; found {value!r:.60}, {_kind(value)}.")
+    return value
+
+
+def _widths(value: Any, name: str) -> dict[str, float]:
+    _require(isinstance(value, Mapping), name, "a mapping from states to half-widths", value)
+    return {_text(state, name): _number(width, name) for state, width in value.items()}
 
 
 def _matrix(value: Any, name: str) -> Any:

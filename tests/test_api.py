@@ -95,6 +95,12 @@ def test_the_policy_names_its_plant_and_its_numbers(tmp_path: Path) -> None:
     assert "trained with m = 0.2" in result.notices[0] and "--" not in result.notices[0]
 
 
+def test_a_tube_by_name(tmp_path: Path) -> None:
+    result = certify_roa(*scalar_tanh(), tmp_path, level=0.25, enlarge=True, box={"x": 0.5})
+    assert (result.verdict, result.claim) == (Verdict.PROVED, "enlarged") and result.tube is not None
+    assert json.loads((result.raw or b"").decode())["claim"]["kind"] == "enlarged"
+
+
 def test_what_the_core_takes_is_taken(tmp_path: Path) -> None:
     seen: list[str] = []
     result = certify_roa(
@@ -123,6 +129,8 @@ def test_options_by_name_are_those_of_the_options() -> None:
         "time_limit": 0,
         "max_boxes": 0,
         "device": "tpu",
+        "enlarge": "yes",
+        "box": {"theta": -1.0},
         "P": [[1.0, 2.0], [0.0, 1.0]],
         "Q": (1.0,),
         "R": (1.0, 2.0),
@@ -132,6 +140,9 @@ def test_options_by_name_are_those_of_the_options() -> None:
         given: dict[str, Any] = {name: value}
         with pytest.raises(InputError, match=name):
             certify_roa("pendulum", SHIPPED, **given)
+    for box in ([1.0, 2.0], {"theta": "1"}, {1: 1.0}):
+        with pytest.raises(InputError, match="box"):
+            certify_roa("pendulum", SHIPPED, box=box)  # type: ignore[arg-type]
 
 
 def test_options_at_once_or_by_name() -> None:

@@ -14,11 +14,11 @@ import pytest
 import sympy
 
 from certify.certificate import limits, read_certificate, run_checker
+from certify.checker import ball as checker_ball
 from certify.checker import document as checker_document
 from certify.checker import exact as checker_exact
 from certify.checker import expression as checker_expression
-from certify.checker import local as checker_local
-from certify.engines import local as producer_local
+from certify.engines import models as producer_models
 from certify.errors import CertificateFormatError
 from certify.expressions import from_tree, to_tree
 from certify.roa import RoaOptions, certify_roa
@@ -224,7 +224,7 @@ def test_the_limits_are_the_checker_s() -> None:
         checker_expression.MAX_EXPONENT,
     )
     assert limits.MOST_MATRIX_BITS == checker_exact.MAX_MATRIX_BITS
-    assert limits.MOST_NUMBERS == checker_local._MOST_NUMBERS == producer_local._MOST_NUMBERS
-    assert producer_local._MOST_PRODUCTS == checker_local._MOST_PRODUCTS
+    assert limits.MOST_NUMBERS == checker_ball._MOST_NUMBERS == producer_models._MOST_NUMBERS
+    assert producer_models._MOST_PRODUCTS == checker_ball._MOST_PRODUCTS
     page = (Path(checker_document.__file__).parent / "FORMAT.md").read_text()
     assert f"at most {limits.MOST_DIGITS:,} digits" in page and f"at most {limits.MOST_NODES:,} nodes" in page

@@ -21,6 +21,7 @@ import pytest
 from certify.checker import document, rules
 from certify.checker.errors import Rejected
 from tests.support.ablation import checker_without
+from tests.support.balls import with_ball
 from tests.support.claim_oracle import EXACT, faults, read
 from tests.support.mutants import (
     BASES,
@@ -195,6 +196,8 @@ def test_honest_practical_certificates_are_accepted(name: str, tmp_path: Path) -
     asymptotic = {**practical_base(name), "claim": {"kind": "asymptotic"}}
     asymptotic["levels"] = {"local": floor, "roa": asymptotic["levels"]["roa"]}
     assert kind == "practical"
+    assert verdict_on(Mutant(name, asymptotic, frozenset()).write(path)) == "format"  # a ball is missing
+    asymptotic = with_ball(asymptotic)
     assert verdict_on(Mutant(name, asymptotic, frozenset()).write(path)) in ("equilibrium", "centring")
 
 

@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 import torch
 
-from certify.engines import local
+from certify.engines import models
 from certify.engines.base import Budget
 from certify.engines.bounds.partition import LEAF
 from certify.engines.bounds.search import prove_outwards
 from certify.engines.falsify import Witness, confirm, falsify
-from certify.engines.local import local_margin, paths, prove_local
+from certify.engines.local import local_margin, prove_local
+from certify.engines.models import paths
 from certify.errors import InputError
 from certify.lyapunov import domain_limit
 from certify.lyapunov.function import Quadratic
@@ -67,11 +68,11 @@ def test_the_local_proof_holds_on_samples_of_every_smaller_level(name: str) -> N
     }[name]
     case = case_of(system, network)
     level = prove_local(case.problem, case.T, domain_limit(case.P, system.domain))
-    assert level is not None and local_margin(case.problem, case.T, level, paths(case.problem, case.T)) > 0
+    assert level is not None and local_margin(case.problem, case.T, level, paths(case.loop)) > 0
     for share in (1.0, 1e-2, 1e-4):
         assert np.max(vdot(case, sphere(case, share * level, 2000))) < 0
     # The margin shrinks with the level, so smaller levels are proved as well.
-    margins = [local_margin(case.problem, case.T, level * 4.0**-k, paths(case.problem, case.T)) for k in range(6)]
+    margins = [local_margin(case.problem, case.T, level * 4.0**-k, paths(case.loop)) for k in range(6)]
     assert margins == sorted(margins)
 
 
@@ -94,7 +95,7 @@ def test_the_local_proof_uses_signs_and_directions() -> None:
 @pytest.mark.parametrize("limit", ["_MOST_NUMBERS", "_MOST_PRODUCTS"])
 def test_a_network_too_large_for_the_local_proof_is_named(limit: str, monkeypatch: pytest.MonkeyPatch) -> None:
     case = case_of(get_system("pendulum"), pendulum_network())
-    monkeypatch.setattr(local, limit, 100)
+    monkeypatch.setattr(models, limit, 100)
     with pytest.raises(InputError, match="too large for the local proof"):
         prove_local(case.problem, case.T, 1.0)
 

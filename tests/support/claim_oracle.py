@@ -293,31 +293,59 @@ def _ball(q: Fraction) -> arb:
     return arb(fmpq(q.numerator, q.denominator))
 
 
+class Undefined(Exception):
+    """A division by exactly 0, a root of what is not positive, or a number that outgrows all reason."""
+
+
 def _at_equilibrium(node: Any, names: dict[str, Fraction]) -> Fraction | None:
-    """An expression in rationals; None if it divides by 0, takes a sine of anything but 0, or outgrows all reason."""
+    """An expression in rationals; None for a number without a value, such as a sine of 1, which 0 times makes 0.
+
+    Raises `Undefined`, under a factor 0 as well.
+    """
     if isinstance(node, str):
         return names[node] if node in names else _rational(node)
     name, rest = node[0], node[1:]
-    operands = [_at_equilibrium(v, names) for v in (rest[:1] if name == "**" else rest)]
-    values = [v for v in operands if v is not None]
-    if len(values) < len(operands) or any(
-        v.numerator.bit_length() + v.denominator.bit_length() > 10**6 for v in values
-    ):
-        return None
+    values = [_at_equilibrium(v, names) for v in (rest[:1] if name == "**" else rest)]
+    if any(v is not None and v.numerator.bit_length() + v.denominator.bit_length() > 10**6 for v in values):
+        raise Undefined
     if name in UNARY:
-        if name == "sqrt":
-            root = Fraction(math.isqrt(max(values[0].numerator, 0)), math.isqrt(values[0].denominator))
-            return root if values[0] > 0 and root**2 == values[0] else None
-        return Fraction(int(name in ("cos", "exp"))) if values[0] == 0 else None
+        return _function_of(name, values[0])
     if name == "**":
-        return None if rest[1] < 0 and values[0] == 0 else values[0] ** rest[1]
+        if rest[1] < 0 and values[0] == 0:
+            raise Undefined
+        return None if values[0] is None else values[0] ** rest[1]
+    if name == "/" and values[1] == 0:
+        raise Undefined
+    if name in ("*", "/") and 0 in values:
+        return Fraction(0)
+    known = [v for v in values if v is not None]
+    if len(known) < len(values):
+        return None
     if name == "+":
-        return sum(values, Fraction(0))
+        return sum(known, Fraction(0))
     if name == "*":
-        return math.prod(values, start=Fraction(1))
+        return math.prod(known, start=Fraction(1))
     if name == "-":
-        return -values[0] if len(values) == 1 else values[0] - values[1]
-    return None if values[1] == 0 else values[0] / values[1]
+        return -known[0] if len(known) == 1 else known[0] - known[1]
+    return known[0] / known[1]
+
+
+def _vanishes(node: Any, names: dict[str, Fraction]) -> bool:
+    try:
+        return _at_equilibrium(node, names) == 0
+    except Undefined:
+        return False
+
+
+def _function_of(name: str, value: Fraction | None) -> Fraction | None:
+    if value is None:
+        return None
+    if name == "sqrt":
+        if value <= 0:
+            raise Undefined
+        root = Fraction(math.isqrt(value.numerator), math.isqrt(value.denominator))
+        return root if root**2 == value else None
+    return Fraction(int(name in ("cos", "exp"))) if value == 0 else None
 
 
 def _raw_at_0(policy: Document, n: int) -> list[Fraction | None]:
@@ -377,9 +405,9 @@ def exact_faults(data: Document) -> dict[str, str]:
         faults["lyapunov"] = "P"
     u_eq = _rationals(plant["u_eq"], m)
     names = dict(zip(plant["states"] + plant["inputs"], [Fraction(0)] * n + u_eq, strict=True))
-    value = [_at_equilibrium(node, names) for node in plant["dynamics"]]
-    if not is_practical(data) and any(v is None or v != 0 for v in value):
-        faults["equilibrium"] = f"component {[v is not None and v == 0 for v in value].index(False)}"
+    wrong_rows = [] if is_practical(data) else [i for i, f in enumerate(plant["dynamics"]) if not _vanishes(f, names)]
+    if wrong_rows:
+        faults["equilibrium"] = f"component {wrong_rows[0]}"
     domain = [_rationals(pair, 2) for pair in plant["domain"]]
     for i, (lo, hi) in enumerate(domain):
         if not lo < 0 < hi or (inverse is not None and c2 * inverse[i][i] >= min(-lo, hi) ** 2):
@@ -554,10 +582,6 @@ class Loop:
             V = sum((p * v for p, v in zip(Px, x, strict=True)), arb(0))
             result.append((V, 2 * sum((p * v for p, v in zip(Px, F, strict=True)), arb(0)), u))
         return result
-
-
-class Undefined(Exception):
-    """A division by exactly 0."""
 
 
 def _near(value: Any) -> float:

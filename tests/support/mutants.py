@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 
 from tests.checker.test_rules import honest, linear_claim, rotor_claim, scalar_claim
+from tests.support.balls import with_ball
 from tests.support.certificates import (
     LEAF,
     Document,
@@ -385,6 +386,8 @@ def claims_too_strong() -> Iterator[Mutant]:
             for t in (0.05, 0.1, 0.2, 0.3, 0.5, 0.7, 0.9, 0.99, 1):
                 value = c1 ** (1 - t) * c2**t
                 new = with_level(data, "local", value)
+                yield mutant(f"{name}: local up to {value:.4g} with the old ball", new, "local")
+                new = with_ball(new)
                 rules = ("ring",) if name == "linear" else ("local",) if name in BY_FORM else ("inputs", "local")
                 yield mutant(f"{name}: local up to {value:.4g}", new, *rules)
             for factor in (0.5, 0.1, 1e-2, 1e-3, 1e-6, 1e-12, 1e-100, 1e-300, 5e-324 / c1):
@@ -650,7 +653,7 @@ def constants(data: Document) -> list[str]:
 
 
 def plants() -> Iterator[Mutant]:
-    """Constants, signs and operators of the equations."""
+    """Constants, signs and operators of the equations; each with a ball that suits the new ones."""
     for name in BASES:
         data = base(name)
         for path in constants(data):
@@ -660,14 +663,16 @@ def plants() -> Iterator[Mutant]:
                     continue
                 new = edited(data, path, str(q * factor))
                 title = f"{float(factor):.4g}" if abs(factor) < 1e300 else "huge"
-                yield predicted(f"{name}: {path} times {title}", new)
+                yield predicted(f"{name}: {path} times {title}", with_ball(new))
         plant = data["plant"]
         state, control = plant["states"][-1], plant["inputs"][0]
         last = len(plant["states"]) - 1
         extra = {
             "a constant 1e-9": "1/1000000000", "a constant 1e-300": "1/" + "1" + "0" * 300, "a constant 1": "1",
             "0/0": ["/", state, state], "cosine": ["cos", state], "sine of 1": ["-", ["sin", "1"], ["sin", "1"]],
-            "pole at 0": ["/", "1", state], "power -1": ["**", state, -1], "tan of 1": ["*", "0", ["tan", "1"]],
+            "pole at 0": ["/", "1", state], "power -1": ["**", state, -1], "tan of 1": ["tan", "1"],
+            "tan of 1 over a state": ["*", state, ["/", ["tan", "1"], state]],
+            "0 times a pole": ["*", "0", ["/", "1", state]], "0 times a root": ["*", "0", ["sqrt", state]],
         }  # fmt: skip
         for what, node in extra.items():
             new = edited(data, f"plant.dynamics.{last}", lambda old, node=node: ["+", old, node])
@@ -682,13 +687,13 @@ def plants() -> Iterator[Mutant]:
             "input reversed": ["*", "-1000", control] if plant["u_eq"] == ["0"] else ["*", "1000", state, control],
         }.items():  # fmt: skip
             new = edited(data, f"plant.dynamics.{last}", lambda old, node=node: ["+", old, node])
-            yield predicted(f"{name}: {what}", new)
+            yield predicted(f"{name}: {what}", with_ball(new))
         new = edited(data, "plant.dynamics", lambda d: [["-", e] for e in d])
-        yield predicted(f"{name}: time reversed", new)
+        yield predicted(f"{name}: time reversed", with_ball(new))
         for power in (3, 5):
             grown = ["*", "1000000", ["**", state, power]]
             new = edited(data, f"plant.dynamics.{last}", lambda old, g=grown: ["+", old, g])
-            yield predicted(f"{name}: {power}rd power added", new)
+            yield predicted(f"{name}: {power}rd power added", with_ball(new))
         yield from poles(name, data, last, state)
         if last:
             yield predicted(f"{name}: equations exchanged", edited(data, "plant.dynamics", lambda d: d[::-1]))
@@ -708,10 +713,10 @@ def poles(name: str, data: Document, last: int, state: str) -> Iterator[Mutant]:
         hint = ((0.0,) * last + (float(a),),)
         inner = float(a) ** 2 * P[last, last] <= 0.5 * c1
         rules = ("local",) if inner or name == "local only" else ("local", "ring")
-        yield mutant(f"{name}: pole at {float(a):.4g}", new, *rules, hints=hint)
+        yield mutant(f"{name}: pole at {float(a):.4g}", with_ball(new), *rules, hints=hint)
         hidden = ["*", "0", node]
         new = edited(data, f"plant.dynamics.{last}", lambda old, node=hidden: ["+", old, node])
-        yield mutant(f"{name}: hidden pole at {float(a):.4g}", new, *rules, hints=hint)
+        yield mutant(f"{name}: hidden pole at {float(a):.4g}", with_ball(new), *rules, hints=hint)
 
 
 def domains() -> Iterator[Mutant]:
@@ -1151,18 +1156,26 @@ def true_edits() -> Iterator[Mutant]:
         yield mutant(
             f"{name}: 0 u added", edited(data, "plant.dynamics", lambda d: [["+", e, ["*", "0", "u"]] for e in d])
         )
+        for what, node in {"0 tan(1)": ["*", "0", ["tan", "1"]], "tan(1) u": ["*", "u", ["tan", "1"]]}.items():
+            if what == "0 tan(1)" or plant["u_eq"] == ["0"]:
+                times = ["*", "1/1000000000", node] if what == "tan(1) u" else node
+                new = edited(data, "plant.dynamics", lambda d, node=times: [["+", e, node] for e in d])
+                yield mutant(f"{name}: {what} added", new)
         for step in (1e-12, 1e-10):
             new = array(with_level(data, "roa", c2 * (1 + step)), "evidence.root", lambda a, s=step: a * (1 + s))
             new = with_level(new, "local", c1 * (1 + step)) if c1 == c2 else new
             yield mutant(f"{name}: roa and root box up by {step}", new)
         if c1 < c2:
             yield mutant(f"{name}: roa down by a millionth", with_level(data, "roa", c2 * (1 - 1e-6)))
-            yield mutant(f"{name}: local up by a millionth", with_level(data, "local", c1 * (1 + 1e-6)))
+            wider_ball = array(data, "evidence.local.J", lambda a: a * (1 + 1e-6))
+            yield mutant(f"{name}: local up by a millionth", with_level(wider_ball, "local", c1 * (1 + 1e-6)))
         k = int(np.flatnonzero(np.frombuffer(tree, np.uint8) == LEAF)[-1])
         if name != "linear":  # the multiplier is a choice, and there the choice for the half is worse
             yield mutant(f"{name}: last leaf halved", with_tree(data, tree[:k] + bytes([n - 1, LEAF, LEAF])))
         yield mutant(f"{name}: root box one bit wider", array(data, "evidence.root", lambda a: np.nextafter(a, np.inf)))
         scaled = array(data, "lyapunov.P", lambda a: a * 2.0**40)
+        weights = np.repeat([2.0**-40, 2.0**-40, 2.0**40], n)  # of P against the models, which stay
+        scaled = array(scaled, "evidence.local.multipliers", lambda a, w=weights: a * w)
         yield mutant(
             f"{name}: P and levels times 2^40",
             with_level(with_level(scaled, "local", c1 * 2.0**40), "roa", c2 * 2.0**40),
