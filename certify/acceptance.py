@@ -107,8 +107,10 @@ class Clerk:
 
 
 def _what_is_lower(first: Certificate, certificate: Certificate) -> str:
-    tube = "without the tube, " if first.kind != certificate.kind else ""
-    return f"{tube}the level is {certificate.roa:.6g} in the place of {first.roa:.6g}"
+    said = ["it is left out with its tube"] if first.kind != certificate.kind else []
+    if certificate.roa < first.roa:
+        said.append(f"the level is {certificate.roa:.6g} in the place of {first.roa:.6g}")
+    return ", ".join(said)
 
 
 def _wanted(certificate: Certificate) -> str:

@@ -32,7 +32,6 @@ from certify.systems import System
 
 Array = NDArray[np.float64]
 SCHEMA = "certify-certificate/4"
-"""Of each claim's kind, what the file calls the inner level."""
 MAX_BYTES = 256 * 2**20
 _LONGEST_UNIT = 40
 

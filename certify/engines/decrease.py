@@ -18,7 +18,7 @@ from certify.engines.models import Models
 Array = NDArray[np.float64]
 _ROUNDS = 5  # of weights that look at the worst direction more and more
 _FOCUS, _LEAST_WEIGHT = 3.0, 1e-3
-_NEGLIGIBLE = 1e-9
+_NEGLIGIBLE, _ROUNDING = 1e-9, 1e-12  # of the bounds; of the decay, where a checker's Q is not quite 0
 _SHORT = 5  # bits of a multiplier: the checker's rationals stay short
 
 
@@ -106,7 +106,8 @@ def multipliers_for(models: Models, b: Array, weight: Array, joint: bool | None 
     spread = np.einsum("jmk,kl,jml->m", C, weight, C, optimize=True)
     diagonal, apart_in_all = np.diag(weight), np.sum(np.sqrt(Q2 * along))
     g = np.sqrt(spread / diagonal)
-    least = _NEGLIGIBLE * max(float(np.max(g)), apart_in_all / np.trace(weight), 1e-200)
+    usual = _ROUNDING * float(np.max(size)) * float(np.max(np.linalg.norm(models.A, axis=1)))  # beside the decay
+    least = max(_NEGLIGIBLE * float(np.max(g)), _NEGLIGIBLE * apart_in_all / np.trace(weight), usual)
     joint = np.sum(np.sqrt(spread * diagonal)) <= apart_in_all if joint is None else joint
     if joint or not np.all(np.isfinite(beta)):
         beta, g = np.zeros_like(beta), np.maximum(g, least)

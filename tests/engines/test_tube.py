@@ -292,7 +292,7 @@ def test_a_tube_that_the_checker_refuses_is_left_out(tmp_path: Path, monkeypatch
     options = RoaOptions(candidate="lqr", enlarge=True, max_boxes=1, time_limit=20)
     result = certify_roa(get_system("pendulum"), load_policy(POLICIES / "pendulum.pt").network, tmp_path, options)
     assert result.verdict is Verdict.PROVED and result.claim == "asymptotic" and result.tube is None
-    assert result.stop is not Stop.STALLED and "without the tube" in (result.notice or "")
+    assert result.stop is not Stop.STALLED and "left out with its tube" in (result.notice or "")
 
 
 def test_a_policy_that_is_not_centred_has_no_tube(tmp_path: Path) -> None:
