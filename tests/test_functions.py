@@ -38,6 +38,7 @@ from certify.roa import RoaOptions, certify_roa
 from certify.systems import System, load_system
 from certify.systems.toml import parse_expression
 from certify.verdict import Verdict
+from tests.support.balls import with_ball
 from tests.support.cases import case_of
 from tests.support.certificates import Document, edited, grow, make, verdict
 from tests.support.loops import box, tank, valve
@@ -370,6 +371,7 @@ def test_honest_certificates_are_accepted_by_both(name: str) -> None:
 @pytest.mark.parametrize(("rule", "name", "tree"), FORGED, ids=[f"{b} {i}" for i, (_, b, _) in enumerate(FORGED)])
 def test_forged_equations_are_refused_by_both(rule: str, name: str, tree: Any) -> None:
     forged = edited(honest(name), "plant.dynamics", [tree])
+    forged = forged if rule == "format" else with_ball(forged)
     assert verdict(forged) == rule and judge(forged) == rule
     if rule != "format":  # and no tree helps
         assert verdict(grow(forged, max_leaves=600, depth=20)) == rule

@@ -42,6 +42,8 @@ from certify.policies import load_policy
 from certify.roa import RoaOptions, certify_roa
 from certify.systems import get_system
 from certify.verdict import Verdict
+from tests.support.balls import ball as ball_of
+from tests.support.balls import enlarge, with_ball
 from tests.support.certificates import LEAF, Document, decode, dump, edited, encode, grow, make, rehash
 from tests.support.oracle import ball, policies_in_arb, value_of
 
@@ -49,7 +51,7 @@ CHECKER = Path(certify.checker.__file__).parent
 SHIPPED = Path(__file__).parents[2] / "examples" / "policies" / "pendulum.pt"
 RULES = {
     "format", "hash", "levels", "lyapunov", "equilibrium", "centring", "domain", "coordinates", "root", "local", "tree",
-    "ring", "inputs",
+    "ring", "inputs", "tube",
 }  # fmt: skip
 RESULTS = {0: "ACCEPTED", 1: "REJECTED", 3: "TRUSTED"}
 SECONDS = 5  # for one small file; a thousand times what it takes
@@ -64,6 +66,13 @@ GIB = 2**30
 def scalar() -> Document:
     """xdot = x/2 - tanh(x)."""
     return grow(make([["+", ["/", "x", "2"], "u"]], [([[1.0]], [0.25])], [[1.0]], (0.01, 3.5)))
+
+
+@cache
+def enlarged() -> Document:
+    """The same, with a tube of two slabs from |x| <= 0.3 into |x| <= 0.25."""
+    data = make([["+", ["/", "x", "2"], "u"]], [([[1.0]], [0.25])], [[1.0]], (0.01, 0.0625))
+    return enlarge(grow(data), [np.eye(1) / c for c in (0.09, 0.075, 0.0624)], [0.5, 0.5])
 
 
 @cache
@@ -88,7 +97,7 @@ def trusted() -> Document:
     return edited(scalar(), "evidence", evidence)
 
 
-SEEDS: tuple[Callable[[], Document], ...] = (scalar, planar, trusted)
+SEEDS: tuple[Callable[[], Document], ...] = (scalar, enlarged, planar, trusted)
 seeds = st.sampled_from(range(len(SEEDS)))
 
 
@@ -125,7 +134,7 @@ def text(node: Any) -> str:
 TOKENS = [
     "{", "}", "[", "]", ",", ":", '"', "\\", "\\u", "\\ud800", "\\u0000", "null", "true", "false", "NaN", "Infinity",
     "-Infinity", "0", "-0", "1", "-", "1e9", "1E400", "0.5", "1234567890", "12345678901", "9" * 5000, '"a"', '""',
-    '"schema"', '"certify-certificate/3"', '"plant"', '"x"', '"0x1.0000000000000p+0"', "0x10", "//", "/*", "'a'", " ",
+    '"schema"', '"certify-certificate/4"', '"plant"', '"x"', '"0x1.0000000000000p+0"', "0x10", "//", "/*", "'a'", " ",
     "\n", "\t", "\x00", "\x1f", "\x7f", "\u0661", "\u2028", "\ufeff", "\U0001f600", "\ud800", "\udfff", "[" * 500,
     '{"a":' * 500, "[" * 2000 + "]" * 2000,
 ]  # fmt: skip
@@ -259,7 +268,7 @@ json_edits = st.lists(
 
 @st.composite
 def edited_json(draw: st.DrawFn) -> bytes:
-    top = {"": edited(SEEDS[draw(seeds)](), "schema", "certify-certificate/3")}  # a deep copy
+    top = {"": edited(SEEDS[draw(seeds)](), "schema", "certify-certificate/4")}  # a deep copy
     for kind, position, other, value in draw(json_edits):
         found = places(top)
         if not found:
@@ -398,17 +407,35 @@ def any_numbers(draw: st.DrawFn) -> bytes:
     if draw(st.booleans()):  # so that the last rules run as well
         P, T, root, levels = np.eye(n), np.eye(n), np.full(n, 3.0), [1e-6, draw(st.sampled_from([1e-6, 1e-5, 1.0]))]
     largest = draw(st.sampled_from(["3", str(2**600), "9" * 1201]))
-    return dump(make(
+    data = make(
         dynamics, [(array(b, a), array(b)) for a, b in pairwise(widths)], np.abs(P), tuple(levels),
         states=states, inputs=inputs, u_eq=["0"] * m, domain=[(f"-{largest}", largest)] * n,
         input_bounds=[(f"-{largest}", largest)] * m, squash=draw(st.sampled_from(["tanh", "identity"])),
         centre=draw(st.sampled_from(["output", "none"])), scale=np.where(array(m) == 0, 1.0, array(m)), offset=array(m),
         T=T, root=root, tree=draw(trees),
-    ))  # fmt: skip
+    )  # fmt: skip
+    if draw(st.booleans()):
+        data = edited(data, "evidence.local", ball_of(array(n, n), np.abs(array(3, n))))
+    if draw(st.booleans()):  # a tube into {V <= c2}, or anywhere
+
+        def node(factor: float) -> Any:
+            with np.errstate(all="ignore"):
+                near = factor * np.abs(P) / levels[1]
+            return encode(near if draw(st.booleans()) and np.isfinite(near).all() else array(n, n))
+
+        def one_ball() -> Document:
+            mine: Document = data["evidence"]["local"]
+            return mine if draw(st.booleans()) else ball_of(array(n, n), np.abs(array(3, n)))
+
+        times = draw(st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=1, max_size=2))
+        slabs = [{"middle": node(1.5), "end": node(2.0), "duration": h.hex()} | one_ball() for h in times]
+        data = edited(data, "claim", {"kind": "enlarged", "start": node(1.0)})
+        data["evidence"]["tube"] = slabs
+    return dump(data)
 
 
 ARRAYS = ["policy.scale", "policy.offset", "policy.layers.0.weight", "policy.layers.0.bias", "lyapunov.P", "evidence.T",
-          "evidence.root"]  # fmt: skip
+          "evidence.root", "evidence.local.J", "evidence.local.multipliers"]  # fmt: skip
 
 
 def power(k: int) -> str:
@@ -431,7 +458,7 @@ def scaled(draw: st.DrawFn) -> bytes:
     change = draw(st.sampled_from(["none", "number", "nudge", "level", "tree", "centre", "bounds"]))
     path = draw(st.sampled_from(ARRAYS))
     if change == "number":
-        data = edited(data, path, encode([draw(numbers)]))
+        data = edited(data, path, encode([draw(numbers)] * len(decode(_at(data, path)))))
     elif change == "nudge":
         factor = draw(st.sampled_from([1 - 2.0**-53, 1 + 2.0**-52, 0.999, 1.001, 0.9, 1.1, -1.0, 2.0, 0.5]))
         with np.errstate(over="ignore"):
@@ -449,7 +476,7 @@ def scaled(draw: st.DrawFn) -> bytes:
         data = edited(
             data, draw(st.sampled_from(["plant.domain.0", "plant.input_bounds.0"])), [str(low), str(high + 1)]
         )
-    return dump(rehash(data))
+    return dump(rehash(with_ball(data) if draw(st.booleans()) else data))
 
 
 def _at(data: Any, path: str) -> Any:
@@ -558,6 +585,33 @@ def counterexample(raw: bytes, path: Path) -> str | None:
             for v, (lo, hi) in zip((*x, *u), (*c.domain, *c.input_bounds), strict=True):
                 if v < ball(lo) or v > ball(hi):
                     return f"a bound is left at {at}"
+        return _leaves_tube(c, trees, generator)
+
+
+def _leaves_tube(c: document.Certificate, trees: list[Any], generator: random.Random) -> str | None:
+    """A point of a slab's ellipsoids in which x'P(t)x does not fall, or that lies outside the last set."""
+    if c.start is None or not isinstance(c.evidence, document.Partition):
+        return None
+    n, before = len(c.states), c.start
+    for k, slab in enumerate(c.evidence.tube):
+        nodes = [[[arb(float(v)) for v in row] for row in P] for P in (before, slab.middle, slab.end)]
+        h, before = arb(slab.duration), slab.end
+        for s in (arb(0), arb(1) / 2, arb(1), arb(generator.random())):
+            weights, rates = [(1 - s) ** 2, 2 * s * (1 - s), s * s], [-2 * (1 - s), 2 - 4 * s, 2 * s]
+            P, R = ([[sum((w * M[i][j] for w, M in zip(each, nodes, strict=True)), arb(0)) for j in range(n)]
+                     for i in range(n)] for each in (weights, rates))  # fmt: skip
+            for share in (1 - arb(2) ** -1000, arb(generator.random())):
+                d = [arb(generator.gauss(0, 1)) for _ in range(n)]
+                size = sum((d[i] * P[i][j] * d[j] for i in range(n) for j in range(n)), arb(0))
+                x = [(v * (share / size).sqrt()).mid() for v in d]
+                (u,) = policies_in_arb(c.policy, c.u_eq, [x])
+                values = dict(zip((*c.states, *c.inputs), (*x, *u), strict=True))
+                F = [value_of(tree, values) for tree in trees]
+                falls = sum(
+                    (x[i] * (R[i][j] / h * x[j] + 2 * P[i][j] * F[j]) for i in range(n) for j in range(n)), arb(0)
+                )
+                if not falls < 0:
+                    return f"x'P(t)x does not fall in slab {k}"
     return None
 
 
@@ -617,6 +671,10 @@ def test_the_oracle_finds_a_false_claim(tmp_path: Path) -> None:
         wrong = dump(edited(scalar(), field, value))
         assert judged(wrong, path, []) == 1
         assert found in (counterexample(wrong, path) or "")
+    for field, change in (("duration", lambda h: (0.1).hex()), ("middle", lambda P: encode(1.2 * decode(P)))):
+        wrong = dump(edited(enlarged(), f"evidence.tube.1.{field}", change))
+        assert judged(wrong, path, []) == 1
+        assert "slab 1" in (counterexample(wrong, path) or "")
 
 
 # --------------------------------------------------------------------------------------------- files made to exhaust it
@@ -747,7 +805,12 @@ def wide_plant(terms: list[Any], n: int = 64, **changes: Any) -> Document:
         "root": [2.0**-39] * n,
     }  # fmt: skip
     layers = [(-np.eye(n), [0.0] * n)]
-    return make(dynamics, layers, np.eye(n), (2.0**-81, 2.0**-80), **{**settings, **changes})
+    plain = [["+", u] for u in inputs]
+    data = make(plain, layers, np.eye(n), (2.0**-81, 2.0**-80), **{**settings, **changes})
+    data["plant"]["dynamics"] = dynamics
+    if data["evidence"]["local"] is not None:
+        data["evidence"]["local"] = ball_of(np.eye(n) * 1.5 * 2.0**-40, np.full((3, n), 2.0**-20))
+    return data
 
 
 def products(count: int) -> list[Any]:
@@ -775,15 +838,17 @@ def extreme_matrices(reach_P: int, reach_T: int, n: int = 64) -> Document:
     cross = np.tril(generator.uniform(1, 2, (n, n)) * 2.0**-reach_P, -1) / 256
     P = np.diag(mixed(reach_P, n)) + cross + cross.T
     far = str(2**3000)
-    return wide_plant([], n, domain=[("-" + far, far)] * n, root=[2.0**1000] * n) | {
+    base = wide_plant([], n, domain=[("-" + far, far)] * n, root=[2.0**1000] * n)
+    evidence = {
+        "T": encode(mixed(reach_T, n, n) if reach_T else np.eye(n)),
+        "root": encode([2.0**1000] * n),
+        "tree": encode_tree([LEAF]),
+        "local": ball_of(np.diag(2 * np.diag(P) ** -0.5), np.ones((3, n))),
+    }
+    return base | {
         "lyapunov": {"kind": "quadratic", "P": encode(P)},
         "levels": {"local": (1.0).hex(), "roa": (2.0).hex()},
-        "evidence": {
-            "kind": "partition-tree",
-            "T": encode(mixed(reach_T, n, n) if reach_T else np.eye(n)),
-            "root": encode([2.0**1000] * n),
-            "tree": encode_tree([LEAF]),
-        },
+        "evidence": base["evidence"] | evidence,
     }
 
 
@@ -807,7 +872,8 @@ def one_state(*terms: Any, **changes: Any) -> Document:
 
 
 HARD: dict[str, tuple[Callable[[], Document], set[str]]] = {
-    "4,000 products of 64 states and 64 inputs": (lambda: wide_plant(products(4000)), {"ring"}),
+    "4,000 products of 64 states and 64 inputs": (lambda: wide_plant(products(4000)), {"local", "ring"}),
+    "4,000 products under another claim": (lambda: wide_plant(products(4000), claim="practical"), {"ring"}),
     # 64 states and more than 8,192 operations are refused under `local` for their size
     "6,000 products of 64 states and 64 inputs": (lambda: wide_plant(products(6000)), {"local", "format"}),
     "one sum of 6,000 products": (

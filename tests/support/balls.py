@@ -90,8 +90,8 @@ def multipliers(data: Document, J: np.ndarray, nodes: Sequence[np.ndarray], R: n
     )
     P = sum(nodes[1:], nodes[0]) / len(nodes)
     b = J.T @ P
-    left = -(J.T @ R @ J + b @ a + a.T @ b.T)
     with np.errstate(all="ignore"):
+        left = -(J.T @ R @ J + b @ a + a.T @ b.T)
         if not (np.isfinite(left).all() and np.linalg.eigvalsh(left)[0] > 0):
             return ones(n)
         inverse = np.linalg.inv(left)
