@@ -210,7 +210,7 @@ class _Run:
 
     def _race(self, loop: ClosedLoop) -> Race:
         """Every candidate for a little time, and more for the better ones."""
-        heat, options = self._heat(), self.options
+        heat, options = self._heat(), replace(self.options, time_limit=self.share * self.options.time_limit)
         self._tell("candidate")
         with self._stage("candidate"):
             trials = solved(loop, options)
@@ -239,6 +239,7 @@ class _Run:
         A proof that comes upon a violation far below its candidate's reach tells the next round of it.
         """
         witnesses: list[Witness] = []
+        options = replace(self.options, time_limit=self.share * self.options.time_limit)
         while self.left() > _FOR_PROOF * self.options.time_limit:
             last = [c for c in race.contenders if c.trial.name == "optimised"][-1:]
             if not last or not last[0].attempt.done:
@@ -249,7 +250,7 @@ class _Run:
                 witnesses.append(found)
             elif not self.cut_short:
                 return
-            again = self._optimised(partial(corrected, loop, last[0].trial, witnesses, self.options))
+            again = self._optimised(partial(corrected, loop, last[0].trial, witnesses, options))
             if again is None or (not misled and again.volume <= _WORTH * race.best.proved):
                 return
             race.enter([again], heat)
@@ -259,7 +260,7 @@ class _Run:
         begin = time.perf_counter()
         with self._stage("candidate"):
             made = make()
-        self.cut_short = time.perf_counter() - begin >= OPTIMISING * self.options.time_limit
+        self.cut_short = time.perf_counter() - begin >= OPTIMISING * self.share * self.options.time_limit
         return made
 
     @property
@@ -270,7 +271,7 @@ class _Run:
     def _heat(self) -> float:
         """Seconds of a candidate's first heat, which for some is the only one."""
         if self.interruptible:
-            return _HEAT * self.options.time_limit
+            return _HEAT * self.share * self.options.time_limit
         return (1.0 if self.options.engine == "dreal" else _SEARCH) * self.left()
 
     def _contest(self) -> Race:
