@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from certify.certificate import Certificate, read_certificate, run_checker
+from certify.claims import Enlarged
 from certify.lyapunov import semi_axes, volume
 from certify.report.figures import draw
 from certify.report.words import above, below, pretty_unit, symbol
@@ -40,6 +41,8 @@ class Entry:
 
 
 OPTIMISED = ("--candidate", "optimised", "--time-limit", "60")
+WHERE = "x=0.3,y=0.3,z=0.3,phi=0.12,theta=0.12,psi=0.12,vx=0.3,vy=0.3,vz=0.3,p=0.6,q=0.6,r=0.6"
+QUADROTOR = ("--box", WHERE, "--time-limit", "300")
 ENTRIES = (
     Entry("pendulum", "inverted pendulum, up to its domain", "pendulum"),
     Entry(
@@ -58,8 +61,8 @@ ENTRIES = (
     Entry("furuta", "rotary pendulum, four states", "furuta", "furuta", OPTIMISED),
     Entry("cartpole", "four states, 256 units a layer", "cartpole", options=("--candidate", "optimised")),
     Entry("satellite", "attitude, six states and three inputs", "satellite", "satellite", OPTIMISED),
-    Entry("quadrotor2d", "six states, five layers of 256 units", "quadrotor2d", options=("--time-limit", "60")),
-    Entry("quadrotor3d", "twelve states on their true equations", "quadrotor3d", options=("--time-limit", "5")),
+    Entry("quadrotor2d", "six states, five layers of 256 units", "quadrotor2d"),
+    Entry("quadrotor3d", "twelve states on their true equations", "quadrotor3d", options=QUADROTOR),
 )
 
 
@@ -94,11 +97,14 @@ def picture(entry: Entry, certificate: Certificate) -> None:
 def section(entry: Entry, certificate: Certificate) -> str:
     """What the page says of an entry; numbers are rounded down."""
     system, network = certificate.system, certificate.network
-    reach = zip(system.states, semi_axes(certificate.P, certificate.roa).tolist(), strict=True)
+    claim = certificate.claim
+    shape = (claim.start.P, 1.0) if isinstance(claim, Enlarged) else (certificate.P, certificate.roa)
+    reach = zip(system.states, semi_axes(*shape).tolist(), strict=True)
     units = {name: "" if unit == "1" else pretty_unit(unit) for name, unit in system.units.items()}
     axes = ", ".join(f"{symbol(s.name)} {below(v, 3)} {units.get(s.name, '')}".strip() for s, v in reach)
     practical = certificate.kind == "practical"
-    size = below(volume(certificate.P, certificate.roa), 3)
+    size = below(volume(*shape), 3)
+    whose = " of the tube's start" if isinstance(claim, Enlarged) else ""
     kind = "area" if system.n == 2 else "volume"
     inner = f"c₀ = {above(certificate.inner, 4)}" if practical else f"c₁ = {below(certificate.inner, 4)}"
     return "\n".join(
@@ -109,7 +115,7 @@ def section(entry: Entry, certificate: Certificate) -> str:
             "",
             f"![The certified set of {entry.name}, section through the origin]({entry.name}.svg)",
             "",
-            f"On the axes ± {axes}; {kind} {size}; {inner}, c₂ = {below(certificate.roa)}.",
+            f"On the axes ± {axes}; {kind} {size}{whose}; {inner}, c₂ = {below(certificate.roa)}.",
             "",
             "<!-- shown: by make gallery -->",
             "```sh",
