@@ -311,7 +311,7 @@ def test_a_middle_at_its_edges_by_hand() -> None:
         (math.nextafter(5 / 24, 0), widest, "slab 1", "the middle coefficient"),
         (5 / 24, widest, None, ""),  # the float lies above
         (0.25, array("evidence.tube.0.J", lambda _: [math.nextafter(2, 3)]), None, ""),
-        (math.nextafter(0.25, 0), array("evidence.tube.0.J", lambda _: [math.nextafter(2, 3)]), "slab 1", "its middle"),
+        (0.25 - 2.0**-52, array("evidence.tube.0.J", lambda _: [math.nextafter(2, 3)]), "slab 1", "its middle"),
         (0.0625, widest, "middle 1", "the ellipsoid leaves the interior of the domain"),
         (math.nextafter(0.0625, 1), widest, "slab 1", "the middle coefficient"),
     ):
