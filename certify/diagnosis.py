@@ -17,6 +17,8 @@ from certify.claims import Problem
 from certify.closed_loop import ClosedLoop
 from certify.engines.base import Proof
 from certify.engines.falsify import falsify
+from certify.engines.models import paths
+from certify.engines.tube import find_tube
 from certify.errors import InputError
 from certify.lyapunov import diagonalising_coordinates, domain_limit, extents, volume
 from certify.options import RoaOptions
@@ -28,6 +30,7 @@ Array = NDArray[np.float64]
 _WIDER = Fraction(3, 2)  # of the side of the domain that binds
 _WORTH = 1.1  # growth of the volume that makes a wider domain worth a word
 _LONGEST = 86_400.0  # seconds that may be suggested
+_LONGER, _SECONDS = 1.1, 5.0  # of a tube's start, relative to the proved set; for looking
 _TOUCHES = 1e-6  # relative distance from the domain's limit
 
 
@@ -128,6 +131,8 @@ def _next(result: RoaResult, options: RoaOptions, proof: Proof | None, name: str
         return _longer(result, options, proof)
     if options.claim == "asymptotic" and options.only is not None and options.P is None and options.level is None:
         return Step((("--candidate", "auto"),), f"only the candidate {options.only} was tried")
+    if result.stop is Stop.STALLED and not options.enlarges and _has_tube(result):
+        return Step((("--enlarge", ""),), f"a tube leads into this set from one {_LONGER:g} times as long, at least")
     if result.stop is Stop.STALLED:
         worst = ", ".join(one for one, _ in _hurting(result, proof)[:3])
         why = f"the bounds are too wide between the local set and beyond, most of all along {worst}; "
@@ -139,6 +144,14 @@ def _next(result: RoaResult, options: RoaOptions, proof: Proof | None, name: str
             return Step((("--time-limit", _round(4 * options.time_limit)),), "another candidate reaches further")
         return Step((), "what this V can show is proved; a larger set needs another policy or another kind of V")
     return Step((), result.reason)
+
+
+def _has_tube(result: RoaResult) -> bool:
+    """Whether a tube leads from a larger multiple of the proved set into it."""
+    if result.P is None or result.levels.roa is None:
+        return False
+    goal = result.P / result.levels.roa
+    return find_tube(paths(ClosedLoop(result.system, result.network)), goal / _LONGER**2, goal, _SECONDS) is not None
 
 
 def _centring(result: RoaResult) -> str | None:

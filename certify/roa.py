@@ -158,6 +158,8 @@ class _Run:
         """Choose, falsify, prove, check."""
         options, loop = self.options, ClosedLoop(self.system, self.network)
         require_within_limits(self.system, self.network)
+        if options.box is not None:
+            _ellipsoid_in(self.system, options.box)
         with self._stage("candidate"):
             claim = self._claim(loop)
             if claim == "practical" and options.enlarges:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from certify.certificate import PartitionTree, read_certificate
 from certify.claims import Enlarged, Problem
 from certify.closed_loop import ClosedLoop
+from certify.diagnosis import diagnose
 from certify.engines import enlarge as enlarging
 from certify.engines.decrease import best_multipliers, decay_of, multipliers_for, rest_of
 from certify.engines.enlarge import enlarge
@@ -334,3 +335,13 @@ def test_the_shipped_quadrotors_are_proved_where_they_fly(
         assert result.contains(x) and result.contains(-x)
     command = [sys.executable, "-I", "-m", "certify.reference", str(result.certificate)]
     assert subprocess.run(command, capture_output=True, timeout=1500, check=False).returncode == 0
+
+
+def test_where_boxes_gain_nothing_the_next_step_is_a_tube(result: RoaResult) -> None:
+    """Only if there is one: not where nothing larger settles."""
+    assert result.P is not None and result.levels.roa is not None
+    stalled = replace(result, stop=Stop.STALLED, tube=None, claim="asymptotic")
+    step = diagnose(stalled, RoaOptions(candidate="auto"), None).next
+    assert step.options == (("--enlarge", ""),) and "1.1 times" in step.why
+    largest = replace(stalled, levels=replace(stalled.levels, roa=domain_limit(result.P, result.system.domain)))
+    assert diagnose(largest, RoaOptions(), None).next.options == ()
