@@ -21,6 +21,8 @@ from .document import Slab
 from .exact import contains_ball, exactly, inverse_diagonal, is_definite
 from .float64 import Array
 
+_MOST_WORK = 2**26  # slabs times n^4, which is what an inequality takes
+
 
 @dataclass(frozen=True)
 class Piece(Ball):
@@ -52,6 +54,8 @@ def pieces(case: Case) -> Iterator[Piece]:
 
 def nodes_are_sound(case: Case) -> Failures:
     """`tube`: positive definite matrices, whose ellipsoids lie in the interior of the domain, the last in {V <= c2}."""
+    if len(case.tube) * len(case.c.states) ** 4 > _MOST_WORK:
+        yield "tube", "the tube is too long for this rule"
     limits = [min(-lo, hi) ** 2 for lo, hi in case.c.domain]
     start = [] if case.c.start is None else [("start", case.c.start)]
     middles_and_ends = [(f"tube[{k}]", P) for k, slab in enumerate(case.tube) for P in (slab.middle, slab.end)]

@@ -27,7 +27,7 @@ _FILLED = 0.9  # of what `_WIDER` allows, by the first guess of a slab's duratio
 _LONGEST = 0.5  # units of time of a slab
 _SURPLUS = 1e-3  # decrease of V per unit of time that is left to the checker's rounding
 _CORRECTIONS, _SHORTENINGS = 5, 12  # of a slab's rate, of its duration
-_MOST_SLABS = 4000
+_MOST_SLABS, _MOST_WORK = 4000, 2**26  # the second over n^4: the checker refuses more
 _GROWN = 8.0  # logarithm of a volume, relative to the start, at which a tube is given up
 _INSIDE = 1 - 1e-6  # of the goal, beyond all rounding
 
@@ -57,9 +57,10 @@ def find_tube(known: Paths, start: Array, goal: Array, seconds: float = math.inf
     slabs: list[Slab] = []
     P, rate = start, None
     begin, domain = np.linalg.slogdet(start)[1], known.loop.system.domain
+    most = min(_MOST_SLABS, _MOST_WORK // len(start) ** 4)
     with np.errstate(all="ignore"):  # what overflows is not shown
         while not np.linalg.eigvalsh(P * _INSIDE - goal)[0] > 0 or not slabs:
-            if time.perf_counter() > end or len(slabs) == _MOST_SLABS or leaves_domain(P, 1.0, domain):
+            if time.perf_counter() > end or len(slabs) == most or leaves_domain(P, 1.0, domain):
                 return None
             made = _slab(known, P, rate, goal)
             if made is None or begin - np.linalg.slogdet(made.end)[1] > 2 * _GROWN:

@@ -14,10 +14,15 @@ import pytest
 from numpy.typing import NDArray
 
 from certify.certificate import PartitionTree, read_certificate
+from certify.checker import tube as tube_rule
+from certify.checker.document import read
+from certify.checker.errors import Rejected
+from certify.checker.rules import check
 from certify.claims import Enlarged, Problem
 from certify.closed_loop import ClosedLoop
 from certify.diagnosis import diagnose
 from certify.engines import enlarge as enlarging
+from certify.engines import tube as tubes
 from certify.engines.decrease import best_multipliers, decay_of, multipliers_for, rest_of
 from certify.engines.enlarge import enlarge
 from certify.engines.local import ball_around, local_margin, prove_local
@@ -345,3 +350,16 @@ def test_where_boxes_gain_nothing_the_next_step_is_a_tube(result: RoaResult) -> 
     assert step.options == (("--enlarge", ""),) and "1.1 times" in step.why
     largest = replace(stalled, levels=replace(stalled.levels, roa=domain_limit(result.P, result.system.domain)))
     assert diagnose(largest, RoaOptions(), None).next.options == ()
+
+
+def test_a_tube_is_no_longer_than_the_checker_takes(result: RoaResult, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The producer stops where the checker would refuse, and the checker refuses by its own count."""
+    assert result.certificate is not None and result.tube is not None
+    monkeypatch.setattr(tube_rule, "_MOST_WORK", 16 * result.tube.slabs)
+    check(read(str(result.certificate)))
+    monkeypatch.setattr(tube_rule, "_MOST_WORK", 16 * result.tube.slabs - 1)
+    with pytest.raises(Rejected, match=r"rule=tube.*too long"):
+        check(read(str(result.certificate)))
+    case, goal = pendulum()
+    monkeypatch.setattr(tubes, "_MOST_WORK", 16 * (len(enlarged().slabs) - 1))
+    assert find_tube(paths(case.loop), goal / 1.3**2, goal) is None
