@@ -59,7 +59,10 @@ def _best_of_a_kind(models: Models, b: Array, inverse: Array, joint: bool) -> Sh
     weight, best = inverse.T @ inverse, NOT_SHOWN
     for _ in range(_ROUNDS):
         multipliers = multipliers_for(models, b, weight, joint)
-        values, vectors = np.linalg.eigh(inverse @ rest_of(models, b, multipliers) @ inverse.T)
+        relative = inverse @ rest_of(models, b, multipliers) @ inverse.T
+        if not np.all(np.isfinite(relative)):
+            return best
+        values, vectors = np.linalg.eigh(relative)
         if 1 - values[-1] > best.margin:
             best = Shown(multipliers, float(1 - values[-1]))
         if not values[-1] > 0:

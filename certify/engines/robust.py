@@ -56,7 +56,10 @@ def robust_candidate(loop: ClosedLoop, seconds: float = math.inf) -> Array:
     best = max(proved, key=lambda P: volume(P, 1.0))
     step = _STEP
     while step > _LEAST_STEP and time.perf_counter() < end:
-        asked = _larger(known, best, step)
+        try:
+            asked = _larger(known, best, step)
+        except np.linalg.LinAlgError:  # an ellipsoid without extent in some direction
+            asked = None
         found = None if asked is None else _scaled(loop, known, asked)
         if found is not None and volume(found, 1.0) > _WORTH * volume(best, 1.0):
             best = found

@@ -62,7 +62,10 @@ def find_tube(known: Paths, start: Array, goal: Array, seconds: float = math.inf
         while not np.linalg.eigvalsh(P * _INSIDE - goal)[0] > 0 or not slabs:
             if time.perf_counter() > end or len(slabs) == most or leaves_domain(P, 1.0, domain):
                 return None
-            made = _slab(known, P, rate, goal)
+            try:
+                made = _slab(known, P, rate, goal)
+            except np.linalg.LinAlgError:  # numbers that have no finite model, or an ellipsoid without extent
+                return None
             if made is None or begin - np.linalg.slogdet(made.end)[1] > 2 * _GROWN:
                 return None
             slabs.append(made)

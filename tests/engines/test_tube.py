@@ -26,7 +26,7 @@ from certify.engines import tube as tubes
 from certify.engines.decrease import best_multipliers, decay_of, multipliers_for, rest_of
 from certify.engines.enlarge import enlarge
 from certify.engines.local import ball_around, local_margin, prove_local
-from certify.engines.models import paths
+from certify.engines.models import Models, paths
 from certify.engines.robust import robust_candidate
 from certify.engines.tube import Tube, find_tube
 from certify.errors import InputError
@@ -363,3 +363,11 @@ def test_a_tube_is_no_longer_than_the_checker_takes(result: RoaResult, monkeypat
     case, goal = pendulum()
     monkeypatch.setattr(tubes, "_MOST_WORK", 16 * (len(enlarged().slabs) - 1))
     assert find_tube(paths(case.loop), goal / 1.3**2, goal) is None
+
+
+def test_errors_beyond_binary64_are_not_shown() -> None:
+    """Squares of remainders overflow: that is no margin, and no exception."""
+    E = np.full((2, 2, 2), 1e200)
+    models = Models(-np.eye(2), np.zeros((2, 2, 2)), E, True)
+    with np.errstate(all="ignore"):
+        assert not best_multipliers(models, np.eye(2), np.eye(2)).margin > 0
