@@ -23,7 +23,7 @@ import numpy as np
 import sympy
 from numpy.typing import NDArray
 
-from certify.claims import CLAIMS, Claim, Enlarged
+from certify.claims import CLAIMS, Claim, Enlarged, Reached
 from certify.errors import CertificateFormatError
 from certify.expressions import from_tree, to_tree
 from certify.lyapunov.function import Quadratic
@@ -31,9 +31,10 @@ from certify.policies import TanhNetwork
 from certify.systems import System
 
 Array = NDArray[np.float64]
-SCHEMA = "certify-certificate/4"
+SCHEMA = "certify-certificate/5"
 MAX_BYTES = 256 * 2**20
 _LONGEST_UNIT = 40
+_OF_A_PATH = ("share", "edge", "motion", "joint")
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +47,24 @@ class LocalBall:
 
 
 @dataclass(frozen=True, slots=True)
+class Waypoint:
+    """Where a slab of a tube around a path ends, and what its inequality takes beyond the multipliers.
+
+    Parameters
+    ----------
+    centre : of the slab's ellipsoids at its end, (n,); between its ends it moves on a line.
+    share : of the slab's ball, that its middle's motion takes; between 0 and 1.
+    edge, motion, joint : multipliers of the tube's edge and of the motion, and the motion's entry of the third row.
+    """
+
+    centre: Array
+    share: float
+    edge: float
+    motion: float
+    joint: float
+
+
+@dataclass(frozen=True, slots=True)
 class Slab:
     """A piece of a tube, on which P(t) is a polynomial of degree 2 in Bernstein's form.
 
@@ -54,6 +73,7 @@ class Slab:
     middle, end : its coefficients after that of the slab before, (n, n); the piece ends at {x'Px <= 1}, P = `end`.
     duration : units of time.
     J, multipliers : a ball that contains it, (n, n), and what the matrix inequalities on it take, (3, n).
+    path : None where the ellipsoids stay around the origin.
     """
 
     middle: Array
@@ -61,6 +81,7 @@ class Slab:
     duration: float
     J: Array
     multipliers: Array
+    path: Waypoint | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -255,9 +276,13 @@ def parse_certificate(raw: bytes, name: str) -> Certificate:
 
 def _read_claim(data: Mapping[str, Any], n: int) -> Claim:
     levels = {k: float.fromhex(v) for k, v in data["levels"].items()}
-    if data["claim"]["kind"] == Enlarged.kind:
+    kind = data["claim"]["kind"]
+    if kind == Enlarged.kind:
         return Enlarged(**levels, start=Quadratic(_decode(data["claim"]["start"], (n, n))))
-    return CLAIMS[data["claim"]["kind"]](**levels)
+    if kind == Reached.kind:
+        start, centre = _decode(data["claim"]["start"], (n, n)), _decode(data["claim"]["centre"], (n,))
+        return Reached(**levels, start=Quadratic(start), centre=tuple(centre.tolist()))
+    return CLAIMS[kind](**levels)
 
 
 def _for_people(system: System) -> dict[str, dict[str, str]]:
@@ -302,6 +327,7 @@ def _evidence(evidence: PartitionTree | TrustedSolver) -> dict[str, Any]:
             "tube": [
                 {"middle": _encode(slab.middle), "end": _encode(slab.end), "duration": float(slab.duration).hex()}
                 | _ball(slab)
+                | {"path": None if slab.path is None else _path(slab.path)}
                 for slab in evidence.tube
             ],
         }
@@ -328,6 +354,7 @@ def _read_evidence(data: Mapping[str, Any], n: int) -> PartitionTree | TrustedSo
                     _decode(slab["end"], (n, n)),
                     float.fromhex(slab["duration"]),
                     *_read_ball(slab, n),
+                    None if slab["path"] is None else _read_path(slab["path"], n),
                 )
                 for slab in data["tube"]
             ),
@@ -344,7 +371,18 @@ def _read_ball(data: Mapping[str, str], n: int) -> tuple[Array, Array]:
     return _decode(data["J"], (n, n)), _decode(data["multipliers"], (3, n))
 
 
+def _path(path: Waypoint) -> dict[str, str]:
+    numbers = {name: float(getattr(path, name)).hex() for name in _OF_A_PATH}
+    return {"centre": _encode(path.centre), **numbers}
+
+
+def _read_path(data: Mapping[str, str], n: int) -> Waypoint:
+    return Waypoint(_decode(data["centre"], (n,)), *(float.fromhex(data[name]) for name in _OF_A_PATH))
+
+
 def _start(claim: Claim) -> dict[str, str]:
+    if isinstance(claim, Reached):
+        return {"start": _encode(claim.start.P), "centre": _encode(np.array(claim.centre))}
     return {"start": _encode(claim.start.P)} if isinstance(claim, Enlarged) else {}
 
 

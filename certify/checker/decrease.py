@@ -1,4 +1,5 @@
-"""The matrix inequality of rules `local` and `tube`: that d'J'RJ d + 2 d'J'P F(J d) < 0 for 0 < ||d|| <= 1.
+"""The matrix inequality of rules `local` and `tube`: that d'J'RJ d + 2 d'J'P F(J d) < 0 for 0 < ||d|| <= 1, or, along a
+path, z'J'RJ z + 2 z'J'P (F - v) < 0 where z'J'PJ z = 1.
 
 The models of F come with their rounding errors bounded (ball.py); all that follows from them is in rationals, so that
 no rounding has to be thought of here. FORMAT.md has the inequality, its three sums, and why each of them is a bound.
@@ -11,52 +12,65 @@ from collections.abc import Sequence
 import numpy as np
 from flint import fmpq, fmpq_mat
 
-from .document import Multipliers
+from .document import Multipliers, Path
 from .exact import exactly, is_definite, root_above
 from .float64 import Array
 from .jets import Jet
 
 
 class Models:
-    """F on a ball, in rationals: `a_i.d + d'Q_i d + r_i`, a_i (n,) within s_i, |r_i| <= d'E_i d."""
+    """F - v on a ball, in rationals: `f_i + a_i.d + d'Q_i d + r_i`, (f_i, a_i) within s_i, |r_i| <= d'E_i d; d has k
+    entries. At rest v = 0 and f_i is exactly 0, so that s_i is about a_i alone."""
 
-    def __init__(self, J: Array, F: Sequence[Jet]) -> None:
-        """Parameters are finite; see `are_finite`."""
+    def __init__(self, J: Array, F: Sequence[Jet], velocity: Sequence[fmpq] | None = None) -> None:
+        """J is (n, n), v the velocity of a path. Parameters are finite; see `are_finite`."""
         self.J = exactly(J)
         self.A = exactly(np.array([f.a for f in F]))
-        self.slack = [fmpq(*float(f.slack).as_integer_ratio()) for f in F]
+        self.slack = [rational(f.slack) for f in F]
         self.Q = [exactly(f.Q) for f in F]
         self.E = [exactly(f.E) for f in F]
+        self.f: list[fmpq] = []
+        if velocity is not None:
+            self.f = [rational(f.c) - v for f, v in zip(F, velocity, strict=True)]
+            self.slack = [s + rational(f.error) for s, f in zip(self.slack, F, strict=True)]
 
 
-def are_usable(by: Multipliers) -> bool:
+def are_usable(by: Multipliers, path: Path | None = None) -> bool:
     """None is negative, and g is positive where it is used."""
-    signs = all(v >= 0 for row in (by.rest, by.apart, by.joint) for v in row)
-    return signs and (all(beta > 0 for beta in by.apart) or all(g > 0 for g in by.joint))
+    edges = () if path is None else (path.edge, path.motion, path.joint)
+    signs = all(v >= 0 for row in (by.rest, by.apart, by.joint, edges) for v in row)
+    joint = by.joint if path is None else (*by.joint, path.joint)
+    return signs and (all(beta > 0 for beta in by.apart) or all(g > 0 for g in joint))
 
 
 def are_finite(F: Sequence[Jet]) -> bool:
     """Whether every component has a finite model."""
-    return all(np.all(np.isfinite(part)) for f in F for part in (f.a, f.slack, f.Q, f.E))
+    return all(np.all(np.isfinite(part)) for f in F for part in (f.c, f.error, f.a, f.slack, f.Q, f.E))
 
 
-def shows(models: Models, P: fmpq_mat, R: fmpq_mat, by: Multipliers) -> bool:
-    """Whether the inequality is shown for symmetric P and R (n, n), by these multipliers."""
-    decay, rest = sides(models, P, R, by)
+def shows(models: Models, P: fmpq_mat, R: fmpq_mat, by: Multipliers, path: Path | None = None) -> bool:
+    """Whether the inequality is shown for symmetric P and R (n, n), by these multipliers and those of the path."""
+    decay, rest = sides(models, P, R, by, path)
     return is_definite(decay - rest)
 
 
-def sides(models: Models, P: fmpq_mat, R: fmpq_mat, by: Multipliers) -> tuple[fmpq_mat, fmpq_mat]:
-    """-(J'RJ + B + B') and the sum of all bounds of the rest, both symmetric (n, n)."""
-    n, J = P.nrows(), models.J
-    b = P * J  # b_i is row i
-    rows = [fmpq_mat(1, n, [b[i, j] for j in range(n)]) for i in range(n)]
+def sides(
+    models: Models, P: fmpq_mat, R: fmpq_mat, by: Multipliers, path: Path | None = None
+) -> tuple[fmpq_mat, fmpq_mat]:
+    """What is negative to first order, with its sign changed, and the sum of all bounds of the rest, both symmetric.
+
+    At rest they are -(J'RJ + B + B') and S over d, (n, n); along a path -M and S over (1, d), (n + 2, n + 2).
+    """
+    J, k = models.J, models.A.ncols()
+    b = padded(P * J, 0, k - J.ncols())  # b_i is row i, 0 for the motion
+    rows = [fmpq_mat(1, k, [b[i, j] for j in range(k)]) for i in range(b.nrows())]
     squares = [row.transpose() * row for row in rows]
     lengths = [root_above((row * row.transpose())[0, 0]) for row in rows]
     B = b.transpose() * models.A
-    decay = -(J.transpose() * R * J + B + B.transpose())
-    rest = fmpq_mat(n, n)
-    joint = [fmpq_mat(n, n) for _ in range(n)]
+    form = padded(J.transpose() * R * J, k - J.ncols(), k - J.ncols()) + B + B.transpose()
+    shares = by.joint if path is None else (*by.joint, rational(path.joint))
+    rest = fmpq_mat(k, k)
+    joint = [fmpq_mat(k, k) for _ in range(k)]
     wrong = fmpq(0)
     for i, (alpha, beta) in enumerate(zip(by.rest, by.apart, strict=True)):
         E, Q = models.E[i], models.Q[i]
@@ -70,11 +84,36 @@ def sides(models: Models, P: fmpq_mat, R: fmpq_mat, by: Multipliers) -> tuple[fm
             joint = [C + b[i, j] * Q for j, C in enumerate(joint)]
         wrong += 2 * lengths[i] * models.slack[i]
     if not all(beta > 0 for beta in by.apart):
-        inverse = diagonal([1 / g for g in by.joint])
-        rest += diagonal(by.joint) + sum((C.transpose() * inverse * C for C in joint), fmpq_mat(n, n))
-    return decay, rest + diagonal([wrong] * n)
+        inverse = diagonal([1 / g for g in shares])
+        rest += diagonal(shares) + sum((C.transpose() * inverse * C for C in joint), fmpq_mat(k, k))
+    if path is not None:
+        form = with_edge(form, models, P, b, path)
+        rest = fmpq_mat([[0] * (k + 1), *([0, *row] for row in rest.tolist())])
+    return -form, rest + diagonal([wrong] * rest.nrows())
+
+
+def with_edge(form: fmpq_mat, models: Models, P: fmpq_mat, b: fmpq_mat, path: Path) -> fmpq_mat:
+    """M: the form over (1, d) with the linear part that F - v has at d = 0, and the multipliers of edge and motion."""
+    n, k = P.nrows(), form.nrows()
+    share, edge, motion = rational(path.share), rational(path.edge), rational(path.motion)
+    inner = form + edge * padded(models.J.transpose() * P * models.J, k - n, k - n)
+    inner[k - 1, k - 1] -= motion
+    linear = (fmpq_mat(1, n, models.f) * b).entries()
+    first = [motion * share * share - edge, *linear]
+    return fmpq_mat([first, *([v, *row] for v, row in zip(linear, inner.tolist(), strict=True))])
+
+
+def padded(A: fmpq_mat, rows: int, columns: int) -> fmpq_mat:
+    """A with that many rows and columns of zeros more."""
+    wider = [[*row, *[0] * columns] for row in A.tolist()]
+    return fmpq_mat([*wider, *([0] * (A.ncols() + columns) for _ in range(rows))])
 
 
 def diagonal(entries: Sequence[fmpq]) -> fmpq_mat:
     n = len(entries)
     return fmpq_mat([[entries[i] if i == j else fmpq(0) for j in range(n)] for i in range(n)])
+
+
+def rational(value: float) -> fmpq:
+    """A finite binary64 number as it is."""
+    return fmpq(*float(value).as_integer_ratio())

@@ -18,7 +18,8 @@ from .schema import Value
 from .strict import MAX_VALUES, load
 
 MAX_STATES, MAX_LAYERS, MAX_WIDTH, MAX_SLABS = 64, 64, 2**14, 10**4
-CLAIMS = ("asymptotic", "practical", "enlarged")
+CLAIMS = ("asymptotic", "practical", "enlarged", "reached")
+WITH_TUBE = ("enlarged", "reached")
 Array = NDArray[np.float64]
 Intervals = tuple[tuple[Fraction, Fraction], ...]
 
@@ -63,6 +64,18 @@ class LocalBall:
 
 
 @dataclass(frozen=True)
+class Path:
+    """Where a slab's ellipsoids have their centre at its end, the share of its ball that the motion takes, and the
+    multipliers of the tube's edge and of the motion."""
+
+    centre: Array
+    share: float
+    edge: float
+    motion: float
+    joint: float
+
+
+@dataclass(frozen=True)
 class Slab:
     """A piece of the tube up to the node `end`, in its time, with a ball that contains it and multipliers on it."""
 
@@ -71,6 +84,7 @@ class Slab:
     duration: float
     J: Array
     multipliers: Multipliers
+    path: Path | None
 
 
 @dataclass(frozen=True)
@@ -113,7 +127,8 @@ class Certificate:
     levels: dict[str, float]
     evidence: Partition | Trusted
     sha256: str
-    start: Array | None = None  # P_0 of an enlarged claim
+    start: Array | None = None  # P_0 of a claim with a tube
+    centre: Array | None = None  # c_0 of a claim whose tube follows a path
 
     @property
     def practical(self) -> bool:
@@ -138,14 +153,15 @@ def certificate(data: Any, sha256: str) -> Certificate:
     """A JSON value as a certificate."""
     keys = "schema claim plant policy lyapunov levels evidence provenance"
     schema, claim, plant, policy, lyapunov, levels, evidence, provenance = Value(data).keys(keys)
-    schema.choice("certify-certificate/4")
+    schema.choice("certify-certificate/5")
     known = isinstance(claim.raw, dict) and claim.raw.get("kind") in CLAIMS
     claim.must(known, f"an object of kind {' or '.join(CLAIMS)}")
     kind = claim.raw["kind"]
     stated = _plant(plant)
     n, m = len(stated["states"]), len(stated["inputs"])
     stated["policy"] = _policy(policy, n, m)
-    start = claim.keys("kind start" if kind == "enlarged" else "kind")[1:]
+    stated_of = {"enlarged": "kind start", "reached": "kind start centre"}
+    _, *of_tube = claim.keys(stated_of.get(kind, "kind"))
     form, P = lyapunov.keys("kind P")
     form.choice("quadratic")
     edges = ("floor" if kind == "practical" else "local", "roa")
@@ -158,7 +174,8 @@ def certificate(data: Any, sha256: str) -> Certificate:
         levels=numbers,
         evidence=_evidence(evidence, n, kind),
         sha256=sha256,
-        start=start[0].array(n, n) if start else None,
+        start=of_tube[0].array(n, n) if of_tube else None,
+        centre=of_tube[1].array(n) if kind == "reached" else None,
     )
 
 
@@ -206,10 +223,19 @@ def _local(value: Value, n: int, claim: str) -> LocalBall | None:
     return LocalBall(J.array(n, n), _multipliers(multipliers, n))
 
 
-def _slab(value: Value, n: int) -> Slab:
-    middle, end, duration, J, multipliers = value.keys("middle end duration J multipliers")
+def _slab(value: Value, n: int, claim: str) -> Slab:
+    middle, end, duration, J, multipliers, path = value.keys("middle end duration J multipliers path")
     nodes = middle.array(n, n), end.array(n, n)
-    return Slab(*nodes, duration.binary64(), J.array(n, n), _multipliers(multipliers, n))
+    by = _multipliers(multipliers, n)
+    return Slab(*nodes, duration.binary64(), J.array(n, n), by, _path(path, n, claim))
+
+
+def _path(value: Value, n: int, claim: str) -> Path | None:
+    if claim != "reached":
+        value.must(value.raw is None, "null under this claim")
+        return None
+    centre, *numbers = value.keys("centre share edge motion joint")
+    return Path(centre.array(n), *(number.binary64() for number in numbers))
 
 
 def _multipliers(value: Value, n: int) -> Multipliers:
@@ -233,12 +259,12 @@ def check_hash(policy: Policy, stated: Any) -> None:
 
 
 def _evidence(value: Value, n: int, claim: str) -> Partition | Trusted:
-    kinds = ("partition-tree", *(() if claim == "enlarged" else ("trusted-solver",)))
+    kinds = ("partition-tree", *(() if claim in WITH_TUBE else ("trusted-solver",)))
     known = isinstance(value.raw, dict) and value.raw.get("kind") in kinds
     value.must(known, f"an object of kind {' or '.join(kinds)}")
     if value.raw["kind"] == "partition-tree":
         _, T, root, tree, local, tube = value.keys("kind T root tree local tube")
-        slabs = tube.listed(lambda slab: _slab(slab, n), *((1, MAX_SLABS) if claim == "enlarged" else (0, 0)))
+        slabs = tube.listed(lambda slab: _slab(slab, n, claim), *((1, MAX_SLABS) if claim in WITH_TUBE else (0, 0)))
         return Partition(T.array(n, n), root.array(n), tree.octets(), _local(local, n, claim), slabs)
     _, solver, version, precision, queries = value.keys("kind solver version precision queries")
     precision.must(precision.binary64() > 0, "positive")

@@ -1,5 +1,7 @@
 """The tube: V(t, x) = x'P(t)x decreases along every trajectory in {V <= 1}, from {x'P_0 x <= 1} to inside {V <= c2}.
 
+Around a path c(t) it is V(t, x) = e'P(t)e, e = x - c(t), that decreases where it is 1, so that nothing leaves {V <= 1}.
+
 On each slab P(t) is a polynomial of degree 2 in Bernstein's form, with the coefficients (start, middle, end). What has
 to be negative is one as well, for every x, and is so if its three coefficients are.
 """
@@ -16,9 +18,9 @@ from flint import fmpq, fmpq_mat
 from . import ball
 from .ball import Ball
 from .case import Case, Failures
-from .decrease import Models, are_finite, are_usable, shows
+from .decrease import Models, are_finite, are_usable, rational, shows
 from .document import Slab
-from .exact import contains_ball, exactly, inverse_diagonal, is_definite
+from .exact import contains_ball, exactly, inverse_diagonal, is_definite, root_above
 from .float64 import Array
 
 _MOST_WORK = 2**26  # slabs times n^4, which is what an inequality takes
@@ -26,9 +28,10 @@ _MOST_WORK = 2**26  # slabs times n^4, which is what an inequality takes
 
 @dataclass(frozen=True)
 class Piece(Ball):
-    """A slab on its ball, after the node `start`."""
+    """A slab on its ball, after the node `start` and its `centre`, which is None at rest."""
 
     start: Array
+    centre: Array | None
     slab: Slab
 
     @property
@@ -39,55 +42,99 @@ class Piece(Ball):
     @property
     def rates(self) -> tuple[fmpq_mat, fmpq_mat, fmpq_mat]:
         """Coefficients of its derivative, also of degree 2."""
-        (start, middle, end), h = self.coefficients, fmpq(*self.slab.duration.as_integer_ratio())
+        (start, middle, end), h = self.coefficients, rational(self.slab.duration)
         return 2 * (middle - start) / h, (end - start) / h, 2 * (end - middle) / h
+
+    @property
+    def centres(self) -> list[tuple[Fraction, Fraction]]:
+        """Those of the start and of the end, state by state; 0 at rest."""
+        if self.centre is None or self.slab.path is None:
+            return [(Fraction(0), Fraction(0))] * len(self.J)
+        ends = zip(self.centre.tolist(), self.slab.path.centre.tolist(), strict=True)
+        return [(Fraction(a), Fraction(b)) for a, b in ends]
+
+    @property
+    def motion(self) -> tuple[list[Fraction], list[Fraction]] | None:
+        if self.slab.path is None:
+            return None
+        twice = 2 * Fraction(self.slab.path.share)
+        return [(a + b) / 2 for a, b in self.centres], [(b - a) / twice for a, b in self.centres]
+
+    @property
+    def velocity(self) -> list[fmpq] | None:
+        """Of the centre; None at rest."""
+        if self.slab.path is None:
+            return None
+        moves = [(b - a) / Fraction(self.slab.duration) for a, b in self.centres]
+        return [fmpq(v.numerator, v.denominator) for v in moves]
 
 
 def pieces(case: Case) -> Iterator[Piece]:
     """The slabs in their order."""
-    node = case.c.start
+    node, centre = case.c.start, case.c.centre
     for k, slab in enumerate(case.tube):
         if node is not None:
-            yield Piece(case, slab.J, f"tube[{k}]", node, slab)
-        node = slab.end
+            yield Piece(case, slab.J, f"tube[{k}]", node, centre, slab)
+        node, centre = slab.end, None if slab.path is None else slab.path.centre
 
 
 def nodes_are_sound(case: Case) -> Failures:
     """`tube`: positive definite matrices, whose ellipsoids lie in the interior of the domain, the last in {V <= c2}."""
     if len(case.tube) * len(case.c.states) ** 4 > _MOST_WORK:
         yield "tube", "the tube is too long for this rule"
-    limits = [min(-lo, hi) ** 2 for lo, hi in case.c.domain]
-    start = [] if case.c.start is None else [("start", case.c.start)]
-    middles_and_ends = [(f"tube[{k}]", P) for k, slab in enumerate(case.tube) for P in (slab.middle, slab.end)]
-    for at, P in (*start, *middles_and_ends):
-        inverse = inverse_diagonal(exactly(P))
-        if not (inverse and all(p < limit for p, limit in zip(inverse, limits, strict=True))):
-            yield at, "P must be positive definite, and its ellipsoid lie in the interior of the domain"
-    last, c2 = exactly(case.tube[-1].end), Fraction(case.c.c2)
-    if not is_definite(last - exactly(case.c.P) / fmpq(c2.numerator, c2.denominator)):
+    last = None
+    for piece in pieces(case):
+        for P in piece.coefficients:
+            if not lies_in(case, P, piece.centres):
+                yield piece.at, "P must be positive definite, and its ellipsoid lie in the interior of the domain"
+        last = piece
+    if last is None or not is_attracted(case, exactly(last.slab.end), [b for _, b in last.centres]):
         yield "tube", "the last ellipsoid must lie in {V <= c2}"
     return 0
 
 
+def lies_in(case: Case, P: fmpq_mat, centres: list[tuple[Fraction, Fraction]]) -> bool:
+    """Whether P is symmetric and positive definite, and the ellipsoids around both centres, and so those around all
+    centres between them, lie in the interior of the domain."""
+    inverse = inverse_diagonal(P)
+    sides = zip(inverse, centres, case.c.domain, strict=True) if inverse else ()
+    return bool(inverse) and all(
+        lo < c < hi and p < min(c - lo, hi - c) ** 2 for p, both, (lo, hi) in sides for c in both
+    )
+
+
+def is_attracted(case: Case, P_N: fmpq_mat, centre: list[Fraction]) -> bool:
+    """Whether {(x - c)'P_N (x - c) <= 1} lies in {V <= c2}: by the triangle inequality for (x'Px)^(1/2)."""
+    P, c2 = exactly(case.c.P), Fraction(case.c.c2)
+    c = fmpq_mat(len(centre), 1, [fmpq(q.numerator, q.denominator) for q in centre])
+    level = fmpq(c2.numerator, c2.denominator)
+    left = 1 - root_above((c.transpose() * P * c)[0, 0] / level)
+    return left > 0 and is_definite(P_N - P / (level * left * left))
+
+
 def fits(piece: Piece) -> Failures:
     """`tube`: a positive duration, a ball that contains the three ellipsoids, jets that are not too large."""
-    J = exactly(piece.J)
+    J, path, room = exactly(piece.J), piece.slab.path, Fraction(1)
     if not 0 < piece.slab.duration < np.inf:
         yield piece.at, "the duration must be positive"
-    if not all(contains_ball(J, P, Fraction(1)) for P in piece.coefficients):
+    if path is not None:
+        if not 0 < path.share < 1:
+            yield piece.at, "the share of the motion must lie between 0 and 1"
+        room = 1 / (1 - Fraction(path.share) ** 2)
+    if not all(contains_ball(J, P, room) for P in piece.coefficients):
         yield piece.at, "the ball must contain the ellipsoids of start, middle and end"
-    if not are_usable(piece.slab.multipliers):
+    if not are_usable(piece.slab.multipliers, path):
         yield piece.at, "no multiplier may be negative, none of g 0 where some beta is"
     yield from ball.fits(piece)
     return 0
 
 
 def decreases(piece: Piece) -> Failures:
-    """`tube`: x'P(t)x decreases on the ball without its centre."""
+    """`tube`: x'P(t)x decreases on the ball without its centre; along a path e'P(t)e where it is 1."""
     if not are_finite(piece.F):
         yield piece.at, "F has no finite model"
-    models = Models(piece.J, piece.F)
+    models = Models(piece.J, piece.F, piece.velocity)
     for P, rate in zip(piece.coefficients, piece.rates, strict=True):
-        if not shows(models, P, rate, piece.slab.multipliers):
+        if not shows(models, P, rate, piece.slab.multipliers, piece.slab.path):
             yield piece.at, "the decrease of x'P(t)x is not shown"
     return 1

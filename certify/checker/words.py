@@ -14,6 +14,9 @@ CLAIMS = {
     "enlarged": "the origin is asymptotically stable; every trajectory of the closed loop that starts in V <= {c.c2!r} "
     "stays there and converges to the origin, and every one that starts in x'Sx <= 1 stays in the domain, is in "
     "V <= {c.c2!r} after {time!r} units of time at the latest, and converges to the origin",
+    "reached": "the origin is asymptotically stable; every trajectory of the closed loop that starts in V <= {c.c2!r} "
+    "stays there and converges to the origin, and every one that starts in (x - c)'S(x - c) <= 1 stays in the domain, is "
+    "in V <= {c.c2!r} after {time!r} units of time at the latest, and converges to the origin",
     "practical": "every trajectory of the closed loop that starts in V <= {c.c2!r} stays there, enters "
     "V <= {c.c1!r} in finite time and stays there from then on; nothing is claimed about what happens inside "
     "V <= {c.c1!r}, and the origin need not be an equilibrium",
@@ -42,6 +45,7 @@ def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
         f"sha256 {c.policy.sha256()}",
         f"V(x) = x'Px with P = {_matrix(c.P)}",
         *([] if c.start is None else [f"S = {_matrix(c.start)}"]),
+        *([] if c.centre is None else [f"c = {' '.join(map(repr, c.centre.tolist()))}"]),
         f"claim: {CLAIMS[c.claim].format(c=c, time=_duration(c))}; u stays in its bounds",
         "rules that held: " + ", ".join(f"{rule} {count}" for rule, count in answer["rules"].items()),
         rest,

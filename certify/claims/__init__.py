@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from certify.claims.claim import CLAIMS, Asymptotic, Claim, Enlarged, Practical, Problem
+from certify.claims.claim import CLAIMS, Asymptotic, Claim, Enlarged, Practical, Problem, Reached
 from certify.claims.conditions import BeforeClip, Condition, Guard, OfInput, OfState, Radicand, Vdot, conditions
 
 __all__ = [
@@ -18,6 +18,7 @@ __all__ = [
     "Practical",
     "Problem",
     "Radicand",
+    "Reached",
     "Vdot",
     "conditions",
 ]

@@ -39,7 +39,7 @@ class Problem:
 class Claim:
     """`roa` is c2: the claim is about every trajectory that starts in {V <= c2}."""
 
-    kind: ClassVar[Kind | Literal["enlarged"]]
+    kind: ClassVar[Kind | Literal["enlarged", "reached"]]
     at_rest: ClassVar[bool]  # the origin must be an equilibrium, exactly
     inner_name: ClassVar[str]  # of the level from which the ring reaches outwards to c2
     roa: float
@@ -62,7 +62,7 @@ class Asymptotic(Claim):
     `local` is c1: below it Vdot < 0 is shown by the linearisation, above it by the ring.
     """
 
-    kind: ClassVar[Kind | Literal["enlarged"]] = "asymptotic"
+    kind: ClassVar[Kind | Literal["enlarged", "reached"]] = "asymptotic"
     at_rest = True
     inner_name = "local"
     local: float
@@ -74,6 +74,17 @@ class Enlarged(Asymptotic):
 
     kind = "enlarged"
     start: Quadratic
+
+
+@dataclass(frozen=True, slots=True)
+class Reached(Asymptotic):
+    """The same, and every trajectory from {W(x - c) <= 1}, W = `start`, c = `centre`, reaches {V <= c2} and converges
+    to the origin.
+    """
+
+    kind = "reached"
+    start: Quadratic
+    centre: tuple[float, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,4 +100,6 @@ class Practical(Claim):
     floor: float
 
 
-CLAIMS: Mapping[str, type[Asymptotic] | type[Practical]] = {c.kind: c for c in (Asymptotic, Practical, Enlarged)}
+CLAIMS: Mapping[str, type[Asymptotic] | type[Practical]] = {
+    c.kind: c for c in (Asymptotic, Practical, Enlarged, Reached)
+}

@@ -73,16 +73,17 @@ def _best_of_a_kind(models: Models, b: Array, inverse: Array, joint: bool) -> Sh
 
 
 def decay_of(models: Models, J: Array, b: Array, R: Array | None = None) -> Array:
-    """-(J'RJ + B + B'), (n, n), where row i of b is J'P_i."""
+    """-(J'RJ + B + B'), (k, k), where row i of b (n, k) is J'P_i."""
     B = b.T @ models.A
     return -(B + B.T) - (0.0 if R is None else J.T @ R @ J)
 
 
 def rest_of(models: Models, b: Array, multipliers: Array) -> Array:
-    """The sum of the bounds of all that the decay is not, (n, n)."""
-    alpha, beta, g = multipliers
-    rest = np.zeros_like(b)
-    for i in range(len(b)):
+    """The sum of the bounds of all that the decay is not, (k, k); multipliers (3, k), of which alpha and beta use n."""
+    n, k = b.shape
+    (alpha, beta), g = multipliers[:2, :n], multipliers[2]
+    rest = np.zeros((k, k))
+    for i in range(n):
         E, Q, square = models.E[i], models.Q[i], np.outer(b[i], b[i])
         rest += alpha[i] * square + E.T @ E / alpha[i] if alpha[i] > 0 else 2 * np.linalg.norm(b[i]) * E
         rest += beta[i] * square + Q.T @ Q / beta[i] if beta[i] > 0 else 0.0
@@ -93,7 +94,7 @@ def rest_of(models: Models, b: Array, multipliers: Array) -> Array:
 
 
 def multipliers_for(models: Models, b: Array, weight: Array, joint: bool | None = None) -> Array:
-    """Those with the least trace of weight times the sum of the bounds; weight (n, n) is positive definite.
+    """Those with the least trace of weight times the sum of the bounds, (3, k), for weight (k, k) positive definite.
 
     `joint` says whether the Q of all components are taken jointly or all apart; None is what has the smaller trace.
     """
@@ -116,14 +117,17 @@ def multipliers_for(models: Models, b: Array, weight: Array, joint: bool | None 
         beta, g = np.zeros_like(beta), np.maximum(g, least)
     else:  # what has no Q stays joint, at next to no cost
         g = np.full_like(g, least)
-    return np.array([_short(np.where(np.isfinite(alpha), alpha, 0.0)), _short(beta), _short(g)])
+    unused = np.zeros(b.shape[1] - len(b))
+    alpha, beta = (np.append(row, unused) for row in (np.where(np.isfinite(alpha), alpha, 0.0), beta))
+    return np.array([short(alpha), short(beta), short(g)])
 
 
 def _joint(models: Models, b: Array, chosen: NDArray[np.bool_]) -> Array:
-    """C_j = sum over the chosen components of (b_i)_j Q_i, (n, n, n)."""
+    """C_j = sum over the chosen components of (b_i)_j Q_i, (k, k, k)."""
     return np.tensordot(b[chosen].T, models.Q[chosen], 1)
 
 
-def _short(values: Array) -> Array:
+def short(values: Array) -> Array:
+    """The numbers to a few bits."""
     mantissa, exponent = np.frexp(values)
     return np.asarray(np.ldexp(np.round(mantissa * 2.0**_SHORT) / 2.0**_SHORT, exponent))

@@ -1,9 +1,10 @@
-"""Second-order models of the closed loop on a ball around the origin, in floats: what rules `local` and `tube` bound.
+"""Second-order models of the closed loop on a ball, in floats: what rules `local` and `tube` bound.
 
-On the ball x = J d, ||d|| <= 1, every quantity is written `v(0) + a.d + d'Q d + r(d)` with |r(d)| <= d'E d and E
-positive semidefinite, for all d in the ball, so the bound holds for every smaller radius too and leaves no hole at the
-origin. What each tanh adds to its tangent reaches the output through the products of weights and slopes at the origin,
-`Paths`, in which it cancels as it does in truth; they do not depend on the ball.
+On the ball x = m + J d, ||d|| <= 1, every quantity is written `v(0) + a.d + d'Q d + r(d)` with |r(d)| <= d'E d and E
+positive semidefinite, for all d in the ball, so the bound holds for every smaller radius too and leaves no hole at its
+middle m. What each tanh adds to its tangent reaches the output through the products of weights and slopes at m,
+`Paths`, in which it cancels as it does in truth; they do not depend on the ball. d may have more entries than x: along
+a path its last is the motion.
 """
 
 from __future__ import annotations
@@ -29,11 +30,13 @@ _MARGIN = 1e-3  # of an input's range, left to the checker's rounding where a cl
 
 @dataclass(frozen=True, slots=True)
 class Models:
-    """The components of F on a ball: gradients A (n, n), half Hessians Q and remainders E (n, n, n).
+    """The components of F on a ball: values f (n,) at its middle, gradients A (n, k), half Hessians Q and remainders
+    E (n, k, k), k the entries of d.
 
     `admitted` says that every input is certain to lie in its bounds and inside its clip.
     """
 
+    f: Array
     A: Array
     Q: Array
     E: Array
@@ -123,48 +126,54 @@ class Jet:
 
 
 class Jets(Algebra[Jet]):
-    def __init__(self, n: int) -> None:
-        self.n = n
+    def __init__(self, k: int) -> None:
+        self.k = k
 
     def constant(self, q: Fraction) -> Jet:
-        nothing = np.zeros((self.n, self.n))
-        return Jet(float(q), np.zeros(self.n), nothing, nothing)
+        nothing = np.zeros((self.k, self.k))
+        return Jet(float(q), np.zeros(self.k), nothing, nothing)
 
 
 @dataclass(frozen=True, slots=True)
 class _Layer:
-    """`y = y(0) + X [x, A]`: A stacks what every tanh before this layer adds to its tangent at the origin."""
+    """`y = y(m) + X [x - m, A]`: A stacks what every tanh before this layer adds to its tangent at m."""
 
     X: Array
-    half: Array  # half of this layer's tanh's second derivative at the origin
+    half: Array  # half of this layer's tanh's second derivative at m
 
 
 @dataclass(frozen=True, slots=True)
 class Paths:
-    """The closed loop at the origin: all of its models that does not depend on the ball."""
+    """The closed loop at a state `middle`, (n,): all of its models that does not depend on the ball around it.
+
+    `u` are the inputs there, before a clip; `slope` is that of the last layer's tanh, (m,), None with squash
+    `identity`.
+    """
 
     loop: ClosedLoop
+    middle: Array
+    u: Array
     layers: tuple[_Layer, ...]
-    slope: Array | None  # of the last layer's tanh, (m,); None with squash `identity`
+    slope: Array | None
 
     def models(self, J: Array) -> Models:
-        """F on the ball x = J d, ||d|| <= 1; J is (n, n)."""
-        loop, n = self.loop, len(J)
-        system, nothing = loop.system, np.zeros((n, n))
-        states = [Jet(0.0, row, nothing, nothing) for row in J]
-        each = zip(loop.u_eq, loop.network.scale, *self._policy(J), strict=True)
+        """F on the ball x = middle + J d, ||d|| <= 1; J is (n, k)."""
+        loop, k = self.loop, J.shape[1]
+        system, nothing = loop.system, np.zeros((k, k))
+        states = [Jet(float(m), row, nothing, nothing) for m, row in zip(self.middle, J, strict=True)]
+        each = zip(self.u, loop.network.scale, *self._policy(J), strict=True)
         inputs = [Jet(float(u), float(s) * a, float(s) * Q, abs(float(s)) * E) for u, s, a, Q, E in each]
         values = dict(zip((*system.states, *system.inputs), (*states, *inputs), strict=True))
-        algebra, shared = Jets(n), dict[Any, Jet]()
+        algebra, shared = Jets(k), dict[Any, Jet]()
         F = [evaluate(e, values, algebra, shared) for e in system.exact_dynamics()]
-        A, Q, E = (np.array([getattr(v, part) for v in F]) for part in ("a", "Q", "E"))
-        return Models(A, Q, E, _are_admitted(loop, inputs))
+        f, A, Q, E = (np.array([getattr(v, part) for v in F]) for part in ("c", "a", "Q", "E"))
+        return Models(f, A, Q, E, _are_admitted(loop, inputs))
 
     def _policy(self, J: Array) -> tuple[Array, Array, Array]:
-        """Gradients (m, n), half Hessians and remainders (m, n, n) of the outputs on x = J d, before scaling."""
-        n = len(J)
-        quad, rest = np.zeros((0, n * n)), np.zeros((0, n * n))
-        eye = np.eye(n).ravel()
+        """Gradients (m, k), half Hessians and remainders (m, k, k) of the outputs on the ball, before scaling."""
+        n, k = J.shape
+        quad, rest = np.zeros((0, k * k)), np.zeros((0, k * k))
+        eye = np.eye(k).ravel()
         for layer in self.layers:
             G, M = layer.X[:, :n] @ J, layer.X[:, n:]
             Q, E = M @ quad, np.abs(M) @ rest
@@ -179,11 +188,12 @@ class Paths:
         if self.slope is not None:
             s = self.slope[:, None]
             G, Q, E = s * G, s * Q + added, s * E + beyond
-        return G, Q.reshape(-1, n, n), E.reshape(-1, n, n)
+        return G, Q.reshape(-1, k, k), E.reshape(-1, k, k)
 
 
-def paths(loop: ClosedLoop) -> Paths:
-    """Follow the states and every tanh's output through the network's linearisation at the origin.
+def paths(loop: ClosedLoop, at: Array | None = None) -> Paths:
+    """Follow the states and every tanh's output through the network's linearisation at a state, (n,), the origin if
+    none is given.
 
     Raises
     ------
@@ -197,20 +207,21 @@ def paths(loop: ClosedLoop) -> Paths:
         products += len(W) * columns * n**2
         if columns * (len(W) + n**2) > _MOST_NUMBERS or products > _MOST_PRODUCTS:
             raise InputError("The network is too large for the local proof: use fewer or narrower layers.")
-    h, X = np.zeros(n), np.eye(n)
+    folded, middle = loop.folded, np.zeros(n) if at is None else at
+    h, X = middle, np.eye(n)
     layers = []
-    for number, (W, b) in enumerate(zip(network.weights, network.biases, strict=True)):
-        last = number == len(network.weights) - 1
+    for number, (W, b) in enumerate(zip(folded.weights, folded.biases, strict=True)):
         y, X = W @ h + b, W @ X
         if number:
             X = np.concatenate([X, W], axis=1)
-        if last and squash:
-            y = network.squashed_at_origin(y, loop.u_eq)
         h = np.tanh(y)
         slope = 1 - h**2
         layers.append(_Layer(X, -h * slope))
         X = slope[:, None] * X
-    return Paths(loop, tuple(layers), slope if squash else None)
+    u = np.array([float(q) for q in loop.u_eq])
+    if at is not None:
+        u = folded.scale * (h if squash else y) + folded.offset
+    return Paths(loop, middle, u, tuple(layers), slope if squash else None)
 
 
 def _are_admitted(loop: ClosedLoop, inputs: list[Jet]) -> bool:

@@ -10,7 +10,9 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import scipy.linalg
@@ -22,22 +24,24 @@ from certify.engines.models import Models, Paths
 from certify.lyapunov import leaves_domain
 
 Array = NDArray[np.float64]
-_WIDER = 1.05  # of a slab's ball, relative to the ellipsoid halfway: how far the ends may differ from that
-_FILLED = 0.9  # of what `_WIDER` allows, by the first guess of a slab's duration
+Growth = Callable[[Array], Array]
+WIDER = 1.05  # of a slab's ball, relative to the ellipsoid halfway: how far the ends may differ from that
+_FILLED = 0.9  # of what `WIDER` allows, by the first guess of a slab's duration
 _LONGEST = 0.5  # units of time of a slab
 _SURPLUS = 1e-3  # decrease of V per unit of time that is left to the checker's rounding
-_CORRECTIONS, _SHORTENINGS = 5, 12  # of a slab's rate, of its duration
-_MOST_SLABS, _MOST_WORK = 4000, 2**26  # the second over n^4: the checker refuses more
+_CORRECTIONS, SHORTENINGS = 5, 12  # of a slab's rate, of its duration
+MOST_SLABS, MOST_WORK = 4000, 2**26  # the second over n^4: the checker refuses more
 _GROWN = 8.0  # logarithm of a volume, relative to the start, at which a tube is given up
-_INSIDE = 1 - 1e-6  # of the goal, beyond all rounding
+INSIDE = 1 - 1e-6  # of the goal, beyond all rounding
 
 
 @dataclass(frozen=True, slots=True)
 class Tube:
-    """From {x'Px <= 1}, P = `start` (n, n), through the slabs."""
+    """From {(x - c)'P(x - c) <= 1}, P = `start` (n, n), c = `centre` (n,), through the slabs; None at rest, c = 0."""
 
     start: Array
     slabs: tuple[Slab, ...]
+    centre: tuple[float, ...] | None = None
 
     @property
     def duration(self) -> float:
@@ -57,9 +61,9 @@ def find_tube(known: Paths, start: Array, goal: Array, seconds: float = math.inf
     slabs: list[Slab] = []
     P, rate = start, None
     begin, domain = np.linalg.slogdet(start)[1], known.loop.system.domain
-    most = min(_MOST_SLABS, _MOST_WORK // len(start) ** 4)
+    most = min(MOST_SLABS, MOST_WORK // len(start) ** 4)
     with np.errstate(all="ignore"):  # what overflows is not shown
-        while not np.linalg.eigvalsh(P * _INSIDE - goal)[0] > 0 or not slabs:
+        while not np.linalg.eigvalsh(P * INSIDE - goal)[0] > 0 or not slabs:
             if time.perf_counter() > end or len(slabs) == most or leaves_domain(P, 1.0, domain):
                 return None
             try:
@@ -79,46 +83,49 @@ def _slab(known: Paths, P: Array, rate: Array | None, weight: Array) -> Slab | N
     The multipliers are best where it counts, in the directions in which `weight` (n, n) is large.
     """
     if rate is None:
-        J = _WIDER * _root(P)
+        J = WIDER * root(P)
         models = known.models(J)
         if not (models.finite and models.admitted):
             return None
-        rate = _back(-_growth(models, J, P, _multipliers(models, J, P, weight)), J)
-    duration = _first_duration(P, rate)
-    for _ in range(_SHORTENINGS):
+        rate = _back(-_growth(models, J, _multipliers(models, J, P, weight), P), J)
+    duration = first_duration(P, rate)
+    for _ in range(SHORTENINGS):
         middle = P + duration / 2 * rate
-        if _is_definite(middle):
-            J = _WIDER * _root(middle)
+        if is_definite(middle):
+            J = WIDER * root(middle)
             models = known.models(J)
             if models.finite and models.admitted:
                 multipliers = _multipliers(models, J, P, weight)
-                nodes = _nodes(models, J, P, duration, multipliers)
+                nodes = nodes_of(partial(_growth, models, J, multipliers), J, P, duration)
                 if nodes is not None:
                     return Slab(*nodes, duration, J, multipliers)
         duration *= 0.6
     return None
 
 
-def _nodes(models: Models, J: Array, P: Array, duration: float, multipliers: Array) -> tuple[Array, Array] | None:
+def nodes_of(growth: Growth, J: Array, P: Array, duration: float, room: float = 1.0) -> tuple[Array, Array] | None:
     """Middle and end after `duration`: V decreases on the slab, and its ball contains the three ellipsoids.
+
+    `growth` gives for P the G (n, n) with 2 x'PF <= d'G d on the ball of J, and `room` is the level of the ellipsoids
+    that the ball has to contain.
 
     P leaves its start at the rate that decrease asks for there, and reaches its end at one that is enough there and,
     with the first, halfway. To second order in the duration the two demands agree.
     """
     ball = J.T @ P @ J
-    surplus, first = _SURPLUS * ball, _growth(models, J, P, multipliers)
+    surplus, first = _SURPLUS * ball, growth(P)
     start_rate = -first - surplus
     middle = _symmetric(P + duration / 2 * _back(start_rate, J))
-    if not (_contains(J, P) and _contains(J, middle)):
+    if not (_contains(J, P, room) and _contains(J, middle, room)):
         return None
-    halfway = _growth(models, J, middle, multipliers)
+    halfway = growth(middle)
     asked = 2 * halfway + start_rate
     worst = asked
     for _ in range(_CORRECTIONS):
         end = _symmetric(middle + duration / 2 * _back(-worst - surplus, J))
-        if not _contains(J, end):
+        if not _contains(J, end, room):
             return None
-        last = _growth(models, J, end, multipliers)
+        last = growth(end)
         rates = (2 * (middle - P), end - P, 2 * (end - middle))
         growths = (first, halfway, last)
         if all(np.linalg.eigvalsh(J.T @ r @ J / duration + g)[-1] < 0 for r, g in zip(rates, growths, strict=True)):
@@ -128,8 +135,7 @@ def _nodes(models: Models, J: Array, P: Array, duration: float, multipliers: Arr
     return None
 
 
-def _growth(models: Models, J: Array, P: Array, multipliers: Array) -> Array:
-    """G (n, n) with 2 x'PF <= d'G d on the ball."""
+def _growth(models: Models, J: Array, multipliers: Array, P: Array) -> Array:
     b = P @ J
     return rest_of(models, b, multipliers) - decay_of(models, J, b)
 
@@ -138,10 +144,10 @@ def _multipliers(models: Models, J: Array, P: Array, weight: Array) -> Array:
     return multipliers_for(models, P @ J, J.T @ weight @ J)
 
 
-def _first_duration(P: Array, rate: Array) -> float:
+def first_duration(P: Array, rate: Array) -> float:
     """After which the ends differ from the ellipsoid halfway by what a ball allows."""
     fastest = float(np.max(np.abs(scipy.linalg.eigh(rate, P, eigvals_only=True))))
-    return min(_LONGEST, 2 * _FILLED * (1 - _WIDER**-2) / fastest) if fastest > 0 else _LONGEST
+    return min(_LONGEST, 2 * _FILLED * (1 - WIDER**-2) / fastest) if fastest > 0 else _LONGEST
 
 
 def _back(G: Array, J: Array) -> Array:
@@ -154,15 +160,15 @@ def _symmetric(X: Array) -> Array:
     return np.asarray((X + X.T) / 2)
 
 
-def _contains(J: Array, P: Array) -> bool:
-    """Whether {x'Px <= 1} lies in {J d : ||d|| <= 1}."""
-    return bool(np.linalg.eigvalsh(J.T @ P @ J)[0] > _INSIDE**-1)
+def _contains(J: Array, P: Array, room: float) -> bool:
+    """Whether {x'Px <= room} lies in {J d : ||d|| <= 1}."""
+    return bool(np.linalg.eigvalsh(J.T @ P @ J)[0] > room / INSIDE)
 
 
-def _root(P: Array) -> Array:
+def root(P: Array) -> Array:
     """L with L L' = P^-1: {x'Px <= 1} is {L d : ||d|| <= 1}."""
     return np.asarray(np.linalg.inv(np.linalg.cholesky(P)).T)
 
 
-def _is_definite(P: Array) -> bool:
+def is_definite(P: Array) -> bool:
     return bool(np.linalg.eigvalsh(P)[0] > 0)
