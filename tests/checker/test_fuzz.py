@@ -134,7 +134,7 @@ def text(node: Any) -> str:
 TOKENS = [
     "{", "}", "[", "]", ",", ":", '"', "\\", "\\u", "\\ud800", "\\u0000", "null", "true", "false", "NaN", "Infinity",
     "-Infinity", "0", "-0", "1", "-", "1e9", "1E400", "0.5", "1234567890", "12345678901", "9" * 5000, '"a"', '""',
-    '"schema"', '"certify-certificate/4"', '"plant"', '"x"', '"0x1.0000000000000p+0"', "0x10", "//", "/*", "'a'", " ",
+    '"schema"', '"certify-certificate/5"', '"plant"', '"x"', '"0x1.0000000000000p+0"', "0x10", "//", "/*", "'a'", " ",
     "\n", "\t", "\x00", "\x1f", "\x7f", "\u0661", "\u2028", "\ufeff", "\U0001f600", "\ud800", "\udfff", "[" * 500,
     '{"a":' * 500, "[" * 2000 + "]" * 2000,
 ]  # fmt: skip
@@ -268,7 +268,7 @@ json_edits = st.lists(
 
 @st.composite
 def edited_json(draw: st.DrawFn) -> bytes:
-    top = {"": edited(SEEDS[draw(seeds)](), "schema", "certify-certificate/4")}  # a deep copy
+    top = {"": edited(SEEDS[draw(seeds)](), "schema", "certify-certificate/5")}  # a deep copy
     for kind, position, other, value in draw(json_edits):
         found = places(top)
         if not found:
@@ -428,7 +428,7 @@ def any_numbers(draw: st.DrawFn) -> bytes:
             return mine if draw(st.booleans()) else ball_of(array(n, n), np.abs(array(3, n)))
 
         times = draw(st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=1, max_size=2))
-        slabs = [{"middle": node(1.5), "end": node(2.0), "duration": h.hex()} | one_ball() for h in times]
+        slabs = [{"middle": node(1.5), "end": node(2.0), "duration": h.hex(), "path": None} | one_ball() for h in times]
         data = edited(data, "claim", {"kind": "enlarged", "start": node(1.0)})
         data["evidence"]["tube"] = slabs
     return dump(data)
