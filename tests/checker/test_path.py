@@ -8,6 +8,7 @@ points of the ball, and, exactly, of the worst that models allow.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from fractions import Fraction
@@ -26,11 +27,11 @@ from certify.checker.decrease import Models, are_usable, shows, sides
 from certify.checker.document import Certificate, Multipliers, Path
 from certify.checker.exact import exactly
 from certify.checker.jets import Jet
-from tests.checker.test_rules import at, array, both, level, linear_claim, rehashed, rotor_claim
+from tests.checker.test_rules import array, at, both, level, linear_claim, rehashed, rotor_claim
 from tests.checker.test_tube import CUBIC, NO_CURVATURE, NONE, Edit, ball, joint, scalar, verdicts
 from tests.support.certificates import Document, decode, edited, encode, make, parse, rehash, verdict
 from tests.support.oracle import ball as exact
-from tests.support.oracle import policy_in_arb, quadratic, value_of
+from tests.support.oracle import policy_in_arb, quadratic
 from tests.support.reached import attracted, field_in_arb, loop_of, nodes_before, rates_outwards, surrounded
 
 # ------------------------------------------------------------------------------------------------- honest certificates
@@ -52,8 +53,8 @@ def moved(before: float, after: float, h: float, radius: float, *, slower: float
     alpha = -(1 - slower) * (before + after) / 2 - (after - before) / h
     line, motion = abs(alpha) / radius + 2.0**-12, (1 - slower) * abs(after - before) / 2 / radius + 2.0**-12
     J, P = radius * math.sqrt(1 / (1 - share**2)) * (1 + 2.0**-20), encode([1 / radius**2])
-    return {"middle": P, "end": P, "duration": h.hex(), "path": waypoint([after], share, line + motion, motion / share**2)
-            } | ball(J, NO_CURVATURE)  # fmt: skip
+    path = waypoint([after], share, line + motion, motion / share**2)
+    return {"middle": P, "end": P, "duration": h.hex(), "path": path} | ball(J, NO_CURVATURE)
 
 
 def glide(
@@ -62,11 +63,13 @@ def glide(
     """From |x - 2| <= 1/4 by lines between points of the flow into |x| < 1; on the other side from |x + 2| <= 1/4."""
     centres = [side * 2 * STEP**k for k in range(7)]
     h = -math.log(STEP)
-    slabs = [moved(a, b, h, radius, slower=slower, share=share) for a, b in zip(centres, centres[1:], strict=False)]
+    slabs = [moved(a, b, h, radius, slower=slower, share=share) for a, b in itertools.pairwise(centres)]
     return following(dynamics or ["-", "x"], 1.0, ball(1.5, NO_CURVATURE), 1 / radius**2, centres[0], slabs)
 
 
-def following(dynamics: Any, c: float, local: Document, start: float, centre: float, slabs: Any, **more: Any) -> Document:
+def following(
+    dynamics: Any, c: float, local: Document, start: float, centre: float, slabs: Any, **more: Any
+) -> Document:
     """In V = x^2 with c1 = c2 = c: the tree is a leaf of which nothing is asked."""
     data = scalar(dynamics, c, local, start, slabs, **more)
     data["claim"] = {"kind": "reached", "start": encode([start]), "centre": encode([centre])}
@@ -272,15 +275,15 @@ FORGERIES: list[tuple[str, str, Edit]] = [  # of the rotor
     ("c2 is larger, and the root", "local", both(level("local", 0.3), level("roa", 0.3), times("evidence.root", 5))),
     ("P is larger", "tube", times("lyapunov.P", 2)),
     ("P is smaller", "root", times("lyapunov.P", 0.5)),
-    ("the domain is touched", "tube", lambda d: touching(d)),
+    ("the domain is touched", "tube", touching),
     ("less torque than the path takes", "inputs", at("plant.input_bounds", [["-1/4", "5/2"]])),
     ("a clip that the path alone meets", "tube", rehashed("clip", [encode([-0.4]), encode([2.5])])),
     *[(f"a plant with {tree} more", "tube", term(1, tree)) for tree in (
         ["*", "4", ["**", "theta", 3]], ["*", "20", ["**", "theta", 4]], ["*", "80", ["**", "theta", 5]],
         ["*", "4", "theta", ["-", "1", ["cos", ["*", "2", "theta"]]]])],
-    ("a pole on the path alone", "tube", term(1, ["*", "1/1000000", ["/", ["**", "theta", 2], ["-", "theta", "2/5"]]])),
+    ("a pole on the path alone", "tube", term(1, ["/", ["*", "1/999999", ["**", "theta", 2]], ["-", "theta", "2/5"]])),
     ("the same, times 0", "tube", term(1, ["*", "0", ["/", ["**", "theta", 2], ["-", "theta", "2/5"]]])),
-    ("a root on the path alone", "tube", term(1, ["*", "1/1000000", ["**", "theta", 2], ["sqrt", ["-", "2/5", "theta"]]])),
+    ("a root on the path alone", "tube", term(1, ["*", "1/999999", "theta", "theta", ["sqrt", ["-", "2/5", "theta"]]])),
     ("another policy", "hash", times("policy.layers.0.weight", 1.01)),
     ("another policy, rehashed", "tube", lambda d: rehash(times("policy.layers.0.weight", 1.1)(d))),
     ("not at rest", "equilibrium", term(1, "1/1000000000")),
@@ -308,7 +311,7 @@ OF_GLIDE: list[tuple[str, str, Callable[[], Document]]] = [
     ("a ball that misses the motion alone", "tube", lambda: times(f"{FIRST}.J", 0.9)(glide())),
     ("a share that leaves no room", "tube", lambda: number(f"{FIRST}.path.share", 0.51)(glide())),
     ("no tube arrives at a point of the edge", "tube", lambda: edited(glide(), "evidence.tube", lambda s: s[:2])),
-    ("nothing moves", "tube", lambda: edited(glide(), "evidence.tube", lambda s: s[:0] + [moved(2.0, 2.0, 1.0, 1.9)])),
+    ("nothing moves", "tube", lambda: edited(glide(), "evidence.tube", [moved(2.0, 2.0, 1.0, 1.9)])),
 ]  # fmt: skip
 
 
@@ -363,6 +366,14 @@ MALFORMED: dict[str, Edit] = {
 @pytest.mark.parametrize("name", MALFORMED)
 def test_malformed_paths(name: str) -> None:
     assert verdicts(MALFORMED[name](glide())) == {"format"}
+
+
+@pytest.mark.parametrize("value", [None, False, 0, 3, "", "a text", [], [[]], {}, {"a": []}], ids=repr)
+def test_a_value_of_another_type_is_malformed(value: Any) -> None:
+    data = glide()
+    for path in [*(f"claim{p}" for p in ("", ".start", ".centre")), f"{FIRST}.path", FIRST, *(
+        f"{FIRST}.path.{key}" for key in ("centre", "share", "edge", "motion", "joint"))]:  # fmt: skip
+        assert verdict(edited(data, path, value)) == "format", path
 
 
 # ------------------------------------------------------------------------------ planted violations, of a few per cent
@@ -422,7 +433,7 @@ def test_planted_violations_are_refused(name: str) -> None:
 
 @pytest.mark.parametrize("name", HONEST)
 def test_nothing_leaves_the_tube_where_the_true_field_is_asked(name: str) -> None:
-    """In ball arithmetic: every rate where W = 1 is negative, such x lie in the domain and their inputs in the bounds."""
+    """In ball arithmetic: every rate where W = 1 is negative, such x lie in the domain, their inputs in the bounds."""
     c = parse(HONEST[name]())
     generator, highest = np.random.default_rng(5), -math.inf
     with ctx.workprec(120):
@@ -477,7 +488,7 @@ def test_no_path_leads_from_beyond_the_region_of_attraction(
     """x' = x^3 - x rests at 1: whatever stands in a tube from a set that holds a point x >= 1 is no proof."""
     centres = np.linspace(reach - radius, 0.0, count + 1).tolist()
     slabs = []
-    for a, b in zip(centres, centres[1:], strict=False):
+    for a, b in itertools.pairwise(centres):
         slab = moved(a, b, h, radius, share=share)
         slab["end"] = encode([max(4.5, 1 / radius**2)]) if b == 0.0 else slab["end"]
         slabs.append(slab | {"multipliers": encode([[1.0], [0.0], [1.0]])})
@@ -510,6 +521,148 @@ def test_in_one_state_a_tube_is_shown_exactly_where_there_is_one(
         assert not list(tube.fits(piece))
         shown = not list(tube.decreases(piece))
     assert shown == (worst < 1)
+
+
+# ------------------------------------------------------------ edits as large as the checker lets through, and a campaign
+
+Size = Callable[[Document, float, np.random.Generator], Document]
+
+
+def one_slab(data: Document, generator: np.random.Generator) -> str:
+    return f"evidence.tube.{generator.integers(len(data['evidence']['tube']))}"
+
+
+def scaled(key: str) -> Size:
+    return lambda d, size, g: times(f"{one_slab(d, g)}.{key}", 1 + size * float(g.choice([-1, 1])))(d)
+
+
+def pushed(key: str) -> Size:
+    return lambda d, size, g: array(f"{one_slab(d, g)}.{key}", lambda a: a + size * g.standard_normal(len(a)))(d)
+
+
+def counted(key: str) -> Size:
+    return lambda d, size, g: number(f"{one_slab(d, g)}.{key}", lambda v: v * (1 + size * float(g.choice([-1, 1]))))(d)
+
+
+def bent(key: str) -> Size:
+    """Congruent to what it was, and symmetric."""
+
+    def change(data: Document, size: float, generator: np.random.Generator) -> Document:
+        def of(a: np.ndarray) -> np.ndarray:
+            n = math.isqrt(len(a))
+            B = np.eye(n) + size * generator.standard_normal((n, n))
+            A = B.T @ a.reshape(n, n) @ B
+            return (A + A.T) / 2
+
+        return array(f"{one_slab(data, generator)}.{key}" if key != START else key, of)(data)
+
+    return change
+
+
+def another_plant(data: Document, size: float, generator: np.random.Generator) -> Document:
+    states = data["plant"]["states"]
+    i, x, y = int(generator.integers(len(states))), *generator.choice(states, 2)
+    k = str(Fraction(size * float(generator.choice([-1, 1]))))
+    trees = [["*", k, x, y], ["*", k, ["**", x, 3]], ["*", k, x, ["sin", y]], ["*", k, ["-", ["cos", x], "1"]]]
+    return term(i, trees[generator.integers(len(trees))])(data)
+
+
+def another_policy(data: Document, size: float, generator: np.random.Generator) -> Document:
+    path = f"policy.layers.{generator.integers(len(data['policy']['layers']))}.weight"
+    return rehash(array(path, lambda a: a * (1 + size * generator.standard_normal(len(a))))(data))
+
+
+def another_domain(data: Document, size: float, generator: np.random.Generator) -> Document:
+    path = f"plant.domain.{generator.integers(len(data['plant']['domain']))}.{generator.integers(2)}"
+    return edited(data, path, lambda q: str(Fraction(q) * Fraction(1 - min(size, 0.999))))
+
+
+SIZED: dict[str, Size] = {
+    "a larger start": lambda d, size, g: times(START, 1 / (1 + size))(d),
+    "another start": bent(START),
+    "another centre": lambda d, size, g: array(CENTRE, lambda a: a + size * g.standard_normal(len(a)))(d),
+    "another path": pushed("path.centre"),
+    "a duration": counted("duration"),
+    "a share": counted("path.share"),
+    "an edge": counted("path.edge"),
+    "a motion": counted("path.motion"),
+    "a joint": counted("path.joint"),
+    "multipliers": scaled("multipliers"),
+    "a ball": scaled("J"),
+    "a middle": bent("middle"),
+    "an end": bent("end"),
+    "a smaller c2": lambda d, size, g: both(*(
+        number(f"levels.{key}", lambda c: c / (1 + size)) for key in ("local", "roa")))(d),
+    "another P": lambda d, size, g: times("lyapunov.P", 1 + size)(d),
+    "another plant": another_plant,
+    "another policy": another_policy,
+    "a smaller domain": another_domain,
+}  # fmt: skip
+
+
+def assert_true(data: Document, directions: int) -> None:
+    """Condition 7' at points of each slab's edge, and where those lie; the last ellipsoid in {V <= c2}."""
+    c = parse(data)
+    generator = np.random.default_rng(8)
+    with ctx.workprec(100):
+        for slab, before in zip(c.evidence.tube, nodes_before(c), strict=True):
+            for s in (Fraction(0), Fraction(1, 2), Fraction(1)):
+                for rate, x in rates_outwards(
+                    c, before, slab, s, generator.standard_normal((directions, len(c.states)))
+                ):
+                    assert rate < 0
+                    assert all(exact(lo) < v < exact(hi) for v, (lo, hi) in zip(x, c.domain, strict=True))
+        slab = c.evidence.tube[-1]
+        edge = np.linalg.inv(np.linalg.cholesky(slab.end)).T @ generator.standard_normal((len(c.states), 99))
+        edge /= np.sqrt(np.einsum("ik,ij,jk->k", edge, slab.end, edge))
+        x = slab.path.centre[:, None] + edge
+        assert np.all(np.einsum("ik,ij,jk->k", x, c.P, x) < c.c2 * (1 + 1e-12))
+
+
+def just_accepted(name: str, edit: Size, seed: int) -> Document:
+    """The largest size of this edit, in one direction, that the checker lets through, to a part in a thousand."""
+    data, low, high = HONEST[name](), 0.0, 1.0
+
+    def of(size: float) -> Document:
+        return edit(data, size, np.random.default_rng(seed))
+
+    while high < 2**6 and verdict(of(high)) == "ACCEPTED":
+        low, high = high, 4 * high
+    for _ in range(10):
+        middle = (low + high) / 2 if low else high / 8
+        low, high = (middle, high) if verdict(of(middle)) == "ACCEPTED" else (low, middle)
+    return of(low)
+
+
+@pytest.mark.parametrize("what", SIZED)
+def test_what_is_just_accepted_of_a_well_is_true(what: str) -> None:
+    assert_true(just_accepted("well", SIZED[what], 1), 2)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name in HONEST if name not in ("glide", "well")])
+@pytest.mark.parametrize("what", SIZED)
+def test_what_is_just_accepted_is_true(what: str, name: str) -> None:
+    data = just_accepted(name, SIZED[what], 2)
+    assert verdicts(data) == {"ACCEPTED"}
+    assert_true(data, 12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", HONEST)
+def test_edits_at_random_are_refused_or_leave_a_true_claim(name: str) -> None:
+    """Two edits at a time, of sizes from 10^-3 to 3: both checkers say the same, but where one of them is tighter, and
+    nothing that either accepts is false where it is looked."""
+    generator, said = np.random.default_rng(list(HONEST).index(name)), []
+    for _ in range(120):
+        data = HONEST[name]()
+        for what in generator.choice(list(SIZED), 2):
+            data = SIZED[what](data, float(10.0 ** generator.uniform(-3, 0.5)), generator)
+        answers = verdicts(data)
+        said.append("ACCEPTED" in answers)
+        if said[-1]:
+            assert_true(data, 4)
+    assert 0 < sum(said) < len(said)
 
 
 # ------------------------------------------------------------------------------------------- soundness of the numbers
@@ -608,8 +761,12 @@ def multipliers_of(generator: np.random.Generator, n: int, kind: str) -> tuple[M
     alpha = np.exp(generator.standard_normal(n)) * generator.choice([0, 1], n)
     beta = np.exp(generator.standard_normal(n)) * {"apart": 1, "jointly": 0, "both": generator.choice([0, 1], n)}[kind]
     rows = (alpha, beta, np.exp(generator.standard_normal(n)))
-    share, edge, motion, joint = (float(v) for v in (generator.uniform(0.1, 0.9), *np.exp(generator.standard_normal(3))))
-    return Multipliers(*(tuple(quotient(v) for v in row) for row in rows)), Path(np.zeros(n), share, edge, motion, joint)
+    share, edge, motion, joint = (
+        float(v) for v in (generator.uniform(0.1, 0.9), *np.exp(generator.standard_normal(3)))
+    )
+    return Multipliers(*(tuple(quotient(v) for v in row) for row in rows)), Path(
+        np.zeros(n), share, edge, motion, joint
+    )
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])
@@ -637,10 +794,14 @@ def test_the_sides_along_a_path_bound_what_they_stand_for(n: int, kind: str) -> 
             value += quotient(path.motion) * (quotient(path.share) ** 2 - sigma * sigma)
             for jet, velocity, along in zip(jets, v, (P * e).entries(), strict=True):
                 column = fmpq_mat(n + 2 - 1, 1, d)
-                model = quotient(jet.c) - velocity + sum((quotient(a) * p for a, p in zip(jet.a, d, strict=True)), fmpq(0))
+                model = (
+                    quotient(jet.c) - velocity + sum((quotient(a) * p for a, p in zip(jet.a, d, strict=True)), fmpq(0))
+                )
                 model += (column.transpose() * exactly(jet.Q) * column)[0, 0]
                 most = quotient(jet.error) + (column.transpose() * exactly(jet.E) * column)[0, 0]
-                most += quotient(jet.slack) * quotient(float(np.max(np.abs(direction))))  # a gradient off along one axis
+                most += quotient(jet.slack) * quotient(
+                    float(np.max(np.abs(direction)))
+                )  # a gradient off along one axis
                 value += 2 * along * model + 2 * abs(along) * most
             left, bound = value + (y.transpose() * decay * y)[0, 0], (y.transpose() * rest * y)[0, 0]
             assert left <= bound
