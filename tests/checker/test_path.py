@@ -523,7 +523,7 @@ def test_in_one_state_a_tube_is_shown_exactly_where_there_is_one(
     assert shown == (worst < 1)
 
 
-# ------------------------------------------------------------ edits as large as the checker lets through, and a campaign
+# ----------------------------------------------------------- edits as large as the checker lets through, and a campaign
 
 Size = Callable[[Document, float, np.random.Generator], Document]
 
