@@ -23,12 +23,12 @@ from hypothesis import strategies as st
 
 from certify.checker import tube, words
 from certify.checker.case import Case
-from certify.checker.decrease import Models, are_usable, shows, sides
+from certify.checker.decrease import Models, are_finite, are_usable, shows, sides
 from certify.checker.document import Certificate, Multipliers, Path
 from certify.checker.exact import exactly
 from certify.checker.jets import Jet
 from tests.checker.test_rules import array, at, both, level, linear_claim, rehashed, rotor_claim
-from tests.checker.test_tube import CUBIC, NO_CURVATURE, NONE, Edit, ball, joint, scalar, verdicts
+from tests.checker.test_tube import CUBIC, NO_CURVATURE, NONE, Edit, ball, joint, random_loop, scalar, verdicts
 from tests.support.certificates import Document, decode, edited, encode, make, parse, rehash, verdict
 from tests.support.oracle import ball as exact
 from tests.support.oracle import policy_in_arb, quadratic
@@ -732,6 +732,48 @@ def test_the_models_along_a_path_enclose_the_field(name: str, where: str) -> Non
                         tight = max(tight, float((abs(left) / known).mid()))
     assert met > 3
     assert tight > 0.01 or where not in ("far", "large motion") or name == "linear"
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_models_of_random_loops_hold_along_random_paths(seed: int) -> None:
+    """Loops, balls and motions of all sizes, at points of the ball: never certainly outside."""
+    random, met, tight = np.random.default_rng(seed + 40), 0, 0.0
+    while met < 60:
+        base, J = random_loop(random)
+        n = len(J)
+        first, step = (random.standard_normal((2, n)).T * 10.0 ** random.uniform([-3, -4], 0.5)).T
+        if random.random() < 0.2:
+            first, step = first * 10.0 ** random.uniform(-300, 0), step * 10.0 ** random.uniform(-300, 1)
+        share = float(random.choice([random.uniform(0.01, 0.99), 2.0**-40, 1 - 2.0**-40]))
+        (piece,) = tube.pieces(Case(parse(placed(base, first.tolist(), (first + step).tolist(), share, J))))
+        with np.errstate(all="ignore"):
+            jets = [*piece.F, *piece.inputs]
+        if not are_finite(jets):
+            continue
+        met += 1
+        assert piece.motion is not None
+        m, w = ([exact(q) for q in part] for part in piece.motion)
+        points = random.standard_normal((3, n + 1))
+        points *= (np.array([1, 1, 10.0 ** random.uniform(-6, 0)]) / np.linalg.norm(points, axis=1))[:, None]
+        points[1] *= [*[0.01] * n, 1]
+        with ctx.workprec(3000):
+            c = piece.case.c
+            at_0 = values(c, m)
+            for d in (points * (1 - 2.0**-50)).tolist():
+                x = [
+                    p + q * arb(d[n]) + sum((arb(a) * arb(v) for a, v in zip(row, d, strict=False)), arb(0))
+                    for p, q, row in zip(m, w, J.tolist(), strict=True)
+                ]
+                size = sum((arb(v) ** 2 for v in d), arb(0)).sqrt()
+                for jet, v, v_0 in zip(jets, values(c, x), at_0, strict=True):
+                    left = v - v_0 - quadratic(jet.Q.tolist(), d)
+                    left -= sum((arb(float(a)) * arb(p) for a, p in zip(jet.a, d, strict=True)), arb(0))
+                    known = arb(float(jet.slack)) * size + quadratic(jet.E.tolist(), d)
+                    assert left.is_finite() and not abs(left) > known
+                    assert not abs(v_0 - arb(float(jet.c))) > arb(float(jet.error))
+                    if known > 1e-9:
+                        tight = max(tight, float((abs(left) / known).mid()))
+    assert tight > 0.5
 
 
 def values(c: Certificate, x: list[arb]) -> list[arb]:
