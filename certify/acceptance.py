@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from certify.certificate import Certificate, PartitionTree, TrustedSolver, run_checker, write_beside
-from certify.claims import Asymptotic, Enlarged, Problem
+from certify.claims import Asymptotic, Enlarged, Problem, Reached
 from certify.engines.bounds.mend import below_leaf, split_again
 from certify.errors import SoundnessError
 
@@ -129,7 +129,7 @@ def _lowered(certificate: Certificate, leaf: int | None, problem: Problem, tries
     claim, evidence = certificate.claim, certificate.evidence
     if not isinstance(evidence, PartitionTree):
         return None
-    if isinstance(claim, Enlarged):  # a tube ends in {V <= c2}: without it, what is refused may not be asked any more
+    if isinstance(claim, Enlarged | Reached):  # without its tube, what is refused may not be asked any more
         return replace(certificate, claim=Asymptotic(claim.roa, claim.local), evidence=replace(evidence, tube=()))
     if leaf is None or claim.inner == claim.roa:
         if not isinstance(claim, Asymptotic):

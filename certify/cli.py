@@ -21,6 +21,7 @@ from certify.commands.import_ import import_
 from certify.commands.importing import takes_import_options
 from certify.commands.plant import plant
 from certify.commands.plot import plot
+from certify.commands.reach import reach
 from certify.commands.report import report
 from certify.commands.roa import roa
 from certify.commands.systems import systems
@@ -35,6 +36,7 @@ app = typer.Typer(
 )
 app.callback()(certify)
 app.command("roa")(takes_import_options(roa))
+app.command("reach")(takes_import_options(reach, kind_is="--kind"))
 app.command("check")(check)
 app.command("report")(report)
 app.command("plot")(plot)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import Literal, get_args
 
 import numpy as np
@@ -38,6 +39,8 @@ class RoaOptions:
     enlarge : look for a tube of ellipsoids from a larger set into the proved one.
     box : half-widths by state; `enlarge` for the largest multiple of the ellipsoid with these half-axes. A state that
         is not named gets the smallest share of its domain that a named one has.
+    reach_from : a state by the states' values, those that are not named at the operating point: look for a tube around
+        the trajectory from there into the proved set, the widest multiple of an ellipsoid; of `box`, if it is given.
     time_limit : seconds for everything up to the verdict, the check included.
     max_boxes : boxes for the ring.
     """
@@ -54,13 +57,14 @@ class RoaOptions:
     device: str = "cpu"
     enlarge: bool = False
     box: Mapping[str, float] | None = None
+    reach_from: Mapping[str, Fraction | float] | None = None
     time_limit: float = 50.0
     max_boxes: int = 4_000_000
 
     @property
     def enlarges(self) -> bool:
         """Whether a tube is looked for."""
-        return self.enlarge or self.box is not None
+        return self.enlarge or self.box is not None or self.reach_from is not None
 
     @property
     def only(self) -> Named | None:
@@ -79,6 +83,8 @@ class RoaOptions:
             raise InputError(f"`level` must be a positive number; found {self.level}.")
         if self.box is not None and not all(math.isfinite(v) and v > 0 for v in self.box.values()):
             raise InputError(f"`box` must have positive half-widths; found {dict(self.box)}.")
+        if self.reach_from is not None and not all(math.isfinite(v) for v in self.reach_from.values()):
+            raise InputError(f"`reach_from` must be a state of finite numbers; found {dict(self.reach_from)}.")
         if self.enlarges and (self.engine == "dreal" or self.claim == "practical"):
             raise InputError(
                 "`enlarge` needs the engine bounds and a claim that is not practical: a tube ends in a set "

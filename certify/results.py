@@ -7,7 +7,7 @@ rationals, sizes are rounded down, and pictures are drawn from the very bytes th
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from fractions import Fraction
 from html import escape
@@ -82,19 +82,27 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class TubeFacts:
-    """A tube that enlarges the set: it starts at {x'Px <= 1}, P = `start` (n, n), of this `shape`, and leads
-    into {V <= c2} in `slabs` pieces, in `duration` units of time."""
+    """A tube that enlarges the set: it starts at {(x - c)'P(x - c) <= 1}, P = `start` (n, n), c = `centre`, None for 0,
+    of this `shape`, and leads into {V <= c2} in `slabs` pieces, in `duration` units of time."""
 
     start: Array
     shape: str
     slabs: int
     duration: float
+    centre: tuple[float, ...] | None = None
+
+    def contains(self, states: Sequence[Sequence[Fraction | float]]) -> list[bool]:
+        """Whether states, as deviations from the operating point, lie in the start, decided in rationals."""
+        if self.centre is not None:
+            c = [Fraction(v) for v in self.centre]
+            states = [[Fraction(v) - q for v, q in zip(x, c, strict=True)] for x in states]
+        return are_inside(self.start, 1.0, states)
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON, with the size of the start along the states."""
         sizes = {"semi_axes": semi_axes(self.start, 1.0).tolist(), "extents": extents(self.start, 1.0).tolist()}
         stated = {"shape": self.shape, "slabs": self.slabs, "duration": self.duration, "start": self.start.tolist()}
-        return {**stated, "volume": volume(self.start, 1.0), **sizes}
+        return {**stated, "centre": self.centre and list(self.centre), "volume": volume(self.start, 1.0), **sizes}
 
 
 @dataclass(frozen=True, slots=True)
@@ -209,11 +217,12 @@ class RoaResult:
 
     @property
     def ellipsoid(self) -> tuple[Array, float] | None:
-        """(P, level) of the larger ellipsoid {x'Px <= level} of those that are proved: {V <= c2}, a tube's start."""
+        """(P, level) of the larger ellipsoid {x'Px <= level} of those that are proved around the operating point:
+        {V <= c2}, a tube's start."""
         if self.P is None or self.levels.roa is None:
             return None
         inner = self.P, self.levels.roa
-        if self.tube is None or volume(self.tube.start, 1.0) < volume(*inner):
+        if self.tube is None or self.tube.centre is not None or volume(self.tube.start, 1.0) < volume(*inner):
             return inner
         return self.tube.start, 1.0
 
@@ -252,7 +261,7 @@ class RoaResult:
             rows = [[Fraction(v) - q for v, q in zip(row, shifts, strict=True)] for row in rows]
         found = are_inside(self.problem.V.P, self.levels.roa, rows)
         if self.tube is not None:
-            found = [a or b for a, b in zip(found, are_inside(self.tube.start, 1.0, rows), strict=True)]
+            found = [a or b for a, b in zip(found, self.tube.contains(rows), strict=True)]
         return found[0] if states.ndim == 1 else np.array(found, dtype=np.bool_)
 
     def report(self, path: str | PathLike[str] | None = None) -> Path:
@@ -318,7 +327,8 @@ class RoaResult:
         level, size = (self.levels.roa, self.volume) if shown else (None, None)
         if level is not None and size is not None:
             unit = volume_unit([self.system.units.get(s.name, "") for s in self.system.states])
-            rows.append(("set", f"V <= {below(level)}" + (", enlarged by a tube" if self.tube is not None else "")))
+            wider = "" if self.tube is None else ", enlarged by a tube" if self.tube.centre is None else ", and a tube"
+            rows.append(("set", f"V <= {below(level)}{wider}"))
             rows.append((volume_name(self.system.n), f"{below(size)} {unit}".rstrip()))
             rows.append(("limited by", self.reason))
         else:

@@ -9,9 +9,10 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from fractions import Fraction
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -27,14 +28,14 @@ from certify.certificate import (
     require_within_limits,
     sole_writer,
 )
-from certify.claims import Asymptotic, Claim, Enlarged, Problem
+from certify.claims import Asymptotic, Claim, Enlarged, Problem, Reached
 from certify.claims.claim import Kind
 from certify.closed_loop import ClosedLoop
 from certify.diagnosis import diagnose
 from certify.engines.base import Attempt, Budget, Progress, Proof, Task
 from certify.engines.falsify import Witness, refutes
 from certify.errors import BackendError, InputError, SoundnessError
-from certify.lyapunov import leaves_domain, volume
+from certify.lyapunov import are_inside, leaves_domain, volume
 from certify.lyapunov.function import Quadratic
 from certify.options import RoaOptions
 from certify.policies import TanhNetwork
@@ -136,6 +137,8 @@ class _Run:
     proof: Proof | None = None
     cut_short: bool = False
     aside: str | None = None
+    centre: tuple[Fraction, ...] | None = None  # of a tube around a path, in deviations
+    missed: str = ""  # why there is no such tube
     share: float = 1.0  # of the time, up to which a stage may go on
 
     def result(self) -> RoaResult:
@@ -160,10 +163,13 @@ class _Run:
         require_within_limits(self.system, self.network)
         if options.box is not None:
             _ellipsoid_in(self.system, options.box)
+        self.centre = None if options.reach_from is None else _state_in(self.system, options.reach_from)
         with self._stage("candidate"):
             claim = self._claim(loop)
             if claim == "practical" and options.enlarges:
                 self.aside = f"{self.aside}; a tube needs a set from which trajectories converge, and is not looked for"
+                if options.reach_from is not None:
+                    raise InputError(f"a tube from a state needs a loop that rests at the origin; {self.aside}.")
                 options = replace(options, enlarge=False, box=None)
             self.options = options = replace(options, claim=claim)
         self.share = _BEFORE_TUBE if options.enlarges else 1.0
@@ -365,13 +371,18 @@ class _Run:
             return result if claim is None else _missed(result, task, claim)
         evidence, facts = proof.evidence, None
         if self.options.enlarges and isinstance(claim, Asymptotic) and isinstance(evidence, PartitionTree):
-            facts, claim, evidence = self._enlarge(race, claim, evidence)
+            around = self._enlarge if self.centre is None else self._surround
+            facts, claim, evidence = around(race, claim, evidence)
         certificate = Certificate(self.system, self.network, task.problem.V, claim, evidence, self.provenance)  # type: ignore[arg-type]
         accepted = self._clerk().accepted(certificate, task.problem)
         certificate = accepted.certificate
         result = replace(result, notice=accepted.mended or result.notice)
-        if isinstance(certificate.claim, Enlarged):
-            result = replace(result, claim="enlarged", tube=facts)
+        if isinstance(certificate.claim, Enlarged | Reached):
+            result = replace(result, claim=certificate.claim.kind, tube=facts)
+        elif self.centre is not None and not _holds(task.problem, certificate.roa, self.centre):
+            why = "the checker refused the tube" if facts is not None else self.missed
+            result = _with_levels(result, certificate.claim.levels, witness)
+            return replace(result, stop=Stop.PATH, detail=why, certificate=accepted.path, raw=accepted.data)
         if task.exactly and certificate.roa < task.target:
             return _missed(replace(result, stop=Stop.REFUSED, detail=accepted.mended or ""), task, certificate.claim)
         trusted = isinstance(proof.evidence, TrustedSolver)
@@ -414,6 +425,36 @@ class _Run:
         facts = TubeFacts(tube.start, found.shape, len(tube.slabs), tube.duration)
         enlarged = Enlarged(roa=claim.roa, local=claim.local, start=Quadratic(tube.start))
         return facts, enlarged, replace(evidence, tube=tube.slabs)
+
+    def _surround(
+        self, race: Race, claim: Asymptotic, evidence: PartitionTree
+    ) -> tuple[TubeFacts | None, Asymptotic, PartitionTree]:
+        """The claim and its evidence with the widest tube around the trajectory from a state that there is time for."""
+        from certify.engines.enlarge import surround
+
+        trial, centre = race.best.trial, self.centre or ()
+        if _holds(trial.task.problem, claim.roa, centre):
+            self.aside = "the state lies in the proved set, and no tube is needed"
+            return None, claim, evidence
+        self.share = 1.0
+        box = self.options.box
+        shapes = {trial.name: trial.P, "domain": _ellipsoid_in(self.system)}
+        shapes = shapes if box is None else {"box": _ellipsoid_in(self.system, box)}
+        end = self.spent + _FOR_SEARCH * self.left()
+        with self._stage("tube"):
+            self._tell("tube")
+            middle = np.array([float(q) for q in centre])
+            loop = trial.task.problem.loop
+            found, self.missed = surround(loop, middle, trial.P / claim.roa, shapes, lambda: end - self.spent)
+        if found is None:
+            return None, claim, evidence
+        tube, at = found.tube, tuple(middle.tolist())
+        facts = TubeFacts(tube.start, found.shape, len(tube.slabs), tube.duration, at)
+        if not facts.contains([centre]):
+            self.missed = "the tube is narrower than the rounding of that state"
+            return None, claim, evidence
+        reached = Reached(roa=claim.roa, local=claim.local, start=Quadratic(tube.start), centre=at)
+        return facts, reached, replace(evidence, tube=tube.slabs)
 
     def _clerk(self) -> Clerk:
         return Clerk(self.out / "certificate.json", self.left, self._stage, lambda: self._tell("check"))
@@ -471,6 +512,32 @@ def _ellipsoid_in(system: System, box: Mapping[str, float] | None = None) -> Arr
         )
     least = min(width / sides[name] for name, width in box.items())
     return np.diag([float(box.get(name, least * sides[name])) ** -2 for name in names])
+
+
+def _state_in(system: System, values: Mapping[str, Fraction | float]) -> tuple[Fraction, ...]:
+    """A state by the states' values as a deviation from the operating point, at which those are that are not named.
+
+    Raises
+    ------
+    InputError : it names what is no state, or does not lie in the interior of the domain.
+    """
+    names, at = [s.name for s in system.states], system.exact_x_eq()
+    if not values or not values.keys() <= set(names):
+        raise InputError(
+            f"`reach_from` must name states of {system.name}, {', '.join(names)}; found {', '.join(values) or 'none'}."
+        )
+    state = tuple(Fraction(values.get(name, q)) - q for name, q in zip(names, at, strict=True))
+    for name, q, v, (lo, hi) in zip(names, at, state, system.domain, strict=True):
+        if not lo < v < hi:
+            raise InputError(
+                f"`reach_from` must lie in the interior of the domain, {name} between {float(lo + q):g} and "
+                f"{float(hi + q):g}; found {float(v + q):g}."
+            )
+    return state
+
+
+def _holds(problem: Problem, level: float, state: Sequence[Fraction]) -> bool:
+    return are_inside(problem.V.P, level, [state])[0]
 
 
 def _kind_of(options: RoaOptions) -> Kind:

@@ -49,6 +49,7 @@ class Stop(Enum):
     LOCAL = "local"
     FLOOR = "floor"
     SMOOTH = "smooth"
+    PATH = "no tube from that state"
     SOLVER = "solver"
     SPECTRUM = "spectrum"
     UNSTABLE = "unstable linearisation"

@@ -69,6 +69,14 @@ def widths(text: str | None, option: str) -> dict[str, float] | None:
         ) from error
 
 
+def state(text: str, option: str) -> dict[str, Fraction]:
+    """Exact numbers by name, separated by commas."""
+    from certify.systems import exact
+
+    pairs = dict(_assignment(part, option) for part in text.split(","))
+    return {name: exact(value, name) for name, value in pairs.items()}
+
+
 def _assignment(text: str, option: str) -> tuple[str, str]:
     name, equals, value = text.partition("=")
     if not equals or not name or not value:

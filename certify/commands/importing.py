@@ -28,8 +28,9 @@ def _option(help_: str, *names: str) -> Any:
     return Annotated[str | None, typer.Option(*names, help=help_, rich_help_panel=_PANEL)]
 
 
+_KINDS = "state-dict, torchscript, onnx, sb3, safetensors or two-stage; auto looks at the file."
 _OPTIONS: dict[str, Any] = {
-    "kind": _option("state-dict, torchscript, onnx, sb3, safetensors or two-stage; auto looks at the file.", "--from"),
+    "kind": _option(_KINDS, "--from"),
     "states": _option("The plant's states in the order in which the network reads them, as in x,theta."),
     "prefix": _option("Keys of a state_dict's layers up to their numbers, as in actor.pi_net.fcs."),
     "activation": _option("Between the layers of a state_dict: tanh."),
@@ -44,13 +45,17 @@ _OPTIONS: dict[str, Any] = {
 }
 
 
-def takes_import_options(command: Callable[..., None]) -> Callable[..., None]:
-    """Give a command the options of policy files of other programs; it receives them as `importing`."""
+def takes_import_options(command: Callable[..., None], kind_is: str = "--from") -> Callable[..., None]:
+    """Give a command the options of policy files of other programs; it receives them as `importing`.
+
+    `kind_is` is the name of the option for the kind of file, where the command has a `--from` of its own.
+    """
     hints = get_type_hints(command, localns={"ImportOptions": object}, include_extras=True)
     own = inspect.signature(command)
     kept = [p.replace(annotation=hints[name]) for name, p in own.parameters.items() if name != "importing"]
     kind = inspect.Parameter.KEYWORD_ONLY
-    added = [inspect.Parameter(name, kind, default=None, annotation=option) for name, option in _OPTIONS.items()]
+    options = _OPTIONS | {"kind": _option(_KINDS, kind_is)}
+    added = [inspect.Parameter(name, kind, default=None, annotation=option) for name, option in options.items()]
 
     @functools.wraps(command)
     def wrapped(**given: Any) -> None:

@@ -2,25 +2,21 @@
 
 from __future__ import annotations
 
-import json
-import shlex
 import time
-from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from certify.commands.arguments import numbers, plant_of, widths
+from certify.commands.certifying import certified
 from certify.commands.importing import policy_of
-from certify.commands.shared import Json, page_of, write
-from certify.commands.terminal import ProgressLine, say, show, tell
+from certify.commands.shared import Json
+from certify.commands.terminal import tell
 from certify.errors import BackendError, InputError
 
 if TYPE_CHECKING:
-    from certify.policies import Policy
     from certify.policies.importers import ImportOptions
-    from certify.systems import System
 
 
 def roa(
@@ -75,17 +71,11 @@ def roa(
     as_json: Json = False,
 ) -> None:
     """Certify a region of attraction: prove, write a certificate, have it checked, report."""
-    from certify.report import summary
-    from certify.roa import RoaOptions, certify_roa
+    from certify.options import RoaOptions
 
     start = time.perf_counter()
     stored = policy_of(policy, importing, system, param or [])
     plant = plant_of(stored, system, param or [], domain or [])
-    note = (lambda _: None) if quiet else tell
-    note(_plant_line(stored, plant, system is not None))
-    shift = stored.beta_shift(plant.exact_u_eq())
-    if shift:
-        note(f"the file's rounded beta is read as the real number; this shifts u(0) by {shift:.3g}")
     options = RoaOptions(
         claim=claim,  # type: ignore[arg-type]
         candidate=candidate,  # type: ignore[arg-type]
@@ -101,52 +91,7 @@ def roa(
         time_limit=time_limit,
         max_boxes=max_boxes,
     )
-    folder = out if out is not None else Path("out") / policy.stem
-    progress = None if quiet else ProgressLine()
-    try:
-        result = certify_roa(
-            plant,
-            stored.network,
-            folder,
-            options,
-            load_seconds=time.perf_counter() - start,
-            provenance=_provenance(policy),
-            progress=progress,
-        )
-    finally:
-        if progress is not None:
-            progress.close()
-    data = result.to_dict()
-    if data["diagnosis"] is not None and data["diagnosis"]["next"]["options"]:
-        data["diagnosis"]["next"]["command"] = _command(context, data["diagnosis"]["next"]["options"])
-    if result.notice is not None:
-        note(result.notice)
-    if result.certificate is not None and result.raw is not None:
-        answer = None if result.checker is None else dict(result.checker)
-        write(folder / "report.html", page_of(result.raw, result.certificate, answer, data))
-    if as_json:
-        say(json.dumps(data))
-    else:
-        show(summary(data))
-        if result.certificate is not None:
-            say(f"certificate  {result.certificate}\nreport       {folder / 'report.html'}")
-    raise typer.Exit(result.verdict.exit_status)
-
-
-def _command(context: typer.Context, changed: Mapping[str, str]) -> str:
-    """The command that was given, with these options in the place of what it had."""
-    parts = ["certify", "roa"]
-    for option in context.command.params:
-        source = context.get_parameter_source(option.name or "")
-        name, value = max(option.opts, key=len), context.params[option.name or ""]
-        if source is None or source.name != "COMMANDLINE" or (name in changed and not option.multiple):
-            continue
-        values = list(value) if isinstance(value, list | tuple) else [value]
-        if name in changed:  # NAME=VALUE options replace those of the same name
-            values = [v for v in values if v.partition("=")[0] != changed[name].partition("=")[0]]
-        for each in values:
-            parts += [name] if each is True else [name, str(each)]
-    return shlex.join([*parts, *(part for pair in changed.items() for part in pair if part)])
+    certified(context, policy, stored, plant, options, out, start, quiet, as_json)
 
 
 def _device(name: str) -> str:
@@ -169,16 +114,3 @@ def _engine(context: typer.Context, name: str) -> str:
             tell(f"engine bounds in the place of {name}: {error}")
             return "bounds"
     return name
-
-
-def _plant_line(stored: Policy, plant: System, overridden: bool) -> str:
-    values = ", ".join(f"{name} = {float(q):g}" for name, q in plant.parameters.items())
-    source = "from the command line" if overridden else "from the policy file"
-    layers = "-".join(map(str, stored.network.layers))
-    return f"plant {plant.name} ({source}) with {values or 'no parameters'}; policy {layers}"
-
-
-def _provenance(policy: Path) -> dict[str, Any]:
-    from certify.installation import versions
-
-    return {"policy": policy.name, **versions()}

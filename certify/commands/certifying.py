@@ -1,0 +1,108 @@
+"""What the commands that certify share: what is said before a run, the run, and what is written and printed of it."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from certify.commands.shared import page_of, write
+from certify.commands.terminal import ProgressLine, say, show, tell
+
+if TYPE_CHECKING:
+    from certify.options import RoaOptions
+    from certify.policies import Policy
+    from certify.systems import System
+
+
+def certified(
+    context: typer.Context,
+    policy: Path,
+    stored: Policy,
+    plant: System,
+    options: RoaOptions,
+    out: Path | None,
+    start: float,
+    quiet: bool,
+    as_json: bool,
+) -> None:
+    """Run, write certificate and report, print the result; ends the command with the verdict's exit status.
+
+    Parameters
+    ----------
+    stored, plant : the policy in the file `policy`, and the plant that it is certified on.
+    out : folder for the results.
+    start : when the command began, by `time.perf_counter`.
+    """
+    from certify.report import summary
+    from certify.roa import certify_roa
+
+    note = (lambda _: None) if quiet else tell
+    note(_plant_line(stored, plant, context.params["system"] is not None))
+    shift = stored.beta_shift(plant.exact_u_eq())
+    if shift:
+        note(f"the file's rounded beta is read as the real number; this shifts u(0) by {shift:.3g}")
+    folder = out if out is not None else Path("out") / policy.stem
+    progress = None if quiet else ProgressLine()
+    try:
+        result = certify_roa(
+            plant,
+            stored.network,
+            folder,
+            options,
+            load_seconds=time.perf_counter() - start,
+            provenance=_provenance(policy),
+            progress=progress,
+        )
+    finally:
+        if progress is not None:
+            progress.close()
+    data = result.to_dict()
+    if data["diagnosis"] is not None and data["diagnosis"]["next"]["options"]:
+        data["diagnosis"]["next"]["command"] = _command(context, data["diagnosis"]["next"]["options"])
+    if result.notice is not None:
+        note(result.notice)
+    if result.certificate is not None and result.raw is not None:
+        answer = None if result.checker is None else dict(result.checker)
+        write(folder / "report.html", page_of(result.raw, result.certificate, answer, data))
+    if as_json:
+        say(json.dumps(data))
+    else:
+        show(summary(data))
+        if result.certificate is not None:
+            say(f"certificate  {result.certificate}\nreport       {folder / 'report.html'}")
+    raise typer.Exit(result.verdict.exit_status)
+
+
+def _command(context: typer.Context, changed: Mapping[str, str]) -> str:
+    """The command that was given, with these options in the place of what it had."""
+    parts = ["certify", str(context.info_name)]
+    for option in context.command.params:
+        source = context.get_parameter_source(option.name or "")
+        name, value = max(option.opts, key=len), context.params[option.name or ""]
+        if source is None or source.name != "COMMANDLINE" or (name in changed and not option.multiple):
+            continue
+        values = list(value) if isinstance(value, list | tuple) else [value]
+        if name in changed:  # NAME=VALUE options replace those of the same name
+            values = [v for v in values if v.partition("=")[0] != changed[name].partition("=")[0]]
+        for each in values:
+            parts += [name] if each is True else [name, str(each)]
+    return shlex.join([*parts, *(part for pair in changed.items() for part in pair if part)])
+
+
+def _plant_line(stored: Policy, plant: System, overridden: bool) -> str:
+    values = ", ".join(f"{name} = {float(q):g}" for name, q in plant.parameters.items())
+    source = "from the command line" if overridden else "from the policy file"
+    layers = "-".join(map(str, stored.network.layers))
+    return f"plant {plant.name} ({source}) with {values or 'no parameters'}; policy {layers}"
+
+
+def _provenance(policy: Path) -> dict[str, Any]:
+    from certify.installation import versions
+
+    return {"policy": policy.name, **versions()}
