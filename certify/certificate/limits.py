@@ -20,7 +20,7 @@ MOST_STATES, MOST_LAYERS, MOST_ROWS = 64, 64, 2**14
 MOST_NODES, MOST_DEPTH, MOST_EXPONENT, MOST_DIGITS = 20_000, 200, 64, 1201
 MOST_NUMBERS = 2**25  # operations times n^2, under the rule `local`
 _LARGEST = Fraction(2) ** 1000
-MOST_MATRIX_BITS = 2**15  # of the longest number of P, times n
+MOST_MATRIX_BITS = 2**16  # of the longest number of P, times n
 
 
 def require_within_limits(system: System, network: TanhNetwork) -> None:
@@ -65,8 +65,9 @@ def require_short(P: np.ndarray) -> None:
     ------
     InputError : n times the bits of its longest number exceed the format's limit.
     """
-    parts = [abs(part) for v in P.ravel() for part in Fraction(float(v)).as_integer_ratio()]
-    bits = len(P) * max(part.bit_length() for part in parts)
+    parts = [Fraction(float(v)).as_integer_ratio() for v in P.ravel()]
+    common = max(below for _, below in parts)  # powers of 2
+    bits = len(P) * max((2 * abs(above) * (common // below)).bit_length() for above, below in parts)
     if bits > MOST_MATRIX_BITS:
         raise InputError(
             f"`P` has entries of too different magnitude for an exact inverse: at most {MOST_MATRIX_BITS} bits times "

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 import time
 from typing import Any
@@ -56,6 +57,9 @@ def _examine(path: str) -> tuple[int, dict[str, Any]]:
     else:
         margins = {"local": tally.local_margin, "ring": tally.ring_margin}
         answer |= {"leaves": tally.rules["tree"], "ring_leaves": tally.rules["ring"], "margins": margins}
+    if c.start is not None:
+        centre, longest = None if c.centre is None else c.centre.tolist(), words.duration(c)
+        answer |= {"start": c.start.tolist(), "centre": centre, "time": longest if math.isfinite(longest) else None}
     status, result = (3, "TRUSTED") if "solver" in answer else (0, "ACCEPTED")
     answer = {"result": result, **answer}
     return status, answer | {"text": words.report(c, answer)}

@@ -7,13 +7,13 @@ from fractions import Fraction
 from math import isqrt
 
 import numpy as np
-from flint import fmpq, fmpq_mat
+from flint import fmpq, fmpq_mat, fmpz
 from numpy.typing import NDArray
 
 from .document import Policy
 
 MAX_BITS = 2**14  # of a number on the tape
-MAX_MATRIX_BITS = 2**15  # of a number in a matrix, times the matrix's size: beyond, an inverse takes minutes
+MAX_MATRIX_BITS = 2**16  # of a number in a matrix, times the matrix's size: beyond, a decision takes minutes
 
 
 def exactly(array: NDArray[np.float64]) -> fmpq_mat:
@@ -32,13 +32,23 @@ def inverse_diagonal(A: fmpq_mat) -> list[Fraction]:
 def is_definite(A: fmpq_mat) -> bool:
     """Whether d'A d > 0 for every d but 0; False as well if A is too large to tell soon.
 
-    That is so if and only if every leading principal minor of the symmetric part is positive (Sylvester).
+    That is so if and only if every leading principal minor of the symmetric part is positive (Sylvester). Elimination
+    without fractions finds them one by one on the diagonal, and each division in it is exact (Bareiss); what it does
+    to a symmetric matrix is symmetric, so that the lower half is enough.
     """
-    n, S = A.nrows(), A + A.transpose()
+    n, (S, _) = A.nrows(), (A + A.transpose()).numer_denom()
     if n * max(v.height_bits() for v in S.entries()) > MAX_MATRIX_BITS:
         return False
-    rows = S.tolist()
-    return all(fmpq_mat([row[:k] for row in rows[:k]]).det() > 0 for k in range(1, n + 1))
+    rows, before = S.tolist(), fmpz(1)
+    for k, pivot_row in enumerate(rows):
+        pivot = pivot_row[k]
+        if not pivot > 0:
+            return False
+        for i in range(k + 1, n):
+            for j in range(k + 1, i + 1):
+                rows[i][j] = (rows[i][j] * pivot - rows[i][k] * rows[j][k]) // before
+        before = pivot
+    return True
 
 
 def contains_ball(J: fmpq_mat, P: fmpq_mat, level: Fraction) -> bool:

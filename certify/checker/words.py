@@ -46,7 +46,7 @@ def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
         f"V(x) = x'Px with P = {_matrix(c.P)}",
         *([] if c.start is None else [f"S = {_matrix(c.start)}"]),
         *([] if c.centre is None else [f"c = {' '.join(map(repr, c.centre.tolist()))}"]),
-        f"claim: {CLAIMS[c.claim].format(c=c, time=_duration(c))}; u stays in its bounds",
+        f"claim: {CLAIMS[c.claim].format(c=c, time=duration(c))}; u stays in its bounds",
         "rules that held: " + ", ".join(f"{rule} {count}" for rule, count in answer["rules"].items()),
         rest,
         f"{verdict} {'c0' if c.practical else 'c1'}={c.c1!r} c2={c.c2!r} sha256={c.sha256}",
@@ -57,7 +57,7 @@ def _matrix(A: Array) -> str:
     return "; ".join(" ".join(map(repr, row)) for row in A.tolist())
 
 
-def _duration(c: Certificate) -> float:
+def duration(c: Certificate) -> float:
     """Of the tube, rounded up; infinite where no binary64 number is as large."""
     slabs = c.evidence.tube if isinstance(c.evidence, Partition) else ()
     try:

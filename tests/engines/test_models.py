@@ -14,7 +14,7 @@ from certify.checker.case import Case
 from certify.checker.decrease import Models, sides
 from certify.checker.exact import exactly
 from certify.engines.decrease import best_multipliers, decay_of, rest_of
-from certify.engines.enlarge import Enlarged, enlarge
+from certify.engines.enlarge import Found, enlarge
 from certify.engines.local import prove_local
 from certify.engines.models import paths
 from certify.engines.tube import Tube, find_tube
@@ -104,7 +104,7 @@ def test_no_tube_starts_beyond_the_region_of_attraction() -> None:
 
 def test_the_search_reports_ever_larger_starts() -> None:
     case = case_of(*scalar_tanh())
-    seen: list[Enlarged] = []
+    seen: list[Found] = []
     goal = np.eye(1) / 0.25
     best = enlarge(paths(case.loop), goal, {"one": np.eye(1), "again": np.eye(1)}, lambda: 20.0, report=seen.append)
     assert best is seen[-1] and best.volume > 2 * 0.5

@@ -361,13 +361,13 @@ def test_a_tube_is_no_longer_than_the_checker_takes(result: RoaResult, monkeypat
     with pytest.raises(Rejected, match=r"rule=tube.*too long"):
         check(read(str(result.certificate)))
     case, goal = pendulum()
-    monkeypatch.setattr(tubes, "_MOST_WORK", 16 * (len(enlarged().slabs) - 1))
+    monkeypatch.setattr(tubes, "MOST_WORK", 16 * (len(enlarged().slabs) - 1))
     assert find_tube(paths(case.loop), goal / 1.3**2, goal) is None
 
 
 def test_errors_beyond_binary64_are_not_shown() -> None:
     """Squares of remainders overflow: that is no margin, and no exception."""
     E = np.full((2, 2, 2), 1e200)
-    models = Models(-np.eye(2), np.zeros((2, 2, 2)), E, True)
+    models = Models(np.zeros(2), -np.eye(2), np.zeros((2, 2, 2)), E, True)
     with np.errstate(all="ignore"):
         assert not best_multipliers(models, np.eye(2), np.eye(2)).margin > 0
