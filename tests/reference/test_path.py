@@ -23,6 +23,8 @@ from flint import arb, arb_mat, ctx, fmpq, fmpq_mat
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from certify.checker.errors import Rejected
+from certify.policies import load_policy
 from certify.reference import __main__ as command
 from certify.reference import decrease, rules, tube
 from certify.reference.balls import PRECISION
@@ -33,13 +35,17 @@ from certify.reference.evidence import Path as Motion
 from certify.reference.loop import Loop
 from certify.reference.model import Model
 from certify.reference.rational import beyond_domain, root_above
+from certify.roa import RoaOptions, certify_roa
+from certify.systems import get_system
 from tests.support.balls import TINY, around, ball, exactly, slab_of, square, with_ball
 from tests.support.certificates import Document, decode, dump, edited, encode, make, write
+from tests.support.certificates import verdict as verdict_of_the_checker
 from tests.support.paths import along, follow
 from tests.support.reference import judge
 
 Edit = Callable[[Document], Document]
 LEAST = 5e-324
+SHIPPED = Path(__file__).parents[2] / "examples" / "policies"
 
 
 @pytest.fixture(autouse=True)
@@ -312,6 +318,15 @@ def test_forgeries(place: str, name: str, edit: Edit) -> None:
     assert str(verdict.at).startswith(place)
 
 
+@pytest.mark.parametrize("name", NAMES)
+def test_the_checker_says_the_same(name: str) -> None:
+    """Of the honest tube and of each forgery, by the rule that refuses it."""
+    edits = [edit for _, base, _, edit in FORGERIES if base == name]
+    assert len(edits) > 25 and said_by_the_checker(honest(name)) == "ACCEPTED"
+    for edit in edits:
+        assert said_by_the_checker(edit(honest(name))) == "tube"
+
+
 HARMLESS: list[tuple[str, str, Edit]] = [
     *((name, "a smaller start", array("claim.start", times(1.001))) for name in NAMES),
     *((name, "J with another sign", array("evidence.tube.2.J", times(-1))) for name in NAMES),
@@ -393,7 +408,8 @@ MALFORMED: dict[str, Edit] = {
 
 @pytest.mark.parametrize("what", MALFORMED)
 def test_malformed(what: str) -> None:
-    assert judge(MALFORMED[what](honest("decay"))) == "format"
+    data = MALFORMED[what](honest("decay"))
+    assert judge(data) == "format" and said_by_the_checker(data) == "format"
 
 
 # ------------------------------------------------------------------------------------------------------ inputs, clips
@@ -711,6 +727,68 @@ def test_no_path_helps_a_start_beyond_the_region_of_attraction(reach: float) -> 
     for count, h in itertools.product((1, 4, 16), (0.05, 0.3, 3.0)):
         centres = [np.array([v]) for v in np.linspace(reach, 0.1, count + 1)]
         assert judge(follow(base, centres, [np.eye(1) * 100] * (count + 1), [h] * count)) == "tube"
+
+
+# ----------------------------------------------------------------------------------------------- beside the checker
+
+
+def said_by_the_checker(data: Document) -> str:
+    try:
+        return verdict_of_the_checker(data)
+    except Rejected as no:  # its reader raises, its rules are caught
+        return no.rule
+
+
+EDGES: list[tuple[str, Callable[[Document, float], Document]]] = [  # how an edit grows, from 0 on
+    ("share", lambda d, s: number("evidence.tube.3.path.share", lambda v: v * (1 - s))(d)),
+    ("edge", lambda d, s: number("evidence.tube.3.path.edge", lambda v: v * (1 + s))(d)),
+    ("motion", lambda d, s: number("evidence.tube.3.path.motion", lambda v: v * (1 - s))(d)),
+    ("duration", lambda d, s: number("evidence.tube.3.duration", lambda v: v * (1 - s))(d)),
+    ("centre", lambda d, s: centre(3, plus(s))(d)),
+    ("start", lambda d, s: centre(-1, plus(-s))(d)),
+    ("middle", lambda d, s: array("evidence.tube.3.middle", times(1 + s))(d)),
+    ("J", lambda d, s: array("evidence.tube.3.J", times(1 + 9 * s))(d)),
+]
+
+
+@pytest.mark.parametrize("name", ["bent", "swing"])
+@pytest.mark.parametrize(("what", "edit"), EDGES)
+def test_the_checker_draws_the_same_line(what: str, edit: Callable[[Document, float], Document], name: str) -> None:
+    """How far a number can be moved before a file is refused: the same for two programs."""
+    ends = []
+    for accepts in (lambda d: judge(d) is None, lambda d: said_by_the_checker(d) == "ACCEPTED"):
+        low, high = 0.0, 1.0
+        assert accepts(edit(honest(name), low)) and not accepts(edit(honest(name), high))
+        while high - low > 1e-4:
+            middle = (low + high) / 2
+            low, high = (middle, high) if accepts(edit(honest(name), middle)) else (low, middle)
+        ends.append(low)
+    assert abs(ends[0] - ends[1]) < 2e-4 < ends[0]
+
+
+def test_a_tube_that_the_engine_finds(tmp_path: Path) -> None:
+    """Of the pendulum that ships, from far outside of its local level: both programs accept it, or neither."""
+    policy = load_policy(SHIPPED / "pendulum.pt")
+    state = {"theta": Fraction(26, 10), "theta_dot": Fraction(-3)}
+    options = RoaOptions(candidate="lqr", max_boxes=1, time_limit=8.0, reach_from=state)
+    result = certify_roa(get_system("pendulum"), policy.network, tmp_path, options)
+    assert result.claim == "reached" and result.certificate is not None
+    data = json.loads(result.certificate.read_bytes())
+    assert data["claim"]["kind"] == "reached" and len(data["evidence"]["tube"]) > 5
+    assert judge(data) is None and said_by_the_checker(data) == "ACCEPTED"
+    slabs = data["evidence"]["tube"]
+    for edit in (
+        of_tube(lambda _: slabs[:-1]),
+        of_tube(lambda _: slabs[1:]),
+        centre(-1, times(1.5)),
+        centre(len(slabs) // 2, times(1.2)),
+        array("claim.start", times(0.5)),
+        number("evidence.tube.4.duration", lambda h: h / 2),
+        number("evidence.tube.4.duration", lambda h: h * 2),
+        number("evidence.tube.4.path.share", lambda v: v / 8),
+        array("evidence.tube.4.J", times(0.5)),
+    ):
+        assert judge(edit(data)) == said_by_the_checker(edit(data)) == "tube"
 
 
 # -------------------------------------------------------------------------------------------- every clause is needed
