@@ -428,19 +428,19 @@ def spring(tmp_path: Path) -> tuple[str | Path, ...]:
 def test_reach_proves_that_a_state_converges(
     tmp_path: Path, spring: tuple[str | Path, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    given = ("reach", *spring, "--from", "p=1.6,v=-1.6", "--box", "p=0.1,v=0.2", "--time-limit", "20", "--json")
+    given = ("reach", *spring, "--from", "p=1.5,v=1.4", "--box", "p=0.1,v=0.2", "--time-limit", "20", "--json")
     status, out, _ = run(capsys, *given)
     assert status == 0 and out.count("\n") == 1
     data = json.loads(out)
     assert data["verdict"] == "PROVED" and data["claim"] == {"kind": "reached"} and data["checked"] == "ACCEPTED"
-    assert data["reach_from"] == {"p": "8/5", "v": "-8/5"} and data["tube"]["centre"] == [1.6, -1.6]
+    assert data["reach_from"] == {"p": "3/2", "v": "7/5"} and data["tube"]["centre"] == [1.5, 1.4]
     assert data["tube"]["shape"] == "box" and data["tube"]["slabs"] > 0
     first, second = data["tube"]["semi_axes"]
     assert second == pytest.approx(2 * first, rel=1e-9)
     page = (tmp_path / "o" / "report.html").read_text()
-    assert "around the state c₀, p = 1.6 m, v = −1.6 m/s" in page and "PROVED · ACCEPTED" in page
+    assert "around the state c₀, p = 1.5 m, v = 1.4 m/s" in page and "PROVED · ACCEPTED" in page
     status, out, _ = run(capsys, "check", tmp_path / "o" / "certificate.json")
-    assert status == 0 and out.splitlines()[-1].startswith("ACCEPTED ") and "1.6" in out
+    assert status == 0 and out.splitlines()[-1].startswith("ACCEPTED ") and "c = 1.5 1.4" in out
 
 
 def test_a_state_that_is_not_shown_to_converge_exits_3(

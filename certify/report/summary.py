@@ -187,7 +187,7 @@ def _tube(result: Mapping[str, Any]) -> str:
     Around a state that is how far each state may be from its own alone, the others being as they are, rounded down.
     """
     tube = result["tube"]
-    size = f"{tube['slabs']} slabs, {number(tube['duration'], 3)} units of time"
+    size = f"{tube['slabs']} slabs, {above(tube['duration'], 3)} units of time"
     start = f"from an ellipsoid of the shape {tube['shape']}"
     if not tube.get("centre"):
         return f"{start}, {size}"
