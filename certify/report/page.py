@@ -252,9 +252,14 @@ def _matrices(certificate: Certificate) -> list[tuple[str, list[list[str]]]]:
     return [(name, [[repr(float(v)) for v in row] for row in P]) for name, P in named]
 
 
+def _is_missed(result: Mapping[str, Any] | None) -> bool:
+    """Whether the run's reason is about a state that it was asked about, and not about the certificate's set."""
+    return result is not None and result.get("stop") == "path"
+
+
 def _missed(result: Mapping[str, Any] | None, status: Status) -> str:
     """That a state was asked about which this certificate says nothing of; nothing if that is not so."""
-    if result is None or result.get("stop") != "path":
+    if result is None or not _is_missed(result):
         return ""
     asked: Mapping[str, str] = result.get("reach_from") or {}
     units = {s["name"]: s.get("unit") or "" for s in result.get("states") or ()}
@@ -281,7 +286,7 @@ def _limits(certificate: Certificate, result: Mapping[str, Any] | None) -> dict[
     step: Mapping[str, Any] = found.get("next") or {}
     options = " ".join(f"{name} {value}" for name, value in (step.get("options") or {}).items())
     return {
-        "binds": limit_in_words(str(found.get("binds", ""))),
+        "binds": "" if _is_missed(result) else limit_in_words(str(found.get("binds", ""))),
         "modes": _modes(found),
         "sets": len(sets),
         "shares": [
@@ -547,7 +552,8 @@ def _tables(
         domain = [f"[{below(lo)}, {above(hi)}]" for lo, hi in system.domain]
         reach = list(zip(names, *columns, domain, strict=True))
     if result is not None:
-        levels.append(("limited by", limited_by(result)))
+        if not _is_missed(result):
+            levels.append(("limited by", limited_by(result)))
         sampled = result["levels"].get("sampled_limit")
         if sampled is not None:
             levels.append(("lowest V of a violation found", number(sampled, 10)))
