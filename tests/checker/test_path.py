@@ -298,6 +298,17 @@ def test_forgeries(rule: str, edit: Edit) -> None:
     assert verdicts(forged) == {rule}
 
 
+def test_every_field_of_a_tube_around_a_path_has_a_forgery() -> None:
+    before = dict(leaves_of(rotor()))
+    touched = set()
+    for _, _, edit in FORGERIES:
+        after = dict(leaves_of(edit(rotor())))
+        touched |= {general(path) for path in before.keys() | after.keys() if before.get(path) != after.get(path)}
+    assert {general(path) for path in before if path.startswith(("claim.", "evidence.tube."))} - touched == {
+        "claim.kind"
+    }
+
+
 OF_GLIDE: list[tuple[str, str, Callable[[], Document]]] = [
     ("slower by 3 %", "tube", lambda: at("plant.dynamics", [["*", "-97/100", "x"]])(glide(slower=0.03))),
     ("slower by 5 %, with the multipliers of the honest plant", "tube", lambda: glide(dynamics=["*", "-19/20", "x"])),
