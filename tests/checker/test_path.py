@@ -27,7 +27,17 @@ from certify.checker.decrease import Models, are_finite, are_usable, shows, side
 from certify.checker.document import Certificate, Multipliers, Path
 from certify.checker.exact import exactly
 from certify.checker.jets import Jet
-from tests.checker.test_rules import array, at, both, level, linear_claim, rehashed, rotor_claim
+from tests.checker.test_rules import (
+    array,
+    at,
+    both,
+    general,
+    leaves_of,
+    level,
+    linear_claim,
+    rehashed,
+    rotor_claim,
+)
 from tests.checker.test_tube import CUBIC, NO_CURVATURE, NONE, Edit, ball, joint, random_loop, scalar, verdicts
 from tests.support.certificates import Document, decode, edited, encode, make, parse, rehash, verdict
 from tests.support.oracle import ball as exact
