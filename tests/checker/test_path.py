@@ -27,7 +27,17 @@ from certify.checker.decrease import Models, are_finite, are_usable, shows, side
 from certify.checker.document import Certificate, Multipliers, Path
 from certify.checker.exact import exactly
 from certify.checker.jets import Jet
-from tests.checker.test_rules import array, at, both, level, linear_claim, rehashed, rotor_claim
+from tests.checker.test_rules import (
+    array,
+    at,
+    both,
+    general,
+    leaves_of,
+    level,
+    linear_claim,
+    rehashed,
+    rotor_claim,
+)
 from tests.checker.test_tube import CUBIC, NO_CURVATURE, NONE, Edit, ball, joint, random_loop, scalar, verdicts
 from tests.support.certificates import Document, decode, edited, encode, make, parse, rehash, verdict
 from tests.support.oracle import ball as exact
@@ -296,6 +306,17 @@ def test_forgeries(rule: str, edit: Edit) -> None:
     forged = edit(rotor())
     assert forged != rotor()
     assert verdicts(forged) == {rule}
+
+
+def test_every_field_of_a_tube_around_a_path_has_a_forgery() -> None:
+    before = dict(leaves_of(rotor()))
+    touched = set()
+    for _, _, edit in FORGERIES:
+        after = dict(leaves_of(edit(rotor())))
+        touched |= {general(path) for path in before.keys() | after.keys() if before.get(path) != after.get(path)}
+    assert {general(path) for path in before if path.startswith(("claim.", "evidence.tube."))} - touched == {
+        "claim.kind"
+    }
 
 
 OF_GLIDE: list[tuple[str, str, Callable[[], Document]]] = [
@@ -885,6 +906,102 @@ def test_the_homogenised_matrix_is_refused_at_its_edges() -> None:
     for worst in ((0.2, 0.0, 0.0), (0.0, 0.2, 0.0), (0.0, 0.0, 0.2)):
         assert any(shown(0.5, edge, *worst) for edge in edges)
         assert not any(shown(0.5, edge, *(2.5 * v for v in worst)) for edge in edges)
+
+
+# ------------------------------------------------------------------------------------------------- where a tube may lie
+
+
+@pytest.mark.parametrize("name", HONEST)
+def test_the_motion_of_a_ball_leads_from_centre_to_centre(name: str) -> None:
+    """m - w rho is the centre before, m + w rho the one after, exactly; v is their difference over the time."""
+    c = parse(HONEST[name]())
+    for piece, (_, before) in zip(tube.pieces(Case(c)), nodes_before(c), strict=True):
+        assert piece.motion is not None and piece.velocity is not None and piece.slab.path is not None
+        rho, h = Fraction(piece.slab.path.share), Fraction(piece.slab.duration)
+        centres = zip(before.tolist(), piece.slab.path.centre.tolist(), strict=True)
+        for m, w, v, (a, b) in zip(*piece.motion, piece.velocity, centres, strict=True):
+            assert (m - w * rho, m + w * rho) == (Fraction(a), Fraction(b))
+            assert Fraction(int(v.p), int(v.q)) * h == Fraction(b) - Fraction(a)
+
+
+@pytest.mark.parametrize("which", [0, 1])
+@pytest.mark.parametrize("side", [0, 1])
+@pytest.mark.parametrize("state", [0, 1])
+def test_the_ellipsoids_around_both_centres_lie_in_the_domain(which: int, side: int, state: int) -> None:
+    """Around (0, 0) and (1, 1)/4, in either order: one side of the domain at a time."""
+    data, rows = linear_claim(0.25, 0.25), np.array([[8.0, 5.0], [5.0, 8.0]])
+    reach = Fraction(math.sqrt(np.linalg.inv(rows)[0, 0]))
+    ends = [Fraction(0), Fraction(1, 4)]
+    edge = ends[1] + reach if side else ends[0] - reach  # of the outermost ellipsoid on this side
+    centres = [(ends[which], ends[1 - which])] * 2
+    for more, expected in ((1 + Fraction(1, 2**30), True), (1 - Fraction(1, 2**30), False)):
+        domain = [["-2", "2"], ["-2", "2"]]
+        domain[state][side] = str(edge * more)
+        assert tube.lies_in(Case(parse(edited(data, "plant.domain", domain))), exactly(rows), centres) is expected
+
+
+@pytest.mark.parametrize("lo", ["1/4", "1/3"])
+def test_a_centre_on_the_domains_edge_or_beyond_lies_nowhere(lo: str) -> None:
+    """(P^-1)_ii is compared with a square, which does not know on which side of the edge a centre is."""
+    case = Case(parse(edited(glide(), "plant.domain", [[lo, "9"]])))
+    inside = (Fraction(5), Fraction(5))
+    narrow = exactly(np.array([[2.0**40]]))
+    assert tube.lies_in(case, narrow, [inside])
+    for centre in (Fraction(1, 4), Fraction(-5), Fraction(9), Fraction(10)):
+        assert not tube.lies_in(case, narrow, [(inside[0], centre)])
+        assert not tube.lies_in(case, narrow, [(centre, inside[0])])
+
+
+@pytest.mark.parametrize("matrix", [[[16.0]], [[-1.0]], [[0.0]]])
+def test_only_a_definite_matrix_lies_anywhere(matrix: list[list[float]]) -> None:
+    case = Case(parse(glide()))
+    assert tube.lies_in(case, exactly(np.array(matrix)), [(Fraction(0), Fraction(1))]) is (matrix[0][0] > 0)
+
+
+@given(st.floats(-0.999, 0.999), st.floats(0.5, 2.0), st.floats(2.0**-20, 2.0**20))
+@example(0.5, 1.0 + 2.0**-40, 1.0)
+@example(0.5, 1.0 - 2.0**-40, 1.0)
+@example(0.0, 1.0, 1.0)
+def test_the_last_ellipsoid_in_one_state(centre: float, factor: float, c2: float) -> None:
+    """|x - c| <= 1 / sqrt(P_N) in x^2 <= c2: |c| + 1 / sqrt(P_N) < sqrt(c2)."""
+    c = Fraction(centre) * Fraction(math.sqrt(c2))
+    data = edited(glide(), "levels", {"local": c2.hex(), "roa": c2.hex()})
+    left = math.sqrt(c2) - abs(float(c))
+    P_N = Fraction(1 / left**2) * Fraction(factor)
+    assume(abs(factor - 1) > 1e-12)
+    shown = tube.is_attracted(Case(parse(data)), fmpq_mat([[fmpq(P_N.numerator, P_N.denominator)]]), [c])
+    assert shown == (factor > 1)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_the_last_ellipsoid_is_attracted(seed: int) -> None:
+    """In three states, just shown: V stays below c2 on its edge, and comes near to it where it can."""
+    generator = np.random.default_rng(seed)
+    data, nearest = edited(spatial(), "levels.roa", (2.0).hex()), 0.0
+    B = generator.standard_normal((3, 3))
+    P = B @ B.T + 0.1 * np.eye(3)
+    P = (P + P.T) / 2
+    case = Case(parse(edited(data, "lyapunov.P", encode(P))))
+    for k in range(10):
+        d = generator.standard_normal(3)
+        c = d / math.sqrt(d @ P @ d / 2.0) * generator.uniform(0, 1)
+        A = np.eye(3) + 0.1 * generator.standard_normal((3, 3))
+        shape = P if k == 0 else A.T @ P @ A
+        low, high = 1e-9, 1e9
+        for _ in range(60):
+            middle = math.sqrt(low * high)
+            node = exactly((shape + shape.T) / 2 * middle)
+            low, high = (low, middle) if tube.is_attracted(case, node, [Fraction(v) for v in c]) else (middle, high)
+        edge = generator.standard_normal((4000, 3))
+        edge /= np.sqrt(np.einsum("ki,ij,kj->k", edge, shape * high, edge))[:, None]
+        edge = np.concatenate([edge, c[None] / math.sqrt(c @ shape @ c * high)])
+        V = np.einsum("ki,ij,kj->k", edge + c, P, edge + c)
+        assert V.max() <= 2.0 * (1 + 1e-12)
+        nearest = max(nearest, float(V.max()))
+        assert not tube.is_attracted(
+            case, exactly(P * 1e9), [Fraction(v) * 2 / Fraction(math.sqrt(c @ P @ c)) for v in c]
+        )
+    assert nearest > 2.0 * (1 - 1e-6)
 
 
 # --------------------------------------------------------------------------------------------- what each clause is for
