@@ -61,6 +61,7 @@ def certify_roa(
     device: str | None = None,
     enlarge: bool | None = None,
     box: Mapping[str, float] | None = None,
+    reach_from: Mapping[str, Fraction | float | str] | None = None,
     time_limit: float | None = None,
     max_boxes: int | None = None,
     load_seconds: float = 0.0,
@@ -98,6 +99,10 @@ def certify_roa(
     device : where boxes are bounded: "cpu" (the default) or "cuda".
     enlarge : look for a tube of ellipsoids from a larger set into the proved one; not by default.
     box : half-widths by state: `enlarge` for the largest multiple of the ellipsoid with these half-axes.
+    reach_from : a state by the states' values, those that are not named at the operating point: prove that it converges
+        too, with what lies around it, by a tube around the trajectory from there into the proved set; the widest
+        multiple of `box`, if that is given. PROVED only if the state lies in a proved set. Text means its decimal
+        value, a float its binary value.
     time_limit : seconds for everything up to the verdict, 50 by default.
     max_boxes : boxes for the ring, 4,000,000 by default.
     load_seconds : time already spent on reading, for the report.
@@ -134,7 +139,7 @@ def certify_roa(
     single = {
         "claim": claim, "candidate": candidate, "Q": Q, "R": R, "P": P, "level": level, "engine": engine,
         "dreal_precision": dreal_precision, "jobs": jobs, "device": device, "enlarge": enlarge, "box": box,
-        "time_limit": time_limit, "max_boxes": max_boxes,
+        "reach_from": reach_from, "time_limit": time_limit, "max_boxes": max_boxes,
     }  # fmt: skip
     notices: list[str] = []
     try:
@@ -214,7 +219,7 @@ def _options(options: RoaOptions | None, single: dict[str, Any]) -> RoaOptions:
         return options
     numbers, whole = ("level", "dreal_precision", "time_limit"), ("jobs", "max_boxes")
     readers: dict[str, Callable[[Any, str], Any]] = dict.fromkeys(single, _text)
-    readers |= {"Q": _row, "R": _row, "P": _matrix, "enlarge": _flag, "box": _widths}
+    readers |= {"Q": _row, "R": _row, "P": _matrix, "enlarge": _flag, "box": _widths, "reach_from": _state}
     readers |= dict.fromkeys(numbers, _number) | dict.fromkeys(whole, _count)
     read = {name: readers[name](value, name) for name, value in single.items()}
     return RoaOptions(**read)
@@ -357,6 +362,17 @@ def _flag(value: Any, name: str) -> bool:
 def _widths(value: Any, name: str) -> dict[str, float]:
     _require(isinstance(value, Mapping), name, "a mapping from states to half-widths", value)
     return {_text(state, name): _number(width, name) for state, width in value.items()}
+
+
+def _state(value: Any, name: str) -> dict[str, Fraction]:
+    _require(isinstance(value, Mapping), name, "a mapping from states to their values", value)
+    found = {}
+    for state, given in value.items():
+        number = given.item() if isinstance(given, np.generic) else given
+        usable = isinstance(number, int | float | str | Fraction) and not isinstance(number, bool)
+        _require(usable, name, "a mapping from states to numbers", given)
+        found[_text(state, name)] = exact(number, name)
+    return found
 
 
 def _matrix(value: Any, name: str) -> Any:

@@ -101,6 +101,12 @@ def test_a_tube_by_name(tmp_path: Path) -> None:
     assert json.loads((result.raw or b"").decode())["claim"]["kind"] == "enlarged"
 
 
+def test_a_state_by_name(tmp_path: Path) -> None:
+    result = certify_roa(*scalar_tanh(), tmp_path, level=0.25, reach_from={"x": "1.3"}, box={"x": 0.1}, time_limit=10)
+    assert (result.verdict, result.claim, result.reach_from) == (Verdict.PROVED, "reached", (Fraction(13, 10),))
+    assert result.contains([Fraction(13, 10)]) is True and result.contains([-1.3]) is False
+
+
 def test_what_the_core_takes_is_taken(tmp_path: Path) -> None:
     seen: list[str] = []
     result = certify_roa(
@@ -131,6 +137,7 @@ def test_options_by_name_are_those_of_the_options() -> None:
         "device": "tpu",
         "enlarge": "yes",
         "box": {"theta": -1.0},
+        "reach_from": {"theta": float("nan")},
         "P": [[1.0, 2.0], [0.0, 1.0]],
         "Q": (1.0,),
         "R": (1.0, 2.0),
@@ -143,6 +150,18 @@ def test_options_by_name_are_those_of_the_options() -> None:
     for box in ([1.0, 2.0], {"theta": "1"}, {1: 1.0}):
         with pytest.raises(InputError, match="box"):
             certify_roa("pendulum", SHIPPED, box=box)  # type: ignore[arg-type]
+    for at in (
+        [1.0, 2.0],
+        {"theta": None},
+        {"theta": True},
+        {"theta": "far"},
+        {1: 1.0},
+        {"phi": 1.0},
+        {"theta": 99},
+        {},
+    ):
+        with pytest.raises(InputError, match="reach_from"):
+            certify_roa("pendulum", SHIPPED, reach_from=at)  # type: ignore[arg-type]
 
 
 def test_options_at_once_or_by_name() -> None:
