@@ -14,10 +14,11 @@ from functools import cached_property
 import numpy as np
 
 from .case import Case, Failures
+from .document import Intervals
 from .elementary import elementary
 from .expression import evaluate
 from .float64 import EPS, Array, ends, float_with_error, frobenius, gamma, norm, total, up, within
-from .jets import Jet, constant, widen
+from .jets import Jet, constant, uncertain, widen
 from .network import Folded
 
 _MOST_NUMBERS = 2**25  # in the matrices of all jets, or of a layer and the paths to it
@@ -60,11 +61,12 @@ class Ball:
             values = [_affine(v, scale, offset, error) for v, scale, offset, error in each]
         return [input_jet(*part) for part in zip(values, net.scale.tolist(), h, strict=True)]
 
-    @cached_property
-    def F(self) -> list[Jet]:
-        """The components of F on the ball. At rest F(0) = 0, of which these jets know no more than that 0 is near."""
+    def F(self, cell: Intervals = ()) -> list[Jet]:
+        """The components of F on the ball, enclosed for all values of the uncertain quantities in a cell. At rest
+        F(0) = 0, of which these jets know no more than that 0 is near."""
         k = len(self.states[0].a)
-        return evaluate(self.case.c.dynamics, lambda q: constant(q, k), [*self.states, *self.inputs])
+        quantities = [uncertain(lo, hi, k) for lo, hi in cell]
+        return evaluate(self.case.c.dynamics, lambda q: constant(q, k), [*self.states, *self.inputs, *quantities])
 
 
 def _affine(h: Jet, scale: float, offset: float, offset_error: float) -> tuple[float, float]:

@@ -8,7 +8,7 @@ matrices with weights >= 0, so it is one, and knows the directions in which v is
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from typing import Any
 
@@ -122,6 +122,12 @@ class Jet:
         wrong = e1 * self.bend + EPS * (steepest * self.bend + frobenius(H))
         a, Q, E = np.asarray(f1)[..., None] * self.a, each(f1) * self.Q + H, each(steepest) * self.E + R
         return Jet(f0, e0, a, up(slack), Q, widen(E, wrong))
+
+
+def uncertain(lo: Fraction, hi: Fraction, n: int) -> Jet:
+    """A number of [lo, hi] over R^n, the same for all d."""
+    middle, (reach, error) = constant((lo + hi) / 2, n), float_with_error((hi - lo) / 2)
+    return replace(middle, error=up(middle.error + reach + error))
 
 
 def constant(q: Fraction, n: int) -> Jet:

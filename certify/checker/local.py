@@ -22,20 +22,28 @@ class Local(Ball):
         super().__init__(case, case.local.J, "local ball")
 
     @cached_property
-    def sides(self) -> tuple[fmpq_mat, fmpq_mat]:
-        """The decay, and what has to stay below it."""
+    def sides(self) -> list[tuple[fmpq_mat, fmpq_mat] | None]:
+        """For each cell the decay, and what has to stay below it; None where F has no finite model."""
         P = exactly(self.case.c.P)
-        nothing = fmpq_mat(P.nrows(), P.nrows())
-        return sides(Models(self.J, self.F), P, nothing, self.case.local.multipliers)
+        nothing, found = fmpq_mat(P.nrows(), P.nrows()), []
+        for cell in self.case.cells:
+            F = self.F(cell)
+            by = self.case.local.multipliers
+            found.append(sides(Models(self.J, F), P, nothing, by) if are_finite(F) else None)
+        return found
 
     @cached_property
     def margin(self) -> float:
-        """1 - the largest share of the decay that the rest may take, in floats for people."""
-        try:
-            decay, rest = (np.array([[float(fraction(v)) for v in row] for row in M.tolist()]) for M in self.sides)
-            return float(1 - np.max(np.linalg.eigvals(np.linalg.solve(decay, rest)).real))
-        except (np.linalg.LinAlgError, OverflowError):
-            return float("nan")
+        """1 - the largest share of the decay that the rest may take in any cell, in floats for people."""
+        return min(_margin(*both) if both is not None else float("nan") for both in self.sides)
+
+
+def _margin(decay: fmpq_mat, rest: fmpq_mat) -> float:
+    try:
+        left, right = (np.array([[float(fraction(v)) for v in row] for row in M.tolist()]) for M in (decay, rest))
+        return float(1 - np.max(np.linalg.eigvals(np.linalg.solve(left, right)).real))
+    except (np.linalg.LinAlgError, OverflowError):
+        return float("nan")
 
 
 def fits(local: Local) -> Failures:
@@ -50,9 +58,11 @@ def fits(local: Local) -> Failures:
 
 def decreases(local: Local) -> Failures:
     """`local`: Vdot < 0 on the ball without its centre."""
-    if not are_finite(local.F):
-        yield "levels.local", "F has no finite model on the local ball"
-    decay, rest = local.sides
-    if not is_definite(decay - rest):
-        yield "levels.local", f"Vdot < 0 is not shown on the local ball: {1 - local.margin:.3g} of the decay"
-    return 1
+    for both in local.sides:
+        if both is None:
+            yield "levels.local", "F has no finite model on the local ball"
+            return 0
+        decay, rest = both
+        if not is_definite(decay - rest):
+            yield "levels.local", f"Vdot < 0 is not shown on the local ball: {1 - local.margin:.3g} of the decay"
+    return len(local.sides)
