@@ -127,7 +127,9 @@ class _Search:
     def __init__(self, problem: Problem, T: Array) -> None:
         self.problem = problem
         self.loop = problem.loop
-        self.corners = [(values, plant.function("torch")) for values, plant in self.loop.system.corners()]
+        self.f = self.loop.system.uncertain_function("torch")
+        self.corners = self.loop.system.corners()
+        self.worst = [[float(q) for q in corner.values()] for corner in self.corners]
         network = self.loop.folded
         self.layers = [
             (torch.tensor(W.T.copy()), torch.tensor(b)) for W, b in zip(network.weights, network.biases, strict=True)
@@ -148,7 +150,7 @@ class _Search:
             h = torch.addmm(b, h.tanh() if k else h, W)
         u = self.clipped(self.scale * self.squashed(h) + self.offset)
         gradient = 2 * (x @ self.P)
-        vdot = torch.stack([(gradient * f(x, u)).sum(-1) for _, f in self.corners]).amax(0)
+        vdot = torch.stack([(gradient * self.f(x, u, values)).sum(-1) for values in self.worst]).amax(0)
         return vdot, torch.maximum(self.lo - u, u - self.hi).amax(-1)
 
     def bad(self, z: torch.Tensor) -> torch.Tensor:
@@ -186,7 +188,7 @@ class _Search:
                 x = (self.T @ (factor * point)).numpy()
                 kinds: tuple[Literal["vdot", "input"], ...] = ("vdot", "input") if self.check_inputs else ("vdot",)
                 for kind in kinds:
-                    for values, _ in self.corners if kind == "vdot" else self.corners[:1]:
+                    for values in self.corners if kind == "vdot" else self.corners[:1]:
                         witness = Witness(x, float(self.problem.V(x)), kind, values)
                         if confirm(self.problem, witness):
                             return witness

@@ -245,20 +245,16 @@ class System:
         dynamics = tuple(e.subs(held) for e in self.dynamics)
         return replace(self.with_parameters(known), dynamics=dynamics, disturbances=(), ranges={})
 
-    def corners(self, most: int = 64) -> tuple[tuple[dict[str, Fraction], System], ...]:
-        """The vertices of the box of ranges, each with the plant there, in an order that is the same each time; beyond
-        `most` of them, some. Without ranges it is the plant alone."""
-        if not self.ranges:
-            return (({}, self),)
+    def corners(self, most: int = 64) -> tuple[dict[str, Fraction], ...]:
+        """The vertices of the box of ranges, in an order that is the same each time; beyond `most` of them, some."""
         vertices = list(itertools.islice(itertools.product((0, 1), repeat=len(self.ranges)), most))
         if 2 ** len(self.ranges) > most:
             drawn = random.Random(0)
             vertices = [tuple(drawn.randint(0, 1) for _ in self.ranges) for _ in range(most)]
-        each = [
+        return tuple(
             {name: ends[side] for (name, ends), side in zip(self.ranges.items(), vertex, strict=True)}
             for vertex in vertices
-        ]
-        return tuple((values, self.at(values)) for values in each)
+        )
 
     def exact_dynamics(self) -> tuple[sympy.Expr, ...]:
         """The nominal f: parameters replaced by exact rationals, disturbances by 0; free are states and inputs."""
@@ -308,10 +304,20 @@ class System:
         return found
 
     def function(self, module: str = "numpy") -> Callable[[Any, Any], Any]:
-        """Floating-point f: arrays x (..., n) and u (..., m) to xdot (..., n); `module` numpy or torch.
+        """Floating-point nominal f: arrays x (..., n) and u (..., m) to xdot (..., n); `module` numpy or torch.
 
         For simulation and search only: nothing is proved with it.
         """
+        f = self._function(self.exact_dynamics(), (), module)
+        return lambda x, u: f(x, u, ())
+
+    def uncertain_function(self, module: str = "numpy") -> Callable[[Any, Any, Sequence[float]], Any]:
+        """The same for values of what is uncertain, in the order of the ranges: a third argument, k numbers."""
+        return self._function(self.uncertain_dynamics(), [s for s, _ in self.uncertain], module)
+
+    def _function(
+        self, expressions: Sequence[sympy.Expr], more: Sequence[sympy.Symbol], module: str
+    ) -> Callable[[Any, Any, Sequence[float]], Any]:
         stack: Any
         broadcast: Any
         if module == "numpy":
@@ -325,14 +331,14 @@ class System:
         else:
             raise InputError(f"`module` must be 'numpy' or 'torch'; found {module!r}.")
         # torch has no sine of a plain number
-        rounded = [e.replace(_is_constant_function, lambda c: c.evalf(17)) for e in self.exact_dynamics()]
-        raw = sympy.lambdify([*self.states, *self.inputs], rounded, modules=module, cse=True)
+        rounded = [e.replace(_is_constant_function, lambda c: c.evalf(17)) for e in expressions]
+        raw = sympy.lambdify([*self.states, *self.inputs, *more], rounded, modules=module, cse=True)
         n, m = self.n, self.m
 
-        def f(x: Any, u: Any) -> Any:
+        def f(x: Any, u: Any, values: Sequence[float]) -> Any:
             columns: list[Any] = [x[..., i] for i in range(n)] + [u[..., j] for j in range(m)]
             zero = 0.0 * (columns[0] + columns[n])  # constant components take the batch's shape
-            return stack(tuple(broadcast(*[value + zero for value in raw(*columns)])), -1)
+            return stack(tuple(broadcast(*[value + zero for value in raw(*columns, *values)])), -1)
 
         return f
 

@@ -86,9 +86,9 @@ class VdotBound:
         smooth = torch.isfinite(bound)  # a component of F that is not enclosed leaves a NaN in the sum over all
         # At the box's centre, and for the worst values of what is uncertain, only the inputs' errors, what is of second
         # order in all these, and the remainder are left.
-        errors, worst = vdot.g[n:].abs().split((self.system.m, len(self.system.uncertain)))
-        doubt = errors.sum(0) + vdot.Q[n:, n:].abs().sum((0, 1)) + vdot.r
-        violated = vdot.c + worst.sum(0) - doubt >= 0
+        known = n + self.system.m
+        doubt = vdot.g[n:known].abs().sum(0) + vdot.Q[n:, n:].abs().sum((0, 1)) + vdot.r
+        violated = vdot.c + vdot.g[known:].abs().sum(0) - doubt >= 0
         bound = self._within_ring(bound, vdot, lo, hi, centre, radius, inner, outer)
         proved = bound < 0
         if self.inside:
