@@ -19,7 +19,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from certify.checker import float64
-from certify.checker.ball import enclose_at_origin, input_jet, too_large
+from certify.checker.ball import enclose_on_ball, input_jet, too_large
 from certify.checker.document import Policy
 from certify.checker.elementary import elementary
 from certify.checker.exact import contains_ball, gershgorin_lower, inverse_diagonal, is_definite, root_above
@@ -885,6 +885,12 @@ def test_the_policys_error_on_boxes_is_of_second_order() -> None:
     assert np.all(orders > 1.8), orders
 
 
+def at_rest(J: np.ndarray) -> list[Jet]:
+    """The states x = J d."""
+    nothing = np.zeros((J.shape[1], J.shape[1]))
+    return [Jet(np.float64(0), 0.0, row, 0.0, nothing, nothing) for row in J]
+
+
 @pytest.mark.parametrize("radius", [1e-200, 1e-9, 1e-3, 0.2, 3.0])
 def test_the_policy_at_the_origin(radius: float) -> None:
     generator, finite = np.random.default_rng(int(radius * 1000) + 51), 0
@@ -893,8 +899,8 @@ def test_the_policy_at_the_origin(radius: float) -> None:
         n = widths[0]
         J = radius * generator.standard_normal((n, n))
         folded = fold(policy, u_eq)
-        gradient, slack, Q, E = enclose_at_origin(folded, J)
-        if not np.isfinite([*slack, *np.ravel(E)]).all():
+        found = enclose_on_ball(folded, at_rest(J))
+        if not all(np.isfinite([h.slack, *np.ravel(h.E)]).all() for h in found):
             continue
         finite += 1
         with ctx.workprec(3000):
@@ -903,10 +909,11 @@ def test_the_policy_at_the_origin(radius: float) -> None:
                 state = [sum((arb(p) * arb(v) for p, v in zip(row, d, strict=True)), arb(0)) for row in J.tolist()]
                 for j, (u, q) in enumerate(zip(policy_in_arb(policy, u_eq, state), u_eq, strict=True)):
                     scale = arb(float(folded.scale[j]))
-                    linear = sum((arb(float(g)) * arb(v) for g, v in zip(gradient[j], d, strict=True)), arb(0))
+                    h = found[j]
+                    linear = sum((arb(float(g)) * arb(v) for g, v in zip(h.a, d, strict=True)), arb(0))
                     line = ball(q) + scale * linear
-                    bound = arb(float(slack[j])) * square.sqrt() + quadratic(E[j], d)
-                    assert abs(u - line - scale * quadratic(Q[j], d)) <= abs(scale) * bound, (
+                    bound = arb(float(h.slack)) * square.sqrt() + quadratic(h.E, d)
+                    assert abs(u - line - scale * quadratic(h.Q, d)) <= abs(scale) * bound, (
                         widths,
                         size,
                         squash,
@@ -931,7 +938,7 @@ def test_what_is_too_large_for_the_local_rule_is_refused_at_once() -> None:
     assert next(too_large(folded([64, 1]), 10_000, 64))[0] == "plant.dynamics"
     small = folded([1, wide // 12, 1, wide // 12, 1])
     assert not list(too_large(small, 1, 1))
-    enclose_at_origin(small, np.ones((1, 1)))
+    enclose_on_ball(small, at_rest(np.ones((1, 1))))
 
 
 @pytest.mark.parametrize("seed", range(10))
@@ -986,7 +993,8 @@ def test_a_subnormal_multiple_of_a_large_model_contains(k: float, value: float) 
 @pytest.mark.parametrize("scale", [5e-324, -(2.0**-1060)])
 def test_a_subnormal_scale_of_an_input_that_bends_much_contains(scale: float) -> None:
     Q = np.full((1, 1), 2.0**500 / 3)
-    u = input_jet(Fraction(0), np.float64(scale), np.zeros(1), 0.0, Q, np.zeros((1, 1)))
+    h = Jet(np.float64(0), 0.0, np.zeros(1), 0.0, Q, np.zeros((1, 1)))
+    u = input_jet((0.0, 0.0), np.float64(scale), h)
     least = 2.0**-53 * abs(Fraction(scale)) * Fraction(float(Q[0, 0]))
     assert Fraction(float(u.E[0, 0])) >= least
 

@@ -67,7 +67,7 @@ def pendulum() -> Document:
     with TemporaryDirectory() as folder:
         command = [sys.executable, "-c", "from certify.cli import main; main()", "roa"]
         command += ["--policy", str(ROOT / "examples" / "policies" / "pendulum.pt")]
-        command += ["--level", "0.3", "--enlarge", "--time-limit", "5", "--out", folder, "--quiet"]
+        command += ["--level", "0.3", "--enlarge", "--time-limit", "30", "--out", folder, "--quiet"]
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stdout + done.stderr
         data: Document = json.loads((Path(folder) / "certificate.json").read_text())
@@ -79,14 +79,15 @@ def ball(J: Any, rows: Any) -> Document:
 
 
 def slab(middle: float, end: float, duration: float, J: float, rows: Any) -> Document:
-    return {"middle": encode([middle]), "end": encode([end]), "duration": duration.hex()} | ball(J, rows)
+    nodes = {"middle": encode([middle]), "end": encode([end])}
+    return nodes | {"duration": duration.hex(), "path": None} | ball(J, rows)
 
 
 def scalar(dynamics: Any, c: float, local: Document, start: float, slabs: Sequence[Document], **more: Any) -> Document:
     """In V = x^2 with c1 = c2 = c: the tree is a leaf of which nothing is asked."""
     options: dict[str, Any] = {"root": [math.sqrt(c) * 1.25], "domain": [("-9", "9")], **more}
     data = make([dynamics], [([[0.0]], [0.0])], 1.0, (c, c), **options)
-    data["schema"], data["claim"] = "certify-certificate/4", {"kind": "enlarged", "start": encode([start])}
+    data["schema"], data["claim"] = "certify-certificate/5", {"kind": "enlarged", "start": encode([start])}
     data["evidence"] |= {"local": local, "tube": list(slabs)}
     return data
 
@@ -534,7 +535,7 @@ def random_loop(random: np.random.Generator) -> tuple[Document, np.ndarray]:
         centre=centre, scale=scale, offset=[0.0] * m, root=[1.0] * n,
         u_eq=[str(Fraction(float(v)) * Fraction(random.integers(-9, 9).item(), 10)) for v in scale],
     )  # fmt: skip
-    data["schema"] = "certify-certificate/4"
+    data["schema"] = "certify-certificate/5"
     data["evidence"] |= {"local": ball(np.eye(n), np.ones((3, n))), "tube": []}
     return data, J
 
@@ -688,7 +689,7 @@ def bribed() -> Document:
 
 CLAUSES: dict[str, tuple[Callable[[], Document], str, Any]] = {
     "the ball contains the ellipsoids": (past_the_pole, "contains_ball", lambda *_: True),
-    "multipliers": (bribed, "are_usable", lambda _: True),
+    "multipliers": (bribed, "are_usable", lambda *_: True),
     "the last node": (lambda: levels(2.0**-9, decay()), "is_definite", lambda _: True),
 }
 

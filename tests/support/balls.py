@@ -104,7 +104,7 @@ def multipliers(data: Document, J: np.ndarray, nodes: Sequence[np.ndarray], R: n
 
 
 def slab_of(middle: np.ndarray, end: np.ndarray, duration: float) -> Document:
-    return {"middle": encode(middle), "end": encode(end), "duration": float(duration).hex()}
+    return {"middle": encode(middle), "end": encode(end), "duration": float(duration).hex(), "path": None}
 
 
 def enlarge(data: Document, nodes: Sequence[np.ndarray], durations: Sequence[float]) -> Document:
