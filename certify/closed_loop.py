@@ -55,10 +55,11 @@ class ClosedLoop:
         """
         system = self.system
         at_zero = dict.fromkeys(system.states, Fraction(0)) | dict(zip(system.inputs, self.u_eq, strict=True))
-        for symbol, expression in zip(system.states, system.exact_dynamics(), strict=True):
+        unknown = [s for s, _ in system.uncertain]
+        for symbol, expression in zip(system.states, system.uncertain_dynamics(), strict=True):
             wanted = f"f(0, u_eq) must be exactly 0 in {system.name}"
             try:
-                value = evaluate_exactly(expression, at_zero)
+                value = evaluate_exactly(expression, at_zero, unknown)
             except InputError as error:
                 raise InputError(f"{wanted}; {symbol}' is not decided in rationals: {error}.") from error
             if value != 0:

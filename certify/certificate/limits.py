@@ -30,7 +30,7 @@ def require_within_limits(system: System, network: TanhNetwork) -> None:
     ------
     InputError : a limit of the format is exceeded; the message names it.
     """
-    dynamics = system.exact_dynamics()
+    dynamics = system.uncertain_dynamics()
     trees = [to_tree(e) for e in dynamics]
     nodes = [node for tree in trees for node in _nodes(tree, 0)]
     numbers = [q for pair in (*system.domain, *system.input_bounds) for q in pair] + list(system.exact_u_eq())
@@ -77,7 +77,7 @@ def require_short(P: np.ndarray) -> None:
 
 def _size(system: System) -> int:
     """Operations, each counted once however often it stands in the equations, times n^2; an upper bound."""
-    seen = {node for e in system.exact_dynamics() for node in sympy.preorder_traversal(e)}
+    seen = {node for e in system.uncertain_dynamics() for node in sympy.preorder_traversal(e)}
     return sum(_operations(node) for node in seen) * system.n**2
 
 

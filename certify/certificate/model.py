@@ -29,6 +29,7 @@ from certify.expressions import from_tree, to_tree
 from certify.lyapunov.function import Quadratic
 from certify.policies import TanhNetwork
 from certify.systems import System
+from certify.systems.system import Interval
 
 Array = NDArray[np.float64]
 SCHEMA = "certify-certificate/5"
@@ -93,6 +94,7 @@ class PartitionTree:
     T, root : (n, n) and (n,), half-widths of the root box in z, x = T z.
     tree : the partition in preorder, one byte a node.
     local : of the local proof; None where the claim has none.
+    cells : into how many parts the range of each uncertain quantity is cut for it, in their order.
     tube : the slabs, in their order, of a claim that is enlarged by a tube.
     """
 
@@ -101,6 +103,7 @@ class PartitionTree:
     tree: bytes
     local: LocalBall | None = None
     tube: tuple[Slab, ...] = ()
+    cells: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -162,7 +165,8 @@ class Certificate:
                 "name": system.name,
                 "states": [s.name for s in system.states],
                 "inputs": [s.name for s in system.inputs],
-                "dynamics": [to_tree(e) for e in system.exact_dynamics()],
+                "uncertain": [{"name": s.name, "range": [str(lo), str(hi)]} for s, (lo, hi) in system.uncertain],
+                "dynamics": [to_tree(e) for e in system.uncertain_dynamics()],
                 "u_eq": [str(u) for u in system.exact_u_eq()],
                 "domain": [[str(lo), str(hi)] for lo, hi in system.domain],
                 "input_bounds": [[str(lo), str(hi)] for lo, hi in system.input_bounds],
@@ -236,20 +240,22 @@ def parse_certificate(raw: bytes, name: str) -> Certificate:
             raise CertificateFormatError(f"{name}: `claim.kind` must be one of {', '.join(CLAIMS)}; found {kind!r}.")
         plant, policy, evidence = data["plant"], data["policy"], data["evidence"]
         states, inputs = (tuple(sympy.Symbol(s) for s in plant[k]) for k in ("states", "inputs"))
-        names = {s.name: s for s in (*states, *inputs)}
+        ranges = {q["name"]: (Fraction(q["range"][0]), Fraction(q["range"][1])) for q in plant["uncertain"]}
+        names = {s.name: s for s in (*states, *inputs, *map(sympy.Symbol, ranges))}
         n, m = len(states), len(inputs)
         provenance, units, x_eq = _read_provenance(data["provenance"], names)
         system = System(
             name=plant["name"],
             states=states,
             inputs=inputs,
-            parameters={},
+            parameters={name: _nominal(interval) for name, interval in ranges.items()},
             dynamics=tuple(from_tree(t, names) for t in plant["dynamics"]),
             u_eq=tuple(sympy.Rational(q) for q in plant["u_eq"]),
             domain=tuple((Fraction(lo), Fraction(hi)) for lo, hi in plant["domain"]),
             input_bounds=tuple((Fraction(lo), Fraction(hi)) for lo, hi in plant["input_bounds"]),
             units=units,
             x_eq=tuple(sympy.Rational(x_eq.get(s.name, "0")) for s in states),
+            ranges=ranges,
         )
         network = TanhNetwork(
             weights=tuple(_decode(x["weight"], tuple(x["shape"])) for x in policy["layers"]),
@@ -283,6 +289,12 @@ def _read_claim(data: Mapping[str, Any], n: int) -> Claim:
         start, centre = _decode(data["claim"]["start"], (n, n)), _decode(data["claim"]["centre"], (n,))
         return Reached(**levels, start=Quadratic(start), centre=tuple(centre.tolist()))
     return CLAIMS[kind](**levels)
+
+
+def _nominal(interval: Interval) -> Fraction:
+    """A value of an uncertain quantity of which nothing else is known: 0 if it may be 0, else the middle."""
+    lo, hi = interval
+    return Fraction(0) if lo <= 0 <= hi else (lo + hi) / 2
 
 
 def _for_people(system: System) -> dict[str, dict[str, str]]:
@@ -323,6 +335,7 @@ def _evidence(evidence: PartitionTree | TrustedSolver) -> dict[str, Any]:
             "T": _encode(evidence.T),
             "root": _encode(evidence.root),
             "tree": base64.b64encode(evidence.tree).decode("ascii"),
+            "cells": list(evidence.cells),
             "local": None if evidence.local is None else _ball(evidence.local),
             "tube": [
                 {"middle": _encode(slab.middle), "end": _encode(slab.end), "duration": float(slab.duration).hex()}
@@ -358,6 +371,7 @@ def _read_evidence(data: Mapping[str, Any], n: int) -> PartitionTree | TrustedSo
                 )
                 for slab in data["tube"]
             ),
+            tuple(map(int, data["cells"])),
         )
     queries = tuple((str(name), str(answer)) for name, answer in data["queries"])
     return TrustedSolver(str(data["solver"]), str(data["version"]), float.fromhex(data["precision"]), queries)

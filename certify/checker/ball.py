@@ -14,10 +14,11 @@ from functools import cached_property
 import numpy as np
 
 from .case import Case, Failures
+from .document import Intervals
 from .elementary import elementary
 from .expression import evaluate
 from .float64 import EPS, Array, ends, float_with_error, frobenius, gamma, norm, total, up, within
-from .jets import Jet, constant, each, tensor_norm, triples, widen
+from .jets import Jet, constant, each, tensor_norm, triples, uncertain, widen
 from .network import Folded
 
 _MOST_JETS = 2**26  # numbers in the matrices and tensors of all jets
@@ -94,12 +95,13 @@ class Ball:
         batch = Jet(c, error, a, slack, each(net.scale) * h.Q, column * h.K, E, np.eye(len(c)), U)
         return batch.members
 
-    @cached_property
-    def F(self) -> list[Jet]:
-        """The components of F on the ball. At rest F(0) = 0, of which these jets know no more than that 0 is near."""
+    def F(self, cell: Intervals = ()) -> list[Jet]:
+        """The components of F on the ball, enclosed for all values of the uncertain quantities in a cell. At rest
+        F(0) = 0, of which these jets know no more than that 0 is near."""
         U = self.units.shares
         states = [replace(x, B=np.zeros(len(U)), U=U) for x in self.states]
-        return evaluate(self.case.c.dynamics, lambda q: constant(q, U), [*states, *self.inputs])
+        quantities = [uncertain(lo, hi, U) for lo, hi in cell]
+        return evaluate(self.case.c.dynamics, lambda q: constant(q, U), [*states, *self.inputs, *quantities])
 
 
 def _affine(h: float, error: float, scale: float, offset: float, offset_error: float) -> tuple[float, float]:

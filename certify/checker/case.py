@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import cached_property
+from itertools import product
 
 from flint import fmpq_mat
 
-from .document import Certificate, LocalBall, Partition, Slab
+from .document import Certificate, Intervals, LocalBall, Partition, Slab
 from .exact import exactly, gershgorin_lower, inverse_diagonal
 from .network import Folded, fold
 
@@ -35,6 +36,15 @@ class Case:
         if self.partition.local is None:
             raise TypeError("this rule is about a local ball")
         return self.partition.local
+
+    @property
+    def cells(self) -> Iterator[Intervals]:
+        """The boxes that the ranges of the uncertain quantities are cut into; one of no extent if there are none."""
+        cut = [
+            [(lo + (hi - lo) * Fraction(i, count), lo + (hi - lo) * Fraction(i + 1, count)) for i in range(count)]
+            for (lo, hi), count in zip(self.c.ranges, self.partition.cells, strict=True)
+        ]
+        return product(*cut)
 
     @property
     def tube(self) -> tuple[Slab, ...]:

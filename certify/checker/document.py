@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import struct
 from dataclasses import dataclass
 from fractions import Fraction
@@ -18,6 +19,7 @@ from .schema import Value
 from .strict import MAX_VALUES, load
 
 MAX_STATES, MAX_LAYERS, MAX_WIDTH, MAX_SLABS = 64, 64, 2**14, 10**4
+MAX_CELLS, MAX_CUTS = 4096, 64  # of the box of uncertain quantities in all, and of one range
 CLAIMS = ("asymptotic", "practical", "enlarged", "reached")
 WITH_TUBE = ("enlarged", "reached")
 Array = NDArray[np.float64]
@@ -95,6 +97,7 @@ class Partition:
     T: Array
     root: Array
     tree: bytes
+    cells: tuple[int, ...]  # how many the range of each uncertain quantity is cut into
     local: LocalBall | None
     tube: tuple[Slab, ...]
 
@@ -119,6 +122,8 @@ class Certificate:
     name: str
     states: tuple[str, ...]
     inputs: tuple[str, ...]
+    uncertain: tuple[str, ...]
+    ranges: Intervals  # of the uncertain quantities
     dynamics: Tape
     u_eq: tuple[Fraction, ...]
     domain: Intervals
@@ -173,7 +178,7 @@ def certificate(data: Any, sha256: str) -> Certificate:
         **stated,
         P=P.array(n, n),
         levels=numbers,
-        evidence=_evidence(evidence, n, kind),
+        evidence=_evidence(evidence, n, len(stated["uncertain"]), kind),
         sha256=sha256,
         start=of_tube[0].array(n, n) if of_tube else None,
         centre=of_tube[1].array(n) if kind == "reached" else None,
@@ -181,19 +186,29 @@ def certificate(data: Any, sha256: str) -> Certificate:
 
 
 def _plant(plant: Value) -> dict[str, Any]:
-    name, *names, dynamics, u_eq, domain, bounds = plant.keys("name states inputs dynamics u_eq domain input_bounds")
+    keys = "name states inputs uncertain dynamics u_eq domain input_bounds"
+    name, *names, uncertain, dynamics, u_eq, domain, bounds = plant.keys(keys)
     states, inputs = (value.listed(Value.name, 1, MAX_STATES) for value in names)
-    n, m = len(states), len(inputs)
-    plant.must(len({*states, *inputs}) == n + m, "a plant whose states and inputs have different names")
+    quantities = uncertain.listed(_quantity, 0, MAX_STATES)
+    n, m, others = len(states), len(inputs), tuple(other for other, _ in quantities)
+    everything = states + inputs + others
+    plant.must(len(set(everything)) == len(everything), "a plant in which no name stands for two things")
     return {
         "name": name.name(),
         "states": states,
         "inputs": inputs,
-        "dynamics": parse_dynamics(dynamics.listed(lambda tree: tree.raw, n), states + inputs),
+        "uncertain": others,
+        "ranges": tuple(interval for _, interval in quantities),
+        "dynamics": parse_dynamics(dynamics.listed(lambda tree: tree.raw, n), everything),
         "u_eq": u_eq.listed(Value.rational, m),
         "domain": domain.listed(Value.interval, n),
         "input_bounds": bounds.listed(Value.interval, m),
     }
+
+
+def _quantity(value: Value) -> tuple[str, tuple[Fraction, Fraction]]:
+    name, interval = value.keys("name range")
+    return name.name(), interval.interval()
 
 
 def _policy(value: Value, n: int, m: int) -> Policy:
@@ -259,14 +274,18 @@ def check_hash(policy: Policy, stated: Any) -> None:
         raise Rejected("hash", "policy.sha256", "does not match the layers in the file")
 
 
-def _evidence(value: Value, n: int, claim: str) -> Partition | Trusted:
-    kinds = ("partition-tree", *(() if claim in WITH_TUBE else ("trusted-solver",)))
+def _evidence(value: Value, n: int, k: int, claim: str) -> Partition | Trusted:
+    kinds = ("partition-tree", *(() if claim in WITH_TUBE or k else ("trusted-solver",)))
     known = isinstance(value.raw, dict) and value.raw.get("kind") in kinds
     value.must(known, f"an object of kind {' or '.join(kinds)}")
     if value.raw["kind"] == "partition-tree":
-        _, T, root, tree, local, tube = value.keys("kind T root tree local tube")
+        _, T, root, tree, cells, local, tube = value.keys("kind T root tree cells local tube")
+        cuts = cells.listed(lambda cut: cut.raw, k)
+        whole = all(type(cut) is int and 1 <= cut <= MAX_CUTS for cut in cuts)
+        cells.must(whole and math.prod(cuts) <= MAX_CELLS, f"from 1 to {MAX_CUTS} parts each, {MAX_CELLS} in all")
+        value.must(k == 0 or claim not in WITH_TUBE, "another where quantities are uncertain")
         slabs = tube.listed(lambda slab: _slab(slab, n, claim), *((1, MAX_SLABS) if claim in WITH_TUBE else (0, 0)))
-        return Partition(T.array(n, n), root.array(n), tree.octets(), _local(local, n, claim), slabs)
+        return Partition(T.array(n, n), root.array(n), tree.octets(), cuts, _local(local, n, claim), slabs)
     _, solver, version, precision, queries = value.keys("kind solver version precision queries")
     precision.must(precision.binary64() > 0, "positive")
     answers = queries.listed(lambda pair: pair.listed(Value.word, 2), 0, MAX_VALUES)

@@ -33,8 +33,8 @@ class Tape:
 
 
 def evaluate(tape: Tape, constant: Callable[[Fraction], Any], variables: Sequence[Any]) -> list[Any]:
-    """The outputs of `tape` at `variables` (states, then inputs), in the arithmetic of these; a value is kept no
-    longer than it is needed."""
+    """The outputs of `tape` at `variables` (states, inputs, uncertain quantities), in their arithmetic; a value is kept
+    no longer than it is needed."""
     last = {i: k for k, (name, *operands) in enumerate(tape.operations) if name not in _LEAVES for i in operands}
     last |= dict.fromkeys(tape.outputs, len(tape.operations))
     values: dict[int, Any] = {}

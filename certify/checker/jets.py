@@ -10,7 +10,7 @@ and knows the directions in which v is far from what is known of it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cache, cached_property
 from itertools import combinations_with_replacement, permutations
@@ -204,6 +204,12 @@ class Jet:
         wrong = up(e1 + EPS * steepest) * self.spread + self.faint
         Q, K, E = each(f1) * self.Q + H, column * self.K + C, widen(each(steepest) * self.E + R, wrong)
         return Jet(f0, e0, column * self.a, slack, Q, K, E, column * self.B, self.U)
+
+
+def uncertain(lo: Fraction, hi: Fraction, U: Array) -> Jet:
+    """A number of [lo, hi], the same for all d, among the jets with these errors."""
+    middle, (reach, error) = constant((lo + hi) / 2, U), float_with_error((hi - lo) / 2)
+    return replace(middle, error=up(middle.error + reach + error))
 
 
 def constant(q: Fraction, U: Array) -> Jet:

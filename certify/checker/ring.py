@@ -41,7 +41,7 @@ class Ring:
 
     def __init__(self, case: Case) -> None:
         self.case, self.c, self.T, self.net = case, case.c, case.partition.T, case.net
-        self.n, self.m = len(case.c.states), len(case.c.inputs)
+        self.n, self.m, self.k = len(case.c.states), len(case.c.inputs), len(case.c.uncertain)
         value, error = np.moveaxis(
             np.array([[float_with_error(fraction(v)) for v in row] for row in case.S.tolist()]), 2, 0
         )
@@ -52,7 +52,7 @@ class Ring:
     def batch(self) -> int:
         """How many leaves are looked at together."""
         width = max(max(layer.W.shape) for layer in self.net.layers)
-        symbols = self.n + self.m
+        symbols = self.n + self.m + self.k
         numbers = max(width * (symbols + 4), symbols * symbols * (len(self.c.dynamics.operations) + 4))
         return int(max(1, min(4096, _BATCH_NUMBERS // numbers)))
 
@@ -93,14 +93,24 @@ class Ring:
         return x, up(error)
 
     def models(self, x: Array, error: Array, mid: Array, slopes: Array, wide: Array) -> tuple[Taylor, list[Taylor]]:
-        """Vdot = (2 P x)'F, and F, on the boxes; symbols: n box coordinates, m input errors."""
-        zeros, errors = np.zeros_like(wide), np.eye(self.m)[:, :, None] * wide[:, None]
+        """Vdot = (2 P x)'F, and F, on the boxes; symbols: n box coordinates, m input errors, k uncertain quantities."""
+        batch = wide.shape[1]
+        zeros, errors = np.zeros((self.m + self.k, batch)), np.eye(self.m)[:, :, None] * wide[:, None]
         states = [affine(v[0], np.concatenate([v[1:], zeros]), e) for v, e in zip(x, error, strict=True)]
         parts = zip(mid, slopes, errors, strict=True)
-        inputs = [affine(v, np.concatenate([slope, own])) for v, slope, own in parts]
-        F = evaluate(self.c.dynamics, lambda q: constant(q, self.n + self.m, len(zeros.T)), [*states, *inputs])
+        inputs = [affine(v, np.concatenate([slope, own, zeros[self.m :]])) for v, slope, own in parts]
+        quantities = [self.quantity(j, batch) for j in range(self.k)]
+        symbols = self.n + self.m + self.k
+        F = evaluate(self.c.dynamics, lambda q: constant(q, symbols, batch), [*states, *inputs, *quantities])
         rows = [[v.scaled(2 * p) for p, v in zip(row, states, strict=True)] for row in self.c.P.tolist()]
         return reduce(add, [reduce(add, row) * f for row, f in zip(rows, F, strict=True)]), F
+
+    def quantity(self, j: int, batch: int) -> Taylor:
+        """An uncertain quantity over its range."""
+        (lo, hi), g = self.c.ranges[j], np.zeros((self.n + self.m + self.k, batch))
+        (middle, error), (reach, doubt) = float_with_error((lo + hi) / 2), float_with_error((hi - lo) / 2)
+        g[self.n + self.m + j] = reach
+        return affine(np.full(batch, middle), g, up(error + doubt))
 
     def bound(self, vdot: Taylor, centre: Array, radius: Array) -> Array:
         """Upper bound of Vdot on the part of each box that lies in the ring.
@@ -122,7 +132,7 @@ class Ring:
         """sign (level - V) on the boxes, which is not negative on the part of a leaf that lies in the ring."""
         far = up(np.abs(centre) + radius)
         size = up(level + total(self.S * far * far, 0))
-        zeros = np.zeros((self.m, centre.shape[1]))
+        zeros = np.zeros((self.m + self.k, centre.shape[1]))
         g = np.concatenate([-2 * sign * self.S * centre * radius, zeros])
         q = np.concatenate([-sign * self.S * radius * radius, zeros])
         c = sign * (level - np.sum(self.S * centre * centre, axis=0))

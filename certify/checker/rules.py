@@ -39,10 +39,11 @@ def lyapunov(case: Case) -> Failures:
 
 
 def equilibrium(case: Case) -> Failures:
-    """f(0, u_eq) = 0 in rationals."""
+    """f(0, u_eq) = 0 in rationals, whatever the uncertain quantities are: these are numbers without a value."""
     c = case.c
+    at_rest = [*[Fraction(0)] * len(c.states), *c.u_eq, *[None] * len(c.uncertain)]
     try:
-        F = evaluate(c.dynamics, Exact, [Exact(q) for q in (*[Fraction(0)] * len(c.states), *c.u_eq)])
+        F = evaluate(c.dynamics, Exact, [Exact(q) for q in at_rest])
     except Undecided as error:
         yield "plant.dynamics", f"f(0, u_eq) is not decided exactly: {error}"
     else:

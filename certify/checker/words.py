@@ -37,6 +37,7 @@ def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
         rest, verdict = f"margins: {'; '.join(margins)}", "ACCEPTED"
     return [
         f"plant {c.name}: xdot = f(x, u), states ({', '.join(c.states)}), inputs ({', '.join(c.inputs)})",
+        *(f"  for every {name}(t) in {_interval(pair)}" for name, pair in zip(c.uncertain, c.ranges, strict=True)),
         *(f"  {name}' = {expression(tree)}" for name, tree in zip(c.states, c.dynamics.trees, strict=True)),
         *(f"  domain {name} in {_interval(pair)}" for name, pair in zip(c.states, c.domain, strict=True)),
         *(f"  input {name} in {_interval(pair)}, u_eq = {_number(u)}" for name, pair, u in inputs),

@@ -142,7 +142,7 @@ def root_conditions(problem: Problem, level: float) -> tuple[Condition, ...]:
 def radicands(problem: Problem) -> tuple[sympy.Expr, ...]:
     """What the equations take square roots of, inner roots before outer ones."""
     found: dict[sympy.Expr, None] = {}
-    for expression in problem.loop.system.exact_dynamics():
+    for expression in problem.loop.system.uncertain_dynamics():
         for node in sympy.postorder_traversal(expression):
             power = as_power(node)
             if power is not None and power[1] > 0 and node.free_symbols:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
@@ -14,8 +15,16 @@ if TYPE_CHECKING:
     from certify.systems import System
 
 
-def plant_of(stored: Policy, name: str | None, params: list[str], bounds: list[str]) -> System:
-    """The plant: the policy file's unless `name` says otherwise, with `--param` and `--domain` put in.
+def plant_of(
+    stored: Policy,
+    name: str | None,
+    params: list[str],
+    bounds: list[str],
+    disturbances: Sequence[str] = (),
+    error: str | None = None,
+) -> System:
+    """The plant: the policy file's unless `name` says otherwise, with `--param`, `--domain`, `--disturbance` and
+    `--input-error` put in.
 
     What is named there counts as it stands; where the policy was trained for other numbers, standard error says so.
     """
@@ -23,12 +32,47 @@ def plant_of(stored: Policy, name: str | None, params: list[str], bounds: list[s
     plant = with_params(plant, params)
     if not own:
         tell_of_other(stored, plant, tell)
-    return where_valid(stored, with_domains(plant, bounds), tell)
+    return where_valid(stored, with_errors(with_disturbances(with_domains(plant, bounds), disturbances), error), tell)
 
 
 def with_params(plant: System, params: list[str]) -> System:
-    """The plant with what `--param` says put in."""
-    return plant.with_parameters(dict(_assignment(p, "--param") for p in params))
+    """The plant with what `--param` says put in: values, and ranges LO..HI of those that are uncertain."""
+    given = dict(_assignment(p, "--param") for p in params)
+    ranges = {name: _range(value, name) for name, value in given.items() if ".." in value}
+    unknown = next((name for name in ranges if name not in plant.parameters), None)
+    if unknown is not None:
+        raise InputError(f"{plant.name} has no parameter {unknown!r}; it has: {', '.join(plant.parameters) or 'none'}.")
+    return plant.with_parameters({n: v for n, v in given.items() if n not in ranges}).with_ranges(ranges)
+
+
+def with_disturbances(plant: System, given: Sequence[str]) -> System:
+    """The plant with the ranges that `--disturbance` says: half-widths or LO..HI."""
+    known, ranges = [s.name for s in plant.disturbances], {}
+    for text in given:
+        name, value = _assignment(text, "--disturbance")
+        if name not in known:
+            raise InputError(f"{plant.name} has no disturbance {name!r}; it has: {', '.join(known) or 'none'}.")
+        ranges[name] = _range(value if ".." in value else f"-{value}..{value}", name)
+    return plant.with_ranges(ranges)
+
+
+def with_errors(plant: System, error: str | None) -> System:
+    """The plant with u + e in the place of u, as `--input-error` bounds |e|: one number for all inputs, or by name."""
+    from certify.systems import exact
+
+    if error is None:
+        return plant
+    if "=" in error:
+        return plant.with_input_errors(state(error, "--input-error"))
+    bound = exact(error, "--input-error")
+    return plant.with_input_errors({s.name: bound for s in plant.inputs})
+
+
+def _range(text: str, name: str) -> tuple[Fraction, Fraction]:
+    from certify.systems import exact
+
+    lo, _, hi = text.partition("..")
+    return exact(lo, name), exact(hi, name)
 
 
 def with_domains(plant: System, bounds: list[str]) -> System:

@@ -29,7 +29,18 @@ def roa(
             help="Plant: a name, FILE.toml, or FILE.py:NAME, whose code is run; default: what the policy file says."
         ),
     ] = None,
-    param: Annotated[list[str] | None, typer.Option(help="Parameter of the plant, NAME=VALUE; repeatable.")] = None,
+    param: Annotated[
+        list[str] | None,
+        typer.Option(help="Parameter of the plant, NAME=VALUE, or NAME=LO..HI: proved for all of it; repeatable."),
+    ] = None,
+    disturbance: Annotated[
+        list[str] | None,
+        typer.Option(help="Disturbance that acts, NAME=D for any value within +-D at any time, or NAME=LO..HI."),
+    ] = None,
+    input_error: Annotated[
+        str | None,
+        typer.Option(help="Bound of what the inputs may be off by at any time: one number, or NAME=E,NAME=E."),
+    ] = None,
     domain: Annotated[
         list[str] | None, typer.Option(help="Half-width NAME=D or interval NAME=LO:HI of a state; repeatable.")
     ] = None,
@@ -75,7 +86,7 @@ def roa(
 
     start = time.perf_counter()
     stored = policy_of(policy, importing, system, param or [])
-    plant = plant_of(stored, system, param or [], domain or [])
+    plant = plant_of(stored, system, param or [], domain or [], disturbance or [], input_error)
     options = RoaOptions(
         claim=claim,  # type: ignore[arg-type]
         candidate=candidate,  # type: ignore[arg-type]

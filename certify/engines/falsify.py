@@ -8,7 +8,8 @@ origin as far as it stays violating. A reported witness is shown in Arb; the sea
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Literal
 
@@ -27,15 +28,20 @@ _RATIO, _LEVELS, _LOWEST = 1.4, 60, 1e-24  # of a survey: between levels, how ma
 
 @dataclass(frozen=True, slots=True)
 class Witness:
-    """A state `x` (n,) with Vdot >= 0 (kind `vdot`) or an input out of bounds (`input`); `level` is V(x), rounded."""
+    """A state `x` (n,) with Vdot >= 0 (kind `vdot`) or an input out of bounds (`input`); `level` is V(x), rounded.
+
+    `values` are those of what is uncertain, at which it is so.
+    """
 
     x: Array
     level: float
     kind: Literal["vdot", "input"]
+    values: Mapping[str, Fraction] = field(default_factory=dict)
 
     def describe(self, system: System) -> str:
         """The violation in words."""
         names = ", ".join(f"{s} = {v:.6g}" for s, v in zip(system.states, self.x, strict=True))
+        names += "".join(f", {name} = {float(q):.6g}" for name, q in self.values.items())
         names += ", in deviations from x_eq," if system.operating_point() else ""
         what = "Vdot >= 0" if self.kind == "vdot" else "the input leaves its bounds"
         return f"{what} at {names} with V = {self.level:.12g} (shown in Arb)"
@@ -100,7 +106,8 @@ def confirm(problem: Problem, witness: Witness) -> bool:
     """True if the violation at the witness's binary64 point is shown in Arb."""
     loop = problem.loop
     if witness.kind == "vdot":
-        return bool(np.any(witness.x != 0)) and evaluate_vdot(loop, problem.V.P, witness.x) >= 0
+        held = replace(loop, system=loop.system.at(witness.values)) if witness.values else loop
+        return bool(np.any(witness.x != 0)) and evaluate_vdot(held, problem.V.P, witness.x) >= 0
     for u, (lo, hi) in zip(evaluate_policy(loop, witness.x), loop.system.input_bounds, strict=True):
         if u * lo.denominator < lo.numerator or u * hi.denominator > hi.numerator:
             return True
@@ -120,7 +127,9 @@ class _Search:
     def __init__(self, problem: Problem, T: Array) -> None:
         self.problem = problem
         self.loop = problem.loop
-        self.f = self.loop.system.function("torch")
+        self.f = self.loop.system.uncertain_function("torch")
+        self.corners = self.loop.system.corners()
+        self.worst = [[float(q) for q in corner.values()] for corner in self.corners]
         network = self.loop.folded
         self.layers = [
             (torch.tensor(W.T.copy()), torch.tensor(b)) for W, b in zip(network.weights, network.biases, strict=True)
@@ -140,7 +149,8 @@ class _Search:
         for k, (W, b) in enumerate(self.layers):
             h = torch.addmm(b, h.tanh() if k else h, W)
         u = self.clipped(self.scale * self.squashed(h) + self.offset)
-        vdot = 2 * ((x @ self.P) * self.f(x, u)).sum(-1)
+        gradient = 2 * (x @ self.P)
+        vdot = torch.stack([(gradient * self.f(x, u, values)).sum(-1) for values in self.worst]).amax(0)
         return vdot, torch.maximum(self.lo - u, u - self.hi).amax(-1)
 
     def bad(self, z: torch.Tensor) -> torch.Tensor:
@@ -178,9 +188,10 @@ class _Search:
                 x = (self.T @ (factor * point)).numpy()
                 kinds: tuple[Literal["vdot", "input"], ...] = ("vdot", "input") if self.check_inputs else ("vdot",)
                 for kind in kinds:
-                    witness = Witness(x, float(self.problem.V(x)), kind)
-                    if confirm(self.problem, witness):
-                        return witness
+                    for values in self.corners if kind == "vdot" else self.corners[:1]:
+                        witness = Witness(x, float(self.problem.V(x)), kind, values)
+                        if confirm(self.problem, witness):
+                            return witness
         return None
 
     def climb(self, start: Array, limit: float, steps: int = 60) -> Array:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from certify.certificate import LocalBall
 from certify.claims import Problem
+from certify.engines.cells import Cells, cells_for
 from certify.engines.decrease import NOT_SHOWN, Shown, best_multipliers
 from certify.engines.models import Paths, paths
 
@@ -31,9 +32,10 @@ def prove_local(problem: Problem, T: Array, limit: float, known: Paths | None = 
     InputError : the network is larger than the checker's local rule allows.
     """
     known = known or paths(problem.loop)
+    cells = _cells(problem, T, known)
 
     def good(level: float) -> bool:
-        return local_margin(problem, T, level, known) > _MARGIN
+        return _shown(problem, ball_around(problem, T, level), known, cells).margin > _MARGIN
 
     if good(limit):
         return limit
@@ -50,13 +52,15 @@ def prove_local(problem: Problem, T: Array, limit: float, known: Paths | None = 
 
 def local_margin(problem: Problem, T: Array, level: float, known: Paths) -> float:
     """Share of the decay that the remainder leaves on {V <= level}; positive means Vdot < 0."""
-    return _shown(problem, ball_around(problem, T, level), known).margin
+    return _shown(problem, ball_around(problem, T, level), known, _cells(problem, T, known)).margin
 
 
-def local_ball(problem: Problem, T: Array, level: float) -> LocalBall:
-    """The evidence for a level that `prove_local` has found, or a lower one."""
-    J = ball_around(problem, T, level)
-    return LocalBall(J, _shown(problem, J, paths(problem.loop)).multipliers)
+def local_ball(problem: Problem, T: Array, level: float) -> tuple[LocalBall, tuple[int, ...]]:
+    """The evidence for a level that `prove_local` has found, or a lower one, and into how many parts the range of each
+    uncertain quantity is cut for it."""
+    J, known = ball_around(problem, T, level), paths(problem.loop)
+    cells = _cells(problem, T, known)
+    return LocalBall(J, _shown(problem, J, known, cells).multipliers), () if cells is None else cells.cuts
 
 
 def ball_around(problem: Problem, T: Array, level: float) -> Array:
@@ -65,7 +69,14 @@ def ball_around(problem: Problem, T: Array, level: float) -> Array:
     return T * (math.sqrt(level / least) * _WIDER) if least > 0 else np.full_like(T, math.inf)
 
 
-def _shown(problem: Problem, J: Array, known: Paths) -> Shown:
+def _cells(problem: Problem, T: Array, known: Paths) -> Cells | None:
+    """The cells of what is uncertain; None where nothing is."""
+    return cells_for(known, T, problem.V.P) if problem.loop.system.ranges else None
+
+
+def _shown(problem: Problem, J: Array, known: Paths, cells: Cells | None) -> Shown:
     with np.errstate(all="ignore"):  # what overflows is not shown
+        if cells is not None:
+            return cells.shown(J, problem.V.P)
         models = known.models(J)
         return best_multipliers(models, J, problem.V.P) if models.admitted else NOT_SHOWN

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
@@ -72,15 +72,19 @@ class _Rational(Algebra[_Number]):
         return _Unnamed(f"{name} of {value}") if value != 0 else Fraction(AT_ZERO[name])
 
 
-def evaluate_exactly(expression: sympy.Expr, values: Mapping[sympy.Symbol, Fraction]) -> Fraction:
-    """The rational value of an expression.
+def evaluate_exactly(
+    expression: sympy.Expr, values: Mapping[sympy.Symbol, Fraction], unknown: Iterable[sympy.Symbol] = ()
+) -> Fraction:
+    """The rational value of an expression, whatever the unknown symbols stand for.
 
     Raises
     ------
     InputError : it divides by 0, takes the root of a number that is not positive, or a number grows too long; or the
-        value is that of a function at another point than 0 (of a square root at a number that is no square).
+        value is that of a function at another point than 0 (of a square root at a number that is no square), or
+        depends on what is unknown.
     """
-    value = evaluate(expression, values, _Rational())
+    numbers: dict[sympy.Symbol, _Number] = {**values, **{s: _Unnamed(f"{s}, which is uncertain,") for s in unknown}}
+    value = evaluate(expression, numbers, _Rational())
     if isinstance(value, _Unnamed):
         raise InputError(f"{value.words} has no exact value")
     return value

@@ -324,7 +324,7 @@ def _modes(found: Mapping[str, Any]) -> str:
 
 def _plant(certificate: Certificate) -> dict[str, Any]:
     system, units = certificate.system, certificate.system.units
-    expressions = system.exact_dynamics()
+    expressions = system.uncertain_dynamics()
 
     def interval(name: str, bounds: tuple[Fraction, Fraction]) -> str:
         lo, hi = bounds

@@ -11,9 +11,11 @@ Everything works in deviations from the operating point x_eq: the claims, the ce
 
 from __future__ import annotations
 
+import itertools
 import math
+import random
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from decimal import Decimal, InvalidOperation
 from fractions import Fraction
@@ -70,11 +72,16 @@ class System:
     x_eq : n expressions in the parameters, with rational values; empty means zeros. `dynamics` and `domain` are in
         deviations from it already (`in_deviations` brings equations there), so that nothing of what is proved depends
         on it.
+    disturbances : symbols of the dynamics that are 0 unless they have a range.
+    ranges : intervals by name, of parameters that are uncertain and of disturbances that act: all that is known of
+        them, at any time. A parameter's value in `parameters` lies in its range and is the nominal one, of which
+        everything is made that is not proved for the whole range: u_eq, linearisation, simulation.
 
     Raises
     ------
     InputError : counts do not match, a domain does not contain 0 in its interior, a parameter that
-        must be positive is not, an expression uses something outside the grammar, or x_eq is irrational.
+        must be positive is not, an expression uses something outside the grammar, x_eq is irrational, or a range is of
+        nothing that can have one.
     """
 
     name: str
@@ -89,9 +96,12 @@ class System:
     units: Mapping[str, str] = field(default_factory=dict)
     description: str = ""
     x_eq: tuple[sympy.Expr, ...] = ()
+    disturbances: tuple[sympy.Symbol, ...] = ()
+    ranges: Mapping[str, Interval] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "parameters", MappingProxyType(dict(self.parameters)))
+        object.__setattr__(self, "ranges", MappingProxyType(dict(self.ranges)))
         object.__setattr__(self, "units", MappingProxyType(dict(self.units)))
         n, m = len(self.states), len(self.inputs)
         object.__setattr__(self, "x_eq", tuple(self.x_eq) or (sympy.Integer(0),) * n)
@@ -106,12 +116,14 @@ class System:
                 raise InputError(f"`{label}` of {self.name} must have {wanted} entries; found {found}.")
         if n == 0 or m == 0:
             raise InputError(f"{self.name} must have at least one state and one input.")
-        names = [s.name for s in (*self.states, *self.inputs)] + list(self.parameters)
+        names = [s.name for s in (*self.states, *self.inputs, *self.disturbances)] + list(self.parameters)
         for name in (self.name, *names):
             if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]{0,63}", name):
                 raise InputError(f"names in {self.name} must be identifiers of at most 64 letters; found {name!r}.")
         if len(set(names)) != len(names):
-            raise InputError(f"names of states, inputs and parameters of {self.name} must differ; found {names}.")
+            raise InputError(
+                f"names of states, inputs, parameters and disturbances of {self.name} must differ; found {names}."
+            )
         for symbol, (lo, hi) in zip(self.states, self.domain, strict=True):
             if not lo < 0 < hi:
                 raise InputError(
@@ -129,10 +141,31 @@ class System:
                 raise InputError(f"parameter {name} of {self.name} must be positive; found {self.parameters[name]}.")
         parameters = {sympy.Symbol(p) for p in self.parameters}
         for expression in self.dynamics:
-            _check_grammar(expression, {*self.states, *self.inputs, *parameters}, self.name)
+            _check_grammar(expression, {*self.states, *self.inputs, *parameters, *self.disturbances}, self.name)
         for expression in (*self.u_eq, *self.x_eq):
             _check_grammar(expression, parameters, self.name)
         self.exact_x_eq()
+        self._check_ranges()
+
+    def _check_ranges(self) -> None:
+        acting, fixed = {s.name for s in self.disturbances}, {s.name for e in self.x_eq for s in e.free_symbols}
+        for name, (lo, hi) in self.ranges.items():
+            if name not in self.parameters and name not in acting:
+                known = ", ".join([*self.parameters, *sorted(acting)]) or "none"
+                raise InputError(f"{self.name} has no parameter or disturbance {name!r}; it has: {known}.")
+            if name in fixed:
+                raise InputError(
+                    f"{name} must have one value, because the operating point of {self.name} depends on it; found the "
+                    f"range [{float(lo):g}, {float(hi):g}]."
+                )
+            nominal = self.parameters.get(name, Fraction(0))
+            if not (lo < hi and lo <= nominal <= hi):
+                raise InputError(
+                    f"the range of {name} must satisfy lo < hi and hold its nominal value {float(nominal):g}; found "
+                    f"[{float(lo):g}, {float(hi):g}]."
+                )
+            if name in self.positive and not lo > 0:
+                raise InputError(f"parameter {name} of {self.name} must be positive; found {float(lo):g} in its range.")
 
     @property
     def n(self) -> int:
@@ -168,9 +201,72 @@ class System:
         domain = tuple(bounds.get(name, old) for name, old in zip(names, self.domain, strict=True))
         return replace(self, domain=domain)
 
+    def with_ranges(self, ranges: Mapping[str, Interval]) -> System:
+        """The same plant where some parameters are uncertain and some disturbances act.
+
+        A parameter whose value does not lie in its range takes the middle of it.
+        """
+        outside = {
+            name: (lo + hi) / 2
+            for name, (lo, hi) in ranges.items()
+            if name in self.parameters and not lo <= self.parameters[name] <= hi
+        }
+        return replace(self.with_parameters(outside), ranges={**self.ranges, **ranges})
+
+    def with_input_errors(self, bounds: Mapping[str, Fraction]) -> System:
+        """The same plant with u + e in the place of u, |e| at most the bound, for the inputs that are named."""
+        by_name, moved, names = {s.name: s for s in self.inputs}, {}, []
+        for name, bound in bounds.items():
+            if name not in by_name or not bound > 0:
+                raise InputError(
+                    f"an input error must be a positive bound for one of {', '.join(by_name)}; found {name} = {bound}."
+                )
+            names.append(f"error_{name}")
+            moved[by_name[name]] = by_name[name] + sympy.Symbol(names[-1])
+        ranges = {error: (-bound, bound) for error, bound in zip(names, bounds.values(), strict=True)}
+        units = {error: self.units[name] for error, name in zip(names, bounds, strict=True) if name in self.units}
+        return replace(
+            self,
+            dynamics=tuple(e.subs(moved, simultaneous=True) for e in self.dynamics),
+            disturbances=(*self.disturbances, *symbols(names)),
+            ranges={**self.ranges, **ranges},
+            units={**self.units, **units},
+        )
+
+    @property
+    def uncertain(self) -> tuple[tuple[sympy.Symbol, Interval], ...]:
+        """What has a range, in the order of the ranges."""
+        return tuple((sympy.Symbol(name), interval) for name, interval in self.ranges.items())
+
+    def at(self, values: Mapping[str, Fraction]) -> System:
+        """The plant without uncertainty, where parameters and disturbances have these values."""
+        known = {name: q for name, q in values.items() if name in self.parameters}
+        held = {s: sympy.Rational(*values.get(s.name, Fraction(0)).as_integer_ratio()) for s in self.disturbances}
+        dynamics = tuple(e.subs(held) for e in self.dynamics)
+        return replace(self.with_parameters(known), dynamics=dynamics, disturbances=(), ranges={})
+
+    def corners(self, most: int = 64) -> tuple[dict[str, Fraction], ...]:
+        """The vertices of the box of ranges, in an order that is the same each time; beyond `most` of them, some."""
+        vertices = list(itertools.islice(itertools.product((0, 1), repeat=len(self.ranges)), most))
+        if 2 ** len(self.ranges) > most:
+            drawn = random.Random(0)
+            vertices = [tuple(drawn.randint(0, 1) for _ in self.ranges) for _ in range(most)]
+        return tuple(
+            {name: ends[side] for (name, ends), side in zip(self.ranges.items(), vertex, strict=True)}
+            for vertex in vertices
+        )
+
     def exact_dynamics(self) -> tuple[sympy.Expr, ...]:
-        """f with the parameters replaced by exact rationals; free symbols are states and inputs."""
-        return tuple(self._substitute(e) for e in self.dynamics)
+        """The nominal f: parameters replaced by exact rationals, disturbances by 0; free are states and inputs."""
+        return tuple(self._substitute(self._undisturbed(e)) for e in self.dynamics)
+
+    def uncertain_dynamics(self) -> tuple[sympy.Expr, ...]:
+        """f for all that the ranges allow: what has one is free, as states and inputs are."""
+        known = {name: q for name, q in self.parameters.items() if name not in self.ranges}
+        return tuple(self._substitute(self._undisturbed(e, self.ranges), known) for e in self.dynamics)
+
+    def _undisturbed(self, expression: sympy.Expr, acting: Collection[str] = ()) -> sympy.Expr:
+        return expression.subs({s: sympy.Integer(0) for s in self.disturbances if s.name not in acting})
 
     def exact_u_eq(self) -> tuple[Fraction, ...]:
         """The equilibrium input as exact rationals, shape (m,)."""
@@ -208,10 +304,20 @@ class System:
         return found
 
     def function(self, module: str = "numpy") -> Callable[[Any, Any], Any]:
-        """Floating-point f: arrays x (..., n) and u (..., m) to xdot (..., n); `module` numpy or torch.
+        """Floating-point nominal f: arrays x (..., n) and u (..., m) to xdot (..., n); `module` numpy or torch.
 
         For simulation and search only: nothing is proved with it.
         """
+        f = self._function(self.exact_dynamics(), (), module)
+        return lambda x, u: f(x, u, ())
+
+    def uncertain_function(self, module: str = "numpy") -> Callable[[Any, Any, Sequence[float]], Any]:
+        """The same for values of what is uncertain, in the order of the ranges: a third argument, k numbers."""
+        return self._function(self.uncertain_dynamics(), [s for s, _ in self.uncertain], module)
+
+    def _function(
+        self, expressions: Sequence[sympy.Expr], more: Sequence[sympy.Symbol], module: str
+    ) -> Callable[[Any, Any, Sequence[float]], Any]:
         stack: Any
         broadcast: Any
         if module == "numpy":
@@ -225,14 +331,14 @@ class System:
         else:
             raise InputError(f"`module` must be 'numpy' or 'torch'; found {module!r}.")
         # torch has no sine of a plain number
-        rounded = [e.replace(_is_constant_function, lambda c: c.evalf(17)) for e in self.exact_dynamics()]
-        raw = sympy.lambdify([*self.states, *self.inputs], rounded, modules=module, cse=True)
+        rounded = [e.replace(_is_constant_function, lambda c: c.evalf(17)) for e in expressions]
+        raw = sympy.lambdify([*self.states, *self.inputs, *more], rounded, modules=module, cse=True)
         n, m = self.n, self.m
 
-        def f(x: Any, u: Any) -> Any:
+        def f(x: Any, u: Any, values: Sequence[float]) -> Any:
             columns: list[Any] = [x[..., i] for i in range(n)] + [u[..., j] for j in range(m)]
             zero = 0.0 * (columns[0] + columns[n])  # constant components take the batch's shape
-            return stack(tuple(broadcast(*[value + zero for value in raw(*columns)])), -1)
+            return stack(tuple(broadcast(*[value + zero for value in raw(*columns, *values)])), -1)
 
         return f
 

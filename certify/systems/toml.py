@@ -20,7 +20,7 @@ from certify.systems.source import PlantFile, read_plant_file
 from certify.systems.system import Interval, System, exact, in_deviations, symbols
 
 _REQUIRED = ("name", "states", "inputs", "dynamics", "u_eq", "domain", "input_bounds")
-_KEYS = (*_REQUIRED, "description", "parameters", "positive", "where", "x_eq", "units", "training")
+_KEYS = (*_REQUIRED, "description", "parameters", "disturbances", "positive", "where", "x_eq", "units", "training")
 _ROUNDED = 1e-12  # of a residual with functions at other points than 0, which rationals do not decide
 
 
@@ -47,12 +47,20 @@ def build_system(file: PlantFile) -> System:
     name, description = _text(file, "name"), _text(file, "description")
     states, inputs = _names(file, "states"), _names(file, "inputs")
     parameters = {p: _number(file, value, "parameters", p) for p, value in file.table("parameters").items()}
-    everything = [*states, *inputs, *parameters]
-    for key, names in (("states", states), ("inputs", inputs), ("parameters", list(parameters))):
+    acting = {w: _disturbance(file, w) for w in file.table("disturbances")}
+    everything = [*states, *inputs, *parameters, *acting]
+    for key, names in (
+        ("states", states),
+        ("inputs", inputs),
+        ("parameters", list(parameters)),
+        ("disturbances", list(acting)),
+    ):
         twice = next((name for name in names if everything.count(name) > 1), None)
         if twice is not None:
-            raise file.refuse(f"names of states, inputs and parameters must differ; found {twice!r} twice.", key)
-    file.require_known("units", everything, "state, input or parameter")
+            raise file.refuse(
+                f"names of states, inputs, parameters and disturbances must differ; found {twice!r} twice.", key
+            )
+    file.require_known("units", everything, "state, input, parameter or disturbance")
     for table, names, what in (
         ("dynamics", states, "state"),
         ("domain", states, "state"),
@@ -66,7 +74,7 @@ def build_system(file: PlantFile) -> System:
         constants = {p: symbol[p] for p in parameters}
         x_eq = [_equation(file, "x_eq", s, constants, "parameter", 0) for s in states]
         shorthand = _shorthand(file, symbol)
-        known = "state, input or parameter" + (", and not defined in [where] above" if shorthand else "")
+        known = "state, input, parameter or disturbance" + (", and not defined in [where] above" if shorthand else "")
         dynamics = [_equation(file, "dynamics", s, symbol | shorthand, known) for s in states]
         u_eq = [_equation(file, "u_eq", s, constants, "parameter") for s in inputs]
         for s, e in zip(inputs, u_eq, strict=True):
@@ -84,6 +92,8 @@ def build_system(file: PlantFile) -> System:
             input_bounds=tuple(_interval(file, "input_bounds", s) for s in inputs),
             units={name: _unit(file, name) for name in file.table("units")},
             x_eq=tuple(x_eq),
+            disturbances=tuple(symbol[w] for w in acting),
+            ranges={w: interval for w, interval in acting.items() if interval is not None},
         )
     except InputError as error:
         if str(file.path) in str(error):
@@ -173,6 +183,19 @@ def _at_rest(
             name,
         )
     return Fraction(int(point.p), int(point.q))
+
+
+def _disturbance(file: PlantFile, name: str) -> Interval | None:
+    """The range of a disturbance: a half-width or a pair; None where it is 0, unless somebody asks for it."""
+    value = file.table("disturbances")[name]
+    if isinstance(value, list):
+        return _interval(file, "disturbances", name)
+    half = _number(file, value, "disturbances", name)
+    if half < 0:
+        raise file.refuse(
+            f"must be a half-width that is not negative, or a pair [lo, hi]; found {value!r}.", "disturbances", name
+        )
+    return (-half, half) if half else None
 
 
 def _interval(file: PlantFile, table: str, name: str) -> Interval:

@@ -89,10 +89,12 @@ class BoundsEngine(Engine):
         self, problem: Problem, ring: RingProof, claim: Asymptotic | Practical, seconds: dict[str, float]
     ) -> Proof:
         """The proof of a claim from a ring's."""
-        local = local_ball(problem, self.T, claim.local) if isinstance(claim, Asymptotic) else None
+        local, cells = None, (1,) * len(problem.loop.system.ranges)
+        if isinstance(claim, Asymptotic):
+            local, cells = local_ball(problem, self.T, claim.local)
         return Proof(
             claim,
-            PartitionTree(self.T, ring.root, ring.tree, local),
+            PartitionTree(self.T, ring.root, ring.tree, local, cells=cells),
             ring.stop,
             witness=ring.witness,
             boxes=ring.boxes,

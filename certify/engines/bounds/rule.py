@@ -58,7 +58,7 @@ class VdotBound:
         self.S_cross = torch.tensor(cross, dtype=torch.float64, device=device)
         self.S = torch.tensor(S, dtype=torch.float64, device=device)
         self.policy = PolicyEnclosure(loop, device)
-        self.dynamics: tuple[sympy.Expr, ...] = loop.system.exact_dynamics()
+        self.dynamics: tuple[sympy.Expr, ...] = loop.system.uncertain_dynamics()
         self.check_inputs = not bounded_by_form(loop.network, loop.system.input_bounds)
 
     def levels(self, lo: Tensor, hi: Tensor) -> tuple[Tensor, Tensor]:
@@ -84,9 +84,11 @@ class VdotBound:
         vdot = self._vdot(x, error, mid, slopes, wide)
         bound, excess = upper_bound(vdot)
         smooth = torch.isfinite(bound)  # a component of F that is not enclosed leaves a NaN in the sum over all
-        # At the box's centre only the inputs' errors and the remainder are left.
-        doubt = vdot.g[n:].abs().sum(0) + vdot.Q[n:, n:].abs().sum((0, 1)) + vdot.r
-        violated = vdot.c - doubt >= 0
+        # At the box's centre, and for the worst values of what is uncertain, only the inputs' errors, what is of second
+        # order in all these, and the remainder are left.
+        known = n + self.system.m
+        doubt = vdot.g[n:known].abs().sum(0) + vdot.Q[n:, n:].abs().sum((0, 1)) + vdot.r
+        violated = vdot.c + vdot.g[known:].abs().sum(0) - doubt >= 0
         bound = self._within_ring(bound, vdot, lo, hi, centre, radius, inner, outer)
         proved = bound < 0
         if self.inside:
@@ -107,10 +109,10 @@ class VdotBound:
         return BoxBounds(proved, bound, score, violated, smooth)
 
     def _vdot(self, x: Tensor, error: Tensor, mid: Tensor, slopes: Tensor, wide: Tensor) -> Taylor:
-        """Vdot = (2 P x)'f(x, u); symbols: n box coordinates, m input errors."""
-        n, m, batch = self.system.n, self.system.m, x.shape[2]
-        zeros = torch.zeros(n + m, n + m, batch, dtype=x.dtype, device=x.device)
-        none = zeros[0, :m]
+        """Vdot = (2 P x)'f(x, u, q); symbols: n box coordinates, m input errors, k uncertain quantities."""
+        n, m, batch, k = self.system.n, self.system.m, x.shape[2], len(self.system.uncertain)
+        zeros = torch.zeros(n + m + k, n + m + k, batch, dtype=x.dtype, device=x.device)
+        none = zeros[0, : m + k]
         values: dict[sympy.Symbol, Taylor] = {}
         for i, symbol in enumerate(self.system.states):
             values[symbol] = Taylor(x[i, 0], torch.cat([x[i, 1:], none]), zeros, error[i])
@@ -118,6 +120,12 @@ class VdotBound:
             own = none.clone()
             own[j] = wide[j]
             values[symbol] = Taylor(mid[j], torch.cat([slopes[j], own]), zeros, zeros[0, 0])
+        for j, (symbol, (lo, hi)) in enumerate(self.system.uncertain):
+            middle, reach = float((lo + hi) / 2), float((hi - lo) / 2)
+            own = zeros[0].clone()
+            own[n + m + j] = reach
+            rounding = EPS * (abs(middle) + reach) + TINY
+            values[symbol] = Taylor(zeros[0, 0] + middle, own, zeros, zeros[0, 0] + rounding)
         known: dict[sympy.Expr, Taylor] = {}
         models = Models(values[self.system.states[0]])
         states = [values[s] for s in self.system.states]

@@ -18,11 +18,12 @@ from certify.systems.system import System, exact, symbols
 def cartpole() -> System:
     """The cart with a pole at its published parameters."""
     p, theta, p_dot, theta_dot, u = symbols(["p", "theta", "p_dot", "theta_dot", "u"])
-    mc, mp, length, g = symbols(["mc", "mp", "l", "g"])
+    mc, mp, length, g, force = symbols(["mc", "mp", "l", "g", "force"])
     s, c = sympy.sin(theta), sympy.cos(theta)
     mass = mc + mp * s**2
-    p_ddot = (u + mp * s * (length * theta_dot**2 - g * c)) / mass
-    theta_ddot = (-u * c - mp * length * theta_dot**2 * c * s + (mc + mp) * g * s) / (length * mass)
+    pushed = u + force
+    p_ddot = (pushed + mp * s * (length * theta_dot**2 - g * c)) / mass
+    theta_ddot = (-pushed * c - mp * length * theta_dot**2 * c * s + (mc + mp) * g * s) / (length * mass)
     return System(
         name="cartpole",
         description="cart with an inverted pole, a force on the cart",
@@ -39,12 +40,14 @@ def cartpole() -> System:
         ),
         input_bounds=((exact(-30), exact(30)),),
         positive=frozenset({"mc", "mp", "l", "g"}),
+        disturbances=(force,),
         units={
             "p": "m",
             "theta": "rad",
             "p_dot": "m/s",
             "theta_dot": "rad/s",
             "u": "N",
+            "force": "N",
             "mc": "kg",
             "mp": "kg",
             "l": "m",

@@ -1,7 +1,8 @@
 """Inverted pendulum with a torque at the pivot (the paper's first example).
 
 State x = (theta, theta_dot): angle from upright in rad (unwrapped), angular rate in rad/s. Input u:
-torque in N m. `theta'' = (g/l) sin(theta) - b/(m l^2) theta' + u/(m l^2)`; upright is the origin.
+torque in N m. `theta'' = (g/l) sin(theta) - b/(m l^2) theta' + (u + torque)/(m l^2)`; upright is the origin, and the
+disturbance `torque` acts at the joint.
 Values: mass 0.15 kg, length 0.5 m, friction 0.1 N m s, gravity 9.81 m/s^2, |u| <= 6 N m,
 domain |theta| <= 3.14 rad, |theta_dot| <= 20 rad/s.
 """
@@ -16,8 +17,9 @@ from certify.systems.system import System, exact, symbols
 def pendulum() -> System:
     """The inverted pendulum at its published parameters."""
     theta, theta_dot, u, m, length, b, g = symbols(["theta", "theta_dot", "u", "m", "l", "b", "g"])
+    (torque,) = symbols(["torque"])
     inertia = m * length**2
-    acceleration = g / length * sympy.sin(theta) - b / inertia * theta_dot + u / inertia
+    acceleration = g / length * sympy.sin(theta) - b / inertia * theta_dot + u / inertia + torque / inertia
     return System(
         name="pendulum",
         description="inverted pendulum with a torque at the pivot",
@@ -29,10 +31,12 @@ def pendulum() -> System:
         domain=((exact("-3.14"), exact("3.14")), (exact(-20), exact(20))),
         input_bounds=((exact(-6), exact(6)),),
         positive=frozenset({"m", "l", "g"}),
+        disturbances=(torque,),
         units={
             "theta": "rad",
             "theta_dot": "rad/s",
             "u": "N m",
+            "torque": "N m",
             "m": "kg",
             "l": "m",
             "b": "N m s",

@@ -19,6 +19,7 @@ def quadrotor2d() -> System:
     states = symbols(["x", "y", "theta", "x_dot", "y_dot", "theta_dot"])
     _, _, theta, x_dot, y_dot, theta_dot = states
     u1, u2, m, length, inertia, g = symbols(["u1", "u2", "m", "l", "I", "g"])
+    wind_x, wind_y, torque = symbols(["wind_x", "wind_y", "torque"])
     thrust = (u1 + u2) / m
     three, bound, rate = (exact(-3), exact(3)), (exact("-1.2"), exact("1.2")), (exact(-8), exact(8))
     return System(
@@ -31,14 +32,15 @@ def quadrotor2d() -> System:
             x_dot,
             y_dot,
             theta_dot,
-            -sympy.sin(theta) * thrust,
-            sympy.cos(theta) * thrust - g,
-            length / inertia * (u1 - u2),
+            -sympy.sin(theta) * thrust + wind_x / m,
+            sympy.cos(theta) * thrust - g + wind_y / m,
+            length / inertia * (u1 - u2) + torque / inertia,
         ),
         u_eq=(m * g / 2, m * g / 2),
         domain=(three, three, bound, rate, rate, rate),
         input_bounds=((exact(0), exact(6)), (exact(0), exact(6))),
         positive=frozenset({"m", "l", "I", "g"}),
+        disturbances=(wind_x, wind_y, torque),
         units={
             "x": "m",
             "y": "m",
@@ -48,6 +50,9 @@ def quadrotor2d() -> System:
             "theta_dot": "rad/s",
             "u1": "N",
             "u2": "N",
+            "wind_x": "N",
+            "wind_y": "N",
+            "torque": "N m",
             "m": "kg",
             "l": "m",
             "I": "kg m^2",

@@ -28,6 +28,9 @@ def quadrotor3d() -> System:
     u1, u2, u3, u4 = inputs
     m, a, k, Ix, Iy, Iz, g = symbols(["m", "a", "k", "Ix", "Iy", "Iz", "g"])
     sin, cos = sympy.sin, sympy.cos
+    wind_x, wind_y, wind_z, torque_x, torque_y, torque_z = disturbances = symbols(
+        ["wind_x", "wind_y", "wind_z", "torque_x", "torque_y", "torque_z"]
+    )
     lift = (u1 + u2 + u3 + u4) / m
     turn = sin(phi) * q + cos(phi) * r
     names = {
@@ -35,7 +38,8 @@ def quadrotor3d() -> System:
         **dict.fromkeys(("phi", "theta", "psi"), "rad"),
         **dict.fromkeys(("vx", "vy", "vz"), "m/s"),
         **dict.fromkeys(("p", "q", "r"), "rad/s"),
-        **dict.fromkeys(("u1", "u2", "u3", "u4"), "N"),
+        **dict.fromkeys(("u1", "u2", "u3", "u4", "wind_x", "wind_y", "wind_z"), "N"),
+        **dict.fromkeys(("torque_x", "torque_y", "torque_z"), "N m"),
         **dict.fromkeys(("Ix", "Iy", "Iz"), "kg m^2"),
         "m": "kg",
         "g": "m/s^2",
@@ -65,16 +69,17 @@ def quadrotor3d() -> System:
             p + sympy.tan(theta) * turn,
             cos(phi) * q - sin(phi) * r,
             turn / cos(theta),
-            (cos(phi) * sin(theta) * cos(psi) + sin(phi) * sin(psi)) * lift,
-            (cos(phi) * sin(theta) * sin(psi) - sin(phi) * cos(psi)) * lift,
-            cos(phi) * cos(theta) * lift - g,
-            (a * (u2 - u4) + (Iy - Iz) * q * r) / Ix,
-            (a * (u3 - u1) + (Iz - Ix) * p * r) / Iy,
-            (k * (u1 - u2 + u3 - u4) + (Ix - Iy) * p * q) / Iz,
+            (cos(phi) * sin(theta) * cos(psi) + sin(phi) * sin(psi)) * lift + wind_x / m,
+            (cos(phi) * sin(theta) * sin(psi) - sin(phi) * cos(psi)) * lift + wind_y / m,
+            cos(phi) * cos(theta) * lift - g + wind_z / m,
+            (a * (u2 - u4) + (Iy - Iz) * q * r) / Ix + torque_x / Ix,
+            (a * (u3 - u1) + (Iz - Ix) * p * r) / Iy + torque_y / Iy,
+            (k * (u1 - u2 + u3 - u4) + (Ix - Iy) * p * q) / Iz + torque_z / Iz,
         ),
         u_eq=(m * g / 4,) * 4,
         domain=(within("3"),) * 3 + (within("1"),) * 2 + (within("3"),) + (within("6"),) * 3 + (within("12"),) * 3,
         input_bounds=((exact(0), exact("3.6")),) * 4,
         positive=frozenset({"m", "a", "k", "Ix", "Iy", "Iz", "g"}),
+        disturbances=disturbances,
         units=names,
     )
