@@ -73,8 +73,9 @@ class FlattenOptions:
     time_limit : seconds after which no more gradient steps are taken, those before them included.
     max_cost_change : bound on the relative rise of the median cost; a fall is no harm.
     states : initial states of the runs that judge a policy.
-    gain : the Jacobian at 0 that is aimed at: `kept` is the policy's own, `lqr` that of the LQR for the weights and the
-        time step of the runs that judge.
+    gain : the Jacobian at 0 that is aimed at: `kept` is the policy's own, `lqr` that of the LQR at the time step of the
+        runs that judge.
+    Q, R : diagonals (n,) and (m,) of the LQR's weights, for `gain` "lqr"; None means those of the runs that judge.
     seed, threads : of everything random; of torch.
 
     Raises
@@ -91,6 +92,8 @@ class FlattenOptions:
     max_cost_change: float = 0.05
     states: int = 200
     gain: Gain = "kept"
+    Q: tuple[float, ...] | None = None
+    R: tuple[float, ...] | None = None
     seed: int = 0
     threads: int = 1
 
@@ -103,6 +106,10 @@ class FlattenOptions:
         self._require("gain", self.gain in get_args(Gain), f"one of {get_args(Gain)}")
         if self.box is not None:
             self._require("box", all(0 < width < math.inf for width in self.box), "positive and finite half-widths")
+        for name, weights in (("Q", self.Q), ("R", self.R)):
+            if weights is not None:
+                self._require(name, all(0 < weight < math.inf for weight in weights), "positive and finite weights")
+                self._require(name, self.gain == "lqr", 'left out unless `gain` is "lqr", whose weights these are')
 
     def _require(self, name: str, holds: bool, requirement: str) -> None:
         if not holds:
@@ -334,13 +341,24 @@ class _Run:
         return float(np.linalg.norm((network.jacobian_at_origin(self.u_eq) - J) * self.box)) / size
 
     def _lqr_gain(self) -> Array:
-        """K (m, n) of `u = u_eq - K x` for the weights and the time step of the runs that judge."""
-        if not np.all(self.R > 0):
+        """K (m, n) of `u = u_eq - K x`, for the plant's linearisation at the time step of the runs that judge."""
+        Q, R = self._lqr_weights()
+        return riccati_gain(*discrete_linearisation(self.system, self.dt), np.diag(Q), np.diag(R))
+
+    def _lqr_weights(self) -> tuple[Array, Array]:
+        asked = zip((self.options.Q, self.options.R), (self.Q, self.R), strict=True)
+        Q, R = (judging if given is None else np.array(given) for given, judging in asked)
+        if (len(Q), len(R)) != (self.system.n, self.system.m):
             raise InputError(
-                f"the LQR gain needs input weights that are positive; the policy's record says {self.R.tolist()}. "
-                "Keep the policy's own gain, or correct `training.input_weights`."
+                f"`Q` and `R` must have {self.system.n} and {self.system.m} weights for {self.system.name}; "
+                f"found {len(Q)} and {len(R)}."
             )
-        return riccati_gain(*discrete_linearisation(self.system, self.dt), np.diag(self.Q), np.diag(self.R))
+        if not np.all(R > 0):
+            raise InputError(
+                f"the LQR gain needs input weights that are positive; the policy's record says {R.tolist()}. Give "
+                "others with --R, or keep the policy's own gain."
+            )
+        return Q, R
 
     def _figures(self, network: TanhNetwork) -> Figures:
         judged = EvaluationOptions(states=self.options.states, seed=self.options.seed, duration=20.0, tolerance=1e-3)
@@ -398,6 +416,8 @@ class _Run:
     def _record(self, network: TanhNetwork, after: Figures, factor: float, steps: int) -> Mapping[str, Any]:
         """The old record, with what changed since: how it was flattened, from which policy, with which figures."""
         record = dict(self.policy.training)
+        if self.K is not None and "K" in record:
+            record["K"] = self.K.tolist()
         if "K" in record:
             record["distance"] = float(np.linalg.norm(network.jacobian_at_origin(self.u_eq) + np.asarray(record["K"])))
         if "curvature" in record and isinstance(record.get("eta"), float):
@@ -418,7 +438,8 @@ class _Run:
             "cost": [self.before.cost, after.cost],
         }
         if self.K is not None:
-            record["flattened"]["K"] = self.K.tolist()
+            Q, R = self._lqr_weights()
+            record["flattened"] |= {"K": self.K.tolist(), "Q": Q.tolist(), "R": R.tolist()}
         return record
 
     def _judge(self) -> tuple[float, Array, Array]:

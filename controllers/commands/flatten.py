@@ -46,6 +46,11 @@ def flatten(
             help="What the policy asks for near the origin: kept (as it is), or lqr (by the weights that judge runs).",
         ),
     ] = "kept",
+    Q: Annotated[
+        str | None,
+        typer.Option("--Q", help="Diagonal of the LQR's Q, as in 1,1,0.1; default: that of the runs that judge."),
+    ] = None,
+    R: Annotated[str | None, typer.Option("--R", help="Diagonal of the LQR's R, as --Q.")] = None,
     states: Annotated[int, typer.Option("--states", help="Initial states of the runs that judge a policy.")] = 200,
     seed: Annotated[int, typer.Option("--seed", help="Seed of everything random.")] = 0,
     system: Annotated[
@@ -75,6 +80,8 @@ def flatten(
             max_cost_change=max_cost_change,
             states=states,
             gain=cast("Gain", gain),
+            Q=_weights(Q, "--Q"),
+            R=_weights(R, "--R"),
             seed=seed,
         )
         with _progress(options) as report:
@@ -100,6 +107,16 @@ def _half_widths(text: str, policy: Policy, own: tuple[System, Plant] | None) ->
         except ValueError as error:
             raise InputError(f"`--box` must be NAME=HALF-WIDTH,...; found {part!r}.") from error
     return tuple(widths.values())
+
+
+def _weights(text: str | None, option: str) -> tuple[float, ...] | None:
+    """The diagonal that `1,1,0.1` is."""
+    if text is None:
+        return None
+    try:
+        return tuple(float(part) for part in text.split(","))
+    except ValueError as error:
+        raise InputError(f"`{option}` must be numbers as in 1,1,0.1; found {text!r}.") from error
 
 
 @contextmanager

@@ -181,9 +181,9 @@ def test_another_gain_is_the_lqr_gain_of_the_weights_that_judge():
     assert found.before.settled == 0 and found.after.settled == 20
     assert found.after.cost < 0.1 * found.before.cost and found.after.departure < found.before.departure
     assert found.policy.training["flattened"]["gain"] == "lqr"
-    assert found.policy.training["distance"] == pytest.approx(
-        np.linalg.norm(network.jacobian_at_origin(u_eq) + np.array(record["K"]))
-    )
+    assert found.policy.training["K"] == K.tolist() != record["K"]
+    distance = np.linalg.norm(network.jacobian_at_origin(u_eq) + K)
+    assert found.policy.training["distance"] == pytest.approx(distance)
 
 
 def test_what_changed_is_said_beside_the_old_policy_and_not_beside_the_goal():
@@ -221,9 +221,43 @@ def test_zero_biases_stay_under_another_gain():
 
 
 def test_an_lqr_gain_needs_input_weights():
-    record = _record(input_weights=[0.0])
+    given = Policy(curved(), "pendulum", training=_record(input_weights=[0.0]))
     with pytest.raises(InputError, match="needs input weights that are positive"):
-        flatten(Policy(curved(), "pendulum", training=record), replace(QUICK, gain="lqr"))
+        flatten(given, replace(QUICK, gain="lqr"))
+    flatten(given, replace(QUICK, gain="lqr", R=(0.1,), steps=0))
+
+
+def test_other_weights_give_another_gain_and_runs_are_judged_as_before():
+    """Dearer inputs, less gain; what a run costs is still what the record's weights say."""
+    own = flatten(Policy(curved(), "pendulum", training=_record(K=[[5.0, 2.0]])), replace(QUICK, gain="lqr"))
+    wide = replace(QUICK, gain="lqr", R=(0.2,), max_cost_change=1.0)
+    dear = flatten(Policy(curved(), "pendulum", training=_record(K=[[5.0, 2.0]])), wide)
+    K, dear_K = (np.array(found.policy.training["K"]) for found in (own, dear))
+    assert np.linalg.norm(dear_K) < np.linalg.norm(K)
+    said = dear.policy.training["flattened"]
+    assert (said["K"], said["Q"], said["R"]) == (dear_K.tolist(), [1.0, 0.1], [0.2])
+    assert dear.policy.training["input_weights"] == [0.1] and dear.before == own.before
+    u_eq = PENDULUM.exact_u_eq()
+    np.testing.assert_allclose(dear.policy.network.jacobian_at_origin(u_eq), -dear_K, rtol=0.02)
+    assert dear.policy.training["distance"] == pytest.approx(
+        np.linalg.norm(dear.policy.network.jacobian_at_origin(u_eq) + dear_K)
+    )
+    cheap = flatten(Policy(curved(), "pendulum", training=_record()), replace(wide, R=None, Q=(2.0, 0.1)))
+    assert cheap.policy.network.jacobian_at_origin(u_eq)[0, 0] < own.policy.network.jacobian_at_origin(u_eq)[0, 0]
+
+
+@pytest.mark.parametrize("weights", [{"Q": (1.0,)}, {"R": (1.0, 1.0)}])
+def test_weights_of_another_size_are_refused(weights):
+    with pytest.raises(InputError, match="`Q` and `R` must have 2 and 1 weights for pendulum"):
+        flatten(Policy(curved(), "pendulum", training=_record()), replace(QUICK, gain="lqr", **weights))
+
+
+def test_weights_without_the_gain_that_they_are_for_are_refused():
+    with pytest.raises(InputError, match='`R` must be left out unless `gain` is "lqr"'):
+        replace(QUICK, R=(1.0,))
+    for bad in (0.0, np.nan, np.inf):
+        with pytest.raises(InputError, match="`Q` must be positive and finite weights"):
+            replace(QUICK, gain="lqr", Q=(1.0, bad))
 
 
 def test_time_ends_training_and_what_is_there_is_judged():
@@ -370,6 +404,8 @@ def test_the_command_says_what_to_try_where_no_run_settles(tmp_path):
         (["--box", "theta=-1"], "`box` must be positive"),
         (["--weight", "-1"], "`weight` must be positive"),
         (["--gain", "pid"], "`gain` must be one of"),
+        (["--gain", "lqr", "--Q", "1,much"], "`--Q` must be numbers as in 1,1,0.1"),
+        (["--R", "1"], "`R` must be left out"),
         (["--system", "nowhere"], "nowhere"),
     ],
 )
