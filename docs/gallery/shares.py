@@ -49,7 +49,7 @@ class Entry:
         return [*self.own, "--time-limit", str(self.seconds), "--box", _text(self.name)]
 
 
-ENTRIES = (Entry("pendulum"), Entry("cartpole", 100), Entry("quadrotor2d", 300), Entry("quadrotor3d", 600))
+ENTRIES = (Entry("pendulum"), Entry("cartpole", 100), Entry("quadrotor2d", 100), Entry("quadrotor3d", 600))
 
 
 def _text(name: str) -> str:
