@@ -2,7 +2,7 @@
 PYTHON ?= python3.11
 BIN := .venv/bin
 
-.PHONY: setup roa test lint docs gallery clean
+.PHONY: setup roa test lint docs gallery shares tradeoff clean
 
 setup: .venv/.installed
 
@@ -28,6 +28,12 @@ docs: setup
 
 gallery: setup
 	$(BIN)/python docs/gallery/draw.py
+
+shares: setup
+	$(BIN)/python docs/gallery/shares.py
+
+tradeoff: setup
+	$(BIN)/python docs/how-to/tradeoff.py
 
 clean:
 	rm -rf .venv out build *.egg-info

@@ -13,6 +13,10 @@ policies between the old one and its linearisation is taken (`contraction`), the
 stay within bounds on what counts, the settled share and the median cost of simulated runs, and the best iterate that
 does is the result. It has the same layers, squash, centring, scale, offset and clip, and what enters the squash at the
 origin is what did.
+
+A policy whose gain at the origin is the trouble is another matter: bounds cannot be large where the loop saturates at a
+hundredth of its box. With `gain` "lqr" the policy to be copied is the old one with the gain that minimises the
+judged cost near the origin (`gain`), and the bounds are still those of the old one.
 """
 
 from __future__ import annotations
@@ -21,7 +25,7 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
@@ -33,12 +37,15 @@ from certify.policies import Policy, TanhNetwork, require_centred
 from certify.systems import System, shipped_system
 from controllers.contraction import contracted, with_value_at_origin
 from controllers.departure import departure, departure_of, linearised
-from controllers.evaluate import EvaluationOptions, curvature, settle
+from controllers.evaluate import EvaluationOptions, curvature, discrete_linearisation, settle
+from controllers.gain import regained
+from controllers.lqr import riccati_gain
 from controllers.options import Plant, get_plant
 from controllers.simulation import held_loop, initial_states, mean_action
 
 Array = NDArray[np.float64]
 Ended = Literal["steps", "time limit"]
+Gain = Literal["kept", "lqr"]
 
 FACTORS = tuple(2.0**-k for k in range(7))
 """Contractions that are tried: powers of two, which round no weight. Beyond the last one nothing is left to gain."""
@@ -66,6 +73,9 @@ class FlattenOptions:
     time_limit : seconds after which no more gradient steps are taken, those before them included.
     max_cost_change : bound on the relative rise of the median cost; a fall is no harm.
     states : initial states of the runs that judge a policy.
+    gain : the Jacobian at 0 that is aimed at: `kept` is the policy's own, `lqr` that of the LQR at the time step of the
+        runs that judge.
+    Q, R : diagonals (n,) and (m,) of the LQR's weights, for `gain` "lqr"; None means those of the runs that judge.
     seed, threads : of everything random; of torch.
 
     Raises
@@ -81,6 +91,9 @@ class FlattenOptions:
     time_limit: float = 180.0
     max_cost_change: float = 0.05
     states: int = 200
+    gain: Gain = "kept"
+    Q: tuple[float, ...] | None = None
+    R: tuple[float, ...] | None = None
     seed: int = 0
     threads: int = 1
 
@@ -90,8 +103,13 @@ class FlattenOptions:
         for name in ("steps", "max_cost_change"):
             self._require(name, 0 <= getattr(self, name) < math.inf, "at least 0 and finite")
         self._require("seed", 0 <= self.seed < 2**63, "at least 0 and below 2^63")
+        self._require("gain", self.gain in get_args(Gain), f"one of {get_args(Gain)}")
         if self.box is not None:
             self._require("box", all(0 < width < math.inf for width in self.box), "positive and finite half-widths")
+        for name, weights in (("Q", self.Q), ("R", self.R)):
+            if weights is not None:
+                self._require(name, all(0 < weight < math.inf for weight in weights), "positive and finite weights")
+                self._require(name, self.gain == "lqr", 'left out unless `gain` is "lqr", whose weights these are')
 
     def _require(self, name: str, holds: bool, requirement: str) -> None:
         if not holds:
@@ -118,7 +136,8 @@ class Flattened:
     """The result: the policy, what it was and is, and how much the input changed on the states that were visited.
 
     `rms` and `largest` are (m,), in the input's units, over the states that both closed loops visit; `gain_change` is
-    the Jacobian's change at 0 on the box, relative; `factor` is the contraction that training began with.
+    the Jacobian's change at 0 on the box, relative to what it was; `factor` is the contraction that training began
+    with.
     """
 
     policy: Policy
@@ -170,7 +189,8 @@ def flatten(
     Raises
     ------
     InputError : policy, box and plant do not fit each other; the policy has no hidden units; its closed loop has no
-        finite cost to compare with; or no iterate has a lower departure within the bounds.
+        finite cost to compare with; there is no LQR gain, or the policy cannot have it, where that is asked for; or no
+        iterate has a lower departure within the bounds.
     """
     options = options or FlattenOptions()
     torch.set_num_threads(options.threads)
@@ -179,7 +199,7 @@ def flatten(
 
 
 class _Run:
-    """One run: the teacher, the states visited so far, the best iterate within the bounds."""
+    """One run: the old policy, the goal that is copied, the states visited so far, the best iterate in the bounds."""
 
     def __init__(self, policy: Policy, options: FlattenOptions, own: tuple[System, Plant] | None) -> None:
         self.began = time.monotonic()
@@ -190,20 +210,23 @@ class _Run:
         else:
             self.system, self.plant = own
         self.plant.check(self.system)
-        self.teacher = policy.network
+        self.old = policy.network
         self._require_sizes()
         self.u_eq = self.system.exact_u_eq()
         self.dt, self.Q, self.R = self._judge()
         self.box = np.array(options.box if options.box is not None else self.plant.initial_states)
-        self.folded = self.teacher.folded(self.u_eq)
+        self.old_J = self.old.jacobian_at_origin(self.u_eq)
+        self.K = None if options.gain == "kept" else self._lqr_gain()
+        self.goal = self.old if self.K is None else regained(self.old, self.u_eq, -self.K, self.box)
+        self.folded = self.goal.folded(self.u_eq)
         self.value = np.asarray(self.folded.net(np.zeros(self.system.n)))  # what enters the squash at the origin
         self.exactly_centred = self._is_exact()
         self.generator = torch.Generator().manual_seed(options.seed)
         self.x0 = initial_states(self.system, _RUNS, options.seed, self.plant)
-        self.states = self.first = self._visited(self.teacher)
+        self.states = self.first = self._visited(self.goal)
         self.scale_of_inputs = self._size_of_inputs()
-        self.J = self.teacher.jacobian_at_origin(self.u_eq)
-        self.before = self._figures(self.teacher)
+        self.J = self.goal.jacobian_at_origin(self.u_eq)
+        self.before = self._figures(self.old)
         if not math.isfinite(self.before.cost):
             raise InputError(
                 f"the policy must have a finite median cost to compare with; half of {options.states} runs of "
@@ -223,14 +246,15 @@ class _Run:
                 "--max-cost-change, or ask for less with a smaller --weight."
             )
         network, after = self.best
-        change = self._actions(network, self.states) - self._actions(self.teacher, self.states)
+        states = self.states if self.goal is self.old else np.concatenate([self.states, self._visited(self.old)])
+        change = self._actions(network, states) - self._actions(self.old, states)
         return Flattened(
             policy=replace(self.policy, network=network, training=self._record(network, after, factor, steps)),
             before=self.before,
             after=after,
             rms=tuple(np.sqrt((change**2).mean(axis=0)).tolist()),
             largest=tuple(np.abs(change).max(axis=0).tolist()),
-            gain_change=self._gain_change(network),
+            gain_change=self._gain_change(network, self.old_J),
             factor=factor,
             steps=steps,
             ended=ended,
@@ -238,11 +262,12 @@ class _Run:
         )
 
     def _contracted(self) -> tuple[float, TanhNetwork]:
-        """The best contraction within the bounds; the policy itself if there is none."""
-        candidates = [contracted(self.teacher, factor) for factor in FACTORS]
+        """The best contraction within the bounds; the goal itself if there is none."""
+        candidates = [contracted(self.goal, factor) for factor in FACTORS]
         ranked = sorted(range(len(FACTORS)), key=lambda k: self._objective(candidates[k]))
         for k in ranked:
-            if k == 0 or self._keep(candidates[k]):
+            as_it_was = k == 0 and self.goal is self.old  # no result, though rounded to float32 it may look flatter
+            if as_it_was or self._keep(candidates[k]):
                 return FACTORS[k], candidates[k]
         return FACTORS[0], candidates[0]
 
@@ -299,21 +324,41 @@ class _Run:
             and figures.cost <= allowed
         ):
             return False
-        if self.exactly_centred and self.teacher.centre == "none":
+        if self.exactly_centred and self.old.centre == "none":
             require_centred(network, self.u_eq)
         self.best, self.objective = (network, figures), objective
         return True
 
     def _objective(self, network: TanhNetwork) -> float:
-        """What training lowers, in double precision, on the states that the old policy visits: the same for all."""
-        change = (self._actions(network, self.first) - self._actions(self.teacher, self.first)) / self.scale_of_inputs
+        """What training lowers, in double precision, on the states that the goal visits: the same for all."""
+        change = (self._actions(network, self.first) - self._actions(self.goal, self.first)) / self.scale_of_inputs
         fit = float((change**2).sum(axis=1).mean())
-        gain = self._gain_change(network) ** 2
+        gain = self._gain_change(network, self.J) ** 2
         return fit + GAIN * gain + self.options.weight * departure_of(network, self.box.tolist())
 
-    def _gain_change(self, network: TanhNetwork) -> float:
-        size = max(float(np.linalg.norm(self.J * self.box)), _NEAR)
-        return float(np.linalg.norm((network.jacobian_at_origin(self.u_eq) - self.J) * self.box)) / size
+    def _gain_change(self, network: TanhNetwork, J: Array) -> float:
+        size = max(float(np.linalg.norm(J * self.box)), _NEAR)
+        return float(np.linalg.norm((network.jacobian_at_origin(self.u_eq) - J) * self.box)) / size
+
+    def _lqr_gain(self) -> Array:
+        """K (m, n) of `u = u_eq - K x`, for the plant's linearisation at the time step of the runs that judge."""
+        Q, R = self._lqr_weights()
+        return riccati_gain(*discrete_linearisation(self.system, self.dt), np.diag(Q), np.diag(R))
+
+    def _lqr_weights(self) -> tuple[Array, Array]:
+        asked = zip((self.options.Q, self.options.R), (self.Q, self.R), strict=True)
+        Q, R = (judging if given is None else np.array(given) for given, judging in asked)
+        if (len(Q), len(R)) != (self.system.n, self.system.m):
+            raise InputError(
+                f"`Q` and `R` must have {self.system.n} and {self.system.m} weights for {self.system.name}; "
+                f"found {len(Q)} and {len(R)}."
+            )
+        if not np.all(R > 0):
+            raise InputError(
+                f"the LQR gain needs input weights that are positive; the policy's record says {R.tolist()}. Give "
+                "others with --R, or keep the policy's own gain."
+            )
+        return Q, R
 
     def _figures(self, network: TanhNetwork) -> Figures:
         judged = EvaluationOptions(states=self.options.states, seed=self.options.seed, duration=20.0, tolerance=1e-3)
@@ -339,22 +384,22 @@ class _Run:
         self.states = np.concatenate([self.states, states])
 
     def _data(self) -> tuple[Tensor, Tensor]:
-        """The states visited so far and the old policy's inputs there, in single precision."""
-        return torch.from_numpy(self.states).float(), torch.from_numpy(self._actions(self.teacher, self.states)).float()
+        """The states visited so far and the goal's inputs there, in single precision."""
+        return torch.from_numpy(self.states).float(), torch.from_numpy(self._actions(self.goal, self.states)).float()
 
     def _actions(self, network: TanhNetwork, states: Array) -> Array:
         return mean_action(network, self.system)(states)
 
     def _size_of_inputs(self) -> Array:
-        """Root mean square (m,) of the old inputs' deviations from u(0): one share of each input's scale for all."""
-        at_0 = self._actions(self.teacher, np.zeros((1, self.system.n)))
-        relative = (self._actions(self.teacher, self.states) - at_0) / np.abs(self.teacher.scale)
+        """Root mean square (m,) of the goal's deviations from u(0): one share of each input's scale for all."""
+        at_0 = self._actions(self.goal, np.zeros((1, self.system.n)))
+        relative = (self._actions(self.goal, self.states) - at_0) / np.abs(self.goal.scale)
         mean = float((relative**2).sum(axis=1).mean())
         if not mean > _NEAR:
             raise InputError(
                 "the policy must act on the states from its box of initial states; its inputs never leave u(0) there."
             )
-        return np.asarray(math.sqrt(mean) * np.abs(self.teacher.scale))
+        return np.asarray(math.sqrt(mean) * np.abs(self.goal.scale))
 
     def _slope(self) -> Array:
         """d u / d net (m,) at the origin."""
@@ -365,19 +410,22 @@ class _Run:
         weights, biases = (
             tuple(p.detach().double().numpy() for p in parameters) for parameters in (student.weights, student.biases)
         )
-        network = replace(self.teacher, weights=weights, biases=biases)
-        return with_value_at_origin(network, np.asarray(self.teacher.net(np.zeros(self.system.n))))
+        network = replace(self.old, weights=weights, biases=biases)
+        return with_value_at_origin(network, np.asarray(self.old.net(np.zeros(self.system.n))))
 
     def _record(self, network: TanhNetwork, after: Figures, factor: float, steps: int) -> Mapping[str, Any]:
         """The old record, with what changed since: how it was flattened, from which policy, with which figures."""
         record = dict(self.policy.training)
+        if self.K is not None and "K" in record:
+            record["K"] = self.K.tolist()
         if "K" in record:
             record["distance"] = float(np.linalg.norm(network.jacobian_at_origin(self.u_eq) + np.asarray(record["K"])))
         if "curvature" in record and isinstance(record.get("eta"), float):
             record["curvature"] = curvature(network, self.system, record["eta"])
         options = self.options
         record["flattened"] = {
-            "sha256": self.teacher.sha256(),
+            "sha256": self.old.sha256(),
+            "gain": options.gain,
             "weight": options.weight,
             "box": self.box.tolist(),
             "steps": steps,
@@ -389,6 +437,9 @@ class _Run:
             "departure": [self.before.departure, after.departure],
             "cost": [self.before.cost, after.cost],
         }
+        if self.K is not None:
+            Q, R = self._lqr_weights()
+            record["flattened"] |= {"K": self.K.tolist(), "Q": Q.tolist(), "R": R.tolist()}
         return record
 
     def _judge(self) -> tuple[float, Array, Array]:
@@ -410,7 +461,7 @@ class _Run:
         return dt, found[1], found[2]
 
     def _require_sizes(self) -> None:
-        network, system, box = self.teacher, self.system, self.options.box
+        network, system, box = self.old, self.system, self.options.box
         if (network.n, network.m) != (system.n, system.m):
             raise InputError(
                 f"the policy must map {system.n} states to {system.m} inputs for {system.name}; "
@@ -423,10 +474,10 @@ class _Run:
 
     def _is_exact(self) -> bool:
         """Whether pi(0) = u_eq rests on the biases' own numbers, which must then stay as they are."""
-        if self.teacher.centre != "none":
+        if self.old.centre != "none":
             return False
         try:
-            require_centred(self.teacher, self.u_eq)
+            require_centred(self.old, self.u_eq)
         except InputError:
             return False
         return True

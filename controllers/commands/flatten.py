@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
@@ -17,7 +17,7 @@ from controllers.files import require_writable
 if TYPE_CHECKING:
     from certify.policies import Policy
     from certify.systems import System
-    from controllers.flatten import Figures, Flattened, FlattenOptions
+    from controllers.flatten import Figures, Flattened, FlattenOptions, Gain
     from controllers.options import Plant
 
 
@@ -39,6 +39,18 @@ def flatten(
     max_cost_change: Annotated[
         float, typer.Option("--max-cost-change", help="By which share the median cost of a run may rise.")
     ] = 0.05,
+    gain: Annotated[
+        str,
+        typer.Option(
+            "--gain",
+            help="What the policy asks for near the origin: kept (as it is), or lqr (by the weights that judge runs).",
+        ),
+    ] = "kept",
+    Q: Annotated[
+        str | None,
+        typer.Option("--Q", help="Diagonal of the LQR's Q, as in 1,1,0.1; default: that of the runs that judge."),
+    ] = None,
+    R: Annotated[str | None, typer.Option("--R", help="Diagonal of the LQR's R, as --Q.")] = None,
     states: Annotated[int, typer.Option("--states", help="Initial states of the runs that judge a policy.")] = 200,
     seed: Annotated[int, typer.Option("--seed", help="Seed of everything random.")] = 0,
     system: Annotated[
@@ -67,12 +79,15 @@ def flatten(
             time_limit=time_limit,
             max_cost_change=max_cost_change,
             states=states,
+            gain=cast("Gain", gain),
+            Q=_weights(Q, "--Q"),
+            R=_weights(R, "--R"),
             seed=seed,
         )
         with _progress(options) as report:
             result = run(given, options, own, report)
         save_policy(out, result.policy)
-        emit({"policy": str(out), **(result.as_json() if as_json else _table(result))}, as_json)
+        emit({"policy": str(out), **(result.as_json() if as_json else _table(result, options))}, as_json)
 
 
 def _half_widths(text: str, policy: Policy, own: tuple[System, Plant] | None) -> tuple[float, ...]:
@@ -92,6 +107,16 @@ def _half_widths(text: str, policy: Policy, own: tuple[System, Plant] | None) ->
         except ValueError as error:
             raise InputError(f"`--box` must be NAME=HALF-WIDTH,...; found {part!r}.") from error
     return tuple(widths.values())
+
+
+def _weights(text: str | None, option: str) -> tuple[float, ...] | None:
+    """The diagonal that `1,1,0.1` is."""
+    if text is None:
+        return None
+    try:
+        return tuple(float(part) for part in text.split(","))
+    except ValueError as error:
+        raise InputError(f"`{option}` must be numbers as in 1,1,0.1; found {text!r}.") from error
 
 
 @contextmanager
@@ -115,13 +140,13 @@ def _progress(options: FlattenOptions) -> Iterator[Callable[[int, float, float],
         yield report
 
 
-def _table(result: Flattened) -> dict[str, Any]:
+def _table(result: Flattened, options: FlattenOptions) -> dict[str, Any]:
     def runs(found: Figures) -> str:
         return f"{found.settled} of {found.states} settled, median cost {found.cost:.4g}"
 
     before, after = result.before, result.after
     rms, largest = (", ".join(f"{v:.3g}" for v in values) for values in (result.rms, result.largest))
-    return {
+    table = {
         "system": result.policy.system,
         "sha256": result.policy.network.sha256(),
         "departure": f"{before.departure:.3g} before, {after.departure:.3g} after",
@@ -132,3 +157,6 @@ def _table(result: Flattened) -> dict[str, Any]:
         "change of J(0)": f"{100 * result.gain_change:.2g} %",
         "trained": f"from factor {result.factor:g}, {result.steps} steps in {result.seconds:.0f} s ({result.ended})",
     }
+    if options.gain == "kept" and not after.settled:
+        table["what to try"] = "--gain lqr, if it is the gain at the origin that lets no run settle"
+    return table

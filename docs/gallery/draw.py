@@ -41,8 +41,8 @@ class Entry:
 
 
 OPTIMISED = ("--candidate", "optimised", "--time-limit", "60")
-WHERE = "x=0.3,y=0.3,z=0.3,phi=0.12,theta=0.12,psi=0.12,vx=0.3,vy=0.3,vz=0.3,p=0.6,q=0.6,r=0.6"
-QUADROTOR = ("--box", WHERE, "--time-limit", "300")
+WHERE = "x=0.5,y=0.5,z=0.5,phi=0.3,theta=0.3,psi=0.3,vx=0.5,vy=0.5,vz=0.5,p=0.5,q=0.5,r=0.5"
+QUADROTOR = ("--time-limit", "600", "--box", WHERE)
 ENTRIES = (
     Entry("pendulum", "inverted pendulum, up to its domain", "pendulum"),
     Entry(

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.linalg
 import torch
 from typer.testing import CliRunner
 
@@ -16,7 +17,7 @@ from certify.policies import Policy, TanhNetwork, load_policy, require_centred, 
 from certify.systems import get_system
 from controllers import flatten as module
 from controllers.cli import app
-from controllers.evaluate import EvaluationOptions, curvature, evaluate
+from controllers.evaluate import EvaluationOptions, curvature, discrete_linearisation, evaluate
 from controllers.flatten import FACTORS, FlattenOptions, bend, flatten
 from controllers.simulation import initial_states
 
@@ -158,6 +159,107 @@ def test_a_policy_without_centring_keeps_its_value_at_the_origin():
     np.testing.assert_allclose(found.policy.network(zero, u_eq), teacher(zero, u_eq), atol=1e-5)
 
 
+def _chattering(centre="preactivation", bias=0.5) -> TanhNetwork:
+    """A policy with sixty times the gain: with actions held over 0.02 s its loop never comes to rest."""
+    steep = curved(centre, bias=bias)
+    return replace(
+        steep, weights=(*steep.weights[:-1], 60 * steep.weights[-1]), biases=(*steep.biases[:-1], np.zeros(1))
+    )
+
+
+def test_another_gain_is_the_lqr_gain_of_the_weights_that_judge():
+    """A is stable under it, runs settle that did not, and the gain is that of the discrete Riccati equation."""
+    old, record = _chattering(), _record(K=[[5.0, 2.0]])
+    found = flatten(Policy(old, "pendulum", training=record), replace(QUICK, gain="lqr"))
+    network, u_eq = found.policy.network, PENDULUM.exact_u_eq()
+    K = np.array(found.policy.training["flattened"]["K"])
+    A, B = discrete_linearisation(PENDULUM, record["dt"])
+    Q, R = np.diag(record["state_weights"]), np.diag(record["input_weights"])
+    X = scipy.linalg.solve_discrete_are(A, B, Q, R)  # another way than riccati_gain's
+    np.testing.assert_allclose(K, np.linalg.solve(R + B.T @ X @ B, B.T @ X @ A), rtol=1e-6)
+    np.testing.assert_allclose(network.jacobian_at_origin(u_eq), -K, rtol=0.02)
+    assert found.before.settled == 0 and found.after.settled == 20
+    assert found.after.cost < 0.1 * found.before.cost and found.after.departure < found.before.departure
+    assert found.policy.training["flattened"]["gain"] == "lqr"
+    assert found.policy.training["K"] == K.tolist() != record["K"]
+    distance = np.linalg.norm(network.jacobian_at_origin(u_eq) + K)
+    assert found.policy.training["distance"] == pytest.approx(distance)
+
+
+def test_what_changed_is_said_beside_the_old_policy_and_not_beside_the_goal():
+    old = _chattering()
+    found = flatten(Policy(old, "pendulum", training=_record()), replace(QUICK, gain="lqr"))
+    u_eq, box = PENDULUM.exact_u_eq(), np.array(module.get_plant("pendulum").initial_states)
+    J, Jn = old.jacobian_at_origin(u_eq), found.policy.network.jacobian_at_origin(u_eq)
+    assert found.gain_change == pytest.approx(np.linalg.norm((Jn - J) * box) / np.linalg.norm(J * box))
+    assert found.gain_change > 0.5
+    x0 = initial_states(PENDULUM, 64, 0)
+    change = np.abs(found.policy.network(x0, u_eq) - old(x0, u_eq)).max()
+    assert found.largest[0] * (1 + 1e-9) >= change > 1
+
+
+def test_the_gain_stays_unless_it_is_asked_for():
+    found = flatten(Policy(_chattering(), "pendulum", training=_record()), QUICK)
+    assert found.gain_change < 0.05 and found.after.settled == found.before.settled == 0
+    assert found.policy.training["flattened"]["gain"] == "kept" and "K" not in found.policy.training["flattened"]
+
+
+def test_another_gain_is_bound_by_what_the_old_policy_costs(monkeypatch):
+    """The bounds are the old policy's own, whatever is copied."""
+    calls = _judging(monkeypatch, lambda call: (20, 1.0 if call == 1 else 1.06))
+    with pytest.raises(InputError, match="no policy within the bounds is easier to prove"):
+        flatten(Policy(curved(), "pendulum", training=_record()), replace(QUICK, gain="lqr"))
+    assert calls[0].sha256() == curved().sha256()
+
+
+def test_zero_biases_stay_under_another_gain():
+    teacher = _chattering("none", bias=0.0)
+    require_centred(teacher, PENDULUM.exact_u_eq())
+    network = flatten(Policy(teacher, "pendulum", training=_record()), replace(QUICK, gain="lqr")).policy.network
+    assert not any(np.any(b) for b in network.biases)
+    require_centred(network, PENDULUM.exact_u_eq())
+
+
+def test_an_lqr_gain_needs_input_weights():
+    given = Policy(curved(), "pendulum", training=_record(input_weights=[0.0]))
+    with pytest.raises(InputError, match="needs input weights that are positive"):
+        flatten(given, replace(QUICK, gain="lqr"))
+    flatten(given, replace(QUICK, gain="lqr", R=(0.1,), steps=0))
+
+
+def test_other_weights_give_another_gain_and_runs_are_judged_as_before():
+    """Dearer inputs, less gain; what a run costs is still what the record's weights say."""
+    own = flatten(Policy(curved(), "pendulum", training=_record(K=[[5.0, 2.0]])), replace(QUICK, gain="lqr"))
+    wide = replace(QUICK, gain="lqr", R=(0.2,), max_cost_change=1.0)
+    dear = flatten(Policy(curved(), "pendulum", training=_record(K=[[5.0, 2.0]])), wide)
+    K, dear_K = (np.array(found.policy.training["K"]) for found in (own, dear))
+    assert np.linalg.norm(dear_K) < np.linalg.norm(K)
+    said = dear.policy.training["flattened"]
+    assert (said["K"], said["Q"], said["R"]) == (dear_K.tolist(), [1.0, 0.1], [0.2])
+    assert dear.policy.training["input_weights"] == [0.1] and dear.before == own.before
+    u_eq = PENDULUM.exact_u_eq()
+    np.testing.assert_allclose(dear.policy.network.jacobian_at_origin(u_eq), -dear_K, rtol=0.02)
+    assert dear.policy.training["distance"] == pytest.approx(
+        np.linalg.norm(dear.policy.network.jacobian_at_origin(u_eq) + dear_K)
+    )
+    cheap = flatten(Policy(curved(), "pendulum", training=_record()), replace(wide, R=None, Q=(2.0, 0.1)))
+    assert cheap.policy.network.jacobian_at_origin(u_eq)[0, 0] < own.policy.network.jacobian_at_origin(u_eq)[0, 0]
+
+
+@pytest.mark.parametrize("weights", [{"Q": (1.0,)}, {"R": (1.0, 1.0)}])
+def test_weights_of_another_size_are_refused(weights):
+    with pytest.raises(InputError, match="`Q` and `R` must have 2 and 1 weights for pendulum"):
+        flatten(Policy(curved(), "pendulum", training=_record()), replace(QUICK, gain="lqr", **weights))
+
+
+def test_weights_without_the_gain_that_they_are_for_are_refused():
+    with pytest.raises(InputError, match='`R` must be left out unless `gain` is "lqr"'):
+        replace(QUICK, R=(1.0,))
+    for bad in (0.0, np.nan, np.inf):
+        with pytest.raises(InputError, match="`Q` must be positive and finite weights"):
+            replace(QUICK, gain="lqr", Q=(1.0, bad))
+
+
 def test_time_ends_training_and_what_is_there_is_judged():
     found = flatten(Policy(curved(), "pendulum", training=_record()), replace(QUICK, time_limit=1e-3))
     assert found.ended == "time limit" and found.steps == 0
@@ -258,6 +360,7 @@ def test_what_cannot_be_flattened_is_refused(policy, options, message):
         ("max_cost_change", -0.1),
         ("max_cost_change", np.nan),
         ("states", 0),
+        ("gain", "pid"),
         ("seed", -1),
     ],
 )
@@ -281,7 +384,15 @@ def test_the_command_writes_the_policy_and_one_json_object(tmp_path):
     assert new.training["flattened"]["box"] == [0.5, module.get_plant("pendulum").initial_states[1]]
     assert new.training["flattened"]["seed"] == 3
     text = _flatten(tmp_path / "p.pt", "--out", tmp_path / "r.pt")
-    assert text.exit_code == 0 and "10 of 10 settled" in text.stdout
+    assert text.exit_code == 0 and "10 of 10 settled" in text.stdout and "what to try" not in text.stdout
+
+
+def test_the_command_says_what_to_try_where_no_run_settles(tmp_path):
+    save_policy(tmp_path / "p.pt", Policy(_chattering(), "pendulum", training=_record()))
+    kept = _flatten(tmp_path / "p.pt", "--out", tmp_path / "q.pt")
+    assert kept.exit_code == 0 and "0 of 10 settled" in kept.stdout and "what to try" in kept.stdout
+    lqr = _flatten(tmp_path / "p.pt", "--out", tmp_path / "q.pt", "--gain", "lqr")
+    assert lqr.exit_code == 0 and "10 of 10 settled" in lqr.stdout and "what to try" not in lqr.stdout
 
 
 @pytest.mark.parametrize(
@@ -292,6 +403,9 @@ def test_the_command_writes_the_policy_and_one_json_object(tmp_path):
         (["--box", "theta=wide"], "`--box` must be NAME=HALF-WIDTH"),
         (["--box", "theta=-1"], "`box` must be positive"),
         (["--weight", "-1"], "`weight` must be positive"),
+        (["--gain", "pid"], "`gain` must be one of"),
+        (["--gain", "lqr", "--Q", "1,much"], "`--Q` must be numbers as in 1,1,0.1"),
+        (["--R", "1"], "`R` must be left out"),
         (["--system", "nowhere"], "nowhere"),
     ],
 )
