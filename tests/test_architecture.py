@@ -23,6 +23,7 @@ EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows th
     "diagnosis": "claims closed_loop engines lyapunov options policies results",
     "enclosures": "closed_loop expressions rigorous",
     "engines": "certificate claims closed_loop enclosures expressions lyapunov policies rigorous running systems",
+    "float_error": "closed_loop policies rigorous systems",
     "inputs": "policies systems",
     "lyapunov": "closed_loop",
     "options": "lyapunov",
