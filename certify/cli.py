@@ -15,6 +15,7 @@ import sys
 import typer
 
 from certify.commands.check import check
+from certify.commands.contains import contains
 from certify.commands.doctor import doctor
 from certify.commands.export_smt2 import export_smt2
 from certify.commands.float_error import float_error
@@ -37,6 +38,7 @@ app = typer.Typer(
 app.callback()(certify)
 app.command("roa")(takes_import_options(roa))
 app.command("check")(check)
+app.command("contains")(contains)
 app.command("report")(report)
 app.command("plot")(plot)
 app.command("import")(takes_import_options(import_))

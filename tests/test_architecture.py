@@ -20,6 +20,7 @@ EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows th
     "certificate": "claims expressions lyapunov policies systems",
     "claims": "closed_loop expressions lyapunov policies",
     "closed_loop": "expressions policies systems",
+    "containment": "certificate claims lyapunov systems",
     "diagnosis": "claims closed_loop engines lyapunov options policies results",
     "enclosures": "closed_loop expressions rigorous",
     "engines": "certificate claims closed_loop enclosures expressions lyapunov policies rigorous running systems",

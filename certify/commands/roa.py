@@ -11,15 +11,18 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from certify.commands.arguments import numbers, plant_of, widths
+from certify.commands.arguments import numbers, plant_of, region, widths
+from certify.commands.contains import stated, text
 from certify.commands.importing import policy_of
 from certify.commands.shared import Json, page_of, write
 from certify.commands.terminal import ProgressLine, say, show, tell
 from certify.errors import BackendError, InputError
 
 if TYPE_CHECKING:
+    from certify.containment import Box
     from certify.policies import Policy
     from certify.policies.importers import ImportOptions
+    from certify.results import RoaResult
     from certify.systems import System
 
 
@@ -68,6 +71,10 @@ def roa(
             help="Enlarge for the largest multiple of an ellipsoid with these half-axes, as in x=0.4,phi=0.2."
         ),
     ] = None,
+    contains: Annotated[
+        str | None,
+        typer.Option(help="Say whether the proved set contains a state or a box, as in x=1.57,x_dot=-1..1."),
+    ] = None,
     time_limit: Annotated[float, typer.Option(help="Seconds for everything up to the verdict.")] = 50.0,
     max_boxes: Annotated[int, typer.Option(help="Boxes for the ring.")] = 4_000_000,
     out: Annotated[Path | None, typer.Option(help="Folder for the results; default: out/POLICY.")] = None,
@@ -101,6 +108,7 @@ def roa(
         time_limit=time_limit,
         max_boxes=max_boxes,
     )
+    asked = None if contains is None else region(contains, plant, "--contains")
     folder = out if out is not None else Path("out") / policy.stem
     progress = None if quiet else ProgressLine()
     try:
@@ -124,13 +132,29 @@ def roa(
     if result.certificate is not None and result.raw is not None:
         answer = None if result.checker is None else dict(result.checker)
         write(folder / "report.html", page_of(result.raw, result.certificate, answer, data))
+    where = None if asked is None else _where(result, asked)
+    if where is not None:
+        data["contains"] = where[0]
     if as_json:
         say(json.dumps(data))
     else:
         show(summary(data))
+        if where is not None:
+            say(where[1])
         if result.certificate is not None:
             say(f"certificate  {result.certificate}\nreport       {folder / 'report.html'}")
     raise typer.Exit(result.verdict.exit_status)
+
+
+def _where(result: RoaResult, box: Box) -> tuple[dict[str, Any], str]:
+    """Whether the proved set contains a box, for JSON and in words, from the very bytes that were checked."""
+    from certify.containment import NOTHING_PROVED, set_of
+    from certify.verdict import Verdict
+
+    found = NOTHING_PROVED
+    if result.verdict is Verdict.PROVED and result.raw is not None:
+        found = set_of(result.raw, str(result.certificate)).locate(box)
+    return stated(found, box, result.system), text(found, box, result.system)
 
 
 def _command(context: typer.Context, changed: Mapping[str, str]) -> str:
