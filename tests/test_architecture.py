@@ -40,7 +40,7 @@ EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows th
     ),
     "systems": "expressions",
     "trials": "certificate claims closed_loop engines lyapunov options",
-    "controllers": "policies systems",
+    "controllers": "containment policies systems",
 }
 
 
