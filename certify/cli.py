@@ -15,8 +15,10 @@ import sys
 import typer
 
 from certify.commands.check import check
+from certify.commands.contains import contains
 from certify.commands.doctor import doctor
 from certify.commands.export_smt2 import export_smt2
+from certify.commands.float_error import float_error
 from certify.commands.import_ import import_
 from certify.commands.importing import takes_import_options
 from certify.commands.plant import plant
@@ -38,12 +40,14 @@ app.callback()(certify)
 app.command("roa")(takes_import_options(roa))
 app.command("reach")(takes_import_options(reach, kind_is="--kind"))
 app.command("check")(check)
+app.command("contains")(contains)
 app.command("report")(report)
 app.command("plot")(plot)
 app.command("import")(takes_import_options(import_))
 app.command("plant")(plant)
 app.command("systems")(systems)
 app.command("export-smt2")(export_smt2)
+app.command("float-error")(float_error)
 app.command("doctor")(doctor)
 
 _INTERRUPTED = 130  # as a shell reports SIGINT

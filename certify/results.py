@@ -388,6 +388,7 @@ class RoaResult:
             "certificate": None if self.certificate is None else str(self.certificate),
             "certificate_sha256": None if self.checker is None else self.checker.get("certificate_sha256"),
             "checked": None if self.checker is None else self.checker.get("result"),
+            "contains": None,  # the answer to `certify roa --contains`
         }
 
 

@@ -72,12 +72,12 @@ def centring_with_errors(loop: ClosedLoop) -> tuple[Array, Array, Array, Array]:
         columns = []
         for balls in _centring(loop):
             middle = [float(b.mid()) for b in balls]
-            columns += [middle, [_above((b - m).abs_upper()) for b, m in zip(balls, middle, strict=True)]]
+            columns += [middle, [rounded_up((b - m).abs_upper()) for b, m in zip(balls, middle, strict=True)]]
     shift, shift_error, offset, offset_error = map(np.array, columns)
     return shift, shift_error, offset, offset_error
 
 
-def _above(x: flint.arb) -> float:
+def rounded_up(x: flint.arb) -> float:
     """A binary64 number that is not below x >= 0."""
     value = float(x)
     return value if value >= x else float(np.nextafter(value * (1 + 2.0**-50), np.inf))

@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from certify.containment import ProvedSet
 from certify.errors import InputError
 from certify.policies import Policy, TanhNetwork
 from certify.systems import System, shipped_system
@@ -76,10 +77,24 @@ class Settling:
 
 
 @dataclass(frozen=True, slots=True)
+class Covered:
+    """How many of the initial states lie in the set that a certificate proves, each of them decided in rationals.
+
+    `claim` is what kind of claim it makes about them, `certificate_sha256` says which file.
+    """
+
+    inside: int
+    states: int
+    claim: str
+    certificate_sha256: str
+
+
+@dataclass(frozen=True, slots=True)
 class Evaluation:
     """Figures of one policy. A, B, K are the learned ones of its record; NaN where the record has none.
 
     `curvature` is that of `curvature()` in the ball in which the plant was identified; NaN without `training.eta`.
+    `covered` is None without a certificate.
     """
 
     system: str
@@ -92,6 +107,7 @@ class Evaluation:
     eigenvalues: tuple[complex, ...]
     continuous: Settling
     held: Settling
+    covered: Covered | None = None
 
     def as_json(self) -> dict[str, Any]:
         """Plain values; NaN and infinity become None."""
@@ -115,18 +131,24 @@ class Evaluation:
             "eigenvalues": [[e.real, e.imag] for e in self.eigenvalues],
             "continuous": settling(self.continuous),
             "held": settling(self.held),
+            "proved": None if self.covered is None else asdict(self.covered),
         }
 
 
 def evaluate(
-    policy: Policy, options: EvaluationOptions | None = None, own: tuple[System, Plant] | None = None
+    policy: Policy,
+    options: EvaluationOptions | None = None,
+    own: tuple[System, Plant] | None = None,
+    proved: ProvedSet | None = None,
 ) -> Evaluation:
     """Simulate `policy` on the plant that it names, or on `own` with its box, and compare it with its learned gain.
+
+    With a `proved` set of this policy the initial states in it are counted.
 
     Raises
     ------
     InputError : the plant is unknown or has no box of initial states, the sizes of policy and plant differ,
-        or the record lacks what the held simulation needs (`dt`, weights).
+        the record lacks what the held simulation needs (`dt`, weights), or `proved` is about another loop.
     """
     options = options or EvaluationOptions()
     if own is None:
@@ -140,6 +162,7 @@ def evaluate(
             f"it maps {network.n} to {network.m}."
         )
     x0 = initial_states(system, options.states, options.seed, plant)
+    covered = None if proved is None else count_covered(proved, network, system, x0)
     dt = _recorded(policy, "dt", ())
     if not dt > 0:
         raise InputError(f"`training.dt` of the policy must be positive; found {dt}.")
@@ -172,7 +195,31 @@ def evaluate(
         eigenvalues=tuple(complex(e) for e in eigenvalues),
         continuous=continuous,
         held=held,
+        covered=covered,
     )
+
+
+def count_covered(proved: ProvedSet, network: TanhNetwork, system: System, x0: Array) -> Covered:
+    """How many of the states (N, n), deviations from x_eq, lie in a set that is proved about this very closed loop.
+
+    Raises
+    ------
+    InputError : the certificate is about another policy, or about other equations.
+    """
+    if proved.policy_sha256 != network.sha256():
+        raise InputError(
+            f"the certificate must be about the policy that is evaluated, {network.sha256()}; it is about "
+            f"{proved.policy_sha256}. Certify this one with `certify roa`."
+        )
+    theirs = proved.system
+    equal = theirs.exact_dynamics() == system.exact_dynamics() and theirs.exact_u_eq() == system.exact_u_eq()
+    if (theirs.states, theirs.inputs) != (system.states, system.inputs) or not equal:
+        raise InputError(
+            f"the certificate must be about the plant that is simulated, {system.name} with these parameters; it is "
+            f"about {theirs.name} with other equations. Certify the policy on this plant."
+        )
+    inside = sum(proved.holds(x0.tolist()))
+    return Covered(inside, len(x0), proved.claim, proved.certificate_sha256)
 
 
 def settle(

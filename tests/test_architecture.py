@@ -20,9 +20,11 @@ EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows th
     "certificate": "claims expressions lyapunov policies systems",
     "claims": "closed_loop expressions lyapunov policies",
     "closed_loop": "expressions policies systems",
+    "containment": "certificate claims lyapunov systems",
     "diagnosis": "claims closed_loop engines lyapunov options policies results",
     "enclosures": "closed_loop expressions rigorous",
     "engines": "certificate claims closed_loop enclosures expressions lyapunov policies rigorous running systems",
+    "float_error": "closed_loop policies rigorous systems",
     "inputs": "policies systems",
     "lyapunov": "closed_loop",
     "options": "lyapunov",
@@ -38,7 +40,7 @@ EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows th
     ),
     "systems": "expressions",
     "trials": "certificate claims closed_loop engines lyapunov options",
-    "controllers": "policies systems",
+    "controllers": "containment policies systems",
 }
 
 

@@ -90,6 +90,35 @@ def with_domains(plant: System, bounds: list[str]) -> System:
     return plant.with_domain(domain)
 
 
+def region(text: str, plant: System, option: str, deviations: bool = False) -> tuple[tuple[Fraction, Fraction], ...]:
+    """A state or a box, NAME=VALUE or NAME=LO..HI separated by commas, as intervals of deviations from x_eq, (n,).
+
+    Numbers are the states' values, as for `--domain NAME=LO:HI`, unless they are `deviations`; text means its decimal
+    value. A state that is not named is at rest.
+
+    Raises
+    ------
+    InputError : a name is no state or comes twice, a number is none, or an interval has lo > hi.
+    """
+    from certify.systems import exact
+
+    names, at = [s.name for s in plant.states], plant.operating_point()
+    found: dict[str, tuple[Fraction, Fraction]] = {}
+    for part in text.split(","):
+        name, value = _assignment(part, option)
+        if name not in names:
+            raise InputError(f"{plant.name} has no state {name!r}; it has: {', '.join(names)}.")
+        if name in found:
+            raise InputError(f"{option} must name each state once; found {name} twice.")
+        lo, dots, hi = value.partition("..")
+        shift = Fraction(0) if deviations else at.get(name, Fraction(0))
+        ends = exact(lo.strip(), name) - shift, exact(hi.strip() if dots else lo.strip(), name) - shift
+        if ends[0] > ends[1]:
+            raise InputError(f"{option} takes intervals LO..HI with LO <= HI; found {part.strip()!r}.")
+        found[name] = ends
+    return tuple(found.get(name, (Fraction(0), Fraction(0))) for name in names)
+
+
 def numbers(text: str | None, option: str) -> tuple[float, ...] | None:
     """Numbers separated by commas."""
     if text is None:

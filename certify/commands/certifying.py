@@ -11,12 +11,15 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from certify.commands.contains import stated, text
 from certify.commands.shared import page_of, write
 from certify.commands.terminal import ProgressLine, say, show, tell
 
 if TYPE_CHECKING:
+    from certify.containment import Box
     from certify.options import RoaOptions
     from certify.policies import Policy
+    from certify.results import RoaResult
     from certify.systems import System
 
 
@@ -30,6 +33,7 @@ def certified(
     start: float,
     quiet: bool,
     as_json: bool,
+    asked: Box | None = None,
 ) -> None:
     """Run, write certificate and report, print the result; ends the command with the verdict's exit status.
 
@@ -38,6 +42,7 @@ def certified(
     stored, plant : the policy in the file `policy`, and the plant that it is certified on.
     out : folder for the results.
     start : when the command began, by `time.perf_counter`.
+    asked : of which it is to be said whether the proved set contains it.
     """
     from certify.report import summary
     from certify.roa import certify_roa
@@ -70,13 +75,29 @@ def certified(
     if result.certificate is not None and result.raw is not None:
         answer = None if result.checker is None else dict(result.checker)
         write(folder / "report.html", page_of(result.raw, result.certificate, answer, data))
+    where = None if asked is None else _where(result, asked)
+    if where is not None:
+        data["contains"] = where[0]
     if as_json:
         say(json.dumps(data))
     else:
         show(summary(data))
+        if where is not None:
+            say(where[1])
         if result.certificate is not None:
             say(f"certificate  {result.certificate}\nreport       {folder / 'report.html'}")
     raise typer.Exit(result.verdict.exit_status)
+
+
+def _where(result: RoaResult, box: Box) -> tuple[dict[str, Any], str]:
+    """Whether the proved set contains a box, for JSON and in words, from the very bytes that were checked."""
+    from certify.containment import NOTHING_PROVED, set_of
+    from certify.verdict import Verdict
+
+    found = NOTHING_PROVED
+    if result.verdict is Verdict.PROVED and result.raw is not None:
+        found = set_of(result.raw, str(result.certificate)).locate(box)
+    return stated(found, box, result.system), text(found, box, result.system)
 
 
 def _command(context: typer.Context, changed: Mapping[str, str]) -> str:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from certify.commands.arguments import numbers, plant_of, widths
+from certify.commands.arguments import numbers, plant_of, region, widths
 from certify.commands.certifying import certified
 from certify.commands.importing import policy_of
 from certify.commands.shared import Json
@@ -75,6 +75,10 @@ def roa(
             help="Enlarge for the largest multiple of an ellipsoid with these half-axes, as in x=0.4,phi=0.2."
         ),
     ] = None,
+    contains: Annotated[
+        str | None,
+        typer.Option(help="Say whether the proved set contains a state or a box, as in x=1.57,x_dot=-1..1."),
+    ] = None,
     time_limit: Annotated[float, typer.Option(help="Seconds for everything up to the verdict.")] = 50.0,
     max_boxes: Annotated[int, typer.Option(help="Boxes for the ring.")] = 4_000_000,
     out: Annotated[Path | None, typer.Option(help="Folder for the results; default: out/POLICY.")] = None,
@@ -102,7 +106,8 @@ def roa(
         time_limit=time_limit,
         max_boxes=max_boxes,
     )
-    certified(context, policy, stored, plant, options, out, start, quiet, as_json)
+    asked = None if contains is None else region(contains, plant, "--contains")
+    certified(context, policy, stored, plant, options, out, start, quiet, as_json, asked)
 
 
 def _device(name: str) -> str:

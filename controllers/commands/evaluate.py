@@ -11,7 +11,7 @@ import typer
 from controllers.commands.shared import Json, emit, errors
 
 if TYPE_CHECKING:
-    from controllers.evaluate import Evaluation, Settling
+    from controllers.evaluate import Covered, Evaluation, Settling
 
 
 def evaluate(
@@ -21,17 +21,23 @@ def evaluate(
     system: Annotated[
         str | None, typer.Option(help="A plant of your own, FILE.toml or FILE.py:NAME; default: what the policy says.")
     ] = None,
+    certificate: Annotated[
+        Path | None, typer.Option(help="A certificate of this policy: how many of the states lie in its proved set.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Simulate a policy from random initial states and compare it with its learned gain."""
     with errors(as_json):
+        from certify.containment import proved_set
         from certify.policies import load_policy
         from controllers.evaluate import EvaluationOptions
         from controllers.evaluate import evaluate as judge
         from controllers.own import chosen_plant
 
         options = EvaluationOptions(states=states, seed=seed)
-        result = judge(load_policy(policy), options, None if system is None else chosen_plant(system))
+        stored, own = load_policy(policy), None if system is None else chosen_plant(system)
+        proved = None if certificate is None else proved_set(certificate)
+        result = judge(stored, options, own, proved)
         emit(result.as_json() if as_json else _table(result), as_json)
 
 
@@ -43,6 +49,7 @@ def _table(result: Evaluation) -> dict[str, Any]:
         )
 
     A_error, B_error = 100 * result.A_relative_error, 100 * result.B_relative_error
+    covered = result.covered
     learned = not math.isnan(result.gain_relative)
     return {
         "system": result.system,
@@ -53,4 +60,11 @@ def _table(result: Evaluation) -> dict[str, Any]:
         "eigenvalues": ", ".join(f"{e:.4g}" for e in result.eigenvalues),
         "continuous": settling(result.continuous),
         "held": settling(result.held),
-    }
+    } | ({} if covered is None else {"in the proved set": _share(covered)})
+
+
+def _share(covered: Covered) -> str:
+    return (
+        f"{covered.inside} of {covered.states} initial states ({100 * covered.inside / covered.states:.3g} %), "
+        f"claim {covered.claim}"
+    )

@@ -2,16 +2,24 @@
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 import json
+import re
 import subprocess
 import sys
+from fractions import Fraction
 from pathlib import Path
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from certify.policies import load_policy
+from certify import certify_roa, get_system
+from certify.containment import Containment, proved_set
+from certify.policies import load_policy, save_policy
 from controllers.cli import app
+from controllers.simulation import initial_states
 
 SHIPPED = Path(__file__).parents[2] / "examples" / "policies" / "pendulum.pt"
 SHORT = ["--steps", "260", "--warm-up", "100", "--n-A", "60", "--n-B", "60", "--batch", "16", "--critic", "8,8"]
@@ -133,3 +141,81 @@ def test_help_loads_no_torch():
     code = "import sys; import controllers.cli; print('torch' in sys.modules, 'gymnasium' in sys.modules)"
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert result.stdout.split() == ["False", "False"]
+
+
+@pytest.fixture(scope="module")
+def certificate(tmp_path_factory):
+    """Of the shipped policy of the pendulum: V <= 0.3, quickly."""
+    found = certify_roa("pendulum", SHIPPED, tmp_path_factory.mktemp("certificate"), level=0.3)
+    assert found.certificate is not None, found.reason
+    return found.certificate
+
+
+def _evaluate(*arguments):
+    return runner.invoke(app, ["evaluate", *map(str, arguments), "--json"])
+
+
+def test_evaluate_counts_the_states_in_the_proved_set(certificate):
+    """Each decided by itself, in rationals, also where thousands are asked about."""
+    done = _evaluate(SHIPPED, "--states", 300, "--seed", 5, "--certificate", certificate)
+    assert done.exit_code == 0, done.stderr
+    found = json.loads(done.stdout)["proved"]
+    proved = proved_set(certificate)
+    states = initial_states(get_system("pendulum"), 300, 5)
+    each = [
+        proved.locate(tuple((Fraction(v),) * 2 for v in x)).answer is Containment.CONTAINED for x in states.tolist()
+    ]
+    assert found == {
+        "inside": sum(each),
+        "states": 300,
+        "claim": "asymptotic",
+        "certificate_sha256": hashlib.sha256(certificate.read_bytes()).hexdigest(),
+    }
+    assert 0 < found["inside"] < 300
+    said = runner.invoke(app, ["evaluate", str(SHIPPED), "--states", "20", "--certificate", str(certificate)]).stdout
+    assert re.search(r"in the proved set +\d+ of 20 initial states", said)
+
+
+def test_evaluate_without_a_certificate_says_nothing_of_a_proof():
+    done = _evaluate(SHIPPED, "--states", 5)
+    assert done.exit_code == 0 and json.loads(done.stdout)["proved"] is None
+    assert "proved" not in runner.invoke(app, ["evaluate", str(SHIPPED), "--states", "5"]).stdout
+
+
+def _forged(certificate, folder, edit):
+    data = json.loads(certificate.read_text())
+    edit(data)
+    path = folder / "forged.json"
+    path.write_text(json.dumps(data))
+    return path
+
+
+def test_evaluate_refuses_a_certificate_that_the_checker_does(certificate, tmp_path):
+    path = _forged(certificate, tmp_path, lambda data: data["levels"].update(roa=(100.0).hex()))
+    done = _evaluate(SHIPPED, "--states", 5, "--certificate", path)
+    assert done.exit_code == 2
+    assert "must be a certificate that the checker accepts; it says REJECTED" in json.loads(done.stdout)["error"]
+
+
+def test_evaluate_refuses_a_certificate_of_another_policy(certificate, tmp_path):
+    """The policy with its last weight moved by one unit in the last place."""
+    policy = load_policy(SHIPPED)
+    last = policy.network.weights[-1].copy()
+    last[0, -1] = np.nextafter(last[0, -1], np.inf)
+    weights = (*policy.network.weights[:-1], last)
+    moved = tmp_path / "moved.pt"
+    save_policy(moved, dataclasses.replace(policy, network=dataclasses.replace(policy.network, weights=weights)))
+    done = _evaluate(moved, "--states", 5, "--certificate", certificate)
+    assert done.exit_code == 2
+    assert "must be about the policy that is evaluated" in json.loads(done.stdout)["error"]
+
+
+def test_evaluate_refuses_a_certificate_of_another_plant(certificate, tmp_path):
+    """The same policy, which a record sends to a heavier pendulum: the set is not proved about that."""
+    policy = load_policy(SHIPPED)
+    heavier = tmp_path / "heavier.pt"
+    save_policy(heavier, dataclasses.replace(policy, parameters={**policy.parameters, "m": "0.2"}))
+    assert load_policy(heavier).network.sha256() == policy.network.sha256()
+    done = _evaluate(heavier, "--states", 5, "--certificate", certificate)
+    assert done.exit_code == 2
+    assert "must be about the plant that is simulated" in json.loads(done.stdout)["error"]

@@ -1,0 +1,217 @@
+"""Whether states lie in the set that a certificate proves, decided in rationals.
+
+The set is {V <= c2}, and under a claim with a tube also the tube's start: ellipsoids, each of them
+convex. So a box of states lies in one of them exactly if its corners do, and the corners' values are rational numbers.
+What is said here is about bytes that the checker has accepted; a file that it does not accept has no proved set.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import tempfile
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from enum import Enum
+from fractions import Fraction
+from pathlib import Path
+from typing import NoReturn
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.certificate import Certificate, parse_certificate, read_raw, run_checker
+from certify.claims import CLAIMS, Enlarged, Reached
+from certify.errors import InputError
+from certify.lyapunov import are_inside
+from certify.systems import System
+
+Array = NDArray[np.float64]
+Box = tuple[tuple[Fraction, Fraction], ...]
+_CORNERS = 16  # 2 to the power of this many corners are looked at one by one
+
+
+class Containment(Enum):
+    """Whether all states of a box lie in a proved set.
+
+    CONTAINED: all do. NOT_CONTAINED: a corner does not. UNDECIDED: neither was shown.
+    """
+
+    CONTAINED = "contained"
+    NOT_CONTAINED = "not contained"
+    UNDECIDED = "undecided"
+
+    def __bool__(self) -> NoReturn:
+        raise TypeError("a Containment has three values; compare it with `is`, do not use it as a bool.")
+
+    @property
+    def exit_status(self) -> int:
+        """Exit status of the command line: 0 contained, 1 not contained, 3 undecided."""
+        return {Containment.CONTAINED: 0, Containment.NOT_CONTAINED: 1}.get(self, 3)
+
+
+@dataclass(frozen=True, slots=True)
+class Ellipsoid:
+    """{(x - c)'P(x - c) <= level} with what it is called; P (n, n), c = `centre` (n,), empty for 0."""
+
+    name: str
+    P: Array
+    level: float
+    centre: tuple[float, ...] = ()
+
+    def around(self, box: Box) -> Box:
+        """A box, or a state as one without widths, as deviations from the centre."""
+        shift = [Fraction(v) for v in self.centre] or [Fraction(0)] * len(box)
+        return tuple((lo - c, hi - c) for (lo, hi), c in zip(box, shift, strict=True))
+
+    def holds(self, points: Iterable[Sequence[Fraction | float]]) -> list[bool]:
+        """Whether each of the states lies in it."""
+        shift = [Fraction(v) for v in self.centre]
+        moved = [[Fraction(v) - c for v, c in zip(x, shift, strict=True)] if shift else x for x in points]
+        return are_inside(self.P, self.level, moved)
+
+
+@dataclass(frozen=True, slots=True)
+class Located:
+    """Where a box lies: `within` names the ellipsoid that contains it, `outside` is a corner in none of them, (n,)."""
+
+    answer: Containment
+    within: str | None = None
+    outside: tuple[Fraction, ...] | None = None
+
+
+NOTHING_PROVED = Located(Containment.UNDECIDED)
+"""Where any box lies if there is no proved set."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProvedSet:
+    """The union of ellipsoids that an accepted certificate proves something about, in deviations from x_eq.
+
+    Parameters
+    ----------
+    system : the plant of the certificate. Its x_eq is what the file says for people; no rule depends on it.
+    claim : the claim's kind.
+    ellipsoids : which together are the set.
+    policy_sha256, certificate_sha256 : of the policy that it is about, and of the file.
+    """
+
+    system: System
+    claim: str
+    ellipsoids: tuple[Ellipsoid, ...]
+    policy_sha256: str
+    certificate_sha256: str
+
+    def holds(self, states: Iterable[Sequence[Fraction | float]]) -> list[bool]:
+        """Whether each of the states, as deviations from x_eq, lies in the set; a float means its binary value."""
+        points = list(states)
+        found = [e.holds(points) for e in self.ellipsoids]
+        return [any(each) for each in zip(*found, strict=True)]
+
+    def locate(self, box: Box) -> Located:
+        """Whether a box of states, as deviations from x_eq, lies in the set.
+
+        With at most 16 states that have a width the corners decide, unless one ellipsoid has some of them and another
+        one the rest; beyond that a bound of x'Px on the box may show that it is contained, and a corner that it is not.
+
+        Raises
+        ------
+        InputError : the box has another number of states, or an interval has lo > hi.
+        """
+        if len(box) != self.system.n or not all(lo <= hi for lo, hi in box):
+            raise InputError(f"a box must have {self.system.n} intervals lo <= hi; found {_shown(box)}.")
+        wide = [i for i, (lo, hi) in enumerate(box) if lo < hi]
+        if len(wide) > _CORNERS:
+            corners = [_steepest(e, box) for e in self.ellipsoids]
+            contained = [_largest(e.P, e.around(box)) <= Fraction(float(e.level)) for e in self.ellipsoids]
+        else:
+            ends = (pair if pair[0] < pair[1] else pair[:1] for pair in box)
+            corners = list(itertools.product(*ends))
+            contained = [all(e.holds(corners)) for e in self.ellipsoids]
+        for ellipsoid, whole in zip(self.ellipsoids, contained, strict=True):
+            if whole:
+                return Located(Containment.CONTAINED, within=ellipsoid.name)
+        for corner, inside in zip(corners, self.holds(corners), strict=True):
+            if not inside:
+                return Located(Containment.NOT_CONTAINED, outside=corner)
+        return Located(Containment.UNDECIDED)
+
+
+def proved_set(path: Path) -> ProvedSet:
+    """The set of a certificate, which is checked first, as `certify check` does it: the very bytes that are read.
+
+    Raises
+    ------
+    InputError : the checker does not accept it; a solver's word, TRUSTED, is no proof.
+    CertificateFormatError : the file cannot be read.
+    """
+    raw = read_raw(path)
+    with tempfile.TemporaryDirectory() as folder:  # whatever happens to the path meanwhile
+        private = Path(folder) / "certificate.json"
+        private.write_bytes(raw)
+        answer = run_checker(private)
+    if answer["result"] != "ACCEPTED":
+        why = f" rule={answer['rule']} at={answer['at']}: {answer['detail']}" if "rule" in answer else ""
+        raise InputError(
+            f"{path} must be a certificate that the checker accepts; it says {answer['result']}{why:.300}. Without "
+            "that there is no proved set."
+        )
+    return set_of(raw, str(path))
+
+
+def set_of(raw: bytes, name: str) -> ProvedSet:
+    """The set of a certificate's bytes, which the checker has accepted; `name` is what messages call them.
+
+    Raises
+    ------
+    InputError : the claim is of a kind whose set is not known here.
+    CertificateFormatError : the bytes are no certificate.
+    """
+    read = parse_certificate(raw, name)
+    return ProvedSet(
+        system=read.system,
+        claim=read.kind,
+        ellipsoids=_ellipsoids(read),
+        policy_sha256=read.network.sha256(),
+        certificate_sha256=hashlib.sha256(raw).hexdigest(),
+    )
+
+
+def _ellipsoids(read: Certificate) -> tuple[Ellipsoid, ...]:
+    if type(read.claim) not in CLAIMS.values():
+        raise InputError(f"the claim must be one of {', '.join(CLAIMS)}; found {read.kind!r}.")
+    found = (Ellipsoid("{V <= c2}", read.P, read.roa),)
+    if not isinstance(read.claim, Enlarged | Reached):
+        return found
+    centre = read.claim.centre if isinstance(read.claim, Reached) else ()
+    return (*found, Ellipsoid("the tube's start", read.claim.start.P, 1.0, centre))
+
+
+def _symmetric(P: Array) -> list[list[Fraction]]:
+    rows = [[Fraction(float(v)) for v in row] for row in P]
+    return [[(rows[i][j] + rows[j][i]) / 2 for j in range(len(rows))] for i in range(len(rows))]
+
+
+def _middle(box: Box) -> tuple[list[Fraction], list[Fraction]]:
+    return [(lo + hi) / 2 for lo, hi in box], [(hi - lo) / 2 for lo, hi in box]
+
+
+def _largest(P: Array, box: Box) -> Fraction:
+    """A bound of x'Px on a box: with x = c + d, |d| <= r, `c'Pc + 2 |Pc| r + r'|P|r`."""
+    S, (c, r) = _symmetric(P), _middle(box)
+    Sc = [sum((s * v for s, v in zip(row, c, strict=True)), Fraction(0)) for row in S]
+    curved = sum(
+        (abs(s) * a * b for row, a in zip(S, r, strict=True) for s, b in zip(row, r, strict=True)), Fraction(0)
+    )
+    return sum((v * g + 2 * abs(g) * w for v, g, w in zip(c, Sc, r, strict=True)), Fraction(0)) + curved
+
+
+def _steepest(ellipsoid: Ellipsoid, box: Box) -> tuple[Fraction, ...]:
+    """The corner to which (x - c)'P(x - c) rises at the middle of the box."""
+    S, (c, _) = _symmetric(ellipsoid.P), _middle(ellipsoid.around(box))
+    slopes = [sum((s * v for s, v in zip(row, c, strict=True)), Fraction(0)) for row in S]
+    return tuple(hi if slope >= 0 else lo for (lo, hi), slope in zip(box, slopes, strict=True))
+
+
+def _shown(box: Box) -> str:
+    return ", ".join(f"[{float(lo):.6g}, {float(hi):.6g}]" for lo, hi in box)
