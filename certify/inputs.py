@@ -3,7 +3,8 @@
 A policy file says which plant it was trained for, and by which numbers; whoever uses it may say otherwise, and what
 he says counts. What has to be known of that goes to `tell`, a line each: the command prints it on standard error, a
 result of Python keeps it. Where a policy's network is what it was made from only on a part of the states, the domain
-is cut to that part here, and nowhere is it left to the caller to remember.
+is cut to that part here, and nowhere is it left to the caller to remember. What is uncertain of a plant, and acts on
+it, is put in here too.
 """
 
 from __future__ import annotations

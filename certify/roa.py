@@ -540,13 +540,13 @@ def _require_one_that_knows_ranges(system: System, options: RoaOptions) -> None:
     ------
     InputError : the option, and what has a range.
     """
-    if not system.ranges or not (options.enlarges or options.engine != "bounds"):
+    if not system.ranges or (options.engine == "bounds" and not options.enlarges):
         return
     found = f"found ranges of {', '.join(system.ranges)} in {system.name}"
     if options.enlarges:
         raise InputError(
-            f"a tube must be of exact equations: there is no such claim yet for what is uncertain; {found}. Ask for the "
-            "set without a tube, or leave the ranges out (of a disturbance in the plant's file: the half-width 0)."
+            f"a tube must be of exact equations: there is no such claim yet for what is uncertain; {found}. Ask for "
+            "the set without a tube, or leave the ranges out (of a disturbance in the plant's file: the half-width 0)."
         )
     raise InputError(
         f"`engine` must be bounds where something is uncertain: dReal is asked about exact equations; {found}. Use the "

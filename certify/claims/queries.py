@@ -43,8 +43,8 @@ def query(condition: Condition, problem: Problem) -> Query:
 
     Raises
     ------
-    InputError : the local condition, where -(A'P + PA) is not positive definite; a plant of which something is uncertain:
-        the query would be about its nominal value alone.
+    InputError : the local condition, where -(A'P + PA) is not positive definite; a plant of which something is
+        uncertain, because the query would be about its nominal value alone.
     """
     system = problem.loop.system
     if system.ranges:

@@ -66,9 +66,7 @@ def with_errors(plant: System, error: str | None) -> System:
 
     if error is None:
         return plant
-    return with_bounded_errors(
-        plant, state(error, "--input-error") if "=" in error else exact(error, "--input-error")
-    )
+    return with_bounded_errors(plant, state(error, "--input-error") if "=" in error else exact(error, "--input-error"))
 
 
 def _range(text: str, name: str) -> tuple[Fraction, Fraction]:

@@ -79,10 +79,7 @@ class Varying:
         >>> Varying("wind", Fraction(-1, 3), Fraction(1, 3), "N").words
         'wind(t) within ±0.333333 N'
         """
-        if self.lo == -self.hi:
-            ends = f"within ±{below(self.hi)}"
-        else:
-            ends = f"in {inside(self.lo, self.hi)}"
+        ends = f"within ±{below(self.hi)}" if self.lo == -self.hi else f"in {inside(self.lo, self.hi)}"
         return f"{symbol(self.name)}(t) {ends} {pretty_unit(self.unit)}".rstrip()
 
 
@@ -109,11 +106,11 @@ def inside(lo: Fraction, hi: Fraction) -> str:
     """`[lo, hi]` rounded inwards, in as many digits as keep the one end below the other.
 
     >>> inside(Fraction(1, 3), Fraction(2, 3)), inside(Fraction(1, 3), Fraction(1, 3) + Fraction(1, 10**8))
-    ('[0.333334, 0.666666]', '[0.33333334, 0.33333334]')
+    ('[0.333334, 0.666666]', '[0.333333334, 0.333333343]')
     """
     for digits in range(6, 40):
         ends = [_value(q, digits, direction) for q, direction in ((lo, math.ceil), (hi, math.floor))]
-        if ends[0] <= ends[1]:
+        if ends[0] < ends[1]:
             return f"[{above(lo, digits)}, {below(hi, digits)}]"
     return f"[{lo}, {hi}]"
 
@@ -126,10 +123,24 @@ def _value(exact: Fraction, digits: int, direction: Callable[[Fraction], int]) -
     return coefficient * Fraction(10) ** last
 
 
+def stated_for(quantities: Sequence[Varying], statement: str) -> str:
+    """A claim's statement for all that is uncertain; as it is where nothing is."""
+    if not quantities:
+        return statement
+    which = "each any" if len(quantities) > 1 else "any"
+    at_once = ", all of them at once" if len(quantities) > 1 else ""
+    return (
+        f"For every {varying(quantities)}, {which} measurable function of time{at_once} \N{EM DASH} constant, drifting "
+        f"or jumping, whatever it is that moves it within its range \N{EM DASH} the following holds. {statement}"
+    )
+
+
 def held_at(system: System) -> str:
     """The values of what is uncertain at which a plant is simulated and linearised; nothing where all is exact."""
     nominal = {name: system.parameters.get(name, Fraction(0)) for name in system.ranges}
-    each = [f"{symbol(n)} = {number(float(q))} {pretty_unit(system.units.get(n, ''))}".rstrip() for n, q in nominal.items()]
+    each = [
+        f"{symbol(n)} = {number(float(q))} {pretty_unit(system.units.get(n, ''))}".rstrip() for n, q in nominal.items()
+    ]
     return listed(each) if each else ""
 
 

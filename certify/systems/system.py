@@ -433,5 +433,7 @@ def _check_grammar(expression: sympy.Expr, allowed: set[sympy.Symbol], system: s
         if node.is_Float:
             raise InputError(f"an equation of {system} holds the rounded number {node}; write it as a fraction.")
         if node.is_Symbol:
-            raise InputError(f"an equation of {system} uses {node}, which is no state, input or parameter.")
+            raise InputError(
+                f"an equation of {system} uses {node}, which is no state, input, parameter or disturbance."
+            )
         raise InputError(f"an equation of {system} uses {node}; allowed are {GRAMMAR} and exact numbers.")
