@@ -23,7 +23,17 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from certify.errors import InputError
-from certify.inputs import centred, lines, named_plant, policy_in, tell_of_other, where_valid
+from certify.inputs import (
+    centred,
+    lines,
+    named_plant,
+    policy_in,
+    tell_of_other,
+    where_valid,
+    with_acting,
+    with_bounded_errors,
+    with_uncertain_parameters,
+)
 from certify.installation import versions
 from certify.lyapunov import Candidate
 from certify.options import Asked, EngineName, RoaOptions
@@ -38,6 +48,10 @@ from certify.systems.equations import nearest
 if TYPE_CHECKING:
     import torch
 
+Exact = Fraction | float | int | str
+"""A number: text means its decimal value, a float its binary value."""
+Change = Callable[[System], System]
+_NUMBERS = (Fraction, float, int, str, np.generic)
 _POLICY_FILES = (".pt", ".pth", ".zip", ".onnx", ".safetensors")
 _WORDS = {"--from": "kind", "--precision": "dreal_precision"}  # options that Python calls otherwise
 
@@ -64,6 +78,9 @@ def certify_roa(
     reach_from: Mapping[str, Fraction | float | str] | None = None,
     time_limit: float | None = None,
     max_boxes: int | None = None,
+    ranges: Mapping[str, Sequence[Exact]] | None = None,
+    disturbances: Mapping[str, Exact | Sequence[Exact]] | None = None,
+    input_error: Exact | Mapping[str, Exact] | None = None,
     load_seconds: float = 0.0,
     provenance: Mapping[str, Any] | None = None,
     progress: Report | None = None,
@@ -105,6 +122,12 @@ def certify_roa(
         value, a float its binary value.
     time_limit : seconds for everything up to the verdict, 50 by default.
     max_boxes : boxes for the ring, 4,000,000 by default.
+    ranges : pairs (lo, hi) by parameter: what is proved holds for every value in them, at any time, even if it varies.
+        The parameter's value must lie in its range, or else the middle is the nominal one.
+    disturbances : half-widths, or pairs (lo, hi), by disturbance of the plant (`System.disturbances`): the same for
+        every function of time within them. A half-width of 0 is a disturbance that does not act.
+    input_error : bound of what each input may be off by at any time, in its unit: one for all, or by input. In these
+        three text means its decimal value, a float its binary value.
     load_seconds : time already spent on reading, for the report.
     provenance : entries for the certificate that the checkers ignore; by default the policy's name and versions.
     progress : called with a stage ("candidate", "ring", "check") and where the search stands, or None.
@@ -143,13 +166,14 @@ def certify_roa(
     }  # fmt: skip
     notices: list[str] = []
     try:
+        unsure = _uncertainty(ranges, disturbances, input_error)
         chosen = _options(options, {name: value for name, value in single.items() if value is not None})
         _require_device(chosen.device)
         seconds = _number(load_seconds, "load_seconds")
         _require(provenance is None or isinstance(provenance, Mapping), "provenance", "a mapping", provenance)
         _require(progress is None or callable(progress), "progress", "callable", progress)
-        stored = _policy(policy, system, _importing(importing), notices.append)
-        plant, network = _closed(stored, system, notices.append)
+        stored = _policy(policy, system, _importing(importing), notices.append, unsure)
+        plant, network = _closed(stored, system, notices.append, unsure)
         folder = _Folder() if out is None else None
         place = folder.path if folder is not None else Path(_path(out, "out"))
         result = run(
@@ -225,7 +249,50 @@ def _options(options: RoaOptions | None, single: dict[str, Any]) -> RoaOptions:
     return RoaOptions(**read)
 
 
-def _policy(given: Any, system: Any, asked: ImportOptions, tell: Callable[[str], None]) -> Policy | TanhNetwork:
+def _uncertainty(ranges: Any, disturbances: Any, input_error: Any) -> Change:
+    """What puts ranges, disturbances and errors of inputs into a plant, from what was given, all of it read at once."""
+    uncertain = {name: _pair(value, f"ranges[{name!r}]") for name, value in _named(ranges, "ranges", "pairs").items()}
+    acting = {
+        name: _exact(value, where) if isinstance(value, _NUMBERS) else _pair(value, where)
+        for name, value in _named(disturbances, "disturbances", "half-widths or pairs").items()
+        for where in (f"disturbances[{name!r}]",)
+    }
+    error: Fraction | Mapping[str, Fraction] | None = None
+    if isinstance(input_error, Mapping):
+        named = _named(input_error, "input_error", "bounds")
+        error = {name: _exact(value, f"input_error[{name!r}]") for name, value in named.items()}
+    elif input_error is not None:
+        error = _exact(input_error, "input_error")
+
+    def change(plant: System) -> System:
+        plant = with_acting(with_uncertain_parameters(plant, uncertain), acting)
+        return plant if error is None else with_bounded_errors(plant, error)
+
+    return change
+
+
+def _named(given: Any, name: str, what: str) -> dict[str, Any]:
+    _require(given is None or isinstance(given, Mapping), name, f"a mapping from names to {what}", given)
+    return {_text(key, name): value for key, value in (given or {}).items()}
+
+
+def _pair(value: Any, where: str) -> tuple[Fraction, Fraction]:
+    ends = _list(value, where)
+    if len(ends) != 2:
+        raise InputError(f"`{where}` must be a pair (lo, hi); found {value!r:.80}.")
+    return _exact(ends[0], where), _exact(ends[1], where)
+
+
+def _exact(value: Any, where: str) -> Fraction:
+    value = value.item() if isinstance(value, np.generic) else value
+    if isinstance(value, bool) or not isinstance(value, Fraction | float | int | str):
+        raise InputError(f"`{where}` must be a number, or text such as '0.15'; found {value!r:.60}, {_kind(value)}.")
+    return exact(value, where)
+
+
+def _policy(
+    given: Any, system: Any, asked: ImportOptions, tell: Callable[[str], None], unsure: Change
+) -> Policy | TanhNetwork:
     """The policy, whatever it was given as."""
     import torch
 
@@ -235,19 +302,19 @@ def _policy(given: Any, system: Any, asked: ImportOptions, tell: Callable[[str],
             raise InputError(f"{', '.join(sorted(others))} must be left out: a {type(given).__name__} says all itself.")
         if isinstance(given, TanhNetwork) or asked.centre is None:
             return given
-        return centred(given, asked.centre, _closed(given, system, lambda _: None)[0], tell)
+        return centred(given, asked.centre, _closed(given, system, lambda _: None, unsure)[0], tell)
     if isinstance(given, str | os.PathLike):
         return policy_in(
             Path(_path(given, "policy")),
             asked,
-            lambda: _plant(system, "a policy of another program"),
-            lambda stored: _closed(stored, system, lambda _: None)[0],
+            lambda: unsure(_plant(system, "a policy of another program")),
+            lambda stored: _closed(stored, system, lambda _: None, unsure)[0],
             tell,
         )
     if isinstance(given, torch.nn.Module):
-        imported = import_module(given, _plant(system, "a module"), asked)
+        imported = import_module(given, unsure(_plant(system, "a module")), asked)
     elif isinstance(given, Mapping):
-        imported = import_state_dict(given, _plant(system, "a state_dict"), asked)
+        imported = import_state_dict(given, unsure(_plant(system, "a state_dict")), asked)
     else:
         raise InputError(
             "`policy` must be the path of a policy file, a Policy, a TanhNetwork, a torch.nn.Module or a state_dict; "
@@ -258,17 +325,19 @@ def _policy(given: Any, system: Any, asked: ImportOptions, tell: Callable[[str],
     return imported.policy
 
 
-def _closed(policy: Policy | TanhNetwork, system: Any, tell: Callable[[str], None]) -> tuple[System, TanhNetwork]:
+def _closed(
+    policy: Policy | TanhNetwork, system: Any, tell: Callable[[str], None], unsure: Change
+) -> tuple[System, TanhNetwork]:
     """Plant and network; of a policy with what it says about itself taken at its word, or told."""
     if isinstance(policy, TanhNetwork):
-        return _plant(system, "a TanhNetwork"), policy
+        return unsure(_plant(system, "a TanhNetwork")), policy
     if isinstance(system, System):
         plant, own = system, False
     else:
         plant, own = named_plant(policy, None if system is None else _name(system))
     if not own:
         tell_of_other(policy, plant, tell)
-    plant = where_valid(policy, plant, tell)
+    plant = unsure(where_valid(policy, plant, tell))
     if shift := policy.beta_shift(plant.exact_u_eq()):
         tell(f"the file's rounded beta is read as the real number; this shifts u(0) by {shift:.3g}")
     return plant, policy.network

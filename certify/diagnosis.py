@@ -1,5 +1,7 @@
 """What limits a result, in the plant's own names, and what to try next: computed from the run, in floats, for people.
 
+Of a plant with ranges the modes and the input that leaves its bounds are those at the nominal values.
+
 Nothing here is part of a proof. The next step is worked out: a longer limit from how the proof grew, a wider domain
 from what sampling finds beyond it, another candidate only if others were left untried.
 """
@@ -90,6 +92,8 @@ def _binding(result: RoaResult) -> tuple[str, str, str | None, str | None, Array
         return f"the {side} side of the domain in {name}, {value:g} {unit}".rstrip(), "domain", name, side, point
     if witness is not None and result.stop in (Stop.WITNESS, Stop.INPUTS):
         where = ", ".join(f"{s.name} = {v:.4g}" for s, v in zip(system.states, witness.x, strict=True))
+        if witness.kind == "vdot" and witness.values:
+            where += " with " + ", ".join(f"{name} = {float(q):.4g}" for name, q in witness.values.items())
         if witness.kind == "input":
             found = _input_out_of_bounds(result, witness.x)
             if found is not None:
@@ -134,7 +138,8 @@ def _next(result: RoaResult, options: RoaOptions, proof: Proof | None, name: str
         return _longer(result, options, proof)
     if options.claim == "asymptotic" and options.only is not None and options.P is None and options.level is None:
         return Step((("--candidate", "auto"),), f"only the candidate {options.only} was tried")
-    if result.stop is Stop.STALLED and not options.enlarges and _has_tube(result):
+    exact = not result.system.ranges  # a tube says nothing of what is uncertain
+    if result.stop is Stop.STALLED and exact and not options.enlarges and _has_tube(result):
         return Step((("--enlarge", ""),), f"a tube leads into this set from one {_LONGER:g} times as long, at least")
     if result.stop is Stop.STALLED:
         worst = ", ".join(one for one, _ in _hurting(result, proof)[:3])

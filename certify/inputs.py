@@ -3,13 +3,14 @@
 A policy file says which plant it was trained for, and by which numbers; whoever uses it may say otherwise, and what
 he says counts. What has to be known of that goes to `tell`, a line each: the command prints it on standard error, a
 result of Python keeps it. Where a policy's network is what it was made from only on a part of the states, the domain
-is cut to that part here, and nowhere is it left to the caller to remember.
+is cut to that part here, and nowhere is it left to the caller to remember. What is uncertain of a plant, and acts on
+it, is put in here too.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from certify.policies import Centre, Policy
     from certify.policies.importers import Imported, ImportOptions
     from certify.systems import System
+    from certify.systems.system import Interval
 
 Tell = Callable[[str], None]
 
@@ -124,6 +126,50 @@ def where_valid(stored: Policy, plant: System, tell: Tell) -> System:
     for name, (lo, hi) in cut.items():
         tell(f"the domain of {name} is cut to [{float(lo):.6g}, {float(hi):.6g}]: there its observation is not clipped")
     return plant.with_domain(cut)
+
+
+def with_uncertain_parameters(plant: System, ranges: Mapping[str, Interval]) -> System:
+    """The plant where parameters have ranges.
+
+    Raises
+    ------
+    InputError : one is no parameter, or cannot have this range.
+    """
+    for name in ranges:
+        if name not in plant.parameters:
+            known = ", ".join(plant.parameters) or "none"
+            raise InputError(f"{plant.name} has no parameter {name!r}; it has: {known}.")
+    return plant.with_ranges(ranges)
+
+
+def with_acting(plant: System, given: Mapping[str, Interval | Fraction]) -> System:
+    """The plant where disturbances act within a range or a half-width; with 0 one that the plant has acts no more.
+
+    Raises
+    ------
+    InputError : one is no disturbance of the plant, or a half-width is negative.
+    """
+    known, ranges = [s.name for s in plant.disturbances], dict[str, "Interval | None"]()
+    for name, value in given.items():
+        if name not in known:
+            raise InputError(f"{plant.name} has no disturbance {name!r}; it has: {', '.join(known) or 'none'}.")
+        if not isinstance(value, tuple) and value < 0:
+            raise InputError(
+                f"disturbance {name} must have a half-width that is not negative, or a range; found {float(value):g}."
+            )
+        ranges[name] = value if isinstance(value, tuple) else (-value, value) if value else None
+    return plant.with_ranges(ranges)
+
+
+def with_bounded_errors(plant: System, bound: Fraction | Mapping[str, Fraction]) -> System:
+    """The plant with u + e in the place of u, |e| at most the bound: one for all inputs, or each by the input's name.
+
+    Raises
+    ------
+    InputError : a bound is not positive, or is of no input.
+    """
+    bounds = bound if isinstance(bound, Mapping) else {s.name: bound for s in plant.inputs}
+    return plant.with_input_errors(bounds)
 
 
 def is_own(path: Path, importing: ImportOptions) -> bool:

@@ -24,7 +24,7 @@ from certify.engines.falsify import Witness
 from certify.errors import InputError
 from certify.lyapunov import are_inside, extents, semi_axes, volume
 from certify.policies import TanhNetwork
-from certify.report.words import below, volume_name, volume_unit
+from certify.report.words import below, varying, varying_in, volume_name, volume_unit
 from certify.rest import Rest
 from certify.systems import System
 from certify.verdict import Stop, Verdict
@@ -160,6 +160,9 @@ class Diagnosis:
 @dataclass(frozen=True, slots=True, repr=False)
 class RoaResult:
     """What was proved. `stop` and `detail` say what limits the level, or why nothing was proved.
+
+    Where `system` has ranges, all that is proved holds for every function of time with values in them; `eigenvalues`,
+    `rest` and the modes of `diagnosis` are those at the nominal values, as `system.parameters` has them.
 
     `rest` is where the loop rests, if not at the origin. `candidate` is where P came from, `tried` all that were tried,
     `notice` what is not as it was asked for. `reach_from` is the state that was asked about, by the states' values;
@@ -326,6 +329,8 @@ class RoaResult:
     def _stated(self) -> list[tuple[str, str]]:
         """What is said of the result in a few rows, names and values."""
         rows = [("verdict", self.verdict.value), ("plant", self.system.name), ("claim", self.claim)]
+        if self.system.ranges:
+            rows.append(("for every", varying(varying_in(self.system))))
         shown = self.verdict in (Verdict.PROVED, Verdict.TRUSTED)
         level, size = (self.levels.roa, self.volume) if shown else (None, None)
         if level is not None and size is not None:
@@ -355,6 +360,16 @@ class RoaResult:
             "claim": {"kind": self.claim},
             "system": system.name,
             "parameters": {name: str(q) for name, q in system.parameters.items()},
+            "uncertain": [
+                {
+                    "name": name,
+                    "kind": system.kind_of(name),
+                    "lo": str(lo),
+                    "hi": str(hi),
+                    "unit": system.units.get(name, ""),
+                }
+                for name, (lo, hi) in system.ranges.items()
+            ],
             "states": [{"name": s.name, "unit": system.units.get(s.name, "")} for s in system.states],
             "operating_point": {name: str(q) for name, q in system.operating_point().items()},
             "inputs": [{"name": s.name, "unit": system.units.get(s.name, "")} for s in system.inputs],
@@ -374,7 +389,13 @@ class RoaResult:
             "rest": None if self.rest is None else asdict(self.rest),
         }
         if witness is not None:
-            stated["witness"] = {"x": witness.x.tolist(), "V": witness.level, "kind": witness.kind}
+            held = witness.values if witness.kind == "vdot" else {}  # an input does not depend on them
+            stated["witness"] = {
+                "x": witness.x.tolist(),
+                "V": witness.level,
+                "kind": witness.kind,
+                "values": {name: str(q) for name, q in held.items()},
+            }
         return {
             **stated,
             **geometry,

@@ -161,6 +161,7 @@ class _Run:
         """Choose, falsify, prove, check."""
         options, loop = self.options, ClosedLoop(self.system, self.network)
         require_within_limits(self.system, self.network)
+        _require_one_that_knows_ranges(self.system, options)
         if options.box is not None:
             _ellipsoid_in(self.system, options.box)
         self.centre = None if options.reach_from is None else _state_in(self.system, options.reach_from)
@@ -530,6 +531,27 @@ def _ellipsoid_in(system: System, box: Mapping[str, float] | None = None) -> Arr
         )
     least = min(width / sides[name] for name, width in box.items())
     return np.diag([float(box.get(name, least * sides[name])) ** -2 for name in names])
+
+
+def _require_one_that_knows_ranges(system: System, options: RoaOptions) -> None:
+    """Refuse what is about exact equations alone, where something has a range: a solver of formulas, a tube.
+
+    Raises
+    ------
+    InputError : the option, and what has a range.
+    """
+    if not system.ranges or (options.engine == "bounds" and not options.enlarges):
+        return
+    found = f"found ranges of {', '.join(system.ranges)} in {system.name}"
+    if options.enlarges:
+        raise InputError(
+            f"a tube must be of exact equations: there is no such claim yet for what is uncertain; {found}. Ask for "
+            "the set without a tube, or leave the ranges out (of a disturbance in the plant's file: the half-width 0)."
+        )
+    raise InputError(
+        f"`engine` must be bounds where something is uncertain: dReal is asked about exact equations; {found}. Use the "
+        "engine bounds, or leave the ranges out."
+    )
 
 
 def _state_in(system: System, values: Mapping[str, Fraction | float]) -> tuple[Fraction, ...]:

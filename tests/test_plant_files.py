@@ -207,7 +207,12 @@ LINES = {line: k for k, line in enumerate(TANK.splitlines(), 1)}
     ("old", "new", "line", "parts"),
     [
         ("level**3", "level^3", 'level = "flow - level**3"', ["dynamics.level", "write **"]),
-        ("level**3", "levle**3", 'level = "flow - level**3"', ["'levle' is no state, input or parameter", "'level'?"]),
+        (
+            "level**3",
+            "levle**3",
+            'level = "flow - level**3"',
+            ["'levle' is no state, input, parameter or disturbance", "'level'?"],
+        ),
         ("level**3", "xyz", 'level = "flow - level**3"', ["'xyz' is no state", "known are level, flow, u, tau, rest"]),
         ("level**3", "gamma(level)", 'level = "flow - level**3"', ["gamma is not supported", "supported are sin, cos"]),
         ("level**3", "sin(level, u)", 'level = "flow - level**3"', ["sin takes one argument"]),
@@ -261,7 +266,7 @@ def test_an_error_names_file_line_and_symbol(tmp_path: Path, old: str, new: str,
         (
             'inputs = ["u"]',
             'inputs = ["level"]',
-            "names of states, inputs and parameters must differ; found 'level' twice",
+            "names of states, inputs, parameters and disturbances must differ; found 'level' twice",
         ),
         ('name = "tank"', 'name = "a tank"', "identifiers"),
         ("tau = 2", "tau = 0", "positive"),
@@ -322,7 +327,7 @@ def test_an_irrational_operating_point_is_refused_with_a_sentence(tmp_path: Path
     x, u, a = sympy.symbols("x u a")
     with pytest.raises(InputError, match=r"x_eq of x in s must be rational.*sin\(1\)"):
         System("s", (x,), (u,), {"a": Fraction(1)}, (u,), (sympy.Integer(0),), box(1), box(1), x_eq=(sympy.sin(a),))
-    with pytest.raises(InputError, match="no state, input or parameter"):
+    with pytest.raises(InputError, match="no state, input, parameter or disturbance"):
         System("s", (x,), (u,), {}, (u,), (sympy.Integer(0),), box(1), box(1), x_eq=(u,))
     with pytest.raises(InputError, match="`x_eq` of s must have 1 entries; found 2"):
         System("s", (x,), (u,), {}, (u,), (sympy.Integer(0),), box(1), box(1), x_eq=(sympy.Integer(0),) * 2)

@@ -139,7 +139,7 @@ def test_domain_must_surround_the_origin(pendulum: System) -> None:
         (lambda x, u: x**x + u, "allowed"),
         (lambda x, u: sympy.sqrt(-2) * x + u, "allowed"),
         (lambda x, u: sympy.sqrt(x + sympy.Float("0.1")) + u, "rounded number"),
-        (lambda x, u: sympy.Symbol("y") + u, "no state, input or parameter"),
+        (lambda x, u: sympy.Symbol("y") + u, "no state, input, parameter or disturbance"),
         (lambda x, u: sympy.EulerGamma * x + u, "allowed"),
     ],
 )

@@ -298,11 +298,12 @@ def _nominal(interval: Interval) -> Fraction:
 
 
 def _for_people(system: System) -> dict[str, dict[str, str]]:
-    """The provenance's entries for units of states and inputs, and for the operating point; none where there are none.
+    """The provenance's entries for units of what the plant names, and for the operating point; none where there are
+    none.
 
     The plant of a certificate is in deviations from x_eq, so that nothing that is checked depends on either.
     """
-    names = [s.name for s in (*system.states, *system.inputs)]
+    names = [s.name for s in (*system.states, *system.inputs, *(s for s, _ in system.uncertain))]
     units = {name: system.units[name] for name in names if name in system.units}
     x_eq = {name: str(q) for name, q in system.operating_point().items()}
     return {key: entry for key, entry in (("units", units), ("x_eq", x_eq)) if entry}

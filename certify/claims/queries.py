@@ -43,9 +43,15 @@ def query(condition: Condition, problem: Problem) -> Query:
 
     Raises
     ------
-    InputError : the local condition, where -(A'P + PA) is not positive definite.
+    InputError : the local condition, where -(A'P + PA) is not positive definite; a plant of which something is
+        uncertain, because the query would be about its nominal value alone.
     """
     system = problem.loop.system
+    if system.ranges:
+        raise InputError(
+            f"queries for solvers of formulas must be about exact equations; {system.name} has ranges of "
+            f"{', '.join(system.ranges)}. Leave the ranges out, or use the engine bounds."
+        )
     constraints: list[tuple[Tree, str, Tree]] = [
         ("V.", "<=" if guard.side == "inside" else ">=", exact(guard.level)) for guard in condition.guards
     ]

@@ -8,7 +8,14 @@ from typing import TYPE_CHECKING
 
 from certify.commands.terminal import tell
 from certify.errors import InputError
-from certify.inputs import named_plant, tell_of_other, where_valid
+from certify.inputs import (
+    named_plant,
+    tell_of_other,
+    where_valid,
+    with_acting,
+    with_bounded_errors,
+    with_uncertain_parameters,
+)
 
 if TYPE_CHECKING:
     from certify.policies import Policy
@@ -39,21 +46,18 @@ def with_params(plant: System, params: list[str]) -> System:
     """The plant with what `--param` says put in: values, and ranges LO..HI of those that are uncertain."""
     given = dict(_assignment(p, "--param") for p in params)
     ranges = {name: _range(value, name) for name, value in given.items() if ".." in value}
-    unknown = next((name for name in ranges if name not in plant.parameters), None)
-    if unknown is not None:
-        raise InputError(f"{plant.name} has no parameter {unknown!r}; it has: {', '.join(plant.parameters) or 'none'}.")
-    return plant.with_parameters({n: v for n, v in given.items() if n not in ranges}).with_ranges(ranges)
+    exact_ones = {name: value for name, value in given.items() if name not in ranges}
+    return with_uncertain_parameters(plant.with_parameters(exact_ones), ranges)
 
 
 def with_disturbances(plant: System, given: Sequence[str]) -> System:
     """The plant with the ranges that `--disturbance` says: half-widths or LO..HI."""
-    known, ranges = [s.name for s in plant.disturbances], {}
-    for text in given:
-        name, value = _assignment(text, "--disturbance")
-        if name not in known:
-            raise InputError(f"{plant.name} has no disturbance {name!r}; it has: {', '.join(known) or 'none'}.")
-        ranges[name] = _range(value if ".." in value else f"-{value}..{value}", name)
-    return plant.with_ranges(ranges)
+    from certify.systems import exact
+
+    pairs = dict(_assignment(text, "--disturbance") for text in given)
+    return with_acting(
+        plant, {name: _range(value, name) if ".." in value else exact(value, name) for name, value in pairs.items()}
+    )
 
 
 def with_errors(plant: System, error: str | None) -> System:
@@ -62,10 +66,7 @@ def with_errors(plant: System, error: str | None) -> System:
 
     if error is None:
         return plant
-    if "=" in error:
-        return plant.with_input_errors(state(error, "--input-error"))
-    bound = exact(error, "--input-error")
-    return plant.with_input_errors({s.name: bound for s in plant.inputs})
+    return with_bounded_errors(plant, state(error, "--input-error") if "=" in error else exact(error, "--input-error"))
 
 
 def _range(text: str, name: str) -> tuple[Fraction, Fraction]:

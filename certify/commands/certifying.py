@@ -117,10 +117,21 @@ def _command(context: typer.Context, changed: Mapping[str, str]) -> str:
 
 
 def _plant_line(stored: Policy, plant: System, overridden: bool) -> str:
-    values = ", ".join(f"{name} = {float(q):g}" for name, q in plant.parameters.items())
+    values = ", ".join(f"{name} = {float(q):g}{_within(plant, name)}" for name, q in plant.parameters.items())
+    acting = [name for name in plant.ranges if name not in plant.parameters]
+    moved = "".join(f"; {plant.kind_of(name)} {name}{_within(plant, name)}" for name in acting)
     source = "from the command line" if overridden else "from the policy file"
     layers = "-".join(map(str, stored.network.layers))
-    return f"plant {plant.name} ({source}) with {values or 'no parameters'}; policy {layers}"
+    return f"plant {plant.name} ({source}) with {values or 'no parameters'}{moved}; policy {layers}"
+
+
+def _within(plant: System, name: str) -> str:
+    """The range of what is uncertain, as it is proved for."""
+    if name not in plant.ranges:
+        return ""
+    from certify.report.words import inside
+
+    return f" in {inside(*plant.ranges[name])}"
 
 
 def _provenance(policy: Path) -> dict[str, Any]:

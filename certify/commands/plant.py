@@ -26,7 +26,7 @@ def plant(
     param: Annotated[list[str] | None, typer.Option(help="Parameter of the plant, NAME=VALUE; repeatable.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Show a plant: equations, operating point, linearisation, controllability, domain, input bounds and units."""
+    """Show a plant: equations, operating point, linearisation, controllability, disturbances, bounds and units."""
     from certify.systems import chosen_system, controllability, linearise
 
     found = with_params(chosen_system(system), param or [])
@@ -72,6 +72,8 @@ def _page(
     parts.append(_variables(s))
     if s.parameters:
         parts += [Text(), _parameters(s)]
+    if s.disturbances:
+        parts += [Text(), _disturbances(s)]
     parts += [Text(), _matrix("A", s, A, [x.name for x in s.states]), Text()]
     parts += [_matrix("B", s, B, [u.name for u in s.inputs]), Text(), facts]
     return Group(*parts)
@@ -94,6 +96,10 @@ def _facts(s: System, eigenvalues: Sequence[complex], reach: Controllability) ->
     off = [f"{name}' = {float(r):.6g}" for name, r in s.residuals().items() if not (abs(float(r)) <= 1e-12)]
     rest = "f(x_eq, u_eq) = 0" if not off else f"no equilibrium: {', '.join(off)} at (x_eq, u_eq)"
     rows.insert(0, ("at rest", rest))
+    if s.ranges:
+        rows.append(
+            ("uncertain", f"{', '.join(s.ranges)}: any value in their ranges, at any time; A, B at nominal ones")
+        )
     if s.operating_point():
         reads = ", ".join(f"{x} - {_number(q)}" if q else x.name for x, q in zip(s.states, s.exact_x_eq(), strict=True))
         rows.append(("policy reads", f"{reads}: deviations from x_eq, and so do A, B, V and the certificate"))
@@ -113,10 +119,26 @@ def _variables(s: System) -> Table:
 
 
 def _parameters(s: System) -> Table:
-    table = _table("parameter", "unit", "value")
+    ranged = any(name in s.ranges for name in s.parameters)
+    table = _table("parameter", "unit", "value", *(("from", "to") if ranged else ()))
     for name, value in s.parameters.items():
-        _row(table, name, _unit(s, name), _number(value))
+        _row(table, name, _unit(s, name), _number(value), *(_ends(s, name) if ranged else ()))
     return table
+
+
+def _disturbances(s: System) -> Table:
+    table = _table("disturbance", "unit", "from", "to")
+    for symbol in s.disturbances:
+        _row(table, symbol.name, _unit(s, symbol.name), *(_ends(s, symbol.name)))
+    return table
+
+
+def _ends(s: System, name: str) -> tuple[str, str]:
+    """The range of what is uncertain: nothing of a parameter that is exact; 0 is where a disturbance stays by itself."""
+    if name in s.ranges:
+        lo, hi = s.ranges[name]
+        return _number(lo), _number(hi)
+    return ("", "") if name in s.parameters else ("0", "0")
 
 
 def _matrix(title: str, s: System, matrix: sympy.Matrix, columns: Sequence[str]) -> Table:

@@ -29,6 +29,8 @@ def describe(s: System) -> dict[str, Any]:
         "states": [x.name for x in s.states],
         "inputs": [u.name for u in s.inputs],
         "parameters": {name: str(q) for name, q in s.parameters.items()},
+        "disturbances": [w.name for w in s.disturbances],
+        "ranges": {name: [str(lo), str(hi)] for name, (lo, hi) in s.ranges.items()},
         "domain": {x.name: [str(lo), str(hi)] for x, (lo, hi) in zip(s.states, domain, strict=True)},
         "input_bounds": {u.name: [str(lo), str(hi)] for u, (lo, hi) in zip(s.inputs, s.input_bounds, strict=True)},
         "dynamics": {x.name: str(e) for x, e in zip(s.states, s.dynamics_of_values(), strict=True)},

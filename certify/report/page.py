@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from importlib import resources
@@ -33,27 +33,34 @@ from certify.report.sampling import SimulatedRoa
 from certify.report.words import (
     ABSENT,
     CHECKED_ALWAYS,
+    INPUTS,
     MINUS,
     TIMES,
+    Varying,
     Words,
     above,
     at_rest,
     below,
     deviation,
+    held_at,
     inner_level,
     kept_apart,
     limit_in_words,
     limited_by,
+    listed,
     number,
     point,
     pretty_unit,
     seconds,
     shortest,
+    stated_for,
     symbol,
+    varying_in,
     volume_name,
     volume_unit,
     words_for,
 )
+from certify.systems import System
 
 _LONG = 10**6  # numerators and denominators beyond it are shown rounded
 _SECONDS, _SHARE = 10.0, 0.1  # the drawing takes no longer than the one, or than this share of the run
@@ -287,7 +294,7 @@ def _limits(certificate: Certificate, result: Mapping[str, Any] | None) -> dict[
     options = " ".join(f"{name} {value}" for name, value in (step.get("options") or {}).items())
     return {
         "binds": "" if _is_missed(result) else limit_in_words(str(found.get("binds", ""))),
-        "modes": _modes(found),
+        "modes": _modes(found, "with " * bool(system.ranges) + held_at(system)),
         "sets": len(sets),
         "shares": [
             {
@@ -311,13 +318,14 @@ def _limits(certificate: Certificate, result: Mapping[str, Any] | None) -> dict[
     }
 
 
-def _modes(found: Mapping[str, Any]) -> str:
-    """How fast the closed loop is at the origin, in a sentence."""
+def _modes(found: Mapping[str, Any], held: str) -> str:
+    """How fast the closed loop is at the origin, in a sentence, with the values that are not exact `held`."""
     if not found.get("stiffness"):
         return ""
     fast, slow = number(abs(found["fastest"]), 3), number(abs(found["slowest"]), 3)
+    where = f"At the origin, {held}," if held else "At the origin"
     return (
-        f"At the origin its slowest mode decays at {slow} per second, its fastest at {fast} per second: a stiffness of "
+        f"{where} its slowest mode decays at {slow} per second, its fastest at {fast} per second: a stiffness of "
         f"{number(found['stiffness'], 2)}."
     )
 
@@ -330,7 +338,7 @@ def _plant(certificate: Certificate) -> dict[str, Any]:
         lo, hi = bounds
         return f"{symbol(name)} ∈ [{below(lo)}, {above(hi)}] {pretty_unit(units.get(name, ''))}".rstrip()
 
-    names = system.states + system.inputs
+    names = (*system.states, *system.inputs, *(s for s, _ in system.uncertain))
     equilibrium = zip(system.inputs, system.exact_u_eq(), strict=True)
     return {
         "name": system.name,
@@ -343,6 +351,10 @@ def _plant(certificate: Certificate) -> dict[str, Any]:
         ),
         "centre": _centre(certificate, of_values=True),
         "u_eq": ", ".join(f"{symbol(s.name)} = {u}" for s, u in equilibrium),
+        "uncertain": [q.words for q in varying_in(system)],
+        "held": held_at(system),
+        "listed": ", ".join(symbol(name) for name in system.ranges),
+        "errors": [f"{symbol(u)} + {symbol(e)}" for u, e in system.input_errors.items()],
     }
 
 
@@ -401,7 +413,9 @@ def _claim(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict[s
         "Inputs": "; ".join(bounds) + ".",
     }
     if local:
-        notes["Local"] = f"Margin of the linear part over the remainder: {below(100 * local, 3)} %."
+        notes["Local"] = (
+            f"Margin of the linear part over the remainder: {below(100 * local, 3)} %{_in_cells(evidence)}."
+        )
     if answer and isinstance(certificate.claim, Asymptotic) and certificate.inner == certificate.roa:
         notes["Ring"] = "As c₁ = c₂, the local part covers the whole set."
     elif answer:
@@ -409,7 +423,7 @@ def _claim(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict[s
         notes["Ring"] = f"{shown}; the smallest bound on {MINUS}V̇ is {below(ring, 3)}." if ring is not None else shown
     notes |= _tube_notes(certificate)
     parts = []
-    for name, condition, shown_by in words.parts:
+    for name, condition, shown_by in _with_errors(words.parts, system):
         note = notes.get(name, "")
         if isinstance(evidence, TrustedSolver):
             text = f"{condition.rstrip('.')}."
@@ -420,8 +434,11 @@ def _claim(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict[s
         parts.append((name, text, note))
     inner, outer = inner_level(certificate.kind, certificate.inner), below(certificate.roa)
     return {
-        "statement": words.statement.format(
-            inner=inner, outer=outer, duration=_duration(certificate), centre=_centre(certificate)
+        "statement": stated_for(
+            varying_in(system),
+            words.statement.format(
+                inner=inner, outer=outer, duration=_duration(certificate), centre=_centre(certificate)
+            ),
         ),
         "enlarged": isinstance(certificate.claim, Enlarged | Reached),
         "centre": isinstance(certificate.claim, Reached),
@@ -430,6 +447,24 @@ def _claim(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict[s
         "bounds": bounds,
         "parts": parts,
     }
+
+
+def _in_cells(evidence: PartitionTree | TrustedSolver) -> str:
+    """Of how many cells of the ranges a margin is the least; nothing where there is but one."""
+    count = math.prod(evidence.cells) if isinstance(evidence, PartitionTree) else 1
+    return f", the least of {count:,} cells of the box of all ranges" if count > 1 else ""
+
+
+def _with_errors(parts: Sequence[tuple[str, str, str]], system: System) -> Iterator[tuple[str, str, str]]:
+    """The parts of a claim, the one on inputs in words that know the error that comes on top of what is asked for."""
+    errors = system.input_errors
+    held = all(lo <= 0 <= hi for lo, hi in (system.ranges[e] for e in errors.values()))
+    on_top = (
+        "On {V ≤ c₂} what the policy asks for, π(x), stays in the bounds of the input; the error comes on top of it. "
+    )
+    clips = "An actuator that clips the two together makes the error smaller, and is covered." if held else ""
+    for part in parts:
+        yield (part[0], (on_top + clips).rstrip(), part[2]) if part == INPUTS and errors else part
 
 
 def _sides(
@@ -488,26 +523,18 @@ def _not_proved(certificate: Certificate, words: Words) -> list[tuple[str, str]]
             "Anything outside the set.",
             f"The true set may be larger: what starts outside {words.sets} may do the same or not.",
         ),
-        (
-            "Any other plant.",
-            "The claim is about the equations above with exactly these numbers: no other mass, no friction, "
-            "flexibility or actuator lag that is not in them.",
-        ),
-        ("Disturbances.", "No wind, no sensor noise, no estimation error, no delay."),
+        *_not_of_the_plant(certificate.system),
         (
             "A sampled controller.",
             "u = π(x) acts in continuous time. An action that is held between samples is another closed loop.",
         ),
-        (
-            "Rounding in the controller.",
-            "The policy is evaluated in exact real arithmetic on its binary64 numbers; an embedded float32 evaluation "
-            "differs by its rounding errors.",
-        ),
+        _rounding(certificate.system),
         *words.excluded[-1:],
         ("Wrapped angles.", "States are real numbers: an angle of a full turn is not the origin."),
         (
             "Simulated figures.",
-            "Trajectories, grids and the share of the simulated region are illustrations in floating point.",
+            "Trajectories, grids and the share of the simulated region are illustrations in floating point"
+            + (f", all of them with {held} from beginning to end." if (held := held_at(certificate.system)) else "."),
         ),
     ]
     if certificate.system.n > 2:
@@ -519,6 +546,52 @@ def _not_proved(certificate: Certificate, words: Words) -> list[tuple[str, str]]
             )
         )
     return items
+
+
+def _not_of_the_plant(system: System) -> list[tuple[str, str]]:
+    """What of plant and surroundings the claim does not cover: less, where something has a range."""
+    if not system.ranges:
+        return [
+            (
+                "Any other plant.",
+                "The claim is about the equations above with exactly these numbers: no other mass, no friction, "
+                "flexibility or actuator lag that is not in them.",
+            ),
+            ("Disturbances.", "No wind, no sensor noise, no estimation error, no delay."),
+        ]
+    names = listed([symbol(name) for name in system.ranges])
+    within = "its range" if len(system.ranges) == 1 else "their ranges"
+    return [
+        (
+            "Any other plant.",
+            f"The claim is about the equations above: with every value of {names} in {within} and none outside, and "
+            "with exactly these numbers in all else: no friction, flexibility or actuator lag that is not in them.",
+        ),
+        (
+            "Other disturbances.",
+            f"Only what {names} can be in these equations: no other wind, no sensor noise, no estimation error, no "
+            "delay.",
+        ),
+    ]
+
+
+def _rounding(system: System) -> tuple[str, str]:
+    """What is not said of how the policy is evaluated: less, where inputs may be in error."""
+    errors = system.input_errors
+    exact = [s.name for s in system.inputs if s.name not in errors]
+    if len(exact) == system.m:
+        return (
+            "Rounding in the controller.",
+            "The policy is evaluated in exact real arithmetic on its binary64 numbers; an embedded float32 evaluation "
+            "differs by its rounding errors.",
+        )
+    ranges = listed([Varying(e, *system.ranges[e], system.units.get(e, "")).words for e in errors.values()])
+    others = f" {listed([symbol(name) for name in exact])} must be exact." if exact else ""
+    return (
+        "Larger errors of the controller.",
+        f"An evaluation of the policy, in float32 for one, is covered as long as it is off by no more than {ranges}, "
+        f"at every state of the set. That a certain program is, is not part of the claim.{others}",
+    )
 
 
 def _tables(
@@ -561,7 +634,8 @@ def _tables(
     if np.all(np.isfinite(P)):
         geometry.append(("eigenvalues of P", ", ".join(number(float(v)) for v in np.linalg.eigvalsh(P))))
     if isinstance(certificate.claim, Asymptotic):  # elsewhere the origin need not be an equilibrium
-        geometry.append(("eigenvalues of the closed loop", _eigenvalues(certificate)))
+        held = f" with {held_at(system)}" if system.ranges else ""
+        geometry.append((f"eigenvalues of the closed loop{held}", _eigenvalues(certificate)))
     slabs = slabs_of(certificate)
     evidence = [
         ("policy", f"{'-'.join(map(str, network.layers))} tanh, squash {network.squash}, centre {network.centre}"),

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 from unicodedata import normalize
 
 from certify.report.words import (
+    Varying,
     above,
     at_rest,
     below,
@@ -22,6 +23,7 @@ from certify.report.words import (
     pretty_unit,
     seconds,
     symbol,
+    varying,
     volume_name,
     volume_unit,
     words_for,
@@ -40,9 +42,9 @@ def summary(result: Mapping[str, Any]) -> RenderableType:
     Parameters
     ----------
     result : the object that `certify roa --json` prints. Of its keys `states` and `inputs` (lists of `{name, unit}`),
-        `operating_point` (values by state), `reach_from` (values by state, of the state that was asked about) and
-        `claim` (`{kind}`) may be absent: then there are no units, the operating point is 0, no state was asked about,
-        and the claim is the asymptotic one.
+        `operating_point` (values by state), `reach_from` (values by state, of the state that was asked about), `claim`
+        (`{kind}`) and `uncertain` may be absent: then there are no units, the operating point is 0, no state was asked
+        about, the claim is the asymptotic one, and all of the plant is exact.
 
     Returns
     -------
@@ -93,12 +95,30 @@ def _headline(result: Mapping[str, Any], verdict: str) -> str:
             outer=below(level), inner="?" if inner is None else inner_level(kind, inner)
         )
         word = ", if the solver is right: nothing checked its answers" if verdict == "TRUSTED" else ""
-        return f"{name}: {stated}{word}"
+        return f"{name}: {stated}{_whatever(result)}{word}"
     if verdict == "REFUTED":
         return f"{name}: a condition of the claim fails for this V and level; another V may show what this one cannot"
     if _is_missed(result):
         return f"{name}: the state is NOT shown to converge; what is proved is {{V <= {below(level)}}}, without it"
     return f"{name}: nothing was proved"
+
+
+_FEW = 3  # uncertain quantities that a headline names
+
+
+def _uncertain(result: Mapping[str, Any]) -> list[Varying]:
+    each = result.get("uncertain") or ()
+    return [Varying(q["name"], Fraction(q["lo"]), Fraction(q["hi"]), q.get("unit") or "") for q in each]
+
+
+def _whatever(result: Mapping[str, Any]) -> str:
+    """For what the headline holds; nothing where the plant is exact."""
+    found = _uncertain(result)
+    if not found:
+        return ""
+    if len(found) > _FEW:
+        return f", for every one of the {len(found)} uncertain quantities within its range at any time"
+    return f", for every {varying(found)}"
 
 
 def _is_missed(result: Mapping[str, Any]) -> bool:
@@ -109,6 +129,11 @@ def _is_missed(result: Mapping[str, Any]) -> bool:
 
 def _rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
     levels, rows = result["levels"], []
+    found = _uncertain(result)
+    if found:
+        each = "; ".join(q.words for q in found)
+        what = "for every" if shown else "asked for every"
+        rows.append((what, f"{each}: any measurable functions of time, constant ones too"))
     if shown:
         rows.append(("limited by", limited_by(result)))
         if result.get("diagnosis"):
@@ -156,9 +181,13 @@ def _rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
     if result.get("rest"):
         rest = result["rest"]
         point = ", ".join(f"{name} = {value}" for name, value in zip(_state_names(result), rest["x"], strict=True))
-        rows.append(("rests at", f"{point}; eigenvalues there {', '.join(rest['eigenvalues']) or 'not enclosed'}"))
+        held = " at the nominal values" if result.get("uncertain") else ""
+        rows.append(
+            ("rests at", f"{point}{held}; eigenvalues there {', '.join(rest['eigenvalues']) or 'not enclosed'}")
+        )
     if result.get("eigenvalues"):
-        rows.append(("eigenvalues", ", ".join(map(str, result["eigenvalues"]))))
+        held = " (at the nominal values)" if result.get("uncertain") else ""
+        rows.append(("eigenvalues", ", ".join(map(str, result["eigenvalues"])) + held))
     if shown and kind != "practical" and inner is not None and inner == levels.get("roa"):
         rows.append(("work", f"{result['boxes']:,} boxes; the local part covers the whole set and no leaf is needed"))
     elif result.get("boxes"):
@@ -209,7 +238,10 @@ def _diagnosis_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
         return []
     if found.get("stiffness"):
         fast, slow = number(found["fastest"], 3), number(found["slowest"], 3)
-        rows.append(("modes", f"from {fast} to {slow} per second, a stiffness of {number(found['stiffness'], 2)}"))
+        held = " (at the nominal values)" if result.get("uncertain") else ""
+        rows.append(
+            ("modes", f"from {fast} to {slow} per second, a stiffness of {number(found['stiffness'], 2)}{held}")
+        )
     if found["hurts"]:
         weights = ", ".join(f"{name} {number(weight, 2)}" for name, weight in found["hurts"].items())
         rows.append(("hurts most", f"{weights} (shares of the domain, the largest 1)"))

@@ -12,9 +12,12 @@ import unicodedata
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from certify.errors import CertificateFormatError
+
+if TYPE_CHECKING:
+    from certify.systems import System
 
 MINUS, TIMES, ABSENT = "\N{MINUS SIGN}", "\N{MULTIPLICATION SIGN}", "\N{EN DASH}"
 _LETTERS = "alpha beta gamma delta epsilon zeta eta theta kappa mu nu xi rho sigma tau phi chi psi omega"
@@ -56,6 +59,89 @@ def deviation(name: str, x_eq: Fraction, unit: str) -> str:
     value = number(float(abs(x_eq)))
     shifted = f"{symbol(name)} {MINUS if x_eq > 0 else '+'} {value}"
     return f"{shifted} ({pretty_unit(unit)})" if unit else shifted
+
+
+@dataclass(frozen=True, slots=True)
+class Varying:
+    """Something uncertain: it may take any value in [lo, hi], at any time."""
+
+    name: str
+    lo: Fraction
+    hi: Fraction
+    unit: str = ""
+
+    @property
+    def words(self) -> str:
+        """The range as people read it, never wider than it is.
+
+        >>> Varying("m", Fraction(27, 200), Fraction(33, 200), "kg").words
+        'm(t) in [0.135, 0.165] kg'
+        >>> Varying("wind", Fraction(-1, 3), Fraction(1, 3), "N").words
+        'wind(t) within ±0.333333 N'
+        """
+        ends = f"within ±{below(self.hi)}" if self.lo == -self.hi else f"in {inside(self.lo, self.hi)}"
+        return f"{symbol(self.name)}(t) {ends} {pretty_unit(self.unit)}".rstrip()
+
+
+def varying_in(system: System) -> tuple[Varying, ...]:
+    """What is uncertain in a plant, in its order."""
+    return tuple(Varying(name, lo, hi, system.units.get(name, "")) for name, (lo, hi) in system.ranges.items())
+
+
+def varying(quantities: Sequence[Varying]) -> str:
+    """Several of them in a sentence: `m(t) in [0.135, 0.165] kg and torque(t) within ±0.05 N m`."""
+    return listed([q.words for q in quantities])
+
+
+def listed(words: Sequence[str]) -> str:
+    """Words in a row, with `and` before the last.
+
+    >>> listed(["a", "b", "c"]), listed(["a"])
+    ('a, b and c', 'a')
+    """
+    return " and ".join([", ".join(words[:-1]), words[-1]] if len(words) > 1 else words)
+
+
+def inside(lo: Fraction, hi: Fraction) -> str:
+    """`[lo, hi]` rounded inwards, in as many digits as keep the one end below the other.
+
+    >>> inside(Fraction(1, 3), Fraction(2, 3)), inside(Fraction(1, 3), Fraction(1, 3) + Fraction(1, 10**8))
+    ('[0.333334, 0.666666]', '[0.333333334, 0.333333343]')
+    """
+    for digits in range(6, 40):
+        ends = [_value(q, digits, direction) for q, direction in ((lo, math.ceil), (hi, math.floor))]
+        if ends[0] < ends[1]:
+            return f"[{above(lo, digits)}, {below(hi, digits)}]"
+    return f"[{lo}, {hi}]"
+
+
+def _value(exact: Fraction, digits: int, direction: Callable[[Fraction], int]) -> Fraction:
+    """What `_rounded` shows."""
+    if exact == 0:
+        return exact
+    coefficient, last = _decimal(exact, digits, direction)
+    return coefficient * Fraction(10) ** last
+
+
+def stated_for(quantities: Sequence[Varying], statement: str) -> str:
+    """A claim's statement for all that is uncertain; as it is where nothing is."""
+    if not quantities:
+        return statement
+    which = "each any" if len(quantities) > 1 else "any"
+    at_once = ", all of them at once" if len(quantities) > 1 else ""
+    return (
+        f"For every {varying(quantities)}, {which} measurable function of time{at_once} \N{EM DASH} constant, drifting "
+        f"or jumping, whatever it is that moves it within its range \N{EM DASH} the following holds. {statement}"
+    )
+
+
+def held_at(system: System) -> str:
+    """The values of what is uncertain at which a plant is simulated and linearised; nothing where all is exact."""
+    nominal = {name: system.parameters.get(name, Fraction(0)) for name in system.ranges}
+    each = [
+        f"{symbol(n)} = {number(float(q))} {pretty_unit(system.units.get(n, ''))}".rstrip() for n, q in nominal.items()
+    ]
+    return listed(each) if each else ""
 
 
 def at_rest(names: Sequence[str], x_eq: Sequence[Fraction], units: Sequence[str]) -> str:

@@ -20,7 +20,7 @@ from dataclasses import dataclass, field, replace
 from decimal import Decimal, InvalidOperation
 from fractions import Fraction
 from types import MappingProxyType
-from typing import Any
+from typing import Any, Literal
 
 import sympy
 
@@ -28,6 +28,7 @@ from certify.errors import InputError
 from certify.expressions import GRAMMAR, evaluate_exactly, has_tree
 
 Interval = tuple[Fraction, Fraction]
+Kind = Literal["parameter", "disturbance", "input error"]
 
 _MOST_DIGITS = 1000  # before or after the point: 1e999999999 would fill the memory
 
@@ -201,17 +202,19 @@ class System:
         domain = tuple(bounds.get(name, old) for name, old in zip(names, self.domain, strict=True))
         return replace(self, domain=domain)
 
-    def with_ranges(self, ranges: Mapping[str, Interval]) -> System:
-        """The same plant where some parameters are uncertain and some disturbances act.
+    def with_ranges(self, ranges: Mapping[str, Interval | None]) -> System:
+        """The same plant where some parameters are uncertain and some disturbances act; None takes a range away.
 
         A parameter whose value does not lie in its range takes the middle of it.
         """
+        given = {name: ends for name, ends in ranges.items() if ends is not None}
         outside = {
             name: (lo + hi) / 2
-            for name, (lo, hi) in ranges.items()
+            for name, (lo, hi) in given.items()
             if name in self.parameters and not lo <= self.parameters[name] <= hi
         }
-        return replace(self.with_parameters(outside), ranges={**self.ranges, **ranges})
+        kept = {name: ends for name, ends in self.ranges.items() if name not in ranges}
+        return replace(self.with_parameters(outside), ranges={**kept, **given})
 
     def with_input_errors(self, bounds: Mapping[str, Fraction]) -> System:
         """The same plant with u + e in the place of u, |e| at most the bound, for the inputs that are named."""
@@ -237,6 +240,28 @@ class System:
     def uncertain(self) -> tuple[tuple[sympy.Symbol, Interval], ...]:
         """What has a range, in the order of the ranges."""
         return tuple((sympy.Symbol(name), interval) for name, interval in self.ranges.items())
+
+    @property
+    def input_errors(self) -> Mapping[str, str]:
+        """Of what has a range, that which the equations know only as the error of an input: its name, by the input's.
+
+        That is so if u stands in them as u + error_u alone: with u - error_u in its place the error is gone. A name by
+        itself says nothing, because a file may give it to anything.
+        """
+        found = {}
+        for u in self.inputs:
+            error = sympy.Symbol(f"error_{u}")
+            moved = [e.subs(u, u - error) for e in self.dynamics]
+            acts = any(error in e.free_symbols for e in self.dynamics)
+            if error.name in self.ranges and acts and not any(error in e.free_symbols for e in moved):
+                found[u.name] = error.name
+        return found
+
+    def kind_of(self, name: str) -> Kind:
+        """What it is that has this range."""
+        if name in self.input_errors.values():
+            return "input error"
+        return "parameter" if name in self.parameters else "disturbance"
 
     def at(self, values: Mapping[str, Fraction]) -> System:
         """The plant without uncertainty, where parameters and disturbances have these values."""
@@ -320,14 +345,15 @@ class System:
     ) -> Callable[[Any, Any, Sequence[float]], Any]:
         stack: Any
         broadcast: Any
+        number: Callable[[Any, Any], Any]
         if module == "numpy":
             import numpy
 
-            stack, broadcast = numpy.stack, numpy.broadcast_arrays
+            stack, broadcast, number = numpy.stack, numpy.broadcast_arrays, _as_it_is
         elif module == "torch":
             import torch
 
-            stack, broadcast = torch.stack, torch.broadcast_tensors
+            stack, broadcast, number = torch.stack, torch.broadcast_tensors, _as_tensor
         else:
             raise InputError(f"`module` must be 'numpy' or 'torch'; found {module!r}.")
         # torch has no sine of a plain number
@@ -338,7 +364,8 @@ class System:
         def f(x: Any, u: Any, values: Sequence[float]) -> Any:
             columns: list[Any] = [x[..., i] for i in range(n)] + [u[..., j] for j in range(m)]
             zero = 0.0 * (columns[0] + columns[n])  # constant components take the batch's shape
-            return stack(tuple(broadcast(*[value + zero for value in raw(*columns, *values)])), -1)
+            held = [number(value, x) for value in values]
+            return stack(tuple(broadcast(*[value + zero for value in raw(*columns, *held)])), -1)
 
         return f
 
@@ -364,6 +391,17 @@ class System:
 
 def _by_symbol(parameters: Mapping[str, Fraction]) -> list[tuple[sympy.Symbol, Fraction]]:
     return [(sympy.Symbol(name), q) for name, q in parameters.items()]
+
+
+def _as_it_is(value: Any, _: Any) -> Any:
+    return value
+
+
+def _as_tensor(value: Any, like: Any) -> Any:
+    """A number as a tensor: torch has no power, and no function, of a plain one."""
+    import torch
+
+    return torch.as_tensor(value, dtype=like.dtype, device=like.device)
 
 
 def _is_constant_function(node: sympy.Expr) -> bool:
@@ -395,5 +433,7 @@ def _check_grammar(expression: sympy.Expr, allowed: set[sympy.Symbol], system: s
         if node.is_Float:
             raise InputError(f"an equation of {system} holds the rounded number {node}; write it as a fraction.")
         if node.is_Symbol:
-            raise InputError(f"an equation of {system} uses {node}, which is no state, input or parameter.")
+            raise InputError(
+                f"an equation of {system} uses {node}, which is no state, input, parameter or disturbance."
+            )
         raise InputError(f"an equation of {system} uses {node}; allowed are {GRAMMAR} and exact numbers.")

@@ -45,7 +45,8 @@ def decay(scene: Scene, paths: NDArray[np.float64], step: float) -> Picture:
     begin += "" if scene.centre is None else " around c₀"
     return Picture(
         "V along trajectories",
-        f"V from starting points {begin}: simulated, not proved. " + scene.words.decay.format(word=scene.proved),
+        f"V from starting points {begin}: simulated{scene.held}, not proved. "
+        + scene.words.decay.format(word=scene.proved),
         to_svg(figure),
         simulated=True,
     )

@@ -35,7 +35,7 @@ def line_figure(scene: Scene, roa: SimulatedRoa | None) -> Picture:
     return Picture(
         "V̇ along the state",
         f"Shaded: the {scene.word} interval, {scene.meaning}{wider}. The curve of V̇ and the interval of the runs that "
-        f"{scene.words.settles} come from floating point and simulation; they are not proved.",
+        f"{scene.words.settles} come from floating point and simulation{scene.held}; they are not proved.",
         to_svg(figure),
         simulated=True,
         wide=True,

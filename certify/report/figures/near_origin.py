@@ -38,7 +38,7 @@ def near_origin(scene: Scene) -> Picture:
     }[scene.kind]
     return Picture(
         "Near the origin",
-        f"{green}{around} Grey trajectories are simulated, not proved.",
+        f"{green}{around} Grey trajectories are simulated{scene.held}, not proved.",
         to_svg(figure),
         simulated=True,
     )

@@ -106,7 +106,7 @@ def set_figure(certificate: Certificate, accepted: bool, options: PaperOptions |
         for spare in panels[count:]:
             spare.set_visible(False)
         legend = _draw(scene, panels[:count])
-        _put_legend(figure, legend, down * panel)
+        _put_legend(figure, legend, down * panel, _star(scene))
     return figure
 
 
@@ -122,12 +122,17 @@ def _draw(scene: Scene, panels: Sequence[Any]) -> tuple[Key, ...]:
     return keys(scene, runs, region, any(growing))
 
 
-def _put_legend(figure: Any, legend: Sequence[Key], height: float) -> None:
+def _star(scene: Scene) -> str:
+    """What the star stands for; where values are uncertain, in a line of its own at which they are simulated."""
+    return _STAR + (f",\n{scene.held.strip()}" if scene.held else "")
+
+
+def _put_legend(figure: Any, legend: Sequence[Key], height: float, star: str) -> None:
     """The legend below the panels, in as many columns as fit; the figure's height in inches follows."""
     width = figure.get_size_inches()[0]
     for columns in range(min(len(legend), 4), 0, -1):
         rows = math.ceil(len(legend) / columns)
-        figure.set_size_inches(width, height + 0.16 * (rows + 1) + 0.1)
+        figure.set_size_inches(width, height + 0.16 * (rows + 1 + star.count("\n")) + 0.1)
         placed = figure.legend(
             handles=[key.handle() for key in legend],
             loc="outside lower center",
@@ -135,7 +140,7 @@ def _put_legend(figure: Any, legend: Sequence[Key], height: float) -> None:
             handlelength=1.8,
             columnspacing=1.2,
             labelspacing=0.35,
-            title=_STAR,
+            title=star,
             title_fontsize=6.5,
         )
         figure.draw_without_rendering()

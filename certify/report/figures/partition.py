@@ -31,7 +31,10 @@ def partition(scene: Scene, leaves: Leaves) -> Picture:
     axes.set_xlabel(labels[0])
     axes.set_ylabel(labels[1])
     shown = "showed" if scene.proved == "proved" else "has to show"
-    asked = f"On each blue one the checker {shown} V̇ < 0; the others lie outside the ring between the two levels."
+    always = " for all values in the ranges" if scene.system.ranges else ""
+    asked = (
+        f"On each blue one the checker {shown} V̇ < 0{always}; the others lie outside the ring between the two levels."
+    )
     return Picture(
         "The leaf partition",
         f"The {_count(len(leaves[0]))} of the certificate, {where}. {asked}",

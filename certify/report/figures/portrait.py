@@ -82,10 +82,10 @@ def portraits(scene: Scene, runs: Runs, region: Region | None) -> list[Picture]:
             if scene.start_shares is not None:
                 both = _takes(scene.start_shares, names, pair), _takes(scene.shares, names, pair)
                 meaning = f"Of its domain the start takes {both[0]}, {{V ≤ c₂}} {both[1]}. "
-        sign = "" if growing or not _shows_vdot(scene) else "V̇ < 0 at every grid point of the picture. "
+        sign = "" if growing or not _shows_vdot(scene) else f"V̇ < 0 at every grid point of the picture{scene.held}. "
         if growing and scene.start is not None:
             sign = "V need not fall outside the blue set: along the tube another function does. "
-        caption = f"{meaning}{sign}*\N{NO-BREAK SPACE}Simulated or evaluated on a grid, not proved."
+        caption = f"{meaning}{sign}*\N{NO-BREAK SPACE}Simulated or evaluated on a grid{scene.held}, not proved."
         pictures.append(Picture(title, caption, svg, simulated=True, wide=scene.n == 2, legend=legend, about=about))
     return pictures
 

@@ -22,7 +22,7 @@ from certify.policies import TanhNetwork
 from certify.report.figures.geometry import PARTS, Box, circle, over_level, refine
 from certify.report.figures.pairs import Pair, pairs_of
 from certify.report.sampling import SETTLED, Flow, Runs, runs_of, time_scales
-from certify.report.words import deviation, label, words_for
+from certify.report.words import deviation, held_at, label, words_for
 
 Array = NDArray[np.float64]
 Leaves = tuple[Array, Array]
@@ -208,6 +208,11 @@ class Scene:
         if self.band is None:
             return far
         return np.asarray(np.maximum(far, np.max(np.abs(self.band.centre) + self.band.half, axis=0)))
+
+    @property
+    def held(self) -> str:
+        """Of what is simulated or on a grid, where something is uncertain: at which values; else nothing."""
+        return f" with {held_at(self.system)} throughout" if self.system.ranges else ""
 
     @property
     def start_on_line(self) -> tuple[float, float]:
