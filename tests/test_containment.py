@@ -104,6 +104,22 @@ def test_a_box_is_contained_up_to_its_corners() -> None:
     assert abs(found.outside[1]) == F(4, 5) + F(1, 10**30)
 
 
+@pytest.mark.parametrize("n", [2, 17])  # corner by corner, and by a bound
+def test_an_ellipsoid_may_lie_around_another_point(n: int) -> None:
+    """The unit ball around (2, 0, ...): what is contained of a box is what is left of it as seen from there."""
+    centre = (2.0, *[0.0] * (n - 1))
+    plain = union(np.eye(n))
+    moved = ProvedSet(plain.system, "reached", (Ellipsoid("E0", np.eye(n), 1.0, centre),), "0" * 64, "0" * 64)
+    side = F(1, 5)
+    around = ((F(2) - side, F(2) + side), *[(-side, side)] * (n - 1))
+    assert moved.locate(around).answer is Containment.CONTAINED
+    assert plain.locate(around).answer is Containment.NOT_CONTAINED
+    assert moved.locate(at(F(3), *[0] * (n - 1))).answer is Containment.CONTAINED  # on its boundary
+    beyond = at(F(3) + F(1, 10**40), *[0] * (n - 1))
+    assert moved.locate(beyond).answer is Containment.NOT_CONTAINED
+    assert moved.holds([[0] * n, [F(5, 2), *[0] * (n - 1)]]) == [False, True]
+
+
 def test_levels_are_the_binary_numbers_that_they_are() -> None:
     tenth = union(np.eye(1), level=0.1)
     assert F(0.1) > F(1, 10)  # of a square 0.1 exactly, the binary number lets in a little more
