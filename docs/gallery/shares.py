@@ -33,23 +33,31 @@ SAMPLES = 200_000
 
 @dataclass(frozen=True)
 class Entry:
-    """A plant, and the seconds that a search for a tube from its box gets; 0 for none."""
+    """A plant; the seconds that its largest set and a tube from its box get, None for the default, 0 for no tube."""
 
     name: str
-    seconds: int = 0
+    seconds: int | None = None
+    tube_seconds: int = 0
 
     @property
     def own(self) -> list[str]:
         """The command that proves the largest set."""
-        return ["certify", "roa", "--policy", f"examples/policies/{self.name}.pt"]
+        limit = [] if self.seconds is None else ["--time-limit", str(self.seconds)]
+        return ["certify", "roa", "--policy", f"examples/policies/{self.name}.pt", *limit]
 
     @property
     def box(self) -> list[str]:
         """The command that proves the largest multiple of the box' ellipsoid."""
-        return [*self.own, "--time-limit", str(self.seconds), "--box", _text(self.name)]
+        limit = ["--time-limit", str(self.tube_seconds)]
+        return [*self.own[:4], *limit, "--box", _text(self.name)]
 
 
-ENTRIES = (Entry("pendulum"), Entry("cartpole", 100), Entry("quadrotor2d", 100), Entry("quadrotor3d", 600))
+ENTRIES = (
+    Entry("pendulum"),
+    Entry("cartpole"),
+    Entry("quadrotor2d", seconds=100),
+    Entry("quadrotor3d", tube_seconds=600),
+)
 
 
 def _text(name: str) -> str:
@@ -97,7 +105,7 @@ def row(entry: Entry) -> str:
     levels = said["levels"]
     limit = levels["sampled_limit"] or levels["domain_limit"]
     length = math.sqrt(levels["roa"] / limit)
-    found = [M] if not entry.seconds else [M, made(entry.box, OUT / f"{entry.name}-box")[0]]
+    found = [M] if not entry.tube_seconds else [M, made(entry.box, OUT / f"{entry.name}-box")[0]]
     inside, share = max(multiple(one, box) for one in found), max(covered(one, box) for one in found)
     by = "samples" if levels["sampled_limit"] else "domain"
     return (
@@ -122,7 +130,7 @@ def main() -> None:
         "limit by",
     ]
     rows = [row(entry) for entry in ENTRIES]
-    commands = [" ".join(c) for e in ENTRIES for c in ([e.own] if not e.seconds else [e.own, e.box])]
+    commands = [" ".join(c) for e in ENTRIES for c in ([e.own] if not e.tube_seconds else [e.own, e.box])]
     block = ["", "<!-- shown: by make shares -->", "```sh", *commands, "```", ""]
     (PAGE / "shares.txt").write_text(
         "\n".join([f"| {' | '.join(head)} |", "|---" * len(head) + "|", *rows, *block]), "utf-8"
