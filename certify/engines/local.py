@@ -15,6 +15,7 @@ from certify.engines.models import Paths, paths
 Array = NDArray[np.float64]
 _LEAST = 1e-280  # a level, below which binary64 holds nothing more
 _MARGIN = 1e-3  # share of the decay that is left to the checker's rounding
+_ENOUGH = 1.01 * _MARGIN
 _WIDER = 1 + 1e-9  # of the ball, which has to contain {V <= c1} beyond all rounding
 
 
@@ -33,7 +34,7 @@ def prove_local(problem: Problem, T: Array, limit: float, known: Paths | None = 
     known = known or paths(problem.loop)
 
     def good(level: float) -> bool:
-        return local_margin(problem, T, level, known) > _MARGIN
+        return _shown(problem, ball_around(problem, T, level), known, _ENOUGH).margin > _MARGIN
 
     if good(limit):
         return limit
@@ -56,7 +57,8 @@ def local_margin(problem: Problem, T: Array, level: float, known: Paths) -> floa
 def local_ball(problem: Problem, T: Array, level: float) -> LocalBall:
     """The evidence for a level that `prove_local` has found, or a lower one."""
     J = ball_around(problem, T, level)
-    return LocalBall(J, _shown(problem, J, paths(problem.loop)).multipliers)
+    shown = _shown(problem, J, paths(problem.loop)).multipliers
+    return LocalBall(J, shown.rows, shown.weight)
 
 
 def ball_around(problem: Problem, T: Array, level: float) -> Array:
@@ -65,7 +67,7 @@ def ball_around(problem: Problem, T: Array, level: float) -> Array:
     return T * (math.sqrt(level / least) * _WIDER) if least > 0 else np.full_like(T, math.inf)
 
 
-def _shown(problem: Problem, J: Array, known: Paths) -> Shown:
+def _shown(problem: Problem, J: Array, known: Paths, enough: float = math.inf) -> Shown:
     with np.errstate(all="ignore"):  # what overflows is not shown
         models = known.models(J)
-        return best_multipliers(models, J, problem.V.P) if models.admitted else NOT_SHOWN
+        return best_multipliers(models, J, problem.V.P, enough=enough) if models.admitted else NOT_SHOWN
