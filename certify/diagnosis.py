@@ -127,6 +127,9 @@ def _next(result: RoaResult, options: RoaOptions, proof: Proof | None, name: str
         return Step((("--centre", centre),), "with pi(0) = u_eq the stronger claim can be tried")
     if result.stop is Stop.DOMAIN and name is not None and options.level is None:
         return _wider_domain(result, name)
+    if result.stop is Stop.PATH:
+        why = "the set that the tube has to reach grows with the time, and so do the widths that are tried"
+        return Step((("--time-limit", _round(4 * options.time_limit)),), why)
     if result.stop in (Stop.TIME, Stop.BOXES):
         return _longer(result, options, proof)
     if options.claim == "asymptotic" and options.only is not None and options.P is None and options.level is None:

@@ -162,10 +162,12 @@ class RoaResult:
     """What was proved. `stop` and `detail` say what limits the level, or why nothing was proved.
 
     `rest` is where the loop rests, if not at the origin. `candidate` is where P came from, `tried` all that were tried,
-    `notice` what is not as it was asked for. `checker` is what the checker said, None if it was not reached, about
-    `raw`, the certificate's bytes; `solver` has dReal's version and every query with its answer, None if it was not
-    asked. `notices` is what had to be known about plant and policy before the run, such as a domain that was cut;
-    `folder` keeps a temporary folder of the certificate alive.
+    `notice` what is not as it was asked for. `reach_from` is the state that was asked about, by the states' values;
+    where the verdict on it is UNKNOWN by `Stop.PATH`, `certificate` and `levels` are of a proved set without it.
+    `checker` is what the checker said, None if it was not reached, about `raw`, the certificate's bytes; `solver` has
+    dReal's version and every query with its answer, None if it was not asked. `notices` is what had to be known about
+    plant and policy before the run, such as a domain that was cut; `folder` keeps a temporary folder of the certificate
+    alive.
 
     In Python: `contains`, `volume`, `plot`, `report`, `certificate` (the file's path), `to_dict`.
     """
@@ -182,6 +184,7 @@ class RoaResult:
     notice: str | None = None
     levels: Levels = field(default_factory=Levels)
     tube: TubeFacts | None = None
+    reach_from: tuple[Fraction, ...] | None = None
     witness: Witness | None = None
     eigenvalues: tuple[str, ...] = ()
     boxes: int = 0
@@ -362,6 +365,9 @@ class RoaResult:
                 "notice": self.notice,
             },
             "levels": {name: getattr(self.levels, name) for name in Levels.__slots__},
+            "reach_from": None
+            if self.reach_from is None
+            else {s.name: str(q) for s, q in zip(system.states, self.reach_from, strict=True)},
             "tube": None if self.tube is None else self.tube.to_dict(),
             "witness": None,
             "eigenvalues": list(self.eigenvalues),

@@ -174,7 +174,15 @@ class _Run:
             self.options = options = replace(options, claim=claim)
         self.share = _BEFORE_TUBE if options.enlarges else 1.0
         kind = _kind_of(options)
-        result = RoaResult(Verdict.UNKNOWN, Stop.REQUESTED, self.system, self.network, kind, engine=options.engine)
+        result = RoaResult(
+            Verdict.UNKNOWN,
+            Stop.REQUESTED,
+            self.system,
+            self.network,
+            kind,
+            engine=options.engine,
+            reach_from=None if self.centre is None else _values(self.system, self.centre),
+        )
         if kind == "asymptotic":
             with self._stage("candidate"):
                 unstable = _unstable(loop)
@@ -380,9 +388,18 @@ class _Run:
         if isinstance(certificate.claim, Enlarged | Reached):
             result = replace(result, claim=certificate.claim.kind, tube=facts)
         elif self.centre is not None and not _holds(task.problem, certificate.roa, self.centre):
-            why = "the checker refused the tube" if facts is not None else self.missed
+            why = self.missed if facts is None else accepted.mended or "the checker refused the tube"
+            self.aside = None
             result = _with_levels(result, certificate.claim.levels, witness)
-            return replace(result, stop=Stop.PATH, detail=why, certificate=accepted.path, raw=accepted.data)
+            return replace(
+                result,
+                stop=Stop.PATH,
+                detail=why,
+                leaves=proof.leaves,
+                certificate=accepted.path,
+                raw=accepted.data,
+                checker=accepted.answer,  # of the set without the state, which is all that it accepted
+            )
         if task.exactly and certificate.roa < task.target:
             return _missed(replace(result, stop=Stop.REFUSED, detail=accepted.mended or ""), task, certificate.claim)
         trusted = isinstance(proof.evidence, TrustedSolver)
@@ -435,6 +452,7 @@ class _Run:
         trial, centre = race.best.trial, self.centre or ()
         if _holds(trial.task.problem, claim.roa, centre):
             self.aside = "the state lies in the proved set, and no tube is needed"
+            self.missed = "the checker accepted only a lower level, and the state lies above it"
             return None, claim, evidence
         self.share = 1.0
         box = self.options.box
@@ -534,6 +552,10 @@ def _state_in(system: System, values: Mapping[str, Fraction | float]) -> tuple[F
                 f"{float(hi + q):g}; found {float(v + q):g}."
             )
     return state
+
+
+def _values(system: System, deviations: Sequence[Fraction]) -> tuple[Fraction, ...]:
+    return tuple(q + v for q, v in zip(system.exact_x_eq(), deviations, strict=True))
 
 
 def _holds(problem: Problem, level: float, state: Sequence[Fraction]) -> bool:

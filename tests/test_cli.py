@@ -393,3 +393,99 @@ def test_a_report_is_about_the_bytes_that_were_checked(
     writer.join(timeout=10)
     assert status == 0 and out.startswith("ACCEPTED")
     assert hashlib.sha256(raw).hexdigest() in page.read_text() and "PROVED" in page.read_text()
+
+
+SPRING = """
+name = "soft_spring"
+states = ["p", "v"]
+inputs = ["F"]
+[dynamics]
+p = "v"
+v = "-p + p**3/4 - 2*v + F"
+[u_eq]
+F = 0
+[domain]
+p = [-2, 2]
+v = [-2, 2]
+[input_bounds]
+F = [-1, 1]
+[units]
+p = "m"
+v = "m/s"
+"""
+
+
+@pytest.fixture
+def spring(tmp_path: Path) -> tuple[str | Path, ...]:
+    """The options of a command that name a plant of two states and a policy of one tanh."""
+    plant, policy = tmp_path / "spring.toml", tmp_path / "spring.pt"
+    plant.write_text(SPRING)
+    network = TanhNetwork((np.array([[-0.3, -0.2]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
+    save_policy(policy, Policy(network, "soft_spring"))
+    return "--policy", policy, "--system", plant, "--out", tmp_path / "o"
+
+
+def test_reach_proves_that_a_state_converges(
+    tmp_path: Path, spring: tuple[str | Path, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = ("reach", *spring, "--from", "p=1.5,v=1.4", "--box", "p=0.1,v=0.2", "--time-limit", "20", "--json")
+    status, out, _ = run(capsys, *given)
+    assert status == 0 and out.count("\n") == 1
+    data = json.loads(out)
+    assert data["verdict"] == "PROVED" and data["claim"] == {"kind": "reached"} and data["checked"] == "ACCEPTED"
+    assert data["reach_from"] == {"p": "3/2", "v": "7/5"} and data["tube"]["centre"] == [1.5, 1.4]
+    assert data["tube"]["shape"] == "box" and data["tube"]["slabs"] > 0
+    first, second = data["tube"]["semi_axes"]
+    assert second == pytest.approx(2 * first, rel=1e-9)
+    page = (tmp_path / "o" / "report.html").read_text()
+    assert "around the state c₀, p = 1.5 m, v = 1.4 m/s" in page and "PROVED · ACCEPTED" in page
+    status, out, _ = run(capsys, "check", tmp_path / "o" / "certificate.json")
+    assert status == 0 and out.splitlines()[-1].startswith("ACCEPTED ") and "c = 1.5 1.4" in out
+
+
+def test_a_state_that_is_not_shown_to_converge_exits_3(
+    tmp_path: Path, spring: tuple[str | Path, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = ("reach", *spring, "--from", "p=1.95,v=1.95", "--time-limit", "6")
+    status, out, _ = run(capsys, *given)
+    assert status == 3
+    said = " ".join(out.split())
+    assert said.startswith("UNKNOWN soft_spring: the state is NOT shown to converge; what is proved is {V <= ")
+    assert "no tube from that state" in said and "PROVED" not in said
+    assert "It is not shown to converge" in (tmp_path / "o" / "report.html").read_text()
+    status, out, _ = run(capsys, *given, "--json")
+    data = json.loads(out)
+    assert (status, data["verdict"], data["stop"], data["tube"]) == (3, "UNKNOWN", "path", None)
+
+
+def test_a_state_in_the_proved_set_needs_no_tube(
+    spring: tuple[str | Path, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, out, err = run(capsys, "reach", *spring, "--from", "p=0.1", "--time-limit", "10", "--json")
+    data = json.loads(out)
+    assert status == 0 and data["verdict"] == "PROVED" and data["claim"] == {"kind": "asymptotic"}
+    assert data["tube"] is None and "the state lies in the proved set, and no tube is needed" in err
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--from", "p=2"), "interior of the domain, p between -2 and 2; found 2"),
+        (("--from", "p=1,v=-7"), "interior of the domain, v between -2 and 2; found -7"),
+        (("--from", "q=1"), "must name states of soft_spring, p, v; found q"),
+        (("--from", "p"), "--from takes NAME=VALUE"),
+        (("--from", "p=one"), "one"),
+        (("--from", "p=1", "--box", "q=1"), "`box` must name states"),
+        (("--from", "p=1", "--box", "p=-1"), "positive half-widths"),
+    ],
+)
+def test_states_that_cannot_be_asked_about_exit_2(
+    tmp_path: Path,
+    spring: tuple[str | Path, ...],
+    options: tuple[str, ...],
+    words: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    status, out, err = run(capsys, "reach", *spring, *options)
+    assert status == 2 and words in err and out == ""
+    assert not (tmp_path / "o" / "certificate.json").exists()

@@ -7,7 +7,7 @@ on a line: x = m + J z + w sigma, d = (z, sigma).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import cached_property
 
@@ -17,11 +17,26 @@ from .case import Case, Failures
 from .elementary import elementary
 from .expression import evaluate
 from .float64 import EPS, Array, ends, float_with_error, frobenius, gamma, norm, total, up, within
-from .jets import Jet, constant, widen
+from .jets import Jet, constant, each, tensor_norm, triples, widen
 from .network import Folded
 
-_MOST_NUMBERS = 2**25  # in the matrices of all jets, or of a layer and the paths to it
+_MOST_JETS = 2**26  # numbers in the matrices and tensors of all jets
+_MOST_NUMBERS = 2**25  # in those of a layer and the paths to it
 _MOST_PRODUCTS = 2**33  # in the sums over paths
+
+
+@dataclass(frozen=True)
+class Units:
+    """What each tanh of the network, q, leaves out of its jet: e_q(d), |e_q(d)| <= d'R_q d, R (N, k, k), which reaches
+    the inputs as sum_q L_jq e_q, L (m, N)."""
+
+    L: Array
+    R: Array
+
+    @cached_property
+    def shares(self) -> Array:
+        """Bounds of these sums, (m, k, k)."""
+        return np.asarray(widen(np.tensordot(np.abs(self.L), self.R, 1), 0.0, gamma(len(self.R)) + EPS))
 
 
 @dataclass(frozen=True)
@@ -39,39 +54,59 @@ class Ball:
 
     @cached_property
     def states(self) -> list[Jet]:
-        """x on the ball."""
-        if self.motion is None:
-            nothing = np.zeros((len(self.J), len(self.J)))
-            return [Jet(np.float64(0), 0.0, row, 0.0, nothing, nothing) for row in self.J]
-        nothing, jets = np.zeros((len(self.J) + 1, len(self.J) + 1)), []
-        for row, m, w in zip(self.J, *self.motion, strict=True):
-            (value, error), (step, slack) = float_with_error(m), float_with_error(w)
-            jets.append(Jet(np.float64(value), error, np.append(row, step), slack, nothing, nothing))
+        """x on the ball, exact but for rounding."""
+        n, still = len(self.J), self.motion is None
+        m, w = ([Fraction(0)] * n, [Fraction(0)] * n) if self.motion is None else self.motion
+        k = n if still else n + 1
+        nothing = constant(Fraction(0), np.zeros((0, k, k)))
+        jets = []
+        for row, at, by in zip(self.J, m, w, strict=True):
+            (c, error), (step, slack) = float_with_error(at), float_with_error(by)
+            a = row if still else np.append(row, step)
+            jets.append(replace(nothing, c=np.float64(c), error=error, a=a, slack=slack))
         return jets
 
     @cached_property
+    def outputs(self) -> Jet:
+        """What the network's last layer has, through tanh if it is squashed: a batch; the errors are its units'."""
+        return enclose_on_ball(self.case.net, self.states)
+
+    @cached_property
+    def units(self) -> Units:
+        """All tanh of the network, the last layer's included, and how they reach the inputs."""
+        h, scale = self.outputs, self.case.net.scale
+        return Units(np.concatenate([scale[:, None] * h.B, np.diag(scale)], 1), np.concatenate([h.U, h.E]))
+
+    @cached_property
     def inputs(self) -> list[Jet]:
-        """pi(x) on the ball, before it is clipped. At rest its value at d = 0 is u_eq by form."""
-        net, h = self.case.net, enclose_on_ball(self.case.net, self.states)
+        """pi(x) on the ball, before it is clipped, each with its own error. At rest its value at d = 0 is u_eq by
+        form."""
+        net, h, U = self.case.net, self.outputs, self.units.shares
         if self.motion is None:
             values = [float_with_error(u) for u in self.case.c.u_eq]
         else:
-            each = zip(h, net.scale.tolist(), net.offset.tolist(), net.offset_error.tolist(), strict=True)
-            values = [_affine(v, scale, offset, error) for v, scale, offset, error in each]
-        return [input_jet(*part) for part in zip(values, net.scale.tolist(), h, strict=True)]
+            parts = zip(h.c, h.error, net.scale.tolist(), net.offset.tolist(), net.offset_error.tolist(), strict=True)
+            values = [_affine(*part) for part in parts]
+        c, error = np.array(values).T
+        k, column = np.abs(net.scale), net.scale[:, None]
+        a, slack = column * h.a, up(k * h.slack + EPS * (k * h.slope))
+        E = widen(np.zeros_like(h.E), EPS * (k * h.spread) + h.faint)
+        batch = Jet(c, error, a, slack, each(net.scale) * h.Q, column * h.K, E, np.eye(len(c)), U)
+        return batch.members
 
     @cached_property
     def F(self) -> list[Jet]:
         """The components of F on the ball. At rest F(0) = 0, of which these jets know no more than that 0 is near."""
-        k = len(self.states[0].a)
-        return evaluate(self.case.c.dynamics, lambda q: constant(q, k), [*self.states, *self.inputs])
+        U = self.units.shares
+        states = [replace(x, B=np.zeros(len(U)), U=U) for x in self.states]
+        return evaluate(self.case.c.dynamics, lambda q: constant(q, U), [*states, *self.inputs])
 
 
-def _affine(h: Jet, scale: float, offset: float, offset_error: float) -> tuple[float, float]:
-    """scale * h(0) + offset, and its error."""
-    through = scale * h.c
+def _affine(h: float, error: float, scale: float, offset: float, offset_error: float) -> tuple[float, float]:
+    """scale * h + offset, h within `error`, and its error."""
+    through = scale * h
     value = through + offset
-    return value, up(abs(scale) * h.error + offset_error + EPS * (abs(through) + abs(offset)))
+    return value, up(abs(scale) * error + offset_error + EPS * (abs(through) + abs(offset)))
 
 
 def fits(ball: Ball) -> Failures:
@@ -101,42 +136,37 @@ def is_not_clipped(ball: Ball) -> Failures:
     return 0
 
 
-def too_large(net: Folded, operations: int, n: int) -> Failures:
-    """Places where jets of so many operations in n symbols, or the network's, take too much memory or time."""
-    if operations * n * n > _MOST_NUMBERS:
+def too_large(net: Folded, operations: int, k: int) -> Failures:
+    """Places where jets of so many operations in k symbols, or the network's, take too much memory or time."""
+    numbers = k * k + len(triples(k)[0])
+    if operations * numbers > _MOST_JETS:
         yield "plant.dynamics", "the equations are too large for this rule"
-    columns, products = n, 0
+    columns, products = k, 0
     for layer in net.layers[1:]:
         rows, width = layer.W.shape
         products += rows * columns * width
         columns += width
-        products += rows * columns * n * n
-        if columns * (rows + n * n) > _MOST_NUMBERS or products > _MOST_PRODUCTS:
+        products += rows * columns * numbers
+        if columns * (rows + numbers) > _MOST_NUMBERS or products > _MOST_PRODUCTS:
             yield "policy.layers", "the network is too large for this rule"
     return 0
 
 
-def input_jet(u: tuple[float, float], scale: float, h: Jet) -> Jet:
-    """u + scale ((a + s).d + d'Q d + r(d)): an input on the ball, whose value at d = 0 is `u`, with an error."""
-    k, a = abs(scale), scale * h.a
-    rest = widen(k * h.E, EPS * (k * frobenius(h.Q)))
-    return Jet(np.float64(u[0]), u[1], a, up(k * h.slack + EPS * norm(a, 0)), scale * h.Q, rest)
+def enclose_on_ball(net: Folded, states: Sequence[Jet]) -> Jet:
+    """What the network's last layer has, through tanh if it is squashed, as a batch of jets; the states are these jets,
+    which have no Q, no K and no E.
 
-
-def enclose_on_ball(net: Folded, states: Sequence[Jet]) -> list[Jet]:
-    """What the network's last layer has, through tanh if it is squashed, where the states are these jets, which have
-    no Q and no E.
-
-    Every layer's value is y(d) = y(0) + X d + M A(d), where A_q is what a tanh of the layers before adds to its tangent
-    at y_q(0), and M the product of weights and slopes with which that reaches y, so that errors cancel as they do in
-    truth. A_q(d) is d'(quad_q)d within d'(rest_q)d, and `bends` bounds ||quad_q||_2; of the first k of these, which
-    stand for the symbols d, all are 0. Each column of [X, M], here X, lies within its `doubt` of the true one.
+    Every layer's value is y(d) = y(0) + a.d + B A(d), where A_q is what a tanh of the layers before adds to its tangent
+    at y_q(0), and B the product of weights and slopes with which that reaches y, so that errors cancel as they do in
+    truth. A_q(d) is d'H_q d + C_q[d] + e_q(d), and `sizes` bounds all three. Each column of X = [a, B] lies within its
+    `doubt` of the true one.
     """
     X, k = np.array([x.a for x in states]), len(states[0].a)
     y = np.array([x.c for x in states], dtype=np.float64)[:, None, None]
     error = np.array([x.error for x in states])[:, None]
     doubt = np.full(k, norm(np.array([x.slack for x in states]), 0))
-    quad, rest, bends = np.zeros((k, k, k)), np.zeros((k, k, k)), np.zeros(k)
+    H, C, R = np.zeros((0, k, k)), np.zeros((0, len(triples(k)[0]))), np.zeros((0, k, k))
+    sizes = np.zeros(0)
     for number, layer in enumerate(net.layers):
         y, rounding = layer.affine(y)
         error = up(layer.widest(error) + rounding)
@@ -145,22 +175,19 @@ def enclose_on_ball(net: Folded, states: Sequence[Jet]) -> list[Jet]:
         X = layer.W @ X
         if number > 0:  # what the tanh just before has added arrives through W alone
             X, doubt = np.concatenate([X, layer.W], 1), np.concatenate([doubt, np.zeros(width)])
-        count = len(doubt)
-        weight = np.abs(X) + doubt
-        Q = (X @ quad.reshape(count, -1)).reshape(-1, k, k)
-        E = (weight @ rest.reshape(count, -1)).reshape(-1, k, k)
-        E = widen(E, total(doubt * bends + gamma(count) * (weight * bends), 1), gamma(count) + EPS)
-        value = Jet(y[:, 0, 0], error[:, 0], X[:, :k], norm(doubt[:k], 0), Q, E)
+        a, B, count = X[:, :k], X[:, k:], len(sizes)
+        Q = np.tensordot(B, H, 1)
+        lost = total(doubt[k:] * sizes + (gamma(count) + EPS) * (np.abs(B) * sizes), 1)
+        E = widen(np.zeros_like(Q), lost)
+        slack = np.full(len(a), norm(doubt[:k], 0))
+        value = Jet(y[:, 0, 0], error[:, 0], a, slack, (Q + Q.swapaxes(1, 2)) / 2, B @ C, E, B, R)
         if number == len(net.layers) - 1:
             break
-        (t, slope, half), (e, wrong, half_error), third = elementary("tanh", value.c, value.error, value.radius)
-        added, beyond = value.beyond_tangent(half, half_error, third)
-        quad, rest = np.concatenate([quad, added]), np.concatenate([rest, beyond])
-        bends = np.concatenate([bends, frobenius(added)])
+        phi = elementary("tanh", value.c, value.error, value.radius)
+        (t, slope, _, _), (e, wrong, _, _) = phi.f, phi.e
+        added = value.beyond_tangent(phi)
+        H, C, R = (np.concatenate(pair) for pair in zip((H, C, R), added, strict=True))
+        sizes = up(frobenius(H) + tensor_norm(C, k) + frobenius(R))
         doubt = up(np.max(up(slope + wrong)) * doubt + (np.max(wrong) + EPS) * norm(X, 0))
         y, error, X = t[:, None, None], e[:, None], slope[:, None] * X
-    if net.squash:
-        value = value.function("tanh")
-    slack = np.broadcast_to(value.slack, len(value.a))
-    each = zip(value.c, value.error, value.a, slack, value.Q, value.E, strict=True)
-    return [Jet(*parts) for parts in each]
+    return value.function("tanh") if net.squash else value

@@ -1,8 +1,9 @@
 """The matrix inequality of rules `local` and `tube`: that d'J'RJ d + 2 d'J'P F(J d) < 0 for 0 < ||d|| <= 1, or, along a
 path, z'J'RJ z + 2 z'J'P (F - v) < 0 where z'J'PJ z = 1.
 
-The models of F come with their rounding errors bounded (ball.py); all that follows from them is in rationals, so that
-no rounding has to be thought of here. FORMAT.md has the inequality, its three sums, and why each of them is a bound.
+The models of F come with their rounding errors bounded (ball.py); what follows from them is in rationals, so that no
+rounding has to be thought of, but for the two sums of many terms (pairs.py). FORMAT.md has the inequality, its five
+sums, and why each of them is a bound.
 """
 
 from __future__ import annotations
@@ -12,19 +13,23 @@ from collections.abc import Sequence
 import numpy as np
 from flint import fmpq, fmpq_mat
 
+from .ball import Units
 from .document import Multipliers, Path
 from .exact import exactly, is_definite, root_above
-from .float64 import Array
-from .jets import Jet
+from .float64 import EPS, Array, gamma, norm, total, up
+from .jets import Jet, unpacked
+from .pairs import bound_of_pairs, in_binary64
 
 
 class Models:
-    """F - v on a ball, in rationals: `f_i + a_i.d + d'Q_i d + r_i`, (f_i, a_i) within s_i, |r_i| <= d'E_i d; d has k
-    entries. At rest v = 0 and f_i is exactly 0, so that s_i is about a_i alone."""
+    """F - v on a ball: `f_i + a_i.d + d'Q_i d + K_i[d] + sum_jq B_ij L_jq e_q + r_i`, (f_i, a_i) within s_i,
+    |r_i| <= d'E_i d; d has k entries. At rest v = 0 and f_i is exactly 0, so that s_i is about a_i alone."""
 
-    def __init__(self, J: Array, F: Sequence[Jet], velocity: Sequence[fmpq] | None = None) -> None:
+    def __init__(self, J: Array, F: Sequence[Jet], units: Units, velocity: Sequence[fmpq] | None = None) -> None:
         """J is (n, n), v the velocity of a path. Parameters are finite; see `are_finite`."""
-        self.J = exactly(J)
+        self.J, self.units = exactly(J), units
+        self.K, self.twists = np.array([f.K for f in F]), np.array([f.twist for f in F])
+        self.B = exactly(np.array([f.B for f in F]))
         self.A = exactly(np.array([f.a for f in F]))
         self.slack = [rational(f.slack) for f in F]
         self.Q = [exactly(f.Q) for f in F]
@@ -43,9 +48,10 @@ def are_usable(by: Multipliers, path: Path | None = None) -> bool:
     return signs and (all(beta > 0 for beta in by.apart) or all(g > 0 for g in joint))
 
 
-def are_finite(F: Sequence[Jet]) -> bool:
-    """Whether every component has a finite model."""
-    return all(np.all(np.isfinite(part)) for f in F for part in (f.c, f.error, f.a, f.slack, f.Q, f.E))
+def are_finite(F: Sequence[Jet], units: Units) -> bool:
+    """Whether every component has a finite model, and what is summed in binary64 has finite sums of squares."""
+    parts = [part for f in F for part in (f.c, f.error, f.a, f.slack, f.Q, f.E, f.B, f.twist)]
+    return all(np.all(np.isfinite(part)) for part in (*parts, norm(units.L.ravel(), 0), norm(units.R.ravel(), 0)))
 
 
 def shows(models: Models, P: fmpq_mat, R: fmpq_mat, by: Multipliers, path: Path | None = None) -> bool:
@@ -83,6 +89,7 @@ def sides(
         else:
             joint = [C + b[i, j] * Q for j, C in enumerate(joint)]
         wrong += 2 * lengths[i] * models.slack[i]
+    rest += cubic(models, b, by.weight) + of_units(models, b, by.weight)
     if not all(beta > 0 for beta in by.apart):
         inverse = diagonal([1 / g for g in shares])
         rest += diagonal(shares) + sum((C.transpose() * inverse * C for C in joint), fmpq_mat(k, k))
@@ -90,6 +97,28 @@ def sides(
         form = with_edge(form, models, P, b, path)
         rest = fmpq_mat([[0] * (k + 1), *([0, *row] for row in rest.tolist())])
     return -form, rest + diagonal([wrong] * rest.nrows())
+
+
+def cubic(models: Models, b: fmpq_mat, weight: Array) -> fmpq_mat:
+    """S_cubic: 2 sum_i (b_i.d) K_i[d] = 2 sum_l d_l N_l[d, d, d], where N is symmetric in all of its indices."""
+    k = b.ncols()
+    if not np.any(models.K):
+        return fmpq_mat(k, k)
+    row, by = in_binary64(b)
+    N = np.tensordot(row.T, unpacked(models.K, k), 1)
+    N = (N + N.transpose(1, 0, 2, 3) + N.transpose(1, 2, 0, 3) + N.transpose(1, 2, 3, 0)) / 4
+    wrong = np.full(k, up((gamma(len(row)) + EPS) * total(norm(row, 1) * models.twists, 0)))
+    return bound_of_pairs(np.eye(k), np.zeros(k), N.reshape(k, k * k, k), wrong, weight) * fmpq(2) ** by
+
+
+def of_units(models: Models, b: fmpq_mat, weight: Array) -> fmpq_mat:
+    """S_units: 2 sum_q (p_q.d) e_q, p_q = sum_i b_i sum_j B_ij L_jq."""
+    L, R = models.units.L, models.units.R
+    if not np.any(L):
+        return fmpq_mat(b.ncols(), b.ncols())
+    row, by = in_binary64(models.B.transpose() * b)
+    p, wrong = L.T @ row, (gamma(len(L)) + EPS) * total(np.abs(L) * norm(row, 1)[:, None], 0)
+    return bound_of_pairs(p, up(wrong), R, np.zeros(len(R)), weight) * fmpq(2) ** by
 
 
 def with_edge(form: fmpq_mat, models: Models, P: fmpq_mat, b: fmpq_mat, path: Path) -> fmpq_mat:

@@ -48,11 +48,12 @@ class Policy:
 
 @dataclass(frozen=True)
 class Multipliers:
-    """alpha, beta and g of the inequality `decrease`, n of each."""
+    """alpha, beta and g of the inequality `decrease`, n of each, and `weight`, (k, k), from which the others follow."""
 
     rest: tuple[fmpq, ...]
     apart: tuple[fmpq, ...]
     joint: tuple[fmpq, ...]
+    weight: Array
 
 
 @dataclass(frozen=True)
@@ -219,14 +220,14 @@ def _local(value: Value, n: int, claim: str) -> LocalBall | None:
     if claim == "practical":
         value.must(value.raw is None, "null under this claim")
         return None
-    J, multipliers = value.keys("J multipliers")
-    return LocalBall(J.array(n, n), _multipliers(multipliers, n))
+    J, multipliers, weight = value.keys("J multipliers weight")
+    return LocalBall(J.array(n, n), _multipliers(multipliers, weight, n, n))
 
 
 def _slab(value: Value, n: int, claim: str) -> Slab:
-    middle, end, duration, J, multipliers, path = value.keys("middle end duration J multipliers path")
+    middle, end, duration, J, multipliers, weight, path = value.keys("middle end duration J multipliers weight path")
     nodes = middle.array(n, n), end.array(n, n)
-    by = _multipliers(multipliers, n)
+    by = _multipliers(multipliers, weight, n, n + (claim == "reached"))
     return Slab(*nodes, duration.binary64(), J.array(n, n), by, _path(path, n, claim))
 
 
@@ -238,10 +239,10 @@ def _path(value: Value, n: int, claim: str) -> Path | None:
     return Path(centre.array(n), *(number.binary64() for number in numbers))
 
 
-def _multipliers(value: Value, n: int) -> Multipliers:
+def _multipliers(value: Value, weight: Value, n: int, k: int) -> Multipliers:
     rows = value.array(3, n)
     rest, apart, joint = (tuple(fmpq(*v.as_integer_ratio()) for v in row) for row in rows.tolist())
-    return Multipliers(rest, apart, joint)
+    return Multipliers(rest, apart, joint, weight.array(k, k))
 
 
 def _clip(value: Value, m: int) -> tuple[Array, Array] | None:

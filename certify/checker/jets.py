@@ -1,25 +1,31 @@
-"""Second-order models on the unit ball: what the local rule evaluates the plant and the policy in.
+"""Third-order models on the unit ball: what the local rule evaluates the plant and the policy in.
 
-A jet of v over d in R^n says, for *all* ||d|| <= 1: `v(d) = v(0) + a.d + d'Q d + r(d)` with |r(d)| <= d'E d. It
-holds on every smaller ball too. v(0) lies within `error` of c, and the true gradient within `slack` of a in the 2-norm;
-Q is the matrix that is stored, and whatever it leaves out lies in E. E dominates a sum of positive semidefinite
-matrices with weights >= 0, so it is one, and knows the directions in which v is far from its linearisation.
+A jet of v over d in R^k says, for *all* ||d|| <= 1: `v(d) = v(0) + a.d + d'Q d + K[d] + sum_j B_j e_j(d) + r(d)` with
+|r(d)| <= d'E d, K[d] being the sum of all K_hij d_h d_i d_j. It holds on every smaller ball too. The errors e_j are the
+same in all jets of one family, so that they cancel as they do in truth: |e_j(d)| <= d'U_j d. v(0) lies within `error`
+of c, and the true gradient within `slack` of a in the 2-norm; Q, K and B are the numbers that are stored, and whatever
+they leave out lies in E. E and U_j dominate sums of positive semidefinite matrices with weights >= 0, so each is one,
+and knows the directions in which v is far from what is known of it.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cache, cached_property
+from itertools import combinations_with_replacement, permutations
 from typing import Any
 
 import numpy as np
 
-from .elementary import elementary
-from .float64 import EPS, float_with_error, frobenius, norm, total, up
+from .elementary import Expansion, elementary
+from .float64 import EPS, Array, float_with_error, frobenius, gamma, norm, total, up
+
+_UNDERFLOW = 2.0**-1000  # more than a few products of two numbers lose where they underflow
 
 
 def widen(E: Any, extra: Any, relative: float = EPS) -> Any:
-    """E (..., n, n) enlarged by its own rounding errors, at most `relative` a term, and by `extra` ||d||^2.
+    """E (..., k, k) enlarged by its own rounding errors, at most `relative` a term, and by `extra` ||d||^2.
 
     E sums semidefinite matrices with weights >= 0. The Frobenius norm of each is at most its trace, so the 2-norm of
     all rounding errors is at most `relative` times the trace of the sum.
@@ -29,7 +35,7 @@ def widen(E: Any, extra: Any, relative: float = EPS) -> Any:
 
 
 def each(x: Any) -> Any:
-    """Numbers (...,) as factors of matrices (..., n, n)."""
+    """Numbers (...,) as factors of matrices (..., k, k)."""
     return np.asarray(x)[..., None, None]
 
 
@@ -37,38 +43,103 @@ def outer(a: Any, b: Any) -> Any:
     return a[..., :, None] * b[..., None, :]
 
 
+@cache
+def triples(k: int) -> tuple[Array, Array, Array, Array]:
+    """h <= i <= j, in the order in which the entries of a symmetric tensor K are stored, and how often each stands in
+    the whole tensor."""
+    kept = list(combinations_with_replacement(range(k), 3))
+    often = [float(len(set(permutations(triple)))) for triple in kept]
+    h, i, j = np.array(kept).T
+    return h, i, j, np.array(often)
+
+
+def symmetric(a: Any, Q: Any) -> Any:
+    """The symmetric part of a_h Q_ij, Q symmetric; its Frobenius norm is at most ||a|| ||Q||_F."""
+    h, i, j, _ = triples(a.shape[-1])
+    return (a[..., h] * Q[..., i, j] + a[..., i] * Q[..., h, j] + a[..., j] * Q[..., h, i]) / 3
+
+
+def tensor_norm(K: Any, k: int) -> Any:
+    """An upper bound of ||K||_F of what is stored."""
+    return up(np.sqrt(total(triples(k)[-1] * (K * K), -1)))
+
+
+def unpacked(K: Array, k: int) -> Array:
+    """The whole tensors (..., k, k, k) of what is stored (..., k (k + 1) (k + 2) / 6)."""
+    place, (h, i, j, _) = np.zeros((k, k, k), dtype=np.intp), triples(k)
+    for p, q, r in permutations((h, i, j)):
+        place[p, q, r] = np.arange(len(h))
+    return K[..., place]
+
+
 @dataclass(frozen=True)
 class Jet:
-    """`c` +- `error`, gradient `a` (n,) +- `slack`, half the Hessian `Q` (n, n), remainder `E` (n, n); or a batch."""
+    """`c` +- `error`, gradient `a` (k,) +- `slack`, half the Hessian `Q` (k, k), a sixth of the third derivatives `K`
+    as `triples` has them, remainder `E` (k, k), and `B` (m,) of the errors within `U` (m, k, k); or a batch, of all but
+    U."""
 
     c: Any
     error: Any
     a: Any
     slack: Any
     Q: Any
+    K: Any
     E: Any
+    B: Any
+    U: Any
 
     @property
+    def members(self) -> list[Jet]:
+        """The jets of a batch."""
+        parts = zip(self.c, self.error, self.a, self.slack, self.Q, self.K, self.E, self.B, strict=True)
+        return [Jet(c, error, a, slack, Q, K, E, B, self.U) for c, error, a, slack, Q, K, E, B in parts]
+
+    @cached_property
     def size(self) -> Any:
         """Upper bound of |v(0)|."""
         return up(abs(self.c) + self.error)
 
-    @property
+    @cached_property
     def slope(self) -> Any:
         """Upper bound of the gradient's 2-norm."""
         return up(norm(self.a, -1) + self.slack)
 
-    @property
+    @cached_property
     def bend(self) -> Any:
-        """Upper bound of ||Q||_2."""
+        """Upper bound of ||Q||_F."""
         return frobenius(self.Q)
 
-    @property
+    @cached_property
+    def twist(self) -> Any:
+        """Upper bound of ||K||_F."""
+        return tensor_norm(self.K, self.a.shape[-1])
+
+    @cached_property
+    def shares(self) -> Any:
+        """Bound of sum_j B_j e_j as a matrix."""
+        return widen(np.tensordot(np.abs(self.B), self.U, 1), 0.0, gamma(len(self.U)) + EPS)
+
+    @cached_property
+    def whole(self) -> Any:
+        """Bound of sum_j B_j e_j + r as a matrix."""
+        return widen(self.E + self.shares, 0.0)
+
+    @cached_property
+    def spread(self) -> Any:
+        """Upper bound of what Q, K and B come to together."""
+        return up(self.bend + self.twist + frobenius(self.shares))
+
+    @cached_property
+    def faint(self) -> Any:
+        """Upper bound of what products of B lose to underflow."""
+        return up(_UNDERFLOW * total(frobenius(self.U), -1))
+
+    @cached_property
     def curve(self) -> Any:
         """Upper bound of |v(d) - v(0) - a.d| / ||d||^2, a being the true gradient."""
-        return up(self.bend + frobenius(self.E))
+        return up(self.bend + self.twist + frobenius(self.whole))
 
-    @property
+    @cached_property
     def radius(self) -> Any:
         """Upper bound of |v(d) - v(0)| / ||d|| on the unit ball."""
         return up(self.slope + self.curve)
@@ -78,10 +149,11 @@ class Jet:
         c = x.c + y.c
         error = up(x.error + y.error + EPS * abs(c))
         slack = up(x.slack + y.slack + EPS * (x.slope + y.slope))
-        return Jet(c, error, x.a + y.a, slack, x.Q + y.Q, widen(x.E + y.E, EPS * (x.bend + y.bend)))
+        E = widen(x.E + y.E, EPS * (x.spread + y.spread))
+        return Jet(c, error, x.a + y.a, slack, x.Q + y.Q, x.K + y.K, E, x.B + y.B, x.U)
 
     def __neg__(self) -> Jet:
-        return Jet(-self.c, self.error, -self.a, self.slack, -self.Q, self.E)
+        return Jet(-self.c, self.error, -self.a, self.slack, -self.Q, -self.K, self.E, -self.B, self.U)
 
     def __mul__(self, other: Jet) -> Jet:
         x, y = self, other
@@ -91,40 +163,52 @@ class Jet:
         slack = up(slack + EPS * (x.size * y.slope + y.size * x.slope))
         ab = outer(x.a, y.a)
         Q = x.c * y.Q + y.c * x.Q + (ab + ab.T) / 2
-        # (x.a.d) s_y + (y.a.d) s_x + s_x s_y, s what each adds to its linearisation: |s| <= d'(bend I + E)d
-        third = x.radius * y.bend + y.slope * x.bend
-        wrong = x.error * y.bend + y.error * x.bend + x.slack * y.slope + y.slack * x.slope
-        wrong = wrong + EPS * (x.size * y.bend + y.size * x.bend + x.slope * y.slope)
-        E = widen((x.size + x.radius) * y.E + (y.size + y.slope) * x.E, third + wrong)
-        return Jet(c, error, x.c * y.a + y.c * x.a, slack, Q, E)
+        K = x.c * y.K + y.c * x.K + symmetric(x.a, y.Q) + symmetric(y.a, x.Q)
+        # all products of what v and w have beyond v(0) and w(0), but those that are in Q and K
+        known = x.slope * y.twist + y.slope * x.twist + up(x.bend + x.twist) * up(y.bend + y.twist)
+        E = each(x.size) * y.E + each(y.size) * x.E
+        E = E + each(x.radius) * y.whole + each(up(y.slope + y.bend + y.twist)) * x.whole
+        sx, sy = up(x.slope + x.bend), up(y.slope + y.bend)
+        wrong = x.error * y.spread + y.error * x.spread + x.slack * sy + y.slack * sx
+        wrong = wrong + EPS * (x.size * y.spread + y.size * x.spread + x.slope * sy + y.slope * sx) + x.faint
+        return Jet(c, error, x.c * y.a + y.c * x.a, slack, Q, K, widen(E, known + wrong), x.c * y.B + y.c * x.B, x.U)
 
-    def beyond_tangent(self, half: Any, half_error: Any, third: Any) -> tuple[Any, Any]:
-        """(H, R): phi(v) less its tangent at v(0) is d'H d within d'R d.
+    def beyond_tangent(self, phi: Expansion) -> tuple[Any, Any, Any]:
+        """(H, C, R): phi(v) less its tangent at v(0) is d'H d + C[d] within d'R d.
 
-        half is phi''/2 at v(0), within half_error, and third as in elementary.py. With delta = v - v(0) what is left is
-        half delta^2 within third |delta|^3, where |delta| <= radius and, a being the true gradient, |delta^2 -
-        (a.d)^2| <= (2 slope + curve) d'(bend I + E)d.
+        With half = phi''/2 and sixth = phi'''/6 it is half D^2 + sixth D^3 within fourth D^4, D = v - v(0) = a.d + z,
+        |D| <= radius ||d||, |z| <= d'W d <= curve ||d||^2, W = (bend + twist) I + whole, a being the true gradient.
+        R covers the roundings of a sum of H or C and something else, too, as far as they are H's or C's.
         """
-        cubic = up(third * self.radius)
-        square = up(np.abs(half) + half_error + cubic)
-        spread = up(square * (2 * self.slope + self.curve))
-        aa = outer(self.a, self.a)
-        wrong = up(half_error + EPS * np.abs(half)) * self.slope * self.slope + 2 * up(square * self.slope) * self.slack
-        R = widen(each(spread) * self.E + each(cubic) * aa, spread * self.bend + wrong)
-        return each(half) * aa, R
+        (_, _, half, sixth), (_, _, half_error, sixth_error) = phi.f, phi.e
+        a, s = self.a, self.slope
+        h, g = up(np.abs(half) + half_error), up(np.abs(sixth) + sixth_error)
+        quartic, ss = up(phi.fourth * up(self.radius * self.radius)), up(s * s)
+        straight = up(2 * h * s)  # 2 half (a.d) (z - d'Q d)
+        cubes = up(3 * ss + 3 * up(s * self.curve) + up(self.curve * self.curve))
+        square = up(h * self.curve + g * cubes + quartic * up(2 * s + self.curve))
+        aa, aQ = outer(a, a), symmetric(a, self.Q)
+        H, C = each(half) * aa, np.asarray(2 * half)[..., None] * aQ + np.asarray(sixth)[..., None] * symmetric(a, aa)
+        plain = straight * self.twist + square * up(self.bend + self.twist)
+        wrong = up(half_error + EPS * h) * up(ss + 2 * up(s * self.bend)) + up(sixth_error + EPS * g) * up(s * ss)
+        moved = up(2 * up(up(h + quartic) * s) + 2 * up(h * self.bend) + 3 * up(g * ss)) * self.slack
+        return H, C, widen(each(up(straight + square)) * self.whole + each(quartic) * aa, plain + wrong + moved)
 
     def function(self, name: str) -> Jet:
         """phi(v) for a function phi that elementary.py knows."""
-        (f0, f1, f2), (e0, e1, e2), third = elementary(name, self.c, self.error, self.radius)
-        H, R = self.beyond_tangent(f2, e2, third)
-        steepest = up(np.abs(f1) + e1)
-        slack = e1 * self.slope + steepest * self.slack + EPS * (steepest * self.slope)
-        wrong = e1 * self.bend + EPS * (steepest * self.bend + frobenius(H))
-        a, Q, E = np.asarray(f1)[..., None] * self.a, each(f1) * self.Q + H, each(steepest) * self.E + R
-        return Jet(f0, e0, a, up(slack), Q, widen(E, wrong))
+        phi = elementary(name, self.c, self.error, self.radius)
+        (f0, f1, _, _), (e0, e1, _, _) = phi.f, phi.e
+        H, C, R = self.beyond_tangent(phi)
+        steepest, column = up(np.abs(f1) + e1), np.asarray(f1)[..., None]
+        slack = up(e1 * self.slope + steepest * self.slack + EPS * (steepest * self.slope))
+        wrong = up(e1 + EPS * steepest) * self.spread + self.faint
+        Q, K, E = each(f1) * self.Q + H, column * self.K + C, widen(each(steepest) * self.E + R, wrong)
+        return Jet(f0, e0, column * self.a, slack, Q, K, E, column * self.B, self.U)
 
 
-def constant(q: Fraction, n: int) -> Jet:
-    """A rational over R^n."""
+def constant(q: Fraction, U: Array) -> Jet:
+    """A rational among the jets with these errors."""
     value, error = float_with_error(q)
-    return Jet(np.float64(value), error, np.zeros(n), 0.0, np.zeros((n, n)), np.zeros((n, n)))
+    m, k, _ = U.shape
+    nothing, thirds = np.zeros((k, k)), np.zeros(len(triples(k)[0]))
+    return Jet(np.float64(value), error, np.zeros(k), 0.0, nothing, thirds, nothing, np.zeros(m), U)

@@ -26,7 +26,7 @@ class Local(Ball):
         """The decay, and what has to stay below it."""
         P = exactly(self.case.c.P)
         nothing = fmpq_mat(P.nrows(), P.nrows())
-        return sides(Models(self.J, self.F), P, nothing, self.case.local.multipliers)
+        return sides(Models(self.J, self.F, self.units), P, nothing, self.case.local.multipliers)
 
     @cached_property
     def margin(self) -> float:
@@ -50,7 +50,7 @@ def fits(local: Local) -> Failures:
 
 def decreases(local: Local) -> Failures:
     """`local`: Vdot < 0 on the ball without its centre."""
-    if not are_finite(local.F):
+    if not are_finite(local.F, local.units):
         yield "levels.local", "F has no finite model on the local ball"
     decay, rest = local.sides
     if not is_definite(decay - rest):

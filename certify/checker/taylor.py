@@ -82,11 +82,12 @@ class Taylor:
         """
         G, q = self.linear, up(self.quadratic + self.r)
         rho = up(G + q)
-        (f0, f1, f2), (e0, e1, e2), third = elementary(name, self.c, 0.0, rho)
+        phi = elementary(name, self.c, 0.0, rho)
+        (f0, f1, f2, _), (e0, e1, e2, _) = phi.f, phi.e
         r = (
             np.abs(f1) * self.r
             + np.abs(f2) * up(2 * G * q + q * q)
-            + third * rho * rho * rho
+            + phi.third * rho * rho * rho
             + e0
             + e1 * rho
             + e2 * rho * rho

@@ -131,9 +131,9 @@ def fits(piece: Piece) -> Failures:
 
 def decreases(piece: Piece) -> Failures:
     """`tube`: x'P(t)x decreases on the ball without its centre; along a path e'P(t)e where it is 1."""
-    if not are_finite(piece.F):
+    if not are_finite(piece.F, piece.units):
         yield piece.at, "F has no finite model"
-    models = Models(piece.J, piece.F, piece.velocity)
+    models = Models(piece.J, piece.F, piece.units, piece.velocity)
     for P, rate in zip(piece.coefficients, piece.rates, strict=True):
         if not shows(models, P, rate, piece.slab.multipliers, piece.slab.path):
             yield piece.at, "the decrease of x'P(t)x is not shown"

@@ -72,6 +72,9 @@ def find_path(
                 slab = None
             if slab is None or slab.path is None or begin - np.linalg.slogdet(slab.end)[1] > 2 * _GROWN:
                 return None, f"the tube cannot be continued after {spent:.3g} units of time"
+            around = [(Q, x) for Q in (P, slab.middle, slab.end) for x in (c, slab.path.centre)]
+            if not all(_is_in_domain(loop, Q, x) for Q, x in around):
+                return None, f"the tube leaves the domain after {spent:.3g} units of time"
             slabs.append(slab)
             spent += slab.duration
             rate = 2 * (slab.end - slab.middle) / slab.duration

@@ -47,11 +47,13 @@ def in_words(c: Certificate) -> str:
     )
     if c.start is None:
         return stays
+    around = "x'P_0 x" if c.centre is None else "(x - c_0)'P_0 (x - c_0)"
+    centre = "" if c.centre is None else f"; c_0 = {centre_numbers(c)}"
     return (
-        f"{stays}; and every trajectory that starts in x'P_0 x <= 1 reaches V <= {c.outer!r} after the sum of the "
+        f"{stays}; and every trajectory that starts in {around} <= 1 reaches V <= {c.outer!r} after the sum of the "
         f"durations ({time_of_tube(c)}) at the latest, stays in the domain on the way, and converges to the origin, "
         f"with {bounds}; "
-        f"P_0 = {start_rows(c)}"
+        f"P_0 = {start_rows(c)}{centre}"
     )
 
 
@@ -60,6 +62,11 @@ def start_rows(c: Certificate) -> list[list[float]] | None:
     if c.start is None:  # a matrix of zeros is false
         return None
     return [[int(v.p) / int(v.q) for v in row] for row in c.start.tolist()]
+
+
+def centre_numbers(c: Certificate) -> list[float] | None:
+    """c_0, exactly as well."""
+    return None if c.centre is None else [int(v.p) / int(v.q) for v in c.centre.entries()]
 
 
 def time_of_tube(c: Certificate) -> float | None:
@@ -101,6 +108,7 @@ def as_json(verdict: Verdict, seconds: float) -> dict[str, Any]:
         "policy_sha256": c and c.policy.sha256,
         "levels": c and {key: value for key, _, value in level_names(c)},
         "start": c and start_rows(c),
+        "centre": c and centre_numbers(c),
         "time": c and time_of_tube(c),
         "leaves": verdict.leaves,
         "seconds": {"check": seconds},

@@ -12,7 +12,7 @@ from functools import cache
 
 from flint import arb, arb_mat
 
-from .document import Certificate, Policy
+from .document import Certificate, Layer, Policy
 from .fields import exact
 
 PRECISION = 128  # bits; single operations of flint cost about the same with 64
@@ -123,6 +123,23 @@ def third(name: str, at: arb, y: arb, reach: arb) -> arb | None:
 
 def weights(policy: Policy) -> list[arb_mat]:
     return [arb_mat(layer.rows, layer.columns, [arb(w) for w in layer.weight]) for layer in policy.layers]
+
+
+def biased(W: arb_mat, layer: Layer, h: arb_mat) -> arb_mat:
+    """W h + b, h a column."""
+    return W * h + arb_mat(layer.rows, 1, [arb(b) for b in layer.bias])
+
+
+def tanhs(column: arb_mat) -> arb_mat:
+    return arb_mat(column.nrows(), 1, [v.tanh() for v in column.entries()])
+
+
+def net_at_0(c: Certificate, matrices: Sequence[arb_mat]) -> list[arb]:
+    """net(0), given the weights."""
+    h = arb_mat(c.n, 1)
+    for k, (W, layer) in enumerate(zip(matrices, c.policy.layers, strict=True)):
+        h = biased(W, layer, tanhs(h) if k else h)
+    return list(h.entries())
 
 
 def beta(c: Certificate) -> list[arb]:

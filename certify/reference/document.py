@@ -15,15 +15,15 @@ from typing import Any
 
 from flint import fmpq, fmpq_mat
 
-from .evidence import Tree, Trusted, read_evidence
+from .evidence import WITH_TUBE, Tree, Trusted, read_evidence
 from .expressions import Equations, equations, rational
-from .fields import binary64, entries, exact, keys, little_endian, numbers, square
+from .fields import binary64, column, entries, exact, keys, little_endian, numbers, square
 from .refusal import Refused, require
 
 MAX_BYTES, MAX_BYTES_BEYOND_ASCII = 256 * 2**20, 16 * 2**20
 MAX_TOKENS = 10**6  # commas and opening brackets
 MAX_NAMES, MAX_LAYERS, MAX_WIDTH = 64, 64, 2**14
-SCHEMA, CLAIMS = "certify-certificate/4", ("asymptotic", "practical", "enlarged")
+SCHEMA, CLAIMS = "certify-certificate/5", ("asymptotic", "practical", *WITH_TUBE)
 IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,63}")
 
 Interval = tuple[fmpq, fmpq]
@@ -72,11 +72,12 @@ class Policy:
 class Certificate:
     """`inner` and `outer`, between which the leaves show Vdot < 0, are c1 (`practical`: c0) and c2.
 
-    `start` is P_0 of an enlarged claim.
+    `start` is P_0 of a claim with a tube, `centre` the column c_0 around which it lies where the tube follows a path.
     """
 
     claim: str
     start: fmpq_mat | None
+    centre: fmpq_mat | None
     plant: Plant
     policy: Policy
     P: fmpq_mat
@@ -108,11 +109,13 @@ def read(raw: bytes) -> Certificate:
     named = isinstance(said, dict) and said.get("kind") in CLAIMS
     require(named, "format", "claim.kind", f"one of {', '.join(CLAIMS)} was expected")
     claim = str(said["kind"])
-    said = keys(said, "claim", "kind", *(["start"] if claim == "enlarged" else []))
+    more = {"enlarged": ("start",), "reached": ("start", "centre")}.get(claim, ())
+    said = keys(said, "claim", "kind", *more)
     inner_name = "floor" if claim == "practical" else "local"
     plant = read_plant(data["plant"])
     n = len(plant.states)
-    start = square(said["start"], "claim.start", n) if claim == "enlarged" else None
+    start = square(said["start"], "claim.start", n) if "start" in said else None
+    centre = column(said["centre"], "claim.centre", n) if "centre" in said else None
     policy = read_policy(data["policy"], n, len(plant.inputs))
     lyapunov = keys(data["lyapunov"], "lyapunov", "kind", "P")
     require(lyapunov["kind"] == "quadratic", "format", "lyapunov.kind", "'quadratic' was expected")
@@ -120,7 +123,7 @@ def read(raw: bytes) -> Certificate:
     levels = keys(data["levels"], "levels", inner_name, "roa")
     inner, outer = binary64(levels[inner_name], f"levels.{inner_name}"), binary64(levels["roa"], "levels.roa")
     evidence = read_evidence(data["evidence"], n, claim)
-    return Certificate(claim, start, plant, policy, P, inner, outer, evidence)
+    return Certificate(claim, start, centre, plant, policy, P, inner, outer, evidence)
 
 
 def parsed(raw: bytes) -> Any:

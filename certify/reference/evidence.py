@@ -8,21 +8,25 @@ from __future__ import annotations
 
 import re
 from array import array
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from flint import fmpq_mat
 
-from .fields import binary64, decoded, entries, keys, numbers, square
+from .fields import binary64, column, decoded, entries, keys, numbers, square
 from .refusal import require
 
 MAX_SLABS = 10**4
+WITH_TUBE = ("enlarged", "reached")  # claims about a set of starts that is no level set of V
 WORD = re.compile(r"[A-Za-z0-9_.+-]{1,80}")
 
 
 @dataclass(frozen=True)
 class Ball:
-    """All x = J d with ||d|| <= 1, and the rows of multipliers with which `decrease` is decided on it."""
+    """All x = J d with ||d|| <= 1, and the rows of multipliers with which `decrease` is decided on it.
+
+    In a slab with a path g has one more number than the others, for the motion.
+    """
 
     J: fmpq_mat
     alpha: array[float]
@@ -31,18 +35,32 @@ class Ball:
 
 
 @dataclass(frozen=True)
+class Path:
+    """The ellipsoids of a slab move in a straight line, and their last one lies around `centre`, a column.
+
+    Of the ball that has to hold them the motion takes `share`; `edge` and `motion` are multipliers.
+    """
+
+    centre: fmpq_mat
+    share: float
+    edge: float
+    motion: float
+
+
+@dataclass(frozen=True)
 class Slab:
-    """From one node of a tube by `middle` to the next, `end`, in the time `duration`."""
+    """From one node of a tube by `middle` to the next, `end`, in the time `duration`; without a path around 0."""
 
     middle: fmpq_mat
     end: fmpq_mat
     duration: float
     ball: Ball
+    path: Path | None
 
 
 @dataclass(frozen=True)
 class Tree:
-    """Evidence that can be replayed. `ball` belongs to claims about the origin, `tube` to an enlarged one."""
+    """Evidence that can be replayed. `ball` belongs to claims about the origin, `tube` to those that have a start."""
 
     T: fmpq_mat
     root: array[float]
@@ -61,7 +79,7 @@ class Trusted:
 
 def read_evidence(value: Any, n: int, claim: str) -> Tree | Trusted:
     if isinstance(value, dict) and value.get("kind") == "trusted-solver":
-        require(claim != "enlarged", "format", "evidence.kind", "an enlarged claim must be replayed")
+        require(claim not in WITH_TUBE, "format", "evidence.kind", f"claim '{claim}' must be replayed")
         return read_trusted(value)
     evidence = keys(value, "evidence", "kind", "T", "root", "tree", "local", "tube")
     require(evidence["kind"] == "partition-tree", "format", "evidence.kind", "an unknown kind")
@@ -73,10 +91,12 @@ def read_evidence(value: Any, n: int, claim: str) -> Tree | Trusted:
     else:
         ball = read_ball(keys(evidence["local"], "evidence.local", "J", "multipliers"), "evidence.local", n)
     tube = entries(evidence["tube"], "evidence.tube")
-    least, most = (1, MAX_SLABS) if claim == "enlarged" else (0, 0)
+    least, most = (1, MAX_SLABS) if claim in WITH_TUBE else (0, 0)
     fits = least <= len(tube) <= most
     require(fits, "format", "evidence.tube", f"{least} to {most} slabs are allowed with claim '{claim}'")
-    return Tree(T, root, tree, ball, tuple(read_slab(v, f"evidence.tube.{k}", n) for k, v in enumerate(tube)))
+    moves = claim == "reached"
+    slabs = tuple(read_slab(v, f"evidence.tube.{k}", n, moves) for k, v in enumerate(tube))
+    return Tree(T, root, tree, ball, slabs)
 
 
 def read_ball(value: dict[str, Any], at: str, n: int) -> Ball:
@@ -84,11 +104,24 @@ def read_ball(value: dict[str, Any], at: str, n: int) -> Ball:
     return Ball(square(value["J"], f"{at}.J", n), rows[:n], rows[n : 2 * n], rows[2 * n :])
 
 
-def read_slab(value: Any, at: str, n: int) -> Slab:
-    slab = keys(value, at, "middle", "end", "duration", "J", "multipliers")
+def read_slab(value: Any, at: str, n: int, moves: bool) -> Slab:
+    slab = keys(value, at, "middle", "end", "duration", "J", "multipliers", "path")
     duration = binary64(slab["duration"], f"{at}.duration")
     middle, end = (square(slab[key], f"{at}.{key}", n) for key in ("middle", "end"))
-    return Slab(middle, end, duration, read_ball(slab, at, n))
+    ball, path = read_ball(slab, at, n), None
+    if moves:
+        path, joint = read_path(slab["path"], f"{at}.path", n)
+        ball = replace(ball, g=ball.g + array("d", [joint]))
+    else:
+        require(slab["path"] is None, "format", f"{at}.path", "null was expected: the claim has no path")
+    return Slab(middle, end, duration, ball, path)
+
+
+def read_path(value: Any, at: str, n: int) -> tuple[Path, float]:
+    """The path, and `joint`, the last number of the slab's g."""
+    path = keys(value, at, "centre", "share", "edge", "motion", "joint")
+    share, edge, motion, joint = (binary64(path[key], f"{at}.{key}") for key in ("share", "edge", "motion", "joint"))
+    return Path(column(path["centre"], f"{at}.centre", n), share, edge, motion), joint
 
 
 def read_trusted(value: dict[str, Any]) -> Trusted:

@@ -62,6 +62,11 @@ def square(text: Any, at: str, n: int) -> fmpq_mat:
     return fmpq_mat(n, n, [exact(v) for v in numbers(text, at, n * n)])
 
 
+def column(text: Any, at: str, n: int) -> fmpq_mat:
+    """An array (n,), exactly, as a matrix of one column."""
+    return fmpq_mat(n, 1, [exact(v) for v in numbers(text, at, n)])
+
+
 def little_endian(values: array[float]) -> bytes:
     if sys.byteorder == "big":
         values = values[:]

@@ -19,6 +19,7 @@ from .balls import (
     beta,
     bounded_by_form,
     columns_scaled,
+    net_at_0,
     total,
     weights,
     within_bounds,
@@ -107,16 +108,8 @@ class Leaves:
         self.inner, self.outer = arb(c.inner), arb(c.outer)
         self.weights = weights(c.policy)
         self.absolute = [absolute(W) for W in self.weights]
-        self.net_at_0 = self.at_0()
+        self.net_at_0 = net_at_0(c, self.weights)
         self.beta = beta(c) if c.policy.centre == "preactivation" else []
-
-    def at_0(self) -> list[arb]:
-        """net(0)."""
-        h = arb_mat(self.n, 1)
-        for k, (W, layer) in enumerate(zip(self.weights, self.c.policy.layers, strict=True)):
-            h = arb_mat(h.nrows(), 1, [v.tanh() for v in h.entries()]) if k else h
-            h = W * h + arb_mat(layer.rows, 1, [arb(b) for b in layer.bias])
-        return list(h.entries())
 
     # ------------------------------------------------------------------------------------------------- which leaves
 

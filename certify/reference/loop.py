@@ -1,6 +1,7 @@
-"""The closed loop on a ball x = J d, ||d|| <= 1: what the rules `local` and `tube` ask before anything decreases.
+"""The closed loop on a ball x = centre + J d, ||d|| <= 1: what is asked before anything decreases.
 
-The inputs within their bounds, no clip that acts, and a finite model of every component of F.
+By the rules `local` and `tube`: the inputs within their bounds, no clip that acts, and a finite model of every
+component of F.
 """
 
 from __future__ import annotations
@@ -20,21 +21,25 @@ class Loop:
     def __init__(self, c: Certificate) -> None:
         self.c, self.network, self.bounded = c, Network(c), bounded_by_form(c)
 
-    def on(self, J: fmpq_mat, rule: str, at: str) -> list[Model]:
-        """Models of F, or a refusal under `inputs` or under the rule that asks, at the place it names."""
-        c, n = self.c, self.c.n
-        u = self.network.on(J)
+    def on(self, J: fmpq_mat, rule: str, at: str, centre: fmpq_mat | None = None) -> list[Model]:
+        """Models of F, or a refusal under `inputs` or under the rule that asks, at the place it names.
+
+        Without a centre it is the origin, where pi(0) = u_eq exactly. J has a row for each state.
+        """
+        c, size = self.c, J.ncols()
+        u = self.network.on(J, centre)
         bounded = self.bounded or within_bounds(c, [(v.v, v.radius) for v in u])
         require(bounded, "inputs", at, "an input is not certain to stay in its bounds")
         for j, v in enumerate(u):
             limits = c.policy.limits(j)
             alone = limits is None or bool(v.v - v.radius > arb(limits[0]) and v.v + v.radius < arb(limits[1]))
             require(alone, rule, at, f"{c.plant.inputs[j]} is not certain to be left alone by the clip")
-        states = [Model.affine(ZERO, row) for row in arb_mat(J).tolist()]
+        middle = [ZERO] * c.n if centre is None else list(arb_mat(centre).entries())
+        states = [Model.affine(v, row) for v, row in zip(middle, arb_mat(J).tolist(), strict=True)]
         names = dict(zip(c.plant.states + c.plant.inputs, [*states, *u], strict=True))
 
         def constant(q: fmpq) -> Model:
-            return Model.affine(arb(q), [ZERO] * n)
+            return Model.affine(arb(q), [ZERO] * size)
 
         try:
             F = c.plant.dynamics.evaluate(names, constant)

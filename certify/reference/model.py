@@ -1,4 +1,4 @@
-"""Models of a number on a ball, with a remainder that vanishes at the origin as the square of d.
+"""Models of a number on a ball, with a remainder that vanishes at the centre as the square of d.
 
 Vdot vanishes at the origin, so that no remainder with a constant can show that it is negative next to it: here all that
 is not known is a quadratic form, and forms can be compared with forms.

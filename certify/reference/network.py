@@ -1,8 +1,9 @@
-"""The policy on a ball x = J d, ||d|| <= 1, as models of the inputs before their clip.
+"""The policy on a ball x = centre + J d, ||d|| <= 1, as models of the inputs before their clip.
 
-A layer is y(d) = y(0) + G J d + L A(d): A stacks what every tanh of the layers before adds to its tangent at y(0). None
-of y(0), G and L depends on the ball, and L is most of the work; so they are found once, for all balls of a
-certificate.
+A layer is y(d) = y(0) + G J d + L A(d): A stacks what every tanh of the layers before adds to its tangent at y(0). Of
+these y(0), G and L depend on the ball's centre alone, and L is most of the work; so they are found once for all balls
+around the origin. There the policy is u_eq, by its form or because rule `centring` has shown it; at any other centre it
+is a number like others.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from dataclasses import dataclass
 
 from flint import arb, arb_mat, fmpq_mat
 
-from .balls import ONE, ZERO, absolute, beta, columns_scaled, weights
+from .balls import ONE, ZERO, absolute, beta, biased, columns_scaled, net_at_0, tanhs, weights
 from .document import Certificate
 from .model import Model
 from .taylor import pairs
@@ -20,7 +21,7 @@ from .taylor import pairs
 
 @dataclass(frozen=True)
 class Unfolded:
-    """A layer at the origin: its values, its gradient in x, and L with the magnitudes of its entries.
+    """A layer at a centre: its values, its gradient in x, and L with the magnitudes of its entries.
 
     L has a column for each tanh of all layers before, and the first layer has no L.
     """
@@ -45,40 +46,61 @@ class Network:
     """The policy of a certificate whose origin is an equilibrium: pi(0) = u_eq exactly."""
 
     def __init__(self, c: Certificate) -> None:
-        self.c, self.layers = c, list[Unfolded]()
-        at_0, G, L = arb_mat(c.n, 1), arb_mat(c.n, c.n), arb_mat(0, 0)
-        for k, (W, layer) in enumerate(zip(weights(c.policy), c.policy.layers, strict=True)):
+        self.c, self.weights = c, weights(c.policy)
+        self.net_at_0 = net_at_0(c, self.weights)
+        self.beta = beta(c) if c.policy.centre == "preactivation" else []
+        self.at_origin = self.unfolded(arb_mat(c.n, 1))
+
+    def unfolded(self, centre: arb_mat) -> list[Unfolded]:
+        """The layers at a centre, a column."""
+        layers, at_0, G, L = list[Unfolded](), centre, arb_mat(self.c.n, self.c.n), arb_mat(0, 0)
+        for k, (W, layer) in enumerate(zip(self.weights, self.c.policy.layers, strict=True)):
             if k:
-                t = [v.tanh() for v in at_0.entries()]
-                weighted = columns_scaled(W, [1 - v * v for v in t])
-                at_0, G, L = arb_mat(len(t), 1, t), weighted * G, beside(weighted * L, W) if k > 1 else W
+                at_0 = tanhs(at_0)
+                weighted = columns_scaled(W, [1 - t * t for t in at_0.entries()])
+                G, L = weighted * G, beside(weighted * L, W) if k > 1 else W
             else:
                 G = W
-            at_0 = W * at_0 + arb_mat(layer.rows, 1, [arb(b) for b in layer.bias])
+            at_0 = biased(W, layer, at_0)
             blocks = (L, absolute(L)) if k else (None, None)
-            self.layers.append(Unfolded(list(at_0.entries()), G, *blocks))
+            layers.append(Unfolded(list(at_0.entries()), G, *blocks))
+        return layers
 
-    def on(self, J: fmpq_mat) -> list[Model]:
-        """The inputs before their clip."""
-        c, ball, n = self.c, arb_mat(J), self.c.n
+    def on(self, J: fmpq_mat, centre: fmpq_mat | None = None) -> list[Model]:
+        """The inputs before their clip; J may have more columns than rows, and without a centre it is the origin."""
+        ball, size = arb_mat(J), J.ncols()
+        layers = self.at_origin if centre is None else self.unfolded(arb_mat(centre))
         H, R = list[list[arb]](), list[list[arb]]()
-        for layer in self.layers[:-1]:
+        for layer in layers[:-1]:
             for y in layer.on(ball, H, R):
                 bent, rest = y.beyond_tanh(y.v.tanh())
                 H.append(half(bent))
                 R.append(half(rest))
-        last = self.layers[-1].on(ball, H, R)
-        if c.policy.centre == "preactivation":
-            last = [Model(v, y.a, y.Q, y.E) for v, y in zip(beta(c), last, strict=True)]
         result = []
-        for q, s, y in zip(c.plant.u_eq, map(arb, c.policy.scale), last, strict=True):
-            slope, (bent, rest) = ONE, (arb_mat(n, n), arb_mat(n, n))
-            if c.policy.squash == "tanh":
-                t = y.v.tanh()
-                slope, (bent, rest) = 1 - t * t, y.beyond_tanh(t)
+        for j, (s, y) in enumerate(zip(map(arb, self.c.policy.scale), layers[-1].on(ball, H, R), strict=True)):
+            value, slope, (bent, rest) = self.before_squash(j, y.v, centre), ONE, (arb_mat(size, size),) * 2
+            if self.c.policy.squash == "tanh":
+                value = value.tanh()
+                slope, (bent, rest) = 1 - value * value, y.beyond_tanh(value)
             Q, E = slope * y.Q + bent, slope * y.E + rest
-            result.append(Model(arb(q), s * slope * y.a, s * Q, abs(s) * E))
+            result.append(Model(self.input_at(j, value, centre), s * slope * y.a, s * Q, abs(s) * E))
         return result
+
+    def before_squash(self, j: int, net: arb, centre: fmpq_mat | None) -> arb:
+        """What is squashed at the centre, where the network is `net`: with `preactivation` at the origin beta alone."""
+        if self.c.policy.centre != "preactivation":
+            return net
+        return self.beta[j] if centre is None else net - self.net_at_0[j] + self.beta[j]
+
+    def input_at(self, j: int, squashed: arb, centre: fmpq_mat | None) -> arb:
+        """Input j at the centre, before its clip."""
+        policy, u_eq = self.c.policy, arb(self.c.plant.u_eq[j])
+        if centre is None:
+            return u_eq
+        scale, at_0 = arb(policy.scale[j]), self.net_at_0[j]
+        if policy.centre != "output":
+            return scale * squashed + arb(policy.offset[j])
+        return scale * (squashed - (at_0.tanh() if policy.squash == "tanh" else at_0)) + u_eq
 
 
 def beside(A: arb_mat, B: arb_mat) -> arb_mat:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from array import array
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from flint import fmpq, fmpq_mat
@@ -41,6 +42,15 @@ def identity(n: int) -> fmpq_mat:
     return fmpq_mat(n, n, [int(i == j) for i in range(n) for j in range(n)])
 
 
+def root_above(value: fmpq) -> fmpq:
+    """A rational at or above the root of what is not negative, and at most 2^-63 of itself above it."""
+    numerator, denominator = int(value.p), int(value.q)
+    shift = max(0, 64 - (numerator * denominator).bit_length() // 2)
+    square = numerator * denominator << 2 * shift
+    above = math.isqrt(square)
+    return fmpq(above + (above * above < square), denominator << shift)
+
+
 def minor(A: fmpq_mat, kept: range | list[int]) -> fmpq:
     """The determinant of the kept rows and columns; that of none is 1."""
     return fmpq_mat(len(kept), len(kept), [A[i, j] for i in kept for j in kept]).det() if kept else fmpq(1)
@@ -54,10 +64,14 @@ def domain(c: Certificate, inverse: list[fmpq]) -> None:
     require(left is None, "domain", left or "", "the ellipsoid {V <= c2} leaves the interior of the domain")
 
 
-def beyond_domain(c: Certificate, largest: list[fmpq]) -> str | None:
-    """The first state that is not within its bounds where no x_i^2 exceeds `largest`; the domain holds 0 inside."""
-    each = zip(c.plant.domain, largest, c.plant.states, strict=True)
-    return next((name for (lo, hi), most, name in each if not most < min(-lo, hi) ** 2), None)
+def beyond_domain(c: Certificate, largest: Sequence[fmpq], centre: fmpq_mat | None = None) -> str | None:
+    """The first state that is not certain to lie inside its bounds where no (x_i - centre_i)^2 exceeds `largest`."""
+    middle = [ZERO] * c.n if centre is None else centre.entries()
+    for (lo, hi), most, x, name in zip(c.plant.domain, largest, middle, c.plant.states, strict=True):
+        room = min(x - lo, hi - x)
+        if not (room > 0 and most < room**2):
+            return name
+    return None
 
 
 def coordinates(c: Certificate, tree: Tree) -> tuple[fmpq_mat, list[fmpq]]:

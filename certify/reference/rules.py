@@ -10,7 +10,7 @@ from flint import ctx
 from . import rational
 from .balls import PRECISION
 from .document import Certificate, read
-from .evidence import Trusted
+from .evidence import WITH_TUBE, Trusted
 from .leaves import Leaves, check_leaves, structure
 from .local import local
 from .loop import Loop
@@ -72,10 +72,10 @@ def check(c: Certificate) -> int | None:
     leaves = structure(evidence.tree, c.n)
     if c.inner < c.outer or loop is None:  # no local ball stands in for the leaves
         check_leaves(Leaves(c, evidence.T, S), evidence)
-    if c.claim == "enlarged":
+    if c.claim in WITH_TUBE:
         if loop is None or c.start is None:
             raise Refused("format", "claim.start", "the claim needs a start")
-        tube(loop, c.start, evidence.tube)
+        tube(loop, c.start, c.centre, evidence.tube)
     return leaves
 
 
@@ -85,6 +85,6 @@ def bearable(c: Certificate, rule: str) -> None:
     require(plant <= MAX_WORK, rule, "plant", "the equations are too large for this checker")
     before, network = 0, 0
     for layer in c.policy.layers:
-        network += layer.rows * (layer.columns + before + c.n**2)
+        network += layer.rows * (layer.columns + before + (c.n + 1) ** 2)
         before += layer.rows
     require(network <= MAX_WORK, rule, "policy", "the network is too large for this checker")

@@ -1,58 +1,109 @@
-"""Rule `tube`: ellipsoids {x'P(t)x <= 1} that no trajectory leaves, from `start` into {V <= c2}.
+"""Rule `tube`: ellipsoids {(x - c(t))'P(t)(x - c(t)) <= 1} that no trajectory leaves, from `start` into {V <= c2}.
 
-On a slab P(s) = (1 - s)^2 A + 2 s (1 - s) M + s^2 B runs from node A to node B by the middle M, and x'P(t)x falls along
-every trajectory inside. What falls is for each x such a polynomial too, with three coefficients that are seen to be
-negative; x'P(s)x <= 1 puts x into the ellipsoid of A, M or B. So these three stand for all that lies between.
+On a slab P(s) = (1 - s)^2 A + 2 s (1 - s) M + s^2 B runs from node A to node B by the middle M. Under `enlarged` c is
+0, and x'P(t)x falls along every trajectory inside. Under `reached` c runs in a straight line from the centre of one
+node to that of the next, and e'P(t)e, e = x - c(t), falls where it is 1. For each e, at each place of the path, the
+derivative is such a polynomial in s too, with three coefficients that are seen to be negative. Along a path they are
+those of the derivative plus edge (e'P(s)e - 1), with the same edge in all three: that a single e'Ae, e'Me or e'Be is 1
+is not asked. e'P(s)e <= 1 puts e into the ellipsoid of A, M or B. So these three stand for all that lies between.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 
-from flint import fmpq_mat
+from flint import arb, fmpq, fmpq_mat
 
-from .decrease import contains, decreases, sound_multipliers
+from .balls import ZERO
+from .decrease import contains, decreases, decreases_along, sound_multipliers
 from .document import Certificate
-from .evidence import Slab
+from .evidence import Path, Slab
 from .fields import exact
 from .loop import Loop
-from .rational import beyond_domain, identity, inverse_diagonal, positive_definite
+from .model import Model
+from .rational import beyond_domain, identity, inverse_diagonal, positive_definite, root_above
 from .refusal import require
 
+Ends = tuple[fmpq_mat, fmpq_mat]  # of a slab: what belongs to the node before, and to the node after
 
-def tube(loop: Loop, start: fmpq_mat, slabs: tuple[Slab, ...]) -> None:
+
+def tube(loop: Loop, start: fmpq_mat, centre: fmpq_mat | None, slabs: tuple[Slab, ...]) -> None:
     """Nodes first, numbered from 0, and middles, numbered as slabs are, from 1; then the slabs."""
-    nodes = [start, *(slab.end for slab in slabs)]
+    c, nodes, origin = loop.c, [start, *(slab.end for slab in slabs)], fmpq_mat(loop.c.n, 1)
+    centres = [origin if centre is None else centre]
+    centres += [origin if slab.path is None else slab.path.centre for slab in slabs]
     for k, P in enumerate(nodes):
-        node(loop.c, P, f"node {k}")
+        node(c, P, centres[max(k - 1, 0) : k + 2], f"node {k}")
     for k, slab in enumerate(slabs, 1):
-        node(loop.c, slab.middle, f"middle {k}")
-    inside = positive_definite(nodes[-1] - loop.c.P / exact(loop.c.outer))
+        node(c, slab.middle, centres[k - 1 : k + 1], f"middle {k}")
+    inside = ends_inside(c, nodes[-1], centres[-1])
     require(inside, "tube", f"node {len(slabs)}", "the last node does not lie in {V <= c2}")
-    for k, (slab, (before, after)) in enumerate(zip(slabs, pairwise(nodes), strict=True), 1):
-        passes(loop, before, after, slab, f"slab {k}")
+    for k, (slab, ends, path) in enumerate(zip(slabs, pairwise(nodes), pairwise(centres), strict=True), 1):
+        passes(loop, slab, ends, path, f"slab {k}")
 
 
-def node(c: Certificate, P: fmpq_mat, at: str) -> None:
-    """P is symmetric and positive definite, and {x'Px <= 1} lies in the interior of the domain."""
-    left = beyond_domain(c, inverse_diagonal(P, "tube", at))
-    require(left is None, "tube", at, f"the ellipsoid leaves the interior of the domain along {left}")
+def node(c: Certificate, P: fmpq_mat, centres: Sequence[fmpq_mat], at: str) -> None:
+    """P is symmetric and positive definite, and {e'Pe <= 1} lies in the interior of the domain around each centre.
+
+    The centres are those of the slabs that P belongs to: their ellipsoids may be as wide as this one all along.
+    """
+    largest = inverse_diagonal(P, "tube", at)
+    for centre in centres:
+        left = beyond_domain(c, largest, centre)
+        require(left is None, "tube", at, f"the ellipsoid leaves the interior of the domain along {left}")
 
 
-def passes(loop: Loop, before: fmpq_mat, after: fmpq_mat, slab: Slab, at: str) -> None:
-    """x'P(s)x falls on the ellipsoids of a slab, whose inputs are within their bounds."""
+def ends_inside(c: Certificate, P: fmpq_mat, centre: fmpq_mat) -> bool:
+    """Whether {(x - centre)'P(x - centre) <= 1} lies in {V <= c2}, by the triangle inequality for the root of V.
+
+    r bounds that of V(centre) / c2, and 1 - r that of V(x - centre) / c2, where P - c.P / (c2 (1 - r)^2) is definite.
+    """
+    c2 = exact(c.outer)
+    r = root_above((centre.transpose() * c.P * centre)[0, 0] / c2)
+    return bool(r < 1) and positive_definite(P - c.P / (c2 * (1 - r) ** 2))
+
+
+def passes(loop: Loop, slab: Slab, nodes: Ends, centres: Ends, at: str) -> None:
+    """e'P(s)e falls on the ellipsoids of a slab, whose inputs are within their bounds."""
     require(slab.duration > 0, "tube", at, f"the duration {slab.duration!r} is not positive")
-    h, middle = exact(slab.duration), slab.middle
+    h, middle, (before, after) = exact(slab.duration), slab.middle, nodes
     pieces = (
         ("first", before, 2 * (middle - before) / h),
         ("middle", middle, (after - before) / h),
         ("last", after, 2 * (after - middle) / h),
     )
+    level = fmpq(1) if slab.path is None else 1 / (1 - share_of(slab.path, at) ** 2)
+    form = "J'PJ - I" if slab.path is None else "J'PJ - I / (1 - share^2)"
     for name, P, _ in pieces:
-        holds = contains(slab.ball, P, identity(loop.c.n))
-        require(holds, "tube", at, f"its ball does not contain its {name} ellipsoid: J'PJ - I is not positive definite")
+        holds = contains(slab.ball, P, level * identity(loop.c.n))
+        require(holds, "tube", at, f"its ball does not contain its {name} ellipsoid: {form} is not positive definite")
     sound_multipliers(slab.ball, "tube", at)
-    F = loop.on(slab.ball.J, "tube", at)
+    if slab.path is not None:
+        none_negative = slab.path.edge >= 0 and slab.path.motion >= 0
+        require(none_negative, "tube", at, "a multiplier of the path is negative")
+        F = relative(loop, slab, slab.path, centres, at)
+    else:
+        F = loop.on(slab.ball.J, "tube", at)
     for name, P, rate in pieces:
-        falls = decreases(slab.ball, P, rate, F)
-        require(falls, "tube", at, f"x'P(t)x does not certainly fall: the {name} coefficient")
+        if slab.path is None:
+            falls = decreases(slab.ball, P, rate, F)
+        else:
+            falls = decreases_along(slab.ball, slab.path, P, rate, F)
+        require(falls, "tube", at, f"e'P(t)e does not certainly fall: the {name} coefficient")
+
+
+def share_of(path: Path, at: str) -> fmpq:
+    """rho: |sigma| <= rho on the path, so that what is left of the ball for the ellipsoids is ||z||^2 <= 1 - rho^2."""
+    require(0 < path.share < 1, "tube", at, f"the share {path.share!r} does not lie between 0 and 1")
+    return exact(path.share)
+
+
+def relative(loop: Loop, slab: Slab, path: Path, centres: Ends, at: str) -> list[Model]:
+    """F less the velocity of the path, where x = m + J z + w sigma; m is half-way, and m +- share w are the centres."""
+    before, after = centres
+    step = after - before
+    J = [[*row, w] for row, w in zip(slab.ball.J.tolist(), (step / (2 * exact(path.share))).entries(), strict=True)]
+    F = loop.on(fmpq_mat(J), "tube", at, (before + after) / 2)
+    velocity = (step / exact(slab.duration)).entries()
+    return [f + Model.affine(arb(-v), [ZERO] * (loop.c.n + 1)) for f, v in zip(F, velocity, strict=True)]

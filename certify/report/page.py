@@ -22,12 +22,12 @@ import sympy
 from numpy.typing import NDArray
 
 from certify.certificate import Certificate, PartitionTree, TrustedSolver
-from certify.claims import Asymptotic, Enlarged
+from certify.claims import Asymptotic, Enlarged, Reached
 from certify.closed_loop import ClosedLoop
 from certify.errors import CertifyError, InputError, SoundnessError
 from certify.lyapunov import domain_limit, extents, semi_axes, volume
 from certify.report.figures import Picture, draw
-from certify.report.figures.scene import is_ellipsoid, slabs_of, start_of
+from certify.report.figures.scene import centre_of, is_ellipsoid, slabs_of, start_of
 from certify.report.figures.style import legend_style
 from certify.report.sampling import SimulatedRoa
 from certify.report.words import (
@@ -45,8 +45,10 @@ from certify.report.words import (
     limit_in_words,
     limited_by,
     number,
+    point,
     pretty_unit,
     seconds,
+    shortest,
     symbol,
     volume_name,
     volume_unit,
@@ -181,6 +183,7 @@ def render_html(
         pictures=[(legend, list(members)) for legend, members in groupby(pictures, lambda p: p.legend)],
         trouble=trouble,
         claim=_claim(certificate, answer if status.accepted else None),
+        missed=_missed(result, status),
         plant=_plant(certificate),
         tables=_tables(certificate, status, answer, result, sha256, size),
         matrices=_matrices(certificate),
@@ -212,7 +215,10 @@ def _contents(status: Status, limits: Mapping[str, Any] | None) -> list[tuple[st
 
 @dataclass(frozen=True, slots=True)
 class _Ellipsoid:
-    """{x'Px <= level}, of those that the certificate is about; `kind` is `start` for that of a tube, else `set`."""
+    """{x'Px <= level}, of those that the certificate is about; `kind` is `start` for that of a tube, else `set`.
+
+    It lies around the origin, that of a tube around a path around its c₀.
+    """
 
     kind: str
     name: str
@@ -224,7 +230,8 @@ def _ellipsoids(certificate: Certificate) -> list[_Ellipsoid]:
     """The start of a tube where there is one, and {V <= c2}."""
     start = start_of(certificate)
     inner = _Ellipsoid("set", "{V ≤ c₂}", certificate.P, certificate.roa)
-    return [inner] if start is None else [_Ellipsoid("start", "the start", start, 1.0), inner]
+    name = "the start" if centre_of(certificate) is None else "the start, around c₀"
+    return [inner] if start is None else [_Ellipsoid("start", name, start, 1.0), inner]
 
 
 def _shares(certificate: Certificate, lengths: NDArray[np.float64]) -> list[float]:
@@ -237,9 +244,28 @@ def _shares(certificate: Certificate, lengths: NDArray[np.float64]) -> list[floa
 def _matrices(certificate: Certificate) -> list[tuple[str, list[list[str]]]]:
     """Names and entries of what the quadratic forms are, as the file has them."""
     named = [("P", certificate.P)]
-    if isinstance(certificate.claim, Enlarged):
+    if isinstance(certificate.claim, Enlarged | Reached):
         named.append(("P₀ of the tube's start", certificate.claim.start.P))
+    centre = centre_of(certificate)
+    if centre is not None:
+        named.append(("c₀, a row of states as the tube's start lies around them", centre[None]))
     return [(name, [[repr(float(v)) for v in row] for row in P]) for name, P in named]
+
+
+def _is_missed(result: Mapping[str, Any] | None) -> bool:
+    """Whether the run's reason is about a state that it was asked about, and not about the certificate's set."""
+    return result is not None and result.get("stop") == "path"
+
+
+def _missed(result: Mapping[str, Any] | None, status: Status) -> str:
+    """That a state was asked about which this certificate says nothing of; nothing if that is not so."""
+    if result is None or not _is_missed(result):
+        return ""
+    asked: Mapping[str, str] = result.get("reach_from") or {}
+    units = {s["name"]: s.get("unit") or "" for s in result.get("states") or ()}
+    where = point(list(asked), [Fraction(v) for v in asked.values()], [units.get(name, "") for name in asked])
+    proved = "The certificate is about {V ≤ c₂} alone, in which this state does not lie." if status.accepted else ""
+    return f"The state {where} was asked about. It is not shown to converge: {result['reason']}. {proved}".rstrip()
 
 
 def _limits(certificate: Certificate, result: Mapping[str, Any] | None) -> dict[str, Any] | None:
@@ -251,6 +277,8 @@ def _limits(certificate: Certificate, result: Mapping[str, Any] | None) -> dict[
         return None
     system = certificate.system
     sets = _ellipsoids(certificate)
+    if centre_of(certificate) is not None:  # how far a set that lies elsewhere reaches is no share of a side
+        sets = sets[-1:]
     reach = [extents(each.P, each.level) for each in sets]
     shares = [_shares(certificate, e) for e in reach]
     found: Mapping[str, Any] = (result or {}).get("diagnosis") or {}
@@ -258,7 +286,7 @@ def _limits(certificate: Certificate, result: Mapping[str, Any] | None) -> dict[
     step: Mapping[str, Any] = found.get("next") or {}
     options = " ".join(f"{name} {value}" for name, value in (step.get("options") or {}).items())
     return {
-        "binds": limit_in_words(str(found.get("binds", ""))),
+        "binds": "" if _is_missed(result) else limit_in_words(str(found.get("binds", ""))),
         "modes": _modes(found),
         "sets": len(sets),
         "shares": [
@@ -313,6 +341,7 @@ def _plant(certificate: Certificate) -> dict[str, Any]:
         "at": at_rest(
             [s.name for s in system.states], system.exact_x_eq(), [units.get(s.name, "") for s in system.states]
         ),
+        "centre": _centre(certificate, of_values=True),
         "u_eq": ", ".join(f"{symbol(s.name)} = {u}" for s, u in equilibrium),
     }
 
@@ -391,8 +420,11 @@ def _claim(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict[s
         parts.append((name, text, note))
     inner, outer = inner_level(certificate.kind, certificate.inner), below(certificate.roa)
     return {
-        "statement": words.statement.format(inner=inner, outer=outer, duration=_duration(certificate)),
-        "enlarged": isinstance(certificate.claim, Enlarged),
+        "statement": words.statement.format(
+            inner=inner, outer=outer, duration=_duration(certificate), centre=_centre(certificate)
+        ),
+        "enlarged": isinstance(certificate.claim, Enlarged | Reached),
+        "centre": isinstance(certificate.claim, Reached),
         "level": outer,
         "inner": inner,
         "bounds": bounds,
@@ -400,14 +432,33 @@ def _claim(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict[s
     }
 
 
-def _sides(certificate: Certificate, P: NDArray[np.float64], level: float) -> str:
-    """How far {x'Px <= level} reaches along each state, and that this is less than the domain does."""
+def _sides(
+    certificate: Certificate, P: NDArray[np.float64], level: float, centre: NDArray[np.float64] | None = None
+) -> str:
+    """How far {(x - c)'P(x - c) <= level} reaches from c along each state, which is less than the domain does."""
     system = certificate.system
-    each = zip(system.states, extents(P, level), system.domain, strict=True)
+    around = np.zeros(system.n) if centre is None else centre
+    each = zip(system.states, extents(P, level), system.domain, map(Fraction, around.tolist()), strict=True)
     units = {s.name: pretty_unit(system.units.get(s.name, "")) for s in system.states}
     return "; ".join(
-        f"|{symbol(s.name)}| ≤ {kept_apart(float(e), min(-lo, hi))} {units[s.name]}".rstrip() for s, e, (lo, hi) in each
+        f"|{_from(s.name, c)}| ≤ {kept_apart(float(e), min(c - lo, hi - c))} {units[s.name]}".rstrip()
+        for s, e, (lo, hi), c in each
     )
+
+
+def _from(name: str, value: Fraction) -> str:
+    """A state less a value: `θ + 0.1`."""
+    return f"{symbol(name)} {MINUS if value > 0 else '+'} {shortest(float(abs(value)))}" if value else symbol(name)
+
+
+def _centre(certificate: Certificate, *, of_values: bool = False) -> str:
+    """c₀ of a tube around a path in words, as a deviation or by the states' values; a dash where there is none."""
+    system, centre = certificate.system, centre_of(certificate)
+    if centre is None or start_of(certificate) is None:
+        return ABSENT
+    names, units = [s.name for s in system.states], [system.units.get(s.name, "") for s in system.states]
+    shifts = system.exact_x_eq() if of_values else [Fraction(0)] * system.n
+    return point(names, [q + Fraction(c) for q, c in zip(shifts, centre.tolist(), strict=True)], units)
 
 
 def _duration(certificate: Certificate) -> str:
@@ -421,7 +472,7 @@ def _tube_notes(certificate: Certificate) -> dict[str, str]:
     start = start_of(certificate)
     if start is None:
         return {}
-    sides = _sides(certificate, start, 1.0)
+    sides = _sides(certificate, start, 1.0, centre_of(certificate))
     count = len(slabs_of(certificate))
     slabs = f"{count:,} slabs" if count != 1 else "One slab"
     return {
@@ -431,12 +482,11 @@ def _tube_notes(certificate: Certificate) -> dict[str, str]:
 
 
 def _not_proved(certificate: Certificate, words: Words) -> list[tuple[str, str]]:
-    sets = "{V ≤ c₂} and the tube's start" if isinstance(certificate.claim, Enlarged) else "{V ≤ c₂}"
     items = [
         *words.excluded[:-1],
         (
             "Anything outside the set.",
-            f"The true set may be larger: what starts outside {sets} may do the same or not.",
+            f"The true set may be larger: what starts outside {words.sets} may do the same or not.",
         ),
         (
             "Any other plant.",
@@ -496,10 +546,14 @@ def _tables(
         heads, columns = _lengths(certificate, sets)
         points = zip(system.states, system.exact_x_eq(), state_units, strict=True)
         names = [deviation(s.name, q, unit) for s, q, unit in points]
+        centre = centre_of(certificate) if len(sets) > 1 else None
+        if centre is not None:
+            heads, columns = ["c₀", *heads], [[shortest(v) for v in centre.tolist()], *columns]
         domain = [f"[{below(lo)}, {above(hi)}]" for lo, hi in system.domain]
         reach = list(zip(names, *columns, domain, strict=True))
     if result is not None:
-        levels.append(("limited by", limited_by(result)))
+        if not _is_missed(result):
+            levels.append(("limited by", limited_by(result)))
         sampled = result["levels"].get("sampled_limit")
         if sampled is not None:
             levels.append(("lowest V of a violation found", number(sampled, 10)))
@@ -565,13 +619,14 @@ def _tables(
 def _lengths(certificate: Certificate, sets: Sequence[_Ellipsoid]) -> tuple[list[str], list[list[str]]]:
     """Heads and columns of how far the sets reach along the states: on the axes, rounded down, and at all, up.
 
-    Where there are two sets, their sizes on the axes stand side by side, as shares of the domain too.
+    Where there are two sets, their sizes on the axes stand side by side, as shares of the domain too if both lie around
+    the origin.
     """
     axes = [[below(float(v)) for v in semi_axes(each.P, each.level)] for each in sets]
     most = [[above(float(v)) for v in extents(each.P, each.level)] for each in sets]
     if len(sets) == 1:
         return ["on its axis, ±", "largest in the set, ±"], [*axes, *most]
-    for column, each in zip(axes, sets, strict=True):
+    for column, each in zip(axes, sets, strict=True) if centre_of(certificate) is None else ():
         shares = _shares(certificate, semi_axes(each.P, each.level))
         column[:] = [f"{v} ({below(100 * q, 3)} %)" for v, q in zip(column, shares, strict=True)]
     heads = [f"{what} {each.name}, ±" for what in ("axis of", "largest in") for each in sets]

@@ -214,17 +214,18 @@ class Runs:
 
 
 def runs_of(flow: Flow, starts: Array, P: Array, level: float, target: float, step: float, steps: int,
-            deadline: float = math.inf, start: Array | None = None) -> Runs:  # fmt: skip
+            deadline: float = math.inf, start: Array | None = None,
+            centre: Array | None = None) -> Runs:  # fmt: skip
     """Simulate and tell the fates.
 
     A run settles if it comes to `V <= target`, and leaves if it leaves the domain, or rises well above `level` from a
-    start below it. Runs from below the level, or from a tube's `start` {x'Px <= 1}, that seem to leave are simulated
-    again in much smaller steps: the first suspect is the integration.
+    start below it. Runs from below the level, or from a tube's `start` {(x - c)'P(x - c) <= 1}, c = `centre` or 0, that
+    seem to leave are simulated again in much smaller steps: the first suspect is the integration.
     """
     path = simulate(flow, starts, step, steps, deadline)
     begins = quadratic(P, path[0]) <= level
     settled, left = _fates(path, begins, P, level, target)
-    suspects = np.flatnonzero(left & _in_sets(path[0], P, level, start))
+    suspects = np.flatnonzero(left & _in_sets(path[0], P, level, start, centre))
     if suspects.size and time.monotonic() < deadline:
         finer = simulate(flow, path[0, suspects], step / _FINER, _FINER * (len(path) - 1), deadline)[::_FINER]
         if len(finer) == len(path):
@@ -233,10 +234,10 @@ def runs_of(flow: Flow, starts: Array, P: Array, level: float, target: float, st
     return Runs(path, step, settled, left)
 
 
-def _in_sets(x: Array, P: Array, level: float, start: Array | None) -> Mask:
-    """Which states (N, n) lie in {V <= level}, or in a tube's start if there is one."""
+def _in_sets(x: Array, P: Array, level: float, start: Array | None, centre: Array | None) -> Mask:
+    """Which states (N, n) lie in {V <= level}, or in a tube's start if there is one, around `centre` or 0."""
     inside = quadratic(P, x) <= level
-    return inside if start is None else inside | (quadratic(start, x) <= 1.0)
+    return inside if start is None else inside | (quadratic(start, x if centre is None else x - centre) <= 1.0)
 
 
 def _fates(path: Array, begins: Mask, P: Array, level: float, target: float) -> tuple[Mask, Mask]:
@@ -260,6 +261,7 @@ def simulated_roa_fraction(
     settled: float | None = None,
     deadline: float = math.inf,
     start: Array | None = None,
+    centre: Array | None = None,
 ) -> SimulatedRoa:
     """Simulate the closed loop from a grid over the domain and compare with `{x'Px <= level}`.
 
@@ -274,7 +276,8 @@ def simulated_roa_fraction(
     step, horizon : in seconds; defaults from the eigenvalues, see `time_scales`.
     settled : the level that a run has to reach; default `SETTLED * level`, near the origin.
     deadline : a reading of `time.monotonic` at which the simulation ends wherever it is.
-    start : (n, n), of the ellipsoid {x'Px <= 1} that belongs to the certified set too, where a tube leads from it.
+    start, centre : (n, n) and (n,), of the ellipsoid {(x - c)'P(x - c) <= 1} that belongs to the certified set too,
+        where a tube leads from it; c = 0 without a centre.
 
     Raises
     ------
@@ -292,7 +295,7 @@ def simulated_roa_fraction(
     centres = (np.arange(points) + 0.5) / points
     axes = tuple(a + (b - a) * centres for a, b in zip(flow.lo, flow.hi, strict=True))
     x = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, system.n)
-    certified = _in_sets(x, P, level, start)
+    certified = _in_sets(x, P, level, start, centre)
     target = SETTLED * level if settled is None else settled
     attracted, left, reached = _run(flow, x, P, target, step, horizon, deadline)
     suspects = np.flatnonzero(certified & left)

@@ -18,8 +18,10 @@ from certify.report.words import (
     label,
     limited_by,
     number,
+    point,
     pretty_unit,
     seconds,
+    symbol,
     volume_name,
     volume_unit,
     words_for,
@@ -38,8 +40,9 @@ def summary(result: Mapping[str, Any]) -> RenderableType:
     Parameters
     ----------
     result : the object that `certify roa --json` prints. Of its keys `states` and `inputs` (lists of `{name, unit}`),
-        `operating_point` (values by state) and `claim` (`{kind}`) may be absent: then there are no units, the
-        operating point is 0, and the claim is the asymptotic one.
+        `operating_point` (values by state), `reach_from` (values by state, of the state that was asked about) and
+        `claim` (`{kind}`) may be absent: then there are no units, the operating point is 0, no state was asked about,
+        and the claim is the asymptotic one.
 
     Returns
     -------
@@ -93,7 +96,15 @@ def _headline(result: Mapping[str, Any], verdict: str) -> str:
         return f"{name}: {stated}{word}"
     if verdict == "REFUTED":
         return f"{name}: a condition of the claim fails for this V and level; another V may show what this one cannot"
+    if _is_missed(result):
+        return f"{name}: the state is NOT shown to converge; what is proved is {{V <= {below(level)}}}, without it"
     return f"{name}: nothing was proved"
+
+
+def _is_missed(result: Mapping[str, Any]) -> bool:
+    """Whether a set is proved, and the state that was asked about not shown to lie in it or to reach it."""
+    proved = result.get("checked") == "ACCEPTED" and result["levels"].get("roa") is not None
+    return bool(result.get("stop") == "path" and proved)
 
 
 def _rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
@@ -116,10 +127,11 @@ def _rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
     if stated:
         rows.append(("levels of V", ", ".join(stated)))
     units = _state_units(result)
+    if result.get("reach_from"):
+        asked = _asked(result)
+        rows.append(("state", f"{asked}, which lies in {{V <= c2}}" if shown and not result.get("tube") else asked))
     if result.get("tube"):
-        tube = result["tube"]
-        size = f"{tube['slabs']} slabs, {number(tube['duration'], 3)} units of time"
-        rows.append(("tube", f"from an ellipsoid of the shape {tube['shape']}, {size}"))
+        rows.append(("tube", _tube(result)))
     if result.get("volume") is not None:
         unit = volume_unit(units)
         size = f"{below(result['volume'])} {unit}".rstrip()
@@ -158,8 +170,36 @@ def _rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
         answers = [q["answer"] for q in solver["queries"]]
         rows.append(("dReal", f"{answers.count('unsat')} of {len(answers)} queries unsat, version {solver['version']}"))
     rows.append(("time", _times(result["seconds"])))
-    rows.append(("checker", result["checked"] or "not reached"))
+    about = ", about {V <= c2} alone, in which the state does not lie" if _is_missed(result) else ""
+    rows.append(("checker", f"{result['checked'] or 'not reached'}{about}"))
     return rows
+
+
+def _asked(result: Mapping[str, Any]) -> str:
+    """The state that was asked about, by the states' values."""
+    names = _state_names(result)
+    return point(names, [Fraction(result["reach_from"][name]) for name in names], _state_units(result))
+
+
+def _tube(result: Mapping[str, Any]) -> str:
+    """Where a tube starts, how far that reaches, and when it ends.
+
+    Around a state that is how far each state may be from its own alone, the others being as they are, rounded down.
+    """
+    tube = result["tube"]
+    size = f"{tube['slabs']} slabs, {above(tube['duration'], 3)} units of time"
+    start = f"from an ellipsoid of the shape {tube['shape']}"
+    if not tube.get("centre"):
+        return f"{start}, {size}"
+    each = zip(_state_names(result), tube["semi_axes"], _state_units(result), strict=True)
+    alone = ", ".join(f"{symbol(name)} +- {below(v, 3)} {pretty_unit(unit)}".rstrip() for name, v, unit in each)
+    at = [Fraction((result.get("operating_point") or {}).get(name, 0)) for name in _state_names(result)]
+    centre = [q + Fraction(c) for q, c in zip(at, tube["centre"], strict=True)]
+    where = point(_state_names(result), centre, _state_units(result))
+    return (
+        f"{start} around {where}, which holds {alone}, one at a time, into {{V <= c2}}, {size}; nothing is said of "
+        "what lies between the two sets"
+    )
 
 
 def _diagnosis_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
@@ -192,7 +232,9 @@ def _of_which(result: Mapping[str, Any]) -> str:
     tube = result.get("tube")
     if not tube:
         return ""
-    return ", of the tube's start" if tube["volume"] == result["volume"] else ", of {V <= c2}"
+    return (
+        ", of the tube's start" if not tube.get("centre") and tube["volume"] == result["volume"] else ", of {V <= c2}"
+    )
 
 
 def _reach(result: Mapping[str, Any]) -> RenderableType:

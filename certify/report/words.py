@@ -66,6 +66,16 @@ def at_rest(names: Sequence[str], x_eq: Sequence[Fraction], units: Sequence[str]
     return ", ".join(f"{symbol(name)} = {number(float(q))} {pretty_unit(unit)}".rstrip() for name, q, unit in each)
 
 
+def point(names: Sequence[str], values: Sequence[float | Fraction], units: Sequence[str]) -> str:
+    """A state in words, such as `p = 1.5 m, v = 0 m/s`; of a float the shortest decimal that reads back as it.
+
+    >>> point(["p", "theta"], [1.5, -0.1], ["m", ""])
+    'p = 1.5 m, θ = −0.1'
+    """
+    each = zip(names, values, units, strict=True)
+    return ", ".join(f"{symbol(name)} = {shortest(float(v))} {pretty_unit(unit)}".rstrip() for name, v, unit in each)
+
+
 def pretty_unit(unit: str) -> str:
     """`m/s^2` as `m/s²`."""
     return re.sub(r"\^(-?\d+)", lambda match: match.group(1).translate(_SUPERSCRIPTS), unit)
@@ -88,6 +98,15 @@ def number(value: float | None, digits: int = 6) -> str:
     ('1.25 × 10⁻⁶', '−2.5')
     """
     return ABSENT if value is None or math.isnan(value) else _typeset(f"{value:.{digits}g}")
+
+
+def shortest(value: float) -> str:
+    """The shortest decimal that reads back as this number.
+
+    >>> shortest(0.1), shortest(-2.0), shortest(1e-9)
+    ('0.1', '−2', '1 × 10⁻⁹')
+    """
+    return _typeset(repr(value).removesuffix(".0"))
 
 
 def below(value: float | Fraction, digits: int = 6) -> str:
@@ -164,7 +183,7 @@ def seconds(value: float | None) -> str:
 @dataclass(frozen=True, slots=True)
 class Words:
     """One kind of claim in words. In texts, {inner} and {outer} stand for its levels in digits, {duration} for how long
-    its tube is.
+    its tube is, {centre} for the state that it begins around.
 
     Parameters
     ----------
@@ -179,6 +198,8 @@ class Words:
     settles, runs : what becomes of a run that counts, and what a legend calls such runs.
     parts : name, condition, and how it is shown from a partition; None where that is in the condition.
     excluded : head and text of what this claim, other than its siblings, does not say.
+    start : what the start of its tube is called; nothing where it has none.
+    sets : what the claim is about, in the caption of what is not.
     """
 
     title: str
@@ -194,6 +215,8 @@ class Words:
     runs: str
     parts: tuple[tuple[str, str, str], ...]
     excluded: tuple[tuple[str, str], ...]
+    start: str = ""
+    sets: str = "{V ≤ c₂}"
 
 
 SMOOTH = ("Equations", "The closed loop is locally Lipschitz on {V ≤ c₂}: solutions exist and are unique.", "")
@@ -307,6 +330,54 @@ CLAIMS = {
                 "cost, is not part of the claim.",
             ),
         ),
+        start="start of the tube",
+        sets="{V ≤ c₂} and the tube's start",
+    ),
+    "reached": replace(
+        _ASYMPTOTIC,
+        statement=_ASYMPTOTIC.statement + " Every trajectory that starts in the ellipsoid "
+        "{{(x − c₀)′P₀(x − c₀) ≤ 1}} around the state c₀, {centre}, stays in the domain, is in {{V(x) ≤ {outer}}} "
+        "after {duration} at the latest, and converges to the origin as well. These two sets are all that the claim is "
+        "about; nothing is said of what starts between them.",
+        headline="{{V <= {outer}}} is invariant and attracted by the origin, and every trajectory from an ellipsoid "
+        "around the state enters it",
+        decay="That V is at most c₂ once the tube has ended, and falls to 0, is {word}; how fast from then on is not.",
+        parts=(
+            *_ASYMPTOTIC.parts,
+            (
+                "Tube",
+                "With c(t) and P(t), which begin as c₀ and P₀, no trajectory from the start leaves "
+                "{(x − c(t))′P(t)(x − c(t)) ≤ 1}: on its edge the form falls along every trajectory; and at its end "
+                "this ellipsoid lies in {V ≤ c₂}",
+                "one slab of time after the other, by the linearisation and a bound on its remainder that knows "
+                "directions and the motion of c(t)",
+            ),
+            (
+                "Along the tube",
+                "Each ellipsoid of the tube lies strictly inside the domain; on it the closed loop is twice "
+                "continuously differentiable, no clip acts, and the input stays in its bounds.",
+                "",
+            ),
+        ),
+        excluded=(
+            (
+                "What lies between.",
+                "The set is the union of {V ≤ c₂} and the ellipsoid around c₀. States on the way from the one to the "
+                "other, the path of the tube among them, belong to it only where they lie in one of the two.",
+            ),
+            (
+                "Staying near c₀, and the path.",
+                "A trajectory may leave the ellipsoid around c₀ on its way: it stays in the tube, which lies inside "
+                "the domain. The path c(t) itself need not be a trajectory.",
+            ),
+            (
+                "Speed and cost.",
+                "The tube says by when {V ≤ c₂} is reached; how fast trajectories converge from there, and at what "
+                "cost, is not part of the claim.",
+            ),
+        ),
+        start="start of the tube, around c₀",
+        sets="{V ≤ c₂} and the ellipsoid around c₀",
     ),
 }
 

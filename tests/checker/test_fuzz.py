@@ -42,6 +42,7 @@ from certify.policies import load_policy
 from certify.roa import RoaOptions, certify_roa
 from certify.systems import get_system
 from certify.verdict import Verdict
+from tests.checker.test_path import glide, waypoint
 from tests.support.balls import ball as ball_of
 from tests.support.balls import enlarge, with_ball
 from tests.support.certificates import LEAF, Document, decode, dump, edited, encode, grow, make, rehash
@@ -97,7 +98,13 @@ def trusted() -> Document:
     return edited(scalar(), "evidence", evidence)
 
 
-SEEDS: tuple[Callable[[], Document], ...] = (scalar, enlarged, planar, trusted)
+@cache
+def reached() -> Document:
+    """xdot = -x, with a tube around a path, all of it by hand."""
+    return glide()
+
+
+SEEDS: tuple[Callable[[], Document], ...] = (scalar, enlarged, reached, planar, trusted)
 seeds = st.sampled_from(range(len(SEEDS)))
 
 
@@ -134,7 +141,7 @@ def text(node: Any) -> str:
 TOKENS = [
     "{", "}", "[", "]", ",", ":", '"', "\\", "\\u", "\\ud800", "\\u0000", "null", "true", "false", "NaN", "Infinity",
     "-Infinity", "0", "-0", "1", "-", "1e9", "1E400", "0.5", "1234567890", "12345678901", "9" * 5000, '"a"', '""',
-    '"schema"', '"certify-certificate/4"', '"plant"', '"x"', '"0x1.0000000000000p+0"', "0x10", "//", "/*", "'a'", " ",
+    '"schema"', '"certify-certificate/5"', '"plant"', '"x"', '"0x1.0000000000000p+0"', "0x10", "//", "/*", "'a'", " ",
     "\n", "\t", "\x00", "\x1f", "\x7f", "\u0661", "\u2028", "\ufeff", "\U0001f600", "\ud800", "\udfff", "[" * 500,
     '{"a":' * 500, "[" * 2000 + "]" * 2000,
 ]  # fmt: skip
@@ -268,7 +275,7 @@ json_edits = st.lists(
 
 @st.composite
 def edited_json(draw: st.DrawFn) -> bytes:
-    top = {"": edited(SEEDS[draw(seeds)](), "schema", "certify-certificate/4")}  # a deep copy
+    top = {"": edited(SEEDS[draw(seeds)](), "schema", "certify-certificate/5")}  # a deep copy
     for kind, position, other, value in draw(json_edits):
         found = places(top)
         if not found:
@@ -428,8 +435,17 @@ def any_numbers(draw: st.DrawFn) -> bytes:
             return mine if draw(st.booleans()) else ball_of(array(n, n), np.abs(array(3, n)))
 
         times = draw(st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=1, max_size=2))
-        slabs = [{"middle": node(1.5), "end": node(2.0), "duration": h.hex()} | one_ball() for h in times]
-        data = edited(data, "claim", {"kind": "enlarged", "start": node(1.0)})
+        moves = draw(st.booleans())
+
+        def one_path() -> Document | None:
+            shares = st.floats(0.1, 0.9) | numbers
+            return waypoint(array(n), draw(shares), *np.abs(array(3)).tolist()) if moves else None
+
+        slabs = [
+            {"middle": node(1.5), "end": node(2.0), "duration": h.hex(), "path": one_path()} | one_ball() for h in times
+        ]
+        claim = {"kind": "reached", "centre": encode(array(n))} if moves else {"kind": "enlarged"}
+        data = edited(data, "claim", claim | {"start": node(1.0)})
         data["evidence"]["tube"] = slabs
     return dump(data)
 
@@ -589,29 +605,35 @@ def counterexample(raw: bytes, path: Path) -> str | None:
 
 
 def _leaves_tube(c: document.Certificate, trees: list[Any], generator: random.Random) -> str | None:
-    """A point of a slab's ellipsoids in which x'P(t)x does not fall, or that lies outside the last set."""
+    """A point of a slab's ellipsoids, around a path of their edges, in which e'P(t)e does not fall."""
     if c.start is None or not isinstance(c.evidence, document.Partition):
         return None
     n, before = len(c.states), c.start
+    centre = [arb(0)] * n if c.centre is None else [arb(float(v)) for v in c.centre]
     for k, slab in enumerate(c.evidence.tube):
         nodes = [[[arb(float(v)) for v in row] for row in P] for P in (before, slab.middle, slab.end)]
-        h, before = arb(slab.duration), slab.end
+        h, before, begin = arb(slab.duration), slab.end, centre
+        if slab.path is not None:
+            centre = [arb(float(v)) for v in slab.path.centre]
+        moved = [(q - p) / h for p, q in zip(begin, centre, strict=True)]
         for s in (arb(0), arb(1) / 2, arb(1), arb(generator.random())):
             weights, rates = [(1 - s) ** 2, 2 * s * (1 - s), s * s], [-2 * (1 - s), 2 - 4 * s, 2 * s]
             P, R = ([[sum((w * M[i][j] for w, M in zip(each, nodes, strict=True)), arb(0)) for j in range(n)]
                      for i in range(n)] for each in (weights, rates))  # fmt: skip
-            for share in (1 - arb(2) ** -1000, arb(generator.random())):
+            inside = [1 - arb(2) ** -1000, arb(generator.random())]
+            for share in inside if slab.path is None else [arb(1), arb(1)]:
                 d = [arb(generator.gauss(0, 1)) for _ in range(n)]
                 size = sum((d[i] * P[i][j] * d[j] for i in range(n) for j in range(n)), arb(0))
-                x = [(v * (share / size).sqrt()).mid() for v in d]
+                e = [(v * (share / size).sqrt()).mid() for v in d]
+                x = [(1 - s) * p + s * q + v for p, q, v in zip(begin, centre, e, strict=True)]
                 (u,) = policies_in_arb(c.policy, c.u_eq, [x])
                 values = dict(zip((*c.states, *c.inputs), (*x, *u), strict=True))
-                F = [value_of(tree, values) for tree in trees]
+                F = [value_of(tree, values) - v for tree, v in zip(trees, moved, strict=True)]
                 falls = sum(
-                    (x[i] * (R[i][j] / h * x[j] + 2 * P[i][j] * F[j]) for i in range(n) for j in range(n)), arb(0)
+                    (e[i] * (R[i][j] / h * e[j] + 2 * P[i][j] * F[j]) for i in range(n) for j in range(n)), arb(0)
                 )
                 if not falls < 0:
-                    return f"x'P(t)x does not fall in slab {k}"
+                    return f"e'P(t)e does not fall in slab {k}"
     return None
 
 
@@ -673,6 +695,10 @@ def test_the_oracle_finds_a_false_claim(tmp_path: Path) -> None:
         assert found in (counterexample(wrong, path) or "")
     for field, change in (("duration", lambda h: (0.1).hex()), ("middle", lambda P: encode(1.2 * decode(P)))):
         wrong = dump(edited(enlarged(), f"evidence.tube.1.{field}", change))
+        assert judged(wrong, path, []) == 1
+        assert "slab 1" in (counterexample(wrong, path) or "")
+    for field, change in (("duration", (0.1).hex()), ("path.centre", encode([1.0])), ("path.centre", encode([1.7]))):
+        wrong = dump(edited(reached(), f"evidence.tube.1.{field}", change))
         assert judged(wrong, path, []) == 1
         assert "slab 1" in (counterexample(wrong, path) or "")
 

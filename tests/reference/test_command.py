@@ -30,6 +30,7 @@ KEYS = [
     "policy_sha256",
     "levels",
     "start",
+    "centre",
     "time",
     "leaves",
     "seconds",

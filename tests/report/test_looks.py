@@ -48,16 +48,18 @@ CONTRAST = """(() => {
 
 @pytest.fixture(scope="module")
 def pages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """A page of two states, one of four and one with a tube, as a run leaves them."""
+    """A page of two states, one of four, one with a tube and one around a path, as a run leaves them."""
     found = {}
     loops = {
         "pendulum": (get_system("pendulum"), load_policy(PENDULUM).network),
         "chain": chain(4, [-1.0, -2.0, -3.0, -4.0]),
         "tube": soft_spring(),
+        "path": soft_spring(),
     }
     for name, (system, network) in loops.items():
         folder = tmp_path_factory.mktemp(name)
-        options = RoaOptions(candidate="lyapunov", enlarge=name == "tube")
+        asked = {"p": 1.2, "v": 0.5} if name == "path" else None
+        options = RoaOptions(candidate="lyapunov", enlarge=name == "tube", reach_from=asked, time_limit=20)
         result = certify_roa(system, network, folder, options, provenance={"numpy": "1.2.3"})
         assert result.certificate is not None and result.checker is not None
         data = result.to_dict()
@@ -84,7 +86,7 @@ def keep(name: str, content: bytes) -> None:
 
 @pytest.mark.parametrize("dark", [False, True], ids=["light", "dark"])
 @pytest.mark.parametrize("width", WIDTHS)
-@pytest.mark.parametrize("name", ["pendulum", "chain", "tube"])
+@pytest.mark.parametrize("name", ["pendulum", "chain", "tube", "path"])
 def test_a_page_fits_and_can_be_read(
     browser: Browser, pages: dict[str, Path], name: str, width: int, dark: bool
 ) -> None:
@@ -147,7 +149,7 @@ def test_a_pendulum_prints_on_two_or_three_pages_and_one_more_with_a_tube(
         keep(f"{name}.pdf", pdf)
         sheets = pypdf.PdfReader(io.BytesIO(pdf)).pages
         printed = [unicodedata.normalize("NFKC", sheet.extract_text()) for sheet in sheets]  # without ligatures
-        assert 2 <= len(printed) <= 3 + (name == "tube")
+        assert 2 <= len(printed) <= 3 + (name in ("tube", "path"))
         plain = {unicodedata.normalize("NFKC", " ".join(text.split())) for text in json.loads(headings)}
         for text in printed:
             lines = [" ".join(line.split()) for line in text.splitlines() if line.strip()]

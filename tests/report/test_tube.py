@@ -26,9 +26,9 @@ from certify.report import render_html, simulated_roa_fraction, summary
 from certify.report.figures import draw
 from certify.report.figures.paper import PaperOptions, paper_figure
 from certify.report.figures.portrait import keys
-from certify.report.figures.scene import Scene, starts
+from certify.report.figures.scene import Band, Scene, band_of, starts
 from certify.report.figures.style import LEAVING, START
-from certify.report.figures.tube import MOST, shadow_over_time, tube
+from certify.report.figures.tube import MOST, tube
 from certify.report.sampling import SETTLED, Flow, quadratic, runs_of
 from certify.report.words import above, below
 from certify.results import RoaResult
@@ -93,6 +93,13 @@ def start_of(certificate: Certificate) -> np.ndarray:
 def slabs_of(certificate: Certificate) -> tuple[Slab, ...]:
     assert isinstance(certificate.evidence, PartitionTree)
     return certificate.evidence.tube
+
+
+def shadow(start: np.ndarray, slabs: Sequence[Slab]) -> tuple[np.ndarray, np.ndarray]:
+    """Times and half-widths of a tube around the origin."""
+    band = band_of(start, None, slabs)
+    assert isinstance(band, Band) and not np.any(band.centre)
+    return band.time, band.half
 
 
 def page_of(result: RoaResult, answer: dict[str, Any] | None = None) -> Page:
@@ -197,7 +204,7 @@ def test_a_refused_tube_still_has_a_page(change: dict[str, Any], tmp_path: Path)
 
 
 def test_the_shadow_is_that_of_bernsteins_form() -> None:
-    time, half = shadow_over_time(np.array([[1.0]]), [slab(np.array([[2.0]]), np.array([[4.0]]), 3.0)])
+    time, half = shadow(np.array([[1.0]]), [slab(np.array([[2.0]]), np.array([[4.0]]), 3.0)])
     assert time[0] == 0 and time[-1] == 3 and half[0, 0] == 1 and half[-1, 0] == 0.5
     (middle,) = np.flatnonzero(time == 1.5)
     assert half[middle, 0] == pytest.approx(2 / 3, rel=1e-12)  # P = 1/4 + 2/2 + 4/4
@@ -207,7 +214,7 @@ def test_the_shadow_is_that_of_bernsteins_form() -> None:
 def test_the_shadow_meets_the_nodes_of_a_real_tube(proved: RoaResult) -> None:
     certificate = certificate_of(proved)
     slabs = slabs_of(certificate)
-    time, half = shadow_over_time(start_of(certificate), slabs)
+    time, half = shadow(start_of(certificate), slabs)
     assert np.all(np.diff(time) > 0) and time[-1] == pytest.approx(math.fsum(s.duration for s in slabs), rel=1e-12)
     pieces = (len(time) - 1) // len(slabs)
     for node, P in ((0, start_of(certificate)), *((k + 1, s.end) for k, s in enumerate(slabs))):
@@ -220,7 +227,7 @@ def test_simulated_trajectories_from_the_start_stay_in_the_shadow(proved: RoaRes
     runs = scene.simulate(starts(scene))
     inside = scene.effort.starts
     assert np.all(quadratic(start_of(certificate), runs.path[0, :inside]) == pytest.approx(0.999, rel=1e-9))
-    time, half = shadow_over_time(start_of(certificate), slabs_of(certificate))
+    time, half = shadow(start_of(certificate), slabs_of(certificate))
     at = runs.step * np.arange(len(runs.path))
     passed = at <= time[-1]
     assert passed.sum() > 20

@@ -88,7 +88,7 @@ def make(
     from tests.support.balls import with_ball
 
     return with_ball(rehash({
-        "schema": "certify-certificate/4",
+        "schema": "certify-certificate/5",
         "claim": {"kind": claim},
         "plant": {
             "name": "plant",

@@ -53,9 +53,15 @@ def simulated_roa(scene: Scene) -> SimulatedRoa | None:
         return None
     network = scene.certificate.network
     settled, deadline = scene.settling_level, scene.deadline
-    P, start = scene.P, scene.start
     return simulated_roa_fraction(
-        scene.system, network, P, scene.outer, settled=settled, deadline=deadline, start=start
+        scene.system,
+        network,
+        scene.P,
+        scene.outer,
+        settled=settled,
+        deadline=deadline,
+        start=scene.start,
+        centre=scene.centre,
     )
 
 
@@ -67,8 +73,8 @@ def region_of(scene: Scene, roa: SimulatedRoa | None) -> Region | None:
 
 
 def _on_the_line(scene: Scene, roa: SimulatedRoa | None) -> list[Picture]:
-    reach = scene.far[0]
-    begin = [[share * reach] for share in (-0.999, -0.5, 0.5, 0.999)]
+    (low, high), shares = scene.begin_on_line, (-0.999, -0.5, 0.5, 0.999)
+    begin = [[(low + high) / 2 + share * (high - low) / 2] for share in shares]
     runs = scene.simulate(begin)
     return [line_figure(scene, roa), *tube(scene, runs), curves(scene), decay(scene, runs.path, runs.step)]
 

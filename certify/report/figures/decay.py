@@ -42,6 +42,7 @@ def decay(scene: Scene, paths: NDArray[np.float64], step: float) -> Picture:
     axes.set_xlabel("time (s)")
     axes.set_ylabel("V(x(t))")
     begin = f"on and in the {scene.word} set" if scene.start is None else "on the edge of the tube's start"
+    begin += "" if scene.centre is None else " around c₀"
     return Picture(
         "V along trajectories",
         f"V from starting points {begin}: simulated, not proved. " + scene.words.decay.format(word=scene.proved),

@@ -46,6 +46,16 @@ def shadow(P: Array, pair: tuple[int, int], level: float) -> tuple[Array, Array]
     return ellipse(inverse(inverse(P)[np.ix_(pair, pair)]), (0, 1), level)
 
 
+def shadows(P: Array, centre: Array, pair: tuple[int, int], count: int) -> list[Array]:
+    """The outlines of the projections of {(x - c)'P(x - c) <= 1} onto the plane of two states, each (count, 2).
+
+    For P (K, n, n) and centres (K, n).
+    """
+    around = circle(count)
+    block = np.linalg.inv(P)[:, pair][:, :, pair]  # of each ellipsoid, whose outline is c + L d with L L' = block
+    return [c + around @ L.T for c, L in zip(centre[:, pair], np.linalg.cholesky(block), strict=True)]
+
+
 def over_level(P: Array, pair: tuple[int, int], directions: Array, level: float) -> Array:
     """States with `V = level` that lie over the outline of the projection, (N, n), for unit vectors (N, 2).
 

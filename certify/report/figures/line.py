@@ -30,6 +30,8 @@ def line_figure(scene: Scene, roa: SimulatedRoa | None) -> Picture:
     figure, axes = figure_of(5.0, 3.4)
     legend = draw_line(axes, scene, roa)
     wider = "" if scene.start is None else ", and around it the start of the tube that leads into it"
+    if scene.centre is not None:
+        wider = ", and the start of the tube that leads into it; nothing is said of what lies between them"
     return Picture(
         "V̇ along the state",
         f"Shaded: the {scene.word} interval, {scene.meaning}{wider}. The curve of V̇ and the interval of the runs that "
@@ -54,8 +56,8 @@ def draw_line(axes: Any, scene: Scene, roa: SimulatedRoa | None) -> tuple[Key, .
     ]
     axes.axhline(0, color=MUTED, lw=0.7)
     if scene.start_reach is not None:
-        keys.insert(0, Key(f"{scene.word} start of the tube", START_FILL, 0, fill=START_FILL))
-        axes.axvspan(-scene.start_reach[0], scene.start_reach[0], color=START_FILL, lw=0)
+        keys.insert(0, Key(f"{scene.word} {scene.words.start}", START_FILL, 0, fill=START_FILL))
+        axes.axvspan(*scene.start_on_line, color=START_FILL, lw=0)
     axes.axvspan(-outer, outer, color=SET_FILL, lw=0)
     axes.axvspan(-inner, inner, color=INNER_FILL, lw=0)
     axes.plot(x[:, 0], vdot, color=INK)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from certify.report.figures.geometry import ellipse
+from certify.report.figures.geometry import ellipse, shadows
 from certify.report.figures.scene import Scene
 from certify.report.figures.style import (
     GROWTH,
@@ -29,7 +29,7 @@ def curves(scene: Scene) -> Picture:
     for k, name in enumerate(scene.input_labels):
         axes.plot(x[:, 0], u[:, k], color=(INK, SET, INNER, GROWTH)[k % 4], label=name)
     if scene.start_reach is not None:
-        axes.axvspan(-scene.start_reach[0], scene.start_reach[0], color=START_FILL, lw=0, zorder=-1)
+        axes.axvspan(*scene.start_on_line, color=START_FILL, lw=0, zorder=-1)
     axes.axvspan(-scene.reach[0], scene.reach[0], color=SET_FILL, lw=0, zorder=0)
     axes.set_xlim(scene.lo[0], scene.hi[0])
     axes.set_xlabel(scene.labels[0])
@@ -51,6 +51,7 @@ def surface(scene: Scene, pair: tuple[int, int]) -> Picture:
     u = scene.flow.policy(x)
     colours = LinearSegmentedColormap.from_list("input", ["#2f5d8a", "#a9c4dd", "#f7f6f2", "#e5c08a", "#a4652a"])
     boundary = ellipse(scene.P, pair, scene.outer)
+    start = _start(scene, pair)
     for k, centre in enumerate([float(v) for v in scene.system.exact_u_eq()[:shown]]):
         left, bottom = 4.2 * (k % 2), 3.6 * (rows - 1 - k // 2)
         axes = add_axes(figure, left + 0.66, bottom + 0.52, 2.54, 2.96)
@@ -67,8 +68,8 @@ def surface(scene: Scene, pair: tuple[int, int]) -> Picture:
         )
         axes.contour(a, b, u[..., k], levels=11, colors=INK, linewidths=0.35, alpha=0.7, linestyles="solid")
         axes.plot(*boundary, color=SET, lw=1.6)
-        if scene.start is not None:
-            axes.plot(*ellipse(scene.start, pair, 1.0), color=START, lw=1.6)
+        if start is not None:
+            axes.plot(*start, color=START, lw=1.6)
         axes.set_xlim(a[0], a[-1])
         axes.set_ylim(b[0], b[-1])
         bar = figure.colorbar(image, cax=add_axes(figure, left + 3.3, bottom + 0.52, 0.1, 2.96))
@@ -77,7 +78,7 @@ def surface(scene: Scene, pair: tuple[int, int]) -> Picture:
         axes.set_xlabel(scene.labels[pair[0]])
         axes.set_ylabel(scene.labels[pair[1]])
     where = "over the domain" if scene.n == 2 else "around the set, all other states being 0,"
-    outline = "boundary" if scene.start is None else "boundaries of the start (magenta) and"
+    outline = "boundary" if start is None else "boundaries of the start (magenta) and"
     more = "" if shown == scene.system.m else f" The first {shown} of {scene.system.m} inputs."
     return Picture(
         "The policy's surface",
@@ -86,3 +87,13 @@ def surface(scene: Scene, pair: tuple[int, int]) -> Picture:
         simulated=False,
         wide=shown > 1,
     )
+
+
+def _start(scene: Scene, pair: tuple[int, int]) -> tuple[np.ndarray, np.ndarray] | None:
+    """The edge of a tube's start in the plane; None where there is none, or where it does not lie around the plane."""
+    if scene.start is None or (scene.centre is not None and scene.n > 2):
+        return None
+    if scene.centre is None:
+        return ellipse(scene.start, pair, 1.0)
+    (outline,) = shadows(scene.start[None], scene.centre[None], pair, 240)
+    return outline[[*range(240), 0], 0], outline[[*range(240), 0], 1]

@@ -3,7 +3,8 @@
 With two states the plane is the whole space and the picture shows the domain. With more there are two exact shapes to
 tell apart: the section through the origin `{y: y'P_ij y <= c}`, the points of the plane that lie in the set, and the
 projection `{y: y'((P^-1)_ij)^-1 y <= c}`, all values that two states take anywhere in the set; the picture is zoomed
-to the latter. The start of a tube has the same two, and then the picture is zoomed to whatever reaches further.
+to the latter. The start of a tube has the same two, and then the picture is zoomed to whatever reaches further. A tube
+around a path leaves the plane through the origin: of it there are projections only, and no sign of Vdot is shown there.
 """
 
 from __future__ import annotations
@@ -14,9 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.report.figures.geometry import ellipse, shadow, thin
+from certify.report.figures.geometry import ellipse, shadow, shadows, thin
 from certify.report.figures.pairs import Pair
-from certify.report.figures.scene import Scene
+from certify.report.figures.scene import Band, Scene
 from certify.report.figures.style import (
     GROWTH,
     GROWTH_FILL,
@@ -29,6 +30,7 @@ from certify.report.figures.style import (
     SET_FILL,
     SIMULATED,
     START,
+    START_FILL,
     UNSETTLED,
     Key,
     Picture,
@@ -46,6 +48,13 @@ _ABOUT = (
     "holds the values that the two take anywhere in the set. Both are exact shapes. Trajectories start over the edge "
     "of the projection, and are projected like it."
 )
+_ABOUT_A_PATH = (
+    "Each picture shows two states. Of {V ≤ c₂} the section holds the states in which all others are 0, the projection "
+    "the values that the two take anywhere in it. The tube does not lie around the plane of the picture: all that is "
+    "shown of it, its start and its path are projections, and where they overlap {V ≤ c₂} here the states need not lie "
+    "in it. Trajectories start over the edge of the start's projection, and are projected like it."
+)
+_MOMENTS, _AROUND = 64, 32  # of a tube's time that are drawn, and points around each ellipse
 
 
 def portraits(scene: Scene, runs: Runs, region: Region | None) -> list[Picture]:
@@ -56,24 +65,34 @@ def portraits(scene: Scene, runs: Runs, region: Region | None) -> list[Picture]:
         drawn.append((pair, draw_plane(axes, scene, pair, runs, region), to_svg(figure)))
     legend = keys(scene, runs, region, any(growing for _, growing, _ in drawn))
     title, meaning = "Phase portrait", f"Blue: the {scene.word} set, {scene.meaning}. "
-    if scene.start is not None:
+    if scene.centre is not None:
+        meaning += (
+            "Magenta: the tube around a path that leads into it, of which only the start, around c₀, is claimed. "
+        )
+    elif scene.start is not None:
         meaning += "Magenta: the start of the tube that leads into it. "
-    about = _ABOUT if len(scene.pairs) > 1 else ""
+    about = (_ABOUT if scene.centre is None else _ABOUT_A_PATH) if len(scene.pairs) > 1 else ""
     pictures = []
     for pair, growing, svg in drawn:
         if scene.n > 2:
             names = [symbol(scene.system.states[k].name) for k in pair]
             title = ", ".join(names)
-            meaning = f"Of its domain the set takes {_takes(scene.shares, names, pair)}. "
+            which = "the set takes" if scene.centre is None else "{V ≤ c₂} takes"
+            meaning = f"Of its domain {which} {_takes(scene.shares, names, pair)}. "
             if scene.start_shares is not None:
                 both = _takes(scene.start_shares, names, pair), _takes(scene.shares, names, pair)
                 meaning = f"Of its domain the start takes {both[0]}, {{V ≤ c₂}} {both[1]}. "
-        sign = "" if growing else "V̇ < 0 at every grid point of the picture. "
+        sign = "" if growing or not _shows_vdot(scene) else "V̇ < 0 at every grid point of the picture. "
         if growing and scene.start is not None:
             sign = "V need not fall outside the blue set: along the tube another function does. "
         caption = f"{meaning}{sign}*\N{NO-BREAK SPACE}Simulated or evaluated on a grid, not proved."
         pictures.append(Picture(title, caption, svg, simulated=True, wide=scene.n == 2, legend=legend, about=about))
     return pictures
+
+
+def _shows_vdot(scene: Scene) -> bool:
+    """Whether the sign of Vdot in the plane says something of all that is drawn in it."""
+    return scene.n == 2 or scene.centre is None
 
 
 def _takes(shares: Array, names: Sequence[str], pair: Pair) -> str:
@@ -85,15 +104,22 @@ def keys(scene: Scene, runs: Runs, region: Region | None, growing: bool) -> tupl
     """The legend of the planes; `growing` says whether Vdot >= 0 somewhere in one of them."""
     outer = f"{scene.word} set, V = {below(scene.outer, 4)}"
     inner = f"{scene.words.inner_set}, V = {inner_level(scene.kind, scene.inner, 3)}"
-    start = f"{scene.word} start of the tube"
+    start = f"{scene.word} {scene.words.start}"
     found = [Key(outer, SET, 1.8, fill=SET_FILL)]
     if scene.n > 2:
         found = [
             Key(f"{outer}: projection", SET, 1.2, "--"),
             Key("its section through the origin", SET, 1.6, fill=SET_FILL),
         ]
-    if scene.start is not None and scene.n > 2:
-        begin = Key(f"{start}: projection", START, 1.2, "--"), Key("section of the start", START, 1.6)
+    if scene.centre is not None:
+        projected = ": projection" if scene.n > 2 else ""
+        begin = [Key(start + projected, START, 1.8)]
+        if scene.band is not None:
+            shown = f"the tube at {len(_moments(scene.band))} moments{projected}"
+            begin += [Key(shown, START_FILL, 0, fill=START_FILL), Key(f"its path c(t){projected}", START, 1.0, ":")]
+        found = [*begin, *found]
+    elif scene.start is not None and scene.n > 2:
+        begin = [Key(f"{start}: projection", START, 1.2, "--"), Key("section of the start", START, 1.6)]
         found = [*begin, *found]
     elif scene.start is not None:
         found = [Key(start, START, 1.8), *found]
@@ -131,7 +157,7 @@ def draw_plane(axes: Any, scene: Scene, pair: Pair, runs: Runs, region: Region |
     vdot = scene.vdot(x)
     section = ellipse(scene.P, pair, scene.outer)
     axes.fill(*section, color=SET_FILL, lw=0, zorder=1)
-    growing = (vdot >= 0) & np.any(x != 0, axis=-1)
+    growing = (vdot >= 0) & np.any(x != 0, axis=-1) & _shows_vdot(scene)
     if np.any(growing):
         axes.contourf(a, b, vdot, levels=[0, np.inf], colors=[GROWTH_FILL], zorder=0)
         if np.any(vdot < 0):
@@ -151,7 +177,9 @@ def draw_plane(axes: Any, scene: Scene, pair: Pair, runs: Runs, region: Region |
     axes.plot(*section, color=SET, lw=1.8 if scene.n == 2 else 1.5, zorder=4)
     if scene.n > 2:
         axes.plot(*shadow(scene.P, pair, scene.outer), color=SET, lw=1.2, ls="--", zorder=4)
-    if scene.start is not None:
+    if scene.centre is not None:
+        _draw_tube(axes, scene, pair)
+    elif scene.start is not None:
         axes.plot(*ellipse(scene.start, pair, 1.0), color=START, lw=1.8 if scene.n == 2 else 1.5, zorder=4)
         if scene.n > 2:
             axes.plot(*shadow(scene.start, pair, 1.0), color=START, lw=1.2, ls="--", zorder=4)
@@ -168,6 +196,30 @@ def draw_plane(axes: Any, scene: Scene, pair: Pair, runs: Runs, region: Region |
     if scene.n == 2:
         axes.spines[["left", "bottom"]].set_visible(False)  # the domain's box is frame enough
     return bool(np.any(growing))
+
+
+def _moments(band: Band) -> Array:
+    """Indices (K,) of the times at which a tube is drawn in a plane, denser where it moves fast for its width."""
+    moved = np.max(np.abs(np.diff(band.centre, axis=0)) / band.half[:-1], axis=1)
+    travelled = np.append(0.0, np.cumsum(moved + np.diff(band.time) / band.time[-1]))
+    return np.unique(np.searchsorted(travelled, np.linspace(0, travelled[-1], _MOMENTS)).clip(max=len(travelled) - 1))
+
+
+def _draw_tube(axes: Any, scene: Scene, pair: Pair) -> None:
+    """The projections of a tube around a path: its start, its ellipsoids at some moments, its path."""
+    from matplotlib.collections import PolyCollection
+
+    if scene.start is None or scene.centre is None:
+        return
+    if scene.band is not None:
+        at = _moments(scene.band)
+        outlines = shadows(scene.band.P[at], scene.band.centre[at], pair, _AROUND)
+        axes.add_collection(PolyCollection(outlines, facecolors=START_FILL, edgecolors="none", zorder=0.5))
+        way = thin(scene.band.centre[:, pair], np.ptp(scene.band.centre[:, pair], axis=0) + scene.far[list(pair)])
+        axes.plot(way[:, 0], way[:, 1], color=START, lw=1.0, ls=":", zorder=3)
+    (outline,) = shadows(scene.start[None], scene.centre[None], pair, 240)
+    closed = np.concatenate([outline, outline[:1]])
+    axes.plot(closed[:, 0], closed[:, 1], color=START, lw=1.8, zorder=4)
 
 
 def _arrows(axes: Any, lines: Sequence[Array], colour: str, size: Array) -> None:

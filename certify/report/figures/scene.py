@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from certify.certificate import Certificate, PartitionTree, Slab, leaves
-from certify.claims import Enlarged, Practical
+from certify.claims import Enlarged, Practical, Reached
 from certify.errors import CertificateFormatError
 from certify.lyapunov import extents, is_positive_definite
 from certify.policies import TanhNetwork
@@ -36,6 +36,7 @@ _EQUATIONS = 500  # multiplications' worth of one evaluation, and of what surrou
 _GRIDS, _RUNS, _RATES = 2e9, 1e10, 5e8  # operations for grids, trajectories and the time scales
 _SHARE = 0.45  # of the time, after which nothing is simulated any more: the rest is for drawing
 _LEAST = 25  # points along a grid
+_POINTS = 240  # of a tube's edge over time, about
 _VIEW = 1.3  # of the set's reach, in pictures of more than two states
 
 
@@ -47,19 +48,70 @@ def is_ellipsoid(certificate: Certificate) -> bool:
 
 
 def start_of(certificate: Certificate) -> Array | None:
-    """P (n, n) of the ellipsoid {x'Px <= 1} from which a tube leads into {V <= c2}.
+    """P (n, n) of the ellipsoid {(x - c)'P(x - c) <= 1} from which a tube leads into {V <= c2}, c as `centre_of` says.
 
     None where the claim has none, and where a rejected file has something else in its place.
     """
-    if not isinstance(certificate.claim, Enlarged):
+    claim = certificate.claim
+    if not isinstance(claim, Enlarged | Reached):
         return None
-    P = certificate.claim.start.P
-    return P if is_positive_definite(P) else None
+    P, c = claim.start.P, centre_of(certificate)
+    return P if is_positive_definite(P) and (c is None or bool(np.all(np.isfinite(c)))) else None
+
+
+def centre_of(certificate: Certificate) -> Array | None:
+    """The state (n,) that a tube around a path begins around; None where the claim has none."""
+    return np.array(certificate.claim.centre) if isinstance(certificate.claim, Reached) else None
 
 
 def slabs_of(certificate: Certificate) -> tuple[Slab, ...]:
     """The tube's slabs; none where the claim has no tube."""
     return certificate.evidence.tube if isinstance(certificate.evidence, PartitionTree) else ()
+
+
+@dataclass(frozen=True, slots=True)
+class Band:
+    """A tube over time, in floats: its ellipsoid at a time is {(x - c)'P(x - c) <= 1}.
+
+    Parameters
+    ----------
+    time : (K,), rising.
+    P, centre : (K, n, n) and (K, n).
+    half : `sqrt((P^-1)_ii)` (K, n): how far it reaches from the centre along each state.
+    """
+
+    time: Array
+    P: Array
+    centre: Array
+    half: Array
+
+
+def band_of(start: Array, centre: Array | None, slabs: Sequence[Slab]) -> Band | None:
+    """The tube over time; None where a rejected file's slabs are none.
+
+    On a slab P(s) = (1 - s)^2 P_0 + 2 s (1 - s) M + s^2 P_1 and c(s) = (1 - s) c_0 + s c_1 for s from 0 to 1, from one
+    node to the next.
+    """
+    if not slabs:
+        return None
+    pieces = max(1, _POINTS // len(slabs))
+    s = np.arange(1, pieces + 1)[:, None, None] / pieces
+    P, begin, c = start, 0.0, np.zeros(len(start)) if centre is None else centre
+    times, matrices, centres = [np.zeros(1)], [start[None]], [c[None]]
+    for slab in slabs:
+        end = c if slab.path is None else slab.path.centre
+        times.append(begin + slab.duration * s[:, 0, 0])
+        matrices.append((1 - s) ** 2 * P + 2 * s * (1 - s) * slab.middle + s**2 * slab.end)
+        centres.append((1 - s[:, 0]) * c + s[:, 0] * end)
+        P, begin, c = slab.end, begin + slab.duration, end
+    time, whole, middle = np.concatenate(times), np.concatenate(matrices), np.concatenate(centres)
+    with np.errstate(invalid="ignore"):
+        try:
+            half = np.sqrt(np.diagonal(np.linalg.inv(whole), axis1=1, axis2=2))
+        except np.linalg.LinAlgError:
+            return None
+    usable = all(bool(np.all(np.isfinite(v))) for v in (time, whole, middle, half)) and bool(np.all(np.diff(time) > 0))
+    return Band(time, whole, middle, half) if usable else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,13 +175,15 @@ class Scene:
         self.inner_reach = extents(self.P, self.inner)
         self.start, self.slabs = start_of(certificate), slabs_of(certificate)
         self.start_reach = None if self.start is None else extents(self.start, 1.0)
-        self.far = self.reach if self.start_reach is None else np.maximum(self.reach, self.start_reach)
+        self.centre = None if self.start is None else centre_of(certificate)
+        self.band = None if self.start is None else band_of(self.start, self.centre, self.slabs)
+        self.far = self.reach if self.start_reach is None else np.maximum(self.reach, self._farthest(self.start_reach))
         self.flow = Flow.of(self.system, certificate.network)
         self.lo, self.hi = self.flow.lo, self.flow.hi
         side = np.minimum(-self.lo, self.hi)  # not positive in files that the checker refuses
         side = np.where(side > 0, side, np.nan)
         self.shares = self.reach / side
-        self.start_shares = None if self.start_reach is None else self.start_reach / side
+        self.start_shares = None if self.start_reach is None or self.centre is not None else self.start_reach / side
         self.pairs = list(pairs) if pairs is not None else pairs_of(self.system, self.P, self.far / side)
         self.effort = Effort.of(certificate.network, len(self.pairs))
         # With more than two states nothing is simulated from outside the sets.
@@ -145,6 +199,27 @@ class Scene:
         if isinstance(evidence, PartitionTree) and len(evidence.tree) <= 2 * _MOST_LEAVES:
             self.T, self.root = evidence.T, evidence.root
             self.leaves = leaves(evidence.tree, evidence.root)
+
+    def _farthest(self, start_reach: Array) -> Array:
+        """How far from the origin what is drawn of a tube reaches, (n,): its start, around a path all of it."""
+        if self.centre is None:
+            return start_reach
+        far = np.abs(self.centre) + start_reach
+        if self.band is None:
+            return far
+        return np.asarray(np.maximum(far, np.max(np.abs(self.band.centre) + self.band.half, axis=0)))
+
+    @property
+    def start_on_line(self) -> tuple[float, float]:
+        """The interval from which a tube leads, for one state."""
+        half = 0.0 if self.start_reach is None else float(self.start_reach[0])
+        middle = 0.0 if self.centre is None else float(self.centre[0])
+        return middle - half, middle + half
+
+    @property
+    def begin_on_line(self) -> tuple[float, float]:
+        """The interval from which trajectories are drawn, for one state."""
+        return (-float(self.far[0]), float(self.far[0])) if self.centre is None else self.start_on_line
 
     @property
     def settling_level(self) -> float:
@@ -177,7 +252,8 @@ class Scene:
         step = PATH_STEP * self.step
         count = steps or min(int((self.duration + 0.5 * self.horizon) / step) + 1, self.effort.steps)
         starts, target = np.asarray(begin, dtype=np.float64), self.settling_level
-        runs = runs_of(self.flow, starts, self.P, self.outer, target, step, count, self.deadline, self.start)
+        begins = self.start, self.centre
+        runs = runs_of(self.flow, starts, self.P, self.outer, target, step, count, self.deadline, *begins)
         return Runs(refine(runs.path, self.flow.field, step), step / PARTS, runs.settled, runs.left)
 
     def view(self, pair: Pair) -> Box:
@@ -186,6 +262,15 @@ class Scene:
         if self.n == 2:
             margin = 0.03 * (hi - lo)
             return Box(lo - margin, hi + margin)
+        if self.centre is not None and self.band is not None:
+            ends = (
+                self.band.centre[:, pair] - self.band.half[:, pair],
+                self.band.centre[:, pair] + self.band.half[:, pair],
+            )
+            least, most = np.min(ends[0], axis=0), np.max(ends[1], axis=0)
+            least, most = np.minimum(least, -self.reach[list(pair)]), np.maximum(most, self.reach[list(pair)])
+            room = (_VIEW - 1) / 2 * (most - least)
+            return Box(np.maximum(least - room, 1.06 * lo), np.minimum(most + room, 1.06 * hi))
         reach = _VIEW * self.far[list(pair)]
         return Box(np.maximum(-reach, 1.06 * lo), np.minimum(reach, 1.06 * hi))
 
@@ -203,15 +288,16 @@ class Scene:
 def starts(scene: Scene) -> Array:
     """Starting points: around the outline of a set in each plane and, for two states, along the domain's edge.
 
-    The set is that of a tube's start if there is one, else {V <= c2}.
+    The set is that of a tube's start if there is one, wherever it lies, else {V <= c2}.
     """
     count = scene.effort.starts
     P, level = (scene.P, scene.outer) if scene.start is None else (scene.start, 1.0)
-    blocks = [over_level(P, pair, circle(count), 0.999 * level) for pair in scene.pairs]
+    middle = 0.0 if scene.centre is None else scene.centre
+    blocks = [middle + over_level(P, pair, circle(count), 0.999 * level) for pair in scene.pairs]
     if scene.n == 2:
         edge = 2 * np.pi * (np.arange(22) + 0.25) / 22
         ring = np.stack([np.cos(edge), np.sin(edge)], -1)
         ring /= np.max(np.abs(ring), axis=1, keepdims=True)
-        middle, half = (scene.lo + scene.hi) / 2, (scene.hi - scene.lo) / 2
-        blocks.append(middle + 0.985 * half * ring)
+        centre, half = (scene.lo + scene.hi) / 2, (scene.hi - scene.lo) / 2
+        blocks.append(centre + 0.985 * half * ring)
     return np.concatenate(blocks)
