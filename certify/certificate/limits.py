@@ -18,7 +18,7 @@ from certify.systems import System
 
 MOST_STATES, MOST_LAYERS, MOST_ROWS = 64, 64, 2**14
 MOST_NODES, MOST_DEPTH, MOST_EXPONENT, MOST_DIGITS = 20_000, 200, 64, 1201
-MOST_NUMBERS = 2**25  # operations times n^2, under the rule `local`
+MOST_NUMBERS = 2**26  # operations times the numbers of a jet, under the rule `local`
 _LARGEST = Fraction(2) ** 1000
 MOST_MATRIX_BITS = 2**16  # of the longest number of P, times n
 
@@ -50,7 +50,7 @@ def require_within_limits(system: System, network: TanhNetwork) -> None:
         ("levels of nesting in an equation", max(depth for _, depth in nodes), MOST_DEPTH),
         ("as the largest exponent in an equation", max(exponents, default=1), MOST_EXPONENT),
         ("digits in the parts of a rational", max(digits), MOST_DIGITS),
-        ("operations in the equations, times the square of the number of states,", _size(system), MOST_NUMBERS),
+        ("operations in the equations, times the numbers of a model of each,", _size(system), MOST_NUMBERS),
     ):
         if found > most:
             raise InputError(
@@ -75,10 +75,15 @@ def require_short(P: np.ndarray) -> None:
         )
 
 
+def numbers_of_a_jet(k: int) -> int:
+    """What a third-order model in k variables holds, but for a few."""
+    return k**2 + k * (k + 1) * (k + 2) // 6
+
+
 def _size(system: System) -> int:
-    """Operations, each counted once however often it stands in the equations, times n^2; an upper bound."""
+    """Operations, each counted once however often it stands in the equations, times their numbers; an upper bound."""
     seen = {node for e in system.uncertain_dynamics() for node in sympy.preorder_traversal(e)}
-    return sum(_operations(node) for node in seen) * system.n**2
+    return sum(_operations(node) for node in seen) * numbers_of_a_jet(system.n)
 
 
 def _operations(node: sympy.Expr) -> int:

@@ -35,16 +35,18 @@ Array = NDArray[np.float64]
 SCHEMA = "certify-certificate/5"
 MAX_BYTES = 256 * 2**20
 _LONGEST_UNIT = 40
+_OF_A_BALL = ("J", "multipliers", "weight")
 _OF_A_PATH = ("share", "edge", "motion", "joint")
 
 
 @dataclass(frozen=True, slots=True)
 class LocalBall:
     """Evidence of the local proof: a ball x = J d, ||d|| <= 1, J (n, n), that contains {V <= c1}, and `multipliers`
-    (3, n) of the matrix inequality on it."""
+    (3, n) of the matrix inequality on it with the `weight` (n, n) from which all others follow."""
 
     J: Array
     multipliers: Array
+    weight: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +75,8 @@ class Slab:
     ----------
     middle, end : its coefficients after that of the slab before, (n, n); the piece ends at {x'Px <= 1}, P = `end`.
     duration : units of time.
-    J, multipliers : a ball that contains it, (n, n), and what the matrix inequalities on it take, (3, n).
+    J, multipliers, weight : a ball that contains it, (n, n), and what the matrix inequalities on it take, (3, n) and
+        (k, k), k = n at rest and n + 1 along a path.
     path : None where the ellipsoids stay around the origin.
     """
 
@@ -82,6 +85,7 @@ class Slab:
     duration: float
     J: Array
     multipliers: Array
+    weight: Array
     path: Waypoint | None = None
 
 
@@ -361,13 +365,13 @@ def _read_evidence(data: Mapping[str, Any], n: int) -> PartitionTree | TrustedSo
             _decode(data["T"], (n, n)),
             root,
             base64.b64decode(data["tree"]),
-            None if local is None else LocalBall(*_read_ball(local, n)),
+            None if local is None else LocalBall(*_read_ball(local, n, n)),
             tuple(
                 Slab(
                     _decode(slab["middle"], (n, n)),
                     _decode(slab["end"], (n, n)),
                     float.fromhex(slab["duration"]),
-                    *_read_ball(slab, n),
+                    *_read_ball(slab, n, n + (slab["path"] is not None)),
                     None if slab["path"] is None else _read_path(slab["path"], n),
                 )
                 for slab in data["tube"]
@@ -379,11 +383,13 @@ def _read_evidence(data: Mapping[str, Any], n: int) -> PartitionTree | TrustedSo
 
 
 def _ball(evidence: LocalBall | Slab) -> dict[str, str]:
-    return {"J": _encode(evidence.J), "multipliers": _encode(evidence.multipliers)}
+    return {name: _encode(getattr(evidence, name)) for name in _OF_A_BALL}
 
 
-def _read_ball(data: Mapping[str, str], n: int) -> tuple[Array, Array]:
-    return _decode(data["J"], (n, n)), _decode(data["multipliers"], (3, n))
+def _read_ball(data: Mapping[str, str], n: int, k: int) -> tuple[Array, Array, Array]:
+    """k is how many entries d has."""
+    J, multipliers, weight = (data[name] for name in _OF_A_BALL)
+    return _decode(J, (n, n)), _decode(multipliers, (3, n)), _decode(weight, (k, k))
 
 
 def _path(path: Waypoint) -> dict[str, str]:

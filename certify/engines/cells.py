@@ -38,7 +38,10 @@ class _Cell:
         slack, bend, wider = np.zeros(len(J)), np.zeros(len(J)), 1.0
         for corner in (paths.models(J) for paths in self.corners):
             slack = np.maximum(slack, np.linalg.norm(corner.A - middle.A, axis=1))
-            bend = np.maximum(bend, np.linalg.norm(corner.Q - middle.Q, axis=(1, 2)))
+            bends = np.linalg.norm(corner.Q - middle.Q, axis=(1, 2))
+            bends += np.linalg.norm((corner.K - middle.K).reshape(len(J), -1), axis=1)
+            bends += np.abs(corner.shares - middle.shares) @ np.linalg.norm(middle.R, axis=(1, 2))
+            bend = np.maximum(bend, bends)
             sizes = [float(np.einsum("iaa->", models.E)) for models in (corner, middle)]
             wider = max(wider, sizes[0] / sizes[1] if sizes[1] > 0 else 1.0)
         E = middle.E * (1 + _CAUTION * (wider - 1)) + _CAUTION * bend[:, None, None] * np.eye(J.shape[1])

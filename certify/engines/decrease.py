@@ -2,7 +2,8 @@
 
 On the ball x = J d, `d'J'RJ d + 2 d'J'P F(J d) < 0` for 0 < ||d|| <= 1 if the decay -(J'RJ + B + B') dominates bounds
 of what the models of F add to their gradients (checker/FORMAT.md, `decrease`). An error kept apart keeps its direction;
-errors of several components taken jointly may cancel, as those of a plant's inputs do.
+errors of several components taken jointly may cancel, as those of a plant's inputs do. What the tanhs leave, and the
+third order, take multipliers that follow from one `weight` of directions: there would be a thousand of them.
 """
 
 from __future__ import annotations
@@ -16,30 +17,40 @@ from numpy.typing import NDArray
 from certify.engines.models import Models
 
 Array = NDArray[np.float64]
-_ROUNDS = 5  # of weights that look at the worst direction more and more
-_FOCUS, _LEAST_WEIGHT = 3.0, 1e-3
+_ROUNDS = 16  # of weights that look at bad directions more and more
+_FOCUS, _LEAST_WEIGHT = 2.0, 1e-4
+_SETTLED = 2e-3  # of a margin: more rounds are not worth less
 _NEGLIGIBLE, _ROUNDING = 1e-9, 1e-12  # of the bounds; of the decay, where a checker's Q is not quite 0
 _SHORT = 5  # bits of a multiplier: the checker's rationals stay short
 
 
 @dataclass(frozen=True, slots=True)
-class Shown:
-    """Multipliers (3, n), and the share of the decay that the rest leaves: positive means that they show it."""
+class Multipliers:
+    """`rows` (3, k): alpha and beta, of which n entries count, and g; `weight` (k, k), k the entries of d."""
 
-    multipliers: Array
+    rows: Array
+    weight: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Shown:
+    """Multipliers, and the share of the decay that the rest leaves: positive means that they show it."""
+
+    multipliers: Multipliers
     margin: float
 
 
-NOT_SHOWN = Shown(np.zeros((3, 0)), -math.inf)
+NOT_SHOWN = Shown(Multipliers(np.zeros((3, 0)), np.zeros((0, 0))), -math.inf)
 
 
-def best_multipliers(models: Models, J: Array, P: Array, R: Array | None = None) -> Shown:
+def best_multipliers(models: Models, J: Array, P: Array, R: Array | None = None, enough: float = math.inf) -> Shown:
     """The multipliers with the largest margin found.
 
     Parameters
     ----------
     models : of F on the ball of J.
     J, P, R : (n, n), P positive definite, R symmetric (None: 0).
+    enough : the margin at which the search may end; it ends too where no multipliers reach that.
     """
     if not models.finite:
         return NOT_SHOWN
@@ -49,26 +60,37 @@ def best_multipliers(models: Models, J: Array, P: Array, R: Array | None = None)
         root = np.linalg.cholesky(decay)
     except np.linalg.LinAlgError:
         return NOT_SHOWN
-    inverse = np.linalg.inv(root)
-    each = (_best_of_a_kind(models, b, inverse, joint) for joint in (True, False))
-    return max(each, key=lambda shown: shown.margin)
+    inverse, best = np.linalg.inv(root), NOT_SHOWN
+    for joint in (False, True):
+        if best.margin < enough:
+            best = max(best, _best_of_a_kind(models, b, inverse, joint, enough), key=lambda shown: shown.margin)
+    return best
 
 
-def _best_of_a_kind(models: Models, b: Array, inverse: Array, joint: bool) -> Shown:
-    """`inverse` (n, n) is that of the decay's Cholesky factor."""
-    weight, best = inverse.T @ inverse, NOT_SHOWN
+def _best_of_a_kind(models: Models, b: Array, inverse: Array, joint: bool, enough: float) -> Shown:
+    """`inverse` (n, n) is that of the decay's Cholesky factor.
+
+    What the rest takes of the decay in its worst direction is least at a saddle: of all weights the one whose own best
+    multipliers leave the least. Weights that look at bad directions more and more, by all rounds so far, lead there
+    (matrix multiplicative weights: Arora, Hazan, Kale, Theory of Computing 8, 2012, section 5), and no multipliers
+    leave more than the weighted mean of any round.
+    """
+    best, looked = NOT_SHOWN, np.zeros_like(inverse)
+    weight = np.eye(len(inverse)) / len(inverse)
     for _ in range(_ROUNDS):
-        multipliers = multipliers_for(models, b, weight, joint)
+        multipliers = multipliers_for(models, b, inverse.T @ weight @ inverse, joint)
         relative = inverse @ rest_of(models, b, multipliers) @ inverse.T
         if not np.all(np.isfinite(relative)):
             return best
-        values, vectors = np.linalg.eigh(relative)
-        if 1 - values[-1] > best.margin:
-            best = Shown(multipliers, float(1 - values[-1]))
-        if not values[-1] > 0:
+        worst = float(np.linalg.eigvalsh(relative)[-1])
+        best = max(best, Shown(multipliers, 1 - worst), key=lambda shown: shown.margin)
+        most = 1 - float(np.sum(weight * relative))
+        if not worst > 0 or best.margin >= enough or most < min(enough, best.margin + _SETTLED):
             return best
-        focus = np.maximum(np.exp(_FOCUS * (values / values[-1] - 1)), _LEAST_WEIGHT)
-        weight = inverse.T @ (vectors * focus) @ vectors.T @ inverse
+        looked += _FOCUS / worst * relative
+        values, vectors = np.linalg.eigh(looked)
+        focus = np.maximum(np.exp(values - values[-1]), _LEAST_WEIGHT)
+        weight = (vectors * (focus / np.sum(focus))) @ vectors.T
     return best
 
 
@@ -78,10 +100,10 @@ def decay_of(models: Models, J: Array, b: Array, R: Array | None = None) -> Arra
     return -(B + B.T) - (0.0 if R is None else J.T @ R @ J)
 
 
-def rest_of(models: Models, b: Array, multipliers: Array) -> Array:
-    """The sum of the bounds of all that the decay is not, (k, k); multipliers (3, k), of which alpha and beta use n."""
+def rest_of(models: Models, b: Array, multipliers: Multipliers) -> Array:
+    """The sum of the bounds of all that the decay is not, (k, k)."""
     n, k = b.shape
-    (alpha, beta), g = multipliers[:2, :n], multipliers[2]
+    (alpha, beta), g = multipliers.rows[:2, :n], multipliers.rows[2]
     rest = np.zeros((k, k))
     for i in range(n):
         E, Q, square = models.E[i], models.Q[i], np.outer(b[i], b[i])
@@ -90,11 +112,13 @@ def rest_of(models: Models, b: Array, multipliers: Array) -> Array:
     if np.any(beta == 0):
         C = _joint(models, b, beta == 0)
         rest += np.diag(g) + np.einsum("jmk,m,jml->kl", C, 1 / g, C, optimize=True)
+    rest += _by_weight(np.eye(k), _cubic(models, b), multipliers.weight)
+    rest += _by_weight(models.shares.T @ b, models.squares, multipliers.weight)
     return (rest + rest.T) / 2
 
 
-def multipliers_for(models: Models, b: Array, weight: Array, joint: bool | None = None) -> Array:
-    """Those with the least trace of weight times the sum of the bounds, (3, k), for weight (k, k) positive definite.
+def multipliers_for(models: Models, b: Array, weight: Array, joint: bool | None = None) -> Multipliers:
+    """Those with the least trace of weight times the sum of the bounds, for weight (k, k) positive definite.
 
     `joint` says whether the Q of all components are taken jointly or all apart; None is what has the smaller trace.
     """
@@ -119,12 +143,30 @@ def multipliers_for(models: Models, b: Array, weight: Array, joint: bool | None 
         g = np.full_like(g, least)
     unused = np.zeros(b.shape[1] - len(b))
     alpha, beta = (np.append(row, unused) for row in (np.where(np.isfinite(alpha), alpha, 0.0), beta))
-    return np.array([short(alpha), short(beta), short(g)])
+    return Multipliers(np.array([short(alpha), short(beta), short(g)]), weight)
 
 
 def _joint(models: Models, b: Array, chosen: NDArray[np.bool_]) -> Array:
     """C_j = sum over the chosen components of (b_i)_j Q_i, (k, k, k)."""
     return np.tensordot(b[chosen].T, models.Q[chosen], 1)
+
+
+def _cubic(models: Models, b: Array) -> Array:
+    """N_l'N_l for each l, (k, k, k): N is the mean of sum_i b_i K_i over all orders of its four indices."""
+    k = b.shape[1]
+    N = np.tensordot(b.T, models.K, 1)  # each K_i is symmetric: what is left is which index is that of b
+    N = (N + N.transpose(1, 0, 2, 3) + N.transpose(1, 2, 0, 3) + N.transpose(1, 2, 3, 0)) / 4
+    N = N.reshape(k, k**2, k)
+    return np.asarray(N.transpose(0, 2, 1) @ N)
+
+
+def _by_weight(p: Array, squares: Array, weight: Array) -> Array:
+    """The sum of the bounds of 2 |p.d| ||T d|| for the rows of p (N, k) and T'T = `squares` (N, k, k)."""
+    size = np.einsum("qij,ij->q", squares, weight)
+    along = np.einsum("qi,ij,qj->q", p, weight, p, optimize=True)
+    some = ~((size <= 0) | (along <= 0))
+    p, tau = p[some], np.sqrt(size[some] / along[some])
+    return np.asarray((p.T * tau) @ p + np.tensordot(1 / tau, squares[some], 1))
 
 
 def short(values: Array) -> Array:

@@ -16,6 +16,7 @@ from certify.engines.models import Paths, paths
 Array = NDArray[np.float64]
 _LEAST = 1e-280  # a level, below which binary64 holds nothing more
 _MARGIN = 1e-3  # share of the decay that is left to the checker's rounding
+_ENOUGH = 1.01 * _MARGIN
 _WIDER = 1 + 1e-9  # of the ball, which has to contain {V <= c1} beyond all rounding
 
 
@@ -35,7 +36,7 @@ def prove_local(problem: Problem, T: Array, limit: float, known: Paths | None = 
     cells = _cells(problem, T, known)
 
     def good(level: float) -> bool:
-        return _shown(problem, ball_around(problem, T, level), known, cells).margin > _MARGIN
+        return _shown(problem, ball_around(problem, T, level), known, cells, _ENOUGH).margin > _MARGIN
 
     if good(limit):
         return limit
@@ -60,7 +61,8 @@ def local_ball(problem: Problem, T: Array, level: float) -> tuple[LocalBall, tup
     uncertain quantity is cut for it."""
     J, known = ball_around(problem, T, level), paths(problem.loop)
     cells = _cells(problem, T, known)
-    return LocalBall(J, _shown(problem, J, known, cells).multipliers), () if cells is None else cells.cuts
+    shown = _shown(problem, J, known, cells).multipliers
+    return LocalBall(J, shown.rows, shown.weight), () if cells is None else cells.cuts
 
 
 def ball_around(problem: Problem, T: Array, level: float) -> Array:
@@ -74,9 +76,9 @@ def _cells(problem: Problem, T: Array, known: Paths) -> Cells | None:
     return cells_for(known, T, problem.V.P) if problem.loop.system.ranges else None
 
 
-def _shown(problem: Problem, J: Array, known: Paths, cells: Cells | None) -> Shown:
+def _shown(problem: Problem, J: Array, known: Paths, cells: Cells | None, enough: float = math.inf) -> Shown:
     with np.errstate(all="ignore"):  # what overflows is not shown
         if cells is not None:
             return cells.shown(J, problem.V.P)
         models = known.models(J)
-        return best_multipliers(models, J, problem.V.P) if models.admitted else NOT_SHOWN
+        return best_multipliers(models, J, problem.V.P, enough=enough) if models.admitted else NOT_SHOWN

@@ -1,26 +1,26 @@
-"""Second-order models of the closed loop on a ball, in floats: what rules `local` and `tube` bound.
+"""Third-order models of the closed loop on a ball, in floats: what rules `local` and `tube` bound.
 
-On the ball x = m + J d, ||d|| <= 1, every quantity is written `v(0) + a.d + d'Q d + r(d)` with |r(d)| <= d'E d and E
-positive semidefinite, for all d in the ball, so the bound holds for every smaller radius too and leaves no hole at its
-middle m. What each tanh adds to its tangent reaches the output through the products of weights and slopes at m,
-`Paths`, in which it cancels as it does in truth; they do not depend on the ball. d may have more entries than x: along
-a path its last is the motion.
+On the ball x = m + J d, ||d|| <= 1, the components of F are jets (jets.py), and the bounds hold for every smaller
+radius too and leave no hole at its middle m. What each tanh adds to its tangent reaches the output through the products
+of weights and slopes at m, `Paths`, in which it cancels as it does in truth; they do not depend on the ball. What is
+left of each tanh beyond its third order, e_q, stays apart to the end: F has all of them in a linear combination that is
+known exactly, and so they keep the directions that they have in x. d may have more entries than x: along a path its
+last is the motion.
 """
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
-from fractions import Fraction
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from certify.certificate.limits import numbers_of_a_jet
 from certify.closed_loop import ClosedLoop
-from certify.enclosures.taylor import EXP_END
+from certify.engines.jets import Jet, Jets, basis, beyond_tangent, fourth_of_tanh, sizes
 from certify.errors import InputError
-from certify.expressions import Algebra, evaluate
+from certify.expressions import evaluate
 from certify.policies import bounded_by_form
 
 Array = NDArray[np.float64]
@@ -29,166 +29,121 @@ _MARGIN = 1e-3  # of an input's range, left to the checker's rounding where a cl
 
 
 @dataclass(frozen=True, slots=True)
-class Models:
-    """The components of F on a ball: values f (n,) at its middle, gradients A (n, k), half Hessians Q and remainders
-    E (n, k, k), k the entries of d.
+class Inputs:
+    """The inputs on a ball: gradients A (m, k), half Hessians Q (m, k, k), forms of third order K (m, k, k, k).
 
-    `admitted` says that every input is certain to lie in its bounds and inside its clip.
+    `curve` (m,) bounds all that they have beyond their gradients, `room` (m,) is how far they may move within their
+    bounds and clips, infinite without any, and `drive` (n, m) are the derivatives of F at the middle by them.
+    """
+
+    A: Array
+    Q: Array
+    K: Array
+    curve: Array
+    room: Array
+    drive: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Models:
+    """The components of F on a ball: values f (n,) at its middle, gradients A (n, k), half Hessians Q (n, k, k), forms
+    of third order K (n, k, k, k) and remainders E (n, k, k) beyond those of the tanhs, k the entries of d.
+
+    Those are N numbers |e_q| <= d'R_q d, R (N, k, k), which enter F as `shares` (n, N) times e; `squares` are R_q'R_q.
     """
 
     f: Array
     A: Array
     Q: Array
+    K: Array
     E: Array
-    admitted: bool
+    shares: Array
+    R: Array
+    squares: Array
+    inputs: Inputs
 
     @property
     def finite(self) -> bool:
         """Whether F has a finite model on the ball."""
-        return bool(np.all(np.isfinite(self.A)) and np.all(np.isfinite(self.Q)) and np.all(np.isfinite(self.E)))
-
-
-@dataclass(frozen=True, slots=True)
-class Jet:
-    c: float
-    a: Array
-    Q: Array
-    E: Array
+        return all(bool(np.all(np.isfinite(part))) for part in (self.A, self.Q, self.K, self.E, self.squares))
 
     @property
-    def slope(self) -> float:
-        return float(np.linalg.norm(self.a))
-
-    @property
-    def bend(self) -> float:
-        return float(np.linalg.norm(self.Q))
-
-    @property
-    def curve(self) -> float:
-        return self.bend + float(np.linalg.norm(self.E))
-
-    @property
-    def radius(self) -> float:
-        return self.slope + self.curve
-
-    def __add__(self, other: Jet) -> Jet:
-        return Jet(self.c + other.c, self.a + other.a, self.Q + other.Q, self.E + other.E)
-
-    def __mul__(self, other: Jet) -> Jet:
-        x, y = self, other
-        outer = np.outer(x.a, y.a)
-        Q = x.c * y.Q + y.c * x.Q + (outer + outer.T) / 2
-        E = (abs(x.c) + x.radius) * y.E + (abs(y.c) + y.slope) * x.E
-        return Jet(x.c * y.c, x.c * y.a + y.c * x.a, Q, E + (x.radius * y.bend + y.slope * x.bend) * np.eye(len(x.a)))
-
-    def compose(self, f0: float, f1: float, f2: float, third: float) -> Jet:
-        """A function's value and derivatives at c, and the largest third derivative on the range."""
-        cubic, outer = third * self.radius / 6, np.outer(self.a, self.a)
-        spread = (abs(f2) / 2 + cubic) * (2 * self.slope + self.curve)
-        E = (abs(f1) + spread) * self.E + cubic * outer + spread * self.bend * np.eye(len(self.a))
-        return Jet(f0, f1 * self.a, f1 * self.Q + f2 / 2 * outer, E)
-
-    def inverse(self) -> Jet:
-        least = abs(self.c) - self.radius
-        if not least > 0:
-            return Jet(math.nan, self.a, self.Q, self.E + math.inf)
-        return self.compose(1 / self.c, -1 / self.c**2, 2 / self.c**3, 6 / least**4)
-
-    def sqrt(self) -> Jet:
-        least = self.c - self.radius
-        if not least > 0:
-            return Jet(math.nan, self.a, self.Q, self.E + math.inf)
-        s, w = math.sqrt(self.c), math.sqrt(least)
-        third = 6 * (3 * s + w) / (8 * s**3 * (s + w) ** 3)  # the remainder's own factor, as for 1/v
-        return self.compose(s, 1 / (2 * s), -1 / (4 * s**3), third)
-
-    def exp(self) -> Jet:
-        if not self.c + self.radius < EXP_END:
-            return Jet(math.nan, self.a, self.Q, self.E + math.inf)
-        e = math.exp(self.c)
-        return self.compose(e, e, e, math.exp(self.c + self.radius))
-
-    def tanh(self) -> Jet:
-        t = math.tanh(self.c)
-        return self.compose(t, 1 - t * t, -2 * t * (1 - t * t), 2.0)
-
-    def atan(self) -> Jet:
-        slope = 1 / (1 + self.c**2)
-        return self.compose(math.atan(self.c), slope, -2 * self.c * slope**2, 2.0)
-
-    def sin(self) -> Jet:
-        s, c = math.sin(self.c), math.cos(self.c)
-        return self.compose(s, c, -s, min(1.0, abs(c) + self.radius))
-
-    def cos(self) -> Jet:
-        s, c = math.sin(self.c), math.cos(self.c)
-        return self.compose(c, -s, -c, min(1.0, abs(s) + self.radius))
-
-
-class Jets(Algebra[Jet]):
-    def __init__(self, k: int) -> None:
-        self.k = k
-
-    def constant(self, q: Fraction) -> Jet:
-        nothing = np.zeros((self.k, self.k))
-        return Jet(float(q), np.zeros(self.k), nothing, nothing)
+    def admitted(self) -> bool:
+        """Whether every input is certain to lie in its bounds and inside its clip."""
+        return bool(np.all(np.linalg.norm(self.inputs.A, axis=1) + self.inputs.curve < self.inputs.room))
 
 
 @dataclass(frozen=True, slots=True)
 class _Layer:
     """`y = y(m) + X [x - m, A]`: A stacks what every tanh before this layer adds to its tangent at m."""
 
+    y: Array
     X: Array
-    half: Array  # half of this layer's tanh's second derivative at m
+    W: Array  # the last columns of X, those of the layer just before
+
+    @property
+    def slope(self) -> Array:
+        return np.asarray(1 - np.tanh(self.y) ** 2)
+
+
+@dataclass(frozen=True, slots=True)
+class _Policy:
+    """Of the outputs before scaling: gradients (m, k), Q and K in their basis; their errors are `shares` (m, N) of
+    those that R, N rows, bounds."""
+
+    G: Array
+    Q: Array
+    K: Array
+    shares: Array
+    R: Array
 
 
 @dataclass(frozen=True, slots=True)
 class Paths:
     """The closed loop at a state `middle`, (n,): all of its models that does not depend on the ball around it.
 
-    `u` are the inputs there, before a clip; `slope` is that of the last layer's tanh, (m,), None with squash
-    `identity`.
+    `u` are the inputs there, before a clip; `squashed` says whether a tanh comes after the last layer.
     """
 
     loop: ClosedLoop
     middle: Array
     u: Array
     layers: tuple[_Layer, ...]
-    slope: Array | None
+    squashed: bool
 
     def models(self, J: Array) -> Models:
         """F on the ball x = middle + J d, ||d|| <= 1; J is (n, k)."""
-        loop, k = self.loop, J.shape[1]
-        system, nothing = loop.system, np.zeros((k, k))
-        states = [Jet(float(m), row, nothing, nothing) for m, row in zip(self.middle, J, strict=True)]
-        each = zip(self.u, loop.network.scale, *self._policy(J), strict=True)
-        inputs = [Jet(float(u), float(s) * a, float(s) * Q, abs(float(s)) * E) for u, s, a, Q, E in each]
+        loop, k, policy = self.loop, J.shape[1], self._policy(J)
+        system, scale, form = loop.system, loop.network.scale[:, None], basis(k)
+        G, Q, K, each = scale * policy.G, scale * policy.Q, scale * policy.K, scale * policy.shares
+        errors = np.abs(each) @ policy.R
+        algebra, shared = Jets(k, errors), dict[Any, Jet]()
+        states = [algebra.state(float(m), row) for m, row in zip(self.middle, J, strict=True)]
+        inputs = [algebra.input(j, float(u), G[j], Q[j], K[j]) for j, u in enumerate(self.u)]
         values = dict(zip((*system.states, *system.inputs), (*states, *inputs), strict=True))
-        algebra, shared = Jets(k), dict[Any, Jet]()
         F = [evaluate(e, values, algebra, shared) for e in system.exact_dynamics()]
-        f, A, Q, E = (np.array([getattr(v, part) for v in F]) for part in ("c", "a", "Q", "E"))
-        return Models(f, A, Q, E, _are_admitted(loop, inputs))
+        a, Qs, Ks, B, E = (np.concatenate([getattr(v, part) for v in F]) for part in ("a", "Q", "K", "B", "E"))
+        f, R = np.array([v.c for v in F]), form.matrices(policy.R)
+        curve, room = sizes(G, Q, K, errors).curve, _room(loop, self.u)
+        moved = Inputs(G, form.matrices(Q), form.forms(K), curve, room, B)
+        return Models(f, a, form.matrices(Qs), form.forms(Ks), form.matrices(E), B @ each, R, R @ R, moved)
 
-    def _policy(self, J: Array) -> tuple[Array, Array, Array]:
-        """Gradients (m, k), half Hessians and remainders (m, k, k) of the outputs on the ball, before scaling."""
+    def _policy(self, J: Array) -> _Policy:
         n, k = J.shape
-        quad, rest = np.zeros((0, k * k)), np.zeros((0, k * k))
-        eye = np.eye(k).ravel()
-        for layer in self.layers:
+        form, last = basis(k), len(self.layers) - 1
+        Q, K, R = (np.zeros((rows, len(of))) for rows, of in ((n, form.eye), (n, form.scale3), (0, form.eye)))
+        for number, layer in enumerate(self.layers):
             G, M = layer.X[:, :n] @ J, layer.X[:, n:]
-            Q, E = M @ quad, np.abs(M) @ rest
-            bend = np.linalg.norm(Q, axis=1)
-            length, curve = np.linalg.norm(G, axis=1), bend + np.linalg.norm(E, axis=1)
-            cubic = (length + curve) / 3
-            spread = (np.abs(layer.half) + cubic) * (2 * length + curve)
-            outer = (G[:, :, None] * G[:, None, :]).reshape(len(G), -1)
-            added = layer.half[:, None] * outer
-            beyond = spread[:, None] * E + cubic[:, None] * outer + (spread * bend)[:, None] * eye
-            quad, rest = np.concatenate([quad, added]), np.concatenate([rest, beyond])
-        if self.slope is not None:
-            s = self.slope[:, None]
-            G, Q, E = s * G, s * Q + added, s * E + beyond
-        return G, Q.reshape(-1, k, k), E.reshape(-1, k, k)
+            Q, K = layer.W @ Q, layer.W @ K
+            if number == last and not self.squashed:
+                return _Policy(G, Q, K, M, R)
+            E, t, slope = np.abs(M) @ R, np.tanh(layer.y), layer.slope
+            size = sizes(G, Q, K, E)
+            second, third = -t * slope, (3 * t**2 - 1) * slope / 3
+            H, cubic, rest = beyond_tangent(G, Q, K, E, size, second, third, fourth_of_tanh(layer.y, size.radius))
+            R = np.concatenate([R, rest])
+            Q, K = slope[:, None] * Q + H, slope[:, None] * K + cubic
+        return _Policy(slope[:, None] * G, Q, K, np.concatenate([slope[:, None] * M, np.eye(len(G))], axis=1), R)
 
 
 def paths(loop: ClosedLoop, at: Array | None = None) -> Paths:
@@ -200,12 +155,13 @@ def paths(loop: ClosedLoop, at: Array | None = None) -> Paths:
     InputError : the network is larger than the checker's rules allow.
     """
     network = loop.network
-    n, squash, columns, products = network.n, network.squash == "tanh", network.n, 0
+    n, squashed = network.n, network.squash == "tanh"
+    columns = k = n if at is None else n + 1
+    numbers, products = numbers_of_a_jet(k), 0
     for W in network.weights[1:]:
-        products += len(W) * columns * W.shape[1]
         columns += W.shape[1]
-        products += len(W) * columns * n**2
-        if columns * (len(W) + n**2) > _MOST_NUMBERS or products > _MOST_PRODUCTS:
+        products += len(W) * columns * (numbers + W.shape[1])
+        if columns * (len(W) + numbers) > _MOST_NUMBERS or products > _MOST_PRODUCTS:
             raise InputError("The network is too large for the local proof: use fewer or narrower layers.")
     folded, middle = loop.folded, np.zeros(n) if at is None else at
     h, X = middle, np.eye(n)
@@ -214,24 +170,24 @@ def paths(loop: ClosedLoop, at: Array | None = None) -> Paths:
         y, X = W @ h + b, W @ X
         if number:
             X = np.concatenate([X, W], axis=1)
+        layers.append(_Layer(y, X, W))
         h = np.tanh(y)
-        slope = 1 - h**2
-        layers.append(_Layer(X, -h * slope))
-        X = slope[:, None] * X
+        X = layers[-1].slope[:, None] * X
     u = np.array([float(q) for q in loop.u_eq])
     if at is not None:
-        u = folded.scale * (h if squash else y) + folded.offset
-    return Paths(loop, middle, u, tuple(layers), slope if squash else None)
+        u = folded.scale * (h if squashed else y) + folded.offset
+    return Paths(loop, middle, u, tuple(layers), squashed)
 
 
-def _are_admitted(loop: ClosedLoop, inputs: list[Jet]) -> bool:
-    """Inside the clip, which has no second derivative at its corners, and within the bounds."""
+def _room(loop: ClosedLoop, u: Array) -> Array:
+    """How far inputs may move from u: inside the clip, which has no second derivative at its corners, and within the
+    bounds."""
     network, bounds = loop.network, loop.system.input_bounds
+    room = np.full(len(u), np.inf)
     if network.clip is not None:
-        for jet, lo, hi in zip(inputs, *network.clip, strict=True):
-            if not (lo < jet.c - (1 + _MARGIN) * jet.radius and jet.c + (1 + _MARGIN) * jet.radius < hi):
-                return False
-    if bounded_by_form(network, bounds):
-        return True
-    each = zip(inputs, bounds, strict=True)
-    return all(float(lo) < jet.c - jet.radius and jet.c + jet.radius < float(hi) for jet, (lo, hi) in each)
+        lo, hi = network.clip
+        room = np.minimum(room, np.minimum(u - lo, hi - u) / (1 + _MARGIN))
+    if not bounded_by_form(network, bounds):
+        lo, hi = np.array([[float(end) for end in pair] for pair in bounds]).T
+        room = np.minimum(room, np.minimum(u - lo, hi - u))
+    return np.asarray(room)

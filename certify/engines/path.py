@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from certify.certificate import Slab, Waypoint
 from certify.closed_loop import ClosedLoop
-from certify.engines.decrease import decay_of, multipliers_for, rest_of, short
+from certify.engines.decrease import Multipliers, decay_of, multipliers_for, rest_of, short
 from certify.engines.models import Models, paths
 from certify.engines.tube import (
     INSIDE,
@@ -94,13 +94,13 @@ def after(loop: ClosedLoop, x: Array, duration: float) -> Array:
 class _Along:
     """The models on a slab's ball, z = J^-1 e and the motion being their symbols, and what widens its ellipsoids.
 
-    `multipliers` are (3, n + 1); W grows by at most e'(G + rate) e where it is 1, G the growth.
+    W grows by at most e'(G + rate) e where it is 1, G the growth.
     """
 
     models: Models
     J: Array
     moved: Array  # F - v at the middle, (n,)
-    multipliers: Array
+    multipliers: Multipliers
     edge: float
     motion: float
 
@@ -146,8 +146,9 @@ def _slab(loop: ClosedLoop, P: Array, c: Array, rate: Array | None, goal: Array,
                 along = _multipliers(models, J, models.f - (end - c) / duration, middle, J.T @ goal @ J)
                 nodes = nodes_of(along.growth, J, P, duration, _ROOM)
                 if nodes is not None:
-                    way = Waypoint(end, _SHARE, along.edge, along.motion, float(along.multipliers[2, -1]))
-                    return Slab(*nodes, duration, J, along.multipliers[:, :-1], way)
+                    rows, weight = along.multipliers.rows, along.multipliers.weight
+                    way = Waypoint(end, _SHARE, along.edge, along.motion, float(rows[2, -1]))
+                    return Slab(*nodes, duration, J, rows[:, :-1], weight, way)
         duration *= 0.6
     return None
 

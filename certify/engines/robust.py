@@ -1,14 +1,12 @@
-"""The candidate `robust`: P chosen together with the bound that has to prove it, by a sequence of matrix inequalities.
+"""The candidate `robust`: P chosen together with the rule that has to prove it, by a sequence of matrix inequalities.
 
-On a ball somewhat larger than the present set the models of the closed loop are F = sum of A d and errors n_i along the
-axes e_i, |n_i|^2 <= d'R_i d. V = x'Px then decreases on {V <= 1}, inside the ball, if with Y = P^-1 and lambda_i > 0
-
-    A Y + Y A' + sum_i (lambda_i e_i e_i' + Y R_i Y / lambda_i) < 0,
-
-which is a linear matrix inequality in Y and lambda: its largest det Y is found, and the ball follows the new set. Each
-step is judged by the local rule itself, whose bounds are sharper; one that does not gain is refused, and the next is
-shorter (Boyd, El Ghaoui, Feron, Balakrishnan, Linear Matrix Inequalities in System and Control Theory, SIAM 1994,
-sections 5.1 and 7.2).
+In coordinates in which the present set is the unit ball let P = 1 + X. The rule's matrix inequality, on the ball of
+that set and with the multipliers that are best at X = 0, is nearly linear in X for small X, and so is what the inputs
+take of their room. Its derivatives are difference quotients of the rule itself, so that nothing of what makes it sharp
+is lost: errors that cancel, or that keep their direction. With log det(1 + X) <= tr X the largest set within a trust
+region is a small semidefinite program, and the local rule judges what it gives. (Boyd, El Ghaoui, Feron, Balakrishnan,
+Linear Matrix Inequalities in System and Control Theory, SIAM 1994, section 5.1, have the inequality for errors that do
+not depend on the set.)
 """
 
 from __future__ import annotations
@@ -16,23 +14,29 @@ from __future__ import annotations
 import math
 import time
 import warnings
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from certify.claims import Problem
 from certify.closed_loop import ClosedLoop
-from certify.engines.local import prove_local
+from certify.engines.decrease import Multipliers, best_multipliers, decay_of, rest_of
+from certify.engines.local import ball_around, prove_local
 from certify.engines.models import Paths, paths
 from certify.errors import BackendError
 from certify.lyapunov import SOLVED, choose_candidate, diagonalising_coordinates, domain_limit, volume
 from certify.lyapunov.function import Quadratic
 
 Array = NDArray[np.float64]
-_STEP, _LEAST_STEP = 1.2, 1.01  # size of the ball, relative to the present set
-_WORTH = 1.001  # of a volume: less is no gain
-_SLACK = 1e-2  # of the decrease, in the coordinates in which the present set is the unit ball
-_SMALL, _THIN = 1e-13, 1e-5  # errors, and directions of one, that are left out
+_TRUST, _MOST_TRUST, _LEAST_TRUST = 0.4, 0.6, 0.01  # of the eigenvalues of X
+_WIDER, _NARROWER = 1.5, 0.5  # the next trust region, after a gain as foretold and after none
+_FORETOLD = 0.5  # of the gain that the program promises
+_WORTH = 0.005  # of the logarithm of a volume: less is no gain
+_DIFFERENCE = 1e-3
+_FAR = -1.0  # of a margin
+_LEFT = 3e-3  # share of the decay that is to be left
+_INSIDE = 0.995  # of the room of an input or a state
 _BELOW = 1 - 1e-9  # of the domain's limit
 
 
@@ -49,85 +53,118 @@ def robust_candidate(loop: ClosedLoop, seconds: float = math.inf) -> Array:
     InputError : the network is larger than the checker's local rule allows.
     """
     end, known = time.perf_counter() + seconds, paths(loop)
-    starts = [_scaled(loop, known, choose_candidate(loop, name).P) for name in SOLVED]
+    starts = [_scaled(known, choose_candidate(loop, name).P) for name in SOLVED]
     proved = [P for P in starts if P is not None]
     if not proved:
         raise BackendError("the local rule proves nothing with the candidates that solve a Lyapunov equation")
-    best = max(proved, key=lambda P: volume(P, 1.0))
-    step = _STEP
-    while step > _LEAST_STEP and time.perf_counter() < end:
-        try:
-            asked = _larger(known, best, step)
-        except np.linalg.LinAlgError:  # an ellipsoid without extent in some direction
-            asked = None
-        found = None if asked is None else _scaled(loop, known, asked)
-        if found is not None and volume(found, 1.0) > _WORTH * volume(best, 1.0):
-            best = found
-        else:
-            step = 1 + (step - 1) / 2
+    best, trust, about = max(proved, key=_log_volume), _TRUST, None
+    while trust > _LEAST_TRUST and time.perf_counter() < end:
+        about = about or _linearised(known, best, end)
+        if about is None:
+            break
+        asked = about.largest(trust)
+        found = None if asked is None else _scaled(known, asked)
+        gain = -math.inf if found is None else _log_volume(found) - _log_volume(best)
+        as_foretold = asked is not None and gain > _FORETOLD * (_log_volume(asked) - _log_volume(best))
+        trust = min(_WIDER * trust, _MOST_TRUST) if as_foretold else _NARROWER * trust
+        if found is not None and gain > _WORTH:
+            best, about = found, None
     return best
 
 
-def _scaled(loop: ClosedLoop, known: Paths, P: Array) -> Array | None:
+def _log_volume(P: Array) -> float:
+    return math.log(volume(P, 1.0))
+
+
+def _scaled(known: Paths, P: Array) -> Array | None:
     """P over the largest level that the local rule proves with it; None if there is none."""
     if not np.linalg.eigvalsh(P)[0] > 0:
         return None
-    T = diagonalising_coordinates(P, loop.linearise()[0])
-    level = prove_local(Problem(loop, Quadratic(P)), T, domain_limit(P, loop.system.domain) * _BELOW, known)
+    level = prove_local(*_problem(known, P), domain_limit(P, known.loop.system.domain) * _BELOW, known)
     return None if level is None else P / level
 
 
-def _larger(known: Paths, P: Array, step: float) -> Array | None:
-    """The P of the matrix inequality on a ball `step` times as large as {x'Px <= 1}; None if there is none."""
-    try:
-        import cvxpy
-    except ImportError as error:
-        raise BackendError(f"the candidate 'robust' needs cvxpy: {error}. Install it, or use another.") from error
+def _problem(known: Paths, P: Array) -> tuple[Problem, Array]:
+    """With the coordinates of its proof."""
+    return Problem(known.loop, Quadratic(P)), diagonalising_coordinates(P, known.loop.linearise()[0])
 
-    n = len(P)
-    L = np.linalg.inv(np.linalg.cholesky(P)).T
+
+@dataclass(frozen=True, slots=True)
+class _Linearised:
+    """The rule around {x'Px <= 1}, x = J d: in a row, what the decay leaves, (n, n), relative to the decay at X = 0, and
+    how far inputs and states move, (m + n,), who have that `room`; `slopes` are its derivatives by the entries of X on
+    and above the diagonal."""
+
+    J: Array
+    here: Array
+    slopes: Array
+    room: Array
+
+    def largest(self, trust: float) -> Array | None:
+        """P (n, n) of the largest set with X between -trust and trust; None if there is none."""
+        try:
+            import cvxpy
+        except ImportError as error:
+            raise BackendError(f"the candidate 'robust' needs cvxpy: {error}. Install it, or use another.") from error
+
+        n = len(self.J)
+        x = cvxpy.Variable(len(self.slopes))
+        X = cvxpy.reshape(np.reshape(_directions(n), (-1, n * n)).T @ x, (n, n), order="C")
+        asked = self.here + self.slopes.T @ x
+        left = cvxpy.reshape(asked[: n * n], (n, n), order="C")
+        least = min(_LEFT, float(np.linalg.eigvalsh(self.here[: n * n].reshape(n, n))[0]))
+        within = [left + left.T >> 2 * least * np.eye(n), X << trust * np.eye(n), X >> -trust * np.eye(n)]
+        within += [asked[n * n + j] <= _INSIDE * room for j, room in enumerate(self.room) if math.isfinite(room)]
+        problem = cvxpy.Problem(cvxpy.Minimize(cvxpy.trace(X)), within)
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of a solution that may be inaccurate: the local rule judges it
+                problem.solve(solver=cvxpy.CLARABEL)
+        except cvxpy.SolverError:
+            return None
+        if X.value is None or not np.all(np.isfinite(X.value)):
+            return None
+        inverse = np.linalg.inv(self.J)
+        found = inverse.T @ (np.eye(n) + X.value) @ inverse
+        return np.asarray((found + found.T) / 2)
+
+
+def _linearised(known: Paths, P: Array, end: float) -> _Linearised | None:
+    """None if there is no time for it, or the rule is far from holding."""
+    J = ball_around(*_problem(known, P), 1.0)
     with np.errstate(all="ignore"):
-        models = known.models(step * L)
-    if not (models.finite and models.admitted):
-        return None
-    inverse = np.linalg.inv(L)
-    A = inverse @ models.A / step
-    Y = cvxpy.Variable((n, n), symmetric=True)
-    corner, columns, weights = A @ Y + Y @ A.T + _SLACK * np.eye(n), [], []
-    for i in range(n):
-        root = _error(models.Q[i], models.E[i], float(np.linalg.norm(models.A[i])))
-        if root is None:
-            continue
-        balance = math.sqrt(np.linalg.norm(root) / (step * np.linalg.norm(inverse[:, i])))
-        along, root = balance * inverse[:, i], root / (step * balance)
-        weight = cvxpy.Variable(nonneg=True)
-        corner = corner + weight * np.outer(along, along)
-        columns.append(Y @ root.T)
-        weights.append(weight * np.ones(len(root)))
-    if not columns:
-        return None
-    edge = cvxpy.hstack(columns)
-    whole = cvxpy.bmat([[corner, edge], [edge.T, -cvxpy.diag(cvxpy.hstack(weights))]])
-    within = [Y << step**2 * np.eye(n), (whole + whole.T) / 2 << 0]
-    problem = cvxpy.Problem(cvxpy.Maximize(cvxpy.log_det(Y)), within)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of a solution that may be inaccurate: the local rule judges it
-            problem.solve(solver=cvxpy.CLARABEL)
-    except cvxpy.SolverError:
-        return None
-    if Y.value is None or not np.all(np.isfinite(Y.value)):
-        return None
-    found = inverse.T @ np.linalg.inv(Y.value) @ inverse
-    return np.asarray((found + found.T) / 2)
+        models = known.models(J)
+        shown = best_multipliers(models, J, P)
+        if not shown.margin > _FAR:
+            return None
+        root = np.linalg.inv(np.linalg.cholesky(decay_of(models, J, P @ J)))
+        here, values = _asked(known, P, J, np.zeros_like(P), shown.multipliers, root), []
+        for X in _directions(len(P)):
+            if time.perf_counter() > end:
+                return None
+            values.append(_asked(known, P, J, _DIFFERENCE * X, shown.multipliers, root))
+    slopes = (np.array(values) - here) / _DIFFERENCE
+    half = [float(min(-lo, hi)) for lo, hi in known.loop.system.domain]
+    room = np.append(models.inputs.room, half)
+    return _Linearised(J, here, slopes, room) if np.all(np.isfinite(slopes)) else None
 
 
-def _error(Q: Array, E: Array, size: float) -> Array | None:
-    """A root of R, (k, n), with (d'Qd + r)^2 <= d'Rd for ||d|| <= 1 and |r| <= d'Ed; None if that is as good as 0."""
-    q, e = float(np.linalg.norm(Q, 2)), float(np.linalg.norm(E, 2))
-    if q + e <= _SMALL * size:
-        return None
-    R = (1 + e / q) * Q.T @ Q + (1 + q / e) * E.T @ E if q > 0 and e > 0 else Q.T @ Q + E.T @ E
-    values, vectors = np.linalg.eigh(R)
-    kept = values > _THIN * values[-1]
-    return np.asarray((vectors[:, kept] * np.sqrt(values[kept])).T)
+def _directions(n: int) -> list[Array]:
+    """A basis of the symmetric matrices, (n, n) each."""
+    found = []
+    for i, j in zip(*np.triu_indices(n), strict=True):
+        X = np.zeros((n, n))
+        X[i, j] = X[j, i] = 1.0
+        found.append(X)
+    return found
+
+
+def _asked(known: Paths, P: Array, J: Array, X: Array, multipliers: Multipliers, root: Array) -> Array:
+    """What `_Linearised` has in a row, at 1 + X; `root` is the inverse of the root of the decay at X = 0."""
+    values, vectors = np.linalg.eigh(np.eye(len(P)) + X)
+    ball = J @ (vectors / np.sqrt(values)) @ vectors.T
+    models, inverse = known.models(ball), np.linalg.inv(J)
+    b = (P + inverse.T @ X @ inverse) @ ball
+    left = root @ (decay_of(models, ball, b) - rest_of(models, b, multipliers)) @ root.T
+    moved = np.linalg.norm(models.inputs.A, axis=1) + models.inputs.curve
+    return np.concatenate([left.ravel(), moved, np.linalg.norm(ball, axis=1)])

@@ -19,7 +19,7 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from certify.certificate import Slab
-from certify.engines.decrease import decay_of, multipliers_for, rest_of
+from certify.engines.decrease import Multipliers, decay_of, multipliers_for, rest_of
 from certify.engines.models import Models, Paths
 from certify.lyapunov import leaves_domain
 
@@ -98,7 +98,7 @@ def _slab(known: Paths, P: Array, rate: Array | None, weight: Array) -> Slab | N
                 multipliers = _multipliers(models, J, P, weight)
                 nodes = nodes_of(partial(_growth, models, J, multipliers), J, P, duration)
                 if nodes is not None:
-                    return Slab(*nodes, duration, J, multipliers)
+                    return Slab(*nodes, duration, J, multipliers.rows, multipliers.weight)
         duration *= 0.6
     return None
 
@@ -135,12 +135,12 @@ def nodes_of(growth: Growth, J: Array, P: Array, duration: float, room: float = 
     return None
 
 
-def _growth(models: Models, J: Array, multipliers: Array, P: Array) -> Array:
+def _growth(models: Models, J: Array, multipliers: Multipliers, P: Array) -> Array:
     b = P @ J
     return rest_of(models, b, multipliers) - decay_of(models, J, b)
 
 
-def _multipliers(models: Models, J: Array, P: Array, weight: Array) -> Array:
+def _multipliers(models: Models, J: Array, P: Array, weight: Array) -> Multipliers:
     return multipliers_for(models, P @ J, J.T @ weight @ J)
 
 
