@@ -38,7 +38,7 @@ def export_smt2(
     if plant.ranges:
         raise InputError(
             "export-smt2 must have a plant of exact equations, because formulas know no ranges; found ranges of "
-            f"{', '.join(plant.ranges)} in {plant.name}. Leave them out (of a disturbance in the plant's file: half-width 0)."
+            f"{', '.join(plant.ranges)} in {plant.name}. Leave them out (of a disturbance in its file: half-width 0)."
         )
     options = RoaOptions(candidate=candidate, level=level, time_limit=time_limit)  # type: ignore[arg-type]
     result = certify_roa(plant, stored.network, out, options)

@@ -134,7 +134,7 @@ def _disturbances(s: System) -> Table:
 
 
 def _ends(s: System, name: str) -> tuple[str, str]:
-    """The range of what is uncertain: nothing of a parameter that is exact; 0 is where a disturbance stays by itself."""
+    """The range of what is uncertain: nothing of an exact parameter; 0 is where a disturbance stays by itself."""
     if name in s.ranges:
         lo, hi = s.ranges[name]
         return _number(lo), _number(hi)

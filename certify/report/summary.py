@@ -95,7 +95,7 @@ def _headline(result: Mapping[str, Any], verdict: str) -> str:
             outer=below(level), inner="?" if inner is None else inner_level(kind, inner)
         )
         word = ", if the solver is right: nothing checked its answers" if verdict == "TRUSTED" else ""
-        return f"{name}: {stated}{_whatever(result)}{word}"
+        return f"{name}: {_whatever(result)}{stated}{word}"
     if verdict == "REFUTED":
         return f"{name}: a condition of the claim fails for this V and level; another V may show what this one cannot"
     if _is_missed(result):
@@ -117,8 +117,8 @@ def _whatever(result: Mapping[str, Any]) -> str:
     if not found:
         return ""
     if len(found) > _FEW:
-        return f", for every one of the {len(found)} uncertain quantities within its range at any time"
-    return f", for every {varying(found)}"
+        return f"for every one of the {len(found)} uncertain quantities within its range at any time, "
+    return f"for every {varying(found)}, "
 
 
 def _is_missed(result: Mapping[str, Any]) -> bool:
