@@ -41,6 +41,7 @@ from certify.verdict import Verdict
 from tests.support.balls import with_ball
 from tests.support.cases import case_of
 from tests.support.certificates import Document, edited, grow, make, verdict
+from tests.support.jets import curved, plain
 from tests.support.loops import box, tank, valve
 from tests.support.oracle import value_of
 from tests.support.reference import judge
@@ -200,8 +201,8 @@ def test_models_of_random_equations_contain_them(tree: Any, seed: int, size: flo
                 assert off <= w.r + arb(2) ** -100 * (1 + w.r + abs(w.c))
         # balls
         n = np.zeros((2, 2))
-        jets = [checker_jets.Jet(np.float64(c), 0.0, a, 0.0, n, n) for c, a in zip(at_0, slopes, strict=True)]
-        [jet] = checker_expression.evaluate(tape, lambda q: checker_jets.constant(q, 2), jets)
+        jets = [plain(np.float64(c), 0.0, a, 0.0, n, n) for c, a in zip(at_0, slopes, strict=True)]
+        [jet] = checker_expression.evaluate(tape, lambda q: checker_jets.constant(q, np.zeros((1, 2, 2))), jets)
         models = {
             name: reference_model.Model.affine(arb(float(c)), [arb(float(v)) for v in a])
             for name, c, a in zip("xy", at_0, slopes, strict=True)
@@ -210,7 +211,9 @@ def test_models_of_random_equations_contain_them(tree: Any, seed: int, size: flo
             [model] = compiled.evaluate(models, lambda q: reference_model.Model.affine(arb(q), [arb(0)] * 2))
         except Refused:
             model = None
-        finite = bool(np.isfinite([jet.size, jet.slack, *np.ravel(jet.a), *np.ravel(jet.Q), *np.ravel(jet.E)]).all())
+        finite = bool(
+            np.isfinite([jet.size, jet.slack, *np.ravel(jet.a), *np.ravel(jet.Q), *jet.K, *np.ravel(jet.E)]).all()
+        )
         for corner in points[:4]:
             d = (np.array(corner) / max(1.0, float(np.linalg.norm(corner)))).tolist()
             value = _at(tree, at_0, slopes, d) if finite or model is not None else arb(0)
@@ -221,7 +224,8 @@ def test_models_of_random_equations_contain_them(tree: Any, seed: int, size: flo
                     + arb(float(jet.slack)) * length.sqrt()
                     + _form([arb(0)] * 2, jet.E.tolist(), d)
                 )
-                assert abs(value - arb(float(jet.c)) - _form(jet.a.tolist(), jet.Q.tolist(), d)) <= room
+                known = _form(jet.a.tolist(), [[0] * 2] * 2, d) + curved(jet, d)
+                assert abs(value - arb(float(jet.c)) - known) <= room
             if model is not None and all(v.is_finite() for v in (model.v, *model.a, *model.Q, *model.E)):
                 a, Q, E = model.a.entries(), model.Q.tolist(), model.E.tolist()
                 off = abs(value - model.v - _form(a, Q, d))

@@ -179,7 +179,8 @@ def enclose_on_ball(net: Folded, states: Sequence[Jet]) -> Jet:
         Q = np.tensordot(B, H, 1)
         lost = total(doubt[k:] * sizes + (gamma(count) + EPS) * (np.abs(B) * sizes), 1)
         E = widen(np.zeros_like(Q), lost)
-        value = Jet(y[:, 0, 0], error[:, 0], a, norm(doubt[:k], 0), (Q + Q.swapaxes(1, 2)) / 2, B @ C, E, B, R)
+        slack = np.full(len(a), norm(doubt[:k], 0))
+        value = Jet(y[:, 0, 0], error[:, 0], a, slack, (Q + Q.swapaxes(1, 2)) / 2, B @ C, E, B, R)
         if number == len(net.layers) - 1:
             break
         phi = elementary("tanh", value.c, value.error, value.radius)

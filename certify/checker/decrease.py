@@ -102,6 +102,8 @@ def sides(
 def cubic(models: Models, b: fmpq_mat, weight: Array) -> fmpq_mat:
     """S_cubic: 2 sum_i (b_i.d) K_i[d] = 2 sum_l d_l N_l[d, d, d], where N is symmetric in all of its indices."""
     k = b.ncols()
+    if not np.any(models.K):
+        return fmpq_mat(k, k)
     row, by = in_binary64(b)
     N = np.tensordot(row.T, unpacked(models.K, k), 1)
     N = (N + N.transpose(1, 0, 2, 3) + N.transpose(1, 2, 0, 3) + N.transpose(1, 2, 3, 0)) / 4
@@ -112,6 +114,8 @@ def cubic(models: Models, b: fmpq_mat, weight: Array) -> fmpq_mat:
 def of_units(models: Models, b: fmpq_mat, weight: Array) -> fmpq_mat:
     """S_units: 2 sum_q (p_q.d) e_q, p_q = sum_i b_i sum_j B_ij L_jq."""
     L, R = models.units.L, models.units.R
+    if not np.any(L):
+        return fmpq_mat(b.ncols(), b.ncols())
     row, by = in_binary64(models.B.transpose() * b)
     p, wrong = L.T @ row, (gamma(len(L)) + EPS) * total(np.abs(L) * norm(row, 1)[:, None], 0)
     return bound_of_pairs(p, up(wrong), R, np.zeros(len(R)), weight) * fmpq(2) ** by

@@ -10,6 +10,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -19,7 +20,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from certify.checker import float64
-from certify.checker.ball import enclose_on_ball, input_jet, too_large
+from certify.checker.ball import enclose_on_ball, too_large
 from certify.checker.document import Policy
 from certify.checker.elementary import elementary
 from certify.checker.exact import contains_ball, gershgorin_lower, inverse_diagonal, is_definite, root_above
@@ -42,6 +43,7 @@ from certify.checker.network import Folded, enclose_on_boxes, fold, relax_tanh
 from certify.checker.ring import Ring
 from certify.checker.taylor import Taylor, affine, upper_bound
 from certify.checker.taylor import constant as constant_model
+from tests.support.jets import curved, plain
 from tests.support.oracle import awkward, ball, certainly_within, policy_in_arb, quadratic
 
 FLOATS = st.floats(allow_nan=False, allow_infinity=False)
@@ -594,7 +596,7 @@ class Member:
 
     def __call__(self, d: list[float]) -> arb:
         linear = sum((p * arb(x) for p, x in zip(self.a, d, strict=True)), self.c)
-        return linear + quadratic(self.jet.Q, d) + arb(self.w) * quadratic(self.jet.E, d)
+        return linear + curved(self.jet, d) + arb(self.w) * quadratic(self.jet.E, d)
 
 
 def points_in_the_ball(generator: np.random.Generator, n: int) -> list[list[float]]:
@@ -608,7 +610,7 @@ def assert_jet(
 ) -> bool:
     """v(0), the gradient, and the remainder at every point; False if the jet says nothing."""
     n = len(gradient)
-    if not np.isfinite([result.error, result.slack, *np.ravel(result.Q), *np.ravel(result.E)]).all():
+    if not np.isfinite([result.error, result.slack, *np.ravel(result.Q), *result.K, *np.ravel(result.E)]).all():
         return False
     at_0 = value([0.0] * n)
     assert abs(at_0 - arb(float(result.c))) <= arb(float(result.error))
@@ -616,7 +618,7 @@ def assert_jet(
     assert distance <= arb(float(result.slack)) ** 2
     for d in points:
         linear = sum((p * arb(x) for p, x in zip(gradient, d, strict=True)), at_0)
-        assert abs(value(d) - linear - quadratic(result.Q, d)) <= quadratic(result.E, d), d
+        assert abs(value(d) - linear - curved(result, d)) <= quadratic(result.E, d), d
     return True
 
 
@@ -627,12 +629,14 @@ def jets(generator: np.random.Generator, n: int, exponent: int) -> Jet:
         return float(abs(generator.standard_normal()) * 2.0 ** generator.integers(-40, most) * scale)
 
     sign = float(generator.choice([-1.0, 1.0]))
-    some = generator.random(4) < 0.8
+    some = generator.random(5) < 0.8
     half, root = generator.standard_normal((2, n, n))
     E = root @ root.T * number(0) * some[3]
-    return Jet(
+    thirds = generator.standard_normal(n * (n + 1) * (n + 2) // 6) * number(0) * some[4]
+    return plain(
         np.float64(sign * number(2)), number(-4) * some[0], generator.standard_normal(n) * number(1),
         number(-4) * some[1], (half + half.T) * number(0) * some[2], widen((E + E.T) / 2, 0.0, 2.0**-40),
+        thirds,
     )  # fmt: skip
 
 
@@ -662,7 +666,7 @@ def test_jets_of_sine_and_cosine_contain(spread: int) -> None:
         for _ in range(40):
             x = jets(generator, 2, spread)
             centre = np.float64(generator.choice([0.0, 1.0, 70.0]) * generator.standard_normal())
-            x = Jet(centre, x.error, x.a, x.slack, x.Q, x.E)
+            x = replace(x, c=centre)
             v, points = Member(x, generator), points_in_the_ball(generator, 2)
             assert assert_jet(x.function("sin"), lambda d, v=v: v(d).sin(), [v.c.cos() * p for p in v.a], points)
             assert assert_jet(x.function("cos"), lambda d, v=v: v(d).cos(), [-v.c.sin() * p for p in v.a], points)
@@ -675,7 +679,7 @@ def test_jets_of_other_functions_contain(spread: int) -> None:
         for _ in range(40):
             x = jets(generator, 2, spread)
             centre = np.float64(generator.choice([0.0, 1.0, 20.0]) * generator.standard_normal())
-            x = Jet(centre, x.error, x.a, x.slack, x.Q, x.E)
+            x = replace(x, c=centre)
             v, points = Member(x, generator), points_in_the_ball(generator, 2)
             slopes = {"exp": v.c.exp(), "atan": 1 / (1 + v.c * v.c), "tanh": 1 - v.c.tanh() ** 2}
             for name, slope in slopes.items():
@@ -690,7 +694,7 @@ def test_jets_of_other_functions_contain(spread: int) -> None:
 def test_a_jet_of_a_root_that_may_not_be_defined_gives_nothing() -> None:
     nothing = np.zeros((1, 1))
     for c, error, slope in ((1.0, 0.0, 1.0), (0.0, 0.0, 0.0), (1.0, 1.0, 0.0), (-4.0, 0.0, 0.5), (1.0, 0.5, 0.5)):
-        x = Jet(np.float64(c), error, np.full(1, slope), 0.0, nothing, nothing)
+        x = plain(np.float64(c), error, np.full(1, slope), 0.0, nothing, nothing)
         with np.errstate(all="ignore"):
             assert np.isnan(x.function("sqrt").E) and np.isnan(x.function("sqrt").slack)
 
@@ -698,17 +702,17 @@ def test_a_jet_of_a_root_that_may_not_be_defined_gives_nothing() -> None:
 def test_a_jet_of_a_divisor_that_may_vanish_gives_nothing() -> None:
     nothing = np.zeros((1, 1))
     for c, error, slope in ((1.0, 0.0, 1.0), (0.0, 0.0, 0.0), (1.0, 1.0, 0.0)):
-        x = Jet(np.float64(c), error, np.full(1, slope), 0.0, nothing, nothing)
+        x = plain(np.float64(c), error, np.full(1, slope), 0.0, nothing, nothing)
         assert np.isnan(x.function("inv").E) and np.isnan(x.function("inv").slack)
-    whole = Jet(np.float64("inf"), float("inf"), np.zeros(1), 0.0, nothing, nothing)
-    assert not np.isfinite((whole * Jet(np.float64(0), 0.0, np.zeros(1), 0.0, nothing, nothing)).error)
+    whole = plain(np.float64("inf"), float("inf"), np.zeros(1), 0.0, nothing, nothing)
+    assert not np.isfinite((whole * plain(np.float64(0), 0.0, np.zeros(1), 0.0, nothing, nothing)).error)
 
 
-@pytest.mark.parametrize(("c", "slope"), [(1e170, 1e150), (-1e160, 1e140), (1e170, 1e120)])
+@pytest.mark.parametrize(("c", "slope"), [(1e170, 1e100), (-1e160, 1e90), (1e170, 1e80)])
 def test_an_inverse_whose_derivative_underflows_contains(c: float, slope: float) -> None:
     """1/c^2 is 0 in binary64, and its error is multiplied by a large gradient."""
     nothing = np.zeros((1, 1))
-    jet = Jet(np.float64(c), 0.0, np.full(1, slope), 0.0, nothing, nothing)
+    jet = plain(np.float64(c), 0.0, np.full(1, slope), 0.0, nothing, nothing)
     with ctx.workprec(3000):
         value = Member(jet, np.random.default_rng(0))
         assert assert_jet(jet.function("inv"), lambda d: 1 / value(d), [-arb(slope) / arb(c) ** 2], [[0.9], [-1e-30]])
@@ -717,7 +721,7 @@ def test_an_inverse_whose_derivative_underflows_contains(c: float, slope: float)
 @given(st.integers(-(10**30), 10**30), st.integers(1, 10**30))
 def test_jets_of_constants_contain(numerator: int, denominator: int) -> None:
     q = Fraction(numerator, denominator)
-    jet = constant_jet(q, 2)
+    jet = constant_jet(q, np.zeros((1, 2, 2)))
     assert abs(Fraction(jet.c) - q) <= Fraction(jet.error) and not (jet.a.any() or jet.Q.any() or jet.E.any())
 
 
@@ -888,7 +892,7 @@ def test_the_policys_error_on_boxes_is_of_second_order() -> None:
 def at_rest(J: np.ndarray) -> list[Jet]:
     """The states x = J d."""
     nothing = np.zeros((J.shape[1], J.shape[1]))
-    return [Jet(np.float64(0), 0.0, row, 0.0, nothing, nothing) for row in J]
+    return [plain(np.float64(0), 0.0, row, 0.0, nothing, nothing) for row in J]
 
 
 @pytest.mark.parametrize("radius", [1e-200, 1e-9, 1e-3, 0.2, 3.0])
@@ -899,8 +903,8 @@ def test_the_policy_at_the_origin(radius: float) -> None:
         n = widths[0]
         J = radius * generator.standard_normal((n, n))
         folded = fold(policy, u_eq)
-        found = enclose_on_ball(folded, at_rest(J))
-        if not all(np.isfinite([h.slack, *np.ravel(h.E)]).all() for h in found):
+        found = enclose_on_ball(folded, at_rest(J)).members
+        if not all(np.isfinite([h.slack, *np.ravel(h.whole)]).all() for h in found):
             continue
         finite += 1
         with ctx.workprec(3000):
@@ -912,8 +916,8 @@ def test_the_policy_at_the_origin(radius: float) -> None:
                     h = found[j]
                     linear = sum((arb(float(g)) * arb(v) for g, v in zip(h.a, d, strict=True)), arb(0))
                     line = ball(q) + scale * linear
-                    bound = arb(float(h.slack)) * square.sqrt() + quadratic(h.E, d)
-                    assert abs(u - line - scale * quadratic(h.Q, d)) <= abs(scale) * bound, (
+                    bound = arb(float(h.slack)) * square.sqrt() + quadratic(h.whole, d)
+                    assert abs(u - line - scale * curved(h, d)) <= abs(scale) * bound, (
                         widths,
                         size,
                         squash,
@@ -990,15 +994,6 @@ def test_a_subnormal_multiple_of_a_large_model_contains(k: float, value: float) 
     assert Fraction(float(result.r[0])) >= least  # what the roundings of normal numbers may come to
 
 
-@pytest.mark.parametrize("scale", [5e-324, -(2.0**-1060)])
-def test_a_subnormal_scale_of_an_input_that_bends_much_contains(scale: float) -> None:
-    Q = np.full((1, 1), 2.0**500 / 3)
-    h = Jet(np.float64(0), 0.0, np.zeros(1), 0.0, Q, np.zeros((1, 1)))
-    u = input_jet((0.0, 0.0), np.float64(scale), h)
-    least = 2.0**-53 * abs(Fraction(scale)) * Fraction(float(Q[0, 0]))
-    assert Fraction(float(u.E[0, 0])) >= least
-
-
 @pytest.mark.parametrize("exponent", [-900, -200, -100])
 def test_products_of_far_corners_in_the_off_diagonal_part_of_V_are_not_lost(exponent: int) -> None:
     """S_01 far_0 underflows, and far_1 is large."""
@@ -1020,12 +1015,12 @@ def test_nothing_is_known_of_a_function_where_nothing_is_known_of_its_argument(n
     radii = (0.0, 1.0, 1e300, np.inf, np.nan)
     wrong = [(c, 0.0) for c in (np.nan, np.inf, -np.inf)] + [(1.0, np.nan), (np.nan, np.nan), (np.inf, np.inf)]
     for (c, error), radius in itertools.product(wrong, radii):
-        _, errors, _ = elementary(name, np.array([c]), error, np.array([radius]))
+        errors = elementary(name, np.array([c]), error, np.array([radius])).e
         assert not np.isfinite([float(np.ravel(e)[0]) for e in errors]).any(), (c, error, radius)
     for c, error, radius in ((1.0, 0.0, np.nan), (1.0, 0.0, np.inf), (0.0, 0.0, 1.0), (-0.0, 0.0, 0.0), (1.0, 1.0, 0)):
         if name in ("inv", "sqrt"):
-            _, errors, third = elementary(name, np.array([c]), error, np.array([radius]))
-            assert all(np.isnan(np.ravel(v)[0]) for v in (*errors, third)), (c, error, radius)
+            phi = elementary(name, np.array([c]), error, np.array([radius]))
+            assert all(np.isnan(np.ravel(v)[0]) for v in (*phi.e, phi.third, phi.fourth)), (c, error, radius)
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])

@@ -30,6 +30,7 @@ from certify.checker.jets import Jet
 from tests.checker.test_rules import array, at, both, level, linear_claim, rehashed, rotor_claim
 from tests.checker.test_tube import CUBIC, NO_CURVATURE, NONE, Edit, ball, joint, random_loop, scalar, verdicts
 from tests.support.certificates import Document, decode, edited, encode, make, parse, rehash, verdict
+from tests.support.jets import curved, no_units, plain
 from tests.support.oracle import ball as exact
 from tests.support.oracle import policy_in_arb, quadratic
 from tests.support.reached import attracted, field_in_arb, loop_of, nodes_before, rates_outwards, surrounded
@@ -54,7 +55,11 @@ def moved(before: float, after: float, h: float, radius: float, *, slower: float
     line, motion = abs(alpha) / radius + 2.0**-12, (1 - slower) * abs(after - before) / 2 / radius + 2.0**-12
     J, P = radius * math.sqrt(1 / (1 - share**2)) * (1 + 2.0**-20), encode([1 / radius**2])
     path = waypoint([after], share, line + motion, motion / share**2)
-    return {"middle": P, "end": P, "duration": h.hex(), "path": path} | ball(J, NO_CURVATURE)
+    return (
+        {"middle": P, "end": P, "duration": h.hex(), "path": path}
+        | ball(J, NO_CURVATURE)
+        | {"weight": encode(np.eye(2))}
+    )
 
 
 def glide(
@@ -722,9 +727,9 @@ def test_the_models_along_a_path_enclose_the_field(name: str, where: str) -> Non
                 ]
                 size = sum((arb(v) ** 2 for v in d), arb(0)).sqrt()
                 for jet, v, v_0 in zip(jets, values(c, x), at_0, strict=True):
-                    left = v - v_0 - quadratic(jet.Q.tolist(), d)
+                    left = v - v_0 - curved(jet, d)
                     left -= sum((arb(float(a)) * arb(p) for a, p in zip(jet.a, d, strict=True)), arb(0))
-                    known = arb(float(jet.slack)) * size + quadratic(jet.E.tolist(), d)
+                    known = arb(float(jet.slack)) * size + quadratic(jet.whole.tolist(), d)
                     assert abs(left) <= known
                     assert abs(v_0 - arb(float(jet.c))) <= arb(float(jet.error))
                     assert abs(v - v_0) <= arb(float(jet.radius)) * size
@@ -748,7 +753,7 @@ def test_models_of_random_loops_hold_along_random_paths(seed: int) -> None:
         (piece,) = tube.pieces(Case(parse(placed(base, first.tolist(), (first + step).tolist(), share, J))))
         with np.errstate(all="ignore"):
             jets = [*piece.F, *piece.inputs]
-        if not are_finite(jets):
+        if not are_finite(jets, piece.units):
             continue
         met += 1
         assert piece.motion is not None
@@ -766,9 +771,9 @@ def test_models_of_random_loops_hold_along_random_paths(seed: int) -> None:
                 ]
                 size = sum((arb(v) ** 2 for v in d), arb(0)).sqrt()
                 for jet, v, v_0 in zip(jets, values(c, x), at_0, strict=True):
-                    left = v - v_0 - quadratic(jet.Q.tolist(), d)
+                    left = v - v_0 - curved(jet, d)
                     left -= sum((arb(float(a)) * arb(p) for a, p in zip(jet.a, d, strict=True)), arb(0))
-                    known = arb(float(jet.slack)) * size + quadratic(jet.E.tolist(), d)
+                    known = arb(float(jet.slack)) * size + quadratic(jet.whole.tolist(), d)
                     assert left.is_finite() and not abs(left) > known
                     assert not abs(v_0 - arb(float(jet.c))) > arb(float(jet.error))
                     if known > 1e-9:
@@ -793,10 +798,10 @@ def random_models(generator: np.random.Generator, n: int) -> tuple[Models, list[
         unit = 2.0 ** generator.integers(-9, 0)
         Q, E = (half + half.T) * unit * generator.choice([0, 1, 1]), B @ B.T * unit * generator.choice([0, 1, 1])
         slack, error = (float(generator.choice([0, 2.0**-4, 2.0**-30])) for _ in range(2))
-        jets.append(Jet(np.float64(generator.standard_normal()), error, generator.standard_normal(k), slack, Q, E))
+        jets.append(plain(np.float64(generator.standard_normal()), error, generator.standard_normal(k), slack, Q, E))
     velocity = [quotient(v) for v in generator.standard_normal(n)]
     J = generator.standard_normal((n, n))
-    return Models(J, jets, velocity), jets, velocity, J
+    return Models(J, jets, no_units(k), velocity), jets, velocity, J
 
 
 def multipliers_of(generator: np.random.Generator, n: int, kind: str) -> tuple[Multipliers, Path]:
@@ -806,7 +811,7 @@ def multipliers_of(generator: np.random.Generator, n: int, kind: str) -> tuple[M
     share, edge, motion, joint = (
         float(v) for v in (generator.uniform(0.1, 0.9), *np.exp(generator.standard_normal(3)))
     )
-    return Multipliers(*(tuple(quotient(v) for v in row) for row in rows)), Path(
+    return Multipliers(*(tuple(quotient(v) for v in row) for row in rows), np.eye(n + 1)), Path(
         np.zeros(n), share, edge, motion, joint
     )
 
@@ -853,7 +858,7 @@ def test_the_sides_along_a_path_bound_what_they_stand_for(n: int, kind: str) -> 
 
 def test_multipliers_that_a_path_can_use() -> None:
     def by(*rows: list[float]) -> Multipliers:
-        return Multipliers(*(tuple(quotient(v) for v in row) for row in rows))
+        return Multipliers(*(tuple(quotient(v) for v in row) for row in rows), np.eye(1))
 
     def path(edge: float = 1.0, motion: float = 1.0, joint: float = 1.0) -> Path:
         return Path(np.zeros(1), 0.5, edge, motion, joint)
@@ -872,9 +877,9 @@ def test_the_homogenised_matrix_is_refused_at_its_edges() -> None:
     def shown(alpha: float, edge: float, error: float = 0.0, slack: float = 0.0, E: float = 0.0) -> bool:
         widest = np.zeros((2, 2))
         widest[0, 0] = E
-        jet = Jet(np.float64(alpha), error, np.array([-1.0, 0.0]), slack, np.zeros((2, 2)), widest)
-        models = Models(np.array([[1.0]]), [jet], [fmpq(0)])
-        rows = Multipliers((fmpq(0),), (quotient(NONE),), (fmpq(0),))
+        jet = plain(np.float64(alpha), error, np.array([-1.0, 0.0]), slack, np.zeros((2, 2)), widest)
+        models = Models(np.array([[1.0]]), [jet], no_units(2), [fmpq(0)])
+        rows = Multipliers((fmpq(0),), (quotient(NONE),), (fmpq(0),), np.eye(2))
         path = Path(np.zeros(1), 0.5, edge, 2 * (error + slack) + 2.0**-20, 0.0)
         return shows(models, exactly(np.eye(1)), fmpq_mat(1, 1), rows, path)
 

@@ -31,9 +31,9 @@ from certify.checker.case import Case
 from certify.checker.decrease import Models, are_finite, are_usable, shows, sides
 from certify.checker.document import Multipliers
 from certify.checker.exact import MAX_MATRIX_BITS, exactly, is_definite, root_above
-from certify.checker.jets import Jet
 from certify.reference import rules as second
 from tests.support.certificates import Document, decode, dump, edited, encode, make, parse, rehash, verdict, write
+from tests.support.jets import curved, no_units, plain
 from tests.support.oracle import policy_in_arb, quadratic, value_of
 
 ROOT = Path(__file__).parents[2]
@@ -75,7 +75,8 @@ def pendulum() -> Document:
 
 
 def ball(J: Any, rows: Any) -> Document:
-    return {"J": encode(np.atleast_2d(J)), "multipliers": encode(rows)}
+    n = len(np.atleast_2d(J))
+    return {"J": encode(np.atleast_2d(J)), "multipliers": encode(rows), "weight": encode(np.eye(n))}
 
 
 def slab(middle: float, end: float, duration: float, J: float, rows: Any) -> Document:
@@ -224,7 +225,7 @@ FORGERIES: list[tuple[str, str, Edit]] = [
 
 
 def ball_of(of: Document) -> Document:
-    return {key: of[key] for key in ("J", "multipliers")}
+    return {key: of[key] for key in ("J", "multipliers", "weight")}
 
 
 def levels(c: float, data: Document) -> Document:
@@ -550,7 +551,7 @@ def test_models_hold_on_their_balls(seed: int) -> None:
         with np.errstate(all="ignore"):
             on = Ball(Case(c), J, "a ball")
             jets = [*on.F, *on.inputs]
-        if not are_finite(jets):
+        if not are_finite(jets, on.units):
             continue
         met += 1
         n = len(J)
@@ -565,9 +566,9 @@ def test_models_hold_on_their_balls(seed: int) -> None:
                 x = [sum((a * arb(v) for a, v in zip(row, d, strict=True)), arb(0)) for row in rows]
                 size = sum((arb(v) ** 2 for v in d), arb(0)).sqrt()
                 for jet, v, v0 in zip(jets, values(c, data, x), at_0, strict=True):
-                    left = v - v0 - quadratic(jet.Q.tolist(), d)
+                    left = v - v0 - curved(jet, d)
                     left -= sum((arb(float(a)) * arb(w) for a, w in zip(jet.a, d, strict=True)), arb(0))
-                    known = arb(float(jet.slack)) * size + quadratic(jet.E.tolist(), d)
+                    known = arb(float(jet.slack)) * size + quadratic(jet.whole.tolist(), d)
                     assert left.is_finite() and not abs(left) > known
                     assert not abs(v0 - arb(float(jet.c))) > arb(float(jet.error))
                     if known > 2.0**-900:
@@ -600,7 +601,7 @@ def test_what_is_just_shown_is_true_of_the_worst_remainder(seed: int) -> None:
         E = np.einsum("iab,icb->iac", E, E) * 10.0 ** random.uniform(-3, 0) * (random.random() < 0.7)
         Q = Q * 10.0 ** random.uniform(-2, 1) * (random.random() < 0.7)
         slack = 10.0 ** random.uniform(-6, 0, n) * (random.random() < 0.5)
-        models = Models(J, [Jet(np.float64(0), 0.0, a[i], slack[i], Q[i], E[i]) for i in range(n)])
+        models = Models(J, [plain(np.float64(0), 0.0, a[i], slack[i], Q[i], E[i]) for i in range(n)], no_units(n))
         by = random_multipliers(random, P @ J, Q, E)
         assert are_usable(by)
         decay_of, rest = sides(models, exactly(P), exactly(R), by)

@@ -1,25 +1,23 @@
 """Balls and tubes for documents that are written by hand.
 
 `with_ball` gives a document its ball, and `enlarge` a tube. J is the least ball around the ellipsoids, or nearly, and
-the multipliers are chosen from the models that the reference itself finds on that ball: they are hints, which only
+the multipliers are chosen from the models that the checker itself finds on that ball: they are hints, which only
 decide whether something is accepted and never whether it is true.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from flint import ctx, fmpq, fmpq_mat
+from flint import fmpq, fmpq_mat
 
-from certify.reference.balls import PRECISION
-from certify.reference.document import read
-from certify.reference.loop import Loop
-from certify.reference.refusal import Refused
-from tests.support.certificates import Document, decode, edited, encode
+from certify.checker.ball import Ball
+from certify.checker.case import Case
+from certify.checker.errors import Rejected
+from tests.support.certificates import Document, decode, edited, encode, parse
 
 MARGIN, TINY = 1e-6, 2.0**-60
 
@@ -66,7 +64,8 @@ def ones(n: int) -> np.ndarray:
 
 
 def ball(J: Any, rows: Any) -> Document:
-    return {"J": encode(J), "multipliers": encode(rows)}
+    """With a weight that has no preference."""
+    return {"J": encode(J), "multipliers": encode(rows), "weight": encode(np.eye(len(np.atleast_2d(J))))}
 
 
 def exactly(A: np.ndarray) -> fmpq_mat:
@@ -76,19 +75,18 @@ def exactly(A: np.ndarray) -> fmpq_mat:
 def multipliers(data: Document, J: np.ndarray, nodes: Sequence[np.ndarray], R: np.ndarray) -> np.ndarray:
     """Alpha and beta that balance the two sides of each inequality where the first-order part decreases; no joint part.
 
-    Ones where the reference finds no model, or nothing decreases.
+    Ones where the checker finds no model, or nothing decreases.
     """
     n = len(J)
     try:
-        with ctx.workprec(PRECISION):
-            F = Loop(read(json.dumps(data).encode())).on(exactly(J), "local", "ball")
-    except Refused:
+        with np.errstate(all="ignore"):
+            F = Ball(Case(parse(data)), np.array(J, float), "ball").F
+    except Rejected:
         return ones(n)
-    a, Q, E = (
-        np.array([[float(v) for v in getattr(f, part).entries()] for f in F]).reshape(n, *shape)
-        for part, shape in (("a", (n,)), ("Q", (n, n)), ("E", (n, n)))
-    )
+    a, Q, E = (np.array([getattr(f, part) for f in F]) for part in ("a", "Q", "E"))
     P = sum(nodes[1:], nodes[0]) / len(nodes)
+    if not all(np.isfinite(part).all() for part in (a, Q, E)):
+        return ones(n)
     b = J.T @ P
     with np.errstate(all="ignore"):
         left = -(J.T @ R @ J + b @ a + a.T @ b.T)
