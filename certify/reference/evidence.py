@@ -25,13 +25,14 @@ WORD = re.compile(r"[A-Za-z0-9_.+-]{1,80}")
 class Ball:
     """All x = J d with ||d|| <= 1, and the rows of multipliers with which `decrease` is decided on it.
 
-    In a slab with a path g has one more number than the others, for the motion.
+    In a slab with a path g has one more number than the others, for the motion, and `weight` a row and a column more.
     """
 
     J: fmpq_mat
     alpha: array[float]
     beta: array[float]
     g: array[float]
+    weight: fmpq_mat
 
 
 @dataclass(frozen=True)
@@ -89,7 +90,7 @@ def read_evidence(value: Any, n: int, claim: str) -> Tree | Trusted:
     if claim == "practical":
         require(evidence["local"] is None, "format", "evidence.local", "null was expected: the claim has no ball")
     else:
-        ball = read_ball(keys(evidence["local"], "evidence.local", "J", "multipliers"), "evidence.local", n)
+        ball = read_ball(keys(evidence["local"], "evidence.local", "J", "multipliers", "weight"), "evidence.local", n)
     tube = entries(evidence["tube"], "evidence.tube")
     least, most = (1, MAX_SLABS) if claim in WITH_TUBE else (0, 0)
     fits = least <= len(tube) <= most
@@ -99,16 +100,17 @@ def read_evidence(value: Any, n: int, claim: str) -> Tree | Trusted:
     return Tree(T, root, tree, ball, slabs)
 
 
-def read_ball(value: dict[str, Any], at: str, n: int) -> Ball:
-    rows = numbers(value["multipliers"], f"{at}.multipliers", 3 * n)
-    return Ball(square(value["J"], f"{at}.J", n), rows[:n], rows[n : 2 * n], rows[2 * n :])
+def read_ball(value: dict[str, Any], at: str, n: int, moves: bool = False) -> Ball:
+    J, rows = square(value["J"], f"{at}.J", n), numbers(value["multipliers"], f"{at}.multipliers", 3 * n)
+    weight = square(value["weight"], f"{at}.weight", n + moves)
+    return Ball(J, rows[:n], rows[n : 2 * n], rows[2 * n :], weight)
 
 
 def read_slab(value: Any, at: str, n: int, moves: bool) -> Slab:
-    slab = keys(value, at, "middle", "end", "duration", "J", "multipliers", "path")
+    slab = keys(value, at, "middle", "end", "duration", "J", "multipliers", "weight", "path")
     duration = binary64(slab["duration"], f"{at}.duration")
     middle, end = (square(slab[key], f"{at}.{key}", n) for key in ("middle", "end"))
-    ball, path = read_ball(slab, at, n), None
+    ball, path = read_ball(slab, at, n, moves), None
     if moves:
         path, joint = read_path(slab["path"], f"{at}.path", n)
         ball = replace(ball, g=ball.g + array("d", [joint]))

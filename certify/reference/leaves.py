@@ -27,7 +27,8 @@ from .balls import (
 from .document import Certificate
 from .evidence import Tree
 from .refusal import Refused, require
-from .taylor import Taylor, pairs
+from .symmetric import pairs
+from .taylor import Taylor
 
 LEAF = 255
 MAX_WAITING = 4096  # boxes of the tree beside the one in hand

@@ -6,13 +6,23 @@ component of F.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 from flint import arb, arb_mat, fmpq, fmpq_mat
 
-from .balls import ZERO, bounded_by_form, finite, within_bounds
+from .balls import ZERO, bounded_by_form, within_bounds
 from .document import Certificate
 from .model import Model
-from .network import Network
+from .network import Network, Units
 from .refusal import Refused, require
+
+
+@dataclass(frozen=True)
+class Field:
+    """Models of the components of F on a ball, and the errors behind those of the inputs."""
+
+    components: list[Model]
+    units: Units
 
 
 class Loop:
@@ -21,13 +31,12 @@ class Loop:
     def __init__(self, c: Certificate) -> None:
         self.c, self.network, self.bounded = c, Network(c), bounded_by_form(c)
 
-    def on(self, J: fmpq_mat, rule: str, at: str, centre: fmpq_mat | None = None) -> list[Model]:
+    def on(self, J: fmpq_mat, rule: str, at: str, centre: fmpq_mat | None = None) -> Field:
         """Models of F, or a refusal under `inputs` or under the rule that asks, at the place it names.
 
         Without a centre it is the origin, where pi(0) = u_eq exactly. J has a row for each state.
         """
-        c, size = self.c, J.ncols()
-        u = self.network.on(J, centre)
+        c, (u, units) = self.c, self.network.on(J, centre)
         bounded = self.bounded or within_bounds(c, [(v.v, v.radius) for v in u])
         require(bounded, "inputs", at, "an input is not certain to stay in its bounds")
         for j, v in enumerate(u):
@@ -35,16 +44,17 @@ class Loop:
             alone = limits is None or bool(v.v - v.radius > arb(limits[0]) and v.v + v.radius < arb(limits[1]))
             require(alone, rule, at, f"{c.plant.inputs[j]} is not certain to be left alone by the clip")
         middle = [ZERO] * c.n if centre is None else list(arb_mat(centre).entries())
-        states = [Model.affine(v, row) for v, row in zip(middle, arb_mat(J).tolist(), strict=True)]
+        errors = u[0].errors
+        states = [Model.affine(v, row, errors) for v, row in zip(middle, arb_mat(J).tolist(), strict=True)]
         names = dict(zip(c.plant.states + c.plant.inputs, [*states, *u], strict=True))
 
         def constant(q: fmpq) -> Model:
-            return Model.affine(arb(q), [ZERO] * size)
+            return Model.affine(arb(q), [ZERO] * J.ncols(), errors)
 
         try:
             F = c.plant.dynamics.evaluate(names, constant)
         except Refused as no:
             raise Refused(rule, at, no.detail) from None
-        known = all(finite([f.v, *f.a.entries(), *f.Q.entries(), *f.E.entries()]) for f in F)
+        known = units.is_finite() and all(f.is_finite() for f in F)
         require(known, rule, at, "F has no finite model")
-        return F
+        return Field(F, units)

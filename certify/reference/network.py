@@ -4,19 +4,35 @@ A layer is y(d) = y(0) + G J d + L A(d): A stacks what every tanh of the layers 
 these y(0), G and L depend on the ball's centre alone, and L is most of the work; so they are found once for all balls
 around the origin. There the policy is u_eq, by its form or because rule `centring` has shown it; at any other centre it
 is a number like others.
+
+What the models of a tanh leave out is an error of its own, which reaches every input through L.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from functools import cached_property
 
 from flint import arb, arb_mat, fmpq_mat
 
-from .balls import ONE, ZERO, absolute, beta, biased, columns_scaled, net_at_0, tanhs, weights
+from .balls import ONE, ZERO, absolute, beta, biased, columns_scaled, finite, net_at_0, tanhs, weights
 from .document import Certificate
 from .model import Model
-from .taylor import pairs
+from .symmetric import half, no_form, whole
+
+
+@dataclass(frozen=True)
+class Bends:
+    """What the tanhs of some layers add to their tangents, a row for each: d'Hd + C[d] within d'Rd; halves of H, R."""
+
+    H: list[list[arb]]
+    C: list[list[arb]]
+    R: list[list[arb]]
+
+    def append(self, H: arb_mat, C: arb_mat, R: arb_mat) -> None:
+        self.H.append(half(H))
+        self.C.append(C.entries())
+        self.R.append(half(R))
 
 
 @dataclass(frozen=True)
@@ -31,15 +47,48 @@ class Unfolded:
     L: arb_mat | None
     absolute: arb_mat | None
 
-    def on(self, J: arb_mat, H: Sequence[list[arb]], R: Sequence[list[arb]]) -> list[Model]:
-        """The rows on a ball: Q_i = sum_q L_iq H_q and E_i = sum_q |L_iq| R_q, H_q and R_q halves of matrices."""
+    def on(self, J: arb_mat, bends: Bends) -> list[Model]:
+        """The rows on a ball: sums over the tanhs before with L, and of their bounds with its magnitudes."""
         n = J.ncols()
         a = (self.G * J).tolist()
         if self.L is None or self.absolute is None:
             return [Model.affine(v, row) for v, row in zip(self.at_0, a, strict=True)]
-        Q, E = (self.L * arb_mat(H)).tolist(), (self.absolute * arb_mat(R)).tolist()
-        each = zip(self.at_0, a, Q, E, strict=True)
-        return [Model(v, arb_mat(n, 1, row), whole(q, n), whole(e, n)) for v, row, q, e in each]
+        Q, K, E = (
+            (weights * arb_mat(each)).tolist()
+            for weights, each in ((self.L, bends.H), (self.L, bends.C), (self.absolute, bends.R))
+        )
+        return [
+            Model(v, arb_mat(n, 1, row), whole(q, n), arb_mat(1, len(k), k), whole(e, n))
+            for v, row, q, k, e in zip(self.at_0, a, Q, K, E, strict=True)
+        ]
+
+
+@dataclass(frozen=True)
+class Units:
+    """What the models of all tanhs leave out: e_q, |e_q| <= d'R_q d, of which input j sees sum_q L_jq e_q.
+
+    R has a half of a matrix a row, for n variables.
+    """
+
+    n: int
+    L: arb_mat
+    R: list[list[arb]]
+
+    @cached_property
+    def squares(self) -> arb_mat:
+        """R_q'R_q, a row for each tanh."""
+        wholes = [whole(row, self.n) for row in self.R]
+        return arb_mat(len(self.R), self.n**2, [v for R in wholes for v in (R.transpose() * R).entries()])
+
+    def errors(self) -> tuple[arb_mat, ...]:
+        """U_j of each input: sum_q |L_jq| R_q."""
+        if not self.R:
+            return (arb_mat(self.n, self.n),) * self.L.nrows()
+        rows: list[list[arb]] = (absolute(self.L) * arb_mat(self.R)).tolist()
+        return tuple(whole(row, self.n) for row in rows)
+
+    def is_finite(self) -> bool:
+        return finite(self.L.entries()) and all(finite(row) for row in self.R)
 
 
 class Network:
@@ -66,25 +115,31 @@ class Network:
             layers.append(Unfolded(list(at_0.entries()), G, *blocks))
         return layers
 
-    def on(self, J: fmpq_mat, centre: fmpq_mat | None = None) -> list[Model]:
+    def on(self, J: fmpq_mat, centre: fmpq_mat | None = None) -> tuple[list[Model], Units]:
         """The inputs before their clip; J may have more columns than rows, and without a centre it is the origin."""
-        ball, size = arb_mat(J), J.ncols()
+        ball, n, m = arb_mat(J), J.ncols(), self.c.m
         layers = self.at_origin if centre is None else self.unfolded(arb_mat(centre))
-        H, R = list[list[arb]](), list[list[arb]]()
+        bends = Bends([], [], [])
         for layer in layers[:-1]:
-            for y in layer.on(ball, H, R):
-                bent, rest = y.beyond_tanh(y.v.tanh())
-                H.append(half(bent))
-                R.append(half(rest))
-        result = []
-        for j, (s, y) in enumerate(zip(map(arb, self.c.policy.scale), layers[-1].on(ball, H, R), strict=True)):
-            value, slope, (bent, rest) = self.before_squash(j, y.v, centre), ONE, (arb_mat(size, size),) * 2
-            if self.c.policy.squash == "tanh":
-                value = value.tanh()
-                slope, (bent, rest) = 1 - value * value, y.beyond_tanh(value)
-            Q, E = slope * y.Q + bent, slope * y.E + rest
-            result.append(Model(self.input_at(j, value, centre), s * slope * y.a, s * Q, abs(s) * E))
-        return result
+            for y in layer.on(ball, bends):
+                bends.append(*y.expanded("tanh")[2:])
+        squashed, inputs, reached = self.c.policy.squash == "tanh", list[Model](), list[list[arb]]()
+        L, hidden = layers[-1].L, len(bends.R)
+        for j, (s, net) in enumerate(zip(map(arb, self.c.policy.scale), layers[-1].on(ball, bends), strict=True)):
+            y, slope, H, C = replace(net, v=self.before_squash(j, net.v, centre)), ONE, arb_mat(n, n), no_form(n)
+            value, own = y.v, [ZERO] * m
+            if squashed:
+                value, slope, H, C, R = y.expanded("tanh")
+                bends.append(H, C, R)
+                own[j] = s
+            ways = [s * slope * L[j, q] for q in range(hidden)] if L is not None else []
+            reached.append(ways + own if squashed else ways)
+            Q, K = s * (slope * y.Q + H), s * (slope * y.K + C)
+            inputs.append(Model(self.input_at(j, value, centre), s * slope * y.a, Q, K, arb_mat(n, n)))
+        units = Units(n, arb_mat(m, len(bends.R), [v for row in reached for v in row]), bends.R)
+        errors = units.errors()
+        unit_vectors = [tuple(ONE if i == j else ZERO for i in range(m)) for j in range(m)]
+        return [replace(u, B=B, errors=errors) for u, B in zip(inputs, unit_vectors, strict=True)], units
 
     def before_squash(self, j: int, net: arb, centre: fmpq_mat | None) -> arb:
         """What is squashed at the centre, where the network is `net`: with `preactivation` at the origin beta alone."""
@@ -105,17 +160,3 @@ class Network:
 
 def beside(A: arb_mat, B: arb_mat) -> arb_mat:
     return arb_mat([[*a, *b] for a, b in zip(A.tolist(), B.tolist(), strict=True)])
-
-
-def half(A: arb_mat) -> list[arb]:
-    """A symmetric matrix without what stands below its diagonal: one number for each of `pairs`."""
-    entries, n = A.entries(), A.nrows()
-    return [entries[i * n + j] for i, j in pairs(n)]
-
-
-def whole(values: Sequence[arb], n: int) -> arb_mat:
-    """The matrix of such a half."""
-    rows = [[ZERO] * n for _ in range(n)]
-    for (i, j), v in zip(pairs(n), values, strict=True):
-        rows[i][j] = rows[j][i] = v
-    return arb_mat(rows)

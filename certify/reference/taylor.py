@@ -8,20 +8,15 @@ what is affine has no Q.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache, cached_property
-from itertools import combinations_with_replacement
+from functools import cached_property
 
 from flint import arb
 
 from .balls import ZERO, derivatives, finite, third, total
 from .refusal import Refused
+from .symmetric import pairs
 
 Coefficients = list[arb] | None
-
-
-@cache
-def pairs(symbols: int) -> tuple[tuple[int, int], ...]:
-    return tuple(combinations_with_replacement(range(symbols), 2))
 
 
 def mix(a: arb, x: Coefficients, b: arb, y: Coefficients) -> Coefficients:

@@ -11,17 +11,16 @@ is not asked. e'P(s)e <= 1 puts e into the ellipsoid of A, M or B. So these thre
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 
 from flint import arb, fmpq, fmpq_mat
 
-from .balls import ZERO
 from .decrease import contains, decreases, decreases_along, sound_multipliers
 from .document import Certificate
 from .evidence import Path, Slab
 from .fields import exact
-from .loop import Loop
-from .model import Model
+from .loop import Field, Loop
 from .rational import beyond_domain, identity, inverse_diagonal, positive_definite, root_above
 from .refusal import require
 
@@ -99,11 +98,11 @@ def share_of(path: Path, at: str) -> fmpq:
     return exact(path.share)
 
 
-def relative(loop: Loop, slab: Slab, path: Path, centres: Ends, at: str) -> list[Model]:
+def relative(loop: Loop, slab: Slab, path: Path, centres: Ends, at: str) -> Field:
     """F less the velocity of the path, where x = m + J z + w sigma; m is half-way, and m +- share w are the centres."""
     before, after = centres
     step = after - before
     J = [[*row, w] for row, w in zip(slab.ball.J.tolist(), (step / (2 * exact(path.share))).entries(), strict=True)]
     F = loop.on(fmpq_mat(J), "tube", at, (before + after) / 2)
     velocity = (step / exact(slab.duration)).entries()
-    return [f + Model.affine(arb(-v), [ZERO] * (loop.c.n + 1)) for f, v in zip(F, velocity, strict=True)]
+    return replace(F, components=[f.shifted(arb(-v)) for f, v in zip(F.components, velocity, strict=True)])
