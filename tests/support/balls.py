@@ -81,7 +81,8 @@ def multipliers(data: Document, J: np.ndarray, nodes: Sequence[np.ndarray], R: n
     n = len(J)
     try:
         with ctx.workprec(PRECISION):
-            F = Loop(read(json.dumps(data).encode())).on(exactly(J), "local", "ball")
+            loop = Loop(read(json.dumps(data).encode()))
+            F = loop.within(loop.known(exactly(J), "local", "ball"), loop.c.plant.ranges, "local", "ball")
     except Refused:
         return ones(n)
     a, Q, E = (
