@@ -35,7 +35,7 @@ def read_once(path: str) -> bytes:
 
 
 def in_words(c: Certificate) -> str:
-    bounds = f"{', '.join(c.plant.inputs)} within the input bounds"
+    bounds = f"{', '.join(c.plant.inputs)} within the input bounds{whatever(c)}"
     if c.claim == "practical":
         return (
             f"{c.plant.name}, policy {c.policy.sha256}: every trajectory that starts in V <= {c.outer!r} stays there, "
@@ -55,6 +55,12 @@ def in_words(c: Certificate) -> str:
         f"with {bounds}; "
         f"P_0 = {start_rows(c)}{centre}"
     )
+
+
+def whatever(c: Certificate) -> str:
+    """Of what the claim does not depend."""
+    each = [f"{name} in [{lo}, {hi}]" for name, (lo, hi) in zip(c.plant.uncertain, c.plant.ranges, strict=True)]
+    return f", whatever values these have at any time: {', '.join(each)}" if each else ""
 
 
 def start_rows(c: Certificate) -> list[list[float]] | None:

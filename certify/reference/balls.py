@@ -12,7 +12,7 @@ from functools import cache
 
 from flint import arb, arb_mat
 
-from .document import Certificate, Layer, Policy
+from .document import Certificate, Interval, Layer, Policy
 from .fields import exact
 
 PRECISION = 128  # bits; single operations of flint cost about the same with 64
@@ -25,6 +25,12 @@ def total(terms: Iterable[arb]) -> arb:
 
 def absolute(A: arb_mat) -> arb_mat:
     return arb_mat(A.nrows(), A.ncols(), [abs(v) for v in A.entries()])
+
+
+def spanning(ends: Interval) -> arb:
+    """A ball that holds every number between two rationals."""
+    lo, hi = ends
+    return arb(lo).union(arb(hi))
 
 
 def columns_scaled(A: arb_mat, factors: Sequence[arb]) -> arb_mat:

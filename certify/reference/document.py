@@ -44,6 +44,8 @@ class Layer:
 
 @dataclass(frozen=True)
 class Plant:
+    """`ranges` are those of what is `uncertain`: the claim is meant for every value in all of them."""
+
     name: str
     states: tuple[str, ...]
     inputs: tuple[str, ...]
@@ -51,6 +53,8 @@ class Plant:
     u_eq: tuple[fmpq, ...]
     domain: tuple[Interval, ...]
     input_bounds: tuple[Interval, ...]
+    uncertain: tuple[str, ...]
+    ranges: tuple[Interval, ...]
 
 
 @dataclass(frozen=True)
@@ -94,6 +98,11 @@ class Certificate:
         return len(self.plant.inputs)
 
     @property
+    def k(self) -> int:
+        """How many quantities are uncertain."""
+        return len(self.plant.uncertain)
+
+    @property
     def ends_at_origin(self) -> bool:
         """Whether the claim is about the equilibrium at the origin, so that a local ball covers {V <= c1}."""
         return self.claim != "practical"
@@ -114,6 +123,8 @@ def read(raw: bytes) -> Certificate:
     inner_name = "floor" if claim == "practical" else "local"
     plant = read_plant(data["plant"])
     n = len(plant.states)
+    fixed = claim not in WITH_TUBE or not plant.uncertain
+    require(fixed, "format", "plant.uncertain", f"nothing may be uncertain with claim '{claim}'")
     start = square(said["start"], "claim.start", n) if "start" in said else None
     centre = column(said["centre"], "claim.centre", n) if "centre" in said else None
     policy = read_policy(data["policy"], n, len(plant.inputs))
@@ -122,7 +133,7 @@ def read(raw: bytes) -> Certificate:
     P = square(lyapunov["P"], "lyapunov.P", n)
     levels = keys(data["levels"], "levels", inner_name, "roa")
     inner, outer = binary64(levels[inner_name], f"levels.{inner_name}"), binary64(levels["roa"], "levels.roa")
-    evidence = read_evidence(data["evidence"], n, claim)
+    evidence = read_evidence(data["evidence"], n, len(plant.uncertain), claim)
     return Certificate(claim, start, centre, plant, policy, P, inner, outer, evidence)
 
 
@@ -159,33 +170,43 @@ def integer(text: str) -> int:
 
 
 def read_plant(value: Any) -> Plant:
-    plant = keys(value, "plant", "name", "states", "inputs", "dynamics", "u_eq", "domain", "input_bounds")
+    sections = ("name", "states", "inputs", "uncertain", "dynamics", "u_eq", "domain", "input_bounds")
+    plant = keys(value, "plant", *sections)
     states, inputs = entries(plant["states"], "plant.states"), entries(plant["inputs"], "plant.inputs")
     n, m = len(states), len(inputs)
     require(1 <= n <= MAX_NAMES and 1 <= m <= MAX_NAMES, "format", "plant", "1 to 64 states and inputs are allowed")
-    for word in (plant["name"], *states, *inputs):
+    quantities = entries(plant["uncertain"], "plant.uncertain")
+    few = len(quantities) <= MAX_NAMES
+    require(few, "format", "plant.uncertain", f"at most {MAX_NAMES} uncertain quantities are allowed")
+    quantities = [keys(each, f"plant.uncertain.{j}", "name", "range") for j, each in enumerate(quantities)]
+    uncertain = [each["name"] for each in quantities]
+    for word in (plant["name"], *states, *inputs, *uncertain):
         named = isinstance(word, str) and IDENTIFIER.fullmatch(word) is not None
         require(named, "format", "plant", "an identifier was expected")
-    require(len({*states, *inputs}) == n + m, "format", "plant", "a name stands for two things")
+    names = {*states, *inputs, *uncertain}
+    require(len(names) == n + m + len(uncertain), "format", "plant", "a name stands for two things")
     u_eq = entries(plant["u_eq"], "plant.u_eq", m)
     return Plant(
         name=plant["name"],
         states=tuple(states),
         inputs=tuple(inputs),
-        dynamics=equations(entries(plant["dynamics"], "plant.dynamics", n), {*states, *inputs}, "plant.dynamics"),
+        dynamics=equations(entries(plant["dynamics"], "plant.dynamics", n), names, "plant.dynamics"),
         u_eq=tuple(rational(q, f"plant.u_eq.{j}") for j, q in enumerate(u_eq)),
         domain=intervals(plant["domain"], "plant.domain", n),
         input_bounds=intervals(plant["input_bounds"], "plant.input_bounds", m),
+        uncertain=tuple(uncertain),
+        ranges=tuple(interval(each["range"], f"plant.uncertain.{j}.range") for j, each in enumerate(quantities)),
     )
 
 
 def intervals(value: Any, at: str, count: int) -> tuple[Interval, ...]:
-    result = []
-    for i, pair in enumerate(entries(value, at, count)):
-        lo, hi = (rational(q, f"{at}.{i}") for q in entries(pair, f"{at}.{i}", 2))
-        require(lo < hi, "format", f"{at}.{i}", "lo < hi must hold")
-        result.append((lo, hi))
-    return tuple(result)
+    return tuple(interval(pair, f"{at}.{i}") for i, pair in enumerate(entries(value, at, count)))
+
+
+def interval(value: Any, at: str) -> Interval:
+    lo, hi = (rational(q, at) for q in entries(value, at, 2))
+    require(lo < hi, "format", at, "lo < hi must hold")
+    return lo, hi
 
 
 def read_policy(value: Any, n: int, m: int) -> Policy:

@@ -6,6 +6,7 @@ certificate, and is refused by the rule that uses it.
 
 from __future__ import annotations
 
+import math
 import re
 from array import array
 from dataclasses import dataclass, replace
@@ -17,6 +18,7 @@ from .fields import binary64, column, decoded, entries, keys, numbers, square
 from .refusal import require
 
 MAX_SLABS = 10**4
+MAX_PARTS, MAX_CELLS = 64, 4096  # of one range; of all of them together
 WITH_TUBE = ("enlarged", "reached")  # claims about a set of starts that is no level set of V
 WORD = re.compile(r"[A-Za-z0-9_.+-]{1,80}")
 
@@ -61,11 +63,15 @@ class Slab:
 
 @dataclass(frozen=True)
 class Tree:
-    """Evidence that can be replayed. `ball` belongs to claims about the origin, `tube` to those that have a start."""
+    """Evidence that can be replayed. `ball` belongs to claims about the origin, `tube` to those that have a start.
+
+    `cells` has a number for each uncertain quantity: into how many equal parts rule `local` cuts its range.
+    """
 
     T: fmpq_mat
     root: array[float]
     tree: bytes
+    cells: tuple[int, ...]
     ball: Ball | None
     tube: tuple[Slab, ...]
 
@@ -78,14 +84,16 @@ class Trusted:
     version: str
 
 
-def read_evidence(value: Any, n: int, claim: str) -> Tree | Trusted:
+def read_evidence(value: Any, n: int, k: int, claim: str) -> Tree | Trusted:
     if isinstance(value, dict) and value.get("kind") == "trusted-solver":
         require(claim not in WITH_TUBE, "format", "evidence.kind", f"claim '{claim}' must be replayed")
+        require(k == 0, "format", "evidence.kind", "what is uncertain must be replayed")
         return read_trusted(value)
-    evidence = keys(value, "evidence", "kind", "T", "root", "tree", "local", "tube")
+    evidence = keys(value, "evidence", "kind", "T", "root", "tree", "cells", "local", "tube")
     require(evidence["kind"] == "partition-tree", "format", "evidence.kind", "an unknown kind")
     T, root = square(evidence["T"], "evidence.T", n), numbers(evidence["root"], "evidence.root", n)
     tree = decoded(evidence["tree"], "evidence.tree")
+    cells = read_cells(evidence["cells"], "evidence.cells", k)
     ball = None
     if claim == "practical":
         require(evidence["local"] is None, "format", "evidence.local", "null was expected: the claim has no ball")
@@ -97,7 +105,15 @@ def read_evidence(value: Any, n: int, claim: str) -> Tree | Trusted:
     require(fits, "format", "evidence.tube", f"{least} to {most} slabs are allowed with claim '{claim}'")
     moves = claim == "reached"
     slabs = tuple(read_slab(v, f"evidence.tube.{k}", n, moves) for k, v in enumerate(tube))
-    return Tree(T, root, tree, ball, slabs)
+    return Tree(T, root, tree, cells, ball, slabs)
+
+
+def read_cells(value: Any, at: str, k: int) -> tuple[int, ...]:
+    parts = entries(value, at, k)
+    good = all(type(part) is int and 1 <= part <= MAX_PARTS for part in parts)  # True is an int to isinstance
+    require(good, "format", at, f"integers from 1 to {MAX_PARTS} were expected")
+    require(math.prod(parts) <= MAX_CELLS, "format", at, f"more than {MAX_CELLS} cells")
+    return tuple(parts)
 
 
 def read_ball(value: dict[str, Any], at: str, n: int, moves: bool = False) -> Ball:

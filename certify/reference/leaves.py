@@ -102,7 +102,7 @@ class Leaves:
     """What all leaves of a certificate share."""
 
     def __init__(self, c: Certificate, T: fmpq_mat, S: fmpq_mat) -> None:
-        self.c, self.n, self.symbols = c, c.n, c.n + c.m
+        self.c, self.n, self.symbols = c, c.n, c.n + c.m + c.k
         self.T, self.PT2 = arb_mat(T), arb_mat(2 * (c.P * T))
         self.S = [arb(S[i, i]) for i in range(c.n)]
         self.cross = [(i, j, arb(2 * abs(S[i, j]))) for j in range(c.n) for i in range(j) if S[i, j] != 0]
@@ -242,19 +242,24 @@ class Leaves:
     # ----------------------------------------------------------------------------------------------------- the ring
 
     def F(self, leaf: Leaf) -> list[Taylor]:
-        """Models of f(x, pi(x)), all of them finite."""
+        """Models of f(x, pi(x), q), all of them finite; an input's error and what is uncertain have a symbol each."""
         n, place = self.n, f"leaf {leaf.box.number}"
         pad = [ZERO] * (self.symbols - n)
         names = {name: Taylor(row[0], row[1:] + pad) for name, row in zip(self.c.plant.states, leaf.x, strict=True)}
         for j, (name, (mid, slopes, error)) in enumerate(zip(self.c.plant.inputs, leaf.u, strict=True)):
-            own = [error if i == j else ZERO for i in range(self.c.m)]  # the error is a symbol
-            names[name] = Taylor(mid, slopes + own)
+            names[name] = self.moving(mid, slopes, n + j, error)
+        for j, (name, (lo, hi)) in enumerate(zip(self.c.plant.uncertain, self.c.plant.ranges, strict=True)):
+            names[name] = self.moving(arb((lo + hi) / 2), [ZERO] * n, n + self.c.m + j, arb((hi - lo) / 2))
         try:
             result = self.c.plant.dynamics.evaluate(names, lambda q: Taylor(arb(q)))
         except Refused as no:
             raise Refused(no.rule, place, no.detail) from None
         require(all(f.is_finite() for f in result), "ring", place, "F has no finite model")
         return result
+
+    def moving(self, mid: arb, slopes: list[arb], symbol: int, size: arb) -> Taylor:
+        """mid + slopes.d + size times a symbol of its own."""
+        return Taylor(mid, slopes + [size if i == symbol else ZERO for i in range(self.n, self.symbols)])
 
     def Vdot(self, leaf: Leaf) -> Taylor:
         """(2 P x)'F."""

@@ -6,12 +6,13 @@ component of F.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from flint import arb, arb_mat, fmpq, fmpq_mat
+from flint import arb, arb_mat, fmpq_mat
 
-from .balls import ZERO, bounded_by_form, within_bounds
-from .document import Certificate
+from .balls import ZERO, bounded_by_form, spanning, within_bounds
+from .document import Certificate, Interval
 from .model import Model
 from .network import Network, Units
 from .refusal import Refused, require
@@ -25,14 +26,26 @@ class Field:
     units: Units
 
 
+@dataclass(frozen=True)
+class Known:
+    """States and inputs on a ball, by their names, and the errors behind those of the inputs."""
+
+    names: Mapping[str, Model]
+    units: Units
+
+
 class Loop:
-    """F(x) = f(x, pi(x)) of a certificate, for as many balls as it has."""
+    """F(x) = f(x, pi(x), q) of a certificate, for as many balls and cells as it has."""
 
     def __init__(self, c: Certificate) -> None:
         self.c, self.network, self.bounded = c, Network(c), bounded_by_form(c)
 
     def on(self, J: fmpq_mat, rule: str, at: str, centre: fmpq_mat | None = None) -> Field:
-        """Models of F, or a refusal under `inputs` or under the rule that asks, at the place it names.
+        """Models of F on a ball of a plant of which nothing is uncertain."""
+        return self.within(self.known(J, rule, at, centre), (), rule, at)
+
+    def known(self, J: fmpq_mat, rule: str, at: str, centre: fmpq_mat | None = None) -> Known:
+        """States and inputs, or a refusal under `inputs` or under the rule that asks, at the place it names.
 
         Without a centre it is the origin, where pi(0) = u_eq exactly. J has a row for each state.
         """
@@ -46,15 +59,24 @@ class Loop:
         middle = [ZERO] * c.n if centre is None else list(arb_mat(centre).entries())
         errors = u[0].errors
         states = [Model.affine(v, row, errors) for v, row in zip(middle, arb_mat(J).tolist(), strict=True)]
-        names = dict(zip(c.plant.states + c.plant.inputs, [*states, *u], strict=True))
+        return Known(dict(zip(c.plant.states + c.plant.inputs, [*states, *u], strict=True)), units)
 
-        def constant(q: fmpq) -> Model:
-            return Model.affine(arb(q), [ZERO] * J.ncols(), errors)
+    def within(self, known: Known, cell: Sequence[Interval], rule: str, at: str) -> Field:
+        """Models of F that are good for every value of what is uncertain in a cell, or a refusal.
 
+        What is uncertain does not depend on d. Its value is a ball with the cell in it, and so each number of a model
+        is a ball with all that it can be.
+        """
+        plant, some = self.c.plant, next(iter(known.names.values()))
+
+        def constant(value: arb) -> Model:
+            return Model.affine(value, [ZERO] * some.a.nrows(), some.errors)
+
+        uncertain = {q: constant(spanning(ends)) for q, ends in zip(plant.uncertain, cell, strict=True)}
         try:
-            F = c.plant.dynamics.evaluate(names, constant)
+            F = plant.dynamics.evaluate({**known.names, **uncertain}, lambda q: constant(arb(q)))
         except Refused as no:
             raise Refused(rule, at, no.detail) from None
-        known = units.is_finite() and all(f.is_finite() for f in F)
-        require(known, rule, at, "F has no finite model")
-        return Field(F, units)
+        finite = known.units.is_finite() and all(f.is_finite() for f in F)
+        require(finite, rule, at, "F has no finite model")
+        return Field(F, known.units)

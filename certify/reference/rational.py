@@ -133,9 +133,10 @@ UNTOLD = Exact(None)
 
 
 def equilibrium(c: Certificate) -> None:
-    """f(0, u_eq) = 0."""
+    """f(0, u_eq) = 0, whatever the uncertain quantities are."""
     names = {name: Exact(ZERO) for name in c.plant.states}
     names.update(zip(c.plant.inputs, map(Exact, c.plant.u_eq), strict=True))
+    names.update(dict.fromkeys(c.plant.uncertain, UNTOLD))  # so that what is 0 here is 0 for each of their values
     for i, component in enumerate(c.plant.dynamics.evaluate(names, Exact)):
         zero = component.value is not None and bool(component.value == 0)
         require(zero, "equilibrium", f"dynamics.{i}", "f(0, u_eq) is not 0, or the rationals do not tell")

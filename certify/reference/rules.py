@@ -68,7 +68,7 @@ def check(c: Certificate) -> int | None:
         if evidence.ball is None:
             raise Refused("format", "evidence.local", "the claim needs a ball")
         loop = Loop(c)
-        local(loop, evidence.ball)
+        local(loop, evidence.ball, evidence.cells)
     leaves = structure(evidence.tree, c.n)
     if c.inner < c.outer or loop is None:  # no local ball stands in for the leaves
         check_leaves(Leaves(c, evidence.T, S), evidence)
@@ -81,7 +81,7 @@ def check(c: Certificate) -> int | None:
 
 def bearable(c: Certificate, rule: str) -> None:
     """Refuses what would fill the memory before it is decided."""
-    plant = len(c.plant.dynamics.steps) * (c.n + c.m) ** 2
+    plant = len(c.plant.dynamics.steps) * (c.n + c.m + c.k) ** 2
     require(plant <= MAX_WORK, rule, "plant", "the equations are too large for this checker")
     before, network = 0, 0
     for layer in c.policy.layers:

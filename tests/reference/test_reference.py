@@ -611,11 +611,11 @@ def test_what_is_not_finite_is_not_accepted(monkeypatch: pytest.MonkeyPatch, wha
         return [dataclasses.replace(first, **change), *others]
 
     with ctx.workprec(160):
-        local.local(Loop(c), ball_of(c))
+        local.local(Loop(c), ball_of(c), ())
         monkeypatch.setattr(Network, "on", broken)
         monkeypatch.setattr("certify.reference.loop.within_bounds", lambda *_: True)
         with pytest.raises(Refused, match="local"):
-            local.local(Loop(c), ball_of(c))
+            local.local(Loop(c), ball_of(c), ())
 
 
 def leaves_of(data: Document) -> tuple[leaves.Leaves, list[leaves.Leaf]]:

@@ -80,7 +80,8 @@ def multipliers(data: Document, J: np.ndarray, nodes: Sequence[np.ndarray], R: n
     n = len(J)
     try:
         with np.errstate(all="ignore"):
-            F = Ball(Case(parse(data)), np.array(J, float), "ball").F
+            case = Case(parse(data))
+            F = Ball(case, np.array(J, float), "ball").F(case.c.ranges)
     except Rejected:
         return ones(n)
     a, Q, E = (np.array([getattr(f, part) for f in F]) for part in ("a", "Q", "E"))

@@ -78,8 +78,13 @@ def make(
     root: Any = None,
     tree: bytes = bytes([LEAF]),
     claim: str = "asymptotic",
+    uncertain: Sequence[tuple[str, str, str]] = (),
+    cells: Sequence[int] | None = None,
 ) -> Document:
-    """A certificate's document; the root box is the least one that binary64 can name, unless it is given."""
+    """A certificate's document; the root box is the least one that binary64 can name, unless it is given.
+
+    `uncertain` has a name and the two ends of each range, of which a single cell is made unless `cells` says more.
+    """
     P = np.atleast_2d(np.asarray(P, dtype=np.float64))
     T = np.eye(len(P)) if T is None else np.atleast_2d(np.asarray(T, dtype=np.float64))
     if root is None:
@@ -94,6 +99,7 @@ def make(
             "name": "plant",
             "states": list(states),
             "inputs": list(inputs),
+            "uncertain": [{"name": name, "range": [lo, hi]} for name, lo, hi in uncertain],
             "dynamics": list(dynamics),
             "u_eq": list(u_eq),
             "domain": [list(pair) for pair in domain],
@@ -115,6 +121,7 @@ def make(
             "T": encode(T),
             "root": encode(root),
             "tree": base64.b64encode(tree).decode("ascii"),
+            "cells": [1] * len(uncertain) if cells is None else list(cells),
             "local": None,
             "tube": [],
         },

@@ -179,8 +179,9 @@ def _shape(data: Any) -> None:
     _need(data["schema"] == "certify-certificate/5", "schema")
     _need(isinstance(data["provenance"], dict), "provenance")
     plant, policy, evidence = data["plant"], data["policy"], data["evidence"]
-    _section(plant, "name", "states", "inputs", "dynamics", "u_eq", "domain", "input_bounds")
+    _section(plant, "name", "states", "inputs", "uncertain", "dynamics", "u_eq", "domain", "input_bounds")
     _need(isinstance(plant["name"], str), "name")
+    _need(plant["uncertain"] == [], "nothing uncertain: this page knows of values only")
     names = _words(plant["states"], 64) + _words(plant["inputs"], 64)
     _need(len(set(names)) == len(names), "different names")
     n, m = len(plant["states"]), len(plant["inputs"])
@@ -233,7 +234,8 @@ def _shape(data: Any) -> None:
         words = [evidence["solver"], evidence["version"], *(word for pair in pairs for word in pair)]
         _need(all(isinstance(w, str) and w and not set(w) & set(" \n\t") for w in words), "words")
         return
-    _section(evidence, "kind", "T", "root", "tree", "local", "tube")
+    _section(evidence, "kind", "T", "root", "tree", "cells", "local", "tube")
+    _need(evidence["cells"] == [], "no cells of nothing")
     _need(evidence["kind"] == "partition-tree", "kind")
     _array(evidence["T"], n, n)
     _array(evidence["root"], n)
