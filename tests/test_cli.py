@@ -489,3 +489,129 @@ def test_states_that_cannot_be_asked_about_exit_2(
     status, out, err = run(capsys, "reach", *spring, *options)
     assert status == 2 and words in err and out == ""
     assert not (tmp_path / "o" / "certificate.json").exists()
+
+
+# what is uncertain
+
+RANGED = SPRING.replace("[dynamics]", "[parameters]\nk = 1\n[disturbances]\nwind = {wind}\n[dynamics]").replace(
+    '"-p + p**3/4 - 2*v + F"', '"-k*p + p**3/4 - 2*v + F + wind"'
+)
+
+
+@pytest.fixture
+def ranged(tmp_path: Path, spring: tuple[str | Path, ...]) -> tuple[str | Path, ...]:
+    """The same with a stiffness k, and a wind that acts only if it is asked for."""
+    (tmp_path / "spring.toml").write_text(RANGED.format(wind=0))
+    return spring
+
+
+def test_roa_for_a_range_says_for_what_it_holds(
+    tmp_path: Path, ranged: tuple[str | Path, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    given = ("roa", *ranged, "--param", "k=0.9..1.1", "--candidate", "lyapunov", "--level", "0.5")
+    status, out, err = run(capsys, *given)
+    said = " ".join(out.split())
+    assert status == 0
+    assert "with k = 1 in [0.9, 1.1]; policy 2-1" in err
+    assert said.startswith("PROVED soft_spring: for every k(t) in [0.9, 1.1], {V <= 0.5} is invariant")
+    page = (tmp_path / "o" / "report.html").read_text()
+    assert "For every k(t) in [0.9, 1.1], any measurable function of time" in page
+    status, out, _ = run(capsys, *given, "--json")
+    data = json.loads(out)
+    assert data["uncertain"] == [{"name": "k", "kind": "parameter", "lo": "9/10", "hi": "11/10", "unit": ""}]
+    assert data["verdict"] == "PROVED" and data["claim"] == {"kind": "asymptotic"}
+    status, out, _ = run(capsys, "check", tmp_path / "o" / "certificate.json")
+    assert status == 0 and "for every k(t) in [9/10 (about 0.9), 11/10 (about 1.1)]" in out
+
+
+def test_three_ways_in_make_one_plant(
+    tmp_path: Path, ranged: tuple[str | Path, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Asked for a level beyond the domain, so that the run ends at once."""
+    given = ("--param", "k=3/4..2", "--disturbance", "wind=-0.01..0.02", "--input-error", "F=1e-3", "--level", "100")
+    status, out, err = run(capsys, "roa", *ranged, *given, "--claim", "practical", "--json", "--time-limit", "5")
+    assert [(q["kind"], q["name"], q["lo"], q["hi"]) for q in json.loads(out)["uncertain"]] == [
+        ("parameter", "k", "3/4", "2"),
+        ("disturbance", "wind", "-1/100", "1/50"),
+        ("input error", "error_F", "-1/1000", "1/1000"),
+    ]
+    assert status in (1, 3)
+    line = err.splitlines()[0]
+    assert "k = 1 in [0.75, 2]; disturbance wind in [−0.01, 0.02]; input error error_F in [−0.001, 0.001]" in line
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--param", "k=2..1"), "the range of k must satisfy lo < hi"),
+        (("--param", "k=1..much"), "`k` must be a finite number"),
+        (("--param", "wind=-1..1"), "soft_spring has no parameter 'wind'; it has: k"),
+        (("--disturbance", "k=1"), "soft_spring has no disturbance 'k'; it has: wind"),
+        (("--disturbance", "wind"), "--disturbance takes NAME=VALUE"),
+        (("--disturbance", "wind=-0.1"), "must have a half-width that is not negative"),
+        (("--disturbance", "wind=0.1..0.2"), "hold its nominal value 0"),
+        (("--input-error", "0"), "must be a positive bound for one of F"),
+        (("--input-error", "G=1e-4"), "must be a positive bound for one of F"),
+        (("--input-error", "some"), "`--input-error` must be a finite number"),
+        (("--param", "k=0.9..1.1", "--enlarge"), "a tube must be of exact equations"),
+        (("--param", "k=0.9..1.1", "--box", "p=0.1"), "a tube must be of exact equations"),
+        (("--param", "k=0.9..1.1", "--engine", "dreal"), "`engine` must be bounds where something is uncertain"),
+        (("--disturbance", "wind=0.1", "--engine", "both"), "found ranges of wind in soft_spring"),
+    ],
+)
+def test_ranges_that_cannot_be_used_exit_2(
+    tmp_path: Path,
+    ranged: tuple[str | Path, ...],
+    options: tuple[str, ...],
+    words: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    status, out, err = run(capsys, "roa", *ranged, *options)
+    assert status == 2 and words in err and out == ""
+    assert not (tmp_path / "o" / "certificate.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        (("reach", "--from", "p=1"), "a tube must be of exact equations"),
+        (("export-smt2",), "export-smt2 must have a plant of exact equations"),
+    ],
+)
+def test_a_disturbance_that_always_acts_is_refused_where_it_would_be_left_out(
+    tmp_path: Path,
+    ranged: tuple[str | Path, ...],
+    command: tuple[str, ...],
+    words: str,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    (tmp_path / "spring.toml").write_text(RANGED.format(wind="0.1"))
+    status, out, err = run(capsys, command[0], *ranged, *command[1:])
+    assert status == 2 and words in err and "found ranges of wind in soft_spring" in err and out == ""
+    assert not (tmp_path / "o").exists() or not any((tmp_path / "o").glob("*.[js]*"))
+
+
+def test_a_disturbance_of_the_file_can_be_switched_off(
+    tmp_path: Path, ranged: tuple[str | Path, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "spring.toml").write_text(RANGED.format(wind="0.1"))
+    given = ("roa", *ranged, "--disturbance", "wind=0", "--candidate", "lyapunov", "--level", "0.1", "--json")
+    status, out, _ = run(capsys, *given)
+    assert status == 0 and json.loads(out)["uncertain"] == [] and json.loads(out)["claim"]["kind"] == "asymptotic"
+
+
+def test_plants_list_disturbances_and_ranges(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "s.toml").write_text(RANGED.format(wind="[-0.1, 0.2]"))
+    status, out, _ = run(capsys, "plant", tmp_path / "s.toml", "--param", "k=0.5..1.5")
+    said = " ".join(out.split())
+    assert status == 0
+    assert "k 1 0.5 1.5" in said and "wind -0.1 0.2" in said
+    assert "uncertain wind, k: any value in their ranges, at any time; A, B at nominal ones" in said
+    data = json.loads(run(capsys, "plant", tmp_path / "s.toml", "--json")[1])
+    assert data["disturbances"] == ["wind"] and data["ranges"] == {"wind": ["-1/10", "1/5"]}
+    exact = " ".join(run(capsys, "plant", "pendulum")[1].split())
+    assert "torque N m 0 0" in exact and "uncertain" not in exact
+    listed = run(capsys, "systems")[1]
+    assert "  disturbance torque N m, 0 unless asked for" in listed
+    known = json.loads(run(capsys, "systems", "--json")[1])["systems"]
+    assert all(s["disturbances"] and s["ranges"] == {} for s in known)

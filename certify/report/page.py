@@ -462,7 +462,7 @@ def _with_errors(parts: Sequence[tuple[str, str, str]], system: System) -> Itera
     on_top = (
         "On {V ≤ c₂} what the policy asks for, π(x), stays in the bounds of the input; the error comes on top of it. "
     )
-    clips = "An actuator that clips the two together makes the error smaller, and is covered." if held else ""
+    clips = "An actuator that clips the two together makes the error no larger, and is covered." if held else ""
     for part in parts:
         yield (part[0], (on_top + clips).rstrip(), part[2]) if part == INPUTS and errors else part
 
@@ -569,7 +569,7 @@ def _not_of_the_plant(system: System) -> list[tuple[str, str]]:
         ),
         (
             "Other disturbances.",
-            f"Only what {names} can be in these equations: no other wind, no sensor noise, no estimation error, no "
+            f"Only what {names} can be in these equations: no other force, no sensor noise, no estimation error, no "
             "delay.",
         ),
     ]
@@ -589,8 +589,8 @@ def _rounding(system: System) -> tuple[str, str]:
     others = f" {listed([symbol(name) for name in exact])} must be exact." if exact else ""
     return (
         "Larger errors of the controller.",
-        f"An evaluation of the policy, in float32 for one, is covered as long as it is off by no more than {ranges}, "
-        f"at every state of the set. That a certain program is, is not part of the claim.{others}",
+        f"An evaluation of the policy, in float32 for one, is covered as long as its error is {ranges}, at "
+        f"every state of the set. That a certain program is, is not part of the claim.{others}",
     )
 
 
