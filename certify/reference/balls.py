@@ -131,8 +131,8 @@ def fourth(name: str, at: arb, y: arb, reach: arb) -> arb | None:
     """A bound of |phi''''| on |v - y| <= reach, phi being `at` at y; None where phi may be undefined, as in `third`.
 
     For 1/v and sqrt it is again the remainder's own factor, 24 times: what 1/v adds to its cubic at y is D^4 / (y^4 v),
-    and a root w -D^4 (5 s^2 + 4 s w + w^2) / (16 s^5 (s + w)^4). The fourth derivative of tanh is below 4.1, the fifth at
-    most 16 in magnitude, and the fourth of atan below 4.7.
+    and a root w -D^4 (5 s^2 + 4 s w + w^2) / (16 s^5 (s + w)^4). The fourth derivative of tanh is below 4.1 and the
+    fifth at most 16, in magnitude, and the fourth of atan below 4.7.
     """
     if name == "1/":
         size = abs(y)

@@ -84,8 +84,8 @@ class Units:
         """U_j of each input: sum_q |L_jq| R_q."""
         if not self.R:
             return (arb_mat(self.n, self.n),) * self.L.nrows()
-        rows: list[list[arb]] = (absolute(self.L) * arb_mat(self.R)).tolist()
-        return tuple(whole(row, self.n) for row in rows)
+        sums = absolute(self.L) * arb_mat(self.R)
+        return tuple([whole(row, self.n) for row in sums.tolist()])
 
     def is_finite(self) -> bool:
         return finite(self.L.entries()) and all(finite(row) for row in self.R)

@@ -17,7 +17,8 @@ from .loop import Loop
 from .refusal import Refused, require
 from .tube import tube
 
-MAX_WORK = 2**22  # numbers of a model times operations of the plant; entries of the matrices of a network
+MAX_PLANT = 2**26  # numbers of a model times operations of the plant
+MAX_NETWORK = 2**22  # entries of the matrices of a network
 
 
 @dataclass(frozen=True)
@@ -80,11 +81,16 @@ def check(c: Certificate) -> int | None:
 
 
 def bearable(c: Certificate, rule: str) -> None:
-    """Refuses what would fill the memory before it is decided."""
-    plant = len(c.plant.dynamics.steps) * (c.n + c.m + c.k) ** 2
-    require(plant <= MAX_WORK, rule, "plant", "the equations are too large for this checker")
+    """Refuses what would fill the memory before it is decided. Models on a ball are of the third order, on a leaf not.
+
+    The symbols are states and the motion, on a leaf states, inputs and what is uncertain.
+    """
+    size = c.n + (c.claim == "reached")
+    thirds = size * (size + 1) * (size + 2) // 6 if c.ends_at_origin else 0
+    plant = len(c.plant.dynamics.steps) * max((c.n + c.m + c.k) ** 2, size**2 + thirds)
+    require(plant <= MAX_PLANT, rule, "plant", "the equations are too large for this checker")
     before, network = 0, 0
     for layer in c.policy.layers:
-        network += layer.rows * (layer.columns + before + (c.n + 1) ** 2)
+        network += layer.rows * (layer.columns + before + size**2 + thirds)
         before += layer.rows
-    require(network <= MAX_WORK, rule, "policy", "the network is too large for this checker")
+    require(network <= MAX_NETWORK, rule, "policy", "the network is too large for this checker")

@@ -69,9 +69,9 @@ def hints(
         F = loop.on(exactly(wide), "tube", "slab", middle)
     except Refused:
         return np.ones((3, n)), 1.0, 1.0
-    f = np.array([float(each.v) for each in F]) - step / h
+    f = np.array([float(each.v) for each in F.components]) - step / h
     a, Q, E = (
-        np.array([[float(v) for v in getattr(each, part).entries()] for each in F]).reshape(n, *shape)
+        np.array([[float(v) for v in getattr(each, part).entries()] for each in F.components]).reshape(n, *shape)
         for part, shape in (("a", (n + 1,)), ("Q", (n + 1, n + 1)), ("E", (n + 1, n + 1)))
     )
     sizes = np.linalg.norm(J.T @ shapes[1], axis=0)
