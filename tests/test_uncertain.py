@@ -241,6 +241,20 @@ def test_the_certificate_has_the_ranges_with_their_units(proved: RoaResult) -> N
     assert dict(system.ranges) == {"k": (F(9, 10), F(11, 10))} and system.units["k"] == "N/m"
 
 
+@pytest.mark.parametrize(
+    ("said", "read"), [("19/20", F(19, 20)), ("1/2", F(1)), ("0.95", F(1)), ("1/0", F(1)), (3, F(1)), (None, F(1))]
+)
+def test_nominal_values_of_a_file_are_for_people(proved: RoaResult, said: object, read: Fraction) -> None:
+    """At which value a picture is drawn: what the file says if it lies in the range, else the middle."""
+    assert proved.raw is not None and b'"nominal": {"k": "1"}' in proved.raw
+    data = json.loads(proved.raw)
+    data["provenance"]["nominal"] = {"k": said}
+    certificate = parse_certificate(json.dumps(data).encode(), "c")
+    assert certificate.system.parameters["k"] == read and dict(certificate.system.ranges) == {"k": (F("0.9"), F("1.1"))}
+    data["provenance"]["nominal"] = {"k": "19/20", "p": "1", "unknown": "2"}  # one that is odd: none is believed
+    assert parse_certificate(json.dumps(data).encode(), "c").system.parameters["k"] == 1
+
+
 def test_all_kinds_at_once_are_claimed_for_a_line(tmp_path: Path) -> None:
     """What pushes at the origin leaves practical stability; the three ways in give one plant."""
     p, u, k, w = sympy.symbols("p F k wind")

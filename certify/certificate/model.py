@@ -247,12 +247,12 @@ def parse_certificate(raw: bytes, name: str) -> Certificate:
         ranges = {q["name"]: (Fraction(q["range"][0]), Fraction(q["range"][1])) for q in plant["uncertain"]}
         names = {s.name: s for s in (*states, *inputs, *map(sympy.Symbol, ranges))}
         n, m = len(states), len(inputs)
-        provenance, units, x_eq = _read_provenance(data["provenance"], names)
+        provenance, units, x_eq, nominal = _read_provenance(data["provenance"], names)
         system = System(
             name=plant["name"],
             states=states,
             inputs=inputs,
-            parameters={name: _nominal(interval) for name, interval in ranges.items()},
+            parameters={name: _nominal(interval, nominal.get(name)) for name, interval in ranges.items()},
             dynamics=tuple(from_tree(t, names) for t in plant["dynamics"]),
             u_eq=tuple(sympy.Rational(q) for q in plant["u_eq"]),
             domain=tuple((Fraction(lo), Fraction(hi)) for lo, hi in plant["domain"]),
@@ -295,34 +295,43 @@ def _read_claim(data: Mapping[str, Any], n: int) -> Claim:
     return CLAIMS[kind](**levels)
 
 
-def _nominal(interval: Interval) -> Fraction:
-    """A value of an uncertain quantity of which nothing else is known: 0 if it may be 0, else the middle."""
+def _nominal(interval: Interval, said: str | None) -> Fraction:
+    """A value of an uncertain quantity: what the file says for people, if it lies in the range, which nothing that is
+    claimed depends on; else 0 if it may be 0, else the middle.
+    """
     lo, hi = interval
+    if said is not None and lo <= Fraction(said) <= hi:
+        return Fraction(said)
     return Fraction(0) if lo <= 0 <= hi else (lo + hi) / 2
 
 
 def _for_people(system: System) -> dict[str, dict[str, str]]:
-    """The provenance's entries for units of what the plant names, and for the operating point; none where there are
-    none.
+    """The provenance's entries for units of what the plant names, for the operating point, and for nominal values of
+    uncertain parameters; none where there are none.
 
     The plant of a certificate is in deviations from x_eq, so that nothing that is checked depends on either.
     """
     names = [s.name for s in (*system.states, *system.inputs, *(s for s, _ in system.uncertain))]
     units = {name: system.units[name] for name in names if name in system.units}
     x_eq = {name: str(q) for name, q in system.operating_point().items()}
-    return {key: entry for key, entry in (("units", units), ("x_eq", x_eq)) if entry}
+    nominal = {name: str(system.parameters[name]) for name in system.ranges if name in system.parameters}
+    return {key: entry for key, entry in (("units", units), ("x_eq", x_eq), ("nominal", nominal)) if entry}
 
 
-def _read_provenance(data: Any, names: Mapping[str, Any]) -> tuple[dict[str, str], dict[str, str], dict[str, str]]:
-    """The provenance as text, and units and operating point in it; it is for people, so what is odd is passed over."""
+def _read_provenance(
+    data: Any, names: Mapping[str, Any]
+) -> tuple[dict[str, str], dict[str, str], dict[str, str], dict[str, str]]:
+    """The provenance as text, and units, operating point and nominal values in it; it is for people, so what is odd is
+    passed over.
+    """
     found = data if isinstance(data, dict) else {}
     read = {}
-    for key, is_one in (("units", _is_unit), ("x_eq", _is_value)):
+    for key, is_one in (("units", _is_unit), ("x_eq", _is_value), ("nominal", _is_value)):
         entry = found.get(key)
         usable = isinstance(entry, dict) and all(k in names and is_one(v) for k, v in entry.items())
         read[key] = entry if usable and isinstance(entry, dict) else {}
     text = {k: str(v) for k, v in found.items() if not read.get(k)}
-    return text, read["units"], read["x_eq"]
+    return text, read["units"], read["x_eq"], read["nominal"]
 
 
 def _is_value(value: Any) -> bool:

@@ -67,7 +67,7 @@ def outside(found: Page) -> str:
 @pytest.fixture(scope="module")
 def proved(tmp_path_factory: pytest.TempPathFactory) -> RoaResult:
     folder = tmp_path_factory.mktemp("spring")
-    result = certify_roa(*spring(), folder, candidate="lyapunov", level=0.5, ranges={"k": ("0.75", "1.25")})
+    result = certify_roa(*spring(), folder, candidate="lyapunov", level=0.5, ranges={"k": ("0.75", "2.25")})
     assert result.verdict is Verdict.PROVED
     return result
 
@@ -116,10 +116,10 @@ def test_words_of_ranges() -> None:
 def test_the_page_says_for_what_it_holds_wherever_it_claims(proved: RoaResult) -> None:
     found = Page(proved.report().read_text("utf-8"))
     text = found.text
-    stated = "For every k(t) in [0.75, 1.25] N/m, any measurable function of time"
+    stated = "For every k(t) in [0.75, 2.25] N/m, any measurable function of time"
     assert f"What was proved {stated}" in text and "the following holds. Every trajectory of the closed loop" in text
     assert "dx/dt = f(x, π(x), k) in exact real arithmetic" in text
-    assert "Uncertain in them is k(t) in [0.75, 1.25] N/m: nothing but the range is known, at any time." in text
+    assert "Uncertain in them is k(t) in [0.75, 2.25] N/m: nothing but the range is known, at any time." in text
     assert "One V, one P and one policy with one u_eq serve all of these values." in text
     assert "parts, each of them for all values in the ranges:" in text
     assert re.search(r"over the remainder: [\d.]+ %(, the least of \d+ cells of the box of all ranges)?\.", text)
@@ -204,11 +204,11 @@ def test_names_in_equations_are_typeset_as_they_are() -> None:
 def test_the_summary_begins_with_the_ranges(proved: RoaResult) -> None:
     said = printed(proved)
     assert (
-        "PROVED  spring: for every k(t) in [0.75, 1.25] N/m, {V <= 0.5} is invariant and attracted by the origin"
+        "PROVED  spring: for every k(t) in [0.75, 2.25] N/m, {V <= 0.5} is invariant and attracted by the origin"
         in said
     )
     assert re.search(
-        r"for every +k\(t\) in \[0\.75, 1\.25\] N/m: any measurable functions of time, constant ones too", said
+        r"for every +k\(t\) in \[0\.75, 2\.25\] N/m: any measurable functions of time, constant ones too", said
     )
     assert "(at the nominal values)" in said
 
