@@ -7,6 +7,7 @@ a few points of a trajectory, and no trajectory itself.
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import json
 import math
@@ -32,7 +33,7 @@ from certify.reference.decrease import decreases_along
 from certify.reference.document import read
 from certify.reference.evidence import Ball
 from certify.reference.evidence import Path as Motion
-from certify.reference.loop import Loop
+from certify.reference.loop import Field, Loop
 from certify.reference.model import Model
 from certify.reference.rational import beyond_domain, root_above
 from certify.roa import RoaOptions, certify_roa
@@ -40,6 +41,7 @@ from certify.systems import get_system
 from tests.support.balls import TINY, around, ball, exactly, slab_of, square, with_ball
 from tests.support.certificates import Document, decode, dump, edited, encode, make, write
 from tests.support.certificates import verdict as verdict_of_the_checker
+from tests.support.models import curves, field, model, numbers, units
 from tests.support.paths import along, follow
 from tests.support.reference import judge
 
@@ -289,7 +291,7 @@ FORGERIES: list[tuple[str, str, str, Edit]] = [  # place, base, what, edit; all 
     ("slab 3", "bent", "no beta and a small joint", lambda d: of_path(2, "joint", LEAST)(rows(2, row(1, 0.0))(d))),
     ("slab 3", "bent", "no beta and a large joint", lambda d: of_path(2, "joint", 1e9)(rows(2, row(1, 0.0))(d))),
     ("slab 3", "swing", "a large alpha", rows(2, row(0, 1e9))),
-    ("slab 3", "swing", "a small alpha", rows(2, row(0, 1e-9))),
+    ("slab 3", "swing", "a small alpha", rows(2, row(0, 1e-30))),
     ("slab 3", "swing", "a large beta", rows(2, row(1, 1e9))),
     ("slab 3", "swing", "a small beta", rows(2, row(1, 1e-9))),
     *(("slab 1", name, "a duration of 0", at("evidence.tube.0.duration", (0.0).hex())) for name in NAMES),
@@ -429,7 +431,7 @@ def models_of(data: Document) -> list[tuple[list[Model], list[Model]]]:
         w = (after - before) / (2 * fmpq(*each.path.share.as_integer_ratio()))  # type: ignore[union-attr,operator]
         wide = fmpq_mat([[*a, b] for a, b in zip(each.ball.J.tolist(), w.entries(), strict=True)])
         m = (before + after) / 2  # type: ignore[operator]
-        result.append((loop.network.on(wide, m), loop.on(wide, "tube", "slab", m)))
+        result.append((loop.network.on(wide, m)[0], loop.on(wide, "tube", "slab", m).components))
     return result
 
 
@@ -468,10 +470,8 @@ def test_the_models_on_a_slab_hold_at_every_point(name: str) -> None:
         d *= generator.choice([1, 1, 0.3], 200) * (1 - 1e-12) / np.linalg.norm(d, axis=0)
         truth = F_of(name, (before + after)[:, None] / 2 + wide @ d)
         for f, values in zip(F, truth, strict=True):
-            a, Q, E = (np.array([float(v) for v in M.entries()]) for M in (f.a, f.Q, f.E))
-            Q, E = Q.reshape(n + 1, -1), E.reshape(n + 1, -1)
-            left = values - float(f.v) - a @ d - np.einsum("ib,ij,jb->b", d, Q, d)
-            assert (np.abs(left) <= np.einsum("ib,ij,jb->b", d, E, d) + 1e-12).all()
+            left = values - float(f.v) - numbers(f.a).T[0] @ d - curves(f, d)
+            assert (np.abs(left) <= np.einsum("ib,ij,jb->b", d, numbers(f.whole), d) + 1e-12).all()
 
 
 POLICIES: list[tuple[str, str, str]] = [
@@ -514,38 +514,28 @@ def test_the_policy_away_from_the_origin(squash: str, centring: str, u_eq: str) 
     assert abs(policy(np.zeros((2, 1)))[0] - rest) < 1e-14
     J = exactly(np.array([[0.05, 0.01, 0.02], [0.0, 0.04, -0.03]]))
     wide = np.array([[float(v) for v in each] for each in arb_mat(J).tolist()])
-    (u,) = network.on(J)
+    ((u,), _) = network.on(J)
     assert u.v == arb(fmpq(*Fraction(u_eq).as_integer_ratio()))
     for centre in generator.uniform(-2, 2, (20, 2)):
-        (u,) = network.on(J, fmpq_mat(2, 1, [fmpq(*float(v).as_integer_ratio()) for v in centre]))
+        ((u,), _) = network.on(J, fmpq_mat(2, 1, [fmpq(*float(v).as_integer_ratio()) for v in centre]))
         assert abs(float(u.v) - policy(centre[:, None])[0]) < 1e-13
         d = generator.standard_normal((3, 300))
         d *= (1 - 1e-12) / np.linalg.norm(d, axis=0)
-        Q, E = (np.array([float(v) for v in M.entries()]).reshape(3, 3) for M in (u.Q, u.E))
-        a = np.array([float(v) for v in u.a.entries()])
-        left = policy(centre[:, None] + wide @ d) - float(u.v) - a @ d - np.einsum("ib,ij,jb->b", d, Q, d)
-        assert (np.abs(left) <= np.einsum("ib,ij,jb->b", d, E, d) + 1e-13).all()
-        assert np.abs(left).max() < 0.05  # the first two orders are right, or else it is of that size
+        left = policy(centre[:, None] + wide @ d) - float(u.v) - numbers(u.a).T[0] @ d - curves(u, d)
+        assert (np.abs(left) <= np.einsum("ib,ij,jb->b", d, numbers(u.whole), d) + 1e-12).all()
+        assert np.abs(left).max() < 0.005  # the first three orders are right, or else it is of that size
 
 
 # ------------------------------------------------------------------------------------------------------ the inequality
 
 
-def hints(J: Any, alpha: Any, beta: Any, g: Any) -> Ball:
-    return Ball(exactly(np.atleast_2d(J)), *(floats("d", list(values)) for values in (alpha, beta, g)))
+def hints(J: Any, alpha: Any, beta: Any, g: Any, weight: Any = None) -> Ball:
+    rows_of = (floats("d", list(values)) for values in (alpha, beta, g))
+    return Ball(exactly(np.atleast_2d(J)), *rows_of, exactly(np.eye(len(g)) if weight is None else weight))
 
 
 def motion(share: float, edge: float, motion: float) -> Motion:
     return Motion(fmpq_mat(1, 1), share, edge, motion)
-
-
-def model(v: float, a: Any, Q: Any, E: Any) -> Model:
-    size = len(a)
-    return Model(
-        arb(v),
-        arb_mat([[arb(float(value))] for value in a]),
-        *(arb_mat(size, size, [arb(float(value)) for value in np.ravel(M)]) for M in (Q, E)),
-    )
 
 
 def scalar(f: float, a: float, w: float, *, P: float = 1.0, R: float = 0.0, edge: float, move: float) -> bool:
@@ -553,7 +543,7 @@ def scalar(f: float, a: float, w: float, *, P: float = 1.0, R: float = 0.0, edge
     flat = np.zeros((2, 2))
     F = [model(f, [a, w], flat, flat)]
     path, (P_, R_) = motion(0.5, edge, move), (exactly(np.array([[value]])) for value in (P, R))
-    return decreases_along(hints([[1.0]], [0.0], [TINY], [1.0, 1.0]), path, P_, R_, F)
+    return decreases_along(hints([[1.0]], [0.0], [TINY], [1.0, 1.0]), path, P_, R_, field(F))
 
 
 GRID = np.geomspace(1e-3, 1e3, 121)
@@ -582,35 +572,47 @@ def test_neither_edge_nor_motion_need_be_asked_not_to_be_negative_here() -> None
 
 
 @pytest.mark.parametrize("bad", ["nan", "inf", "-inf", "[0 +/- inf]"])
-@pytest.mark.parametrize("part", ["v", "a", "Q", "E"])
+@pytest.mark.parametrize("part", ["v", "a", "Q", "K", "E", "B", "L", "R"])
 @pytest.mark.parametrize("multipliers", [([0.0], [1.0], [1.0, 1.0]), ([1.0], [0.0], [1.0, 1.0])])
 def test_what_is_not_finite_does_not_decrease(bad: str, part: str, multipliers: Any) -> None:
     one, zero, path = fmpq_mat([[1]]), fmpq_mat(1, 1), motion(0.5, 1.0, 2.0)
-    parts = {"v": arb(0), "a": arb_mat([[-9], [0]]), "Q": arb_mat(2, 2), "E": arb_mat(2, 2)}
-    assert decreases_along(hints([[1.0]], *multipliers), path, one, zero, [Model(**parts)])
-    for place in range(1 if part == "v" else 2 if part == "a" else 4):
-        changed = dict(parts)
+    F, behind = model(0.0, [-9, 0], np.zeros((2, 2)), np.zeros((2, 2)), B=[1.0]), units([[1.0]], [0.1 * np.eye(2)])
+    assert decreases_along(hints([[1.0]], *multipliers), path, one, zero, field([F], behind))
+    number_of = {"v": 1, "a": 2, "Q": 4, "K": 4, "E": 4, "B": 1, "L": 1, "R": 3}[part]
+    for place in range(number_of):
+        changed, units_of = F, behind
         if part == "v":
-            changed["v"] = arb(bad)
+            changed = dataclasses.replace(F, v=arb(bad))
+        elif part == "B":
+            changed = dataclasses.replace(F, B=(arb(bad),))
+        elif part == "L":
+            units_of = dataclasses.replace(behind, L=arb_mat([[arb(bad)]]))
+        elif part == "R":
+            units_of = dataclasses.replace(
+                behind, R=[[arb(bad) if k == place else v for k, v in enumerate(behind.R[0])]]
+            )
         else:
-            M = parts[part]
+            M = getattr(F, part)
             entries = [arb(bad) if k == place else v for k, v in enumerate(M.entries())]
-            changed[part] = arb_mat(M.nrows(), M.ncols(), entries)
-        assert not decreases_along(hints([[1.0]], *multipliers), path, one, zero, [Model(**changed)])
+            changed = dataclasses.replace(F, **{part: arb_mat(M.nrows(), M.ncols(), entries)})
+        assert not decreases_along(hints([[1.0]], *multipliers), path, one, zero, field([changed], units_of))
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])
 @pytest.mark.parametrize("kind", ["apart", "jointly"])
 def test_what_decreases_does_so_at_every_point(n: int, kind: str) -> None:
-    """Systems at random, near the edge; the remainder takes the worst sign and size that its bound allows.
+    """Systems at random, near the edge; remainders and errors take the worst sign and size that their bounds allow.
 
     With the terms of edge and motion, at every point of the ball: that is what the three coefficients of a slab share.
     """
     generator, answers = np.random.default_rng(n), []
     for _ in range(150):
-        size = generator.uniform(0, 0.4) / n**2
+        size = generator.uniform(0, 0.3) / n**2
         Q, E = size * generator.standard_normal((2, n, n + 1, n + 1))
         Q, E = (Q + Q.transpose(0, 2, 1)) / 2, np.einsum("iab,icb->iac", E, E) / max(size, 1e-9) / n
+        K = size / n * generator.standard_normal((n, (n + 1) * (n + 2) * (n + 3) // 6))
+        inputs, L = 0.3 * size * generator.standard_normal((n, 2)), generator.standard_normal((2, 3))
+        S = np.einsum("qab,qcb->qac", *(generator.standard_normal((1, 3, n + 1, n + 1)).repeat(2, 0))) / n
         B, R = generator.standard_normal((2, n, n))
         P, R = B @ B.T + np.eye(n), 0.1 / n * (R + R.T)
         P = (P + P.T) / 2
@@ -621,20 +623,24 @@ def test_what_decreases_does_so_at_every_point(n: int, kind: str) -> None:
         f = 0.1 * generator.standard_normal(n)
         k = float(generator.uniform(0.3, 1.5))
         q = float(generator.uniform(0.2, 0.9)) * k / share**2
-        F = [model(*each) for each in zip(f, a, Q, E, strict=True)]
+        F = [model(*each) for each in zip(f, a, Q, E, K, inputs.tolist(), strict=True)]
         beta = size * np.ones(n) if kind == "apart" else np.zeros(n)
-        multipliers = hints(J, size * generator.choice([0, 1], n), beta, n * size * np.ones(n + 1) + 1e-9)
-        answer = decreases_along(multipliers, motion(share, k, q), exactly(P), exactly(R), F)
+        C = generator.standard_normal((n + 1, n + 1))
+        weight = [np.eye(n + 1), C @ C.T, C][generator.integers(3)]
+        alpha = size * generator.choice([0, 1], n)
+        multipliers = hints(J, alpha, beta, n * size * np.ones(n + 1) + 1e-9, weight)
+        answer = decreases_along(multipliers, motion(share, k, q), exactly(P), exactly(R), field(F, units(L, S)))
         answers.append(answer)
         if not answer:
             continue
         for direction in generator.standard_normal((200, n + 1)):
             d = direction * generator.choice([1, 1, 0.5]) * (1 - 1e-12) / np.linalg.norm(direction)
             z, b = d[:-1], P @ J @ d[:-1]
-            known = f + a @ d + np.array([d @ each @ d for each in Q])
+            known = f + a @ d + np.array([curves(each, d[:, None])[0] for each in F])
             worst = np.sign(b) * np.array([d @ each @ d for each in E])
+            errors = inputs @ L @ (np.sign(b @ inputs @ L) * np.array([d @ each @ d for each in S]))
             W = z @ J.T @ P @ J @ z
-            form = z @ J.T @ R @ J @ z + 2 * b @ (known + worst) + k * (W - 1) + q * (share**2 - d[-1] ** 2)
+            form = z @ J.T @ R @ J @ z + 2 * b @ (known + worst + errors) + k * (W - 1) + q * (share**2 - d[-1] ** 2)
             assert form < 0
     assert 5 < sum(answers) < 145
 
@@ -802,7 +808,7 @@ def one(_: Motion, __: str) -> fmpq:
     return fmpq(1, 2)
 
 
-def unmoved(loop: Loop, slab: Any, path: Motion, centres: Any, at: str) -> list[Model]:
+def unmoved(loop: Loop, slab: Any, path: Motion, centres: Any, at: str) -> Field:
     """As if the path stood at its end: no velocity, and no motion."""
     J = fmpq_mat([[*each, 0] for each in slab.ball.J.tolist()])
     return loop.on(J, "tube", at, centres[1])
@@ -864,7 +870,7 @@ def test_every_coefficient_of_a_slab_is_asked(which: str, monkeypatch: pytest.Mo
         "motion": (0.0018).hex(),
         "joint": "0x0.0p+0",
     }
-    slab = slab_of(middle, last, h) | ball(J, [[0.0] * 2, [TINY] * 2, [0.0] * 2]) | {"path": path}
+    slab = slab_of(middle, last, h) | ball(J, [[0.0] * 2, [TINY] * 2, [0.0] * 2], np.eye(3)) | {"path": path}
     claim = {"kind": "reached", "start": encode(first), "centre": encode(zero)}
     data = edited(edited(data, "claim", claim), "evidence.tube", [slab])
     verdict = rules.judge(dump(data))

@@ -368,7 +368,7 @@ def inputs_of(data: Document) -> list[Any]:
     """The model of the input on each slab."""
     c = rules.read(dump(data))
     network = Loop(c).network
-    return [network.on(each.ball.J)[0] for each in c.evidence.tube]  # type: ignore[union-attr]
+    return [network.on(each.ball.J)[0][0] for each in c.evidence.tube]  # type: ignore[union-attr]
 
 
 def test_by_form_the_inputs_need_no_model() -> None:

@@ -63,9 +63,12 @@ def ones(n: int) -> np.ndarray:
     return np.ones((3, n))
 
 
-def ball(J: Any, rows: Any) -> Document:
-    """With a weight that has no preference."""
-    return {"J": encode(J), "multipliers": encode(rows), "weight": encode(np.eye(len(np.atleast_2d(J))))}
+def ball(J: Any, rows: Any, weight: Any = None) -> Document:
+    """With a weight that has no preference, unless it is given: on a slab with a path it is larger by one."""
+    indifferent = np.eye(len(np.atleast_2d(J)))
+    return {
+        "J": encode(J), "multipliers": encode(rows), "weight": encode(indifferent if weight is None else weight),
+    }  # fmt: skip
 
 
 def exactly(A: np.ndarray) -> fmpq_mat:

@@ -55,7 +55,7 @@ def along(
         "motion": motion.hex(),
         "joint": (1.0).hex(),
     }
-    return slab_of(shapes[1], shapes[2], h) | ball(J, rows) | {"weight": encode(np.eye(len(J) + 1)), "path": path}
+    return slab_of(shapes[1], shapes[2], h) | ball(J, rows, np.eye(len(J) + 1)) | {"path": path}
 
 
 def hints(
