@@ -678,6 +678,7 @@ def placed(data: Document, centre: Sequence[float], after: Sequence[float], shar
     n = len(centre)
     one = {"middle": encode(np.eye(n)), "end": encode(np.eye(n)), "duration": (1.0).hex(),
            "path": waypoint(after, share, 1.0, 1.0)} | ball(J, np.ones((3, n)))  # fmt: skip
+    one["weight"] = encode(np.eye(n + 1))
     data = edited(data, "claim", {"kind": "reached", "start": encode(np.eye(n)), "centre": encode(centre)})
     return edited(data, "evidence.tube", [one])
 
