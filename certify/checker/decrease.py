@@ -89,7 +89,7 @@ def sides(
         else:
             joint = [C + b[i, j] * Q for j, C in enumerate(joint)]
         wrong += 2 * lengths[i] * models.slack[i]
-    rest += cubic(models, b, by.weight) + of_units(models, b, by.weight)
+    rest += cubic(models, b, by) + of_units(models, b, by.weight)
     if not all(beta > 0 for beta in by.apart):
         inverse = diagonal([1 / g for g in shares])
         rest += diagonal(shares) + sum((C.transpose() * inverse * C for C in joint), fmpq_mat(k, k))
@@ -99,16 +99,22 @@ def sides(
     return -form, rest + diagonal([wrong] * rest.nrows())
 
 
-def cubic(models: Models, b: fmpq_mat, weight: Array) -> fmpq_mat:
-    """S_cubic: 2 sum_i (b_i.d) K_i[d] = 2 sum_l d_l N_l[d, d, d], where N is symmetric in all of its indices."""
+def cubic(models: Models, b: fmpq_mat, by: Multipliers) -> fmpq_mat:
+    """S_cubic: where beta_i > 0 each 2 (b_i.d) K_i[d] by itself, and the sum of all others as 2 sum_l d_l N_l[d, d, d], N
+    being symmetric in all of its indices."""
     k = b.ncols()
     if not np.any(models.K):
         return fmpq_mat(k, k)
-    row, by = in_binary64(b)
-    N = np.tensordot(row.T, unpacked(models.K, k), 1)
+    row, power = in_binary64(b)
+    K, apart = unpacked(models.K, k), np.array([beta > 0 for beta in by.apart])
+    each, others = row[apart], row[~apart]
+    T = K[apart].reshape(-1, k * k, k)
+    S = bound_of_pairs(each, up(EPS * norm(each, 1)), T, np.zeros(len(T)), by.weight)
+    N = np.tensordot(others.T, K[~apart], 1)
     N = (N + N.transpose(1, 0, 2, 3) + N.transpose(1, 2, 0, 3) + N.transpose(1, 2, 3, 0)) / 4
-    wrong = np.full(k, up((gamma(len(row)) + EPS) * total(norm(row, 1) * models.twists, 0)))
-    return bound_of_pairs(np.eye(k), np.zeros(k), N.reshape(k, k * k, k), wrong, weight) * fmpq(2) ** by
+    wrong = np.full(k, up((gamma(len(row)) + EPS) * total(norm(others, 1) * models.twists[~apart], 0)))
+    S += bound_of_pairs(np.eye(k), np.zeros(k), N.reshape(k, k * k, k), wrong, by.weight)
+    return S * fmpq(2) ** power
 
 
 def of_units(models: Models, b: fmpq_mat, weight: Array) -> fmpq_mat:

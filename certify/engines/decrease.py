@@ -112,7 +112,8 @@ def rest_of(models: Models, b: Array, multipliers: Multipliers) -> Array:
     if np.any(beta == 0):
         C = _joint(models, b, beta == 0)
         rest += np.diag(g) + np.einsum("jmk,m,jml->kl", C, 1 / g, C, optimize=True)
-    rest += _by_weight(np.eye(k), _cubic(models, b), multipliers.weight)
+        rest += _by_weight(np.eye(k), _cubic(models, b, beta == 0), multipliers.weight)
+    rest += _by_weight(b[beta > 0], _squares(models.K[beta > 0]), multipliers.weight)
     rest += _by_weight(models.shares.T @ b, models.squares, multipliers.weight)
     return (rest + rest.T) / 2
 
@@ -151,13 +152,17 @@ def _joint(models: Models, b: Array, chosen: NDArray[np.bool_]) -> Array:
     return np.tensordot(b[chosen].T, models.Q[chosen], 1)
 
 
-def _cubic(models: Models, b: Array) -> Array:
-    """N_l'N_l for each l, (k, k, k): N is the mean of sum_i b_i K_i over all orders of its four indices."""
-    k = b.shape[1]
-    N = np.tensordot(b.T, models.K, 1)  # each K_i is symmetric: what is left is which index is that of b
-    N = (N + N.transpose(1, 0, 2, 3) + N.transpose(1, 2, 0, 3) + N.transpose(1, 2, 3, 0)) / 4
-    N = N.reshape(k, k**2, k)
-    return np.asarray(N.transpose(0, 2, 1) @ N)
+def _cubic(models: Models, b: Array, chosen: NDArray[np.bool_]) -> Array:
+    """N_l'N_l for each l, (k, k, k): N is the mean of the sum of the chosen b_i K_i over all orders of four indices."""
+    N = np.tensordot(b[chosen].T, models.K[chosen], 1)  # K_i is symmetric: what is left is which index is that of b
+    return _squares((N + N.transpose(1, 0, 2, 3) + N.transpose(1, 2, 0, 3) + N.transpose(1, 2, 3, 0)) / 4)
+
+
+def _squares(forms: Array) -> Array:
+    """T'T for forms of order three, (N, k, k, k), as matrices T (k^2, k)."""
+    k = forms.shape[-1]
+    T = forms.reshape(-1, k**2, k)
+    return np.asarray(T.transpose(0, 2, 1) @ T)
 
 
 def _by_weight(p: Array, squares: Array, weight: Array) -> Array:

@@ -91,9 +91,11 @@ def _problem(known: Paths, P: Array) -> tuple[Problem, Array]:
 
 @dataclass(frozen=True, slots=True)
 class _Linearised:
-    """The rule around {x'Px <= 1}, x = J d: in a row, what the decay leaves, (n, n), relative to the decay at X = 0, and
-    how far inputs and states move, (m + n,), who have that `room`; `slopes` are its derivatives by the entries of X on
-    and above the diagonal."""
+    """The rule around {x'Px <= 1}, x = J d.
+
+    A row holds what the decay leaves, (n, n), relative to the decay at X = 0, and how far inputs and states move, who
+    have that `room`, (m + n,); `slopes` are its derivatives by the entries of X on and above the diagonal.
+    """
 
     J: Array
     here: Array

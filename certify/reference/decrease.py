@@ -115,19 +115,29 @@ def joint(ball: Ball, b: Sequence[arb_mat], F: Sequence[Model]) -> arb_mat:
 
 
 def cubic(ball: Ball, b: Sequence[arb_mat], F: Sequence[Model]) -> arb_mat:
-    """S_cubic: sum (b_i.d) K_i[d] is sum_k d_k N_k[d], N the mean of its coefficients over all orders of four indices.
+    """S_cubic: of components that have a beta each (b_i.d) K_i[d] by itself, |K_i[d]| <= ||d||^2 ||T_i d||.
 
-    |N_k[d]| <= ||d||^2 ||N_k d||, N_k a matrix with a row for each two indices, of which two orders are one row here.
+    The sum of all others is sum_k d_k N_k[d], N the mean of its coefficients over all orders of four indices, and
+    |N_k[d]| <= ||d||^2 ||N_k d||. T_i and N_k are matrices with a row for each two indices.
     """
-    size = b[0].nrows()
+    size, weight, result = b[0].nrows(), arb_mat(ball.weight), nothing(b)
+    place, two, quarter = places(size), pairs(size), ONE / 4
     if all(f.twist.is_zero() for f in F):
-        return nothing(b)
-    columns = arb_mat([column.entries() for column in b]).transpose()
-    M = (columns * arb_mat([f.K.entries() for f in F])).tolist()
-    weight, place, result = arb_mat(ball.weight), places(size), nothing(b)
-    quarter, two = ONE / 4, pairs(size)
+        return result
+    together = list[tuple[arb_mat, Model]]()
+    for beta, column, f in zip(ball.beta, b, F, strict=True):
+        if beta > 0:
+            K = f.K.entries()
+            rows = [[K[place[(h * size + i) * size + j]] for j in range(size)] for h, i in two]
+            result += balanced(column, square_of(rows, two), weight)
+        else:
+            together.append((column, f))
+    if not together:
+        return result
+    columns = arb_mat([column.entries() for column, _ in together]).transpose()
+    M = (columns * arb_mat([f.K.entries() for _, f in together])).tolist()
     for k in range(size):
-        rows, counted = list[list[arb]](), list[list[arb]]()
+        rows = []
         for h, i in two:
             hi, ki, kh = ((p * size + q) * size for p, q in ((h, i), (k, i), (k, h)))
             row = [
@@ -135,10 +145,14 @@ def cubic(ball: Ball, b: Sequence[arb_mat], F: Sequence[Model]) -> arb_mat:
                 for j in range(size)
             ]
             rows.append(row)
-            counted.append(row if h == i else [2 * v for v in row])
-        square = arb_mat(rows).transpose() * arb_mat(counted)
-        result += balanced(unit_vector(k, size), square, weight)
+        result += balanced(unit_vector(k, size), square_of(rows, two), weight)
     return result
+
+
+def square_of(rows: list[list[arb]], two: Sequence[tuple[int, int]]) -> arb_mat:
+    """T'T of a matrix with a row for each two indices, of which both orders are one of these rows."""
+    counted = [row if h == i else [2 * v for v in row] for row, (h, i) in zip(rows, two, strict=True)]
+    return arb_mat(rows).transpose() * arb_mat(counted)
 
 
 def units(ball: Ball, b: Sequence[arb_mat], F: Sequence[Model], each: Units) -> arb_mat:

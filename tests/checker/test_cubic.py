@@ -20,7 +20,7 @@ from certify.checker import decrease, local, tube
 from certify.checker.ball import Ball, Units, too_large
 from certify.checker.case import Case
 from certify.checker.decrease import Models
-from certify.checker.document import Certificate
+from certify.checker.document import Certificate, Multipliers
 from certify.checker.elementary import Expansion, elementary
 from certify.checker.exact import exactly
 from certify.checker.jets import Jet, constant, symmetric, tensor_norm, unpacked, widen
@@ -564,8 +564,10 @@ def test_the_two_new_sums_bound_what_they_stand_for(n: int, kind: str) -> None:
         models = random_models(generator, n, k, 5)
         b = exactly(generator.standard_normal((n, k)) * 2.0 ** float(generator.integers(-300, 300)))
         weight = WEIGHTS[kind](generator, k)
+        apart = tuple(fmpq(int(beta)) for beta in generator.integers(0, 2, n))
         with np.errstate(all="ignore"):
-            sums = decrease.cubic(models, b, weight), decrease.of_units(models, b, weight)
+            by = Multipliers(apart, apart, apart, weight)
+            sums = decrease.cubic(models, b, by), decrease.of_units(models, b, weight)
         L, R = exactly(models.units.L), [exactly(part) for part in models.units.R]
         p = b.transpose() * models.B * L
         whole = [unpacked(K, k) for K in models.K]

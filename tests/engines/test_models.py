@@ -3,29 +3,35 @@
 from __future__ import annotations
 
 import json
+import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import sympy
 from flint import fmpq_mat
 
 from certify.checker.ball import Ball
 from certify.checker.case import Case
-from certify.checker.decrease import Models, sides
+from certify.checker.decrease import Models as TheirModels
+from certify.checker.decrease import sides
 from certify.checker.exact import exactly
-from certify.engines.decrease import best_multipliers, decay_of, rest_of
+from certify.checker.jets import unpacked
+from certify.closed_loop import ClosedLoop
+from certify.engines.decrease import Multipliers, best_multipliers, decay_of, rest_of
 from certify.engines.enlarge import Found, enlarge
 from certify.engines.local import prove_local
-from certify.engines.models import paths
+from certify.engines.models import Models, paths
 from certify.engines.tube import Tube, find_tube
 from certify.lyapunov import domain_limit, leaves_domain
-from certify.policies import TanhNetwork
+from certify.policies import TanhNetwork, load_policy
 from certify.roa import RoaOptions, certify_roa
 from certify.systems import System, get_system
 from certify.verdict import Verdict
 from tests.support.cases import case_of
 from tests.support.certificates import parse
-from tests.support.loops import chain, pendulum_network, scalar_tanh
+from tests.support.loops import chain, pendulum_network, scalar_tanh, tank, valve
 
 
 def loop_of(name: str) -> tuple[System, TanhNetwork]:
@@ -50,16 +56,74 @@ def test_models_and_sides_are_those_of_the_checker(name: str, tmp_path: Path) ->
     mine = paths(case_of(system, network).loop).models(J)
     assert mine.finite and mine.admitted
     with np.errstate(all="ignore"):
-        theirs = Ball(Case(c), J, "ball").F
+        ball = Ball(Case(c), J, "ball")
+        theirs, units = ball.F, ball.units
+    shares = np.array([f.B for f in theirs]) @ units.L
     for k, f in enumerate(theirs):
-        for a, b in ((mine.A[k], f.a), (mine.Q[k], f.Q), (mine.E[k], f.E)):
+        third = unpacked(f.K[None], len(J))[0]
+        for a, b in ((mine.A[k], f.a), (mine.Q[k], f.Q), (mine.K[k], third), (mine.E[k], f.E)):
             assert np.max(np.abs(a - b)) <= 1e-9 * (np.max(np.abs(b)) + 1e-6)
-    decay, rest = map(floats, sides(Models(J, theirs), exactly(c.P), fmpq_mat(len(J), len(J)), by))
+    for a, b in ((mine.shares, shares), (mine.R, units.R)):
+        assert np.max(np.abs(a - b), initial=0.0) <= 1e-9 * (np.max(np.abs(b), initial=0.0) + 1e-6)
+    models = sides(TheirModels(J, theirs, units), exactly(c.P), fmpq_mat(len(J), len(J)), by)
+    decay, rest = map(floats, models)
     rows = np.array([[int(v.p) / int(v.q) for v in row] for row in (by.rest, by.apart, by.joint)])
     b = c.P @ J
     assert np.allclose(decay_of(mine, J, b), decay, rtol=1e-9, atol=1e-12 * np.max(decay))
-    assert np.allclose(rest_of(mine, b, rows), rest, rtol=1e-6, atol=1e-6 * np.max(decay))
+    assert np.allclose(rest_of(mine, b, Multipliers(rows, by.weight)), rest, rtol=1e-6, atol=1e-6 * np.max(decay))
     assert best_multipliers(mine, J, c.P).margin > 0
+
+
+def loops() -> dict[str, ClosedLoop]:
+    """Networks with and without tanh at their ends, and plants with every function of the grammar."""
+    curved = Path(__file__).parents[1] / "data" / "quadrotor2d_curved.pt"
+    found = {name: loop_of(name) for name in ("scalar", "chain", "pendulum")} | {"tank": tank(), "valve": valve()}
+    found["quadrotor2d"] = get_system("quadrotor2d"), load_policy(curved).network
+    x, u = sympy.symbols("x u")
+    others = {"trigonometric": sympy.sin(x + u / 3) + sympy.cos(x * u) - 1, "inverse": u + x / (2 + x + u / 5)}
+    for name, f in others.items():
+        system, network = scalar_tanh()
+        found[name] = replace(system, states=(x,), inputs=(u,), dynamics=(f,)), network
+    return {name: ClosedLoop(*pair) for name, pair in found.items()}
+
+
+def beyond(loop: ClosedLoop, models: Models, x: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """What F has at x beyond its models' third order, and the bound of that, (points, n)."""
+    F = loop.system.function()(x, loop.policy(x))
+    third = np.einsum("ihjk,ph,pj,pk->pi", models.K, d, d, d, optimize=True)
+    polynomial = models.f + d @ models.A.T + np.einsum("ijk,pj,pk->pi", models.Q, d, d) + third
+    units = np.einsum("qjk,pj,pk->pq", models.R, d, d, optimize=True) @ np.abs(models.shares).T
+    return np.abs(F - polynomial), np.einsum("ijk,pj,pk->pi", models.E, d, d) + units
+
+
+@pytest.mark.parametrize("name", list(loops()))
+@pytest.mark.parametrize("moved", [False, True])
+def test_models_enclose_the_loop_to_third_order(name: str, moved: bool) -> None:
+    """At points of balls around the origin and around another state; half the ball has a sixteenth of the error."""
+    loop, generator = loops()[name], np.random.default_rng(1)
+    n = loop.system.n
+    middle = 0.1 * generator.uniform(-1, 1, n) if moved else np.zeros(n)
+    known = paths(loop, middle) if moved else paths(loop)
+    whole = (0.05 if name == "quadrotor2d" else 0.3) / math.sqrt(n) * generator.standard_normal((n, n + moved))
+    d = generator.standard_normal((2000, n + moved))
+    d *= generator.random((2000, 1)) ** 0.3 / np.linalg.norm(d, axis=1, keepdims=True)
+    bounds = []
+    for J in (whole, whole / 2):
+        models = known.models(J)
+        error, bound = beyond(loop, models, middle + d @ J.T, d)
+        assert np.all(error <= bound * (1 + 1e-9) + 1e-12)
+        bounds.append(np.max(bound, axis=0))
+    curved = bounds[0] > 1e-9
+    assert np.any(curved) and np.all(bounds[0][curved] > 12 * bounds[1][curved])
+
+
+def test_what_has_no_finite_model_says_so() -> None:
+    """A root of what may be negative, an inverse of what may be 0."""
+    for name, size in (("tank", 17.0), ("inverse", 2.5)):
+        loop = loops()[name]
+        with np.errstate(all="ignore"):
+            assert not paths(loop).models(np.array([[size]])).finite
+        assert paths(loop).models(np.array([[size / 10]])).finite
 
 
 def check_in_floats(name: str, tube: Tube, goal: np.ndarray) -> None:

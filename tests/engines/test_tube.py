@@ -5,7 +5,9 @@ from __future__ import annotations
 import subprocess
 import sys
 from dataclasses import replace
+from fractions import Fraction
 from functools import cache
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +25,10 @@ from certify.closed_loop import ClosedLoop
 from certify.diagnosis import diagnose
 from certify.engines import enlarge as enlarging
 from certify.engines import tube as tubes
-from certify.engines.decrease import best_multipliers, decay_of, multipliers_for, rest_of
+from certify.engines.decrease import Multipliers, best_multipliers, decay_of, multipliers_for, rest_of
 from certify.engines.enlarge import enlarge
 from certify.engines.local import ball_around, local_margin, prove_local
-from certify.engines.models import Models, paths
+from certify.engines.models import paths
 from certify.engines.robust import robust_candidate
 from certify.engines.tube import Tube, find_tube
 from certify.errors import InputError
@@ -139,26 +141,28 @@ def test_no_time_is_no_tube() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_bounds_of_the_rest_hold(seed: int) -> None:
-    """2 sum (b_i.d)(d'Q_i d + r_i) <= d'S d for whatever |r_i| <= d'E_i d, and any multipliers."""
+    """2 sum (b_i.d)(d'Q_i d + K_i[d] + r_i) + 2 sum (p_q.d) e_q <= d'S d for any |r_i| <= d'E_i d, |e_q| <= d'R_q d, and any
+    multipliers."""
     case, goal = pendulum()
     generator = np.random.default_rng(seed)
     J = np.linalg.inv(np.linalg.cholesky(goal)).T @ np.diag([1.0, 0.7])
     models = paths(case.loop).models(J)
     b = goal @ J
-    rows = [
+    rows = np.abs(generator.standard_normal((3, 2)))
+    root = generator.standard_normal((2, 2))
+    every = [
         multipliers_for(models, b, np.eye(2)),
-        np.abs(generator.standard_normal((3, 2))) + 0.01,
-        np.abs(generator.standard_normal((3, 2))) * [[0], [0], [1]] + [[0], [0], [0.01]],
+        Multipliers(rows + 0.01, root @ root.T),
+        Multipliers(rows * [[0], [0], [1]] + [[0], [0], [0.01]], np.diag([1.0, 1e-3])),
     ]
     d = generator.standard_normal((500, 2))
     d *= generator.random((500, 1)) / np.linalg.norm(d, axis=1, keepdims=True)
-    Q, E = (np.einsum("ki,mij,kj->km", d, part, d) for part in (models.Q, models.E))
-    for sign in (1, -1):
-        left = 2 * np.einsum("km,km->k", d @ b.T, Q) + 2 * np.einsum("km,km->k", np.abs(d @ b.T), E)
-        left = (
-            left if sign > 0 else -2 * np.einsum("km,km->k", d @ b.T, Q) + 2 * np.einsum("km,km->k", np.abs(d @ b.T), E)
-        )
-        for multipliers in rows:
+    Q, E, R = (np.einsum("ki,mij,kj->km", d, part, d) for part in (models.Q, models.E, models.R))
+    K = np.einsum("mhij,kh,ki,kj->km", models.K, d, d, d)
+    errors = np.sum(np.abs(d @ b.T) * E, axis=1) + np.sum(np.abs(d @ b.T @ models.shares) * R, axis=1)
+    for quadratic, cubic in product((1, -1), repeat=2):
+        left = 2 * np.sum((d @ b.T) * (quadratic * Q + cubic * K), axis=1) + 2 * errors
+        for multipliers in every:
             S = rest_of(models, b, multipliers)
             assert np.all(left <= np.einsum("ki,ij,kj->k", d, S, d) * (1 + 1e-9) + 1e-12)
 
@@ -171,12 +175,43 @@ def test_the_best_multipliers_are_no_worse_than_the_first() -> None:
     decay = decay_of(models, J, b)
     inverse = np.linalg.inv(np.linalg.cholesky(decay))
 
-    def margin(multipliers: Array) -> float:
+    def margin(multipliers: Multipliers) -> float:
         return float(1 - np.linalg.eigvalsh(inverse @ rest_of(models, b, multipliers) @ inverse.T)[-1])
 
     assert shown.margin == pytest.approx(margin(shown.multipliers))
     assert shown.margin >= margin(multipliers_for(models, b, inverse.T @ inverse)) - 1e-12
-    assert np.all(shown.multipliers >= 0)
+    assert np.all(shown.multipliers.rows >= 0)
+
+
+def test_a_search_for_enough_decides_as_the_whole_search_does() -> None:
+    """On balls from well inside of what the multipliers show to well outside."""
+    case, goal = pendulum()
+    known, seen = paths(case.loop), set()
+    for size in np.linspace(0.5, 1.6, 12):
+        J = size * np.linalg.inv(np.linalg.cholesky(goal)).T
+        models = known.models(J)
+        whole, quick = best_multipliers(models, J, goal), best_multipliers(models, J, goal, enough=0.1)
+        assert quick.margin <= whole.margin + 1e-2 and (quick.margin >= 0.1) == (whole.margin >= 0.1)
+        seen.add(whole.margin >= 0.1)
+    assert seen == {True, False}
+
+
+def test_no_multipliers_are_much_better_than_the_best() -> None:
+    """The weighted mean of what is left bounds what any multipliers leave in the worst direction."""
+    loop = ClosedLoop(get_system("quadrotor2d"), load_policy(CURVED / "quadrotor2d_curved.pt").network)
+    P = choose_candidate(loop, "lqr").P
+    J = 0.05 * np.linalg.inv(np.linalg.cholesky(P)).T * volume(P, 1.0) ** (-1 / 6)
+    models, generator = paths(loop).models(J), np.random.default_rng(0)
+    shown = best_multipliers(models, J, P)
+    inverse = np.linalg.inv(np.linalg.cholesky(decay_of(models, J, P @ J)))
+    others = []
+    for joint in (True, False):
+        for _ in range(100):
+            factor = generator.standard_normal((6, 6)) * generator.uniform(0, 1, 6) ** 3
+            weight = inverse.T @ (factor @ factor.T + 1e-4 * np.eye(6)) @ inverse
+            rest = rest_of(models, P @ J, multipliers_for(models, P @ J, weight, joint))
+            others.append(1 - np.linalg.eigvalsh(inverse @ rest @ inverse.T)[-1])
+    assert shown.margin > max(others)
 
 
 def test_a_rate_takes_its_part_of_the_decay() -> None:
@@ -215,7 +250,27 @@ def test_robust_is_larger_than_what_it_starts_from() -> None:
 
     P = robust_candidate(loop)
     assert np.array_equal(P, P.T) and volume(P, 1.0) == pytest.approx(local(P), rel=0.3)  # in other coordinates
-    assert local(P) > 4 * max(local(choose_candidate(loop, name).P) for name in SOLVED)
+    assert local(P) > 300 * max(local(choose_candidate(loop, name).P) for name in SOLVED)
+
+
+def test_robust_minds_the_bounds_of_inputs() -> None:
+    """Where these are what limits the set, P gives way along the policy's gradient and gains elsewhere."""
+    wide = get_system("quadrotor2d")
+    network = load_policy(CURVED / "quadrotor2d_curved.pt").network
+    narrow = replace(
+        wide, input_bounds=tuple((u - Fraction(1, 20), u + Fraction(1, 20)) for u in ClosedLoop(wide, network).u_eq)
+    )
+    loops = [ClosedLoop(system, network) for system in (wide, narrow)]
+    free, bound = (robust_candidate(loop) for loop in loops)
+    reach = [
+        np.sqrt(np.einsum("ji,ik,jk->j", K, np.linalg.inv(P), K))
+        for K, P in zip((loops[0].linearise()[2],) * 2, (free, bound), strict=True)
+    ]
+    assert np.max(reach[0]) > 0.05 > np.max(reach[1]) > 0.02
+    known = paths(loops[1])
+    T = diagonalising_coordinates(free, loops[1].linearise()[0])
+    blind = prove_local(Problem(loops[1], Quadratic(free)), T, domain_limit(free, narrow.domain), known)
+    assert blind is not None and volume(bound, 1.0) > 2 * volume(free, blind)
 
 
 def test_the_ball_contains_its_level_set() -> None:
@@ -367,7 +422,9 @@ def test_a_tube_is_no_longer_than_the_checker_takes(result: RoaResult, monkeypat
 
 def test_errors_beyond_binary64_are_not_shown() -> None:
     """Squares of remainders overflow: that is no margin, and no exception."""
-    E = np.full((2, 2, 2), 1e200)
-    models = Models(np.zeros(2), -np.eye(2), np.zeros((2, 2, 2)), E, True)
-    with np.errstate(all="ignore"):
-        assert not best_multipliers(models, np.eye(2), np.eye(2)).margin > 0
+    case, goal = pendulum()
+    models = paths(case.loop).models(np.linalg.inv(np.linalg.cholesky(goal)).T)
+    for part in ("E", "K", "squares"):
+        huge = replace(models, **{part: np.full_like(getattr(models, part), 1e200)})
+        with np.errstate(all="ignore"):
+            assert not best_multipliers(huge, np.eye(2), goal).margin > 0

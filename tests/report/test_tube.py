@@ -63,7 +63,7 @@ def enlarged(
 
 def slab(middle: np.ndarray, end: np.ndarray, duration: float = 1.0) -> Slab:
     n = len(end)
-    return Slab(middle, end, duration, 2 * np.eye(n), np.ones((3, n)))
+    return Slab(middle, end, duration, 2 * np.eye(n), np.ones((3, n)), np.eye(n))
 
 
 def plane(first: str, second: str, half: float = 1.0) -> System:
