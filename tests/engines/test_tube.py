@@ -141,7 +141,7 @@ def test_no_time_is_no_tube() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_bounds_of_the_rest_hold(seed: int) -> None:
-    """2 sum (b_i.d)(d'Q_i d + K_i[d] + r_i) + 2 sum (p_q.d) e_q <= d'S d for any |r_i| <= d'E_i d, |e_q| <= d'R_q d, and
+    """2 sum (b_i.d)(d'Q_i d + K_i[d] + r_i) + 2 sum (p_q.d) e_q <= d'S d for |r_i| <= d'E_i d, |e_q| <= d'R_q d, and
     any multipliers."""
     case, goal = pendulum()
     generator = np.random.default_rng(seed)
