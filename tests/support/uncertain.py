@@ -73,7 +73,8 @@ def hull(ends: tuple[Fraction, Fraction]) -> arb:
 FACTORS = {  # of a range in [1/4, 2]
     "q": "q", "1/q": ["/", "1", "q"], "q^2": ["**", "q", 2], "q^-3": ["**", "q", -3], "tanh": ["tanh", "q"],
     "sqrt": ["sqrt", "q"], "sin": ["sin", "q"], "cos": ["cos", "q"], "exp": ["exp", ["-", "q"]],
-    "atan": ["atan", ["*", "2", "q"]], "tan": ["tan", ["/", "q", "2"]], "1/(1+q^2)": ["/", "1", ["+", "1", ["**", "q", 2]]],
+    "atan": ["atan", ["*", "2", "q"]], "tan": ["tan", ["/", "q", "2"]],
+    "1/(1+q^2)": ["/", "1", ["+", "1", ["**", "q", 2]]],
     "q - q": ["-", ["*", "2", "q"], "q"],
 }  # fmt: skip
 SHAPES: dict[str, Callable[[Any, Any, Any], Any]] = {  # of a factor g of q, q itself and a state; 0 where the state is
