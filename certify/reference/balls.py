@@ -103,20 +103,20 @@ def third(name: str, at: arb, y: arb, reach: arb) -> arb | None:
 
     For 1/v and sqrt it is six times the remainder's own factor. 1/v is its parabola at y less D^3 / (y^3 v), D = v - y.
     The root w of v is its parabola at y and D^3 (3 s + w) / (8 s^3 (s + w)^3), s the root of y, most where w is least.
-    For tanh and atan |phi'''| is largest at 0.
+    Both fall as |y| rises, and are taken where it is least. For tanh and atan |phi'''| is largest at 0.
 
     A division by a ball that holds 0, or a root of one that holds what is not positive, must be refused here, and not
     left to what becomes of its result: 0 times it is 0.
     """
     if name == "1/":
-        least = abs(y) - reach
-        size = abs(y)
+        size = arb(abs(y).lower())  # a number: the power of a wide ball may hold 0 where the ball does not
+        least = arb((size - reach).lower())
         return 6 / (size * size * size * least) if least > 0 else None
     if name == "sqrt":
         least = arb((y - reach).lower())
         if not (least > 0 and y > 0):
             return None
-        s, w = y.sqrt(), least.sqrt()
+        s, w = arb(y.lower()).sqrt(), least.sqrt()
         return 6 * (3 * s + w) / (8 * s * s * s * (s + w) * (s + w) * (s + w))
     if name in ("tanh", "atan"):
         return arb(2)

@@ -264,11 +264,15 @@ class System:
         return "parameter" if name in self.parameters else "disturbance"
 
     def at(self, values: Mapping[str, Fraction]) -> System:
-        """The plant without uncertainty, where parameters and disturbances have these values."""
+        """The plant without uncertainty, where parameters and disturbances have these values.
+
+        u_eq stays that of the nominal parameters: it belongs to the policy, which does not know these values.
+        """
         known = {name: q for name, q in values.items() if name in self.parameters}
         held = {s: sympy.Rational(*values.get(s.name, Fraction(0)).as_integer_ratio()) for s in self.disturbances}
         dynamics = tuple(e.subs(held) for e in self.dynamics)
-        return replace(self.with_parameters(known), dynamics=dynamics, disturbances=(), ranges={})
+        u_eq = tuple(sympy.Rational(q.numerator, q.denominator) for q in self.exact_u_eq())
+        return replace(self.with_parameters(known), dynamics=dynamics, u_eq=u_eq, disturbances=(), ranges={})
 
     def corners(self, most: int = 64) -> tuple[dict[str, Fraction], ...]:
         """The vertices of the box of ranges, in an order that is the same each time; beyond `most` of them, some."""
