@@ -83,9 +83,9 @@ class Units:
     def errors(self) -> tuple[arb_mat, ...]:
         """U_j of each input: sum_q |L_jq| R_q."""
         if not self.R:
-            return (arb_mat(self.n, self.n),) * self.L.nrows()
-        sums = absolute(self.L) * arb_mat(self.R)
-        return tuple([whole(row, self.n) for row in sums.tolist()])
+            return tuple(arb_mat(self.n, self.n) for _ in range(self.L.nrows()))
+        sums: list[list[arb]] = (absolute(self.L) * arb_mat(self.R)).tolist()
+        return tuple(whole(row, self.n) for row in sums)
 
     def is_finite(self) -> bool:
         return finite(self.L.entries()) and all(finite(row) for row in self.R)

@@ -2,7 +2,7 @@
 
 Loops are random, with every function, quotient and power, under networks of every form, at rest and along a path. At
 each of them points of the ball climb to where a bound is used most, and there it must hold with certainty in ball
-arithmetic. Where the true limit of a claim is known, no hint may reach it; slabs that are accepted next to the true flow
+arithmetic. Where the true limit of a claim is known, no hint may reach it; slabs accepted next to the true flow
 are true. Each campaign has a sample that always runs and a full size, `pytest -m slow`.
 """
 
