@@ -100,8 +100,8 @@ def sides(
 
 
 def cubic(models: Models, b: fmpq_mat, by: Multipliers) -> fmpq_mat:
-    """S_cubic: where beta_i > 0 each 2 (b_i.d) K_i[d] by itself, and the sum of all others as 2 sum_l d_l N_l[d, d, d], N
-    being symmetric in all of its indices."""
+    """S_cubic: where beta_i > 0 each 2 (b_i.d) K_i[d] by itself, and the sum of all others as 2 sum_l d_l N_l[d, d, d],
+    N being symmetric in all of its indices."""
     k = b.ncols()
     if not np.any(models.K):
         return fmpq_mat(k, k)
