@@ -111,7 +111,8 @@ def test_runs_stay_in_the_tube_and_arrive() -> None:
 @pytest.mark.parametrize("centre", ["none", "output", "preactivation"])
 @pytest.mark.parametrize("squash", ["tanh", "identity"])
 def test_models_away_from_the_origin_enclose_the_loop(centre: str, squash: str) -> None:
-    """F = f + A d + d'Q d within d'E d on a ball around a state, the last entry of d a motion."""
+    """F = f + A d + d'Q d + K[d] within what the tanhs leave and d'E d on a ball around a state, the last entry of d a
+    motion."""
     if (centre, squash) == ("preactivation", "identity"):
         return
     generator = np.random.default_rng(3)
@@ -125,7 +126,9 @@ def test_models_away_from_the_origin_enclose_the_loop(centre: str, squash: str) 
     x = m + d @ J.T
     F = loop.system.function()(x, loop.policy(x))
     model = models.f + d @ models.A.T + np.einsum("ka,iab,kb->ki", d, models.Q, d)
-    away = np.einsum("ka,iab,kb->ki", d, models.E, d)
+    model += np.einsum("iabc,ka,kb,kc->ki", models.K, d, d, d)
+    units = np.einsum("ka,qab,kb->kq", d, models.R, d)
+    away = np.einsum("ka,iab,kb->ki", d, models.E, d) + units @ np.abs(models.shares).T
     assert np.all(np.abs(F - model) <= away + 1e-12)
     assert np.max(np.abs(F - model)) > 1e-6  # there is something to bound
 

@@ -141,8 +141,8 @@ def test_no_time_is_no_tube() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_the_bounds_of_the_rest_hold(seed: int) -> None:
-    """2 sum (b_i.d)(d'Q_i d + K_i[d] + r_i) + 2 sum (p_q.d) e_q <= d'S d for |r_i| <= d'E_i d, |e_q| <= d'R_q d, and
-    any multipliers."""
+    """2 sum (b_i.d)(d'Q_i d + K_i[d] + r_i) + 2 sum (p_q.d) e_q <= d'S d for any |r_i| <= d'E_i d, |e_q| <= d'R_q d,
+    and any multipliers."""
     case, goal = pendulum()
     generator = np.random.default_rng(seed)
     J = np.linalg.inv(np.linalg.cholesky(goal)).T @ np.diag([1.0, 0.7])
@@ -257,16 +257,14 @@ def test_robust_minds_the_bounds_of_inputs() -> None:
     """Where these are what limits the set, P gives way along the policy's gradient and gains elsewhere."""
     wide = get_system("quadrotor2d")
     network = load_policy(CURVED / "quadrotor2d_curved.pt").network
-    narrow = replace(
-        wide, input_bounds=tuple((u - Fraction(1, 20), u + Fraction(1, 20)) for u in ClosedLoop(wide, network).u_eq)
-    )
+    room = Fraction(1, 20)
+    around = tuple((u - room, u + room) for u in ClosedLoop(wide, network).u_eq)
+    narrow = replace(wide, input_bounds=around)
     loops = [ClosedLoop(system, network) for system in (wide, narrow)]
     free, bound = (robust_candidate(loop) for loop in loops)
-    reach = [
-        np.sqrt(np.einsum("ji,ik,jk->j", K, np.linalg.inv(P), K))
-        for K, P in zip((loops[0].linearise()[2],) * 2, (free, bound), strict=True)
-    ]
-    assert np.max(reach[0]) > 0.05 > np.max(reach[1]) > 0.02
+    K = loops[0].linearise()[2]
+    reach = [np.max(np.sqrt(np.diag(K @ np.linalg.inv(P) @ K.T))) for P in (free, bound)]
+    assert reach[0] > room > reach[1] > room / 3
     known = paths(loops[1])
     T = diagonalising_coordinates(free, loops[1].linearise()[0])
     blind = prove_local(Problem(loops[1], Quadratic(free)), T, domain_limit(free, narrow.domain), known)
