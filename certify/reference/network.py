@@ -83,7 +83,7 @@ class Units:
     def errors(self) -> tuple[arb_mat, ...]:
         """U_j of each input: sum_q |L_jq| R_q."""
         if not self.R:
-            return (arb_mat(self.n, self.n),) * self.L.nrows()
+            return tuple(arb_mat(self.n, self.n) for _ in range(self.L.nrows()))
         sums = absolute(self.L) * arb_mat(self.R)
         return tuple([whole(row, self.n) for row in sums.tolist()])
 
