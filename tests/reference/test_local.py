@@ -61,6 +61,10 @@ def row(index: Any, value: float) -> Callable[[np.ndarray], np.ndarray]:
     return change
 
 
+def weight(change: Callable[[np.ndarray], Any]) -> Edit:
+    return lambda data: edited(data, "evidence.local.weight", lambda text: encode(change(decode(text))))
+
+
 def level(value: float) -> Edit:
     """Of both levels, with a root box that is large enough."""
     levels = {"local": value.hex(), "roa": value.hex()}
@@ -94,6 +98,8 @@ FORGERIES: list[tuple[str, Document, Edit]] = [
     ("multipliers of another order", rotor(), rows(lambda v: v[[1, 2, 0]])),
     ("huge multipliers", rotor(), rows(lambda v: v + 1e300)),
     ("tiny multipliers", rotor(), rows(lambda v: 0 * v + LEAST)),
+    ("no weight, and so a tau of 1", cubic(0.04, 0.25), weight(lambda v: 0 * v)),
+    ("a weight that sees one direction alone", rotor(), weight(lambda v: v * [1, 0, 0, 1e-30])),
 ]
 
 
@@ -108,15 +114,18 @@ def test_forgeries(data: Document, edit: Edit) -> None:
     st.floats(0.01, 4.0),
     st.floats(-2.0, 2.0),
     st.tuples(*[st.sampled_from([-1.0, 0.0, LEAST, 1e-9]) | st.floats(0, 4)] * 3),
+    st.sampled_from([0.0, -0.0, -1.0, LEAST, 1.0]) | st.floats(allow_nan=False, allow_infinity=False),
 )
-@example(0.99, 0.999, (0.0, LEAST, 0.0))
-@example(1.0, 1.0001, (0.0, LEAST, 0.0))
-@example(0.99, 0.999, (0.999, LEAST, 0.0))
+@example(0.99, 0.999, (0.0, LEAST, 0.0), 1.0)
+@example(1.0, 1.0001, (0.0, LEAST, 0.0), 1.0)
+@example(0.99, 0.999, (0.999, LEAST, 0.0), -1.0)
+@example(0.25, 0.75, (0.0, LEAST, 0.0), 0.0)
 def test_no_ball_helps_a_claim_beyond_the_region_of_attraction(
-    c1: float, reach: float, multipliers: tuple[float, float, float]
+    c1: float, reach: float, multipliers: tuple[float, float, float], of_weight: float
 ) -> None:
     """x' = -x + x^3 attracts |x| < 1."""
     data = edited(cubic(c1, reach, [[v] for v in multipliers]), "plant.domain.0", ["-9", "9"])
+    data = weight(lambda _: [of_weight])(data)
     if judge(data) is None:
         assert c1 < reach**2 < 1 and min(multipliers) >= 0 and max(multipliers[1:]) > 0
 
@@ -130,6 +139,24 @@ def test_the_edge_of_the_ball_by_hand() -> None:
             assert judge(cubic(c1, reach)) == (None if inside else "local")
             answers.add(inside)
     assert answers == {True, False} and judge(cubic(0.81, 1.0)) == "local"
+
+
+@pytest.mark.parametrize("factor", [LEAST, 1e-300, 1e-9, 3.0, 1e300, -1.0])
+def test_a_weight_counts_in_proportion(factor: float) -> None:
+    assert judge(weight(lambda v: 0 * v + factor)(cubic())) is None
+    whole = rotor()["evidence"]["local"]["weight"]
+    assert decode(whole).tolist() == np.eye(2).ravel().tolist()
+    assert judge(weight(lambda v: factor * v)(rotor())) is None
+
+
+def test_a_weight_may_be_anything() -> None:
+    """Nothing is asked of it: not symmetric, not definite; what is accepted with it is true anyway."""
+    generator, found = np.random.default_rng(5), set()
+    for _ in range(20):
+        found.add(
+            judge(weight(lambda v: np.exp(9 * generator.standard_normal(4)) * generator.choice([-1, 1], 4))(rotor()))
+        )
+    assert found <= {None, "local"}
 
 
 def test_a_division_anywhere_on_the_ball() -> None:

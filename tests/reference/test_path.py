@@ -337,6 +337,8 @@ HARMLESS: list[tuple[str, str, Edit]] = [
       for name in NAMES),
     ("swing", "components taken jointly", lambda d: of_path(2, "joint", 0.01)(
         rows(2, lambda v: [v[0], [0, 0], [0.01, 0.01]])(d))),
+    *((name, "a weight in other units", array("evidence.tube.2.weight", times(1e9))) for name in NAMES),
+    ("oscillator", "no weight where nothing is bent", array("evidence.tube.2.weight", times(0))),
     ("decay", "a larger domain", at("plant.domain.0", ["-7", "8"])),
     ("decay", "the last ellipsoid just inside", array("evidence.tube.4.end", lambda _: [1.001])),
 ]  # fmt: skip
@@ -397,6 +399,13 @@ MALFORMED: dict[str, Edit] = {
     "multipliers as an object": at(
         "evidence.tube.0.multipliers", {key: encode([1.0]) for key in ("alpha", "beta", "g")}
     ),
+    "a weight without a row for the motion": at("evidence.tube.0.weight", encode(np.eye(1))),
+    "a weight with a column for the motion": at("evidence.tube.0.weight", encode([1.0, 0.0])),
+    "a weight for two motions": at("evidence.tube.0.weight", encode(np.eye(3))),
+    "a weight of the ball for a motion": at("evidence.local.weight", encode(np.eye(2))),
+    "a weight that is not a number": at("evidence.tube.0.weight", encode([1.0, 0.0, 0.0, math.nan])),
+    "no weight": without("evidence.tube.0", "weight"),
+    "a weight of the path": more("evidence.tube.0.path", "weight", encode(np.eye(2))),
     "a path that knows more": more("evidence.tube.0.path", "velocity", encode([1.0])),
     "a path that is a list": at("evidence.tube.0.path", []),
     **{f"no {key}": without("evidence.tube.0.path", key) for key in PATH_KEYS},

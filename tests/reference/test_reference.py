@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from flint import arb, arb_mat, ctx, fmpq, fmpq_mat
+from flint import arb, arb_mat, arb_series, ctx, fmpq, fmpq_mat
 from hypothesis import example, given
 from hypothesis import strategies as st
 
@@ -68,6 +68,7 @@ from tests.support.certificates import (
     verdict,
     with_tree,
 )
+from tests.support.models import beyond, curved, form, linear, matrix, model
 from tests.support.oracle import policy_in_arb, value_of
 from tests.support.reference import judge, judge_bytes
 
@@ -150,7 +151,7 @@ def test_harmless_edits_stay_accepted(edit: str) -> None:
     assert judge_bytes(HARMLESS[edit](with_ball(honest("linear")))) is None
 
 
-@pytest.mark.parametrize("exponent", [-200, 0, 200])
+@pytest.mark.parametrize("exponent", [-200, 0, 100])  # at 200 what a tanh leaves out has no square in binary64
 def test_units_do_not_matter(exponent: int) -> None:
     assert both(grow(bump(exponent, "+"), max_leaves=3000, depth=30)) == ("ACCEPTED", "ACCEPTED")
 
@@ -393,34 +394,9 @@ def test_a_tanh_lies_between_its_two_lines(lo: float, width: float) -> None:
             assert 0 <= gap <= 0.1 * width**2  # |tanh''| < 0.77, an eighth of it
 
 
-Numbers = tuple[float, list[float], list[list[float]], list[list[float]]]
-
-
-def model(v: Numbers) -> Model:
-    at_0, a, Q, E = v
-    return Model(arb(at_0), arb_mat([[arb(x)] for x in a]), arb_mat(Q), arb_mat(E))
-
-
-def form(A: arb_mat, d: list[float]) -> arb:
-    """d'Ad."""
-    column = arb_mat([[arb(v)] for v in d])
-    return (column.transpose() * A * column)[0, 0]
-
-
-def linear(v: Model, d: list[float]) -> arb:
-    return v.v + balls.total(x * y for x, y in zip(v.a.entries(), d, strict=True))
-
-
-def beyond(value: arb, v: Model, d: list[float]) -> arb:
-    """|r(d)| / d'Ed, at most 1 if v is a model of the value."""
-    E = form(v.E, d)
-    assert E >= 0
-    return abs(value - linear(v, d) - form(v.Q, d)) / (E * (1 + arb(2) ** -50) + arb(2) ** -130)
-
-
 def member(v: Model, d: list[float], sign: int) -> arb:
-    """The largest or the least number that v allows at d."""
-    return linear(v, d) + form(v.Q, d) + sign * form(v.E, d)
+    """The largest or the least number that v allows at d, errors of inputs among the rest."""
+    return linear(v, d) + curved(v, d) + sign * form(v.whole, d)
 
 
 def value_of_function(name: str, v: arb) -> arb:
@@ -430,72 +406,161 @@ def value_of_function(name: str, v: arb) -> arb:
 @pytest.mark.parametrize("size", [1, 2, 3])
 @pytest.mark.parametrize("h", [1.0, 0.1, 1e-4])
 def test_a_local_model_of_a_product_or_a_function_holds(size: int, h: float) -> None:
-    """Of anything that the models of the operands allow."""
-    generator = np.random.default_rng(size)
+    """Of anything that the models of the operands allow, with errors of inputs that they share."""
+    generator, count = np.random.default_rng(size), size * (size + 1) * (size + 2) // 6
+
+    def semidefinite() -> np.ndarray:
+        A = generator.choice([0, 1, 1]) * generator.standard_normal((size, size))
+        result: np.ndarray = h * A @ A.T
+        return result
 
     def anything() -> Model:
-        a, Q, E = (h * generator.choice([0, 1, 1]) * generator.standard_normal((size, k)) for k in (1, size, size))
+        a, Q = (h * generator.choice([0, 1, 1]) * generator.standard_normal((size, k)) for k in (1, size))
+        K = h * generator.choice([0, 1, 1]) * generator.standard_normal(count)
         at_0 = generator.choice([-1, 0, 1]) * generator.uniform(0, 2) + generator.choice([0, 20 * h])
-        return model((at_0, a[:, 0].tolist(), (Q + Q.T).tolist(), (E @ E.T).tolist()))
+        B = (generator.choice([0, 1, 1], 2) * generator.standard_normal(2)).tolist()
+        return model(at_0, a[:, 0], Q + Q.T, semidefinite(), K, B, errors)
+
+    def value(v: Model) -> arb:
+        """Somewhere within its own bound; the errors of the inputs are the same for all."""
+        own = float(generator.choice([-1, 1])) * form(v.E, d)
+        return linear(v, d) + curved(v, d) + own + named(v)
+
+    def named(v: Model) -> arb:
+        return balls.total(b * e for b, e in zip(v.B, common, strict=True))
+
+    def left(truth: arb, v: Model) -> arb:
+        """What remains beside the named errors, as a part of d'Ed."""
+        return beyond(truth - named(v), dataclasses.replace(v, B=(), errors=()), d)
 
     with ctx.workprec(160):
         for _ in range(60):
-            v, w, signs = anything(), anything(), generator.choice([-1, 1], 2).tolist()
+            errors = [matrix(semidefinite()) for _ in range(2)]
+            v, w = anything(), anything()
             d = generator.standard_normal(size)
             d = (d / np.linalg.norm(d) * generator.choice([1 - 1e-12, 0.5])).tolist()
-            x, y = member(v, d, signs[0]), member(w, d, signs[1])
-            assert beyond(x * y, v * w, d) <= 1
-            assert beyond(x - y, v + -w, d) <= 1
+            common = [float(generator.choice([-1, 1, 0.3])) * form(U, d) for U in errors]
+            x, y = value(v), value(w)
+            assert left(x * y, v * w) <= 1
+            assert left(x - y, v + -w) <= 1
+            assert left(x - 2, v.shifted(arb(-2))) <= 1
             for name in ("sin", "cos", "tanh", "exp", "atan"):
                 if name != "exp" or v.v < 5:  # else rounding is more than what this helper forgives
-                    assert beyond(value_of_function(name, x), v.function(name), d) <= 1
+                    assert left(value_of_function(name, x), v.function(name)) <= 1
             if abs(v.v) > v.radius:
-                assert beyond(1 / x, v.function("1/"), d) <= 1
+                assert left(1 / x, v.function("1/")) <= 1
             else:
                 with pytest.raises(Refused, match="local"):
                     v.function("1/")
             if v.v > v.radius:
-                assert beyond(x.sqrt(), v.function("sqrt"), d) <= 1
+                assert left(x.sqrt(), v.function("sqrt")) <= 1
             else:
                 with pytest.raises(Refused, match="local"):
                     v.function("sqrt")
 
 
-PARTS = [p for p in itertools.product([0, 1], repeat=3) if any(p)]  # of a, Q, E: which are not 0
+PARTS = [p for p in itertools.product([0, 1], repeat=4) if any(p)]  # of a, Q, K, E: which are not 0
 
 
+def one_state(at_0: float, sizes: tuple[float, ...], of_input: float = 0.0) -> Model:
+    """What is left is in E; or, of an input whose error is that large, it is weighed such that it is as large."""
+    a, Q, K, E = sizes
+    if of_input:
+        return model(at_0, [a], [[Q]], [[0.0]], [K], [-E / of_input], [matrix([[of_input]])])
+    return model(at_0, [a], [[Q]], [[E]], [K])
+
+
+@pytest.mark.parametrize("named", [False, True])
 @pytest.mark.parametrize(("p", "q"), list(itertools.product(PARTS, PARTS)))
-def test_the_remainder_of_a_product_is_the_least(p: tuple[int, ...], q: tuple[int, ...]) -> None:
+def test_the_remainder_of_a_product_is_the_least(p: tuple[int, ...], q: tuple[int, ...], named: bool) -> None:
     """In one state, where everything has the same sign: no term of E may go."""
     with ctx.workprec(160):
-        v, w = (model((c, [0.5 * a], [[0.25 * b]], [[0.375 * e]])) for c, (a, b, e) in ((0.75, p), (1.25, q)))
-        product = v * w
-        assert product.E[0, 0] == 0 or beyond(member(v, [1.0], 1) * member(w, [1.0], 1), product, [1.0]) > 1 - 1e-12
+        v, w = (
+            one_state(c, tuple(x * y for x, y in zip(parts, (0.5, 0.25, 0.125, 0.375), strict=True)), 0.75 * named)
+            for c, parts in ((0.75, p), (1.25, q))
+        )
+        product, value = v * w, member(v, [1.0], 1) * member(w, [1.0], 1)
+        assert product.whole[0, 0] == 0 or 1 >= beyond(value, product, [1.0]) > 1 - 1e-12
 
 
+LINEAR = (1, 0, 0, 0)
+
+
+@pytest.mark.parametrize("named", [False, True])
 @pytest.mark.parametrize(
     ("name", "at_0", "parts"),
     [
-        *(("1/", -2.0, p) for p in PARTS),
-        *(("cos", 0.0, p) for p in PARTS if p != (1, 0, 0)),  # there the bound is of the fourth order
-        *(("cos", 1.0, p) for p in PARTS),
-        *(("sin", 0.0, p) for p in PARTS),
-        *(("sin", -1.0, p) for p in PARTS),
-        *((name, at, p) for name, at in (("exp", 0.5), ("sqrt", 2.0), ("tanh", 0.0), ("atan", 0.0)) for p in PARTS),
+        *((name, at, p) for name in ("sin", "tanh") for at in (0.0,) for p in PARTS if p != LINEAR),  # a fifth order
+        *(
+            (name, at, p)
+            for name, at in (
+                *(("1/", -2.0), ("1/", 0.75), ("cos", 0.0), ("cos", 1.0), ("sin", -1.0), ("exp", 0.5), ("sqrt", 2.0)),
+                *(("tanh", 0.5), ("tanh", -0.25), ("tanh", 2.0), ("atan", math.tan(math.pi / 10))),
+            )
+            for p in PARTS
+        ),
     ],
 )
-def test_the_remainder_of_a_function_is_the_least(name: str, at_0: float, parts: tuple[int, ...]) -> None:
+def test_the_remainder_of_a_function_is_the_least(name: str, at_0: float, parts: tuple[int, ...], named: bool) -> None:
     """In one state, where v moves little and the terms of the leading order have the same sign."""
     h = 2.0**-14
-    with ctx.workprec(160):
-        v = model((at_0, [h * parts[0]], [[h * parts[1]]], [[h * parts[2]]]))
-        assert beyond(value_of_function(name, member(v, [1.0], 1)), v.function(name), [1.0]) > 0.999
+    with ctx.workprec(300):
+        v = one_state(at_0, tuple(h * p for p in parts), 2 * h * named)
+        found = beyond(value_of_function(name, member(v, [1.0], 1)), v.function(name), [1.0])
+        assert 1 >= found > (0.99 if name == "atan" else 0.995)
+
+
+def series(name: str, v: arb) -> arb_series:
+    x = arb_series([v, 1], 5)
+    if name == "tanh":
+        return 1 - 2 / ((2 * x).exp() + 1)
+    return getattr(x, name)()
+
+
+@pytest.mark.parametrize("name", ["sin", "cos", "tanh", "exp", "atan", "1/", "sqrt"])
+def test_the_fourth_derivative_is_bounded(name: str) -> None:
+    """Over ranges of all sizes, by series of balls; for 1/v and sqrt the rest itself, divided by D^4."""
+    generator = np.random.default_rng(4)
+    with ctx.workprec(200):
+        for _ in range(200):
+            c, reach = float(generator.uniform(-4, 4)), float(np.exp(generator.uniform(-9, 1.5)))
+            if name == "sqrt" or (name == "1/" and abs(c) <= reach):
+                c = reach * float(1 + np.exp(generator.uniform(-9, 2))) * (1 if name == "sqrt" else np.sign(c))
+            at = balls.derivatives(name, arb(c))
+            most = balls.fourth(name, at[0], arb(c), arb(reach))
+            assert most is not None
+            for D in [-reach, reach, *(reach * generator.uniform(-1, 1, 8))]:
+                v = arb(c) + arb(float(D))
+                if name in ("1/", "sqrt"):
+                    e = arb(float(D))
+                    cube = at[0] + at[1] * e + at[2] / 2 * e * e + at[3] / 6 * e * e * e
+                    here = 24 * (value_of_function(name, v) - cube) / (e * e * e * e)
+                else:
+                    here = 24 * series(name, v)[4]
+                assert abs(here) <= most * (1 + arb(2) ** -40) + arb(2) ** -100
+
+
+@pytest.mark.parametrize(
+    ("name", "at_0", "reach"),
+    [
+        ("1/", 2.0, 2.0),
+        ("1/", -1.0, 3.0),
+        ("1/", 0.0, 0.0),
+        ("sqrt", 2.0, 2.0),
+        ("sqrt", -2.0, 0.5),
+        ("sqrt", 0.0, 0.0),
+    ],
+)
+def test_what_may_be_undefined_has_no_fourth_derivative(name: str, at_0: float, reach: float) -> None:
+    assert balls.fourth(name, arb(1), arb(at_0), arb(reach)) is None
+    with pytest.raises(Refused, match="local"):
+        model(at_0, [reach], [[0.0]], [[0.0]]).function(name)
 
 
 def local_inputs(data: Document, rho: float) -> list[Model]:
     """The policy on the ball x = T rho d, ||d|| <= 1."""
     c = read_certificate(dump(with_ball(data)))
-    return Network(c).on(exact(rho) * tree_evidence(c).T)
+    return Network(c).on(exact(rho) * tree_evidence(c).T)[0]
 
 
 def deep(squash: str, centre: str) -> Document:
@@ -519,11 +584,12 @@ def test_the_local_ball_encloses_the_policy(name: str, rho: float) -> None:
     mine = read_certificate(dump(with_ball(data)))
     T = tree_evidence(mine).T.tolist()
     with ctx.workprec(160):
+        inputs = local_inputs(data, rho)
         for direction in generator.standard_normal((40, mine.n)):
             d = direction / np.linalg.norm(direction) * generator.uniform(0, 1 - 1e-12)
             z = [arb(rho) * v for v in d.tolist()]
             x = [balls.total(arb(t) * v for t, v in zip(row, z, strict=True)) for row in T]
-            for value, u in zip(policy_in_arb(c.policy, c.u_eq, x), local_inputs(data, rho), strict=True):
+            for value, u in zip(policy_in_arb(c.policy, c.u_eq, x), inputs, strict=True):
                 assert beyond(value, u, d.tolist()) <= 1
 
 
@@ -531,18 +597,34 @@ CHAIN = ((0.75, 0.5), (1.25, 0.25), (0.875, 0.375), (1.5, 0.125))
 
 
 @pytest.mark.parametrize("squash", ["tanh", "identity"])
-@pytest.mark.parametrize("what", ["Q", "E"])
+@pytest.mark.parametrize("what", ["Q", "K"])
 def test_the_local_model_is_sharp_on_a_small_ball(squash: str, what: str) -> None:
-    """A chain of tanhs that all bend the same way, at 0 for E: what is left is Q, and E, as the ball shrinks."""
+    """A chain of tanhs that all bend the same way, at 0 for K: what is left is Q, and K, as the ball shrinks."""
     layers = [(np.array([[w]]), np.array([-b if what == "Q" else 0.0])) for w, b in CHAIN]
     data = make(["u"], layers, np.eye(1), (0.01, 0.01), squash=squash, centre="output", scale=[2.0])
     rho, policy = 2.0**-20, parse(data).policy
     with ctx.workprec(160):
         (u,) = local_inputs(data, rho)
         (value,) = policy_in_arb(policy, [Fraction(0)], [arb(rho)])
-        bound = u.Q[0, 0] if what == "Q" else -u.E[0, 0]
+        bound = u.Q[0, 0] if what == "Q" else u.K[0, 0]
         assert abs((value - linear(u, [1.0])) / bound - 1) < 1e-4
         assert what == "Q" or u.bend == 0
+
+
+@pytest.mark.parametrize("squash", ["tanh", "identity"])
+def test_what_a_local_model_leaves_out_is_of_the_fourth_order(squash: str) -> None:
+    """Beside the truth, on balls that shrink: a sixteenth of it at half the radius, and no hundred times the truth."""
+    layers = [(np.array([[w]]), np.array([-b])) for w, b in CHAIN]
+    data = make(["u"], layers, np.eye(1), (0.01, 0.01), squash=squash, centre="output", scale=[2.0])
+    policy, rests, bounds = parse(data).policy, list[float](), list[float]()
+    with ctx.workprec(300):
+        for rho in (2.0**-8, 2.0**-9, 2.0**-10):
+            (u,) = local_inputs(data, rho)
+            (value,) = policy_in_arb(policy, [Fraction(0)], [arb(rho)])
+            rests.append(float(abs(value - linear(u, [1.0]) - curved(u, [1.0]))))
+            bounds.append(float(u.whole[0, 0]))
+    assert all(15 < p / q < 17 for values in (rests, bounds) for p, q in itertools.pairwise(values))
+    assert rests[-1] < bounds[-1] < 100 * rests[-1]
 
 
 @pytest.mark.parametrize("name", ["rotor", "rotor, preactivation", "crane"])
@@ -552,7 +634,7 @@ def test_the_ball_encloses_F(name: str, rho: float) -> None:
     c, mine, generator = parse(data), read_certificate(dump(with_ball(data))), np.random.default_rng(1)
     with ctx.workprec(160):
         J = exact(rho) * tree_evidence(mine).T
-        F = Loop(mine).on(J, "local", "ball")
+        F = Loop(mine).on(J, "local", "ball").components
         for direction in generator.standard_normal((40, mine.n)):
             d = (direction / np.linalg.norm(direction) * generator.uniform(0, 1 - 1e-12)).tolist()
             x = (arb_mat(J) * arb_mat([[arb(v)] for v in d])).entries()
@@ -569,13 +651,17 @@ def test_the_limit_of_the_local_rule(power: int, states: str) -> None:
     """Without an input: x' = -x + 2 x^k alone, or x' = -x and y' = -y + 2 x^k, with V = 4 ||x||^2.
 
     In one state the rule ends where Vdot < 0 does, at 2 r^(k - 1) = 1. In two a square is its Q, 2 r^2 on d_x^2, which
-    leaves 8 r^2 - 4 r^4 / beta and 8 r^2 - 16 r^2 beta; a higher power has E = 2 r^k I, and 8 r^2 - 16 r^(k + 1).
+    leaves 8 r^2 - 4 r^4 / beta and 8 r^2 - 16 r^2 beta. A cube is N, with 2 r^4 where one of four indices is y: S_cubic
+    is tau_y + N_x'N_x / tau_x on d_y^2, and on d_x^2 tau_x + N_y'N_y / tau_y + N_x'N_x / tau_x, 2 + sqrt(12) + 4 /
+    sqrt(3) times r^2^2. A fifth power is a product of x^2 x^2 and x, and no more than E = 2 r^5 I: 8 r^2 - 16 r^6.
     """
     n = len(states)
-    bound = 2 if n == 2 and power == 2 else 1
     beta = 2.0**-60 if power > 2 else 0.49975 if n == 2 else 0.25
-    limit = 4 * (bound / 2) ** (2 / (power - 1))
-    T = np.array([[0.6, -0.8], [0.8, 0.6]]) if n == 2 else np.eye(1)
+    limit = 4 * 0.5 ** (2 / (power - 1))
+    if n == 2 and power < 5:
+        limit = 4.0 if power == 2 else 4 * 8 / (2 + math.sqrt(12) + 4 / math.sqrt(3))
+    turned = n == 2 and power != 3
+    T = np.array([[0.6, -0.8], [0.8, 0.6]]) if turned else np.eye(n)
     bent = ["*", "2", ["**", "x", power]]
     dynamics: list[Any] = [["-", "x"], ["+", ["-", "y"], bent]] if n == 2 else [["+", ["-", "x"], bent]]
     for c1, found in ((0.999 * limit, None), (1.001 * limit, "local")):
@@ -591,24 +677,24 @@ def test_the_inputs_on_the_local_ball() -> None:
     data = with_ball(edited(data, "levels.roa", data["levels"]["local"]))
     c = read_certificate(dump(data))
     with ctx.workprec(160):
-        reach = [Fraction(float(u.radius)) for u in Network(c).on(ball_of(c).J)]
+        reach = [Fraction(float(u.radius)) for u in Network(c).on(ball_of(c).J)[0]]
     for factor, found in ((1 + Fraction(1, 2**20), None), (1 - Fraction(1, 2**20), "inputs")):
         each = zip(map(fraction, c.plant.u_eq), reach, strict=True)
         bounds = [[str(q - factor * r), str(q + factor * r)] for q, r in each]
         assert judge(edited(data, "plant.input_bounds", bounds)) == found
 
 
-@pytest.mark.parametrize("what", ["a", "Q", "E"])
+@pytest.mark.parametrize("what", ["a", "Q", "K", "E"])
 @pytest.mark.parametrize("bad", ["nan", "inf", "-inf", "[0 +/- inf]"])
 def test_what_is_not_finite_is_not_accepted(monkeypatch: pytest.MonkeyPatch, what: str, bad: str) -> None:
     c = read_certificate(dump(with_ball(honest("local only"))))
     policy = Network.on
 
-    def broken(*arguments: Any) -> list[Model]:
-        first, *others = policy(*arguments)
+    def broken(*arguments: Any) -> Any:
+        (first, *others), units = policy(*arguments)
         old = getattr(first, what)
         change = {what: arb_mat(old.nrows(), old.ncols(), [arb(bad)] * len(old.entries()))}
-        return [dataclasses.replace(first, **change), *others]
+        return [dataclasses.replace(first, **change), *others], units
 
     with ctx.workprec(160):
         local.local(Loop(c), ball_of(c), ())

@@ -339,6 +339,8 @@ HARMLESS: list[tuple[str, str, Edit]] = [
     ("swing", "J with another sign", array("evidence.tube.2.J", times(-1))),
     ("swing", "J with other axes", array("evidence.tube.2.J", lambda v: v.reshape(2, 2) @ [[0.6, -0.8], [0.8, 0.6]])),
     ("swing", "a smaller start", array("claim.start", times(1.01))),
+    *((name, "a weight in other units", array("evidence.tube.1.weight", times(1e-9))) for name in NAMES),
+    ("decay", "no weight where nothing is bent", array("evidence.tube.1.weight", times(0))),
     ("decay", "a larger domain", at("plant.domain.0", ["-4", "5"])),
     ("decay", "a start that is the last end", array("claim.start", lambda _: [1.0625])),
     ("ring", "a longer duration", duration(3, lambda h: 2 * h)),
@@ -438,6 +440,18 @@ MALFORMED: dict[str, Edit] = {
     "four rows of multipliers": at("evidence.local.multipliers", encode([1.0] * 4)),
     "a multiplier that is not a number": at("evidence.tube.0.multipliers", encode([math.nan, 1.0, 1.0])),
     "an infinite multiplier": at("evidence.local.multipliers", encode([1.0, math.inf, 1.0])),
+    "no weight of the ball": without("evidence.local", "weight"),
+    "no weight of a slab": without("evidence.tube.1", "weight"),
+    "a weight that is not a number": at("evidence.local.weight", encode([math.nan])),
+    "an infinite weight of a slab": at("evidence.tube.0.weight", encode([-math.inf])),
+    "a weight for a motion that is none": at("evidence.tube.0.weight", encode(np.eye(2))),
+    "a weight for a motion of the ball": at("evidence.local.weight", encode(np.eye(2))),
+    "an empty weight": at("evidence.tube.0.weight", ""),
+    "a weight that is null": at("evidence.tube.0.weight", None),
+    "a decimal weight": at("evidence.local.weight", 1),
+    "a weight in the place of multipliers": lambda d: edited(
+        without("evidence.tube.0", "multipliers")(d), "evidence.tube.0.weights", encode([1.0])
+    ),
     "an infinite duration": at("evidence.tube.0.duration", "inf"),
     "a duration that is no number": at("evidence.tube.0.duration", "nan"),
     "a decimal duration": at("evidence.tube.0.duration", "1"),
@@ -459,11 +473,19 @@ def test_malformed_tubes(what: str) -> None:
     assert judge_bytes(dump(MALFORMED[what](honest("decay")))) == "format"
 
 
-PLACES = ["claim", "claim.kind", "claim.start", "evidence.local", "evidence.local.J", "evidence.local.multipliers"]
+PLACES = [
+    "claim",
+    "claim.kind",
+    "claim.start",
+    "evidence.local",
+    "evidence.local.J",
+    "evidence.local.multipliers",
+    "evidence.local.weight",
+]
 PLACES += [
     "evidence.tube",
     "evidence.tube.1",
-    *(f"evidence.tube.1.{key}" for key in ("middle", "end", "duration", "J")),
+    *(f"evidence.tube.1.{key}" for key in ("middle", "end", "duration", "J", "weight")),
 ]
 
 
