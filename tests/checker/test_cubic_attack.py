@@ -1,9 +1,9 @@
 """Attacks on third-order models and on the inequality `decrease`: searches for what would make ACCEPTED wrong.
 
 Loops are random, with every function, quotient and power, under networks of every form, at rest and along a path. At
-each of them points of the ball climb to where a bound is used most, and there it must hold with certainty in ball
-arithmetic. Where the true limit of a claim is known, no hint may reach it; slabs accepted next to the true flow
-are true. Each campaign has a sample that always runs and a full size, `pytest -m slow`.
+each of them points of the ball climb to where a bound is used most, and there it must hold with certainty, in ball
+arithmetic. Where the true limit of a claim is known, no hint may reach it; slabs that are accepted next to the true
+flow are true. Each campaign has a sample that always runs and a full size, `pytest -m slow`.
 """
 
 from __future__ import annotations
@@ -185,7 +185,7 @@ def part_used(jet: Jet, value: arb, at_0: arb, d: Array) -> float:
     return float(left / bound)
 
 
-@sizes(12, 1000)
+@sizes(12, 400)
 def test_no_point_of_a_ball_leaves_its_models(count: int) -> None:
     closest, known = 0.0, 0
     for seed in range(count):
@@ -280,7 +280,7 @@ def in_form(A: Any, y: Sequence[arb]) -> arb:
     return dot([dot([arb(v) for v in row], y) for row in A], y)
 
 
-@sizes(12, 1000)
+@sizes(12, 400)
 def test_no_point_of_a_ball_crosses_the_inequality(count: int) -> None:
     """What has to be negative is at most -(decay - S) everywhere on the ball, for P and R that may be anything."""
     closest, known = 0.0, 0
@@ -445,7 +445,7 @@ def attempts(case: Case, piece: tube.Piece) -> Iterator[tube.Piece]:
 
 @pytest.mark.parametrize("name", LIMITS)
 @pytest.mark.parametrize("moving", [False, True])
-@sizes(1, 60)
+@sizes(1, 20)
 def test_slabs_that_are_accepted_next_to_the_flow_are_true(name: str, moving: bool, count: int) -> None:
     """The interval around a point that moves with the flow; its end is the image by the flow, or a little more or less
     than that: what is false by any amount is refused, and some of what is true is accepted."""
