@@ -8,43 +8,43 @@ nothing, at the origin.
 from __future__ import annotations
 
 import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from functools import cache
 
 import numpy as np
+import sympy
 from numpy.typing import NDArray
 
-from certify.closed_loop import ClosedLoop
 from certify.engines.decrease import NOT_SHOWN, Shown, best_multipliers, decay_of, rest_of
 from certify.engines.models import Models, Paths
 
 Array = NDArray[np.float64]
 _CAUTION = 2.0  # on what the corners of a cell differ by: a checker adds norms where these cancel
-_MOST = 256  # cells
+_MOST = 64  # cells
 _ENOUGH = 0.5  # of the decay at the origin that the cells' extent may leave at least
 
 
 @dataclass(frozen=True, slots=True)
 class _Cell:
-    """The loop in the middle of a cell, and at its corners."""
+    """Which of the plants is the one in the middle of a cell, and which those at its corners."""
 
-    middle: Paths
-    corners: tuple[Paths, ...]
+    middle: int
+    corners: tuple[int, ...]
 
-    def enclosed(self, J: Array) -> tuple[Models, Array]:
+    def enclosed(self, models: Sequence[Models]) -> tuple[Models, Array]:
         """The models in the middle, wide enough for the corners, and the distance (n,) of the gradients."""
-        middle = self.middle.models(J)
-        slack, bend, wider = np.zeros(len(J)), np.zeros(len(J)), 1.0
-        for corner in (paths.models(J) for paths in self.corners):
+        middle, n = models[self.middle], len(models[0].A)
+        slack, bend, wider = np.zeros(n), np.zeros(n), 1.0
+        for corner in (models[number] for number in self.corners):
             slack = np.maximum(slack, np.linalg.norm(corner.A - middle.A, axis=1))
             bends = np.linalg.norm(corner.Q - middle.Q, axis=(1, 2))
-            bends += np.linalg.norm((corner.K - middle.K).reshape(len(J), -1), axis=1)
+            bends += np.linalg.norm((corner.K - middle.K).reshape(n, -1), axis=1)
             bends += np.abs(corner.shares - middle.shares) @ np.linalg.norm(middle.R, axis=(1, 2))
             bend = np.maximum(bend, bends)
-            sizes = [float(np.einsum("iaa->", models.E)) for models in (corner, middle)]
+            sizes = [float(np.einsum("iaa->", one.E)) for one in (corner, middle)]
             wider = max(wider, sizes[0] / sizes[1] if sizes[1] > 0 else 1.0)
-        E = middle.E * (1 + _CAUTION * (wider - 1)) + _CAUTION * bend[:, None, None] * np.eye(J.shape[1])
+        E = middle.E * (1 + _CAUTION * (wider - 1)) + _CAUTION * bend[:, None, None] * np.eye(middle.E.shape[1])
         return replace(middle, E=E), _CAUTION * slack
 
 
@@ -52,12 +52,14 @@ class _Cell:
 class Cells:
     """The local models in each cell; `cuts` says how many parts each range is cut into."""
 
+    known: Paths
     cuts: tuple[int, ...]
+    plants: tuple[tuple[sympy.Expr, ...], ...]
     cells: tuple[_Cell, ...]
 
     def shown(self, J: Array, P: Array) -> Shown:
         """One choice of multipliers for all cells on the ball of J, and the least margin that it leaves in any."""
-        each = [cell.enclosed(J) for cell in self.cells]
+        each = self._enclosed(J)
         if not all(models.finite and models.admitted for models, _ in each):
             return NOT_SHOWN
         inverse, b = np.linalg.inv(J), P @ J
@@ -80,7 +82,11 @@ class Cells:
     def extent(self, J: Array, P: Array) -> float:
         """What is charged to the decay in the worst cell."""
         sizes = np.linalg.norm(P @ J, axis=1)
-        return max(float(sizes @ slack) for _, slack in (cell.enclosed(J) for cell in self.cells))
+        return max(float(sizes @ slack) for _, slack in self._enclosed(J))
+
+    def _enclosed(self, J: Array) -> list[tuple[Models, Array]]:
+        models = self.known.models_of(J, self.plants)
+        return [cell.enclosed(models) for cell in self.cells]
 
 
 def _cut(known: Paths, cuts: tuple[int, ...]) -> Cells:
@@ -90,16 +96,18 @@ def _cut(known: Paths, cuts: tuple[int, ...]) -> Cells:
         for (lo, hi), count in zip(ranges.values(), cuts, strict=True)
     ]
 
-    @cache
-    def at(values: tuple[Fraction, ...]) -> Paths:
-        system = loop.system.at(dict(zip(ranges, values, strict=True)))
-        return replace(known, loop=ClosedLoop(system, loop.network))
+    places: dict[tuple[Fraction, ...], int] = {}
 
-    cells = []
-    for cell in itertools.product(*cut):
-        middle = at(tuple((lo + hi) / 2 for lo, hi in cell))
-        cells.append(_Cell(middle, tuple(at(corner) for corner in itertools.product(*cell))))
-    return Cells(cuts, tuple(cells))
+    def at(values: tuple[Fraction, ...]) -> int:
+        return places.setdefault(values, len(places))
+
+    cells = tuple(
+        _Cell(at(tuple((lo + hi) / 2 for lo, hi in cell)), tuple(at(corner) for corner in itertools.product(*cell)))
+        for cell in itertools.product(*cut)
+    )
+    uncertain, dynamics = [s for s, _ in loop.system.uncertain], loop.system.uncertain_dynamics()
+    held = ({s: sympy.Rational(*q.as_integer_ratio()) for s, q in zip(uncertain, v, strict=True)} for v in places)
+    return Cells(known, cuts, tuple(tuple(e.subs(values) for e in dynamics) for values in held), cells)
 
 
 def cells_for(known: Paths, J: Array, P: Array) -> Cells:

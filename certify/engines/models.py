@@ -10,10 +10,12 @@ last is the motion.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import sympy
 from numpy.typing import NDArray
 
 from certify.certificate.limits import numbers_of_a_jet
@@ -113,20 +115,28 @@ class Paths:
 
     def models(self, J: Array) -> Models:
         """F on the ball x = middle + J d, ||d|| <= 1; J is (n, k)."""
+        return self.models_of(J, [self.loop.system.exact_dynamics()])[0]
+
+    def models_of(self, J: Array, plants: Sequence[tuple[sympy.Expr, ...]]) -> list[Models]:
+        """The same for each of several plants' equations in the loop's states and inputs, under the one policy."""
         loop, k, policy = self.loop, J.shape[1], self._policy(J)
         system, scale, form = loop.system, loop.network.scale[:, None], basis(k)
         G, Q, K, each = scale * policy.G, scale * policy.Q, scale * policy.K, scale * policy.shares
         errors = np.abs(each) @ policy.R
-        algebra, shared = Jets(k, errors), dict[Any, Jet]()
+        algebra, R = Jets(k, errors), form.matrices(policy.R)
         states = [algebra.state(float(m), row) for m, row in zip(self.middle, J, strict=True)]
         inputs = [algebra.input(j, float(u), G[j], Q[j], K[j]) for j, u in enumerate(self.u)]
         values = dict(zip((*system.states, *system.inputs), (*states, *inputs), strict=True))
-        F = [evaluate(e, values, algebra, shared) for e in system.exact_dynamics()]
-        a, Qs, Ks, B, E = (np.concatenate([getattr(v, part) for v in F]) for part in ("a", "Q", "K", "B", "E"))
-        f, R = np.array([v.c for v in F]), form.matrices(policy.R)
-        curve, room = sizes(G, Q, K, errors).curve, _room(loop, self.u)
-        moved = Inputs(G, form.matrices(Q), form.forms(K), curve, room, B)
-        return Models(f, a, form.matrices(Qs), form.forms(Ks), form.matrices(E), B @ each, R, R @ R, moved)
+        curve, room, squares = sizes(G, Q, K, errors).curve, _room(loop, self.u), R @ R
+        own, found = (form.matrices(Q), form.forms(K)), []
+        for dynamics in plants:
+            shared = dict[Any, Jet]()
+            F = [evaluate(e, values, algebra, shared) for e in dynamics]
+            a, Qs, Ks, B, E = (np.concatenate([getattr(v, part) for v in F]) for part in ("a", "Q", "K", "B", "E"))
+            f, moved = np.array([v.c for v in F]), Inputs(G, *own, curve, room, B)
+            parts = form.matrices(Qs), form.forms(Ks), form.matrices(E)
+            found.append(Models(f, a, *parts, B @ each, R, squares, moved))
+        return found
 
     def _policy(self, J: Array) -> _Policy:
         n, k = J.shape
