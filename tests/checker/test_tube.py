@@ -116,7 +116,7 @@ def cubic() -> Document:
 
 
 def joint() -> list[list[float]]:
-    """No Q at the origin, as little as possible for g, and no alpha: x^3 is its own model, and only rounding is left."""
+    """No Q at the origin, as little as possible for g, no alpha: x^3 is its own model, only rounding is left."""
     return [[0.0], [0.0], [NONE]]
 
 
