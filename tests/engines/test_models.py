@@ -50,7 +50,7 @@ def test_models_and_sides_are_those_of_the_checker(name: str, tmp_path: Path) ->
     mine = paths(case_of(system, network).loop).models(J)
     assert mine.finite and mine.admitted
     with np.errstate(all="ignore"):
-        theirs = Ball(Case(c), J, "ball").F
+        theirs = Ball(Case(c), J, "ball").F()
     for k, f in enumerate(theirs):
         for a, b in ((mine.A[k], f.a), (mine.Q[k], f.Q), (mine.E[k], f.E)):
             assert np.max(np.abs(a - b)) <= 1e-9 * (np.max(np.abs(b)) + 1e-6)
