@@ -339,6 +339,10 @@ MUTANTS: list[tuple[str, str, str, Edit]] = [  # rule, base, what, edit
     ("format", "enlarged", "middle of another size", array("evidence.tube.1.middle", lambda a: np.ones(4))),
     ("format", "enlarged", "end not finite", array("evidence.tube.1.end", lambda a: a * np.nan)),
     ("format", "enlarged", "duration not finite", at("evidence.tube.1.duration", "inf")),
+    ("format", "enlarged", "a path where nothing moves", at("evidence.tube.1.path", {})),
+    ("format", "scalar", "something uncertain without cells", at(
+        "plant.uncertain", [{"name": "q", "range": ["0", "1"]}])),
+    ("format", "scalar", "cells of nothing", at("evidence.cells", [1])),
     ("hash", "scalar", "sha256", at("policy.sha256", "0" * 64)),
     ("hash", "scalar", "sha256 in capitals", at("policy.sha256", str.upper)),
     ("hash", "scalar", "sha256 of another type", at("policy.sha256", None)),
