@@ -308,8 +308,8 @@ def test_an_unsymmetric_matrix_has_no_inverse_for_the_rules() -> None:
 
 
 def test_a_matrix_of_long_numbers_is_not_decided() -> None:
-    """Twice the symmetric part: two rows of numbers of 2^14 bits are the most."""
-    for bits, decided in ((2**14 - 2, True), (2**14, False)):
+    """Twice the symmetric part: two rows of numbers of 2^15 bits are the most."""
+    for bits, decided in ((2**15 - 2, True), (2**15, False)):
         A = fmpq_mat([[fmpq(2**bits), 1], [1, 1]])
         assert is_definite(A) is decided and bool(inverse_diagonal(A)) is decided
 

@@ -731,7 +731,7 @@ def test_the_models_along_a_path_enclose_the_field(name: str, where: str) -> Non
         c = parse(data)
         (piece,) = tube.pieces(Case(c))
         with np.errstate(all="ignore"):
-            jets = [*piece.F, *piece.inputs]
+            jets = [*piece.F(), *piece.inputs]
         if not all(np.isfinite(part).all() for jet in jets for part in (jet.c, jet.error, jet.a, jet.Q, jet.E)):
             continue
         met += 1
@@ -774,7 +774,7 @@ def test_models_of_random_loops_hold_along_random_paths(seed: int) -> None:
         share = float(random.choice([random.uniform(0.01, 0.99), 2.0**-40, 1 - 2.0**-40]))
         (piece,) = tube.pieces(Case(parse(placed(base, first.tolist(), (first + step).tolist(), share, J))))
         with np.errstate(all="ignore"):
-            jets = [*piece.F, *piece.inputs]
+            jets = [*piece.F(), *piece.inputs]
         if not are_finite(jets, piece.units):
             continue
         met += 1

@@ -343,6 +343,9 @@ MUTANTS: list[tuple[str, str, str, Edit]] = [  # rule, base, what, edit
     ("format", "enlarged", "a path", at("evidence.tube.1.path", {
         "centre": encode([0.0]), **dict.fromkeys(("share", "edge", "motion", "joint"), (0.5).hex())})),
     ("format", "scalar", "the schema before", at("schema", "certify-certificate/4")),
+    ("format", "scalar", "something uncertain without cells", at(
+        "plant.uncertain", [{"name": "q", "range": ["0", "1"]}])),
+    ("format", "scalar", "cells of nothing", at("evidence.cells", [1])),
     ("hash", "scalar", "sha256", at("policy.sha256", "0" * 64)),
     ("hash", "scalar", "sha256 in capitals", at("policy.sha256", str.upper)),
     ("hash", "scalar", "sha256 of another type", at("policy.sha256", None)),

@@ -550,7 +550,7 @@ def test_models_hold_on_their_balls(seed: int) -> None:
         c = parse(data)
         with np.errstate(all="ignore"):
             on = Ball(Case(c), J, "a ball")
-            jets = [*on.F, *on.inputs]
+            jets = [*on.F(), *on.inputs]
         if not are_finite(jets, on.units):
             continue
         met += 1

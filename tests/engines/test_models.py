@@ -57,7 +57,7 @@ def test_models_and_sides_are_those_of_the_checker(name: str, tmp_path: Path) ->
     assert mine.finite and mine.admitted
     with np.errstate(all="ignore"):
         ball = Ball(Case(c), J, "ball")
-        theirs, units = ball.F, ball.units
+        theirs, units = ball.F(), ball.units
     shares = np.array([f.B for f in theirs]) @ units.L
     for k, f in enumerate(theirs):
         third = unpacked(f.K[None], len(J))[0]
