@@ -388,7 +388,7 @@ def test_units_carry_all_that_their_inputs_leave_out(
             (found,) = tube.pieces(Case(parse(placed(data, ends[0].tolist(), ends.sum(0).tolist(), 0.5, J))))
         layers = spied(found, monkeypatch)
         with np.errstate(all="ignore"):
-            units, inputs, F = found.units, found.inputs, found.F
+            units, inputs, F = found.units, found.inputs, found.F()
         hidden = len(units.R) - len(inputs)
         for d in points(generator, n + moving):
             with ctx.workprec(500):

@@ -192,7 +192,7 @@ def test_no_point_of_a_ball_leaves_its_models(count: int) -> None:
         generator = np.random.default_rng(seed)
         _, found = random_loop(generator)
         truth = Truth(found)
-        jets = [*found.inputs, *found.F]
+        jets = [*found.inputs, *found.F()]
         at_0 = [ball(q) for q in found.case.c.u_eq] if found.motion is None else truth.centre[: len(found.inputs)]
         at_0 += truth.centre[len(found.inputs) :]
         asked = [i for i, jet in enumerate(jets) if is_known(jet)]
@@ -242,7 +242,7 @@ def test_polynomials_up_to_the_third_degree_leave_roundings_alone(span: int) -> 
         with ctx.workprec(1500):
             truth = Truth(found)
             for d in scattered(generator, 4, 3):
-                for jet, value, at_0 in zip(found.F, truth.at(d)[1:], truth.centre[1:], strict=True):
+                for jet, value, at_0 in zip(found.F(), truth.at(d)[1:], truth.centre[1:], strict=True):
                     assert is_known(jet)
                     closest = max(closest, part_used(jet, value, at_0, d))
     assert 1e-6 < closest <= 1
@@ -288,14 +288,14 @@ def test_no_point_of_a_ball_crosses_the_inequality(count: int) -> None:
         generator = np.random.default_rng([1, seed])
         _, found = random_loop(generator)
         n, moving = len(found.J), found.motion is not None
-        if not are_finite(found.F, found.units):
+        if not are_finite(found.F(), found.units):
             continue
         known += 1
         truth, A, B = Truth(found), generator.standard_normal((n, n)), generator.standard_normal((n, n))
         P, R = A + A.T if seed % 2 else A @ A.T, 10.0 ** generator.uniform(-3, 3) * (B + B.T)
-        by, path = random_hints(generator, found.J, P, found.F, n + moving)
+        by, path = random_hints(generator, found.J, P, found.F(), n + moving)
         v = [fmpq(int(q), 7) for q in generator.integers(-9, 10, n)]
-        models = Models(found.J, found.F, found.units, v if moving else None)
+        models = Models(found.J, found.F(), found.units, v if moving else None)
         decay, rest = sides(models, exactly(P), exactly(R), by, path if moving else None)
         inputs = len(found.inputs)
         moved = [arb(q) for q in v] if moving else truth.centre[inputs:]
@@ -429,7 +429,7 @@ GRID = np.geomspace(0.1, 10, 5).tolist()
 
 def attempts(case: Case, piece: tube.Piece) -> Iterator[tube.Piece]:
     """The slab with multipliers that balance the sums, edge and motion on a grid around the rate of the flow."""
-    F = piece.F
+    F = piece.F()
     b = abs(float(piece.J[0, 0] * piece.slab.middle[0, 0]))
     rest, apart = ((quotient(max(float(np.linalg.norm(getattr(F[0], part))) / b, 1e-30)),) for part in ("E", "Q"))
     by = Multipliers(rest, apart, (fmpq(1),), piece.slab.multipliers.weight)
