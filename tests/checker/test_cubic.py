@@ -21,7 +21,7 @@ from certify.checker.ball import Ball, Units, too_large
 from certify.checker.case import Case
 from certify.checker.decrease import Models
 from certify.checker.document import Certificate, Multipliers
-from certify.checker.elementary import elementary
+from certify.checker.elementary import Expansion, elementary
 from certify.checker.exact import exactly
 from certify.checker.jets import Jet, constant, symmetric, tensor_norm, unpacked, widen
 from certify.checker.network import fold
@@ -211,6 +211,49 @@ def test_operations_know_the_errors_that_their_operands_share(size: float) -> No
                 truth = lambda d, u=u, name=name: value(name, u(d))  # noqa: E731
                 used = max(used, closeness(f, common, truth, [slope * p for p in u.a], where))
     assert used > 0.05
+
+
+def alone(part: str, generator: Generator, U: np.ndarray) -> Jet:
+    """A jet that is 0 but for one of its parts."""
+    k = U.shape[1]
+    nothing = constant(Fraction(0), U)
+    half, root = generator.standard_normal((2, k, k))
+    only = {"a": generator.standard_normal(k), "Q": half + half.T, "E": root @ root.T, "B": np.ones(len(U)),
+            "K": generator.standard_normal(k * (k + 1) * (k + 2) // 6)}  # fmt: skip
+    return replace(nothing, **{part: only[part]})
+
+
+@pytest.mark.parametrize(("left", "right"), list(itertools.product("aQKEB", repeat=2)))
+def test_every_pair_of_parts_has_its_place_in_a_product(left: str, right: str) -> None:
+    generator = np.random.default_rng(70)
+    with ctx.workprec(2500):
+        for _ in range(4):
+            U = shares(generator, 1, 2)
+            x, y = alone(left, generator, U), alone(right, generator, U)
+            v, w = Member(x, JUST, [JUST]), Member(y, JUST, [JUST])
+            closeness(x * y, [JUST], lambda d, v=v, w=w: v(d) * w(d), [arb(0)] * 2, points(generator, 2))
+
+
+@pytest.mark.parametrize("order", [2, 3, 4])
+@pytest.mark.parametrize(("left", "right"), list(itertools.combinations_with_replacement("aQKEB", 2)))
+def test_every_power_has_its_place_in_what_a_function_adds(order: int, left: str, right: str) -> None:
+    """D^2, D^3 or D^4 itself, of two parts of a jet: |D^order - d'H d - C[d]| <= d'R d."""
+    generator, used = np.random.default_rng(order), 0.0
+    f = tuple(np.float64(j == order) for j in range(4))
+    phi = Expansion(f, (0.0, 0.0, 0.0, 0.0), np.float64(1), np.float64(order == 4))  # type: ignore[arg-type]
+    with ctx.workprec(2500):
+        for size in (0.01, 0.3, 1.0, 1.0, 3.0):
+            U = shares(generator, 1, 2)
+            x, y = alone(left, generator, U), alone(right, generator, U)
+            jet = x if left == right else replace(x, **{right: size * getattr(y, right)})
+            member = Member(jet, JUST, [JUST])
+            H, C, R = jet.beyond_tangent(phi)
+            for d in points(generator, 2):
+                bound = quadratic(R.tolist(), d)
+                off = abs(member(d) ** order - curved(plain(0.0, 0.0, jet.a, 0.0, H, R, C), d))
+                assert off <= bound, d
+                used = max(used, float((off / bound).mid()) if bound > 1e-30 else 0.0)
+    assert used > 0.02 or left == right == "a"
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
