@@ -351,7 +351,7 @@ def test_the_summary_says_of_which_set_its_sizes_are(proved: RoaResult) -> None:
     assert (
         f"area {below(data['volume'])} m · m/s, of the tube's start" in text and "lengths, of the tube's start" in text
     )
-    assert f"tube from an ellipsoid of the shape domain, {data['tube']['slabs']} slabs" in text
+    assert f"tube from an ellipsoid of the shape {data['tube']['shape']}, {data['tube']['slabs']} slabs" in text
     smaller = {**data, "volume": 2 * data["volume"]}  # of {V <= c2}, were it the larger one
     assert "of {V <= c2}" in rendered(smaller) and "of the tube's start" not in rendered(smaller)
     assert "lengths" not in rendered({**data, "tube": None})
