@@ -342,8 +342,8 @@ def test_what_decreases_does_so_at_every_point(n: int) -> None:
         F, Q, E = any_form(generator, n)
         Q, E = [size * A for A in Q], [size * A for A in E]
         K = [size / n * np.array([float(v) for v in f.K.entries()]) for f in F]
-        inputs, L, S = (0.3 * size * generator.standard_normal(shape) for shape in ((n, 2), (2, 3), (3, n, n)))
-        L, S = L / max(size, 1e-9), np.einsum("qab,qcb->qac", S, S) / max(size, 1e-9)
+        inputs, L, S = (generator.standard_normal(shape) for shape in ((n, 2), (2, 3), (3, n, n)))
+        S = 0.5 * size / n * np.einsum("qab,qcb->qac", S, S)
         a = -np.eye(n) + 0.3 / n * generator.standard_normal((n, n))
         J, B, R = (generator.standard_normal((n, n)) for _ in range(3))
         P, R = B @ B.T + np.eye(n), 0.2 / n * (R + R.T)

@@ -620,8 +620,9 @@ def test_what_decreases_does_so_at_every_point(n: int, kind: str) -> None:
         Q, E = size * generator.standard_normal((2, n, n + 1, n + 1))
         Q, E = (Q + Q.transpose(0, 2, 1)) / 2, np.einsum("iab,icb->iac", E, E) / max(size, 1e-9) / n
         K = size / n * generator.standard_normal((n, (n + 1) * (n + 2) * (n + 3) // 6))
-        inputs, L = 0.3 * size * generator.standard_normal((n, 2)), generator.standard_normal((2, 3))
-        S = np.einsum("qab,qcb->qac", *(generator.standard_normal((1, 3, n + 1, n + 1)).repeat(2, 0))) / n
+        inputs, L = generator.standard_normal((n, 2)), generator.standard_normal((2, 3))
+        S = generator.standard_normal((3, n + 1, n + 1))
+        S = 0.3 * size / n * np.einsum("qab,qcb->qac", S, S)
         B, R = generator.standard_normal((2, n, n))
         P, R = B @ B.T + np.eye(n), 0.1 / n * (R + R.T)
         P = (P + P.T) / 2

@@ -627,6 +627,28 @@ def test_what_a_local_model_leaves_out_is_of_the_fourth_order(squash: str) -> No
     assert rests[-1] < bounds[-1] < 100 * rests[-1]
 
 
+@pytest.mark.parametrize("scale", [2.0, -0.5])
+@pytest.mark.parametrize("squash", ["tanh", "identity"])
+def test_a_single_tanh_leaves_out_what_it_must(squash: str, scale: float) -> None:
+    """As the output, or as the only unit before it: on a small ball no number is left that a bound could spare."""
+    layers = [(np.array([[0.75]]), np.array([0.5]))]
+    if squash == "identity":
+        layers.append((np.array([[-1.5]]), np.array([0.25])))
+    data = make(["u"], layers, np.eye(1), (0.01, 0.01), squash=squash, centre="output", scale=[scale])
+    rho, policy = 2.0**-20, parse(data).policy
+    with ctx.workprec(300):
+        (u,) = local_inputs(data, rho)
+        (value,) = policy_in_arb(policy, [Fraction(0)], [arb(rho)])
+        assert 1 >= beyond(value * 2**60, scaled(u, 2**60), [1.0]) > 0.99
+
+
+def scaled(v: Model, factor: int) -> Model:
+    """Such that what is left is large beside the rounding that `beyond` forgives."""
+    return dataclasses.replace(
+        v, v=v.v * factor, a=factor * v.a, Q=factor * v.Q, K=factor * v.K, E=factor * v.whole, B=(), errors=()
+    )
+
+
 @pytest.mark.parametrize("name", ["rotor", "rotor, preactivation", "crane"])
 @pytest.mark.parametrize("rho", [2.0**-20, 0.01])
 def test_the_ball_encloses_F(name: str, rho: float) -> None:
