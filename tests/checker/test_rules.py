@@ -339,7 +339,7 @@ MUTANTS: list[tuple[str, str, str, Edit]] = [  # rule, base, what, edit
     ("format", "enlarged", "middle of another size", array("evidence.tube.1.middle", lambda a: np.ones(4))),
     ("format", "enlarged", "end not finite", array("evidence.tube.1.end", lambda a: a * np.nan)),
     ("format", "enlarged", "duration not finite", at("evidence.tube.1.duration", "inf")),
-    ("format", "enlarged", "a path where nothing moves", at("evidence.tube.1.path", {})),
+    ("format", "enlarged", "a path where nothing moves", at("evidence.tube.1.path", "straight")),
     ("format", "scalar", "something uncertain without cells", at(
         "plant.uncertain", [{"name": "q", "range": ["0", "1"]}])),
     ("format", "scalar", "cells of nothing", at("evidence.cells", [1])),
