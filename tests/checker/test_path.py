@@ -84,7 +84,7 @@ def following(
 @cache
 def well(centre: float = 0.7, radius: float = 0.08) -> Document:
     """x' = x^3 - x from |x - centre| <= radius into |x| < 1/2, by the engine."""
-    data = scalar(CUBIC, 0.25, ball(0.5005, joint(0.5005)), 1.0, [])
+    data = scalar(CUBIC, 0.25, ball(0.5005, joint()), 1.0, [])
     found = surrounded(edited(data, "claim", {"kind": "asymptotic"}), [centre], [[1 / radius**2]])
     assert found is not None
     return found
@@ -497,7 +497,7 @@ def test_no_path_leads_from_beyond_the_region_of_attraction(
         slab = moved(a, b, h, radius, share=share)
         slab["end"] = encode([max(4.5, 1 / radius**2)]) if b == 0.0 else slab["end"]
         slabs.append(slab | {"multipliers": encode([[1.0], [0.0], [1.0]])})
-    data = following(CUBIC, 0.25, ball(0.5005, joint(0.5005)), 1 / radius**2, centres[0], slabs)
+    data = following(CUBIC, 0.25, ball(0.5005, joint()), 1 / radius**2, centres[0], slabs)
     assert verdicts(data) == {"tube"}
 
 
@@ -678,6 +678,7 @@ def placed(data: Document, centre: Sequence[float], after: Sequence[float], shar
     n = len(centre)
     one = {"middle": encode(np.eye(n)), "end": encode(np.eye(n)), "duration": (1.0).hex(),
            "path": waypoint(after, share, 1.0, 1.0)} | ball(J, np.ones((3, n)))  # fmt: skip
+    one["weight"] = encode(np.eye(n + 1))
     data = edited(data, "claim", {"kind": "reached", "start": encode(np.eye(n)), "centre": encode(centre)})
     return edited(data, "evidence.tube", [one])
 
@@ -912,7 +913,7 @@ def standing() -> Document:
 def blinkered() -> Document:
     """x' = x^3 - x from |x - 3/2| <= 1/4 at a speed that leads to 0, on a ball that knows nothing of the way."""
     slab = moved(1.5, 0.0, 30.0, 1.25) | ball(1e-3, joint(1e-3))
-    return following(CUBIC, 0.25, ball(0.5005, joint(0.5005)), 0.64, 1.5, [slab])
+    return following(CUBIC, 0.25, ball(0.5005, joint()), 0.64, 1.5, [slab])
 
 
 CLAUSES: dict[str, tuple[Callable[[], Document], str, Any]] = {
