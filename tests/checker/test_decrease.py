@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from array import array
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -152,8 +153,14 @@ def test_the_sums_are_those_of_the_reference(n: int, kind: str) -> None:
                     (hints.rest, hints.apart, hints.joint)]  # fmt: skip
             b = arb_mat(exactly(J).transpose() * exactly(P))
             columns = [arb_mat(n, 1, column) for column in b.transpose().tolist()]
-            models = [Model(arb(0), arb_mat(n, 1, [arb(v) for v in f.a.tolist()]), arb_mat(exactly(f.Q)),
-                            arb_mat(exactly(f.E))) for f in F]  # fmt: skip
+            models = [
+                replace(
+                    Model.affine(arb(0), [arb(v) for v in f.a.tolist()]),
+                    Q=arb_mat(exactly(f.Q)),
+                    E=arb_mat(exactly(f.E)),
+                )
+                for f in F
+            ]
             ball = Ball(exactly(J), *rows)
             sums = [part(ball, columns, models) for part in (reference.rest, reference.apart, reference.joint)]
             lengths = [sum((v * v for v in column.entries()), arb(0)).sqrt() for column in columns]

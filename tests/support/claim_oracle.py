@@ -244,9 +244,10 @@ def _shape(data: Any) -> None:
     if inner == "floor":
         _need(evidence["local"] is None, "no ball")
         return
-    _section(evidence["local"], "J", "multipliers")
+    _section(evidence["local"], "J", "multipliers", "weight")
     _array(evidence["local"]["J"], n, n)
     _array(evidence["local"]["multipliers"], 3, n)
+    _array(evidence["local"]["weight"], n, n)
 
 
 # --------------------------------------------------------------------------------------------------------- exact facts

@@ -66,7 +66,7 @@ def surrounded(data: Document, centre: Sequence[float], start: Any, seconds: flo
     result = edited(data, "claim", {"kind": "reached", "start": encode(P_0), "centre": encode(c)})
     result["evidence"]["tube"] = [
         {"middle": encode(slab.middle), "end": encode(slab.end), "duration": float(slab.duration).hex(),
-         "J": encode(slab.J), "multipliers": encode(slab.multipliers), "weight": encode(np.eye(n + 1)),
+         "J": encode(slab.J), "multipliers": encode(slab.multipliers), "weight": encode(slab.weight),
          "path": {"centre": encode(slab.path.centre)}
          | {key: float(getattr(slab.path, key)).hex() for key in ("share", "edge", "motion", "joint")}}
         for slab in tube.slabs if slab.path is not None
