@@ -161,7 +161,7 @@ def test_the_sums_are_those_of_the_reference(n: int, kind: str) -> None:
                 )
                 for f in F
             ]
-            ball = Ball(exactly(J), *rows)
+            ball = Ball(exactly(J), *rows, exactly(np.eye(n)))
             sums = [part(ball, columns, models) for part in (reference.rest, reference.apart, reference.joint)]
             lengths = [sum((v * v for v in column.entries()), arb(0)).sqrt() for column in columns]
             wrong = sum((2 * length * arb(f.slack) for length, f in zip(lengths, F, strict=True)), arb(0))

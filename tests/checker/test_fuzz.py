@@ -897,8 +897,8 @@ def one_state(*terms: Any, **changes: Any) -> Document:
 
 
 HARD: dict[str, tuple[Callable[[], Document], set[str]]] = {
-    "4,000 products of 64 states and 64 inputs": (lambda: wide_plant(products(4000)), {"ring"}),
-    # 64 states and more than 8,192 operations are refused under `local` for their size
+    "600 products of 64 states and 64 inputs": (lambda: wide_plant(products(600)), {"ring"}),
+    # 64 states and more than 1,346 operations are refused under `local` for their size
     "6,000 products of 64 states and 64 inputs": (lambda: wide_plant(products(6000)), {"local", "format"}),
     "one sum of 6,000 products": (
         lambda: edited(wide_plant([]), "plant.dynamics.0", ["+", "u0", *products(6000)]), {"local", "format"}

@@ -102,8 +102,6 @@ def multipliers(data: Document, J: np.ndarray, nodes: Sequence[np.ndarray], R: n
     alpha = np.where(E.any((1, 2)) & np.isfinite(sizes[0]), sizes[0], 0.0)
     least = TINY / np.where(along > 0, along, 1.0)  # as good as nothing, and positive: no component is taken jointly
     beta = np.where(Q.any((1, 2)) & np.isfinite(sizes[1]) & (sizes[1] > 0), sizes[1], least)
-    if not Q.any():  # nothing is lost by taking all jointly, and the third order gains
-        return np.stack([alpha, np.zeros(n), np.full(n, TINY * float(np.trace(left)))])
     return np.stack([alpha, beta, np.ones(n)])
 
 
