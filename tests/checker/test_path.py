@@ -111,7 +111,7 @@ ROTORS: dict[str, tuple[dict[str, Any], tuple[float, float]]] = {
 def rotor(name: str = "rotor") -> Document:
     """Of two states; of `rotor` no input bound holds by form."""
     more, centre = ROTORS[name]
-    found = surrounded(attracted(rotor_claim(**more), 0.3), centre, [[100.0, 0.0], [0.0, 100.0]])
+    found = surrounded(attracted(rotor_claim(**more), 0.03), centre, [[100.0, 0.0], [0.0, 100.0]])
     assert found is not None
     return found
 
@@ -293,9 +293,11 @@ FORGERIES: list[tuple[str, str, Edit]] = [  # of the rotor
     ("the domain is touched", "tube", touching),
     ("less torque than the path takes", "inputs", at("plant.input_bounds", [["-1/4", "5/2"]])),
     ("a clip that the path alone meets", "tube", rehashed("clip", [encode([-0.4]), encode([2.5])])),
-    *[(f"a plant with {tree} more", "tube", term(1, tree)) for tree in (
-        ["*", "4", ["**", "theta", 3]], ["*", "20", ["**", "theta", 4]], ["*", "80", ["**", "theta", 5]],
-        ["*", "4", "theta", ["-", "1", ["cos", ["*", "2", "theta"]]]])],
+    *[(f"a plant with {tree} more", rule, term(1, tree)) for rule, tree in (
+        ("tube", ["*", "4", ["**", "theta", 3]]),
+        ("local", ["*", "20", ["**", "theta", 4]]),  # of fourth order, for which the local alphas leave no room
+        ("local", ["*", "80", ["**", "theta", 5]]),
+        ("tube", ["*", "4", "theta", ["-", "1", ["cos", ["*", "2", "theta"]]]]))],
     ("a pole on the path alone", "tube", term(1, ["/", ["*", "1/999999", ["**", "theta", 2]], ["-", "theta", "2/5"]])),
     ("the same, times 0", "tube", term(1, ["*", "0", ["/", ["**", "theta", 2], ["-", "theta", "2/5"]]])),
     ("a root on the path alone", "tube", term(1, ["*", "1/999999", "theta", "theta", ["sqrt", ["-", "2/5", "theta"]]])),
