@@ -324,7 +324,11 @@ class _Run:
             return
         winner, report = race.open[0], race.report
         boxes = self.options.max_boxes
-        while not (winner.attempt.gained or winner.attempt.done or winner.hopeless) and self.left() > 0:
+        while (
+            not (winner.attempt.gained or winner.attempt.done or winner.hopeless)
+            and self.left() > 0
+            and winner.attempt.boxes < boxes
+        ):
             winner.advance(Budget(self._within(_PATIENCE * self.options.time_limit), boxes), report)
         if winner.attempt.done or not winner.attempt.gained or not self.interruptible:
             return

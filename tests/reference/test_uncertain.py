@@ -18,7 +18,9 @@ from certify.reference.local import cells
 from certify.reference.loop import Loop
 from certify.reference.model import Model
 from certify.reference.rational import coordinates
+from certify.reference.refusal import Refused
 from certify.reference.rules import judge as whole_verdict
+from certify.reference.symmetric import orders, triples
 from certify.reference.taylor import Taylor, pairs
 from tests.checker.test_ball import points
 from tests.checker.test_uncertain import HONEST, Edit, forgeries, honest, in_arb, wider
@@ -89,7 +91,11 @@ def test_models_in_a_cell_enclose_F_for_all_its_values(factor: str) -> None:
     with ctx.workprec(PRECISION):
         loop = Loop(c)
         (cell,) = cells(c.plant.ranges, (1,))
-        F = loop.within(loop.known(exactly(J), "local", "ball"), cell, "local", "ball")[0]
+        try:
+            F = loop.within(loop.known(exactly(J), "local", "ball"), cell, "local", "ball").components[0]
+        except Refused:
+            assert factor == "q^-3"  # of a wide number the product with itself may be 0
+            return
     lo, hi = ranges_of(data)["q"]
     with ctx.workprec(1000):
         for share in (0, 1, Fraction(1, 2), Fraction(1, 7)):
@@ -105,7 +111,9 @@ def holds(f: Model, true: arb, d: list[float]) -> bool:
     n, e = len(d), [arb(v) for v in d]
     known = f.v + sum((f.a[i, 0] * e[i] for i in range(n)), arb(0))
     known += sum((f.Q[i, j] * e[i] * e[j] for i in range(n) for j in range(n)), arb(0))
-    rest = sum((f.E[i, j] * e[i] * e[j] for i in range(n) for j in range(n)), arb(0))
+    each = zip(orders(n), triples(n), f.K.entries(), strict=True)
+    known += sum((often * k * e[h] * e[i] * e[j] for often, (h, i, j), k in each), arb(0))
+    rest = sum((f.whole[i, j] * e[i] * e[j] for i in range(n) for j in range(n)), arb(0))
     return bool((true - known).overlaps(rest.union(-rest)))
 
 
