@@ -434,14 +434,7 @@ def _widths(value: Any, name: str) -> dict[str, float]:
 
 
 def _state(value: Any, name: str) -> dict[str, Fraction]:
-    _require(isinstance(value, Mapping), name, "a mapping from states to their values", value)
-    found = {}
-    for state, given in value.items():
-        number = given.item() if isinstance(given, np.generic) else given
-        usable = isinstance(number, int | float | str | Fraction) and not isinstance(number, bool)
-        _require(usable, name, "a mapping from states to numbers", given)
-        found[_text(state, name)] = exact(number, name)
-    return found
+    return {state: _exact(number, f"{name}[{state!r}]") for state, number in _named(value, name, "values").items()}
 
 
 def _matrix(value: Any, name: str) -> Any:

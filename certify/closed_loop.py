@@ -23,7 +23,8 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class ClosedLoop:
-    """A plant under a tanh policy; `u_eq` is the exact equilibrium input, `folded` the policy without its centring.
+    """A plant under a tanh policy; `u_eq` is the exact equilibrium input, `folded` the policy without its centring,
+    `dynamics` the nominal equations.
 
     Raises
     ------
@@ -34,6 +35,7 @@ class ClosedLoop:
     network: TanhNetwork
     u_eq: tuple[Fraction, ...] = field(init=False, repr=False, compare=False)
     folded: TanhNetwork = field(init=False, repr=False, compare=False)
+    dynamics: tuple[sympy.Expr, ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         system, network = self.system, self.network
@@ -45,6 +47,7 @@ class ClosedLoop:
         u_eq = system.exact_u_eq()
         object.__setattr__(self, "u_eq", u_eq)
         object.__setattr__(self, "folded", network.folded(u_eq))
+        object.__setattr__(self, "dynamics", system.exact_dynamics())
 
     def require_rest(self) -> None:
         """Refuse a loop whose origin is not an equilibrium, exactly: `f(0, u_eq) = 0` and `pi(0) = u_eq`.

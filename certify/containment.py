@@ -60,15 +60,13 @@ class Ellipsoid:
     centre: tuple[float, ...] = ()
 
     def around(self, box: Box) -> Box:
-        """A box, or a state as one without widths, as deviations from the centre."""
+        """A box as deviations from the centre."""
         shift = [Fraction(v) for v in self.centre] or [Fraction(0)] * len(box)
         return tuple((lo - c, hi - c) for (lo, hi), c in zip(box, shift, strict=True))
 
     def holds(self, points: Iterable[Sequence[Fraction | float]]) -> list[bool]:
         """Whether each of the states lies in it."""
-        shift = [Fraction(v) for v in self.centre]
-        moved = [[Fraction(v) - c for v, c in zip(x, shift, strict=True)] if shift else x for x in points]
-        return are_inside(self.P, self.level, moved)
+        return are_inside(self.P, self.level, points, self.centre)
 
 
 @dataclass(frozen=True, slots=True)

@@ -93,10 +93,7 @@ class TubeFacts:
 
     def contains(self, states: Sequence[Sequence[Fraction | float]]) -> list[bool]:
         """Whether states, as deviations from the operating point, lie in the start, decided in rationals."""
-        if self.centre is not None:
-            c = [Fraction(v) for v in self.centre]
-            states = [[Fraction(v) - q for v, q in zip(x, c, strict=True)] for x in states]
-        return are_inside(self.start, 1.0, states)
+        return are_inside(self.start, 1.0, states, self.centre or ())
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON, with the size of the start along the states."""

@@ -90,7 +90,7 @@ def evaluate_vdot(loop: ClosedLoop, P: Array, x: Array) -> flint.arb:
         values: dict[sympy.Symbol, flint.arb] = dict(zip(loop.system.states, state, strict=True))
         values |= zip(loop.system.inputs, evaluate_policy(loop, x), strict=True)
         total, known = flint.arb(0), dict[Any, flint.arb]()
-        for row, expression in zip(P, loop.system.exact_dynamics(), strict=True):
+        for row, expression in zip(P, loop.dynamics, strict=True):
             Px = sum((flint.arb(float(p)) * v for p, v in zip(row, state, strict=True)), flint.arb(0))
             total += 2 * Px * evaluate(expression, values, _Balls(), known)
         return total
@@ -148,9 +148,9 @@ def field_on(loop: ClosedLoop, x: Balls) -> tuple[Balls, flint.arb_mat]:
     u, gain = policy_on(loop, x)
     values = dict(zip((*system.states, *system.inputs), (*x, *u), strict=True))
     known: dict[Any, flint.arb] = {}
-    F = [evaluate(e, values, _Balls(), known) for e in system.exact_dynamics()]
+    F = [evaluate(e, values, _Balls(), known) for e in loop.dynamics]
     A, B = (
-        flint.arb_mat([[evaluate(e.diff(s), values, _Balls(), known) for s in by] for e in system.exact_dynamics()])
+        flint.arb_mat([[evaluate(e.diff(s), values, _Balls(), known) for s in by] for e in loop.dynamics])
         for by in (system.states, system.inputs)
     )
     return F, A + B * gain

@@ -158,7 +158,7 @@ def _level(o: Problem) -> list[tuple[str, Tree]]:
 
 def _vdot(o: Problem) -> list[tuple[str, Tree]]:
     """Definition of `Vdot.` = 2 x'P f(x, pi(x))."""
-    F = o.loop.system.exact_dynamics()
+    F = o.loop.dynamics
     result: list[tuple[str, Tree]] = [(f"f.{i}", to_tree(e)) for i, e in enumerate(F)]
     return [*result, ("Vdot.", ["*", "2", total([["*", f"Px.{i}", f"f.{i}"] for i in range(len(F))])])]
 
@@ -255,7 +255,7 @@ def _jacobian(loop: ClosedLoop) -> list[tuple[str, Tree]]:
     """Definitions of `DF.i.j`, the closed loop's Jacobian at x."""
     system = loop.system
     result: list[tuple[str, Tree]] = []
-    for i, e in enumerate(system.exact_dynamics()):
+    for i, e in enumerate(loop.dynamics):
         for j, state in enumerate(system.states):
             terms = [to_tree(e.diff(state))]
             terms += [["*", to_tree(e.diff(u)), f"Du.{k}.{j}"] for k, u in enumerate(system.inputs)]

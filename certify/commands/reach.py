@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -11,7 +10,7 @@ import typer
 from certify.commands.arguments import plant_of, state, widths
 from certify.commands.certifying import certified
 from certify.commands.importing import policy_of
-from certify.commands.shared import Json
+from certify.commands.shared import Domain, Json, PlantName, PolicyFile, Quiet, Results, TimeLimit
 
 if TYPE_CHECKING:
     from certify.policies.importers import ImportOptions
@@ -19,29 +18,22 @@ if TYPE_CHECKING:
 
 def reach(
     context: typer.Context,
-    policy: Annotated[Path, typer.Option(help="Policy file (.pt), or another program's (see certify import).")],
+    policy: PolicyFile,
     importing: ImportOptions,
     from_: Annotated[
         str,
         typer.Option("--from", help="The state, as in x=0.5,y=-0.2; what is not named is at the operating point."),
     ],
-    system: Annotated[
-        str | None,
-        typer.Option(
-            help="Plant: a name, FILE.toml, or FILE.py:NAME, whose code is run; default: what the policy file says."
-        ),
-    ] = None,
+    system: PlantName = None,
     param: Annotated[list[str] | None, typer.Option(help="Parameter of the plant, NAME=VALUE; repeatable.")] = None,
-    domain: Annotated[
-        list[str] | None, typer.Option(help="Half-width NAME=D or interval NAME=LO:HI of a state; repeatable.")
-    ] = None,
+    domain: Domain = None,
     box: Annotated[
         str | None,
         typer.Option(help="Half-axes of the ellipsoid around the state that is to be widest, as in x=0.4,phi=0.2."),
     ] = None,
-    time_limit: Annotated[float, typer.Option(help="Seconds for everything up to the verdict.")] = 50.0,
-    out: Annotated[Path | None, typer.Option(help="Folder for the results; default: out/POLICY.")] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress and no notices, errors only.")] = False,
+    time_limit: TimeLimit = 50.0,
+    out: Results = None,
+    quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Prove that a state, with what lies around it, converges: a tube around its trajectory into a certified set."""

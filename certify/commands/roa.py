@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -11,7 +10,7 @@ import typer
 from certify.commands.arguments import numbers, plant_of, region, widths
 from certify.commands.certifying import certified
 from certify.commands.importing import policy_of
-from certify.commands.shared import Json
+from certify.commands.shared import Domain, Json, PlantName, PolicyFile, Quiet, Results, TimeLimit
 from certify.commands.terminal import tell
 from certify.errors import BackendError, InputError
 
@@ -21,14 +20,9 @@ if TYPE_CHECKING:
 
 def roa(
     context: typer.Context,
-    policy: Annotated[Path, typer.Option(help="Policy file (.pt), or another program's (see certify import).")],
+    policy: PolicyFile,
     importing: ImportOptions,
-    system: Annotated[
-        str | None,
-        typer.Option(
-            help="Plant: a name, FILE.toml, or FILE.py:NAME, whose code is run; default: what the policy file says."
-        ),
-    ] = None,
+    system: PlantName = None,
     param: Annotated[
         list[str] | None,
         typer.Option(help="Parameter of the plant, NAME=VALUE, or NAME=LO..HI: proved for all of it; repeatable."),
@@ -41,9 +35,7 @@ def roa(
         str | None,
         typer.Option(help="Bound of what the inputs may be off by at any time: one number, or NAME=E,NAME=E."),
     ] = None,
-    domain: Annotated[
-        list[str] | None, typer.Option(help="Half-width NAME=D or interval NAME=LO:HI of a state; repeatable.")
-    ] = None,
+    domain: Domain = None,
     claim: Annotated[
         str,
         typer.Option(
@@ -79,10 +71,10 @@ def roa(
         str | None,
         typer.Option(help="Say whether the proved set contains a state or a box, as in x=1.57,x_dot=-1..1."),
     ] = None,
-    time_limit: Annotated[float, typer.Option(help="Seconds for everything up to the verdict.")] = 50.0,
+    time_limit: TimeLimit = 50.0,
     max_boxes: Annotated[int, typer.Option(help="Boxes for the ring.")] = 4_000_000,
-    out: Annotated[Path | None, typer.Option(help="Folder for the results; default: out/POLICY.")] = None,
-    quiet: Annotated[bool, typer.Option("--quiet", help="No progress and no notices, errors only.")] = False,
+    out: Results = None,
+    quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
     """Certify a region of attraction: prove, write a certificate, have it checked, report."""

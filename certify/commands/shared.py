@@ -11,6 +11,19 @@ if TYPE_CHECKING:
     from certify.systems import System
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
+PolicyFile = Annotated[Path, typer.Option(help="Policy file (.pt), or another program's (see certify import).")]
+PlantName = Annotated[
+    str | None,
+    typer.Option(
+        help="Plant: a name, FILE.toml, or FILE.py:NAME, whose code is run; default: what the policy file says."
+    ),
+]
+Domain = Annotated[
+    list[str] | None, typer.Option(help="Half-width NAME=D or interval NAME=LO:HI of a state; repeatable.")
+]
+TimeLimit = Annotated[float, typer.Option(help="Seconds for everything up to the verdict.")]
+Results = Annotated[Path | None, typer.Option(help="Folder for the results; default: out/POLICY.")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="No progress and no notices, errors only.")]
 
 
 def page_of(raw: bytes, path: Path, answer: dict[str, Any] | None, data: dict[str, Any] | None) -> str:

@@ -115,7 +115,7 @@ class Paths:
 
     def models(self, J: Array) -> Models:
         """F on the ball x = middle + J d, ||d|| <= 1; J is (n, k)."""
-        return self.models_of(J, [self.loop.system.exact_dynamics()])[0]
+        return self.models_of(J, [self.loop.dynamics])[0]
 
     def models_of(self, J: Array, plants: Sequence[tuple[sympy.Expr, ...]]) -> list[Models]:
         """The same for each of several plants' equations in the loop's states and inputs, under the one policy."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,6 +35,7 @@ from certify.engines.tube import (
 from certify.systems.ode import rk4_step
 
 Array = NDArray[np.float64]
+Flow = Callable[[Array], Array]
 _SHARE = 0.25  # of a slab's ball, that the motion of its middle takes
 _ROOM = 1 / (1 - _SHARE**2)
 _FIRST, _LONGEST, _LONGER = 0.02, 0.5, 1.5  # units of time of a slab; growth from one to the next
@@ -53,7 +55,11 @@ def find_path(
     centre : (n,), the state from which the path goes.
     start, goal : (n, n), positive definite.
     """
-    until = time.perf_counter() + seconds
+    until, f = time.perf_counter() + seconds, loop.system.function()
+
+    def flow(x: Array) -> Array:
+        return np.asarray(f(x, loop.policy(x)))
+
     slabs: list[Slab] = []
     P, c, rate, duration = start, centre, None, _FIRST
     begin, most = np.linalg.slogdet(start)[1], min(MOST_SLABS, MOST_WORK // len(start) ** 4)
@@ -67,7 +73,7 @@ def find_path(
             if not _is_in_domain(loop, P, c):
                 return None, f"the tube leaves the domain after {spent:.3g} units of time"
             try:
-                slab = _slab(loop, P, c, rate, goal, duration)
+                slab = _slab(loop, flow, P, c, rate, goal, duration)
             except np.linalg.LinAlgError:  # numbers that have no finite model, or an ellipsoid without extent
                 slab = None
             if slab is None or slab.path is None or begin - np.linalg.slogdet(slab.end)[1] > 2 * _GROWN:
@@ -82,11 +88,10 @@ def find_path(
     return Tube(start, tuple(slabs), tuple(centre.tolist())), ""
 
 
-def after(loop: ClosedLoop, x: Array, duration: float) -> Array:
+def after(flow: Flow, x: Array, duration: float) -> Array:
     """The simulated state after that time, (n,)."""
-    f = loop.system.function()
     for _ in range(_STEPS):
-        x = rk4_step(lambda y: f(y, loop.policy(y)), x, duration / _STEPS)
+        x = rk4_step(flow, x, duration / _STEPS)
     return x
 
 
@@ -132,13 +137,15 @@ class _Along:
         return n, whole, self.moved @ b[:, :n]
 
 
-def _slab(loop: ClosedLoop, P: Array, c: Array, rate: Array | None, goal: Array, duration: float) -> Slab | None:
+def _slab(
+    loop: ClosedLoop, flow: Flow, P: Array, c: Array, rate: Array | None, goal: Array, duration: float
+) -> Slab | None:
     """One slab from {e'Pe <= 1} around c on, of at most that duration; `rate` is a guess of that of P."""
     if rate is not None:
         duration = min(duration, first_duration(P, rate))
     for _ in range(SHORTENINGS):
         middle = P if rate is None else P + duration / 2 * rate
-        end = after(loop, c, duration)
+        end = after(flow, c, duration)
         if is_definite(middle) and np.all(np.isfinite(end)):
             J = WIDER * math.sqrt(_ROOM) * root(middle)
             models = paths(loop, (c + end) / 2).models(np.append(J, ((end - c) / (2 * _SHARE))[:, None], axis=1))

@@ -44,18 +44,25 @@ def leaves_domain(P: Array, level: float, domain: Sequence[tuple[Fraction, Fract
     return Fraction(float(level)) >= _domain_limit(P, domain)
 
 
-def are_inside(P: Array, level: float, points: Iterable[Sequence[Fraction | float]]) -> list[bool]:
-    """Whether `x'Px <= level` at each of the points, decided in rationals; their entries are finite numbers, exact.
+def are_inside(
+    P: Array, level: float, points: Iterable[Sequence[Fraction | float]], centre: Sequence[float] = ()
+) -> list[bool]:
+    """Whether `(x - c)'P(x - c) <= level` at each of the points, decided in rationals; all entries are finite numbers,
+    exact. c is `centre`, 0 if it is empty.
 
     >>> are_inside(np.eye(2), 1.0, [(0.6, Fraction(4, 5)), (Fraction(3, 5), Fraction(4, 5)), (0.0, 2)])
     [True, True, False]
     """
     c, rows = _rational(float(level)), _exact(P).tolist()
+    shift = [_rational(float(v)) for v in centre] or [flint.fmpq(0)] * len(rows)
 
     def value(x: Sequence[flint.fmpq]) -> flint.fmpq:
         return sum(v * sum(p * w for p, w in zip(row, x, strict=True)) for v, row in zip(x, rows, strict=True))
 
-    return [bool(value([flint.fmpq(*v.as_integer_ratio()) for v in point]) <= c) for point in points]
+    def moved(point: Sequence[Fraction | float]) -> list[flint.fmpq]:
+        return [flint.fmpq(*v.as_integer_ratio()) - q for v, q in zip(point, shift, strict=True)]
+
+    return [bool(value(moved(point)) <= c) for point in points]
 
 
 def semi_axes(P: Array, level: float) -> Array:

@@ -38,7 +38,18 @@ from tests.checker.test_rules import (
     rehashed,
     rotor_claim,
 )
-from tests.checker.test_tube import CUBIC, NO_CURVATURE, NONE, Edit, ball, joint, random_loop, scalar, verdicts
+from tests.checker.test_tube import (
+    CUBIC,
+    NO_CURVATURE,
+    NONE,
+    Edit,
+    ball,
+    joint,
+    random_loop,
+    scalar,
+    slabs_to,
+    verdicts,
+)
 from tests.support.certificates import Document, decode, edited, encode, make, parse, rehash, verdict
 from tests.support.jets import curved, no_units, plain
 from tests.support.oracle import ball as exact
@@ -193,10 +204,6 @@ def number(path: str, value: float | Callable[[float], float]) -> Edit:
         return float(value(float.fromhex(text)) if callable(value) else value).hex()
 
     return lambda data: edited(data, path, change)
-
-
-def slabs_to(change: Callable[[list[Document]], list[Document]]) -> Edit:
-    return lambda data: edited(data, "evidence.tube", lambda slabs: change(list(slabs)))
 
 
 def entry(path: str, i: int, value: float) -> Edit:
@@ -715,6 +722,21 @@ ENCLOSED: dict[str, Callable[[], Document]] = {
 WHERE = ["near", "far", "inexact", "tiny motion", "large motion", "point"]
 
 
+def state_at(m: Sequence[arb], w: Sequence[arb], J: np.ndarray, d: list[float]) -> list[arb]:
+    """m + J z + w sigma, d = (z, sigma)."""
+    return [
+        p + q * arb(d[-1]) + sum((arb(a) * arb(v) for a, v in zip(row, d, strict=False)), arb(0))
+        for p, q, row in zip(m, w, J.tolist(), strict=True)
+    ]
+
+
+def left_over(jet: Jet, change: arb, d: list[float]) -> tuple[arb, arb]:
+    """What a jet does not say of v(d) - v(0), and the bound of it."""
+    size = sum((arb(v) ** 2 for v in d), arb(0)).sqrt()
+    linear = sum((arb(float(a)) * arb(p) for a, p in zip(jet.a, d, strict=True)), arb(0))
+    return change - curved(jet, d) - linear, arb(float(jet.slack)) * size + quadratic(jet.whole.tolist(), d)
+
+
 @pytest.mark.parametrize("where", WHERE)
 @pytest.mark.parametrize("name", ENCLOSED)
 def test_the_models_along_a_path_enclose_the_field(name: str, where: str) -> None:
@@ -745,15 +767,9 @@ def test_the_models_along_a_path_enclose_the_field(name: str, where: str) -> Non
             points[1] = [*[0.0] * n, 1.0]
             at_0 = values(c, m)
             for d in points.tolist():
-                x = [
-                    p + q * arb(d[n]) + sum((arb(a) * arb(v) for a, v in zip(row, d, strict=False)), arb(0))
-                    for p, q, row in zip(m, w, J.tolist(), strict=True)
-                ]
                 size = sum((arb(v) ** 2 for v in d), arb(0)).sqrt()
-                for jet, v, v_0 in zip(jets, values(c, x), at_0, strict=True):
-                    left = v - v_0 - curved(jet, d)
-                    left -= sum((arb(float(a)) * arb(p) for a, p in zip(jet.a, d, strict=True)), arb(0))
-                    known = arb(float(jet.slack)) * size + quadratic(jet.whole.tolist(), d)
+                for jet, v, v_0 in zip(jets, values(c, state_at(m, w, J, d)), at_0, strict=True):
+                    left, known = left_over(jet, v - v_0, d)
                     assert abs(left) <= known
                     assert abs(v_0 - arb(float(jet.c))) <= arb(float(jet.error))
                     assert abs(v - v_0) <= arb(float(jet.radius)) * size
@@ -790,15 +806,8 @@ def test_models_of_random_loops_hold_along_random_paths(seed: int) -> None:
             c = piece.case.c
             at_0 = values(c, m)
             for d in (points * (1 - 2.0**-50)).tolist():
-                x = [
-                    p + q * arb(d[n]) + sum((arb(a) * arb(v) for a, v in zip(row, d, strict=False)), arb(0))
-                    for p, q, row in zip(m, w, J.tolist(), strict=True)
-                ]
-                size = sum((arb(v) ** 2 for v in d), arb(0)).sqrt()
-                for jet, v, v_0 in zip(jets, values(c, x), at_0, strict=True):
-                    left = v - v_0 - curved(jet, d)
-                    left -= sum((arb(float(a)) * arb(p) for a, p in zip(jet.a, d, strict=True)), arb(0))
-                    known = arb(float(jet.slack)) * size + quadratic(jet.whole.tolist(), d)
+                for jet, v, v_0 in zip(jets, values(c, state_at(m, w, J, d)), at_0, strict=True):
+                    left, known = left_over(jet, v - v_0, d)
                     assert left.is_finite() and not abs(left) > known
                     assert not abs(v_0 - arb(float(jet.c))) > arb(float(jet.error))
                     if known > 1e-9:

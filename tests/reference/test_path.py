@@ -38,6 +38,8 @@ from certify.reference.model import Model
 from certify.reference.rational import beyond_domain, root_above
 from certify.roa import RoaOptions, certify_roa
 from certify.systems import get_system
+from tests.reference.test_local import row
+from tests.reference.test_tube import array, at, more, of_tube, times, without, yes
 from tests.support.balls import TINY, around, ball, exactly, slab_of, square, with_ball
 from tests.support.certificates import Document, decode, dump, edited, encode, make, write
 from tests.support.certificates import verdict as verdict_of_the_checker
@@ -178,14 +180,6 @@ def V_of(data: Document, x: np.ndarray) -> np.ndarray:
 # ------------------------------------------------------------------------------------------------------- forgeries
 
 
-def at(path: str, value: Any) -> Edit:
-    return lambda data: edited(data, path, value)
-
-
-def array(path: str, change: Callable[[np.ndarray], Any]) -> Edit:
-    return at(path, lambda text: encode(change(decode(text))))
-
-
 def number(path: str, change: Callable[[float], float]) -> Edit:
     return at(path, lambda text: change(float.fromhex(text)).hex())
 
@@ -202,25 +196,8 @@ def rows(k: int, change: Callable[[np.ndarray], Any]) -> Edit:
     return array(f"evidence.tube.{k}.multipliers", lambda values: change(values.reshape(3, -1)))
 
 
-def row(index: Any, value: float) -> Callable[[np.ndarray], np.ndarray]:
-    def change(values: np.ndarray) -> np.ndarray:
-        result = values.copy()
-        result[index] = value
-        return result
-
-    return change
-
-
-def times(factor: float) -> Callable[[np.ndarray], np.ndarray]:
-    return lambda values: values * factor
-
-
 def plus(step: float) -> Callable[[np.ndarray], np.ndarray]:
     return lambda values: values + step
-
-
-def of_tube(change: Callable[[list[Any]], list[Any]]) -> Edit:
-    return at("evidence.tube", change)
 
 
 def stays(data: Document) -> Document:
@@ -350,14 +327,6 @@ def test_harmless_edits(name: str, edit: Edit) -> None:
 
 
 # ------------------------------------------------------------------------------------------------------- the file
-
-
-def without(path: str, key: str) -> Edit:
-    return at(path, lambda old: {k: v for k, v in old.items() if k != key})
-
-
-def more(path: str, key: str, value: Any) -> Edit:
-    return at(path, lambda old: old | {key: value})
 
 
 def enlarged(data: Document) -> Document:
@@ -808,10 +777,6 @@ def test_a_tube_that_the_engine_finds(tmp_path: Path) -> None:
 
 
 # -------------------------------------------------------------------------------------------- every clause is needed
-
-
-def yes(*_: Any) -> bool:
-    return True
 
 
 def one(_: Motion, __: str) -> fmpq:
