@@ -32,7 +32,7 @@ from certify.systems import System
 from certify.systems.system import Interval
 
 Array = NDArray[np.float64]
-SCHEMA = "certify-certificate/5"
+SCHEMA = "certify-certificate/6"
 MAX_BYTES = 256 * 2**20
 _LONGEST_UNIT = 40
 _OF_A_BALL = ("J", "multipliers", "weight")
@@ -42,11 +42,16 @@ _OF_A_PATH = ("share", "edge", "motion", "joint")
 @dataclass(frozen=True, slots=True)
 class LocalBall:
     """Evidence of the local proof: a ball x = J d, ||d|| <= 1, J (n, n), that contains {V <= c1}, and `multipliers`
-    (3, n) of the matrix inequality on it with the `weight` (n, n) from which all others follow."""
+    (3, n) of the matrix inequality on it with the `weight` (n, n) from which all others follow.
+
+    `edge` is the multiplier of V - c0 of a practical claim, `order` that of the series in time of a sampled one.
+    """
 
     J: Array
     multipliers: Array
     weight: Array
+    edge: float = 0.0
+    order: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,6 +105,7 @@ class PartitionTree:
     local : of the local proof; None where the claim has none.
     cells : into how many parts the range of each uncertain quantity is cut for it, in their order.
     tube : the slabs, in their order, of a claim that is enlarged by a tube.
+    order : of the series in time on its leaves, where the input is held over a period.
     """
 
     T: Array
@@ -108,6 +114,7 @@ class PartitionTree:
     local: LocalBall | None = None
     tube: tuple[Slab, ...] = ()
     cells: tuple[int, ...] = ()
+    order: int = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,9 +171,15 @@ class Certificate:
         system, network = self.system, self.network
         sections: dict[str, Any] = {
             "schema": SCHEMA,
-            "claim": {"kind": self.claim.kind} | _start(self.claim),
+            "claim": {
+                "kind": self.claim.kind,
+                "rate": float(self.claim.rate).hex(),
+                "sample": None if system.sample is None else [str(h) for h in system.sample],
+            }
+            | _start(self.claim),
             "plant": {
                 "name": system.name,
+                "time": system.time,
                 "states": [s.name for s in system.states],
                 "inputs": [s.name for s in system.inputs],
                 "uncertain": [{"name": s.name, "range": [str(lo), str(hi)]} for s, (lo, hi) in system.uncertain],
@@ -247,6 +260,7 @@ def parse_certificate(raw: bytes, name: str) -> Certificate:
         ranges = {q["name"]: (Fraction(q["range"][0]), Fraction(q["range"][1])) for q in plant["uncertain"]}
         names = {s.name: s for s in (*states, *inputs, *map(sympy.Symbol, ranges))}
         n, m = len(states), len(inputs)
+        sample = data["claim"]["sample"]
         provenance, units, x_eq, nominal = _read_provenance(data["provenance"], names)
         system = System(
             name=plant["name"],
@@ -260,6 +274,8 @@ def parse_certificate(raw: bytes, name: str) -> Certificate:
             units=units,
             x_eq=tuple(sympy.Rational(x_eq.get(s.name, "0")) for s in states),
             ranges=ranges,
+            time=plant["time"],
+            sample=None if sample is None else (Fraction(sample[0]), Fraction(sample[1])),
         )
         network = TanhNetwork(
             weights=tuple(_decode(x["weight"], tuple(x["shape"])) for x in policy["layers"]),
@@ -286,6 +302,7 @@ def parse_certificate(raw: bytes, name: str) -> Certificate:
 
 def _read_claim(data: Mapping[str, Any], n: int) -> Claim:
     levels = {k: float.fromhex(v) for k, v in data["levels"].items()}
+    levels["rate"] = float.fromhex(data["claim"]["rate"])
     kind = data["claim"]["kind"]
     if kind == Enlarged.kind:
         return Enlarged(**levels, start=Quadratic(_decode(data["claim"]["start"], (n, n))))
@@ -350,7 +367,8 @@ def _evidence(evidence: PartitionTree | TrustedSolver) -> dict[str, Any]:
             "root": _encode(evidence.root),
             "tree": base64.b64encode(evidence.tree).decode("ascii"),
             "cells": list(evidence.cells),
-            "local": None if evidence.local is None else _ball(evidence.local),
+            "order": evidence.order,
+            "local": None if evidence.local is None else _local(evidence.local),
             "tube": [
                 {"middle": _encode(slab.middle), "end": _encode(slab.end), "duration": float(slab.duration).hex()}
                 | _ball(slab)
@@ -374,7 +392,7 @@ def _read_evidence(data: Mapping[str, Any], n: int) -> PartitionTree | TrustedSo
             _decode(data["T"], (n, n)),
             root,
             base64.b64decode(data["tree"]),
-            None if local is None else LocalBall(*_read_ball(local, n, n)),
+            None if local is None else _read_local(local, n),
             tuple(
                 Slab(
                     _decode(slab["middle"], (n, n)),
@@ -386,6 +404,7 @@ def _read_evidence(data: Mapping[str, Any], n: int) -> PartitionTree | TrustedSo
                 for slab in data["tube"]
             ),
             tuple(map(int, data["cells"])),
+            int(data["order"]),
         )
     queries = tuple((str(name), str(answer)) for name, answer in data["queries"])
     return TrustedSolver(str(data["solver"]), str(data["version"]), float.fromhex(data["precision"]), queries)
@@ -393,6 +412,14 @@ def _read_evidence(data: Mapping[str, Any], n: int) -> PartitionTree | TrustedSo
 
 def _ball(evidence: LocalBall | Slab) -> dict[str, str]:
     return {name: _encode(getattr(evidence, name)) for name in _OF_A_BALL}
+
+
+def _local(ball: LocalBall) -> dict[str, Any]:
+    return {**_ball(ball), "edge": float(ball.edge).hex(), "order": ball.order}
+
+
+def _read_local(data: Mapping[str, Any], n: int) -> LocalBall:
+    return LocalBall(*_read_ball(data, n, n), float.fromhex(data["edge"]), int(data["order"]))
 
 
 def _read_ball(data: Mapping[str, str], n: int, k: int) -> tuple[Array, Array, Array]:

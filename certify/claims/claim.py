@@ -6,8 +6,9 @@ in which coordinates and with which boxes, is the evidence's affair.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import ClassVar, Literal
 
 from certify.closed_loop import ClosedLoop
@@ -19,53 +20,59 @@ Kind = Literal["asymptotic", "practical"]
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """The closed loop `xdot = F(x)` and the Lyapunov function V that claims are about.
+    """The closed loop and the Lyapunov function V that claims are about, and how fast V is to fall.
+
+    With `rate` lambda what has to be negative is D + 2 lambda V, where D is V's increment over a step, by time: Vdot in
+    continuous time, `V(F(x)) - V(x)` in discrete time, `(V(x(h)) - V(x))/h` where the input is held over h.
 
     Raises
     ------
-    InputError : V has another number of states.
+    InputError : V has another number of states, or the rate is negative or no number.
     """
 
     loop: ClosedLoop
     V: Quadratic
+    rate: float = 0.0
 
     def __post_init__(self) -> None:
         n = self.loop.system.n
         if self.V.n != n:
             raise InputError(f"`P` must be a finite matrix of shape ({n}, {n}); found shape {self.V.P.shape}.")
+        if not (math.isfinite(self.rate) and self.rate >= 0):
+            raise InputError(f"`rate` must be a number of at least 0; found {self.rate}.")
 
 
 @dataclass(frozen=True, slots=True)
 class Claim:
-    """`roa` is c2: the claim is about every trajectory that starts in {V <= c2}."""
+    """`roa` is c2: the claim is about every trajectory that starts in {V <= c2}.
+
+    `local` is c1, the level from which the ring reaches outwards to c2: below it what is shown is shown on a ball.
+    `rate` is lambda: V falls at least as exp(-2 lambda t) where it is claimed to fall.
+    """
 
     kind: ClassVar[Kind | Literal["enlarged", "reached"]]
     at_rest: ClassVar[bool]  # the origin must be an equilibrium, exactly
-    inner_name: ClassVar[str]  # of the level from which the ring reaches outwards to c2
     roa: float
+    local: float
+    rate: float = field(default=0.0, kw_only=True)
 
     @property
     def inner(self) -> float:
         """The level from which the ring reaches outwards to c2."""
-        return float(getattr(self, self.inner_name))
+        return self.local
 
     @property
     def levels(self) -> Mapping[str, float]:
         """The section `levels` of the certificate, in its order."""
-        return {self.inner_name: self.inner, "roa": self.roa}
+        return {"local": self.local, "roa": self.roa}
 
 
 @dataclass(frozen=True, slots=True)
 class Asymptotic(Claim):
-    """Every trajectory from {V <= c2} stays in it and converges to the origin, which is asymptotically stable.
-
-    `local` is c1: below it Vdot < 0 is shown by the linearisation, above it by the ring.
-    """
+    """Every trajectory from {V <= c2} stays in it and converges to the origin, which is asymptotically stable."""
 
     kind: ClassVar[Kind | Literal["enlarged", "reached"]] = "asymptotic"
     at_rest = True
-    inner_name = "local"
-    local: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,13 +98,18 @@ class Reached(Asymptotic):
 class Practical(Claim):
     """Every trajectory from {V <= c2} stays in it, enters {V <= c0} in finite time, and stays there.
 
-    `floor` is c0. Nothing is said about what happens inside {V <= c0}; the origin need not be an equilibrium.
+    `floor` is c0, at most c1, and equal to it where there is no ball. Nothing is said about what happens inside
+    {V <= c0}; the origin need not be an equilibrium.
     """
 
     kind = "practical"
     at_rest = False
-    inner_name = "floor"
     floor: float
+
+    @property
+    def levels(self) -> Mapping[str, float]:
+        """The section `levels` of the certificate, in its order."""
+        return {"floor": self.floor, "local": self.local, "roa": self.roa}
 
 
 CLAIMS: Mapping[str, type[Asymptotic] | type[Practical]] = {

@@ -96,12 +96,11 @@ def status_of(certificate: Certificate, sha256: str, answer: Mapping[str, Any] |
     if kind not in ("ACCEPTED", "TRUSTED"):
         return Status("NOT CHECKED", "The checker gave no verdict. Nothing here is proved.")
     levels = answer.get("levels")
-    given = levels if isinstance(levels, Mapping) else {}
-    inner, outer = given.get(certificate.claim.inner_name), given.get("roa")
+    given = dict(levels) if isinstance(levels, Mapping) else {}
     for what, found, wanted in (
         ("bytes with sha256", answer.get("certificate_sha256"), sha256),
         ("policy with sha256", answer.get("policy_sha256"), certificate.network.sha256()),
-        ("levels", (inner, outer), (certificate.inner, certificate.roa)),
+        ("levels", given, dict(certificate.claim.levels)),
         ("evidence to replay", kind == "ACCEPTED", isinstance(certificate.evidence, PartitionTree)),
     ):
         if found != wanted:

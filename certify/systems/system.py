@@ -20,7 +20,7 @@ from dataclasses import dataclass, field, replace
 from decimal import Decimal, InvalidOperation
 from fractions import Fraction
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import sympy
 
@@ -29,6 +29,7 @@ from certify.expressions import GRAMMAR, evaluate_exactly, has_tree
 
 Interval = tuple[Fraction, Fraction]
 Kind = Literal["parameter", "disturbance", "input error"]
+Time = Literal["continuous", "discrete"]
 
 _MOST_DIGITS = 1000  # before or after the point: 1e999999999 would fill the memory
 
@@ -77,6 +78,9 @@ class System:
     ranges : intervals by name, of parameters that are uncertain and of disturbances that act: all that is known of
         them, at any time. A parameter's value in `parameters` lies in its range and is the nominal one, of which
         everything is made that is not proved for the whole range: u_eq, linearisation, simulation.
+    time : `continuous`, or `discrete`: then the equations are those of x+, the state one step later.
+    sample : the least and the largest time over which an input is held, in a continuous plant; None if it follows the
+        state at once.
 
     Raises
     ------
@@ -99,6 +103,8 @@ class System:
     x_eq: tuple[sympy.Expr, ...] = ()
     disturbances: tuple[sympy.Symbol, ...] = ()
     ranges: Mapping[str, Interval] = field(default_factory=dict)
+    time: Time = "continuous"
+    sample: Interval | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "parameters", MappingProxyType(dict(self.parameters)))
@@ -147,6 +153,7 @@ class System:
             _check_grammar(expression, parameters, self.name)
         self.exact_x_eq()
         self._check_ranges()
+        self._check_time()
 
     def _check_ranges(self) -> None:
         acting, fixed = {s.name for s in self.disturbances}, {s.name for e in self.x_eq for s in e.free_symbols}
@@ -167,6 +174,21 @@ class System:
                 )
             if name in self.positive and not lo > 0:
                 raise InputError(f"parameter {name} of {self.name} must be positive; found {float(lo):g} in its range.")
+
+    def _check_time(self) -> None:
+        if self.time not in get_args(Time):
+            raise InputError(f"`time` of {self.name} must be one of {get_args(Time)}; found {self.time!r}.")
+        if self.sample is None:
+            return
+        if self.time == "discrete":
+            raise InputError(
+                f"{self.name} is a plant in discrete time, whose steps are its samples: leave out `sample`."
+            )
+        lo, hi = self.sample
+        if not 0 <= lo <= hi or not hi > 0:
+            raise InputError(
+                f"`sample` must be a positive time, or two with 0 <= lo <= hi; found {float(lo):g} and {float(hi):g}."
+            )
 
     @property
     def n(self) -> int:
@@ -215,6 +237,10 @@ class System:
         }
         kept = {name: ends for name, ends in self.ranges.items() if name not in ranges}
         return replace(self.with_parameters(outside), ranges={**kept, **given})
+
+    def with_sample(self, sample: Interval | None) -> System:
+        """The same plant whose inputs are held over periods of these lengths; None for inputs that follow at once."""
+        return replace(self, sample=sample)
 
     def with_input_errors(self, bounds: Mapping[str, Fraction]) -> System:
         """The same plant with u + e in the place of u, |e| at most the bound, for the inputs that are named."""

@@ -551,5 +551,5 @@ def test_a_violation_contradicts_only_where_the_guards_hold(
     problem = Problem(ClosedLoop(system, network), Quadratic(np.eye(1)))
     answer = Answer("delta-sat", 0.1, "fake", {"x": (at, at)})
     monkeypatch.setattr("certify.engines.dreal.proof.decide", lambda *_: answer)
-    _, witness = confirm_with_dreal(problem, Practical(roa=4.0, floor=1.0), FAKE, DrealOptions())
+    _, witness = confirm_with_dreal(problem, Practical(roa=4.0, local=1.0, floor=1.0), FAKE, DrealOptions())
     assert (witness is not None) is contradicts

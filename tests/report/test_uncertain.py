@@ -49,7 +49,7 @@ def spring() -> tuple[System, TanhNetwork]:
 def claimed(system: System, network: TanhNetwork, *, practical: bool = False) -> Certificate:
     """A claim that nobody has checked."""
     n = system.n
-    claim = Practical(roa=0.5, floor=0.1) if practical else Asymptotic(roa=0.5, local=0.5)
+    claim = Practical(roa=0.5, local=0.1, floor=0.1) if practical else Asymptotic(roa=0.5, local=0.5)
     evidence = PartitionTree(np.eye(n), np.ones(n), bytes([255]), cells=(1,) * len(system.ranges))
     written = Certificate(system, network, Quadratic(np.eye(n)), claim, evidence)
     return parse_certificate(written.to_json().encode(), "c")  # as a reader has it, without kinds and nominal values

@@ -68,7 +68,9 @@ class BoundsEngine(Engine):
             why = f"F and its inputs are not enclosed on all of V <= {ring.inner:.6g}"
             return Proof(None, None, Stop.SMOOTH, why, boxes=ring.boxes)
         return replace(
-            self.stated(task.problem, ring, Practical(roa=ring.outer, floor=ring.inner), {}), stop=stop, witness=witness
+            self.stated(task.problem, ring, Practical(roa=ring.outer, local=ring.inner, floor=ring.inner), {}),
+            stop=stop,
+            witness=witness,
         )
 
     def _outer_level(
