@@ -35,6 +35,12 @@ def roa(
         str | None,
         typer.Option(help="Bound of what the inputs may be off by at any time: one number, or NAME=E,NAME=E."),
     ] = None,
+    sample_time: Annotated[
+        str | None,
+        typer.Option(
+            help="Period over which the input is held, as in 0.02, or LO..HI: any sequence of periods between the two."
+        ),
+    ] = None,
     domain: Domain = None,
     claim: Annotated[
         str,
@@ -51,6 +57,9 @@ def roa(
     ] = "auto",
     q: Annotated[str | None, typer.Option("--Q", help="Diagonal of Q, as in 1,1.")] = None,
     r: Annotated[str | None, typer.Option("--R", help="Diagonal of R (candidate lqr), as in 1.")] = None,
+    rate: Annotated[
+        float, typer.Option(help="Prove that V falls at least as exp(-2 RATE t), by steps in discrete time.")
+    ] = 0.0,
     level: Annotated[float | None, typer.Option(help="Prove exactly this level; less is not PROVED.")] = None,
     engine: Annotated[
         str, typer.Option(envvar="CERTIFY_ENGINE", help="bounds, dreal (trusted, not checked), or both.")
@@ -82,7 +91,7 @@ def roa(
 
     start = time.perf_counter()
     stored = policy_of(policy, importing, system, param or [])
-    plant = plant_of(stored, system, param or [], domain or [], disturbance or [], input_error)
+    plant = plant_of(stored, system, param or [], domain or [], disturbance or [], input_error, sample_time)
     options = RoaOptions(
         claim=claim,  # type: ignore[arg-type]
         candidate=candidate,  # type: ignore[arg-type]
@@ -97,6 +106,7 @@ def roa(
         box=widths(box, "--box"),
         time_limit=time_limit,
         max_boxes=max_boxes,
+        rate=rate,
     )
     asked = None if contains is None else region(contains, plant, "--contains")
     certified(context, policy, stored, plant, options, out, start, quiet, as_json, asked)
