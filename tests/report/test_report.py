@@ -47,8 +47,10 @@ from certify.lyapunov import domain_limit, solve_lyapunov, volume
 from certify.lyapunov.function import Quadratic
 from certify.policies import TanhNetwork
 from certify.report import render_html, simulated_roa_fraction, summary
+from certify.report.claims import CLAIMS
 from certify.report.figures import draw
 from certify.report.figures.geometry import PARTS, ellipse, refine, shadow
+from certify.report.limits import limited_by
 from certify.report.page import status_of
 from certify.report.sampling import (
     Flow,
@@ -57,7 +59,7 @@ from certify.report.sampling import (
     simulate,
     time_scales,
 )
-from certify.report.words import CLAIMS, above, below, kept_apart, label, limited_by, number, symbol
+from certify.report.words import above, below, kept_apart, label, number, symbol
 from certify.roa import RoaOptions, certify_roa
 from certify.systems import System, get_system
 from certify.systems.ode import rk4_step
@@ -881,7 +883,8 @@ def practical_case(tmp_path_factory: pytest.TempPathFactory) -> Case:
     network = TanhNetwork((np.array([[1.0, 0.0]]),), (np.zeros(1),), np.full(1, 0.1), np.zeros(1), "tanh", "none")
     path = tmp_path_factory.mktemp("practical") / "certificate.json"
     write_atomically(
-        path, raw(Certificate(system, network, Quadratic(np.eye(2)), Practical(roa=1.7, local=1 / 3, floor=1 / 3), ONE_LEAF))
+        path,
+        raw(Certificate(system, network, Quadratic(np.eye(2)), Practical(roa=1.7, local=1 / 3, floor=1 / 3), ONE_LEAF)),
     )
     answer = {
         "result": "ACCEPTED",

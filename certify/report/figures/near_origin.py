@@ -15,8 +15,9 @@ def near_origin(scene: Scene) -> Picture:
 
     figure, axes = figure_of(4.2, 3.6)
     reach = 2.6 * scene.inner_reach
-    if scene.leaves is not None:
-        add_leaves(axes, scene, scene.leaves, (0, 1), within=reach)
+    leaves = None if scene.local_is_enough else scene.leaves
+    if leaves is not None:
+        add_leaves(axes, scene, leaves, (0, 1), within=reach)
     begin = on_level(scene.P, circle(scene.effort.starts), min(9 * scene.inner, 0.999 * scene.outer))
     paths = scene.simulate(begin, steps=60).path
     lines = [thin(paths[:, k], 2 * reach) for k in range(paths.shape[1])]
@@ -29,11 +30,12 @@ def near_origin(scene: Scene) -> Picture:
     axes.ticklabel_format(style="sci", scilimits=(-2, 3))
     axes.set_xlabel(scene.labels[0])
     axes.set_ylabel(scene.labels[1])
-    around = "" if scene.leaves is None else " Around it the innermost leaves (blue)."
+    around = "" if leaves is None else " Around it the innermost leaves (blue)."
     inner = f"{{V ≤ {inner_level(scene.kind, scene.inner, 3)}}}"
+    keeps = "and do not leave" if scene.timing.is_plain or scene.timing.from_zero else f"and {scene.there}"
     green = {
         "asymptotic": f"Green: the local set {inner}, {scene.word} at all radii at once.",
-        "practical": f"Green: the inner set {inner}, which trajectories enter and do not leave; the dot marks the "
+        "practical": f"Green: the inner set {inner}, which trajectories enter {keeps}; the dot marks the "
         "origin, of which nothing is said.",
     }[scene.kind]
     return Picture(
