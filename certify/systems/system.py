@@ -263,6 +263,11 @@ class System:
         )
 
     @property
+    def in_steps(self) -> bool:
+        """Whether V is compared at the ends of steps: of discrete time, or of periods over which an input is held."""
+        return self.time == "discrete" or self.sample is not None
+
+    @property
     def rests_where(self) -> str:
         """What f(x_eq, u_eq) is at an equilibrium, in words."""
         return "0" if self.time == "continuous" else "x_eq"
