@@ -26,8 +26,12 @@ from .network import reaches
 
 
 def levels(case: Case) -> Failures:
-    if not 0 < case.c.c1 <= case.c.c2 < float("inf"):
-        yield "levels", f"must satisfy 0 < {' <= '.join(case.c.levels)}"
+    c = case.c
+    inner = c.c0 if c.practical else c.c1
+    if not 0 < inner <= c.c1 <= c.c2 < float("inf"):
+        yield "levels", f"must satisfy 0 < {' <= '.join(c.levels)}"
+    if not (isinstance(c.evidence, Partition) and case.covered) and inner != c.c1:
+        yield "levels.local", "must be the floor where there is no ball"
     return 1
 
 
@@ -100,10 +104,11 @@ ON_THE_BALL: Table[local.Local] = (
     ("local", local.fits),
     ("inputs", ball.keeps_inputs),
     ("local", ball.is_not_clipped),
+    ("flow", local.stays),
     ("local", local.decreases),
 )
 OF_THE_TREE: Table[Case] = (("tree", ring.is_whole),)
-ON_LEAVES: Table[ring.Leaves] = (("inputs", ring.keeps_inputs), ("ring", ring.decreases))
+ON_LEAVES: Table[ring.Leaves] = (("inputs", ring.keeps_inputs), ("flow", ring.stays), ("ring", ring.decreases))
 OF_THE_TUBE: Table[Case] = (("tube", tube.nodes_are_sound),)
 ON_SLABS: Table[tube.Piece] = (
     ("tube", tube.fits),
@@ -152,13 +157,13 @@ def check(c: Certificate) -> Tally:
         tally.hold([(name, rule) for name, rule in STATED if not spared.get(name)], case)
         if not replayed:
             return tally
-        if not c.practical:
+        if case.covered:
             origin = local.Local(case)
             tally.hold(ON_THE_BALL, origin)
             if np.isfinite(origin.margin):  # binary64 may not hold the sides of an inequality that rationals decide
                 tally.local_margin = origin.margin
         tally.hold(OF_THE_TREE, case)
-        if c.practical or c.c1 != c.c2:
+        if not case.covered or c.c1 != c.c2:
             bounds, margin = ring.Ring(case), np.inf
             for batch in ring.batches(case.partition.tree, case.partition.root, bounds.batch):
                 leaves = bounds.examine(*batch)

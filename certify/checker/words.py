@@ -50,7 +50,7 @@ def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
         f"claim: {CLAIMS[c.claim].format(c=c, time=duration(c))}; u stays in its bounds",
         "rules that held: " + ", ".join(f"{rule} {count}" for rule, count in answer["rules"].items()),
         rest,
-        f"{verdict} {'c0' if c.practical else 'c1'}={c.c1!r} c2={c.c2!r} sha256={c.sha256}",
+        f"{verdict} {f'c0={c.c0!r} ' if c.practical else ''}c1={c.c1!r} c2={c.c2!r} sha256={c.sha256}",
     ]
 
 
