@@ -1,6 +1,7 @@
 """Jets on a ball where something is uncertain: value and gradient are affine in it, all else is as good as at its worst.
 
-In a cell of the box of ranges each quantity is its middle plus half its width times y_j in [-1, 1]. What decides a stiff
+In a cell of the box of ranges each quantity is its middle plus half its width times y_j in [-1, 1]; the length of a
+period may be one more of them. What decides a stiff
 loop is how the gradients of F move with y: they move in directions that the decay can afford, which a norm of them does
 not know. So `v(0) = c + moves.y` within `error`, the gradient is `a + turns.y` within `slack`, and what moves in the
 second and third order, where the ball is what makes it small, is part of E (checker/FORMAT.md, cells).
@@ -25,6 +26,7 @@ from certify.engines.jets import ATAN4, TANH4, TANH5, Sizes, basis, beyond_tange
 from certify.expressions import Algebra
 
 Array = NDArray[np.float64]
+Four = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,8 +122,8 @@ class RangedJet:
         xm, ym = (float(np.sum(np.abs(v.moves))) for v in (x, y))
         xt, yt = (v.turned - v.slack for v in (x, y))
         ps, qs = float(p.slope[0]), float(q.slope[0])
-        error = xm * ym + x.error * y.value + (abs(x.c) + xm) * y.error
-        slack = xm * yt + ym * xt + x.error * qs + y.error * ps + (abs(x.c) + xm) * y.slack + (abs(y.c) + ym) * x.slack
+        error = x.value * y.error + y.value * x.error + xm * ym  # the last is of second order in y
+        slack = x.value * y.slack + x.error * qs + y.value * x.slack + y.error * ps + xm * yt + ym * xt
         Q = x.c * y.Q + y.c * x.Q + b.between(x.a, y.a)
         K = x.c * y.K + y.c * x.K + b.times(x.a, y.Q) + b.times(y.a, x.Q)
         left = p.slope * q.twist + p.twist * q.slope + (p.bend + p.twist) * (q.bend + q.twist)
@@ -142,32 +144,36 @@ class RangedJet:
             x.errors,
         )
 
-    def compose(self, f0: float, f1: float, f2: float, f3: float, near: float, fourth: float) -> RangedJet:
-        """A function's value and derivatives at c; at least |phi''''| for all v(0), and |phi''''|/24 on the range."""
-        size, D = self.sizes, self.away
+    def compose(self, f: Four, e: Four, fourth: float) -> RangedJet:
+        """A function's phi, phi', phi''/2 and phi'''/6 at c, how far they are from those at v(0), and at least
+        |phi''''|/24 on the range."""
+        (f0, f1, half, sixth), (e0, e1, e2, e3) = f, e
+        size, far = self.sizes, self.away
         slope, bend = float(size.slope[0]), float(size.bend[0])
-        third = abs(f3) + D * near
-        second = abs(f2) + D * abs(f3) + D**2 / 2 * near
-        first = abs(f1) + D * second
-        one = np.array([1.0])
-        H, cubic = beyond_tangent(self.a, self.Q, self.K, f2 / 2 * one, f3 / 6 * one)
-        R = remainder(self.a, size, self.rest, second / 2 * one, third / 6 * one, fourth * one)
-        moved = D * second * self._spread(size)
-        moved += D * third / 2 * (slope**2 + 2 * slope * bend) + D * near / 6 * slope**3
-        moved += self.turned * (2 * (second / 2 + fourth * float(size.radius[0]) ** 2) * slope + second * bend + third / 2 * slope**2)
-        slack = first * self.slack + D * second * (self.turned - self.slack)
-        slack += (abs(f2) * self.error + third / 2 * D**2) * float(np.linalg.norm(self.a))
+        h, g = abs(half) + e2, abs(sixth) + e3
+        each = (np.array([v]) for v in (half, sixth, h, g, fourth))
+        second, third, *bounds = each
+        H, cubic = beyond_tangent(self.a, self.Q, self.K, second, third)
+        R = remainder(self.a, size, self.rest, *bounds)
+        moved = e1 * self._spread(size) + e2 * (slope**2 + 2 * slope * bend) + e3 * slope**3
+        bent = 2 * (h + fourth * float(size.radius[0]) ** 2) * slope + 2 * h * bend + 3 * g * slope**2
+        if len(self.moves):
+            tilt, by_y = self.turned - self.slack, 2 * abs(half) * float(np.sum(np.abs(self.moves)))
+            error = abs(f1) * self.error + h * far**2
+            slack = (2 * h * self.error + 3 * g * far**2) * slope + (abs(f1) + by_y) * self.slack + by_y * tilt
+        else:
+            error, slack = e0, e1 * slope + (abs(f1) + e1) * self.slack
         return RangedJet(
             f0,
             f1 * self.moves,
-            abs(f1) * self.error + second / 2 * D**2,
+            error,
             f1 * self.a,
-            f1 * self.turns + f2 * self.moves[:, None] * self.a,
+            f1 * self.turns + 2 * half * self.moves[:, None] * self.a,
             slack,
             f1 * self.Q + H,
             f1 * self.K + cubic,
             f1 * self.B,
-            first * self.E + R + moved * basis(self.a.shape[1]).eye,
+            (abs(f1) + e1) * self.E + R + (moved + bent * self.turned) * basis(self.a.shape[1]).eye,
             self.errors,
         )
 
@@ -175,48 +181,57 @@ class RangedJet:
         return replace(self, c=math.nan, E=self.E + math.inf)
 
     def inverse(self) -> RangedJet:
-        c, close = self.c, abs(self.c) - self.away
+        c, far = self.c, self.away
+        close = abs(c) - far
         least = close - self.radius
         if not least > 0:
             return self._nowhere()
-        return self.compose(1 / c, -1 / c**2, 2 / c**3, -6 / c**4, 24 / close**5, 1 / (close**4 * least))
+        f = 1 / c, -1 / c**2, 1 / c**3, -1 / c**4
+        e = far / close**2, 2 * far / close**3, 3 * far / close**4, 4 * far / close**5
+        return self.compose(f, e, 1 / (close**4 * least))
 
     def sqrt(self) -> RangedJet:
-        close = self.c - self.away
+        far = self.away
+        close = self.c - far
         if not close - self.radius > 0:
             return self._nowhere()
         r, s, w = math.sqrt(self.c), math.sqrt(close), math.sqrt(close - self.radius)
-        fourth = (5 * s**2 + 4 * s * w + w**2) / (16 * s**5 * (s + w) ** 4)
-        return self.compose(r, 1 / (2 * r), -1 / (4 * r**3), 3 / (8 * r**5), 15 / (16 * s**7), fourth)
+        f = r, 1 / (2 * r), -1 / (8 * r**3), 1 / (16 * r**5)
+        e = far / (2 * s), far / (4 * s**3), 0.1875 * far / s**5, 0.15625 * far / s**7
+        return self.compose(f, e, (5 * s**2 + 4 * s * w + w**2) / (16 * s**5 * (s + w) ** 4))
 
     def exp(self) -> RangedJet:
         end = self.c + self.away + self.radius
         if not end < EXP_END:
             return self._nowhere()
-        e = math.exp(self.c)
-        return self.compose(e, e, e, e, math.exp(self.c + self.away), math.exp(end) / 24)
+        here, most = math.exp(self.c), math.exp(end)
+        e = self.away * most
+        return self.compose((here, here, here / 2, here / 6), (e, e, e, e), most / 24)
 
     def tanh(self) -> RangedJet:
-        t = math.tanh(self.c)
+        t, far = math.tanh(self.c), self.away
         slope = 1 - t * t
+        e1 = 2 * far * (1 + far)
+        e = far, e1, far * (slope + e1) + abs(t) * e1, 1.4 * far
         there = abs(8 * t * (2 - 3 * t**2) * slope)
-        near, far = (min(TANH4, there + TANH5 * r) for r in (self.away, self.away + self.radius))
-        return self.compose(t, slope, -2 * t * slope, (6 * t * t - 2) * slope, near, far / 24)
+        fourth = min(TANH4, there + TANH5 * (far + self.radius)) / 24
+        return self.compose((t, slope, -t * slope, (t * t - 1 / 3) * slope), e, fourth)
 
     def atan(self) -> RangedJet:
-        slope = 1 / (1 + self.c**2)
-        f3 = (6 * self.c**2 - 2) * slope**3
-        return self.compose(math.atan(self.c), slope, -2 * self.c * slope**2, f3, ATAN4, ATAN4 / 24)
+        slope, far = 1 / (1 + self.c**2), self.away
+        f = math.atan(self.c), slope, -self.c * slope**2, (self.c**2 - 1 / 3) * slope**3
+        return self.compose(f, (far, far, far, far), ATAN4 / 24)
 
     def sin(self) -> RangedJet:
-        s, c = math.sin(self.c), math.cos(self.c)
-        near, far = (min(1.0, abs(s) + r) for r in (self.away, self.away + self.radius))
-        return self.compose(s, c, -s, -c, near, far / 24)
+        return self._wave(math.sin(self.c), math.cos(self.c))
 
     def cos(self) -> RangedJet:
-        s, c = math.sin(self.c), math.cos(self.c)
-        near, far = (min(1.0, abs(c) + r) for r in (self.away, self.away + self.radius))
-        return self.compose(c, -s, -c, s, near, far / 24)
+        return self._wave(math.cos(self.c), -math.sin(self.c))
+
+    def _wave(self, value: float, slope: float) -> RangedJet:
+        far = self.away
+        fourth = min(1.0, abs(value) + far + self.radius) / 24
+        return self.compose((value, slope, -value / 2, -slope / 6), (far, far, far, far), fourth)
 
 
 class RangedJets(Algebra[RangedJet]):

@@ -2,8 +2,8 @@
 
 G is F itself in continuous time, F - x in discrete time, and where the input is held over h the mean of f over the
 period: `x_1 + h x_2 + ... + h^(r-1) x_r` by the power series of the solution, whose last coefficient is taken at states
-that are near enough to x for the whole period. A quantity may change within it: only in x_1, the mean of f at x, is
-it one number (checker/FORMAT.md, flow).
+that are near enough to x for the whole period. A quantity may change within it, and leave its cell: only in x_1, the
+mean of f at x, is it one number (checker/FORMAT.md, flow).
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from fractions import Fraction
 
 import numpy as np
 import sympy
@@ -95,7 +94,9 @@ class _Walk:
 
     def __init__(self, steps: Steps, J: Array, driven: Driven, cell: Cell) -> None:
         self.steps, self.J, self.cell = steps, J, cell
-        self.algebra = RangedJets(J.shape[1], len(cell), driven.errors)
+        sample = self.loop.system.sample
+        self.varies = sample is not None and sample[0] < sample[1]
+        self.algebra = RangedJets(J.shape[1], len(cell) + self.varies, driven.errors)
         u = enumerate(steps.known.u)
         self._inputs = [self.algebra.input(j, float(value), *driven.of(j)) for j, value in u]
 
@@ -111,7 +112,7 @@ class _Walk:
         return [self.algebra.state(0.0, row, float(e), float(s)) for row, e, s in rows]
 
     def rates(self, near: tuple[Array, Array] | None = None, fixed: bool = True) -> list[RangedJet]:
-        """f at these states; the quantities are `fixed`, or may be others at every place."""
+        """f at these states; the quantities are one point of the cell, or anywhere at every place if not `fixed`."""
         shared: dict[sympy.Expr, RangedJet] = {}
         values = self._states_by_name(near) | self._held_by_name(fixed)
         return [evaluate(e, values, self.algebra, shared) for e in self.steps.dynamics]
@@ -130,15 +131,16 @@ class _Walk:
 
     def _held_by_name(self, fixed: bool) -> dict[sympy.Symbol, RangedJet]:
         system = self.loop.system
-        names = [s for s, _ in system.uncertain]
-        known = (self.algebra.quantity(*ends, j if fixed else None) for j, ends in enumerate(self.cell))
-        return dict(zip(system.inputs, self._inputs, strict=True)) | dict(zip(names, known, strict=True))
+        held = dict(zip(system.inputs, self._inputs, strict=True))
+        for j, ((symbol, whole), part) in enumerate(zip(system.uncertain, self.cell, strict=True)):
+            held[symbol] = self.algebra.quantity(*part, j) if fixed else self.algebra.quantity(*whole, None)
+        return held
 
 
 def _held(walk: _Walk, order: int, sample: Interval, reach: Array) -> tuple[list[RangedJet], bool] | None:
     """`h x_2 + ... + h^(r-1) x_r` for every h of the range, and whether the states stay in the domain; None where they
     are not known to stay anywhere."""
-    lo, hi = (float(h) for h in sample)
+    hi = float(sample[1])
     moved = _within_a_period(walk, hi)
     if moved is None:
         return None
@@ -147,7 +149,7 @@ def _held(walk: _Walk, order: int, sample: Interval, reach: Array) -> tuple[list
     stays = all(a < -r - hi * v and r + hi * v < b for (a, b), r, v in zip(ends, reach, rate, strict=True))
     last = [row[-1] for row in walk.series(order, near)]
     early = walk.series(order - 1) if order > 2 else [[]] * len(last)
-    h = walk.algebra.quantity(Fraction(lo), Fraction(hi), None)
+    h = walk.algebra.quantity(*sample, len(walk.cell) if walk.varies else None)
     found = []
     for own, end in zip(early, last, strict=True):
         value = walk.still(end)
