@@ -8,6 +8,7 @@ chosen where the rest is nothing, at the origin.
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 from fractions import Fraction
 
 import numpy as np
@@ -33,31 +34,37 @@ def cut(ranges: list[Interval], cuts: tuple[int, ...]) -> list[Cell]:
     return list(itertools.product(*parts))
 
 
-def cuts_for(steps: Steps, J: Array, P: Array, R: Array | None) -> tuple[int, ...]:
-    """As few as leave enough of the decay near the origin; J (n, n) is of a ball, whose size does not matter."""
+def cuts_for(steps: Steps, J: Array, P: Array, R: Array | None) -> tuple[int, ...] | None:
+    """As few as leave enough of the decay near the origin; None if no ball can show anything, however small.
+
+    J (n, n) is of a ball, whose size does not matter.
+    """
     ranges = list(steps.known.loop.system.ranges.values())
     cuts, tiny = (1,) * len(ranges), J * 1e-6
-    if not ranges:
-        return cuts
     left = _left(steps, tiny, P, R, cuts)
-    while left < _ENOUGH and 2 * int(np.prod(cuts)) <= _MOST:
+    while ranges and left < _ENOUGH and 2 * int(np.prod(cuts)) <= _MOST:
         finer = [tuple(2 * c if i == j else c for j, c in enumerate(cuts)) for i in range(len(ranges))]
         found, best = max((_left(steps, tiny, P, R, one), one) for one in finer)
         hopeless = int(np.prod(cuts)) >= _FEW if found == -np.inf else left > 0 and not found > left + _WORTH
         if hopeless:
             break
         left, cuts = found, best
-    return cuts
+    return cuts if left > 0 else None
 
 
 def _left(steps: Steps, J: Array, P: Array, R: Array | None, cuts: tuple[int, ...]) -> float:
-    """The least share of the decay, in any cell and direction, that the gradients' slack leaves."""
+    """The least share of the decay, in any cell and direction, that the gradients' slack leaves; what the values at the
+    origin are does not count."""
     least = 1.0
     for models in steps.models(J, cut(list(steps.known.loop.system.ranges.values()), cuts), np.zeros(len(J))):
-        if not (models.finite and models.spread is not None):
+        if not models.finite:
             return -np.inf
-        for corner in corners_of(models, J, P, R, steps.longest):
-            charge = 2 * float(np.linalg.norm(corner.b, axis=1) @ models.spread.slack)
+        nothing, spread = np.zeros_like(models.f), models.spread
+        if spread is not None:
+            spread = replace(spread, moves=np.zeros_like(spread.moves), error=nothing)
+        for corner in corners_of(replace(models, f=nothing, spread=spread), J, P, R, steps.longest):
+            slack = nothing if spread is None else spread.slack
+            charge = 2 * float(np.linalg.norm(corner.b, axis=1) @ slack)
             values = np.linalg.eigvalsh(corner.decay + charge * np.eye(len(J)))
             least = min(least, 1 - charge / float(values[0]) if values[0] > 0 else -np.inf)
     return least

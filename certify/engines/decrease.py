@@ -64,16 +64,15 @@ def corners_of(models: Models, J: Array, P: Array, R: Array | None = None, h: fl
 
     What is known of f and A as a norm is charged to the decay, and so is `h g'P g`, g what the models have beyond them.
     """
-    if not h and models.spread is None:
-        return [_corner(models, J, P, R, h, models.f, models.A, 0.0)]
-    gamma = _gamma(models, P) if h else 0.0
-    return [_corner(models, J, P, R, h, f, A, gamma) for f, A in models.corners]
+    gamma, still = _gamma(models, P) if h else 0.0, P @ J
+    return [_corner(models, J, P, R, h, f, A, gamma, still) for f, A in models.corners]
 
 
 def _corner(
-    models: Models, J: Array, P: Array, R: Array | None, h: float, f: Array, A: Array, gamma: float
+    models: Models, J: Array, P: Array, R: Array | None, h: float, f: Array, A: Array, gamma: float, still: Array
 ) -> Corner:
-    b = P @ (J + h * A) if h else P @ J
+    """`gamma` and `still`, b for h = 0, are the same at all corners."""
+    b = P @ (J + h * A) if h else still
     moved = P @ f
     whole = J.T @ P @ A
     decay = -(whole + whole.T) - (h * A.T @ P @ A if h else 0.0) - (0.0 if R is None else J.T @ R @ J)
@@ -134,12 +133,11 @@ def _best_of_a_kind(corners: Sequence[Corner], roots: Sequence[Array], joint: bo
     weights = [np.eye(len(root)) / (len(root) * len(roots)) for root in roots]
     for _ in range(_ROUNDS):
         seen = [root.T @ weight @ root for root, weight in zip(roots, weights, strict=True)]
-        multipliers = multipliers_at([(c.models, c.b) for c in corners], seen, joint)
-        relative = []
-        for corner, root in zip(corners, roots, strict=True):
-            relative.append(root @ rest_of(corner.models, corner.b, multipliers) @ root.T)
-            if not np.all(np.isfinite(relative[-1])):
-                return best
+        multipliers = _multipliers_at(corners, seen, joint)
+        rests = rests_of(corners, multipliers)
+        relative = [root @ rest @ root.T for root, rest in zip(roots, rests, strict=True)]
+        if not all(np.all(np.isfinite(one)) for one in relative):
+            return best
         worst = max(float(np.linalg.eigvalsh(one)[-1]) for one in relative)
         best = max(best, Shown(multipliers, 1 - worst), key=lambda shown: shown.margin)
         most = 1 - sum(float(np.sum(weight * one)) for weight, one in zip(weights, relative, strict=True))
@@ -158,6 +156,15 @@ def decay_of(models: Models, J: Array, b: Array, R: Array | None = None) -> Arra
     """-(J'RJ + B + B'), (k, k), where row i of b (n, k) is J'P_i."""
     B = b.T @ models.A
     return -(B + B.T) - (0.0 if R is None else J.T @ R @ J)
+
+
+def rests_of(corners: Sequence[Corner], multipliers: Multipliers) -> list[Array]:
+    """`rest_of` at each corner, (k, k)."""
+    known: dict[int, Array] = {}
+    for corner in corners:
+        if id(corner.b) not in known:
+            known[id(corner.b)] = rest_of(corner.models, corner.b, multipliers)
+    return [known[id(corner.b)] for corner in corners]
 
 
 def rest_of(models: Models, b: Array, multipliers: Multipliers) -> Array:
@@ -183,17 +190,24 @@ def multipliers_for(models: Models, b: Array, weight: Array, joint: bool | None 
 
     `joint` says whether the Q of all components are taken jointly or all apart; None is what has the smaller trace.
     """
-    return multipliers_at([(models, b)], [weight], joint)
+    return _multipliers_of([(models, b, weight)], joint)
 
 
-def multipliers_at(
-    corners: Sequence[tuple[Models, Array]], weights: Sequence[Array], joint: bool | None = None
-) -> Multipliers:
-    """The same for the sum of the traces at several corners, models with their b, each with its own weight."""
-    n, k = corners[0][1].shape
-    usual = 0.0
+def _multipliers_at(corners: Sequence[Corner], weights: Sequence[Array], joint: bool) -> Multipliers:
+    """The same for the sum of the traces at several corners, each with its own weight."""
+    parts: dict[int, tuple[Models, Array, Array]] = {}  # corners that share their b share their bounds
+    for corner, weight in zip(corners, weights, strict=True):
+        _, _, before = parts.get(id(corner.b), (None, None, 0.0))
+        parts[id(corner.b)] = corner.models, corner.b, before + weight
+    return _multipliers_of(list(parts.values()), joint)
+
+
+def _multipliers_of(parts: Sequence[tuple[Models, Array, Array]], joint: bool | None) -> Multipliers:
+    n, k = parts[0][1].shape
+    usual, whole = 0.0, np.zeros((k, k))
     along, by_size, E2, Q2, spread = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(k)
-    for (models, b), weight in zip(corners, weights, strict=True):
+    for models, b, weight in parts:
+        whole = whole + weight
         size = np.linalg.norm(b, axis=1)
         along = along + np.einsum("ij,jk,ik->i", b, weight, b)
         E2, Q2 = (
@@ -204,7 +218,6 @@ def multipliers_at(
         C = _joint(models, b, np.ones(n, dtype=bool))
         spread = spread + np.einsum("jmk,kl,jml->m", C, weight, C, optimize=True)
         usual = max(usual, float(np.max(size)) * float(np.max(np.linalg.norm(models.A, axis=1))))
-    whole = sum(weights[1:], weights[0])
     with np.errstate(divide="ignore", invalid="ignore"):
         apart = np.sqrt(E2 * along) < by_size
         alpha = np.where(apart, np.sqrt(E2 / along), 0.0)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from certify.certificate import LocalBall
 from certify.claims import Problem
 from certify.engines.cells import cut, cuts_for
-from certify.engines.decrease import NOT_SHOWN, Corner, Multipliers, Shown, best_at, corners_of, rest_of
+from certify.engines.decrease import NOT_SHOWN, Corner, Multipliers, Shown, best_at, corners_of, rests_of
 from certify.engines.models import Paths, paths
 from certify.engines.steps import Cell, Steps, steps_of
 
@@ -29,9 +29,12 @@ _ENOUGH = 1.01 * _MARGIN
 _WIDER = 1 + 1e-9  # of the ball, which has to contain {V <= c1} beyond all rounding
 _ORDER = 3  # of the series in time, where an input is held
 _FAR, _NEAR = 1e-2, 0.3  # from one level to the next lower one, where all below one is good, and where not
+_LOWER = 0.5  # from one level to the next, while floors fall with them
+_NOTHING = 1e-12  # of the limit: no floor is asked to be lower
 _EDGES = 400  # that are tried
 _ROUNDS = 3  # of multipliers and edge, each best for the other
 _WORTH = 0.01  # of a floor: less is no gain
+_ROUNDING = 1e-12  # of the decay, of which the checker's numbers are in doubt at d = 0 as well
 _ABOVE = 1 + 1e-3  # of the least floor that is shown
 
 
@@ -52,22 +55,50 @@ def prove_local(
     InputError : the network is larger than the checker's local rule allows.
     """
     rule = _Rule.of(problem, T, steps_of(known or paths(problem.loop), True, _order(problem)))
+    if rule.cuts is None:
+        return None
     return _largest(lambda level: rule.shown(level, _ENOUGH).margin > _MARGIN, limit, until)
 
 
 def prove_band(
-    problem: Problem, T: Array, limit: float, known: Paths | None = None, until: float = math.inf
+    problem: Problem,
+    T: Array,
+    limit: float,
+    known: Paths | None = None,
+    until: float = math.inf,
+    above: float = 1.5,
 ) -> tuple[float, float] | None:
-    """(c0, c1) with c0 < c1: V falls where c0 <= V <= c1, c1 up to `limit` being the largest within 2 % for which a
-    ball shows that, and c0 the least that this ball shows; None if there are none, or none are found in the time.
+    """(c0, c1) with c0 < c1: V falls where c0 <= V <= c1; None if there are none, or none are found in the time.
 
     Parameters
     ----------
-    known : the `paths` of the loop that need not be at rest.
+    known : the `paths` of the loop, which need not be at rest.
+    until : the reading of `time.perf_counter` at which the search ends with what it has.
+    above : a large ball has a large floor: c1, up to `limit`, is about the largest level whose ball shows a floor of at
+        most so many times the least that any ball shows, and c0 is that floor.
+
+    Raises
+    ------
+    InputError : the network is larger than the checker's local rule allows.
     """
     rule = _Rule.of(problem, T, steps_of(known or paths(problem.loop, resting=False), False, _order(problem)))
-    top = _largest(lambda level: rule.around(level).floor < level, limit, until, _NEAR)
-    return None if top is None else (rule.around(top).floor, top)
+    if rule.cuts is None:
+        return None
+    floors: dict[float, float] = {}
+
+    def floor(level: float) -> float:
+        if level not in floors:
+            floors[level] = max(rule.around(level).floor, _NOTHING * limit)
+        return floors[level]
+
+    top = _largest(lambda level: floor(level) < level, limit, until, _NEAR)
+    if top is None:
+        return None
+    level, least = top * _LOWER, floor(top)
+    while time.perf_counter() < until and floor(level) < min(level, (1 - _WORTH) * least):
+        level, least = level * _LOWER, floor(level)
+    c1 = _largest(lambda level: floor(level) <= above * least, top, until, _LOWER)
+    return (floor(top), top) if c1 is None else (floor(c1), c1)
 
 
 def local_margin(problem: Problem, T: Array, level: float, known: Paths) -> float:
@@ -88,7 +119,7 @@ def local_ball(
     else:
         found = rule.around(level)
         by, edge = found.multipliers, found.edge
-    return LocalBall(ball_around(problem, T, level), by.rows, by.weight, edge, order), rule.cuts
+    return LocalBall(ball_around(problem, T, level), by.rows, by.weight, edge, order), rule.cuts or (1,) * len(problem.loop.system.ranges)
 
 
 def ball_around(problem: Problem, T: Array, level: float) -> Array:
@@ -116,7 +147,7 @@ class _Rule:
     problem: Problem
     T: Array
     steps: Steps
-    cuts: tuple[int, ...]
+    cuts: tuple[int, ...] | None
     cells: Sequence[Cell]
     R: Array | None
 
@@ -126,7 +157,8 @@ class _Rule:
         R = 2 * problem.rate * problem.V.P if problem.rate else None
         with np.errstate(all="ignore"):
             cuts = cuts_for(steps, T, problem.V.P, R)
-        return cls(problem, T, steps, cuts, cut(list(problem.loop.system.ranges.values()), cuts), R)
+        cells = [] if cuts is None else cut(list(problem.loop.system.ranges.values()), cuts)
+        return cls(problem, T, steps, cuts, cells, R)
 
     def shown(self, level: float, enough: float = math.inf) -> Shown:
         """At rest, on the ball of a level."""
@@ -156,10 +188,10 @@ class _Rule:
         """Where `edge floor - start > linear' (D - edge V)^-1 linear` and D > edge V, D being what of the decay is
         left, at all corners."""
         parts = []
-        for c in corners:
-            left = (1 - _MARGIN) * c.decay - rest_of(c.models, c.b, by)
+        for c, rest in zip(corners, rests_of(corners, by), strict=True):
+            left = (1 - _MARGIN) * c.decay - rest
             values, vectors = scipy.linalg.eigh((left + left.T) / 2, V)
-            parts.append((values, (vectors.T @ c.linear) ** 2, c.start))
+            parts.append((values, (vectors.T @ c.linear) ** 2, c.start + _ROUNDING * float(np.trace(c.decay))))
         most, h = min(float(values[0]) for values, _, _ in parts), self.steps.longest
         if not most > 0:
             return _NOWHERE
@@ -168,11 +200,13 @@ class _Rule:
         floors = [(s + np.sum(w / (v - edges[:, None]), axis=1)) / edges for v, w, s in parts]
         worst = np.max(floors, axis=0) * _ABOVE
         at = int(np.argmin(worst))
-        return _Around(max(float(worst[at]), _LEAST), float(edges[at]), by) if worst[at] < math.inf else _NOWHERE
+        return _Around(float(worst[at]), float(edges[at]), by) if worst[at] < math.inf else _NOWHERE
 
     def _corners(self, level: float) -> list[Corner] | None:
         """The inequality at the corners of all cells; None where something has no finite model, or may leave its
-        bounds."""
+        bounds, or no ball can show anything."""
+        if self.cuts is None:
+            return None
         P, J = self.problem.V.P, ball_around(self.problem, self.T, level)
         reach = np.minimum(np.linalg.norm(J, axis=1), np.sqrt(level * np.diag(np.linalg.inv(P))) * _WIDER)
         found = []
