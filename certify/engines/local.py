@@ -19,8 +19,9 @@ from certify.certificate import LocalBall
 from certify.claims import Problem
 from certify.engines.cells import cut, cuts_for
 from certify.engines.decrease import NOT_SHOWN, Corner, Multipliers, Shown, best_at, corners_of, rests_of
-from certify.engines.models import Paths, paths
+from certify.engines.models import Models, Paths, paths
 from certify.engines.steps import Cell, Steps, steps_of
+from certify.lyapunov import extents
 
 Array = NDArray[np.float64]
 _LEAST = 1e-280  # a level, below which binary64 holds nothing more
@@ -54,7 +55,7 @@ def prove_local(
     ------
     InputError : the network is larger than the checker's local rule allows.
     """
-    rule = _Rule.of(problem, T, steps_of(known or paths(problem.loop), True, _order(problem)))
+    rule = Rule.at_rest(problem, T, known)
     if rule.cuts is None:
         return None
     return _largest(lambda level: rule.shown(level, _ENOUGH).margin > _MARGIN, limit, until)
@@ -81,7 +82,7 @@ def prove_band(
     ------
     InputError : the network is larger than the checker's local rule allows.
     """
-    rule = _Rule.of(problem, T, steps_of(known or paths(problem.loop, resting=False), False, _order(problem)))
+    rule = Rule.anywhere(problem, T, known)
     if rule.cuts is None:
         return None
     floors: dict[float, float] = {}
@@ -103,7 +104,7 @@ def prove_band(
 
 def local_margin(problem: Problem, T: Array, level: float, known: Paths) -> float:
     """Share of the decay that the remainder leaves on {V <= level}; positive means that V falls there."""
-    return _Rule.of(problem, T, steps_of(known, True, _order(problem))).shown(level).margin
+    return Rule.at_rest(problem, T, known).shown(level).margin
 
 
 def local_ball(
@@ -111,15 +112,14 @@ def local_ball(
 ) -> tuple[LocalBall, tuple[int, ...]]:
     """The evidence for a level that `prove_local` has found, or a lower one, and into how many parts the range of each
     uncertain quantity is cut for it; with a floor, for both that `prove_band` has found, or a higher floor."""
-    order = _order(problem)
-    known = paths(problem.loop, resting=floor is None)
-    rule = _Rule.of(problem, T, steps_of(known, floor is None, order))
     if floor is None:
+        rule = Rule.at_rest(problem, T)
         by, edge = rule.shown(level).multipliers, 0.0
     else:
+        rule = Rule.anywhere(problem, T)
         found = rule.around(level)
         by, edge = found.multipliers, found.edge
-    return LocalBall(ball_around(problem, T, level), by.rows, by.weight, edge, order), rule.cuts or (1,) * len(problem.loop.system.ranges)
+    return LocalBall(ball_around(problem, T, level), by.rows, by.weight, edge, rule.steps.order), rule.cuts or (1,) * len(problem.loop.system.ranges)
 
 
 def ball_around(problem: Problem, T: Array, level: float) -> Array:
@@ -141,8 +141,8 @@ _NOWHERE = _Around(math.inf, 0.0, NOT_SHOWN.multipliers)
 
 
 @dataclass(frozen=True, slots=True)
-class _Rule:
-    """The rule `local` on balls of one shape."""
+class Rule:
+    """The rule `local` on balls of one shape; `cuts` is None where it can show nothing on any."""
 
     problem: Problem
     T: Array
@@ -152,7 +152,17 @@ class _Rule:
     R: Array | None
 
     @classmethod
-    def of(cls, problem: Problem, T: Array, steps: Steps) -> _Rule:
+    def at_rest(cls, problem: Problem, T: Array, known: Paths | None = None) -> Rule:
+        """For a loop that rests at the origin; `known` are its paths, if they are there already."""
+        return cls._of(problem, T, steps_of(known or paths(problem.loop), True, _order(problem)))
+
+    @classmethod
+    def anywhere(cls, problem: Problem, T: Array, known: Paths | None = None) -> Rule:
+        """For one that need not."""
+        return cls._of(problem, T, steps_of(known or paths(problem.loop, resting=False), False, _order(problem)))
+
+    @classmethod
+    def _of(cls, problem: Problem, T: Array, steps: Steps) -> Rule:
         """With as many cells as it takes."""
         R = 2 * problem.rate * problem.V.P if problem.rate else None
         with np.errstate(all="ignore"):
@@ -169,10 +179,10 @@ class _Rule:
     def around(self, level: float) -> _Around:
         """The least floor on the ball of a level, with its edge."""
         with np.errstate(all="ignore"):
+            J = ball_around(self.problem, self.T, level)
             corners, best, edge = self._corners(level), _NOWHERE, 0.0
             if corners is None:
                 return best
-            J = ball_around(self.problem, self.T, level)
             V = J.T @ self.problem.V.P @ J
             for _ in range(_ROUNDS):
                 found = best_at([replace(c, decay=c.decay - edge * V) for c in corners])
@@ -202,18 +212,21 @@ class _Rule:
         at = int(np.argmin(worst))
         return _Around(float(worst[at]), float(edges[at]), by) if worst[at] < math.inf else _NOWHERE
 
+    def models(self, J: Array, level: float) -> list[Models]:
+        """Of a step on a ball that holds {V <= level}, in each cell."""
+        reach = np.minimum(np.linalg.norm(J, axis=1), extents(self.problem.V.P, level) * _WIDER)
+        return self.steps.models(J, self.cells, reach)
+
     def _corners(self, level: float) -> list[Corner] | None:
         """The inequality at the corners of all cells; None where something has no finite model, or may leave its
-        bounds, or no ball can show anything."""
+        bounds."""
         if self.cuts is None:
             return None
-        P, J = self.problem.V.P, ball_around(self.problem, self.T, level)
-        reach = np.minimum(np.linalg.norm(J, axis=1), np.sqrt(level * np.diag(np.linalg.inv(P))) * _WIDER)
-        found = []
-        for models in self.steps.models(J, self.cells, reach):
+        J, found = ball_around(self.problem, self.T, level), list[Corner]()
+        for models in self.models(J, level):
             if not (models.finite and models.admitted):
                 return None
-            found += corners_of(models, J, P, self.R, self.steps.longest)
+            found += corners_of(models, J, self.problem.V.P, self.R, self.steps.longest)
         return found
 
 
