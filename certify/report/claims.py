@@ -1,8 +1,8 @@
 """Each kind of claim in words.
 
 A claim's words have places, `$name`, for what depends on how time passes in the loop and on the claimed rate
-(timing.py), and places in braces for its numbers. So there is one set of words for each kind of claim, and none for each
-combination; what is said of a loop in continuous time without a rate has nothing left over from the others.
+(timing.py), and places in braces for its numbers. So there is one set of words for each kind of claim, and none for
+each combination; what is said of a loop in continuous time without a rate has nothing left over from the others.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 
 from certify.errors import CertificateFormatError
 from certify.report.timing import PLAIN, Timing
-from certify.report.words import exact_number
+from certify.report.words import PRACTICAL, exact_number
 
 Part = tuple[str, str, str]
 
@@ -22,7 +22,8 @@ Part = tuple[str, str, str]
 @dataclass(frozen=True, slots=True)
 class Words:
     """One kind of claim in words. In texts, {inner} and {outer} stand for its levels in digits, {duration} for how long
-    its tube is, {centre} for the state that it begins around, {speed} for what a rate says (Timing.speed).
+    its tube is, {centre} for the state that it begins around, {speed} for what a rate says (Timing.speed),
+    {constant} for the words that ask what is uncertain to be constant.
 
     Parameters
     ----------
@@ -107,7 +108,7 @@ CLAIMS: Mapping[str, Words] = {
         headline="from {{V <= {outer}}} every trajectory enters {{V <= {inner}}} and $there; nothing is said of "
         "the origin$over{speed}",
         meaning="from which every trajectory enters the green set and $there",
-        decay="That V falls below c₀ $within and stays there$instants is {word}; $later is not.$between",
+        decay="That V falls below c₀ $within and stays there$instants is {word}; $later is not.$kept",
         simulated="stay in the domain and enter {V ≤ c₀}",
         settles="enter {V ≤ c₀}",
         runs="trajectories that enter",
@@ -131,8 +132,40 @@ CLAIMS: Mapping[str, Words] = {
 
 
 _ASYMPTOTIC = CLAIMS["asymptotic"]
+_PRACTICAL = CLAIMS["practical"]
 CLAIMS = {
     **CLAIMS,
+    "nearby": replace(
+        _PRACTICAL,
+        title="A nearby equilibrium",
+        statement=_PRACTICAL.statement.split(" That is all:")[0] + " And {constant}there is exactly one equilibrium in "
+        "the smaller set, and every one of these trajectories converges to it. Of what else happens inside the smaller "
+        "set nothing is said.",
+        headline="from {{V <= {outer}}} every trajectory enters {{V <= {inner}}} and $there; there it converges to the "
+        "one equilibrium in it{constant}$over{speed}",
+        parts=(
+            *_PRACTICAL.parts,
+            (
+                "Contraction",
+                "2(x − y)′P(F(x) − F(y)) < 0 for all x other than y with V(x) ≤ c₀ and V(y) ≤ c₀",
+                "by models of the closed loop, with Lipschitz constants of what they leave out, on a ball that "
+                "contains {V ≤ c₀}",
+            ),
+        ),
+        excluded=(
+            (
+                "Where the equilibrium is.",
+                "It lies in {V ≤ c₀}. Where in it, and how it depends on what is uncertain, is not stated; the origin "
+                "need not be one.",
+            ),
+            (
+                "Anything else inside {V ≤ c₀}.",
+                "Where something uncertain changes with time, trajectories end up in this set and remain there, "
+                "whatever they do in it.",
+            ),
+            _PRACTICAL.excluded[-1],
+        ),
+    ),
     "enlarged": replace(
         _ASYMPTOTIC,
         statement=_ASYMPTOTIC.statement + " Every trajectory that starts in the ellipsoid {{x′P₀x ≤ 1}}, the start of "
@@ -244,7 +277,7 @@ def words_for(kind: str, timing: Timing = PLAIN, *, ball: bool = False) -> Words
 
 def _with_ball(kind: str, parts: tuple[Part, ...], ball: bool) -> tuple[Part, ...]:
     """The parts of a practical claim whose ring ends at a ball around its inner set."""
-    if kind != "practical" or not ball:
+    if kind not in PRACTICAL or not ball:
         return parts
     return tuple(one for part in parts for one in ((_AROUND_A_LEVEL, RING) if part[0] == "Ring" else (part,)))
 
@@ -261,7 +294,7 @@ def _in_steps(kind: str, parts: tuple[Part, ...], timing: Timing) -> Iterator[Pa
                 f"{exact_number(timing.sample[1])} s and stays strictly inside the domain",
                 "by an enclosure of it on each of the sets below",
             )
-        if part[0] == "Ring" and kind == "practical" and not timing.is_plain:
+        if part[0] == "Ring" and kind in PRACTICAL and not timing.is_plain:
             yield ("Inner set", f"V({after}) < c₀ for all x with V(x) ≤ c₀$every", "with the parts above")
 
 

@@ -457,6 +457,7 @@ def _claim(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict[s
         duration=_duration(certificate),
         centre=_centre(certificate),
         speed=timing.speed(inner_of(certificate) if practical else None, certificate.roa) if drawable else "",
+        constant="where what is uncertain is constant in time, " if system.ranges else "",
     )
     return {
         "statement": stated_for(varying_in(system), statement, by_steps=timing.discrete),

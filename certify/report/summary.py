@@ -15,6 +15,7 @@ from certify.report.limits import limited_by
 from certify.report.timing import Timing, reach_time
 from certify.report.words import (
     ABSENT,
+    PRACTICAL,
     Varying,
     above,
     at_rest,
@@ -102,6 +103,7 @@ def _headline(result: Mapping[str, Any], verdict: str) -> str:
             outer=below(level),
             inner="?" if inner is None else inner_level(kind, inner),
             speed=Timing.of_result(result).headline_rate(),
+            constant=", where what is uncertain is constant in time" if result.get("uncertain") else "",
         )
         word = ", if the solver is right: nothing checked its answers" if verdict == "TRUSTED" else ""
         return f"{name}: {_whatever(result)}{stated}{word}"
@@ -155,7 +157,7 @@ def _rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
         rows.append(("rate", _rate(result, timing) if shown else f"asked for {timing.shown_rate}"))
     kind, inner = _kind(result), _inner(result)
     words = _words(result)
-    local = levels.get("local") if kind == "practical" else None
+    local = levels.get("local") if kind in PRACTICAL else None
     known = [
         (f"{words.inner_word} {normalize('NFKC', words.inner)}", "" if inner is None else inner_level(kind, inner)),
         ("local c1", _level(local) if local != inner else ""),
@@ -203,7 +205,7 @@ def _rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
     if result.get("eigenvalues"):
         held = " (at the nominal values)" if result.get("uncertain") else ""
         rows.append(("eigenvalues", ", ".join(map(str, result["eigenvalues"])) + held))
-    whole = levels.get("local") if kind != "practical" or local != inner else None
+    whole = levels.get("local") if kind not in PRACTICAL or local != inner else None
     if shown and whole is not None and whole == levels.get("roa"):
         rows.append(("work", f"{result['boxes']:,} boxes; the local part covers the whole set and no leaf is needed"))
     elif result.get("boxes"):
@@ -228,7 +230,7 @@ def _functions(timing: Timing) -> str:
 
 def _rate(result: Mapping[str, Any], timing: Timing) -> str:
     """What the rate says of the time, rounded up."""
-    floor = result["levels"].get("floor") if _kind(result) == "practical" else None
+    floor = result["levels"].get("floor") if _kind(result) in PRACTICAL else None
     latest = reach_time(timing, floor, result["levels"].get("roa"))
     what = "V at most 1 % of what it was" if floor is None else "in {V <= c0}"
     when = f"after {ABSENT if latest is None else above(latest)} {timing.unit} at the latest"

@@ -38,7 +38,7 @@ class Timing:
 
     @classmethod
     def of_result(cls, result: Mapping[str, Any]) -> Timing:
-        """Of the object that `certify roa --json` prints; what it does not say is continuous, at once, without a rate."""
+        """Of the object that `certify roa --json` prints; what it does not say is as it always was."""
         claim = result.get("claim") or {}
         sample = claim.get("sample")
         ends = None if sample is None else (Fraction(sample[0]), Fraction(sample[1]))
@@ -166,17 +166,36 @@ class Timing:
         """The times at which a claim holds."""
         if self.is_plain:
             return {
-                "begins": "", "stays": "stays in it for all time", "also": " and", "enters": "enters the smaller set",
-                "by": "in finite time", "remains": "stays there", "there": "stays there", "at": "", "over": "",
-                "instants": "", "between": "", "unique": ": solutions exist and are unique",
-            }  # fmt: skip
+                "begins": "",
+                "stays": "stays in it for all time",
+                "also": " and",
+                "enters": "enters the smaller set",
+                "by": "in finite time",
+                "remains": "stays there",
+                "there": "stays there",
+                "at": "",
+                "over": "",
+                "instants": "",
+                "between": "",
+                "kept": "",
+                "unique": ": solutions exist and are unique",
+            }
         if self.discrete:
             return {
-                "begins": "", "stays": "is in it at every later step", "also": ", and", "enters": "is in the smaller set",
-                "by": "after finitely many steps", "remains": "is there at every step",
-                "there": "is there at every step from then on", "at": " at every step", "over": "",
-                "instants": " step by step", "between": "", "unique": "",
-            }  # fmt: skip
+                "begins": "",
+                "stays": "is in it at every later step",
+                "also": ", and",
+                "enters": "is in the smaller set",
+                "by": "after finitely many steps",
+                "remains": "is there at every step",
+                "there": "is there at every step from then on",
+                "at": " at every step",
+                "over": "",
+                "instants": " step by step",
+                "between": "",
+                "kept": "",
+                "unique": "",
+            }
         always = self.from_zero
         return {
             "begins": " at a sampling instant",
@@ -192,6 +211,7 @@ class Timing:
             "over": f", its input held over {self.periods}",
             "instants": "" if always else " from one sampling instant to the next",
             "between": f" Between two instants V {'stays below its value at the first' if always else 'may rise'}.",
+            "kept": f" Between two instants V {'stays below its value at the first, or c₀' if always else 'may rise'}.",
             "unique": ": between two sampling instants solutions are unique",
         }
 
@@ -199,12 +219,15 @@ class Timing:
         """What is said of the speed."""
         if not self.rate:
             return {
-                "fall": f"{self.derivative}(x) < 0", "fast": "", "slow": "; how fast is not",
-                "within": "in finite time", "later": "how soon, and what V does below c₀,",
-                "speed": "Speed and cost.", "converge": "Trajectories converge; how fast, and at what cost, is not part "
-                "of the claim.", "finite": "The time to reach {V ≤ c₀} is finite; how long, and at what cost, is not "
-                "stated.",
-            }  # fmt: skip
+                "fall": f"{self.derivative}(x) < 0",
+                "fast": "",
+                "slow": "; how fast is not",
+                "within": "in finite time",
+                "later": "how soon, and what V does below c₀,",
+                "speed": "Speed and cost.",
+                "converge": "Trajectories converge; how fast, and at what cost, is not part of the claim.",
+                "finite": "The time to reach {V ≤ c₀} is finite; how long, and at what cost, is not stated.",
+            }
         at_least = f"at least as fast as e^(−2λt) with λ = {self.shown_rate}"
         return {
             "fall": f"{self.derivative}(x) + 2λV(x) < 0",
@@ -235,8 +258,8 @@ class Timing:
         if inner is not None:
             return f"{said}it is there {when.format(f'ln(c₂/c₀)/(2λ){value}')}."
         return (
-            f"{said}V is at most 1 % of what it was {when.format(f'ln(100)/(2λ){value}')}, and what starts in {{V ≤ c}} "
-            f"is in {{V ≤ c′}} {when.format('ln(c/c′)/(2λ)')}."
+            f"{said}V is at most 1 % of what it was {when.format(f'ln(100)/(2λ){value}')}, and what starts in "
+            f"{{V ≤ c}} is in {{V ≤ c′}} {when.format('ln(c/c′)/(2λ)')}."
         )
 
     def _bound(self, *, all_times: bool) -> tuple[str, str]:

@@ -1,7 +1,8 @@
 """What a report says, and how: names, units, ranges and numbers as people read them.
 
-Shared by the terminal summary, the figures and the page; the words of each claim are in claims.py. Numbers are rounded in a direction wherever a reader could
-take them for a bound: `below` what is claimed of a set, `above` what contains it.
+Shared by the terminal summary, the figures and the page; the words of each claim are in claims.py. Numbers are rounded
+in a direction wherever a reader could take them for a bound: `below` what is claimed of a set, `above` what contains
+it.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ _GREEK = {name: unicodedata.lookup(f"GREEK SMALL LETTER {name}") for name in _LE
 _SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 _SUPERSCRIPTS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 _DOT = "\u0307"
+PRACTICAL = frozenset({"practical", "nearby"})
+"""The claims whose inner set is the one in which trajectories end."""
 
 
 def symbol(name: str) -> str:
@@ -277,4 +280,4 @@ def seconds(value: float | None) -> str:
 
 def inner_level(kind: str, value: float | Fraction, digits: int = 6) -> str:
     """The inner level rounded to the safe side: down where something is claimed inside it, up where outside."""
-    return above(value, digits) if kind == "practical" else below(value, digits)
+    return above(value, digits) if kind in PRACTICAL else below(value, digits)

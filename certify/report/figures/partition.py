@@ -35,7 +35,8 @@ def partition(scene: Scene, leaves: Leaves) -> Picture:
     asked = (
         f"On each blue one the checker {shown} {scene.timing.decrease} < 0{always}; the others lie outside the ring "
         "between the two levels."
-    )return Picture(
+    )
+    return Picture(
         "The leaf partition",
         f"The {_count(len(leaves[0]))} of the certificate, {where}. {asked}",
         to_svg(figure),
