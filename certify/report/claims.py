@@ -108,7 +108,7 @@ CLAIMS: Mapping[str, Words] = {
         headline="from {{V <= {outer}}} every trajectory enters {{V <= {inner}}} and $there; nothing is said of "
         "the origin$over{speed}",
         meaning="from which every trajectory enters the green set and $there",
-        decay="That V falls below c₀ $within and stays there$instants is {word}; $later is not.$kept",
+        decay="That V falls below c₀ $within and stays there$always is {word}; $later is not.$kept",
         simulated="stay in the domain and enter {V ≤ c₀}",
         settles="enter {V ≤ c₀}",
         runs="trajectories that enter",

@@ -128,6 +128,11 @@ class Timing:
         )
 
     @property
+    def simulated(self) -> Timing:
+        """What pictures show of several periods: the longest."""
+        return self if self.sample is None else Timing(sample=(self.sample[1], self.sample[1]), rate=self.rate)
+
+    @property
     def definitions(self) -> str:
         """What D and lambda are, those of them that conditions speak of."""
         rate = f"λ = {self.shown_rate} is the rate, rounded down here." if self.rate else ""
@@ -176,6 +181,7 @@ class Timing:
                 "at": "",
                 "over": "",
                 "instants": "",
+                "always": "",
                 "between": "",
                 "kept": "",
                 "unique": ": solutions exist and are unique",
@@ -192,6 +198,7 @@ class Timing:
                 "at": " at every step",
                 "over": "",
                 "instants": " step by step",
+                "always": " at every step",
                 "between": "",
                 "kept": "",
                 "unique": "",
@@ -208,7 +215,8 @@ class Timing:
             "remains": f"is there at {'all times' if always else 'every one'}",
             "there": f"is there at {'all times' if always else 'every sampling instant'} from then on",
             "at": " from each sampling instant on" if always else " at sampling instants",
-            "over": f", its input held over {self.periods}",
+            "over": f", the input held over {self.periods}",
+            "always": "" if always else " at every sampling instant",
             "instants": "" if always else " from one sampling instant to the next",
             "between": f" Between two instants V {'stays below its value at the first' if always else 'may rise'}.",
             "kept": f" Between two instants V {'stays below its value at the first, or c₀' if always else 'may rise'}.",
@@ -254,12 +262,12 @@ class Timing:
         time = self.time_to_fall(_PERCENT if inner is None else Fraction(outer) / Fraction(inner))
         value = f" = {above(time)} {self.unit}" if math.isfinite(time) else ""
         until = "" if inner is None else " until it is in the smaller set"
-        said = f" On the way {bound}{until}, with λ = {self.shown_rate}: "
+        said = f" Moreover {bound}{until}, with λ = {self.shown_rate}: "
         if inner is not None:
             return f"{said}it is there {when.format(f'ln(c₂/c₀)/(2λ){value}')}."
         return (
-            f"{said}V is at most 1 % of what it was {when.format(f'ln(100)/(2λ){value}')}, and what starts in "
-            f"{{V ≤ c}} is in {{V ≤ c′}} {when.format('ln(c/c′)/(2λ)')}."
+            f"{said}V is at most 1 % of what it was {when.format(f'ln(100)/(2λ){value}')}, and for "
+            f"c′ < c ≤ c₂ what starts in {{V ≤ c}} is in {{V ≤ c′}} {when.format('ln(c/c′)/(2λ)')}."
         )
 
     def _bound(self, *, all_times: bool) -> tuple[str, str]:

@@ -20,7 +20,7 @@ def decay(scene: Scene, paths: NDArray[np.float64], step: float) -> Picture:
     else:  # the claim is about V at the dots
         apart = scene.flow.steps_between(step)
         axes.semilogy(time, np.maximum(V, 1e-300), color=SIMULATED, lw=0.5, ls=":" if scene.timing.discrete else "-")
-        axes.semilogy(time[::apart], np.maximum(V[::apart], 1e-300), ".", ms=2.5, color=SIMULATED)
+        axes.semilogy(time[::apart], np.maximum(V[::apart], 1e-300), ".", ms=2.5, color=SIMULATED, rasterized=True)
     axes.axhline(scene.outer, color=SET, lw=1.4)
     if scene.inner < scene.outer:
         axes.axhline(scene.inner, color=INNER, lw=1.4)

@@ -37,7 +37,7 @@ def line_figure(scene: Scene, roa: SimulatedRoa | None) -> Picture:
         f"Shaded: the {scene.word} interval, {scene.meaning}{wider}. The curve of {scene.timing.derivative} and the "
         f"interval of the runs that "
         f"{scene.words.settles} come from floating point and simulation{scene.held}; they are not proved. "
-        f"{scene.timing.definition}".rstrip(),
+        f"{scene.timing.simulated.definition}".rstrip(),
         to_svg(figure),
         simulated=True,
         wide=True,

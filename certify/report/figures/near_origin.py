@@ -32,11 +32,12 @@ def near_origin(scene: Scene) -> Picture:
     axes.set_ylabel(scene.labels[1])
     around = "" if leaves is None else " Around it the innermost leaves (blue)."
     inner = f"{{V ≤ {inner_level(scene.kind, scene.inner, 3)}}}"
-    keeps = "and do not leave" if scene.timing.is_plain or scene.timing.from_zero else f"and {scene.there}"
+    keeps = "which trajectories enter and do not leave"
+    if not scene.timing.is_plain:
+        keeps = f"which every trajectory enters and in which it {scene.there}".replace(" is there at ", " is at ")
     green = {
         "asymptotic": f"Green: the local set {inner}, {scene.word} at all radii at once.",
-        "practical": f"Green: the inner set {inner}, which trajectories enter {keeps}; the dot marks the "
-        "origin, of which nothing is said.",
+        "practical": f"Green: the inner set {inner}, {keeps}; the dot marks the origin, of which nothing is said.",
     }[scene.kind]
     return Picture(
         "Near the origin",

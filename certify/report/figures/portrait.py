@@ -25,6 +25,7 @@ from certify.report.figures.style import (
     INNER,
     INNER_FILL,
     LEAVING,
+    RASTER_FROM,
     REGION,
     SET,
     SET_FILL,
@@ -90,7 +91,7 @@ def portraits(scene: Scene, runs: Runs, region: Region | None) -> list[Picture]:
         if growing and scene.start is not None:
             sign = "V need not fall outside the blue set: along the tube another function does. "
         sign += "The dots are steps; lines only join them. " if scene.timing.discrete else ""
-        sign += f"{scene.timing.definition} " if scene.timing.definition and scene.n == 2 else ""
+        sign += f"{scene.timing.simulated.definition} ".lstrip() if scene.n == 2 else ""
         caption = f"{meaning}{sign}*\N{NO-BREAK SPACE}Simulated or evaluated on a grid{scene.held}, not proved."
         pictures.append(Picture(title, caption, svg, simulated=True, wide=scene.n == 2, legend=legend, about=about))
     return pictures
@@ -183,7 +184,9 @@ def draw_plane(axes: Any, scene: Scene, pair: Pair, runs: Runs, region: Region |
         )
         if scene.timing.discrete:
             points = np.concatenate([np.zeros((0, 2)), *lines])
-            axes.plot(points[:, 0], points[:, 1], ".", ms=2.0, color=colour, zorder=2.5)
+            axes.plot(
+                points[:, 0], points[:, 1], ".", ms=2.0, color=colour, zorder=2.5, rasterized=len(points) > RASTER_FROM
+            )
         _arrows(axes, lines, colour, size)
     if region is not None:
         axes.contour(
