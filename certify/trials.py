@@ -84,7 +84,8 @@ def trial(loop: ClosedLoop, P: Array, name: str, options: RoaOptions, notice: st
     if P.shape != (n, n) or not is_positive_definite(P):
         raise InputError(f"`P` must be a symmetric positive definite matrix of shape ({n}, {n}).")
     require_short(P)
-    problem, T = Problem(loop, Quadratic(P)), diagonalising_coordinates(P, loop.mean_rate(), loop.step)
+    problem = Problem(loop, Quadratic(P), options.rate)
+    T = diagonalising_coordinates(P, loop.mean_rate(), loop.step)
     limit = domain_limit(P, loop.system.domain)
     level = options.level or limit * (1 - _BELOW)
     if not _SMALLEST < level < 1 / _SMALLEST:

@@ -1,6 +1,6 @@
 """The closed loop on a ball, ||d|| <= 1: every quantity as a jet over d (jets.py).
 
-At rest x = J d, around the origin, where F is 0. Along a path the last entry of d is the motion of the ball's middle
+Around the origin x = J d; there F is 0 at rest. Along a path the last entry of d is the motion of the ball's middle
 on a line: x = m + J z + w sigma, d = (z, sigma).
 """
 
@@ -18,7 +18,7 @@ from .document import Intervals
 from .elementary import elementary
 from .expression import evaluate
 from .float64 import EPS, Array, ends, float_with_error, frobenius, gamma, norm, total, up, within
-from .jets import Jet, constant, each, tensor_norm, triples, uncertain, widen
+from .jets import Jet, between, constant, each, tensor_norm, triples, uncertain, widen
 from .network import Folded
 
 _MOST_JETS = 2**26  # numbers in the matrices and tensors of all jets
@@ -50,8 +50,24 @@ class Ball:
 
     @property
     def motion(self) -> tuple[list[Fraction], list[Fraction]] | None:
-        """m and w of a ball along a path, n numbers each; None at rest."""
+        """m and w of a ball along a path, n numbers each; None around the origin."""
         return None
+
+    @property
+    def starts_at_u_eq(self) -> bool:
+        """Whether the inputs at d = 0 are u_eq: by form, or by rule `centring`."""
+        return self.motion is None and (self.case.c.policy.centre != "none" or not self.case.c.practical)
+
+    @property
+    def order(self) -> int:
+        """Of the series in time."""
+        return 1
+
+    @property
+    def count(self) -> int:
+        """How many numbers y there are: one for each quantity that is uncertain, one for the period if that is."""
+        lo, hi = self.case.c.sample or (0, 0)
+        return len(self.case.c.ranges) + (lo < hi)
 
     @cached_property
     def states(self) -> list[Jet]:
@@ -59,7 +75,7 @@ class Ball:
         n, still = len(self.J), self.motion is None
         m, w = ([Fraction(0)] * n, [Fraction(0)] * n) if self.motion is None else self.motion
         k = n if still else n + 1
-        nothing = constant(Fraction(0), np.zeros((0, k, k)))
+        nothing = constant(Fraction(0), np.zeros((0, k, k)), self.count)
         jets = []
         for row, at, by in zip(self.J, m, w, strict=True):
             (c, error), (step, slack) = float_with_error(at), float_with_error(by)
@@ -80,10 +96,9 @@ class Ball:
 
     @cached_property
     def inputs(self) -> list[Jet]:
-        """pi(x) on the ball, before it is clipped, each with its own error. At rest its value at d = 0 is u_eq by
-        form."""
+        """pi(x) on the ball, before it is clipped, each with its own error."""
         net, h, U = self.case.net, self.outputs, self.units.shares
-        if self.motion is None:
+        if self.starts_at_u_eq:
             values = [float_with_error(u) for u in self.case.c.u_eq]
         else:
             parts = zip(h.c, h.error, net.scale.tolist(), net.offset.tolist(), net.offset_error.tolist(), strict=True)
@@ -92,16 +107,38 @@ class Ball:
         k, column = np.abs(net.scale), net.scale[:, None]
         a, slack = column * h.a, up(k * h.slack + EPS * (k * h.slope))
         E = widen(np.zeros_like(h.E), EPS * (k * h.spread) + h.faint)
-        batch = Jet(c, error, a, slack, each(net.scale) * h.Q, column * h.K, E, np.eye(len(c)), U)
+        of_y = np.zeros((len(c), self.count)), np.zeros((len(c), self.count, a.shape[1]))
+        lip = up(k * h.lip + 2 * EPS * (k * h.bend))
+        batch = Jet(c, error, a, slack, each(net.scale) * h.Q, column * h.K, E, np.eye(len(c)), U, *of_y, lip)
         return batch.members
 
+    def constant(self, q: Fraction) -> Jet:
+        """A rational among the jets of this ball."""
+        return constant(q, self.units.shares, self.count)
+
     def F(self, cell: Intervals = ()) -> list[Jet]:
-        """The components of F on the ball, enclosed for all values of the uncertain quantities in a cell. At rest
-        F(0) = 0, of which these jets know no more than that 0 is near."""
+        """The components of F on the ball, for all values of the uncertain quantities in a cell. At rest F(0) = 0, of
+        which these jets know no more than that 0 is near."""
+        return self.f(self.states, self.symbols(cell))
+
+    def f(self, states: Sequence[Jet], quantities: Sequence[Jet]) -> list[Jet]:
+        """f(x, pi(x), q) at such states and quantities."""
+        return evaluate(self.case.c.dynamics, self.constant, [*self.shared(states), *self.inputs, *quantities])
+
+    def shared(self, states: Sequence[Jet]) -> list[Jet]:
+        """States among the jets that know the inputs' errors."""
         U = self.units.shares
-        states = [replace(x, B=np.zeros(len(U)), U=U) for x in self.states]
-        quantities = [uncertain(lo, hi, U) for lo, hi in cell]
-        return evaluate(self.case.c.dynamics, lambda q: constant(q, U), [*states, *self.inputs, *quantities])
+        return [replace(x, B=np.zeros(len(U)), U=U) for x in states]
+
+    def symbols(self, cell: Intervals) -> list[Jet]:
+        """The uncertain quantities of a cell, as the numbers y have them."""
+        U = self.units.shares
+        return [uncertain(lo, hi, U, j, self.count) for j, (lo, hi) in enumerate(cell)]
+
+    @property
+    def ranges(self) -> list[Jet]:
+        """The uncertain quantities, of which only their whole ranges are known."""
+        return [between(lo, hi, self.units.shares, self.count) for lo, hi in self.case.c.ranges]
 
 
 def _affine(h: float, error: float, scale: float, offset: float, offset_error: float) -> tuple[float, float]:
@@ -114,7 +151,8 @@ def _affine(h: float, error: float, scale: float, offset: float, offset_error: f
 def fits(ball: Ball) -> Failures:
     """The jets take neither too much memory nor too much time."""
     symbols = len(ball.J) + (ball.motion is not None)
-    yield from too_large(ball.case.net, len(ball.case.c.dynamics.operations), symbols)
+    operations = len(ball.case.c.dynamics.operations) * ball.order**2 * (1 + ball.count)
+    yield from too_large(ball.case.net, operations, symbols)
     return 0
 
 
@@ -168,7 +206,7 @@ def enclose_on_ball(net: Folded, states: Sequence[Jet]) -> Jet:
     error = np.array([x.error for x in states])[:, None]
     doubt = np.full(k, norm(np.array([x.slack for x in states]), 0))
     H, C, R = np.zeros((0, k, k)), np.zeros((0, len(triples(k)[0]))), np.zeros((0, k, k))
-    sizes = np.zeros(0)
+    sizes = steep = lips = np.zeros(0)
     for number, layer in enumerate(net.layers):
         y, rounding = layer.affine(y)
         error = up(layer.widest(error) + rounding)
@@ -181,8 +219,10 @@ def enclose_on_ball(net: Folded, states: Sequence[Jet]) -> Jet:
         Q = np.tensordot(B, H, 1)
         lost = total(doubt[k:] * sizes + (gamma(count) + EPS) * (np.abs(B) * sizes), 1)
         E = widen(np.zeros_like(Q), lost)
+        lip = total(np.abs(B) * lips + (doubt[k:] + (gamma(count) + EPS) * np.abs(B)) * steep, 1)
         slack = np.full(len(a), norm(doubt[:k], 0))
-        value = Jet(y[:, 0, 0], error[:, 0], a, slack, (Q + Q.swapaxes(1, 2)) / 2, B @ C, E, B, R)
+        of_y = np.zeros((len(a), 0)), np.zeros((len(a), 0, k))  # a policy knows nothing of what is uncertain
+        value = Jet(y[:, 0, 0], error[:, 0], a, slack, (Q + Q.swapaxes(1, 2)) / 2, B @ C, E, B, R, *of_y, lip)
         if number == len(net.layers) - 1:
             break
         phi = elementary("tanh", value.c, value.error, value.radius)
@@ -190,6 +230,8 @@ def enclose_on_ball(net: Folded, states: Sequence[Jet]) -> Jet:
         added = value.beyond_tangent(phi)
         H, C, R = (np.concatenate(pair) for pair in zip((H, C, R), added, strict=True))
         sizes = up(frobenius(H) + tensor_norm(C, k) + frobenius(R))
+        lips = np.concatenate([lips, value.lip_beyond_tangent(phi)])
+        steep = up(2 * frobenius(H) + lips)
         doubt = up(np.max(up(slope + wrong)) * doubt + (np.max(wrong) + EPS) * norm(X, 0))
         y, error, X = t[:, None, None], e[:, None], slope[:, None] * X
     return value.function("tanh") if net.squash else value

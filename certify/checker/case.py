@@ -12,6 +12,7 @@ from flint import fmpq_mat
 
 from .document import Certificate, Intervals, LocalBall, Partition, Slab
 from .exact import exactly, gershgorin_lower, inverse_diagonal
+from .float64 import float_with_error, up
 from .network import Folded, fold
 
 Failures = Generator[tuple[str, str], None, int]  # what a rule makes: each failure's (place, detail); how much it met
@@ -45,6 +46,17 @@ class Case:
             for (lo, hi), count in zip(self.c.ranges, self.partition.cells, strict=True)
         ]
         return product(*cut)
+
+    @property
+    def covered(self) -> bool:
+        """Whether there is a local ball, so that nothing is asked of leaves inside {V < c1}."""
+        return self.partition.local is not None
+
+    @property
+    def longest(self) -> float:
+        """At or above the longest period."""
+        value, error = float_with_error(self.c.step)
+        return float(up(value + error))
 
     @property
     def tube(self) -> tuple[Slab, ...]:

@@ -1,14 +1,18 @@
-"""The matrix inequality of rules `local` and `tube`: that d'J'RJ d + 2 d'J'P F(J d) < 0 for 0 < ||d|| <= 1, or, along a
-path, z'J'RJ z + 2 z'J'P (F - v) < 0 where z'J'PJ z = 1.
+"""The matrix inequality of rules `local` and `tube`: that d'J'RJ d + 2 d'J'P G + h G'P G < 0 for 0 < ||d|| <= 1 at
+rest, that this and k (V - c0) is negative around a level c0, or, along a path, z'J'RJ z + 2 z'J'P (F - v) < 0 where
+z'J'PJ z = 1.
 
-The models of F come with their rounding errors bounded (ball.py); what follows from them is in rationals, so that no
-rounding has to be thought of, but for the two sums of many terms (pairs.py). FORMAT.md has the inequality, its five
-sums, and why each of them is a bound.
+The models of G come with their rounding errors bounded (ball.py); what follows from them is in rationals, so that no
+rounding has to be thought of, but for the sums of many terms (pairs.py, `beyond`). FORMAT.md has the inequality, its
+six sums, and why each of them is a bound.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from copy import copy
+from dataclasses import dataclass
+from itertools import product
 
 import numpy as np
 from flint import fmpq, fmpq_mat
@@ -16,28 +20,50 @@ from flint import fmpq, fmpq_mat
 from .ball import Units
 from .document import Multipliers, Path
 from .exact import exactly, is_definite, root_above
-from .float64 import EPS, Array, gamma, norm, total, up
-from .jets import Jet, unpacked
+from .float64 import EPS, Array, frobenius, gamma, norm, total, up
+from .jets import Jet, triples, unpacked
 from .pairs import bound_of_pairs, in_binary64
+
+_NOTHING = fmpq(0)
+
+
+@dataclass(frozen=True)
+class Level:
+    """c0, and the multiplier of V - c0."""
+
+    c0: fmpq
+    edge: fmpq
 
 
 class Models:
-    """F - v on a ball: `f_i + a_i.d + d'Q_i d + K_i[d] + sum_jq B_ij L_jq e_q + r_i`, (f_i, a_i) within s_i,
-    |r_i| <= d'E_i d; d has k entries. At rest v = 0 and f_i is exactly 0, so that s_i is about a_i alone."""
+    """G on a ball: `f_i + a_i.d + d'Q_i d + K_i[d] + sum_jq B_ij L_jq e_q + r_i`, (f_i, a_i) within s_i, |r_i| <=
+    d'E_i d; d has k entries. Along a path it is F - v. At rest f_i is exactly 0, so that s_i is about a_i alone."""
 
-    def __init__(self, J: Array, F: Sequence[Jet], units: Units, velocity: Sequence[fmpq] | None = None) -> None:
-        """J is (n, n), v the velocity of a path. Parameters are finite; see `are_finite`."""
+    def __init__(self, J: Array, G: Sequence[Jet], units: Units, rest: bool, velocity: Sequence[fmpq] = ()) -> None:
+        """J is (n, n), v the velocity of a path, `rest` says whether G vanishes at d = 0. Parameters are finite; see
+        `are_finite`. Where y is uncertain these are the models at y = 0; see `corners`."""
         self.J, self.units = exactly(J), units
-        self.K, self.twists = np.array([f.K for f in F]), np.array([f.twist for f in F])
-        self.B = exactly(np.array([f.B for f in F]))
-        self.A = exactly(np.array([f.a for f in F]))
-        self.slack = [rational(f.slack) for f in F]
-        self.Q = [exactly(f.Q) for f in F]
-        self.E = [exactly(f.E) for f in F]
-        self.f: list[fmpq] = []
-        if velocity is not None:
-            self.f = [rational(f.c) - v for f, v in zip(F, velocity, strict=True)]
-            self.slack = [s + rational(f.error) for s, f in zip(self.slack, F, strict=True)]
+        self.K, self.twists = np.array([g.K for g in G]), np.array([g.twist for g in G])
+        self.shares = np.array([g.B for g in G])
+        self.B = exactly(self.shares)
+        self.A = exactly(np.array([g.a for g in G]))
+        self.slack = [rational(g.slack) + (0 if rest else rational(g.error)) for g in G]
+        self.Qs, self.Es = np.array([g.Q.ravel() for g in G]), np.array([g.E for g in G])
+        self.Q = [exactly(g.Q) for g in G]
+        self.E = [exactly(g.E) for g in G]
+        self.f = [] if rest else [rational(g.c) - v for g, v in zip(G, velocity or [fmpq(0)] * len(G), strict=True)]
+        self.by_y = [
+            ([rational(g.c_y[j]) for g in G], exactly(np.array([g.a_y[j] for g in G]))) for j in range(len(G[0].c_y))
+        ]
+
+    def corners(self) -> Iterator[Models]:
+        """The models at each y of which all entries are 1 or -1; the one there is where nothing is uncertain."""
+        for signs in product((1, -1), repeat=len(self.by_y)):
+            corner = copy(self)
+            for sign, (c_y, a_y) in zip(signs, self.by_y, strict=True):
+                corner.A = corner.A + sign * a_y
+                corner.f = [f + sign * c for f, c in zip(corner.f, c_y, strict=True)] if self.f else []
+            yield corner
 
 
 def are_usable(by: Multipliers, path: Path | None = None) -> bool:
@@ -61,23 +87,36 @@ def shows(models: Models, P: fmpq_mat, R: fmpq_mat, by: Multipliers, path: Path 
 
 
 def sides(
-    models: Models, P: fmpq_mat, R: fmpq_mat, by: Multipliers, path: Path | None = None
+    models: Models,
+    P: fmpq_mat,
+    R: fmpq_mat,
+    by: Multipliers,
+    path: Path | None = None,
+    h: fmpq = _NOTHING,
+    beyond: fmpq = _NOTHING,
+    level: Level | None = None,
 ) -> tuple[fmpq_mat, fmpq_mat]:
-    """What is negative to first order, with its sign changed, and the sum of all bounds of the rest, both symmetric.
-
-    At rest they are -(J'RJ + B + B') and S over d, (n, n); along a path -M and S over (1, d), (n + 2, n + 2).
+    """What is negative to first order, with its sign changed, and the sum of all bounds of the rest, both symmetric:
+    over d at rest, (n, n), else over y = (1, d). `beyond` is Gamma, used where h > 0.
     """
-    J, k = models.J, models.A.ncols()
-    b = padded(P * J, 0, k - J.ncols())  # b_i is row i, 0 for the motion
-    rows = [fmpq_mat(1, k, [b[i, j] for j in range(k)]) for i in range(b.nrows())]
+    k, first = models.A.ncols(), int(bool(models.f))
+    U = padded(models.J, 0, k - models.J.ncols())  # x as a function of y, or d
+    Y = models.A
+    if first:
+        U, Y = (
+            fmpq_mat([[c, *row] for c, row in zip(column, M.tolist(), strict=True)])
+            for column, M in (([fmpq(0)] * U.nrows(), U), (models.f, Y))
+        )
+    b = P * (U + h * Y)  # b_i is row i
+    rows = [fmpq_mat(1, k, row[first:]) for row in b.tolist()]
+    whole = [root_above(sum((v * v for v in row), fmpq(0))) for row in b.tolist()]
     squares = [row.transpose() * row for row in rows]
     lengths = [root_above((row * row.transpose())[0, 0]) for row in rows]
-    B = b.transpose() * models.A
-    form = padded(J.transpose() * R * J, k - J.ncols(), k - J.ncols()) + B + B.transpose()
+    crossed = U.transpose() * P * Y
+    form = U.transpose() * R * U + crossed + crossed.transpose() + h * (Y.transpose() * P * Y)
     shares = by.joint if path is None else (*by.joint, rational(path.joint))
     rest = fmpq_mat(k, k)
     joint = [fmpq_mat(k, k) for _ in range(k)]
-    wrong = fmpq(0)
     for i, (alpha, beta) in enumerate(zip(by.rest, by.apart, strict=True)):
         E, Q = models.E[i], models.Q[i]
         if alpha > 0:
@@ -87,16 +126,54 @@ def sides(
         if beta > 0:
             rest += beta * squares[i] + Q.transpose() * Q / beta
         else:
-            joint = [C + b[i, j] * Q for j, C in enumerate(joint)]
-        wrong += 2 * lengths[i] * models.slack[i]
-    rest += cubic(models, b, by) + of_units(models, b, by.weight)
+            joint = [C + rows[i][0, j] * Q for j, C in enumerate(joint)]
+    bare = fmpq_mat([row.entries() for row in rows])
+    rest += cubic(models, bare, by) + of_units(models, bare, by.weight)
     if not all(beta > 0 for beta in by.apart):
         inverse = diagonal([1 / g for g in shares])
         rest += diagonal(shares) + sum((C.transpose() * inverse * C for C in joint), fmpq_mat(k, k))
-    if path is not None:
-        form = with_edge(form, models, P, b, path)
+    wrong = 2 * sum((length * s for length, s in zip(whole, models.slack, strict=True)), fmpq(0))
+    if h > 0:
+        s = sum((root_above(P[i, i]) * slack for i, slack in enumerate(models.slack)), fmpq(0))
+        f = fmpq_mat(len(models.f), 1, models.f) if first else fmpq_mat(P.nrows(), 1)
+        start = root_above((f.transpose() * P * f)[0, 0])
+        rest += diagonal([h * beyond * (beyond + 2 * start + s)] * k)
+        wrong += h * s * (s + beyond)
+    if first:
         rest = fmpq_mat([[0] * (k + 1), *([0, *row] for row in rest.tolist())])
+    if level is not None:
+        form += level.edge * (U.transpose() * P * U)
+        form[0, 0] -= level.edge * level.c0
+    if path is not None:
+        form = with_edge(form, models, P, path)
     return -form, rest + diagonal([wrong] * rest.nrows())
+
+
+def size_beyond(models: Models, P: Array) -> float:
+    """Gamma: an upper bound of ||g||_P / ||d||^2, g what the models have beyond (f, A d); maybe infinite, or NaN."""
+    L, often = models.units.L, np.sqrt(triples(models.A.ncols())[-1])
+    c = models.shares @ L
+    wrong = up((gamma(len(L)) + 2 * EPS) * total(norm(models.shares, 1), 0) * norm(L, 0))
+    each = up(np.sqrt(_columns(c, P)) + up(np.sqrt(frobenius(P))) * wrong)
+    quadratic, cubic = (np.sqrt(_gram(rows, P)) for rows in (models.Qs, models.K * often))
+    E = np.array([frobenius(own) for own in models.Es])
+    rest = total(each * frobenius(models.units.R), 0) + total(up(np.sqrt(np.diag(P))) * E, 0)
+    return float(up(quadratic + cubic + rest))
+
+
+def _gram(rows: Array, P: Array) -> float:
+    """An upper bound of sum_ij P_ij rows_i.rows_j, (n, N)."""
+    (n, N), lengths = rows.shape, norm(rows, 1)
+    value = np.sum(P * (rows @ rows.T))
+    error = (gamma(N) + gamma(n * n) + 3 * EPS) * total(total(np.abs(P) * lengths[:, None] * lengths, 0), 0)
+    return float(up(np.maximum(value, 0.0) + up(error)))
+
+
+def _columns(c: Array, P: Array) -> Array:
+    """Upper bounds of c_q'P c_q for the columns of c (n, N)."""
+    size = np.abs(c)
+    error = (gamma(len(P)) * 2 + 2 * EPS) * np.sum(size * (np.abs(P) @ size), axis=0)
+    return up(np.maximum(np.sum(c * (P @ c), axis=0), 0.0) + up(2 * error))
 
 
 def cubic(models: Models, b: fmpq_mat, by: Multipliers) -> fmpq_mat:
@@ -127,15 +204,16 @@ def of_units(models: Models, b: fmpq_mat, weight: Array) -> fmpq_mat:
     return bound_of_pairs(p, up(wrong), R, np.zeros(len(R)), weight) * fmpq(2) ** by
 
 
-def with_edge(form: fmpq_mat, models: Models, P: fmpq_mat, b: fmpq_mat, path: Path) -> fmpq_mat:
-    """M: the form over (1, d) with the linear part that F - v has at d = 0, and the multipliers of edge and motion."""
-    n, k = P.nrows(), form.nrows()
+def with_edge(form: fmpq_mat, models: Models, P: fmpq_mat, path: Path) -> fmpq_mat:
+    """The form over (1, d) and the multipliers of edge and motion."""
+    n, k = P.nrows(), form.nrows() - 1
     share, edge, motion = rational(path.share), rational(path.edge), rational(path.motion)
-    inner = form + edge * padded(models.J.transpose() * P * models.J, k - n, k - n)
-    inner[k - 1, k - 1] -= motion
-    linear = (fmpq_mat(1, n, models.f) * b).entries()
-    first = [motion * share * share - edge, *linear]
-    return fmpq_mat([first, *([v, *row] for v, row in zip(linear, inner.tolist(), strict=True))])
+    inner = padded(models.J.transpose() * P * models.J, k - n, k - n)
+    ends = fmpq_mat([[0] * (k + 1), *([0, *row] for row in inner.tolist())])
+    form = form + edge * ends
+    form[k, k] -= motion
+    form[0, 0] += motion * share * share - edge
+    return form
 
 
 def padded(A: fmpq_mat, rows: int, columns: int) -> fmpq_mat:

@@ -19,8 +19,10 @@ from .schema import Value
 from .strict import MAX_VALUES, load
 
 MAX_STATES, MAX_LAYERS, MAX_WIDTH, MAX_SLABS = 64, 64, 2**14, 10**4
+MAX_ORDER = 8  # of a series in time
 MAX_CELLS, MAX_CUTS = 4096, 64  # of the box of uncertain quantities in all, and of one range
-CLAIMS = ("asymptotic", "practical", "enlarged", "reached")
+CLAIMS = ("asymptotic", "practical", "nearby", "enlarged", "reached")
+PRACTICAL = ("practical", "nearby")
 WITH_TUBE = ("enlarged", "reached")
 Array = NDArray[np.float64]
 Intervals = tuple[tuple[Fraction, Fraction], ...]
@@ -60,10 +62,21 @@ class Multipliers:
 
 @dataclass(frozen=True)
 class LocalBall:
-    """The ball x = J d, ||d|| <= 1, and multipliers on it."""
+    """The ball x = J d, ||d|| <= 1, and multipliers on it, the one of V - c0 among them; the order of the series in
+    time there."""
 
     J: Array
     multipliers: Multipliers
+    edge: float
+    order: int
+
+
+@dataclass(frozen=True)
+class Contraction:
+    """The ball x = J d, ||d|| <= 1, on which trajectories come closer, and the weights g of the bound on it."""
+
+    J: Array
+    weights: Array
 
 
 @dataclass(frozen=True)
@@ -97,8 +110,10 @@ class Partition:
     T: Array
     root: Array
     tree: bytes
+    order: int  # of the series in time on leaves
     cells: tuple[int, ...]  # how many the range of each uncertain quantity is cut into
     local: LocalBall | None
+    contraction: Contraction | None
     tube: tuple[Slab, ...]
 
 
@@ -115,11 +130,14 @@ class Trusted:
 class Certificate:
     """The claim and its evidence. Provenance is not kept: nothing may depend on it.
 
-    `levels` are as stated: the inner edge of the ring, which is c1 (`local`) or c0 (`floor`), and c2 (`roa`).
+    `levels` are as stated: c0 (`floor`) of a practical claim, the inner edge of the ring c1 (`local`), and c2 (`roa`).
     """
 
     claim: str
+    rate: float
+    sample: tuple[Fraction, Fraction] | None  # the least and the largest period over which the input is held
     name: str
+    discrete: bool
     states: tuple[str, ...]
     inputs: tuple[str, ...]
     uncertain: tuple[str, ...]
@@ -138,16 +156,26 @@ class Certificate:
 
     @property
     def practical(self) -> bool:
-        return self.claim == "practical"
+        return self.claim in PRACTICAL
+
+    @property
+    def c0(self) -> float:
+        """The level that a practical claim ends at; 0 of other claims."""
+        return self.levels.get("floor", 0.0)
 
     @property
     def c1(self) -> float:
-        """The ring's inner edge: c1, or c0 of a practical claim."""
-        return self.levels["floor" if self.practical else "local"]
+        """The ring's inner edge."""
+        return self.levels["local"]
 
     @property
     def c2(self) -> float:
         return self.levels["roa"]
+
+    @property
+    def step(self) -> Fraction:
+        """h where it stands by itself: the longest period, 1 in discrete time, 0 where time does not go in steps."""
+        return self.sample[1] if self.sample else Fraction(int(self.discrete))
 
 
 def read(path: str) -> Certificate:
@@ -159,26 +187,33 @@ def certificate(data: Any, sha256: str) -> Certificate:
     """A JSON value as a certificate."""
     keys = "schema claim plant policy lyapunov levels evidence provenance"
     schema, claim, plant, policy, lyapunov, levels, evidence, provenance = Value(data).keys(keys)
-    schema.choice("certify-certificate/5")
+    schema.choice("certify-certificate/6")
     known = isinstance(claim.raw, dict) and claim.raw.get("kind") in CLAIMS
     claim.must(known, f"an object of kind {' or '.join(CLAIMS)}")
     kind = claim.raw["kind"]
     stated = _plant(plant)
     n, m = len(stated["states"]), len(stated["inputs"])
     stated["policy"] = _policy(policy, n, m)
-    stated_of = {"enlarged": "kind start", "reached": "kind start centre"}
-    _, *of_tube = claim.keys(stated_of.get(kind, "kind"))
+    stated_of = {"enlarged": " start", "reached": " start centre"}
+    _, rate, sample, *of_tube = claim.keys("kind rate sample" + stated_of.get(kind, ""))
+    fall, periods = rate.binary64(), _sample(sample)
+    rate.must(0 <= fall < math.inf and (fall == 0 or kind not in WITH_TUBE), "0, or a rate where a claim may have one")
+    plain = periods is None and not stated["discrete"]
+    sample.must(plain or kind not in (*WITH_TUBE, "nearby"), "null, and the plant continuous, under this claim")
+    sample.must(periods is None or not stated["discrete"], "null where time is discrete")
     form, P = lyapunov.keys("kind P")
     form.choice("quadratic")
-    edges = ("floor" if kind == "practical" else "local", "roa")
+    edges = (*(("floor",) if kind in PRACTICAL else ()), "local", "roa")
     numbers = {edge: level.binary64() for edge, level in zip(edges, levels.keys(" ".join(edges)), strict=True)}
     provenance.must(isinstance(provenance.raw, dict), "an object")
     return Certificate(
         kind,
+        fall,
+        periods,
         **stated,
         P=P.array(n, n),
         levels=numbers,
-        evidence=_evidence(evidence, n, len(stated["uncertain"]), kind),
+        evidence=_evidence(evidence, n, len(stated["uncertain"]), kind, periods is not None, plain and fall == 0),
         sha256=sha256,
         start=of_tube[0].array(n, n) if of_tube else None,
         centre=of_tube[1].array(n) if kind == "reached" else None,
@@ -186,8 +221,8 @@ def certificate(data: Any, sha256: str) -> Certificate:
 
 
 def _plant(plant: Value) -> dict[str, Any]:
-    keys = "name states inputs uncertain dynamics u_eq domain input_bounds"
-    name, *names, uncertain, dynamics, u_eq, domain, bounds = plant.keys(keys)
+    keys = "name time states inputs uncertain dynamics u_eq domain input_bounds"
+    name, time, *names, uncertain, dynamics, u_eq, domain, bounds = plant.keys(keys)
     states, inputs = (value.listed(Value.name, 1, MAX_STATES) for value in names)
     quantities = uncertain.listed(_quantity, 0, MAX_STATES)
     n, m, others = len(states), len(inputs), tuple(other for other, _ in quantities)
@@ -195,6 +230,7 @@ def _plant(plant: Value) -> dict[str, Any]:
     plant.must(len(set(everything)) == len(everything), "a plant in which no name stands for two things")
     return {
         "name": name.name(),
+        "discrete": time.choice("continuous", "discrete") == "discrete",
         "states": states,
         "inputs": inputs,
         "uncertain": others,
@@ -204,6 +240,14 @@ def _plant(plant: Value) -> dict[str, Any]:
         "domain": domain.listed(Value.interval, n),
         "input_bounds": bounds.listed(Value.interval, m),
     }
+
+
+def _sample(value: Value) -> tuple[Fraction, Fraction] | None:
+    if value.raw is None:
+        return None
+    lo, hi = value.listed(Value.rational, 2)
+    value.must(0 <= lo <= hi and hi > 0, "two periods, 0 <= lo <= hi and hi > 0")
+    return lo, hi
 
 
 def _quantity(value: Value) -> tuple[str, tuple[Fraction, Fraction]]:
@@ -231,12 +275,26 @@ def _policy(value: Value, n: int, m: int) -> Policy:
     return policy
 
 
-def _local(value: Value, n: int, claim: str) -> LocalBall | None:
-    if claim == "practical":
+def _local(value: Value, n: int, claim: str, sampled: bool) -> LocalBall | None:
+    if claim in PRACTICAL and value.raw is None:
+        return None
+    J, multipliers, weight, edge, order = value.keys("J multipliers weight edge order")
+    k = edge.binary64()
+    edge.must(0 <= k < math.inf and (k == 0 or claim in PRACTICAL), "0, or a multiplier under a practical claim")
+    return LocalBall(J.array(n, n), _multipliers(multipliers, weight, n, n), k, _order(order, sampled))
+
+
+def _contraction(value: Value, n: int, claim: str) -> Contraction | None:
+    if claim != "nearby":
         value.must(value.raw is None, "null under this claim")
         return None
-    J, multipliers, weight = value.keys("J multipliers weight")
-    return LocalBall(J.array(n, n), _multipliers(multipliers, weight, n, n))
+    J, weights = value.keys("J weights")
+    return Contraction(J.array(n, n), weights.array(n))
+
+
+def _order(value: Value, sampled: bool) -> int:
+    value.must(type(value.raw) is int and 1 <= value.raw <= (MAX_ORDER if sampled else 1), "an order that is allowed")
+    return int(value.raw)
 
 
 def _slab(value: Value, n: int, claim: str) -> Slab:
@@ -274,18 +332,25 @@ def check_hash(policy: Policy, stated: Any) -> None:
         raise Rejected("hash", "policy.sha256", "does not match the layers in the file")
 
 
-def _evidence(value: Value, n: int, k: int, claim: str) -> Partition | Trusted:
-    kinds = ("partition-tree", *(() if claim in WITH_TUBE or k else ("trusted-solver",)))
+def _evidence(value: Value, n: int, k: int, claim: str, sampled: bool, plain: bool) -> Partition | Trusted:
+    """k quantities are uncertain; `plain` says that no rate is claimed of a loop without steps."""
+    kinds = (
+        "partition-tree",
+        *(("trusted-solver",) if plain and not k and claim not in (*WITH_TUBE, "nearby") else ()),
+    )
     known = isinstance(value.raw, dict) and value.raw.get("kind") in kinds
     value.must(known, f"an object of kind {' or '.join(kinds)}")
     if value.raw["kind"] == "partition-tree":
-        _, T, root, tree, cells, local, tube = value.keys("kind T root tree cells local tube")
+        keys = "kind T root tree order cells local contraction tube"
+        _, T, root, tree, order, cells, local, contraction, tube = value.keys(keys)
         cuts = cells.listed(lambda cut: cut.raw, k)
         whole = all(type(cut) is int and 1 <= cut <= MAX_CUTS for cut in cuts)
         cells.must(whole and math.prod(cuts) <= MAX_CELLS, f"from 1 to {MAX_CUTS} parts each, {MAX_CELLS} in all")
         value.must(k == 0 or claim not in WITH_TUBE, "another where quantities are uncertain")
         slabs = tube.listed(lambda slab: _slab(slab, n, claim), *((1, MAX_SLABS) if claim in WITH_TUBE else (0, 0)))
-        return Partition(T.array(n, n), root.array(n), tree.octets(), cuts, _local(local, n, claim), slabs)
+        ball = _local(local, n, claim, sampled)
+        close = _contraction(contraction, n, claim)
+        return Partition(T.array(n, n), root.array(n), tree.octets(), _order(order, sampled), cuts, ball, close, slabs)
     _, solver, version, precision, queries = value.keys("kind solver version precision queries")
     precision.must(precision.binary64() > 0, "positive")
     answers = queries.listed(lambda pair: pair.listed(Value.word, 2), 0, MAX_VALUES)

@@ -2,10 +2,13 @@
 
 A jet of v over d in R^k says, for *all* ||d|| <= 1: `v(d) = v(0) + a.d + d'Q d + K[d] + sum_j B_j e_j(d) + r(d)` with
 |r(d)| <= d'E d, K[d] being the sum of all K_hij d_h d_i d_j. It holds on every smaller ball too. The errors e_j are the
-same in all jets of one family, so that they cancel as they do in truth: |e_j(d)| <= d'U_j d. v(0) lies within `error`
-of c, and the true gradient within `slack` of a in the 2-norm; Q, K and B are the numbers that are stored, and whatever
-they leave out lies in E. E and U_j dominate sums of positive semidefinite matrices with weights >= 0, so each is one,
-and knows the directions in which v is far from what is known of it.
+same in all jets of one family, so that they cancel as they do in truth: |e_j(d)| <= d'U_j d. With numbers y_j in
+[-1, 1] that are uncertain v(0) lies within `error` of c + sum_j y_j c_j, and the true gradient within `slack` of a +
+sum_j y_j a_j in the 2-norm; Q, K and B are the numbers that are stored, and whatever they leave out lies in E. All of
+this is meant for each d by itself: nothing asks how v(0) and the gradient at two d belong together. But `lip`, a
+Lipschitz constant of what v has beyond v(0) + a.d + d'Q d, is meant where v(0) and the gradient are the same for all d.
+E and U_j dominate sums of positive semidefinite matrices with weights >= 0, so each is one, and knows the directions in
+which v is far from what is known of it.
 """
 
 from __future__ import annotations
@@ -75,8 +78,8 @@ def unpacked(K: Array, k: int) -> Array:
 @dataclass(frozen=True)
 class Jet:
     """`c` +- `error`, gradient `a` (k,) +- `slack`, half the Hessian `Q` (k, k), a sixth of the third derivatives `K`
-    as `triples` has them, remainder `E` (k, k), and `B` (m,) of the errors within `U` (m, k, k); or a batch, of all but
-    U."""
+    as `triples` has them, remainder `E` (k, k), `B` (m,) of the errors within `U` (m, k, k), what y adds to c and a,
+    `c_y` (N,) and `a_y` (N, k), and the Lipschitz constant `lip`; or a batch, of all but U."""
 
     c: Any
     error: Any
@@ -87,22 +90,45 @@ class Jet:
     E: Any
     B: Any
     U: Any
+    c_y: Any
+    a_y: Any
+    lip: Any
 
     @property
     def members(self) -> list[Jet]:
         """The jets of a batch."""
-        parts = zip(self.c, self.error, self.a, self.slack, self.Q, self.K, self.E, self.B, strict=True)
-        return [Jet(c, error, a, slack, Q, K, E, B, self.U) for c, error, a, slack, Q, K, E, B in parts]
+        names = ("c", "error", "a", "slack", "Q", "K", "E", "B", "c_y", "a_y", "lip")
+        return [replace(self, **{name: getattr(self, name)[i] for name in names}) for i in range(len(self.c))]
+
+    @cached_property
+    def sway(self) -> Any:
+        """Upper bound of what y adds to v(0)."""
+        return total(np.abs(self.c_y), -1)
+
+    @cached_property
+    def tilt(self) -> Any:
+        """Upper bound of what y adds to the gradient."""
+        return total(norm(self.a_y, -1), -1)
+
+    @cached_property
+    def doubt(self) -> Any:
+        """Upper bound of |v(0) - c|."""
+        return up(self.error + self.sway)
+
+    @cached_property
+    def turn(self) -> Any:
+        """Upper bound of the gradient's distance from a."""
+        return up(self.slack + self.tilt)
 
     @cached_property
     def size(self) -> Any:
         """Upper bound of |v(0)|."""
-        return up(abs(self.c) + self.error)
+        return up(abs(self.c) + self.doubt)
 
     @cached_property
     def slope(self) -> Any:
         """Upper bound of the gradient's 2-norm."""
-        return up(norm(self.a, -1) + self.slack)
+        return up(norm(self.a, -1) + self.turn)
 
     @cached_property
     def bend(self) -> Any:
@@ -147,20 +173,25 @@ class Jet:
     def __add__(self, other: Jet) -> Jet:
         x, y = self, other
         c = x.c + y.c
-        error = up(x.error + y.error + EPS * abs(c))
+        error = up(x.error + y.error + EPS * (abs(c) + x.sway + y.sway))
         slack = up(x.slack + y.slack + EPS * (x.slope + y.slope))
         E = widen(x.E + y.E, EPS * (x.spread + y.spread))
-        return Jet(c, error, x.a + y.a, slack, x.Q + y.Q, x.K + y.K, E, x.B + y.B, x.U)
+        of_y, lip = (x.c_y + y.c_y, x.a_y + y.a_y), up(x.lip + y.lip + 2 * EPS * (x.bend + y.bend))
+        return Jet(c, error, x.a + y.a, slack, x.Q + y.Q, x.K + y.K, E, x.B + y.B, x.U, *of_y, lip)
 
     def __neg__(self) -> Jet:
-        return Jet(-self.c, self.error, -self.a, self.slack, -self.Q, -self.K, self.E, -self.B, self.U)
+        x = self
+        return Jet(-x.c, x.error, -x.a, x.slack, -x.Q, -x.K, x.E, -x.B, x.U, -x.c_y, -x.a_y, x.lip)
 
     def __mul__(self, other: Jet) -> Jet:
         x, y = self, other
         c = x.c * y.c
-        error = up(x.size * y.error + y.size * x.error + EPS * abs(c))
+        error = x.size * y.error + y.size * x.error + x.sway * y.sway  # the last is of second order in y
+        error = up(error + EPS * (abs(c) + x.size * y.sway + y.size * x.sway))
         slack = x.size * y.slack + x.error * y.slope + y.size * x.slack + y.error * x.slope
-        slack = up(slack + EPS * (x.size * y.slope + y.size * x.slope))
+        slack = up(slack + x.sway * y.tilt + y.sway * x.tilt + EPS * (x.size * y.slope + y.size * x.slope))
+        c_y = x.c * y.c_y + y.c * x.c_y
+        a_y = x.c * y.a_y + y.c * x.a_y + outer(x.c_y, y.a) + outer(y.c_y, x.a)
         ab = outer(x.a, y.a)
         Q = x.c * y.Q + y.c * x.Q + (ab + ab.T) / 2
         K = x.c * y.K + y.c * x.K + symmetric(x.a, y.Q) + symmetric(y.a, x.Q)
@@ -169,9 +200,27 @@ class Jet:
         E = each(x.size) * y.E + each(y.size) * x.E
         E = E + each(x.radius) * y.whole + each(up(y.slope + y.bend + y.twist)) * x.whole
         sx, sy = up(x.slope + x.bend), up(y.slope + y.bend)
-        wrong = x.error * y.spread + y.error * x.spread + x.slack * sy + y.slack * sx
+        wrong = x.doubt * y.spread + y.doubt * x.spread + x.turn * sy + y.turn * sx
         wrong = wrong + EPS * (x.size * y.spread + y.size * x.spread + x.slope * sy + y.slope * sx) + x.faint
-        return Jet(c, error, x.c * y.a + y.c * x.a, slack, Q, K, widen(E, known + wrong), x.c * y.B + y.c * x.B, x.U)
+        B, E = x.c * y.B + y.c * x.B, widen(E, known + wrong)
+        lost = x.doubt * y.bend + y.doubt * x.bend + x.turn * y.slope + y.turn * x.slope
+        lost = lost + EPS * (x.size * y.bend + y.size * x.bend + x.slope * y.slope)
+        (zx, lx), (zy, ly) = x.rest, y.rest
+        lip = x.size * y.lip + y.size * x.lip + x.slope * up(zy + ly) + y.slope * up(zx + lx) + zx * ly + zy * lx
+        return Jet(c, error, x.c * y.a + y.c * x.a, slack, Q, K, E, B, x.U, c_y, a_y, up(lip + 2 * lost))
+
+    @cached_property
+    def rest(self) -> tuple[Any, Any]:
+        """Upper bounds of what v has beyond v(0) + a.d, and of a Lipschitz constant of that."""
+        return up(self.bend + self.lip), up(2 * self.bend + self.lip)
+
+    def lip_beyond_tangent(self, phi: Expansion) -> Any:
+        """A Lipschitz constant of what phi(v) has beyond its tangent at v(0) and the d'H d of `beyond_tangent`."""
+        (_, _, half, _), (_, _, wrong, _) = phi.f, phi.e
+        (z, steep), s, h = self.rest, self.slope, up(np.abs(half) + wrong)
+        cubic = 3 * up(phi.third * up(self.radius * self.radius)) * up(s + steep)
+        lost = up(wrong + EPS * h) * up(s * s) + 2 * up(h * s) * self.turn
+        return up(2 * up(h * up(s * up(z + steep) + z * steep)) + cubic + 2 * lost)
 
     def beyond_tangent(self, phi: Expansion) -> tuple[Any, Any, Any]:
         """(H, C, R): phi(v) less its tangent at v(0) is d'H d + C[d] within d'R d.
@@ -191,30 +240,59 @@ class Jet:
         H, C = each(half) * aa, np.asarray(2 * half)[..., None] * aQ + np.asarray(sixth)[..., None] * symmetric(a, aa)
         plain = straight * self.twist + square * up(self.bend + self.twist)
         wrong = up(half_error + EPS * h) * up(ss + 2 * up(s * self.bend)) + up(sixth_error + EPS * g) * up(s * ss)
-        moved = up(2 * up(up(h + quartic) * s) + 2 * up(h * self.bend) + 3 * up(g * ss)) * self.slack
+        moved = up(2 * up(up(h + quartic) * s) + 2 * up(h * self.bend) + 3 * up(g * ss)) * self.turn
         return H, C, widen(each(up(straight + square)) * self.whole + each(quartic) * aa, plain + wrong + moved)
 
     def function(self, name: str) -> Jet:
         """phi(v) for a function phi that elementary.py knows."""
-        phi = elementary(name, self.c, self.error, self.radius)
+        phi = elementary(name, self.c, self.doubt, self.radius)
         (f0, f1, _, _), (e0, e1, _, _) = phi.f, phi.e
         H, C, R = self.beyond_tangent(phi)
         steepest, column = up(np.abs(f1) + e1), np.asarray(f1)[..., None]
         slack = up(e1 * self.slope + steepest * self.slack + EPS * (steepest * self.slope))
+        c_y, a_y = column * self.c_y, each(f1) * self.a_y
+        if self.c_y.size:
+            e0, slack, a_y = self._by_y(name, phi, a_y)
         wrong = up(e1 + EPS * steepest) * self.spread + self.faint
         Q, K, E = each(f1) * self.Q + H, column * self.K + C, widen(each(steepest) * self.E + R, wrong)
-        return Jet(f0, e0, column * self.a, slack, Q, K, E, column * self.B, self.U)
+        lip = steepest * self.lip + self.lip_beyond_tangent(phi) + 2 * up(e1 + EPS * steepest) * self.bend
+        return Jet(f0, e0, column * self.a, slack, Q, K, E, column * self.B, self.U, c_y, a_y, up(lip))
+
+    def _by_y(self, name: str, phi: Expansion, plain: Any) -> tuple[Any, Any, Any]:
+        """`error`, `slack` and `a_y` of phi(v); `plain` is phi'(c) a_y.
+
+        With delta = v(0) - c, phi(v(0)) is phi(c) + phi'(c) delta within sup|phi''|/2 delta^2, and phi'(v(0)) is
+        phi'(c) + phi''(c) delta within sup|phi'''|/2 delta^2, the suprema over all that v(0) may be.
+        """
+        here = elementary(name, self.c, 0.0, 0.0)
+        (_, f1, half, _), (e0, e1, e2, _) = here.f, here.e
+        bent, twisted = (up(np.abs(f) + e) for f, e in zip(phi.f[2:], phi.e[2:], strict=True))
+        off, slope = self.doubt, up(np.abs(f1) + e1)
+        error = up(e0 + e1 * off + slope * self.error + bent * up(off * off) + EPS * (slope * self.sway))
+        moved = up(e1 + 2 * bent * self.error + 2 * e2 * off + 3 * twisted * up(off * off))  # phi' less its part in y
+        by_y = 2 * up(np.abs(half) * self.sway)
+        slack = moved * self.slope + up(slope + by_y) * self.slack + by_y * self.tilt
+        slack = up(slack + EPS * (up(slope + by_y) * self.slope))
+        return error, slack, plain + outer(2 * np.asarray(half)[..., None] * self.c_y, self.a)
 
 
-def uncertain(lo: Fraction, hi: Fraction, U: Array) -> Jet:
-    """A number of [lo, hi], the same for all d, among the jets with these errors."""
-    middle, (reach, error) = constant((lo + hi) / 2, U), float_with_error((hi - lo) / 2)
+def uncertain(lo: Fraction, hi: Fraction, U: Array, number: int, count: int) -> Jet:
+    """A number of [lo, hi], lo + hi + (hi - lo) y over 2, y being the one of this number of `count`."""
+    middle, (reach, error) = constant((lo + hi) / 2, U, count), float_with_error((hi - lo) / 2)
+    c_y = np.where(np.arange(count) == number, reach, 0.0)
+    return replace(middle, error=up(middle.error + error), c_y=c_y)
+
+
+def between(lo: Fraction, hi: Fraction, U: Array, count: int) -> Jet:
+    """A number of [lo, hi] of which nothing else is known, maybe another one wherever it is used."""
+    middle, (reach, error) = constant((lo + hi) / 2, U, count), float_with_error((hi - lo) / 2)
     return replace(middle, error=up(middle.error + reach + error))
 
 
-def constant(q: Fraction, U: Array) -> Jet:
-    """A rational among the jets with these errors."""
+def constant(q: Fraction, U: Array, count: int) -> Jet:
+    """A rational among the jets with these errors and `count` numbers y."""
     value, error = float_with_error(q)
     m, k, _ = U.shape
     nothing, thirds = np.zeros((k, k)), np.zeros(len(triples(k)[0]))
-    return Jet(np.float64(value), error, np.zeros(k), 0.0, nothing, thirds, nothing, np.zeros(m), U)
+    of_y = np.zeros(count), np.zeros((count, k))
+    return Jet(np.float64(value), error, np.zeros(k), 0.0, nothing, thirds, nothing, np.zeros(m), U, *of_y, 0.0)

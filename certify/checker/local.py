@@ -1,21 +1,29 @@
-"""The local rule: Vdot < 0 on a ball around the origin that holds {V <= c1}, with no hole."""
+"""The local rule: D + 2 lambda V < 0 on a ball around the origin that holds {V <= c1}, with no hole; under a practical
+claim as far as c0 <= V, below which a step must not lead out of {V <= c0}."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from fractions import Fraction
 from functools import cached_property
 from math import prod
 
 import numpy as np
-from flint import fmpq_mat
+from flint import fmpq, fmpq_mat
 
 from . import ball
 from .ball import Ball
 from .case import Case, Failures
-from .decrease import Models, are_finite, are_usable, sides
-from .exact import contains_ball, exactly, fraction, is_definite
+from .decrease import Level, Models, are_finite, are_usable, rational, sides, size_beyond
+from .document import Intervals
+from .exact import contains_ball, exactly, fraction, is_definite, root_above
+from .float64 import Array, norm, up
+from .flow import mean
+from .jets import Jet, uncertain
 
-_MOST_WORK = 2**26  # cells times n^4, which is what an inequality takes
+MOST_WORK = 2**26  # corners of cells times n^4, which is what an inequality takes
+_ATTEMPTS = 4  # at the a-priori enclosure
+Way = tuple[Array, Array]  # how far each state may move in a period: a number, and one times ||d||
 
 
 class Local(Ball):
@@ -24,20 +32,74 @@ class Local(Ball):
     def __init__(self, case: Case) -> None:
         super().__init__(case, case.local.J, "local ball")
 
+    @property
+    def order(self) -> int:
+        return self.case.local.order
+
+    @property
+    def at_rest(self) -> bool:
+        """Whether F vanishes at the origin, and so everything that is made of it."""
+        return not self.case.c.practical
+
+    @cached_property
+    def way(self) -> Way | None:
+        """The a-priori enclosure of the states during a period, the first that holds of a few attempts: what f may come
+        to there, over the longest period, is less. None if none does."""
+        n, h = len(self.J), self.case.longest
+        far, along = np.zeros(n), np.zeros(n)
+        for _ in range(1 + _ATTEMPTS):
+            F = self.f(self.during((far, along)), self.ranges)
+            most = up(h * np.array([0.0 if self.at_rest else f.size for f in F]))
+            steepest = up(h * np.array([f.radius for f in F]))
+            if np.all((most < far) | self.at_rest) and np.all(steepest < along):
+                return far, along
+            far, along = (0 * most if self.at_rest else 1.25 * most), 1.25 * steepest
+        return None
+
+    def during(self, way: Way) -> list[Jet]:
+        """The states within a way of the ball's."""
+        moved = zip(self.states, *way, strict=True)
+        return [replace(x, error=up(x.error + far), slack=up(x.slack + along)) for x, far, along in moved]
+
+    def settled(self, v: Jet) -> Jet:
+        """What is 0 at d = 0 in truth is known to be."""
+        return replace(v, c=np.float64(0), error=0.0, c_y=0 * v.c_y) if self.at_rest else v
+
+    def G(self, cell: Intervals) -> list[Jet]:
+        """The increment of x by time over a step. Within a period what is uncertain may leave the cell: the cell counts
+        for its mean alone, in which D is convex."""
+        c, symbols = self.case.c, self.symbols(cell)
+        if c.discrete:
+            return [f + -x for f, x in zip(self.F(cell), self.shared(self.states), strict=True)]
+        if c.sample is None or self.way is None:
+            return self.F(cell)
+        start, during, (lo, hi) = self.shared(self.states), self.shared(self.during(self.way)), c.sample
+        first = [self.settled(f) for f in self.f(during if self.order == 1 else start, symbols)]
+        held, U = [*self.inputs, *self.ranges], self.units.shares
+        h = uncertain(lo, hi, U, len(cell), self.count) if lo < hi else self.constant(hi)
+        return mean(c.dynamics, self.constant, first, start, during, held, h, self.order, self.settled)
+
     @cached_property
     def sides(self) -> list[tuple[fmpq_mat, fmpq_mat] | None]:
-        """For each cell the decay, and what has to stay below it; None where F has no finite model."""
-        P = exactly(self.case.c.P)
-        nothing, found = fmpq_mat(P.nrows(), P.nrows()), []
+        """For each corner of each cell the decay, and what has to stay below it; None where G has no finite model."""
+        c, by = self.case.c, self.case.local
+        P, h = exactly(c.P), _fmpq(c.step)
+        found: list[tuple[fmpq_mat, fmpq_mat] | None] = []
+        R = 2 * rational(c.rate) * P
+        level = None if self.at_rest else Level(rational(c.c0), rational(by.edge))
         for cell in self.case.cells:
-            F, by = self.F(cell), self.case.local.multipliers
-            finite = are_finite(F, self.units)
-            found.append(sides(Models(self.J, F, self.units), P, nothing, by) if finite else None)
+            G = self.G(cell)
+            models = Models(self.J, G, self.units, self.at_rest) if are_finite(G, self.units) else None
+            most = size_beyond(models, c.P) if models is not None and h > 0 else 0.0
+            if models is None or not np.isfinite(most):
+                return [*found, None]
+            for corner in models.corners():
+                found.append(sides(corner, P, R, by.multipliers, None, h, rational(most), level))
         return found
 
     @cached_property
     def margin(self) -> float:
-        """1 - the largest share of the decay that the rest may take in any cell, in floats for people."""
+        """1 - the largest share of the decay that the rest may take at any corner, in floats for people."""
         return min(_margin(*both) if both is not None else float("nan") for both in self.sides)
 
 
@@ -51,23 +113,48 @@ def _margin(decay: fmpq_mat, rest: fmpq_mat) -> float:
 
 def fits(local: Local) -> Failures:
     """`local`: the ball contains {V <= c1}, and its jets take neither too much memory nor too much time."""
-    if not contains_ball(exactly(local.J), exactly(local.case.c.P), Fraction(local.case.c.c1)):
+    c = local.case.c
+    if not contains_ball(exactly(local.J), exactly(c.P), Fraction(c.c1)):
         yield "levels.local", "the ball must contain {V <= c1}"
-    if prod(local.case.partition.cells) * len(local.J) ** 4 > _MOST_WORK:
+    if prod(local.case.partition.cells) * 2**local.count * len(local.J) ** 4 > MOST_WORK:
         yield "evidence.cells", "there are too many cells for this rule"
     if not are_usable(local.case.local.multipliers):
         yield "evidence.local", "no multiplier may be negative, none of g 0 where some beta is"
+    if c.step > 0 and Fraction(local.case.local.edge) * c.step > 1:
+        yield "evidence.local.edge", "a step may lead out of {V <= c0}: the edge must be at most 1/h"
     yield from ball.fits(local)
     return 0
 
 
+def stays(local: Local) -> Failures:
+    """`flow`: during a period the state stays in the interior of the domain."""
+    c, way = local.case.c, local.way if local.case.c.sample else None
+    if c.sample is None:
+        return 0
+    if way is None:
+        yield local.at, "the state is not shown to stay near during a period"
+        return 0
+    F = local.f(local.during(way), local.ranges)
+    for i, (f, name, (lo, hi)) in enumerate(zip(F, c.states, c.domain, strict=True)):
+        reach, of_ball = root_above(rational(c.c1) * _fmpq(local.case.P_inverse[i])), float(norm(local.J[i], 0))
+        reach = min(reach, rational(of_ball)) if np.isfinite(of_ball) else reach
+        moved = up(local.case.longest * (f.radius + (0.0 if local.at_rest else f.size)))
+        if not (np.isfinite(moved) and fraction(reach + rational(float(moved))) < min(-lo, hi)):
+            yield local.at, f"{name} may leave the domain during a period"
+    return len(c.states)
+
+
 def decreases(local: Local) -> Failures:
-    """`local`: Vdot < 0 on the ball without its centre."""
+    """`local`: D + 2 lambda V < 0 on the ball without its centre, or as far as V >= c0."""
     for both in local.sides:
         if both is None:
             yield "levels.local", "F has no finite model on the local ball"
             return 0
         decay, rest = both
         if not is_definite(decay - rest):
-            yield "levels.local", f"Vdot < 0 is not shown on the local ball: {1 - local.margin:.3g} of the decay"
+            yield "levels.local", f"the decrease is not shown on the local ball: {1 - local.margin:.3g} of the decay"
     return len(local.sides)
+
+
+def _fmpq(q: Fraction) -> fmpq:
+    return fmpq(q.numerator, q.denominator)

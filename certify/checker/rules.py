@@ -15,7 +15,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from . import ball, local, ring, tube
+from . import ball, contraction, local, ring, tube
 from .case import Case, Failures
 from .document import Certificate, Partition
 from .errors import Rejected
@@ -26,8 +26,12 @@ from .network import reaches
 
 
 def levels(case: Case) -> Failures:
-    if not 0 < case.c.c1 <= case.c.c2 < float("inf"):
-        yield "levels", f"must satisfy 0 < {' <= '.join(case.c.levels)}"
+    c = case.c
+    inner = c.c0 if c.practical else c.c1
+    if not 0 < inner <= c.c1 <= c.c2 < float("inf"):
+        yield "levels", f"must satisfy 0 < {' <= '.join(c.levels)}"
+    if not (isinstance(c.evidence, Partition) and case.covered) and inner != c.c1:
+        yield "levels.local", "must be the floor where there is no ball"
     return 1
 
 
@@ -85,7 +89,7 @@ def centring(case: Case) -> Failures:
         limits = zip(*(end.tolist() for end in policy.clip), u_eq, strict=True)
         if not all(Fraction(lo) < u < Fraction(hi) for lo, hi, u in limits):
             yield "policy.clip", "u_eq must lie strictly inside the clip"
-    if policy.centre == "none" and case.c.claim != "practical" and policy_at_origin(policy) != list(u_eq):
+    if policy.centre == "none" and not case.c.practical and policy_at_origin(policy) != list(u_eq):
         yield "policy.centre", "pi(0) = u_eq cannot be shown exactly without centring"
     return 1
 
@@ -100,10 +104,11 @@ ON_THE_BALL: Table[local.Local] = (
     ("local", local.fits),
     ("inputs", ball.keeps_inputs),
     ("local", ball.is_not_clipped),
+    ("flow", local.stays),
     ("local", local.decreases),
 )
 OF_THE_TREE: Table[Case] = (("tree", ring.is_whole),)
-ON_LEAVES: Table[ring.Leaves] = (("inputs", ring.keeps_inputs), ("ring", ring.decreases))
+ON_LEAVES: Table[ring.Leaves] = (("inputs", ring.keeps_inputs), ("flow", ring.stays), ("ring", ring.decreases))
 OF_THE_TUBE: Table[Case] = (("tube", tube.nodes_are_sound),)
 ON_SLABS: Table[tube.Piece] = (
     ("tube", tube.fits),
@@ -111,10 +116,19 @@ ON_SLABS: Table[tube.Piece] = (
     ("tube", ball.is_not_clipped),
     ("tube", tube.decreases),
 )
+OF_CONTRACTION: Table[contraction.Contracted] = (
+    ("contraction", contraction.fits),
+    ("contraction", ball.is_not_clipped),
+    ("contraction", contraction.contracts),
+)
 READ = {"format": 1, "hash": 1}  # rules of document.py, which have held
 RULES = (
     *READ,
-    *dict.fromkeys(name for table in (STATED, ON_THE_BALL, OF_THE_TREE, ON_LEAVES, OF_THE_TUBE) for name, _ in table),
+    *dict.fromkeys(
+        name
+        for table in (STATED, ON_THE_BALL, OF_THE_TREE, ON_LEAVES, OF_THE_TUBE, OF_CONTRACTION)
+        for name, _ in table
+    ),
 )
 
 
@@ -152,13 +166,13 @@ def check(c: Certificate) -> Tally:
         tally.hold([(name, rule) for name, rule in STATED if not spared.get(name)], case)
         if not replayed:
             return tally
-        if not c.practical:
+        if case.covered:
             origin = local.Local(case)
             tally.hold(ON_THE_BALL, origin)
             if np.isfinite(origin.margin):  # binary64 may not hold the sides of an inequality that rationals decide
                 tally.local_margin = origin.margin
         tally.hold(OF_THE_TREE, case)
-        if c.practical or c.c1 != c.c2:
+        if not case.covered or c.c1 != c.c2:
             bounds, margin = ring.Ring(case), np.inf
             for batch in ring.batches(case.partition.tree, case.partition.root, bounds.batch):
                 leaves = bounds.examine(*batch)
@@ -169,4 +183,6 @@ def check(c: Certificate) -> Tally:
             tally.hold(OF_THE_TUBE, case)
             for piece in tube.pieces(case):
                 tally.hold(ON_SLABS, piece)
+        if case.partition.contraction is not None:
+            tally.hold(OF_CONTRACTION, contraction.Contracted(case, case.partition.contraction))
     return tally

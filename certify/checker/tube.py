@@ -61,10 +61,10 @@ class Piece(Ball):
         return [(a + b) / 2 for a, b in self.centres], [(b - a) / twice for a, b in self.centres]
 
     @property
-    def velocity(self) -> list[fmpq] | None:
-        """Of the centre; None at rest."""
+    def velocity(self) -> list[fmpq]:
+        """Of the centre; empty at rest."""
         if self.slab.path is None:
-            return None
+            return []
         moves = [(b - a) / Fraction(self.slab.duration) for a, b in self.centres]
         return [fmpq(v.numerator, v.denominator) for v in moves]
 
@@ -134,7 +134,7 @@ def decreases(piece: Piece) -> Failures:
     F = piece.F()
     if not are_finite(F, piece.units):
         yield piece.at, "F has no finite model"
-    models = Models(piece.J, F, piece.units, piece.velocity)
+    models = Models(piece.J, F, piece.units, piece.slab.path is None, piece.velocity)
     for P, rate in zip(piece.coefficients, piece.rates, strict=True):
         if not shows(models, P, rate, piece.slab.multipliers, piece.slab.path):
             yield piece.at, "the decrease of x'P(t)x is not shown"

@@ -1,4 +1,4 @@
-"""The plant `xdot = f(x, u)`: sympy expressions over exact rational parameters.
+"""The plant `xdot = f(x, u)`, or `x+ = f(x, u)`: sympy expressions over exact rational parameters.
 
 Numbers are exact because the proof is about *this* plant: `m = 0.15` written as text is 3/20, while a
 Python float stands for its binary value. sympy never folds floats here; an expression that contains
@@ -265,6 +265,16 @@ class System:
         )
 
     @property
+    def in_steps(self) -> bool:
+        """Whether V is compared at the ends of steps: of discrete time, or of periods over which an input is held."""
+        return self.time == "discrete" or self.sample is not None
+
+    @property
+    def rests_where(self) -> str:
+        """What f(x_eq, u_eq) is at an equilibrium, in words."""
+        return "0" if self.time == "continuous" else "x_eq"
+
+    @property
     def uncertain(self) -> tuple[tuple[sympy.Symbol, Interval], ...]:
         """What has a range, in the order of the ranges."""
         return tuple((sympy.Symbol(name), interval) for name, interval in self.ranges.items())
@@ -340,7 +350,8 @@ class System:
 
     def dynamics_of_values(self) -> tuple[sympy.Expr, ...]:
         """f over the states' values x_eq + x, as people write it, with the parameters by name."""
-        return in_deviations(self.dynamics, self.states, [-e for e in self.x_eq])
+        moved = in_deviations(self.dynamics, self.states, [-e for e in self.x_eq])
+        return moved if self.time == "continuous" else tuple(e + at for e, at in zip(moved, self.x_eq, strict=True))
 
     def domain_of_values(self) -> tuple[Interval, ...]:
         """The domain's intervals of the states' values x_eq + x."""

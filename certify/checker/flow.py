@@ -1,0 +1,139 @@
+"""The mean of f over a period in which the input is held: G, with x(h) = x + h G, in models of a ball or of leaves.
+
+Taylor's formula in time: G = x_1 + h x_2 + ... + h^(r-1) x_r, the last coefficient, which is the remainder, taken where
+the state may be during the period. Power series give the coefficients in any arithmetic (Moore). What is uncertain may
+change within the period. So all coefficients but the first take it as a range, which encloses another value at each
+place; the first is linear in it but for what its caller has moved away, so that there the symbol stands for the mean.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from functools import reduce
+from operator import add
+from typing import Any
+
+from .expression import Tape, evaluate
+
+Constant = Callable[[Fraction], Any]
+
+
+@dataclass(frozen=True)
+class Series:
+    """`parts[0] + parts[1] t + ...`, of which the first `count` are of interest; those that are missing are 0."""
+
+    parts: list[Any]
+    count: int
+    constant: Constant
+
+    def _of(self, parts: list[Any]) -> Series:
+        return Series(parts[: self.count], self.count, self.constant)
+
+    def __add__(self, other: Series) -> Series:
+        a, b = self.parts, other.parts
+        common = min(len(a), len(b))
+        return self._of([x + y for x, y in zip(a, b, strict=False)] + a[common:] + b[common:])
+
+    def __neg__(self) -> Series:
+        return self._of([-x for x in self.parts])
+
+    def __mul__(self, other: Series) -> Series:
+        a, b = self.parts, other.parts
+        found = []
+        for k in range(min(self.count, len(a) + len(b) - 1)):
+            first, last = max(0, k - len(b) + 1), min(k, len(a) - 1)
+            found.append(reduce(add, [a[i] * b[k - i] for i in range(first, last + 1)]))
+        return self._of(found)
+
+    def function(self, name: str) -> Series:
+        """phi(v): k phi_k = sum_(j=1..k) j v_j w_(k-j), w = phi'(v), or what is multiplied out for 1/v and the root."""
+        v, whole = self.parts, range(1, self.count if len(self.parts) > 1 else 1)
+        y = [v[0].function(name)]
+        if name == "inv":
+            for k in whole:
+                y.append(-(self._sum(v, y, 1, k) * y[0]))
+        elif name == "sqrt":
+            half = self.constant(Fraction(1, 2)) * y[0].function("inv")
+            for k in whole:
+                known = [v[k]] if k < len(v) else []
+                known += [-(y[i] * y[k - i]) for i in range(1, k)]
+                y.append(half * reduce(add, known) if known else self.constant(Fraction(0)))
+        elif name in ("sin", "cos"):
+            other = [v[0].function("cos" if name == "sin" else "sin")]
+            for k in whole:
+                rise, fall = self._step(other, k), self._step(y, k)
+                y.append(rise if name == "sin" else -rise)
+                other.append(-fall if name == "sin" else fall)
+        elif name == "exp":
+            for k in whole:
+                y.append(self._step(y, k))
+        elif name == "tanh":
+            slope: list[Any] = []
+            for k in whole:
+                square = reduce(add, [y[i] * y[k - 1 - i] for i in range(k)])
+                slope.append(self.constant(Fraction(1)) + -square if k == 1 else -square)
+                y.append(self._step(slope, k))
+        elif name == "atan":
+            slopes = (self._of([self.constant(Fraction(1))]) + self * self).function("inv").parts
+            for k in whole:
+                y.append(self._step(slopes, k))
+        else:
+            raise ValueError(f"nothing is known of {name}")
+        return self._of(y)
+
+    def _step(self, w: list[Any], k: int) -> Any:
+        """sum_(j=1..k) j v_j w_(k-j) / k."""
+        v = self.parts
+        terms = [self.constant(Fraction(j, k)) * (v[j] * w[k - j]) for j in range(1, min(k, len(v) - 1) + 1)]
+        return reduce(add, terms) if terms else self.constant(Fraction(0))
+
+    def _sum(self, v: list[Any], y: list[Any], first: int, k: int) -> Any:
+        return reduce(add, [v[j] * y[k - j] for j in range(first, min(k, len(v) - 1) + 1)])
+
+
+def coefficients(
+    dynamics: Tape,
+    constant: Constant,
+    states: Sequence[Any],
+    held: Sequence[Any],
+    order: int,
+    rest: Callable[[Any], Any],
+) -> list[list[Any]]:
+    """x_1 to x_order for each state, from there on, inputs and quantities `held`; `rest` is applied to each."""
+    parts = [[x] for x in states]
+    for k in range(1, order + 1):
+        series = [Series(list(own), k, constant) for own in parts]
+        others = [Series([v], k, constant) for v in held]
+        F = evaluate(dynamics, lambda q, k=k: Series([constant(q)], k, constant), [*series, *others])  # type: ignore[misc]
+        for own, f in zip(parts, F, strict=True):
+            last = f.parts[k - 1] if len(f.parts) >= k else constant(Fraction(0))
+            own.append(rest(last if k == 1 else constant(Fraction(1, k)) * last))
+    return [own[1:] for own in parts]
+
+
+def mean(
+    dynamics: Tape,
+    constant: Constant,
+    first: Sequence[Any],
+    states: Sequence[Any],
+    during: Sequence[Any],
+    held: Sequence[Any],
+    h: Any,
+    order: int,
+    rest: Callable[[Any], Any],
+) -> list[Any]:
+    """G. `first` is x_1 with what is uncertain as symbols, from the states at the period's beginning, or if `order` is
+    1, from those during it; `held` are inputs, and ranges of what is uncertain."""
+    if order == 1:
+        return list(first)
+    early = coefficients(dynamics, constant, states, held, order - 1, rest) if order > 2 else [[] for _ in states]
+    late = coefficients(dynamics, constant, during, held, order, rest)
+    found = []
+    for start, known, last in zip(first, early, late, strict=True):
+        G = last[order - 1]
+        for x in reversed(known[1:]):
+            G = x + h * G
+        found.append(start + h * G)
+    return found
