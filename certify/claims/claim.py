@@ -102,7 +102,7 @@ class Practical(Claim):
     {V <= c0}; the origin need not be an equilibrium.
     """
 
-    kind = "practical"
+    kind: ClassVar[Kind | Literal["nearby", "enlarged", "reached"]] = "practical"
     at_rest = False
     floor: float
 
