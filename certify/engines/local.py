@@ -235,9 +235,7 @@ def _order(problem: Problem) -> int:
     return 1 if problem.loop.system.sample is None else _ORDER
 
 
-def _largest(
-    good: Callable[[float], bool], limit: float, until: float, fall: float = _FAR
-) -> float | None:
+def _largest(good: Callable[[float], bool], limit: float, until: float, fall: float = _FAR) -> float | None:
     """The largest level up to `limit` that is good, within 2 %, if those somewhat below it are."""
     if good(limit):
         return limit
