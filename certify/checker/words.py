@@ -90,8 +90,9 @@ def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
         margins += [] if ring is None else [f"smallest bound of -{_falling(c)} on a ring's leaf {ring:.3g}"]
         rest, verdict = f"margins: {'; '.join(margins)}", "ACCEPTED"
     after = "+" if c.discrete else "'"
+    left = "x+" if c.discrete else "xdot"
     return [
-        f"plant {c.name}: {'x+' if c.discrete else 'xdot'} = f(x, u), states ({', '.join(c.states)}), inputs ({', '.join(c.inputs)})",
+        f"plant {c.name}: {left} = f(x, u), states ({', '.join(c.states)}), inputs ({', '.join(c.inputs)})",
         *(
             f"  for every {name}({'k' if c.discrete else 't'}) in {_interval(pair)}"
             for name, pair in zip(c.uncertain, c.ranges, strict=True)
