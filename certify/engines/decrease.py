@@ -199,10 +199,14 @@ def _multipliers_at(corners: Sequence[Corner], weights: Sequence[Array], joint: 
     for corner, weight in zip(corners, weights, strict=True):
         _, _, before = parts.get(id(corner.b), (None, None, 0.0))
         parts[id(corner.b)] = corner.models, corner.b, before + weight
-    return _multipliers_of(list(parts.values()), joint)
+    largest = max(float(np.max(np.diag(corner.decay))) for corner in corners)
+    return _multipliers_of(list(parts.values()), joint, largest)
 
 
-def _multipliers_of(parts: Sequence[tuple[Models, Array, Array]], joint: bool | None) -> Multipliers:
+def _multipliers_of(
+    parts: Sequence[tuple[Models, Array, Array]], joint: bool | None, decay: float = 1.0
+) -> Multipliers:
+    """`decay` is what g is to be small beside where no component has any weight."""
     n, k = parts[0][1].shape
     usual, whole = 0.0, np.zeros((k, k))
     along, by_size, E2, Q2, spread = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(k)
@@ -224,7 +228,9 @@ def _multipliers_of(parts: Sequence[tuple[Models, Array, Array]], joint: bool | 
         beta = np.where(along > 0, np.sqrt(Q2 / along), 0.0)
     diagonal, apart_in_all = np.diag(whole), np.sum(np.sqrt(Q2 * along))
     g = np.sqrt(spread / diagonal)
-    least = max(_NEGLIGIBLE * float(np.max(g)), _NEGLIGIBLE * apart_in_all / np.trace(whole), _ROUNDING * usual)
+    least = max(
+        _NEGLIGIBLE * float(np.max(g)), _NEGLIGIBLE * apart_in_all / np.trace(whole), _ROUNDING * (usual or decay)
+    )
     joint = np.sum(np.sqrt(spread * diagonal)) <= apart_in_all if joint is None else joint
     if joint or not np.all(np.isfinite(beta)):
         beta, g = np.zeros_like(beta), np.maximum(g, least)
