@@ -64,15 +64,19 @@ def corners_of(models: Models, J: Array, P: Array, R: Array | None = None, h: fl
 
     What is known of f and A as a norm is charged to the decay, and so is `h g'P g`, g what the models have beyond them.
     """
-    gamma, still = _gamma(models, P) if h else 0.0, P @ J
-    return [_corner(models, J, P, R, h, f, A, gamma, still) for f, A in models.corners]
+    gamma, weights = _gamma(models, P) if h else 0.0, dict[bytes, Array]()
+    found = []
+    for f, A in models.corners:
+        key = A.tobytes() if h else b""
+        if key not in weights:  # corners with the same b have the same bounds
+            weights[key] = P @ (J + h * A) if h else P @ J
+        found.append(_corner(models, J, P, R, h, f, A, gamma, weights[key]))
+    return found
 
 
 def _corner(
-    models: Models, J: Array, P: Array, R: Array | None, h: float, f: Array, A: Array, gamma: float, still: Array
+    models: Models, J: Array, P: Array, R: Array | None, h: float, f: Array, A: Array, gamma: float, b: Array
 ) -> Corner:
-    """`gamma` and `still`, b for h = 0, are the same at all corners."""
-    b = P @ (J + h * A) if h else still
     moved = P @ f
     whole = J.T @ P @ A
     decay = -(whole + whole.T) - (h * A.T @ P @ A if h else 0.0) - (0.0 if R is None else J.T @ R @ J)

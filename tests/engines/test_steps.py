@@ -96,7 +96,7 @@ def accepted(problem: Problem, T: Array, c1: float, c0: float | None = None) -> 
 
 
 def after(loop: ClosedLoop, x: Array, h: float, values: Array) -> Array:
-    """States (points, n) a step later: `values` (parts, N) are the uncertain quantities in equal parts of the period."""
+    """States (points, n) a step later: `values` (parts, N) is what is uncertain, in equal parts of the period."""
     f, u = loop.system.uncertain_function(), loop.policy(x)
     if loop.system.time == "discrete":
         return np.asarray(f(x, u, values[0]))
@@ -386,7 +386,7 @@ def test_a_policy_that_is_not_centred_has_a_band_around_where_it_rests() -> None
     network = dataclasses.replace(problem.loop.network, biases=(np.array([0.05]),))
     problem = Problem(ClosedLoop(problem.loop.system, network), problem.V)
     found = prove_band(problem, T, 0.25)
-    assert found is not None and 0.0025 < found[0] < 0.00275
+    assert found is not None and found[0] > 0.0025 and found[0] == pytest.approx(0.0025, rel=0.1)
     assert accepted(problem, T, found[1], found[0]) == "ACCEPTED"
 
 
@@ -427,7 +427,7 @@ def test_the_edge_is_at_most_one_over_the_step() -> None:
     """x+ = w: everything ends within one step, and only the edge's limit says where."""
     problem, T = linear(W, time="discrete")
     found = prove_band(problem, T, 0.25)
-    assert found is not None and 0.01 < found[0] < 0.011
+    assert found is not None and found[0] == pytest.approx(0.01, rel=0.1) and found[0] > 0.01
     ball, _ = local_ball(problem, T, found[1], found[0])
     assert 0 < ball.edge < 1
 
