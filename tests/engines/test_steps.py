@@ -418,7 +418,7 @@ def test_bands_are_accepted_and_true(loop: ClosedLoop) -> None:
         G = mean_rate(loop, x, h, values)
         step = h if stepwise else 0.0
         D = 2 * np.einsum("pi,ij,pj->p", x, P, G) + step * np.einsum("pi,ij,pj->p", G, P, G)
-        assert np.all(D[(V >= floor) & (V <= level)] < 0)
+        assert np.all(D[(floor <= V) & (level >= V)] < 0)
         if stepwise:
             assert np.all((V + step * D)[floor > V] < floor)
 
