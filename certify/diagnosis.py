@@ -15,7 +15,6 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.claims import Problem
 from certify.closed_loop import ClosedLoop
 from certify.engines.base import Proof
 from certify.engines.falsify import falsify
@@ -209,7 +208,8 @@ def _wider_domain(result: RoaResult, name: str) -> Step:
     P = problem.V.P
     loop = ClosedLoop(wider, result.network)
     limit = domain_limit(P, wider.domain)
-    witness = falsify(Problem(loop, problem.V), diagonalising_coordinates(P, loop.linearise()[0]), limit, samples=4000)
+    T = diagonalising_coordinates(P, loop.mean_rate(), loop.step)
+    witness = falsify(replace(problem, loop=loop), T, limit, samples=4000)
     reach = volume(P, limit if witness is None else min(limit, witness.level))
     grown = reach / volume(P, level)
     if grown < _WORTH:

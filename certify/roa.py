@@ -35,14 +35,14 @@ from certify.diagnosis import diagnose
 from certify.engines.base import Attempt, Budget, Progress, Proof, Task
 from certify.engines.falsify import Witness, refutes
 from certify.errors import BackendError, InputError, SoundnessError
-from certify.lyapunov import are_inside, leaves_domain, volume
+from certify.lyapunov import are_inside, leaves_domain, slowest_decay, volume
 from certify.lyapunov.function import Quadratic
 from certify.options import RoaOptions
 from certify.policies import TanhNetwork
 from certify.race import Contender, Race
 from certify.rest import find_rest
 from certify.results import Levels, RoaResult, Tried, TubeFacts
-from certify.rigorous import eigenvalues
+from certify.rigorous import eigenvalues, instability
 from certify.systems import System
 from certify.trials import OPTIMISING, Trial, blends, by_reach, corrected, named, optimised, robust, solved
 from certify.verdict import Stop, Verdict
@@ -670,13 +670,15 @@ def _unstable(loop: ClosedLoop) -> tuple[Verdict, Stop, tuple[str, ...]] | None:
     """REFUTED or UNKNOWN with the eigenvalues, or None if the spectrum is rigorously stable."""
     enclosures = eigenvalues(loop)
     if enclosures is None:
-        approximate = np.linalg.eigvals(loop.linearise()[0])
-        if np.max(approximate.real) < 0:
+        L, h = loop.mean_rate(), loop.step
+        approximate = np.linalg.eigvals(np.eye(len(L)) + h * L if h else L)
+        if slowest_decay(L, h) > 0:
             return None  # nearly multiple eigenvalues: the local proof decides
         return Verdict.UNKNOWN, Stop.SPECTRUM, tuple(f"{v:.6g}" for v in approximate)
     shown = tuple(f"{complex(v.mid()):.6g}" for v in enclosures)
-    if any(v.real > 0 for v in enclosures):
+    signs = [instability(loop, v) for v in enclosures]
+    if any(v > 0 for v in signs):
         return Verdict.REFUTED, Stop.UNSTABLE, shown
-    if not all(v.real < 0 for v in enclosures):
+    if not all(v < 0 for v in signs):
         return Verdict.UNKNOWN, Stop.SPECTRUM, shown
     return None

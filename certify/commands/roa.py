@@ -41,7 +41,7 @@ def roa(
     sample_time: Annotated[
         str | None,
         typer.Option(
-            help="Period over which the input is held, as in 0.02; LO..HI: any sequence of periods between the two; max: "
+            help="Period over which the input is held, as in 0.02; LO..HI: any sequence of periods between them; max: "
             "the longest for which the set proved without one can still be proved."
         ),
     ] = None,

@@ -1,9 +1,9 @@
 """Power series in time over any arithmetic: what a solution of the plant's equations does within a sampling period.
 
 A value of this arithmetic is a row of coefficients of t^0, t^1, ..., each a value of the arithmetic beneath. Because
-x' = f(x, u), coefficient k of f gives coefficient k + 1 of x: the expressions are walked once, and then every node takes
-its next coefficient in the order in which the nodes arose, so that nothing is computed twice. A coefficient that is 0
-for certain is no value at all, so that it costs nothing and adds no error.
+x' = f(x, u), coefficient k of f gives coefficient k + 1 of x: the expressions are walked once, and then every node
+takes its next coefficient in the order in which the nodes arose, so that nothing is computed twice. A coefficient that
+is 0 for certain is no value at all, so that it costs nothing and adds no error.
 """
 
 from __future__ import annotations

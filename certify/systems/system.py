@@ -26,11 +26,13 @@ import sympy
 
 from certify.errors import InputError
 from certify.expressions import GRAMMAR, evaluate_exactly, has_tree
+from certify.systems.ode import rk4_step
 
 Interval = tuple[Fraction, Fraction]
 Kind = Literal["parameter", "disturbance", "input error"]
 Time = Literal["continuous", "discrete"]
 
+_SUBSTEPS = 4  # of a sampling period, in simulation
 _MOST_DIGITS = 1000  # before or after the point: 1e999999999 would fill the memory
 
 
@@ -380,6 +382,20 @@ class System:
     def uncertain_function(self, module: str = "numpy") -> Callable[[Any, Any, Sequence[float]], Any]:
         """The same for values of what is uncertain, in the order of the ranges: a third argument, k numbers."""
         return self._function(self.uncertain_dynamics(), [s for s, _ in self.uncertain], module)
+
+    def mean_rate(self, f: Callable[[Any, Any], Any], x: Any, u: Any, step: float) -> Any:
+        """G (..., n) of `x+ = x + h G` in floating point, from this plant's f, with the input held over the step h.
+
+        f itself where h = 0; in discrete time h = 1 and G = f - x. For search only: nothing is proved with it.
+        """
+        if self.time == "discrete":
+            return f(x, u) - x
+        if step == 0:
+            return f(x, u)
+        after = x
+        for _ in range(_SUBSTEPS):
+            after = rk4_step(lambda y: f(y, u), after, step / _SUBSTEPS)
+        return (after - x) / step
 
     def _function(
         self, expressions: Sequence[sympy.Expr], more: Sequence[sympy.Symbol], module: str
