@@ -28,7 +28,7 @@ _LEAST = 1e-280  # a level, below which binary64 holds nothing more
 _MARGIN = 1e-3  # share of the decay that is left to the checker's rounding
 _ENOUGH = 1.01 * _MARGIN
 _WIDER = 1 + 1e-9  # of the ball, which has to contain {V <= c1} beyond all rounding
-_ORDER = 3  # of the series in time, where an input is held
+_ORDER = 4  # of the series in time, where an input is held
 _FAR, _NEAR = 1e-2, 0.3  # from one level to the next lower one, where all below one is good, and where not
 _LOWER = 0.5  # from one level to the next, while floors fall with them
 _NOTHING = 1e-12  # of the limit: no floor is asked to be lower

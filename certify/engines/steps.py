@@ -47,10 +47,7 @@ class Steps:
     @property
     def longest(self) -> float:
         """h, the length of the step in V's increment: 0 in continuous time."""
-        system = self.known.loop.system
-        if system.time == "discrete":
-            return 1.0
-        return 0.0 if system.sample is None else float(system.sample[1])
+        return self.known.loop.step
 
     @property
     def is_plain(self) -> bool:
