@@ -64,15 +64,19 @@ def corners_of(models: Models, J: Array, P: Array, R: Array | None = None, h: fl
 
     What is known of f and A as a norm is charged to the decay, and so is `h g'P g`, g what the models have beyond them.
     """
-    gamma, still = _gamma(models, P) if h else 0.0, P @ J
-    return [_corner(models, J, P, R, h, f, A, gamma, still) for f, A in models.corners]
+    gamma, weights = _gamma(models, P) if h else 0.0, dict[bytes, Array]()
+    found = []
+    for f, A in models.corners:
+        key = A.tobytes() if h else b""
+        if key not in weights:  # corners with the same b have the same bounds
+            weights[key] = P @ (J + h * A) if h else P @ J
+        found.append(_corner(models, J, P, R, h, f, A, gamma, weights[key]))
+    return found
 
 
 def _corner(
-    models: Models, J: Array, P: Array, R: Array | None, h: float, f: Array, A: Array, gamma: float, still: Array
+    models: Models, J: Array, P: Array, R: Array | None, h: float, f: Array, A: Array, gamma: float, b: Array
 ) -> Corner:
-    """`gamma` and `still`, b for h = 0, are the same at all corners."""
-    b = P @ (J + h * A) if h else still
     moved = P @ f
     whole = J.T @ P @ A
     decay = -(whole + whole.T) - (h * A.T @ P @ A if h else 0.0) - (0.0 if R is None else J.T @ R @ J)
@@ -199,10 +203,14 @@ def _multipliers_at(corners: Sequence[Corner], weights: Sequence[Array], joint: 
     for corner, weight in zip(corners, weights, strict=True):
         _, _, before = parts.get(id(corner.b), (None, None, 0.0))
         parts[id(corner.b)] = corner.models, corner.b, before + weight
-    return _multipliers_of(list(parts.values()), joint)
+    largest = max(float(np.max(np.diag(corner.decay))) for corner in corners)
+    return _multipliers_of(list(parts.values()), joint, largest)
 
 
-def _multipliers_of(parts: Sequence[tuple[Models, Array, Array]], joint: bool | None) -> Multipliers:
+def _multipliers_of(
+    parts: Sequence[tuple[Models, Array, Array]], joint: bool | None, decay: float = 1.0
+) -> Multipliers:
+    """`decay` is what g is to be small beside where no component has any weight."""
     n, k = parts[0][1].shape
     usual, whole = 0.0, np.zeros((k, k))
     along, by_size, E2, Q2, spread = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(k)
@@ -224,7 +232,9 @@ def _multipliers_of(parts: Sequence[tuple[Models, Array, Array]], joint: bool | 
         beta = np.where(along > 0, np.sqrt(Q2 / along), 0.0)
     diagonal, apart_in_all = np.diag(whole), np.sum(np.sqrt(Q2 * along))
     g = np.sqrt(spread / diagonal)
-    least = max(_NEGLIGIBLE * float(np.max(g)), _NEGLIGIBLE * apart_in_all / np.trace(whole), _ROUNDING * usual)
+    least = max(
+        _NEGLIGIBLE * float(np.max(g)), _NEGLIGIBLE * apart_in_all / np.trace(whole), _ROUNDING * (usual or decay)
+    )
     joint = np.sum(np.sqrt(spread * diagonal)) <= apart_in_all if joint is None else joint
     if joint or not np.all(np.isfinite(beta)):
         beta, g = np.zeros_like(beta), np.maximum(g, least)
