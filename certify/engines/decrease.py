@@ -22,6 +22,7 @@ _ROUNDS = 16  # of weights that look at bad directions more and more
 _FOCUS, _LEAST_WEIGHT = 2.0, 1e-4
 _SETTLED = 2e-3  # of a margin: more rounds are not worth less
 _NEGLIGIBLE, _ROUNDING = 1e-9, 1e-12  # of the bounds; of the decay, where a checker's Q is not quite 0
+_SHARE = 0.25  # of 1 against d in products of the two, as the checker has it
 _SHORT = 5  # bits of a multiplier: the checker's rationals stay short
 
 
@@ -83,10 +84,11 @@ def _corner(
     charge = h * (gamma**2 + 2 * math.sqrt(max(float(f @ moved), 0.0)) * gamma)
     start = h * float(f @ moved)
     if models.spread is not None:
-        wrong = models.spread.slack + models.spread.error
-        s = float(np.sqrt(np.diag(P)) @ wrong)
-        both = 2 * float(np.hypot(np.linalg.norm(b, axis=1), h * moved) @ wrong) + h * s * (s + gamma)
-        charge, start = charge + both + h * s * gamma, start + both
+        error, slack, roots = models.spread.error, models.spread.slack, np.sqrt(np.diag(P))
+        e, s, lengths, p = float(roots @ error), float(roots @ slack), np.linalg.norm(b, axis=1), h * np.abs(moved)
+        both = float(lengths @ error + p @ slack) + h * e * s
+        charge += 2 * float(lengths @ slack) + h * s * s + 2 * h * gamma * (e + s) + both / _SHARE
+        start += 2 * float(p @ error) + h * e * e + _SHARE * both
     return Corner(models, b, decay - charge * np.eye(len(decay)), b.T @ f, start)
 
 
