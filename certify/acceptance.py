@@ -120,7 +120,7 @@ def _wanted(certificate: Certificate) -> str:
 def _leaf_of(answer: Mapping[str, Any]) -> int | None:
     """The number of the leaf that the checker refuses; None if it refuses something else."""
     found = re.fullmatch(r"leaf (\d+)", str(answer.get("at", "")))
-    return int(found[1]) if found and answer.get("rule") in ("ring", "inputs") else None
+    return int(found[1]) if found and answer.get("rule") in ("ring", "inputs", "flow") else None
 
 
 def _lowered(certificate: Certificate, leaf: int | None, problem: Problem, tries: int) -> Certificate | None:

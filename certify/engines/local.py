@@ -119,7 +119,9 @@ def local_ball(
         rule = Rule.anywhere(problem, T)
         found = rule.around(level)
         by, edge = found.multipliers, found.edge
-    return LocalBall(ball_around(problem, T, level), by.rows, by.weight, edge, rule.steps.order), rule.cuts or (1,) * len(problem.loop.system.ranges)
+    return LocalBall(ball_around(problem, T, level), by.rows, by.weight, edge, rule.steps.order), rule.cuts or (
+        1,
+    ) * len(problem.loop.system.ranges)
 
 
 def ball_around(problem: Problem, T: Array, level: float) -> Array:
@@ -234,9 +236,7 @@ def _order(problem: Problem) -> int:
     return 1 if problem.loop.system.sample is None else _ORDER
 
 
-def _largest(
-    good: Callable[[float], bool], limit: float, until: float, fall: float = _FAR
-) -> float | None:
+def _largest(good: Callable[[float], bool], limit: float, until: float, fall: float = _FAR) -> float | None:
     """The largest level up to `limit` that is good, within 2 %, if those somewhat below it are."""
     if good(limit):
         return limit
