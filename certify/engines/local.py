@@ -119,9 +119,8 @@ def local_ball(
         rule = Rule.anywhere(problem, T)
         found = rule.around(level)
         by, edge = found.multipliers, found.edge
-    return LocalBall(ball_around(problem, T, level), by.rows, by.weight, edge, rule.steps.order), rule.cuts or (
-        1,
-    ) * len(problem.loop.system.ranges)
+    ball = LocalBall(ball_around(problem, T, level), by.rows, by.weight, edge, rule.steps.order)
+    return ball, rule.cuts or (1,) * len(problem.loop.system.ranges)
 
 
 def ball_around(problem: Problem, T: Array, level: float) -> Array:

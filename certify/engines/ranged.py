@@ -1,4 +1,4 @@
-"""Jets on a ball where something is uncertain: value and gradient are affine in it, all else is as good as at its worst.
+"""Jets on a ball where something is uncertain: value and gradient are affine in it, all else is as at its worst.
 
 In a cell of the box of ranges each quantity is its middle plus half its width times y_j in [-1, 1]; the length of a
 period may be one more of them. What decides a stiff
