@@ -17,7 +17,8 @@ from certify.reference.rules import judge
 from tests.checker.test_rules import honest as of_version_3
 from tests.reference.test_practical import scalar
 from tests.support.balls import with_ball
-from tests.support.certificates import Document, dump, edited, write
+from tests.support.certificates import Document, edited
+from tests.support.reference import dump, write
 
 TRUSTED = {"kind": "trusted-solver", "solver": "dReal", "version": "4", "precision": (0.5).hex(), "queries": []}
 KEYS = [

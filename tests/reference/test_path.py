@@ -41,11 +41,11 @@ from certify.systems import get_system
 from tests.reference.test_local import row
 from tests.reference.test_tube import array, at, more, of_tube, times, without, yes
 from tests.support.balls import TINY, around, ball, exactly, slab_of, square, with_ball
-from tests.support.certificates import Document, decode, dump, edited, encode, make, write
+from tests.support.certificates import Document, decode, edited, encode, make
 from tests.support.certificates import verdict as verdict_of_the_checker
 from tests.support.models import curves, field, model, numbers, units
 from tests.support.paths import along, follow
-from tests.support.reference import judge
+from tests.support.reference import dump, judge, write
 
 Edit = Callable[[Document], Document]
 LEAST = 5e-324

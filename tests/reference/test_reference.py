@@ -57,7 +57,6 @@ from tests.support.certificates import (
     LEAF,
     Document,
     decode,
-    dump,
     edited,
     encode,
     grow,
@@ -70,7 +69,7 @@ from tests.support.certificates import (
 )
 from tests.support.models import beyond, curved, form, linear, matrix, model
 from tests.support.oracle import policy_in_arb, value_of
-from tests.support.reference import judge, judge_bytes
+from tests.support.reference import dump, judge, judge_bytes
 
 SHIPPED = Path(__file__).parents[2] / "examples" / "policies" / "pendulum.pt"
 
