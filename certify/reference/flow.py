@@ -22,13 +22,15 @@ from .balls import ZERO, spanning
 from .document import Certificate, Interval
 from .evidence import Ball
 from .expressions import Equations
+from .fields import exact
 from .loop import Field, Known, Loop
 from .model import SPREAD, Model
+from .rational import inverse_diagonal
 from .refusal import Refused, require
 from .series import Constant, added, coefficients
 from .taylor import Taylor
 
-ATTEMPTS = (1.25, 1.25, 1.25, 1.25, 1.5, 2.0)  # how much more than the last |f| is tried
+ATTEMPTS, MORE = 12, arb(1.25)  # more than the last hi |f| is tried, as long as that grows by more than this
 LEAST = arb(2) ** -200  # of what is tried: hi |f| < kappa is asked, also where f is 0
 
 
@@ -90,13 +92,13 @@ def settled(c: Certificate) -> Callable[[Model], Model]:
     return Model.at_rest if c.ends_at_origin else lambda v: v
 
 
-def steps_on(loop: Loop, known: Known, ball: Ball, largest: Sequence[fmpq], at: str) -> Steps:
-    """Without a sample nothing is asked; `largest` are bounds of the x_i^2 that count."""
+def steps_on(loop: Loop, known: Known, ball: Ball, at: str) -> Steps:
+    """Rule `flow` on a ball; without a sample nothing is asked."""
     c = loop.c
     if c.sample is None:
         return Steps(loop, known)
     states = {name: known.names[name] for name in c.plant.states}
-    within = reached_on(loop, known, ball, largest, at)
+    within = reached_on(loop, known, at)
     held = {name: known.names[name] for name in c.plant.inputs} | loop.anything(known)
     hi = arb(c.step)
     period = known.moving(c.sample, c.k, loop.symbols)
@@ -111,7 +113,7 @@ def steps_on(loop: Loop, known: Known, ball: Ball, largest: Sequence[fmpq], at: 
     return Steps(loop, known, ball.order, within, tail)
 
 
-def reached_on(loop: Loop, known: Known, ball: Ball, largest: Sequence[fmpq], at: str) -> dict[str, Model]:
+def reached_on(loop: Loop, known: Known, at: str) -> dict[str, Model]:
     """The states of a whole period, each within kappa + kappa' ||d|| of where it was, or a refusal.
 
     For each d they have a model with these numbers: what a state moves by is a part that depends on d alone, and a part
@@ -121,7 +123,7 @@ def reached_on(loop: Loop, known: Known, ball: Ball, largest: Sequence[fmpq], at
     states = [known.names[name] for name in c.plant.states]
     uncertain = loop.anything(known)
     far, turned = [ZERO] * c.n, [ZERO] * c.n
-    for factor in ATTEMPTS:
+    for _ in range(ATTEMPTS):
         moved = [beyond(x, k, t) for x, k, t in zip(states, far, turned, strict=True)]
         within = dict(zip(c.plant.states, moved, strict=True))
         F = loop.field(replace(known, names={**known.names, **within}), uncertain, "flow", at).components
@@ -131,11 +133,12 @@ def reached_on(loop: Loop, known: Known, ball: Ball, largest: Sequence[fmpq], at
         stays = all(rest or v < k for rest, v, k in zip(rests, most[0], far, strict=True))
         if stays and all(v < t for v, t in zip(most[1], turned, strict=True)):
             ranges = [f.v + f.radius * SPREAD for f in F]
-            sizes = [x.slope.min(arb(square).sqrt()) for x, square in zip(states, largest, strict=True)]
-            in_domain(c, [size * SPREAD for size in sizes], ranges, at)
+            largest = (arb(exact(c.inner) * s).sqrt() for s in inverse_diagonal(c.P, "lyapunov"))
+            sizes = [x.slope.min(size) for x, size in zip(states, largest, strict=True)]
+            in_domain(c, [v * SPREAD for v in sizes], ranges, at)
             return {name: beyond(x, k, t) for name, x, k, t in zip(c.plant.states, states, *most, strict=True)}
-        far = [ZERO if rest else arb(factor) * v + LEAST for rest, v in zip(rests, most[0], strict=True)]
-        turned = [arb(factor) * v + LEAST for v in most[1]]
+        far = [ZERO if rest else MORE * v + LEAST for rest, v in zip(rests, most[0], strict=True)]
+        turned = [MORE * v + LEAST for v in most[1]]
     raise Refused("flow", at, "no bound of how far the state goes within a period was found")
 
 
@@ -179,7 +182,7 @@ def reached_from(c: Certificate, leaf: Moving, at: str) -> dict[str, Taylor]:
     """The states of a whole period, each within kappa of where it was, or a refusal."""
     hi, names = arb(c.step), c.plant.states
     far = [ZERO] * c.n
-    for factor in ATTEMPTS:
+    for _ in range(ATTEMPTS):
         moved = dict(zip(names, map(widened, leaf.states.values(), far), strict=True))
         try:
             F = c.plant.dynamics.evaluate({**moved, **leaf.inputs, **leaf.anything}, constant)
@@ -193,7 +196,7 @@ def reached_from(c: Certificate, leaf: Moving, at: str) -> dict[str, Taylor]:
             states = [within_both(x.c + (x.first + x.r) * SPREAD, w) for x, w in each]
             in_domain(c, states, ranges, at)
             return dict(zip(names, map(widened, leaf.states.values(), most), strict=True))
-        far = [arb(factor) * v + LEAST for v in most]
+        far = [MORE * v + LEAST for v in most]
     raise Refused("flow", at, "no bound of how far the state goes within a period was found")
 
 

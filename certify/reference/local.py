@@ -11,8 +11,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from itertools import pairwise, product
 
-from flint import fmpq
-
 from .decrease import contains, decreases, decreases_around, sound_multipliers, whatever_y
 from .document import Certificate, Interval
 from .evidence import Ball
@@ -23,11 +21,8 @@ from .rational import identity
 from .refusal import require
 
 
-def local(loop: Loop, ball: Ball, parts: Sequence[int], inverse: Sequence[fmpq]) -> None:
-    """What the file says of the ball comes first, then rules `inputs` and `flow`, and then what decreases, in each cell.
-
-    `inverse` is the diagonal of P^-1.
-    """
+def local(loop: Loop, ball: Ball, parts: Sequence[int]) -> None:
+    """What the file says of the ball comes first, then rules `inputs` and `flow`, and then what falls, in each cell."""
     c: Certificate = loop.c
     holds = contains(ball, c.P, exact(c.inner) * identity(c.n))
     require(holds, "local", "ball", "it does not contain {V <= c1}: J'PJ - c1 I is not positive definite")
@@ -35,7 +30,7 @@ def local(loop: Loop, ball: Ball, parts: Sequence[int], inverse: Sequence[fmpq])
     h, R, level = c.step, 2 * c.rate * c.P, c.floor
     short = h == 0 or exact(ball.edge) * h <= 1
     require(bool(short), "local", "ball", "the edge is beyond 1/h: V could rise above c0 from below")
-    steps = steps_on(loop, loop.known(ball.J, "local", "ball"), ball, [exact(c.inner) * s for s in inverse], "ball")
+    steps = steps_on(loop, loop.known(ball.J, "local", "ball"), ball, "ball")
 
     def falls(G: Field) -> bool:
         if level is None:

@@ -52,10 +52,10 @@ def judge(raw: bytes) -> Verdict:
 def check(c: Certificate) -> int | None:
     """Every rule in its order; the number of leaves, or None where the evidence cannot be replayed."""
     rational.levels(c)
-    of_P = rational.inverse_diagonal(c.P, "lyapunov")
+    inverse = rational.inverse_diagonal(c.P, "lyapunov")
     if c.ends_at_origin:
         rational.equilibrium(c)
-    rational.domain(c, of_P)
+    rational.domain(c, inverse)
     evidence = c.evidence
     if isinstance(evidence, Trusted):
         rational.centring(c)
@@ -67,7 +67,7 @@ def check(c: Certificate) -> int | None:
     loop = None
     if evidence.ball is not None:
         loop = Loop(c)
-        local(loop, evidence.ball, evidence.cells, of_P)
+        local(loop, evidence.ball, evidence.cells)
     leaves = structure(evidence.tree, c.n)
     if c.inner < c.outer or loop is None:  # no local ball stands in for the leaves
         check_leaves(Leaves(c, evidence.T, S), evidence)

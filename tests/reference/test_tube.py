@@ -414,7 +414,6 @@ TRUSTED = {"kind": "trusted-solver", "solver": "dReal", "version": "4", "precisi
 MALFORMED: dict[str, Edit] = {
     "a tube under claim asymptotic": other_claim("asymptotic"),
     "a tube under claim practical": lambda d: edited(practical(d), "evidence.local", None),
-    "a ball under claim practical": lambda d: edited(practical(d), "evidence.tube", []),
     "no ball under claim enlarged": at("evidence.local", None),
     "no ball under claim asymptotic": lambda d: edited(
         edited(other_claim("asymptotic")(d), "evidence.tube", []), "evidence.local", None

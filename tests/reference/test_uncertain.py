@@ -109,7 +109,7 @@ def test_models_in_a_cell_enclose_F_for_all_its_values(factor: str) -> None:
 def holds(f: Model, true: arb, d: list[float]) -> bool:
     """Not certainly outside: each number of the model is a ball, of which no more is known."""
     n, e = len(d), [arb(v) for v in d]
-    known = f.v + sum((f.a[i, 0] * e[i] for i in range(n)), arb(0))
+    known = f.range + sum((f.gradient[i, 0] * e[i] for i in range(n)), arb(0))
     known += sum((f.Q[i, j] * e[i] * e[j] for i in range(n) for j in range(n)), arb(0))
     each = zip(orders(n), triples(n), f.K.entries(), strict=True)
     known += sum((often * k * e[h] * e[i] * e[j] for often, (h, i, j), k in each), arb(0))
@@ -164,7 +164,7 @@ def test_leaf_models_enclose_Vdot_at_every_value(seed: int) -> None:
         radius = 10.0 ** generator.uniform(-3, -0.7, c.n)
         box = Box(0, (centre - radius).tolist(), (centre + radius).tolist())
         (leaf,) = leaves.enclose([box])
-        model = leaves.Vdot(leaf)
+        model = leaves.D(leaf)
     for _ in range(12):
         values = drawn(data, generator)
         share = np.where(generator.random(c.n) < 0.4, 1.0, generator.random(c.n))
