@@ -288,8 +288,14 @@ def balanced(p: arb_mat, square: arb_mat, weight: arb_mat) -> arb_mat:
 
 
 def share(trace: arb, length: arb) -> arb:
-    """tau = sqrt(tr(T weight T') / p'weight p), or 1; any positive number will do, so it is one number and no ball."""
-    tau = arb((trace / length).sqrt().mid()) if length != 0 else ONE
+    """tau = sqrt(tr(T weight T') / p'weight p), or 1; any positive number will do, so it is one number and no ball.
+
+    Of balls that may be 0 it is the largest values that count.
+    """
+    ratio = trace / length
+    if not (ratio > 0 or ratio < 0):
+        ratio = arb(abs(trace).upper()) / arb(abs(length).upper())
+    tau = arb(ratio.sqrt().mid())
     return tau if tau.is_finite() and tau > 0 else ONE
 
 

@@ -48,7 +48,10 @@ def stepping(
     The tree is grown if there is something between the ball and the outer level.
     """
     *floor, inner, outer = levels
-    options: dict[str, Any] = {"squash": "identity", "centre": "none", "scale": [1.0], **more}
+    P = np.atleast_2d(np.asarray(P, dtype=float))
+    P = (P + P.T) / 2
+    T = np.linalg.inv(np.linalg.cholesky(P)).T
+    options: dict[str, Any] = {"squash": "identity", "centre": "none", "scale": [1.0], "T": T, **more}
     data = upgraded(make(dynamics, layers, P, (inner, outer), **options))
     data["plant"]["time"] = "discrete" if discrete else "continuous"
     data["claim"] |= {"rate": rate.hex(), "sample": sample and list(sample)}
