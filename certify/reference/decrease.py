@@ -1,16 +1,16 @@
 """The matrix inequality of the rules `local` and `tube`: d'J'RJ d + 2 d'J'P G + h G'PG < 0 for 0 < ||d|| <= 1.
 
-G is F in continuous time, where h = 0, and by how much the state changes, over h, where time has steps. Around a level
-G need not vanish at the centre, and the inequality has k (V - c0) beside it. Along a path d = (z, sigma), x = m + J z +
-w sigma, and it is of z'J'RJ z + 2 z'J'P (F - v), v the velocity.
+G is F in continuous time, where h = 0, and by how much the state changes, over h, where time has steps. Around a
+level G need not vanish at the centre, and the inequality has k (V - c0) beside it. Along a path d = (z, sigma), x = m +
+J z + w sigma, and it is of z'J'RJ z + 2 z'J'P (F - v), v the velocity.
 
-With b_i the columns of (J + h A)'P and models f_i + a_i.d + d'Q_i d + K_i[d] + sum_j B_ij e_j + r_i of the components of
-G, a_i the rows of A, the left side is a quadratic form, what is left of the products of b_i.d with the other parts, and
-the square of these. Each is put below a quadratic form: 2 p q <= k p^2 + q^2 / k for any k > 0. The file gives these
-numbers, as multipliers or by a weight.
+With b_i the columns of (J + h A)'P and models f_i + a_i.d + d'Q_i d + K_i[d] + sum_j B_ij e_j + r_i of the components
+of G, a_i the rows of A, the left side is a quadratic form, what is left of the products of b_i.d with the other parts,
+and the square of these. Each is put below a quadratic form: 2 p q <= k p^2 + q^2 / k for any k > 0. The file gives
+these numbers, as multipliers or by a weight.
 
-Where something is uncertain f and A are affine in its symbols y. At one d, and for one value of the other parts, the left
-side is a convex function of G, as P is positive definite, and so of y: it is largest at a corner of [-1, 1]^N.
+Where something is uncertain f and A are affine in its symbols y. At one d, and for one value of the other parts, the
+left side is a convex function of G, as P is positive definite, and so of y: it is largest at a corner of [-1, 1]^N.
 """
 
 from __future__ import annotations
@@ -107,8 +107,8 @@ def quadratic(ball: Ball, P: fmpq_mat, R: fmpq_mat, G: Field, h: fmpq) -> tuple[
 def step(P: fmpq_mat, G: Field, size: int, at_centre: arb) -> arb_mat:
     """S_step / h: the square of all that is beyond the second order, and its product with f, of length `at_centre`.
 
-    With ||v|| = (v'Pv)^(1/2) these parts are within Gamma ||d||^2: sum_i e_i d'Q_i d is the image of the matrix dd' under
-    a linear map, and so is that of K; each error counts with the length of what it moves.
+    With ||v|| = (v'Pv)^(1/2) these parts are within Gamma ||d||^2: sum_i e_i d'Q_i d is the image of the matrix dd'
+    under a linear map, and so is that of K; each error counts with the length of what it moves.
     """
     of_P, components = arb_mat(P), G.components
     bent = arb_mat([list(g.Q.entries()) for g in components])
@@ -138,8 +138,8 @@ def certainly_positive(left: arb_mat) -> bool:
     """Whether the symmetric part of each matrix is positive definite, by its pivots or by its midpoints and radii.
 
     A ball takes part in many pivots and counts in each for itself. But with the radii r_ij the form of what a matrix
-    differs from its midpoints by is at most sum r_ij |d_i| |d_j|, and that at most sum_i d_i^2 sum_j r_ij w_j / w_i, for
-    any w > 0: here of the size that evens out the diagonal.
+    differs from its midpoints by is at most sum r_ij |d_i| |d_j|, and that at most sum_i d_i^2 sum_j r_ij w_j / w_i,
+    for any w > 0: here of the size that evens out the diagonal.
     """
     left = (left + left.transpose()) / 2
     if not finite(left.entries()):

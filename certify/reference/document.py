@@ -176,7 +176,7 @@ def read_sample(value: Any) -> Interval | None:
     if value is None:
         return None
     lo, hi = (rational(q, "claim.sample") for q in entries(value, "claim.sample", 2))
-    require(bool(0 <= lo) and bool(lo <= hi) and bool(hi > 0), "format", "claim.sample", "0 <= lo <= hi and hi > 0")
+    require(bool(lo >= 0) and bool(lo <= hi) and bool(hi > 0), "format", "claim.sample", "0 <= lo <= hi and hi > 0")
     return lo, hi
 
 

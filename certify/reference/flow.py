@@ -1,13 +1,14 @@
 """Rule `flow`: the mean of f over a period in which the inputs are held, for every period of the sample.
 
-phi(h) = x + h G, where x_1 is the mean over the period of f(x, u, q(t)), and what f changes by on the way is written as a
-series in time whose last coefficient is taken at every state that phi may reach. That is found first: where hi |f| stays
-below kappa as long as the state stays within kappa of where it was, no component can be the first to leave.
+phi(h) = x + h G, where x_1 is the mean over the period of f(x, u, q(t)), and what f changes by on the way is written as
+a series in time whose last coefficient is taken at every state that phi may reach. That is found first: where hi |f|
+stays below kappa as long as the state stays within kappa of where it was, no component can be the first to leave.
 
-What is uncertain may be another number at each instant. In x_1 alone a quantity stands at one instant at a time, so that
-a symbol can be its mean. All else takes it as any number of its whole range, and not of a cell of it: within a period q
-may go through several, and these numbers hold for all of them. D is a convex function of x_1 with the rest given, and x_1
-is a mean of means over the times that q spends in each cell, so that cells, one after the other, are enough.
+What is uncertain may be another number at each instant. In x_1 alone a quantity stands at one instant at a time, so
+that a symbol can be its mean. All else takes it as any number of its whole range, and not of a cell of it: within a
+period q may go through several, and these numbers hold for all of them. D is a convex function of x_1 with the rest
+given, and x_1 is a mean of means over the times that q spends in each cell, so that cells, one after the other, are
+enough.
 """
 
 from __future__ import annotations

@@ -28,8 +28,9 @@ class Model:
     a is a column, K a row with a number for each triple. e_j is what the model of input j leaves out, |e_j(d)| <= d'U_j
     d with U_j of `errors`: these are the same in all models of a ball.
 
-    Where something is uncertain v(0) and a are affine in its symbols y in [-1, 1]^N: `v` + sum_j y_j `dv_j`, and `a` with
-    `da` likewise; all other numbers are balls that hold what they are for every y. Without `dv` there is no y in them.
+    Where something is uncertain v(0) and a are affine in its symbols y in [-1, 1]^N: `v` + sum_j y_j `dv_j`, and `a`
+    with `da` likewise; all other numbers are balls that hold what they are for every y. Without `dv` there is no y in
+    them.
     """
 
     v: arb
@@ -169,7 +170,7 @@ class Model:
         return Model(v, a, Q, K, E, B, self.errors, dv, da)
 
     def tangent(self, name: str) -> tuple[arb, tuple[arb, ...], tuple[arb, tuple[arb, ...]]]:
-        """phi(v(0)), its coefficients of y, and phi'(v(0)) with its own, for a range on which phi is known to be defined.
+        """phi(v(0)), its coefficients of y, and phi'(v(0)) with its own, where phi is known to be defined on the range.
 
         What an affine function of y leaves out is the square of sum_j y_j dv_j, times half of the second derivative of
         phi or of phi' somewhere on the range of v(0).

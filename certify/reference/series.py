@@ -1,8 +1,8 @@
 """Power series in time of everything in the equations, while the inputs are held: x + x_1 t + x_2 t^2 + ...
 
-A coefficient may be any kind of number that has `+`, `*`, unary `-`, `scaled` and `function(name)`. Each rule below gives
-the coefficient of t^k from those of the operands up to t^k, so that all series are continued together, one order at a
-time, in the order in which the equations' operations were written down; x_(k+1) is f_k / (k + 1).
+A coefficient may be any kind of number that has `+`, `*`, unary `-`, `scaled` and `function(name)`. Each rule below
+gives the coefficient of t^k from those of the operands up to t^k, so that all series are continued together, one order
+at a time, in the order in which the equations' operations were written down; x_(k+1) is f_k / (k + 1).
 
 What is uncertain may change within the period. A coefficient then stands for the mean of what the rule gives for the
 values at several instants; so it must hold that for any choice of one value for each place where a quantity stands. For

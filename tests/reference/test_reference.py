@@ -743,7 +743,7 @@ def test_leaves_enclose_the_policy_V_and_Vdot(name: str) -> None:
         shared, each = leaves_of(data)
         mine = shared.c
         for leaf in each[::5]:
-            Vdot, V = shared.Vdot(leaf).bound(), (shared.V(leaf).bound(), (-shared.V(leaf)).bound())
+            Vdot, V = shared.D(leaf).bound(), (shared.V(leaf).bound(), (-shared.V(leaf)).bound())
             for d in generator.uniform(-1, 1, (3, mine.n)).round().tolist():
                 ends = zip(leaf.box.lo, leaf.box.hi, d, strict=True)
                 z = [(Fraction(a) + Fraction(b) + (Fraction(b) - Fraction(a)) * Fraction(t)) / 2 for a, b, t in ends]

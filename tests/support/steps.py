@@ -77,17 +77,17 @@ def with_ball(data: Document, order: int, edge: float) -> Document:
         with ctx.workprec(PRECISION):
             c = read(dump(data))
             h, loop = float(Fraction(str(c.step))), Loop(c)
-            G = steps_on(loop, loop.known(c.evidence.ball.J, "local", "ball"), c.evidence.ball, "ball").change(  # type: ignore[union-attr]
-                next(cells(c.plant.ranges, c.evidence.cells)), "local", "ball"  # type: ignore[union-attr]
-            )
+            if not isinstance(c.evidence, Tree) or c.evidence.ball is None:
+                raise TypeError("a ball was expected")
+            steps = steps_on(loop, loop.known(c.evidence.ball.J, "local", "ball"), c.evidence.ball, "ball")
+            G = steps.change(next(cells(c.plant.ranges, c.evidence.cells)), "local", "ball")
     except Refused:
         return data
-    a, Q, E = (
-        np.array([[float(v.mid()) for v in getattr(g, part).entries()] for g in G.components]) for part in "aQE"
-    )
+    a, Q, E = (np.array([[float(v.mid()) for v in getattr(g, part).entries()] for g in G.components]) for part in "aQE")
     Q, E = Q.reshape(n, n, n), E.reshape(n, n, n)
     b = (J + h * a).T @ P
-    left = -(J.T @ P @ a + a.T @ P @ J + h * a.T @ P @ a + 2 * float(str(c.rate.p)) / float(str(c.rate.q)) * J.T @ P @ J)
+    rate = 2 * float.fromhex(data["claim"]["rate"])
+    left = -(J.T @ P @ a + a.T @ P @ J + h * a.T @ P @ a + rate * J.T @ P @ J)
     if not np.linalg.eigvalsh(left)[0] > 0:
         return data
     inverse = np.linalg.inv(left)
