@@ -118,7 +118,7 @@ SAMPLES = [
 ]
 
 
-# ---------------------------------------------------------------------------------------------------------- on a ball
+# ------------------------------------------------------------------------------------------------------------ on a ball
 
 
 def around(value: mpmath.mpf) -> arb:
@@ -225,7 +225,7 @@ def test_no_state_leaves_what_is_reached(practical: bool) -> None:
                     assert holds(steps.within[name], around(start + 0.125 * share * g), d, [])  # type: ignore[index]
 
 
-# ---------------------------------------------------------------------------------------------------------- on leaves
+# ------------------------------------------------------------------------------------------------------------ on leaves
 
 
 def leaf_of(data: Document, box: Box) -> tuple[Leaves, Any]:
@@ -296,7 +296,7 @@ def test_discrete_time(name: str, practical: bool) -> None:
                     assert holds(g, value, d, y) if models == "ball" else value_at(t, symbols).overlaps(value)
 
 
-# ------------------------------------------------------------------------------------------------- kappa, and the series
+# ------------------------------------------------------------------------------------------------ kappa, and the series
 
 
 @pytest.mark.parametrize(

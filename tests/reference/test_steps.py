@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
+from dataclasses import replace
 from fractions import Fraction
 from functools import cache
 from typing import Any
@@ -18,7 +19,6 @@ import pytest
 from certify.reference import decrease, flow, leaves, local, rules
 from certify.reference.__main__ import in_words
 from certify.reference.document import read
-from certify.reference.model import Model
 from tests.support.certificates import Document, decode, edited, encode
 from tests.support.periods import mean_change, switching
 from tests.support.reference import dump, judge
@@ -33,7 +33,7 @@ def gain(k: float) -> list[Any]:
     return [([[-k]], [0.0])]
 
 
-# --------------------------------------------------------------------------------------------------- discrete and held
+# ---------------------------------------------------------------------------------------------------- discrete and held
 
 
 @pytest.mark.parametrize(("factor", "true"), [("99/100", True), ("-99/100", True), ("1", False), ("-101/100", False)])
@@ -84,20 +84,23 @@ def test_an_integrator_whose_input_is_held(k: float, true: bool, sample: tuple[s
 def test_an_unstable_loop_whose_input_is_held(order: int, hi: str, true: bool) -> None:
     """x' = x + u, u = -k x: x(h) = (e^h - k (e^h - 1)) x, and -1 at e^h = (k + 1) / (k - 1): for k = 6 at 0.336."""
     data = stepping([["+", "x", "u"]], gain(6.0), [[1.0]], (0.25, 1.0), sample=(hi, hi), order=order, leaves=60, **WIDE)
-    assert accepted(data) == (true and order > 2)
+    assert accepted(data) == true
     assert not accepted(edited(data, "claim.sample", ["0", "7/20"]))
 
 
 def test_a_period_that_the_file_makes_longer() -> None:
-    data = stepping([["+", "x", "u"]], gain(6.0), [[1.0]], (1.0, 1.0), sample=("1/4", "1/4"), order=4, **WIDE)
+    domain = [("-9", "9")]
+    data = stepping(
+        [["+", "x", "u"]], gain(6.0), [[1.0]], (1.0, 1.0), sample=("1/4", "1/4"), order=4, domain=domain, **WIDE
+    )
     assert judge(data) is None
     assert judge(edited(data, "claim.sample", ["1/4", "17/50"])) == "local"
     assert judge(edited(data, "claim.sample", ["1/4", "2"])) == "flow"
     assert judge(edited(data, "claim.sample", None)) == "format"  # the order belongs to a sample
-    assert judge(edited(data, "evidence.local.order", 1)) == "local"
+    assert judge(edited(data, "evidence.local.order", 1)) == "local"  # too coarse
 
 
-# ------------------------------------------------------------------------------------------------- practical with a ball
+# ------------------------------------------------------------------------------------------------ practical with a ball
 
 
 def drifting(edge: float | None, levels: tuple[float, float, float] = (0.25, 0.5, 1.0), **more: Any) -> Document:
@@ -123,9 +126,9 @@ def test_the_rate_around_a_level() -> None:
         assert accepted(data) == true
 
 
-@pytest.mark.parametrize(("edge", "rule"), [(0.5, None), (1.0, None), (1.0 + 2.0**-52, "local"), (1.5, "local")])
-def test_the_edge_of_a_discrete_loop_is_at_most_1(edge: float, rule: str | None) -> None:
-    """x+ = x/2 + w/4: from V <= c0 to at most (c0^(1/2) / 2 + 1/16)^2."""
+@pytest.mark.parametrize(("edge", "rule"), [(0.5, None), (0.7, None), (0.75, "local"), (1.0, "local"), (1.5, "local")])
+def test_the_edge_of_a_discrete_loop(edge: float, rule: str | None) -> None:
+    """x+ = x/2 + w/4: -3/4 x^2 + k x^2 must be negative, for which k < 3/4; beyond 1 nothing could be."""
     data = stepping(
         [["+", ["*", "1/2", "x"], ["*", "1/4", "w"]]], STILL, [[1.0]], (0.25, 0.5, 0.5), edge=edge, discrete=True,
         uncertain=[("w", "-1/4", "1/4")],
@@ -140,9 +143,9 @@ def test_a_discrete_loop_must_not_jump_out_of_the_level() -> None:
     for f, true in ((jump, False), (near, True)):
         data = stepping([f], STILL, [[1.0]], (0.25, 0.25, 1.0), edge=None, discrete=True, leaves=600)
         assert accepted(data) == true
-        for edge in (0.1, 0.3, 0.5, 0.7, 0.9, 1.0):
+        for edge in (0.1, 0.5, 0.9):
             with_one = stepping([f], STILL, [[1.0]], (0.25, 0.3, 1.0), edge=edge, discrete=True, leaves=600)
-            assert not accepted(with_one) or true
+            assert true or not accepted(with_one)
 
 
 def test_without_the_bound_of_k_a_loop_would_jump_out(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -170,14 +173,14 @@ def test_a_hole_is_looked_at_where_time_has_steps() -> None:
 
 def test_held_inputs_around_a_level() -> None:
     """x' = u + w, u = -x, h = 1: x(1) = w, |w| <= 1/4, from anywhere."""
-    for edge in (None, 0.5, 1.0, 1.5):
+    for edge in (None, 0.5, 0.9, 1.5):
         data = stepping(
             [["+", "u", "w"]], gain(1.0), [[1.0]], (0.25, 0.25 if edge is None else 0.5, 1.0), edge=edge,
             sample=("1", "1"), order=2, uncertain=[("w", "-1/4", "1/4")], leaves=600, **WIDE,
         )  # fmt: skip
         assert judge(data) == ("local" if edge == 1.5 else None)
-        if edge == 1.0:
-            assert judge(at_level(data, floor=0.07)) is None and judge(at_level(data, floor=0.06)) == "local"
+        if edge == 0.9:
+            assert judge(at_level(data, floor=0.08)) is None and judge(at_level(data, floor=0.06)) == "local"
 
 
 def test_centring_none_starts_from_the_policy_at_0() -> None:
@@ -189,11 +192,11 @@ def test_centring_none_starts_from_the_policy_at_0() -> None:
         assert accepted(data) == true
 
 
-# ------------------------------------------------------------------------------------------------------------- corners
+# -------------------------------------------------------------------------------------------------------------- corners
 
 
 def turned(w: Fraction, cells: int = 1, **more: Any) -> Document:
-    """x' = -x + a y, y' = -b x - y, a and b in 6 +- w: V falls up to |a - b| < 2, though the two are far larger than 1."""
+    """x' = -x + a y, y' = -b x - y, a and b in 6 +- w: V falls up to |a - b| < 2, though both are larger."""
     ranges = [(name, str(6 - w), str(6 + w)) for name in "ab"]
     f = [["+", ["-", "x"], ["*", "a", "y"]], ["-", ["-", ["*", "b", "x"]], "y"]]
     return stepping(
@@ -209,17 +212,25 @@ def test_corners_are_exact_where_everything_is_linear(w: str, true: bool, cells:
 
 
 def test_a_norm_would_not_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Were all corners taken into one ball, less than half of the range would be left."""
-    for name in ("1/2", "99/100"):
-        assert accepted(turned(Fraction(name)))
+    """A stiff pair: what 10 % of 1000 does is far more than what the slow state leaves."""
     stiff = stepping(
         [["+", ["-", "x"], "y"], ["+", ["*", "-1000", "q", "y"], ["*", "-10", "p", "x"]]], [([[0.0, 0.0]], [0.0])],
-        np.diag([1.0, 0.1]), (0.5, 0.5), states="xy", domain=[("-9", "9")] * 2,
-        uncertain=[("q", "19/20", "21/20"), ("p", "19/20", "21/20")],
+        np.eye(2), (0.5, 0.5), states="xy", domain=[("-9", "9")] * 2,
+        uncertain=[("q", "9/10", "11/10"), ("p", "9/10", "11/10")],
     )  # fmt: skip
     assert accepted(stiff)
-    monkeypatch.setattr(local, "whatever_y", lambda F, holds: holds(F.whatever()))
-    assert not accepted(turned(Fraction(99, 100)))
+
+    def by_norms(F: Any, holds: Any) -> bool:
+        """Each gradient within the 2-norm of what y does to it, in any direction."""
+        far = [decrease.norm(sum((decrease.arb_mat(p) for p in f.da), 0 * f.a).entries()) for f in F.components]
+        models = [
+            replace(f.where((0,) * len(f.dv)), a=f.a + r * leaves.arb(0, 1) * decrease.arb_mat(2, 1, [1, 1]))
+            for f, r in zip(F.components, far, strict=True)
+        ]
+        return bool(holds(replace(F, components=models)))
+
+    monkeypatch.setattr(local, "whatever_y", by_norms)
+    assert not accepted(stiff)
 
 
 def test_each_corner_counts(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -247,22 +258,23 @@ def test_what_is_not_affine_in_q_is_taken_in(power: int) -> None:
         assert accepted(data) == true
 
 
-# --------------------------------------------------------------------------------- periods that visit several cells
+# ------------------------------------------------------------------------------------- periods that visit several cells
 
 
-def test_a_period_that_visits_several_cells() -> None:
-    """x' = q y, y' = -2 y + q x, |q| <= 9/10: with x_2 from one cell alone a q(t) that jumps would not be enclosed."""
+def test_a_period_that_visits_several_cells(monkeypatch: pytest.MonkeyPatch) -> None:
+    """x' = -x + q y, y' = -2 y + q x: all but x_1 takes q from its whole range, whatever the cells are."""
     f = [["+", ["*", "q", "y"], ["-", "x"]], ["+", ["*", "-2", "y"], ["*", "q", "x"]]]
-    more: dict[str, Any] = {"states": "xy", "domain": [("-3", "3")] * 2, "uncertain": [("q", "-9/10", "9/10")]}
+    more: dict[str, Any] = {"states": "xy", "domain": [("-3", "3")] * 2, "uncertain": [("q", "-1/2", "1/2")]}
     data = stepping(
         f, [([[0.0, 0.0]], [0.0])], np.eye(2), (0.5, 0.5), sample=("1/10", "1/10"), order=2, cells=[8], **more
     )
+    asked, of_all = [], flow.Loop.anything
+    monkeypatch.setattr(flow.Loop, "anything", lambda self, known: asked.append(of_all(self, known)) or asked[-1])
     assert accepted(data)
-    c = read(dump(data))
-    assert flow.steps_on.__doc__ and c.k == 1
+    assert asked and all(q["q"].v.contains(leaves.arb(0.5)) and q["q"].v.contains(leaves.arb(-0.5)) for q in asked)
 
 
-# ----------------------------------------------------------------------------------------- what is accepted is true
+# --------------------------------------------------------------------------------------------- what is accepted is true
 
 
 @pytest.mark.parametrize("kind", ["discrete", "held", "held 0"])
@@ -271,7 +283,7 @@ def test_a_period_that_visits_several_cells() -> None:
 def test_what_is_accepted_of_a_random_loop_is_true(seed: int, practical: bool, kind: str) -> None:
     """Gains are raised until the claim is refused; each that is accepted is held against periods that jump."""
     generator, some = np.random.default_rng([seed, practical]), False
-    a, b, K = generator.uniform(0.4, 1.0, 2), generator.uniform(0.2, 0.5), generator.uniform(0.8, 1.2, 2)
+    a, b, K = generator.uniform(0.2, 0.6, 2), generator.uniform(0.2, 0.5), generator.uniform(0.8, 1.2, 2)
     for factor in (0.5, 1.0, 2.0, 4.0, 8.0, 16.0):
         data = loop_of(kind, practical, a, b, K * factor)
         if judge(data) is not None:
@@ -294,7 +306,7 @@ def loop_of(kind: str, practical: bool, a: np.ndarray, b: float, K: np.ndarray) 
     return stepping(
         f, [(np.array([-K]) / 2, [0.0]), ([[1.0]], [0.0])], np.array([[1.0, 0.125], [0.125, 1.0]]),
         (0.02, 0.05, 0.08) if practical else (0.05, 0.08), discrete=kind == "discrete", sample=sample, order=3,
-        edge=0.8, states="xy", domain=[("-3", "3")] * 2, uncertain=uncertain, leaves=120, **WIDE,
+        edge=0.4 * practical, states="xy", domain=[("-3", "3")] * 2, uncertain=uncertain, leaves=120, **WIDE,
     )  # fmt: skip
 
 
@@ -315,11 +327,11 @@ def largest(data: Document, generator: np.random.Generator, count: int) -> float
         pieces = pieces[:1] if discrete else pieces
         G = np.array([float(v) for v in mean_change(data, list(x), [u], pieces)]) - (x if discrete else 0)
         after = float((x + h * G) @ P @ (x + h * G))
-        worst = max(worst, (after - V) / V if V >= c0 * (1 - 1e-9) else after - c0)
+        worst = max(worst, (after - V) / V if c0 * (1 - 1e-9) <= V else after - c0)
     return worst
 
 
-# ---------------------------------------------------------------------------------------------------------- forgeries
+# ------------------------------------------------------------------------------------------------------------ forgeries
 
 
 @cache
@@ -391,7 +403,6 @@ FORGERIES: list[tuple[str, str, str, Edit]] = [
     ("local", "level", "the least edge", at("evidence.local.edge", (5e-324).hex())),
     ("local", "level", "a ball too small", lambda d: edited(
         d, "evidence.local.J", lambda J: encode(0.9 * decode(J)))),
-    ("local", "level", "a huge ball", lambda d: edited(d, "evidence.local.J", lambda J: encode(9e99 * decode(J)))),
     ("local", "level", "a negative multiplier", lambda d: edited(
         d, "evidence.local.multipliers", encode([1.0, -1.0, 1.0]))),
     ("local", "level", "a floor too low", at("levels.floor", (0.06).hex())),
@@ -425,22 +436,12 @@ def test_a_tube_has_neither(key: str) -> None:
     assert (verdict.rule, verdict.at) == ("format", path)
 
 
-CLAUSES: dict[str, tuple[Any, str, Any, Document]] = {
-    "the domain between the samples": (flow, "in_domain", lambda *_: None, edited(
-        stepping(["u"], gain(1.9), [[1.0]], (1.0, 1.0), sample=("1", "1"), order=1, **WIDE),
-        "plant.domain.0", ["-6/5", "6/5"])),
-    "the square of what is beyond the second order": (decrease, "step", lambda P, G, size, f: 0 * decrease.identity(size),
-        stepping([["+", ["*", "1/2", "x"], ["*", "7/2", ["**", "x", 3]]]], STILL, [[1.0]], (0.15, 0.15), discrete=True)),
-    "what vanishes at rest": (Model, "at_rest", lambda v: v.shifted(leaves.arb(1)), honest("held")),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize("clause", ["the domain between the samples"])
-def test_with_a_clause_disabled_a_forgery_gets_through(clause: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    module, name, instead, data = CLAUSES[clause]
-    assert judge(data) is not None
-    monkeypatch.setattr(module, name, instead)
-    assert judge(data) is None
+def test_with_the_domain_disabled_a_forgery_gets_through(monkeypatch: pytest.MonkeyPatch) -> None:
+    data = stepping(["u"], gain(1.9), [[1.0]], (1.0, 1.0), sample=("1", "1"), order=1, **WIDE)
+    forged = edited(data, "plant.domain.0", ["-6/5", "6/5"])
+    assert judge(forged) == "flow"
+    monkeypatch.setattr(flow, "in_domain", lambda *_: None)
+    assert judge(forged) is None
 
 
 def test_the_step_counts(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -453,7 +454,7 @@ def test_the_step_counts(monkeypatch: pytest.MonkeyPatch) -> None:
     assert any(without_it)
 
 
-# --------------------------------------------------------------------------------------------------------------- words
+# ---------------------------------------------------------------------------------------------------------------- words
 
 
 def test_the_words_say_how_time_passes() -> None:

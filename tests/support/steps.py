@@ -90,12 +90,13 @@ def with_ball(data: Document, order: int, edge: float) -> Document:
     left = -(J.T @ P @ a + a.T @ P @ J + h * a.T @ P @ a + rate * J.T @ P @ J)
     if not np.linalg.eigvalsh(left)[0] > 0:
         return data
-    inverse = np.linalg.inv(left)
-    along = np.einsum("ji,jk,ki->i", b, inverse, b)
-    sizes = [np.sqrt(np.einsum("iab,bc,iac->i", A, inverse, A) / along) for A in (E, Q)]
-    alpha = np.where(E.any((1, 2)) & np.isfinite(sizes[0]), sizes[0], 0.0)
-    least = TINY / np.where(along > 0, along, 1.0)
-    beta = np.where(Q.any((1, 2)) & np.isfinite(sizes[1]) & (sizes[1] > 0), sizes[1], least)
+    with np.errstate(all="ignore"):
+        inverse = np.linalg.inv(left)
+        along = np.einsum("ji,jk,ki->i", b, inverse, b)
+        sizes = [np.sqrt(np.einsum("iab,bc,iac->i", A, inverse, A) / along) for A in (E, Q)]
+        alpha = np.where(E.any((1, 2)) & np.isfinite(sizes[0]), sizes[0], 0.0)
+        least = TINY / np.where(along > 0, along, 1.0)
+        beta = np.where(Q.any((1, 2)) & np.isfinite(sizes[1]) & (sizes[1] > 0), sizes[1], least)
     return edited(data, "evidence.local", ball(J, np.stack([alpha, beta, np.ones(n)]), inverse) | more)
 
 
