@@ -104,7 +104,7 @@ class Model:
         """Whether y_j is in none of its numbers."""
         return not self.dv or (self.dv[j].is_zero() and all(v.is_zero() for v in self.da[j].entries()))
 
-    def where(self, y: Sequence[int]) -> Model:
+    def where(self, y: Sequence[int] | Sequence[arb]) -> Model:
         """The same at one y."""
         if not self.dv:
             return self

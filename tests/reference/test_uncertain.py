@@ -103,13 +103,13 @@ def test_models_in_a_cell_enclose_F_for_all_its_values(factor: str) -> None:
             for d in points(generator, 2):
                 x = [sum((arb(p) * arb(e) for p, e in zip(row, d, strict=True)), arb(0)) for row in J.tolist()]
                 true = in_arb(data, x, {"q": q}, data["plant"]["dynamics"][0])
-                assert holds(F, true, d), (q, d)
+                assert holds(F, true, d, 2 * share - 1), (q, d)
 
 
-def holds(f: Model, true: arb, d: list[float]) -> bool:
+def holds(f: Model, true: arb, d: list[float], y: Fraction | int) -> bool:
     """Not certainly outside: each number of the model is a ball, of which no more is known."""
-    n, e = len(d), [arb(v) for v in d]
-    known = f.range + sum((f.gradient[i, 0] * e[i] for i in range(n)), arb(0))
+    n, e, f = len(d), [arb(v) for v in d], f.where([ball(Fraction(y))])
+    known = f.v + sum((f.a[i, 0] * e[i] for i in range(n)), arb(0))
     known += sum((f.Q[i, j] * e[i] * e[j] for i in range(n) for j in range(n)), arb(0))
     each = zip(orders(n), triples(n), f.K.entries(), strict=True)
     known += sum((often * k * e[h] * e[i] * e[j] for often, (h, i, j), k in each), arb(0))
