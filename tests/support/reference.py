@@ -10,6 +10,7 @@ from typing import Any
 from certify.reference import rules
 
 BEFORE, NOW = "certify-certificate/5", "certify-certificate/6"
+CONTINUOUS = {"rate": (0.0).hex(), "sample": None}  # of a claim
 
 
 def judge_bytes(raw: bytes) -> str | None:
@@ -33,8 +34,8 @@ def upgraded(data: dict[str, Any]) -> dict[str, Any]:
     data["schema"] = NOW
     claim, plant, levels, evidence = (data.get(key) for key in ("claim", "plant", "levels", "evidence"))
     if isinstance(claim, dict):
-        claim.setdefault("rate", (0.0).hex())
-        claim.setdefault("sample", None)
+        for key, value in CONTINUOUS.items():
+            claim.setdefault(key, value)
     if isinstance(plant, dict):
         plant.setdefault("time", "continuous")
     if isinstance(levels, dict) and isinstance(claim, dict) and claim.get("kind") == "practical" and "floor" in levels:
