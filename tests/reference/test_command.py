@@ -58,7 +58,7 @@ def test_accepted(tmp_path: Path) -> None:
 
 
 def test_practical_in_words(tmp_path: Path) -> None:
-    done = run(write(with_ball(scalar(["-", "x"])), tmp_path))
+    done = run(write(scalar(["-", "x"]), tmp_path))
     claim, verdict = done.stdout.splitlines()
     assert done.returncode == 0 and "enters V <= 0.04 in finite time" in claim
     assert verdict.startswith("ACCEPTED c0=0.04 c1=0.04 c2=1.0 sha256=")
