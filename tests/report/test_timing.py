@@ -258,7 +258,8 @@ def test_one_equilibrium_is_said_of_constants_alone() -> None:
     assert (
         "stays there from then on. Moreover V(x(t)) ≤ V(x(0)) e^(−2λt) until it is in the smaller set, with λ = 0.25 "
         "per s: it is there after ln(c₂/c₀)/(2λ) = 5.54518 s at the latest. And where what is uncertain is constant in "
-        "time, there is exactly one equilibrium in the smaller set, and every one of these trajectories converges to it."
+        "time, there is exactly one equilibrium in the smaller set, and every one of these trajectories converges to "
+        "it."
     ) in found.text
     assert "Contraction. 2(x − y)′P(F(x) − F(y)) < 0" in found.text and "That is all" not in found.text
     said = outside(found)
