@@ -15,6 +15,7 @@ from certify.claims.claim import Kind
 from certify.closed_loop import ClosedLoop
 from certify.engines.base import Task
 from certify.engines.falsify import Witness, falsify, survey
+from certify.engines.peak import peak_candidate
 from certify.engines.robust import robust_candidate
 from certify.errors import BackendError, InputError
 from certify.lyapunov import (
@@ -111,6 +112,8 @@ def named(loop: ClosedLoop, options: RoaOptions) -> Trial:
     if options.P is not None:
         return trial(loop, options.P, "given", options)
     name = options.only or "lyapunov"
+    if name == "peak":
+        return trial(loop, peak_candidate(loop, OPTIMISING * options.time_limit), name, options)
     if name == "robust":
         return trial(loop, robust_candidate(loop, OPTIMISING * options.time_limit), name, options)
     chosen = choose_candidate(loop, name, options.Q, options.R, OPTIMISING * options.time_limit)
@@ -142,6 +145,14 @@ def robust(loop: ClosedLoop, options: RoaOptions) -> Trial | None:
     """The candidate that the local rule likes best, or None if it is not to be had."""
     try:
         return trial(loop, robust_candidate(loop, OPTIMISING * options.time_limit), "robust", options)
+    except (BackendError, InputError):
+        return None
+
+
+def peak(loop: ClosedLoop, options: RoaOptions) -> Trial | None:
+    """The candidate of a practical claim whose floor is small beside the set, or None if it is not to be had."""
+    try:
+        return trial(loop, peak_candidate(loop, OPTIMISING * options.time_limit), "peak", options)
     except (BackendError, InputError):
         return None
 

@@ -14,6 +14,10 @@ from certify.engines.falsify import Witness
 from certify.verdict import Stop
 
 
+FEW = 3
+"""States, up to which a tree of boxes may carry a practical claim without a ball."""
+
+
 @dataclass(frozen=True, slots=True)
 class Budget:
     """What a proof may use: seconds on the wall, of which `check` are left for the check of each proved box; boxes,
