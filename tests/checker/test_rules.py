@@ -114,6 +114,11 @@ def rotor_claim(c1: float = 1e-4, c2: float = 0.3, centre: str = "output", **cha
     return make(dynamics, layers, P, (c1, c2), **{**settings, **changes})
 
 
+def sampled_claim() -> Document:
+    """x' = x/2 - 2 tanh(x), the input held for 1/16 to 1/10."""
+    return scalar_claim(0.01, 0.25, scale=[-2.0], input_bounds=[("-2", "2")], sample=("1/16", "1/10"), order=2)
+
+
 def lyapunov(A: np.ndarray) -> np.ndarray:
     """P with A'P + PA = -I."""
     n = len(A)
@@ -138,6 +143,7 @@ HONEST: dict[str, Callable[[], Document]] = {
     "scalar": scalar_claim,
     "scalar, no centring": lambda: scalar_claim(bias=0.0, centre="none"),
     "linear": linear_claim,
+    "sampled": sampled_claim,
     "local only": lambda: linear_claim(3.0, 3.0),
     "rotor": rotor_claim,
     "rotor, preactivation": lambda: rotor_claim(c2=0.2, centre="preactivation"),
@@ -324,8 +330,15 @@ MUTANTS: list[tuple[str, str, str, Edit]] = [  # rule, base, what, edit
     ("format", "scalar", "root not finite", array("evidence.root", lambda a: a * np.inf)),
     ("format", "scalar", "tree not base64", at("evidence.tree", "AP8")),
     ("format", "scalar", "no ball", at("evidence.local", None)),
-    ("format", "practical, clipped", "a ball", lambda d: edited(
-        d, "evidence.local", honest("scalar")["evidence"]["local"])),
+    ("format", "practical, clipped", "a ball of another order", lambda d: edited(
+        d, "evidence.local", honest("scalar")["evidence"]["local"] | {"order": 2})),
+    ("format", "scalar", "an edge", at("evidence.local.edge", (1.0).hex())),
+    ("format", "scalar", "orders on leaves of what is not sampled", at("evidence.order", 2)),
+    ("format", "scalar", "a rate below 0", at("claim.rate", (-1.0).hex())),
+    ("format", "scalar", "a sample of nothing", at("claim.sample", ["0", "0"])),
+    ("format", "scalar", "time by another name", at("plant.time", "sampled")),
+    ("flow", "sampled", "held for so long that nothing is known", at("claim.sample", ["1/16", "9"])),
+    ("format", "scalar", "the schema of version 5", at("schema", "certify-certificate/5")),
     ("format", "scalar", "J of another size", array("evidence.local.J", lambda a: np.ones(4))),
     ("format", "scalar", "J not finite", array("evidence.local.J", lambda a: a * np.nan)),
     ("format", "scalar", "two rows of multipliers", array("evidence.local.multipliers", lambda a: a[:2])),
@@ -516,7 +529,7 @@ def test_every_field_and_every_rule_has_a_mutant() -> None:
     format_page = (Path(certify.checker.__file__).parent / "FORMAT.md").read_text()
     table = format_page.split("| rule | inequality | gives |")[1].split("\n\n")[0]
     documented = {name for row in table.splitlines()[2:] for name in re.findall(r"`(\w+)`", row.split("|")[1])}
-    assert len(documented) == 14 and {rule for rule, *_ in MUTANTS} == documented
+    assert len(documented) == 15 and {rule for rule, *_ in MUTANTS} == documented
     touched = set()
     for _, base, _, edit in MUTANTS:
         before, after = dict(leaves_of(honest(base))), dict(leaves_of(edit(honest(base))))
@@ -727,7 +740,7 @@ def test_a_leaf_is_missed_only_if_it_lies_outside_the_ring(exponent: int) -> Non
             ring = Ring(Case(replace(c, P=P, evidence=replace(c.evidence, T=np.eye(2)))))
             lo = generator.uniform(-3, 3, (2, 40))
             hi = lo + generator.uniform(0, 1, (2, 40))
-            result = np.logical_or(*ring.misses(lo, hi))
+            result = np.logical_or(*ring.misses(lo, hi)[:2])
         missed, kept = missed + int(result.sum()), kept + int((~result).sum())
         for box in np.flatnonzero(result):
             t = np.concatenate([generator.uniform(0, 1, (15, 2)), [[0, 0], [0, 1], [1, 0], [1, 1]]])
@@ -748,7 +761,7 @@ def test_a_lower_bound_of_V_that_overflows_puts_no_leaf_outside() -> None:
             with np.errstate(all="ignore"):
                 ring = Ring(Case(replace(c, P=np.array([[s]]))))
                 overflows = not np.isfinite(s * near * near)
-                outside, _ = ring.misses(np.array([[near]]), np.array([[1.001 * near]]))
+                outside, *_ = ring.misses(np.array([[near]]), np.array([[1.001 * near]]))
             if overflows and Fraction(s) * Fraction(near) ** 2 < Fraction(c.c2):
                 met += 1
                 assert not outside[0]

@@ -881,7 +881,8 @@ def practical_case(tmp_path_factory: pytest.TempPathFactory) -> Case:
     network = TanhNetwork((np.array([[1.0, 0.0]]),), (np.zeros(1),), np.full(1, 0.1), np.zeros(1), "tanh", "none")
     path = tmp_path_factory.mktemp("practical") / "certificate.json"
     write_atomically(
-        path, raw(Certificate(system, network, Quadratic(np.eye(2)), Practical(roa=1.7, local=1 / 3, floor=1 / 3), ONE_LEAF))
+        path,
+        raw(Certificate(system, network, Quadratic(np.eye(2)), Practical(roa=1.7, local=1 / 3, floor=1 / 3), ONE_LEAF)),
     )
     answer = {
         "result": "ACCEPTED",
