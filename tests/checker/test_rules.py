@@ -806,6 +806,12 @@ def skewed() -> Document:
     )  # fmt: skip
 
 
+def held_too_long() -> Document:
+    """x' = 20 x - 30 tanh(x) decreases, and so does x + h F(x), but not the state: e^2 - 3/2 (e^2 - 1) is below -1."""
+    plant = [["+", ["*", "20", "x"], ["*", "30", "u"]]]
+    return make(plant, [([[1.0]], [0.0])], 1.0, (0.01, 0.01), domain=[("-9", "9")], sample=("1/10", "1/10"))
+
+
 ABLATED: dict[str, Callable[[], Document]] = {
     "format": lambda: honest("scalar") | {"comment": "unknown key"},
     "hash": lambda: array("policy.layers.0.bias", nudged(0))(honest("scalar")),
@@ -821,6 +827,7 @@ ABLATED: dict[str, Callable[[], Document]] = {
     "tree": lambda: scalar_claim(c2=4.0, tree=bytes([0])),
     "ring": lambda: scalar_claim(c2=4.0),
     "inputs": lambda: at("plant.input_bounds", [["-9/10", "1"]])(honest("scalar")),
+    "flow": held_too_long,
 }
 
 
