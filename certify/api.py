@@ -32,6 +32,7 @@ from certify.inputs import (
     where_valid,
     with_acting,
     with_bounded_errors,
+    with_period,
     with_uncertain_parameters,
 )
 from certify.installation import versions
@@ -81,6 +82,8 @@ def certify_roa(
     ranges: Mapping[str, Sequence[Exact]] | None = None,
     disturbances: Mapping[str, Exact | Sequence[Exact]] | None = None,
     input_error: Exact | Mapping[str, Exact] | None = None,
+    sample_time: Exact | Sequence[Exact] | None = None,
+    rate: float | None = None,
     load_seconds: float = 0.0,
     provenance: Mapping[str, Any] | None = None,
     progress: Report | None = None,
@@ -128,6 +131,10 @@ def certify_roa(
         every function of time within them. A half-width of 0 is a disturbance that does not act.
     input_error : bound of what each input may be off by at any time, in its unit: one for all, or by input. In these
         three text means its decimal value, a float its binary value.
+    sample_time : the period over which the input is held, or a pair (lo, hi): any sequence of periods between the two.
+        Exact, as those three are. By default the input follows the state at once.
+    rate : prove that V falls at least as exp(-2 rate t), in discrete time by the share 2 rate in each step; 0 (the
+        default) says only that it falls.
     load_seconds : time already spent on reading, for the report.
     provenance : entries for the certificate that the checkers ignore; by default the policy's name and versions.
     progress : called with a stage ("candidate", "ring", "check") and where the search stands, or None.
@@ -162,11 +169,11 @@ def certify_roa(
     single = {
         "claim": claim, "candidate": candidate, "Q": Q, "R": R, "P": P, "level": level, "engine": engine,
         "dreal_precision": dreal_precision, "jobs": jobs, "device": device, "enlarge": enlarge, "box": box,
-        "reach_from": reach_from, "time_limit": time_limit, "max_boxes": max_boxes,
+        "reach_from": reach_from, "time_limit": time_limit, "max_boxes": max_boxes, "rate": rate,
     }  # fmt: skip
     notices: list[str] = []
     try:
-        unsure = _uncertainty(ranges, disturbances, input_error)
+        unsure = _uncertainty(ranges, disturbances, input_error, sample_time)
         chosen = _options(options, {name: value for name, value in single.items() if value is not None})
         _require_device(chosen.device)
         seconds = _number(load_seconds, "load_seconds")
@@ -241,7 +248,7 @@ def _options(options: RoaOptions | None, single: dict[str, Any]) -> RoaOptions:
                 "Put them into `options`."
             )
         return options
-    numbers, whole = ("level", "dreal_precision", "time_limit"), ("jobs", "max_boxes")
+    numbers, whole = ("level", "dreal_precision", "time_limit", "rate"), ("jobs", "max_boxes")
     readers: dict[str, Callable[[Any, str], Any]] = dict.fromkeys(single, _text)
     readers |= {"Q": _row, "R": _row, "P": _matrix, "enlarge": _flag, "box": _widths, "reach_from": _state}
     readers |= dict.fromkeys(numbers, _number) | dict.fromkeys(whole, _count)
@@ -249,8 +256,9 @@ def _options(options: RoaOptions | None, single: dict[str, Any]) -> RoaOptions:
     return RoaOptions(**read)
 
 
-def _uncertainty(ranges: Any, disturbances: Any, input_error: Any) -> Change:
-    """What puts ranges, disturbances and errors of inputs into a plant, from what was given, all of it read at once."""
+def _uncertainty(ranges: Any, disturbances: Any, input_error: Any, sample_time: Any) -> Change:
+    """What puts ranges, disturbances, errors of inputs and periods into a plant, from what was given, all of it read at
+    once."""
     uncertain = {name: _pair(value, f"ranges[{name!r}]") for name, value in _named(ranges, "ranges", "pairs").items()}
     acting = {
         name: _exact(value, where) if isinstance(value, _NUMBERS) else _pair(value, where)
@@ -264,9 +272,15 @@ def _uncertainty(ranges: Any, disturbances: Any, input_error: Any) -> Change:
     elif input_error is not None:
         error = _exact(input_error, "input_error")
 
+    period: Fraction | tuple[Fraction, Fraction] | None = None
+    if sample_time is not None:
+        single = isinstance(sample_time, _NUMBERS)
+        period = _exact(sample_time, "sample_time") if single else _pair(sample_time, "sample_time")
+
     def change(plant: System) -> System:
         plant = with_acting(with_uncertain_parameters(plant, uncertain), acting)
-        return plant if error is None else with_bounded_errors(plant, error)
+        plant = plant if error is None else with_bounded_errors(plant, error)
+        return plant if period is None else with_period(plant, period)
 
     return change
 

@@ -10,6 +10,7 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
+import scipy.linalg
 import sympy
 from numpy.typing import NDArray
 
@@ -81,6 +82,33 @@ class ClosedLoop:
         A_open, B = (_to_float(M) for M in self.plant_jacobians())
         K = -self.network.jacobian_at_origin(self.u_eq)
         return A_open - B @ K, B, K
+
+    @property
+    def step(self) -> float:
+        """h in V's increment over a step, `2 x'P G + h G'P G`: 0 in continuous time, 1 in discrete time, and else the
+        longest period over which the input is held, in units of time."""
+        sample = self.system.sample
+        return float(self.system.time == "discrete") if sample is None else float(sample[1])
+
+    def mean_rate(self) -> Array:
+        """L (n, n) with `G = L x` to first order, G the mean rate of a step: A; A - I; (Phi(h) - I)/h, Phi the map of
+        the linearised plant whose input is held over the step h.
+
+        With it whatever is linear is the same in continuous and discrete time: `I + h L` is the map of a step, and V
+        decreases if `L'P + P L + h L'P L < 0`.
+        """
+        A, B, K = self.linearise()
+        if self.system.time == "discrete":
+            return A - np.eye(len(A))
+        if self.system.sample is None:
+            return A
+        n, m, h = self.system.n, self.system.m, self.step
+        held = np.zeros((n + m, n + m))
+        held[:n] = h * np.hstack([A + B @ K, B])
+        # (exp(M) - I)/h without the cancellation: the corner of the exponential of a block matrix
+        mean = scipy.linalg.expm(np.block([[held, np.eye(n + m)], [np.zeros((n + m, 2 * (n + m)))]]))[: n + m, n + m :]
+        rate: Array = (mean @ held / h)[:n] @ np.vstack([np.eye(n), -K])
+        return rate
 
     def plant_jacobians(self) -> tuple[sympy.Matrix, sympy.Matrix]:
         """(df/dx, df/du) at the origin and u_eq, exact."""

@@ -15,7 +15,6 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.claims import Problem
 from certify.closed_loop import ClosedLoop
 from certify.engines.base import Proof
 from certify.engines.falsify import falsify
@@ -138,7 +137,9 @@ def _next(result: RoaResult, options: RoaOptions, proof: Proof | None, name: str
         return _longer(result, options, proof)
     if options.claim == "asymptotic" and options.only is not None and options.P is None and options.level is None:
         return Step((("--candidate", "auto"),), f"only the candidate {options.only} was tried")
-    exact = not result.system.ranges  # a tube says nothing of what is uncertain
+    exact = not (
+        result.system.ranges or result.system.in_steps
+    )  # a tube says nothing of what is uncertain, or of steps
     if result.stop is Stop.STALLED and exact and not options.enlarges and _has_tube(result):
         return Step((("--enlarge", ""),), f"a tube leads into this set from one {_LONGER:g} times as long, at least")
     if result.stop is Stop.STALLED:
@@ -207,7 +208,8 @@ def _wider_domain(result: RoaResult, name: str) -> Step:
     P = problem.V.P
     loop = ClosedLoop(wider, result.network)
     limit = domain_limit(P, wider.domain)
-    witness = falsify(Problem(loop, problem.V), diagonalising_coordinates(P, loop.linearise()[0]), limit, samples=4000)
+    T = diagonalising_coordinates(P, loop.mean_rate(), loop.step)
+    witness = falsify(replace(problem, loop=loop), T, limit, samples=4000)
     reach = volume(P, limit if witness is None else min(limit, witness.level))
     grown = reach / volume(P, level)
     if grown < _WORTH:

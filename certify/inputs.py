@@ -172,6 +172,17 @@ def with_bounded_errors(plant: System, bound: Fraction | Mapping[str, Fraction])
     return plant.with_input_errors(bounds)
 
 
+def with_period(plant: System, period: Fraction | Interval | None) -> System:
+    """The plant whose inputs are held over a period, or over any period between two; None for inputs that follow at
+    once.
+
+    Raises
+    ------
+    InputError : the plant is in discrete time, a period is negative, or all are 0.
+    """
+    return plant.with_sample((period, period) if isinstance(period, Fraction) else period)
+
+
 def is_own(path: Path, importing: ImportOptions) -> bool:
     """Whether a file is to be read as this program's own: also one that nobody can read, whose reader says why.
 

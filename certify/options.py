@@ -43,6 +43,8 @@ class RoaOptions:
         the trajectory from there into the proved set, the widest multiple of an ellipsoid; of `box`, if it is given.
     time_limit : seconds for everything up to the verdict, the check included.
     max_boxes : boxes for the ring.
+    rate : lambda in `D + 2 lambda V < 0`: V is to fall at least as exp(-2 lambda t), in units of time of the plant, or
+        in discrete time at each step by the share 2 lambda.
     """
 
     claim: Asked = "auto"
@@ -60,6 +62,7 @@ class RoaOptions:
     reach_from: Mapping[str, Fraction | float] | None = None
     time_limit: float = 50.0
     max_boxes: int = 4_000_000
+    rate: float = 0.0
 
     @property
     def enlarges(self) -> bool:
@@ -90,5 +93,9 @@ class RoaOptions:
                 "`enlarge` needs the engine bounds and a claim that is not practical: a tube ends in a set "
                 "that the checker can replay, and from which trajectories converge."
             )
+        if not (math.isfinite(self.rate) and self.rate >= 0):
+            raise InputError(f"`rate` must be a number of at least 0; found {self.rate}.")
+        if self.rate and (self.enlarges or self.engine != "bounds"):
+            raise InputError("`rate` needs the engine bounds, and a claim without a tube.")
         if not self.time_limit > 0 or not self.max_boxes > 0:
             raise InputError("`time_limit` and `max_boxes` must be positive.")

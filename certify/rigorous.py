@@ -17,11 +17,12 @@ import sympy
 from numpy.typing import NDArray
 
 from certify.closed_loop import ClosedLoop
-from certify.expressions import Algebra, evaluate
+from certify.expressions import Algebra, evaluate, solution_series
 from certify.policies import TanhNetwork
 
 Array = NDArray[np.float64]
 _PRECISION = 200  # bits
+_ATTEMPTS, _WIDER, _ORDER = 6, 1.25, 30  # at the balls around a solution over a period; of its series in time
 Balls = list[flint.arb]
 
 
@@ -96,18 +97,85 @@ def evaluate_vdot(loop: ClosedLoop, P: Array, x: Array) -> flint.arb:
         return total
 
 
+def evaluate_increment(
+    loop: ClosedLoop, P: Array, x: Array, period: Fraction | None = None, rate: float = 0.0
+) -> flint.arb:
+    """`D + 2 lambda V` at a binary64 point (n,), as an Arb ball, D being V's increment over a step, by time.
+
+    That is `Vdot = 2 x'P F(x)`; in discrete time V(F(x)) - V(x); with a `period` h over which the input is held
+    (V(phi(h)) - V(x))/h, or Vdot where h = 0. No number where no solution is enclosed.
+    """
+    with precision():
+        state = _points(x)
+        states = dict(zip(loop.system.states, state, strict=True))
+        inputs = dict(zip(loop.system.inputs, evaluate_policy(loop, x), strict=True))
+        step, G = flint.arb(0), _field(loop, {**states, **inputs})
+        if loop.system.time == "discrete":
+            step, G = flint.arb(1), [after - before for after, before in zip(G, state, strict=True)]
+        elif period:
+            step, G = ball(period), _mean_rate(loop, states, inputs, G, period)
+        lam, total = flint.arb(float(rate)), flint.arb(0)
+        for row, v, own in zip(P, state, G, strict=True):
+            p = [flint.arb(float(entry)) for entry in row]
+            Px, PG = (sum((a * b for a, b in zip(p, by, strict=True)), flint.arb(0)) for by in (state, G))
+            total += own * (2 * Px + step * PG) + 2 * lam * v * Px
+        return total
+
+
+def _field(loop: ClosedLoop, values: Mapping[sympy.Symbol, flint.arb]) -> Balls:
+    known: dict[Any, flint.arb] = {}
+    return [evaluate(expression, values, _Balls(), known) for expression in loop.dynamics]
+
+
+def _mean_rate(
+    loop: ClosedLoop,
+    states: Mapping[sympy.Symbol, flint.arb],
+    inputs: Mapping[sympy.Symbol, flint.arb],
+    now: Balls,
+    period: Fraction,
+) -> Balls:
+    """(phi(h) - x)/h with the input held, by a series whose last coefficient is taken on balls around all of phi.
+
+    A solution cannot be the first to leave the balls of radius kappa if h |f| < kappa on them.
+    """
+    h, size = ball(period), [v.abs_upper() for v in now]
+    for _ in range(_ATTEMPTS):
+        kappa = [(_WIDER * h * v).abs_upper() for v in size]
+        around = {s: v + flint.arb(0, k) for (s, v), k in zip(states.items(), kappa, strict=True)}
+        size = [v.abs_upper() for v in _field(loop, {**around, **inputs})]
+        if all(bool(h * v < k) for v, k in zip(size, kappa, strict=True)):
+            break
+    else:
+        return [flint.arb.nan()] * len(size)
+    rows = solution_series(loop.dynamics, states, inputs, _Balls(), _ORDER - 1)
+    last = [row[-1] for row in solution_series(loop.dynamics, around, inputs, _Balls(), _ORDER)]
+    result = last
+    for k in reversed(range(_ORDER - 1)):
+        result = [row[k] + h * v for row, v in zip(rows, result, strict=True)]
+    return result
+
+
 def eigenvalues(loop: ClosedLoop) -> list[flint.acb] | None:
     """Rigorous enclosures of the eigenvalues of the closed loop's Jacobian at 0.
 
+    Where the input is held, those of the linear maps over the shortest (if it is not 0) and the longest period.
     None if Arb cannot isolate them, or the clip is not certain to be inactive at the origin.
     """
     with precision():
         if not _unclipped(loop):
             return None
+        sample = loop.system.sample
         try:
-            return list(flint.acb_mat(_jacobian(loop)).eig(multiple=True))
+            found = [_jacobian(loop)] if sample is None else [_held_map(loop, h) for h in dict.fromkeys(sample) if h]
+            return [value for matrix in found for value in flint.acb_mat(matrix).eig(multiple=True)]
         except (ValueError, ArithmeticError):
             return None
+
+
+def instability(loop: ClosedLoop, eigenvalue: flint.acb) -> flint.arb:
+    """What is negative of each of `eigenvalues` where they show stability: the real part, or with steps |v| - 1."""
+    with precision():
+        return eigenvalue.real if loop.step == 0 else abs(eigenvalue) - 1
 
 
 def policy_on(loop: ClosedLoop, x: Balls) -> tuple[Balls, flint.arb_mat]:
@@ -164,6 +232,21 @@ def _jacobian(loop: ClosedLoop) -> flint.arb_mat:
         for M in loop.plant_jacobians()
     )
     return A + B * gain
+
+
+def _held_map(loop: ClosedLoop, period: Fraction) -> flint.arb_mat:
+    """The map over a period of the linearised plant whose input `-K x` is held."""
+    n, m = loop.system.n, loop.system.m
+    _, gain = policy_on(loop, [flint.arb(0)] * n)
+    A, B = loop.plant_jacobians()
+    block = flint.arb_mat(n + m, n + m)
+    for i in range(n):
+        for j in range(n + m):
+            block[i, j] = ball(period) * evaluate_arb(A[i, j] if j < n else B[i, j - n], {})
+    motion = block.exp()
+    free = flint.arb_mat([[motion[i, j] for j in range(n)] for i in range(n)])
+    forced = flint.arb_mat([[motion[i, n + j] for j in range(m)] for i in range(n)])
+    return free + forced * gain
 
 
 def _unclipped(loop: ClosedLoop) -> bool:

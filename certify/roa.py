@@ -35,14 +35,14 @@ from certify.diagnosis import diagnose
 from certify.engines.base import Attempt, Budget, Progress, Proof, Task
 from certify.engines.falsify import Witness, refutes
 from certify.errors import BackendError, InputError, SoundnessError
-from certify.lyapunov import are_inside, leaves_domain, volume
+from certify.lyapunov import are_inside, leaves_domain, slowest_decay, volume
 from certify.lyapunov.function import Quadratic
 from certify.options import RoaOptions
 from certify.policies import TanhNetwork
 from certify.race import Contender, Race
 from certify.rest import find_rest
 from certify.results import Levels, RoaResult, Tried, TubeFacts
-from certify.rigorous import eigenvalues
+from certify.rigorous import eigenvalues, instability
 from certify.systems import System
 from certify.trials import OPTIMISING, Trial, blends, by_reach, corrected, named, optimised, robust, solved
 from certify.verdict import Stop, Verdict
@@ -161,7 +161,7 @@ class _Run:
         """Choose, falsify, prove, check."""
         options, loop = self.options, ClosedLoop(self.system, self.network)
         require_within_limits(self.system, self.network)
-        _require_one_that_knows_ranges(self.system, options)
+        _require_one_that_knows(self.system, options)
         if options.box is not None:
             _ellipsoid_in(self.system, options.box)
         self.centre = None if options.reach_from is None else _state_in(self.system, options.reach_from)
@@ -191,7 +191,7 @@ class _Run:
                 verdict, stop, shown = unstable
                 detail = f"eigenvalues {', '.join(shown)}" + (" touch the axis" if stop is Stop.SPECTRUM else "")
                 return replace(result, verdict=verdict, stop=stop, detail=detail, eigenvalues=shown)
-        elif self.aside is not None:
+        elif self.aside is not None and not self.system.in_steps:
             with self._stage("candidate"):
                 result = replace(result, rest=find_rest(loop))
         if options.P is None and options.only is None:
@@ -537,14 +537,24 @@ def _ellipsoid_in(system: System, box: Mapping[str, float] | None = None) -> Arr
     return np.diag([float(box.get(name, least * sides[name])) ** -2 for name in names])
 
 
-def _require_one_that_knows_ranges(system: System, options: RoaOptions) -> None:
-    """Refuse what is about exact equations alone, where something has a range: a solver of formulas, a tube.
+def _require_one_that_knows(system: System, options: RoaOptions) -> None:
+    """Refuse what is about exact equations and Vdot alone, a solver of formulas and a tube, where something has a range
+    or time goes in steps.
 
     Raises
     ------
-    InputError : the option, and what has a range.
+    InputError : the option, and what has a range or goes in steps.
     """
-    if not system.ranges or (options.engine == "bounds" and not options.enlarges):
+    if options.engine == "bounds" and not options.enlarges:
+        return
+    if system.in_steps:
+        what = "a tube" if options.enlarges else "dReal's question"
+        found = "its time is discrete" if system.time == "discrete" else "its input is held over a period"
+        raise InputError(
+            f"{what} must be about a plant in continuous time whose input follows the state at once; of {system.name} "
+            f"{found}. Ask for the set with the engine bounds, without a tube."
+        )
+    if not system.ranges:
         return
     found = f"found ranges of {', '.join(system.ranges)} in {system.name}"
     if options.enlarges:
@@ -660,13 +670,15 @@ def _unstable(loop: ClosedLoop) -> tuple[Verdict, Stop, tuple[str, ...]] | None:
     """REFUTED or UNKNOWN with the eigenvalues, or None if the spectrum is rigorously stable."""
     enclosures = eigenvalues(loop)
     if enclosures is None:
-        approximate = np.linalg.eigvals(loop.linearise()[0])
-        if np.max(approximate.real) < 0:
+        L, h = loop.mean_rate(), loop.step
+        approximate = np.linalg.eigvals(np.eye(len(L)) + h * L if h else L)
+        if slowest_decay(L, h) > 0:
             return None  # nearly multiple eigenvalues: the local proof decides
         return Verdict.UNKNOWN, Stop.SPECTRUM, tuple(f"{v:.6g}" for v in approximate)
     shown = tuple(f"{complex(v.mid()):.6g}" for v in enclosures)
-    if any(v.real > 0 for v in enclosures):
+    signs = [instability(loop, v) for v in enclosures]
+    if any(v > 0 for v in signs):
         return Verdict.REFUTED, Stop.UNSTABLE, shown
-    if not all(v.real < 0 for v in enclosures):
+    if not all(v < 0 for v in signs):
         return Verdict.UNKNOWN, Stop.SPECTRUM, shown
     return None

@@ -84,7 +84,8 @@ def trial(loop: ClosedLoop, P: Array, name: str, options: RoaOptions, notice: st
     if P.shape != (n, n) or not is_positive_definite(P):
         raise InputError(f"`P` must be a symmetric positive definite matrix of shape ({n}, {n}).")
     require_short(P)
-    problem, T = Problem(loop, Quadratic(P)), diagonalising_coordinates(P, loop.linearise()[0])
+    problem = Problem(loop, Quadratic(P), options.rate)
+    T = diagonalising_coordinates(P, loop.mean_rate(), loop.step)
     limit = domain_limit(P, loop.system.domain)
     level = options.level or limit * (1 - _BELOW)
     if not _SMALLEST < level < 1 / _SMALLEST:
@@ -125,10 +126,12 @@ def optimised(loop: ClosedLoop, options: RoaOptions) -> Trial | None:
     """The candidate of the largest sampled set, or None if it is not to be had.
 
     Under `practical` it is that of the loop whose policy is centred: near the origin no V decreases under this one, and
-    away from it the two differ little.
+    away from it the two differ little. Of an input that is held it is that of the loop whose input follows at once: a
+    period is short, and Vdot cheap.
     """
     try:
         about = _centred(loop) if options.claim == "practical" else loop
+        about = about if loop.system.sample is None else replace(about, system=about.system.with_sample(None))
         chosen = choose_candidate(about, "optimised", options.Q, options.R, OPTIMISING * options.time_limit)
     except (BackendError, InputError):
         return None

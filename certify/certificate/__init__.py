@@ -6,6 +6,7 @@ from certify.certificate.checking import run_checker
 from certify.certificate.limits import require_short, require_within_limits
 from certify.certificate.model import (
     Certificate,
+    Contraction,
     LocalBall,
     PartitionTree,
     Slab,
@@ -20,6 +21,7 @@ from certify.certificate.writing import sole_writer, write_atomically, write_bes
 
 __all__ = [
     "Certificate",
+    "Contraction",
     "LocalBall",
     "PartitionTree",
     "Slab",

@@ -55,6 +55,15 @@ class LocalBall:
 
 
 @dataclass(frozen=True, slots=True)
+class Contraction:
+    """Evidence that trajectories come closer: a ball x = J d, ||d|| <= 1, J (n, n), that contains {V <= c0}, and the
+    `weights` (n,) of the bound on it."""
+
+    J: Array
+    weights: Array
+
+
+@dataclass(frozen=True, slots=True)
 class Waypoint:
     """Where a slab of a tube around a path ends, and what its inequality takes beyond the multipliers.
 
@@ -106,6 +115,7 @@ class PartitionTree:
     cells : into how many parts the range of each uncertain quantity is cut for it, in their order.
     tube : the slabs, in their order, of a claim that is enlarged by a tube.
     order : of the series in time on its leaves, where the input is held over a period.
+    contraction : of a claim of a nearby equilibrium.
     """
 
     T: Array
@@ -115,6 +125,7 @@ class PartitionTree:
     tube: tuple[Slab, ...] = ()
     cells: tuple[int, ...] = ()
     order: int = 1
+    contraction: Contraction | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -369,6 +380,7 @@ def _evidence(evidence: PartitionTree | TrustedSolver) -> dict[str, Any]:
             "cells": list(evidence.cells),
             "order": evidence.order,
             "local": None if evidence.local is None else _local(evidence.local),
+            "contraction": None if evidence.contraction is None else _contraction(evidence.contraction),
             "tube": [
                 {"middle": _encode(slab.middle), "end": _encode(slab.end), "duration": float(slab.duration).hex()}
                 | _ball(slab)
@@ -405,6 +417,7 @@ def _read_evidence(data: Mapping[str, Any], n: int) -> PartitionTree | TrustedSo
             ),
             tuple(map(int, data["cells"])),
             int(data["order"]),
+            None if data["contraction"] is None else _read_contraction(data["contraction"], n),
         )
     queries = tuple((str(name), str(answer)) for name, answer in data["queries"])
     return TrustedSolver(str(data["solver"]), str(data["version"]), float.fromhex(data["precision"]), queries)
@@ -412,6 +425,14 @@ def _read_evidence(data: Mapping[str, Any], n: int) -> PartitionTree | TrustedSo
 
 def _ball(evidence: LocalBall | Slab) -> dict[str, str]:
     return {name: _encode(getattr(evidence, name)) for name in _OF_A_BALL}
+
+
+def _contraction(ball: Contraction) -> dict[str, str]:
+    return {"J": _encode(ball.J), "weights": _encode(ball.weights)}
+
+
+def _read_contraction(data: Mapping[str, str], n: int) -> Contraction:
+    return Contraction(_decode(data["J"], (n, n)), _decode(data["weights"], (n,)))
 
 
 def _local(ball: LocalBall) -> dict[str, Any]:

@@ -108,7 +108,8 @@ class Ball:
         a, slack = column * h.a, up(k * h.slack + EPS * (k * h.slope))
         E = widen(np.zeros_like(h.E), EPS * (k * h.spread) + h.faint)
         of_y = np.zeros((len(c), self.count)), np.zeros((len(c), self.count, a.shape[1]))
-        batch = Jet(c, error, a, slack, each(net.scale) * h.Q, column * h.K, E, np.eye(len(c)), U, *of_y)
+        lip = up(k * h.lip + 2 * EPS * (k * h.bend))
+        batch = Jet(c, error, a, slack, each(net.scale) * h.Q, column * h.K, E, np.eye(len(c)), U, *of_y, lip)
         return batch.members
 
     def constant(self, q: Fraction) -> Jet:
@@ -205,7 +206,7 @@ def enclose_on_ball(net: Folded, states: Sequence[Jet]) -> Jet:
     error = np.array([x.error for x in states])[:, None]
     doubt = np.full(k, norm(np.array([x.slack for x in states]), 0))
     H, C, R = np.zeros((0, k, k)), np.zeros((0, len(triples(k)[0]))), np.zeros((0, k, k))
-    sizes = np.zeros(0)
+    sizes = steep = lips = np.zeros(0)
     for number, layer in enumerate(net.layers):
         y, rounding = layer.affine(y)
         error = up(layer.widest(error) + rounding)
@@ -218,9 +219,10 @@ def enclose_on_ball(net: Folded, states: Sequence[Jet]) -> Jet:
         Q = np.tensordot(B, H, 1)
         lost = total(doubt[k:] * sizes + (gamma(count) + EPS) * (np.abs(B) * sizes), 1)
         E = widen(np.zeros_like(Q), lost)
+        lip = total(np.abs(B) * lips + (doubt[k:] + (gamma(count) + EPS) * np.abs(B)) * steep, 1)
         slack = np.full(len(a), norm(doubt[:k], 0))
         of_y = np.zeros((len(a), 0)), np.zeros((len(a), 0, k))  # a policy knows nothing of what is uncertain
-        value = Jet(y[:, 0, 0], error[:, 0], a, slack, (Q + Q.swapaxes(1, 2)) / 2, B @ C, E, B, R, *of_y)
+        value = Jet(y[:, 0, 0], error[:, 0], a, slack, (Q + Q.swapaxes(1, 2)) / 2, B @ C, E, B, R, *of_y, lip)
         if number == len(net.layers) - 1:
             break
         phi = elementary("tanh", value.c, value.error, value.radius)
@@ -228,6 +230,8 @@ def enclose_on_ball(net: Folded, states: Sequence[Jet]) -> Jet:
         added = value.beyond_tangent(phi)
         H, C, R = (np.concatenate(pair) for pair in zip((H, C, R), added, strict=True))
         sizes = up(frobenius(H) + tensor_norm(C, k) + frobenius(R))
+        lips = np.concatenate([lips, value.lip_beyond_tangent(phi)])
+        steep = up(2 * frobenius(H) + lips)
         doubt = up(np.max(up(slope + wrong)) * doubt + (np.max(wrong) + EPS) * norm(X, 0))
         y, error, X = t[:, None, None], e[:, None], slope[:, None] * X
     return value.function("tanh") if net.squash else value

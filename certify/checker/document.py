@@ -21,7 +21,8 @@ from .strict import MAX_VALUES, load
 MAX_STATES, MAX_LAYERS, MAX_WIDTH, MAX_SLABS = 64, 64, 2**14, 10**4
 MAX_ORDER = 8  # of a series in time
 MAX_CELLS, MAX_CUTS = 4096, 64  # of the box of uncertain quantities in all, and of one range
-CLAIMS = ("asymptotic", "practical", "enlarged", "reached")
+CLAIMS = ("asymptotic", "practical", "nearby", "enlarged", "reached")
+PRACTICAL = ("practical", "nearby")
 WITH_TUBE = ("enlarged", "reached")
 Array = NDArray[np.float64]
 Intervals = tuple[tuple[Fraction, Fraction], ...]
@@ -71,6 +72,14 @@ class LocalBall:
 
 
 @dataclass(frozen=True)
+class Contraction:
+    """The ball x = J d, ||d|| <= 1, on which trajectories come closer, and the weights g of the bound on it."""
+
+    J: Array
+    weights: Array
+
+
+@dataclass(frozen=True)
 class Path:
     """Where a slab's ellipsoids have their centre at its end, the share of its ball that the motion takes, and the
     multipliers of the tube's edge and of the motion."""
@@ -104,6 +113,7 @@ class Partition:
     order: int  # of the series in time on leaves
     cells: tuple[int, ...]  # how many the range of each uncertain quantity is cut into
     local: LocalBall | None
+    contraction: Contraction | None
     tube: tuple[Slab, ...]
 
 
@@ -146,7 +156,7 @@ class Certificate:
 
     @property
     def practical(self) -> bool:
-        return self.claim == "practical"
+        return self.claim in PRACTICAL
 
     @property
     def c0(self) -> float:
@@ -189,11 +199,11 @@ def certificate(data: Any, sha256: str) -> Certificate:
     fall, periods = rate.binary64(), _sample(sample)
     rate.must(0 <= fall < math.inf and (fall == 0 or kind not in WITH_TUBE), "0, or a rate where a claim may have one")
     plain = periods is None and not stated["discrete"]
-    sample.must(plain or kind not in WITH_TUBE, "null, and the plant continuous, under this claim")
+    sample.must(plain or kind not in (*WITH_TUBE, "nearby"), "null, and the plant continuous, under this claim")
     sample.must(periods is None or not stated["discrete"], "null where time is discrete")
     form, P = lyapunov.keys("kind P")
     form.choice("quadratic")
-    edges = (*(("floor",) if kind == "practical" else ()), "local", "roa")
+    edges = (*(("floor",) if kind in PRACTICAL else ()), "local", "roa")
     numbers = {edge: level.binary64() for edge, level in zip(edges, levels.keys(" ".join(edges)), strict=True)}
     provenance.must(isinstance(provenance.raw, dict), "an object")
     return Certificate(
@@ -266,12 +276,20 @@ def _policy(value: Value, n: int, m: int) -> Policy:
 
 
 def _local(value: Value, n: int, claim: str, sampled: bool) -> LocalBall | None:
-    if claim == "practical" and value.raw is None:
+    if claim in PRACTICAL and value.raw is None:
         return None
     J, multipliers, weight, edge, order = value.keys("J multipliers weight edge order")
     k = edge.binary64()
-    edge.must(0 <= k < math.inf and (k == 0 or claim == "practical"), "0, or a multiplier under a practical claim")
+    edge.must(0 <= k < math.inf and (k == 0 or claim in PRACTICAL), "0, or a multiplier under a practical claim")
     return LocalBall(J.array(n, n), _multipliers(multipliers, weight, n, n), k, _order(order, sampled))
+
+
+def _contraction(value: Value, n: int, claim: str) -> Contraction | None:
+    if claim != "nearby":
+        value.must(value.raw is None, "null under this claim")
+        return None
+    J, weights = value.keys("J weights")
+    return Contraction(J.array(n, n), weights.array(n))
 
 
 def _order(value: Value, sampled: bool) -> int:
@@ -316,18 +334,23 @@ def check_hash(policy: Policy, stated: Any) -> None:
 
 def _evidence(value: Value, n: int, k: int, claim: str, sampled: bool, plain: bool) -> Partition | Trusted:
     """k quantities are uncertain; `plain` says that no rate is claimed of a loop without steps."""
-    kinds = ("partition-tree", *(("trusted-solver",) if plain and not k and claim not in WITH_TUBE else ()))
+    kinds = (
+        "partition-tree",
+        *(("trusted-solver",) if plain and not k and claim not in (*WITH_TUBE, "nearby") else ()),
+    )
     known = isinstance(value.raw, dict) and value.raw.get("kind") in kinds
     value.must(known, f"an object of kind {' or '.join(kinds)}")
     if value.raw["kind"] == "partition-tree":
-        _, T, root, tree, order, cells, local, tube = value.keys("kind T root tree order cells local tube")
+        keys = "kind T root tree order cells local contraction tube"
+        _, T, root, tree, order, cells, local, contraction, tube = value.keys(keys)
         cuts = cells.listed(lambda cut: cut.raw, k)
         whole = all(type(cut) is int and 1 <= cut <= MAX_CUTS for cut in cuts)
         cells.must(whole and math.prod(cuts) <= MAX_CELLS, f"from 1 to {MAX_CUTS} parts each, {MAX_CELLS} in all")
         value.must(k == 0 or claim not in WITH_TUBE, "another where quantities are uncertain")
         slabs = tube.listed(lambda slab: _slab(slab, n, claim), *((1, MAX_SLABS) if claim in WITH_TUBE else (0, 0)))
         ball = _local(local, n, claim, sampled)
-        return Partition(T.array(n, n), root.array(n), tree.octets(), _order(order, sampled), cuts, ball, slabs)
+        close = _contraction(contraction, n, claim)
+        return Partition(T.array(n, n), root.array(n), tree.octets(), _order(order, sampled), cuts, ball, close, slabs)
     _, solver, version, precision, queries = value.keys("kind solver version precision queries")
     precision.must(precision.binary64() > 0, "positive")
     answers = queries.listed(lambda pair: pair.listed(Value.word, 2), 0, MAX_VALUES)

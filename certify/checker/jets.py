@@ -5,9 +5,10 @@ A jet of v over d in R^k says, for *all* ||d|| <= 1: `v(d) = v(0) + a.d + d'Q d 
 same in all jets of one family, so that they cancel as they do in truth: |e_j(d)| <= d'U_j d. With numbers y_j in
 [-1, 1] that are uncertain v(0) lies within `error` of c + sum_j y_j c_j, and the true gradient within `slack` of a +
 sum_j y_j a_j in the 2-norm; Q, K and B are the numbers that are stored, and whatever they leave out lies in E. All of
-this is meant for each d by itself: nothing asks how v(0) and the gradient at two d belong together. E and U_j dominate
-sums of positive semidefinite matrices with weights >= 0, so each is one, and knows the directions in which v is far
-from what is known of it.
+this is meant for each d by itself: nothing asks how v(0) and the gradient at two d belong together. But `lip`, a
+Lipschitz constant of what v has beyond v(0) + a.d + d'Q d, is meant where v(0) and the gradient are the same for all d.
+E and U_j dominate sums of positive semidefinite matrices with weights >= 0, so each is one, and knows the directions in
+which v is far from what is known of it.
 """
 
 from __future__ import annotations
@@ -77,8 +78,8 @@ def unpacked(K: Array, k: int) -> Array:
 @dataclass(frozen=True)
 class Jet:
     """`c` +- `error`, gradient `a` (k,) +- `slack`, half the Hessian `Q` (k, k), a sixth of the third derivatives `K`
-    as `triples` has them, remainder `E` (k, k), `B` (m,) of the errors within `U` (m, k, k), and what y adds to c and
-    a, `c_y` (N,) and `a_y` (N, k); or a batch, of all but U."""
+    as `triples` has them, remainder `E` (k, k), `B` (m,) of the errors within `U` (m, k, k), what y adds to c and a,
+    `c_y` (N,) and `a_y` (N, k), and the Lipschitz constant `lip`; or a batch, of all but U."""
 
     c: Any
     error: Any
@@ -91,11 +92,12 @@ class Jet:
     U: Any
     c_y: Any
     a_y: Any
+    lip: Any
 
     @property
     def members(self) -> list[Jet]:
         """The jets of a batch."""
-        names = ("c", "error", "a", "slack", "Q", "K", "E", "B", "c_y", "a_y")
+        names = ("c", "error", "a", "slack", "Q", "K", "E", "B", "c_y", "a_y", "lip")
         return [replace(self, **{name: getattr(self, name)[i] for name in names}) for i in range(len(self.c))]
 
     @cached_property
@@ -174,12 +176,12 @@ class Jet:
         error = up(x.error + y.error + EPS * (abs(c) + x.sway + y.sway))
         slack = up(x.slack + y.slack + EPS * (x.slope + y.slope))
         E = widen(x.E + y.E, EPS * (x.spread + y.spread))
-        of_y = x.c_y + y.c_y, x.a_y + y.a_y
-        return Jet(c, error, x.a + y.a, slack, x.Q + y.Q, x.K + y.K, E, x.B + y.B, x.U, *of_y)
+        of_y, lip = (x.c_y + y.c_y, x.a_y + y.a_y), up(x.lip + y.lip + 2 * EPS * (x.bend + y.bend))
+        return Jet(c, error, x.a + y.a, slack, x.Q + y.Q, x.K + y.K, E, x.B + y.B, x.U, *of_y, lip)
 
     def __neg__(self) -> Jet:
         x = self
-        return Jet(-x.c, x.error, -x.a, x.slack, -x.Q, -x.K, x.E, -x.B, x.U, -x.c_y, -x.a_y)
+        return Jet(-x.c, x.error, -x.a, x.slack, -x.Q, -x.K, x.E, -x.B, x.U, -x.c_y, -x.a_y, x.lip)
 
     def __mul__(self, other: Jet) -> Jet:
         x, y = self, other
@@ -201,7 +203,24 @@ class Jet:
         wrong = x.doubt * y.spread + y.doubt * x.spread + x.turn * sy + y.turn * sx
         wrong = wrong + EPS * (x.size * y.spread + y.size * x.spread + x.slope * sy + y.slope * sx) + x.faint
         B, E = x.c * y.B + y.c * x.B, widen(E, known + wrong)
-        return Jet(c, error, x.c * y.a + y.c * x.a, slack, Q, K, E, B, x.U, c_y, a_y)
+        lost = x.doubt * y.bend + y.doubt * x.bend + x.turn * y.slope + y.turn * x.slope
+        lost = lost + EPS * (x.size * y.bend + y.size * x.bend + x.slope * y.slope)
+        (zx, lx), (zy, ly) = x.rest, y.rest
+        lip = x.size * y.lip + y.size * x.lip + x.slope * up(zy + ly) + y.slope * up(zx + lx) + zx * ly + zy * lx
+        return Jet(c, error, x.c * y.a + y.c * x.a, slack, Q, K, E, B, x.U, c_y, a_y, up(lip + 2 * lost))
+
+    @cached_property
+    def rest(self) -> tuple[Any, Any]:
+        """Upper bounds of what v has beyond v(0) + a.d, and of a Lipschitz constant of that."""
+        return up(self.bend + self.lip), up(2 * self.bend + self.lip)
+
+    def lip_beyond_tangent(self, phi: Expansion) -> Any:
+        """A Lipschitz constant of what phi(v) has beyond its tangent at v(0) and the d'H d of `beyond_tangent`."""
+        (_, _, half, _), (_, _, wrong, _) = phi.f, phi.e
+        (z, steep), s, h = self.rest, self.slope, up(np.abs(half) + wrong)
+        cubic = 3 * up(phi.third * up(self.radius * self.radius)) * up(s + steep)
+        lost = up(wrong + EPS * h) * up(s * s) + 2 * up(h * s) * self.turn
+        return up(2 * up(h * up(s * up(z + steep) + z * steep)) + cubic + 2 * lost)
 
     def beyond_tangent(self, phi: Expansion) -> tuple[Any, Any, Any]:
         """(H, C, R): phi(v) less its tangent at v(0) is d'H d + C[d] within d'R d.
@@ -236,7 +255,8 @@ class Jet:
             e0, slack, a_y = self._by_y(name, phi, a_y)
         wrong = up(e1 + EPS * steepest) * self.spread + self.faint
         Q, K, E = each(f1) * self.Q + H, column * self.K + C, widen(each(steepest) * self.E + R, wrong)
-        return Jet(f0, e0, column * self.a, slack, Q, K, E, column * self.B, self.U, c_y, a_y)
+        lip = steepest * self.lip + self.lip_beyond_tangent(phi) + 2 * up(e1 + EPS * steepest) * self.bend
+        return Jet(f0, e0, column * self.a, slack, Q, K, E, column * self.B, self.U, c_y, a_y, up(lip))
 
     def _by_y(self, name: str, phi: Expansion, plain: Any) -> tuple[Any, Any, Any]:
         """`error`, `slack` and `a_y` of phi(v); `plain` is phi'(c) a_y.
@@ -275,4 +295,4 @@ def constant(q: Fraction, U: Array, count: int) -> Jet:
     m, k, _ = U.shape
     nothing, thirds = np.zeros((k, k)), np.zeros(len(triples(k)[0]))
     of_y = np.zeros(count), np.zeros((count, k))
-    return Jet(np.float64(value), error, np.zeros(k), 0.0, nothing, thirds, nothing, np.zeros(m), U, *of_y)
+    return Jet(np.float64(value), error, np.zeros(k), 0.0, nothing, thirds, nothing, np.zeros(m), U, *of_y, 0.0)

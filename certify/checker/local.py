@@ -21,7 +21,7 @@ from .float64 import Array, norm, up
 from .flow import mean
 from .jets import Jet, uncertain
 
-_MOST_WORK = 2**26  # corners of cells times n^4, which is what an inequality takes
+MOST_WORK = 2**26  # corners of cells times n^4, which is what an inequality takes
 _ATTEMPTS = 4  # at the a-priori enclosure
 Way = tuple[Array, Array]  # how far each state may move in a period: a number, and one times ||d||
 
@@ -116,7 +116,7 @@ def fits(local: Local) -> Failures:
     c = local.case.c
     if not contains_ball(exactly(local.J), exactly(c.P), Fraction(c.c1)):
         yield "levels.local", "the ball must contain {V <= c1}"
-    if prod(local.case.partition.cells) * 2**local.count * len(local.J) ** 4 > _MOST_WORK:
+    if prod(local.case.partition.cells) * 2**local.count * len(local.J) ** 4 > MOST_WORK:
         yield "evidence.cells", "there are too many cells for this rule"
     if not are_usable(local.case.local.multipliers):
         yield "evidence.local", "no multiplier may be negative, none of g 0 where some beta is"

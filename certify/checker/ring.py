@@ -183,7 +183,7 @@ class Ring:
         """D = sum_i G_i (2 P x + h P G)_i."""
         along = [v.scaled(2.0) for v in states]
         if self.c.step:
-            step = constant(self.c.step, self.symbols, len(states[0].c))
+            step = self.number(self.c.sample or (self.c.step,) * 2, self.symbols - 1, len(states[0].c))
             along = [v + step * g for v, g in zip(along, G, strict=True)]
         rows = [reduce(add, [v.scaled(p) for p, v in zip(row, along, strict=True)]) for row in self.c.P.tolist()]
         return reduce(add, [row * g for row, g in zip(rows, G, strict=True)])

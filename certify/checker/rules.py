@@ -15,7 +15,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from . import ball, local, ring, tube
+from . import ball, contraction, local, ring, tube
 from .case import Case, Failures
 from .document import Certificate, Partition
 from .errors import Rejected
@@ -89,7 +89,7 @@ def centring(case: Case) -> Failures:
         limits = zip(*(end.tolist() for end in policy.clip), u_eq, strict=True)
         if not all(Fraction(lo) < u < Fraction(hi) for lo, hi, u in limits):
             yield "policy.clip", "u_eq must lie strictly inside the clip"
-    if policy.centre == "none" and case.c.claim != "practical" and policy_at_origin(policy) != list(u_eq):
+    if policy.centre == "none" and not case.c.practical and policy_at_origin(policy) != list(u_eq):
         yield "policy.centre", "pi(0) = u_eq cannot be shown exactly without centring"
     return 1
 
@@ -116,10 +116,19 @@ ON_SLABS: Table[tube.Piece] = (
     ("tube", ball.is_not_clipped),
     ("tube", tube.decreases),
 )
+OF_CONTRACTION: Table[contraction.Contracted] = (
+    ("contraction", contraction.fits),
+    ("contraction", ball.is_not_clipped),
+    ("contraction", contraction.contracts),
+)
 READ = {"format": 1, "hash": 1}  # rules of document.py, which have held
 RULES = (
     *READ,
-    *dict.fromkeys(name for table in (STATED, ON_THE_BALL, OF_THE_TREE, ON_LEAVES, OF_THE_TUBE) for name, _ in table),
+    *dict.fromkeys(
+        name
+        for table in (STATED, ON_THE_BALL, OF_THE_TREE, ON_LEAVES, OF_THE_TUBE, OF_CONTRACTION)
+        for name, _ in table
+    ),
 )
 
 
@@ -174,4 +183,6 @@ def check(c: Certificate) -> Tally:
             tally.hold(OF_THE_TUBE, case)
             for piece in tube.pieces(case):
                 tally.hold(ON_SLABS, piece)
+        if case.partition.contraction is not None:
+            tally.hold(OF_CONTRACTION, contraction.Contracted(case, case.partition.contraction))
     return tally

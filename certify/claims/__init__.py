@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from certify.claims.claim import CLAIMS, Asymptotic, Claim, Enlarged, Practical, Problem, Reached
+from certify.claims.claim import CLAIMS, Asymptotic, Claim, Enlarged, Nearby, Practical, Problem, Reached
 from certify.claims.conditions import BeforeClip, Condition, Guard, OfInput, OfState, Radicand, Vdot, conditions
 
 __all__ = [
@@ -13,6 +13,7 @@ __all__ = [
     "Condition",
     "Enlarged",
     "Guard",
+    "Nearby",
     "OfInput",
     "OfState",
     "Practical",

@@ -50,7 +50,7 @@ class Claim:
     `rate` is lambda: V falls at least as exp(-2 lambda t) where it is claimed to fall.
     """
 
-    kind: ClassVar[Kind | Literal["enlarged", "reached"]]
+    kind: ClassVar[Kind | Literal["nearby", "enlarged", "reached"]]
     at_rest: ClassVar[bool]  # the origin must be an equilibrium, exactly
     roa: float
     local: float
@@ -71,7 +71,7 @@ class Claim:
 class Asymptotic(Claim):
     """Every trajectory from {V <= c2} stays in it and converges to the origin, which is asymptotically stable."""
 
-    kind: ClassVar[Kind | Literal["enlarged", "reached"]] = "asymptotic"
+    kind: ClassVar[Kind | Literal["nearby", "enlarged", "reached"]] = "asymptotic"
     at_rest = True
 
 
@@ -102,7 +102,7 @@ class Practical(Claim):
     {V <= c0}; the origin need not be an equilibrium.
     """
 
-    kind = "practical"
+    kind: ClassVar[Kind | Literal["nearby", "enlarged", "reached"]] = "practical"
     at_rest = False
     floor: float
 
@@ -112,6 +112,13 @@ class Practical(Claim):
         return {"floor": self.floor, "local": self.local, "roa": self.roa}
 
 
+@dataclass(frozen=True, slots=True)
+class Nearby(Practical):
+    """The same, and where what is uncertain is constant there is one equilibrium in {V <= c0}, to which all converge."""
+
+    kind = "nearby"
+
+
 CLAIMS: Mapping[str, type[Asymptotic] | type[Practical]] = {
-    c.kind: c for c in (Asymptotic, Practical, Enlarged, Reached)
+    c.kind: c for c in (Asymptotic, Practical, Nearby, Enlarged, Reached)
 }

@@ -44,13 +44,18 @@ def query(condition: Condition, problem: Problem) -> Query:
     Raises
     ------
     InputError : the local condition, where -(A'P + PA) is not positive definite; a plant of which something is
-        uncertain, because the query would be about its nominal value alone.
+        uncertain, because the query would be about its nominal value alone; time in steps, or a rate.
     """
     system = problem.loop.system
     if system.ranges:
         raise InputError(
             f"queries for solvers of formulas must be about exact equations; {system.name} has ranges of "
             f"{', '.join(system.ranges)}. Leave the ranges out, or use the engine bounds."
+        )
+    if system.in_steps or problem.rate:
+        raise InputError(
+            f"queries for solvers of formulas must be about Vdot; {system.name} has "
+            f"{'steps' if system.in_steps else 'a rate'}. Use the engine bounds."
         )
     constraints: list[tuple[Tree, str, Tree]] = [
         ("V.", "<=" if guard.side == "inside" else ">=", exact(guard.level)) for guard in condition.guards

@@ -14,6 +14,7 @@ from certify.inputs import (
     where_valid,
     with_acting,
     with_bounded_errors,
+    with_period,
     with_uncertain_parameters,
 )
 
@@ -29,9 +30,10 @@ def plant_of(
     bounds: list[str],
     disturbances: Sequence[str] = (),
     error: str | None = None,
+    period: str | None = None,
 ) -> System:
-    """The plant: the policy file's unless `name` says otherwise, with `--param`, `--domain`, `--disturbance` and
-    `--input-error` put in.
+    """The plant: the policy file's unless `name` says otherwise, with `--param`, `--domain`, `--disturbance`,
+    `--input-error` and `--sample-time` put in.
 
     What is named there counts as it stands; where the policy was trained for other numbers, standard error says so.
     """
@@ -39,7 +41,8 @@ def plant_of(
     plant = with_params(plant, params)
     if not own:
         tell_of_other(stored, plant, tell)
-    return where_valid(stored, with_errors(with_disturbances(with_domains(plant, bounds), disturbances), error), tell)
+    plant = with_errors(with_disturbances(with_domains(plant, bounds), disturbances), error)
+    return where_valid(stored, with_samples(plant, period), tell)
 
 
 def with_params(plant: System, params: list[str]) -> System:
@@ -67,6 +70,16 @@ def with_errors(plant: System, error: str | None) -> System:
     if error is None:
         return plant
     return with_bounded_errors(plant, state(error, "--input-error") if "=" in error else exact(error, "--input-error"))
+
+
+def with_samples(plant: System, period: str | None) -> System:
+    """The plant whose inputs are held as `--sample-time` says: a period, or any between LO..HI."""
+    from certify.systems import exact
+
+    if period is None:
+        return plant
+    ends = _range(period, "--sample-time") if ".." in period else exact(period, "--sample-time")
+    return with_period(plant, ends)
 
 
 def _range(text: str, name: str) -> tuple[Fraction, Fraction]:

@@ -6,6 +6,7 @@ import json
 import shlex
 import time
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +18,7 @@ from certify.commands.terminal import ProgressLine, say, show, tell
 
 if TYPE_CHECKING:
     from certify.containment import Box
+    from certify.largest import Quantity
     from certify.options import RoaOptions
     from certify.policies import Policy
     from certify.results import RoaResult
@@ -34,6 +36,7 @@ def certified(
     quiet: bool,
     as_json: bool,
     asked: Box | None = None,
+    largest: Quantity | None = None,
 ) -> None:
     """Run, write certificate and report, print the result; ends the command with the verdict's exit status.
 
@@ -43,10 +46,13 @@ def certified(
     out : folder for the results.
     start : when the command began, by `time.perf_counter`.
     asked : of which it is to be said whether the proved set contains it.
+    largest : what is to be as large as can be proved for the set.
     """
+    from certify.largest import certify_largest
     from certify.report import summary
     from certify.roa import certify_roa
 
+    run = certify_roa if largest is None else partial(certify_largest, largest)
     note = (lambda _: None) if quiet else tell
     note(_plant_line(stored, plant, context.params["system"] is not None))
     shift = stored.beta_shift(plant.exact_u_eq())
@@ -55,7 +61,7 @@ def certified(
     folder = out if out is not None else Path("out") / policy.stem
     progress = None if quiet else ProgressLine()
     try:
-        result = certify_roa(
+        result = run(
             plant,
             stored.network,
             folder,

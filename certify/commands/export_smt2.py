@@ -40,6 +40,10 @@ def export_smt2(
             "export-smt2 must have a plant of exact equations, because formulas know no ranges; found ranges of "
             f"{', '.join(plant.ranges)} in {plant.name}. Leave them out (of a disturbance in its file: half-width 0)."
         )
+    if plant.in_steps:
+        raise InputError(
+            f"export-smt2 must have a plant in continuous time; found {plant.name}, whose time is discrete."
+        )
     options = RoaOptions(candidate=candidate, level=level, time_limit=time_limit)  # type: ignore[arg-type]
     result = certify_roa(plant, stored.network, out, options)
     inner, outer = result.levels.local, result.levels.roa

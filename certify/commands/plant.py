@@ -62,7 +62,7 @@ def _page(
     grid.add_column(style="dim", no_wrap=True)
     grid.add_column(overflow="fold")
     for x, e in zip(s.states, s.dynamics_of_values(), strict=True):
-        grid.add_row(Text(f"d {x}/dt"), Text(f"= {e}"))
+        grid.add_row(Text(f"d {x}/dt" if s.time == "continuous" else f"{x}, next"), Text(f"= {e}"))
     facts = Table.grid(padding=(0, 2))
     facts.add_column(style="dim", no_wrap=True)
     facts.add_column(overflow="fold")
@@ -80,8 +80,10 @@ def _page(
 
 
 def _facts(s: System, eigenvalues: Sequence[complex], reach: Controllability) -> list[tuple[str, str]]:
-    largest = max(e.real for e in eigenvalues)
-    word = "unstable" if largest > 1e-9 else "stable" if largest < -1e-9 else "on the axis, within rounding"
+    steps = s.time == "discrete"
+    largest = max(abs(e) - 1 if steps else e.real for e in eigenvalues)
+    edge = "on the unit circle, within rounding" if steps else "on the axis, within rounding"
+    word = "unstable" if largest > 1e-9 else "stable" if largest < -1e-9 else edge
     shown = ", ".join(_complex(e) for e in eigenvalues)
     how = (
         "exact rank of [B, AB, ...] in rationals"
@@ -93,8 +95,9 @@ def _facts(s: System, eigenvalues: Sequence[complex], reach: Controllability) ->
         ("open loop", f"{word}; eigenvalues {shown}"),
         ("inputs reach", f"{reach.rank} of {s.n} directions: {word_reach} ({how})"),
     ]
-    off = [f"{name}' = {float(r):.6g}" for name, r in s.residuals().items() if not (abs(float(r)) <= 1e-12)]
-    rest = "f(x_eq, u_eq) = 0" if not off else f"no equilibrium: {', '.join(off)} at (x_eq, u_eq)"
+    residuals = {name: float(r) for name, r in s.residuals().items() if not (abs(float(r)) <= 1e-12)}
+    off = [f"{name} moves by {r:.6g}" if steps else f"{name}' = {r:.6g}" for name, r in residuals.items()]
+    rest = f"f(x_eq, u_eq) = {s.rests_where}" if not off else f"no equilibrium: {', '.join(off)} at (x_eq, u_eq)"
     rows.insert(0, ("at rest", rest))
     if s.ranges:
         rows.append(

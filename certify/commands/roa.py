@@ -15,7 +15,10 @@ from certify.commands.terminal import tell
 from certify.errors import BackendError, InputError
 
 if TYPE_CHECKING:
+    from certify.largest import Quantity
     from certify.policies.importers import ImportOptions
+
+_MOST = "max"
 
 
 def roa(
@@ -35,6 +38,13 @@ def roa(
         str | None,
         typer.Option(help="Bound of what the inputs may be off by at any time: one number, or NAME=E,NAME=E."),
     ] = None,
+    sample_time: Annotated[
+        str | None,
+        typer.Option(
+            help="Period over which the input is held, as in 0.02; LO..HI: any sequence of periods between them; max: "
+            "the longest for which the set proved without one can still be proved."
+        ),
+    ] = None,
     domain: Domain = None,
     claim: Annotated[
         str,
@@ -51,6 +61,13 @@ def roa(
     ] = "auto",
     q: Annotated[str | None, typer.Option("--Q", help="Diagonal of Q, as in 1,1.")] = None,
     r: Annotated[str | None, typer.Option("--R", help="Diagonal of R (candidate lqr), as in 1.")] = None,
+    rate: Annotated[
+        str,
+        typer.Option(
+            help="Prove that V falls at least as exp(-2 RATE t), in discrete time by the share 2 RATE a step; max: the "
+            "largest for which the set proved without one can still be proved."
+        ),
+    ] = "0",
     level: Annotated[float | None, typer.Option(help="Prove exactly this level; less is not PROVED.")] = None,
     engine: Annotated[
         str, typer.Option(envvar="CERTIFY_ENGINE", help="bounds, dreal (trusted, not checked), or both.")
@@ -81,8 +98,17 @@ def roa(
     from certify.options import RoaOptions
 
     start = time.perf_counter()
+    largest = _largest(sample_time, rate)
     stored = policy_of(policy, importing, system, param or [])
-    plant = plant_of(stored, system, param or [], domain or [], disturbance or [], input_error)
+    plant = plant_of(
+        stored,
+        system,
+        param or [],
+        domain or [],
+        disturbance or [],
+        input_error,
+        None if sample_time == _MOST else sample_time,
+    )
     options = RoaOptions(
         claim=claim,  # type: ignore[arg-type]
         candidate=candidate,  # type: ignore[arg-type]
@@ -97,9 +123,24 @@ def roa(
         box=widths(box, "--box"),
         time_limit=time_limit,
         max_boxes=max_boxes,
+        rate=0.0 if rate == _MOST else _number(rate),
     )
     asked = None if contains is None else region(contains, plant, "--contains")
-    certified(context, policy, stored, plant, options, out, start, quiet, as_json, asked)
+    certified(context, policy, stored, plant, options, out, start, quiet, as_json, asked, largest)
+
+
+def _largest(sample_time: str | None, rate: str) -> Quantity | None:
+    """What is to be as large as can be proved, if anything is."""
+    if sample_time == _MOST and rate != "0":
+        raise InputError("--sample-time max must stand without --rate; found both. Ask for one of them at a time.")
+    return "period" if sample_time == _MOST else "rate" if rate == _MOST else None
+
+
+def _number(rate: str) -> float:
+    try:
+        return float(rate)
+    except ValueError as error:
+        raise InputError(f"--rate takes a number of at least 0, or max; found {rate!r}.") from error
 
 
 def _device(name: str) -> str:

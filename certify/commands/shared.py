@@ -39,6 +39,7 @@ def describe(s: System) -> dict[str, Any]:
     return {
         "name": s.name,
         "description": s.description,
+        "time": s.time,
         "states": [x.name for x in s.states],
         "inputs": [u.name for u in s.inputs],
         "parameters": {name: str(q) for name, q in s.parameters.items()},

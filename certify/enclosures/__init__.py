@@ -6,7 +6,8 @@ here is accepted there.
 
 from __future__ import annotations
 
+from certify.enclosures.flow import Flow
 from certify.enclosures.policy import PolicyEnclosure
 from certify.enclosures.taylor import Models, Taylor, upper_bound
 
-__all__ = ["Models", "PolicyEnclosure", "Taylor", "upper_bound"]
+__all__ = ["Flow", "Models", "PolicyEnclosure", "Taylor", "upper_bound"]

@@ -9,6 +9,7 @@ third order, take multipliers that follow from one `weight` of directions: there
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -43,8 +44,60 @@ class Shown:
 NOT_SHOWN = Shown(Multipliers(np.zeros((3, 0)), np.zeros((0, 0))), -math.inf)
 
 
+@dataclass(frozen=True, slots=True)
+class Corner:
+    """The inequality at a corner of a cell, as far as it does not depend on multipliers.
+
+    `b` (n, k) are the weights of the components, `decay` (k, k) is what the rest has to stay below. Where G does not
+    vanish at d = 0 it gives `2 linear.d + start` beside them: linear (k,).
+    """
+
+    models: Models
+    b: Array
+    decay: Array
+    linear: Array
+    start: float
+
+
+def corners_of(models: Models, J: Array, P: Array, R: Array | None = None, h: float = 0.0) -> list[Corner]:
+    """The inequality at each corner of the models' cell, for a step of length h.
+
+    What is known of f and A as a norm is charged to the decay, and so is `h g'P g`, g what the models have beyond them.
+    """
+    gamma, still = _gamma(models, P) if h else 0.0, P @ J
+    return [_corner(models, J, P, R, h, f, A, gamma, still) for f, A in models.corners]
+
+
+def _corner(
+    models: Models, J: Array, P: Array, R: Array | None, h: float, f: Array, A: Array, gamma: float, still: Array
+) -> Corner:
+    """`gamma` and `still`, b for h = 0, are the same at all corners."""
+    b = P @ (J + h * A) if h else still
+    moved = P @ f
+    whole = J.T @ P @ A
+    decay = -(whole + whole.T) - (h * A.T @ P @ A if h else 0.0) - (0.0 if R is None else J.T @ R @ J)
+    charge = h * (gamma**2 + 2 * math.sqrt(max(float(f @ moved), 0.0)) * gamma)
+    start = h * float(f @ moved)
+    if models.spread is not None:
+        wrong = models.spread.slack + models.spread.error
+        s = float(np.sqrt(np.diag(P)) @ wrong)
+        both = 2 * float(np.hypot(np.linalg.norm(b, axis=1), h * moved) @ wrong) + h * s * (s + gamma)
+        charge, start = charge + both + h * s * gamma, start + both
+    return Corner(models, b, decay - charge * np.eye(len(decay)), b.T @ f, start)
+
+
+def _gamma(models: Models, P: Array) -> float:
+    """||g||_P is at most this times ||d||^2."""
+    size = np.sqrt(np.diag(P))
+    bends = np.einsum("ij,iab,jab->", P, models.Q, models.Q, optimize=True)
+    twists = np.einsum("ij,iabc,jabc->", P, models.K, models.K, optimize=True)
+    units = np.sqrt(np.maximum(np.einsum("iq,ij,jq->q", models.shares, P, models.shares, optimize=True), 0.0))
+    each = np.linalg.norm(models.R, axis=(1, 2)), np.linalg.norm(models.E, axis=(1, 2))
+    return float(math.sqrt(max(bends, 0.0)) + math.sqrt(max(twists, 0.0)) + units @ each[0] + size @ each[1])
+
+
 def best_multipliers(models: Models, J: Array, P: Array, R: Array | None = None, enough: float = math.inf) -> Shown:
-    """The multipliers with the largest margin found.
+    """The multipliers with the largest margin found, for a step of no length.
 
     Parameters
     ----------
@@ -52,45 +105,50 @@ def best_multipliers(models: Models, J: Array, P: Array, R: Array | None = None,
     J, P, R : (n, n), P positive definite, R symmetric (None: 0).
     enough : the margin at which the search may end; it ends too where no multipliers reach that.
     """
-    if not models.finite:
-        return NOT_SHOWN
-    b = P @ J
-    decay = decay_of(models, J, b, R)
+    return best_at(corners_of(models, J, P, R), enough) if models.finite else NOT_SHOWN
+
+
+def best_at(corners: Sequence[Corner], enough: float = math.inf) -> Shown:
+    """The multipliers whose margin is the largest found at the corner where it is least."""
     try:
-        root = np.linalg.cholesky(decay)
+        roots = [np.linalg.inv(np.linalg.cholesky(corner.decay)) for corner in corners]
     except np.linalg.LinAlgError:
         return NOT_SHOWN
-    inverse, best = np.linalg.inv(root), NOT_SHOWN
+    best = NOT_SHOWN
     for joint in (False, True):
         if best.margin < enough:
-            best = max(best, _best_of_a_kind(models, b, inverse, joint, enough), key=lambda shown: shown.margin)
+            best = max(best, _best_of_a_kind(corners, roots, joint, enough), key=lambda shown: shown.margin)
     return best
 
 
-def _best_of_a_kind(models: Models, b: Array, inverse: Array, joint: bool, enough: float) -> Shown:
-    """`inverse` (n, n) is that of the decay's Cholesky factor.
+def _best_of_a_kind(corners: Sequence[Corner], roots: Sequence[Array], joint: bool, enough: float) -> Shown:
+    """`roots` are the inverses of the decays' Cholesky factors, (k, k) each.
 
-    What the rest takes of the decay in its worst direction is least at a saddle: of all weights the one whose own best
-    multipliers leave the least. Weights that look at bad directions more and more, by all rounds so far, lead there
-    (matrix multiplicative weights: Arora, Hazan, Kale, Theory of Computing 8, 2012, section 5), and no multipliers
-    leave more than the weighted mean of any round.
+    What the rest takes of the decay in its worst direction is least at a saddle: of all weights, of directions at all
+    corners, the one whose own best multipliers leave the least. Weights that look at bad directions more and more, by
+    all rounds so far, lead there (matrix multiplicative weights: Arora, Hazan, Kale, Theory of Computing 8, 2012,
+    section 5), and no multipliers leave more than the weighted mean of any round.
     """
-    best, looked = NOT_SHOWN, np.zeros_like(inverse)
-    weight = np.eye(len(inverse)) / len(inverse)
+    best, looked = NOT_SHOWN, [np.zeros_like(root) for root in roots]
+    weights = [np.eye(len(root)) / (len(root) * len(roots)) for root in roots]
     for _ in range(_ROUNDS):
-        multipliers = multipliers_for(models, b, inverse.T @ weight @ inverse, joint)
-        relative = inverse @ rest_of(models, b, multipliers) @ inverse.T
-        if not np.all(np.isfinite(relative)):
+        seen = [root.T @ weight @ root for root, weight in zip(roots, weights, strict=True)]
+        multipliers = _multipliers_at(corners, seen, joint)
+        rests = rests_of(corners, multipliers)
+        relative = [root @ rest @ root.T for root, rest in zip(roots, rests, strict=True)]
+        if not all(np.all(np.isfinite(one)) for one in relative):
             return best
-        worst = float(np.linalg.eigvalsh(relative)[-1])
+        worst = max(float(np.linalg.eigvalsh(one)[-1]) for one in relative)
         best = max(best, Shown(multipliers, 1 - worst), key=lambda shown: shown.margin)
-        most = 1 - float(np.sum(weight * relative))
+        most = 1 - sum(float(np.sum(weight * one)) for weight, one in zip(weights, relative, strict=True))
         if not worst > 0 or best.margin >= enough or most < min(enough, best.margin + _SETTLED):
             return best
-        looked += _FOCUS / worst * relative
-        values, vectors = np.linalg.eigh(looked)
-        focus = np.maximum(np.exp(values - values[-1]), _LEAST_WEIGHT)
-        weight = (vectors * (focus / np.sum(focus))) @ vectors.T
+        looked = [before + _FOCUS / worst * one for before, one in zip(looked, relative, strict=True)]
+        spectra = [np.linalg.eigh(one) for one in looked]
+        top = max(values[-1] for values, _ in spectra)
+        focus = [np.maximum(np.exp(values - top), _LEAST_WEIGHT) for values, _ in spectra]
+        total = sum(float(np.sum(part)) for part in focus)
+        weights = [(v * (part / total)) @ v.T for (_, v), part in zip(spectra, focus, strict=True)]
     return best
 
 
@@ -98,6 +156,15 @@ def decay_of(models: Models, J: Array, b: Array, R: Array | None = None) -> Arra
     """-(J'RJ + B + B'), (k, k), where row i of b (n, k) is J'P_i."""
     B = b.T @ models.A
     return -(B + B.T) - (0.0 if R is None else J.T @ R @ J)
+
+
+def rests_of(corners: Sequence[Corner], multipliers: Multipliers) -> list[Array]:
+    """`rest_of` at each corner, (k, k)."""
+    known: dict[int, Array] = {}
+    for corner in corners:
+        if id(corner.b) not in known:
+            known[id(corner.b)] = rest_of(corner.models, corner.b, multipliers)
+    return [known[id(corner.b)] for corner in corners]
 
 
 def rest_of(models: Models, b: Array, multipliers: Multipliers) -> Array:
@@ -123,28 +190,49 @@ def multipliers_for(models: Models, b: Array, weight: Array, joint: bool | None 
 
     `joint` says whether the Q of all components are taken jointly or all apart; None is what has the smaller trace.
     """
-    size = np.linalg.norm(b, axis=1)
-    along = np.einsum("ij,jk,ik->i", b, weight, b)
-    E2, Q2 = (np.einsum("ikj,jl,ikl->i", part, weight, part, optimize=True) for part in (models.E, models.Q))
-    by_size = size * np.einsum("ijk,jk->i", models.E, weight)
+    return _multipliers_of([(models, b, weight)], joint)
+
+
+def _multipliers_at(corners: Sequence[Corner], weights: Sequence[Array], joint: bool) -> Multipliers:
+    """The same for the sum of the traces at several corners, each with its own weight."""
+    parts: dict[int, tuple[Models, Array, Array]] = {}  # corners that share their b share their bounds
+    for corner, weight in zip(corners, weights, strict=True):
+        _, _, before = parts.get(id(corner.b), (None, None, 0.0))
+        parts[id(corner.b)] = corner.models, corner.b, before + weight
+    return _multipliers_of(list(parts.values()), joint)
+
+
+def _multipliers_of(parts: Sequence[tuple[Models, Array, Array]], joint: bool | None) -> Multipliers:
+    n, k = parts[0][1].shape
+    usual, whole = 0.0, np.zeros((k, k))
+    along, by_size, E2, Q2, spread = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(k)
+    for models, b, weight in parts:
+        whole = whole + weight
+        size = np.linalg.norm(b, axis=1)
+        along = along + np.einsum("ij,jk,ik->i", b, weight, b)
+        E2, Q2 = (
+            before + np.einsum("ikj,jl,ikl->i", part, weight, part, optimize=True)
+            for before, part in ((E2, models.E), (Q2, models.Q))
+        )
+        by_size = by_size + size * np.einsum("ijk,jk->i", models.E, weight)
+        C = _joint(models, b, np.ones(n, dtype=bool))
+        spread = spread + np.einsum("jmk,kl,jml->m", C, weight, C, optimize=True)
+        usual = max(usual, float(np.max(size)) * float(np.max(np.linalg.norm(models.A, axis=1))))
     with np.errstate(divide="ignore", invalid="ignore"):
         apart = np.sqrt(E2 * along) < by_size
         alpha = np.where(apart, np.sqrt(E2 / along), 0.0)
         beta = np.where(along > 0, np.sqrt(Q2 / along), 0.0)
-    C = _joint(models, b, np.ones(len(b), dtype=bool))
-    spread = np.einsum("jmk,kl,jml->m", C, weight, C, optimize=True)
-    diagonal, apart_in_all = np.diag(weight), np.sum(np.sqrt(Q2 * along))
+    diagonal, apart_in_all = np.diag(whole), np.sum(np.sqrt(Q2 * along))
     g = np.sqrt(spread / diagonal)
-    usual = _ROUNDING * float(np.max(size)) * float(np.max(np.linalg.norm(models.A, axis=1)))  # beside the decay
-    least = max(_NEGLIGIBLE * float(np.max(g)), _NEGLIGIBLE * apart_in_all / np.trace(weight), usual)
+    least = max(_NEGLIGIBLE * float(np.max(g)), _NEGLIGIBLE * apart_in_all / np.trace(whole), _ROUNDING * usual)
     joint = np.sum(np.sqrt(spread * diagonal)) <= apart_in_all if joint is None else joint
     if joint or not np.all(np.isfinite(beta)):
         beta, g = np.zeros_like(beta), np.maximum(g, least)
     else:  # what has no Q stays joint, at next to no cost
         g = np.full_like(g, least)
-    unused = np.zeros(b.shape[1] - len(b))
+    unused = np.zeros(k - n)
     alpha, beta = (np.append(row, unused) for row in (np.where(np.isfinite(alpha), alpha, 0.0), beta))
-    return Multipliers(np.array([short(alpha), short(beta), short(g)]), weight)
+    return Multipliers(np.array([short(alpha), short(beta), short(g)]), whole)
 
 
 def _joint(models: Models, b: Array, chosen: NDArray[np.bool_]) -> Array:

@@ -1,8 +1,9 @@
-"""The falsifier: the lowest V at which Vdot >= 0, or at which the input leaves its bounds.
+"""The falsifier: the lowest V at which D' >= 0, or at which the input leaves its bounds.
 
-Violating samples of the ellipsoid are improved by descending V along Vdot = 0, each on its own so that they end in
-different valleys: a gradient step on Vdot along the sphere V = const makes room, and the point is scaled towards the
-origin as far as it stays violating. A reported witness is shown in Arb; the search itself proves nothing.
+D' = D + 2 lambda V, where D is Vdot, or V's increment over a step by time. Violating samples of the ellipsoid are
+improved by descending V along D' = 0, each on its own so that they end in different valleys: a gradient step on D'
+along the sphere V = const makes room, and the point is scaled towards the origin as far as it stays violating. A
+reported witness is shown in Arb; the search itself proves nothing.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 
 from certify.claims import Problem
 from certify.policies import bounded_by_form
-from certify.rigorous import evaluate_policy, evaluate_vdot
+from certify.rigorous import evaluate_increment, evaluate_policy
 from certify.systems import System
 
 Array = NDArray[np.float64]
@@ -28,22 +29,26 @@ _RATIO, _LEVELS, _LOWEST = 1.4, 60, 1e-24  # of a survey: between levels, how ma
 
 @dataclass(frozen=True, slots=True)
 class Witness:
-    """A state `x` (n,) with Vdot >= 0 (kind `vdot`) or an input out of bounds (`input`); `level` is V(x), rounded.
+    """A state `x` (n,) with D' >= 0 (kind `vdot`) or an input out of bounds (`input`); `level` is V(x), rounded.
 
-    `values` are those of what is uncertain, at which it is so.
+    `values` are those of what is uncertain, at which it is so, and `period` the sampling period; None without one.
     """
 
     x: Array
     level: float
     kind: Literal["vdot", "input"]
     values: Mapping[str, Fraction] = field(default_factory=dict)
+    period: Fraction | None = None
 
     def describe(self, system: System) -> str:
         """The violation in words."""
         names = ", ".join(f"{s} = {v:.6g}" for s, v in zip(system.states, self.x, strict=True))
         names += "".join(f", {name} = {float(q):.6g}" for name, q in self.values.items())
         names += ", in deviations from x_eq," if system.operating_point() else ""
-        what = "Vdot >= 0" if self.kind == "vdot" else "the input leaves its bounds"
+        what = "the input leaves its bounds" if self.kind == "input" else "Vdot >= 0"
+        if self.kind == "vdot" and (system.time == "discrete" or self.period):
+            over = "a step" if self.period is None else f"a period of {float(self.period):.6g}"
+            what = f"V does not fall over {over}"
         return f"{what} at {names} with V = {self.level:.12g} (shown in Arb)"
 
 
@@ -69,7 +74,7 @@ def falsify(problem: Problem, T: Array, limit: float, samples: int = 20_000, see
     radius = np.where(np.arange(samples) % 2 == 0, 1.0, generator.random(samples))
     z = direction * (radius * np.sqrt(limit) * (1 - 1e-9))[:, None]
     best = search.lowest(z)
-    if best is None:  # climb Vdot on the boundary before giving up
+    if best is None:  # climb D' on the boundary before giving up
         z = search.climb(z[:: max(1, samples // 512)], limit)
         best = search.lowest(z)
     return best
@@ -107,7 +112,8 @@ def confirm(problem: Problem, witness: Witness) -> bool:
     loop = problem.loop
     if witness.kind == "vdot":
         held = replace(loop, system=loop.system.at(witness.values)) if witness.values else loop
-        return bool(np.any(witness.x != 0)) and evaluate_vdot(held, problem.V.P, witness.x) >= 0
+        found = evaluate_increment(held, problem.V.P, witness.x, witness.period, problem.rate)
+        return bool(np.any(witness.x != 0)) and found >= 0
     for u, (lo, hi) in zip(evaluate_policy(loop, witness.x), loop.system.input_bounds, strict=True):
         if u * lo.denominator < lo.numerator or u * hi.denominator > hi.numerator:
             return True
@@ -129,7 +135,13 @@ class _Search:
         self.loop = problem.loop
         self.f = self.loop.system.uncertain_function("torch")
         self.corners = self.loop.system.corners()
-        self.worst = [[float(q) for q in corner.values()] for corner in self.corners]
+        system = self.loop.system
+        self.periods: list[Fraction | None] = [None] if system.sample is None else [*dict.fromkeys(system.sample)]
+        self.worst = [
+            ([float(q) for q in corner.values()], self.loop.step if period is None else float(period))
+            for period in self.periods
+            for corner in self.corners
+        ]
         network = self.loop.folded
         self.layers = [
             (torch.tensor(W.T.copy()), torch.tensor(b)) for W, b in zip(network.weights, network.biases, strict=True)
@@ -143,15 +155,25 @@ class _Search:
         self.check_inputs = not bounded_by_form(network, bounds)
 
     def violation(self, z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """(Vdot, how far the worst input lies outside its bounds) at x = T z, shapes (B,)."""
+        """(D', how far the worst input lies outside its bounds) at x = T z, shapes (B,)."""
         x = z @ self.T.T
         h = x
         for k, (W, b) in enumerate(self.layers):
             h = torch.addmm(b, h.tanh() if k else h, W)
         u = self.clipped(self.scale * self.squashed(h) + self.offset)
+        decrease = torch.stack([self._decrease(x, u, values, step) for values, step in self.worst]).amax(0)
+        return decrease, torch.maximum(self.lo - u, u - self.hi).amax(-1)
+
+    def _decrease(self, x: torch.Tensor, u: torch.Tensor, values: list[float], step: float) -> torch.Tensor:
+        """D' (B,) for constant values of what is uncertain."""
+        G = self.loop.system.mean_rate(lambda y, v: self.f(y, v, values), x, u, step)
         gradient = 2 * (x @ self.P)
-        vdot = torch.stack([(gradient * self.f(x, u, values)).sum(-1) for values in self.worst]).amax(0)
-        return vdot, torch.maximum(self.lo - u, u - self.hi).amax(-1)
+        result: torch.Tensor = (gradient * G).sum(-1)
+        if step:
+            result = result + step * ((G @ self.P) * G).sum(-1)
+        if self.problem.rate:
+            result = result + self.problem.rate * (gradient * x).sum(-1)
+        return result
 
     def bad(self, z: torch.Tensor) -> torch.Tensor:
         vdot, excess = self.violation(z)
@@ -188,14 +210,15 @@ class _Search:
                 x = (self.T @ (factor * point)).numpy()
                 kinds: tuple[Literal["vdot", "input"], ...] = ("vdot", "input") if self.check_inputs else ("vdot",)
                 for kind in kinds:
-                    for values in self.corners if kind == "vdot" else self.corners[:1]:
-                        witness = Witness(x, float(self.problem.V(x)), kind, values)
+                    every = itertools.product(self.periods, self.corners)
+                    for period, values in every if kind == "vdot" else [(None, self.corners[0])]:
+                        witness = Witness(x, float(self.problem.V(x)), kind, values, period)
                         if confirm(self.problem, witness):
                             return witness
         return None
 
     def climb(self, start: Array, limit: float, steps: int = 60) -> Array:
-        """Gradient ascent of Vdot on the sphere V = limit."""
+        """Gradient ascent of D' on the sphere V = limit."""
         z = torch.tensor(start, dtype=torch.float64)
         radius = np.sqrt(limit) * (1 - 1e-9)
         step = 0.1

@@ -22,7 +22,7 @@ from certify.enclosures.taylor import EXP_END
 from certify.expressions import Algebra
 
 Array = NDArray[np.float64]
-_TANH4, _TANH5, _ATAN4 = 4.1, 16.0, 4.7  # no derivative of this order is larger
+TANH4, TANH5, ATAN4 = 4.1, 16.0, 4.7  # no derivative of this order is larger
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -112,32 +112,39 @@ def sizes(a: Array, Q: Array, K: Array, E: Array) -> Sizes:
     return Sizes(slope, bend, twist, bend + twist + rest)
 
 
-def beyond_tangent(
-    a: Array, Q: Array, K: Array, E: Array, size: Sizes, second: Array, third: Array, fourth: Array
-) -> tuple[Array, Array, Array]:
-    """What a function adds to its tangent: its H, K and remainder R, one a row.
+def beyond_tangent(a: Array, Q: Array, K: Array, second: Array, third: Array) -> tuple[Array, Array]:
+    """What a function adds to its tangent, but for its `remainder`: H and K, one a row.
 
     Parameters
     ----------
     second, third : (N,), phi''/2 and phi'''/6 at the middle.
+    """
+    b, x = basis(a.shape[1]), np.newaxis
+    return second[:, x] * b.square(a), 2 * second[:, x] * b.times(a, Q) + third[:, x] * b.cube(a)
+
+
+def remainder(a: Array, size: Sizes, E: Array, second: Array, third: Array, fourth: Array) -> Array:
+    """R of what a function adds to its tangent, one a row.
+
+    Parameters
+    ----------
+    second, third : (N,), at or above |phi''|/2 and |phi'''|/6 at the middle.
     fourth : (N,), at or above |phi''''|/24 on the range.
     """
-    b = basis(a.shape[1])
-    squares, x = b.square(a), np.newaxis
+    b, x = basis(a.shape[1]), np.newaxis
     slope, curve = size.slope, size.curve
     flat = size.twist[:, x] * b.eye + E
     wide = flat + size.bend[:, x] * b.eye
-    h, g, m = np.abs(second), np.abs(third), fourth * size.radius**2
-    spread = h * curve + g * (3 * slope**2 + 3 * slope * curve + curve**2) + m * (2 * slope + curve)
-    R = (2 * h * slope)[:, x] * flat + spread[:, x] * wide + m[:, x] * squares
-    return second[:, x] * squares, 2 * second[:, x] * b.times(a, Q) + third[:, x] * b.cube(a), R
+    m = fourth * size.radius**2
+    spread = second * curve + third * (3 * slope**2 + 3 * slope * curve + curve**2) + m * (2 * slope + curve)
+    return np.asarray((2 * second * slope)[:, x] * flat + spread[:, x] * wide + m[:, x] * b.square(a))
 
 
 def fourth_of_tanh(y: Array, radius: Array) -> Array:
     """At least |tanh''''|/24 on |v - y| <= radius."""
     t = np.tanh(y)
     there = np.abs(8 * t * (2 - 3 * t**2) * (1 - t**2))
-    return np.asarray(np.minimum(_TANH4, there + _TANH5 * radius) / 24)
+    return np.asarray(np.minimum(TANH4, there + TANH5 * radius) / 24)
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,8 +188,9 @@ class Jet:
     def compose(self, f0: float, f1: float, f2: float, f3: float, fourth: float) -> Jet:
         """A function's value and derivatives at c, and at least |phi''''|/24 on the range."""
         a, Q, K = self.a, self.Q, self.K
-        each = (np.array([v]) for v in (f2 / 2, f3 / 6, fourth))
-        H, cubic, R = beyond_tangent(a, Q, K, self.rest, self.sizes, *each)
+        second, third, bound = (np.array([v]) for v in (f2 / 2, f3 / 6, fourth))
+        H, cubic = beyond_tangent(a, Q, K, second, third)
+        R = remainder(a, self.sizes, self.rest, np.abs(second), np.abs(third), bound)
         return Jet(f0, f1 * a, f1 * Q + H, f1 * K + cubic, f1 * self.B, abs(f1) * self.E + R, self.errors)
 
     def _nowhere(self) -> Jet:
@@ -218,7 +226,7 @@ class Jet:
     def atan(self) -> Jet:
         slope = 1 / (1 + self.c**2)
         f3 = (6 * self.c**2 - 2) * slope**3
-        return self.compose(math.atan(self.c), slope, -2 * self.c * slope**2, f3, _ATAN4 / 24)
+        return self.compose(math.atan(self.c), slope, -2 * self.c * slope**2, f3, ATAN4 / 24)
 
     def sin(self) -> Jet:
         s, c = math.sin(self.c), math.cos(self.c)

@@ -10,17 +10,18 @@ last is the motion.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import sympy
 from numpy.typing import NDArray
 
 from certify.certificate.limits import numbers_of_a_jet
 from certify.closed_loop import ClosedLoop
-from certify.engines.jets import Jet, Jets, basis, beyond_tangent, fourth_of_tanh, sizes
+from certify.engines.jets import Jet, Jets, basis, beyond_tangent, fourth_of_tanh, remainder, sizes
+from certify.engines.ranged import RangedJet
 from certify.errors import InputError
 from certify.expressions import evaluate
 from certify.policies import bounded_by_form
@@ -47,11 +48,24 @@ class Inputs:
 
 
 @dataclass(frozen=True, slots=True)
+class Spread:
+    """How f and A of models move with y, N numbers in [-1, 1]: f + moves.y within `error` (n,), A + turns.y within
+    `slack` (n,), a norm for each row; `moves` (N, n), `turns` (N, n, k)."""
+
+    moves: Array
+    turns: Array
+    error: Array
+    slack: Array
+
+
+@dataclass(frozen=True, slots=True)
 class Models:
     """The components of F on a ball: values f (n,) at its middle, gradients A (n, k), half Hessians Q (n, k, k), forms
     of third order K (n, k, k, k) and remainders E (n, k, k) beyond those of the tanhs, k the entries of d.
 
     Those are N numbers |e_q| <= d'R_q d, R (N, k, k), which enter F as `shares` (n, N) times e; `squares` are R_q'R_q.
+    `spread` says what is uncertain of f and A, None that nothing is; `stays` whether the states are certain to stay in
+    the domain over a sampling period.
     """
 
     f: Array
@@ -63,16 +77,30 @@ class Models:
     R: Array
     squares: Array
     inputs: Inputs
+    spread: Spread | None = None
+    stays: bool = True
+
+    @property
+    def corners(self) -> list[tuple[Array, Array]]:
+        """f and A at each corner of the cell."""
+        if self.spread is None:
+            return [(self.f, self.A)]
+        moves, turns = self.spread.moves, self.spread.turns
+        signs = (np.array(y) for y in itertools.product((-1.0, 1.0), repeat=len(moves)))
+        return [(self.f + y @ moves, self.A + np.tensordot(y, turns, 1)) for y in signs]
 
     @property
     def finite(self) -> bool:
         """Whether F has a finite model on the ball."""
-        return all(bool(np.all(np.isfinite(part))) for part in (self.A, self.Q, self.K, self.E, self.squares))
+        s = self.spread
+        of_spread = () if s is None else (s.moves, s.turns, s.error, s.slack)
+        parts = (self.f, self.A, self.Q, self.K, self.E, self.squares, *of_spread)
+        return all(bool(np.all(np.isfinite(part))) for part in parts)
 
     @property
     def admitted(self) -> bool:
-        """Whether every input is certain to lie in its bounds and inside its clip."""
-        return bool(np.all(np.linalg.norm(self.inputs.A, axis=1) + self.inputs.curve < self.inputs.room))
+        """Whether every input is certain to lie in its bounds and inside its clip, and the states in the domain."""
+        return self.stays and bool(np.all(np.linalg.norm(self.inputs.A, axis=1) + self.inputs.curve < self.inputs.room))
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +129,36 @@ class _Policy:
 
 
 @dataclass(frozen=True, slots=True)
+class Driven:
+    """The inputs on a ball as rows in their basis: gradients G (m, k), Q and K, and `errors` (m, ...) of what is left,
+    which are `shares` (m, N) of those that R (N, k, k) bounds; `curve` and `room` as `Inputs` has them.
+    """
+
+    G: Array
+    Q: Array
+    K: Array
+    errors: Array
+    shares: Array
+    R: Array
+    squares: Array
+    curve: Array
+    room: Array
+
+    def of(self, j: int) -> tuple[Array, Array, Array]:
+        """The model of an input but for its value."""
+        return self.G[j], self.Q[j], self.K[j]
+
+    def models(self, F: Sequence[Jet | RangedJet], spread: Spread | None = None, stays: bool = True) -> Models:
+        """Those with these components."""
+        form = basis(self.G.shape[1])
+        a, Q, K, B, E = (np.concatenate([getattr(v, part) for v in F]) for part in ("a", "Q", "K", "B", "E"))
+        inputs = Inputs(self.G, form.matrices(self.Q), form.forms(self.K), self.curve, self.room, B)
+        parts = form.matrices(Q), form.forms(K), form.matrices(E)
+        f = np.array([v.c for v in F])
+        return Models(f, a, *parts, B @ self.shares, self.R, self.squares, inputs, spread, stays)
+
+
+@dataclass(frozen=True, slots=True)
 class Paths:
     """The closed loop at a state `middle`, (n,): all of its models that does not depend on the ball around it.
 
@@ -115,28 +173,22 @@ class Paths:
 
     def models(self, J: Array) -> Models:
         """F on the ball x = middle + J d, ||d|| <= 1; J is (n, k)."""
-        return self.models_of(J, [self.loop.dynamics])[0]
-
-    def models_of(self, J: Array, plants: Sequence[tuple[sympy.Expr, ...]]) -> list[Models]:
-        """The same for each of several plants' equations in the loop's states and inputs, under the one policy."""
-        loop, k, policy = self.loop, J.shape[1], self._policy(J)
-        system, scale, form = loop.system, loop.network.scale[:, None], basis(k)
-        G, Q, K, each = scale * policy.G, scale * policy.Q, scale * policy.K, scale * policy.shares
-        errors = np.abs(each) @ policy.R
-        algebra, R = Jets(k, errors), form.matrices(policy.R)
+        driven, loop = self.driven(J), self.loop
+        algebra = Jets(J.shape[1], driven.errors)
         states = [algebra.state(float(m), row) for m, row in zip(self.middle, J, strict=True)]
-        inputs = [algebra.input(j, float(u), G[j], Q[j], K[j]) for j, u in enumerate(self.u)]
-        values = dict(zip((*system.states, *system.inputs), (*states, *inputs), strict=True))
-        curve, room, squares = sizes(G, Q, K, errors).curve, _room(loop, self.u), R @ R
-        own, found = (form.matrices(Q), form.forms(K)), []
-        for dynamics in plants:
-            shared = dict[Any, Jet]()
-            F = [evaluate(e, values, algebra, shared) for e in dynamics]
-            a, Qs, Ks, B, E = (np.concatenate([getattr(v, part) for v in F]) for part in ("a", "Q", "K", "B", "E"))
-            f, moved = np.array([v.c for v in F]), Inputs(G, *own, curve, room, B)
-            parts = form.matrices(Qs), form.forms(Ks), form.matrices(E)
-            found.append(Models(f, a, *parts, B @ each, R, squares, moved))
-        return found
+        inputs = [algebra.input(j, float(u), *driven.of(j)) for j, u in enumerate(self.u)]
+        values = dict(zip((*loop.system.states, *loop.system.inputs), (*states, *inputs), strict=True))
+        shared = dict[Any, Jet]()
+        return driven.models([evaluate(e, values, algebra, shared) for e in loop.dynamics])
+
+    def driven(self, J: Array) -> Driven:
+        """The inputs on that ball."""
+        policy, loop = self._policy(J), self.loop
+        scale, form = loop.network.scale[:, None], basis(J.shape[1])
+        G, Q, K, each = scale * policy.G, scale * policy.Q, scale * policy.K, scale * policy.shares
+        errors, R = np.abs(each) @ policy.R, form.matrices(policy.R)
+        curve = sizes(G, Q, K, errors).curve
+        return Driven(G, Q, K, errors, each, R, R @ R, curve, _room(loop, self.u))
 
     def _policy(self, J: Array) -> _Policy:
         n, k = J.shape
@@ -150,15 +202,17 @@ class Paths:
             E, t, slope = np.abs(M) @ R, np.tanh(layer.y), layer.slope
             size = sizes(G, Q, K, E)
             second, third = -t * slope, (3 * t**2 - 1) * slope / 3
-            H, cubic, rest = beyond_tangent(G, Q, K, E, size, second, third, fourth_of_tanh(layer.y, size.radius))
+            H, cubic = beyond_tangent(G, Q, K, second, third)
+            bounds = np.abs(second), np.abs(third), fourth_of_tanh(layer.y, size.radius)
+            rest = remainder(G, size, E, *bounds)
             R = np.concatenate([R, rest])
             Q, K = slope[:, None] * Q + H, slope[:, None] * K + cubic
         return _Policy(slope[:, None] * G, Q, K, np.concatenate([slope[:, None] * M, np.eye(len(G))], axis=1), R)
 
 
-def paths(loop: ClosedLoop, at: Array | None = None) -> Paths:
+def paths(loop: ClosedLoop, at: Array | None = None, resting: bool = True) -> Paths:
     """Follow the states and every tanh's output through the network's linearisation at a state, (n,), the origin if
-    none is given.
+    none is given; if that is not `resting`, the inputs there are what the policy says, else u_eq.
 
     Raises
     ------
@@ -184,7 +238,7 @@ def paths(loop: ClosedLoop, at: Array | None = None) -> Paths:
         h = np.tanh(y)
         X = layers[-1].slope[:, None] * X
     u = np.array([float(q) for q in loop.u_eq])
-    if at is not None:
+    if at is not None or (not resting and network.centre == "none"):
         u = folded.scale * (h if squashed else y) + folded.offset
     return Paths(loop, middle, u, tuple(layers), squashed)
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 import time
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,9 +22,9 @@ from numpy.typing import NDArray
 
 from certify.claims import Problem
 from certify.closed_loop import ClosedLoop
-from certify.engines.decrease import Multipliers, best_multipliers, decay_of, rest_of
-from certify.engines.local import ball_around, prove_local
-from certify.engines.models import Paths, paths
+from certify.engines.decrease import Corner, Multipliers, best_at, corners_of, rests_of
+from certify.engines.local import Rule, ball_around, prove_local
+from certify.engines.models import Models, Paths, paths
 from certify.errors import BackendError
 from certify.lyapunov import SOLVED, choose_candidate, diagonalising_coordinates, domain_limit, volume
 from certify.lyapunov.function import Quadratic
@@ -93,8 +94,9 @@ def _problem(known: Paths, P: Array) -> tuple[Problem, Array]:
 class _Linearised:
     """The rule around {x'Px <= 1}, x = J d.
 
-    A row holds what the decay leaves, (n, n), relative to the decay at X = 0, and how far inputs and states move, who
-    have that `room`, (m + n,); `slopes` are its derivatives by the entries of X on and above the diagonal.
+    A row holds what the decay leaves at each corner of what is uncertain, (n, n) each, relative to the decay at X = 0,
+    and how far inputs and states move, who have that `room`, (m + n,); `slopes` are its derivatives by the entries of X
+    on and above the diagonal.
     """
 
     J: Array
@@ -113,10 +115,13 @@ class _Linearised:
         x = cvxpy.Variable(len(self.slopes))
         X = cvxpy.reshape(np.reshape(_directions(n), (-1, n * n)).T @ x, (n, n), order="C")
         asked = self.here + self.slopes.T @ x
-        left = cvxpy.reshape(asked[: n * n], (n, n), order="C")
-        least = min(_LEFT, float(np.linalg.eigvalsh(self.here[: n * n].reshape(n, n))[0]))
-        within = [left + left.T >> 2 * least * np.eye(n), X << trust * np.eye(n), X >> -trust * np.eye(n)]
-        within += [asked[n * n + j] <= _INSIDE * room for j, room in enumerate(self.room) if math.isfinite(room)]
+        within = [X << trust * np.eye(n), X >> -trust * np.eye(n)]
+        after = len(self.here) - len(self.room)
+        for start in range(0, after, n * n):
+            left = cvxpy.reshape(asked[start : start + n * n], (n, n), order="C")
+            least = min(_LEFT, float(np.linalg.eigvalsh(self.here[start : start + n * n].reshape(n, n))[0]))
+            within.append(left + left.T >> 2 * least * np.eye(n))
+        within += [asked[after + j] <= _INSIDE * room for j, room in enumerate(self.room) if math.isfinite(room)]
         problem = cvxpy.Problem(cvxpy.Minimize(cvxpy.trace(X)), within)
         try:
             with warnings.catch_warnings():
@@ -133,22 +138,30 @@ class _Linearised:
 
 def _linearised(known: Paths, P: Array, end: float) -> _Linearised | None:
     """None if there is no time for it, or the rule is far from holding."""
-    J = ball_around(*_problem(known, P), 1.0)
+    problem, T = _problem(known, P)
+    rule, J = Rule.at_rest(problem, T, known), ball_around(problem, T, 1.0)
     with np.errstate(all="ignore"):
-        models = known.models(J)
-        shown = best_multipliers(models, J, P)
+        models = rule.models(J, 1.0)
+        if not (models and all(one.finite for one in models)):
+            return None
+        corners = _corners(rule, models, J, P)
+        shown = best_at(corners)
         if not shown.margin > _FAR:
             return None
-        root = np.linalg.inv(np.linalg.cholesky(decay_of(models, J, P @ J)))
-        here, values = _asked(known, P, J, np.zeros_like(P), shown.multipliers, root), []
+        roots = [np.linalg.inv(np.linalg.cholesky(corner.decay)) for corner in corners]
+        here, values = _asked(rule, J, np.zeros_like(P), shown.multipliers, roots), []
         for X in _directions(len(P)):
             if time.perf_counter() > end:
                 return None
-            values.append(_asked(known, P, J, _DIFFERENCE * X, shown.multipliers, root))
+            values.append(_asked(rule, J, _DIFFERENCE * X, shown.multipliers, roots))
     slopes = (np.array(values) - here) / _DIFFERENCE
     half = [float(min(-lo, hi)) for lo, hi in known.loop.system.domain]
-    room = np.append(models.inputs.room, half)
+    room = np.append(models[0].inputs.room, half)
     return _Linearised(J, here, slopes, room) if np.all(np.isfinite(slopes)) else None
+
+
+def _corners(rule: Rule, models: Sequence[Models], J: Array, P: Array) -> list[Corner]:
+    return [corner for one in models for corner in corners_of(one, J, P, None, rule.steps.longest)]
 
 
 def _directions(n: int) -> list[Array]:
@@ -161,12 +174,14 @@ def _directions(n: int) -> list[Array]:
     return found
 
 
-def _asked(known: Paths, P: Array, J: Array, X: Array, multipliers: Multipliers, root: Array) -> Array:
-    """What `_Linearised` has in a row, at 1 + X; `root` is the inverse of the root of the decay at X = 0."""
-    values, vectors = np.linalg.eigh(np.eye(len(P)) + X)
+def _asked(rule: Rule, J: Array, X: Array, multipliers: Multipliers, roots: Sequence[Array]) -> Array:
+    """What `_Linearised` has in a row, at 1 + X; `roots` are the inverses of the roots of the decays at X = 0."""
+    values, vectors = np.linalg.eigh(np.eye(len(J)) + X)
     ball = J @ (vectors / np.sqrt(values)) @ vectors.T
-    models, inverse = known.models(ball), np.linalg.inv(J)
-    b = (P + inverse.T @ X @ inverse) @ ball
-    left = root @ (decay_of(models, ball, b) - rest_of(models, b, multipliers)) @ root.T
-    moved = np.linalg.norm(models.inputs.A, axis=1) + models.inputs.curve
-    return np.concatenate([left.ravel(), moved, np.linalg.norm(ball, axis=1)])
+    models, inverse = rule.models(ball, 1.0), np.linalg.inv(J)
+    corners = _corners(rule, models, ball, rule.problem.V.P + inverse.T @ X @ inverse)
+    rests = rests_of(corners, multipliers)
+    left = [root @ (c.decay - rest) @ root.T for root, c, rest in zip(roots, corners, rests, strict=True)]
+    inputs = models[0].inputs
+    moved = np.linalg.norm(inputs.A, axis=1) + inputs.curve
+    return np.concatenate([np.ravel(left), moved, np.linalg.norm(ball, axis=1)])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from certify.lyapunov.candidates import solve_lyapunov
+from certify.lyapunov.candidates import slowest_decay, solve_lyapunov
 from certify.lyapunov.choice import SOLVED, Candidate, Chosen, Named, choose_candidate
 from certify.lyapunov.level_sets import (
     are_inside,
@@ -33,6 +33,7 @@ __all__ = [
     "optimise_candidate",
     "optimise_repeatedly",
     "semi_axes",
+    "slowest_decay",
     "solve_lyapunov",
     "volume",
 ]

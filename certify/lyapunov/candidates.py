@@ -11,30 +11,55 @@ from certify.errors import InputError
 Array = NDArray[np.float64]
 
 
-def solve_lyapunov(A: Array, Q: Array) -> Array:
-    """Solve `A'P + PA = -Q` for the symmetric P.
+def solve_lyapunov(A: Array, Q: Array, step: float = 0.0, decay: float = 0.0) -> Array:
+    """Solve `A'P + PA + h A'PA + 2 alpha P = -Q` for the symmetric P: over a step, V falls by x'Qx + 2 alpha V by time.
 
     Parameters
     ----------
-    A : (n, n), Hurwitz (every eigenvalue has negative real part).
+    A : (n, n), the rate of x over a step, x+ = x + h A x; in continuous time h = 0, and A + alpha I is Hurwitz (every
+        eigenvalue has negative real part).
     Q : (n, n), symmetric positive definite.
+    step : h, at least 0.
+    decay : alpha, at least 0.
 
     Raises
     ------
-    InputError : A is not Hurwitz or Q not symmetric positive definite.
+    InputError : A is not stable, or not with this decay, or Q not symmetric positive definite.
 
     Notes
     -----
-    SciPy solves `A X + X A' = Q`, so it is given A' and -Q. Khalil, Nonlinear Systems, 3rd ed., theorem 4.6.
+    SciPy solves `A X + X A' = Q`, so it is given A' and -Q, and `A X A' - X = -Q` in discrete time. Khalil, Nonlinear
+    Systems, 3rd ed., theorem 4.6.
 
     >>> solve_lyapunov(np.array([[0.0, 1.0], [-2.0, -3.0]]), np.eye(2)).round(12)
     array([[1.25, 0.25],
            [0.25, 0.25]])
     """
-    eigenvalues = np.linalg.eigvals(A)
-    if not np.max(eigenvalues.real) < 0:
-        raise InputError(f"`A` must be Hurwitz; its eigenvalues are {eigenvalues}.")
     if not np.array_equal(Q, Q.T) or not np.min(np.linalg.eigvalsh(Q)) > 0:
         raise InputError("`Q` must be symmetric positive definite.")
-    P = scipy.linalg.solve_continuous_lyapunov(A.T, -Q)
+    if step == 0:
+        M = A + decay * np.eye(len(A)) if decay else A
+        eigenvalues = np.linalg.eigvals(M)
+        if not np.max(eigenvalues.real) < 0:
+            raise InputError(f"`A` must be Hurwitz; its eigenvalues are {eigenvalues}.")
+        P = scipy.linalg.solve_continuous_lyapunov(M.T, -Q)
+    else:
+        M = np.eye(len(A)) + step * A
+        eigenvalues = np.linalg.eigvals(M)
+        if not np.max(np.abs(eigenvalues)) ** 2 < 1 - 2 * decay * step:
+            raise InputError(f"the map of a step must be stable; its eigenvalues are {eigenvalues}.")
+        share = 1 - 2 * decay * step
+        P = scipy.linalg.solve_discrete_lyapunov(M.T / share**0.5, step * Q / share)
     return np.asarray((P + P.T) / 2)
+
+
+def slowest_decay(A: Array, step: float = 0.0) -> float:
+    """The largest alpha for which a V falls by 2 alpha V, by time: of `solve_lyapunov`, in 1/time.
+
+    >>> round(slowest_decay(np.array([[-2.0]])), 12), round(slowest_decay(np.array([[-0.5]]), 1.0), 12)
+    (2.0, 0.375)
+    """
+    eigenvalues = np.linalg.eigvals(A)
+    if step == 0:
+        return -float(np.max(eigenvalues.real))
+    return float(np.min(1 - np.abs(1 + step * eigenvalues) ** 2)) / (2 * step)

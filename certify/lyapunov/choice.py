@@ -42,9 +42,10 @@ def choose_candidate(
 
     Parameters
     ----------
-    name : `lyapunov` solves `A'P + PA = -Q`; `scaled` has the Q that weighs each state by its domain, `1 / d_i^2`;
-        `lqr` has `Q + K'RK`, K = -J_pi(0); `optimised` starts at the one of these whose sampled set is largest, or at
-        `lyapunov` if Q is given, and enlarges it; it falls back to `lyapunov` with a notice.
+    name : `lyapunov` solves `A'P + PA = -Q`, or its like for the map of a step; `scaled` has the Q that weighs each
+        state by its domain, `1 / d_i^2`; `lqr` has `Q + K'RK`, K = -J_pi(0); `optimised` starts at the one of these
+        whose sampled set is largest, or at `lyapunov` if Q is given, and enlarges it; it falls back to `lyapunov` with
+        a notice.
     Q, R : diagonals, (n,) and (m,); None means ones.
     seconds : after which `optimised` takes what it has.
 
@@ -52,15 +53,16 @@ def choose_candidate(
     ------
     InputError : a weight is not positive, or the linearisation is not stable.
     """
-    A, _, K = loop.linearise()
+    K = loop.linearise()[2]
+    A, h = loop.mean_rate(), loop.step
     weight = _weight(Q, A.shape[0], "Q")
     if name == "lqr":
         M = K.T @ _weight(R, K.shape[0], "R") @ K
-        return Chosen(solve_lyapunov(A, weight + (M + M.T) / 2), "lqr")
+        return Chosen(solve_lyapunov(A, weight + (M + M.T) / 2, h), "lqr")
     if name == "scaled":
         nearer = np.array([min(-float(lo), float(hi)) for lo, hi in loop.system.domain])
-        return Chosen(solve_lyapunov(A, np.diag(nearer**-2)), "scaled")
-    P = solve_lyapunov(A, weight)
+        return Chosen(solve_lyapunov(A, np.diag(nearer**-2), h), "scaled")
+    P = solve_lyapunov(A, weight, h)
     if name == "lyapunov":
         return Chosen(P, "lyapunov")
     try:

@@ -133,8 +133,10 @@ def inverse(P: Array) -> Array:
     return np.array([[_nearest(Fraction(int(q.p), int(q.q))) for q in row] for row in M.tolist()])
 
 
-def diagonalising_coordinates(P: Array, A: Array) -> Array:
-    """T with `T'PT = I` and `T'(A'P + PA)T` diagonal, up to rounding; columns sorted by decay rate.
+def diagonalising_coordinates(P: Array, A: Array, step: float = 0.0) -> Array:
+    """T with `T'PT = I` and `T'(A'P + PA + h A'PA)T` diagonal, up to rounding; columns sorted by decay rate.
+
+    A is the rate of x over a step h, which is 0 in continuous time (`ClosedLoop.mean_rate`, `ClosedLoop.step`).
 
     In the coordinates `x = T z` sublevel sets are balls, so a smaller inner level costs only logarithmically many
     boxes, and the quadratic part of Vdot is separable.
@@ -148,7 +150,8 @@ def diagonalising_coordinates(P: Array, A: Array) -> Array:
     except np.linalg.LinAlgError as error:
         raise InputError("`P` must be positive definite; Cholesky failed. Try another --Q.") from error
     inverse_root = np.linalg.inv(L)
-    rate = inverse_root @ (A.T @ P + P @ A) @ inverse_root.T
+    decrease = A.T @ P + P @ A + (step * (A.T @ P @ A) if step else 0.0)
+    rate = inverse_root @ decrease @ inverse_root.T
     _, U = np.linalg.eigh((rate + rate.T) / 2)
     return np.asarray(inverse_root.T @ U)
 

@@ -1,6 +1,7 @@
 """A candidate whose sublevel set is as large as sampling can make it: a sequence of small linear matrix inequalities.
 
-For a fixed state x, V(x) and `g(x) = Vdot(x) + 2 alpha V(x)` are linear in P. If the ray through x crosses g = 0 near
+For a fixed state x, V(x) and `g(x) = D(x) + 2 alpha V(x)` are linear in P, D being Vdot, or V's increment over a step
+by time, `2 x'P G + h G'P G` with the mean rate G of the step. If the ray through x crosses g = 0 near
 x, the level at which it does is, to first order, `V(x) - mu g(x)`, with mu the ratio of the slopes of V and g along the
 ray. And whatever mu >= 0 is, keeping this at 1 or more forbids `g > 0` at x inside `{V < 1}` (the S-procedure, state by
 state). Each round samples the closed loop, remembers the states that limit the set, and minimises the linearised
@@ -22,7 +23,7 @@ from numpy.typing import NDArray
 
 from certify.closed_loop import ClosedLoop
 from certify.errors import BackendError
-from certify.lyapunov.candidates import solve_lyapunov
+from certify.lyapunov.candidates import slowest_decay, solve_lyapunov
 from certify.lyapunov.level_sets import domain_limit, volume
 
 Array = NDArray[np.float64]
@@ -52,8 +53,9 @@ def optimise_candidate(
 
     Parameters
     ----------
-    loop : the closed loop; its linearisation A is Hurwitz.
-    start : (n, n), symmetric positive definite with `A'P + PA < 0`, such as a solution of the Lyapunov equation.
+    loop : the closed loop; its linearisation A is Hurwitz, or the linear map of a step is stable.
+    start : (n, n), symmetric positive definite with `A'P + PA < 0`, or its like over a step, such as a solution of
+        the Lyapunov equation.
     decays : alpha over the slowest decay rate of A, each between 0 and 0.7; the first that beats `start` is taken.
     seed : of the samples; equal seeds give equal results, unless the time ends the search.
     seconds : after which the present P is taken.
@@ -79,8 +81,8 @@ def _optimise(
     loop: ClosedLoop, start: Array, decays: tuple[float, ...], seed: int, seconds: float, known: Array | None
 ) -> tuple[Array, float]:
     """P, and the ratio of its sampled volume and the start's."""
-    A, _, _ = loop.linearise()
-    slowest = -float(np.max(np.linalg.eigvals(A).real))
+    A, h = loop.mean_rate(), loop.step
+    slowest = slowest_decay(A, h)
     found = given = 0.0
     end = time.monotonic() + seconds
     for decay in decays:
@@ -88,8 +90,10 @@ def _optimise(
         if known is not None:
             samples.remember(known)
         P = _enlarge(samples, A, start, decay * slowest, end)
-        if not (np.all(np.linalg.eigvalsh(P) > 0) and np.all(np.linalg.eigvalsh(A.T @ P + P @ A) < 0)):
-            raise BackendError("the optimised P must satisfy P > 0 and A'P + PA < 0; it does not. Use 'lyapunov'.")
+        if not (np.all(np.linalg.eigvalsh(P) > 0) and np.all(np.linalg.eigvalsh(_linear(P, A, h)) < 0)):
+            raise BackendError(
+                "the optimised P must satisfy P > 0 and A'P + PA + h A'PA < 0; it does not. Use 'lyapunov'."
+            )
         found, given = (volume(samples.fit(candidate, 0.0), 1.0) for candidate in (P, start))
         if found > given:
             return P, found / given
@@ -125,16 +129,17 @@ def optimise_repeatedly(loop: ClosedLoop, start: Array, seconds: float = math.in
 
 def largest_sampled(loop: ClosedLoop, candidates: Sequence[Array], seed: int = 0) -> Array:
     """The P, (n, n), of those given whose set inside the domain without a sampled violation has the largest volume."""
-    slowest = -float(np.max(np.linalg.eigvals(loop.linearise()[0]).real))
+    slowest = slowest_decay(loop.mean_rate(), loop.step)
     samples = _Samples(loop, 1e-3 * slowest, np.random.default_rng(seed))
     return max(candidates, key=lambda P: volume(samples.fit(P, 0.0), 1.0))
 
 
 def _enlarge(samples: _Samples, A: Array, start: Array, alpha: float, end: float) -> Array:
     """Rounds of sampling and solving, from `start` to P with its margin."""
-    Q = -(A.T @ start + start @ A)
-    # The linearisation of this P keeps `Vdot <= -2 lambda V`: its equation is the one of A + lambda I.
-    P = solve_lyapunov(A + _LINEAR * alpha * np.eye(len(A)), (Q + Q.T) / 2)
+    h = samples.loop.step
+    Q = -_linear(start, A, h)
+    # The linearisation of this P keeps `D <= -2 lambda V`: its equation is the one of A + lambda I.
+    P = solve_lyapunov(A, (Q + Q.T) / 2, h, _LINEAR * alpha)
     P = samples.fit(P, _SCORED * alpha)
     radius, answers = 0.4, 0
     for _ in range(_ROUNDS):
@@ -165,35 +170,38 @@ def _enlarge(samples: _Samples, A: Array, start: Array, alpha: float, end: float
 class _Samples:
     """States that limit sublevel sets of the closed loop, remembered from search to search.
 
-    x, F(x), (dF/dx) x : (N, n). outside : (N,), the input leaves its bounds at x or F has a pole there.
+    x, G(x), (dG/dx) x : (N, n), G being the mean rate of a step, F in continuous time. outside : (N,), the input leaves
+    its bounds at x or G has a pole there.
     """
 
     def __init__(self, loop: ClosedLoop, least: float, generator: np.random.Generator) -> None:
         self.loop, self.least, self.generator = loop, least, generator
-        self.f = loop.system.function()
+        self.f, self.step = loop.system.function(), loop.step
         self.bounds = np.array([[float(v) for v in b] for b in loop.system.input_bounds]).T
         self.x, self.F, self.dF = (np.zeros((0, loop.system.n)) for _ in range(3))
         self.outside = np.zeros(0, dtype=bool)
 
     def field(self, x: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """F and `outside` at x, shapes (..., n) and (...)."""
+        """G and `outside` at x, shapes (..., n) and (...)."""
         # One matrix product for all states: numpy would make one for each leading index.
         u = self.loop.policy(x.reshape(-1, x.shape[-1])).reshape(*x.shape[:-1], self.loop.system.m)
         with np.errstate(all="ignore"):
-            F = self.f(x, u)
+            F = self.loop.system.mean_rate(self.f, x, u, self.step)
         outside = ~np.isfinite(F).all(-1)
         F = np.where(outside[..., None], 0.0, F)
         return F, outside | np.any((u < self.bounds[0]) | (u > self.bounds[1]), axis=-1)
 
     def known(self, P: Array, alpha: float) -> float:
-        """The lowest level of a remembered violation of `Vdot + 2 alpha V < 0`, inf if there is none."""
-        bad = ~(_g(P, self.x, self.F, alpha) < 0) | self.outside
+        """The lowest level of a remembered violation of `D + 2 alpha V < 0`, inf if there is none."""
+        bad = ~(_g(P, self.x, self.F, alpha, self.step) < 0) | self.outside
         return float(np.min(_form(P, self.x[bad], self.x[bad]), initial=np.inf))
 
     def crossings(self, P: Array, alpha: float) -> tuple[Array, Array]:
         """`V - mu g` and mu of the remembered states, (N,) each; mu = 0 where P cannot change the violation."""
-        V, g = _form(P, self.x, self.x), _g(P, self.x, self.F, alpha)
+        V, g = _form(P, self.x, self.x), _g(P, self.x, self.F, alpha, self.step)
         slope = 2 * _form(P, self.x, self.F + self.dF) + 4 * alpha * V
+        if self.step:
+            slope += 2 * self.step * _form(P, self.F, self.dF)
         mu = np.where(self.outside, 0.0, 2 * V / np.maximum(slope, self.least * V))
         return V - mu * g, mu
 
@@ -225,7 +233,7 @@ class _Samples:
         rays = _unit(z) @ np.linalg.inv(L)
         x = _RADII[:, None] * rays[:, None, :]
         F, outside = self.field(x)
-        g = _g(P, x, F, alpha)
+        g = _g(P, x, F, alpha, self.step)
         bad = ~(g < 0) | outside
         first = np.where(bad.any(axis=1), bad.argmax(axis=1), len(_RADII))
         share = np.where(np.arange(len(_RADII)) < first[:, None], g / _RADII**2, -np.inf)
@@ -239,7 +247,7 @@ class _Samples:
             middle = (low + high) / 2
             state = middle[:, None] * rays[crossed]
             F, outside = self.field(state)
-            bad = ~(_g(P, state, F, alpha) < 0) | outside
+            bad = ~(_g(P, state, F, alpha, self.step) < 0) | outside
             low, high = np.where(bad, low, middle), np.where(bad, middle, high)
         self.remember(np.concatenate([x[worst, share[worst].argmax(axis=1)], high[:, None] * rays[crossed]]))
 
@@ -261,9 +269,12 @@ def _solve(samples: _Samples, P: Array, A: Array, alpha: float, radius: float) -
     L = np.linalg.cholesky(P)
     inverse = np.linalg.inv(L)
     M = cvxpy.Variable((n, n), symmetric=True)
-    rate = M @ (L.T @ A @ inverse.T)
+    h = samples.step
+    along = L.T @ A @ inverse.T
+    rate = M @ along
+    twice = rate + rate.T + (h * (along.T @ M @ along) if h else 0.0)
     constraints = [M >> (1 - radius) * np.eye(n), M << (1 + radius) * np.eye(n)]
-    constraints.append(rate + rate.T + 2 * _LINEAR * alpha * M << 0)
+    constraints.append(twice + 2 * _LINEAR * alpha * M << 0)
     for (lo, hi), column in zip(samples.loop.system.domain, inverse.T, strict=True):
         e = column / min(float(-lo), float(hi))
         constraints.append(M >> np.outer(e, e))  # (P^-1)_ii <= d_i^2
@@ -273,7 +284,11 @@ def _solve(samples: _Samples, P: Array, A: Array, alpha: float, radius: float) -
         rows = inside[np.argsort(level[inside], kind="stable")[:_ROWS]]
         z = samples.x[rows] @ L
         w = z - 2 * mu[rows, None] * ((samples.F[rows] + margin * samples.x[rows]) @ L)
-        G = ((z[:, :, None] * w[:, None, :] + w[:, :, None] * z[:, None, :]) / 2).reshape(len(rows), n * n)
+        G = (z[:, :, None] * w[:, None, :] + w[:, :, None] * z[:, None, :]) / 2
+        if h:
+            v = samples.F[rows] @ L
+            G = G - h * mu[rows, None, None] * v[:, :, None] * v[:, None, :]
+        G = G.reshape(len(rows), n * n)
         size = np.linalg.norm(G, axis=1)
         least = np.minimum(1.0, level[rows]) - _SLACK
         constraints.append((G / size[:, None]) @ cvxpy.vec(M, order="C") >= least / size)
@@ -298,9 +313,16 @@ def _form(P: Array, x: Array, y: Array) -> Array:
     return np.asarray(((x @ P) * y).sum(axis=-1))
 
 
-def _g(P: Array, x: Array, F: Array, alpha: float) -> Array:
-    """`Vdot + 2 alpha V`."""
-    return 2 * _form(P, x, F + alpha * x)
+def _g(P: Array, x: Array, F: Array, alpha: float, step: float) -> Array:
+    """`D + 2 alpha V`."""
+    value = 2 * _form(P, x, F + alpha * x)
+    return value + step * _form(P, F, F) if step else value
+
+
+def _linear(P: Array, A: Array, step: float) -> Array:
+    """The matrix of D for G = A x."""
+    M: Array = A.T @ P + P @ A
+    return M + step * A.T @ P @ A if step else M
 
 
 def _log_det(P: Array) -> float:

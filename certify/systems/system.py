@@ -1,4 +1,4 @@
-"""The plant `xdot = f(x, u)`: sympy expressions over exact rational parameters.
+"""The plant `xdot = f(x, u)`, or `x+ = f(x, u)`: sympy expressions over exact rational parameters.
 
 Numbers are exact because the proof is about *this* plant: `m = 0.15` written as text is 3/20, while a
 Python float stands for its binary value. sympy never folds floats here; an expression that contains
@@ -26,11 +26,13 @@ import sympy
 
 from certify.errors import InputError
 from certify.expressions import GRAMMAR, evaluate_exactly, has_tree
+from certify.systems.ode import rk4_step
 
 Interval = tuple[Fraction, Fraction]
 Kind = Literal["parameter", "disturbance", "input error"]
 Time = Literal["continuous", "discrete"]
 
+_SUBSTEPS = 4  # of a sampling period, in simulation
 _MOST_DIGITS = 1000  # before or after the point: 1e999999999 would fill the memory
 
 
@@ -263,6 +265,16 @@ class System:
         )
 
     @property
+    def in_steps(self) -> bool:
+        """Whether V is compared at the ends of steps: of discrete time, or of periods over which an input is held."""
+        return self.time == "discrete" or self.sample is not None
+
+    @property
+    def rests_where(self) -> str:
+        """What f(x_eq, u_eq) is at an equilibrium, in words."""
+        return "0" if self.time == "continuous" else "x_eq"
+
+    @property
     def uncertain(self) -> tuple[tuple[sympy.Symbol, Interval], ...]:
         """What has a range, in the order of the ranges."""
         return tuple((sympy.Symbol(name), interval) for name, interval in self.ranges.items())
@@ -338,7 +350,8 @@ class System:
 
     def dynamics_of_values(self) -> tuple[sympy.Expr, ...]:
         """f over the states' values x_eq + x, as people write it, with the parameters by name."""
-        return in_deviations(self.dynamics, self.states, [-e for e in self.x_eq])
+        moved = in_deviations(self.dynamics, self.states, [-e for e in self.x_eq])
+        return moved if self.time == "continuous" else tuple(e + at for e, at in zip(moved, self.x_eq, strict=True))
 
     def domain_of_values(self) -> tuple[Interval, ...]:
         """The domain's intervals of the states' values x_eq + x."""
@@ -369,6 +382,20 @@ class System:
     def uncertain_function(self, module: str = "numpy") -> Callable[[Any, Any, Sequence[float]], Any]:
         """The same for values of what is uncertain, in the order of the ranges: a third argument, k numbers."""
         return self._function(self.uncertain_dynamics(), [s for s, _ in self.uncertain], module)
+
+    def mean_rate(self, f: Callable[[Any, Any], Any], x: Any, u: Any, step: float) -> Any:
+        """G (..., n) of `x+ = x + h G` in floating point, from this plant's f, with the input held over the step h.
+
+        f itself where h = 0; in discrete time h = 1 and G = f - x. For search only: nothing is proved with it.
+        """
+        if self.time == "discrete":
+            return f(x, u) - x
+        if step == 0:
+            return f(x, u)
+        after = x
+        for _ in range(_SUBSTEPS):
+            after = rk4_step(lambda y: f(y, u), after, step / _SUBSTEPS)
+        return (after - x) / step
 
     def _function(
         self, expressions: Sequence[sympy.Expr], more: Sequence[sympy.Symbol], module: str

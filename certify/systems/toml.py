@@ -6,10 +6,10 @@ is here that they become deviations from x_eq. Every error says the line, the en
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, cast, get_args
 
 import sympy
 
@@ -17,10 +17,21 @@ from certify.errors import InputError
 from certify.expressions import FUNCTIONS
 from certify.systems.equations import nearest, parse_expression
 from certify.systems.source import PlantFile, read_plant_file
-from certify.systems.system import Interval, System, exact, in_deviations, symbols
+from certify.systems.system import Interval, System, Time, exact, in_deviations, symbols
 
 _REQUIRED = ("name", "states", "inputs", "dynamics", "u_eq", "domain", "input_bounds")
-_KEYS = (*_REQUIRED, "description", "parameters", "disturbances", "positive", "where", "x_eq", "units", "training")
+_KEYS = (
+    *_REQUIRED,
+    "description",
+    "parameters",
+    "disturbances",
+    "positive",
+    "where",
+    "x_eq",
+    "units",
+    "training",
+    "time",
+)
 _ROUNDED = 1e-12  # of a residual with functions at other points than 0, which rationals do not decide
 
 
@@ -44,7 +55,7 @@ def build_system(file: PlantFile) -> System:
     missing = [key for key in _REQUIRED if key not in file.data]
     if missing:
         raise file.refuse(f"missing keys: a plant must have {', '.join(missing)}.")
-    name, description = _text(file, "name"), _text(file, "description")
+    name, description, time = _text(file, "name"), _text(file, "description"), _time(file)
     states, inputs = _names(file, "states"), _names(file, "inputs")
     parameters = {p: _number(file, value, "parameters", p) for p, value in file.table("parameters").items()}
     acting = {w: _disturbance(file, w) for w in file.table("disturbances")}
@@ -86,7 +97,8 @@ def build_system(file: PlantFile) -> System:
             inputs=tuple(symbol[s] for s in inputs),
             parameters=parameters,
             positive=frozenset(_list(file, "positive")),
-            dynamics=in_deviations(dynamics, [symbol[s] for s in states], x_eq),
+            dynamics=_in_deviations(dynamics, [symbol[s] for s in states], x_eq, time),
+            time=time,
             u_eq=tuple(u_eq),
             domain=tuple(_domain(file, s, e, parameters) for s, e in zip(states, x_eq, strict=True)),
             input_bounds=tuple(_interval(file, "input_bounds", s) for s in inputs),
@@ -113,9 +125,10 @@ def require_equilibrium(system: System, refuse: Callable[[str], InputError] = In
     """
     off = {name: r for name, r in system.residuals().items() if _is_off(r)}
     if off:
-        shown = ", ".join(_residual(name, r, system.units.get(name, "")) for name, r in off.items())
+        shown = ", ".join(_residual(system, name, r) for name, r in off.items())
         raise refuse(
-            f"x_eq of {system.name} must be an equilibrium, f(x_eq, u_eq) = 0; found {shown}. Correct x_eq or u_eq."
+            f"x_eq of {system.name} must be an equilibrium, f(x_eq, u_eq) = {system.rests_where}; found {shown}. "
+            "Correct x_eq or u_eq."
         )
 
 
@@ -123,8 +136,11 @@ def _is_off(residual: Fraction | float) -> bool:
     return residual != 0 if isinstance(residual, Fraction) else not abs(residual) <= _ROUNDED
 
 
-def _residual(name: str, residual: Fraction | float, unit: str) -> str:
+def _residual(system: System, name: str, residual: Fraction | float) -> str:
     exactly = f" (exactly {residual})" if isinstance(residual, Fraction) and len(str(residual)) <= 40 else ""
+    unit = system.units.get(name, "")
+    if system.time == "discrete":
+        return f"{name} moves by {float(residual):.6g}{exactly}{unit and f' {unit}'} in a step"
     return f"{name}' = {float(residual):.6g}{exactly}" + (f" in {unit} per second" if unit else "")
 
 
@@ -136,6 +152,23 @@ def _shorthand(file: PlantFile, symbol: Mapping[str, sympy.Symbol]) -> dict[str,
             raise file.refuse("must be a new name, and no state, input, parameter or function.", "where", name)
         found[name] = _equation(file, "where", name, {**symbol, **found}, "name of the plant or of a line above")
     return found
+
+
+def _time(file: PlantFile) -> Time:
+    """`continuous` unless the file says `discrete`."""
+    found = file.data.get("time", "continuous")
+    for known in get_args(Time):
+        if found == known:
+            return cast("Time", known)
+    raise file.refuse(f"must be one of {', '.join(get_args(Time))}; found {found!r}.", "time")
+
+
+def _in_deviations(
+    equations: Sequence[sympy.Expr], states: Sequence[sympy.Symbol], x_eq: Sequence[sympy.Expr], time: Time
+) -> tuple[sympy.Expr, ...]:
+    """The equations in deviations: a rate is the same there, the state one step later is a deviation as well."""
+    moved = in_deviations(equations, states, x_eq)
+    return moved if time == "continuous" else tuple(e - at for e, at in zip(moved, x_eq, strict=True))
 
 
 def _equation(

@@ -65,7 +65,7 @@ def test_models_and_sides_are_those_of_the_checker(name: str, tmp_path: Path) ->
             assert np.max(np.abs(a - b)) <= 1e-9 * (np.max(np.abs(b)) + 1e-6)
     for a, b in ((mine.shares, shares), (mine.R, units.R)):
         assert np.max(np.abs(a - b), initial=0.0) <= 1e-9 * (np.max(np.abs(b), initial=0.0) + 1e-6)
-    models = sides(TheirModels(J, theirs, units), exactly(c.P), fmpq_mat(len(J), len(J)), by)
+    models = sides(TheirModels(J, theirs, units, True), exactly(c.P), fmpq_mat(len(J), len(J)), by)
     decay, rest = map(floats, models)
     rows = np.array([[int(v.p) / int(v.q) for v in row] for row in (by.rest, by.apart, by.joint)])
     b = c.P @ J

@@ -41,7 +41,8 @@ class BoundsEngine(Engine):
         bands = survey(task.problem, self.T, task.target)
         if task.exactly:
             bands = [band for band in bands if band.top >= task.target]
-        why = f"Vdot >= 0 or an input out of bounds was sampled {'near' if task.exactly else 'around'} every level"
+        where = "near" if task.exactly else "around"
+        why = f"Vdot >= 0 or an input out of bounds was sampled {where} every level"
         found = Proof(None, None, Stop.FLOOR, why)
         for k, band in enumerate(bands):
             left = budget.seconds - (time.perf_counter() - start)
@@ -68,7 +69,12 @@ class BoundsEngine(Engine):
             why = f"F and its inputs are not enclosed on all of V <= {ring.inner:.6g}"
             return Proof(None, None, Stop.SMOOTH, why, boxes=ring.boxes)
         return replace(
-            self.stated(task.problem, ring, Practical(roa=ring.outer, local=ring.inner, floor=ring.inner), {}),
+            self.stated(
+                task.problem,
+                ring,
+                Practical(roa=ring.outer, local=ring.inner, floor=ring.inner, rate=task.problem.rate),
+                {},
+            ),
             stop=stop,
             witness=witness,
         )
@@ -96,7 +102,7 @@ class BoundsEngine(Engine):
             local, cells = local_ball(problem, self.T, claim.local)
         return Proof(
             claim,
-            PartitionTree(self.T, ring.root, ring.tree, local, cells=cells),
+            PartitionTree(self.T, ring.root, ring.tree, local, cells=cells, order=ring.order),
             ring.stop,
             witness=ring.witness,
             boxes=ring.boxes,
@@ -154,5 +160,5 @@ class _Outwards:
             ring = empty_ring(self.task.problem, self.engine.T, self.inner)
         else:
             ring = self.ring.proof(self.stop)
-        claim = Asymptotic(roa=ring.outer, local=self.inner)
+        claim = Asymptotic(roa=ring.outer, local=self.inner, rate=self.task.problem.rate)
         return self.engine.stated(self.task.problem, ring, claim, dict(self.seconds))

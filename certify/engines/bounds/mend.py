@@ -27,7 +27,7 @@ _SLACK = 2e-9  # relative distance of a level from the leaves that it leaves out
 def split_again(problem: Problem, evidence: PartitionTree, claim: Claim, leaf: int) -> PartitionTree:
     """The tree with the leaf of this number, counted in preorder, cut into eight along the axes that matter most."""
     lo, hi = leaves(evidence.tree, evidence.root)
-    rule = VdotBound(problem, evidence.T, torch.device("cpu"))
+    rule = VdotBound(problem, evidence.T, torch.device("cpu"), order=evidence.order)
     nodes = np.frombuffer(evidence.tree, dtype=np.uint8)
     at = int(np.flatnonzero(nodes == LEAF)[leaf])
     lower, upper = (torch.tensor(corner[leaf][:, None]) for corner in (lo, hi))

@@ -1,10 +1,16 @@
-"""The rule for a box: an upper bound of Vdot on the part of the ring that lies in it.
+"""The rule for a box: an upper bound of D' = D + 2 lambda V on the part of the ring that lies in it.
 
-Where a box sticks out of the ring, Vdot need not be negative on all of it. For any multiplier >= 0,
-`Vdot < 0` on {V <= c2} follows from `Vdot + multiplier (c2 - V) < 0`, and on {V >= c1} from
-`Vdot + multiplier (V - c1) < 0` (the S-procedure: Boyd, El Ghaoui, Feron, Balakrishnan 1994, section 2.6.3). Near the
-point where {V <= c2} touches {Vdot >= 0} the two gradients are parallel, and the right multiplier cancels the first
+D is V's increment over a step, by time: Vdot; V(F(x)) - V(x) in discrete time; (V(phi(h)) - V(x))/h where the input is
+held over h. With the mean rate of the step, G = F; F(x) - x; (phi(h) - x)/h, it is `2 x'P G + h G'P G`.
+
+Where a box sticks out of the ring, D' need not be negative on all of it. For any multiplier >= 0,
+`D' < 0` on {V <= c2} follows from `D' + multiplier (c2 - V) < 0`, and on {V >= c1} from
+`D' + multiplier (V - c1) < 0` (the S-procedure: Boyd, El Ghaoui, Feron, Balakrishnan 1994, section 2.6.3). Near the
+point where {V <= c2} touches {D' >= 0} the two gradients are parallel, and the right multiplier cancels the first
 order: close to the largest level this saves tenfold in boxes.
+
+A bound over a step keeps something that no splitting takes away, because a solution leaves each box, however small.
+Whether a box's centre can be proved at all is therefore asked of the centre alone, before the box is split for ever.
 """
 
 from __future__ import annotations
@@ -18,19 +24,21 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from certify.claims import Problem
-from certify.enclosures import Models, PolicyEnclosure, Taylor, upper_bound
+from certify.enclosures import Flow, Models, PolicyEnclosure, Taylor, upper_bound
 from certify.enclosures.taylor import EPS, TINY
 from certify.expressions import evaluate
 from certify.policies import bounded_by_form
 
 Array = NDArray[np.float64]
 _SLACK = 1e-9  # relative distance from the inner level at which a box counts as inside
+_ENDS = 1e-11  # relative distance kept from the ends of the domain
+_POINT = 2.0**-20  # of a box: what is left of it around its centre
 
 
 class BoxBounds(NamedTuple):
-    """What is known of each box: `proved` (B,), `bound` of Vdot (B,), `score` (n, B): what each axis adds to the bound,
-    `violated` (B,): a condition fails at the centre; `smooth` (B,): F is enclosed on the box and the inputs keep their
-    bounds there."""
+    """What is known of each box: `proved` (B,), `bound` of D' (B,), `score` (n, B): what each axis adds to the bound,
+    `violated` (B,): a condition fails at the centre, or cannot be proved there; `smooth` (B,): what is asked inside
+    the inner level holds."""
 
     proved: Tensor
     bound: Tensor
@@ -40,16 +48,18 @@ class BoxBounds(NamedTuple):
 
 
 class VdotBound:
-    """Upper bounds of Vdot, and bounds of V, over batches of boxes in the coordinates z.
+    """Upper bounds of D', which is Vdot in continuous time, and bounds of V, over boxes in the coordinates z.
 
     With `inside`, a box on which V is below the inner level is proved if F is enclosed there and the inputs keep their
-    bounds; otherwise such a box is nobody's concern here.
+    bounds, and where time has steps if none leads from it to V of at least that level; otherwise such a box is
+    nobody's concern here. `order` is that of the series in time where the input is held.
     """
 
-    def __init__(self, problem: Problem, T: Array, device: torch.device, inside: bool = False) -> None:
+    def __init__(self, problem: Problem, T: Array, device: torch.device, inside: bool = False, order: int = 2) -> None:
         self.inside = inside
         loop = problem.loop
         self.system = loop.system
+        self.rate = problem.rate
         self.T = torch.tensor(T, dtype=torch.float64, device=device)
         self.P = problem.V.P
         S = T.T @ self.P @ T
@@ -60,6 +70,14 @@ class VdotBound:
         self.policy = PolicyEnclosure(loop, device)
         self.dynamics: tuple[sympy.Expr, ...] = loop.system.uncertain_dynamics()
         self.check_inputs = not bounded_by_form(loop.network, loop.system.input_bounds)
+        sample = loop.system.sample
+        self.flow = None if sample is None else Flow(self.dynamics, sample, order)
+        self.order = 1 if self.flow is None else order
+        self.step = loop.step
+        ends = [[float(end) for end in pair] for pair in loop.system.domain]
+        self.ends = torch.tensor(ends, dtype=torch.float64, device=device).T[:, :, None]
+        extent = np.sqrt(np.diag(np.linalg.inv(self.P))) * (1 + 1e-9)
+        self.extent = torch.tensor(extent, dtype=torch.float64, device=device)[:, None]  # of {V <= 1}
 
     def levels(self, lo: Tensor, hi: Tensor) -> tuple[Tensor, Tensor]:
         """Bounds of V from below and above on boxes (n, B)."""
@@ -72,31 +90,58 @@ class VdotBound:
         """V at points (n, B)."""
         return (z * (self.S @ z)).sum(0)
 
+    def at_points(self, z: Tensor, outer: float) -> Tensor:
+        """The bound of D' at points (n, B) in {V <= outer}; infinite where nothing is known of it."""
+        return self._judge(z, torch.zeros_like(z), z, z, 0.0, outer).bound.nan_to_num(torch.inf, torch.inf)
+
+    def levels_after(self, z: Tensor, outer: float) -> Tensor:
+        """V after a step from points (n, B) in {V <= outer}, from above; infinite where nothing is known of it."""
+        return self.levels_at(z) + self.step * self.at_points(z, outer)
+
     def __call__(self, lo: Tensor, hi: Tensor, inner: float, outer: float) -> BoxBounds:
         """Bounds on inner <= V <= outer within boxes lo, hi (n, B)."""
-        n = self.system.n
         centre = 0.5 * lo + 0.5 * hi
         radius = torch.maximum(hi - centre, centre - lo) * (1 + EPS)
+        found = self._judge(centre, radius, lo, hi, inner, outer)
+        if self.step == 0:
+            return found
+        asked = ~found.proved & ~found.violated
+        if not self.inside:
+            asked = asked & (self.levels_at(centre) >= inner)
+        index = torch.nonzero(asked)[:, 0]
+        if not len(index):
+            return found
+        z, small = centre[:, index], _POINT * radius[:, index]
+        provable = self._judge(z, small, z - small, z + small, inner, outer).proved
+        return found._replace(violated=found.violated.index_put((index,), ~provable))
+
+    def _judge(self, centre: Tensor, radius: Tensor, lo: Tensor, hi: Tensor, inner: float, outer: float) -> BoxBounds:
+        n = self.system.n
         slopes_x = self.T[:, :, None] * radius
         x = torch.cat([(self.T @ centre)[:, None], slopes_x], 1)
         error = 2 * (n + 4) * EPS * (self.T.abs() @ (centre.abs() + radius)) + TINY
         mid, slopes, wide, share = self.policy(x, error)
-        vdot = self._vdot(x, error, mid, slopes, wide)
-        bound, excess = upper_bound(vdot)
+        decrease, kept = self._decrease(x, error, mid, slopes, wide, outer)
+        if self.rate:
+            decrease = decrease + self._level(centre, radius, decrease).scaled(2 * self.rate)
+        bound, excess = upper_bound(decrease)
         smooth = torch.isfinite(bound)  # a component of F that is not enclosed leaves a NaN in the sum over all
         # At the box's centre, and for the worst values of what is uncertain, only the inputs' errors, what is of second
         # order in all these, and the remainder are left.
         known = n + self.system.m
-        doubt = vdot.g[n:known].abs().sum(0) + vdot.Q[n:, n:].abs().sum((0, 1)) + vdot.r
-        violated = vdot.c + vdot.g[known:].abs().sum(0) - doubt >= 0
-        bound = self._within_ring(bound, vdot, lo, hi, centre, radius, inner, outer)
+        doubt = decrease.g[n:known].abs().sum(0) + decrease.Q[n:, n:].abs().sum((0, 1)) + decrease.r
+        violated = decrease.c + decrease.g[known:].abs().sum(0) - doubt >= 0
+        bound = self._within_ring(bound, decrease, lo, hi, centre, radius, inner, outer)
         proved = bound < 0
-        if self.inside:
+        if self.inside and self.step == 0:
             proved = smooth & (proved | (self.levels(lo, hi)[1] < inner * (1 - _SLACK)))
         # What the inputs' errors and the remainder add is charged to the axes that spread the network.
-        extra = excess[n:].sum(0) + vdot.r
+        extra = excess[n:].sum(0) + decrease.r
         score = excess[:n] + share * extra
         score = torch.where(torch.isfinite(score), score, slopes_x.abs().sum(0))
+        if kept is not None:
+            score = torch.where(kept, score, slopes_x.abs().sum(0))
+            proved, bound = proved & kept, torch.where(kept, bound, torch.inf)
         if self.check_inputs:
             reach = slopes.abs().sum(1) + wide + 1e-11 * mid.abs()
             for j, (low, high) in enumerate(self.system.input_bounds):
@@ -106,44 +151,93 @@ class VdotBound:
                 proved, violated, smooth = proved & inside, violated | outside, smooth & inside
                 spread = slopes[j].abs() + share * wide[j]
                 score = torch.where(inside, score, spread)
+        if self.inside and self.step:
+            smooth = proved
         return BoxBounds(proved, bound, score, violated, smooth)
 
-    def _vdot(self, x: Tensor, error: Tensor, mid: Tensor, slopes: Tensor, wide: Tensor) -> Taylor:
-        """Vdot = (2 P x)'f(x, u, q); symbols: n box coordinates, m input errors, k uncertain quantities."""
+    def _decrease(
+        self, x: Tensor, error: Tensor, mid: Tensor, slopes: Tensor, wide: Tensor, outer: float
+    ) -> tuple[Taylor, Tensor | None]:
+        """D, and where (B,) the solution stays in the domain over a period in which the input is held, if it is.
+
+        Symbols: n box coordinates, m input errors, k uncertain quantities, and the period if that is in a range.
+        """
         n, m, batch, k = self.system.n, self.system.m, x.shape[2], len(self.system.uncertain)
+        k += 0 if self.flow is None else self.flow.symbols
         zeros = torch.zeros(n + m + k, n + m + k, batch, dtype=x.dtype, device=x.device)
         none = zeros[0, : m + k]
-        values: dict[sympy.Symbol, Taylor] = {}
+        states: dict[sympy.Symbol, Taylor] = {}
+        inputs: dict[sympy.Symbol, Taylor] = {}
+        quantities: dict[sympy.Symbol, Taylor] = {}
         for i, symbol in enumerate(self.system.states):
-            values[symbol] = Taylor(x[i, 0], torch.cat([x[i, 1:], none]), zeros, error[i])
+            states[symbol] = Taylor(x[i, 0], torch.cat([x[i, 1:], none]), zeros, error[i])
         for j, symbol in enumerate(self.system.inputs):
             own = none.clone()
             own[j] = wide[j]
-            values[symbol] = Taylor(mid[j], torch.cat([slopes[j], own]), zeros, zeros[0, 0])
+            inputs[symbol] = Taylor(mid[j], torch.cat([slopes[j], own]), zeros, zeros[0, 0])
         for j, (symbol, (lo, hi)) in enumerate(self.system.uncertain):
             middle, reach = float((lo + hi) / 2), float((hi - lo) / 2)
             own = zeros[0].clone()
             own[n + m + j] = reach
             rounding = EPS * (abs(middle) + reach) + TINY
-            values[symbol] = Taylor(zeros[0, 0] + middle, own, zeros, zeros[0, 0] + rounding)
-        known: dict[sympy.Expr, Taylor] = {}
-        models = Models(values[self.system.states[0]])
-        states = [values[s] for s in self.system.states]
+            quantities[symbol] = Taylor(zeros[0, 0] + middle, own, zeros, zeros[0, 0] + rounding)
+        here = list(states.values())
+        kept = None
+        if self.flow is not None:
+            mean = self.flow(states, inputs, quantities, n + m)
+            G, kept = mean.G, mean.exists & self._in_domain(here, mean.least, mean.most, outer)
+        else:
+            known: dict[sympy.Expr, Taylor] = {}
+            values, models = {**states, **inputs, **quantities}, Models(here[0])
+            G = [evaluate(expression, values, models, known) for expression in self.dynamics]
+            if self.system.time == "discrete":
+                G = [after + before.scaled(-1.0) for after, before in zip(G, here, strict=True)]
         terms = []
-        for i, expression in enumerate(self.dynamics):
-            gradient = states[0].scaled(2 * float(self.P[i, 0]))
-            for j in range(1, n):
-                gradient = gradient + states[j].scaled(2 * float(self.P[i, j]))
-            terms.append(gradient * evaluate(expression, values, models, known))
+        for i, rate in enumerate(G):
+            gradient = self._row(i, here, 2.0)
+            if self.step:
+                gradient = gradient + self._row(i, G, self.step)
+            terms.append(gradient * rate)
         result = terms[0]
         for term in terms[1:]:
             result = result + term
+        return result, kept
+
+    def _row(self, i: int, models: list[Taylor], factor: float) -> Taylor:
+        """Component i of P v, times the factor."""
+        result = models[0].scaled(factor * float(self.P[i, 0]))
+        for j in range(1, len(models)):
+            result = result + models[j].scaled(factor * float(self.P[i, j]))
         return result
+
+    def _in_domain(self, states: list[Taylor], least: Tensor, most: Tensor, outer: float) -> Tensor:
+        """Where (B,) the solution from V <= outer stays inside the domain over the longest period."""
+        centre = torch.stack([model.c for model in states])
+        reach = torch.stack([model.radius() for model in states])
+        wide = outer**0.5 * self.extent
+        longest = self.step * (1 + EPS)
+        down = torch.maximum(centre - reach, -wide) + longest * least.clamp(max=0.0)
+        up = torch.minimum(centre + reach, wide) + longest * most.clamp(min=0.0)
+        low, high = self.ends
+        slack = _ENDS * (low.abs() + high.abs() + centre.abs() + reach)
+        inside: Tensor = ((down > low + slack) & (up < high - slack)).all(0)
+        return inside
+
+    def _level(self, centre: Tensor, radius: Tensor, like: Taylor) -> Taylor:
+        """V as a model in the box coordinates, among as many symbols as another model has."""
+        n = len(centre)
+        far = centre.abs() + radius
+        g, Q = torch.zeros_like(like.g), torch.zeros_like(like.Q)
+        g[:n] = 2 * self.S_diagonal * centre * radius
+        torch.diagonal(Q, dim1=0, dim2=1)[:, :n] = (self.S_diagonal * radius * radius).T
+        size = (self.S_diagonal * far * far).sum(0)
+        rest = (far * (self.S_cross @ far)).sum(0) + n * EPS * size + TINY
+        return Taylor((self.S_diagonal * centre * centre).sum(0), g, Q, rest)
 
     def _within_ring(
         self,
         bound: Tensor,
-        vdot: Taylor,
+        decrease: Taylor,
         lo: Tensor,
         hi: Tensor,
         centre: Tensor,
@@ -151,34 +245,38 @@ class VdotBound:
         inner: float,
         outer: float,
     ) -> Tensor:
-        """The bound, made tighter by the S-procedure where it is not negative and the box sticks out of the ring."""
+        """The bound, made tighter by the S-procedure where it is not negative and the box sticks out of the ring.
+
+        Where nothing but a step's end shows that it does not lead out of {V < inner}, on boxes that meet that set, the
+        multiplier of V - inner is at most 1/h, and there is no other.
+        """
         n = len(centre)
         lowest, highest = self.levels(lo, hi)
-        for level, sign, outside in ((outer, 1.0, highest > outer), (inner, -1.0, lowest < inner)):
+        below, beyond = lowest < inner, highest > outer
+        most = torch.inf
+        if self.inside and self.step:
+            below = lowest < inner * (1 + _SLACK)
+            beyond = beyond & ~below
+            most = (1 - 1e-12) / self.step
+        for level, sign, outside in ((outer, 1.0, beyond), (inner, -1.0, below)):
             index = torch.nonzero(outside & ~(bound < 0))[:, 0]
             if not len(index):
                 continue
             # gap = sign (level - V), as a model in the box coordinates; it is >= 0 in the ring
-            z, r = centre[:, index], radius[:, index]
-            far = z.abs() + r
-            g = torch.zeros_like(vdot.g[:, index])
-            Q = torch.zeros_like(vdot.Q[:, :, index])
-            g[:n] = -2 * sign * self.S_diagonal * z * r
-            torch.diagonal(Q, dim1=0, dim2=1)[:, :n] = -sign * (self.S_diagonal * r * r).T
-            size = (self.S_diagonal * far * far).sum(0)
-            gap = Taylor(
-                sign * (level - (self.S_diagonal * z * z).sum(0)),
-                g,
-                Q,
-                (far * (self.S_cross @ far)).sum(0) + n * EPS * (size + level) + TINY,
-            )
+            V = self._level(centre[:, index], radius[:, index], _part(decrease, index))
+            size = V.c.abs() + V.g.abs().sum(0) + V.Q.abs().sum((0, 1))
+            g, Q = -sign * V.g, -sign * V.Q
+            gap = Taylor(sign * (level - V.c), g, Q, V.r + n * EPS * level + TINY)
             scale = gap.r + EPS * size
-            for each in _multipliers(vdot.g[:n, index], g[:n], gap.c):
+            tried = _multipliers(decrease.g[:n, index], g[:n], gap.c).clamp(max=most)
+            if most < torch.inf:
+                tried = torch.cat([tried, torch.full_like(tried[:1], most)])
+            for each in tried:
                 left = torch.nonzero(~(bound[index] < 0) & (each > 0))[:, 0]
                 k, still = each[left], index[left]
                 c = k * gap.c[left]
                 added = Taylor(c, k * g[:, left], k * Q[:, :, left], k * scale[left] + EPS * c.abs() + TINY)
-                here = Taylor(vdot.c[still], vdot.g[:, still], vdot.Q[:, :, still], vdot.r[still])
+                here = Taylor(decrease.c[still], decrease.g[:, still], decrease.Q[:, :, still], decrease.r[still])
                 tighter, _ = upper_bound(here + added)
                 bound = bound.index_put((still,), torch.fmin(bound[still], tighter))
         return bound
@@ -189,3 +287,7 @@ def _multipliers(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
     k = torch.nan_to_num(torch.where(b != 0, -a / b, 0.0), 0.0, 0.0, 0.0).clamp(min=0.0)
     value = c * k + (a[:, None] + k * b[:, None]).abs().sum(0)
     return k.gather(0, value.argsort(dim=0, stable=True))
+
+
+def _part(model: Taylor, index: Tensor) -> Taylor:
+    return Taylor(model.c[index], model.g[:, index], model.Q[:, :, index], model.r[index])

@@ -21,6 +21,7 @@ from torch import Tensor
 from certify.claims import Problem
 from certify.engines.base import Budget, Progress, Report
 from certify.engines.bounds.frontier import Frontier
+from certify.engines.bounds.order import choose_order
 from certify.engines.bounds.partition import LEAF, Partition
 from certify.engines.bounds.rule import BoxBounds, VdotBound
 from certify.engines.falsify import Witness, descend
@@ -36,12 +37,13 @@ _MOST_SPLITS = 40_000_000  # what a certificate can hold, and two gibibytes
 
 @dataclass(frozen=True, slots=True)
 class RingProof:
-    """Vdot < 0 is proved for `inner <= V <= outer` (equal if the ring is empty); `stop` says what ended the pass.
+    """D' < 0 is proved for `inner <= V <= outer` (equal if the ring is empty); `stop` says what ended the pass.
 
     `tree` is the partition in preorder: an axis for a split, 255 for a leaf; `root` its half-widths (n,) in z.
     `direction` and `seconds_left` are those of `Proof`.
     `witness` is the lowest violation found along the way. `covered` is False if a pass inwards left boxes inside
-    the inner level on which F could not be enclosed.
+    the inner level on which F could not be enclosed, or a step might lead to the inner level. `order` is that of the
+    series in time of the leaves.
     """
 
     inner: float
@@ -55,6 +57,7 @@ class RingProof:
     covered: bool = True
     direction: tuple[float, ...] | None = None
     seconds_left: float | None = None
+    order: int = 1
 
 
 def prove_outwards(
@@ -67,7 +70,7 @@ def prove_outwards(
     report: Report | None = None,
     rule: VdotBound | None = None,
 ) -> RingProof:
-    """Prove Vdot < 0 (and the input bounds) on `inner <= V <= level` for the largest level up to `target`.
+    """Prove D' < 0 (and the input bounds) on `inner <= V <= level` for the largest level up to `target`.
 
     Parameters
     ----------
@@ -91,7 +94,10 @@ def outwards(
 ) -> Pass:
     """The pass of `prove_outwards` before its first box."""
     sweep = _Outwards(problem, T, inner, target)
-    return Pass(sweep, _root(problem, T, target), runner, rule or VdotBound(problem, T, runner.device))
+    if rule is None:
+        order = choose_order(problem, T, inner, target)
+        rule = VdotBound(problem, T, runner.device, order=order)
+    return Pass(sweep, _root(problem, T, target), runner, rule)
 
 
 def empty_ring(problem: Problem, T: Array, level: float) -> RingProof:
@@ -108,12 +114,14 @@ def prove_inwards(
     runner: Runner,
     report: Report | None = None,
 ) -> RingProof:
-    """Prove Vdot < 0 on `level <= V <= outer` for the smallest level from `floor` on, and F and its inputs inside it.
+    """Prove D' < 0 on `level <= V <= outer` for the smallest level from `floor` on, and F and its inputs inside it.
 
     Parameters are those of `prove_outwards`. On {V < level} every leaf of the tree has a finite enclosure of F
-    and inputs in their bounds; if the budget ends before, the proof is not `covered`.
+    and inputs in their bounds, and where time has steps none leads from it to V >= level; if the budget ends before,
+    the proof is not `covered`.
     """
-    rule = VdotBound(problem, T, runner.device, inside=True)
+    order = choose_order(problem, T, max(floor, 1e-3 * outer), outer)
+    rule = VdotBound(problem, T, runner.device, inside=True, order=order)
     ring = Pass(_Inwards(problem, T, floor, outer), _root(problem, T, outer), runner, rule)
     stop = ring.advance(budget, report)
     if stop is not None:
@@ -302,7 +310,7 @@ class Pass:
         self.proved += int(found.proved.sum())
         self._expect(found)
         centres = 0.5 * lo + 0.5 * hi
-        if sweep.violated(centres, torch.where(found.violated, rule.levels_at(centres), math.inf)):
+        if sweep.violated(centres, self._levels(centres, found)):
             self._stop = Stop.WITNESS
         halves_lo, halves_hi, halves, small = _split(self.partition, lo, hi, number, found, least_width * self.half)
         if bool(small.any()):
@@ -313,6 +321,16 @@ class Pass:
         keep = sweep.wanted(lowest, highest)
         self.frontier.add(halves_lo[:, keep], halves_hi[:, keep], sweep.key(lowest, highest)[keep], halves[keep])
         self.frontier.drop_above(sweep.last())
+
+    def _levels(self, centres: Tensor, found: BoxBounds) -> Tensor:
+        """V at violations, infinite elsewhere; where a step leads from within the outer level to a higher V, that, but
+        no more than just above the outer level."""
+        levels = torch.where(found.violated, self.rule.levels_at(centres), math.inf)
+        index = torch.nonzero(levels <= self.sweep.outer)[:, 0]
+        if not (self.rule.inside and self.rule.step) or not len(index):
+            return levels
+        after = self.rule.levels_after(centres[:, index], self.sweep.outer).clamp(max=self.sweep.outer)
+        return levels.index_put((index,), torch.maximum(levels[index], after))
 
     def _expect(self, found: BoxBounds) -> None:
         """How often a box of this batch that is not proved has to be halved, so that what its axes add to the bound is
@@ -343,7 +361,8 @@ class Pass:
         tree = self.partition.preorder()
         leaves = tree.count(bytes([LEAF]))
         found = RingProof(inner, outer, stop, tree, self.root, self.boxes, leaves, witness, covered)
-        return replace(found, direction=self._direction(), seconds_left=None if self.done else self._clock.left)
+        left = None if self.done else self._clock.left
+        return replace(found, direction=self._direction(), seconds_left=left, order=self.rule.order)
 
     def _direction(self) -> tuple[float, ...] | None:
         """The coordinate that was halved most often, in the states, as long as the root box in it; None at first."""

@@ -1,0 +1,81 @@
+"""The rule `contraction`: on a ball that holds {V <= c0} any two trajectories come closer, where q is constant, in the
+norm of P. So there is one equilibrium at most, and all trajectories converge to it."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from functools import cached_property
+from math import prod
+
+import numpy as np
+from flint import fmpq_mat
+
+from . import ball
+from .ball import Ball
+from .case import Case, Failures
+from .decrease import Models, are_finite, diagonal, rational
+from .document import Contraction
+from .exact import contains_ball, exactly, is_definite, root_above
+from .local import MOST_WORK
+
+
+class Contracted(Ball):
+    """The ball of the section `contraction`."""
+
+    def __init__(self, case: Case, evidence: Contraction) -> None:
+        super().__init__(case, evidence.J, "contraction")
+
+    @cached_property
+    def weights(self) -> list[float]:
+        """g."""
+        found = self.case.partition.contraction
+        return [] if found is None else found.weights.tolist()
+
+
+def fits(ball_: Contracted) -> Failures:
+    """The ball contains {V <= c0}, and its jets take neither too much memory nor too much time."""
+    c = ball_.case.c
+    if not contains_ball(exactly(ball_.J), exactly(c.P), Fraction(c.c0)):
+        yield "levels.floor", "the ball must contain {V <= c0}"
+    if prod(ball_.case.partition.cells) * 2**ball_.count * len(ball_.J) ** 4 > MOST_WORK:
+        yield "evidence.cells", "there are too many cells for this rule"
+    if not all(g > 0 for g in ball_.weights):
+        yield "evidence.contraction.weights", "must be positive"
+    yield from ball.fits(ball_)
+    return 0
+
+
+def contracts(ball_: Contracted) -> Failures:
+    """2 (x - y)'P (F(x) - F(y)) < 0 for any two points of the ball."""
+    P, count = exactly(ball_.case.c.P), 0
+    for cell in ball_.case.cells:
+        F = ball_.F(cell)
+        lips = [float(f.lip) for f in F]
+        if not (are_finite(F, ball_.units) and np.all(np.isfinite(lips))):
+            yield ball_.at, "F has no finite model"
+            return count
+        models = Models(ball_.J, F, ball_.units, rest=True)
+        b = P * models.J  # b_i is row i
+        rest = _turning(models, b, ball_.weights)
+        for i, lip in enumerate(lips):
+            size = root_above(sum((v * v for v in b.tolist()[i]), rational(0.0)))
+            rest += diagonal([2 * size * (rational(float(F[i].slack)) + rational(lip))] * b.ncols())
+        for corner in models.corners():
+            crossed = models.J.transpose() * P * corner.A
+            count += 1
+            if not is_definite(-(crossed + crossed.transpose()) - rest):
+                yield ball_.at, "it is not shown that trajectories come closer"
+    return count
+
+
+def _turning(models: Models, b: fmpq_mat, weights: list[float]) -> fmpq_mat:
+    """(diag(g) + sum_j N_j diag(1/g) N_j)/2, N_j = 2 sum_i (b_i (Q_i)_j:' + (Q_i)_j: b_i')."""
+    k, g = b.ncols(), [rational(w) for w in weights]
+    inverse, found = diagonal([1 / w for w in g]), diagonal(g)
+    columns = [fmpq_mat(k, 1, row) for row in b.tolist()]
+    for j in range(k):
+        halves = (column * fmpq_mat(1, k, Q.tolist()[j]) for column, Q in zip(columns, models.Q, strict=True))
+        half = sum(halves, fmpq_mat(k, k))
+        N = 2 * (half + half.transpose())
+        found += N * inverse * N
+    return found / 2

@@ -1,0 +1,176 @@
+"""Models of a step on a ball around the origin, in cells of what is uncertain: G, by which V's increment is decided.
+
+G is F itself in continuous time, F - x in discrete time, and where the input is held over h the mean of f over the
+period: `x_1 + h x_2 + ... + h^(r-1) x_r` by the power series of the solution, whose last coefficient is taken at states
+that are near enough to x for the whole period. A quantity may change within it, and leave its cell: only in x_1, the
+mean of f at x, is it one number (checker/FORMAT.md, flow).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import sympy
+from numpy.typing import NDArray
+
+from certify.closed_loop import ClosedLoop
+from certify.engines.models import Driven, Models, Paths, Spread
+from certify.engines.ranged import RangedJet, RangedJets
+from certify.expressions import evaluate, solution_series
+from certify.systems.system import Interval
+
+Array = NDArray[np.float64]
+Cell = tuple[Interval, ...]
+_ATTEMPTS, _FURTHER = 4, 1.25  # at how far the states move in a period, each from the rates of the last
+
+
+@dataclass(frozen=True, slots=True)
+class Steps:
+    """What the closed loop does in a step.
+
+    Parameters
+    ----------
+    known : the loop at the origin.
+    at_rest : the loop rests there for certain, so that the models start from 0 exactly.
+    order : r, of the series where inputs are held.
+    dynamics : f in states, inputs and uncertain quantities.
+    """
+
+    known: Paths
+    at_rest: bool
+    order: int
+    dynamics: tuple[sympy.Expr, ...]
+
+    @property
+    def longest(self) -> float:
+        """h, the length of the step in V's increment: 0 in continuous time."""
+        system = self.known.loop.system
+        if system.time == "discrete":
+            return 1.0
+        return 0.0 if system.sample is None else float(system.sample[1])
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether G is F, and nothing is uncertain."""
+        return not self.longest and not self.known.loop.system.ranges
+
+    def models(self, J: Array, cells: Sequence[Cell], reach: Array) -> list[Models]:
+        """Of G on the ball x = J d for each cell; no state of interest there is larger than `reach`, (n,)."""
+        if self.is_plain:
+            return [self.known.models(J)]
+        driven = self.known.driven(J)
+        return [self._in_cell(J, driven, cell, reach) for cell in cells]
+
+    def _in_cell(self, J: Array, driven: Driven, cell: Cell, reach: Array) -> Models:
+        walk = _Walk(self, J, driven, cell)
+        system = self.known.loop.system
+        G, stays = [walk.still(v) for v in walk.rates()], True
+        if system.sample is not None:
+            held = _held(walk, self.order, system.sample, reach)
+            if held is None:
+                G, stays = [replace(v, c=math.nan) for v in G], False
+            else:
+                G = [v + more for v, more in zip(G, held[0], strict=True)]
+                stays = held[1]
+        if system.time == "discrete":
+            G = [v + x.scaled(-1.0) for v, x in zip(G, walk.states(), strict=True)]
+        parts = ([getattr(v, part) for v in G] for part in ("moves", "turns", "error", "slack"))
+        moves, turns, error, slack = map(np.array, parts)
+        spread = Spread(np.swapaxes(moves, 0, 1), np.swapaxes(turns, 0, 1), error, slack)
+        return driven.models(G, spread, stays)
+
+
+def steps_of(known: Paths, at_rest: bool, order: int) -> Steps:
+    """Those of a loop."""
+    loop = known.loop
+    return Steps(known, at_rest, order, loop.system.uncertain_dynamics() if loop.system.ranges else loop.dynamics)
+
+
+class _Walk:
+    """The equations on a ball, in a cell."""
+
+    def __init__(self, steps: Steps, J: Array, driven: Driven, cell: Cell) -> None:
+        self.steps, self.J, self.cell = steps, J, cell
+        sample = self.loop.system.sample
+        self.varies = sample is not None and sample[0] < sample[1]
+        self.algebra = RangedJets(J.shape[1], len(cell) + self.varies, driven.errors)
+        u = enumerate(steps.known.u)
+        self._inputs = [self.algebra.input(j, float(value), *driven.of(j)) for j, value in u]
+
+    @property
+    def loop(self) -> ClosedLoop:
+        return self.steps.known.loop
+
+    def states(self, near: tuple[Array, Array] | None = None) -> list[RangedJet]:
+        """x, or what is as `near` to it: v(0) and gradients within these, (n,) each."""
+        n = len(self.J)
+        errors, slacks = (np.zeros(n), np.zeros(n)) if near is None else near
+        rows = zip(self.J, errors, slacks, strict=True)
+        return [self.algebra.state(0.0, row, float(e), float(s)) for row, e, s in rows]
+
+    def rates(self, near: tuple[Array, Array] | None = None, fixed: bool = True) -> list[RangedJet]:
+        """f at these states; the quantities are one point of the cell, or anywhere at every place if not `fixed`."""
+        shared: dict[sympy.Expr, RangedJet] = {}
+        values = self._states_by_name(near) | self._held_by_name(fixed)
+        return [evaluate(e, values, self.algebra, shared) for e in self.steps.dynamics]
+
+    def series(self, order: int, near: tuple[Array, Array] | None = None) -> list[list[RangedJet]]:
+        """x_1 to x_order, from these states, for each component."""
+        states, held = self._states_by_name(near), self._held_by_name(False)
+        return solution_series(self.steps.dynamics, states, held, self.algebra, order)
+
+    def still(self, v: RangedJet) -> RangedJet:
+        """At rest what vanishes at d = 0 does so exactly."""
+        return replace(v, c=0.0, moves=np.zeros_like(v.moves), error=0.0) if self.steps.at_rest else v
+
+    def _states_by_name(self, near: tuple[Array, Array] | None) -> dict[sympy.Symbol, RangedJet]:
+        return dict(zip(self.loop.system.states, self.states(near), strict=True))
+
+    def _held_by_name(self, fixed: bool) -> dict[sympy.Symbol, RangedJet]:
+        system = self.loop.system
+        held = dict(zip(system.inputs, self._inputs, strict=True))
+        for j, ((symbol, whole), part) in enumerate(zip(system.uncertain, self.cell, strict=True)):
+            held[symbol] = self.algebra.quantity(*part, j) if fixed else self.algebra.quantity(*whole, None)
+        return held
+
+
+def _held(walk: _Walk, order: int, sample: Interval, reach: Array) -> tuple[list[RangedJet], bool] | None:
+    """`h x_2 + ... + h^(r-1) x_r` for every h of the range, and whether the states stay in the domain; None where they
+    are not known to stay anywhere."""
+    hi = float(sample[1])
+    moved = _within_a_period(walk, hi)
+    if moved is None:
+        return None
+    near, rate = moved
+    ends = [(float(a), float(b)) for a, b in walk.loop.system.domain]
+    stays = all(a < -r - hi * v and r + hi * v < b for (a, b), r, v in zip(ends, reach, rate, strict=True))
+    last = [row[-1] for row in walk.series(order, near)]
+    early = walk.series(order - 1) if order > 2 else [[]] * len(last)
+    h = walk.algebra.quantity(*sample, len(walk.cell) if walk.varies else None)
+    found = []
+    for own, end in zip(early, last, strict=True):
+        value = walk.still(end)
+        for v in reversed(own[1:]):
+            value = walk.still(v) + h * value
+        found.append(h * value)
+    return found, stays
+
+
+def _within_a_period(walk: _Walk, hi: float) -> tuple[tuple[Array, Array], Array] | None:
+    """Bounds, (n,), of how far v(0) and gradients of the states move from x within a period, and their rates."""
+    n = len(walk.J)
+    near = np.zeros(n), np.zeros(n)
+    for attempt in range(_ATTEMPTS + 1):
+        rates = walk.rates(near, fixed=False)
+        first = np.array([0.0 if walk.steps.at_rest else v.value for v in rates])
+        steep = np.array([v.radius for v in rates])
+        if not (np.all(np.isfinite(first)) and np.all(np.isfinite(steep))):
+            return None
+        held = all(bool(np.all((hi * v < r) | ((v == 0) & (r == 0)))) for v, r in ((first, near[0]), (steep, near[1])))
+        if attempt and held:
+            return near, first + steep
+        near = _FURTHER * hi * first, _FURTHER * hi * steep
+    return None
