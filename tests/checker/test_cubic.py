@@ -139,7 +139,7 @@ def random_jet(generator: Generator, k: int, U: np.ndarray, size: float = 1.0) -
         generator.standard_normal(k) * number(), number() * 2.0**-8 * generator.choice([0, 1]),
         (half + half.T) * number(), generator.standard_normal(k * (k + 1) * (k + 2) // 6) * number(),
         widen((E + E.T) / 2, 0.0, 2.0**-40), generator.standard_normal(len(U)) * number(), U,
-        np.zeros(0), np.zeros((0, k)),
+        np.zeros(0), np.zeros((0, k)), 0.0,
     )  # fmt: skip
 
 
@@ -283,7 +283,7 @@ def test_errors_that_are_shared_cancel() -> None:
     """v - w, v w - w v and sin(v) - sin(w) of the same errors: nothing is left of them to first order."""
     U = np.array([np.eye(2) * 0.01])
     one = Jet(np.float64(1), 0.0, np.zeros(2), 0.0, np.zeros((2, 2)), np.zeros(4), np.zeros((2, 2)), np.ones(1), U,
-              np.zeros(0), np.zeros((0, 2)))  # fmt: skip
+              np.zeros(0), np.zeros((0, 2)), 0.0)  # fmt: skip
     assert abs((one + -one).B[0]) == 0 and np.trace((one + -one).whole) < 1e-12
     assert (one + one).B[0] == 2 and np.trace((one + one).E) < 1e-12
     product = one * one
@@ -459,7 +459,7 @@ def test_a_subnormal_scale_of_an_input_that_bends_much_contains(scale: float) ->
     Q, flat = np.full((2, 2, 2), 2.0**500 / 3), np.zeros((2, 2, 2))
     found.__dict__["outputs"] = Jet(np.zeros(2), np.zeros(2), np.zeros((2, 2)), np.zeros(2), Q, np.zeros((2, 4)), flat,
                                     np.full((2, 1), 2.0**-20), np.full((1, 2, 2), 2.0**400), np.zeros((2, 0)),
-                                    np.zeros((2, 0, 2)))  # fmt: skip
+                                    np.zeros((2, 0, 2)), np.zeros(2))  # fmt: skip
     with np.errstate(all="ignore"):
         u = found.inputs[0]
     least = abs(quotient(scale)) * (quotient(2.0**-53) * quotient(Q[0, 0, 0]))

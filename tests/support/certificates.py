@@ -28,6 +28,7 @@ from certify.checker.ring import Ring
 
 Document = dict[str, Any]
 LEAF = 255
+AROUND_A_LEVEL = ("practical", "nearby")
 ASYMPTOTIC: Document = {"kind": "asymptotic", "rate": (0.0).hex(), "sample": None}
 
 
@@ -95,8 +96,8 @@ def make(
     T = np.eye(len(P)) if T is None else np.atleast_2d(np.asarray(T, dtype=np.float64))
     if root is None:
         root = least_root(P, T, levels[-1])
-    edges = ("floor", "local", "roa")[claim != "practical" :]
-    if claim == "practical" and len(levels) == 2:
+    edges = ("floor", "local", "roa")[claim not in AROUND_A_LEVEL :]
+    if claim in AROUND_A_LEVEL and len(levels) == 2:
         levels = (levels[0], *levels)
     arrays = [(np.atleast_2d(np.asarray(W, dtype=np.float64)), np.atleast_1d(b)) for W, b in layers]
     from tests.support.balls import with_ball
@@ -134,6 +135,7 @@ def make(
             "order": order,
             "cells": [1] * len(uncertain) if cells is None else list(cells),
             "local": None,
+            "contraction": None,
             "tube": [],
         },
         "provenance": {"tool": "written by hand"},

@@ -236,7 +236,8 @@ def _shape(data: Any) -> None:
         words = [evidence["solver"], evidence["version"], *(word for pair in pairs for word in pair)]
         _need(all(isinstance(w, str) and w and not set(w) & set(" \n\t") for w in words), "words")
         return
-    _section(evidence, "kind", "T", "root", "tree", "order", "cells", "local", "tube")
+    _section(evidence, "kind", "T", "root", "tree", "order", "cells", "local", "contraction", "tube")
+    _need(evidence["contraction"] is None, "no contraction")
     _need(type(evidence["order"]) is int and evidence["order"] == 1, "order")
     _need(evidence["cells"] == [], "no cells of nothing")
     _need(evidence["kind"] == "partition-tree", "kind")

@@ -19,7 +19,7 @@ def plain(c: Any, error: Any, a: Any, slack: Any, Q: Any, E: Any, K: Any = None)
     """A model without the errors of inputs, and, if no K is given, without one."""
     k = len(a)
     thirds = np.zeros(k * (k + 1) * (k + 2) // 6) if K is None else np.array(K, float)
-    return Jet(c, error, a, slack, Q, thirds, E, np.zeros(1), np.zeros((1, k, k)), np.zeros(0), np.zeros((0, k)))
+    return Jet(c, error, a, slack, Q, thirds, E, np.zeros(1), np.zeros((1, k, k)), np.zeros(0), np.zeros((0, k)), 0.0)
 
 
 def given(jet: Jet, y: Sequence[Any]) -> Jet:

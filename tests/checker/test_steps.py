@@ -1,0 +1,90 @@
+"""Claims over steps, at a rate, around a level: what is planted beyond the truth is refused, and what lies within it is
+accepted. The truth is known in closed form (tests/support/steps.py), and integrated here once more."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from certify.checker.document import Certificate
+from tests.support.certificates import Document, parse, verdict
+from tests.support.steps import Family, families, shares
+
+FAMILIES = {family.name: family for family in families()}
+EACH = 6  # planted violations of a family
+
+
+def value(tree: object, names: dict[str, np.ndarray]) -> np.ndarray:
+    """An equation of these loops in binary64."""
+    if isinstance(tree, str):
+        return names[tree] if tree in names else np.asarray(float(Fraction(tree)))
+    assert isinstance(tree, list)
+    parts = [value(operand, names) for operand in tree[1:]]
+    result = parts[0]
+    for part in parts[1:]:
+        result = {"+": np.add, "*": np.multiply, "/": np.divide}[tree[0]](result, part)
+    return result
+
+
+def policy(c: Certificate, x: np.ndarray) -> np.ndarray:
+    """Of one layer, x (n, B)."""
+    [W], [bias], p = c.policy.weights, c.policy.biases, c.policy
+    squash = np.tanh if p.squash == "tanh" else lambda v: v
+    u = W @ x + (bias[:, None] if p.centre == "none" else 0.0)
+    return np.asarray(p.scale[:, None] * squash(u) + p.offset[:, None])
+
+
+def largest(data: Document) -> float:
+    """The largest D + 2 lambda V, as a part of V, at constant values at the ends of ranges and periods, on both levels."""
+    c = parse(data)
+    inner = c.c0 if c.practical else 1e-4 * c.c1
+    angles = np.linspace(0, 2 * np.pi, 360)
+    circle = np.array([[1.0, -1.0]]) if len(c.states) == 1 else np.stack([np.cos(angles), np.sin(angles)])
+    circle = np.linalg.inv(np.linalg.cholesky(c.P)).T @ circle
+    worst = -math.inf
+    for level, q, h in itertools.product(
+        (inner, c.c1, c.c2), itertools.product(*c.ranges), set(c.sample or (Fraction(int(c.discrete)),))
+    ):
+        x = circle * math.sqrt(level)
+        u = policy(c, x)
+
+        def f(at: np.ndarray, u: np.ndarray = u, q: tuple[Fraction, ...] = q) -> np.ndarray:
+            numbers = [*at, *u, *(np.asarray(float(v)) for v in q)]
+            names = dict(zip((*c.states, *c.inputs, *c.uncertain), numbers, strict=True))
+            return np.stack([value(tree, names) + 0 * at[0] for tree in c.dynamics.trees])
+
+        V, t = np.sum(x * (c.P @ x), axis=0), float(h)
+        if c.discrete:
+            rise = np.sum(f(x) * (c.P @ f(x)), axis=0) - V
+        elif t == 0:
+            rise = 2 * np.sum(x * (c.P @ f(x)), axis=0)
+        else:
+            after, step = x, t / 64
+            for _ in range(64):
+                k1 = f(after)
+                k2 = f(after + step / 2 * k1)
+                k3 = f(after + step / 2 * k2)
+                after = after + step / 6 * (k1 + 2 * k2 + 2 * k3 + f(after + step * k3))
+            rise = (np.sum(after * (c.P @ after), axis=0) - V) / t
+        worst = max(worst, float(np.max(rise / V + 2 * c.rate)))
+    return worst
+
+
+def test_there_are_enough_planted_violations() -> None:
+    near = sum(share < 0.05 for share in shares(EACH, np.random.default_rng(0)))
+    assert EACH * len(FAMILIES) >= 200 and 2 * near >= EACH
+
+
+@pytest.mark.parametrize("name", FAMILIES)
+def test_what_is_planted_is_refused_and_what_lies_within_is_accepted(name: str) -> None:
+    family: Family = FAMILIES[name]
+    generator = np.random.default_rng(len(name))
+    for number, share in enumerate(shares(EACH, generator)):
+        false, true = family.beyond(share), family.within(family.near * (1 + number / EACH))
+        assert largest(false) > 0 > largest(true), share
+        assert verdict(false) in ("local", "ring", "flow"), share
+        assert verdict(true) == "ACCEPTED", share
