@@ -6,12 +6,15 @@ from __future__ import annotations
 import itertools
 import math
 from fractions import Fraction
+from functools import reduce
 
 import numpy as np
 import pytest
 
 from certify.checker.document import Certificate
-from tests.support.certificates import Document, parse, verdict
+from tests.support.certificates import Document, dump, parse, verdict
+from tests.support.reference import judge
+from tests.support.step_forgeries import BASES, base, forgeries
 from tests.support.steps import Family, families, shares
 
 FAMILIES = {family.name: family for family in families()}
@@ -23,11 +26,13 @@ def value(tree: object, names: dict[str, np.ndarray]) -> np.ndarray:
     if isinstance(tree, str):
         return names[tree] if tree in names else np.asarray(float(Fraction(tree)))
     assert isinstance(tree, list)
-    parts = [value(operand, names) for operand in tree[1:]]
-    result = parts[0]
-    for part in parts[1:]:
-        result = {"+": np.add, "*": np.multiply, "/": np.divide}[tree[0]](result, part)
-    return result
+    name, *operands = tree
+    if name == "**":
+        return np.asarray(value(operands[0], names) ** operands[1])
+    parts = [value(operand, names) for operand in operands]
+    if len(parts) == 1:
+        return np.asarray({"-": np.negative, "sin": np.sin, "tanh": np.tanh}[name](parts[0]))
+    return np.asarray(reduce({"+": np.add, "*": np.multiply, "/": np.divide, "-": np.subtract}[name], parts))
 
 
 def policy(c: Certificate, x: np.ndarray) -> np.ndarray:
@@ -39,7 +44,7 @@ def policy(c: Certificate, x: np.ndarray) -> np.ndarray:
 
 
 def largest(data: Document) -> float:
-    """The largest D + 2 lambda V, as a part of V, at constant values at the ends of ranges and periods, on both levels."""
+    """The largest (D + 2 lambda V) / V on all levels, at constant values at the ends of ranges and of periods."""
     c = parse(data)
     inner = c.c0 if c.practical else 1e-4 * c.c1
     angles = np.linspace(0, 2 * np.pi, 360)
@@ -88,3 +93,39 @@ def test_what_is_planted_is_refused_and_what_lies_within_is_accepted(name: str) 
         assert largest(false) > 0 > largest(true), share
         assert verdict(false) in ("local", "ring", "flow"), share
         assert verdict(true) == "ACCEPTED", share
+
+
+# ------------------------------------------------------------------------------------------------------------ forgeries
+
+
+@pytest.mark.parametrize("name", BASES)
+def test_the_originals_are_accepted(name: str) -> None:
+    assert verdict(base(name)) == "ACCEPTED"
+    assert largest(base(name)) < 0
+
+
+@pytest.mark.parametrize("name", BASES)
+def test_the_second_checker_accepts_the_originals(name: str) -> None:
+    assert judge(base(name)) is None
+
+
+def test_forgeries_are_refused_by_the_rule_that_is_meant() -> None:
+    each = [(rule, what, verdict(data)) for rule, what, data in forgeries()]
+    wrong = [f"{what}: {found} in place of {rule}" for rule, what, found in each if found != rule]
+    assert not wrong, "\n".join(wrong)
+    assert len(each) >= 300 and len({what for _, what, _ in each}) == len(each)
+    apart = [what for rule, what, _ in each if rule != "format"]
+    assert len(apart) >= 300 and {"local", "flow", "ring", "levels"} <= {rule for rule, *_ in each}
+
+
+def test_forgeries_differ_from_the_originals() -> None:
+    honest = {dump(base(name)) for name in BASES}
+    files = [dump(data) for *_, data in forgeries()]
+    assert not honest & set(files) and len(set(files)) == len(files)
+
+
+@pytest.mark.parametrize("rule", sorted({rule for rule, *_ in forgeries()}))
+def test_the_second_checker_refuses_forgeries(rule: str) -> None:
+    each = [(what, judge(data)) for stated, what, data in forgeries() if stated == rule]
+    wrong = [f"{what}: {found} in place of {rule}" for what, found in each if found != rule]
+    assert not wrong, "\n".join(wrong)

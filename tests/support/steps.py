@@ -1,7 +1,7 @@
 """Small loops that go in steps, decay at a rate, or stay near a level, whose truth is known.
 
-V is x'x on a ball alone (c1 = c2), unless a loop says otherwise. Multipliers are hints: they are balanced for the models
-that the checker finds, and only decide whether something is accepted, never whether it is true.
+V is x'x on a ball alone (c1 = c2), unless a loop says otherwise. Multipliers are hints: they are balanced for the
+models that the checker finds, and only decide whether something is accepted, never whether it is true.
 """
 
 from __future__ import annotations
