@@ -3,6 +3,7 @@ ball and on leaves, with what is uncertain switching within the period, and the 
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,6 +20,7 @@ from certify.checker.case import Case
 from certify.checker.decrease import Level, Models, sides, size_beyond
 from certify.checker.document import Multipliers
 from certify.checker.exact import exactly
+from certify.checker.flow import Series
 from certify.checker.jets import Jet, between, uncertain
 from certify.checker.local import Local
 from certify.checker.network import enclose_on_boxes
@@ -27,7 +29,7 @@ from tests.checker.test_ball import points
 from tests.checker.test_cubic import FUNCTIONS, JUST, Member, closeness, derivatives, random_jet, shares, value
 from tests.checker.test_uncertain import holds
 from tests.support.certificates import Document, edited, make, parse
-from tests.support.jets import curved, given
+from tests.support.jets import curved, given, no_units, plain
 from tests.support.leaves import on_boxes
 from tests.support.steps import fitted
 
@@ -264,6 +266,16 @@ def test_a_symbol_in_the_place_of_the_mean_is_not_enough_for_its_square() -> Non
     assert jet.c + jet.error >= 1.0
 
 
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_the_order_of_values_within_a_period_counts(order: int) -> None:
+    """x' = q, y' = x: the same, and linear in q."""
+    h, case = 0.25, Case(parse(idle(["q", "x"], "q", "1/4", order)))
+    for jet, each in zip(Local(case).G(next(iter(case.cells))), (0.0, h / 4), strict=True):
+        assert within_jet(jet, [0.0], np.zeros(2), each, 1e-12)
+    for model, each in zip(on_boxes(Ring(case), np.zeros((2, 1)), np.full((2, 1), 0.01))[1], (0.0, h / 4), strict=True):
+        assert holds(replace_slack(model), 0, 2, 1, [0.0, 0.0, 0.0], arb(each))
+
+
 @pytest.mark.parametrize("order", [1, 2, 3, 5])
 def test_what_switches_within_a_period_may_do_what_no_constant_does(order: int) -> None:
     """x' = q, y' = p x: from 0, with p = 1, and q = 1 and then -1, y rises by h^2/4, and q has mean 0."""
@@ -275,6 +287,39 @@ def test_what_switches_within_a_period_may_do_what_no_constant_does(order: int) 
         assert within_jet(jet, [0.0, 1.0], np.zeros(2), each, 1e-12)
     for model, each in zip(on_boxes(Ring(case), np.zeros((2, 1)), np.full((2, 1), 0.01))[1], true, strict=True):
         assert holds(replace_slack(model), 0, 2, 2, [0.0, 0.0, 0.0, 1.0], arb(each))
+
+
+@dataclasses.dataclass(frozen=True)
+class Number:
+    """An arithmetic for series, of one number each."""
+
+    v: arb
+
+    def __add__(self, other: Number) -> Number:
+        return Number(self.v + other.v)
+
+    def __neg__(self) -> Number:
+        return Number(-self.v)
+
+    def __mul__(self, other: Number) -> Number:
+        return Number(self.v * other.v)
+
+    def function(self, name: str) -> Number:
+        return Number(1 / self.v if name == "inv" else getattr(self.v, name)())
+
+
+@pytest.mark.parametrize("name", ["sin", "cos", "exp", "tanh", "atan", "sqrt", "inv"])
+@pytest.mark.parametrize("length", [1, 2, 4, 7])
+def test_coefficients_of_functions_are_those_of_the_series(name: str, length: int) -> None:
+    """phi(v) at several instants, from the coefficients of v: what is left is of the order that follows."""
+    generator, count = np.random.default_rng(length), 7
+    v = [Number(arb(float(c))) for c in [1.5, *generator.uniform(-1, 1, length - 1)]]
+    with ctx.workprec(400):
+        found = Series(v, count, lambda q: Number(arb(q.numerator) / q.denominator)).function(name).parts
+        for t in (arb(2) ** -20, -(arb(2) ** -21)):
+            at = sum((c.v * t**k for k, c in enumerate(v)), arb(0))
+            left = Number(at).function(name).v - sum((c.v * t**k for k, c in enumerate(found)), arb(0))
+            assert abs(left) < 1000 * abs(t) ** count
 
 
 # -------------------------------------------------------------------------------------------- the inequality of a step
@@ -363,6 +408,19 @@ def test_the_sides_of_a_step_bound_what_they_stand_for(n: int, level: bool, h: f
                 assert true <= bound + 1e-9 * (1 + abs(bound))
                 closest = min(closest, (bound - true) / (1 + abs(bound)))
     assert closest < 0.5
+
+
+def test_what_is_left_counts_twice_with_the_value_that_it_is_added_to() -> None:
+    """Next to x = 0 the increment f + c d^2 has the square f^2 + 2 f c d^2 + c^2 d^4."""
+    f, c, small = 1.0, 0.5, 2.0**-30
+    jet = plain(np.float64(f), 0.0, np.zeros(1), 0.0, np.full((1, 1), c), np.zeros((1, 1)))
+    models, one = Models(np.full((1, 1), small), [jet], no_units(1), False), np.eye(1)
+    by, around = Multipliers((fmpq(1),), (fmpq(1),), (fmpq(1),), one), Level(q(1.0), q(0.0))
+    decay, rest = sides(models, exactly(one), exactly(0 * one), by, None, q(1.0), q(size_beyond(models, one)), around)
+    left = numbers(decay - rest)
+    for d in (1.0, -1.0, 0.5):
+        y, true = np.array([1.0, d]), (f + c * d * d) ** 2
+        assert true - 1e-6 <= -(y @ left @ y) <= true + c * c + 1e-6  # S_apart has c^2 more
 
 
 def q(value_: float) -> fmpq:

@@ -15,7 +15,7 @@ from certify.checker.document import Certificate
 from tests.support.certificates import Document, dump, parse, verdict
 from tests.support.reference import judge
 from tests.support.step_forgeries import BASES, base, forgeries
-from tests.support.steps import Family, families, shares
+from tests.support.steps import Family, families, peaked, shares
 
 FAMILIES = {family.name: family for family in families()}
 EACH = 6  # planted violations of a family
@@ -93,6 +93,14 @@ def test_what_is_planted_is_refused_and_what_lies_within_is_accepted(name: str) 
         assert largest(false) > 0 > largest(true), share
         assert verdict(false) in ("local", "ring", "flow"), share
         assert verdict(true) == "ACCEPTED", share
+
+
+@pytest.mark.parametrize("peak", [0.5, 0.501, 0.52, 0.6, 0.75, 0.9])
+def test_a_step_out_of_what_is_to_be_kept_is_refused(peak: float) -> None:
+    """D is negative wherever V >= c0, and from 0 a step leads to the peak, beyond c0."""
+    assert largest(peaked(peak)) < 0
+    assert verdict(peaked(peak)) == "ring"
+    assert verdict(peaked(0.95 - peak)) == "ACCEPTED"
 
 
 # ------------------------------------------------------------------------------------------------------------ forgeries

@@ -233,6 +233,18 @@ def moved(kind: str, c: float = 0.5, w: float = 0.0625, h: str = "1/8") -> Famil
     return Family(f"moved, {kind}", low, claim, near=0.05, falls=True)
 
 
+def bent_rate() -> Family:
+    """x' = x^3/4 - x decays at the rate 1 - x^2/4, the least of which in {x^2 <= 1} is 3/4, on leaves."""
+    plant = [["+", ["*", "1/4", ["**", "x", 3]], "u"]]
+    return Family("bent, rate", 0.75, lambda rate: grow(fitted(linear(plant, 1.0, (0.01, 1.0), rate=rate)), 800, 14))
+
+
+def peaked(peak: float) -> Document:
+    """x+ = peak / (1 + 4 x^2) in discrete time, without a ball; {|x| <= 1/2} is kept if peak is below 1/2."""
+    plant = [["+", ["/", exactly(peak), ["+", "1", ["*", "4", "x", "x"]]], ["*", "0", "u"]]]
+    return grow(linear(plant, 0.0, (0.25, 1.0), claim="practical", time="discrete"), 400, 12)
+
+
 def families() -> Iterator[Family]:
     for a, b, h, order in ((0.0, 1.0, "1/2", 2), (0.5, 2.0, "1/4", 5), (-1.0, 0.5, "1/4", 6), (1.0, 1.0, "1/8", 5)):
         yield held_gain(a, b, h, order)
@@ -254,7 +266,7 @@ def families() -> Iterator[Family]:
     yield from (floor("continuous", 1.0, 0.25), floor("continuous", 3.0, 0.5), floor("discrete", 0.5, 0.125))
     yield from (floor("discrete", 1.5, 0.25), floor("held", 2.0, 0.5), floor("held", 6.0, 0.25))
     yield from (turning(0.25), turning(0.5), saturated("held"), saturated("discrete"))
-    yield from (moved("held"), moved("discrete"))
+    yield from (moved("held"), moved("discrete"), bent_rate())
 
 
 def with_multipliers(data: Document, change: Callable[[np.ndarray], Any]) -> Document:
