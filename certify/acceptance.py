@@ -16,11 +16,12 @@ from pathlib import Path
 from typing import Any
 
 from certify.certificate import Certificate, PartitionTree, TrustedSolver, run_checker, write_beside
-from certify.claims import Asymptotic, Enlarged, Problem, Reached
+from certify.claims import Asymptotic, Enlarged, Nearby, Practical, Problem, Reached
 from certify.engines.bounds.mend import below_leaf, split_again
 from certify.errors import SoundnessError
 
 _SPLITS, _LOWERINGS = 3, 9  # of what the checker refuses
+_HIGHER = 1.5  # the next floor, after one that is refused
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,7 +108,13 @@ class Clerk:
 
 
 def _what_is_lower(first: Certificate, certificate: Certificate) -> str:
-    said = ["it is left out with its tube"] if first.kind != certificate.kind else []
+    said = []
+    if first.kind != certificate.kind:
+        what = "that trajectories converge to one equilibrium" if isinstance(first.claim, Nearby) else "it"
+        said.append(f"{what} is left out" + ("" if isinstance(first.claim, Nearby) else " with its tube"))
+    floors = [c.claim.floor for c in (certificate, first) if isinstance(c.claim, Practical)]
+    if len(floors) == 2 and floors[0] > floors[1]:
+        said.append(f"the floor is {floors[0]:.6g} in the place of {floors[1]:.6g}")
     if certificate.roa < first.roa:
         said.append(f"the level is {certificate.roa:.6g} in the place of {first.roa:.6g}")
     return ", ".join(said)
@@ -120,7 +127,7 @@ def _wanted(certificate: Certificate) -> str:
 def _leaf_of(answer: Mapping[str, Any]) -> int | None:
     """The number of the leaf that the checker refuses; None if it refuses something else."""
     found = re.fullmatch(r"leaf (\d+)", str(answer.get("at", "")))
-    return int(found[1]) if found and answer.get("rule") in ("ring", "inputs") else None
+    return int(found[1]) if found and answer.get("rule") in ("ring", "inputs", "flow") else None
 
 
 def _lowered(certificate: Certificate, leaf: int | None, problem: Problem, tries: int) -> Certificate | None:
@@ -129,9 +136,15 @@ def _lowered(certificate: Certificate, leaf: int | None, problem: Problem, tries
     claim, evidence = certificate.claim, certificate.evidence
     if not isinstance(evidence, PartitionTree):
         return None
+    if isinstance(claim, Nearby):
+        weaker = Practical(claim.roa, claim.local, claim.floor, rate=claim.rate)
+        return replace(certificate, claim=weaker, evidence=replace(evidence, contraction=None))
     if isinstance(claim, Enlarged | Reached):  # without its tube, what is refused may not be asked any more
         return replace(certificate, claim=Asymptotic(claim.roa, claim.local), evidence=replace(evidence, tube=()))
     if leaf is None or claim.inner == claim.roa:
+        if isinstance(claim, Practical):
+            floor = _HIGHER * claim.floor
+            return replace(certificate, claim=replace(claim, floor=floor)) if floor < claim.local else None
         if not isinstance(claim, Asymptotic):
             return None
         return _local_only(certificate, claim.local / (2 if claim.inner == claim.roa else 1))
@@ -144,4 +157,4 @@ def _lowered(certificate: Certificate, leaf: int | None, problem: Problem, tries
 
 def _local_only(certificate: Certificate, level: float) -> Certificate:
     """A claim of the local set alone, of which no leaf is asked."""
-    return replace(certificate, claim=Asymptotic(roa=level, local=level))
+    return replace(certificate, claim=Asymptotic(roa=level, local=level, rate=certificate.claim.rate))

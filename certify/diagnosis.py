@@ -98,7 +98,12 @@ def _binding(result: RoaResult) -> tuple[str, str, str | None, str | None, Array
             if found is not None:
                 name, side, value = found
                 return f"{name} leaves its {side} bound {value:g} at {where}", "input", name, side, witness.x
-        return f"Vdot = 0 near {where}", "vdot", None, None, witness.x
+        what = (
+            "Vdot = 0"
+            if result.timing.is_plain and not result.timing.rate
+            else f"V does not fall enough{result.timing.over_what}"
+        )
+        return f"{what} near {where}", "vdot", None, None, witness.x
     return result.reason, result.stop.name.lower(), None, None, None
 
 

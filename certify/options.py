@@ -16,7 +16,7 @@ from certify.lyapunov import Candidate, Named
 
 Array = NDArray[np.float64]
 EngineName = Literal["bounds", "dreal", "both"]
-Asked = Literal["auto", "asymptotic", "practical"]
+Asked = Literal["auto", "asymptotic", "practical", "nearby"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,8 +25,9 @@ class RoaOptions:
 
     Parameters
     ----------
-    claim : `asymptotic`, or `practical`, which asks for no equilibrium at the origin; `auto` is the first where the
-        loop rests at the origin exactly, and the second where it does not.
+    claim : `asymptotic`; `practical`, which asks for no equilibrium at the origin; `nearby`, which is that and, if it
+        can be shown, that all trajectories converge to one equilibrium where what is uncertain is constant. `auto` is
+        the first where the loop rests at the origin exactly, and the last where it does not.
     candidate : where P comes from, see `choose_candidate`, or `robust`, which chooses P with the local rule's own
         bounds; `auto` tries several and keeps the one with which the largest volume is proved. With Q, R or a level it
         is `lyapunov`, or `lqr` if R is given.
@@ -88,7 +89,7 @@ class RoaOptions:
             raise InputError(f"`box` must have positive half-widths; found {dict(self.box)}.")
         if self.reach_from is not None and not all(math.isfinite(v) for v in self.reach_from.values()):
             raise InputError(f"`reach_from` must be a state of finite numbers; found {dict(self.reach_from)}.")
-        if self.enlarges and (self.engine == "dreal" or self.claim == "practical"):
+        if self.enlarges and (self.engine == "dreal" or self.claim in ("practical", "nearby")):
             raise InputError(
                 "`enlarge` needs the engine bounds and a claim that is not practical: a tube ends in a set "
                 "that the checker can replay, and from which trajectories converge."

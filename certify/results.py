@@ -24,6 +24,7 @@ from certify.engines.falsify import Witness
 from certify.errors import InputError
 from certify.lyapunov import are_inside, extents, semi_axes, volume
 from certify.policies import TanhNetwork
+from certify.report.timing import Timing, reach_time
 from certify.report.words import below, varying, varying_in, volume_name, volume_unit
 from certify.rest import Rest
 from certify.systems import System
@@ -40,8 +41,8 @@ _STAGES = ("load", "candidate", "local", "ring", "tube", "write", "check", "tota
 class Levels:
     """Levels of V. None means that there is none.
 
-    `local` (c1) and `roa` (c2) state an asymptotic claim, `floor` (c0) and `roa` a practical one. `sampled_limit` is
-    where the lowest violation was found, `domain_limit` where the set meets the domain.
+    `local` (c1) and `roa` (c2) state an asymptotic claim, `floor` (c0), `local` and `roa` a practical one.
+    `sampled_limit` is where the lowest violation was found, `domain_limit` where the set meets the domain.
     """
 
     local: float | None = None
@@ -52,8 +53,17 @@ class Levels:
 
     @property
     def inner(self) -> float | None:
-        """The level from which the ring reaches outwards."""
-        return self.floor if self.local is None else self.local
+        """The level of the inner set that the claim speaks of: c0 of a practical claim, else c1."""
+        return self.local if self.floor is None else self.floor
+
+    @property
+    def ultimate(self) -> float | None:
+        """c0 of a practical claim: the level below which every trajectory ends."""
+        return self.floor
+
+    def to_dict(self) -> dict[str, float | None]:
+        """For JSON."""
+        return {**{name: getattr(self, name) for name in self.__slots__}, "ultimate": self.ultimate}
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,6 +221,22 @@ class RoaResult:
         return self.stop.explain(self.detail)
 
     @property
+    def timing(self) -> Timing:
+        """How time passes in the loop, and the rate that was asked for."""
+        return Timing.of(self.system, 0.0 if self.problem is None else self.problem.rate)
+
+    @property
+    def reach_time(self) -> float | None:
+        """By when a trajectory from {V <= c2} certainly is in {V <= c0}, or, without a c0, has come to a hundredth of
+        its V; in units of time of the plant, in discrete time in steps. None without a proved set or a rate.
+
+        Where the input is held a sampling instant has come by then at which that is so.
+        """
+        if self.verdict is not Verdict.PROVED:
+            return None
+        return reach_time(self.timing, self.levels.floor, self.levels.roa)
+
+    @property
     def volume(self) -> float | None:
         """A certain lower bound of the proved set's volume, in the product of the states' units; None without a set.
 
@@ -311,9 +337,11 @@ class RoaResult:
     def __repr__(self) -> str:
         said = dict(self._stated())
         verdict = said["verdict"] if self.claim == "asymptotic" else f"{said['verdict']} {self.claim}"
-        shown = [verdict, *(said[name] for name in ("plant", "set") if name in said)]
+        shown = [verdict, *(said[name] for name in ("plant", "in time", "set") if name in said)]
         shown += [
-            f"{name} {said[name]}" for name in ("length", "area", "volume", "limited by", "reason") if name in said
+            f"{name} {said[name]}"
+            for name in ("rate", "length", "area", "volume", "limited by", "reason")
+            if name in said
         ]
         return f"RoaResult({'; '.join(shown)})"
 
@@ -328,6 +356,10 @@ class RoaResult:
         rows = [("verdict", self.verdict.value), ("plant", self.system.name), ("claim", self.claim)]
         if self.system.ranges:
             rows.append(("for every", varying(varying_in(self.system))))
+        if not self.timing.is_plain:
+            rows.append(("in time", "by steps" if self.timing.discrete else f"input held over {self.timing.periods}"))
+        if self.timing.rate:
+            rows.append(("rate", self.timing.shown_rate))
         shown = self.verdict in (Verdict.PROVED, Verdict.TRUSTED)
         level, size = (self.levels.roa, self.volume) if shown else (None, None)
         if level is not None and size is not None:
@@ -340,6 +372,12 @@ class RoaResult:
             rows.append(("reason", self.reason))
         rows += [("certificate", str(self.certificate))] if self.certificate is not None else []
         return rows + [("notice", text) for text in (self.notice, *self.notices) if text is not None]
+
+    def _claim(self) -> dict[str, Any]:
+        """The claim's kind, with the rate and the periods where there are any."""
+        rate = {"rate": self.timing.rate} if self.timing.rate else {}
+        sample = self.system.sample
+        return {"kind": self.claim, **rate, **({} if sample is None else {"sample": [str(h) for h in sample]})}
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON object of `certify roa --json`; lengths along the states are in their units."""
@@ -354,7 +392,8 @@ class RoaResult:
             "verdict": self.verdict.value,
             "reason": self.reason,
             "stop": self.stop.name.lower(),
-            "claim": {"kind": self.claim},
+            "claim": self._claim(),
+            "time": self.system.time,
             "system": system.name,
             "parameters": {name: str(q) for name, q in system.parameters.items()},
             "uncertain": [
@@ -376,7 +415,8 @@ class RoaResult:
                 "candidate": self.candidate,
                 "notice": self.notice,
             },
-            "levels": {name: getattr(self.levels, name) for name in Levels.__slots__},
+            "levels": self.levels.to_dict(),
+            "reach_time": self.reach_time,
             "reach_from": None
             if self.reach_from is None
             else {s.name: str(q) for s, q in zip(system.states, self.reach_from, strict=True)},

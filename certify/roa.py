@@ -28,11 +28,12 @@ from certify.certificate import (
     require_within_limits,
     sole_writer,
 )
-from certify.claims import Asymptotic, Claim, Enlarged, Problem, Reached
+from certify.claims import Asymptotic, Claim, Enlarged, Nearby, Practical, Problem, Reached
 from certify.claims.claim import Kind
 from certify.closed_loop import ClosedLoop
 from certify.diagnosis import diagnose
 from certify.engines.base import Attempt, Budget, Progress, Proof, Task
+from certify.engines.contraction import contraction
 from certify.engines.falsify import Witness, refutes
 from certify.errors import BackendError, InputError, SoundnessError
 from certify.lyapunov import are_inside, leaves_domain, slowest_decay, volume
@@ -139,6 +140,7 @@ class _Run:
     aside: str | None = None
     centre: tuple[Fraction, ...] | None = None  # of a tube around a path, in deviations
     missed: str = ""  # why there is no such tube
+    converging: bool = False  # of a practical claim: to ask for one equilibrium as well
     share: float = 1.0  # of the time, up to which a stage may go on
 
     def result(self) -> RoaResult:
@@ -214,7 +216,8 @@ class _Run:
         ------
         InputError : the claim `asymptotic` is asked for, and the loop does not rest at the origin.
         """
-        if self.options.claim == "practical":
+        self.converging = self.options.claim in ("auto", "nearby") and not self.system.in_steps
+        if self.options.claim in ("practical", "nearby"):
             return "practical"
         try:
             loop.require_rest()
@@ -386,10 +389,17 @@ class _Run:
         if self.options.enlarges and isinstance(claim, Asymptotic) and isinstance(evidence, PartitionTree):
             around = self._enlarge if self.centre is None else self._surround
             facts, claim, evidence = around(race, claim, evidence)
+        if self.converging and isinstance(claim, Practical) and isinstance(evidence, PartitionTree):
+            closer = contraction(task.problem, best.trial.T, claim.floor)
+            if closer is not None:
+                claim = Nearby(claim.roa, claim.local, claim.floor, rate=claim.rate)
+                evidence = replace(evidence, contraction=closer)
         certificate = Certificate(self.system, self.network, task.problem.V, claim, evidence, self.provenance)  # type: ignore[arg-type]
         accepted = self._clerk().accepted(certificate, task.problem)
         certificate = accepted.certificate
         result = replace(result, notice=accepted.mended or result.notice)
+        if isinstance(certificate.claim, Nearby):
+            result = replace(result, claim=certificate.claim.kind)
         if isinstance(certificate.claim, Enlarged | Reached):
             result = replace(result, claim=certificate.claim.kind, tube=facts)
         elif self.centre is not None and not _holds(task.problem, certificate.roa, self.centre):

@@ -26,6 +26,7 @@ EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows th
     "engines": "certificate claims closed_loop enclosures expressions lyapunov policies rigorous running systems",
     "float_error": "closed_loop policies rigorous systems",
     "inputs": "policies systems",
+    "largest": "certificate claims closed_loop engines lyapunov options policies results roa systems",
     "lyapunov": "closed_loop",
     "options": "lyapunov",
     "policies": "systems",

@@ -50,6 +50,8 @@ def _examine(path: str) -> tuple[int, dict[str, Any]]:
     tally = rules.check(c)
     seconds = {"start": ready - start, "check": time.perf_counter() - ready}
     answer: dict[str, Any] = {"certificate_sha256": c.sha256, "policy_sha256": c.policy.sha256(), "claim": c.claim}
+    sample = None if c.sample is None else [str(h) for h in c.sample]
+    answer |= {"rate": c.rate, "sample": sample, "discrete": c.discrete}
     answer |= {"levels": c.levels, "rules": tally.rules, "seconds": seconds}
     if isinstance(c.evidence, document.Trusted):
         answers = [": ".join(pair) for pair in c.evidence.queries]

@@ -25,6 +25,7 @@ from .jets import Jet, triples, unpacked
 from .pairs import bound_of_pairs, in_binary64
 
 _NOTHING = fmpq(0)
+_SHARE = fmpq(1, 4)
 
 
 @dataclass(frozen=True)
@@ -36,8 +37,8 @@ class Level:
 
 
 class Models:
-    """G on a ball: `f_i + a_i.d + d'Q_i d + K_i[d] + sum_jq B_ij L_jq e_q + r_i`, (f_i, a_i) within s_i, |r_i| <=
-    d'E_i d; d has k entries. Along a path it is F - v. At rest f_i is exactly 0, so that s_i is about a_i alone."""
+    """G on a ball: `f_i + a_i.d + d'Q_i d + K_i[d] + sum_jq B_ij L_jq e_q + r_i`, f_i within `error`, a_i within
+    `slack`, |r_i| <= d'E_i d; d has k entries. Along a path it is F - v. At rest f_i is exactly 0."""
 
     def __init__(self, J: Array, G: Sequence[Jet], units: Units, rest: bool, velocity: Sequence[fmpq] = ()) -> None:
         """J is (n, n), v the velocity of a path, `rest` says whether G vanishes at d = 0. Parameters are finite; see
@@ -47,7 +48,8 @@ class Models:
         self.shares = np.array([g.B for g in G])
         self.B = exactly(self.shares)
         self.A = exactly(np.array([g.a for g in G]))
-        self.slack = [rational(g.slack) + (0 if rest else rational(g.error)) for g in G]
+        self.slack = [rational(g.slack) for g in G]
+        self.error = [fmpq(0) if rest else rational(g.error) for g in G]
         self.Qs, self.Es = np.array([g.Q.ravel() for g in G]), np.array([g.E for g in G])
         self.Q = [exactly(g.Q) for g in G]
         self.E = [exactly(g.E) for g in G]
@@ -109,7 +111,6 @@ def sides(
         )
     b = P * (U + h * Y)  # b_i is row i
     rows = [fmpq_mat(1, k, row[first:]) for row in b.tolist()]
-    whole = [root_above(sum((v * v for v in row), fmpq(0))) for row in b.tolist()]
     squares = [row.transpose() * row for row in rows]
     lengths = [root_above((row * row.transpose())[0, 0]) for row in rows]
     crossed = U.transpose() * P * Y
@@ -132,21 +133,36 @@ def sides(
     if not all(beta > 0 for beta in by.apart):
         inverse = diagonal([1 / g for g in shares])
         rest += diagonal(shares) + sum((C.transpose() * inverse * C for C in joint), fmpq_mat(k, k))
-    wrong = 2 * sum((length * s for length, s in zip(whole, models.slack, strict=True)), fmpq(0))
-    if h > 0:
-        s = sum((root_above(P[i, i]) * slack for i, slack in enumerate(models.slack)), fmpq(0))
-        f = fmpq_mat(len(models.f), 1, models.f) if first else fmpq_mat(P.nrows(), 1)
-        start = root_above((f.transpose() * P * f)[0, 0])
-        rest += diagonal([h * beyond * (beyond + 2 * start + s)] * k)
-        wrong += h * s * (s + beyond)
+    at_0, along = doubts(models, P, h, beyond, [abs(row[0]) if first else fmpq(0) for row in b.tolist()], lengths)
+    f = fmpq_mat(len(models.f), 1, models.f) if first else fmpq_mat(P.nrows(), 1)
+    start = root_above((f.transpose() * P * f)[0, 0])
+    rest += diagonal([along + h * beyond * (beyond + 2 * start)] * k)
     if first:
-        rest = fmpq_mat([[0] * (k + 1), *([0, *row] for row in rest.tolist())])
+        rest = fmpq_mat([[at_0, *[0] * k], *([0, *row] for row in rest.tolist())])
     if level is not None:
         form += level.edge * (U.transpose() * P * U)
         form[0, 0] -= level.edge * level.c0
     if path is not None:
         form = with_edge(form, models, P, path)
-    return -form, rest + diagonal([wrong] * rest.nrows())
+    return -form, rest
+
+
+def doubts(
+    models: Models, P: fmpq_mat, h: fmpq, beyond: fmpq, at_0: Sequence[fmpq], lengths: Sequence[fmpq]
+) -> tuple[fmpq, fmpq]:
+    """What errors of f and slacks of a come to in the entry of 1, and in each entry of d.
+
+    `at_0` and `lengths` are the magnitudes of b_i's first entry, and of the rest of it. Twice a product of 1 and ||d||
+    is at most `_SHARE` + ||d||^2 / `_SHARE`.
+    """
+    roots = [root_above(P[i, i]) for i in range(P.nrows())]
+    e = sum((root * v for root, v in zip(roots, models.error, strict=True)), fmpq(0))
+    s = sum((root * v for root, v in zip(roots, models.slack, strict=True)), fmpq(0))
+    pairs = list(zip(at_0, lengths, models.error, models.slack, strict=True))
+    both = sum((length * wrong + p * slack for p, length, wrong, slack in pairs), h * e * s)
+    start = 2 * sum((p * wrong for p, _, wrong, _ in pairs), fmpq(0)) + h * e * e
+    along = 2 * sum((length * slack for _, length, _, slack in pairs), fmpq(0)) + h * s * s + 2 * h * beyond * (e + s)
+    return start + _SHARE * both, along + both / _SHARE
 
 
 def size_beyond(models: Models, P: Array) -> float:

@@ -10,7 +10,7 @@ from .document import Array, Certificate, Partition, Policy
 
 CLAIMS = {
     "asymptotic": "the origin is asymptotically stable, and every trajectory of the closed loop that starts in "
-    "V <= {c.c2!r} stays there and converges to the origin",
+    "V <= {c.c2!r}{when[start]} {when[stays]} and converges to the origin",
     "enlarged": "the origin is asymptotically stable; every trajectory of the closed loop that starts in V <= {c.c2!r} "
     "stays there and converges to the origin, and every one that starts in x'Sx <= 1 stays in the domain, is in "
     "V <= {c.c2!r} after {time!r} units of time at the latest, and converges to the origin",
@@ -20,10 +20,61 @@ CLAIMS = {
     "nearby": "every trajectory of the closed loop that starts in V <= {c.c2!r} stays there, enters V <= {c.c0!r} in "
     "finite time and stays there from then on; and where what is uncertain is constant in time, there is exactly one "
     "equilibrium in V <= {c.c0!r}, and all of these trajectories converge to it",
-    "practical": "every trajectory of the closed loop that starts in V <= {c.c2!r} stays there, enters "
-    "V <= {c.c0!r} in finite time and stays there from then on; nothing is claimed about what happens inside "
+    "practical": "every trajectory of the closed loop that starts in V <= {c.c2!r}{when[start]} {when[stays]}, enters "
+    "V <= {c.c0!r} {when[enters]} and {when[remains]} from then on; nothing is claimed about what happens inside "
     "V <= {c.c0!r}, and the origin need not be an equilibrium",
 }
+
+_AT_ONCE = {"start": "", "stays": "stays there", "enters": "in finite time", "remains": "stays there"}
+_BY_STEPS = {
+    "start": "",
+    "stays": "is there at every later step",
+    "enters": "after finitely many steps",
+    "remains": "is there at every step",
+}
+_SAMPLED = {
+    "start": " at a sampling instant",
+    "stays": "is there at every later sampling instant, is in the domain at all times",
+    "enters": "at some sampling instant",
+    "remains": "is there at every sampling instant",
+}
+_SAMPLED_FROM_0 = {**_SAMPLED, "stays": "is there at all later times", "remains": "is there at all times"}
+
+
+def claim(c: Certificate) -> list[str]:
+    """What is claimed: of which trajectories, and with a sample or a rate what these add."""
+    when = _BY_STEPS if c.discrete else _AT_ONCE
+    lines = []
+    if c.sample is not None:
+        lo, hi = c.sample
+        when = _SAMPLED if lo else _SAMPLED_FROM_0
+        each = f"any sequence of periods in {_interval(c.sample)}" if lo < hi else f"exactly {_number(hi)}"
+        lines.append(f"  the input is held from each sampling instant to the next, for {each} units of time")
+    if c.rate:
+        lines.append(f"  {_falls(c)}, lambda = {c.rate!r}")
+    said = CLAIMS[c.claim].format(c=c, time=duration(c), when=when)
+    return [f"claim: {said}; u stays in its bounds", *lines]
+
+
+def _falls(c: Certificate) -> str:
+    """How fast V falls under a rate, and what that says of reaching c0, if there is one."""
+    if c.discrete:
+        bound, latest = "V(x_k) <= V(x_0) exp(-2 lambda k) after k steps", "after {} steps, rounded up, at the latest"
+    elif c.sample is None:
+        bound, latest = "V(x(t)) <= V(x(0)) exp(-2 lambda t)", "after {} units of time at the latest"
+    else:
+        bound = "V(x(t_k)) <= V(x(t_0)) exp(-2 lambda (t_k - t_0)) at sampling instants"
+        latest = "at every sampling instant that comes {} units of time or more after the start"
+    if "floor" not in c.levels:
+        return bound
+    reached = latest.format("log(c2/c0)/(2 lambda)")
+    return f"{bound}, until V <= {c.c0!r}, where the trajectory is {reached}"
+
+
+def _falling(c: Certificate) -> str:
+    """What the ring bounds from above."""
+    name = "Vdot" if not c.discrete and c.sample is None else "D"
+    return f"({name} + 2 lambda V)" if c.rate else name
 
 
 def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
@@ -36,12 +87,17 @@ def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
     else:
         local, ring = answer["margins"]["local"], answer["margins"]["ring"]
         margins = [] if local is None else [f"local {local:.1%}"]
-        margins += [] if ring is None else [f"smallest bound of -Vdot on a ring's leaf {ring:.3g}"]
+        margins += [] if ring is None else [f"smallest bound of -{_falling(c)} on a ring's leaf {ring:.3g}"]
         rest, verdict = f"margins: {'; '.join(margins)}", "ACCEPTED"
+    after = "+" if c.discrete else "'"
+    left = "x+" if c.discrete else "xdot"
     return [
-        f"plant {c.name}: xdot = f(x, u), states ({', '.join(c.states)}), inputs ({', '.join(c.inputs)})",
-        *(f"  for every {name}(t) in {_interval(pair)}" for name, pair in zip(c.uncertain, c.ranges, strict=True)),
-        *(f"  {name}' = {expression(tree)}" for name, tree in zip(c.states, c.dynamics.trees, strict=True)),
+        f"plant {c.name}: {left} = f(x, u), states ({', '.join(c.states)}), inputs ({', '.join(c.inputs)})",
+        *(
+            f"  for every {name}({'k' if c.discrete else 't'}) in {_interval(pair)}"
+            for name, pair in zip(c.uncertain, c.ranges, strict=True)
+        ),
+        *(f"  {name}{after} = {expression(tree)}" for name, tree in zip(c.states, c.dynamics.trees, strict=True)),
         *(f"  domain {name} in {_interval(pair)}" for name, pair in zip(c.states, c.domain, strict=True)),
         *(f"  input {name} in {_interval(pair)}, u_eq = {_number(u)}" for name, pair, u in inputs),
         f"policy {'-'.join(map(str, widths))} tanh, squash {c.policy.squash}, centred by {c.policy.centre}, "
@@ -50,7 +106,7 @@ def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
         f"V(x) = x'Px with P = {_matrix(c.P)}",
         *([] if c.start is None else [f"S = {_matrix(c.start)}"]),
         *([] if c.centre is None else [f"c = {' '.join(map(repr, c.centre.tolist()))}"]),
-        f"claim: {CLAIMS[c.claim].format(c=c, time=duration(c))}; u stays in its bounds",
+        *claim(c),
         "rules that held: " + ", ".join(f"{rule} {count}" for rule, count in answer["rules"].items()),
         rest,
         f"{verdict} {f'c0={c.c0!r} ' if c.practical else ''}c1={c.c1!r} c2={c.c2!r} sha256={c.sha256}",

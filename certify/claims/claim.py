@@ -114,7 +114,7 @@ class Practical(Claim):
 
 @dataclass(frozen=True, slots=True)
 class Nearby(Practical):
-    """The same, and where what is uncertain is constant there is one equilibrium in {V <= c0}, to which all converge."""
+    """The same, and where what is uncertain is constant, one equilibrium in {V <= c0}, to which all converge."""
 
     kind = "nearby"
 

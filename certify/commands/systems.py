@@ -23,7 +23,8 @@ def systems(as_json: Json = False) -> None:
     for s in found:
         lines = [f"{s.name}: {s.description}"]
         equations = zip(s.states, s.dynamics_of_values(), strict=True)
-        lines += [f"  {symbol}' = {expression}" for symbol, expression in equations]
+        mark = "'" if s.time == "continuous" else "+"  # of the state one step later
+        lines += [f"  {symbol}{mark} = {expression}" for symbol, expression in equations]
         lines += [
             f"  {name} = {float(value):g} {s.units.get(name, '')}{_range(s, name)}"
             for name, value in s.parameters.items()

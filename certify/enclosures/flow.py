@@ -106,10 +106,11 @@ class Flow:
         """`x_1 + h x_2 + ... + h^(r-1) x_r`."""
         result = row[-1]
         for model in reversed(row[:-1]):
-            result = model + self._times_period(result)
+            result = model + self.times_period(result)
         return result
 
-    def _times_period(self, model: Taylor) -> Taylor:
+    def times_period(self, model: Taylor) -> Taylor:
+        """h v."""
         if not self.symbols:
             return model.scaled(float(self.longest))
         middle = float((self.shortest + self.longest) / 2)

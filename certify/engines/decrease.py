@@ -22,6 +22,7 @@ _ROUNDS = 16  # of weights that look at bad directions more and more
 _FOCUS, _LEAST_WEIGHT = 2.0, 1e-4
 _SETTLED = 2e-3  # of a margin: more rounds are not worth less
 _NEGLIGIBLE, _ROUNDING = 1e-9, 1e-12  # of the bounds; of the decay, where a checker's Q is not quite 0
+_SHARE = 0.25  # of 1 against d in products of the two, as the checker has it
 _SHORT = 5  # bits of a multiplier: the checker's rationals stay short
 
 
@@ -64,25 +65,30 @@ def corners_of(models: Models, J: Array, P: Array, R: Array | None = None, h: fl
 
     What is known of f and A as a norm is charged to the decay, and so is `h g'P g`, g what the models have beyond them.
     """
-    gamma, still = _gamma(models, P) if h else 0.0, P @ J
-    return [_corner(models, J, P, R, h, f, A, gamma, still) for f, A in models.corners]
+    gamma, weights = _gamma(models, P) if h else 0.0, dict[bytes, Array]()
+    found = []
+    for f, A in models.corners:
+        key = A.tobytes() if h else b""
+        if key not in weights:  # corners with the same b have the same bounds
+            weights[key] = P @ (J + h * A) if h else P @ J
+        found.append(_corner(models, J, P, R, h, f, A, gamma, weights[key]))
+    return found
 
 
 def _corner(
-    models: Models, J: Array, P: Array, R: Array | None, h: float, f: Array, A: Array, gamma: float, still: Array
+    models: Models, J: Array, P: Array, R: Array | None, h: float, f: Array, A: Array, gamma: float, b: Array
 ) -> Corner:
-    """`gamma` and `still`, b for h = 0, are the same at all corners."""
-    b = P @ (J + h * A) if h else still
     moved = P @ f
     whole = J.T @ P @ A
     decay = -(whole + whole.T) - (h * A.T @ P @ A if h else 0.0) - (0.0 if R is None else J.T @ R @ J)
     charge = h * (gamma**2 + 2 * math.sqrt(max(float(f @ moved), 0.0)) * gamma)
     start = h * float(f @ moved)
     if models.spread is not None:
-        wrong = models.spread.slack + models.spread.error
-        s = float(np.sqrt(np.diag(P)) @ wrong)
-        both = 2 * float(np.hypot(np.linalg.norm(b, axis=1), h * moved) @ wrong) + h * s * (s + gamma)
-        charge, start = charge + both + h * s * gamma, start + both
+        error, slack, roots = models.spread.error, models.spread.slack, np.sqrt(np.diag(P))
+        e, s, lengths, p = float(roots @ error), float(roots @ slack), np.linalg.norm(b, axis=1), h * np.abs(moved)
+        both = float(lengths @ error + p @ slack) + h * e * s
+        charge += 2 * float(lengths @ slack) + h * s * s + 2 * h * gamma * (e + s) + both / _SHARE
+        start += 2 * float(p @ error) + h * e * e + _SHARE * both
     return Corner(models, b, decay - charge * np.eye(len(decay)), b.T @ f, start)
 
 
@@ -199,10 +205,14 @@ def _multipliers_at(corners: Sequence[Corner], weights: Sequence[Array], joint: 
     for corner, weight in zip(corners, weights, strict=True):
         _, _, before = parts.get(id(corner.b), (None, None, 0.0))
         parts[id(corner.b)] = corner.models, corner.b, before + weight
-    return _multipliers_of(list(parts.values()), joint)
+    largest = max(float(np.max(np.diag(corner.decay))) for corner in corners)
+    return _multipliers_of(list(parts.values()), joint, largest)
 
 
-def _multipliers_of(parts: Sequence[tuple[Models, Array, Array]], joint: bool | None) -> Multipliers:
+def _multipliers_of(
+    parts: Sequence[tuple[Models, Array, Array]], joint: bool | None, decay: float = 1.0
+) -> Multipliers:
+    """`decay` is what g is to be small beside where no component has any weight."""
     n, k = parts[0][1].shape
     usual, whole = 0.0, np.zeros((k, k))
     along, by_size, E2, Q2, spread = np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(n), np.zeros(k)
@@ -224,7 +234,9 @@ def _multipliers_of(parts: Sequence[tuple[Models, Array, Array]], joint: bool | 
         beta = np.where(along > 0, np.sqrt(Q2 / along), 0.0)
     diagonal, apart_in_all = np.diag(whole), np.sum(np.sqrt(Q2 * along))
     g = np.sqrt(spread / diagonal)
-    least = max(_NEGLIGIBLE * float(np.max(g)), _NEGLIGIBLE * apart_in_all / np.trace(whole), _ROUNDING * usual)
+    least = max(
+        _NEGLIGIBLE * float(np.max(g)), _NEGLIGIBLE * apart_in_all / np.trace(whole), _ROUNDING * (usual or decay)
+    )
     joint = np.sum(np.sqrt(spread * diagonal)) <= apart_in_all if joint is None else joint
     if joint or not np.all(np.isfinite(beta)):
         beta, g = np.zeros_like(beta), np.maximum(g, least)

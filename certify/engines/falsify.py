@@ -83,12 +83,13 @@ def falsify(problem: Problem, T: Array, limit: float, samples: int = 20_000, see
 def survey(problem: Problem, T: Array, limit: float, samples: int = 512, seed: int = 0) -> list[Band]:
     """The bands of levels up to `limit` on which no violation was found, the highest first."""
     search = _Search(problem, T)
+    steps = 20 if problem.loop.system.sample is None else 8  # each of many times the work
     generator = np.random.default_rng(seed)
     direction = generator.standard_normal((samples, problem.loop.system.n))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
 
     def good(level: float) -> bool:
-        z = torch.tensor(search.climb(np.sqrt(level) * direction, level, steps=20), dtype=torch.float64)
+        z = torch.tensor(search.climb(np.sqrt(level) * direction, level, steps=steps), dtype=torch.float64)
         with torch.no_grad():
             return not bool(search.bad(z).any())
 
@@ -137,11 +138,7 @@ class _Search:
         self.corners = self.loop.system.corners()
         system = self.loop.system
         self.periods: list[Fraction | None] = [None] if system.sample is None else [*dict.fromkeys(system.sample)]
-        self.worst = [
-            ([float(q) for q in corner.values()], self.loop.step if period is None else float(period))
-            for period in self.periods
-            for corner in self.corners
-        ]
+        self.worst = self._worst()
         network = self.loop.folded
         self.layers = [
             (torch.tensor(W.T.copy()), torch.tensor(b)) for W, b in zip(network.weights, network.biases, strict=True)
@@ -161,16 +158,32 @@ class _Search:
         for k, (W, b) in enumerate(self.layers):
             h = torch.addmm(b, h.tanh() if k else h, W)
         u = self.clipped(self.scale * self.squashed(h) + self.offset)
-        decrease = torch.stack([self._decrease(x, u, values, step) for values, step in self.worst]).amax(0)
-        return decrease, torch.maximum(self.lo - u, u - self.hi).amax(-1)
+        decrease = [self._decrease(x, u, values, step) for values, step in self.worst]
+        return torch.cat(decrease).amax(0), torch.maximum(self.lo - u, u - self.hi).amax(-1)
 
-    def _decrease(self, x: torch.Tensor, u: torch.Tensor, values: list[float], step: float) -> torch.Tensor:
-        """D' (B,) for constant values of what is uncertain."""
-        G = self.loop.system.mean_rate(lambda y, v: self.f(y, v, values), x, u, step)
+    def _worst(self) -> list[tuple[list[torch.Tensor], float | torch.Tensor]]:
+        """Values (C, 1) of what is uncertain and steps, one for all or (C, 1, 1), at which D' is looked at together."""
+        rows = [[float(q) for q in corner.values()] for corner in self.corners]
+
+        def columns(times: int) -> list[torch.Tensor]:
+            return [torch.tensor(column * times, dtype=torch.float64)[:, None] for column in zip(*rows, strict=True)]
+
+        if self.periods == [None]:
+            return [(columns(1), self.loop.step)]
+        positive = [float(period) for period in self.periods if period]
+        steps = torch.tensor([h for h in positive for _ in rows], dtype=torch.float64)[:, None, None]
+        found: list[tuple[list[torch.Tensor], float | torch.Tensor]] = [(columns(len(positive)), steps)]
+        return found if len(positive) == len(self.periods) else [*found, (columns(1), 0.0)]
+
+    def _decrease(
+        self, x: torch.Tensor, u: torch.Tensor, values: list[torch.Tensor], step: float | torch.Tensor
+    ) -> torch.Tensor:
+        """D' (C, B) for constant values of what is uncertain, or (1, B) without any."""
+        G = self.loop.system.mean_rate(lambda y, v: self.f(y, v, values), x[None], u, step)
         gradient = 2 * (x @ self.P)
         result: torch.Tensor = (gradient * G).sum(-1)
-        if step:
-            result = result + step * ((G @ self.P) * G).sum(-1)
+        if self.loop.step:
+            result = result + (step * (G @ self.P) * G).sum(-1)
         if self.problem.rate:
             result = result + self.problem.rate * (gradient * x).sum(-1)
         return result

@@ -112,32 +112,34 @@ def sizes(a: Array, Q: Array, K: Array, E: Array) -> Sizes:
     return Sizes(slope, bend, twist, bend + twist + rest)
 
 
-def beyond_tangent(a: Array, Q: Array, K: Array, second: Array, third: Array) -> tuple[Array, Array]:
+def beyond_tangent(a: Array, squares: Array, Q: Array, K: Array, second: Array, third: Array) -> tuple[Array, Array]:
     """What a function adds to its tangent, but for its `remainder`: H and K, one a row.
 
     Parameters
     ----------
+    squares : those of the gradients a, in their basis.
     second, third : (N,), phi''/2 and phi'''/6 at the middle.
     """
     b, x = basis(a.shape[1]), np.newaxis
-    return second[:, x] * b.square(a), 2 * second[:, x] * b.times(a, Q) + third[:, x] * b.cube(a)
+    return second[:, x] * squares, 2 * second[:, x] * b.times(a, Q) + third[:, x] * b.cube(a)
 
 
-def remainder(a: Array, size: Sizes, E: Array, second: Array, third: Array, fourth: Array) -> Array:
+def remainder(squares: Array, size: Sizes, E: Array, second: Array, third: Array, fourth: Array) -> Array:
     """R of what a function adds to its tangent, one a row.
 
     Parameters
     ----------
+    squares : those of the gradients, in their basis.
     second, third : (N,), at or above |phi''|/2 and |phi'''|/6 at the middle.
     fourth : (N,), at or above |phi''''|/24 on the range.
     """
-    b, x = basis(a.shape[1]), np.newaxis
-    slope, curve = size.slope, size.curve
-    flat = size.twist[:, x] * b.eye + E
-    wide = flat + size.bend[:, x] * b.eye
+    x, slope, curve = np.newaxis, size.slope, size.curve
+    eye = basis(math.isqrt(2 * squares.shape[1])).eye  # k (k + 1) / 2 pairs
+    flat = size.twist[:, x] * eye + E
+    wide = flat + size.bend[:, x] * eye
     m = fourth * size.radius**2
     spread = second * curve + third * (3 * slope**2 + 3 * slope * curve + curve**2) + m * (2 * slope + curve)
-    return np.asarray((2 * second * slope)[:, x] * flat + spread[:, x] * wide + m[:, x] * b.square(a))
+    return np.asarray((2 * second * slope)[:, x] * flat + spread[:, x] * wide + m[:, x] * squares)
 
 
 def fourth_of_tanh(y: Array, radius: Array) -> Array:
@@ -189,8 +191,9 @@ class Jet:
         """A function's value and derivatives at c, and at least |phi''''|/24 on the range."""
         a, Q, K = self.a, self.Q, self.K
         second, third, bound = (np.array([v]) for v in (f2 / 2, f3 / 6, fourth))
-        H, cubic = beyond_tangent(a, Q, K, second, third)
-        R = remainder(a, self.sizes, self.rest, np.abs(second), np.abs(third), bound)
+        squares = basis(a.shape[1]).square(a)
+        H, cubic = beyond_tangent(a, squares, Q, K, second, third)
+        R = remainder(squares, self.sizes, self.rest, np.abs(second), np.abs(third), bound)
         return Jet(f0, f1 * a, f1 * Q + H, f1 * K + cubic, f1 * self.B, abs(f1) * self.E + R, self.errors)
 
     def _nowhere(self) -> Jet:

@@ -28,11 +28,12 @@ _LEAST = 1e-280  # a level, below which binary64 holds nothing more
 _MARGIN = 1e-3  # share of the decay that is left to the checker's rounding
 _ENOUGH = 1.01 * _MARGIN
 _WIDER = 1 + 1e-9  # of the ball, which has to contain {V <= c1} beyond all rounding
-_ORDER = 3  # of the series in time, where an input is held
+_ORDER = 4  # of the series in time, where an input is held
 _FAR, _NEAR = 1e-2, 0.3  # from one level to the next lower one, where all below one is good, and where not
 _LOWER = 0.5  # from one level to the next, while floors fall with them
 _NOTHING = 1e-12  # of the limit: no floor is asked to be lower
 _EDGES = 400  # that are tried
+_AMPLE = 0.3  # a margin that is good enough for the multipliers of a floor
 _ROUNDS = 3  # of multipliers and edge, each best for the other
 _WORTH = 0.01  # of a floor: less is no gain
 _ROUNDING = 1e-12  # of the decay, of which the checker's numbers are in doubt at d = 0 as well
@@ -186,7 +187,7 @@ class Rule:
                 return best
             V = J.T @ self.problem.V.P @ J
             for _ in range(_ROUNDS):
-                found = best_at([replace(c, decay=c.decay - edge * V) for c in corners])
+                found = best_at([replace(c, decay=c.decay - edge * V) for c in corners], _AMPLE)
                 if not found.margin > _MARGIN:
                     return best
                 around = self._least(corners, V, found.multipliers)
@@ -235,9 +236,7 @@ def _order(problem: Problem) -> int:
     return 1 if problem.loop.system.sample is None else _ORDER
 
 
-def _largest(
-    good: Callable[[float], bool], limit: float, until: float, fall: float = _FAR
-) -> float | None:
+def _largest(good: Callable[[float], bool], limit: float, until: float, fall: float = _FAR) -> float | None:
     """The largest level up to `limit` that is good, within 2 %, if those somewhat below it are."""
     if good(limit):
         return limit

@@ -202,9 +202,10 @@ class Paths:
             E, t, slope = np.abs(M) @ R, np.tanh(layer.y), layer.slope
             size = sizes(G, Q, K, E)
             second, third = -t * slope, (3 * t**2 - 1) * slope / 3
-            H, cubic = beyond_tangent(G, Q, K, second, third)
+            squares = form.square(G)
+            H, cubic = beyond_tangent(G, squares, Q, K, second, third)
             bounds = np.abs(second), np.abs(third), fourth_of_tanh(layer.y, size.radius)
-            rest = remainder(G, size, E, *bounds)
+            rest = remainder(squares, size, E, *bounds)
             R = np.concatenate([R, rest])
             Q, K = slope[:, None] * Q + H, slope[:, None] * K + cubic
         return _Policy(slope[:, None] * G, Q, K, np.concatenate([slope[:, None] * M, np.eye(len(G))], axis=1), R)

@@ -1,4 +1,4 @@
-"""Jets on a ball where something is uncertain: value and gradient are affine in it, all else is as good as at its worst.
+"""Jets on a ball where something is uncertain: value and gradient are affine in it, all else is as at its worst.
 
 In a cell of the box of ranges each quantity is its middle plus half its width times y_j in [-1, 1]; the length of a
 period may be one more of them. What decides a stiff
@@ -153,8 +153,9 @@ class RangedJet:
         h, g = abs(half) + e2, abs(sixth) + e3
         each = (np.array([v]) for v in (half, sixth, h, g, fourth))
         second, third, *bounds = each
-        H, cubic = beyond_tangent(self.a, self.Q, self.K, second, third)
-        R = remainder(self.a, size, self.rest, *bounds)
+        squares = basis(self.a.shape[1]).square(self.a)
+        H, cubic = beyond_tangent(self.a, squares, self.Q, self.K, second, third)
+        R = remainder(squares, size, self.rest, *bounds)
         moved = e1 * self._spread(size) + e2 * (slope**2 + 2 * slope * bend) + e3 * slope**3
         bent = 2 * (h + fourth * float(size.radius[0]) ** 2) * slope + 2 * h * bend + 3 * g * slope**2
         if len(self.moves):

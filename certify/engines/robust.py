@@ -64,7 +64,7 @@ def robust_candidate(loop: ClosedLoop, seconds: float = math.inf) -> Array:
         if about is None:
             break
         asked = about.largest(trust)
-        found = None if asked is None else _scaled(known, asked)
+        found = None if asked is None else _scaled(known, asked, end)
         gain = -math.inf if found is None else _log_volume(found) - _log_volume(best)
         as_foretold = asked is not None and gain > _FORETOLD * (_log_volume(asked) - _log_volume(best))
         trust = min(_WIDER * trust, _MOST_TRUST) if as_foretold else _NARROWER * trust
@@ -77,17 +77,18 @@ def _log_volume(P: Array) -> float:
     return math.log(volume(P, 1.0))
 
 
-def _scaled(known: Paths, P: Array) -> Array | None:
+def _scaled(known: Paths, P: Array, until: float = math.inf) -> Array | None:
     """P over the largest level that the local rule proves with it; None if there is none."""
     if not np.linalg.eigvalsh(P)[0] > 0:
         return None
-    level = prove_local(*_problem(known, P), domain_limit(P, known.loop.system.domain) * _BELOW, known)
+    limit = domain_limit(P, known.loop.system.domain) * _BELOW
+    level = prove_local(*_problem(known, P), limit, known, until)
     return None if level is None else P / level
 
 
 def _problem(known: Paths, P: Array) -> tuple[Problem, Array]:
     """With the coordinates of its proof."""
-    return Problem(known.loop, Quadratic(P)), diagonalising_coordinates(P, known.loop.linearise()[0])
+    return Problem(known.loop, Quadratic(P)), diagonalising_coordinates(P, known.loop.mean_rate(), known.loop.step)
 
 
 @dataclass(frozen=True, slots=True)

@@ -35,7 +35,7 @@ class Steps:
     ----------
     known : the loop at the origin.
     at_rest : the loop rests there for certain, so that the models start from 0 exactly.
-    order : r, of the series where inputs are held.
+    order : r, of the series where inputs are held, at least 2 there.
     dynamics : f in states, inputs and uncertain quantities.
     """
 
@@ -47,10 +47,7 @@ class Steps:
     @property
     def longest(self) -> float:
         """h, the length of the step in V's increment: 0 in continuous time."""
-        system = self.known.loop.system
-        if system.time == "discrete":
-            return 1.0
-        return 0.0 if system.sample is None else float(system.sample[1])
+        return self.known.loop.step
 
     @property
     def is_plain(self) -> bool:
@@ -61,26 +58,22 @@ class Steps:
         """Of G on the ball x = J d for each cell; no state of interest there is larger than `reach`, (n,)."""
         if self.is_plain:
             return [self.known.models(J)]
-        driven = self.known.driven(J)
-        return [self._in_cell(J, driven, cell, reach) for cell in cells]
+        driven, sample = self.known.driven(J), self.known.loop.system.sample
+        walks = [_Walk(self, J, driven, cell) for cell in cells]
+        # what comes after x_1 is of the whole ranges, and so the same for every cell
+        later = None if sample is None else _later(walks[0], self.order, sample, reach)
+        return [self._in_cell(walk, driven, later) for walk in walks]
 
-    def _in_cell(self, J: Array, driven: Driven, cell: Cell, reach: Array) -> Models:
-        walk = _Walk(self, J, driven, cell)
-        system = self.known.loop.system
-        G, stays = [walk.still(v) for v in walk.rates()], True
-        if system.sample is not None:
-            held = _held(walk, self.order, system.sample, reach)
-            if held is None:
-                G, stays = [replace(v, c=math.nan) for v in G], False
-            else:
-                G = [v + more for v, more in zip(G, held[0], strict=True)]
-                stays = held[1]
+    def _in_cell(self, walk: _Walk, driven: Driven, later: _Later | None) -> Models:
+        system, G, stays = self.known.loop.system, [walk.still(v) for v in walk.rates()], True
+        if later is not None:
+            G, stays = [v + more for v, more in zip(G, later.terms, strict=True)], later.stays
         if system.time == "discrete":
             G = [v + x.scaled(-1.0) for v, x in zip(G, walk.states(), strict=True)]
-        parts = ([getattr(v, part) for v in G] for part in ("moves", "turns", "error", "slack"))
-        moves, turns, error, slack = map(np.array, parts)
-        spread = Spread(np.swapaxes(moves, 0, 1), np.swapaxes(turns, 0, 1), error, slack)
-        return driven.models(G, spread, stays)
+        moves, turns, error, slack = (
+            np.array([getattr(v, part) for v in G]) for part in ("moves", "turns", "error", "slack")
+        )
+        return driven.models(G, Spread(moves.T, np.swapaxes(turns, 0, 1), error, slack), stays)
 
 
 def steps_of(known: Paths, at_rest: bool, order: int) -> Steps:
@@ -137,40 +130,47 @@ class _Walk:
         return held
 
 
-def _held(walk: _Walk, order: int, sample: Interval, reach: Array) -> tuple[list[RangedJet], bool] | None:
-    """`h x_2 + ... + h^(r-1) x_r` for every h of the range, and whether the states stay in the domain; None where they
-    are not known to stay anywhere."""
+@dataclass(frozen=True, slots=True)
+class _Later:
+    """`h x_2 + ... + h^(r-1) x_r` for every h of the sample, and whether the states stay in the domain."""
+
+    terms: list[RangedJet]
+    stays: bool
+
+
+def _later(walk: _Walk, order: int, sample: Interval, reach: Array) -> _Later:
+    """Of a walk in any cell; without finite numbers where the states are not known to stay anywhere."""
     hi = float(sample[1])
     moved = _within_a_period(walk, hi)
     if moved is None:
-        return None
+        return _Later([replace(x, c=math.nan) for x in walk.states()], False)
     near, rate = moved
     ends = [(float(a), float(b)) for a, b in walk.loop.system.domain]
     stays = all(a < -r - hi * v and r + hi * v < b for (a, b), r, v in zip(ends, reach, rate, strict=True))
     last = [row[-1] for row in walk.series(order, near)]
     early = walk.series(order - 1) if order > 2 else [[]] * len(last)
     h = walk.algebra.quantity(*sample, len(walk.cell) if walk.varies else None)
-    found = []
+    terms = []
     for own, end in zip(early, last, strict=True):
         value = walk.still(end)
         for v in reversed(own[1:]):
             value = walk.still(v) + h * value
-        found.append(h * value)
-    return found, stays
+        terms.append(h * value)
+    return _Later(terms, stays)
 
 
 def _within_a_period(walk: _Walk, hi: float) -> tuple[tuple[Array, Array], Array] | None:
-    """Bounds, (n,), of how far v(0) and gradients of the states move from x within a period, and their rates."""
-    n = len(walk.J)
+    """Bounds, (n,), of how far v(0) and gradients of the states move from x within a period, and their rates; None if
+    none is found."""
+    n, at_rest = len(walk.J), walk.steps.at_rest
     near = np.zeros(n), np.zeros(n)
-    for attempt in range(_ATTEMPTS + 1):
+    for _ in range(_ATTEMPTS + 1):
         rates = walk.rates(near, fixed=False)
-        first = np.array([0.0 if walk.steps.at_rest else v.value for v in rates])
+        first = np.array([0.0 if at_rest else v.value for v in rates])
         steep = np.array([v.radius for v in rates])
         if not (np.all(np.isfinite(first)) and np.all(np.isfinite(steep))):
             return None
-        held = all(bool(np.all((hi * v < r) | ((v == 0) & (r == 0)))) for v, r in ((first, near[0]), (steep, near[1])))
-        if attempt and held:
+        if (at_rest or np.all(hi * first < near[0])) and np.all(hi * steep < near[1]):
             return near, first + steep
         near = _FURTHER * hi * first, _FURTHER * hi * steep
     return None

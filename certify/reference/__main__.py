@@ -36,14 +36,16 @@ def read_once(path: str) -> bytes:
 
 def in_words(c: Certificate) -> str:
     bounds = f"{', '.join(c.plant.inputs)} within the input bounds{whatever(c)}"
+    head = f"{c.plant.name}, policy {c.policy.sha256}{stepping(c)}: every trajectory that starts in V <= {c.outer!r}"
+    remains = "stays there" if c.sample is None else "at a sampling instant is there at every later one"
+    between = "" if c.sample is None else ", is in the domain at all times"
     if c.claim == "practical":
-        return (
-            f"{c.plant.name}, policy {c.policy.sha256}: every trajectory that starts in V <= {c.outer!r} stays there, "
-            f"enters V <= {c.inner!r} in finite time and stays in that set from then on, with {bounds}"
-        )
+        enters = f"enters V <= {c.floor!r} in finite time and stays in that set from then on"
+        at_last = "" if c.sample is None else " at sampling instants"
+        return f"{head} {remains}{between}, {enters}{at_last}{falling(c)}, with {bounds}"
     stays = (
-        f"{c.plant.name}, policy {c.policy.sha256}: every trajectory that starts in V <= {c.outer!r} stays there and "
-        f"converges to the origin, which is asymptotically stable, with {bounds}"
+        f"{head} {remains}{between} and "
+        f"converges to the origin, which is asymptotically stable{falling(c)}, with {bounds}"
     )
     if c.start is None:
         return stays
@@ -55,6 +57,25 @@ def in_words(c: Certificate) -> str:
         f"with {bounds}; "
         f"P_0 = {start_rows(c)}{centre}"
     )
+
+
+def stepping(c: Certificate) -> str:
+    """How time passes, where it does not simply pass."""
+    if c.sample is not None:
+        return f", its inputs held for any periods in [{c.sample[0]}, {c.sample[1]}]"
+    return ", in discrete time" if c.plant.discrete else ""
+
+
+def falling(c: Certificate) -> str:
+    """How fast V falls; the rate is a binary64 number and so exact here."""
+    if c.rate == 0:
+        return ""
+    until = f" until V <= {c.floor!r}" if c.claim == "practical" else ""
+    return f", V falling at least as exp(-2 lambda t){until}, lambda = {rate_of(c)!r}"
+
+
+def rate_of(c: Certificate) -> float:
+    return int(c.rate.p) / int(c.rate.q)
 
 
 def whatever(c: Certificate) -> str:
@@ -90,8 +111,8 @@ def time_of_tube(c: Certificate) -> float | None:
 
 def level_names(c: Certificate) -> tuple[tuple[str, str, float], ...]:
     """Key in the file, letter, value."""
-    inner = ("local", "c1", c.inner) if c.ends_at_origin else ("floor", "c0", c.inner)
-    return inner, ("roa", "c2", c.outer)
+    least = () if c.floor is None else (("floor", "c0", c.floor),)
+    return *least, ("local", "c1", c.inner), ("roa", "c2", c.outer)
 
 
 def line(verdict: Verdict) -> str:

@@ -1,19 +1,26 @@
-"""The matrix inequality of the rules `local` and `tube`: d'J'RJ d + 2 d'J'P F(Jd) < 0 for 0 < ||d|| <= 1.
+"""The matrix inequality of the rules `local` and `tube`: d'J'RJ d + 2 d'J'P G + h G'PG < 0 for 0 < ||d|| <= 1.
 
-Along a path d = (z, sigma), x = m + J z + w sigma, and the inequality is of z'J'RJ z + 2 z'J'P (F - v), v the velocity.
+G is F in continuous time, where h = 0, and by how much the state changes, over h, where time has steps. Around a
+level G need not vanish at the centre, and the inequality has k (V - c0) beside it. Along a path d = (z, sigma), x = m +
+J z + w sigma, and it is of z'J'RJ z + 2 z'J'P (F - v), v the velocity.
 
-With b_i the columns of J'P and models a_i.d + d'Q_i d + K_i[d] + sum_j B_ij e_j + r_i of the components of F the left
-side is a quadratic form and what is left of the products of b_i.d with the other parts, each of which is put below a
-quadratic form: 2 p q <= k p^2 + q^2 / k for any k > 0. The file gives these numbers, as multipliers or by a weight.
+With b_i the columns of (J + h A)'P and models f_i + a_i.d + d'Q_i d + K_i[d] + sum_j B_ij e_j + r_i of the components
+of G, a_i the rows of A, the left side is a quadratic form, what is left of the products of b_i.d with the other parts,
+and the square of these. Each is put below a quadratic form: 2 p q <= k p^2 + q^2 / k for any k > 0. The file gives
+these numbers, as multipliers or by a weight.
+
+Where something is uncertain f and A are affine in its symbols y. At one d, and for one value of the other parts, the
+left side is a convex function of G, as P is positive definite, and so of y: it is largest at a corner of [-1, 1]^N.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from itertools import product
 
-from flint import arb, arb_mat, fmpq_mat
+from flint import arb, arb_mat, fmpq, fmpq_mat
 
-from .balls import ONE, ZERO, certainly_definite, columns_scaled, finite, norm, total
+from .balls import ONE, ZERO, certainly_definite, columns_scaled, finite, identity, norm, total
 from .evidence import Ball, Path
 from .fields import exact
 from .loop import Field
@@ -21,7 +28,10 @@ from .model import Model
 from .network import Units
 from .rational import positive_definite
 from .refusal import require
-from .symmetric import pairs, places
+from .symmetric import orders, pairs, places
+
+MAX_CORNERS = 2**16  # of one cell
+NO_STEP = fmpq(0)
 
 
 def sound_multipliers(ball: Ball, rule: str, at: str) -> None:
@@ -40,15 +50,110 @@ def contains(ball: Ball, P: fmpq_mat, level: fmpq_mat) -> bool:
     return positive_definite(ball.J.transpose() * P * ball.J - level)
 
 
-def decreases(ball: Ball, P: fmpq_mat, R: fmpq_mat, F: Field) -> bool:
-    """Whether the matrix that is left is certainly positive definite; P and R symmetric, F the models on the ball."""
+def whatever_y(F: Field, holds: Callable[[Field], bool]) -> bool:
+    """Whether it holds with every y taken into the balls of the models, or else at each corner."""
+    count = max(len(f.dv) for f in F.components)
+    if count == 0:
+        return holds(F)
+    if holds(F.whatever()):
+        return True
+    moved = [not all(f.without(j) for f in F.components) for j in range(count)]
+    few = 2 ** sum(moved) <= MAX_CORNERS
+    return few and all(holds(F.where(y)) for y in product(*((-1, 1) if each else (0,) for each in moved)))
+
+
+def decreases(ball: Ball, P: fmpq_mat, R: fmpq_mat, G: Field, h: fmpq = NO_STEP) -> bool:
+    """Whether the matrix that is left is certainly positive definite, at rest: G vanishes at d = 0, exactly.
+
+    P, positive definite where h > 0, and R are symmetric, G are the models on the ball, without y.
+    """
+    known, A, columns = quadratic(ball, P, R, G, h)
+    left = -known - beyond_second(ball, columns, G)
+    if h > 0:
+        left -= arb(h) * step(P, G, A.nrows(), ZERO)
+    return certainly_positive(left)
+
+
+def decreases_around(ball: Ball, P: fmpq_mat, R: fmpq_mat, G: Field, h: fmpq, level: fmpq) -> bool:
+    """Whether d'J'RJ d + 2 d'J'P G + h G'PG + edge (V - level) is certainly negative on the ball, V = d'J'PJ d.
+
+    The form is one in (1, d): a first row and column hold what G is at the centre.
+    """
+    n, k = P.nrows(), exact(ball.edge)
+    known, A, columns = quadratic(ball, P, R + k * P, G, h)
+    f, of_P = arb_mat(n, 1, [g.v for g in G.components]), arb_mat(P)
+    length = (f.transpose() * of_P * f)[0, 0]
+    below = -known - beyond_second(ball, columns, G)
+    if h > 0:
+        below -= arb(h) * step(P, G, n, arb(length.upper()).sqrt())
+    linear = -((arb_mat(ball.J) + arb(h) * A).transpose() * of_P * f)
+    first = [arb(k * level) - arb(h) * length, *linear.entries()]
+    below = (below + below.transpose()) / 2
+    return certainly_positive(arb_mat([first, *([v, *row] for v, row in zip(first[1:], below.tolist(), strict=True))]))
+
+
+def quadratic(ball: Ball, P: fmpq_mat, R: fmpq_mat, G: Field, h: fmpq) -> tuple[arb_mat, arb_mat, list[arb_mat]]:
+    """J'RJ + J'PA + A'PJ + h A'PA, A, and the columns of (J + h A)'P."""
     n, b = P.nrows(), arb_mat(ball.J.transpose() * P)
-    columns = [arb_mat(n, 1, column) for column in b.transpose().tolist()]
-    B = b * arb_mat([list(f.a.entries()) for f in F.components])
-    sums = beyond_second(ball, columns, F)
-    left = -(arb_mat(ball.J.transpose() * R * ball.J) + B + B.transpose()) - sums
+    A = arb_mat([list(g.a.entries()) for g in G.components])
+    B, known = b * A, arb_mat(ball.J.transpose() * R * ball.J)
+    known += B + B.transpose()
+    if h > 0:
+        stepped = arb(h) * (A.transpose() * arb_mat(P))
+        known, b = known + stepped * A, b + stepped
+    return known, A, [arb_mat(n, 1, column) for column in b.transpose().tolist()]
+
+
+def step(P: fmpq_mat, G: Field, size: int, at_centre: arb) -> arb_mat:
+    """S_step / h: the square of all that is beyond the second order, and its product with f, of length `at_centre`.
+
+    With ||v|| = (v'Pv)^(1/2) these parts are within Gamma ||d||^2: sum_i e_i d'Q_i d is the image of the matrix dd'
+    under a linear map, and so is that of K; each error counts with the length of what it moves.
+    """
+    of_P, components = arb_mat(P), G.components
+    bent = arb_mat([list(g.Q.entries()) for g in components])
+    count = arb_mat(1, len(orders(size)), [arb(often).sqrt() for often in orders(size)])
+    cubes = columns_scaled(arb_mat([list(g.K.entries()) for g in components]), list(count.entries()))
+    gamma = length_of(bent, of_P) + length_of(cubes, of_P)
+    gamma += total(arb(P[i, i]).sqrt() * norm(g.E.entries()) for i, g in enumerate(components))
+    if G.units.R:
+        moved = (arb_mat([list(g.B) for g in components]) * G.units.L).transpose()
+        lengths = row_products(moved * of_P, moved)
+        sizes = [total(G.units.squares[q, i * (size + 1)] for i in range(size)) for q in range(len(lengths))]
+        gamma += total(root(v) * root(w) for v, w in zip(lengths, sizes, strict=True))
+    return (gamma * gamma + 2 * at_centre * gamma) * identity(size)
+
+
+def length_of(M: arb_mat, P: arb_mat) -> arb:
+    """The root of sum_ij P_ij M_i.M_j over the rows of M."""
+    return root(total(row_products(P * M, M)))
+
+
+def root(value: arb) -> arb:
+    """The largest root of what is not negative."""
+    return arb(value.upper()).sqrt()
+
+
+def certainly_positive(left: arb_mat) -> bool:
+    """Whether the symmetric part of each matrix is positive definite, by its pivots or by its midpoints and radii.
+
+    A ball takes part in many pivots and counts in each for itself. But with the radii r_ij the form of what a matrix
+    differs from its midpoints by is at most sum r_ij |d_i| |d_j|, and that at most sum_i d_i^2 sum_j r_ij w_j / w_i,
+    for any w > 0: here of the size that evens out the diagonal.
+    """
     left = (left + left.transpose()) / 2
-    return finite(left.entries()) and certainly_definite(left)
+    if not finite(left.entries()):
+        return False
+    if certainly_definite(left):
+        return True
+    rows, n = left.tolist(), left.nrows()
+    if not all(rows[i][i].mid() > 0 for i in range(n)):
+        return False
+    w = [arb((1 / arb(rows[i][i].mid()).sqrt()).mid()) for i in range(n)]
+    middle = [[arb(v.mid()) for v in row] for row in rows]
+    for i in range(n):
+        middle[i][i] -= total(arb(rows[i][j].rad()) * w[j] for j in range(n)) / w[i]
+    return certainly_definite(arb_mat(middle))
 
 
 def decreases_along(ball: Ball, path: Path, P: fmpq_mat, R: fmpq_mat, F: Field) -> bool:
@@ -183,8 +288,14 @@ def balanced(p: arb_mat, square: arb_mat, weight: arb_mat) -> arb_mat:
 
 
 def share(trace: arb, length: arb) -> arb:
-    """tau = sqrt(tr(T weight T') / p'weight p), or 1; any positive number will do, so it is one number and no ball."""
-    tau = arb((trace / length).sqrt().mid()) if length != 0 else ONE
+    """tau = sqrt(tr(T weight T') / p'weight p), or 1; any positive number will do, so it is one number and no ball.
+
+    Of balls that may be 0 it is the largest values that count.
+    """
+    ratio = trace / length
+    if not (ratio > 0 or ratio < 0):
+        ratio = arb(abs(trace).upper()) / arb(abs(length).upper())
+    tau = arb(ratio.sqrt().mid())
     return tau if tau.is_finite() and tau > 0 else ONE
 
 

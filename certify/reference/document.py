@@ -23,7 +23,7 @@ from .refusal import Refused, require
 MAX_BYTES, MAX_BYTES_BEYOND_ASCII = 256 * 2**20, 16 * 2**20
 MAX_TOKENS = 10**6  # commas and opening brackets
 MAX_NAMES, MAX_LAYERS, MAX_WIDTH = 64, 64, 2**14
-SCHEMA, CLAIMS = "certify-certificate/5", ("asymptotic", "practical", *WITH_TUBE)
+SCHEMA, CLAIMS = "certify-certificate/6", ("asymptotic", "practical", *WITH_TUBE)
 IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,63}")
 
 Interval = tuple[fmpq, fmpq]
@@ -44,9 +44,13 @@ class Layer:
 
 @dataclass(frozen=True)
 class Plant:
-    """`ranges` are those of what is `uncertain`: the claim is meant for every value in all of them."""
+    """`ranges` are those of what is `uncertain`: the claim is meant for every value in all of them.
+
+    `dynamics` are those of xdot, or of the next state where the plant is `discrete`.
+    """
 
     name: str
+    discrete: bool
     states: tuple[str, ...]
     inputs: tuple[str, ...]
     dynamics: Equations
@@ -74,17 +78,21 @@ class Policy:
 
 @dataclass(frozen=True)
 class Certificate:
-    """`inner` and `outer`, between which the leaves show Vdot < 0, are c1 (`practical`: c0) and c2.
+    """`inner` and `outer`, between which the leaves show that V falls, are c1 and c2; `floor` is c0 under `practical`.
 
+    V falls at the `rate` lambda, D + 2 lambda V < 0. With a `sample` inputs are held for a time in this range.
     `start` is P_0 of a claim with a tube, `centre` the column c_0 around which it lies where the tube follows a path.
     """
 
     claim: str
+    rate: fmpq
+    sample: Interval | None
     start: fmpq_mat | None
     centre: fmpq_mat | None
     plant: Plant
     policy: Policy
     P: fmpq_mat
+    floor: float | None
     inner: float
     outer: float
     evidence: Tree | Trusted
@@ -103,9 +111,21 @@ class Certificate:
         return len(self.plant.uncertain)
 
     @property
+    def varies(self) -> bool:
+        """Whether the period of a sample may be one of many."""
+        return self.sample is not None and bool(self.sample[0] < self.sample[1])
+
+    @property
     def ends_at_origin(self) -> bool:
-        """Whether the claim is about the equilibrium at the origin, so that a local ball covers {V <= c1}."""
+        """Whether the claim is about the equilibrium at the origin, where every model is then at rest."""
         return self.claim != "practical"
+
+    @property
+    def step(self) -> fmpq:
+        """h of D = 2 x'PG + h G'PG: the longest period of a sample, 1 in discrete time, else 0."""
+        if self.sample is not None:
+            return self.sample[1]
+        return fmpq(int(self.plant.discrete))
 
 
 def read(raw: bytes) -> Certificate:
@@ -119,22 +139,45 @@ def read(raw: bytes) -> Certificate:
     require(named, "format", "claim.kind", f"one of {', '.join(CLAIMS)} was expected")
     claim = str(said["kind"])
     more = {"enlarged": ("start",), "reached": ("start", "centre")}.get(claim, ())
-    said = keys(said, "claim", "kind", *more)
-    inner_name = "floor" if claim == "practical" else "local"
+    said = keys(said, "claim", "kind", "rate", "sample", *more)
+    rate, sample = read_rate(said["rate"], claim), read_sample(said["sample"])
     plant = read_plant(data["plant"])
     n = len(plant.states)
     fixed = claim not in WITH_TUBE or not plant.uncertain
     require(fixed, "format", "plant.uncertain", f"nothing may be uncertain with claim '{claim}'")
+    continuous = claim not in WITH_TUBE or not plant.discrete
+    require(continuous, "format", "plant.time", f"time must be continuous with claim '{claim}'")
+    free = sample is None or not (claim in WITH_TUBE or plant.discrete)
+    require(free, "format", "claim.sample", "null was expected: the claim has a tube, or the plant steps of its own")
     start = square(said["start"], "claim.start", n) if "start" in said else None
     centre = column(said["centre"], "claim.centre", n) if "centre" in said else None
     policy = read_policy(data["policy"], n, len(plant.inputs))
     lyapunov = keys(data["lyapunov"], "lyapunov", "kind", "P")
     require(lyapunov["kind"] == "quadratic", "format", "lyapunov.kind", "'quadratic' was expected")
     P = square(lyapunov["P"], "lyapunov.P", n)
-    levels = keys(data["levels"], "levels", inner_name, "roa")
-    inner, outer = binary64(levels[inner_name], f"levels.{inner_name}"), binary64(levels["roa"], "levels.roa")
-    evidence = read_evidence(data["evidence"], n, len(plant.uncertain), claim)
-    return Certificate(claim, start, centre, plant, policy, P, inner, outer, evidence)
+    named_levels = ("floor", "local", "roa") if claim == "practical" else ("local", "roa")
+    levels = keys(data["levels"], "levels", *named_levels)
+    *floor, inner, outer = (binary64(levels[name], f"levels.{name}") for name in named_levels)
+    least = floor[0] if floor else None
+    evidence = read_evidence(data["evidence"], n, len(plant.uncertain), claim, sample is not None)
+    replayed = isinstance(evidence, Tree) or not (rate > 0 or sample is not None or plant.discrete)
+    require(replayed, "format", "evidence.kind", "a rate, a sample and discrete time must be replayed")
+    return Certificate(claim, rate, sample, start, centre, plant, policy, P, least, inner, outer, evidence)
+
+
+def read_rate(value: Any, claim: str) -> fmpq:
+    rate = binary64(value, "claim.rate")
+    require(rate >= 0, "format", "claim.rate", "must not be negative")
+    require(rate == 0 or claim not in WITH_TUBE, "format", "claim.rate", f"0 was expected with claim '{claim}'")
+    return exact(rate)
+
+
+def read_sample(value: Any) -> Interval | None:
+    if value is None:
+        return None
+    lo, hi = (rational(q, "claim.sample") for q in entries(value, "claim.sample", 2))
+    require(bool(lo >= 0) and bool(lo <= hi) and bool(hi > 0), "format", "claim.sample", "0 <= lo <= hi and hi > 0")
+    return lo, hi
 
 
 def parsed(raw: bytes) -> Any:
@@ -170,8 +213,10 @@ def integer(text: str) -> int:
 
 
 def read_plant(value: Any) -> Plant:
-    sections = ("name", "states", "inputs", "uncertain", "dynamics", "u_eq", "domain", "input_bounds")
+    sections = ("name", "time", "states", "inputs", "uncertain", "dynamics", "u_eq", "domain", "input_bounds")
     plant = keys(value, "plant", *sections)
+    timed = plant["time"] in ("continuous", "discrete")
+    require(timed, "format", "plant.time", "'continuous' or 'discrete' was expected")
     states, inputs = entries(plant["states"], "plant.states"), entries(plant["inputs"], "plant.inputs")
     n, m = len(states), len(inputs)
     require(1 <= n <= MAX_NAMES and 1 <= m <= MAX_NAMES, "format", "plant", "1 to 64 states and inputs are allowed")
@@ -188,6 +233,7 @@ def read_plant(value: Any) -> Plant:
     u_eq = entries(plant["u_eq"], "plant.u_eq", m)
     return Plant(
         name=plant["name"],
+        discrete=plant["time"] == "discrete",
         states=tuple(states),
         inputs=tuple(inputs),
         dynamics=equations(entries(plant["dynamics"], "plant.dynamics", n), names, "plant.dynamics"),

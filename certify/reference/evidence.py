@@ -19,6 +19,7 @@ from .refusal import require
 
 MAX_SLABS = 10**4
 MAX_PARTS, MAX_CELLS = 64, 4096  # of one range; of all of them together
+MAX_ORDER = 8  # of a series in time
 WITH_TUBE = ("enlarged", "reached")  # claims about a set of starts that is no level set of V
 WORD = re.compile(r"[A-Za-z0-9_.+-]{1,80}")
 
@@ -28,6 +29,7 @@ class Ball:
     """All x = J d with ||d|| <= 1, and the rows of multipliers with which `decrease` is decided on it.
 
     In a slab with a path g has one more number than the others, for the motion, and `weight` a row and a column more.
+    `edge` is the multiplier of V - c0 under `practical`, `order` that of the series in time with a sample.
     """
 
     J: fmpq_mat
@@ -35,6 +37,8 @@ class Ball:
     beta: array[float]
     g: array[float]
     weight: fmpq_mat
+    edge: float = 0.0
+    order: int = 1
 
 
 @dataclass(frozen=True)
@@ -63,14 +67,16 @@ class Slab:
 
 @dataclass(frozen=True)
 class Tree:
-    """Evidence that can be replayed. `ball` belongs to claims about the origin, `tube` to those that have a start.
+    """Evidence that can be replayed. `tube` belongs to claims that have a start; `practical` may do without a `ball`.
 
-    `cells` has a number for each uncertain quantity: into how many equal parts rule `local` cuts its range.
+    `cells` has a number for each uncertain quantity: into how many equal parts rule `local` cuts its range. `order` is
+    that of the series in time on leaves.
     """
 
     T: fmpq_mat
     root: array[float]
     tree: bytes
+    order: int
     cells: tuple[int, ...]
     ball: Ball | None
     tube: tuple[Slab, ...]
@@ -84,28 +90,44 @@ class Trusted:
     version: str
 
 
-def read_evidence(value: Any, n: int, k: int, claim: str) -> Tree | Trusted:
+def read_evidence(value: Any, n: int, k: int, claim: str, sampled: bool) -> Tree | Trusted:
     if isinstance(value, dict) and value.get("kind") == "trusted-solver":
         require(claim not in WITH_TUBE, "format", "evidence.kind", f"claim '{claim}' must be replayed")
         require(k == 0, "format", "evidence.kind", "what is uncertain must be replayed")
         return read_trusted(value)
-    evidence = keys(value, "evidence", "kind", "T", "root", "tree", "cells", "local", "tube")
+    evidence = keys(value, "evidence", "kind", "T", "root", "tree", "order", "cells", "local", "tube")
     require(evidence["kind"] == "partition-tree", "format", "evidence.kind", "an unknown kind")
     T, root = square(evidence["T"], "evidence.T", n), numbers(evidence["root"], "evidence.root", n)
     tree = decoded(evidence["tree"], "evidence.tree")
+    order = read_order(evidence["order"], "evidence.order", sampled)
     cells = read_cells(evidence["cells"], "evidence.cells", k)
     ball = None
-    if claim == "practical":
-        require(evidence["local"] is None, "format", "evidence.local", "null was expected: the claim has no ball")
-    else:
-        ball = read_ball(keys(evidence["local"], "evidence.local", "J", "multipliers", "weight"), "evidence.local", n)
+    if claim != "practical" or evidence["local"] is not None:
+        ball = read_local(evidence["local"], n, claim, sampled)
     tube = entries(evidence["tube"], "evidence.tube")
     least, most = (1, MAX_SLABS) if claim in WITH_TUBE else (0, 0)
     fits = least <= len(tube) <= most
     require(fits, "format", "evidence.tube", f"{least} to {most} slabs are allowed with claim '{claim}'")
     moves = claim == "reached"
     slabs = tuple(read_slab(v, f"evidence.tube.{k}", n, moves) for k, v in enumerate(tube))
-    return Tree(T, root, tree, cells, ball, slabs)
+    return Tree(T, root, tree, order, cells, ball, slabs)
+
+
+def read_order(value: Any, at: str, sampled: bool) -> int:
+    """Without a sample there is no series, whose order is then 1."""
+    most = MAX_ORDER if sampled else 1
+    good = type(value) is int and 1 <= value <= most  # True is an int to isinstance
+    require(good, "format", at, f"an integer from 1 to {most} was expected")
+    return int(value)
+
+
+def read_local(value: Any, n: int, claim: str, sampled: bool) -> Ball:
+    at = "evidence.local"
+    local = keys(value, at, "J", "multipliers", "weight", "edge", "order")
+    edge, order = binary64(local["edge"], f"{at}.edge"), read_order(local["order"], f"{at}.order", sampled)
+    good = edge >= 0 and (edge == 0 or claim == "practical")
+    require(good, "format", f"{at}.edge", f"{edge!r} is not allowed with claim '{claim}'")
+    return replace(read_ball(local, at, n), edge=edge, order=order)
 
 
 def read_cells(value: Any, at: str, k: int) -> tuple[int, ...]:

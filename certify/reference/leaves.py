@@ -1,4 +1,4 @@
-"""Rules `tree`, `ring` and `inputs`: the leaves of the partition.
+"""Rules `tree`, `ring`, `inputs` and `flow`: the leaves of the partition.
 
 The weights meet several leaves at a time: a layer is one product of matrices of balls whose columns are the centres and
 the half-widths of all leaves of a batch. What is left to Python is a few operations for each tanh of each leaf.
@@ -26,6 +26,8 @@ from .balls import (
 )
 from .document import Certificate
 from .evidence import Tree
+from .flow import Moving, constant, mean_on, reached_from
+from .rational import inverse_diagonal
 from .refusal import Refused, require
 from .symmetric import pairs
 from .taylor import Taylor
@@ -102,7 +104,14 @@ class Leaves:
     """What all leaves of a certificate share."""
 
     def __init__(self, c: Certificate, T: fmpq_mat, S: fmpq_mat) -> None:
-        self.c, self.n, self.symbols = c, c.n, c.n + c.m + c.k
+        if not isinstance(c.evidence, Tree):
+            raise TypeError("a solver's word has no leaves")
+        self.c, self.n, self.symbols = c, c.n, c.n + c.m + c.k + c.varies
+        self.order, self.alone = c.evidence.order, c.evidence.ball is None
+        self.step, self.steps = arb(c.step), c.step > 0
+        self.P, self.rate = arb_mat(c.P), arb(2 * c.rate)
+        squares = inverse_diagonal(c.P, "lyapunov") if c.sample is not None else []
+        self.bounds = [(arb(c.outer) * arb(square)).sqrt() for square in squares]
         self.T, self.PT2 = arb_mat(T), arb_mat(2 * (c.P * T))
         self.S = [arb(S[i, i]) for i in range(c.n)]
         self.cross = [(i, j, arb(2 * abs(S[i, j]))) for j in range(c.n) for i in range(j) if S[i, j] != 0]
@@ -241,31 +250,75 @@ class Leaves:
 
     # ----------------------------------------------------------------------------------------------------- the ring
 
+    def numbers(self, leaf: Leaf) -> Moving:
+        """Models by their names; an input's error and what is uncertain have a symbol each."""
+        n, plant = self.n, self.c.plant
+        states = {name: self.affine(row) for name, row in zip(plant.states, leaf.x, strict=True)}
+        inputs = {
+            name: self.moving(mid, slopes, n + j, error)
+            for j, (name, (mid, slopes, error)) in enumerate(zip(plant.inputs, leaf.u, strict=True))
+        }
+        uncertain, anything = dict[str, Taylor](), dict[str, Taylor]()
+        for j, (name, (lo, hi)) in enumerate(zip(plant.uncertain, plant.ranges, strict=True)):
+            middle, half = arb((lo + hi) / 2), arb((hi - lo) / 2)
+            uncertain[name] = self.moving(middle, [ZERO] * n, n + self.c.m + j, half)
+            anything[name] = Taylor(middle, r=half)
+        return Moving(states, inputs, uncertain, anything, self.bounds)
+
+    def affine(self, row: list[arb]) -> Taylor:
+        """A list [constant, coefficients of d]."""
+        return Taylor(row[0], row[1:] + [ZERO] * (self.symbols - self.n))
+
     def F(self, leaf: Leaf) -> list[Taylor]:
-        """Models of f(x, pi(x), q), all of them finite; an input's error and what is uncertain have a symbol each."""
-        n, place = self.n, f"leaf {leaf.box.number}"
-        pad = [ZERO] * (self.symbols - n)
-        names = {name: Taylor(row[0], row[1:] + pad) for name, row in zip(self.c.plant.states, leaf.x, strict=True)}
-        for j, (name, (mid, slopes, error)) in enumerate(zip(self.c.plant.inputs, leaf.u, strict=True)):
-            names[name] = self.moving(mid, slopes, n + j, error)
-        for j, (name, (lo, hi)) in enumerate(zip(self.c.plant.uncertain, self.c.plant.ranges, strict=True)):
-            names[name] = self.moving(arb((lo + hi) / 2), [ZERO] * n, n + self.c.m + j, arb((hi - lo) / 2))
+        """Models of f(x, pi(x), q), all of them finite."""
+        known, place = self.numbers(leaf), f"leaf {leaf.box.number}"
         try:
-            result = self.c.plant.dynamics.evaluate(names, lambda q: Taylor(arb(q)))
+            result = self.c.plant.dynamics.evaluate({**known.states, **known.inputs, **known.uncertain}, constant)
         except Refused as no:
             raise Refused(no.rule, place, no.detail) from None
         require(all(f.is_finite() for f in result), "ring", place, "F has no finite model")
         return result
 
+    def reached(self, leaf: Leaf) -> dict[str, Taylor]:
+        """Rule `flow`: the states of a whole period."""
+        return reached_from(self.c, self.numbers(leaf), f"leaf {leaf.box.number}")
+
+    def G(self, leaf: Leaf, within: dict[str, Taylor] | None = None) -> list[Taylor]:
+        """What the states change by over a step, by its length: F in continuous time.
+
+        With a sample `within` are the states of the whole period.
+        """
+        if within is None:
+            F = self.F(leaf)
+            if not self.c.plant.discrete:
+                return F
+            return [f + -self.affine(row) for f, row in zip(F, leaf.x, strict=True)]
+        return mean_on(self.c, self.numbers(leaf), within, self.order, self.period(), f"leaf {leaf.box.number}")
+
+    def period(self) -> Taylor:
+        """With the last symbol, where it may be one of many."""
+        lo, hi = self.c.sample or (self.c.step, self.c.step)
+        middle = arb((lo + hi) / 2)
+        if not self.c.varies:
+            return Taylor(middle)
+        return self.moving(middle, [ZERO] * self.n, self.symbols - 1, arb((hi - lo) / 2))
+
     def moving(self, mid: arb, slopes: list[arb], symbol: int, size: arb) -> Taylor:
         """mid + slopes.d + size times a symbol of its own."""
         return Taylor(mid, slopes + [size if i == symbol else ZERO for i in range(self.n, self.symbols)])
 
-    def Vdot(self, leaf: Leaf) -> Taylor:
-        """(2 P x)'F."""
-        pad, result = [ZERO] * (self.symbols - self.n), Taylor(ZERO)
-        for row, f in zip(leaf.gradient, self.F(leaf), strict=True):
-            result += Taylor(row[0], row[1:] + pad) * f
+    def D(self, leaf: Leaf, within: dict[str, Taylor] | None = None) -> Taylor:
+        """(2 P x + h P G)'G with the longest h: Vdot in continuous time. What V changes by over a step, by its length.
+
+        The square of G has no negative part, so that a longer h makes this no less.
+        """
+        G, result = self.G(leaf, within), Taylor(ZERO)
+        for i, (row, g) in enumerate(zip(leaf.gradient, G, strict=True)):
+            along = self.affine(row)
+            if self.steps:
+                for k, other in enumerate(G):
+                    along += other.scaled(self.step * self.P[i, k])
+            result += along * g
         return result
 
     def V(self, leaf: Leaf) -> Taylor:
@@ -277,21 +330,40 @@ class Leaves:
         Q = [diagonal[i] if i == j and i < self.n else ZERO for i, j in pairs(self.symbols)]
         return Taylor(c, g, Q, self.cross_part(leaf.box))
 
-    def decreases(self, leaf: Leaf) -> bool:
-        """Whether Vdot, Vdot + k (c2 - V) or Vdot + k (V - inner) is certainly negative on the leaf, for some k >= 0.
+    def decreases(self, leaf: Leaf, within: dict[str, Taylor] | None = None) -> bool:
+        """Whether D', D' + k (c2 - V) or D' + k (V - c1), D' = D + 2 lambda V, is certainly negative, for some k >= 0.
 
         The first-order part of the bound is piecewise linear in k: each of its kinks is tried. Any number may be k; one
         that is not finite makes the bound so, and that is negative for no comparison.
         """
-        Vdot, V = self.Vdot(leaf), self.V(leaf)
-        if Vdot.bound() < 0:
+        D, V = self.D(leaf, within), self.V(leaf)
+        if self.rate > 0:
+            D += V.scaled(self.rate)
+        if self.alone and self.steps and not self.is_beyond_floor(leaf.box):
+            return self.stays(D, V + Taylor(-self.inner))
+        if D.bound() < 0:
             return True
         for slack in (Taylor(self.outer) + -V, V + Taylor(-self.inner)):
-            for g, w in zip(Vdot.g or (), slack.g or (), strict=Vdot.g is not None):
-                k = -(g / w).mid()
-                if k > 0 and (Vdot + slack.scaled(k)).bound() < 0:
-                    return True
+            if any(k > 0 and (D + slack.scaled(k)).bound() < 0 for k in kinks(D, slack)):
+                return True
         return False
+
+    def stays(self, D: Taylor, above: Taylor) -> bool:
+        """Whether D' + k (V - c0) is certainly negative for some k from 0 to 1/h, where V may be below c0.
+
+        A step from there then leads to V + h D < V + h k (c0 - V) <= c0, if no ball has shown it. From c0 on D' < 0.
+        """
+        tried = [ZERO, *(k for k in kinks(D, above) if k >= 0 and k * self.step <= 1), 1 / self.step]
+        return any((D + above.scaled(k)).bound() < 0 for k in tried)
+
+    def is_beyond_floor(self, box: Box) -> bool:
+        """Whether V is at least the inner level on all of the box, certainly."""
+        return bool(self.diagonal_part(box.least()) - self.cross_part(box) >= self.inner)
+
+
+def kinks(D: Taylor, slack: Taylor) -> list[arb]:
+    """Each k at which a coefficient of the first order vanishes in D + k slack."""
+    return [-(g / w).mid() for g, w in zip(D.g or (), slack.g or (), strict=D.g is not None)]
 
 
 Affine = tuple[arb, list[arb], arb]  # mid + slopes.d within an error
@@ -352,22 +424,24 @@ def clip(y: Affine, lo: arb, hi: arb) -> Affine:
 
 
 def check_leaves(leaves: Leaves, evidence: Tree) -> None:
-    """Rules `inputs` and `ring`; in each batch of leaves the inputs come first.
+    """Rules `inputs`, `flow` and `ring`; in each batch of leaves they are taken in this order.
 
-    An inside leaf has been covered by rule `local` where the claim is about the origin. Under `practical` by nothing:
-    there the inputs are asked, and that F has a finite model.
+    An inside leaf has been covered by rule `local` where there is a ball. Without one nothing has: there the inputs are
+    asked, and in continuous time that F has a finite model, but where time has steps that V stays below c0.
     """
     c, bounded = leaves.c, bounded_by_form(leaves.c)
     size = max(1, BATCH // max(layer.rows for layer in c.policy.layers))
-    passing = c.ends_at_origin
-    asked = (box for box in boxes(evidence) if not (leaves.is_outside(box) or (passing and leaves.is_inside(box))))
+    covered = not leaves.alone
+    asked = (box for box in boxes(evidence) if not (leaves.is_outside(box) or (covered and leaves.is_inside(box))))
     while batch := list(islice(asked, size)):
         enclosed = leaves.enclose(batch)
         for leaf in enclosed:
             good = bounded or within_bounds(c, leaf.ranges())
             require(good, "inputs", f"leaf {leaf.box.number}", "an input is not certain to stay in its bounds")
-        for leaf in enclosed:
-            if leaves.is_inside(leaf.box):
+        reached = [None if c.sample is None else leaves.reached(leaf) for leaf in enclosed]
+        for leaf, within in zip(enclosed, reached, strict=True):
+            if leaves.is_inside(leaf.box) and not leaves.steps:
                 leaves.F(leaf)
                 continue
-            require(leaves.decreases(leaf), "ring", f"leaf {leaf.box.number}", "no bound of Vdot is certainly negative")
+            falls = leaves.decreases(leaf, within)
+            require(falls, "ring", f"leaf {leaf.box.number}", "no bound of what V changes by is certainly negative")

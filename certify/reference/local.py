@@ -1,7 +1,9 @@
-"""Rule `local`: Vdot < 0 on a ball that contains {V <= c1}, without a hole at the origin, for all that is uncertain.
+"""Rule `local`: V falls on a ball that contains {V <= c1}, without a hole at the origin, for all that is uncertain.
 
-The matrix inequality has no symbol for an uncertain quantity; the models' balls take in what it does to them, so that
-one inequality holds for all of its values. They are wide where its range is wide, and so the ranges are cut into cells.
+Under `practical` there is a hole: V falls where it is at least c0, and from below c0 it does not rise beyond.
+
+What is uncertain has symbols in the values and gradients of the models, whose corners count; all else that it does to
+them is taken in by their balls. These are wide where its range is wide, and so the ranges are cut into cells.
 """
 
 from __future__ import annotations
@@ -9,28 +11,38 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from itertools import pairwise, product
 
-from flint import fmpq_mat
-
-from .decrease import contains, decreases, sound_multipliers
+from .decrease import contains, decreases, decreases_around, sound_multipliers, whatever_y
 from .document import Certificate, Interval
 from .evidence import Ball
 from .fields import exact
-from .loop import Loop
+from .flow import steps_on
+from .loop import Field, Loop
 from .rational import identity
 from .refusal import require
 
 
 def local(loop: Loop, ball: Ball, parts: Sequence[int]) -> None:
-    """What the file says of the ball comes first, then rule `inputs` on it, and then what decreases, in each cell."""
+    """What the file says of the ball comes first, then rules `inputs` and `flow`, and then what falls, in each cell."""
     c: Certificate = loop.c
     holds = contains(ball, c.P, exact(c.inner) * identity(c.n))
     require(holds, "local", "ball", "it does not contain {V <= c1}: J'PJ - c1 I is not positive definite")
     sound_multipliers(ball, "local", "ball")
-    known, still = loop.known(ball.J, "local", "ball"), fmpq_mat(c.n, c.n)
+    h, R, level = c.step, 2 * c.rate * c.P, c.floor
+    short = h == 0 or exact(ball.edge) * h <= 1
+    require(bool(short), "local", "ball", "the edge is beyond 1/h: V could rise above c0 from below")
+    steps = steps_on(loop, loop.known(ball.J, "local", "ball"), ball, "ball")
+
+    def falls(G: Field) -> bool:
+        if level is None:
+            return decreases(ball, c.P, R, G, h)
+        return decreases_around(ball, c.P, R, G, h, exact(level))
+
     for number, cell in enumerate(cells(c.plant.ranges, parts)):
         at = f"cell {number}" if parts else "ball"
-        falls = decreases(ball, c.P, still, loop.within(known, cell, "local", at))
-        require(falls, "local", at, "Vdot < 0 does not follow: the matrix that is left is not positive definite")
+        everywhere = whatever_y(steps.change(cell, "local", at), falls)
+        require(
+            everywhere, "local", at, "that V falls does not follow: the matrix that is left is not positive definite"
+        )
 
 
 def cells(ranges: Sequence[Interval], parts: Sequence[int]) -> Iterator[tuple[Interval, ...]]:

@@ -7,9 +7,9 @@ component of F.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from flint import arb, arb_mat, fmpq_mat
+from flint import arb, arb_mat, fmpq, fmpq_mat
 
 from .balls import ZERO, bounded_by_form, spanning, within_bounds
 from .document import Certificate, Interval
@@ -25,6 +25,12 @@ class Field:
     components: list[Model]
     units: Units
 
+    def whatever(self) -> Field:
+        return replace(self, components=[f.whatever() for f in self.components])
+
+    def where(self, y: Sequence[int]) -> Field:
+        return replace(self, components=[f.where(y) for f in self.components])
+
 
 @dataclass(frozen=True)
 class Known:
@@ -33,12 +39,28 @@ class Known:
     names: Mapping[str, Model]
     units: Units
 
+    def still(self, value: arb) -> Model:
+        """What does not depend on d."""
+        some = next(iter(self.names.values()))
+        return Model.affine(value, [ZERO] * some.a.nrows(), some.errors)
+
+    def constant(self, value: fmpq) -> Model:
+        return self.still(arb(value))
+
+    def moving(self, ends: Interval, symbol: int, symbols: int) -> Model:
+        """A number between two others, with a symbol of its own."""
+        lo, hi = ends
+        middle, half = self.constant((lo + hi) / 2), arb((hi - lo) / 2)
+        none = arb_mat(middle.a.nrows(), 1)
+        return replace(middle, dv=tuple(half if i == symbol else ZERO for i in range(symbols)), da=(none,) * symbols)
+
 
 class Loop:
     """F(x) = f(x, pi(x), q) of a certificate, for as many balls and cells as it has."""
 
     def __init__(self, c: Certificate) -> None:
         self.c, self.network, self.bounded = c, Network(c), bounded_by_form(c)
+        self.symbols = c.k + c.varies
 
     def on(self, J: fmpq_mat, rule: str, at: str, centre: fmpq_mat | None = None) -> Field:
         """Models of F on a ball of a plant of which nothing is uncertain."""
@@ -47,7 +69,8 @@ class Loop:
     def known(self, J: fmpq_mat, rule: str, at: str, centre: fmpq_mat | None = None) -> Known:
         """States and inputs, or a refusal under `inputs` or under the rule that asks, at the place it names.
 
-        Without a centre it is the origin, where pi(0) = u_eq exactly. J has a row for each state.
+        Without a centre it is the origin, where the policy is u_eq, but for claims that do not ask it. J has a row for
+        each state.
         """
         c, (u, units) = self.c, self.network.on(J, centre)
         bounded = self.bounded or within_bounds(c, [(v.v, v.radius) for v in u])
@@ -62,21 +85,27 @@ class Loop:
         return Known(dict(zip(c.plant.states + c.plant.inputs, [*states, *u], strict=True)), units)
 
     def within(self, known: Known, cell: Sequence[Interval], rule: str, at: str) -> Field:
-        """Models of F that are good for every value of what is uncertain in a cell, or a refusal.
+        """Models of f that are good for every value of what is uncertain in a cell, or a refusal."""
+        return self.field(known, self.varying(known, cell), rule, at)
 
-        What is uncertain does not depend on d. Its value is a ball with the cell in it, and so each number of a model
-        is a ball with all that it can be.
-        """
-        plant, some = self.c.plant, next(iter(known.names.values()))
-
-        def constant(value: arb) -> Model:
-            return Model.affine(value, [ZERO] * some.a.nrows(), some.errors)
-
-        uncertain = {q: constant(spanning(ends)) for q, ends in zip(plant.uncertain, cell, strict=True)}
+    def field(self, known: Known, uncertain: Mapping[str, Model], rule: str, at: str) -> Field:
+        """Models of f, all of them finite."""
         try:
-            F = plant.dynamics.evaluate({**known.names, **uncertain}, lambda q: constant(arb(q)))
+            F = self.c.plant.dynamics.evaluate({**known.names, **uncertain}, known.constant)
         except Refused as no:
             raise Refused(rule, at, no.detail) from None
         finite = known.units.is_finite() and all(f.is_finite() for f in F)
         require(finite, rule, at, "F has no finite model")
         return Field(F, known.units)
+
+    def varying(self, known: Known, cell: Sequence[Interval]) -> dict[str, Model]:
+        """What is uncertain, each quantity with a symbol of its own that runs through the cell."""
+        return {
+            name: known.moving(ends, j, self.symbols)
+            for j, (name, ends) in enumerate(zip(self.c.plant.uncertain, cell, strict=True))
+        }
+
+    def anything(self, known: Known) -> dict[str, Model]:
+        """What is uncertain as balls that hold their ranges, without a symbol."""
+        plant = self.c.plant
+        return {q: known.still(spanning(ends)) for q, ends in zip(plant.uncertain, plant.ranges, strict=True)}

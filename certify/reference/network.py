@@ -3,7 +3,7 @@
 A layer is y(d) = y(0) + G J d + L A(d): A stacks what every tanh of the layers before adds to its tangent at y(0). Of
 these y(0), G and L depend on the ball's centre alone, and L is most of the work; so they are found once for all balls
 around the origin. There the policy is u_eq, by its form or because rule `centring` has shown it; at any other centre it
-is a number like others.
+is a number like others, and so it is at the origin with centring `none` where nothing is asked of it.
 
 What the models of a tanh leave out is an error of its own, which reaches every input through L.
 """
@@ -92,7 +92,7 @@ class Units:
 
 
 class Network:
-    """The policy of a certificate whose origin is an equilibrium: pi(0) = u_eq exactly."""
+    """The policy of a certificate. At the origin it is u_eq, but under `practical` what it is with centring `none`."""
 
     def __init__(self, c: Certificate) -> None:
         self.c, self.weights = c, weights(c.policy)
@@ -150,7 +150,7 @@ class Network:
     def input_at(self, j: int, squashed: arb, centre: fmpq_mat | None) -> arb:
         """Input j at the centre, before its clip."""
         policy, u_eq = self.c.policy, arb(self.c.plant.u_eq[j])
-        if centre is None:
+        if centre is None and (self.c.ends_at_origin or policy.centre != "none"):
             return u_eq
         scale, at_0 = arb(policy.scale[j]), self.net_at_0[j]
         if policy.centre != "output":

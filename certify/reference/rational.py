@@ -19,7 +19,12 @@ ZERO = fmpq(0)
 
 
 def levels(c: Certificate) -> None:
+    """0 < c1 <= c2; under `practical` 0 < c0 <= c1, and c0 = c1 where no ball lies between them."""
     require(0 < c.inner <= c.outer, "levels", "levels", f"0 < {c.inner!r} <= {c.outer!r} does not hold")
+    if c.floor is not None:
+        require(0 < c.floor <= c.inner, "levels", "levels", f"0 < {c.floor!r} <= {c.inner!r} does not hold")
+        between = isinstance(c.evidence, Tree) and c.evidence.ball is not None
+        require(between or c.floor == c.inner, "levels", "levels", "without a ball c0 = c1 must hold")
 
 
 def inverse_diagonal(A: fmpq_mat, rule: str, at: str | None = None) -> list[fmpq]:

@@ -10,7 +10,7 @@ from flint import ctx
 from . import rational
 from .balls import PRECISION
 from .document import Certificate, read
-from .evidence import WITH_TUBE, Trusted
+from .evidence import WITH_TUBE, Tree, Trusted
 from .leaves import Leaves, check_leaves, structure
 from .local import local
 from .loop import Loop
@@ -63,11 +63,9 @@ def check(c: Certificate) -> int | None:
     S, inverse = rational.coordinates(c, evidence)
     rational.root(c, evidence, inverse)
     rational.centring(c)
-    bearable(c, "local" if c.ends_at_origin else "ring")
+    bearable(c, evidence)
     loop = None
-    if c.ends_at_origin:
-        if evidence.ball is None:
-            raise Refused("format", "evidence.local", "the claim needs a ball")
+    if evidence.ball is not None:
         loop = Loop(c)
         local(loop, evidence.ball, evidence.cells)
     leaves = structure(evidence.tree, c.n)
@@ -80,14 +78,17 @@ def check(c: Certificate) -> int | None:
     return leaves
 
 
-def bearable(c: Certificate, rule: str) -> None:
-    """Refuses what would fill the memory before it is decided. Models on a ball are of the third order, on a leaf not.
+def bearable(c: Certificate, evidence: Tree) -> None:
+    """Refuses what would fill the memory, or take days, before it is decided.
 
-    The symbols are states and the motion, on a leaf states, inputs and what is uncertain.
+    Models on a ball are of the third order, on a leaf not. The symbols are states and the motion, on a leaf states,
+    inputs, what is uncertain and a period. A series of order r has r products for each of r^2 / 2 coefficients.
     """
-    size = c.n + (c.claim == "reached")
-    thirds = size * (size + 1) * (size + 2) // 6 if c.ends_at_origin else 0
-    plant = len(c.plant.dynamics.steps) * max((c.n + c.m + c.k) ** 2, size**2 + thirds)
+    ball, size = evidence.ball, c.n + (c.claim == "reached")
+    thirds = size * (size + 1) * (size + 2) // 6 if ball else 0
+    order = max(evidence.order, ball.order if ball else 1)
+    plant = len(c.plant.dynamics.steps) * max((c.n + c.m + c.k + c.varies) ** 2, size**2 + thirds) * order**2
+    rule = "local" if ball else "ring"
     require(plant <= MAX_PLANT, rule, "plant", "the equations are too large for this checker")
     before, network = 0, 0
     for layer in c.policy.layers:

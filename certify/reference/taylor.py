@@ -64,6 +64,20 @@ class Taylor:
     def __add__(self, other: Taylor) -> Taylor:
         return Taylor(self.c + other.c, plus(self.g, other.g), plus(self.Q, other.Q), self.r + other.r)
 
+    def averaged(self, symbols: range) -> Taylor:
+        """The mean of such numbers for many values of these symbols, each of which then stands for its own mean.
+
+        The mean of the product of two is another number than that of their means: it lies in [-1, 1], that of a square
+        in [0, 1].
+        """
+        if self.Q is None or not symbols:
+            return self
+        c, r, Q = self.c, self.r, list(self.Q)
+        for k, (i, j) in enumerate(pairs(len(self.g or ()))):
+            if i in symbols and j in symbols:
+                c, r, Q[k] = (c + Q[k] / 2, r + abs(Q[k]) / 2, ZERO) if i == j else (c, r + abs(Q[k]), ZERO)
+        return Taylor(c, self.g, Q, r)
+
     def scaled(self, k: arb) -> Taylor:
         return Taylor(k * self.c, mix(k, self.g, ZERO, None), mix(k, self.Q, ZERO, None), abs(k) * self.r)
 

@@ -26,18 +26,18 @@ from certify.claims import Asymptotic, Enlarged, Reached
 from certify.closed_loop import ClosedLoop
 from certify.errors import CertifyError, InputError, SoundnessError
 from certify.lyapunov import domain_limit, extents, semi_axes, volume
+from certify.report.claims import CHECKED_ALWAYS, INPUTS, Words, words_for
 from certify.report.figures import Picture, draw
-from certify.report.figures.scene import centre_of, is_ellipsoid, slabs_of, start_of
+from certify.report.figures.scene import centre_of, inner_of, is_ellipsoid, is_local_enough, slabs_of, start_of
 from certify.report.figures.style import legend_style
+from certify.report.limits import limit_in_words, limited_by
 from certify.report.sampling import SimulatedRoa
+from certify.report.timing import Timing
 from certify.report.words import (
     ABSENT,
-    CHECKED_ALWAYS,
-    INPUTS,
     MINUS,
     TIMES,
     Varying,
-    Words,
     above,
     at_rest,
     below,
@@ -45,8 +45,6 @@ from certify.report.words import (
     held_at,
     inner_level,
     kept_apart,
-    limit_in_words,
-    limited_by,
     listed,
     number,
     point,
@@ -58,7 +56,6 @@ from certify.report.words import (
     varying_in,
     volume_name,
     volume_unit,
-    words_for,
 )
 from certify.systems import System
 
@@ -118,6 +115,16 @@ def status_of(certificate: Certificate, sha256: str, answer: Mapping[str, Any] |
     return Status("ACCEPTED", "The independent checker accepted the certificate.")
 
 
+def _timing(certificate: Certificate) -> Timing:
+    return Timing.of(certificate.system, certificate.claim.rate)
+
+
+def _words(certificate: Certificate) -> Words:
+    evidence = certificate.evidence
+    ball = isinstance(evidence, PartitionTree) and evidence.local is not None
+    return words_for(certificate.kind, _timing(certificate), ball=ball)
+
+
 def _checked(kind: str) -> str:
     """What is checked whatever the evidence is."""
     names = {"Lyapunov function": "P", "Equilibrium": "P, the equilibrium", "Domain": "the domain"}
@@ -166,7 +173,7 @@ def render_html(
         certificate.roa,
     ):
         raise InputError("`result` must be of the run that made the certificate; its policy or level is another.")
-    words = words_for(certificate.kind)
+    words = _words(certificate)
     pictures: list[Picture] = []
     roa, trouble = None, ""
     try:
@@ -194,6 +201,7 @@ def render_html(
         tables=_tables(certificate, status, answer, result, sha256, size),
         matrices=_matrices(certificate),
         roa=None if roa is None else _simulated(roa, certificate),
+        timing=_timing(certificate),
         provenance=sorted((str(k), str(v)) for k, v in certificate.provenance.items()),
         file=certificate_path.name,
         not_proved=_not_proved(certificate, words),
@@ -292,8 +300,10 @@ def _limits(certificate: Certificate, result: Mapping[str, Any] | None) -> dict[
     step: Mapping[str, Any] = found.get("next") or {}
     options = " ".join(f"{name} {value}" for name, value in (step.get("options") or {}).items())
     return {
-        "binds": "" if _is_missed(result) else limit_in_words(str(found.get("binds", ""))),
-        "modes": _modes(found, "with " * bool(system.ranges) + held_at(system)),
+        "binds": "" if _is_missed(result) else limit_in_words(str(found.get("binds", "")), _timing(certificate)),
+        "modes": ""
+        if _timing(certificate).discrete
+        else _modes(found, "with " * bool(system.ranges) + held_at(system)),
         "sets": len(sets),
         "shares": [
             {
@@ -331,7 +341,7 @@ def _modes(found: Mapping[str, Any], held: str) -> str:
 
 def _plant(certificate: Certificate) -> dict[str, Any]:
     system, units = certificate.system, certificate.system.units
-    expressions = system.uncertain_dynamics()
+    expressions, steps = system.uncertain_dynamics(), system.time == "discrete"
 
     def interval(name: str, bounds: tuple[Fraction, Fraction]) -> str:
         lo, hi = bounds
@@ -341,7 +351,7 @@ def _plant(certificate: Certificate) -> dict[str, Any]:
     equilibrium = zip(system.inputs, system.exact_u_eq(), strict=True)
     return {
         "name": system.name,
-        "equations": [_equation(s, e, names) for s, e in zip(system.states, expressions, strict=True)],
+        "equations": [_equation(s, e, names, steps=steps) for s, e in zip(system.states, expressions, strict=True)],
         "rounded": any(_is_long(v) for e in expressions for v in e.atoms(sympy.Rational)),
         "domain": [interval(s.name, b) for s, b in zip(system.states, system.domain, strict=True)],
         "inputs": [interval(s.name, b) for s, b in zip(system.inputs, system.input_bounds, strict=True)],
@@ -357,8 +367,8 @@ def _plant(certificate: Certificate) -> dict[str, Any]:
     }
 
 
-def _equation(state: sympy.Symbol, expression: sympy.Expr, names: Sequence[sympy.Symbol]) -> Any:
-    """`state' = expression` as MathML, which browsers typeset without help."""
+def _equation(state: sympy.Symbol, expression: sympy.Expr, names: Sequence[sympy.Symbol], *, steps: bool) -> Any:
+    """`state' = expression`, or by steps `state+ = expression`, as MathML, which browsers typeset without help."""
     from markupsafe import Markup
     from sympy.printing.mathml import MathMLPresentationPrinter
 
@@ -371,6 +381,8 @@ def _equation(state: sympy.Symbol, expression: sympy.Expr, names: Sequence[sympy
     text = text.replace("<mo>-</mo>", f"<mo>{MINUS}</mo>")
     text = text.replace("<mo>&InvisibleTimes;</mo>", '<mspace width="0.15em"/>')
     left = f"<mfrac><mrow><mi>d</mi>{_identifier(state.name)}</mrow><mrow><mi>d</mi><mi>t</mi></mrow></mfrac>"
+    if steps:
+        left = f"<msup>{_identifier(state.name)}<mo>+</mo></msup>"
     inner = text.removeprefix("<math>").removesuffix("</math>")
     return Markup(f'<math display="block">{left}<mo>=</mo>{inner}</math>')
 
@@ -398,7 +410,12 @@ def _claim(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict[s
 
     Of a solver's word the checker shows only the exact parts; the others say whose word they are.
     """
-    system, words, evidence = certificate.system, words_for(certificate.kind), certificate.evidence
+    system, words, evidence, timing = (
+        certificate.system,
+        _words(certificate),
+        certificate.evidence,
+        _timing(certificate),
+    )
     units = {s.name: pretty_unit(system.units.get(s.name, "")) for s in (*system.states, *system.inputs)}
     drawable = is_ellipsoid(certificate)
     bounds = [
@@ -413,13 +430,14 @@ def _claim(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict[s
     }
     if local:
         notes["Local"] = (
-            f"Margin of the linear part over the remainder: {below(100 * local, 3)} %{_in_cells(evidence)}."
+            f"Margin{' of the linear part over the remainder' if certificate.claim.at_rest else ''}: "
+            f"{below(100 * local, 3)} %{_in_cells(evidence)}."
         )
-    if answer and isinstance(certificate.claim, Asymptotic) and certificate.inner == certificate.roa:
+    if answer and is_local_enough(certificate):
         notes["Ring"] = "As c₁ = c₂, the local part covers the whole set."
     elif answer:
         shown = f"Shown on {answer.get('ring_leaves', 0):,} of {answer.get('leaves', 0):,} leaves"
-        notes["Ring"] = f"{shown}; the smallest bound on {MINUS}V̇ is {below(ring, 3)}." if ring is not None else shown
+        notes["Ring"] = f"{shown}; {_smallest(timing)} is {below(ring, 3)}." if ring is not None else shown
     notes |= _tube_notes(certificate)
     parts = []
     for name, condition, shown_by in _with_errors(words.parts, system):
@@ -431,14 +449,20 @@ def _claim(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict[s
         else:
             text = f"{condition}, {shown_by}." if shown_by else condition
         parts.append((name, text, note))
-    inner, outer = inner_level(certificate.kind, certificate.inner), below(certificate.roa)
+    inner, outer = inner_level(certificate.kind, inner_of(certificate)), below(certificate.roa)
+    practical = not certificate.claim.at_rest
+    statement = words.statement.format(
+        inner=inner,
+        outer=outer,
+        duration=_duration(certificate),
+        centre=_centre(certificate),
+        speed=timing.speed(inner_of(certificate) if practical else None, certificate.roa) if drawable else "",
+        constant="where what is uncertain is constant in time, " if system.ranges else "",
+    )
     return {
-        "statement": stated_for(
-            varying_in(system),
-            words.statement.format(
-                inner=inner, outer=outer, duration=_duration(certificate), centre=_centre(certificate)
-            ),
-        ),
+        "statement": stated_for(varying_in(system), statement, by_steps=timing.discrete),
+        "definition": timing.definitions,
+        "middle": below(certificate.inner) if practical and certificate.inner != inner_of(certificate) else "",
         "enlarged": isinstance(certificate.claim, Enlarged | Reached),
         "centre": isinstance(certificate.claim, Reached),
         "level": outer,
@@ -446,6 +470,11 @@ def _claim(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict[s
         "bounds": bounds,
         "parts": parts,
     }
+
+
+def _smallest(timing: Timing) -> str:
+    """Of what the margin of the ring is the least."""
+    return f"the smallest bound on {MINUS}{f'({timing.decrease})' if timing.rate else timing.decrease}"
 
 
 def _in_cells(evidence: PartitionTree | TrustedSolver) -> str:
@@ -523,10 +552,7 @@ def _not_proved(certificate: Certificate, words: Words) -> list[tuple[str, str]]
             f"The true set may be larger: what starts outside {words.sets} may do the same or not.",
         ),
         *_not_of_the_plant(certificate.system),
-        (
-            "A sampled controller.",
-            "u = π(x) acts in continuous time. An action that is held between samples is another closed loop.",
-        ),
+        *_other_times(_timing(certificate)),
         _rounding(certificate.system),
         *words.excluded[-1:],
         ("Wrapped angles.", "States are real numbers: an angle of a full turn is not the origin."),
@@ -545,6 +571,36 @@ def _not_proved(certificate: Certificate, words: Words) -> list[tuple[str, str]]
             )
         )
     return items
+
+
+def _other_times(timing: Timing) -> Iterator[tuple[str, str]]:
+    """In which other ways than the claim's time may pass in a loop."""
+    if timing.discrete:
+        yield (
+            "Time between the steps.",
+            "The equations say what the state is one step later, and nothing of what lies between two steps. Where "
+            "they come from a plant in continuous time, that they are exact for it, and what it does between them, is "
+            "not part of the claim.",
+        )
+    elif timing.sample is None:
+        yield (
+            "A sampled controller.",
+            "u = π(x) acts in continuous time. An action that is held between samples is another closed loop.",
+        )
+    else:
+        longer = "longer" if timing.from_zero else "longer or shorter"
+        yield (
+            "Other periods, and delay.",
+            f"The input changes at the sampling instants, at once, and is held over {timing.periods}. With a period "
+            f"that is {longer} even once, a sample that is missed, or the time that computing the input takes, it is "
+            "another closed loop.",
+        )
+        if not timing.from_zero:
+            yield (
+                "The set between two sampling instants.",
+                "At the sampling instants the state is in the set; between two of them it is in the domain, and may be "
+                "outside the set.",
+            )
 
 
 def _not_of_the_plant(system: System) -> list[tuple[str, str]]:
@@ -601,9 +657,12 @@ def _tables(
     sha256: str,
     size: int | None,
 ) -> dict[str, Any]:
-    system, P, network, words = certificate.system, certificate.P, certificate.network, words_for(certificate.kind)
+    system, P, network, words = certificate.system, certificate.P, certificate.network, _words(certificate)
+    timing, inner = _timing(certificate), inner_of(certificate)
     state_units = [system.units.get(s.name, "") for s in system.states]
-    levels = [(f"{words.inner}, {words.inner_word}", repr(certificate.inner)), ("c₂, enlarged", repr(certificate.roa))]
+    levels = [(f"{words.inner}, {words.inner_word}", repr(inner))]
+    levels += [("c₁, local", repr(certificate.inner))] if inner != certificate.inner else []
+    levels += [("c₂, enlarged", repr(certificate.roa))]
     reach: list[tuple[str, ...]] = []
     heads: list[str] = []
     size_of_set: list[tuple[str, str]] = []
@@ -634,7 +693,11 @@ def _tables(
         geometry.append(("eigenvalues of P", ", ".join(number(float(v)) for v in np.linalg.eigvalsh(P))))
     if isinstance(certificate.claim, Asymptotic):  # elsewhere the origin need not be an equilibrium
         held = f" with {held_at(system)}" if system.ranges else ""
-        geometry.append((f"eigenvalues of the closed loop{held}", _eigenvalues(certificate)))
+        geometry.append((f"eigenvalues of the closed loop{timing.linearised}{held}", _eigenvalues(certificate)))
+    if timing.sample is not None:
+        geometry.append(("input held over", timing.periods))
+    if timing.rate:
+        geometry.append(("rate λ", f"{certificate.claim.rate!r} per {'step' if timing.discrete else 's'}"))
     slabs = slabs_of(certificate)
     evidence = [
         ("policy", f"{'-'.join(map(str, network.layers))} tanh, squash {network.squash}, centre {network.centre}"),
@@ -652,7 +715,7 @@ def _tables(
         evidence += [(f"its answer to {name}", said) for name, said in solver.queries]
     elif answer is not None and status.accepted:
         leaves = f"{answer.get('leaves', 0):,}, of which {answer.get('ring_leaves', 0):,} in the ring"
-        whole = isinstance(certificate.claim, Asymptotic) and certificate.inner == certificate.roa
+        whole = is_local_enough(certificate)
         evidence.append(("leaves", "none needed: the local part covers the whole set" if whole else leaves))
     run: list[tuple[str, str]] = []
     if result is not None:
@@ -707,12 +770,13 @@ def _lengths(certificate: Certificate, sets: Sequence[_Ellipsoid]) -> tuple[list
 
 
 def _simulated(roa: SimulatedRoa, certificate: Certificate) -> dict[str, str]:
+    timing = _timing(certificate)
     return {
         "fraction": ABSENT if np.isnan(roa.fraction) else f"{100 * roa.fraction:.1f} %",
         "grid": f" {TIMES} ".join(str(len(a)) for a in roa.axes),
         "attracted": f"{int(roa.attracted.sum()):,} of {roa.attracted.size:,}",
-        "step": f"{number(roa.step, 3)} s",
-        "horizon": f"{number(roa.horizon, 3)} s",
+        "how": _integrated(roa, timing),
+        "horizon": f"{number(roa.horizon, 3)} {timing.unit}",
         "undecided": f"{roa.undecided:,}",
         "left": f"{int(roa.left.sum()):,}",
         "contradictions": f"{roa.contradictions:,}" if roa.contradictions else "",
@@ -720,6 +784,16 @@ def _simulated(roa: SimulatedRoa, certificate: Certificate) -> dict[str, str]:
         "of": volume_name(certificate.system.n),
         "who": words_for(certificate.kind).simulated,
     }
+
+
+def _integrated(roa: SimulatedRoa, timing: Timing) -> str:
+    """How the runs of a grid come about; {} stands for the values that are held."""
+    step = f"step {number(roa.step, 3)} s"
+    if timing.discrete:
+        return "the loop's own steps{}"
+    if timing.sample is not None:
+        return f"Runge–Kutta of order four with the input held over {number(float(timing.sample[1]), 6)} s{{}}, {step}"
+    return f"Runge–Kutta of order four on the continuous closed loop{{}}, {step}"
 
 
 def _clip(certificate: Certificate) -> str:
@@ -731,10 +805,21 @@ def _clip(certificate: Certificate) -> str:
 
 def _eigenvalues(certificate: Certificate) -> str:
     try:
-        A, _, _ = ClosedLoop(certificate.system, certificate.network).linearise()
+        A, B, K = ClosedLoop(certificate.system, certificate.network).linearise()
     except CertifyError as error:
         return str(error)
+    if certificate.system.sample is not None:
+        A = _over_period(A + B @ K, B, K, float(certificate.system.sample[1]))
     return ", ".join(_complex(complex(v)) for v in sorted(np.linalg.eigvals(A), key=lambda v: (v.real, v.imag)))
+
+
+def _over_period(A: NDArray[np.float64], B: NDArray[np.float64], K: NDArray[np.float64], h: float) -> Any:
+    """What the linear loop x' = A x + B u makes of x over a period, u = -K x held: e^(A h) - int_0^h e^(A s) ds B K."""
+    from scipy.linalg import expm
+
+    n, m = B.shape
+    both = expm(h * np.block([[A, B], [np.zeros((m, n + m))]]))
+    return both[:n, :n] - both[:n, n:] @ K
 
 
 def _complex(value: complex) -> str:

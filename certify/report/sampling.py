@@ -1,8 +1,9 @@
 """Simulation for pictures. Nothing here is proved, and whatever is shown of it is labelled as simulated.
 
 The continuous closed loop is integrated by the classical Runge-Kutta method of order four with the policy evaluated at
-every stage, many initial states at a time. Runs leave the batch as soon as they are decided, which is
-what keeps a grid of a few thousand states well below a second.
+every stage, many initial states at a time; where the input is held over a period, with the policy evaluated at its
+beginning, in steps that divide it. A loop in discrete time takes its own steps. Runs leave the batch as soon as they
+are decided, which is what keeps a grid of a few thousand states well below a second.
 
 A run has one of three fates: it settles, it leaves, or it has done neither by the end. The third is a fate of its own:
 a slow run is no sign that anything leaves.
@@ -98,12 +99,18 @@ class Flow:
         class.
     policy : pi, shapes (..., n) to (..., m).
     lo, hi : corners of the domain box, shape (n,).
+    plant : f, shapes (..., n) and (..., m) to (..., n).
+    period : over which the input is held, the longest that is allowed, in seconds; 0 if it follows the state at once.
+    discrete : whether F(x) is the state one step later, and not the rate of change.
     """
 
     field: Field
     policy: Field
     lo: Array
     hi: Array
+    plant: Callable[[Array, Array], Array]
+    period: float = 0.0
+    discrete: bool = False
 
     @classmethod
     def of(cls, system: System, network: TanhNetwork) -> Flow:
@@ -127,7 +134,33 @@ class Flow:
         def field(x: Array) -> Array:
             return np.asarray(f(x, policy(x)))
 
-        return cls(field, policy, *domain_bounds(system))
+        def plant(x: Array, u: Array) -> Array:
+            return np.asarray(f(x, u))
+
+        period = 0.0 if system.sample is None else float(system.sample[1])
+        return cls(field, policy, *domain_bounds(system), plant, period, system.time == "discrete")
+
+    def fitting(self, step: float) -> float:
+        """The largest step of a simulation up to `step`, in seconds, that divides the period; in discrete time 1."""
+        if self.discrete:
+            return 1.0
+        return self.period / math.ceil(self.period / step) if self.period else step
+
+    def steps_between(self, step: float) -> int:
+        """How many of these steps lie between two instants of which the claim speaks."""
+        return max(round(self.period / step), 1)
+
+    def input(self, x: Array, held: Array | None, k: int, step: float) -> Array | None:
+        """The input that acts from step k on, (..., m): the one that is held, or a new one; None if none is held."""
+        if not self.period:
+            return None
+        return self.policy(x) if held is None or k % self.steps_between(step) == 0 else held
+
+    def advance(self, x: Array, u: Array | None, step: float) -> Array:
+        """States one step later, (..., n), with the input held at u if there is one."""
+        if self.discrete:
+            return self.field(x)
+        return rk4_step(self.field if u is None else lambda y: self.plant(y, u), x, step)
 
 
 def time_scales(flow: Flow, samples: int = _RATE_SAMPLES, reach: Array | None = None) -> tuple[float, float]:
@@ -137,15 +170,19 @@ def time_scales(flow: Flow, samples: int = _RATE_SAMPLES, reach: Array | None = 
 
     The fastest is taken over Jacobians at the origin and at sampled states of the domain, because a plant can be
     stiffer away from the origin; Runge-Kutta of order four is stable up to 2.8 of it. The horizon is cut at 3,000
-    steps.
+    steps. In discrete time the two are numbers of steps, the first 1.
     """
     lo, hi = (flow.lo, flow.hi) if reach is None else (np.maximum(flow.lo, -reach), np.minimum(flow.hi, reach))
     x = np.random.default_rng(0).uniform(lo, hi, (samples, len(lo)))
     rates = _eigenvalues(flow, np.concatenate([np.zeros((1, len(flow.lo))), x]))
+    if flow.discrete:
+        with np.errstate(divide="ignore"):
+            slowest = -float(np.max(np.log(np.abs(rates[:1])), initial=-math.inf))
+        return 1.0, min(math.ceil(_HORIZON / slowest) if slowest > _HORIZON / _MAX_STEPS else _MAX_STEPS, _MAX_STEPS)
     fastest = float(np.max(np.abs(rates), initial=0.0))
     slowest = float(np.min(np.abs(rates[:1].real), initial=math.inf))
     step = _STEP / fastest if fastest > 0 else 1.0
-    return step, min(_HORIZON / slowest if slowest > 0 else math.inf, _MAX_STEPS * step)
+    return step, min(_HORIZON / slowest if slowest > 0 else math.inf, _MAX_STEPS * flow.fitting(step))
 
 
 def _eigenvalues(flow: Flow, x: Array) -> NDArray[np.complex128]:
@@ -161,8 +198,10 @@ def _eigenvalues(flow: Flow, x: Array) -> NDArray[np.complex128]:
 def simulate(flow: Flow, starts: Array, step: float, steps: int, deadline: float = math.inf) -> Array:
     """Trajectories from `starts` (N, n), shape (steps + 1, N, n); NaN from the first step outside the domain on.
 
-    At `deadline`, a reading of `time.monotonic`, the trajectories end where they are, in fewer steps.
+    At `deadline`, a reading of `time.monotonic`, the trajectories end where they are, in fewer steps. Where the input
+    is held `step` must divide the period (Flow.fitting); the first period begins at the start.
     """
+    u: Array | None = None
     x = np.array(starts, dtype=np.float64)
     path = np.full((steps + 1, *x.shape), math.nan)
     path[0] = x
@@ -173,9 +212,10 @@ def simulate(flow: Flow, starts: Array, step: float, steps: int, deadline: float
                 break
             if k > 1 and time.monotonic() > deadline:
                 return path[:k]
-            x = rk4_step(flow.field, x, step)
+            u = flow.input(x, u, k - 1, step)
+            x = flow.advance(x, u, step)
             inside = np.all((x >= flow.lo) & (x <= flow.hi), axis=-1)
-            x, alive = x[inside], alive[inside]
+            x, alive, u = x[inside], alive[inside], None if u is None else u[inside]
             path[k, alive] = x
     return path
 
@@ -222,15 +262,15 @@ def runs_of(flow: Flow, starts: Array, P: Array, level: float, target: float, st
     start below it. Runs from below the level, or from a tube's `start` {(x - c)'P(x - c) <= 1}, c = `centre` or 0, that
     seem to leave are simulated again in much smaller steps: the first suspect is the integration.
     """
-    path = simulate(flow, starts, step, steps, deadline)
+    path, apart = simulate(flow, starts, step, steps, deadline), flow.steps_between(step)
     begins = quadratic(P, path[0]) <= level
-    settled, left = _fates(path, begins, P, level, target)
+    settled, left = _fates(path, begins, P, level, target, apart)
     suspects = np.flatnonzero(left & _in_sets(path[0], P, level, start, centre))
-    if suspects.size and time.monotonic() < deadline:
+    if suspects.size and not flow.discrete and time.monotonic() < deadline:
         finer = simulate(flow, path[0, suspects], step / _FINER, _FINER * (len(path) - 1), deadline)[::_FINER]
         if len(finer) == len(path):
             path[:, suspects] = finer
-            settled, left = _fates(path, begins, P, level, target)
+            settled, left = _fates(path, begins, P, level, target, apart)
     return Runs(path, step, settled, left)
 
 
@@ -240,12 +280,12 @@ def _in_sets(x: Array, P: Array, level: float, start: Array | None, centre: Arra
     return inside if start is None else inside | (quadratic(start, x if centre is None else x - centre) <= 1.0)
 
 
-def _fates(path: Array, begins: Mask, P: Array, level: float, target: float) -> tuple[Mask, Mask]:
-    """Which runs settle and which leave, each (N,)."""
-    V = quadratic(P, path)
+def _fates(path: Array, begins: Mask, P: Array, level: float, target: float, apart: int) -> tuple[Mask, Mask]:
+    """Which runs settle and which leave, each (N,), by V at instants that are so many steps `apart`."""
+    V = quadratic(P, path[::apart])
     with np.errstate(invalid="ignore"):
         settled = np.any(target >= V, axis=0)
-        left = np.any(np.isnan(V), axis=0) | (begins & np.any(_OUTSIDE * level < V, axis=0))
+        left = np.any(np.isnan(path[-1]), axis=-1) | (begins & np.any(_OUTSIDE * level < V, axis=0))
     return settled & ~left, left
 
 
@@ -292,6 +332,7 @@ def simulated_roa_fraction(
     points = _GRID[system.n] if points is None else points
     if not (points >= 1 and 0 < step < math.inf and 0 < horizon < math.inf):
         raise InputError("`points`, `step` and `horizon` must be positive and finite.")
+    step = flow.fitting(step)
     centres = (np.arange(points) + 0.5) / points
     axes = tuple(a + (b - a) * centres for a, b in zip(flow.lo, flow.hi, strict=True))
     x = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, system.n)
@@ -299,7 +340,7 @@ def simulated_roa_fraction(
     target = SETTLED * level if settled is None else settled
     attracted, left, reached = _run(flow, x, P, target, step, horizon, deadline)
     suspects = np.flatnonzero(certified & left)
-    if suspects.size:
+    if suspects.size and not flow.discrete:
         again, gone, _ = _run(flow, x[suspects], P, target, step / _FINER, reached, deadline)
         attracted[suspects], left[suspects] = again, gone
     shape = (points,) * system.n
@@ -311,22 +352,24 @@ def _run(
 ) -> tuple[Mask, Mask, float]:
     """Which runs came to `V <= target`, which left the domain, and how many seconds were simulated."""
     attracted, left = np.zeros((2, len(x)), dtype=np.bool_)
-    alive = np.arange(len(x))
-    reached = horizon
+    alive, apart = np.arange(len(x)), flow.steps_between(step)
+    reached, u = horizon, None
     with np.errstate(all="ignore"):
-        for k in range(math.ceil(horizon / step)):
-            near = quadratic(P, x) <= target
-            attracted[alive[near]] = True
-            x, alive = x[~near], alive[~near]
+        for k in range(math.ceil(horizon / step / apart) * apart):
+            if k % apart == 0:
+                near = quadratic(P, x) <= target
+                attracted[alive[near]] = True
+                x, alive, u = x[~near], alive[~near], None
             if not alive.size:
                 break
             if time.monotonic() > deadline:
                 reached = k * step
                 break
-            x = rk4_step(flow.field, x, step)
+            u = flow.input(x, u, k, step)
+            x = flow.advance(x, u, step)
             inside = np.all((x >= flow.lo) & (x <= flow.hi), axis=-1)  # False for NaN
             left[alive[~inside]] = True
-            x, alive = x[inside], alive[inside]
+            x, alive, u = x[inside], alive[inside], None if u is None else u[inside]
         near = quadratic(P, x) <= target
     attracted[alive[near]] = True
     return attracted, left, reached
@@ -372,6 +415,20 @@ def _halved(axis: Array) -> Array:
     fine = np.empty(2 * len(axis) - 1)
     fine[::2], fine[1::2] = axis, (axis[:-1] + axis[1:]) / 2
     return fine
+
+
+def growth(flow: Flow, P: Array, x: Array, step: float) -> Array:
+    """V's change by time at states (..., n), shape (...): Vdot, in discrete time the increment of a step, with a held
+    input that of a period over the period, simulated in steps up to `step`."""
+    with np.errstate(all="ignore"):
+        if flow.discrete:
+            return quadratic(P, flow.field(x)) - quadratic(P, x)
+        if not flow.period:
+            return np.asarray(2 * np.einsum("...i,...i->...", x @ P, flow.field(x)))
+        u, y, step = flow.policy(x), x, flow.fitting(step)
+        for _ in range(flow.steps_between(step)):
+            y = flow.advance(y, u, step)
+        return (quadratic(P, y) - quadratic(P, x)) / flow.period
 
 
 def quadratic(P: Array, x: Array) -> Array:

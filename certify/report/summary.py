@@ -10,14 +10,18 @@ from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 from unicodedata import normalize
 
+from certify.report.claims import Words, words_for
+from certify.report.limits import limited_by
+from certify.report.timing import Timing, reach_time
 from certify.report.words import (
+    ABSENT,
+    PRACTICAL,
     Varying,
     above,
     at_rest,
     below,
     inner_level,
     label,
-    limited_by,
     number,
     point,
     pretty_unit,
@@ -26,7 +30,6 @@ from certify.report.words import (
     varying,
     volume_name,
     volume_unit,
-    words_for,
 )
 
 if TYPE_CHECKING:
@@ -43,8 +46,9 @@ def summary(result: Mapping[str, Any]) -> RenderableType:
     ----------
     result : the object that `certify roa --json` prints. Of its keys `states` and `inputs` (lists of `{name, unit}`),
         `operating_point` (values by state), `reach_from` (values by state, of the state that was asked about), `claim`
-        (`{kind}`) and `uncertain` may be absent: then there are no units, the operating point is 0, no state was asked
-        about, the claim is the asymptotic one, and all of the plant is exact.
+        (`{kind}`, with `rate` and `sample` where there are), `time` and `uncertain` may be absent: then there are no
+        units, the operating point is 0, no state was asked about, the claim is the asymptotic one, time is continuous,
+        and all of the plant is exact.
 
     Returns
     -------
@@ -83,16 +87,23 @@ def _kind(result: Mapping[str, Any]) -> str:
 
 
 def _inner(result: Mapping[str, Any]) -> float | None:
-    value: float | None = result["levels"].get(words_for(_kind(result)).inner_word)
+    value: float | None = result["levels"].get(_words(result).inner_word)
     return value
+
+
+def _words(result: Mapping[str, Any]) -> Words:
+    return words_for(_kind(result), Timing.of_result(result))
 
 
 def _headline(result: Mapping[str, Any], verdict: str) -> str:
     name, level, kind = result["system"], result["levels"].get("roa"), _kind(result)
     if verdict in ("PROVED", "TRUSTED") and level is not None:
         inner = _inner(result)
-        stated = words_for(kind).headline.format(
-            outer=below(level), inner="?" if inner is None else inner_level(kind, inner)
+        stated = _words(result).headline.format(
+            outer=below(level),
+            inner="?" if inner is None else inner_level(kind, inner),
+            speed=Timing.of_result(result).headline_rate(),
+            constant=", where what is uncertain is constant in time" if result.get("uncertain") else "",
         )
         word = ", if the solver is right: nothing checked its answers" if verdict == "TRUSTED" else ""
         return f"{name}: {_whatever(result)}{stated}{word}"
@@ -129,21 +140,27 @@ def _is_missed(result: Mapping[str, Any]) -> bool:
 
 def _rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
     levels, rows = result["levels"], []
-    found = _uncertain(result)
+    found, timing = _uncertain(result), Timing.of_result(result)
     if found:
         each = "; ".join(q.words for q in found)
         what = "for every" if shown else "asked for every"
-        rows.append((what, f"{each}: any measurable functions of time, constant ones too"))
+        rows.append((what, f"{each}: {_functions(timing)}"))
+    if timing.sample is not None:
+        rows.append(("input held over" if shown else "asked to hold", timing.periods))
     if shown:
         rows.append(("limited by", limited_by(result)))
         if result.get("diagnosis"):
             rows.append(("binds", str(result["diagnosis"]["binds"])))
     else:
         rows.append(("reason", str(result["reason"])))
+    if timing.rate:
+        rows.append(("rate", _rate(result, timing) if shown else f"asked for {timing.shown_rate}"))
     kind, inner = _kind(result), _inner(result)
-    words = words_for(kind)
+    words = _words(result)
+    local = levels.get("local") if kind in PRACTICAL else None
     known = [
         (f"{words.inner_word} {normalize('NFKC', words.inner)}", "" if inner is None else inner_level(kind, inner)),
+        ("local c1", _level(local) if local != inner else ""),
         ("enlarged c2", _level(levels.get("roa"))),
         ("domain limit", _level(levels.get("domain_limit"))),
         ("sampled limit", _level(levels.get("sampled_limit"))),
@@ -188,7 +205,8 @@ def _rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
     if result.get("eigenvalues"):
         held = " (at the nominal values)" if result.get("uncertain") else ""
         rows.append(("eigenvalues", ", ".join(map(str, result["eigenvalues"])) + held))
-    if shown and kind != "practical" and inner is not None and inner == levels.get("roa"):
+    whole = levels.get("local") if kind not in PRACTICAL or local != inner else None
+    if shown and whole is not None and whole == levels.get("roa"):
         rows.append(("work", f"{result['boxes']:,} boxes; the local part covers the whole set and no leaf is needed"))
     elif result.get("boxes"):
         rows.append(("work", f"{result['boxes']:,} boxes, {result['leaves']:,} leaves"))
@@ -202,6 +220,21 @@ def _rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
     about = ", about {V <= c2} alone, in which the state does not lie" if _is_missed(result) else ""
     rows.append(("checker", f"{result['checked'] or 'not reached'}{about}"))
     return rows
+
+
+def _functions(timing: Timing) -> str:
+    if timing.discrete:
+        return "any sequences of values, constant ones too"
+    return "any measurable functions of time, constant ones too"
+
+
+def _rate(result: Mapping[str, Any], timing: Timing) -> str:
+    """What the rate says of the time, rounded up."""
+    floor = result["levels"].get("floor") if _kind(result) in PRACTICAL else None
+    latest = reach_time(timing, floor, result["levels"].get("roa"))
+    what = "V at most 1 % of what it was" if floor is None else "in {V <= c0}"
+    when = f"after {ABSENT if latest is None else above(latest)} {timing.unit} at the latest"
+    return f"{timing.shown_rate}; {what} {when}{', at sampling instants' if timing.sample else ''}"
 
 
 def _asked(result: Mapping[str, Any]) -> str:
@@ -236,7 +269,7 @@ def _diagnosis_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
     found, rows = result.get("diagnosis"), []
     if not found:
         return []
-    if found.get("stiffness"):
+    if found.get("stiffness") and not Timing.of_result(result).discrete:
         fast, slow = number(found["fastest"], 3), number(found["slowest"], 3)
         held = " (at the nominal values)" if result.get("uncertain") else ""
         rows.append(

@@ -1,7 +1,8 @@
-"""What a report says, and how: names, units and numbers as people read them, and each kind of claim in words.
+"""What a report says, and how: names, units, ranges and numbers as people read them.
 
-Shared by the terminal summary, the figures and the page. Numbers are rounded in a direction wherever a reader could
-take them for a bound: `below` what is claimed of a set, `above` what contains it.
+Shared by the terminal summary, the figures and the page; the words of each claim are in claims.py. Numbers are rounded
+in a direction wherever a reader could take them for a bound: `below` what is claimed of a set, `above` what contains
+it.
 """
 
 from __future__ import annotations
@@ -9,12 +10,10 @@ from __future__ import annotations
 import math
 import re
 import unicodedata
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any
-
-from certify.errors import CertificateFormatError
+from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from certify.systems import System
@@ -25,6 +24,8 @@ _GREEK = {name: unicodedata.lookup(f"GREEK SMALL LETTER {name}") for name in _LE
 _SUBSCRIPTS = str.maketrans("0123456789", "₀₁₂₃₄₅₆₇₈₉")
 _SUPERSCRIPTS = str.maketrans("0123456789-", "⁰¹²³⁴⁵⁶⁷⁸⁹⁻")
 _DOT = "\u0307"
+PRACTICAL = frozenset({"practical", "nearby"})
+"""The claims whose inner set is the one in which trajectories end."""
 
 
 def symbol(name: str) -> str:
@@ -123,14 +124,15 @@ def _value(exact: Fraction, digits: int, direction: Callable[[Fraction], int]) -
     return coefficient * Fraction(10) ** last
 
 
-def stated_for(quantities: Sequence[Varying], statement: str) -> str:
-    """A claim's statement for all that is uncertain; as it is where nothing is."""
+def stated_for(quantities: Sequence[Varying], statement: str, *, by_steps: bool = False) -> str:
+    """A claim's statement for all that is uncertain, from step to step or in time; as it is where nothing is."""
     if not quantities:
         return statement
     which = "each any" if len(quantities) > 1 else "any"
     at_once = ", all of them at once" if len(quantities) > 1 else ""
+    functions = "sequence of values from step to step" if by_steps else "measurable function of time"
     return (
-        f"For every {varying(quantities)}, {which} measurable function of time{at_once} \N{EM DASH} constant, drifting "
+        f"For every {varying(quantities)}, {which} {functions}{at_once} \N{EM DASH} constant, drifting "
         f"or jumping, whatever it is that moves it within its range \N{EM DASH} the following holds. {statement}"
     )
 
@@ -241,6 +243,16 @@ def _decimal(exact: Fraction, digits: int, direction: Callable[[Fraction], int])
     return direction(exact / Fraction(10) ** last), last
 
 
+def exact_number(value: Fraction) -> str:
+    """A number without rounding: a decimal where a short one is it, else a fraction.
+
+    >>> exact_number(Fraction(1, 50)), exact_number(Fraction(1, 3)), exact_number(Fraction(2))
+    ('0.02', '1/3', '2')
+    """
+    shown = shortest(float(value))
+    return shown if Fraction(repr(float(value))) == value else str(value)
+
+
 def kept_apart(value: float, limit: Fraction) -> str:
     """`value < limit`, the value rounded up and the limit down, in as many digits as keep the one below the other.
 
@@ -266,262 +278,6 @@ def seconds(value: float | None) -> str:
     return ABSENT if value is None else f"{value:.2f} s" if value >= 0.095 else f"{value * 1000:.0f} ms"
 
 
-@dataclass(frozen=True, slots=True)
-class Words:
-    """One kind of claim in words. In texts, {inner} and {outer} stand for its levels in digits, {duration} for how long
-    its tube is, {centre} for the state that it begins around.
-
-    Parameters
-    ----------
-    title : the page's.
-    inner, inner_word : symbol and name of the inner level.
-    inner_set : what the figures call the inner set.
-    statement : the claim, after which nothing has to be added.
-    headline : the same in a line of the terminal.
-    meaning : of the outer set, for captions.
-    decay : what of a falling V is part of the claim and what is not; {word} is "proved" or "claimed".
-    simulated : which runs count in the simulated figures.
-    settles, runs : what becomes of a run that counts, and what a legend calls such runs.
-    parts : name, condition, and how it is shown from a partition; None where that is in the condition.
-    excluded : head and text of what this claim, other than its siblings, does not say.
-    start : what the start of its tube is called; nothing where it has none.
-    sets : what the claim is about, in the caption of what is not.
-    """
-
-    title: str
-    inner: str
-    inner_word: str
-    inner_set: str
-    statement: str
-    headline: str
-    meaning: str
-    decay: str
-    simulated: str
-    settles: str
-    runs: str
-    parts: tuple[tuple[str, str, str], ...]
-    excluded: tuple[tuple[str, str], ...]
-    start: str = ""
-    sets: str = "{V ≤ c₂}"
-
-
-SMOOTH = ("Equations", "The closed loop is locally Lipschitz on {V ≤ c₂}: solutions exist and are unique.", "")
-DEFINITE = ("Lyapunov function", "P is symmetric positive definite, so that {V ≤ c₂} is compact.", "")
-DOMAIN = ("Domain", "{V ≤ c₂} lies strictly inside the domain.", "")
-INPUTS = ("Inputs", "On {V ≤ c₂} the input stays in its bounds, so that an actuator that clips changes nothing.", "")
-LEAF_BY_LEAF = "leaf by leaf of a partition that covers the set by construction"
-CHECKED_ALWAYS = frozenset({"Lyapunov function", "Equilibrium", "Domain"})
-"""The parts that the checker checks whatever the evidence is; the others are then the solver's word."""
-
-CLAIMS: Mapping[str, Words] = {
-    "asymptotic": Words(
-        title="Region of attraction",
-        inner="c₁",
-        inner_word="local",
-        inner_set="local set",
-        statement="Every trajectory of the closed loop that starts in the set {{V(x) ≤ {outer}}} stays in it for all "
-        "time and converges to the origin, which is asymptotically stable.",
-        headline="{{V <= {outer}}} is invariant and attracted by the origin",
-        meaning="in which every trajectory converges to the origin",
-        decay="That V falls to 0 is {word}; how fast is not.",
-        simulated="stay in the domain and come near the origin",
-        settles="settle",
-        runs="trajectories that settle",
-        parts=(
-            SMOOTH,
-            ("Equilibrium", "P is symmetric positive definite and f(0, u_eq) = 0 exactly.", ""),
-            DOMAIN,
-            (
-                "Local",
-                "V̇(x) < 0 for all x with 0 < V(x) ≤ c₁",
-                "by the linearisation and a bound on its remainder that holds at all smaller radii: there is no hole "
-                "around the origin",
-            ),
-            ("Ring", "V̇(x) < 0 for all x with c₁ ≤ V(x) ≤ c₂", LEAF_BY_LEAF),
-            INPUTS,
-        ),
-        excluded=(("Speed and cost.", "Trajectories converge; how fast, and at what cost, is not part of the claim."),),
-    ),
-    "practical": Words(
-        title="Practical stability",
-        inner="c₀",
-        inner_word="floor",
-        inner_set="inner set",
-        statement="Every trajectory of the closed loop that starts in the set {{V(x) ≤ {outer}}} stays in it for all "
-        "time, enters the smaller set {{V(x) ≤ {inner}}} in finite time, and stays there from then on. That is all: "
-        "of what happens inside the smaller set nothing is said.",
-        headline="from {{V <= {outer}}} every trajectory enters {{V <= {inner}}} and stays there; nothing is said of "
-        "the origin",
-        meaning="from which every trajectory enters the green set and stays there",
-        decay="That V falls below c₀ in finite time and stays there is {word}; how soon, and what V does below c₀, is "
-        "not.",
-        simulated="stay in the domain and enter {V ≤ c₀}",
-        settles="enter {V ≤ c₀}",
-        runs="trajectories that enter",
-        parts=(
-            SMOOTH,
-            DEFINITE,
-            DOMAIN,
-            ("Ring", "V̇(x) < 0 for all x with c₀ ≤ V(x) ≤ c₂, both boundaries included", LEAF_BY_LEAF),
-            INPUTS,
-        ),
-        excluded=(
-            (
-                "Anything inside {V ≤ c₀}.",
-                "Trajectories end up in this set and remain there, whatever they do in it: circle, jitter, or rest "
-                "somewhere. The origin need not attract them, and need not be an equilibrium at all.",
-            ),
-            ("Speed and cost.", "The time to reach {V ≤ c₀} is finite; how long, and at what cost, is not stated."),
-        ),
-    ),
-}
-
-
-_ASYMPTOTIC = CLAIMS["asymptotic"]
-CLAIMS = {
-    **CLAIMS,
-    "enlarged": replace(
-        _ASYMPTOTIC,
-        statement=_ASYMPTOTIC.statement + " Every trajectory that starts in the ellipsoid {{x′P₀x ≤ 1}}, the start of "
-        "a tube, stays in the domain, is in {{V(x) ≤ {outer}}} after {duration} at the latest, and converges to the "
-        "origin as well.",
-        headline="{{V <= {outer}}} is invariant and attracted by the origin, and every trajectory from the tube's "
-        "start enters it",
-        decay="That V is at most c₂ once the tube has ended, and falls to 0, is {word}; how fast from then on is not.",
-        parts=(
-            *_ASYMPTOTIC.parts,
-            (
-                "Tube",
-                "x′P(t)x falls along every trajectory in {x′P(t)x ≤ 1} but the origin; P(t) begins as P₀, and at its "
-                "end {x′P(t)x ≤ 1} lies in {V ≤ c₂}",
-                "one slab of time after the other, by the linearisation and a bound on its remainder that knows "
-                "directions",
-            ),
-            (
-                "Along the tube",
-                "Each ellipsoid {x′P(t)x ≤ 1} lies strictly inside the domain; on it the closed loop is twice "
-                "continuously differentiable, no clip acts, and the input stays in its bounds.",
-                "",
-            ),
-        ),
-        excluded=(
-            (
-                "Staying in the start.",
-                "A trajectory from the tube's start may leave that ellipsoid on its way: it stays in the tube, which "
-                "lies inside the domain.",
-            ),
-            (
-                "Speed and cost.",
-                "The tube says by when {V ≤ c₂} is reached; how fast trajectories converge from there, and at what "
-                "cost, is not part of the claim.",
-            ),
-        ),
-        start="start of the tube",
-        sets="{V ≤ c₂} and the tube's start",
-    ),
-    "reached": replace(
-        _ASYMPTOTIC,
-        statement=_ASYMPTOTIC.statement + " Every trajectory that starts in the ellipsoid "
-        "{{(x − c₀)′P₀(x − c₀) ≤ 1}} around the state c₀, {centre}, stays in the domain, is in {{V(x) ≤ {outer}}} "
-        "after {duration} at the latest, and converges to the origin as well. These two sets are all that the claim is "
-        "about; nothing is said of what starts between them.",
-        headline="{{V <= {outer}}} is invariant and attracted by the origin, and every trajectory from an ellipsoid "
-        "around the state enters it",
-        decay="That V is at most c₂ once the tube has ended, and falls to 0, is {word}; how fast from then on is not.",
-        parts=(
-            *_ASYMPTOTIC.parts,
-            (
-                "Tube",
-                "With c(t) and P(t), which begin as c₀ and P₀, no trajectory from the start leaves "
-                "{(x − c(t))′P(t)(x − c(t)) ≤ 1}: on its edge the form falls along every trajectory; and at its end "
-                "this ellipsoid lies in {V ≤ c₂}",
-                "one slab of time after the other, by the linearisation and a bound on its remainder that knows "
-                "directions and the motion of c(t)",
-            ),
-            (
-                "Along the tube",
-                "Each ellipsoid of the tube lies strictly inside the domain; on it the closed loop is twice "
-                "continuously differentiable, no clip acts, and the input stays in its bounds.",
-                "",
-            ),
-        ),
-        excluded=(
-            (
-                "What lies between.",
-                "The set is the union of {V ≤ c₂} and the ellipsoid around c₀. States on the way from the one to the "
-                "other, the path of the tube among them, belong to it only where they lie in one of the two.",
-            ),
-            (
-                "Staying near c₀, and the path.",
-                "A trajectory may leave the ellipsoid around c₀ on its way: it stays in the tube, which lies inside "
-                "the domain. The path c(t) itself need not be a trajectory.",
-            ),
-            (
-                "Speed and cost.",
-                "The tube says by when {V ≤ c₂} is reached; how fast trajectories converge from there, and at what "
-                "cost, is not part of the claim.",
-            ),
-        ),
-        start="start of the tube, around c₀",
-        sets="{V ≤ c₂} and the ellipsoid around c₀",
-    ),
-}
-
-
-def words_for(kind: str) -> Words:
-    """The words of a claim.
-
-    Raises
-    ------
-    CertificateFormatError : there are none for this kind; a page must not guess.
-    """
-    if kind not in CLAIMS:
-        raise CertificateFormatError(f"reports know the claims {', '.join(CLAIMS)}; found {kind!r}.")
-    return CLAIMS[kind]
-
-
 def inner_level(kind: str, value: float | Fraction, digits: int = 6) -> str:
     """The inner level rounded to the safe side: down where something is claimed inside it, up where outside."""
-    return above(value, digits) if kind == "practical" else below(value, digits)
-
-
-_LIMITS = {
-    "domain": "the domain",
-    "inputs": "the input bounds: beyond it the policy asks for more than the actuator gives",
-    "witness": "a point where Vdot >= 0",
-    "time": "the time limit: more may be provable",
-    "refused by the checker": "the checker, which refuses some of what was found",
-    "boxes": "the limit on boxes: more may be provable",
-    "requested": "the level that was asked for",
-}
-_TOUCHING = Fraction(1, 10**6)  # relative distance from the domain's limit below which a set is said to touch it
-
-
-def limited_by(result: Mapping[str, Any]) -> str:
-    """What limits the level of a result, in words; reasons that are sentences already stay as they are.
-
-    An engine may stop short of the domain's limit by a margin of its own, such as a solver's precision. Then the
-    margin limits, and it is named with its size.
-    """
-    reason = str(result["reason"])
-    levels = result["levels"]
-    level, limit = levels.get("roa"), levels.get("domain_limit")
-    if reason == "domain" and level and limit:
-        short = 1 - Fraction(level) / Fraction(limit)
-        if short > _TOUCHING:
-            solver: Mapping[str, Any] = result.get("solver") or {}
-            precision = solver.get("precision")
-            apart = f"{number(float(100 * short), 3)} % below the domain's limit {below(limit)}"
-            if precision is None:
-                return f"a margin that the engine keeps: {apart}"
-            return f"the precision of {solver['solver']} (delta {number(precision)}), which stops {apart}"
-    return limit_in_words(reason)
-
-
-def limit_in_words(reason: str) -> str:
-    """A reason that is a single word as a reader understands it; sentences stay as they are.
-
-    >>> limit_in_words("time")
-    'the time limit: more may be provable'
-    """
-    return _LIMITS.get(reason, reason)
+    return above(value, digits) if kind in PRACTICAL else below(value, digits)

@@ -32,7 +32,7 @@ Interval = tuple[Fraction, Fraction]
 Kind = Literal["parameter", "disturbance", "input error"]
 Time = Literal["continuous", "discrete"]
 
-_SUBSTEPS = 4  # of a sampling period, in simulation
+_SUBSTEPS = 2  # of a sampling period, in simulation
 _MOST_DIGITS = 1000  # before or after the point: 1e999999999 would fill the memory
 
 
@@ -379,18 +379,19 @@ class System:
         f = self._function(self.exact_dynamics(), (), module)
         return lambda x, u: f(x, u, ())
 
-    def uncertain_function(self, module: str = "numpy") -> Callable[[Any, Any, Sequence[float]], Any]:
+    def uncertain_function(self, module: str = "numpy") -> Callable[[Any, Any, Sequence[Any]], Any]:
         """The same for values of what is uncertain, in the order of the ranges: a third argument, k numbers."""
         return self._function(self.uncertain_dynamics(), [s for s, _ in self.uncertain], module)
 
-    def mean_rate(self, f: Callable[[Any, Any], Any], x: Any, u: Any, step: float) -> Any:
+    def mean_rate(self, f: Callable[[Any, Any], Any], x: Any, u: Any, step: Any) -> Any:
         """G (..., n) of `x+ = x + h G` in floating point, from this plant's f, with the input held over the step h.
 
-        f itself where h = 0; in discrete time h = 1 and G = f - x. For search only: nothing is proved with it.
+        f itself where h is the number 0; in discrete time h = 1 and G = f - x; else h may be an array (..., 1) of
+        positive numbers. For search only: nothing is proved with it.
         """
         if self.time == "discrete":
             return f(x, u) - x
-        if step == 0:
+        if isinstance(step, float | int) and step == 0:
             return f(x, u)
         after = x
         for _ in range(_SUBSTEPS):
@@ -399,7 +400,7 @@ class System:
 
     def _function(
         self, expressions: Sequence[sympy.Expr], more: Sequence[sympy.Symbol], module: str
-    ) -> Callable[[Any, Any, Sequence[float]], Any]:
+    ) -> Callable[[Any, Any, Sequence[Any]], Any]:
         stack: Any
         broadcast: Any
         number: Callable[[Any, Any], Any]
@@ -418,7 +419,7 @@ class System:
         raw = sympy.lambdify([*self.states, *self.inputs, *more], rounded, modules=module, cse=True)
         n, m = self.n, self.m
 
-        def f(x: Any, u: Any, values: Sequence[float]) -> Any:
+        def f(x: Any, u: Any, values: Sequence[Any]) -> Any:
             columns: list[Any] = [x[..., i] for i in range(n)] + [u[..., j] for j in range(m)]
             zero = 0.0 * (columns[0] + columns[n])  # constant components take the batch's shape
             held = [number(value, x) for value in values]

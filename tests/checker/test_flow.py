@@ -31,7 +31,7 @@ from tests.checker.test_uncertain import holds
 from tests.support.certificates import Document, edited, make, parse
 from tests.support.jets import curved, given, no_units, plain
 from tests.support.leaves import on_boxes
-from tests.support.steps import fitted
+from tests.support.stepped_loops import fitted
 
 # ------------------------------------------------------------------------------------------ jets with what is uncertain
 

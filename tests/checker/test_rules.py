@@ -119,6 +119,15 @@ def sampled_claim() -> Document:
     return scalar_claim(0.01, 0.25, scale=[-2.0], input_bounds=[("-2", "2")], sample=("1/16", "1/10"), order=2)
 
 
+def nearby_claim(cubic: str = "0", J: float = 0.2 * (1 + 1e-9), weight: float = 2.0**-40) -> Document:
+    """x' = cubic x^3 - x + 1/100 has one equilibrium in {x^2 <= 1/25} if there it falls."""
+    data = make(
+        [["+", ["-", "x"], "1/100", ["*", cubic, ["**", "x", 3]], ["*", "0", "u"]]], [([[0.0]], [0.0])], 1.0, (0.04, 0.09),
+        claim="nearby",
+    )  # fmt: skip
+    return edited(data, "evidence.contraction", {"J": encode([J]), "weights": encode([weight])})
+
+
 def lyapunov(A: np.ndarray) -> np.ndarray:
     """P with A'P + PA = -I."""
     n = len(A)
@@ -144,6 +153,7 @@ HONEST: dict[str, Callable[[], Document]] = {
     "scalar, no centring": lambda: scalar_claim(bias=0.0, centre="none"),
     "linear": linear_claim,
     "sampled": sampled_claim,
+    "nearby": nearby_claim,
     "local only": lambda: linear_claim(3.0, 3.0),
     "rotor": rotor_claim,
     "rotor, preactivation": lambda: rotor_claim(c2=0.2, centre="preactivation"),
@@ -161,7 +171,7 @@ def test_honest_certificates_are_accepted(name: str) -> None:
     tally = rules.check(parse(data))
     assert tally.rules["tree"] == tree_of(data).count(LEAF)
     assert tally.rules["tube"] == len(data["evidence"]["tube"])
-    assert (tally.local_margin is None) if name.startswith("practical") else 0 < tally.local_margin <= 1
+    assert (tally.local_margin is None) if name.startswith(("practical", "nearby")) else 0 < tally.local_margin <= 1
     if name == "scalar":  # bounded by form: no leaf is asked for its inputs
         assert tally.rules["inputs"] == 1
     if name == "local only":
@@ -337,6 +347,13 @@ MUTANTS: list[tuple[str, str, str, Edit]] = [  # rule, base, what, edit
     ("format", "scalar", "a rate below 0", at("claim.rate", (-1.0).hex())),
     ("format", "scalar", "a sample of nothing", at("claim.sample", ["0", "0"])),
     ("format", "scalar", "time by another name", at("plant.time", "sampled")),
+    ("format", "nearby", "no contraction", at("evidence.contraction", None)),
+    ("format", "scalar", "a contraction", at("evidence.contraction", {"J": encode([1.0]), "weights": encode([1.0])})),
+    ("contraction", "nearby", "a ball in the set", array("evidence.contraction.J", lambda a: a * 0.999)),
+    ("contraction", "nearby", "a weight of 0", array("evidence.contraction.weights", lambda a: 0 * a)),
+    ("contraction", "nearby", "a weight below 0", array("evidence.contraction.weights", lambda a: -a)),
+    ("contraction", "nearby", "a weight that takes all", array("evidence.contraction.weights", lambda a: a + 1)),
+    ("contraction", "nearby", "a ball where it rises", lambda d: grow(edited(d, "plant.dynamics.0.3.1", "9"))),
     ("flow", "sampled", "held for so long that nothing is known", at("claim.sample", ["1/16", "9"])),
     ("format", "scalar", "the schema of version 5", at("schema", "certify-certificate/5")),
     ("format", "scalar", "J of another size", array("evidence.local.J", lambda a: np.ones(4))),
@@ -529,12 +546,12 @@ def test_every_field_and_every_rule_has_a_mutant() -> None:
     format_page = (Path(certify.checker.__file__).parent / "FORMAT.md").read_text()
     table = format_page.split("| rule | inequality | gives |")[1].split("\n\n")[0]
     documented = {name for row in table.splitlines()[2:] for name in re.findall(r"`(\w+)`", row.split("|")[1])}
-    assert len(documented) == 15 and {rule for rule, *_ in MUTANTS} == documented
+    assert len(documented) == 16 and {rule for rule, *_ in MUTANTS} == documented
     touched = set()
     for _, base, _, edit in MUTANTS:
         before, after = dict(leaves_of(honest(base))), dict(leaves_of(edit(honest(base))))
         touched |= {general(path) for path in before.keys() | after.keys() if before.get(path) != after.get(path)}
-    fields = {general(path) for base in ("rotor", "enlarged") for path, _ in leaves_of(honest(base))}
+    fields = {general(path) for base in ("rotor", "enlarged", "nearby") for path, _ in leaves_of(honest(base))}
     assert fields - touched == {"provenance.tool"}
 
 
@@ -828,6 +845,7 @@ ABLATED: dict[str, Callable[[], Document]] = {
     "ring": lambda: scalar_claim(c2=4.0),
     "inputs": lambda: at("plant.input_bounds", [["-9/10", "1"]])(honest("scalar")),
     "flow": held_too_long,
+    "contraction": lambda: grow(nearby_claim("9")),
 }
 
 

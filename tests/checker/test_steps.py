@@ -1,5 +1,5 @@
 """Claims over steps, at a rate, around a level: what is planted beyond the truth is refused, and what lies within it is
-accepted. The truth is known in closed form (tests/support/steps.py), and integrated here once more."""
+accepted. The truth is known in closed form (tests/support/stepped_loops.py), and integrated here once more."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from certify.checker.document import Certificate
 from tests.support.certificates import Document, dump, parse, verdict
 from tests.support.reference import judge
 from tests.support.step_forgeries import BASES, base, forgeries
-from tests.support.steps import Family, families, peaked, shares
+from tests.support.stepped_loops import Family, families, peaked, shares
 
 FAMILIES = {family.name: family for family in families()}
 EACH = 6  # planted violations of a family

@@ -190,6 +190,48 @@ def test_the_flow_of_a_plant_that_escapes() -> None:
         assert not bool(Flow((x**2,), held(h), 4)(states, {}, {}, 1).exists)
 
 
+@pytest.mark.parametrize(
+    "equations", [("q**2", "-y"), ("p*y", "q"), ("q**2*y", "q"), ("q*x/(2 + q) + q**2*y", "q**3 - x*q*p")]
+)
+@pytest.mark.parametrize("order", [1, 2, 3, 4])
+def test_the_mean_over_a_period_holds_for_quantities_that_switch(equations: tuple[str, str], order: int) -> None:
+    """A symbol stands for a quantity's mean: of q, -1 for one half and 1 for the other, it is 0, and of q^2 it is 1."""
+    x, y, q, p = sympy.symbols("x y q p")
+    f = tuple(sympy.sympify(text, locals={"x": x, "y": y, "q": q, "p": p}) for text in equations)
+    rate = sympy.lambdify((x, y, q, p), f)
+    centre, h = {x: 0.3, y: -0.2}, 0.25
+
+    def model(value: float, symbol: int, radius: float) -> Taylor:
+        g = torch.zeros(4, 1, dtype=torch.float64)
+        g[symbol] = radius
+        c = torch.tensor([value], dtype=torch.float64)
+        return Taylor(c, g, torch.zeros(4, 4, 1, dtype=torch.float64), 0 * c)
+
+    states = {s: model(v, i, 0.05) for i, (s, v) in enumerate(centre.items())}
+    quantities = {q: model(0.0, 2, 1.0), p: model(0.5, 3, 0.5)}
+    mean = Flow(f, held("1/4"), order)(states, {}, quantities, 2)
+    assert bool(mean.exists)
+    generator = np.random.default_rng(0)
+    for _ in range(60):
+        d = generator.uniform(-1, 1, 2)
+        before = np.array(list(centre.values())) + 0.05 * d
+        switching = generator.choice([-1.0, 1.0], 4) if generator.random() < 0.7 else generator.uniform(-1, 1, 4)
+        other = generator.uniform(0, 1, 4)
+        after = before.copy()
+        for a, b in zip(switching, other, strict=True):
+            step = h / 4 / 50
+            for _ in range(50):
+                k1 = np.array(rate(*after, a, b))
+                k2 = np.array(rate(*(after + step / 2 * k1), a, b))
+                k3 = np.array(rate(*(after - step * k1 + 2 * step * k2), a, b))
+                after = after + step / 6 * (k1 + 4 * k2 + k3)
+        G = (after - before) / h
+        all_d = torch.tensor([*d, switching.mean(), 2 * other.mean() - 1])
+        for found, value in zip(mean.G, G, strict=True):
+            told = found.c[0] + found.g[:, 0] @ all_d + all_d @ found.Q[:, :, 0] @ all_d
+            assert abs(float(told) - value) <= float(found.r[0]) + 1e-9
+
+
 def test_a_held_input_knows_the_exact_limit_of_its_period() -> None:
     """x+ = (1 - k h) x decreases for k h < 2 and for no other period."""
     for sample, holds in (

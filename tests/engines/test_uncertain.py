@@ -140,7 +140,8 @@ def test_a_violation_is_judged_with_the_policy_of_the_nominal_plant() -> None:
 # -------------------------------------------------------------------------------------------------------- local proof
 
 
-def test_a_wider_range_needs_more_cells_and_proves_less() -> None:
+def test_a_wider_range_proves_less_with_one_cell() -> None:
+    """The gradient of q x moves with q in a straight line."""
     cuts, levels = [], []
     for hi in ("1/2", "4/5", "19/20"):
         problem, T = problem_of(*gain("2/5", hi))
@@ -151,7 +152,7 @@ def test_a_wider_range_needs_more_cells_and_proves_less() -> None:
         cuts.append(parts[0])
         levels.append(level)
     assert levels == sorted(levels, reverse=True) and levels[-1] > 0
-    assert cuts == sorted(cuts) and cuts[0] < cuts[-1] <= 64
+    assert cuts == [1, 1, 1]
 
 
 @pytest.mark.slow

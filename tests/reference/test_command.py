@@ -17,7 +17,8 @@ from certify.reference.rules import judge
 from tests.checker.test_rules import honest as of_version_3
 from tests.reference.test_practical import scalar
 from tests.support.balls import with_ball
-from tests.support.certificates import Document, dump, edited, write
+from tests.support.certificates import Document, edited
+from tests.support.reference import dump, write
 
 TRUSTED = {"kind": "trusted-solver", "solver": "dReal", "version": "4", "precision": (0.5).hex(), "queries": []}
 KEYS = [
@@ -57,10 +58,10 @@ def test_accepted(tmp_path: Path) -> None:
 
 
 def test_practical_in_words(tmp_path: Path) -> None:
-    done = run(write(with_ball(scalar(["-", "x"])), tmp_path))
+    done = run(write(scalar(["-", "x"]), tmp_path))
     claim, verdict = done.stdout.splitlines()
     assert done.returncode == 0 and "enters V <= 0.04 in finite time" in claim
-    assert verdict.startswith("ACCEPTED c0=0.04 c2=1.0 sha256=")
+    assert verdict.startswith("ACCEPTED c0=0.04 c1=0.04 c2=1.0 sha256=")
 
 
 def test_rejected_and_trusted(tmp_path: Path) -> None:

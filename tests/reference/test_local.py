@@ -21,8 +21,8 @@ from certify.reference import local, rules
 from certify.reference.decrease import decreases
 from tests.checker.test_rules import honest as of_version_3
 from tests.support.balls import ball, with_ball
-from tests.support.certificates import Document, decode, dump, edited, encode, make
-from tests.support.reference import judge
+from tests.support.certificates import Document, decode, edited, encode, make
+from tests.support.reference import dump, judge
 
 Edit = Callable[[Document], Document]
 LEAST = 5e-324

@@ -41,11 +41,11 @@ from certify.systems import get_system
 from tests.reference.test_local import row
 from tests.reference.test_tube import array, at, more, of_tube, times, without, yes
 from tests.support.balls import TINY, around, ball, exactly, slab_of, square, with_ball
-from tests.support.certificates import Document, decode, dump, edited, encode, make, write
+from tests.support.certificates import Document, decode, edited, encode, make
 from tests.support.certificates import verdict as verdict_of_the_checker
 from tests.support.models import curves, field, model, numbers, units
 from tests.support.paths import along, follow
-from tests.support.reference import judge
+from tests.support.reference import CONTINUOUS, dump, judge, write
 
 Edit = Callable[[Document], Document]
 LEAST = 5e-324
@@ -353,9 +353,9 @@ MALFORMED: dict[str, Edit] = {
     "no centre": without("claim", "centre"),
     "no start": without("claim", "start"),
     "an empty tube": at("evidence.tube", []),
-    "a tube under claim asymptotic": at("claim", {"kind": "asymptotic"}),
+    "a tube under claim asymptotic": at("claim", {"kind": "asymptotic", **CONTINUOUS}),
     "a centre under claim asymptotic": lambda d: edited(
-        edited(d, "claim", {"kind": "asymptotic", "centre": encode([0.0])}), "evidence.tube", []
+        edited(d, "claim", {"kind": "asymptotic", **CONTINUOUS, "centre": encode([0.0])}), "evidence.tube", []
     ),
     "a solver's word": at("evidence", TRUSTED),
     "a centre of another size": at("claim.centre", encode([1.0, 2.0])),
@@ -683,7 +683,9 @@ def test_no_tube_is_narrower_than_the_flow(
             low, high = low * math.exp(-h), high * math.exp(-h)
             kept = kept and centre - r_after <= low + 1e-9 and high <= centre + r_after + 1e-9
             before, r = centre, r_after
-    data = edited(data, "claim", {"kind": "reached", "start": encode([radius**-2]), "centre": encode([start])})
+    data = edited(
+        data, "claim", {"kind": "reached", **CONTINUOUS, "start": encode([radius**-2]), "centre": encode([start])}
+    )
     if judge(edited(data, "evidence.tube", slabs)) is None:
         assert kept and abs(before) + r <= 2 + 1e-9
 
@@ -697,7 +699,7 @@ def test_some_of_those_tubes_are_accepted() -> None:
         x, h = generator.uniform(-3, 3), generator.uniform(0.1, 0.6)
         centres = [np.array([x]), np.array([x * math.exp(-h)])]
         shapes = [np.eye(1) * 1.5**-2, np.eye(1) * 1.4**-2, np.eye(1) * 1.3**-2]
-        claim = {"kind": "reached", "start": encode(shapes[0]), "centre": encode(centres[0])}
+        claim = {"kind": "reached", **CONTINUOUS, "start": encode(shapes[0]), "centre": encode(centres[0])}
         tried = edited(edited(data, "claim", claim), "evidence.tube", [along(loop, centres, shapes, h)])
         accepted += judge(edited(tried, "levels", {"local": (16.0).hex(), "roa": (16.0).hex()}) | {
             "evidence": tried["evidence"] | {"root": encode([4.0]), "local": ball([[4.5]], [[0.0], [1.0], [0.0]])}
@@ -805,7 +807,7 @@ CLAUSES: dict[str, tuple[Any, str, Callable[..., Any], Edit]] = {  # where, what
 
 def follow_still(data: Document) -> Document:
     """Around 0, and accepted as such, before somebody moves its first centre, in a time far too short for that."""
-    data = edited(edited(data, "claim", {"kind": "asymptotic"}), "evidence.tube", [])
+    data = edited(edited(data, "claim", {"kind": "asymptotic", **CONTINUOUS}), "evidence.tube", [])
     return follow(data, [np.zeros(1), np.zeros(1)], [np.eye(1), np.eye(1) * 1.03125], [1 / 32])
 
 
@@ -846,7 +848,7 @@ def test_every_coefficient_of_a_slab_is_asked(which: str, monkeypatch: pytest.Mo
         "joint": "0x0.0p+0",
     }
     slab = slab_of(middle, last, h) | ball(J, [[0.0] * 2, [TINY] * 2, [0.0] * 2], np.eye(3)) | {"path": path}
-    claim = {"kind": "reached", "start": encode(first), "centre": encode(zero)}
+    claim = {"kind": "reached", **CONTINUOUS, "start": encode(first), "centre": encode(zero)}
     data = edited(edited(data, "claim", claim), "evidence.tube", [slab])
     verdict = rules.judge(dump(data))
     assert (verdict.rule, verdict.at) == ("tube", "slab 1") and f"the {which} coefficient" in str(verdict.detail)

@@ -9,16 +9,17 @@ import pytest
 
 from tests.support.balls import with_ball
 from tests.support.certificates import LEAF, Document, edited, make, rehash, with_tree
-from tests.support.reference import judge, judge_bytes
+from tests.support.reference import CONTINUOUS, judge, judge_bytes
 
 SPLIT = 0
 
 
 def practical(data: Document, floor: float | None = None) -> Document:
     """The claim with c1 as c0, or with another c0."""
-    result = edited(data, "claim", {"kind": "practical"})
+    result = edited(data, "claim", {"kind": "practical", **CONTINUOUS})
     result["evidence"]["local"], levels = None, data["levels"]
-    result["levels"] = {"floor": levels["local"] if floor is None else floor.hex(), "roa": levels["roa"]}
+    least = levels["local"] if floor is None else floor.hex()
+    result["levels"] = {"floor": least, "local": least, "roa": levels["roa"]}
     return result
 
 
@@ -37,7 +38,7 @@ def test_a_loop_without_an_equilibrium_at_the_origin() -> None:
     """x' = -x + 1/20 + u/20: V falls from |x| = 1/10 on."""
     loop = ["+", ["-", "x"], "1/20", ["*", "1/20", "u"]]
     assert judge(scalar(loop)) is None
-    asymptotic = edited(scalar(loop), "claim", {"kind": "asymptotic"})
+    asymptotic = edited(scalar(loop), "claim", {"kind": "asymptotic", **CONTINUOUS})
     asymptotic["levels"] = {"local": (0.04).hex(), "roa": (1.0).hex()}
     assert judge(asymptotic) == "format"  # a ball is missing
     assert judge(with_ball(asymptotic)) == "equilibrium"
@@ -97,7 +98,7 @@ def test_levels(floor: float, rule: str) -> None:
 
 def test_the_keys_of_the_levels_belong_to_the_claim() -> None:
     data = scalar(["-", "x"])
-    assert judge(edited(data, "claim", {"kind": "asymptotic"})) == "format"
+    assert judge(edited(data, "claim", {"kind": "asymptotic", **CONTINUOUS})) == "format"
     assert judge(edited(data, "levels", {"local": (0.04).hex(), "roa": (1.0).hex()})) == "format"
     assert judge(edited(data, "claim", {"kind": "sampled"})) == "format"
     assert judge_bytes(b"{}") == "format"

@@ -57,7 +57,6 @@ from tests.support.certificates import (
     LEAF,
     Document,
     decode,
-    dump,
     edited,
     encode,
     grow,
@@ -70,7 +69,7 @@ from tests.support.certificates import (
 )
 from tests.support.models import beyond, curved, form, linear, matrix, model
 from tests.support.oracle import policy_in_arb, value_of
-from tests.support.reference import judge, judge_bytes
+from tests.support.reference import dump, judge, judge_bytes, upgraded
 
 SHIPPED = Path(__file__).parents[2] / "examples" / "policies" / "pendulum.pt"
 
@@ -148,7 +147,7 @@ def test_two_inputs_and_three_states_are_accepted(centre: str, v: tuple[str, str
 
 @pytest.mark.parametrize("edit", HARMLESS)
 def test_harmless_edits_stay_accepted(edit: str) -> None:
-    assert judge_bytes(HARMLESS[edit](with_ball(honest("linear")))) is None
+    assert judge_bytes(HARMLESS[edit](upgraded(with_ball(honest("linear"))))) is None
 
 
 @pytest.mark.parametrize("exponent", [-200, 0, 100])  # at 200 what a tanh leaves out has no square in binary64
@@ -744,7 +743,7 @@ def test_leaves_enclose_the_policy_V_and_Vdot(name: str) -> None:
         shared, each = leaves_of(data)
         mine = shared.c
         for leaf in each[::5]:
-            Vdot, V = shared.Vdot(leaf).bound(), (shared.V(leaf).bound(), (-shared.V(leaf)).bound())
+            Vdot, V = shared.D(leaf).bound(), (shared.V(leaf).bound(), (-shared.V(leaf)).bound())
             for d in generator.uniform(-1, 1, (3, mine.n)).round().tolist():
                 ends = zip(leaf.box.lo, leaf.box.hi, d, strict=True)
                 z = [(Fraction(a) + Fraction(b) + (Fraction(b) - Fraction(a)) * Fraction(t)) / 2 for a, b, t in ends]

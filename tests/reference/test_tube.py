@@ -26,8 +26,8 @@ from certify.reference import __main__ as command
 from certify.reference import decrease, rules, tube
 from certify.reference.loop import Loop
 from tests.support.balls import around, ball, enlarge, slab_of, square, with_ball
-from tests.support.certificates import Document, decode, dump, edited, encode, grow, make, write
-from tests.support.reference import judge, judge_bytes
+from tests.support.certificates import Document, decode, edited, encode, grow, make
+from tests.support.reference import CONTINUOUS, dump, judge, judge_bytes, write
 
 Edit = Callable[[Document], Document]
 NONE = 2.0**-60  # a beta of a component that has no Q
@@ -49,7 +49,9 @@ def slab(before: Any, end: Any, duration: float, J: Any, rows: Any) -> Document:
 def decay() -> Document:
     """From |x| <= 2 into |x| <= 1 by |x| <= 4/3: (P_k - P_(k-1)) / h < 2 P_(k-1), with P_k = 1/4, 9/16, 17/16."""
     data = edited(
-        with_ball(still([["-", "x"]], 1.0, (1.0, 1.0))), "claim", {"kind": "enlarged", "start": encode([0.25])}
+        with_ball(still([["-", "x"]], 1.0, (1.0, 1.0))),
+        "claim",
+        {"kind": "enlarged", **CONTINUOUS, "start": encode([0.25])},
     )
     rows = [[0.0], [NONE], [0.0]]
     data["evidence"]["tube"] = [slab(0.25, 0.5625, 0.75, 2.125, rows), slab(0.5625, 1.0625, 0.5, 1.375, rows)]
@@ -124,7 +126,7 @@ def test_honest_tubes_are_accepted(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_without_its_tube_each_is_an_asymptotic_claim(name: str) -> None:
-    data = edited(edited(honest(name), "evidence.tube", []), "claim", {"kind": "asymptotic"})
+    data = edited(edited(honest(name), "evidence.tube", []), "claim", {"kind": "asymptotic", **CONTINUOUS})
     assert judge(data) is None
 
 
@@ -407,14 +409,13 @@ def more(path: str, key: str, value: Any) -> Edit:
 
 def practical(data: Document) -> Document:
     data = other_claim("practical")(data)
-    return edited(data, "levels", lambda old: {"floor": old["local"], "roa": old["roa"]})
+    return edited(data, "levels", lambda old: {"floor": old["local"], **old})
 
 
 TRUSTED = {"kind": "trusted-solver", "solver": "dReal", "version": "4", "precision": (0.5).hex(), "queries": []}
 MALFORMED: dict[str, Edit] = {
     "a tube under claim asymptotic": other_claim("asymptotic"),
     "a tube under claim practical": lambda d: edited(practical(d), "evidence.local", None),
-    "a ball under claim practical": lambda d: edited(practical(d), "evidence.tube", []),
     "no ball under claim enlarged": at("evidence.local", None),
     "no ball under claim asymptotic": lambda d: edited(
         edited(other_claim("asymptotic")(d), "evidence.tube", []), "evidence.local", None

@@ -47,8 +47,10 @@ from certify.lyapunov import domain_limit, solve_lyapunov, volume
 from certify.lyapunov.function import Quadratic
 from certify.policies import TanhNetwork
 from certify.report import render_html, simulated_roa_fraction, summary
+from certify.report.claims import CLAIMS
 from certify.report.figures import draw
 from certify.report.figures.geometry import PARTS, ellipse, refine, shadow
+from certify.report.limits import limited_by
 from certify.report.page import status_of
 from certify.report.sampling import (
     Flow,
@@ -57,7 +59,7 @@ from certify.report.sampling import (
     simulate,
     time_scales,
 )
-from certify.report.words import CLAIMS, above, below, kept_apart, label, limited_by, number, symbol
+from certify.report.words import above, below, kept_apart, label, number, symbol
 from certify.roa import RoaOptions, certify_roa
 from certify.systems import System, get_system
 from certify.systems.ode import rk4_step
@@ -888,7 +890,7 @@ def practical_case(tmp_path_factory: pytest.TempPathFactory) -> Case:
         "result": "ACCEPTED",
         "certificate_sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
         "policy_sha256": network.sha256(),
-        "levels": {"floor": 1 / 3, "roa": 1.7},
+        "levels": {"floor": 1 / 3, "local": 1 / 3, "roa": 1.7},
         "leaves": 9,
         "ring_leaves": 8,
         "margins": {"local": None, "ring": 0.0123456},
@@ -899,7 +901,7 @@ def practical_case(tmp_path_factory: pytest.TempPathFactory) -> Case:
         "system": "drifting",
         "claim": {"kind": "practical"},
         "policy": {"sha256": network.sha256(), "layers": [2, 1]},
-        "levels": {"local": None, "floor": 1 / 3, "roa": 1.7, "sampled_limit": None, "domain_limit": 4.0},
+        "levels": {"local": 1 / 3, "floor": 1 / 3, "roa": 1.7, "sampled_limit": None, "domain_limit": 4.0},
         "checked": "ACCEPTED",
         "volume": 5.0,
         "semi_axes": [1.3, 1.3],
@@ -914,7 +916,8 @@ def practical_case(tmp_path_factory: pytest.TempPathFactory) -> Case:
 
 def test_the_practical_claim_survives_the_file(practical_case: Case) -> None:
     data, read = json.loads(practical_case.raw), practical_case.certificate
-    assert data["claim"] == {"kind": "practical"} and set(data["levels"]) == {"floor", "roa"}
+    assert data["claim"] == {"kind": "practical", "rate": "0x0.0p+0", "sample": None}
+    assert set(data["levels"]) == {"floor", "local", "roa"}
     assert (read.kind, read.inner, read.to_json()) == ("practical", 1 / 3, practical_case.raw.decode())
     for kind in ("other", ["practical"], None):
         data["claim"]["kind"] = kind
@@ -958,7 +961,7 @@ def test_runs_of_the_practical_claim_count_when_they_enter_the_inner_set(practic
 def test_every_claim_has_all_its_words() -> None:
     assert set(CLAIMS) == set(KINDS)
     for kind, words in CLAIMS.items():
-        assert words.inner_word == KINDS[kind].inner_name
+        assert words.inner_word == ("local" if KINDS[kind].at_rest else "floor")
         assert {"Equations", "Domain", "Ring", "Inputs"} <= {name for name, _, _ in words.parts}
 
 

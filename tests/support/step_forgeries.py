@@ -13,7 +13,7 @@ import numpy as np
 
 from tests.support.balls import enlarged_from
 from tests.support.certificates import LEAF, Document, decode, edited, encode, make, rehash, tree_of, with_tree
-from tests.support.steps import WIDE, fitted, linear, saturated, turning
+from tests.support.stepped_loops import WIDE, fitted, linear, saturated, turning
 
 Edit = Callable[[Document], Document]
 Forgery = tuple[str, str, Document]  # the rule, what it is, and the document

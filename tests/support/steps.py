@@ -1,279 +1,153 @@
-"""Small loops that go in steps, decay at a rate, or stay near a level, whose truth is known.
+"""Documents of version 6 for loops with steps, written by hand: discrete time, inputs that are held, a rate, a level.
 
-V is x'x on a ball alone (c1 = c2), unless a loop says otherwise. Multipliers are hints: they are balanced for the
-models that the checker finds, and only decide whether something is accepted, never whether it is true.
+As in `balls.py` what is chosen are hints: multipliers from the models that the reference finds, and a tree that its own
+leaf rule grows. They decide whether something is accepted and never whether it is true.
 """
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+import base64
+from collections.abc import Sequence
 from fractions import Fraction
 from typing import Any
 
 import numpy as np
+from flint import ctx
 
-from certify.checker.case import Case
-from certify.checker.errors import Rejected
-from certify.checker.local import Local
-from tests.support.balls import centred, ones
-from tests.support.certificates import Document, decode, edited, encode, grow, make, parse
+from certify.reference.balls import PRECISION
+from certify.reference.document import read
+from certify.reference.evidence import Tree
+from certify.reference.flow import steps_on
+from certify.reference.leaves import LEAF, Box, Leaves
+from certify.reference.local import cells
+from certify.reference.loop import Loop
+from certify.reference.refusal import Refused
+from tests.support.balls import around, ball, square
+from tests.support.certificates import Document, edited, encode, make
+from tests.support.reference import dump, judge, upgraded
 
-TINY = 2.0**-40
-WIDE = [("-99", "99")]
-
-
-def fitted(data: Document, edge: float = 0.0, order: int = 1, wider: float = 1e-6) -> Document:
-    """With the least ball that holds {V <= c1}, nearly, and multipliers that balance what the models leave."""
-    P, c1 = decode(data["lyapunov"]["P"]), float.fromhex(data["levels"]["local"])
-    n = round(len(P) ** 0.5)
-    P = P.reshape(n, n)
-    J = np.linalg.inv(np.linalg.cholesky(P / c1)).T * (1 + wider)
-    data = edited(data, "evidence.local", centred(J, ones(n), edge=edge, order=order))
-    rows = np.stack([np.full(n, TINY), np.full(n, TINY), np.ones(n)])
-    try:
-        with np.errstate(all="ignore"):
-            local = Local(Case(parse(data)))
-            G = local.G(next(iter(local.case.cells)))
-            A, Q, E = (np.array([getattr(g, part) for g in G]) for part in ("a", "Q", "E"))
-            sizes = np.linalg.norm((J + float(local.case.c.step) * A).T @ P, axis=0)
-            for row, parts in ((0, E), (1, Q)):
-                found = np.linalg.norm(parts, axis=(1, 2)) / np.maximum(sizes, TINY)
-                rows[row] = np.maximum(np.where(np.isfinite(found), found, 1.0), TINY)
-    except Rejected:
-        pass
-    data["evidence"]["local"] = centred(J, rows, edge=edge, order=order)
-    return data
+TINY = 2.0**-60
 
 
-def linear(dynamics: Any, gains: Any, level: Any = 1.0, **more: Any) -> Document:
-    """Any equations under u = -gains x, in binary64 as they stand; scalar unless `more` says otherwise."""
-    gains, levels = np.atleast_2d(gains), (level, level) if isinstance(level, float) else level
-    n = gains.shape[1]
-    options: dict[str, Any] = {
-        "states": ["x", "y"][:n], "domain": WIDE * n, "input_bounds": [("-9999", "9999")], "squash": "identity",
-        "centre": "none", **more,
-    }  # fmt: skip
-    P = options.pop("P", np.eye(n))
-    return make(dynamics, [(gains, [0.0])], P, levels, **options)
+def stepping(
+    dynamics: Sequence[Any],
+    layers: Sequence[tuple[Any, Any]],
+    P: Any,
+    levels: Sequence[float],
+    *,
+    discrete: bool = False,
+    sample: tuple[str, str] | None = None,
+    rate: float = 0.0,
+    order: int = 1,
+    edge: float | None = 0.0,
+    leaves: int = 400,
+    **more: Any,
+) -> Document:
+    """Three levels are those of claim `practical`, whose ball has this edge, or is not there for None.
 
-
-def exactly(value: float) -> str:
-    return str(Fraction(value))
-
-
-# ------------------------------------------------------------------------------------------ loops with a known boundary
-
-
-@dataclass(frozen=True)
-class Family:
-    """Claims by one number, true below `limit` (above it if `falls`), and how near to it one is accepted."""
-
-    name: str
-    limit: float
-    claim: Callable[[float], Document]
-    near: float = 0.005
-    falls: bool = False
-
-    def beyond(self, share: float) -> Document:
-        """Past the limit by this share of it: false."""
-        return self.claim(self.limit * (1 - share if self.falls else 1 + share))
-
-    def within(self, share: float) -> Document:
-        return self.claim(self.limit * (1 + share if self.falls else 1 - share))
-
-
-def held_gain(a: float, b: float, h: str, order: int) -> Family:
-    """x' = a x - b k x(t_k): |e^(a h) - k b (e^(a h) - 1)/a| < 1, largest k."""
-    t = float(Fraction(h))
-    grown, input_share = math.exp(a * t), math.expm1(a * t) / a if a else t
-    limit = (grown + 1) / (b * input_share)
-
-    def claim(k: float) -> Document:
-        plant = [["+", ["*", exactly(a), "x"], ["*", exactly(b), "u"]]]
-        return fitted(linear(plant, k, sample=(h, h)), order=order)
-
-    return Family(f"held, a = {a}, b = {b}, h = {h}: largest gain", limit, claim, near=0.02)
-
-
-def held_for(a: float, k: float, lo: str) -> Family:
-    """The longest period, from a shortest one: x' = a x - k x(t_k)."""
-    limit = 2 / k if a == 0 else math.log((k + a) / (k - a)) / a
-
-    def claim(h: float) -> Document:
-        plant = [["+", ["*", exactly(a), "x"], "u"]]
-        hi = str(Fraction(h).limit_denominator(10**6))
-        return fitted(linear(plant, k, sample=(hi if lo == "exact" else lo, hi)), order=5)
-
-    return Family(
-        f"held, a = {a}, k = {k}, from {lo}: longest period", limit, claim, near=0.02 if lo == "exact" else 0.3
-    )
-
-
-def discrete_gain(a: float, b: float, largest: bool) -> Family:
-    """x+ = (a - b k) x."""
-    limit = (a + 1) / b if largest else (a - 1) / b
-    plant = [["+", ["*", exactly(a), "x"], ["*", exactly(b), "u"]]]
-    return Family(
-        f"discrete, a = {a}, b = {b}: {'largest' if largest else 'least'} gain",
-        limit, lambda k: fitted(linear(plant, k, time="discrete")), falls=not largest,
-    )  # fmt: skip
-
-
-def rate_of(kind: str, k: float, h: str = "1") -> Family:
-    """The largest rate: x' = -k x; x+ = (1 - k) x; x' = -k x(t_k)."""
-    t = float(Fraction(h))
-    limit = k if kind == "continuous" else (1 - (1 - k * t) ** 2) / (2 * t)
-    plant = [["+", "x", "u"]] if kind == "discrete" else ["u"]
-    more: dict[str, Any] = {"sample": (h, h)} if kind == "held" else {"time": kind}
-    return Family(
-        f"rate, {kind}, k = {k}, h = {h}", limit, lambda rate: fitted(linear(plant, k, rate=rate, **more)),
-    )  # fmt: skip
-
-
-def quantity(kind: str, k: float, cells: int, h: str = "1/4") -> Family:
-    """The largest end of a range [0, end] of q: x' = q x - k x; x+ = q x + (1/4 - k) x; x' = (q - k) x(t_k)."""
-    limit = k if kind != "discrete" else 0.75 + k
-    plant = [["+", ["*", "q", "x"], "u"]]
-    more: dict[str, Any] = {"time": kind}
-    if kind == "discrete":
-        plant = [["+", ["*", "q", "x"], ["/", "x", "4"], "u"]]
-    elif kind == "held":
-        more = {"sample": (h, h)}
-
-    def claim(end: float) -> Document:
-        return fitted(
-            linear(plant, k, uncertain=[("q", "0", exactly(end))], cells=[cells], **more),
-            order=1 + 3 * (kind == "held"),
-        )
-
-    return Family(f"range, {kind}, k = {k}, {cells} cells", limit, claim, near=0.1 if kind == "held" else 0.005)
-
-
-def floor(kind: str, k: float, w: float, h: str = "1/4") -> Family:
-    """The least r of {|x| <= r} that keeps x' = -k x + w; x+ = (1 - k) x + w; x' = -k x(t_k) + w(t), |w| <= w."""
-    t = 1.0 if kind == "discrete" else float(Fraction(h))
-    if kind == "continuous":
-        limit, edge = w / k, k
+    The tree is grown if there is something between the ball and the outer level.
+    """
+    *floor, inner, outer = levels
+    P = np.atleast_2d(np.asarray(P, dtype=float))
+    P = (P + P.T) / 2
+    T = np.linalg.inv(np.linalg.cholesky(P)).T
+    options: dict[str, Any] = {"squash": "identity", "centre": "none", "scale": [1.0], "T": T, **more}
+    data = upgraded(make(dynamics, layers, P, (inner, outer), **options))
+    data["plant"]["time"] = "discrete" if discrete else "continuous"
+    data["claim"] |= {"rate": rate.hex(), "sample": sample and list(sample)}
+    data["evidence"]["order"] = order if sample else 1
+    if floor:
+        data["claim"]["kind"] = "practical"
+        data["levels"]["floor"] = floor[0].hex()
+    if floor and edge is None:
+        data["evidence"]["local"] = None
     else:
-        limit, edge = t * w / (1 - abs(1 - k * t)), (1 - abs(1 - k * t)) / t
-    plant = [["+", "x", "u", "w"]] if kind == "discrete" else [["+", "u", "w"]]
-    more: dict[str, Any] = {"sample": (h, h)} if kind == "held" else {"time": kind}
-
-    def claim(r: float) -> Document:
-        data = linear(
-            plant,
-            k,
-            (r * r, 4 * r * r, 4 * r * r),
-            claim="practical",
-            uncertain=[("w", exactly(-w), exactly(w))],
-            **more,
-        )
-        return fitted(data, edge=edge * (1 - 2.0**-40))
-
-    return Family(f"floor, {kind}, k = {k}, w = {w}", limit, claim, falls=True)
+        data = with_ball(data, order if sample else 1, edge or 0.0)
+    between = inner < outer or data["evidence"]["local"] is None
+    return grown(data, leaves) if between else data
 
 
-def turning(share: float, h: str = "1/2") -> Family:
-    """x' = y, y' = -g (x + 2 y)(t_k): the largest g for which V decreases, P from a smaller one."""
-    t = float(Fraction(h))
-
-    def step(g: float) -> np.ndarray:
-        return np.array([[1 - t * t * g / 2, t - t * t * g], [-t * g, 1 - 2 * t * g]])
-
-    A = step(share)
-    P = np.linalg.solve(np.eye(4) - np.kron(A.T, A.T), np.eye(2).ravel()).reshape(2, 2)
-    P = np.round(2**20 * (P + P.T)) / 2**21
-    low, high = share, 20.0
-    for _ in range(60):
-        g = (low + high) / 2
-        decreases = np.linalg.eigvalsh(step(g).T @ P @ step(g) - P)[-1] < 0
-        low, high = (g, high) if decreases else (low, g)
-
-    def claim(g: float) -> Document:
-        plant = ["y", "u"]
-        T = np.round(2**20 * np.linalg.inv(np.linalg.cholesky(P)).T) / 2**20
-        return fitted(linear(plant, [[g, 2 * g]], sample=(h, h), P=P, T=T), order=3)
-
-    return Family(f"turning, from {share}, h = {h}", low, claim, near=0.02)
-
-
-def saturated(kind: str, c: float = 0.5, h: str = "1/8") -> Family:
-    """x' = c x - tanh(x), x' = c x - tanh(x(t_k)), x+ = (1 + c) x - tanh(x) come nearer to 0 where tanh(x) > c x."""
-    low, high = 1e-3, 1 / c
-    for _ in range(80):
-        middle = (low + high) / 2
-        low, high = (middle, high) if math.tanh(middle) > c * middle else (low, middle)
-    plant = [["+", ["*", exactly(1 + c if kind == "discrete" else c), "x"], "u"]]
-    more: dict[str, Any] = {"sample": (h, h), "order": 3} if kind == "held" else {"time": kind}
-
-    def claim(reach: float) -> Document:
-        levels = (0.01, reach * reach)
-        data = make(plant, [([[1.0]], [0.25])], 1.0, levels, domain=WIDE, **more)
-        return grow(fitted(data, order=more.get("order", 1)), max_leaves=800, depth=14)
-
-    return Family(f"saturated, {kind}", low, claim, near=0.02)
+def with_ball(data: Document, order: int, edge: float) -> Document:
+    """The least ball around {V <= c1}, nearly, and multipliers that balance the two sides of each inequality."""
+    P, c1 = square(data["lyapunov"]["P"]), float.fromhex(data["levels"]["local"])
+    J, n = around(P / c1), len(P)
+    more = {"edge": edge.hex(), "order": order}
+    data = edited(data, "evidence.local", ball(J, np.ones((3, n))) | more)
+    try:
+        with ctx.workprec(PRECISION):
+            c = read(dump(data))
+            h, loop = float(Fraction(str(c.step))), Loop(c)
+            if not isinstance(c.evidence, Tree) or c.evidence.ball is None:
+                raise TypeError("a ball was expected")
+            steps = steps_on(loop, loop.known(c.evidence.ball.J, "local", "ball"), c.evidence.ball, "ball")
+            G = steps.change(next(cells(c.plant.ranges, c.evidence.cells)), "local", "ball")
+    except Refused:
+        return data
+    a, Q, E = (np.array([[float(v.mid()) for v in getattr(g, part).entries()] for g in G.components]) for part in "aQE")
+    Q, E = Q.reshape(n, n, n), E.reshape(n, n, n)
+    b = (J + h * a).T @ P
+    rate = 2 * float.fromhex(data["claim"]["rate"])
+    left = -(J.T @ P @ a + a.T @ P @ J + h * a.T @ P @ a + rate * J.T @ P @ J)
+    if not np.linalg.eigvalsh(left)[0] > 0:
+        return data
+    with np.errstate(all="ignore"):
+        inverse = np.linalg.inv(left)
+        along = np.einsum("ji,jk,ki->i", b, inverse, b)
+        sizes = [np.sqrt(np.einsum("iab,bc,iac->i", A, inverse, A) / along) for A in (E, Q)]
+        alpha = np.where(E.any((1, 2)) & np.isfinite(sizes[0]), sizes[0], 0.0)
+        least = TINY / np.where(along > 0, along, 1.0)
+        beta = np.where(Q.any((1, 2)) & np.isfinite(sizes[1]) & (sizes[1] > 0), sizes[1], least)
+    return edited(data, "evidence.local", ball(J, np.stack([alpha, beta, np.ones(n)]), inverse) | more)
 
 
-def moved(kind: str, c: float = 0.5, w: float = 0.0625, h: str = "1/8") -> Family:
-    """The same with |w(t)| <= w and without a ball: the least r of {|x| <= r} that keeps it, tanh(r) = c r + w."""
-    low, high = 1e-3, 1.0
-    for _ in range(80):
-        middle = (low + high) / 2
-        low, high = (low, middle) if math.tanh(middle) > c * middle + w else (middle, high)
-    plant = [["+", ["*", exactly(1 + c if kind == "discrete" else c), "x"], "u", "w"]]
-    more: dict[str, Any] = {"sample": (h, h), "order": 3} if kind == "held" else {"time": kind}
-
-    def claim(r: float) -> Document:
-        levels, range_ = (r * r, 1.0), [("w", exactly(-w), exactly(w))]
-        data = make(plant, [([[1.0]], [0.25])], 1.0, levels, domain=WIDE, claim="practical", uncertain=range_, **more)
-        return grow(data, max_leaves=800, depth=14)
-
-    return Family(f"moved, {kind}", low, claim, near=0.05, falls=True)
-
-
-def bent_rate() -> Family:
-    """x' = x^3/4 - x decays at the rate 1 - x^2/4, the least of which in {x^2 <= 1} is 3/4, on leaves."""
-    plant = [["+", ["*", "1/4", ["**", "x", 3]], "u"]]
-    return Family("bent, rate", 0.75, lambda rate: grow(fitted(linear(plant, 1.0, (0.01, 1.0), rate=rate)), 800, 14))
-
-
-def peaked(peak: float) -> Document:
-    """x+ = peak / (1 + 4 x^2) in discrete time, without a ball; {|x| <= 1/2} is kept if peak is below 1/2."""
-    plant = [["+", ["/", exactly(peak), ["+", "1", ["*", "4", "x", "x"]]], ["*", "0", "u"]]]
-    return grow(linear(plant, 0.0, (0.25, 1.0), claim="practical", time="discrete"), 400, 12)
+def grown(data: Document, leaves: int) -> Document:
+    """Leaves that are not accepted are halved on their widest axis, as long as there are few."""
+    with ctx.workprec(PRECISION):
+        c = read(dump(data))
+        if not isinstance(c.evidence, Tree):
+            raise TypeError("a tree was expected")
+        rule = Leaves(c, c.evidence.T, c.evidence.T.transpose() * c.P * c.evidence.T)
+        root, tree, count = np.array(c.evidence.root), bytearray(), 0
+        stack = [(-root, root)]
+        while stack:
+            lo, hi = stack.pop()
+            if count + len(stack) >= leaves or good(rule, lo, hi):
+                tree.append(LEAF)
+                count += 1
+                continue
+            axis = int(np.argmax((hi - lo) / root))
+            tree.append(axis)
+            middle = 0.5 * lo[axis] + 0.5 * hi[axis]
+            below, above = hi.copy(), lo.copy()
+            below[axis] = above[axis] = middle
+            stack += [(above, hi), (lo, below)]
+    return edited(data, "evidence.tree", base64.b64encode(bytes(tree)).decode())
 
 
-def families() -> Iterator[Family]:
-    for a, b, h, order in ((0.0, 1.0, "1/2", 2), (0.5, 2.0, "1/4", 5), (-1.0, 0.5, "1/4", 6), (1.0, 1.0, "1/8", 5)):
-        yield held_gain(a, b, h, order)
-    for a, k, lo in (
-        (0.0, 2.0, "exact"),
-        (0.25, 4.0, "exact"),
-        (-0.5, 8.0, "exact"),
-        (0.0, 1.0, "1/2"),
-        (0.0, 2.0, "0"),
-    ):
-        yield held_for(a, k, lo)
-    for a, b in ((1.5, 1.0), (1.25, 0.5), (3.0, -2.0)):
-        yield discrete_gain(a, b, b > 0)
-        yield discrete_gain(a, b, b < 0)
-    yield from (rate_of("continuous", 1.5), rate_of("discrete", 0.25), rate_of("discrete", 1.5))
-    yield from (rate_of("held", 1.0, "1/4"), rate_of("held", 3.0, "1/2"))
-    yield from (quantity("continuous", 1.0, 1), quantity("continuous", 2.5, 3), quantity("discrete", 0.5, 1))
-    yield from (quantity("discrete", 0.25, 2), quantity("held", 1.0, 1), quantity("held", 0.5, 4))
-    yield from (floor("continuous", 1.0, 0.25), floor("continuous", 3.0, 0.5), floor("discrete", 0.5, 0.125))
-    yield from (floor("discrete", 1.5, 0.25), floor("held", 2.0, 0.5), floor("held", 6.0, 0.25))
-    yield from (turning(0.25), turning(0.5), saturated("held"), saturated("discrete"))
-    yield from (moved("held"), moved("discrete"), bent_rate())
+def good(rule: Leaves, lo: np.ndarray, hi: np.ndarray) -> bool:
+    box = Box(0, lo.tolist(), hi.tolist())
+    if rule.is_outside(box) or (rule.is_inside(box) and not rule.alone):
+        return True
+    (leaf,) = rule.enclose([box])
+    try:
+        within = None if rule.c.sample is None else rule.reached(leaf)
+        if rule.is_inside(box) and not rule.steps:
+            return bool(rule.F(leaf))
+        return rule.decreases(leaf, within)
+    except Refused:
+        return False
 
 
-def with_multipliers(data: Document, change: Callable[[np.ndarray], Any]) -> Document:
-    return edited(data, "evidence.local.multipliers", lambda text: encode(change(decode(text))))
+def at_level(data: Document, **levels: float) -> Document:
+    """Another level or two, the root box as it must be, and the ball around the new one."""
+    result = edited(data, "levels", lambda old: old | {key: value.hex() for key, value in levels.items()})
+    P, T = square(data["lyapunov"]["P"]), square(data["evidence"]["T"])
+    most = float.fromhex(result["levels"]["roa"])
+    root = np.sqrt(most * np.diag(np.linalg.inv(T.T @ P @ T))) * (1 + 1e-12)
+    result = edited(result, "evidence.root", encode(root))
+    old = result["evidence"]["local"]
+    return result if old is None else with_ball(result, old["order"], float.fromhex(old["edge"]))
 
 
-def shares(count: int, generator: np.random.Generator) -> Sequence[float]:
-    """Half of them below 5 %, down to a tenth of one; the others up to 100 %."""
-    few = count - count // 2
-    return [*np.geomspace(0.001, 0.049, few), *generator.uniform(0.06, 1.0, count // 2)]
+def accepted(data: Document) -> bool:
+    return judge(data) is None

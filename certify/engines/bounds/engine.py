@@ -14,12 +14,15 @@ from certify.claims import Asymptotic, Practical, Problem
 from certify.engines.base import Attempt, Budget, Engine, Once, Proof, Report, Task
 from certify.engines.bounds.search import Pass, RingProof, empty_ring, outwards, prove_inwards, prove_outwards
 from certify.engines.falsify import Band, Witness, survey
-from certify.engines.local import local_ball, prove_local
+from certify.engines.local import local_ball, prove_band, prove_local
 from certify.running import Runner
 from certify.verdict import Stop
 
 Array = NDArray[np.float64]
 _SHARE = 0.6  # of the time, for finding c2 before c0
+_FOR_BALL = 0.5  # of the time, for a ring from a ball, and of that for the ball
+_FEW = 3  # states, up to which leaves may carry a claim alone
+_EQUAL = 0.01  # of a level
 _TRIES = 4  # inner levels from which c2 is looked for, each with half of the time that is left for it
 
 
@@ -36,6 +39,33 @@ class BoundsEngine(Engine):
         return Once(lambda budget, report: self._practical(task, budget, report))
 
     def _practical(self, task: Task, budget: Budget, report: Report | None) -> Proof:
+        """The better of two: a ring from a ball around a level, and one that leaves alone have to carry."""
+        start = time.perf_counter()
+        first = self._from_ball(task, replace(budget, seconds=_FOR_BALL * budget.seconds), report)
+        left = replace(budget, seconds=budget.seconds - (time.perf_counter() - start))
+        if first is not None and (self.T.shape[0] > _FEW or left.seconds < _FOR_BALL * budget.seconds):
+            return first
+        second = self._by_leaves(task, left, report)
+        found = second if first is None or _is_better(second, first) else first
+        return replace(found, seconds={"ring": time.perf_counter() - start})
+
+    def _from_ball(self, task: Task, budget: Budget, report: Report | None) -> Proof | None:
+        """A ring that grows from the ball whose floor is about the least; None without such a ball."""
+        start = time.perf_counter()
+        found = prove_band(task.problem, self.T, task.target, until=start + _FOR_BALL * budget.seconds)
+        if found is None:
+            return None
+        (floor, inner), stop = found, None
+        if inner < task.target:
+            grown = outwards(task.problem, self.T, inner, task.target, self.runner)
+            stop = grown.advance(replace(budget, seconds=budget.seconds - (time.perf_counter() - start)), report)
+            ring = grown.proof(stop)
+        else:
+            ring = empty_ring(task.problem, self.T, inner)
+        claim = Practical(roa=ring.outer, local=inner, floor=floor, rate=task.problem.rate)
+        return self.stated(task.problem, ring, claim, {"ring": time.perf_counter() - start})
+
+    def _by_leaves(self, task: Task, budget: Budget, report: Report | None) -> Proof:
         """The bands of a survey in turn, the highest first, until one holds a proof."""
         start = time.perf_counter()
         bands = survey(task.problem, self.T, task.target)
@@ -100,6 +130,8 @@ class BoundsEngine(Engine):
         local, cells = None, (1,) * len(problem.loop.system.ranges)
         if isinstance(claim, Asymptotic):
             local, cells = local_ball(problem, self.T, claim.local)
+        elif claim.floor < claim.local:
+            local, cells = local_ball(problem, self.T, claim.local, claim.floor)
         return Proof(
             claim,
             PartitionTree(self.T, ring.root, ring.tree, local, cells=cells, order=ring.order),
@@ -111,6 +143,16 @@ class BoundsEngine(Engine):
             direction=ring.direction,
             seconds_left=ring.seconds_left,
         )
+
+
+def _is_better(one: Proof, other: Proof) -> bool:
+    """Whether a practical claim is about a larger set, or about nearly the same with a lower floor."""
+    a, b = one.claim, other.claim
+    if not (isinstance(a, Practical) and isinstance(b, Practical)):
+        return a is not None
+    if abs(a.roa - b.roa) <= _EQUAL * b.roa:
+        return a.floor < b.floor
+    return a.roa > b.roa
 
 
 class _Outwards:

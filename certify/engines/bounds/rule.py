@@ -192,12 +192,11 @@ class VdotBound:
             G = [evaluate(expression, values, models, known) for expression in self.dynamics]
             if self.system.time == "discrete":
                 G = [after + before.scaled(-1.0) for after, before in zip(G, here, strict=True)]
-        terms = []
-        for i, rate in enumerate(G):
-            gradient = self._row(i, here, 2.0)
-            if self.step:
-                gradient = gradient + self._row(i, G, self.step)
-            terms.append(gradient * rate)
+        along, factor = here, 2.0
+        if self.step:  # 2 x + h G, with the period's own symbol where it has one
+            moved = G if self.flow is None else [self.flow.times_period(rate) for rate in G]
+            along, factor = [v.scaled(2.0) + by for v, by in zip(here, moved, strict=True)], 1.0
+        terms = [self._row(i, along, factor) * rate for i, rate in enumerate(G)]
         result = terms[0]
         for term in terms[1:]:
             result = result + term

@@ -32,6 +32,7 @@ Array = NDArray[np.float64]
 _SLACK = 1e-9  # relative distance kept from every level, so that the checker's own rounding agrees
 _BESIDE_WITNESS = 1e-3  # relative distance kept from a violation
 _SHELL = 16.0  # a batch reaches up to this multiple of the nearest open level
+_HIGHER = 8.0  # an inner level over one from below which a step may lead out
 _MOST_SPLITS = 40_000_000  # what a certificate can hold, and two gibibytes
 
 
@@ -122,12 +123,19 @@ def prove_inwards(
     """
     order = choose_order(problem, T, max(floor, 1e-3 * outer), outer)
     rule = VdotBound(problem, T, runner.device, inside=True, order=order)
-    ring = Pass(_Inwards(problem, T, floor, outer), _root(problem, T, outer), runner, rule)
-    stop = ring.advance(budget, report)
-    if stop is not None:
-        ring.settle()
-        ring.advance(budget, report)
-    return ring.proof(stop)
+    end = time.monotonic() + budget.seconds
+    while True:
+        ring = Pass(_Inwards(problem, T, floor, outer), _root(problem, T, outer), runner, rule)
+        left = replace(budget, seconds=max(0.0, end - time.monotonic()))
+        stop = ring.advance(left, report)
+        if stop is not None:
+            ring.settle()
+            ring.advance(budget, report)
+        found = ring.proof(stop)
+        # A step from below may end above a level to which the ring reaches: then there is none from which it does not.
+        floor = _HIGHER * max(floor, found.inner)
+        if found.covered or not rule.step or floor >= outer or time.monotonic() > end:
+            return found
 
 
 def _root(problem: Problem, T: Array, level: float) -> Array:

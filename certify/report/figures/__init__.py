@@ -84,7 +84,7 @@ def _in_planes(scene: Scene, roa: SimulatedRoa | None) -> list[Picture]:
     inside = len(scene.pairs) * scene.effort.starts  # what starts along the domain's edge comes after these
     from_set = replace(runs, path=runs.path[:, :inside], settled=runs.settled[:inside], left=runs.left[:inside])
     pictures = [*portraits(scene, runs, region), *tube(scene, from_set)]
-    if scene.n == 2 and not scene.local_is_enough:
+    if scene.n == 2 and scene.shows_inner:
         pictures.append(near_origin(scene))
     if scene.leaves is not None and not scene.local_is_enough:
         pictures.append(partition(scene, scene.leaves))

@@ -15,7 +15,12 @@ def decay(scene: Scene, paths: NDArray[np.float64], step: float) -> Picture:
     V = quadratic(scene.P, paths)
     time = step * np.arange(len(V))
     figure, axes = figure_of(4.2, 3.6)
-    axes.semilogy(time, np.maximum(V, 1e-300), color=SIMULATED, lw=0.8)
+    if scene.timing.is_plain:
+        axes.semilogy(time, np.maximum(V, 1e-300), color=SIMULATED, lw=0.8)
+    else:  # the claim is about V at the dots
+        apart = scene.flow.steps_between(step)
+        axes.semilogy(time, np.maximum(V, 1e-300), color=SIMULATED, lw=0.5, ls=":" if scene.timing.discrete else "-")
+        axes.semilogy(time[::apart], np.maximum(V[::apart], 1e-300), ".", ms=2.5, color=SIMULATED, rasterized=True)
     axes.axhline(scene.outer, color=SET, lw=1.4)
     if scene.inner < scene.outer:
         axes.axhline(scene.inner, color=INNER, lw=1.4)
@@ -39,14 +44,21 @@ def decay(scene: Scene, paths: NDArray[np.float64], step: float) -> Picture:
     axes.set_ylim(max(min(lowest, scene.inner / 10), 1e-14 * scene.outer), highest * 4)
     axes.set_xlim(0, time[-1])
     plain_powers(axes)
-    axes.set_xlabel("time (s)")
+    axes.set_xlabel(scene.timing.axis)
     axes.set_ylabel("V(x(t))")
     begin = f"on and in the {scene.word} set" if scene.start is None else "on the edge of the tube's start"
     begin += "" if scene.centre is None else " around c₀"
     return Picture(
         "V along trajectories",
-        f"V from starting points {begin}: simulated{scene.held}, not proved. "
+        f"V from starting points {begin}: simulated{scene.held}, not proved{_dots(scene)}. "
         + scene.words.decay.format(word=scene.proved),
         to_svg(figure),
         simulated=True,
     )
+
+
+def _dots(scene: Scene) -> str:
+    """What the dots on the lines are, where there are any."""
+    if scene.timing.is_plain:
+        return ""
+    return "; a dot for each step" if scene.timing.discrete else "; the dots are at sampling instants"

@@ -1,4 +1,4 @@
-"""Vdot along the one state."""
+"""Vdot, or what takes its place, along the one state."""
 
 from __future__ import annotations
 
@@ -26,16 +26,18 @@ from certify.report.sampling import SimulatedRoa
 
 
 def line_figure(scene: Scene, roa: SimulatedRoa | None) -> Picture:
-    """Vdot over the domain, the two intervals, and where runs settle."""
+    """V's change over the domain, the two intervals, and where runs settle."""
     figure, axes = figure_of(5.0, 3.4)
     legend = draw_line(axes, scene, roa)
     wider = "" if scene.start is None else ", and around it the start of the tube that leads into it"
     if scene.centre is not None:
         wider = ", and the start of the tube that leads into it; nothing is said of what lies between them"
     return Picture(
-        "V̇ along the state",
-        f"Shaded: the {scene.word} interval, {scene.meaning}{wider}. The curve of V̇ and the interval of the runs that "
-        f"{scene.words.settles} come from floating point and simulation{scene.held}; they are not proved.",
+        f"{scene.timing.derivative} along the state",
+        f"Shaded: the {scene.word} interval, {scene.meaning}{wider}. The curve of {scene.timing.derivative} and the "
+        f"interval of the runs that "
+        f"{scene.words.settles} come from floating point and simulation{scene.held}; they are not proved. "
+        f"{scene.timing.simulated.definition}".rstrip(),
         to_svg(figure),
         simulated=True,
         wide=True,
@@ -47,12 +49,12 @@ def draw_line(axes: Any, scene: Scene, roa: SimulatedRoa | None) -> tuple[Key, .
     """Fill the axes; their legend."""
     x = np.linspace(scene.lo[0], scene.hi[0], 601)[:, None]
     outer, inner = scene.reach[0], scene.inner_reach[0]
-    vdot = scene.vdot(x)
+    change, symbol = scene.growth(x), scene.timing.derivative
     keys = [
         Key(f"{scene.word} set", SET_FILL, 0, fill=SET_FILL),
         Key(scene.words.inner_set, INNER_FILL, 0, fill=INNER_FILL),
-        Key("V̇ (float64, not proved)", INK),
-        Key("V̇ ≥ 0 (not proved)", GROWTH_FILL, 0, fill=GROWTH_FILL),
+        Key(f"{symbol} (float64, not proved)", INK),
+        Key(f"{symbol} ≥ 0 (not proved)", GROWTH_FILL, 0, fill=GROWTH_FILL),
     ]
     axes.axhline(0, color=MUTED, lw=0.7)
     if scene.start_reach is not None:
@@ -60,8 +62,8 @@ def draw_line(axes: Any, scene: Scene, roa: SimulatedRoa | None) -> tuple[Key, .
         axes.axvspan(*scene.start_on_line, color=START_FILL, lw=0)
     axes.axvspan(-outer, outer, color=SET_FILL, lw=0)
     axes.axvspan(-inner, inner, color=INNER_FILL, lw=0)
-    axes.plot(x[:, 0], vdot, color=INK)
-    axes.fill_between(x[:, 0], 0, vdot, where=vdot >= 0, color=GROWTH_FILL, lw=0)
+    axes.plot(x[:, 0], change, color=INK)
+    axes.fill_between(x[:, 0], 0, change, where=change >= 0, color=GROWTH_FILL, lw=0)
     if roa is not None:
         inside = roa.axes[0][roa.attracted]
         if inside.size:
@@ -74,5 +76,5 @@ def draw_line(axes: Any, scene: Scene, roa: SimulatedRoa | None) -> tuple[Key, .
         keys.append(Key("leaves", SET, 1.0))
     axes.set_xlim(scene.lo[0], scene.hi[0])
     axes.set_xlabel(scene.labels[0])
-    axes.set_ylabel("V̇")
+    axes.set_ylabel(symbol)
     return tuple(keys)

@@ -15,8 +15,9 @@ def near_origin(scene: Scene) -> Picture:
 
     figure, axes = figure_of(4.2, 3.6)
     reach = 2.6 * scene.inner_reach
-    if scene.leaves is not None:
-        add_leaves(axes, scene, scene.leaves, (0, 1), within=reach)
+    leaves = None if scene.local_is_enough else scene.leaves
+    if leaves is not None:
+        add_leaves(axes, scene, leaves, (0, 1), within=reach)
     begin = on_level(scene.P, circle(scene.effort.starts), min(9 * scene.inner, 0.999 * scene.outer))
     paths = scene.simulate(begin, steps=60).path
     lines = [thin(paths[:, k], 2 * reach) for k in range(paths.shape[1])]
@@ -29,12 +30,14 @@ def near_origin(scene: Scene) -> Picture:
     axes.ticklabel_format(style="sci", scilimits=(-2, 3))
     axes.set_xlabel(scene.labels[0])
     axes.set_ylabel(scene.labels[1])
-    around = "" if scene.leaves is None else " Around it the innermost leaves (blue)."
+    around = "" if leaves is None else " Around it the innermost leaves (blue)."
     inner = f"{{V ≤ {inner_level(scene.kind, scene.inner, 3)}}}"
+    keeps = "which trajectories enter and do not leave"
+    if not scene.timing.is_plain:
+        keeps = f"which every trajectory enters and in which it {scene.there}".replace(" is there at ", " is at ")
     green = {
         "asymptotic": f"Green: the local set {inner}, {scene.word} at all radii at once.",
-        "practical": f"Green: the inner set {inner}, which trajectories enter and do not leave; the dot marks the "
-        "origin, of which nothing is said.",
+        "practical": f"Green: the inner set {inner}, {keeps}; the dot marks the origin, of which nothing is said.",
     }[scene.kind]
     return Picture(
         "Near the origin",

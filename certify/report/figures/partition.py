@@ -33,7 +33,8 @@ def partition(scene: Scene, leaves: Leaves) -> Picture:
     shown = "showed" if scene.proved == "proved" else "has to show"
     always = " for all values in the ranges" if scene.system.ranges else ""
     asked = (
-        f"On each blue one the checker {shown} V̇ < 0{always}; the others lie outside the ring between the two levels."
+        f"On each blue one the checker {shown} {scene.timing.decrease} < 0{always}; the others lie outside the ring "
+        "between the two levels."
     )
     return Picture(
         "The leaf partition",
@@ -78,7 +79,7 @@ def _in_ring(scene: Scene, lower: Array, upper: Array) -> NDArray[np.bool_]:
     T = scene.T
     weight = np.diag(T.T @ scene.P @ T)
     near, far = np.clip(0.0, lower, upper), np.maximum(np.abs(lower), np.abs(upper))
-    return np.asarray((near**2 @ weight <= scene.outer) & (far**2 @ weight >= scene.inner))
+    return np.asarray((near**2 @ weight <= scene.outer) & (far**2 @ weight >= scene.certificate.inner))
 
 
 def _count(leaves: int) -> str:

@@ -25,6 +25,7 @@ from certify.report.figures.style import (
     INNER,
     INNER_FILL,
     LEAVING,
+    RASTER_FROM,
     REGION,
     SET,
     SET_FILL,
@@ -82,15 +83,21 @@ def portraits(scene: Scene, runs: Runs, region: Region | None) -> list[Picture]:
             if scene.start_shares is not None:
                 both = _takes(scene.start_shares, names, pair), _takes(scene.shares, names, pair)
                 meaning = f"Of its domain the start takes {both[0]}, {{V ≤ c₂}} {both[1]}. "
-        sign = "" if growing or not _shows_vdot(scene) else f"V̇ < 0 at every grid point of the picture{scene.held}. "
+        sign = (
+            ""
+            if growing or not _shows_sign(scene)
+            else f"{scene.timing.derivative} < 0 at every grid point of the picture{scene.held}. "
+        )
         if growing and scene.start is not None:
             sign = "V need not fall outside the blue set: along the tube another function does. "
+        sign += "The dots are steps; lines only join them. " if scene.timing.discrete else ""
+        sign += f"{scene.timing.simulated.definition} ".lstrip() if scene.n == 2 else ""
         caption = f"{meaning}{sign}*\N{NO-BREAK SPACE}Simulated or evaluated on a grid{scene.held}, not proved."
         pictures.append(Picture(title, caption, svg, simulated=True, wide=scene.n == 2, legend=legend, about=about))
     return pictures
 
 
-def _shows_vdot(scene: Scene) -> bool:
+def _shows_sign(scene: Scene) -> bool:
     """Whether the sign of Vdot in the plane says something of all that is drawn in it."""
     return scene.n == 2 or scene.centre is None
 
@@ -123,10 +130,10 @@ def keys(scene: Scene, runs: Runs, region: Region | None, growing: bool) -> tupl
         found = [*begin, *found]
     elif scene.start is not None:
         found = [Key(start, START, 1.8), *found]
-    if not scene.local_is_enough:
+    if scene.shows_inner:
         found.append(Key(inner + (": section" if scene.n > 2 else ""), INNER, 1.4, fill=INNER_FILL))
     if growing:
-        found.append(Key("V̇ ≥ 0 on a grid*", GROWTH, 1.0, fill=GROWTH_FILL))
+        found.append(Key(f"{scene.timing.derivative} ≥ 0 on a grid*", GROWTH, 1.0, fill=GROWTH_FILL))
     found += [Key(text, colour, 1.4, style) for _, colour, style, text in _kinds(scene, runs)]
     if region is not None:
         found.append(Key("edge of the simulated region*", REGION, 1.4, "--"))
@@ -140,7 +147,12 @@ def _kinds(scene: Scene, runs: Runs) -> list[tuple[NDArray[np.bool_], str, Any, 
         leaving = "trajectories that leave the domain or the set*"
     kinds = (
         (runs.settled, SIMULATED, "-", f"{scene.words.runs}*"),
-        (runs.unsettled, UNSETTLED, "--", f"trajectories not settled in {number(runs.seconds, 3)} s*"),
+        (
+            runs.unsettled,
+            UNSETTLED,
+            "--",
+            f"trajectories not settled in {number(runs.seconds, 3)} {scene.timing.unit}*",
+        ),
         (runs.left, LEAVING, "-", leaving),
     )
     return [kind for kind in kinds if np.any(kind[0])]
@@ -154,21 +166,27 @@ def draw_plane(axes: Any, scene: Scene, pair: Pair, runs: Runs, region: Region |
     i, j = pair
     view = scene.view(pair)
     a, b, x = scene.plane(pair)
-    vdot = scene.vdot(x)
+    change = scene.growth(x)
     section = ellipse(scene.P, pair, scene.outer)
     axes.fill(*section, color=SET_FILL, lw=0, zorder=1)
-    growing = (vdot >= 0) & np.any(x != 0, axis=-1) & _shows_vdot(scene)
+    growing = (change >= 0) & np.any(x != 0, axis=-1) & _shows_sign(scene)
     if np.any(growing):
-        axes.contourf(a, b, vdot, levels=[0, np.inf], colors=[GROWTH_FILL], zorder=0)
-        if np.any(vdot < 0):
-            axes.contour(a, b, vdot, levels=[0.0], colors=[GROWTH], linewidths=1.0, zorder=3)
+        axes.contourf(a, b, change, levels=[0, np.inf], colors=[GROWTH_FILL], zorder=0)
+        if np.any(change < 0):
+            axes.contour(a, b, change, levels=[0.0], colors=[GROWTH], linewidths=1.0, zorder=3)
     size = view.hi - view.lo
     for which, colour, style, _ in _kinds(scene, runs):
         lines = [thin(runs.path[:, k][:, [i, j]], size) for k in np.flatnonzero(which)]
         lines = [path for path in lines if len(path) > 1]
+        width = 0.4 if scene.timing.discrete else 0.8  # the lines join steps, which are the dots
         axes.add_collection(
-            LineCollection(lines, colors=colour, linewidths=0.8, linestyles=style, zorder=2.5 if style == "--" else 2)
+            LineCollection(lines, colors=colour, linewidths=width, linestyles=style, zorder=2.5 if style == "--" else 2)
         )
+        if scene.timing.discrete:
+            points = np.concatenate([np.zeros((0, 2)), *lines])
+            axes.plot(
+                points[:, 0], points[:, 1], ".", ms=2.0, color=colour, zorder=2.5, rasterized=len(points) > RASTER_FROM
+            )
         _arrows(axes, lines, colour, size)
     if region is not None:
         axes.contour(
@@ -183,7 +201,7 @@ def draw_plane(axes: Any, scene: Scene, pair: Pair, runs: Runs, region: Region |
         axes.plot(*ellipse(scene.start, pair, 1.0), color=START, lw=1.8 if scene.n == 2 else 1.5, zorder=4)
         if scene.n > 2:
             axes.plot(*shadow(scene.start, pair, 1.0), color=START, lw=1.2, ls="--", zorder=4)
-    if not scene.local_is_enough:
+    if scene.shows_inner:
         inner = ellipse(scene.P, pair, scene.inner)
         axes.fill(*inner, color=INNER_FILL, lw=0, zorder=1.5)
         axes.plot(*inner, color=INNER, lw=1.4, zorder=3.5)

@@ -10,6 +10,7 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -19,10 +20,12 @@ from certify.claims import Enlarged, Practical, Reached
 from certify.errors import CertificateFormatError
 from certify.lyapunov import extents, is_positive_definite
 from certify.policies import TanhNetwork
+from certify.report.claims import words_for
 from certify.report.figures.geometry import PARTS, Box, circle, over_level, refine
 from certify.report.figures.pairs import Pair, pairs_of
-from certify.report.sampling import SETTLED, Flow, Runs, runs_of, time_scales
-from certify.report.words import deviation, held_at, label, words_for
+from certify.report.sampling import SETTLED, Flow, Runs, growth, runs_of, time_scales
+from certify.report.timing import Timing
+from certify.report.words import deviation, exact_number, held_at, label
 
 Array = NDArray[np.float64]
 Leaves = tuple[Array, Array]
@@ -31,6 +34,7 @@ ON_BOUNDARY = 14  # trajectories that start on the certified boundary, in each p
 PATH_STEP = 0.6  # of the step of `time_scales`
 _MOST_LEAVES = 400_000
 _MOST_STEPS = 500
+_MOST_SHORT = 8  # times as many where a period is shorter than a step would be
 _TANH = 30  # multiplications' worth
 _EQUATIONS = 500  # multiplications' worth of one evaluation, and of what surrounds it
 _GRIDS, _RUNS, _RATES = 2e9, 1e10, 5e8  # operations for grids, trajectories and the time scales
@@ -43,8 +47,21 @@ _VIEW = 1.3  # of the set's reach, in pictures of more than two states
 def is_ellipsoid(certificate: Certificate) -> bool:
     """Whether `{V <= c2}` is one, with levels in order; a rejected file may hold anything."""
     P = certificate.P
-    ordered = 0 < certificate.inner <= certificate.roa < np.inf
+    ordered = 0 < inner_of(certificate) <= certificate.inner <= certificate.roa < np.inf
     return ordered and bool(np.all(np.isfinite(P))) and is_positive_definite(P)
+
+
+def inner_of(certificate: Certificate) -> float:
+    """The level of the inner set that the claim speaks of: c0 of a practical claim, else c1."""
+    claim = certificate.claim
+    return claim.floor if isinstance(claim, Practical) else claim.local
+
+
+def is_local_enough(certificate: Certificate) -> bool:
+    """Whether the local rule covers the whole set, so that leaves are not asked (FORMAT.md, local)."""
+    evidence = certificate.evidence
+    ball = certificate.claim.at_rest or (isinstance(evidence, PartitionTree) and evidence.local is not None)
+    return ball and certificate.claim.local == certificate.roa
 
 
 def start_of(certificate: Certificate) -> Array | None:
@@ -165,11 +182,12 @@ class Scene:
         self.deadline = time.monotonic() + _SHARE * seconds
         if not is_ellipsoid(certificate):
             raise CertificateFormatError("P must be positive definite and the levels positive and in order.")
-        self.certificate, self.words = certificate, words_for(certificate.kind)
+        self.timing = Timing.of(certificate.system, certificate.claim.rate)
+        self.certificate, self.words = certificate, words_for(certificate.kind, self.timing)
         self.kind = "practical" if isinstance(certificate.claim, Practical) else "asymptotic"
         self.word, self.proved = ("certified", "proved") if accepted else ("claimed", "claimed")
         self.system, self.P = certificate.system, certificate.P
-        self.inner, self.outer = certificate.inner, certificate.roa
+        self.inner, self.outer = inner_of(certificate), certificate.roa
         self.n = self.system.n
         self.reach = extents(self.P, self.outer)
         self.inner_reach = extents(self.P, self.inner)
@@ -211,8 +229,11 @@ class Scene:
 
     @property
     def held(self) -> str:
-        """Of what is simulated or on a grid, where something is uncertain: at which values; else nothing."""
-        return f" with {held_at(self.system)} throughout" if self.system.ranges else ""
+        """Of what is simulated or on a grid: at which values, where something is uncertain, and at which one of several
+        periods; else nothing."""
+        held = f" with {held_at(self.system)} throughout" if self.system.ranges else ""
+        lo, hi = self.system.sample or (Fraction(0), Fraction(0))
+        return held + (f" with periods of {exact_number(hi)} s" if lo < hi else "")
 
     @property
     def start_on_line(self) -> tuple[float, float]:
@@ -238,27 +259,42 @@ class Scene:
 
     @property
     def local_is_enough(self) -> bool:
-        """Whether the local rule covers the whole set, so that leaves are not asked (FORMAT.md, local)."""
-        return self.kind == "asymptotic" and self.inner == self.outer
+        """Whether the local rule covers the whole set, so that there are no leaves to show."""
+        return is_local_enough(self.certificate)
+
+    @property
+    def shows_inner(self) -> bool:
+        """Whether there is an inner set besides the outer one."""
+        return self.kind == "practical" or not self.local_is_enough
+
+    @property
+    def there(self) -> str:
+        """When trajectories are in a set that they have entered."""
+        return self.timing.phrases["there"]
 
     @property
     def meaning(self) -> str:
         """Of the outer set, for captions."""
         return self.words.meaning + ("" if self.proved == "proved" else ", if the claim is true")
 
-    def vdot(self, x: Array) -> Array:
-        """Vdot in float64; NaN where the equations have a pole."""
-        with np.errstate(all="ignore"):
-            value = 2 * np.einsum("...i,...i->...", x @ self.P, self.flow.field(x))
+    def growth(self, x: Array) -> Array:
+        """V's change by time in float64, Vdot or what takes its place; NaN where the equations have a pole."""
+        value = growth(self.flow, self.P, x, self.step)
         return np.where(np.isfinite(value), value, np.nan)
 
     def simulate(self, begin: ArrayLike, steps: int | None = None) -> Runs:
         """Trajectories with their fates, by default over the tube and half the horizon; smooth for a picture."""
-        step = PATH_STEP * self.step
-        count = steps or min(int((self.duration + 0.5 * self.horizon) / step) + 1, self.effort.steps)
+        wanted = PATH_STEP * self.step
+        step = self.flow.fitting(wanted)
+        every = (
+            min(max(int(wanted / step), 1), _MOST_SHORT) if self.flow.period else 1
+        )  # of short periods some are kept
+        count = steps or min(int((self.duration + 0.5 * self.horizon) / step) + 1, every * self.effort.steps)
         starts, target = np.asarray(begin, dtype=np.float64), self.settling_level
         begins = self.start, self.centre
         runs = runs_of(self.flow, starts, self.P, self.outer, target, step, count, self.deadline, *begins)
+        if not self.timing.is_plain:  # the rate of change jumps where the input does
+            return Runs(runs.path[::every], every * step, runs.settled, runs.left)
         return Runs(refine(runs.path, self.flow.field, step), step / PARTS, runs.settled, runs.left)
 
     def view(self, pair: Pair) -> Box:

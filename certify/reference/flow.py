@@ -1,0 +1,232 @@
+"""Rule `flow`: the mean of f over a period in which the inputs are held, for every period of the sample.
+
+phi(h) = x + h G, where x_1 is the mean over the period of f(x, u, q(t)), and what f changes by on the way is written as
+a series in time whose last coefficient is taken at every state that phi may reach. That is found first: where hi |f|
+stays below kappa as long as the state stays within kappa of where it was, no component can be the first to leave.
+
+What is uncertain may be another number at each instant. In x_1 alone a quantity stands at one instant at a time, so
+that a symbol can be its mean. All else takes it as any number of its whole range, and not of a cell of it: within a
+period q may go through several, and these numbers hold for all of them. D is a convex function of x_1 with the rest
+given, and x_1 is a mean of means over the times that q spends in each cell, so that cells, one after the other, are
+enough.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from flint import arb, arb_mat, fmpq
+
+from .balls import ZERO, spanning
+from .document import Certificate, Interval
+from .evidence import Ball
+from .expressions import Equations
+from .fields import exact
+from .loop import Field, Known, Loop
+from .model import SPREAD, Model
+from .rational import inverse_diagonal
+from .refusal import Refused, require
+from .series import Constant, added, coefficients
+from .taylor import Taylor
+
+ATTEMPTS, MORE = 12, arb(1.25)  # more than the last hi |f| is tried, as long as that grows by more than this
+LEAST = arb(2) ** -200  # of what is tried: hi |f| < kappa is asked, also where f is 0
+
+
+def later(
+    dynamics: Equations,
+    states: Mapping[str, Any],
+    within: Mapping[str, Any],
+    held: Mapping[str, Any],
+    constant: Constant,
+    order: int,
+    settled: Callable[[Any], Any],
+    times_h: Callable[[Any], Any],
+) -> list[Any]:
+    """h x_2 + ... + h^(order - 1) x_order of each component, None where nothing is left.
+
+    `states` are those at the instant of the sample, `within` those of the whole period, from which the last comes.
+    """
+    result: list[Any] = [None] * len(states)
+    if order == 1:
+        return result
+    known = coefficients(dynamics, states, held, constant, order - 1, settled) if order > 2 else [[]]
+    last = coefficients(dynamics, within, held, constant, order, settled)[-1]
+    for x in reversed([*known[1:], last]):
+        result = [None if v is None else times_h(v) for v in map(added, zip(result, x, strict=True))]
+    return result
+
+
+# ------------------------------------------------------------------------------------------------------------ on a ball
+
+
+@dataclass(frozen=True)
+class Steps:
+    """By how much the states of a ball change over a step: `within` a period they are these, `tail` is all but x_1."""
+
+    loop: Loop
+    known: Known
+    order: int = 1
+    within: Mapping[str, Model] | None = None
+    tail: Sequence[Model | None] = ()
+
+    def change(self, cell: Sequence[Interval], rule: str, at: str) -> Field:
+        """Models of G for every q of a cell, or a refusal."""
+        c, known = self.loop.c, self.known
+        if self.within is not None and self.order == 1:
+            known = replace(known, names={**known.names, **self.within})
+        F = self.loop.within(known, cell, rule, at)
+        if c.plant.discrete:
+            less = (-known.names[name] for name in c.plant.states)
+            return replace(F, components=[f + x for f, x in zip(F.components, less, strict=True)])
+        if self.within is None:
+            return F
+        G = [f if t is None else settled(c)(f) + t for f, t in zip(F.components, self.tail, strict=True)]
+        require(all(g.is_finite() for g in G), rule, at, "the series of F has no finite model")
+        return replace(F, components=G)
+
+
+def settled(c: Certificate) -> Callable[[Model], Model]:
+    """At rest every coefficient vanishes at d = 0: f does, for every q, and each term has f as a factor."""
+    return Model.at_rest if c.ends_at_origin else lambda v: v
+
+
+def steps_on(loop: Loop, known: Known, ball: Ball, at: str) -> Steps:
+    """Rule `flow` on a ball; without a sample nothing is asked."""
+    c = loop.c
+    if c.sample is None:
+        return Steps(loop, known)
+    states = {name: known.names[name] for name in c.plant.states}
+    within = reached_on(loop, known, at)
+    held = {name: known.names[name] for name in c.plant.inputs} | loop.anything(known)
+    hi = arb(c.step)
+    period = known.moving(c.sample, c.k, loop.symbols)
+
+    def times_h(v: Model) -> Model:
+        return period * v if c.varies else v.scaled(hi)
+
+    try:
+        tail = later(c.plant.dynamics, states, within, held, known.constant, ball.order, settled(c), times_h)
+    except Refused as no:
+        raise Refused("flow", at, no.detail) from None
+    return Steps(loop, known, ball.order, within, tail)
+
+
+def reached_on(loop: Loop, known: Known, at: str) -> dict[str, Model]:
+    """The states of a whole period, each within kappa + kappa' ||d|| of where it was, or a refusal.
+
+    For each d they have a model with these numbers: what a state moves by is a part that depends on d alone, and a part
+    that is a multiple of d / ||d||.
+    """
+    c, hi = loop.c, arb(loop.c.step)
+    states = [known.names[name] for name in c.plant.states]
+    uncertain = loop.anything(known)
+    far, turned = [ZERO] * c.n, [ZERO] * c.n
+    for _ in range(ATTEMPTS):
+        moved = [beyond(x, k, t) for x, k, t in zip(states, far, turned, strict=True)]
+        within = dict(zip(c.plant.states, moved, strict=True))
+        F = loop.field(replace(known, names={**known.names, **within}), uncertain, "flow", at).components
+        F = [settled(c)(f) for f in F]
+        most = [arb((hi * abs(f.v)).upper()) for f in F], [arb((hi * f.radius).upper()) for f in F]
+        rests = [c.ends_at_origin and v.is_zero() for v in most[0]]
+        stays = all(rest or v < k for rest, v, k in zip(rests, most[0], far, strict=True))
+        if stays and all(v < t for v, t in zip(most[1], turned, strict=True)):
+            ranges = [f.v + f.radius * SPREAD for f in F]
+            largest = (arb(exact(c.inner) * s).sqrt() for s in inverse_diagonal(c.P, "lyapunov"))
+            sizes = [x.slope.min(size) for x, size in zip(states, largest, strict=True)]
+            in_domain(c, [v * SPREAD for v in sizes], ranges, at)
+            return {name: beyond(x, k, t) for name, x, k, t in zip(c.plant.states, states, *most, strict=True)}
+        far = [ZERO if rest else MORE * v + LEAST for rest, v in zip(rests, most[0], strict=True)]
+        turned = [MORE * v + LEAST for v in most[1]]
+    raise Refused("flow", at, "no bound of how far the state goes within a period was found")
+
+
+def beyond(x: Model, far: arb, turned: arb) -> Model:
+    """x within far + turned ||d||."""
+    a = arb_mat(x.a.nrows(), 1, [v + turned * SPREAD for v in x.a.entries()])
+    return replace(x, v=x.v + far * SPREAD, a=a)
+
+
+def in_domain(c: Certificate, states: Sequence[arb], F: Sequence[arb], at: str) -> None:
+    """x_i + t f_i lies strictly inside for 0 <= t <= hi, so that phi does: it is x_i and t times a mean of f_i."""
+    times = spanning((fmpq(0), c.step))
+    for x, f, (lo, hi), name in zip(states, F, c.plant.domain, c.plant.states, strict=True):
+        reached = x + times * f
+        inside = reached > arb(lo) and reached < arb(hi)
+        require(inside, "flow", at, f"{name} is not certain to stay in the domain within a period")
+
+
+# ------------------------------------------------------------------------------------------------------------ on a leaf
+
+
+@dataclass(frozen=True)
+class Moving:
+    """The numbers of a leaf by their names: `symbols` are models in d, `anything` what is uncertain without a symbol.
+
+    `bounds` are those of the |x_i| that count.
+    """
+
+    states: Mapping[str, Taylor]
+    inputs: Mapping[str, Taylor]
+    uncertain: Mapping[str, Taylor]
+    anything: Mapping[str, Taylor]
+    bounds: Sequence[arb]
+
+
+def constant(q: fmpq) -> Taylor:
+    return Taylor(arb(q))
+
+
+def reached_from(c: Certificate, leaf: Moving, at: str) -> dict[str, Taylor]:
+    """The states of a whole period, each within kappa of where it was, or a refusal."""
+    hi, names = arb(c.step), c.plant.states
+    far = [ZERO] * c.n
+    for _ in range(ATTEMPTS):
+        moved = dict(zip(names, map(widened, leaf.states.values(), far), strict=True))
+        try:
+            F = c.plant.dynamics.evaluate({**moved, **leaf.inputs, **leaf.anything}, constant)
+        except Refused as no:
+            raise Refused("flow", at, no.detail) from None
+        require(all(f.is_finite() for f in F), "flow", at, "F has no finite model within a period")
+        ranges = [arb((-(-f).bound()).lower()).union(arb(f.bound().upper())) for f in F]
+        most = [arb((hi * abs(v)).upper()) for v in ranges]
+        if all(v < k for v, k in zip(most, far, strict=True)):
+            each = zip(leaf.states.values(), leaf.bounds, strict=True)
+            states = [within_both(x.c + (x.first + x.r) * SPREAD, w) for x, w in each]
+            in_domain(c, states, ranges, at)
+            return dict(zip(names, map(widened, leaf.states.values(), most), strict=True))
+        far = [MORE * v + LEAST for v in most]
+    raise Refused("flow", at, "no bound of how far the state goes within a period was found")
+
+
+def within_both(x: arb, w: arb) -> arb:
+    """What is in x and between -w and w; where that is nothing, nothing is asked of it, and x will do."""
+    lo, hi = arb(x.lower()).max(-w), arb(x.upper()).min(w)
+    return lo.union(hi) if lo <= hi else x
+
+
+def widened(x: Taylor, far: arb) -> Taylor:
+    return replace(x, r=x.r + far)
+
+
+def mean_on(
+    c: Certificate, leaf: Moving, within: Mapping[str, Taylor], order: int, period: Taylor, at: str
+) -> list[Taylor]:
+    """G on a leaf, or a refusal; `period` is h, with a symbol of its own where it may be one of many."""
+    start, place = within if order == 1 else leaf.states, c.n + c.m
+
+    def times_h(v: Taylor) -> Taylor:
+        return v.scaled(period.c) if period.g is None else period * v
+
+    try:
+        x_1 = c.plant.dynamics.evaluate({**start, **leaf.inputs, **leaf.uncertain}, constant)
+        held = {**leaf.inputs, **leaf.anything}
+        tail = later(c.plant.dynamics, leaf.states, within, held, constant, order, lambda v: v, times_h)
+    except Refused as no:
+        raise Refused("flow", at, no.detail) from None
+    x_1 = [f.averaged(range(place, place + c.k)) for f in x_1]
+    G = [f if t is None else f + t for f, t in zip(x_1, tail, strict=True)]
+    require(all(g.is_finite() for g in G), "flow", at, "the series of F has no finite model")
+    return G

@@ -1,0 +1,305 @@
+"""Each kind of claim in words.
+
+A claim's words have places, `$name`, for what depends on how time passes in the loop and on the claimed rate
+(timing.py), and places in braces for its numbers. So there is one set of words for each kind of claim, and none for
+each combination; what is said of a loop in continuous time without a rate has nothing left over from the others.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields, replace
+from string import Template
+from typing import Any
+
+from certify.errors import CertificateFormatError
+from certify.report.timing import PLAIN, Timing
+from certify.report.words import PRACTICAL, exact_number
+
+Part = tuple[str, str, str]
+
+
+@dataclass(frozen=True, slots=True)
+class Words:
+    """One kind of claim in words. In texts, {inner} and {outer} stand for its levels in digits, {duration} for how long
+    its tube is, {centre} for the state that it begins around, {speed} for what a rate says (Timing.speed),
+    {constant} for the words that ask what is uncertain to be constant.
+
+    Parameters
+    ----------
+    title : the page's.
+    inner, inner_word : symbol and name of the inner level.
+    inner_set : what the figures call the inner set.
+    statement : the claim, after which nothing has to be added.
+    headline : the same in a line of the terminal.
+    meaning : of the outer set, for captions.
+    decay : what of a falling V is part of the claim and what is not; {word} is "proved" or "claimed".
+    simulated : which runs count in the simulated figures.
+    settles, runs : what becomes of a run that counts, and what a legend calls such runs.
+    parts : name, condition, and how it is shown from a partition; None where that is in the condition.
+    excluded : head and text of what this claim, other than its siblings, does not say.
+    start : what the start of its tube is called; nothing where it has none.
+    sets : what the claim is about, in the caption of what is not.
+    """
+
+    title: str
+    inner: str
+    inner_word: str
+    inner_set: str
+    statement: str
+    headline: str
+    meaning: str
+    decay: str
+    simulated: str
+    settles: str
+    runs: str
+    parts: tuple[Part, ...]
+    excluded: tuple[tuple[str, str], ...]
+    start: str = ""
+    sets: str = "{V ≤ c₂}"
+
+
+SMOOTH = ("Equations", "The closed loop is locally Lipschitz on {V ≤ c₂}$unique.", "")
+DEFINITE = ("Lyapunov function", "P is symmetric positive definite, so that {V ≤ c₂} is compact.", "")
+DOMAIN = ("Domain", "{V ≤ c₂} lies strictly inside the domain.", "")
+INPUTS = ("Inputs", "On {V ≤ c₂} the input stays in its bounds, so that an actuator that clips changes nothing.", "")
+LEAF_BY_LEAF = "leaf by leaf of a partition that covers the set by construction"
+RING = ("Ring", "$fall for all x with c₁ ≤ V(x) ≤ c₂$each", LEAF_BY_LEAF)
+CHECKED_ALWAYS = frozenset({"Lyapunov function", "Equilibrium", "Domain"})
+"""The parts that the checker checks whatever the evidence is; the others are then the solver's word."""
+
+CLAIMS: Mapping[str, Words] = {
+    "asymptotic": Words(
+        title="Region of attraction",
+        inner="c₁",
+        inner_word="local",
+        inner_set="local set",
+        statement="Every trajectory of the closed loop that starts in the set {{V(x) ≤ {outer}}}$begins "
+        "$stays$also converges to the origin, which is asymptotically stable.$held{speed}",
+        headline="{{V <= {outer}}} is invariant$at and attracted by the origin$over{speed}",
+        meaning="in which every trajectory converges to the origin",
+        decay="That V falls to 0$instants$fast is {word}$slow.$between",
+        simulated="stay in the domain and come near the origin",
+        settles="settle",
+        runs="trajectories that settle",
+        parts=(
+            SMOOTH,
+            ("Equilibrium", "P is symmetric positive definite and f(0, u_eq) = 0 exactly.", ""),
+            DOMAIN,
+            (
+                "Local",
+                "$fall for all x with 0 < V(x) ≤ c₁$each",
+                "by the linearisation and a bound on its remainder that holds at all smaller radii: there is no hole "
+                "around the origin",
+            ),
+            RING,
+            INPUTS,
+        ),
+        excluded=(("$speed", "$converge"),),
+    ),
+    "practical": Words(
+        title="Practical stability",
+        inner="c₀",
+        inner_word="floor",
+        inner_set="inner set",
+        statement="Every trajectory of the closed loop that starts in the set {{V(x) ≤ {outer}}}$begins "
+        "$stays, $enters {{V(x) ≤ {inner}}} $by, and $remains from then on.$held{speed} That is "
+        "all: of what happens inside the smaller set nothing is said.",
+        headline="from {{V <= {outer}}} every trajectory enters {{V <= {inner}}} and $there; nothing is said of "
+        "the origin$over{speed}",
+        meaning="from which every trajectory enters the green set and $there",
+        decay="That V falls below c₀ $within and stays there$always is {word}; $later is not.$kept",
+        simulated="stay in the domain and enter {V ≤ c₀}",
+        settles="enter {V ≤ c₀}",
+        runs="trajectories that enter",
+        parts=(
+            SMOOTH,
+            DEFINITE,
+            DOMAIN,
+            ("Ring", "$fall for all x with c₀ ≤ V(x) ≤ c₂, both boundaries included$each", LEAF_BY_LEAF),
+            INPUTS,
+        ),
+        excluded=(
+            (
+                "Anything inside {V ≤ c₀}.",
+                "Trajectories end up in this set and remain there, whatever they do in it: circle, jitter, or rest "
+                "somewhere. The origin need not attract them, and need not be an equilibrium at all.",
+            ),
+            ("$speed", "$finite"),
+        ),
+    ),
+}
+
+
+_ASYMPTOTIC = CLAIMS["asymptotic"]
+_PRACTICAL = CLAIMS["practical"]
+CLAIMS = {
+    **CLAIMS,
+    "nearby": replace(
+        _PRACTICAL,
+        title="A nearby equilibrium",
+        statement=_PRACTICAL.statement.split(" That is all:")[0] + " And {constant}there is exactly one equilibrium in "
+        "the smaller set, and every one of these trajectories converges to it. Of what else happens inside the smaller "
+        "set nothing is said.",
+        headline="from {{V <= {outer}}} every trajectory enters {{V <= {inner}}} and $there; there it converges to the "
+        "one equilibrium in it{constant}$over{speed}",
+        parts=(
+            *_PRACTICAL.parts,
+            (
+                "Contraction",
+                "2(x − y)′P(F(x) − F(y)) < 0 for all x other than y with V(x) ≤ c₀ and V(y) ≤ c₀",
+                "by models of the closed loop, with Lipschitz constants of what they leave out, on a ball that "
+                "contains {V ≤ c₀}",
+            ),
+        ),
+        excluded=(
+            (
+                "Where the equilibrium is.",
+                "It lies in {V ≤ c₀}. Where in it, and how it depends on what is uncertain, is not stated; the origin "
+                "need not be one.",
+            ),
+            (
+                "Anything else inside {V ≤ c₀}.",
+                "Where something uncertain changes with time, trajectories end up in this set and remain there, "
+                "whatever they do in it.",
+            ),
+            _PRACTICAL.excluded[-1],
+        ),
+    ),
+    "enlarged": replace(
+        _ASYMPTOTIC,
+        statement=_ASYMPTOTIC.statement + " Every trajectory that starts in the ellipsoid {{x′P₀x ≤ 1}}, the start of "
+        "a tube, stays in the domain, is in {{V(x) ≤ {outer}}} after {duration} at the latest, and converges to the "
+        "origin as well.",
+        headline="{{V <= {outer}}} is invariant and attracted by the origin, and every trajectory from the tube's "
+        "start enters it",
+        decay="That V is at most c₂ once the tube has ended, and falls to 0, is {word}; how fast from then on is not.",
+        parts=(
+            *_ASYMPTOTIC.parts,
+            (
+                "Tube",
+                "x′P(t)x falls along every trajectory in {x′P(t)x ≤ 1} but the origin; P(t) begins as P₀, and at its "
+                "end {x′P(t)x ≤ 1} lies in {V ≤ c₂}",
+                "one slab of time after the other, by the linearisation and a bound on its remainder that knows "
+                "directions",
+            ),
+            (
+                "Along the tube",
+                "Each ellipsoid {x′P(t)x ≤ 1} lies strictly inside the domain; on it the closed loop is twice "
+                "continuously differentiable, no clip acts, and the input stays in its bounds.",
+                "",
+            ),
+        ),
+        excluded=(
+            (
+                "Staying in the start.",
+                "A trajectory from the tube's start may leave that ellipsoid on its way: it stays in the tube, which "
+                "lies inside the domain.",
+            ),
+            (
+                "Speed and cost.",
+                "The tube says by when {V ≤ c₂} is reached; how fast trajectories converge from there, and at what "
+                "cost, is not part of the claim.",
+            ),
+        ),
+        start="start of the tube",
+        sets="{V ≤ c₂} and the tube's start",
+    ),
+    "reached": replace(
+        _ASYMPTOTIC,
+        statement=_ASYMPTOTIC.statement + " Every trajectory that starts in the ellipsoid "
+        "{{(x − c₀)′P₀(x − c₀) ≤ 1}} around the state c₀, {centre}, stays in the domain, is in {{V(x) ≤ {outer}}} "
+        "after {duration} at the latest, and converges to the origin as well. These two sets are all that the claim is "
+        "about; nothing is said of what starts between them.",
+        headline="{{V <= {outer}}} is invariant and attracted by the origin, and every trajectory from an ellipsoid "
+        "around the state enters it",
+        decay="That V is at most c₂ once the tube has ended, and falls to 0, is {word}; how fast from then on is not.",
+        parts=(
+            *_ASYMPTOTIC.parts,
+            (
+                "Tube",
+                "With c(t) and P(t), which begin as c₀ and P₀, no trajectory from the start leaves "
+                "{(x − c(t))′P(t)(x − c(t)) ≤ 1}: on its edge the form falls along every trajectory; and at its end "
+                "this ellipsoid lies in {V ≤ c₂}",
+                "one slab of time after the other, by the linearisation and a bound on its remainder that knows "
+                "directions and the motion of c(t)",
+            ),
+            (
+                "Along the tube",
+                "Each ellipsoid of the tube lies strictly inside the domain; on it the closed loop is twice "
+                "continuously differentiable, no clip acts, and the input stays in its bounds.",
+                "",
+            ),
+        ),
+        excluded=(
+            (
+                "What lies between.",
+                "The set is the union of {V ≤ c₂} and the ellipsoid around c₀. States on the way from the one to the "
+                "other, the path of the tube among them, belong to it only where they lie in one of the two.",
+            ),
+            (
+                "Staying near c₀, and the path.",
+                "A trajectory may leave the ellipsoid around c₀ on its way: it stays in the tube, which lies inside "
+                "the domain. The path c(t) itself need not be a trajectory.",
+            ),
+            (
+                "Speed and cost.",
+                "The tube says by when {V ≤ c₂} is reached; how fast trajectories converge from there, and at what "
+                "cost, is not part of the claim.",
+            ),
+        ),
+        start="start of the tube, around c₀",
+        sets="{V ≤ c₂} and the ellipsoid around c₀",
+    ),
+}
+
+
+_AROUND_A_LEVEL = (
+    "Local",
+    "$fall for all x with c₀ ≤ V(x) ≤ c₁$each",
+    "by models of the closed loop on a ball that contains {V ≤ c₁}",
+)
+
+
+def words_for(kind: str, timing: Timing = PLAIN, *, ball: bool = False) -> Words:
+    """The words of a claim about a loop in which time passes so; `ball` says that its evidence has one.
+
+    Raises
+    ------
+    CertificateFormatError : there are none for this kind; a page must not guess.
+    """
+    if kind not in CLAIMS:
+        raise CertificateFormatError(f"reports know the claims {', '.join(CLAIMS)}; found {kind!r}.")
+    words = CLAIMS[kind]
+    words = replace(words, parts=tuple(_in_steps(kind, _with_ball(kind, words.parts, ball), timing)))
+    return Words(**{f.name: _filled(getattr(words, f.name), timing.phrases) for f in fields(Words)})
+
+
+def _with_ball(kind: str, parts: tuple[Part, ...], ball: bool) -> tuple[Part, ...]:
+    """The parts of a practical claim whose ring ends at a ball around its inner set."""
+    if kind not in PRACTICAL or not ball:
+        return parts
+    return tuple(one for part in parts for one in ((_AROUND_A_LEVEL, RING) if part[0] == "Ring" else (part,)))
+
+
+def _in_steps(kind: str, parts: tuple[Part, ...], timing: Timing) -> Iterator[Part]:
+    """The parts, with those that a loop needs that is spoken of at its samples or steps."""
+    after = "F(x)" if timing.discrete else "φ(h)"
+    for part in parts:
+        yield part
+        if part[0] == "Domain" and timing.sample is not None:
+            yield (
+                "Within a period",
+                f"From every x in {{V ≤ c₂}}, with the input held at π(x), the solution φ exists for "
+                f"{exact_number(timing.sample[1])} s and stays strictly inside the domain",
+                "by an enclosure of it on each of the sets below",
+            )
+        if part[0] == "Ring" and kind in PRACTICAL and not timing.is_plain:
+            yield ("Inner set", f"V({after}) < c₀ for all x with V(x) ≤ c₀$every", "with the parts above")
+
+
+def _filled(text: Any, phrases: Mapping[str, str]) -> Any:
+    """Texts, and tuples of them, with the phrases in their places."""
+    if isinstance(text, tuple):
+        return tuple(_filled(one, phrases) for one in text)
+    return Template(text).substitute(phrases)

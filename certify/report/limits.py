@@ -1,0 +1,53 @@
+"""What limits the level of a result, in words."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from fractions import Fraction
+from typing import Any
+
+from certify.report.timing import PLAIN, Timing
+from certify.report.words import below, number
+
+_LIMITS = {
+    "domain": "the domain",
+    "inputs": "the input bounds: beyond it the policy asks for more than the actuator gives",
+    "witness": "a point where Vdot >= 0",
+    "time": "the time limit: more may be provable",
+    "refused by the checker": "the checker, which refuses some of what was found",
+    "boxes": "the limit on boxes: more may be provable",
+    "requested": "the level that was asked for",
+}
+_TOUCHING = Fraction(1, 10**6)  # relative distance from the domain's limit below which a set is said to touch it
+
+
+def limited_by(result: Mapping[str, Any]) -> str:
+    """What limits the level of a result, in words; reasons that are sentences already stay as they are.
+
+    An engine may stop short of the domain's limit by a margin of its own, such as a solver's precision. Then the
+    margin limits, and it is named with its size.
+    """
+    reason = str(result["reason"])
+    levels = result["levels"]
+    level, limit = levels.get("roa"), levels.get("domain_limit")
+    if reason == "domain" and level and limit:
+        short = 1 - Fraction(level) / Fraction(limit)
+        if short > _TOUCHING:
+            solver: Mapping[str, Any] = result.get("solver") or {}
+            precision = solver.get("precision")
+            apart = f"{number(float(100 * short), 3)} % below the domain's limit {below(limit)}"
+            if precision is None:
+                return f"a margin that the engine keeps: {apart}"
+            return f"the precision of {solver['solver']} (delta {number(precision)}), which stops {apart}"
+    return limit_in_words(reason, Timing.of_result(result))
+
+
+def limit_in_words(reason: str, timing: Timing = PLAIN) -> str:
+    """A reason that is a single word as a reader understands it; sentences stay as they are.
+
+    >>> limit_in_words("time")
+    'the time limit: more may be provable'
+    """
+    if reason == "witness" and not (timing.is_plain and not timing.rate):
+        return f"a point where V does not fall{' at the rate asked for' if timing.rate else ''}{timing.over_what}"
+    return _LIMITS.get(reason, reason)

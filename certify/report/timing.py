@@ -1,0 +1,334 @@
+"""How time passes in a closed loop, in words: what of a claim's sentences depends on it, and on the claimed rate.
+
+A claim says the same of every loop; *when* it holds is another matter. A loop in continuous time is spoken of at all
+times, one whose input is held over a period at its sampling instants, one in discrete time at its steps. Each text of a
+report that depends on this takes its words from here, so that no text has to be written once for every kind of claim.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import TYPE_CHECKING, Any
+
+from certify.report.words import above, below, exact_number, inside
+
+if TYPE_CHECKING:
+    from certify.systems import System
+    from certify.systems.system import Interval
+
+_PERCENT = 100  # of V: the share of it after which a rate is told as a time
+
+
+@dataclass(frozen=True, slots=True)
+class Timing:
+    """Whether a plant is in `discrete` time, the least and the largest period over which its input is held (`sample`;
+    None if it follows the state at once), and the `rate` lambda at which V is claimed to fall (0: no rate)."""
+
+    discrete: bool = False
+    sample: Interval | None = None
+    rate: float = 0.0
+
+    @classmethod
+    def of(cls, system: System, rate: float = 0.0) -> Timing:
+        """Of a plant, with what is claimed of it."""
+        return cls(system.time == "discrete", system.sample, rate)
+
+    @classmethod
+    def of_result(cls, result: Mapping[str, Any]) -> Timing:
+        """Of the object that `certify roa --json` prints; what it does not say is as it always was."""
+        claim = result.get("claim") or {}
+        sample = claim.get("sample")
+        ends = None if sample is None else (Fraction(sample[0]), Fraction(sample[1]))
+        return cls(result.get("time") == "discrete", ends, float(claim.get("rate") or 0.0))
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether the input follows at once in continuous time."""
+        return not self.discrete and self.sample is None
+
+    @property
+    def from_zero(self) -> bool:
+        """Whether the claim holds within each period as well, because each part of a period is one that is allowed."""
+        return self.sample is not None and self.sample[0] == 0
+
+    @property
+    def unit(self) -> str:
+        """In which times are counted."""
+        return "steps" if self.discrete else "s"
+
+    @property
+    def axis(self) -> str:
+        """Of a picture over time."""
+        return "steps" if self.discrete else "time (s)"
+
+    @property
+    def periods(self) -> str:
+        """Over what the input is held, such as `exactly 0.02 s`; nothing where it is not held.
+
+        >>> Timing(sample=(Fraction(1, 50), Fraction(1, 50))).periods
+        'exactly 0.02 s'
+        >>> Timing(sample=(Fraction(0), Fraction(1, 50))).periods
+        'any sequence of periods up to 0.02 s'
+        """
+        if self.sample is None:
+            return ""
+        lo, hi = self.sample
+        if lo == hi:
+            return f"exactly {exact_number(hi)} s"
+        return f"any sequence of periods {f'in {inside(lo, hi)}' if lo else f'up to {below(hi)}'} s"
+
+    @property
+    def linearised(self) -> str:
+        """Of what the eigenvalues are, where not of the rate of change."""
+        if self.sample is not None:
+            return f" over a period of {exact_number(self.sample[1])} s"
+        return " over a step" if self.discrete else ""
+
+    @property
+    def over_what(self) -> str:
+        """Over what V is to fall, where that is not every instant."""
+        return " over a period" if self.sample is not None else " in a step" if self.discrete else ""
+
+    @property
+    def loop(self) -> str:
+        """What passes in which time, after the equation `dx/dt = f(...)` or `x+ = f(...)`."""
+        if self.discrete:
+            return "in exact real arithmetic, one step after the other"
+        if self.sample is None:
+            return "in exact real arithmetic and continuous time"
+        lo, hi = self.sample
+        apart = f"tₖ₊₁ − tₖ = {exact_number(hi)} s" if lo == hi else f"tₖ₊₁ − tₖ {self._each()[len(' and every h ') :]}"
+        return f"for t from tₖ to tₖ₊₁, {apart}, in exact real arithmetic and continuous time"
+
+    @property
+    def derivative(self) -> str:
+        """The symbol of what has to be negative, without a rate: of V's change by time."""
+        return "V̇" if self.is_plain else "D"
+
+    @property
+    def decrease(self) -> str:
+        """The symbol of what has to be negative."""
+        return f"{self.derivative} + 2λV" if self.rate else self.derivative
+
+    @property
+    def definition(self) -> str:
+        """What D is; nothing where it is not spoken of."""
+        if self.discrete:
+            return "D(x) = V(F(x)) − V(x), F(x) = f(x, π(x)): by how much V changes in a step."
+        if self.sample is None:
+            return ""
+        lo, hi = self.sample
+        which = f"{exact_number(hi)} s" if lo == hi else "any of the periods"
+        return (
+            "D(x) = (V(φ(h)) − V(x))/h: by how much V changes over a period, by time, where φ(h) is the state that x "
+            f"has become when the input has been held at π(x) for h = {which}{'' if lo else '; V̇ at h = 0'}."
+        )
+
+    @property
+    def simulated(self) -> Timing:
+        """What pictures show of several periods: the longest."""
+        return self if self.sample is None else Timing(sample=(self.sample[1], self.sample[1]), rate=self.rate)
+
+    @property
+    def definitions(self) -> str:
+        """What D and lambda are, those of them that conditions speak of."""
+        rate = f"λ = {self.shown_rate} is the rate, rounded down here." if self.rate else ""
+        return f"{self.definition} {rate}".strip()
+
+    @property
+    def shown_rate(self) -> str:
+        """The rate, rounded down: V is claimed to fall at least as fast as that says."""
+        return f"{below(self.rate)} per {'step' if self.discrete else 's'}"
+
+    @property
+    def phrases(self) -> Mapping[str, str]:
+        """What the words of a claim (words.py) have a place for, each `$name` there."""
+        return {
+            **self._when(),
+            **self._how_fast(),
+            "held": self._held,
+            "each": self._each(),
+            "every": self._each(proper=True),
+        }
+
+    @property
+    def _held(self) -> str:
+        return f" The input is held from each sampling instant to the next, over {self.periods}." if self.sample else ""
+
+    def _each(self, *, proper: bool = False) -> str:
+        """For which periods a condition on D holds; one on what is reached is not asked of a `proper` period of 0."""
+        if self.sample is None or self.sample[0] == self.sample[1]:
+            return ""
+        lo, hi = self.sample
+        if lo:
+            return f" and every h in {inside(lo, hi)} s"
+        return f" and every h {'above 0' if proper else 'from 0'} {'up ' * proper}to {below(hi)} s"
+
+    def _when(self) -> dict[str, str]:
+        """The times at which a claim holds."""
+        if self.is_plain:
+            return {
+                "begins": "",
+                "stays": "stays in it for all time",
+                "also": " and",
+                "enters": "enters the smaller set",
+                "by": "in finite time",
+                "remains": "stays there",
+                "there": "stays there",
+                "at": "",
+                "over": "",
+                "instants": "",
+                "always": "",
+                "between": "",
+                "kept": "",
+                "unique": ": solutions exist and are unique",
+            }
+        if self.discrete:
+            return {
+                "begins": "",
+                "stays": "is in it at every later step",
+                "also": ", and",
+                "enters": "is in the smaller set",
+                "by": "after finitely many steps",
+                "remains": "is there at every step",
+                "there": "is there at every step from then on",
+                "at": " at every step",
+                "over": "",
+                "instants": " step by step",
+                "always": " at every step",
+                "between": "",
+                "kept": "",
+                "unique": "",
+            }
+        always = self.from_zero
+        return {
+            "begins": " at a sampling instant",
+            "stays": "is in it at all later times"
+            if always
+            else "is in it at every later one, in the domain at all times",
+            "also": ", and",
+            "enters": "is in the smaller set",
+            "by": "at some sampling instant",
+            "remains": f"is there at {'all times' if always else 'every one'}",
+            "there": f"is there at {'all times' if always else 'every sampling instant'} from then on",
+            "at": " from each sampling instant on" if always else " at sampling instants",
+            "over": f", the input held over {self.periods}",
+            "always": "" if always else " at every sampling instant",
+            "instants": "" if always else " from one sampling instant to the next",
+            "between": f" Between two instants V {'stays below its value at the first' if always else 'may rise'}.",
+            "kept": f" Between two instants V {'stays below its value at the first, or c₀' if always else 'may rise'}.",
+            "unique": ": between two sampling instants solutions are unique",
+        }
+
+    def _how_fast(self) -> dict[str, str]:
+        """What is said of the speed."""
+        if not self.rate:
+            return {
+                "fall": f"{self.derivative}(x) < 0",
+                "fast": "",
+                "slow": "; how fast is not",
+                "within": "in finite time",
+                "later": "how soon, and what V does below c₀,",
+                "speed": "Speed and cost.",
+                "converge": "Trajectories converge; how fast, and at what cost, is not part of the claim.",
+                "finite": "The time to reach {V ≤ c₀} is finite; how long, and at what cost, is not stated.",
+            }
+        at_least = f"at least as fast as e^(−2λt) with λ = {self.shown_rate}"
+        return {
+            "fall": f"{self.derivative}(x) + 2λV(x) < 0",
+            "fast": f", {at_least},",
+            "slow": "",
+            "within": at_least,
+            "later": "what V does below c₀",
+            "speed": "Cost, and more speed.",
+            "converge": "V falls at least at the rate λ; whether faster, and at what cost, is not part of the claim.",
+            "finite": "The time to reach {V ≤ c₀} is bounded by the rate λ; whether it is shorter, and at what cost, "
+            "is not stated.",
+        }
+
+    def speed(self, inner: float | None, outer: float) -> str:
+        """What a rate says of trajectories, after the statement of the claim; nothing without a rate.
+
+        Parameters
+        ----------
+        inner, outer : levels c0 and c2 of a practical claim; of an asymptotic one `inner` is None.
+        """
+        if not self.rate:
+            return ""
+        bound, when = self._bound(all_times=inner is None)
+        time = self.time_to_fall(_PERCENT if inner is None else Fraction(outer) / Fraction(inner))
+        value = f" = {above(time)} {self.unit}" if math.isfinite(time) else ""
+        until = "" if inner is None else " until it is in the smaller set"
+        said = f" Moreover {bound}{until}, with λ = {self.shown_rate}: "
+        if inner is not None:
+            return f"{said}it is there {when.format(f'ln(c₂/c₀)/(2λ){value}')}."
+        return (
+            f"{said}V is at most 1 % of what it was {when.format(f'ln(100)/(2λ){value}')}, and for "
+            f"c′ < c ≤ c₂ what starts in {{V ≤ c}} is in {{V ≤ c′}} {when.format('ln(c/c′)/(2λ)')}."
+        )
+
+    def _bound(self, *, all_times: bool) -> tuple[str, str]:
+        """The inequality of V over time, and from when on something holds, with a place for the time.
+
+        `all_times` says that it is asked for between sampling instants, too, if it holds there.
+        """
+        if self.discrete:
+            return "V(xₖ) ≤ V(x₀) e^(−2λk) after k steps", "after {} at the latest, rounded up to whole steps"
+        if self.is_plain:
+            return "V(x(t)) ≤ V(x(0)) e^(−2λt)", "after {} at the latest"
+        if self.from_zero and all_times:
+            return "V(x(t)) ≤ V(x(t₀)) e^(−2λ(t − t₀)) at all later times", "after {} at the latest"
+        bound = "V(x(tₖ)) ≤ V(x(t₀)) e^(−2λ(tₖ − t₀)) at the sampling instants tₖ"
+        return bound, "at every sampling instant that comes {} or more after the start"
+
+    def headline_rate(self) -> str:
+        """The same in a line of the terminal."""
+        if not self.rate:
+            return ""
+        return f", V falling at least as exp(-2*{below(self.rate)} {'k) in k steps' if self.discrete else 't)'}"
+
+    def time_to_fall(self, factor: Fraction | int) -> float:
+        """How long it takes V at most to be divided by a factor of at least 1, rounded up; infinite without a rate.
+
+        With a sample it is by when a sampling instant has come at which that is so, less the longest period.
+        """
+        if not self.rate:
+            return math.inf
+        if factor <= 1:
+            return 0.0
+        time = math.nextafter(_log(Fraction(factor)) / self.rate / 2, math.inf)
+        return float(math.ceil(time)) if self.discrete and math.isfinite(time) else time
+
+    def reach_time(self, factor: Fraction | int) -> float | None:
+        """By when V is certainly divided by the factor: in units of time, at a step, or at a sampling instant that has
+        come by then. None without a rate, or where no number is as large."""
+        time = self.time_to_fall(factor)
+        if self.sample is not None:  # the next instant comes within a period
+            time = math.nextafter(time + math.nextafter(float(self.sample[1]), math.inf), math.inf)
+        return time if math.isfinite(time) else None
+
+
+PLAIN = Timing()
+
+
+def reach_time(timing: Timing, floor: float | None, roa: float | None) -> float | None:
+    """By when a trajectory from {V <= c2} is in {V <= c0}, `floor`; without a floor, by when V is a hundredth of what
+    it was. None where nothing is claimed."""
+    if roa is None:
+        return None
+    return timing.reach_time(_PERCENT if floor is None else Fraction(roa) / Fraction(floor))
+
+
+def _log(factor: Fraction) -> float:
+    """The natural logarithm of a number above 1, rounded up."""
+    try:
+        # of the next number above the factor; the logarithm itself is off by less than two units in the last place
+        value = math.log(math.nextafter(float(factor), math.inf))
+    except OverflowError:
+        value = (math.log(factor.numerator) - math.log(factor.denominator)) * (1 + 1e-12)
+    for _ in range(3):
+        value = math.nextafter(value, math.inf)
+    return value
