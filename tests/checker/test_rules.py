@@ -122,8 +122,8 @@ def sampled_claim() -> Document:
 def nearby_claim(cubic: str = "0", J: float = 0.2 * (1 + 1e-9), weight: float = 2.0**-40) -> Document:
     """x' = cubic x^3 - x + 1/100 has one equilibrium in {x^2 <= 1/25} if there it falls."""
     data = make(
-        [["+", ["-", "x"], "1/100", ["*", cubic, ["**", "x", 3]], ["*", "0", "u"]]], [([[0.0]], [0.0])], 1.0, (0.04, 0.09),
-        claim="nearby",
+        [["+", ["-", "x"], "1/100", ["*", cubic, ["**", "x", 3]], ["*", "0", "u"]]], [([[0.0]], [0.0])], 1.0,
+        (0.04, 0.09), claim="nearby",
     )  # fmt: skip
     return edited(data, "evidence.contraction", {"J": encode([J]), "weights": encode([weight])})
 
@@ -349,6 +349,7 @@ MUTANTS: list[tuple[str, str, str, Edit]] = [  # rule, base, what, edit
     ("format", "scalar", "time by another name", at("plant.time", "sampled")),
     ("format", "nearby", "no contraction", at("evidence.contraction", None)),
     ("format", "scalar", "a contraction", at("evidence.contraction", {"J": encode([1.0]), "weights": encode([1.0])})),
+    ("format", "scalar", "a contraction in words", at("evidence.contraction", "null")),
     ("contraction", "nearby", "a ball in the set", array("evidence.contraction.J", lambda a: a * 0.999)),
     ("contraction", "nearby", "a weight of 0", array("evidence.contraction.weights", lambda a: 0 * a)),
     ("contraction", "nearby", "a weight below 0", array("evidence.contraction.weights", lambda a: -a)),
@@ -551,7 +552,8 @@ def test_every_field_and_every_rule_has_a_mutant() -> None:
     for _, base, _, edit in MUTANTS:
         before, after = dict(leaves_of(honest(base))), dict(leaves_of(edit(honest(base))))
         touched |= {general(path) for path in before.keys() | after.keys() if before.get(path) != after.get(path)}
-    fields = {general(path) for base in ("rotor", "enlarged", "nearby") for path, _ in leaves_of(honest(base))}
+    fields = {general(path) for base in ("rotor", "enlarged") for path, _ in leaves_of(honest(base))}
+    fields |= {"evidence.contraction.J", "evidence.contraction.weights"}
     assert fields - touched == {"provenance.tool"}
 
 
