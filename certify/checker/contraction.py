@@ -59,7 +59,8 @@ def contracts(ball_: Contracted) -> Failures:
         rest = _turning(models, b, ball_.weights)
         for i, lip in enumerate(lips):
             size = root_above(sum((v * v for v in b.tolist()[i]), rational(0.0)))
-            rest += diagonal([2 * size * (rational(float(F[i].slack)) + rational(lip))] * b.ncols())
+            bends = rational(float(F[i].slack)) + rational(lip) + 3 * rational(float(F[i].twist))
+            rest += diagonal([2 * size * bends] * b.ncols())
         for corner in models.corners():
             crossed = models.J.transpose() * P * corner.A
             count += 1
