@@ -241,7 +241,7 @@ def test_every_power_has_its_place_in_what_a_function_adds(order: int, left: str
     """D^2, D^3 or D^4 itself, of two parts of a jet: |D^order - d'H d - C[d]| <= d'R d."""
     generator, used = np.random.default_rng(order), 0.0
     f = tuple(np.float64(j == order) for j in range(4))
-    phi = Expansion(f, (0.0, 0.0, 0.0, 0.0), np.float64(1), np.float64(order == 4))  # type: ignore[arg-type]
+    phi = Expansion(f, (0.0, 0.0, 0.0, 0.0), np.float64(1), np.float64(order == 4), 0.0)  # type: ignore[arg-type]
     with ctx.workprec(2500):
         for size in (0.01, 0.3, 1.0, 1.0, 3.0):
             U = shares(generator, 1, 2)
