@@ -957,8 +957,8 @@ def test_a_decay_below_every_binary64_number(second: Any, found: tuple[str, str]
     ("gain", "verdict_of"), [("30", "contraction"), ("90", "contraction"), ("1" + "0" * 7, "ACCEPTED")]
 )
 def test_contraction_takes_derivatives_of_what_a_function_leaves(gain: str, verdict_of: str) -> None:
-    """x' = 1 - x + x^2 - 1/(1 + x) - gain x: next to -0.9 what 1/(1 + x) leaves rises by 97, four times
-    what its size says."""
+    """x' = 1 - x + x^2 - 1/(1 + x) - gain x: next to -0.9 what 1/(1 + x) leaves rises by 97, four times what its size
+    says."""
     left = ["-", ["+", "1", ["-", "x"], ["*", "x", "x"]], ["/", "1", ["+", "1", "x"]]]
     data = make(
         [["-", left, ["+", ["*", gain, "x"], ["*", "0", "u"]]]], [([[0.0]], [0.0])], 1.0, (0.81, 0.8181), claim="nearby",
