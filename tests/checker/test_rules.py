@@ -961,8 +961,8 @@ def test_contraction_takes_derivatives_of_what_a_function_leaves(gain: str, verd
     says."""
     left = ["-", ["+", "1", ["-", "x"], ["*", "x", "x"]], ["/", "1", ["+", "1", "x"]]]
     data = make(
-        [["-", left, ["+", ["*", gain, "x"], ["*", "0", "u"]]]], [([[0.0]], [0.0])], 1.0, (0.81, 0.8181), claim="nearby",
-        domain=[("-97/100", "97/100")],
+        [["-", left, ["+", ["*", gain, "x"], ["*", "0", "u"]]]], [([[0.0]], [0.0])], 1.0, (0.81, 0.8181),
+        claim="nearby", domain=[("-97/100", "97/100")],
     )  # fmt: skip
     data["evidence"]["contraction"] = {"J": encode([0.9 * (1 + 1e-9)]), "weights": encode([1e-9])}
     assert verdict(grow(data)) == verdict_of
