@@ -13,7 +13,7 @@ from certify.certificate import require_short
 from certify.claims import Problem
 from certify.claims.claim import Kind
 from certify.closed_loop import ClosedLoop
-from certify.engines.base import Task
+from certify.engines.base import FEW, Task
 from certify.engines.falsify import Witness, falsify, survey
 from certify.engines.peak import peak_candidate
 from certify.engines.robust import robust_candidate
@@ -97,6 +97,8 @@ def trial(loop: ClosedLoop, P: Array, name: str, options: RoaOptions, notice: st
     task = Task(problem, kind, level, options.level is not None)
     if options.level is not None and leaves_domain(P, options.level, loop.system.domain):
         return Trial(name, task, T, limit, "domain", volume(P, limit), notice)
+    if kind == "practical" and n > FEW:  # a ball decides, and no survey could
+        return Trial(name, task, T, limit, "domain", volume(P, level), notice)
     if kind == "practical":
         bands = survey(problem, T, level)
         reach = bands[0].above if bands else 0.0

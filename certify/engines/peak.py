@@ -1,7 +1,7 @@
 """The candidate `peak`: P for a practical claim, whose floor is to be small beside the set.
 
-What pushes the loop off the origin, a disturbance, a parameter that moves its equilibrium, a policy that is not centred,
-shifts the floor by an ellipsoid that P shapes. To first order the least floor c0 of {x'Px <= 1} at an edge k is a linear
+What pushes the loop off the origin (a disturbance, a parameter that moves its equilibrium, a policy that is not
+centred) makes a floor that P shapes. To first order the least floor c0 of {x'Px <= 1} at an edge k is a linear
 matrix inequality in P at each corner of what is uncertain (the peak of a bounded input: Boyd, El Ghaoui, Feron,
 Balakrishnan 1994, section 6.1), and P >= W keeps the set inside one that the local rule proves without the push.
 """

@@ -42,7 +42,9 @@ class BoundsEngine(Engine):
         start = time.perf_counter()
         first = self._from_ball(task, replace(budget, seconds=_FOR_BALL * budget.seconds), report)
         left = replace(budget, seconds=budget.seconds - (time.perf_counter() - start))
-        if first is not None and (self.T.shape[0] > FEW or left.seconds < _FOR_BALL * budget.seconds):
+        if self.T.shape[0] > FEW:
+            return first or Proof(None, None, Stop.LOCAL, "no ball shows V to fall around any level; try another P")
+        if first is not None and left.seconds < _FOR_BALL * budget.seconds:
             return first
         second = self._by_leaves(task, left, report)
         found = second if first is None or _is_better(second, first) else first
