@@ -37,6 +37,7 @@ _BELOW_WITNESS = 1e-3
 _SMALLEST = 1e-120  # of levels: squares of states and products of bounds must not underflow
 _BLENDS = (0.05, 0.15, 0.3)
 OPTIMISING = 0.2  # share of the time that the optimised candidate may take
+_FOR_PEAK = 0.4  # share of the time for a candidate that may be the only one
 _SAMPLES = 4000  # of a search for violations; the proof itself finds others
 
 
@@ -154,7 +155,7 @@ def robust(loop: ClosedLoop, options: RoaOptions) -> Trial | None:
 def peak(loop: ClosedLoop, options: RoaOptions) -> Trial | None:
     """The candidate of a practical claim whose floor is small beside the set, or None if it is not to be had."""
     try:
-        return trial(loop, peak_candidate(loop, OPTIMISING * options.time_limit), "peak", options)
+        return trial(loop, peak_candidate(loop, _FOR_PEAK * options.time_limit), "peak", options)
     except (BackendError, InputError):
         return None
 
