@@ -257,12 +257,15 @@ class _Run:
 
     def _around_a_level(self, loop: ClosedLoop, trials: list[Trial], options: RoaOptions) -> Race:
         """A practical claim in many states, where no tree of boxes can carry what a ball does not: the candidate made
-        for that, then others until one proves something."""
+        for that, then others until one proves something; then the largest sampled one, if there is time."""
         race, first = self._contest(), self._optimised(partial(peak, loop, options))
         for one in ([] if first is None else [first]) + by_reach(trials):
             race.enter([one], self._heat())
             if race.best.proved:
                 break
+        if race.best.proved and self.left() > _FOR_PROOF * self.options.time_limit:
+            large = self._optimised(partial(optimised, loop, options))
+            race.enter([] if large is None else [large], self._heat())
         return race
 
     def _improve(self, race: Race, loop: ClosedLoop, heat: float) -> None:
