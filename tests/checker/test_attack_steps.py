@@ -219,12 +219,7 @@ def closer(name: str, sign: int) -> Drive:
 
     def claim(t: float) -> Document:
         left = ["+", ["*", exactly(-1 / t), "x"], ["*", str(sign), ["-", phi, parabola]], ["*", "0", "u"]]
-        data = loop(
-            left,
-            (level, level, level),
-            edge=None,
-            depth=9,
-        )
+        data = loop(left, (level, level, level), edge=None, depth=9)
         data["claim"]["kind"] = "nearby"
         weights = {"J": encode([[radius]]), "weights": encode([2.0**-40])}
         return edited(data, "evidence.contraction", weights)
