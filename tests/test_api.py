@@ -134,6 +134,7 @@ def test_options_by_name_are_those_of_the_options() -> None:
     bad |= {
         "time_limit": 0,
         "max_boxes": 0,
+        "rate": -1.0,
         "device": "tpu",
         "enlarge": "yes",
         "box": {"theta": -1.0},

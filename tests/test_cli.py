@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -598,6 +599,39 @@ def test_a_disturbance_of_the_file_can_be_switched_off(
     given = ("roa", *ranged, "--disturbance", "wind=0", "--candidate", "lyapunov", "--level", "0.1", "--json")
     status, out, _ = run(capsys, *given)
     assert status == 0 and json.loads(out)["uncertain"] == [] and json.loads(out)["claim"]["kind"] == "asymptotic"
+
+
+def test_a_sample_time_and_a_rate_are_said_everywhere(
+    tmp_path: Path, ranged: tuple[str | Path, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Result, JSON, page and checker speak of the same periods and the same rate."""
+    asked = ("--candidate", "lyapunov", "--level", "0.25", "--sample-time", "0.01..0.05", "--rate", "0.25")
+    status, out, _ = run(capsys, "roa", *ranged, *asked)
+    said = " ".join(out.split())
+    assert status == 0 and "is invariant at sampling instants and attracted by the origin" in said
+    assert "the input held over any sequence of periods in [0.01, 0.05] s" in said
+    assert "falling at least as exp(-2*0.25 t)" in said
+    data = json.loads(run(capsys, "roa", *ranged, *asked, "--json")[1])
+    assert data["claim"] == {"kind": "asymptotic", "rate": 0.25, "sample": ["1/100", "1/20"]}
+    assert data["time"] == "continuous" and 9.26 < data["reach_time"] < 9.27  # ln(100)/0.5 and a period
+    page = (tmp_path / "o" / "report.html").read_text("utf-8")
+    assert "over any sequence of periods in [0.01, 0.05] s." in page and "for all time" not in page
+    status, out, _ = run(capsys, "check", tmp_path / "o" / "certificate.json")
+    assert status == 0 and "at a sampling instant is there at every later sampling instant" in out
+    answer = json.loads(run(capsys, "check", tmp_path / "o" / "certificate.json", "--json")[1])
+    assert (answer["rate"], answer["sample"], answer["discrete"]) == (0.25, ["1/100", "1/20"], False)
+
+
+def test_a_plant_in_discrete_time_is_listed_by_its_steps(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from certify.systems import get_system
+
+    steps = replace(get_system("pendulum"), time="discrete", dynamics=get_system("pendulum").states)
+    monkeypatch.setattr("certify.systems.available_systems", lambda: ("pendulum",))
+    monkeypatch.setattr("certify.systems.get_system", lambda _: steps)
+    listed = run(capsys, "systems")[1]
+    assert "  theta+ = theta\n" in listed and "theta' =" not in listed
 
 
 def test_plants_list_disturbances_and_ranges(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

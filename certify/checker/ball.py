@@ -108,7 +108,7 @@ class Ball:
         a, slack = column * h.a, up(k * h.slack + EPS * (k * h.slope))
         E = widen(np.zeros_like(h.E), EPS * (k * h.spread) + h.faint)
         of_y = np.zeros((len(c), self.count)), np.zeros((len(c), self.count, a.shape[1]))
-        lip = up(k * h.lip + 2 * EPS * (k * h.bend))
+        lip = up(k * h.lip + 3 * EPS * (k * h.spread))
         batch = Jet(c, error, a, slack, each(net.scale) * h.Q, column * h.K, E, np.eye(len(c)), U, *of_y, lip)
         return batch.members
 
@@ -231,7 +231,7 @@ def enclose_on_ball(net: Folded, states: Sequence[Jet]) -> Jet:
         H, C, R = (np.concatenate(pair) for pair in zip((H, C, R), added, strict=True))
         sizes = up(frobenius(H) + tensor_norm(C, k) + frobenius(R))
         lips = np.concatenate([lips, value.lip_beyond_tangent(phi)])
-        steep = up(2 * frobenius(H) + lips)
+        steep = up(2 * frobenius(H) + 3 * tensor_norm(C, k) + lips)
         doubt = up(np.max(up(slope + wrong)) * doubt + (np.max(wrong) + EPS) * norm(X, 0))
         y, error, X = t[:, None, None], e[:, None], slope[:, None] * X
     return value.function("tanh") if net.squash else value

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from fractions import Fraction
 from functools import cached_property
-from math import prod
 
 import numpy as np
 from flint import fmpq_mat
@@ -16,7 +15,7 @@ from .case import Case, Failures
 from .decrease import Models, are_finite, diagonal, rational
 from .document import Contraction
 from .exact import contains_ball, exactly, is_definite, root_above
-from .local import MOST_WORK
+from .local import too_many_corners
 
 
 class Contracted(Ball):
@@ -37,7 +36,7 @@ def fits(ball_: Contracted) -> Failures:
     c = ball_.case.c
     if not contains_ball(exactly(ball_.J), exactly(c.P), Fraction(c.c0)):
         yield "levels.floor", "the ball must contain {V <= c0}"
-    if prod(ball_.case.partition.cells) * 2**ball_.count * len(ball_.J) ** 4 > MOST_WORK:
+    if too_many_corners(ball_):
         yield "evidence.cells", "there are too many cells for this rule"
     if not all(g > 0 for g in ball_.weights):
         yield "evidence.contraction.weights", "must be positive"
@@ -59,7 +58,8 @@ def contracts(ball_: Contracted) -> Failures:
         rest = _turning(models, b, ball_.weights)
         for i, lip in enumerate(lips):
             size = root_above(sum((v * v for v in b.tolist()[i]), rational(0.0)))
-            rest += diagonal([2 * size * (rational(float(F[i].slack)) + rational(lip))] * b.ncols())
+            bends = rational(float(F[i].slack)) + rational(lip) + 3 * rational(float(F[i].twist))
+            rest += diagonal([2 * size * bends] * b.ncols())
         for corner in models.corners():
             crossed = models.J.transpose() * P * corner.A
             count += 1

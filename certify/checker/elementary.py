@@ -27,6 +27,7 @@ class Expansion:
     e: Four
     third: Any
     fourth: Any
+    sup: Any  # of |phi''''|/6 over the range: what is left after four terms has a derivative by D of at most sup |D|^3
 
 
 def elementary(name: str, c: Any, error: Any, radius: Any) -> Expansion:
@@ -46,7 +47,7 @@ def elementary(name: str, c: Any, error: Any, radius: Any) -> Expansion:
         sixth = (t * t - 1 / 3) * slope  # its derivative by t is below 1.4, |t| <= 1
         here = np.abs(t * (2 - 3 * t * t) * slope) / 3  # |phi''''|/24 at c
         fourth = np.minimum(_TANH_FOURTH, up(here + EPS + _TANH_FIFTH * up(error + radius)))
-        return Expansion((t, slope, half, sixth), (e, wrong, bent, up(1.4 * e + EPS)), _THIRD, fourth)
+        return Expansion((t, slope, half, sixth), (e, wrong, bent, up(1.4 * e + EPS)), _THIRD, fourth, up(4 * fourth))
     if name == "inv":
         # the least magnitude of v, then that of v0; NaN for both if v may vanish
         least = _rounded_down(np.abs(c) - up(error + radius))
@@ -57,14 +58,16 @@ def elementary(name: str, c: Any, error: Any, radius: Any) -> Expansion:
         f0 = 1 / c
         f = (f0, -f0 * f0, f0 * f0 * f0, -(f0 * f0) * (f0 * f0))
         moved = (square, 2 * cube, 3 * fourth, 4 * up(fourth / nearest))  # derivatives of f where v0 may be
-        return Expansion(f, _moved(f, error, moved), up(cube / least), up(fourth / least))
+        p = up(1 / least)
+        sup = up(4 * up(p * p) * up(p * up(p * p)))
+        return Expansion(f, _moved(f, error, moved), up(cube / least), up(fourth / least), sup)
     if name == "exp":
         most = c + up(error + radius)
         f0, e0 = exp(c)
         worst, more = exp(most + EPS * np.abs(most))
         most = up(worst + more)
         e0 = up(e0 + error * most)
-        return Expansion((f0, f0, f0 / 2, f0 / 6), (e0, e0, e0, e0), up(most / 6), up(most / 24))
+        return Expansion((f0, f0, f0 / 2, f0 / 6), (e0, e0, e0, e0), up(most / 6), up(most / 24), up(most / 6))
     if name == "atan":
         f0, e0 = atan(c)
         slope = np.where(np.isfinite(c), 1 / (1 + c * c), np.nan)
@@ -72,7 +75,9 @@ def elementary(name: str, c: Any, error: Any, radius: Any) -> Expansion:
         sixth = slope * ((c * slope) * (c * slope) - slope * slope / 3)  # a difference of numbers up to 1/3
         # |phi'| and |phi'''|/2 are at most 1, |phi''| at most 0.65 and |phi''''|/6 at most 0.79
         e1, e2, e3 = (up(2 * EPS * np.abs(v) + error) for v in (slope, half, slope))
-        return Expansion((f0, slope, half, sixth), (up(e0 + error), e1, e2, e3), _THIRD, _ATAN_FOURTH)
+        return Expansion(
+            (f0, slope, half, sixth), (up(e0 + error), e1, e2, e3), _THIRD, _ATAN_FOURTH, up(4 * _ATAN_FOURTH)
+        )
     if name == "sqrt":
         # the least that v may be, then v0; NaN for both if v may not be positive
         least = _rounded_down(c - up(error + radius))
@@ -88,7 +93,9 @@ def elementary(name: str, c: Any, error: Any, radius: Any) -> Expansion:
         # 3 s + w is 2 s + (s + w), and 5 s^2 + 4 s w + w^2 is 2 s^2 + 2 s (s + w) + (s + w)^2
         third = up(up(pq * pq) * up(2 * q + p) / 8)
         fourth = up(up(up(pq * pq) * p) * up(2 * qq + 2 * pq + pp) / 16)
-        return Expansion(f, _moved(f, error, moved), third, fourth)
+        r = up(1 / _rounded_down(np.sqrt(least)))
+        sup = up(0.15625 * up(up(r * r) * up(r * up(r * r))) * up(r * r))  # 15/16 w^-7 is the largest derivative
+        return Expansion(f, _moved(f, error, moved), third, fourth, sup)
     if name not in ("sin", "cos"):
         raise ValueError(f"nothing is known of {name}")
     s, c, s_error, c_error = sin_cos(c)
@@ -96,7 +103,9 @@ def elementary(name: str, c: Any, error: Any, radius: Any) -> Expansion:
         s, c, s_error, c_error = c, -s, c_error, s_error
     s_error, c_error = up(s_error + error), up(c_error + error)
     third, fourth = (np.minimum(up(np.abs(v) + e + radius), 1.0) for v, e in ((c, c_error), (s, s_error)))
-    return Expansion((s, c, -s / 2, -c / 6), (s_error, c_error, s_error, c_error), up(third / 6), up(fourth / 24))
+    return Expansion(
+        (s, c, -s / 2, -c / 6), (s_error, c_error, s_error, c_error), up(third / 6), up(fourth / 24), up(fourth / 6)
+    )
 
 
 def _moved(f: Four, error: Any, most: Four) -> Four:

@@ -113,10 +113,9 @@ def coefficients(
     return [own[1:] for own in parts]
 
 
-def mean(
+def later(
     dynamics: Tape,
     constant: Constant,
-    first: Sequence[Any],
     states: Sequence[Any],
     during: Sequence[Any],
     held: Sequence[Any],
@@ -124,16 +123,14 @@ def mean(
     order: int,
     rest: Callable[[Any], Any],
 ) -> list[Any]:
-    """G. `first` is x_1 with what is uncertain as symbols, from the states at the period's beginning, or if `order` is
-    1, from those during it; `held` are inputs, and ranges of what is uncertain."""
-    if order == 1:
-        return list(first)
+    """(G - x_1)/h, `order` being at least 2: `states` are those at the period's beginning, `during` where they may be
+    during it, `held` inputs and ranges of what is uncertain."""
     early = coefficients(dynamics, constant, states, held, order - 1, rest) if order > 2 else [[] for _ in states]
     late = coefficients(dynamics, constant, during, held, order, rest)
     found = []
-    for start, known, last in zip(first, early, late, strict=True):
-        G = last[order - 1]
+    for known, last in zip(early, late, strict=True):
+        rising = last[order - 1]
         for x in reversed(known[1:]):
-            G = x + h * G
-        found.append(start + h * G)
+            rising = x + h * rising
+        found.append(rising)
     return found

@@ -6,9 +6,9 @@ same in all jets of one family, so that they cancel as they do in truth: |e_j(d)
 [-1, 1] that are uncertain v(0) lies within `error` of c + sum_j y_j c_j, and the true gradient within `slack` of a +
 sum_j y_j a_j in the 2-norm; Q, K and B are the numbers that are stored, and whatever they leave out lies in E. All of
 this is meant for each d by itself: nothing asks how v(0) and the gradient at two d belong together. But `lip`, a
-Lipschitz constant of what v has beyond v(0) + a.d + d'Q d, is meant where v(0) and the gradient are the same for all d.
-E and U_j dominate sums of positive semidefinite matrices with weights >= 0, so each is one, and knows the directions in
-which v is far from what is known of it.
+Lipschitz constant of what v has beyond v(0) + a.d + d'Q d + K[d], is meant where v(0) and the gradient are the same for
+all d. E and U_j dominate sums of positive semidefinite matrices with weights >= 0, so each is one, and knows the
+directions in which v is far from what is known of it.
 """
 
 from __future__ import annotations
@@ -176,7 +176,7 @@ class Jet:
         error = up(x.error + y.error + EPS * (abs(c) + x.sway + y.sway))
         slack = up(x.slack + y.slack + EPS * (x.slope + y.slope))
         E = widen(x.E + y.E, EPS * (x.spread + y.spread))
-        of_y, lip = (x.c_y + y.c_y, x.a_y + y.a_y), up(x.lip + y.lip + 2 * EPS * (x.bend + y.bend))
+        of_y, lip = (x.c_y + y.c_y, x.a_y + y.a_y), up(x.lip + y.lip + 3 * EPS * (x.spread + y.spread))
         return Jet(c, error, x.a + y.a, slack, x.Q + y.Q, x.K + y.K, E, x.B + y.B, x.U, *of_y, lip)
 
     def __neg__(self) -> Jet:
@@ -203,24 +203,39 @@ class Jet:
         wrong = x.doubt * y.spread + y.doubt * x.spread + x.turn * sy + y.turn * sx
         wrong = wrong + EPS * (x.size * y.spread + y.size * x.spread + x.slope * sy + y.slope * sx) + x.faint
         B, E = x.c * y.B + y.c * x.B, widen(E, known + wrong)
-        lost = x.doubt * y.bend + y.doubt * x.bend + x.turn * y.slope + y.turn * x.slope
-        lost = lost + EPS * (x.size * y.bend + y.size * x.bend + x.slope * y.slope)
-        (zx, lx), (zy, ly) = x.rest, y.rest
-        lip = x.size * y.lip + y.size * x.lip + x.slope * up(zy + ly) + y.slope * up(zx + lx) + zx * ly + zy * lx
-        return Jet(c, error, x.c * y.a + y.c * x.a, slack, Q, K, E, B, x.U, c_y, a_y, up(lip + 2 * lost))
+        (zx, lx), (zy, ly) = x.second, y.second
+        lip = x.size * y.lip + y.size * x.lip + x.slope * sum(y.third) + y.slope * sum(x.third) + zx * ly + zy * lx
+        return Jet(c, error, x.c * y.a + y.c * x.a, slack, Q, K, E, B, x.U, c_y, a_y, up(lip + 3 * wrong))
 
     @cached_property
-    def rest(self) -> tuple[Any, Any]:
+    def second(self) -> tuple[Any, Any]:
         """Upper bounds of what v has beyond v(0) + a.d, and of a Lipschitz constant of that."""
-        return up(self.bend + self.lip), up(2 * self.bend + self.lip)
+        return up(self.bend + self.twist + self.lip), up(2 * self.bend + 3 * self.twist + self.lip)
+
+    @cached_property
+    def third(self) -> tuple[Any, Any]:
+        """The same of what v has beyond d'Q d, too."""
+        return up(self.twist + self.lip), up(3 * self.twist + self.lip)
 
     def lip_beyond_tangent(self, phi: Expansion) -> Any:
-        """A Lipschitz constant of what phi(v) has beyond its tangent at v(0) and the d'H d of `beyond_tangent`."""
-        (_, _, half, _), (_, _, wrong, _) = phi.f, phi.e
-        (z, steep), s, h = self.rest, self.slope, up(np.abs(half) + wrong)
-        cubic = 3 * up(phi.third * up(self.radius * self.radius)) * up(s + steep)
-        lost = up(wrong + EPS * h) * up(s * s) + 2 * up(h * s) * self.turn
-        return up(2 * up(h * up(s * up(z + steep) + z * steep)) + cubic + 2 * lost)
+        """A Lipschitz constant of what phi(v) has beyond its tangent at v(0) and d'H d + C[d] of `beyond_tangent`: of
+        half (D^2 - (a.d)^2 - 2 (a.d) d'Q d), sixth (D^3 - (a.d)^3), and what four terms of phi's series leave."""
+        (_, _, half, sixth), (_, _, half_error, sixth_error) = phi.f, phi.e
+        (z, L), s = self.second, self.slope
+        h, g = up(np.abs(half) + half_error), up(np.abs(sixth) + sixth_error)
+        squares = 2 * h * up(s * up(self.third[0] + self.third[1]) + z * L)
+        cubes = 3 * g * up(s * s * up(L + 2 * z) + s * z * up(2 * L + z) + z * z * L)
+        rest = phi.sup * up(self.radius * up(self.radius * self.radius)) * up(s + L)
+        return up(squares + cubes + rest + 3 * self.mistaken(phi))
+
+    def mistaken(self, phi: Expansion) -> Any:
+        """Upper bound of what H and C of `beyond_tangent` come to that is not in the truth, each at its most."""
+        (_, _, half, sixth), (_, _, half_error, sixth_error) = phi.f, phi.e
+        s, ss = self.slope, up(self.slope * self.slope)
+        h, g = up(np.abs(half) + half_error), up(np.abs(sixth) + sixth_error)
+        quartic = up(phi.fourth * up(self.radius * self.radius))
+        wrong = up(half_error + EPS * h) * up(ss + 2 * up(s * self.bend)) + up(sixth_error + EPS * g) * up(s * ss)
+        return wrong + up(2 * up(up(h + quartic) * s) + 2 * up(h * self.bend) + 3 * up(g * ss)) * self.turn
 
     def beyond_tangent(self, phi: Expansion) -> tuple[Any, Any, Any]:
         """(H, C, R): phi(v) less its tangent at v(0) is d'H d + C[d] within d'R d.
@@ -239,9 +254,7 @@ class Jet:
         aa, aQ = outer(a, a), symmetric(a, self.Q)
         H, C = each(half) * aa, np.asarray(2 * half)[..., None] * aQ + np.asarray(sixth)[..., None] * symmetric(a, aa)
         plain = straight * self.twist + square * up(self.bend + self.twist)
-        wrong = up(half_error + EPS * h) * up(ss + 2 * up(s * self.bend)) + up(sixth_error + EPS * g) * up(s * ss)
-        moved = up(2 * up(up(h + quartic) * s) + 2 * up(h * self.bend) + 3 * up(g * ss)) * self.turn
-        return H, C, widen(each(up(straight + square)) * self.whole + each(quartic) * aa, plain + wrong + moved)
+        return H, C, widen(each(up(straight + square)) * self.whole + each(quartic) * aa, plain + self.mistaken(phi))
 
     def function(self, name: str) -> Jet:
         """phi(v) for a function phi that elementary.py knows."""
@@ -255,7 +268,7 @@ class Jet:
             e0, slack, a_y = self._by_y(name, phi, a_y)
         wrong = up(e1 + EPS * steepest) * self.spread + self.faint
         Q, K, E = each(f1) * self.Q + H, column * self.K + C, widen(each(steepest) * self.E + R, wrong)
-        lip = steepest * self.lip + self.lip_beyond_tangent(phi) + 2 * up(e1 + EPS * steepest) * self.bend
+        lip = steepest * self.lip + self.lip_beyond_tangent(phi) + 3 * wrong
         return Jet(f0, e0, column * self.a, slack, Q, K, E, column * self.B, self.U, c_y, a_y, up(lip))
 
     def _by_y(self, name: str, phi: Expansion, plain: Any) -> tuple[Any, Any, Any]:

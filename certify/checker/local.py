@@ -3,6 +3,7 @@ claim as far as c0 <= V, below which a step must not lead out of {V <= c0}."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 from fractions import Fraction
 from functools import cached_property
@@ -18,10 +19,11 @@ from .decrease import Level, Models, are_finite, are_usable, rational, sides, si
 from .document import Intervals
 from .exact import contains_ball, exactly, fraction, is_definite, root_above
 from .float64 import Array, norm, up
-from .flow import mean
+from .flow import later
 from .jets import Jet, uncertain
 
-MOST_WORK = 2**26  # corners of cells times n^4, which is what an inequality takes
+_MOST_CORNERS = 2**16  # of all cells
+_MOST_WORK = 2**26  # corners times n^4, which is what an inequality takes
 _ATTEMPTS = 4  # at the a-priori enclosure
 Way = tuple[Array, Array]  # how far each state may move in a period: a number, and one times ||d||
 
@@ -31,6 +33,14 @@ class Local(Ball):
 
     def __init__(self, case: Case) -> None:
         super().__init__(case, case.local.J, "local ball")
+        object.__setattr__(self, "margins", list[float]())
+
+    margins: list[float]  # 1 - the largest share of the decay that the rest takes at a corner, in floats for people
+
+    @property
+    def margin(self) -> float:
+        """The least of those that were looked at."""
+        return min(self.margins, default=float("nan"))
 
     @property
     def order(self) -> int:
@@ -65,6 +75,21 @@ class Local(Ball):
         """What is 0 at d = 0 in truth is known to be."""
         return replace(v, c=np.float64(0), error=0.0, c_y=0 * v.c_y) if self.at_rest else v
 
+    @property
+    def period(self) -> Jet:
+        """h, by the last of the numbers y if it has a range."""
+        lo, hi = self.case.c.sample or (Fraction(0), Fraction(0))
+        return uncertain(lo, hi, self.units.shares, self.count - 1, self.count) if lo < hi else self.constant(hi)
+
+    @cached_property
+    def later(self) -> list[Jet]:
+        """What G has beyond x_1, over h: of this whatever is uncertain is known by its whole range alone."""
+        if self.way is None or self.order == 1:
+            return []
+        start, during = self.shared(self.states), self.shared(self.during(self.way))
+        held, dynamics = [*self.inputs, *self.ranges], self.case.c.dynamics
+        return later(dynamics, self.constant, start, during, held, self.period, self.order, self.settled)
+
     def G(self, cell: Intervals) -> list[Jet]:
         """The increment of x by time over a step. Within a period what is uncertain may leave the cell: the cell counts
         for its mean alone, in which D is convex."""
@@ -73,18 +98,15 @@ class Local(Ball):
             return [f + -x for f, x in zip(self.F(cell), self.shared(self.states), strict=True)]
         if c.sample is None or self.way is None:
             return self.F(cell)
-        start, during, (lo, hi) = self.shared(self.states), self.shared(self.during(self.way)), c.sample
-        first = [self.settled(f) for f in self.f(during if self.order == 1 else start, symbols)]
-        held, U = [*self.inputs, *self.ranges], self.units.shares
-        h = uncertain(lo, hi, U, len(cell), self.count) if lo < hi else self.constant(hi)
-        return mean(c.dynamics, self.constant, first, start, during, held, h, self.order, self.settled)
+        first = self.f(self.during(self.way) if self.order == 1 else self.states, symbols)
+        rising = self.later or [self.constant(Fraction(0))] * len(first)
+        return [self.settled(x) + self.period * more for x, more in zip(first, rising, strict=True)]
 
-    @cached_property
-    def sides(self) -> list[tuple[fmpq_mat, fmpq_mat] | None]:
-        """For each corner of each cell the decay, and what has to stay below it; None where G has no finite model."""
+    def sides(self) -> Iterator[tuple[fmpq_mat, fmpq_mat] | None]:
+        """For each corner of each cell the decay, and what has to stay below it; None, at the end, where G has no
+        finite model."""
         c, by = self.case.c, self.case.local
         P, h = exactly(c.P), _fmpq(c.step)
-        found: list[tuple[fmpq_mat, fmpq_mat] | None] = []
         R = 2 * rational(c.rate) * P
         level = None if self.at_rest else Level(rational(c.c0), rational(by.edge))
         for cell in self.case.cells:
@@ -92,15 +114,10 @@ class Local(Ball):
             models = Models(self.J, G, self.units, self.at_rest) if are_finite(G, self.units) else None
             most = size_beyond(models, c.P) if models is not None and h > 0 else 0.0
             if models is None or not np.isfinite(most):
-                return [*found, None]
+                yield None
+                return
             for corner in models.corners():
-                found.append(sides(corner, P, R, by.multipliers, None, h, rational(most), level))
-        return found
-
-    @cached_property
-    def margin(self) -> float:
-        """1 - the largest share of the decay that the rest may take at any corner, in floats for people."""
-        return min(_margin(*both) if both is not None else float("nan") for both in self.sides)
+                yield sides(corner, P, R, by.multipliers, None, h, rational(most), level)
 
 
 def _margin(decay: fmpq_mat, rest: fmpq_mat) -> float:
@@ -111,12 +128,18 @@ def _margin(decay: fmpq_mat, rest: fmpq_mat) -> float:
         return float("nan")
 
 
+def too_many_corners(ball: Ball) -> bool:
+    """Whether deciding an inequality at each corner of each cell would take too long."""
+    corners = prod(ball.case.partition.cells) * 2**ball.count
+    return bool(corners > _MOST_CORNERS or corners * len(ball.J) ** 4 > _MOST_WORK)
+
+
 def fits(local: Local) -> Failures:
     """`local`: the ball contains {V <= c1}, and its jets take neither too much memory nor too much time."""
     c = local.case.c
     if not contains_ball(exactly(local.J), exactly(c.P), Fraction(c.c1)):
         yield "levels.local", "the ball must contain {V <= c1}"
-    if prod(local.case.partition.cells) * 2**local.count * len(local.J) ** 4 > MOST_WORK:
+    if too_many_corners(local):
         yield "evidence.cells", "there are too many cells for this rule"
     if not are_usable(local.case.local.multipliers):
         yield "evidence.local", "no multiplier may be negative, none of g 0 where some beta is"
@@ -146,14 +169,17 @@ def stays(local: Local) -> Failures:
 
 def decreases(local: Local) -> Failures:
     """`local`: D + 2 lambda V < 0 on the ball without its centre, or as far as V >= c0."""
-    for both in local.sides:
+    count = 0
+    for both in local.sides():
         if both is None:
             yield "levels.local", "F has no finite model on the local ball"
-            return 0
-        decay, rest = both
+            return count
+        count, (decay, rest) = count + 1, both
+        local.margins.append(_margin(decay, rest))
         if not is_definite(decay - rest):
-            yield "levels.local", f"the decrease is not shown on the local ball: {1 - local.margin:.3g} of the decay"
-    return len(local.sides)
+            share = 1 - local.margins[-1]
+            yield "levels.local", f"the decrease is not shown on the local ball: {share:.3g} of the decay"
+    return count
 
 
 def _fmpq(q: Fraction) -> fmpq:

@@ -16,7 +16,7 @@ from .case import Case, Failures
 from .exact import fraction, root_above
 from .expression import evaluate
 from .float64 import EPS, Array, ends, float_with_error, gamma, norm, total, up, within
-from .flow import mean
+from .flow import later
 from .network import enclose_on_boxes
 from .taylor import Taylor, affine, constant, upper_bound
 
@@ -131,8 +131,10 @@ class Ring:
         loose = [*inputs, *(_between(v) for v in ranges)]
         during, F = self.way(states, loose)
         order, h = self.case.partition.order, self.number(self.c.sample, self.symbols - 1, batch)
-        first = [self.of_mean(f) for f in self.f(during if order == 1 else states, [*inputs, *ranges])]
-        G = mean(self.c.dynamics, self.constant(batch), first, states, during, loose, h, order, _itself)
+        G = [self.of_mean(f) for f in self.f(during if order == 1 else states, [*inputs, *ranges])]
+        if order > 1:
+            rising = later(self.c.dynamics, self.constant(batch), states, during, loose, h, order, _itself)
+            G = [x + h * more for x, more in zip(G, rising, strict=True)]
         return G, self.hull(states, F)
 
     def constant(self, batch: int) -> Callable[[Fraction], Taylor]:

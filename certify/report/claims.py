@@ -141,8 +141,8 @@ CLAIMS = {
         statement=_PRACTICAL.statement.split(" That is all:")[0] + " And {constant}there is exactly one equilibrium in "
         "the smaller set, and every one of these trajectories converges to it. Of what else happens inside the smaller "
         "set nothing is said.",
-        headline="from {{V <= {outer}}} every trajectory enters {{V <= {inner}}} and $there; there it converges to the "
-        "one equilibrium in it{constant}$over{speed}",
+        headline="from {{V <= {outer}}} every trajectory enters {{V <= {inner}}} and $there; {constant}it converges to "
+        "the one equilibrium in that set$over{speed}",
         parts=(
             *_PRACTICAL.parts,
             (

@@ -103,7 +103,7 @@ def _headline(result: Mapping[str, Any], verdict: str) -> str:
             outer=below(level),
             inner="?" if inner is None else inner_level(kind, inner),
             speed=Timing.of_result(result).headline_rate(),
-            constant=", where what is uncertain is constant in time" if result.get("uncertain") else "",
+            constant="where what is uncertain is constant in time, " if result.get("uncertain") else "",
         )
         word = ", if the solver is right: nothing checked its answers" if verdict == "TRUSTED" else ""
         return f"{name}: {_whatever(result)}{stated}{word}"

@@ -20,10 +20,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from certify.certificate import Certificate, LocalBall, PartitionTree, parse_certificate
+from certify.certificate import Certificate, Contraction, LocalBall, PartitionTree, parse_certificate
 from certify.checker import document
 from certify.checker import words as checker_words
-from certify.claims import Asymptotic, Claim, Practical, Problem
+from certify.claims import Asymptotic, Claim, Nearby, Practical, Problem
 from certify.closed_loop import ClosedLoop
 from certify.lyapunov.function import Quadratic
 from certify.policies import TanhNetwork
@@ -238,6 +238,41 @@ def test_a_rate_alone_in_continuous_time() -> None:
         not in text.split("Figures")[0].replace("A sampled controller", "").replace("held between samples", "")
     )
     assert ["rate λ", "0.25 per s"] in found.rows
+
+
+# A nearby equilibrium
+
+
+def nearby(*, push: bool, rate: float = 0.0) -> Certificate:
+    """A practical claim with one condition more."""
+    ball = LocalBall(np.eye(2), np.ones((3, 2)), np.eye(2))
+    evidence = PartitionTree(
+        np.eye(2), np.ones(2), bytes([255]), ball, cells=(1,) * push, contraction=Contraction(np.eye(2), np.ones(2))
+    )
+    claim = Nearby(roa=2.0, local=0.5, floor=0.125, rate=rate)
+    return Certificate(integrator(Timing(), push=push), gain("1", 2), Quadratic(np.eye(2)), claim, evidence)
+
+
+def test_one_equilibrium_is_said_of_constants_alone() -> None:
+    found = page(nearby(push=True, rate=0.25))
+    assert (
+        "stays there from then on. Moreover V(x(t)) ≤ V(x(0)) e^(−2λt) until it is in the smaller set, with λ = 0.25 "
+        "per s: it is there after ln(c₂/c₀)/(2λ) = 5.54518 s at the latest. And where what is uncertain is constant in "
+        "time, there is exactly one equilibrium in the smaller set, and every one of these trajectories converges to "
+        "it."
+    ) in found.text
+    assert "Contraction. 2(x − y)′P(F(x) − F(y)) < 0" in found.text and "That is all" not in found.text
+    said = outside(found)
+    assert "Where the equilibrium is." in said and "Where something uncertain changes with time" in said
+    assert "Region of attraction" not in found.text and "asymptotically" not in found.text
+    alone = page(nearby(push=False))
+    assert "And there is exactly one equilibrium in the smaller set" in alone.text
+    assert "c₀ = 0.125 (floor), c₁ = 0.5 (local)" in alone.text
+    headline = printed(result_of(Timing(), nearby(push=True).claim, push=True).to_dict())
+    assert (
+        "enters {V <= 0.125} and stays there; where what is uncertain is constant in time, it converges to the one "
+        "equilibrium in that set"
+    ) in headline
 
 
 # Times
