@@ -139,6 +139,7 @@ def random_jet(generator: Generator, k: int, U: np.ndarray, size: float = 1.0) -
         generator.standard_normal(k) * number(), number() * 2.0**-8 * generator.choice([0, 1]),
         (half + half.T) * number(), generator.standard_normal(k * (k + 1) * (k + 2) // 6) * number(),
         widen((E + E.T) / 2, 0.0, 2.0**-40), generator.standard_normal(len(U)) * number(), U,
+        np.zeros(0), np.zeros((0, k)), 0.0,
     )  # fmt: skip
 
 
@@ -216,7 +217,7 @@ def test_operations_know_the_errors_that_their_operands_share(size: float) -> No
 def alone(part: str, generator: Generator, U: np.ndarray) -> Jet:
     """A jet that is 0 but for one of its parts."""
     k = U.shape[1]
-    nothing = constant(Fraction(0), U)
+    nothing = constant(Fraction(0), U, 0)
     half, root = generator.standard_normal((2, k, k))
     only = {"a": generator.standard_normal(k), "Q": half + half.T, "E": root @ root.T, "B": np.ones(len(U)),
             "K": generator.standard_normal(k * (k + 1) * (k + 2) // 6)}  # fmt: skip
@@ -240,7 +241,7 @@ def test_every_power_has_its_place_in_what_a_function_adds(order: int, left: str
     """D^2, D^3 or D^4 itself, of two parts of a jet: |D^order - d'H d - C[d]| <= d'R d."""
     generator, used = np.random.default_rng(order), 0.0
     f = tuple(np.float64(j == order) for j in range(4))
-    phi = Expansion(f, (0.0, 0.0, 0.0, 0.0), np.float64(1), np.float64(order == 4))  # type: ignore[arg-type]
+    phi = Expansion(f, (0.0, 0.0, 0.0, 0.0), np.float64(1), np.float64(order == 4), 0.0)  # type: ignore[arg-type]
     with ctx.workprec(2500):
         for size in (0.01, 0.3, 1.0, 1.0, 3.0):
             U = shares(generator, 1, 2)
@@ -281,7 +282,8 @@ def test_a_function_of_one_direction_is_bounded_tightly(name: str, c: float) -> 
 def test_errors_that_are_shared_cancel() -> None:
     """v - w, v w - w v and sin(v) - sin(w) of the same errors: nothing is left of them to first order."""
     U = np.array([np.eye(2) * 0.01])
-    one = Jet(np.float64(1), 0.0, np.zeros(2), 0.0, np.zeros((2, 2)), np.zeros(4), np.zeros((2, 2)), np.ones(1), U)
+    one = Jet(np.float64(1), 0.0, np.zeros(2), 0.0, np.zeros((2, 2)), np.zeros(4), np.zeros((2, 2)), np.ones(1), U,
+              np.zeros(0), np.zeros((0, 2)), 0.0)  # fmt: skip
     assert abs((one + -one).B[0]) == 0 and np.trace((one + -one).whole) < 1e-12
     assert (one + one).B[0] == 2 and np.trace((one + one).E) < 1e-12
     product = one * one
@@ -456,7 +458,8 @@ def test_a_subnormal_scale_of_an_input_that_bends_much_contains(scale: float) ->
     found.case.__dict__["net"] = replace(net, scale=np.array([scale, 1.0]))
     Q, flat = np.full((2, 2, 2), 2.0**500 / 3), np.zeros((2, 2, 2))
     found.__dict__["outputs"] = Jet(np.zeros(2), np.zeros(2), np.zeros((2, 2)), np.zeros(2), Q, np.zeros((2, 4)), flat,
-                                    np.full((2, 1), 2.0**-20), np.full((1, 2, 2), 2.0**400))  # fmt: skip
+                                    np.full((2, 1), 2.0**-20), np.full((1, 2, 2), 2.0**400), np.zeros((2, 0)),
+                                    np.zeros((2, 0, 2)), np.zeros(2))  # fmt: skip
     with np.errstate(all="ignore"):
         u = found.inputs[0]
     least = abs(quotient(scale)) * (quotient(2.0**-53) * quotient(Q[0, 0, 0]))
@@ -552,7 +555,7 @@ def random_models(generator: Generator, n: int, k: int, units: int) -> Models:
     U = np.zeros((m, k, k))
     F = [replace(random_jet(generator, k, U), B=generator.standard_normal(m)) for _ in range(n)]
     R = np.asarray(shares(generator, units, k))
-    return Models(generator.standard_normal((n, n)), F, Units(generator.standard_normal((m, units)), R))
+    return Models(generator.standard_normal((n, n)), F, Units(generator.standard_normal((m, units)), R), True)
 
 
 @pytest.mark.parametrize("n", [1, 2, 3])
@@ -708,5 +711,5 @@ def test_along_a_path_a_weight_has_a_row_for_the_motion() -> None:
 
 
 def test_constants_have_no_part_in_the_errors() -> None:
-    q = constant(Fraction(2, 3), np.ones((2, 3, 3)))
+    q = constant(Fraction(2, 3), np.ones((2, 3, 3)), 0)
     assert not q.B.any() and np.trace(q.whole) < 1e-200 and q.K.shape == (10,)

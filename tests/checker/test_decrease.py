@@ -107,7 +107,7 @@ def test_the_sides_bound_what_they_stand_for(n: int, kind: str) -> None:
         J, P, R = generator.standard_normal((n, n)), symmetric(generator, n), symmetric(generator, n)
         J, P, R = exactly(J), exactly(P), exactly(R)
         exact = np.array([[float(int(v.p)) / int(v.q) for v in row] for row in J.tolist()])
-        decay, rest = sides(Models(exact, F, no_units(n)), P, R, random_multipliers(generator, n, kind))
+        decay, rest = sides(Models(exact, F, no_units(n), True), P, R, random_multipliers(generator, n, kind))
         assert decay == decay.transpose() and rest == rest.transpose()
         for _ in range(12):
             d, unit = inside(generator, n), [quotient(v) for v in UNITS[generator.integers(len(UNITS))][:n]]
@@ -132,7 +132,7 @@ def test_what_is_shown_is_so(n: int) -> None:
         hints = by(
             *([float(v) for v in size / 4 * generator.choice([0, 1, 1], n)] for _ in range(2)), [n * size / 4] * n
         )
-        answers.append(shows(Models(J, F, no_units(n)), P, R, hints))
+        answers.append(shows(Models(J, F, no_units(n), True), P, R, hints))
         for _ in range(20 if answers[-1] else 0):
             d, unit = inside(generator, n), [quotient(v) for v in UNITS[generator.integers(len(UNITS))][:n]]
             assert worst(exactly(J), P, R, F, d, unit) < 0
@@ -147,7 +147,7 @@ def test_the_sums_are_those_of_the_reference(n: int, kind: str) -> None:
     for _ in range(20):
         F, hints = random_jets(generator, n, 1.0), random_multipliers(generator, n, kind)
         J, P, R = generator.standard_normal((n, n)), symmetric(generator, n), symmetric(generator, n)
-        decay, rest = sides(Models(J, F, no_units(n)), exactly(P), exactly(R), hints)
+        decay, rest = sides(Models(J, F, no_units(n), True), exactly(P), exactly(R), hints)
         with ctx.workprec(300):
             rows = [array("d", [float(int(v.p)) / int(v.q) for v in row]) for row in
                     (hints.rest, hints.apart, hints.joint)]  # fmt: skip
@@ -179,7 +179,7 @@ def scalar(
 ) -> bool:
     one = [jet([a], slack, [[Q]], [[E]])]
     return shows(
-        Models(np.array([[J]]), one, no_units(1)), exactly(np.array([[P]])), exactly(np.array([[R]])), by(*rows)
+        Models(np.array([[J]]), one, no_units(1), True), exactly(np.array([[P]])), exactly(np.array([[R]])), by(*rows)
     )
 
 
@@ -220,7 +220,7 @@ def test_errors_of_two_components_cancel_jointly_alone() -> None:
     """F = -x + k x_1^2 (1, -1), and P for which (1, -1) is short: x'PF sees a tenth of the square."""
     P, zero, flat = exactly(np.array([[1.0, 0.9], [0.9, 1.0]])), fmpq_mat(2, 2), np.zeros((2, 2))
     F = [jet([-1, 0], 0.0, [[0.75, 0], [0, 0]], flat), jet([0, -1], 0.0, [[-0.75, 0], [0, 0]], flat)]
-    models, each = Models(np.eye(2), F, no_units(2)), np.exp(np.arange(-6, 3, 0.25)).tolist()
+    models, each = Models(np.eye(2), F, no_units(2), True), np.exp(np.arange(-6, 3, 0.25)).tolist()
     assert shows(models, P, zero, by([0, 0], [0, 0], [0.125, 2.0**-60]))
     assert not any(shows(models, P, zero, by([0, 0], [v, w], [0, 0])) for v in each for w in each)
 
@@ -247,7 +247,7 @@ def test_no_multiplier_is_negative(row: int, value: float) -> None:
 
 def test_a_negative_multiplier_would_show_what_is_false(monkeypatch: pytest.MonkeyPatch) -> None:
     """x' = x/2: a beta of -9 with Q = 1, or g = -9, takes from the rest what the decay lacks."""
-    growing = Models(np.eye(1), [jet([0.5], 0.0, [[1.0]], [[0.0]])], no_units(1))
+    growing = Models(np.eye(1), [jet([0.5], 0.0, [[1.0]], [[0.0]])], no_units(1), True)
     one, zero = fmpq_mat([[1]]), fmpq_mat(1, 1)
     for rows in (([0.0], [0.0], [-9.0]), ([-9.0], [0.0], [-9.0])):
         assert shows(growing, one, zero, by(*rows)) and not are_usable(by(*rows))

@@ -721,7 +721,7 @@ def test_an_inverse_whose_derivative_underflows_contains(c: float, slope: float)
 @given(st.integers(-(10**30), 10**30), st.integers(1, 10**30))
 def test_jets_of_constants_contain(numerator: int, denominator: int) -> None:
     q = Fraction(numerator, denominator)
-    jet = constant_jet(q, np.zeros((1, 2, 2)))
+    jet = constant_jet(q, np.zeros((1, 2, 2)), 2)
     assert abs(Fraction(jet.c) - q) <= Fraction(jet.error) and not (jet.a.any() or jet.Q.any() or jet.E.any())
 
 

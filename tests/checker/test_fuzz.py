@@ -44,7 +44,7 @@ from certify.systems import get_system
 from certify.verdict import Verdict
 from tests.checker.test_path import glide, waypoint
 from tests.support.balls import ball as ball_of
-from tests.support.balls import enlarge, with_ball
+from tests.support.balls import centred, enlarge, enlarged_from, reached_from, with_ball
 from tests.support.certificates import LEAF, Document, decode, dump, edited, encode, grow, make, rehash
 from tests.support.oracle import ball, policies_in_arb, value_of
 
@@ -52,7 +52,7 @@ CHECKER = Path(certify.checker.__file__).parent
 SHIPPED = Path(__file__).parents[2] / "examples" / "policies" / "pendulum.pt"
 RULES = {
     "format", "hash", "levels", "lyapunov", "equilibrium", "centring", "domain", "coordinates", "root", "local", "tree",
-    "ring", "inputs", "tube",
+    "ring", "inputs", "tube", "flow",
 }  # fmt: skip
 RESULTS = {0: "ACCEPTED", 1: "REJECTED", 3: "TRUSTED"}
 SECONDS = 5  # for one small file; a thousand times what it takes
@@ -141,7 +141,7 @@ def text(node: Any) -> str:
 TOKENS = [
     "{", "}", "[", "]", ",", ":", '"', "\\", "\\u", "\\ud800", "\\u0000", "null", "true", "false", "NaN", "Infinity",
     "-Infinity", "0", "-0", "1", "-", "1e9", "1E400", "0.5", "1234567890", "12345678901", "9" * 5000, '"a"', '""',
-    '"schema"', '"certify-certificate/5"', '"plant"', '"x"', '"0x1.0000000000000p+0"', "0x10", "//", "/*", "'a'", " ",
+    '"schema"', '"certify-certificate/6"', '"plant"', '"x"', '"0x1.0000000000000p+0"', "0x10", "//", "/*", "'a'", " ",
     "\n", "\t", "\x00", "\x1f", "\x7f", "\u0661", "\u2028", "\ufeff", "\U0001f600", "\ud800", "\udfff", "[" * 500,
     '{"a":' * 500, "[" * 2000 + "]" * 2000,
 ]  # fmt: skip
@@ -275,7 +275,7 @@ json_edits = st.lists(
 
 @st.composite
 def edited_json(draw: st.DrawFn) -> bytes:
-    top = {"": edited(SEEDS[draw(seeds)](), "schema", "certify-certificate/5")}  # a deep copy
+    top = {"": edited(SEEDS[draw(seeds)](), "schema", "certify-certificate/6")}  # a deep copy
     for kind, position, other, value in draw(json_edits):
         found = places(top)
         if not found:
@@ -422,7 +422,7 @@ def any_numbers(draw: st.DrawFn) -> bytes:
         T=T, root=root, tree=draw(trees),
     )  # fmt: skip
     if draw(st.booleans()):
-        data = edited(data, "evidence.local", ball_of(array(n, n), np.abs(array(3, n))))
+        data = edited(data, "evidence.local", centred(array(n, n), np.abs(array(3, n))))
     if draw(st.booleans()):  # a tube into {V <= c2}, or anywhere
 
         def node(factor: float) -> Any:
@@ -431,7 +431,7 @@ def any_numbers(draw: st.DrawFn) -> bytes:
             return encode(near if draw(st.booleans()) and np.isfinite(near).all() else array(n, n))
 
         def one_ball() -> Document:
-            mine: Document = data["evidence"]["local"]
+            mine = {key: data["evidence"]["local"][key] for key in ("J", "multipliers", "weight")}
             return mine if draw(st.booleans()) else ball_of(array(n, n), np.abs(array(3, n)))
 
         times = draw(st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=1, max_size=2))
@@ -444,8 +444,9 @@ def any_numbers(draw: st.DrawFn) -> bytes:
         slabs = [
             {"middle": node(1.5), "end": node(2.0), "duration": h.hex(), "path": one_path()} | one_ball() for h in times
         ]
-        claim = {"kind": "reached", "centre": encode(array(n))} if moves else {"kind": "enlarged"}
-        data = edited(data, "claim", claim | {"start": node(1.0)})
+        start = node(1.0)
+        claim = (reached_from(np.eye(n), array(n)) if moves else enlarged_from(np.eye(n))) | {"start": start}
+        data = edited(data, "claim", claim)
         data["evidence"]["tube"] = slabs
     return dump(data)
 
@@ -834,7 +835,7 @@ def wide_plant(terms: list[Any], n: int = 64, **changes: Any) -> Document:
     plain = [["+", u] for u in inputs]
     data = make(plain, layers, np.eye(n), (2.0**-81, 2.0**-80), **{**settings, **changes})
     data["plant"]["dynamics"] = dynamics
-    data["evidence"]["local"] = ball_of(np.eye(n) * 1.5 * 2.0**-40, np.full((3, n), 2.0**-20))
+    data["evidence"]["local"] = centred(np.eye(n) * 1.5 * 2.0**-40, np.full((3, n), 2.0**-20))
     return data
 
 
@@ -868,7 +869,7 @@ def extreme_matrices(reach_P: int, reach_T: int, n: int = 64) -> Document:
         "T": encode(mixed(reach_T, n, n) if reach_T else np.eye(n)),
         "root": encode([2.0**1000] * n),
         "tree": encode_tree([LEAF]),
-        "local": ball_of(np.diag(2 * np.diag(P) ** -0.5), np.ones((3, n))),
+        "local": centred(np.diag(2 * np.diag(P) ** -0.5), np.ones((3, n))),
     }
     return base | {
         "lyapunov": {"kind": "quadratic", "P": encode(P)},

@@ -22,6 +22,7 @@ from certify.checker import document, rules
 from certify.checker.errors import Rejected
 from tests.support.ablation import checker_without
 from tests.support.balls import with_ball
+from tests.support.certificates import edited
 from tests.support.claim_oracle import EXACT, faults, read
 from tests.support.mutants import (
     BASES,
@@ -192,9 +193,9 @@ def test_honest_practical_certificates_are_accepted(name: str, tmp_path: Path) -
     tally = rules.check(document.read(str(path)))
     assert tally.rules["equilibrium"] == tally.rules["local"] == 0 and tally.local_margin is None
     assert tally.rules["tree"] >= tally.rules["ring"] > 0
-    kind, floor = practical_base(name)["claim"]["kind"], practical_base(name)["levels"]["floor"]
-    asymptotic = {**practical_base(name), "claim": {"kind": "asymptotic"}}
-    asymptotic["levels"] = {"local": floor, "roa": asymptotic["levels"]["roa"]}
+    kind, levels = practical_base(name)["claim"]["kind"], practical_base(name)["levels"]
+    asymptotic = edited(practical_base(name), "claim.kind", "asymptotic")
+    asymptotic["levels"] = {key: levels[key] for key in ("local", "roa")}
     assert kind == "practical"
     assert verdict_on(Mutant(name, asymptotic, frozenset()).write(path)) == "format"  # a ball is missing
     asymptotic = with_ball(asymptotic)

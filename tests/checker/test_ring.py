@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from certify.checker import ring as checker_ring
 from certify.checker.case import Case
 from certify.checker.exact import exactly, fraction
-from certify.checker.network import enclose_on_boxes
 from certify.checker.ring import Ring, multipliers
 from certify.checker.taylor import Taylor, upper_bound
 from tests.checker.test_rules import honest, scalar_claim
 from tests.support.certificates import grow, parse, verdict
+from tests.support.leaves import on_boxes
 from tests.support.oracle import policies_in_arb, value_of
 
 Array = np.ndarray
@@ -31,9 +31,8 @@ def ring_of(name: str) -> Ring:
 
 
 def vdot_on(ring: Ring, centre: Array, radius: Array) -> Taylor:
-    x, error = ring.states(centre, radius)
-    vdot, _ = ring.models(x, error, *enclose_on_boxes(ring.net, x, error))
-    return vdot
+    states, F, _ = on_boxes(ring, centre, radius)
+    return ring.rise(states, F)
 
 
 def ends(model: Taylor, index: int, d: list[Fraction]) -> tuple[Fraction, Fraction]:

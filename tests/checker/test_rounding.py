@@ -44,6 +44,7 @@ from certify.policies.network import Centre, Squash
 from certify.rigorous import evaluate_policy
 from certify.systems import System, get_system
 from tests.support.certificates import make, parse
+from tests.support.leaves import on_boxes
 from tests.support.loops import box
 from tests.support.oracle import Array, awkward, policies_in_arb, policy_in_arb, value_of
 
@@ -649,8 +650,8 @@ def vdot_bounds(ring: Ring, lo: Array, hi: Array) -> tuple[Array, Array, Array]:
     """Lower and upper bound of Vdot on boxes, and its upper bound on the part of each box that lies in the ring."""
     centre = 0.5 * lo + 0.5 * hi
     radius = float64.up(np.maximum(hi - centre, centre - lo))
-    x, error = ring.states(centre, radius)
-    model, _ = ring.models(x, error, *checker.enclose_on_boxes(ring.net, x, error))
+    states, F, _ = on_boxes(ring, centre, radius)
+    model = ring.rise(states, F)
     negated = taylor.Taylor(-model.c, -model.g, -model.Q, model.r)
     return -taylor.upper_bound(negated), taylor.upper_bound(model), ring.bound(model, centre, radius)
 

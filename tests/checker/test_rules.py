@@ -114,6 +114,20 @@ def rotor_claim(c1: float = 1e-4, c2: float = 0.3, centre: str = "output", **cha
     return make(dynamics, layers, P, (c1, c2), **{**settings, **changes})
 
 
+def sampled_claim() -> Document:
+    """x' = x/2 - 2 tanh(x), the input held for 1/16 to 1/10."""
+    return scalar_claim(0.01, 0.25, scale=[-2.0], input_bounds=[("-2", "2")], sample=("1/16", "1/10"), order=2)
+
+
+def nearby_claim(cubic: str = "0", J: float = 0.2 * (1 + 1e-9), weight: float = 2.0**-40) -> Document:
+    """x' = cubic x^3 - x + 1/100 has one equilibrium in {x^2 <= 1/25} if there it falls."""
+    data = make(
+        [["+", ["-", "x"], "1/100", ["*", cubic, ["**", "x", 3]], ["*", "0", "u"]]], [([[0.0]], [0.0])], 1.0,
+        (0.04, 0.09), claim="nearby",
+    )  # fmt: skip
+    return edited(data, "evidence.contraction", {"J": encode([J]), "weights": encode([weight])})
+
+
 def lyapunov(A: np.ndarray) -> np.ndarray:
     """P with A'P + PA = -I."""
     n = len(A)
@@ -138,6 +152,8 @@ HONEST: dict[str, Callable[[], Document]] = {
     "scalar": scalar_claim,
     "scalar, no centring": lambda: scalar_claim(bias=0.0, centre="none"),
     "linear": linear_claim,
+    "sampled": sampled_claim,
+    "nearby": nearby_claim,
     "local only": lambda: linear_claim(3.0, 3.0),
     "rotor": rotor_claim,
     "rotor, preactivation": lambda: rotor_claim(c2=0.2, centre="preactivation"),
@@ -155,7 +171,7 @@ def test_honest_certificates_are_accepted(name: str) -> None:
     tally = rules.check(parse(data))
     assert tally.rules["tree"] == tree_of(data).count(LEAF)
     assert tally.rules["tube"] == len(data["evidence"]["tube"])
-    assert (tally.local_margin is None) if name.startswith("practical") else 0 < tally.local_margin <= 1
+    assert (tally.local_margin is None) if name.startswith(("practical", "nearby")) else 0 < tally.local_margin <= 1
     if name == "scalar":  # bounded by form: no leaf is asked for its inputs
         assert tally.rules["inputs"] == 1
     if name == "local only":
@@ -324,8 +340,23 @@ MUTANTS: list[tuple[str, str, str, Edit]] = [  # rule, base, what, edit
     ("format", "scalar", "root not finite", array("evidence.root", lambda a: a * np.inf)),
     ("format", "scalar", "tree not base64", at("evidence.tree", "AP8")),
     ("format", "scalar", "no ball", at("evidence.local", None)),
-    ("format", "practical, clipped", "a ball", lambda d: edited(
-        d, "evidence.local", honest("scalar")["evidence"]["local"])),
+    ("format", "practical, clipped", "a ball of another order", lambda d: edited(
+        d, "evidence.local", honest("scalar")["evidence"]["local"] | {"order": 2})),
+    ("format", "scalar", "an edge", at("evidence.local.edge", (1.0).hex())),
+    ("format", "scalar", "orders on leaves of what is not sampled", at("evidence.order", 2)),
+    ("format", "scalar", "a rate below 0", at("claim.rate", (-1.0).hex())),
+    ("format", "scalar", "a sample of nothing", at("claim.sample", ["0", "0"])),
+    ("format", "scalar", "time by another name", at("plant.time", "sampled")),
+    ("format", "nearby", "no contraction", at("evidence.contraction", None)),
+    ("format", "scalar", "a contraction", at("evidence.contraction", {"J": encode([1.0]), "weights": encode([1.0])})),
+    ("format", "scalar", "a contraction in words", at("evidence.contraction", "null")),
+    ("contraction", "nearby", "a ball in the set", array("evidence.contraction.J", lambda a: a * 0.999)),
+    ("contraction", "nearby", "a weight of 0", array("evidence.contraction.weights", lambda a: 0 * a)),
+    ("contraction", "nearby", "a weight below 0", array("evidence.contraction.weights", lambda a: -a)),
+    ("contraction", "nearby", "a weight that takes all", array("evidence.contraction.weights", lambda a: a + 1)),
+    ("contraction", "nearby", "a ball where it rises", lambda d: grow(edited(d, "plant.dynamics.0.3.1", "9"))),
+    ("flow", "sampled", "held for so long that nothing is known", at("claim.sample", ["1/16", "9"])),
+    ("format", "scalar", "the schema of version 5", at("schema", "certify-certificate/5")),
     ("format", "scalar", "J of another size", array("evidence.local.J", lambda a: np.ones(4))),
     ("format", "scalar", "J not finite", array("evidence.local.J", lambda a: a * np.nan)),
     ("format", "scalar", "two rows of multipliers", array("evidence.local.multipliers", lambda a: a[:2])),
@@ -516,12 +547,13 @@ def test_every_field_and_every_rule_has_a_mutant() -> None:
     format_page = (Path(certify.checker.__file__).parent / "FORMAT.md").read_text()
     table = format_page.split("| rule | inequality | gives |")[1].split("\n\n")[0]
     documented = {name for row in table.splitlines()[2:] for name in re.findall(r"`(\w+)`", row.split("|")[1])}
-    assert len(documented) == 14 and {rule for rule, *_ in MUTANTS} == documented
+    assert len(documented) == 16 and {rule for rule, *_ in MUTANTS} == documented
     touched = set()
     for _, base, _, edit in MUTANTS:
         before, after = dict(leaves_of(honest(base))), dict(leaves_of(edit(honest(base))))
         touched |= {general(path) for path in before.keys() | after.keys() if before.get(path) != after.get(path)}
     fields = {general(path) for base in ("rotor", "enlarged") for path, _ in leaves_of(honest(base))}
+    fields |= {"evidence.contraction.J", "evidence.contraction.weights"}
     assert fields - touched == {"provenance.tool"}
 
 
@@ -727,7 +759,7 @@ def test_a_leaf_is_missed_only_if_it_lies_outside_the_ring(exponent: int) -> Non
             ring = Ring(Case(replace(c, P=P, evidence=replace(c.evidence, T=np.eye(2)))))
             lo = generator.uniform(-3, 3, (2, 40))
             hi = lo + generator.uniform(0, 1, (2, 40))
-            result = np.logical_or(*ring.misses(lo, hi))
+            result = np.logical_or(*ring.misses(lo, hi)[:2])
         missed, kept = missed + int(result.sum()), kept + int((~result).sum())
         for box in np.flatnonzero(result):
             t = np.concatenate([generator.uniform(0, 1, (15, 2)), [[0, 0], [0, 1], [1, 0], [1, 1]]])
@@ -748,7 +780,7 @@ def test_a_lower_bound_of_V_that_overflows_puts_no_leaf_outside() -> None:
             with np.errstate(all="ignore"):
                 ring = Ring(Case(replace(c, P=np.array([[s]]))))
                 overflows = not np.isfinite(s * near * near)
-                outside, _ = ring.misses(np.array([[near]]), np.array([[1.001 * near]]))
+                outside, *_ = ring.misses(np.array([[near]]), np.array([[1.001 * near]]))
             if overflows and Fraction(s) * Fraction(near) ** 2 < Fraction(c.c2):
                 met += 1
                 assert not outside[0]
@@ -793,6 +825,12 @@ def skewed() -> Document:
     )  # fmt: skip
 
 
+def held_too_long() -> Document:
+    """x' = 20 x - 30 tanh(x) decreases, and so does x + h F(x), but not the state: e^2 - 3/2 (e^2 - 1) is below -1."""
+    plant = [["+", ["*", "20", "x"], ["*", "30", "u"]]]
+    return make(plant, [([[1.0]], [0.0])], 1.0, (0.01, 0.01), domain=[("-9", "9")], sample=("1/10", "1/10"))
+
+
 ABLATED: dict[str, Callable[[], Document]] = {
     "format": lambda: honest("scalar") | {"comment": "unknown key"},
     "hash": lambda: array("policy.layers.0.bias", nudged(0))(honest("scalar")),
@@ -808,6 +846,8 @@ ABLATED: dict[str, Callable[[], Document]] = {
     "tree": lambda: scalar_claim(c2=4.0, tree=bytes([0])),
     "ring": lambda: scalar_claim(c2=4.0),
     "inputs": lambda: at("plant.input_bounds", [["-9/10", "1"]])(honest("scalar")),
+    "flow": held_too_long,
+    "contraction": lambda: grow(nearby_claim("9")),
 }
 
 
@@ -911,3 +951,18 @@ def test_a_decay_below_every_binary64_number(second: Any, found: tuple[str, str]
             centre="none", scale=(-4.9e-91,), T=np.eye(2) * 8.9e-308, root=[6.8e153, 6.8e153],
         )  # fmt: skip
         assert verdict(data) == rule
+
+
+@pytest.mark.parametrize(
+    ("gain", "verdict_of"), [("30", "contraction"), ("90", "contraction"), ("1" + "0" * 7, "ACCEPTED")]
+)
+def test_contraction_takes_derivatives_of_what_a_function_leaves(gain: str, verdict_of: str) -> None:
+    """x' = 1 - x + x^2 - 1/(1 + x) - gain x: next to -0.9 what 1/(1 + x) leaves rises by 97, four times what its size
+    says."""
+    left = ["-", ["+", "1", ["-", "x"], ["*", "x", "x"]], ["/", "1", ["+", "1", "x"]]]
+    data = make(
+        [["-", left, ["+", ["*", gain, "x"], ["*", "0", "u"]]]], [([[0.0]], [0.0])], 1.0, (0.81, 0.8181),
+        claim="nearby", domain=[("-97/100", "97/100")],
+    )  # fmt: skip
+    data["evidence"]["contraction"] = {"J": encode([0.9 * (1 + 1e-9)]), "weights": encode([1e-9])}
+    assert verdict(grow(data)) == verdict_of

@@ -32,7 +32,20 @@ from certify.checker.decrease import Models, are_finite, are_usable, shows, side
 from certify.checker.document import Multipliers
 from certify.checker.exact import MAX_MATRIX_BITS, exactly, is_definite, root_above
 from certify.reference import rules as second
-from tests.support.certificates import Document, decode, dump, edited, encode, make, parse, rehash, verdict, write
+from tests.support.balls import AT_REST, centred, enlarged_from
+from tests.support.certificates import (
+    ASYMPTOTIC,
+    Document,
+    decode,
+    dump,
+    edited,
+    encode,
+    make,
+    parse,
+    rehash,
+    verdict,
+    write,
+)
 from tests.support.jets import curved, no_units, plain
 from tests.support.oracle import policy_in_arb, quadratic, value_of
 
@@ -88,8 +101,8 @@ def scalar(dynamics: Any, c: float, local: Document, start: float, slabs: Sequen
     """In V = x^2 with c1 = c2 = c: the tree is a leaf of which nothing is asked."""
     options: dict[str, Any] = {"root": [math.sqrt(c) * 1.25], "domain": [("-9", "9")], **more}
     data = make([dynamics], [([[0.0]], [0.0])], 1.0, (c, c), **options)
-    data["schema"], data["claim"] = "certify-certificate/5", {"kind": "enlarged", "start": encode([start])}
-    data["evidence"] |= {"local": local, "tube": list(slabs)}
+    data["claim"] = enlarged_from([start])
+    data["evidence"] |= {"local": local | AT_REST, "tube": list(slabs)}
     return data
 
 
@@ -132,7 +145,7 @@ def test_honest_tubes_are_accepted(name: str) -> None:
 
 @pytest.mark.parametrize("name", HONEST)
 def test_without_its_tube_each_is_an_asymptotic_claim(name: str) -> None:
-    data = edited(edited(HONEST[name](), "evidence.tube", []), "claim", {"kind": "asymptotic"})
+    data = edited(edited(HONEST[name](), "evidence.tube", []), "claim", ASYMPTOTIC)
     assert verdicts(data) == {"ACCEPTED"}
 
 
@@ -216,8 +229,16 @@ FORGERIES: list[tuple[str, str, Edit]] = [
         for i, value in ((1, 0.0), (1, 1e300), (3, 1e-300), (3, 1e300), (4, 0.0), (5, -0.0), (4, 1e300), (1, 5e-324))
         if (at, i, value) != (LOCAL, 1, 0.0)  # where so little is left that alpha may be 0
     ],
-    ("a ball of the slab for the local one", "local", lambda d: edited(d, LOCAL, ball_of(d["evidence"]["tube"][0]))),
-    ("the local ball for a slab's", "tube", lambda d: edited(d, FIRST, lambda old: old | d["evidence"]["local"])),
+    (
+        "a ball of the slab for the local one",
+        "local",
+        lambda d: edited(d, LOCAL, ball_of(d["evidence"]["tube"][0]) | AT_REST),
+    ),
+    (
+        "the local ball for a slab's",
+        "tube",
+        lambda d: edited(d, FIRST, lambda old: old | ball_of(d["evidence"]["local"])),
+    ),
     ("c1 = c2 are larger", "local", lambda d: levels(0.5, times("evidence.root", 2)(d))),
     ("c1 = c2 are smaller", "tube", lambda d: levels(0.2, d)),
     ("a domain that the start touches", "tube", lambda d: edited(d, "plant.domain.0", touching(d))),
@@ -344,10 +365,10 @@ def test_next_to_forgeries(name: str) -> None:
 
 
 MALFORMED: dict[str, Edit] = {
-    "no start": at("claim", {"kind": "enlarged"}),
+    "no start": at("claim", ASYMPTOTIC | {"kind": "enlarged"}),
     "a start for nothing": lambda d: edited(d, "claim.kind", "asymptotic"),
     "no tube": at("evidence.tube", []),
-    "a tube for nothing": at("claim", {"kind": "asymptotic"}),
+    "a tube for nothing": at("claim", ASYMPTOTIC),
     "a tube of another kind": at("evidence.tube", {}),
     "null for a tube": at("evidence.tube", None),
     "null for a slab": at("evidence.tube.1", None),
@@ -366,7 +387,9 @@ MALFORMED: dict[str, Edit] = {
     "a duration as a number": at(f"{FIRST}.duration", 1),
     "an unknown claim": at("claim.kind", "enlarged "),
     "a practical claim": lambda d: edited(
-        edited(d, "claim", {"kind": "practical"}), "levels", {"floor": (0.5).hex(), "roa": (1.0).hex()}
+        edited(d, "claim", ASYMPTOTIC | {"kind": "practical"}),
+        "levels",
+        {"floor": (0.5).hex(), "local": (0.5).hex(), "roa": (1.0).hex()},
     ),
     "a solver's word": at(
         "evidence",
@@ -537,8 +560,7 @@ def random_loop(random: np.random.Generator) -> tuple[Document, np.ndarray]:
         centre=centre, scale=scale, offset=[0.0] * m, root=[1.0] * n,
         u_eq=[str(Fraction(float(v)) * Fraction(random.integers(-9, 9).item(), 10)) for v in scale],
     )  # fmt: skip
-    data["schema"] = "certify-certificate/5"
-    data["evidence"] |= {"local": ball(np.eye(n), np.ones((3, n))), "tube": []}
+    data["evidence"] |= {"local": centred(np.eye(n), np.ones((3, n))), "tube": []}
     return data, J
 
 
@@ -602,7 +624,7 @@ def test_what_is_just_shown_is_true_of_the_worst_remainder(seed: int) -> None:
         E = np.einsum("iab,icb->iac", E, E) * 10.0 ** random.uniform(-3, 0) * (random.random() < 0.7)
         Q = Q * 10.0 ** random.uniform(-2, 1) * (random.random() < 0.7)
         slack = 10.0 ** random.uniform(-6, 0, n) * (random.random() < 0.5)
-        models = Models(J, [plain(np.float64(0), 0.0, a[i], slack[i], Q[i], E[i]) for i in range(n)], no_units(n))
+        models = Models(J, [plain(np.float64(0), 0.0, a[i], slack[i], Q[i], E[i]) for i in range(n)], no_units(n), True)
         by = random_multipliers(random, P @ J, Q, E)
         assert are_usable(by)
         decay_of, rest = sides(models, exactly(P), exactly(R), by)

@@ -6,6 +6,7 @@ Each forgery is refused by the rule that was named beforehand, by this checker a
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -21,12 +22,13 @@ from flint import arb, ctx
 from certify.checker.ball import Ball
 from certify.checker.case import Case
 from certify.checker.jets import Jet, constant, uncertain
-from certify.checker.network import enclose_on_boxes
 from certify.checker.ring import Ring
 from certify.checker.taylor import Taylor
 from tests.checker.test_ball import BITS, contains, points, states
-from tests.support.balls import with_ball
+from tests.support.balls import enlarged_from, reached_from, with_ball
 from tests.support.certificates import Document, edited, encode, grow, make, parse, rehash, verdict
+from tests.support.jets import given
+from tests.support.leaves import on_boxes
 from tests.support.oracle import ball, policy_in_arb, value_of
 from tests.support.uncertain import FACTORS, drawn, largest, random_plant, ranges_of, refutation
 
@@ -74,7 +76,7 @@ HONEST: dict[str, Callable[[], Document]] = {
     "names of functions": lambda: scaled_claim(["*", "sin", ["sin", "x"]], ("sin", "2/5", "9/10")),
     "64 quantities": lambda: scaled_claim(
         ["+", *[["*", f"q{i}", "x", "1/64"] for i in range(64)]], *[(f"q{i}", "0", "1/2") for i in range(64)],
-        cells=[1] * 64,
+        cells=[1] * 64, claim="practical",
     ),
     "4,096 cells": lambda: scaled_claim(["*", "q", "p", "x"], ("q", "0", "9/10"), ("p", "0", "1"), cells=[64, 64]),
 }  # fmt: skip
@@ -168,7 +170,6 @@ def _format() -> list[tuple[str, str, str, Edit]]:
         ("scaled", "cells in the plant", lambda d: edited(d, "plant", {**d["plant"], "cells": [4]})),
         ("disturbed", "cells of nothing", at("evidence.cells", [])),
         ("disturbed", "cells null", at("evidence.cells", None)),
-        ("disturbed", "a ball", lambda d: edited(d, "evidence.local", honest("scaled")["evidence"]["local"])),
         ("scaled", "a trusted solver", at("evidence", TRUSTED)),
         ("unused", "a trusted solver, unused", at("evidence", TRUSTED)),
         ("disturbed", "a trusted solver, practical", at("evidence", TRUSTED)),
@@ -194,9 +195,7 @@ def with_tube(kind: str) -> Edit:
             "middle": encode([25.0]), "end": encode([25.0]), "duration": (1.0).hex(), "J": encode([1.0]),
             "multipliers": encode([1.0] * 3), "path": path if moves else None,
         }  # fmt: skip
-        data = edited(
-            data, "claim", {"kind": kind, "start": encode([25.0]), **({"centre": encode([0.0])} if moves else {})}
-        )
+        data = edited(data, "claim", reached_from([25.0], [0.0]) if moves else enlarged_from([25.0]))
         return edited(data, "evidence.tube", [slab])
 
     return change
@@ -346,7 +345,9 @@ def _claims() -> list[tuple[str, str, str, Edit]]:
         ("hash", "scaled", "another weight", at("policy.layers.0.weight", encode([2.0]))),
         ("centring", "scaled", "no rest at u_eq", lambda d: rehash(edited(d, "policy.layers.0.bias", encode([0.5])))),
         ("tree", "scaled", "no tree", at("evidence.tree", "")),
-        ("local", "64 quantities", "the last is larger", at("plant.uncertain.63.range", ["0", "100"])),
+        ("local", "disturbed", "a ball without an edge", lambda d: edited(
+            d, "evidence.local", honest("scaled")["evidence"]["local"])),
+        ("ring", "64 quantities", "the last is larger", at("plant.uncertain.63.range", ["0", "100"])),
     ]  # fmt: skip
     return result
 
@@ -358,8 +359,8 @@ def moved_equilibrium(data: Document) -> Document:
 
 
 def asymptotic(data: Document) -> Document:
-    data = edited(data, "claim", {"kind": "asymptotic"})
-    data["levels"] = {"local": data["levels"]["floor"], "roa": data["levels"]["roa"]}
+    data = edited(data, "claim.kind", "asymptotic")
+    data["levels"] = {key: data["levels"][key] for key in ("local", "roa")}
     return with_ball(data)
 
 
@@ -460,10 +461,11 @@ def test_cells_cover_the_ranges_exactly() -> None:
                                    ("1" + "0" * 30, "1" + "0" * 31)])  # fmt: skip
 def test_a_quantity_is_enclosed(lo_hi: tuple[str, str]) -> None:
     lo, hi = sorted(map(Fraction, lo_hi))
-    jet = uncertain(lo, hi, np.zeros((0, 2, 2)))
+    jet = uncertain(lo, hi, np.zeros((0, 2, 2)), 0, 1)
     for q in (lo, hi, (lo + hi) / 2):
-        assert abs(q - Fraction(float(jet.c))) <= Fraction(float(jet.error))
-    assert not jet.a.any() and not jet.Q.any() and not jet.E.any() and jet.slack == 0
+        y = (2 * q - lo - hi) / (hi - lo)
+        assert abs(q - Fraction(float(jet.c)) - y * Fraction(float(jet.c_y[0]))) <= Fraction(float(jet.error))
+    assert not any(part.any() for part in (jet.a, jet.Q, jet.E, jet.a_y)) and jet.slack == 0
 
 
 @pytest.mark.parametrize("factor", FACTORS)
@@ -492,7 +494,10 @@ def test_jets_of_a_function_of_a_quantity_enclose_it(factor: str, width: str) ->
             [q] = within(cell, generator)
             for d in points(generator, 2):
                 value = in_arb(data, states(J, d), {"q": q}, tree)
-                assert contains(found, value, arb(0), d), (q, d)
+                assert contains(given(found, [(2 * q - sum(cell[0])) / (cell[0][1] - cell[0][0])]), value, arb(0), d), (
+                    q,
+                    d,
+                )
 
 
 def test_a_jet_of_a_quantity_alone_is_as_wide_as_its_values() -> None:
@@ -502,7 +507,7 @@ def test_a_jet_of_a_quantity_alone_is_as_wide_as_its_values() -> None:
         for lo, hi in (("1/64", "7/2"), ("1/2", "9/16"), ("3", "40")):
             a, b = Fraction(lo), Fraction(hi)
             with np.errstate(all="ignore"):
-                jet = uncertain(a, b, np.zeros((0, 1, 1))).function(name)
+                jet = uncertain(a, b, np.zeros((0, 1, 1)), 0, 1).function(name)
             if not np.isfinite(jet.error):
                 continue
             for share in [0.0, 1.0, *generator.random(5)]:
@@ -510,8 +515,9 @@ def test_a_jet_of_a_quantity_alone_is_as_wide_as_its_values() -> None:
                 with ctx.workprec(200):
                     tree = ["/", "1", "q"] if name == "inv" else [name, "q"]
                     true = value_of(tree, {"q": ball(q)})
-                    assert abs(true - arb(float(jet.c))) <= arb(float(jet.error))
-            assert not jet.a.any() and not jet.slack > 1e-100  # no more than underflow
+                    y = ball((2 * q - a - b) / (b - a))
+                    assert abs(true - arb(float(jet.c)) - y * arb(float(jet.c_y[0]))) <= arb(float(jet.error))
+            assert not jet.a.any() and not jet.a_y.any() and not jet.slack > 1e-100  # no more than underflow
 
 
 def test_products_of_wide_jets_enclose_what_they_stand_for() -> None:
@@ -521,13 +527,14 @@ def test_products_of_wide_jets_enclose_what_they_stand_for() -> None:
         a, b = (generator.uniform(-1, 1, 2) for _ in range(2))
         lo = [Fraction(float(v)) for v in generator.uniform(-2, 2, 2)]
         hi = [v + Fraction(float(w)) for v, w in zip(lo, 10.0 ** generator.uniform(-6, 0.5, 2), strict=True)]
-        p, q = (uncertain(*ends, no_errors) for ends in zip(lo, hi, strict=True))
-        x, y = (replace(constant(Fraction(0), no_errors), a=v) for v in (a, b))
+        p, q = (uncertain(*ends, no_errors, j, 2) for j, ends in enumerate(zip(lo, hi, strict=True)))
+        x, y = (replace(constant(Fraction(0), no_errors, 2), a=v) for v in (a, b))
         with np.errstate(all="ignore"):
             jets = [(p + x) * (q + y)]
             jets += [jets[0].function(name) for name in ("sin", "tanh", "atan")]
-            jets.append((jets[0] * jets[0] + constant(Fraction(1), no_errors)).function("sqrt"))
-        for values in [(lo[0], lo[1]), (lo[0], hi[1]), (hi[0], lo[1]), (hi[0], hi[1])]:
+            jets.append((jets[0] * jets[0] + constant(Fraction(1), no_errors, 2)).function("sqrt"))
+        for y in itertools.product((-1, 0, 1), repeat=2):
+            values = [(low + high + sign * (high - low)) / 2 for low, high, sign in zip(lo, hi, y, strict=True)]
             with ctx.workprec(BITS):
                 for d in points(generator, 2):
                     v, w = (
@@ -539,7 +546,7 @@ def test_products_of_wide_jets_enclose_what_they_stand_for() -> None:
                              (product.atan(), at_0.atan()),
                              ((product * product + 1).sqrt(), (at_0 * at_0 + 1).sqrt())]  # fmt: skip
                     for jet, (true, middle) in zip(jets, pairs, strict=True):
-                        assert spans(jet, true, middle, d), (values, d)
+                        assert spans(given(jet, y), true, middle, d), (values, d)
 
 
 def spans(jet: Jet, true: arb, at_0: arb, d: list[float]) -> bool:
@@ -554,8 +561,8 @@ def test_leaf_models_enclose_Vdot_at_every_value(seed: int) -> None:
     n, k = ring.n, ring.k
     centre, radius = 0.2 * generator.standard_normal((n, 3)), 10.0 ** generator.uniform(-3, -0.7, (n, 3))
     with np.errstate(all="ignore"):
-        x, error = ring.states(centre, radius)
-        vdot, F = ring.models(x, error, *enclose_on_boxes(ring.net, x, error))
+        states, F, _ = on_boxes(ring, centre, radius)
+        vdot = ring.rise(states, F)
     ranges, T, P = ranges_of(data), ring.c.evidence.T.tolist(), ring.c.P.tolist()
     for index in range(3):
         for _ in range(6):

@@ -34,7 +34,7 @@ def checker_without(rule: str, folder: Path) -> Iterator[ModuleType]:
         for module in ("case", "document", "exact", "rules", "strict"):
             importlib.import_module(f"{name}.{module}")
         removed = 0
-        for table in ("STATED", "ON_THE_BALL", "OF_THE_TREE", "ON_LEAVES", "OF_THE_TUBE", "ON_SLABS"):
+        for table in ("STATED", "ON_THE_BALL", "OF_THE_TREE", "ON_LEAVES", "OF_THE_TUBE", "ON_SLABS", "OF_CONTRACTION"):
             rows = getattr(package.rules, table)
             kept = tuple(row for row in rows if row[0] != rule)
             setattr(package.rules, table, kept)

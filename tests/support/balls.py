@@ -17,14 +17,15 @@ from flint import fmpq, fmpq_mat
 from certify.checker.ball import Ball
 from certify.checker.case import Case
 from certify.checker.errors import Rejected
-from tests.support.certificates import Document, decode, edited, encode, parse
+from tests.support.certificates import ASYMPTOTIC, Document, decode, edited, encode, parse
 
 MARGIN, TINY = 1e-6, 2.0**-60
+AT_REST: Document = {"edge": (0.0).hex(), "order": 1}  # what the ball of the section `local` has besides
 
 
 def with_ball(data: Document) -> Document:
     """The document with a ball for its levels, P, plant and policy, where its claim has one."""
-    if "local" not in data["levels"]:
+    if "floor" in data["levels"] and data["levels"]["floor"] == data["levels"]["local"]:
         return data
     return edited(data, "evidence.local", local_ball(data))
 
@@ -42,10 +43,10 @@ def local_ball(data: Document) -> Document:
         with np.errstate(all="ignore"):
             J = around(P / c1)
     except (TypeError, ValueError, OverflowError, np.linalg.LinAlgError):
-        return ball(np.eye(n), ones(n))
+        return centred(np.eye(n), ones(n))
     if not np.isfinite(J).all():
-        return ball(np.eye(n), ones(n))
-    return ball(J, multipliers(edited(data, "evidence.local", ball(J, ones(n))), J, [P], np.zeros((n, n))))
+        return centred(np.eye(n), ones(n))
+    return centred(J, multipliers(edited(data, "evidence.local", centred(J, ones(n))), J, [P], np.zeros((n, n))))
 
 
 def around(*nodes: np.ndarray) -> np.ndarray:
@@ -69,6 +70,11 @@ def ball(J: Any, rows: Any, weight: Any = None) -> Document:
     return {
         "J": encode(J), "multipliers": encode(rows), "weight": encode(indifferent if weight is None else weight),
     }  # fmt: skip
+
+
+def centred(J: Any, rows: Any, weight: Any = None, edge: float = 0.0, order: int = 1) -> Document:
+    """The ball of the section `local`."""
+    return ball(J, rows, weight) | {"edge": float(edge).hex(), "order": order}
 
 
 def exactly(A: np.ndarray) -> fmpq_mat:
@@ -109,9 +115,17 @@ def slab_of(middle: np.ndarray, end: np.ndarray, duration: float) -> Document:
     return {"middle": encode(middle), "end": encode(end), "duration": float(duration).hex(), "path": None}
 
 
+def enlarged_from(start: Any) -> Document:
+    return ASYMPTOTIC | {"kind": "enlarged", "start": encode(start)}
+
+
+def reached_from(start: Any, centre: Any) -> Document:
+    return enlarged_from(start) | {"kind": "reached", "centre": encode(centre)}
+
+
 def enlarge(data: Document, nodes: Sequence[np.ndarray], durations: Sequence[float]) -> Document:
     """The enlarged claim from the first node, with a slab to each of the others."""
-    data = edited(data, "claim", {"kind": "enlarged", "start": encode(nodes[0])})
+    data = edited(data, "claim", enlarged_from(nodes[0]))
     slabs = []
     data["evidence"]["tube"] = [slab_of(nodes[-1], nodes[-1], 1.0) | ball(nodes[-1], ones(len(nodes[0])))]
     for (before, after), h in zip(pairwise(nodes), durations, strict=True):

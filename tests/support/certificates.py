@@ -28,7 +28,8 @@ from certify.checker.ring import Ring
 
 Document = dict[str, Any]
 LEAF = 255
-INNER = {"asymptotic": "local", "practical": "floor"}  # the name of the inner level
+AROUND_A_LEVEL = ("practical", "nearby")
+ASYMPTOTIC: Document = {"kind": "asymptotic", "rate": (0.0).hex(), "sample": None}
 
 
 def encode(array: Any) -> str:
@@ -62,7 +63,7 @@ def make(
     dynamics: Sequence[Any],
     layers: Sequence[tuple[Any, Any]],
     P: Any,
-    levels: tuple[float, float],
+    levels: Sequence[float],
     *,
     states: Sequence[str] = ("x",),
     inputs: Sequence[str] = ("u",),
@@ -80,23 +81,33 @@ def make(
     claim: str = "asymptotic",
     uncertain: Sequence[tuple[str, str, str]] = (),
     cells: Sequence[int] | None = None,
+    time: str = "continuous",
+    rate: float = 0.0,
+    sample: tuple[str, str] | None = None,
+    order: int = 1,
 ) -> Document:
     """A certificate's document; the root box is the least one that binary64 can name, unless it is given.
 
     `uncertain` has a name and the two ends of each range, of which a single cell is made unless `cells` says more.
+    `levels` are c1 and c2, under a practical claim without a ball c0 and c2, with one c0, c1 and c2. `order` is that of
+    the series on leaves.
     """
     P = np.atleast_2d(np.asarray(P, dtype=np.float64))
     T = np.eye(len(P)) if T is None else np.atleast_2d(np.asarray(T, dtype=np.float64))
     if root is None:
-        root = least_root(P, T, levels[1])
+        root = least_root(P, T, levels[-1])
+    edges = ("floor", "local", "roa")[claim not in AROUND_A_LEVEL :]
+    if claim in AROUND_A_LEVEL and len(levels) == 2:
+        levels = (levels[0], *levels)
     arrays = [(np.atleast_2d(np.asarray(W, dtype=np.float64)), np.atleast_1d(b)) for W, b in layers]
     from tests.support.balls import with_ball
 
     return with_ball(rehash({
-        "schema": "certify-certificate/5",
-        "claim": {"kind": claim},
+        "schema": "certify-certificate/6",
+        "claim": {"kind": claim, "rate": float(rate).hex(), "sample": sample and list(sample)},
         "plant": {
             "name": "plant",
+            "time": time,
             "states": list(states),
             "inputs": list(inputs),
             "uncertain": [{"name": name, "range": [lo, hi]} for name, lo, hi in uncertain],
@@ -115,14 +126,16 @@ def make(
             "sha256": "",
         },
         "lyapunov": {"kind": "quadratic", "P": encode(P)},
-        "levels": {INNER[claim]: float(levels[0]).hex(), "roa": float(levels[1]).hex()},
+        "levels": {name: float(level).hex() for name, level in zip(edges, levels, strict=True)},
         "evidence": {
             "kind": "partition-tree",
             "T": encode(T),
             "root": encode(root),
             "tree": base64.b64encode(tree).decode("ascii"),
+            "order": order,
             "cells": [1] * len(uncertain) if cells is None else list(cells),
             "local": None,
+            "contraction": None,
             "tube": [],
         },
         "provenance": {"tool": "written by hand"},

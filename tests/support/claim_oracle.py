@@ -36,7 +36,7 @@ Matrix = list[list[Fraction]]
 LARGEST_FILE = 256 * 2**20
 EXACT = ("format", "hash", "levels", "lyapunov", "equilibrium", "domain", "coordinates", "root", "centring", "tree")
 PRECISION = 160
-INNER = {"asymptotic": "local", "practical": "floor"}
+EDGES = {"asymptotic": ("local", "roa"), "practical": ("floor", "local", "roa")}
 
 
 def is_practical(data: Document) -> bool:
@@ -176,11 +176,12 @@ def _expression(node: Any, names: set[str]) -> None:
 def _shape(data: Any) -> None:
     """Every section, key, count and number."""
     _section(data, "schema", "claim", "plant", "policy", "lyapunov", "levels", "evidence", "provenance")
-    _need(data["schema"] == "certify-certificate/5", "schema")
+    _need(data["schema"] == "certify-certificate/6", "schema")
     _need(isinstance(data["provenance"], dict), "provenance")
     plant, policy, evidence = data["plant"], data["policy"], data["evidence"]
-    _section(plant, "name", "states", "inputs", "uncertain", "dynamics", "u_eq", "domain", "input_bounds")
+    _section(plant, "name", "time", "states", "inputs", "uncertain", "dynamics", "u_eq", "domain", "input_bounds")
     _need(isinstance(plant["name"], str), "name")
+    _need(plant["time"] == "continuous", "time: this page knows of no steps")
     _need(plant["uncertain"] == [], "nothing uncertain: this page knows of values only")
     names = _words(plant["states"], 64) + _words(plant["inputs"], 64)
     _need(len(set(names)) == len(names), "different names")
@@ -216,15 +217,16 @@ def _shape(data: Any) -> None:
         _need(isinstance(policy["clip"], list) and len(policy["clip"]) == 2, "clip")
         _need(np.all(_array(policy["clip"][0], m) < _array(policy["clip"][1], m)), "clip: lo < hi")
 
-    _section(data["claim"], "kind")
-    _need(data["claim"]["kind"] in tuple(INNER), "claim")
+    _section(data["claim"], "kind", "rate", "sample")
+    _need(data["claim"]["kind"] in tuple(EDGES), "claim")
+    _need(data["claim"]["rate"] == (0.0).hex() and data["claim"]["sample"] is None, "neither a rate nor a sample")
     _section(data["lyapunov"], "kind", "P")
     _need(data["lyapunov"]["kind"] == "quadratic", "lyapunov")
     _array(data["lyapunov"]["P"], n, n)
-    inner = INNER[data["claim"]["kind"]]
-    _section(data["levels"], inner, "roa")
-    _binary64(data["levels"][inner])
-    _binary64(data["levels"]["roa"])
+    practical, edges = data["claim"]["kind"] == "practical", EDGES[data["claim"]["kind"]]
+    _section(data["levels"], *edges)
+    for edge in edges:
+        _binary64(data["levels"][edge])
     if isinstance(evidence, dict) and evidence.get("kind") == "trusted-solver":
         _section(evidence, "kind", "solver", "version", "precision", "queries")
         _binary64(evidence["precision"])
@@ -234,17 +236,21 @@ def _shape(data: Any) -> None:
         words = [evidence["solver"], evidence["version"], *(word for pair in pairs for word in pair)]
         _need(all(isinstance(w, str) and w and not set(w) & set(" \n\t") for w in words), "words")
         return
-    _section(evidence, "kind", "T", "root", "tree", "cells", "local", "tube")
+    _section(evidence, "kind", "T", "root", "tree", "order", "cells", "local", "contraction", "tube")
+    _need(evidence["contraction"] is None, "no contraction")
+    _need(type(evidence["order"]) is int and evidence["order"] == 1, "order")
     _need(evidence["cells"] == [], "no cells of nothing")
     _need(evidence["kind"] == "partition-tree", "kind")
     _array(evidence["T"], n, n)
     _array(evidence["root"], n)
     _bytes(evidence["tree"])
     _need(evidence["tube"] == [], "no tube: this page knows of no enlarged claim")
-    if inner == "floor":
+    if practical:
         _need(evidence["local"] is None, "no ball")
         return
-    _section(evidence["local"], "J", "multipliers", "weight")
+    _section(evidence["local"], "J", "multipliers", "weight", "edge", "order")
+    _need(evidence["local"]["edge"] == (0.0).hex(), "edge")
+    _need(type(evidence["local"]["order"]) is int and evidence["local"]["order"] == 1, "order")
     _array(evidence["local"]["J"], n, n)
     _array(evidence["local"]["multipliers"], 3, n)
     _array(evidence["local"]["weight"], n, n)
@@ -402,6 +408,8 @@ def exact_faults(data: Document) -> dict[str, str]:
     c1, c2 = map(Fraction, ring_of(data))
     if not 0 < c1 <= c2:
         faults["levels"] = "0 < c1 <= c2"
+    if is_practical(data) and Fraction(float.fromhex(data["levels"]["local"])) != c1:
+        faults["levels"] = "there is no ball, and c0 is not c1"
     P = _matrix(_array(data["lyapunov"]["P"], n, n))
     inverse = _inverse(P)
     if inverse is None:

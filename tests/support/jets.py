@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import combinations_with_replacement
 from typing import Any
 
@@ -18,7 +19,17 @@ def plain(c: Any, error: Any, a: Any, slack: Any, Q: Any, E: Any, K: Any = None)
     """A model without the errors of inputs, and, if no K is given, without one."""
     k = len(a)
     thirds = np.zeros(k * (k + 1) * (k + 2) // 6) if K is None else np.array(K, float)
-    return Jet(c, error, a, slack, Q, thirds, E, np.zeros(1), np.zeros((1, k, k)))
+    return Jet(c, error, a, slack, Q, thirds, E, np.zeros(1), np.zeros((1, k, k)), np.zeros(0), np.zeros((0, k)), 0.0)
+
+
+def given(jet: Jet, y: Sequence[Any]) -> Jet:
+    """The model where what is uncertain has these y: v(0) and the gradient in binary64, and that rounding apart."""
+    y = [float(v) for v in y]
+    c, a = jet.c + np.dot(y, jet.c_y), jet.a + np.tensordot(y, jet.a_y, 1)
+    lost = (len(y) + 4) * 2.0**-50
+    error = jet.error + lost * (abs(jet.c) + np.abs(jet.c_y).sum())
+    slack = jet.slack + lost * (np.linalg.norm(jet.a) + np.linalg.norm(jet.a_y))
+    return replace(jet, c=c, a=a, error=error, slack=slack, c_y=np.zeros(0), a_y=np.zeros((0, len(a))))
 
 
 def no_units(k: int) -> Units:

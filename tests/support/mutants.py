@@ -1058,7 +1058,7 @@ PRACTICAL = ("scalar", "linear", "rotor, output", "rotor, preactivation")
 
 
 def asymptotic_levels(data: Document) -> dict[str, str]:
-    return {"local": data["levels"]["floor"], "roa": data["levels"]["roa"]}
+    return {key: data["levels"][key] for key in ("local", "roa")}
 
 
 def practical() -> Iterator[Mutant]:
@@ -1078,9 +1078,10 @@ def practical() -> Iterator[Mutant]:
             ("format", "claim asymptotic", edited(data, "claim.kind", "asymptotic")),
             ("format", "claim in capitals", edited(data, "claim.kind", "Practical")),
             ("format", "claim of nothing", edited(data, "claim", {})),
-            ("format", "local in place of floor", edited(data, "levels", asymptotic_levels(data))),
-            ("format", "local as well", edited(data, "levels", lambda v: {**v, "local": v["floor"]})),
-            ("format", "floor missing", edited(data, "levels", lambda v: {"roa": v["roa"]})),
+            ("format", "floor missing", edited(data, "levels", asymptotic_levels(data))),
+            ("format", "local missing", edited(data, "levels", lambda v: {k: v[k] for k in ("floor", "roa")})),
+            ("format", "roa missing", edited(data, "levels", lambda v: {k: v[k] for k in ("floor", "local")})),
+            ("levels", "local above floor, without a ball", with_level(data, "local", np.nextafter(c0, 9))),
             ("hash", "bit of a weight", array(data, "policy.layers.0.weight", at_index(0, lambda v: flipped(v, 3)))),
             ("levels", "floor 0", with_level(data, "floor", 0.0)),
             ("levels", "floor -0", with_level(data, "floor", -0.0)),

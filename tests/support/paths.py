@@ -16,9 +16,9 @@ from certify.reference.balls import PRECISION
 from certify.reference.document import read
 from certify.reference.loop import Loop
 from certify.reference.refusal import Refused
-from tests.support.balls import TINY, around, ball, exactly, slab_of
+from tests.support.balls import TINY, around, ball, exactly, reached_from, slab_of
 from tests.support.certificates import Document, edited, encode
-from tests.support.reference import CONTINUOUS, dump
+from tests.support.reference import dump
 
 GRID = np.geomspace(1e-4, 1e4, 65)  # of edge, and of motion as a part of edge / share^2
 SHARE = 0.5
@@ -38,9 +38,7 @@ def follow(
             along(loop, centres[k : k + 2], (nodes[k], (nodes[k] + nodes[k + 1]) / 2, nodes[k + 1]), h, share)
             for k, h in enumerate(durations)
         ]
-    data = edited(
-        data, "claim", {"kind": "reached", **CONTINUOUS, "start": encode(nodes[0]), "centre": encode(centres[0])}
-    )
+    data = edited(data, "claim", reached_from(nodes[0], centres[0]))
     return edited(data, "evidence.tube", slabs)
 
 

@@ -18,7 +18,7 @@ from certify.certificate import parse_certificate
 from certify.checker.document import Certificate, Slab
 from certify.closed_loop import ClosedLoop
 from certify.engines.path import find_path
-from tests.support.balls import with_ball
+from tests.support.balls import reached_from, with_ball
 from tests.support.certificates import Document, decode, dump, edited, encode, verdict
 from tests.support.oracle import ball, policies_in_arb, value_of
 
@@ -63,7 +63,7 @@ def surrounded(data: Document, centre: Sequence[float], start: Any, seconds: flo
     tube, _ = find_path(loop_of(data), c, P_0, P / c2, seconds)
     if tube is None:
         return None
-    result = edited(data, "claim", {"kind": "reached", "start": encode(P_0), "centre": encode(c)})
+    result = edited(data, "claim", reached_from(P_0, c))
     result["evidence"]["tube"] = [
         {"middle": encode(slab.middle), "end": encode(slab.end), "duration": float(slab.duration).hex(),
          "J": encode(slab.J), "multipliers": encode(slab.multipliers), "weight": encode(slab.weight),

@@ -1,0 +1,431 @@
+"""Enclosures over steps, against points: jets that are affine in what is uncertain, the mean of f over a period on a
+ball and on leaves, with what is uncertain switching within the period, and the inequality of a step around a level."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Callable
+from dataclasses import replace
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import pytest
+from flint import arb, ctx, fmpq, fmpq_mat
+from numpy.random import Generator
+
+from certify.checker.ball import Units
+from certify.checker.case import Case
+from certify.checker.decrease import Level, Models, sides, size_beyond
+from certify.checker.document import Multipliers
+from certify.checker.exact import exactly
+from certify.checker.flow import Series
+from certify.checker.jets import Jet, between, uncertain
+from certify.checker.local import Local
+from certify.checker.network import enclose_on_boxes
+from certify.checker.ring import Ring
+from tests.checker.test_ball import points
+from tests.checker.test_cubic import FUNCTIONS, JUST, Member, closeness, derivatives, random_jet, shares, value
+from tests.checker.test_uncertain import holds
+from tests.support.certificates import Document, edited, make, parse
+from tests.support.jets import curved, given, no_units, plain
+from tests.support.leaves import on_boxes
+from tests.support.stepped_loops import fitted
+
+# ------------------------------------------------------------------------------------------ jets with what is uncertain
+
+
+def swaying(generator: Generator, k: int, U: np.ndarray, count: int, size: float) -> Jet:
+    jet = random_jet(generator, k, U, size)
+    by = size * 2.0 ** generator.integers(-8, 0, 2)
+    c_y, a_y = by[0] * generator.standard_normal(count), by[1] * generator.standard_normal((count, k))
+    return replace(jet, c_y=c_y, a_y=a_y)
+
+
+class At(Member):
+    """A function that a jet holds where what is uncertain has these y."""
+
+    def __init__(self, jet: Jet, own: float, common: list[float], y: list[float]) -> None:
+        super().__init__(jet, own, common)
+        for sign, c, a in zip(y, jet.c_y.tolist(), jet.a_y.tolist(), strict=True):
+            self.c += arb(sign) * arb(c)
+            self.a = [p + arb(sign) * arb(q) for p, q in zip(self.a, a, strict=True)]
+
+
+@pytest.mark.parametrize("size", [1e-6, 0.02, 0.2])
+def test_jets_that_are_affine_in_y_contain_what_they_stand_for(size: float) -> None:
+    """Sums, products and functions at the corners of y, in the middle and anywhere, with the errors that are shared."""
+    generator, used, k, m, count = np.random.default_rng(int(size * 1e6)), 0.0, 2, 2, 2
+    with ctx.workprec(2500):
+        for number in range(12):
+            U = shares(generator, m, k) * size
+            common = generator.choice([-1.0, 1.0, 0.5, 0.0], m).tolist()
+            x, y = (swaying(generator, k, U, count, size) for _ in range(2))
+            where = points(generator, k)
+            corners = [list(signs) for signs in itertools.product((-1.0, 1.0), repeat=count)]
+            for at in (corners[number % 4], [0.0, 0.0], generator.uniform(-1, 1, count).tolist()):
+                v, w = (At(jet, float(generator.choice([-JUST, JUST, 0.0])), common, at) for jet in (x, y))
+                sums = [p + q for p, q in zip(v.a, w.a, strict=True)]
+                products = [v.c * q + w.c * p for p, q in zip(v.a, w.a, strict=True)]
+                closeness(given(x + y, at), common, lambda d, v=v, w=w: v(d) + w(d), sums, where)
+                closeness(given(-x, at), common, lambda d, v=v: -v(d), [-p for p in v.a], where)
+                truth: Any = lambda d, v=v, w=w: v(d) * w(d)  # noqa: E731
+                used = max(used, closeness(given(x * y, at), common, truth, products, where))
+                for name in FUNCTIONS:
+                    jet = replace(x, c=np.float64(abs(x.c) + 14 * size)) if name in ("inv", "sqrt") else x
+                    f, u = jet.function(name), At(jet, v.own, common, at)
+                    if not np.isfinite(f.E).all():
+                        assert name in ("inv", "sqrt")
+                        continue
+                    slope = derivatives(name, u.c)[1]
+                    truth = lambda d, u=u, name=name: value(name, u(d))  # noqa: E731
+                    used = max(used, closeness(given(f, at), common, truth, [slope * p for p in u.a], where))
+    assert used > 0.05
+
+
+def test_what_is_left_of_y_is_of_second_order() -> None:
+    """The error of sin(c + r y) falls by four where r is halved, that of a range without a symbol by two."""
+    U = np.zeros((0, 1, 1))
+    ends = [(1 - r, 1 + r) for r in (Fraction(1, 2**8), Fraction(1, 2**9))]
+    known = [uncertain(*pair, U, 0, 1).function("sin").error for pair in ends]
+    ranges = [between(*pair, U, 1).function("sin").error for pair in ends]
+    assert known[0] / known[1] == pytest.approx(4, rel=0.05) and ranges[0] / ranges[1] == pytest.approx(2, rel=0.05)
+
+
+# ----------------------------------------------------------------------------------------------- the mean over a period
+
+EQUATIONS: list[Any] = [
+    ["+", ["-", "y", ["*", "q", "x"]], ["/", ["sin", ["*", "p", "x", "y"]], "3"],
+     ["*", "p", ["-", ["exp", ["/", "x", "2"]], "1"]], ["*", "1/2", ["-", ["sqrt", ["+", "1", ["*", "q", "y"]]], "1"]]],
+    ["+", "u", ["*", "q", "q", ["tanh", "x"]], ["*", "p", ["atan", ["-", "y", "x"]]], ["-", ["cos", "y"], "1"],
+     ["/", "x", ["+", "2", ["*", "p", "y"]]], ["tan", ["*", "q", "y"]], ["*", "p", "x", "x"]],
+]  # fmt: skip
+
+
+def curved_plant(disturbed: bool, lo: str, hi: str, order: int, wide: float = 1.0) -> Document:
+    """Every function of the format, two uncertain quantities, two layers. Nothing here has to be stable."""
+    generator = np.random.default_rng(8)
+    layers = [
+        (generator.standard_normal((4, 2)), generator.uniform(-1, 1, 4)),
+        (generator.standard_normal((1, 4)), [0.3]),
+    ]
+    equations = [["+", tree, ["*", "p", "1/8"]] for tree in EQUATIONS] if disturbed else EQUATIONS
+    ends = [(str(Fraction(1, 2) - Fraction(wide) / 4), str(Fraction(1, 2) + Fraction(wide) / 4)),
+            (str(-Fraction(wide) / 2), str(Fraction(wide) / 2))]  # fmt: skip
+    data = make(
+        equations, layers, np.eye(2), (0.01, 0.01, 0.01) if disturbed else (0.01, 0.01), states="xy", centre="output",
+        domain=[("-3", "3")] * 2, input_bounds=[("-9", "9")], scale=[-1.5], sample=(lo, hi), order=order,
+        claim="practical" if disturbed else "asymptotic", uncertain=[("q", *ends[0]), ("p", *ends[1])],
+    )  # fmt: skip
+    return edited(fitted(data), "evidence.local.order", order)
+
+
+def field(x: np.ndarray, u: np.ndarray, w: np.ndarray, disturbed: bool) -> np.ndarray:
+    (a, b), (q, p) = x, w
+    first = b - q * a + np.sin(p * a * b) / 3 + p * np.expm1(a / 2) + (np.sqrt(1 + q * b) - 1) / 2
+    second = u[0] + q * q * np.tanh(a) + p * np.arctan(b - a) + np.cos(b) - 1
+    second = second + a / (2 + p * b) + np.tan(q * b) + p * a * a
+    return np.array([first, second]) + disturbed * p / 8
+
+
+def policy(data: Document, x: np.ndarray) -> np.ndarray:
+    c = parse(data)
+    h, h0 = x, np.zeros_like(x)
+    for W, bias in zip(c.policy.weights[:-1], c.policy.biases[:-1], strict=True):
+        h, h0 = np.tanh(W @ h + bias), np.tanh(W @ h0 + bias)
+    last, bias = c.policy.weights[-1], c.policy.biases[-1]
+    return np.asarray(c.policy.scale * (np.tanh(last @ h + bias) - np.tanh(last @ h0 + bias)))
+
+
+def travelled(x: np.ndarray, f: Callable[[np.ndarray, np.ndarray], np.ndarray], pieces: list[Any]) -> list[np.ndarray]:
+    """The states at the ends of pieces (time, values), and on the way; Runge and Kutta's rule of 20 steps a piece."""
+    path = [x]
+    for time, w in pieces:
+        step = time / 20
+        for _ in range(20):
+            at = path[-1]
+            k1 = f(at, w)
+            k2 = f(at + step / 2 * k1, w)
+            k3 = f(at + step / 2 * k2, w)
+            path.append(at + step / 6 * (k1 + 2 * k2 + 2 * k3 + f(at + step * k3, w)))
+    return path
+
+
+def switching(generator: Generator, lo: float, hi: float, ends: np.ndarray) -> tuple[float, list[Any], np.ndarray]:
+    """A period, its pieces with the values of both quantities, and their means; most pieces are at ends of ranges."""
+    h = float(generator.choice([lo or hi / 64, hi, generator.uniform(lo, hi)]))
+    count = int(generator.choice([1, 2, 3]))
+    times = generator.dirichlet(np.ones(count)) * h
+    values = np.where(generator.random((count, 2)) < 0.8, ends[generator.integers(2, size=(count, 2)), [0, 1]],
+                      generator.uniform(ends[0], ends[1], (count, 2)))  # fmt: skip
+    return h, list(zip(times, values, strict=True)), times @ values / h
+
+
+def within_jet(jet: Jet, y: list[float], d: np.ndarray, true: float, sure: float) -> bool:
+    at = given(jet, y)
+    with ctx.workprec(120):
+        middle = at.c + at.a @ d + float(curved(at, d.tolist()).mid())
+    room = at.error + at.slack * np.linalg.norm(d) + d @ at.whole @ d
+    return bool(abs(true - middle) <= room + sure)
+
+
+CASES = [(False, "1/10", "1/10", 1), (False, "1/10", "1/10", 2), (False, "1/20", "1/10", 3), (False, "0", "1/10", 4),
+         (True, "1/10", "1/10", 3), (True, "1/20", "1/10", 2), (True, "1/20", "1/10", 4)]  # fmt: skip
+
+
+@pytest.mark.parametrize(("disturbed", "lo", "hi", "order"), CASES)
+def test_the_ball_holds_the_mean_over_a_period_in_which_what_is_uncertain_switches(
+    disturbed: bool, lo: str, hi: str, order: int
+) -> None:
+    for wide in (1.0, 1 / 64):
+        data, generator = curved_plant(disturbed, lo, hi, order, wide), np.random.default_rng(order)
+        with np.errstate(all="ignore"):
+            local = Local(Case(parse(data)))
+            [cell] = local.case.cells
+            G, way = local.G(cell), local.way
+        assert way is not None and all(np.isfinite(g.E).all() for g in G)
+        ends = np.array([[float(q) for q in pair] for pair in cell]).T
+        widest = 0.0
+        for d in (np.array(p) for _ in range(6) for p in points(generator, 2)[:5]):
+            x = local.J @ d
+            u = policy(data, x)
+            h, pieces, mean = switching(generator, float(Fraction(lo)), float(Fraction(hi)), ends)
+            path = travelled(x, lambda at, w, u=u: field(at, u, w, disturbed), pieces)
+            y = ((2 * mean - ends.sum(0)) / (ends[1] - ends[0])).tolist()
+            if lo != hi:
+                y.append((2 * h - float(Fraction(lo)) - float(Fraction(hi))) / float(Fraction(hi) - Fraction(lo)))
+            true = (path[-1] - x) / h
+            for jet, each in zip(G, true.tolist(), strict=True):
+                assert within_jet(jet, y, d, each, 1e-9), (d, pieces)
+            moved = np.max(np.abs(np.array(path) - x), axis=0)
+            assert np.all(moved <= way[0] + way[1] * np.linalg.norm(d) + 1e-9)
+            widest = max(widest, float(np.max(np.abs(true))))
+        assert max(np.linalg.norm(g.whole) + g.error + g.slack for g in G) < 40 * widest  # not everything is held
+
+
+@pytest.mark.parametrize(("disturbed", "lo", "hi", "order"), CASES)
+def test_leaves_hold_the_mean_over_a_period_in_which_what_is_uncertain_switches(
+    disturbed: bool, lo: str, hi: str, order: int
+) -> None:
+    data, generator = curved_plant(disturbed, lo, hi, order), np.random.default_rng(order + 10)
+    c = replace(parse(data), levels={"floor": 1.0, "local": 1.0, "roa": 4.0})
+    ring = Ring(Case(c))
+    centre, radius = 0.3 * generator.standard_normal((2, 6)), 10.0 ** generator.uniform(-4, -1.5, (2, 6))
+    with np.errstate(all="ignore"):
+        states, G, between_ = on_boxes(ring, centre, radius)
+        mid, slopes, wide = enclose_on_boxes(ring.net, *ring.states(centre, radius))
+        rise = ring.rise(states, G)
+    ends = np.array([[float(q) for q in pair] for pair in c.ranges]).T
+    symbols = 2 + (lo != hi)
+    known = np.flatnonzero(np.isfinite(G[0].r + G[1].r))
+    assert len(known) >= 4
+    for index in known:
+        for _ in range(12):
+            d = np.where(generator.random(2) < 0.5, np.sign(generator.standard_normal(2)), generator.uniform(-1, 1, 2))
+            x = centre[:, index] + radius[:, index] * d
+            u = policy(data, x)
+            h, pieces, mean = switching(generator, float(Fraction(lo)), float(Fraction(hi)), ends)
+            path = travelled(x, lambda at, w, u=u: field(at, u, w, disturbed), pieces)
+            y = ((2 * mean - ends.sum(0)) / (ends[1] - ends[0])).tolist()
+            if lo != hi:
+                y.append((2 * h - float(Fraction(lo)) - float(Fraction(hi))) / float(Fraction(hi) - Fraction(lo)))
+            true = (path[-1] - x) / h
+            for model, each in zip(G, true.tolist(), strict=True):
+                assert holds(replace_slack(model), index, 2, symbols, [*d, *y], arb(each)), (index, pieces)
+            D = float((path[-1] @ path[-1] - x @ x) / h)
+            assert holds(replace_slack(rise), index, 2, symbols, [*d, *y], arb(D)), (index, pieces)
+            if x @ x <= 4:
+                assert np.all(np.array(path) >= between_[0, :, index] - 1e-9)
+                assert np.all(np.array(path) <= between_[1, :, index] + 1e-9)
+    assert np.all(wide >= 0) and mid.shape == (1, 6) and slopes.shape == (1, 2, 6)
+
+
+def replace_slack(model: Any) -> Any:
+    """With room for what integration and rounding of points may miss."""
+    return replace(model, r=model.r + 1e-9)
+
+
+def idle(equations: list[Any], names: str, h: str, order: int = 1) -> Document:
+    """A practical claim about equations that ignore the input, with quantities in [-1, 1]."""
+    n = len(equations)
+    data = make(
+        [["+", tree, ["*", "0", "u"]] for tree in equations], [(np.zeros((1, n)), [0.0])], np.eye(n), (0.25,) * 3,
+        states="xy"[:n], domain=[("-3", "3")] * n, claim="practical", uncertain=[(name, "-1", "1") for name in names],
+        sample=(h, h), order=order,
+    )  # fmt: skip
+    return edited(fitted(data), "evidence.local.order", order)
+
+
+def test_a_symbol_in_the_place_of_the_mean_is_not_enough_for_its_square() -> None:
+    """x' = q^2, q = 1 and -1 for half a period each: the mean of q is 0, that of q^2 is 1."""
+    case = Case(parse(idle([["**", "q", 2]], "q", "1/8")))
+    [g] = on_boxes(Ring(case), np.zeros((1, 1)), np.full((1, 1), 0.1))[1]
+    assert float(g.c[0] + g.r[0]) >= 1.0
+    [jet] = Local(case).G(next(iter(case.cells)))
+    assert jet.c + jet.error >= 1.0
+
+
+@pytest.mark.parametrize("order", [1, 2, 3])
+def test_the_order_of_values_within_a_period_counts(order: int) -> None:
+    """x' = q, y' = x: the same, and linear in q."""
+    h, case = 0.25, Case(parse(idle(["q", "x"], "q", "1/4", order)))
+    for jet, each in zip(Local(case).G(next(iter(case.cells))), (0.0, h / 4), strict=True):
+        assert within_jet(jet, [0.0], np.zeros(2), each, 1e-12)
+    for model, each in zip(on_boxes(Ring(case), np.zeros((2, 1)), np.full((2, 1), 0.01))[1], (0.0, h / 4), strict=True):
+        assert holds(replace_slack(model), 0, 2, 1, [0.0, 0.0, 0.0], arb(each))
+
+
+@pytest.mark.parametrize("order", [1, 2, 3, 5])
+def test_what_switches_within_a_period_may_do_what_no_constant_does(order: int) -> None:
+    """x' = q, y' = p x: from 0, with p = 1, and q = 1 and then -1, y rises by h^2/4, and q has mean 0."""
+    h, case = 0.25, Case(parse(idle(["q", ["*", "p", "x"]], "qp", "1/4", order)))
+    path = travelled(np.zeros(2), lambda at, w: np.array([w, at[0]]), [(h / 2, 1.0), (h / 2, -1.0)])
+    true = path[-1] / h
+    assert true == pytest.approx([0, h / 4], abs=1e-12)
+    for jet, each in zip(Local(case).G(next(iter(case.cells))), true, strict=True):
+        assert within_jet(jet, [0.0, 1.0], np.zeros(2), each, 1e-12)
+    for model, each in zip(on_boxes(Ring(case), np.zeros((2, 1)), np.full((2, 1), 0.01))[1], true, strict=True):
+        assert holds(replace_slack(model), 0, 2, 2, [0.0, 0.0, 0.0, 1.0], arb(each))
+
+
+@dataclasses.dataclass(frozen=True)
+class Number:
+    """An arithmetic for series, of one number each."""
+
+    v: arb
+
+    def __add__(self, other: Number) -> Number:
+        return Number(self.v + other.v)
+
+    def __neg__(self) -> Number:
+        return Number(-self.v)
+
+    def __mul__(self, other: Number) -> Number:
+        return Number(self.v * other.v)
+
+    def function(self, name: str) -> Number:
+        return Number(1 / self.v if name == "inv" else getattr(self.v, name)())
+
+
+@pytest.mark.parametrize("name", ["sin", "cos", "exp", "tanh", "atan", "sqrt", "inv"])
+@pytest.mark.parametrize("length", [1, 2, 4, 7])
+def test_coefficients_of_functions_are_those_of_the_series(name: str, length: int) -> None:
+    """phi(v) at several instants, from the coefficients of v: what is left is of the order that follows."""
+    generator, count = np.random.default_rng(length), 7
+    v = [Number(arb(float(c))) for c in [1.5, *generator.uniform(-1, 1, length - 1)]]
+    with ctx.workprec(400):
+        found = Series(v, count, lambda q: Number(arb(q.numerator) / q.denominator)).function(name).parts
+        for t in (arb(2) ** -20, -(arb(2) ** -21)):
+            at = sum((c.v * t**k for k, c in enumerate(v)), arb(0))
+            left = Number(at).function(name).v - sum((c.v * t**k for k, c in enumerate(found)), arb(0))
+            assert abs(left) < 1000 * abs(t) ** count
+
+
+# -------------------------------------------------------------------------------------------- the inequality of a step
+
+
+def stepped(generator: Generator, n: int, units: int, count: int) -> tuple[list[Jet], Units]:
+    m = 2
+    U = np.zeros((m, n, n))
+    jets = [
+        replace(
+            swaying(generator, n, U, count, 0.4),
+            B=generator.standard_normal(m),
+            c=np.float64(0.2 * generator.standard_normal()),
+        )
+        for _ in range(n)
+    ]
+    return jets, Units(generator.standard_normal((m, units)), np.asarray(shares(generator, units, n)))
+
+
+def beyond(jets: list[Jet], units: Units, generator: Generator, d: np.ndarray) -> np.ndarray:
+    """What some member of the models has beyond f and a.d; all errors are at an end of what they may be."""
+    errors = np.array([generator.choice([-1, 1]) * (d @ R @ d) for R in units.R])
+    own = np.array([generator.choice([-1, 1]) * (d @ jet.E @ d) for jet in jets])
+    with ctx.workprec(120):
+        curves = np.array([float(curved(jet, d.tolist()).mid()) for jet in jets])
+    return curves + np.array([jet.B for jet in jets]) @ units.L @ errors + own
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+def test_gamma_bounds_what_models_have_beyond_their_first_order(n: int) -> None:
+    generator, used = np.random.default_rng(n), 0.0
+    for _ in range(15):
+        jets, units = stepped(generator, n, 3, 0)
+        root = generator.standard_normal((n, n))
+        P = root @ root.T + 0.1 * np.eye(n)
+        most = size_beyond(Models(np.eye(n), jets, units, True), P)
+        for _ in range(40):
+            d = generator.standard_normal(n)
+            d /= np.linalg.norm(d) * (1 + 2.0**-40)
+            d *= generator.choice([1.0, 1.0, 0.3])
+            g = beyond(jets, units, generator, d)
+            length = float(np.sqrt(g @ P @ g))
+            assert length <= most * (d @ d) * (1 + 1e-12)
+            used = max(used, length / (most * (d @ d)))
+    assert used > 0.2
+
+
+@pytest.mark.parametrize("n", [1, 2])
+@pytest.mark.parametrize("level", [False, True])
+@pytest.mark.parametrize("h", [0.0, 0.25, 1.0])
+def test_the_sides_of_a_step_bound_what_they_stand_for(n: int, level: bool, h: float) -> None:
+    """D + 2 lambda V + k (V - c0) at points is at most what the matrices say, at every corner and between them."""
+    generator, closest = np.random.default_rng(n), np.inf
+    for _ in range(12):
+        count = int(generator.integers(0, 3))
+        jets, units = stepped(generator, n, 2, count)
+        jets = [replace(jet, error=0.05 * generator.random(), slack=0.05 * generator.random()) for jet in jets]
+        root, J = generator.standard_normal((2, n, n))
+        P = root @ root.T + 0.1 * np.eye(n)
+        rate, c0, k = 0.3, 0.5, float(generator.choice([0.0, 0.7, 2.0]))
+        rows = np.exp(generator.uniform(-3, 1, (3, n))).tolist()
+        by = Multipliers(*(tuple(map(q, row)) for row in rows), np.eye(n))
+        models = Models(J, jets, units, not level)
+        most, around = size_beyond(models, P), Level(q(c0), q(k)) if level else None
+        for corner, signs in zip(models.corners(), itertools.product((1, -1), repeat=count), strict=True):
+            R = 2 * q(rate) * exactly(P)
+            decay, rest = sides(corner, exactly(P), R, by, None, q(h), q(most), around)
+            left = numbers(decay - rest)
+            for _ in range(25):
+                d = generator.standard_normal(n)
+                d /= np.linalg.norm(d) * (1 + 2.0**-40)
+                d *= generator.choice([1.0, 1.0, 0.5, 0.01])
+                at = [given(replace(jet, error=0.0, slack=0.0), list(signs)) for jet in jets]
+                f = np.array([jet.c for jet in at]) + np.array([jet.error for jet in jets]) * generator.choice(
+                    [-1, 1], n
+                )
+                away = generator.standard_normal((n, n))
+                away /= np.linalg.norm(away, axis=1, keepdims=True)
+                a = np.array([jet.a for jet in at]) + np.array([[jet.slack] for jet in jets]) * away
+                G = (f if level else 0 * f) + a @ d + beyond(jets, units, generator, d)
+                x = J @ d
+                V = x @ P @ x
+                true = 2 * x @ P @ G + h * G @ P @ G + 2 * rate * V + (k * (V - c0) if level else 0.0)
+                y = np.append(1.0, d) if level else d
+                bound = -float(y @ left @ y)
+                assert true <= bound + 1e-9 * (1 + abs(bound))
+                closest = min(closest, (bound - true) / (1 + abs(bound)))
+    assert closest < 0.5
+
+
+def test_what_is_left_counts_twice_with_the_value_that_it_is_added_to() -> None:
+    """Next to x = 0 the increment f + c d^2 has the square f^2 + 2 f c d^2 + c^2 d^4."""
+    f, c, small = 1.0, 0.5, 2.0**-30
+    jet = plain(np.float64(f), 0.0, np.zeros(1), 0.0, np.full((1, 1), c), np.zeros((1, 1)))
+    models, one = Models(np.full((1, 1), small), [jet], no_units(1), False), np.eye(1)
+    by, around = Multipliers((fmpq(1),), (fmpq(1),), (fmpq(1),), one), Level(q(1.0), q(0.0))
+    decay, rest = sides(models, exactly(one), exactly(0 * one), by, None, q(1.0), q(size_beyond(models, one)), around)
+    left = numbers(decay - rest)
+    for d in (1.0, -1.0, 0.5):
+        y, true = np.array([1.0, d]), (f + c * d * d) ** 2
+        assert true - 1e-6 <= -(y @ left @ y) <= true + c * c + 1e-6  # S_apart has c^2 more
+
+
+def q(value_: float) -> fmpq:
+    return fmpq(*float(value_).as_integer_ratio())
+
+
+def numbers(A: fmpq_mat) -> np.ndarray:
+    return np.array([[float(Fraction(int(v.p), int(v.q))) for v in row] for row in A.tolist()])
