@@ -156,22 +156,16 @@ def fourth(name: str, at: arb, y: arb, reach: arb) -> arb | None:
     return (abs(at) + reach).min(ONE)
 
 
-def turning(name: str, at: arb, y: arb, reach: arb) -> arb | None:
-    """k with |phi'(v) - phi'(y) - phi''(y) D| <= k D^2 for |D| = |v - y| <= reach; None where phi may be undefined.
+def largest_fourth(name: str, at: arb, y: arb, reach: arb) -> arb | None:
+    """A bound of |phi''''| itself, phi being `at` at y; None where phi may be undefined.
 
-    Half of the largest |phi'''| will do, its value at y being `at`. What `third` has for 1/v and sqrt will not: it is
-    six times the factor of D^3 in a remainder, whose derivative has a larger one. For 1/v this is exactly (y + 2 v) /
-    (y^3 v^2), and for a root w of v, s that of y, (2 s + w) / (4 s^3 w (s + w)^2): both fall as v rises.
+    What `fourth` has for 1/v and sqrt bounds a remainder, and not its derivative, which is larger.
     """
-    most = third(name, at, y, reach)
-    if most is None or name not in ("1/", "sqrt"):
-        return None if most is None else most / 2
-    if name == "1/":
-        size = arb(abs(y).lower())
-        least = arb((size - reach).lower())
-        return (size + 2 * least) / (size * size * size * least * least)
-    s, w = arb(y.lower()).sqrt(), arb((y - reach).lower()).sqrt()
-    return (2 * s + w) / (4 * s * s * s * w * (s + w) * (s + w))
+    bound = fourth(name, at, y, reach)
+    if bound is None or name not in ("1/", "sqrt"):
+        return bound
+    least = arb((abs(y) - reach).lower())
+    return 24 / least**5 if name == "1/" else 15 / (16 * least.sqrt() ** 7)
 
 
 def weights(policy: Policy) -> list[arb_mat]:

@@ -1,9 +1,10 @@
 """Rule `contraction`: in {V <= c0} any two trajectories approach each other, while what is uncertain does not change.
 
 So there is one equilibrium to which all of them go. For two points J d and J d' of a ball, with e = d - d' and m half
-of their sum, the components of F differ by a_i.e + 2 m'Q_i e and what is beyond the second order, whose Lipschitz
-constant the models have. b_i being the columns of J'P, the distance's derivative is a quadratic form in e, with one
-more for each entry of m, sum_j m_j e'N_j e, and as |m| <= 1 these are together below another: 2 e'w <= e'ge + w'(1/g)w.
+of their sum, the components of F differ by a_i.e + 2 m'Q_i e and by what is beyond the second order, of which the
+models have a Lipschitz constant. b_i being the columns of J'P, the distance's derivative is a quadratic form in e, with
+one more for each entry of m, sum_j m_j e'N_j e, and as |m| <= 1 these are together below another: 2 e'w <= e'ge +
+w'(1/g)w.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from .evidence import Contraction
 from .fields import exact
 from .local import cells
 from .loop import Field, Loop
+from .model import Model
 from .rational import identity, positive_definite
 from .refusal import Refused, require
 
@@ -56,11 +58,11 @@ def contracts(c: Certificate, J: fmpq_mat, g: Sequence[arb], F: Field) -> bool:
             N += column * arb_mat([f.Q.tolist()[j]])
         N = 2 * (N + N.transpose())
         turned += columns_scaled(N, inverse) * N
-    rest = total(2 * norm(column.entries()) * lip_of(f.lip) for column, f in zip(columns, F.components, strict=True))
+    rest = total(2 * norm(column.entries()) * steep(f) for column, f in zip(columns, F.components, strict=True))
     left = -(linear + linear.transpose()) - turned / 2
     return certainly_positive(left - diagonal([rest] * n))
 
 
-def lip_of(lip: arb | None) -> arb:
-    """The constant of a model, without which nothing is certain."""
-    return arb("nan") if lip is None else lip
+def steep(f: Model) -> arb:
+    """The Lipschitz constant of what is beyond the second order; without one nothing is certain."""
+    return arb("nan") if f.lip is None else f.beyond_square(f.lip).steep

@@ -13,12 +13,24 @@ from functools import cached_property
 
 from flint import arb, arb_mat
 
-from .balls import ZERO, absolute, derivatives, finite, fourth, identity, norm, total, turning
+from .balls import ZERO, absolute, derivatives, finite, fourth, identity, largest_fourth, norm, total
 from .refusal import Refused
 from .symmetric import linear_times_square, no_form, squared_norm
 
 Form = tuple[arb_mat, tuple[arb_mat, ...]]  # a column that is affine in y: c + sum_j y_j c_j; without c_j it is c
 SPREAD, SHARE = arb(0, 1), arb(0.5, 0.5)  # what a product of two y may be, and a square
+
+
+@dataclass(frozen=True)
+class Beyond:
+    """The largest size on the ball of a part of a number, and a Lipschitz constant of it: how `steep` it is."""
+
+    size: arb
+    steep: arb
+
+    @property
+    def both(self) -> arb:
+        return self.size + self.steep
 
 
 @dataclass(frozen=True)
@@ -32,7 +44,7 @@ class Model:
     with `da` likewise; all other numbers are balls that hold what they are for every y. Without `dv` there is no y in
     them.
 
-    `lip`, where it is asked for, is a Lipschitz constant on the ball of what there is beyond v(0) + a.d + d'Qd.
+    `lip`, where it is asked for, is a Lipschitz constant on the ball of what there is beyond v(0) + a.d + d'Qd + K[d].
     """
 
     v: arb
@@ -95,10 +107,13 @@ class Model:
     def radius(self) -> arb:
         return self.slope + self.curve
 
-    @property
-    def beyond_linear(self) -> tuple[arb, arb] | None:
-        """Of what there is beyond v(0) + a.d the largest size on the ball, and a Lipschitz constant."""
-        return None if self.lip is None else (self.bend + self.lip, 2 * self.bend + self.lip)
+    def beyond_linear(self, lip: arb) -> Beyond:
+        """Of what there is beyond v(0) + a.d; the Lipschitz constants of d'Qd and K[d] are 2 bend and 3 twist."""
+        return Beyond(self.bend + self.twist + lip, 2 * self.bend + 3 * self.twist + lip)
+
+    def beyond_square(self, lip: arb) -> Beyond:
+        """Of what there is beyond v(0) + a.d + d'Qd."""
+        return Beyond(self.twist + lip, 3 * self.twist + lip)
 
     def is_finite(self) -> bool:
         parts = (self.a, self.Q, self.K, self.E, *self.errors)
@@ -167,16 +182,17 @@ class Model:
         return Model(value[0, 0], a, Q, K, E, B, v.errors, tuple(p[0, 0] for p in dv), da, lip)
 
     def lip_of_product(self, other: Model) -> arb | None:
-        """Of what v w has beyond the second order: v(0) z_w less its Q, (a_v.d) z_w, z_v z_w, and so on.
+        """Of what v w has beyond K: v(0) of w, (a.d) of what is beyond Q in w, the product of what is beyond a.d.
 
-        z is what v has beyond v(0) + a.d. A product has the size of each times the other's constant.
+        A product has the size of each times the other's constant.
         """
-        v, w, of_v, of_w = self, other, self.beyond_linear, other.beyond_linear
-        if v.lip is None or w.lip is None or of_v is None or of_w is None:
+        v, w = self, other
+        if v.lip is None or w.lip is None:
             return None
-        (z_v, steep_v), (z_w, steep_w) = of_v, of_w
-        result = abs(v.range) * w.lip + abs(w.range) * v.lip + v.slope * (z_w + steep_w) + w.slope * (z_v + steep_v)
-        return result + steep_v * z_w + z_v * steep_w
+        result = abs(v.range) * w.lip + abs(w.range) * v.lip
+        result += v.slope * w.beyond_square(w.lip).both + w.slope * v.beyond_square(v.lip).both
+        of_v, of_w = v.beyond_linear(v.lip), w.beyond_linear(w.lip)
+        return result + of_v.size * of_w.steep + of_w.size * of_v.steep
 
     def times_square(self, other: Model) -> arb_mat:
         """(a.d)(d'Qd), a of this model and Q of the other."""
@@ -208,7 +224,7 @@ class Model:
     def expanded(self, name: str) -> tuple[arb, arb, arb_mat, arb_mat, arb_mat, arb | None]:
         """phi and phi' at v(0), for every y, and H, C, R: what phi adds to its tangent is d'Hd + C[d] within d'Rd.
 
-        The last is a Lipschitz constant of what phi adds beyond d'Hd, where this model has one of its own.
+        The last is a Lipschitz constant of what phi adds beyond d'Hd + C[d], where this model has one of its own.
 
         Whoever asked for the ball knows the rule and the place of a refusal, and puts them into it.
         """
@@ -224,18 +240,20 @@ class Model:
         return at[0], at[1], H, C, R, self.lip_beyond_tangent(name, at)
 
     def lip_beyond_tangent(self, name: str, at: tuple[arb, arb, arb, arb]) -> arb | None:
-        """Of phi''/2 (D^2 - (a.d)^2), D = a.d + z, and of what is of third order.
+        """Of phi''/2 (D^2 - y^2 - 2 y d'Qd) + phi'''/6 (D^3 - y^3), D = y + z, y = a.d, and of the rest of the series.
 
-        The derivative of that by D is at most `turn` D^2, and D itself has the constant slope + 2 bend + lip.
+        The derivative of that by D is at most |phi''''|/6 |D|^3.
         """
-        beyond, turn = self.beyond_linear, turning(name, at[3], self.range, self.radius)
-        if beyond is None:
+        if self.lip is None:
             return None
-        if turn is None:
+        most = largest_fourth(name, at[0], self.range, self.radius)
+        if most is None:
             raise Refused("contraction", "ball", f"{name} may be undefined")
-        z, steep = beyond
-        second = abs(at[2]) * (self.slope * (z + steep) + z * steep)
-        return second + turn * self.radius * self.radius * (self.slope + steep)
+        beyond, left = self.beyond_linear(self.lip), self.beyond_square(self.lip)
+        y, z, steep = self.slope, beyond.size, beyond.steep
+        second = abs(at[2]) * (y * left.both + z * steep)
+        third = abs(at[3]) / 2 * (y * y * (steep + 2 * z) + y * z * (2 * steep + z) + z * z * steep)
+        return second + third + most / 6 * self.radius**3 * (y + steep)
 
     def beyond_tangent(self, h: arb, g: arb, m: arb) -> tuple[arb_mat, arb_mat, arb_mat]:
         """H, C and R; h = phi''(v(0)) / 2, g = phi'''(v(0)) / 6, m >= |phi''''| / 24 on the range.

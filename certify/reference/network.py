@@ -25,7 +25,7 @@ from .symmetric import half, no_form, whole
 class Bends:
     """What the tanhs of some layers add to their tangents, a row for each: d'Hd + C[d] within d'Rd; halves of H, R.
 
-    `lip`, where it is asked for, has the Lipschitz constants of what they add beyond d'Hd.
+    `lip`, where it is asked for, has the Lipschitz constants of what they add beyond these.
     """
 
     H: list[list[arb]]
