@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from flint import arb, ctx
+from flint import arb, arb_mat, ctx
 
 from certify.reference.__main__ import as_json, in_words
 from certify.reference.balls import PRECISION, derivatives, fourth, largest_fourth
@@ -29,7 +29,7 @@ from certify.reference.rules import judge as whole_verdict
 from tests.reference.test_flow import FUNCTIONS, document
 from tests.reference.test_practical import scalar
 from tests.support.balls import around, exactly, square
-from tests.support.certificates import Document, dump, edited, encode, rehash
+from tests.support.certificates import Document, dump, edited, encode, make, rehash
 from tests.support.claim_oracle import Loop as Plant
 from tests.support.models import curved, linear
 from tests.support.oracle import value_of
@@ -212,6 +212,86 @@ def rest_of(data: Document, f: Model, node: Any, J: np.ndarray, d: list[float]) 
 def policy(data: Document, x: list[arb]) -> list[arb]:
     """Its input; the loop of the oracle has no q."""
     return Plant(held(data, {"q": Fraction(1), "p": Fraction(1, 4)})).closed_loop([x])[0][0]
+
+
+POLYNOMIALS = {  # of d: v(0), a, Q, K
+    "d^2": (0, 0, 0.1, 0),
+    "d^3": (0, 0, 0, 0.1),
+    "d + d^2": (0.5, 0.1, 0.1, 0),
+    "d + d^3": (0.5, 0.1, 0, 0.1),
+    "1 + d": (1, 0.25, 0, 0),
+    "1 + d^2": (1, 0, 0.125, 0),
+    "all": (1, 0.1, -0.05, 0.025),
+}
+OPERATIONS: dict[str, tuple[Callable[[Model], Model], Callable[[arb], arb]]] = {
+    "square": (lambda m: m * m, lambda v: v * v),
+    "cube": (lambda m: m * m * m, lambda v: v * v * v),
+    "negative": (lambda m: -(m + m), lambda v: -2 * v),
+    "scaled": (lambda m: (m * m).scaled(arb(-3)), lambda v: -3 * v * v),
+    "exp": (lambda m: m.function("exp"), lambda v: v.exp()),
+    "sin": (lambda m: m.function("sin"), lambda v: v.sin()),
+    "cos": (lambda m: m.function("cos"), lambda v: v.cos()),
+    "tanh": (lambda m: m.function("tanh"), lambda v: v.tanh()),
+    "atan": (lambda m: m.function("atan"), lambda v: v.atan()),
+    "1/(2 + v)": (lambda m: m.shifted(arb(2)).function("1/"), lambda v: 1 / (2 + v)),
+    "sqrt(2 + v)": (lambda m: m.shifted(arb(2)).function("sqrt"), lambda v: (2 + v).sqrt()),
+    "sin of exp": (lambda m: m.function("exp").function("sin"), lambda v: v.exp().sin()),
+}
+SHARP = {("d^2", "square"), ("d^3", "square"), ("d^2", "exp"), ("d^2", "cos"), ("d^2", "sin"), ("d^3", "sin")}
+
+
+@pytest.mark.parametrize("operation", OPERATIONS)
+@pytest.mark.parametrize("name", POLYNOMIALS)
+def test_the_constant_of_each_operation(name: str, operation: str) -> None:
+    """In one variable what is beyond the third order is steepest at an end, near the constant."""
+    with ctx.workprec(600):
+        at_0, a, Q, K = (arb(v) for v in POLYNOMIALS[name])
+        one, nothing = arb_mat([[1]]), arb_mat(1, 1)
+        model = Model(at_0, a * one, Q * one, K * one, nothing, lip=arb(0))
+        apply, true = OPERATIONS[operation]
+        result, most = apply(model), arb(0)
+        assert result.lip is not None
+
+        def rest(d: arb) -> arb:
+            v = true(at_0 + a * d + Q * d * d + K * d * d * d)
+            return v - linear(result, [d]) - curved(result, [d])
+
+        for end in (-1, -0.5, 0.5, 1):
+            near = arb(end) * (1 - arb(2) ** -60)
+            slope = abs((rest(arb(end)) - rest(near)) / (arb(end) - near))
+            assert not slope > result.lip * (1 + arb(2) ** -40)
+            most = most.max(slope)
+        if (name, operation) in SHARP:
+            assert most > result.lip / 2
+
+
+@pytest.mark.parametrize("centre", ["none", "preactivation", "output"])
+@pytest.mark.parametrize("squash", ["tanh", "identity"])
+@pytest.mark.parametrize("hidden", [False, True])
+def test_the_constant_of_an_input(hidden: bool, squash: str, centre: str) -> None:
+    if (squash, centre) == ("identity", "preactivation"):
+        return
+    layers: list[tuple[Any, Any]] = [([[2.0]], [0.7])]
+    if hidden:
+        layers = [([[2.0], [-1.0]], [0.7, 0.2]), ([[1.0, 0.5]], [0.3])]
+    data = make(
+        [["-", "x"]], layers, 1.0, (0.01, 0.01), squash=squash, centre=centre, scale=[0.75], u_eq=["1/4"],
+        offset=[0.125], claim="practical",
+    )  # fmt: skip
+    steep = arb(0)
+    with ctx.workprec(300):
+        loop, plant = Loop(read(dump(data))), Plant(data)
+        u = loop.steady(exactly(np.array([[0.2]])), "contraction", "ball").names["u"]
+        assert u.lip is not None
+        for end in (-1.0, -0.5, 0.5, 1.0):
+            rest = []
+            for d in (arb(end), arb(end) * (1 - arb(2) ** -30)):
+                ((value,), _) = plant.closed_loop([[d * arb(0.2)]])[0]
+                rest.append(value - linear(u, [d]) - curved(u, [d]))
+            steep = steep.max(abs((rest[0] - rest[1]) / (arb(end) * arb(2) ** -30)))
+        assert not steep > u.lip
+        assert u.lip == 0 or steep > u.lip / 40
+        assert hidden or squash == "tanh" or u.lip == 0
 
 
 # ----------------------------------------------------------------------------------------------------- plants at random
