@@ -32,7 +32,7 @@ from certify.claims import Asymptotic, Claim, Enlarged, Nearby, Practical, Probl
 from certify.claims.claim import Kind
 from certify.closed_loop import ClosedLoop
 from certify.diagnosis import diagnose
-from certify.engines.base import Attempt, Budget, Progress, Proof, Task
+from certify.engines.base import FEW, Attempt, Budget, Progress, Proof, Task
 from certify.engines.contraction import contraction
 from certify.engines.falsify import Witness, refutes
 from certify.errors import BackendError, InputError, SoundnessError
@@ -45,7 +45,7 @@ from certify.rest import find_rest
 from certify.results import Levels, RoaResult, Tried, TubeFacts
 from certify.rigorous import eigenvalues, instability
 from certify.systems import System
-from certify.trials import OPTIMISING, Trial, blends, by_reach, corrected, named, optimised, robust, solved
+from certify.trials import OPTIMISING, Trial, blends, by_reach, corrected, named, optimised, peak, robust, solved
 from certify.verdict import Stop, Verdict
 
 if TYPE_CHECKING:
@@ -234,6 +234,8 @@ class _Run:
         self._tell("candidate")
         with self._stage("candidate"):
             trials = solved(loop, options)
+        if self.options.claim == "practical" and options.engine != "dreal" and loop.system.n > FEW:
+            return self._around_a_level(loop, trials, options)
         large = self._optimised(partial(optimised, loop, options)) if options.engine != "dreal" else None
         certain = self._optimised(partial(robust, loop, options)) if self.interruptible else None
         trials += [one for one in (certain, large) if one is not None]
@@ -251,6 +253,19 @@ class _Run:
                 between = list(blends(loop, unproved[0].trial, best, options))
             race.enter(between, heat if race.gained else 0.0)  # without a gain their local levels tell
         race.knock_out(heat)
+        return race
+
+    def _around_a_level(self, loop: ClosedLoop, trials: list[Trial], options: RoaOptions) -> Race:
+        """A practical claim in many states, where no tree of boxes can carry what a ball does not: the candidate made
+        for that, then others until one proves something; then the largest sampled one, if there is time."""
+        race, first = self._contest(), self._optimised(partial(peak, loop, options))
+        for one in ([] if first is None else [first]) + by_reach(trials):
+            race.enter([one], self._heat())
+            if race.best.proved:
+                break
+        if race.best.proved and self.left() > _FOR_PROOF * self.options.time_limit:
+            large = self._optimised(partial(optimised, loop, options))
+            race.enter([] if large is None else [large], self._heat())
         return race
 
     def _improve(self, race: Race, loop: ClosedLoop, heat: float) -> None:

@@ -13,8 +13,9 @@ from certify.certificate import require_short
 from certify.claims import Problem
 from certify.claims.claim import Kind
 from certify.closed_loop import ClosedLoop
-from certify.engines.base import Task
+from certify.engines.base import FEW, Task
 from certify.engines.falsify import Witness, falsify, survey
+from certify.engines.peak import peak_candidate
 from certify.engines.robust import robust_candidate
 from certify.errors import BackendError, InputError
 from certify.lyapunov import (
@@ -36,6 +37,7 @@ _BELOW_WITNESS = 1e-3
 _SMALLEST = 1e-120  # of levels: squares of states and products of bounds must not underflow
 _BLENDS = (0.05, 0.15, 0.3)
 OPTIMISING = 0.2  # share of the time that the optimised candidate may take
+_FOR_PEAK = 0.4  # share of the time for a candidate that may be the only one
 _SAMPLES = 4000  # of a search for violations; the proof itself finds others
 
 
@@ -96,6 +98,8 @@ def trial(loop: ClosedLoop, P: Array, name: str, options: RoaOptions, notice: st
     task = Task(problem, kind, level, options.level is not None)
     if options.level is not None and leaves_domain(P, options.level, loop.system.domain):
         return Trial(name, task, T, limit, "domain", volume(P, limit), notice)
+    if kind == "practical" and n > FEW:  # a ball decides, and no survey could
+        return Trial(name, task, T, limit, "domain", volume(P, level), notice)
     if kind == "practical":
         bands = survey(problem, T, level)
         reach = bands[0].above if bands else 0.0
@@ -111,6 +115,8 @@ def named(loop: ClosedLoop, options: RoaOptions) -> Trial:
     if options.P is not None:
         return trial(loop, options.P, "given", options)
     name = options.only or "lyapunov"
+    if name == "peak":
+        return trial(loop, peak_candidate(loop, OPTIMISING * options.time_limit), name, options)
     if name == "robust":
         return trial(loop, robust_candidate(loop, OPTIMISING * options.time_limit), name, options)
     chosen = choose_candidate(loop, name, options.Q, options.R, OPTIMISING * options.time_limit)
@@ -142,6 +148,14 @@ def robust(loop: ClosedLoop, options: RoaOptions) -> Trial | None:
     """The candidate that the local rule likes best, or None if it is not to be had."""
     try:
         return trial(loop, robust_candidate(loop, OPTIMISING * options.time_limit), "robust", options)
+    except (BackendError, InputError):
+        return None
+
+
+def peak(loop: ClosedLoop, options: RoaOptions) -> Trial | None:
+    """The candidate of a practical claim whose floor is small beside the set, or None if it is not to be had."""
+    try:
+        return trial(loop, peak_candidate(loop, _FOR_PEAK * options.time_limit), "peak", options)
     except (BackendError, InputError):
         return None
 

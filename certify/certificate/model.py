@@ -57,10 +57,11 @@ class LocalBall:
 @dataclass(frozen=True, slots=True)
 class Contraction:
     """Evidence that trajectories come closer: a ball x = J d, ||d|| <= 1, J (n, n), that contains {V <= c0}, and the
-    `weights` (n,) of the bound on it."""
+    `weights` (n,) of one bound on it and the `weight` (n, n) of another."""
 
     J: Array
     weights: Array
+    weight: Array
 
 
 @dataclass(frozen=True, slots=True)
@@ -428,11 +429,11 @@ def _ball(evidence: LocalBall | Slab) -> dict[str, str]:
 
 
 def _contraction(ball: Contraction) -> dict[str, str]:
-    return {"J": _encode(ball.J), "weights": _encode(ball.weights)}
+    return {name: _encode(getattr(ball, name)) for name in ("J", "weights", "weight")}
 
 
 def _read_contraction(data: Mapping[str, str], n: int) -> Contraction:
-    return Contraction(_decode(data["J"], (n, n)), _decode(data["weights"], (n,)))
+    return Contraction(_decode(data["J"], (n, n)), _decode(data["weights"], (n,)), _decode(data["weight"], (n, n)))
 
 
 def _local(ball: LocalBall) -> dict[str, Any]:

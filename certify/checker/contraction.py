@@ -4,10 +4,9 @@ norm of P. So there is one equilibrium at most, and all trajectories converge to
 from __future__ import annotations
 
 from fractions import Fraction
-from functools import cached_property
 
 import numpy as np
-from flint import fmpq_mat
+from flint import fmpq, fmpq_mat
 
 from . import ball
 from .ball import Ball
@@ -15,7 +14,10 @@ from .case import Case, Failures
 from .decrease import Models, are_finite, diagonal, rational
 from .document import Contraction
 from .exact import contains_ball, exactly, is_definite, root_above
+from .float64 import EPS, Array, norm, up
+from .jets import unpacked
 from .local import too_many_corners
+from .pairs import bound_of_pairs, in_binary64
 
 
 class Contracted(Ball):
@@ -23,12 +25,9 @@ class Contracted(Ball):
 
     def __init__(self, case: Case, evidence: Contraction) -> None:
         super().__init__(case, evidence.J, "contraction")
+        object.__setattr__(self, "by", evidence)
 
-    @cached_property
-    def weights(self) -> list[float]:
-        """g."""
-        found = self.case.partition.contraction
-        return [] if found is None else found.weights.tolist()
+    by: Contraction
 
 
 def fits(ball_: Contracted) -> Failures:
@@ -38,7 +37,7 @@ def fits(ball_: Contracted) -> Failures:
         yield "levels.floor", "the ball must contain {V <= c0}"
     if too_many_corners(ball_):
         yield "evidence.cells", "there are too many cells for this rule"
-    if not all(g > 0 for g in ball_.weights):
+    if not np.all(ball_.by.weights > 0):
         yield "evidence.contraction.weights", "must be positive"
     yield from ball.fits(ball_)
     return 0
@@ -55,11 +54,10 @@ def contracts(ball_: Contracted) -> Failures:
             return count
         models = Models(ball_.J, F, ball_.units, rest=True)
         b = P * models.J  # b_i is row i
-        rest = _turning(models, b, ball_.weights)
+        rest = _turning(models, b, ball_.by.weights.tolist()) + _twisting(models, b, ball_.by.weight)
         for i, lip in enumerate(lips):
             size = root_above(sum((v * v for v in b.tolist()[i]), rational(0.0)))
-            bends = rational(float(F[i].slack)) + rational(lip) + 3 * rational(float(F[i].twist))
-            rest += diagonal([2 * size * bends] * b.ncols())
+            rest += diagonal([2 * size * (rational(float(F[i].slack)) + rational(lip))] * b.ncols())
         for corner in models.corners():
             crossed = models.J.transpose() * P * corner.A
             count += 1
@@ -79,3 +77,13 @@ def _turning(models: Models, b: fmpq_mat, weights: list[float]) -> fmpq_mat:
         N = 2 * (half + half.transpose())
         found += N * inverse * N
     return found / 2
+
+
+def _twisting(models: Models, b: fmpq_mat, weight: Array) -> fmpq_mat:
+    """3 sum_i <b_i, T_i>, from above."""
+    k = b.ncols()
+    if not np.any(models.K):
+        return fmpq_mat(k, k)
+    row, power = in_binary64(b)
+    T = unpacked(models.K, k).reshape(-1, k * k, k)
+    return 3 * bound_of_pairs(row, up(EPS * norm(row, 1)), T, np.zeros(len(T)), weight) * fmpq(2) ** power

@@ -73,10 +73,12 @@ class LocalBall:
 
 @dataclass(frozen=True)
 class Contraction:
-    """The ball x = J d, ||d|| <= 1, on which trajectories come closer, and the weights g of the bound on it."""
+    """The ball x = J d, ||d|| <= 1, on which trajectories come closer, and on it the weights g of one bound, and the
+    weight of another."""
 
     J: Array
     weights: Array
+    weight: Array
 
 
 @dataclass(frozen=True)
@@ -288,8 +290,8 @@ def _contraction(value: Value, n: int, claim: str) -> Contraction | None:
     if claim != "nearby":
         value.must(value.raw is None, "null under this claim")
         return None
-    J, weights = value.keys("J weights")
-    return Contraction(J.array(n, n), weights.array(n))
+    J, weights, weight = value.keys("J weights weight")
+    return Contraction(J.array(n, n), weights.array(n), weight.array(n, n))
 
 
 def _order(value: Value, sampled: bool) -> int:

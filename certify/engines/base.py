@@ -13,6 +13,9 @@ from certify.claims.claim import Kind
 from certify.engines.falsify import Witness
 from certify.verdict import Stop
 
+FEW = 3
+"""States, up to which a tree of boxes may carry a practical claim without a ball."""
+
 
 @dataclass(frozen=True, slots=True)
 class Budget:

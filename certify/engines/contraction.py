@@ -37,7 +37,7 @@ def contraction(problem: Problem, T: Array, floor: float) -> Contraction | None:
         return None
     half = np.einsum("ia,ijb->jab", b, models.Q)
     N = 2 * (half + half.transpose(0, 2, 1))
-    weight = np.linalg.inv(decay)
+    weight = np.asarray(np.linalg.inv(decay), dtype=np.float64)
     spread = np.einsum("jlk,km,jlm->l", N, weight, N, optimize=True)
     g = np.sqrt(np.maximum(spread, 0.0) / np.diag(weight))
-    return Contraction(J, np.maximum(g, _LEAST * float(np.max(np.diag(decay)))))
+    return Contraction(J, np.maximum(g, _LEAST * float(np.max(np.diag(decay)))), weight)

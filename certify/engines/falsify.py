@@ -80,6 +80,17 @@ def falsify(problem: Problem, T: Array, limit: float, samples: int = 20_000, see
     return best
 
 
+def is_violated(problem: Problem, T: Array, limit: float, samples: int = 4000, seed: int = 0) -> bool:
+    """Whether a violation is sampled in {V <= limit}, at any level, in floats: nothing is shown of it."""
+    search = _Search(problem, T)
+    direction = np.random.default_rng(seed).standard_normal((samples, problem.loop.system.n))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    radius = np.sqrt(limit) * (1 - 1e-9) * np.linspace(0.01, 1.0, samples)
+    z = np.concatenate([direction * radius[:, None], search.climb(direction[::8] * radius[-1], limit)])
+    with torch.no_grad():
+        return bool(search.bad(torch.tensor(z, dtype=torch.float64)).any())
+
+
 def survey(problem: Problem, T: Array, limit: float, samples: int = 512, seed: int = 0) -> list[Band]:
     """The bands of levels up to `limit` on which no violation was found, the highest first."""
     search = _Search(problem, T)

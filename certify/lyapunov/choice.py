@@ -16,8 +16,8 @@ from certify.lyapunov.optimised import largest_sampled, optimise_repeatedly
 
 Array = NDArray[np.float64]
 Solved = Literal["lyapunov", "scaled", "lqr"]
-Named = Literal["lyapunov", "scaled", "lqr", "optimised", "robust"]
-Candidate = Literal["auto", "lyapunov", "scaled", "lqr", "optimised", "robust"]
+Named = Literal["lyapunov", "scaled", "lqr", "optimised", "robust", "peak"]
+Candidate = Literal["auto", "lyapunov", "scaled", "lqr", "optimised", "robust", "peak"]
 SOLVED: tuple[Solved, ...] = ("lyapunov", "scaled", "lqr")
 """The candidates that solve a Lyapunov equation."""
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from certify.certificate import PartitionTree
 from certify.claims import Asymptotic, Practical, Problem
-from certify.engines.base import Attempt, Budget, Engine, Once, Proof, Report, Task
+from certify.engines.base import FEW, Attempt, Budget, Engine, Once, Proof, Report, Task
 from certify.engines.bounds.search import Pass, RingProof, empty_ring, outwards, prove_inwards, prove_outwards
 from certify.engines.falsify import Band, Witness, survey
 from certify.engines.local import local_ball, prove_band, prove_local
@@ -21,8 +21,8 @@ from certify.verdict import Stop
 Array = NDArray[np.float64]
 _SHARE = 0.6  # of the time, for finding c2 before c0
 _FOR_BALL = 0.5  # of the time, for a ring from a ball, and of that for the ball
-_FEW = 3  # states, up to which leaves may carry a claim alone
 _EQUAL = 0.01  # of a level
+_ABOVE = 1.1  # of the least floor: in many states leaves do not lower it any more
 _TRIES = 4  # inner levels from which c2 is looked for, each with half of the time that is left for it
 
 
@@ -43,7 +43,9 @@ class BoundsEngine(Engine):
         start = time.perf_counter()
         first = self._from_ball(task, replace(budget, seconds=_FOR_BALL * budget.seconds), report)
         left = replace(budget, seconds=budget.seconds - (time.perf_counter() - start))
-        if first is not None and (self.T.shape[0] > _FEW or left.seconds < _FOR_BALL * budget.seconds):
+        if self.T.shape[0] > FEW:
+            return first or Proof(None, None, Stop.LOCAL, "no ball shows V to fall around any level; try another P")
+        if first is not None and left.seconds < _FOR_BALL * budget.seconds:
             return first
         second = self._by_leaves(task, left, report)
         found = second if first is None or _is_better(second, first) else first
@@ -52,7 +54,8 @@ class BoundsEngine(Engine):
     def _from_ball(self, task: Task, budget: Budget, report: Report | None) -> Proof | None:
         """A ring that grows from the ball whose floor is about the least; None without such a ball."""
         start = time.perf_counter()
-        found = prove_band(task.problem, self.T, task.target, until=start + _FOR_BALL * budget.seconds)
+        until, above = start + _FOR_BALL * budget.seconds, _ABOVE if len(self.T) > FEW else 1.5
+        found = prove_band(task.problem, self.T, task.target, until=until, above=above)
         if found is None:
             return None
         (floor, inner), stop = found, None
