@@ -44,10 +44,14 @@ class Ball:
 
 @dataclass(frozen=True)
 class Contraction:
-    """All x = J d with ||d|| <= 1, where any two trajectories approach each other, and the weights g of a bound."""
+    """All x = J d with ||d|| <= 1, where any two trajectories approach each other.
+
+    The weights g and `weight` say which of many bounds is taken.
+    """
 
     J: fmpq_mat
     weights: array[float]
+    weight: fmpq_mat
 
 
 @dataclass(frozen=True)
@@ -149,8 +153,9 @@ def read_contraction(value: Any, n: int, claim: str) -> Contraction | None:
     if claim != "nearby":
         require(value is None, "format", at, f"null was expected with claim '{claim}'")
         return None
-    contraction = keys(value, at, "J", "weights")
-    return Contraction(square(contraction["J"], f"{at}.J", n), numbers(contraction["weights"], f"{at}.weights", n))
+    contraction = keys(value, at, "J", "weights", "weight")
+    J, weight = (square(contraction[key], f"{at}.{key}", n) for key in ("J", "weight"))
+    return Contraction(J, numbers(contraction["weights"], f"{at}.weights", n), weight)
 
 
 def read_cells(value: Any, at: str, k: int) -> tuple[int, ...]:

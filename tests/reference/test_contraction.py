@@ -24,6 +24,7 @@ from certify.reference.evidence import Tree
 from certify.reference.local import cells
 from certify.reference.loop import Loop
 from certify.reference.model import Model
+from certify.reference.rational import identity
 from certify.reference.refusal import Refused
 from certify.reference.rules import judge as whole_verdict
 from tests.reference.test_flow import FUNCTIONS, document
@@ -44,7 +45,9 @@ TRUSTED = {"kind": "trusted-solver", "solver": "dReal", "version": "4", "precisi
 def nearby(data: Document, J: Any, weights: Any) -> Document:
     """A practical document with a ball on which it contracts."""
     data = edited(data, "claim.kind", "nearby")
-    return edited(data, "evidence.contraction", {"J": encode(J), "weights": encode(weights)})
+    return edited(
+        data, "evidence.contraction", {"J": encode(J), "weights": encode(weights), "weight": encode(np.eye(len(J)))}
+    )
 
 
 def bent(term: Any, *, J: float = 1.0, weight: float = 1.0, floor: float = 0.99, outer: float = 1.0) -> Document:
@@ -334,4 +337,4 @@ def holds(loop: Loop, J: np.ndarray, g: np.ndarray, parts: tuple[int, ...]) -> b
         each = [loop.within(known, cell, "contraction", "ball") for cell in cells(c.plant.ranges, parts)]
     except Refused:
         return False
-    return all(whatever_y(F, lambda G: contracts(c, exactly(J), weights, G)) for F in each)
+    return all(whatever_y(F, lambda G: contracts(c, exactly(J), weights, arb_mat(identity(c.n)), G)) for F in each)
