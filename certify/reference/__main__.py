@@ -39,10 +39,10 @@ def in_words(c: Certificate) -> str:
     head = f"{c.plant.name}, policy {c.policy.sha256}{stepping(c)}: every trajectory that starts in V <= {c.outer!r}"
     remains = "stays there" if c.sample is None else "at a sampling instant is there at every later one"
     between = "" if c.sample is None else ", is in the domain at all times"
-    if c.claim == "practical":
+    if c.floor is not None:
         enters = f"enters V <= {c.floor!r} in finite time and stays in that set from then on"
         at_last = "" if c.sample is None else " at sampling instants"
-        return f"{head} {remains}{between}, {enters}{at_last}{falling(c)}, with {bounds}"
+        return f"{head} {remains}{between}, {enters}{at_last}{falling(c)}, with {bounds}{nearby(c)}"
     stays = (
         f"{head} {remains}{between} and "
         f"converges to the origin, which is asymptotically stable{falling(c)}, with {bounds}"
@@ -70,8 +70,17 @@ def falling(c: Certificate) -> str:
     """How fast V falls; the rate is a binary64 number and so exact here."""
     if c.rate == 0:
         return ""
-    until = f" until V <= {c.floor!r}" if c.claim == "practical" else ""
+    until = f" until V <= {c.floor!r}" if c.floor is not None else ""
     return f", V falling at least as exp(-2 lambda t){until}, lambda = {rate_of(c)!r}"
+
+
+def nearby(c: Certificate) -> str:
+    """Where trajectories go in the end, if that is claimed."""
+    if c.claim != "nearby":
+        return ""
+    still = f" where {', '.join(c.plant.uncertain)} stays as it is" if c.plant.uncertain else ""
+    inside = f"{still} there is exactly one equilibrium in V <= {c.floor!r}"
+    return f"; and{inside}, to which every such trajectory converges"
 
 
 def rate_of(c: Certificate) -> float:
@@ -131,6 +140,9 @@ def as_json(verdict: Verdict, seconds: float) -> dict[str, Any]:
         "at": verdict.at,
         "detail": verdict.detail,
         "claim": c and c.claim,
+        "rate": c and rate_of(c),
+        "sample": c and c.sample and [str(h) for h in c.sample],
+        "discrete": c and c.plant.discrete,
         "certificate_sha256": verdict.certificate_sha256,
         "policy_sha256": c and c.policy.sha256,
         "levels": c and {key: value for key, _, value in level_names(c)},

@@ -135,14 +135,14 @@ def fourth(name: str, at: arb, y: arb, reach: arb) -> arb | None:
     fifth at most 16, in magnitude, and the fourth of atan below 4.7.
     """
     if name == "1/":
-        size = abs(y)
-        least = size - reach
+        size = arb(abs(y).lower())  # as in `third`
+        least = arb((size - reach).lower())
         return 24 / (size * size * size * size * least) if least > 0 else None
     if name == "sqrt":
         least = arb((y - reach).lower())
         if not (least > 0 and y > 0):
             return None
-        s, w = y.sqrt(), least.sqrt()
+        s, w = arb(y.lower()).sqrt(), least.sqrt()
         return 24 * (5 * s * s + 4 * s * w + w * w) / (16 * s**5 * (s + w) ** 4)
     if name == "tanh":
         here = 8 * at * (2 - 3 * at * at) * (1 - at * at)
@@ -154,6 +154,18 @@ def fourth(name: str, at: arb, y: arb, reach: arb) -> arb | None:
     if name not in ("sin", "cos"):
         raise ValueError(f"nothing is known of {name}")
     return (abs(at) + reach).min(ONE)
+
+
+def largest_fourth(name: str, at: arb, y: arb, reach: arb) -> arb | None:
+    """A bound of |phi''''| itself, phi being `at` at y; None where phi may be undefined.
+
+    What `fourth` has for 1/v and sqrt bounds a remainder, and not its derivative, which is larger.
+    """
+    bound = fourth(name, at, y, reach)
+    if bound is None or name not in ("1/", "sqrt"):
+        return bound
+    least = arb((abs(y) - reach).lower())
+    return 24 / least**5 if name == "1/" else 15 / (16 * least.sqrt() ** 7)
 
 
 def weights(policy: Policy) -> list[arb_mat]:

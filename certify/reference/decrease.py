@@ -232,9 +232,7 @@ def cubic(ball: Ball, b: Sequence[arb_mat], F: Sequence[Model]) -> arb_mat:
     together = list[tuple[arb_mat, Model]]()
     for beta, column, f in zip(ball.beta, b, F, strict=True):
         if beta > 0:
-            K = f.K.entries()
-            rows = [[K[place[(h * size + i) * size + j]] for j in range(size)] for h, i in two]
-            result += balanced(column, square_of(rows, two), weight)
+            result += with_cubic(column, f, weight)
         else:
             together.append((column, f))
     if not together:
@@ -252,6 +250,14 @@ def cubic(ball: Ball, b: Sequence[arb_mat], F: Sequence[Model]) -> arb_mat:
             rows.append(row)
         result += balanced(unit_vector(k, size), square_of(rows, two), weight)
     return result
+
+
+def with_cubic(column: arb_mat, f: Model, weight: arb_mat) -> arb_mat:
+    """<b, T> of the K of one component."""
+    size, K = column.nrows(), f.K.entries()
+    place, two = places(size), pairs(size)
+    rows = [[K[place[(h * size + i) * size + j]] for j in range(size)] for h, i in two]
+    return balanced(column, square_of(rows, two), weight)
 
 
 def square_of(rows: list[list[arb]], two: Sequence[tuple[int, int]]) -> arb_mat:

@@ -15,7 +15,7 @@ from typing import Any
 
 from flint import fmpq, fmpq_mat
 
-from .evidence import WITH_TUBE, Tree, Trusted, read_evidence
+from .evidence import WITH_FLOOR, WITH_TUBE, Tree, Trusted, read_evidence
 from .expressions import Equations, equations, rational
 from .fields import binary64, column, entries, exact, keys, little_endian, numbers, square
 from .refusal import Refused, require
@@ -23,7 +23,7 @@ from .refusal import Refused, require
 MAX_BYTES, MAX_BYTES_BEYOND_ASCII = 256 * 2**20, 16 * 2**20
 MAX_TOKENS = 10**6  # commas and opening brackets
 MAX_NAMES, MAX_LAYERS, MAX_WIDTH = 64, 64, 2**14
-SCHEMA, CLAIMS = "certify-certificate/6", ("asymptotic", "practical", *WITH_TUBE)
+SCHEMA, CLAIMS = "certify-certificate/6", ("asymptotic", *WITH_FLOOR, *WITH_TUBE)
 IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,63}")
 
 Interval = tuple[fmpq, fmpq]
@@ -78,7 +78,7 @@ class Policy:
 
 @dataclass(frozen=True)
 class Certificate:
-    """`inner` and `outer`, between which the leaves show that V falls, are c1 and c2; `floor` is c0 under `practical`.
+    """`inner` and `outer`, between which the leaves show that V falls, are c1 and c2; `floor` is c0, if there is one.
 
     V falls at the `rate` lambda, D + 2 lambda V < 0. With a `sample` inputs are held for a time in this range.
     `start` is P_0 of a claim with a tube, `centre` the column c_0 around which it lies where the tube follows a path.
@@ -118,7 +118,7 @@ class Certificate:
     @property
     def ends_at_origin(self) -> bool:
         """Whether the claim is about the equilibrium at the origin, where every model is then at rest."""
-        return self.claim != "practical"
+        return self.claim not in WITH_FLOOR
 
     @property
     def step(self) -> fmpq:
@@ -145,17 +145,18 @@ def read(raw: bytes) -> Certificate:
     n = len(plant.states)
     fixed = claim not in WITH_TUBE or not plant.uncertain
     require(fixed, "format", "plant.uncertain", f"nothing may be uncertain with claim '{claim}'")
-    continuous = claim not in WITH_TUBE or not plant.discrete
+    flows = claim in (*WITH_TUBE, "nearby")
+    continuous = not (flows and plant.discrete)
     require(continuous, "format", "plant.time", f"time must be continuous with claim '{claim}'")
-    free = sample is None or not (claim in WITH_TUBE or plant.discrete)
-    require(free, "format", "claim.sample", "null was expected: the claim has a tube, or the plant steps of its own")
+    free = sample is None or not (flows or plant.discrete)
+    require(free, "format", "claim.sample", f"null was expected with claim '{claim}', or in discrete time")
     start = square(said["start"], "claim.start", n) if "start" in said else None
     centre = column(said["centre"], "claim.centre", n) if "centre" in said else None
     policy = read_policy(data["policy"], n, len(plant.inputs))
     lyapunov = keys(data["lyapunov"], "lyapunov", "kind", "P")
     require(lyapunov["kind"] == "quadratic", "format", "lyapunov.kind", "'quadratic' was expected")
     P = square(lyapunov["P"], "lyapunov.P", n)
-    named_levels = ("floor", "local", "roa") if claim == "practical" else ("local", "roa")
+    named_levels = ("floor", "local", "roa") if claim in WITH_FLOOR else ("local", "roa")
     levels = keys(data["levels"], "levels", *named_levels)
     *floor, inner, outer = (binary64(levels[name], f"levels.{name}") for name in named_levels)
     least = floor[0] if floor else None

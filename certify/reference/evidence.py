@@ -21,6 +21,7 @@ MAX_SLABS = 10**4
 MAX_PARTS, MAX_CELLS = 64, 4096  # of one range; of all of them together
 MAX_ORDER = 8  # of a series in time
 WITH_TUBE = ("enlarged", "reached")  # claims about a set of starts that is no level set of V
+WITH_FLOOR = ("practical", "nearby")  # claims about a set in which everything ends, {V <= c0}, and not the origin
 WORD = re.compile(r"[A-Za-z0-9_.+-]{1,80}")
 
 
@@ -29,7 +30,7 @@ class Ball:
     """All x = J d with ||d|| <= 1, and the rows of multipliers with which `decrease` is decided on it.
 
     In a slab with a path g has one more number than the others, for the motion, and `weight` a row and a column more.
-    `edge` is the multiplier of V - c0 under `practical`, `order` that of the series in time with a sample.
+    `edge` is the multiplier of V - c0 where the claim has a floor, `order` that of the series in time with a sample.
     """
 
     J: fmpq_mat
@@ -39,6 +40,18 @@ class Ball:
     weight: fmpq_mat
     edge: float = 0.0
     order: int = 1
+
+
+@dataclass(frozen=True)
+class Contraction:
+    """All x = J d with ||d|| <= 1, where any two trajectories approach each other.
+
+    The weights g and `weight` say which of many bounds is taken.
+    """
+
+    J: fmpq_mat
+    weights: array[float]
+    weight: fmpq_mat
 
 
 @dataclass(frozen=True)
@@ -67,8 +80,9 @@ class Slab:
 
 @dataclass(frozen=True)
 class Tree:
-    """Evidence that can be replayed. `tube` belongs to claims that have a start; `practical` may do without a `ball`.
+    """Evidence that can be replayed. `tube` belongs to claims that have a start, `contraction` to `nearby`.
 
+    Claims that have a floor may do without a `ball`.
     `cells` has a number for each uncertain quantity: into how many equal parts rule `local` cuts its range. `order` is
     that of the series in time on leaves.
     """
@@ -79,6 +93,7 @@ class Tree:
     order: int
     cells: tuple[int, ...]
     ball: Ball | None
+    contraction: Contraction | None
     tube: tuple[Slab, ...]
 
 
@@ -92,25 +107,28 @@ class Trusted:
 
 def read_evidence(value: Any, n: int, k: int, claim: str, sampled: bool) -> Tree | Trusted:
     if isinstance(value, dict) and value.get("kind") == "trusted-solver":
-        require(claim not in WITH_TUBE, "format", "evidence.kind", f"claim '{claim}' must be replayed")
+        said = claim not in (*WITH_TUBE, "nearby")
+        require(said, "format", "evidence.kind", f"claim '{claim}' must be replayed")
         require(k == 0, "format", "evidence.kind", "what is uncertain must be replayed")
         return read_trusted(value)
-    evidence = keys(value, "evidence", "kind", "T", "root", "tree", "order", "cells", "local", "tube")
+    names = ("kind", "T", "root", "tree", "order", "cells", "local", "contraction", "tube")
+    evidence = keys(value, "evidence", *names)
     require(evidence["kind"] == "partition-tree", "format", "evidence.kind", "an unknown kind")
     T, root = square(evidence["T"], "evidence.T", n), numbers(evidence["root"], "evidence.root", n)
     tree = decoded(evidence["tree"], "evidence.tree")
     order = read_order(evidence["order"], "evidence.order", sampled)
     cells = read_cells(evidence["cells"], "evidence.cells", k)
     ball = None
-    if claim != "practical" or evidence["local"] is not None:
+    if claim not in WITH_FLOOR or evidence["local"] is not None:
         ball = read_local(evidence["local"], n, claim, sampled)
+    contraction = read_contraction(evidence["contraction"], n, claim)
     tube = entries(evidence["tube"], "evidence.tube")
     least, most = (1, MAX_SLABS) if claim in WITH_TUBE else (0, 0)
     fits = least <= len(tube) <= most
     require(fits, "format", "evidence.tube", f"{least} to {most} slabs are allowed with claim '{claim}'")
     moves = claim == "reached"
     slabs = tuple(read_slab(v, f"evidence.tube.{k}", n, moves) for k, v in enumerate(tube))
-    return Tree(T, root, tree, order, cells, ball, slabs)
+    return Tree(T, root, tree, order, cells, ball, contraction, slabs)
 
 
 def read_order(value: Any, at: str, sampled: bool) -> int:
@@ -125,9 +143,19 @@ def read_local(value: Any, n: int, claim: str, sampled: bool) -> Ball:
     at = "evidence.local"
     local = keys(value, at, "J", "multipliers", "weight", "edge", "order")
     edge, order = binary64(local["edge"], f"{at}.edge"), read_order(local["order"], f"{at}.order", sampled)
-    good = edge >= 0 and (edge == 0 or claim == "practical")
+    good = edge >= 0 and (edge == 0 or claim in WITH_FLOOR)
     require(good, "format", f"{at}.edge", f"{edge!r} is not allowed with claim '{claim}'")
     return replace(read_ball(local, at, n), edge=edge, order=order)
+
+
+def read_contraction(value: Any, n: int, claim: str) -> Contraction | None:
+    at = "evidence.contraction"
+    if claim != "nearby":
+        require(value is None, "format", at, f"null was expected with claim '{claim}'")
+        return None
+    contraction = keys(value, at, "J", "weights", "weight")
+    J, weight = (square(contraction[key], f"{at}.{key}", n) for key in ("J", "weight"))
+    return Contraction(J, numbers(contraction["weights"], f"{at}.weights", n), weight)
 
 
 def read_cells(value: Any, at: str, k: int) -> tuple[int, ...]:

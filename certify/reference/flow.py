@@ -19,7 +19,7 @@ from typing import Any
 
 from flint import arb, arb_mat, fmpq
 
-from .balls import ZERO, spanning
+from .balls import ZERO
 from .document import Certificate, Interval
 from .evidence import Ball
 from .expressions import Equations
@@ -150,11 +150,14 @@ def beyond(x: Model, far: arb, turned: arb) -> Model:
 
 
 def in_domain(c: Certificate, states: Sequence[arb], F: Sequence[arb], at: str) -> None:
-    """x_i + t f_i lies strictly inside for 0 <= t <= hi, so that phi does: it is x_i and t times a mean of f_i."""
-    times = spanning((fmpq(0), c.step))
+    """x_i + t f_i lies strictly inside for 0 <= t <= hi, so that phi does: it is x_i and t times a mean of f_i.
+
+    By their ends: the product of two balls also holds what would be the least t f_i if t could be negative.
+    """
+    period = arb(c.step)
     for x, f, (lo, hi), name in zip(states, F, c.plant.domain, c.plant.states, strict=True):
-        reached = x + times * f
-        inside = reached > arb(lo) and reached < arb(hi)
+        down, up = (period * arb(f.lower())).min(ZERO), (period * arb(f.upper())).max(ZERO)
+        inside = arb(x.lower()) + down > arb(lo) and arb(x.upper()) + up < arb(hi)
         require(inside, "flow", at, f"{name} is not certain to stay in the domain within a period")
 
 

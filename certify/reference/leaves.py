@@ -308,16 +308,18 @@ class Leaves:
         return Taylor(mid, slopes + [size if i == symbol else ZERO for i in range(self.n, self.symbols)])
 
     def D(self, leaf: Leaf, within: dict[str, Taylor] | None = None) -> Taylor:
-        """(2 P x + h P G)'G with the longest h: Vdot in continuous time. What V changes by over a step, by its length.
+        """(2 P x + h P G)'G: Vdot in continuous time. What V changes by over a step, by its length.
 
-        The square of G has no negative part, so that a longer h makes this no less.
+        h is the very number on which G depends, with the same symbol where it may be one of many.
         """
-        G, result = self.G(leaf, within), Taylor(ZERO)
+        G, result, h = self.G(leaf, within), Taylor(ZERO), self.period()
         for i, (row, g) in enumerate(zip(leaf.gradient, G, strict=True)):
             along = self.affine(row)
             if self.steps:
+                moved = Taylor(ZERO)
                 for k, other in enumerate(G):
-                    along += other.scaled(self.step * self.P[i, k])
+                    moved += other.scaled(self.P[i, k])
+                along += h * moved if self.c.varies else moved.scaled(self.step)
             result += along * g
         return result
 

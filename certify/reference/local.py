@@ -1,6 +1,6 @@
 """Rule `local`: V falls on a ball that contains {V <= c1}, without a hole at the origin, for all that is uncertain.
 
-Under `practical` there is a hole: V falls where it is at least c0, and from below c0 it does not rise beyond.
+Where the claim has a floor there is a hole: V falls where it is at least c0, and from below c0 it does not rise beyond.
 
 What is uncertain has symbols in the values and gradients of the models, whose corners count; all else that it does to
 them is taken in by their balls. These are wide where its range is wide, and so the ranges are cut into cells.

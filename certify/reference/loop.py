@@ -42,7 +42,7 @@ class Known:
     def still(self, value: arb) -> Model:
         """What does not depend on d."""
         some = next(iter(self.names.values()))
-        return Model.affine(value, [ZERO] * some.a.nrows(), some.errors)
+        return Model.affine(value, [ZERO] * some.a.nrows(), some.errors, None if some.lip is None else ZERO)
 
     def constant(self, value: fmpq) -> Model:
         return self.still(arb(value))
@@ -72,16 +72,27 @@ class Loop:
         Without a centre it is the origin, where the policy is u_eq, but for claims that do not ask it. J has a row for
         each state.
         """
-        c, (u, units) = self.c, self.network.on(J, centre)
-        bounded = self.bounded or within_bounds(c, [(v.v, v.radius) for v in u])
+        u, units = self.network.on(J, centre)
+        bounded = self.bounded or within_bounds(self.c, [(v.v, v.radius) for v in u])
         require(bounded, "inputs", at, "an input is not certain to stay in its bounds")
+        return self.unclipped(u, units, J, rule, at, centre)
+
+    def steady(self, J: fmpq_mat, rule: str, at: str) -> Known:
+        """The same around the origin, with Lipschitz constants; whether inputs keep their bounds is not asked."""
+        return self.unclipped(*self.network.on(J, steady=True), J, rule, at)
+
+    def unclipped(
+        self, u: Sequence[Model], units: Units, J: fmpq_mat, rule: str, at: str, centre: fmpq_mat | None = None
+    ) -> Known:
+        """States and inputs, which no clip changes, or a refusal."""
+        c = self.c
         for j, v in enumerate(u):
             limits = c.policy.limits(j)
             alone = limits is None or bool(v.v - v.radius > arb(limits[0]) and v.v + v.radius < arb(limits[1]))
             require(alone, rule, at, f"{c.plant.inputs[j]} is not certain to be left alone by the clip")
         middle = [ZERO] * c.n if centre is None else list(arb_mat(centre).entries())
-        errors = u[0].errors
-        states = [Model.affine(v, row, errors) for v, row in zip(middle, arb_mat(J).tolist(), strict=True)]
+        errors, lip = u[0].errors, None if u[0].lip is None else ZERO
+        states = [Model.affine(v, row, errors, lip) for v, row in zip(middle, arb_mat(J).tolist(), strict=True)]
         return Known(dict(zip(c.plant.states + c.plant.inputs, [*states, *u], strict=True)), units)
 
     def within(self, known: Known, cell: Sequence[Interval], rule: str, at: str) -> Field:

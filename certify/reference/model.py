@@ -13,12 +13,24 @@ from functools import cached_property
 
 from flint import arb, arb_mat
 
-from .balls import ZERO, absolute, derivatives, finite, fourth, identity, norm, total
+from .balls import ZERO, absolute, derivatives, finite, fourth, identity, largest_fourth, norm, total
 from .refusal import Refused
 from .symmetric import linear_times_square, no_form, squared_norm
 
 Form = tuple[arb_mat, tuple[arb_mat, ...]]  # a column that is affine in y: c + sum_j y_j c_j; without c_j it is c
 SPREAD, SHARE = arb(0, 1), arb(0.5, 0.5)  # what a product of two y may be, and a square
+
+
+@dataclass(frozen=True)
+class Beyond:
+    """The largest size on the ball of a part of a number, and a Lipschitz constant of it: how `steep` it is."""
+
+    size: arb
+    steep: arb
+
+    @property
+    def both(self) -> arb:
+        return self.size + self.steep
 
 
 @dataclass(frozen=True)
@@ -31,6 +43,8 @@ class Model:
     Where something is uncertain v(0) and a are affine in its symbols y in [-1, 1]^N: `v` + sum_j y_j `dv_j`, and `a`
     with `da` likewise; all other numbers are balls that hold what they are for every y. Without `dv` there is no y in
     them.
+
+    `lip`, where it is asked for, is a Lipschitz constant on the ball of what there is beyond v(0) + a.d + d'Qd + K[d].
     """
 
     v: arb
@@ -42,12 +56,13 @@ class Model:
     errors: tuple[arb_mat, ...] = ()
     dv: tuple[arb, ...] = ()
     da: tuple[arb_mat, ...] = ()
+    lip: arb | None = None
 
     @classmethod
-    def affine(cls, v: arb, a: Sequence[arb], errors: tuple[arb_mat, ...] = ()) -> Model:
+    def affine(cls, v: arb, a: Sequence[arb], errors: tuple[arb_mat, ...] = (), lip: arb | None = None) -> Model:
         n = len(a)
         square = arb_mat(n, n)
-        return cls(v, arb_mat(n, 1, list(a)), square, no_form(n), square, (ZERO,) * len(errors), errors)
+        return cls(v, arb_mat(n, 1, list(a)), square, no_form(n), square, (ZERO,) * len(errors), errors, lip=lip)
 
     @cached_property
     def reach(self) -> arb:
@@ -92,9 +107,18 @@ class Model:
     def radius(self) -> arb:
         return self.slope + self.curve
 
+    def beyond_linear(self, lip: arb) -> Beyond:
+        """Of what there is beyond v(0) + a.d; the Lipschitz constants of d'Qd and K[d] are 2 bend and 3 twist."""
+        return Beyond(self.bend + self.twist + lip, 2 * self.bend + 3 * self.twist + lip)
+
+    def beyond_square(self, lip: arb) -> Beyond:
+        """Of what there is beyond v(0) + a.d + d'Qd."""
+        return Beyond(self.twist + lip, 3 * self.twist + lip)
+
     def is_finite(self) -> bool:
         parts = (self.a, self.Q, self.K, self.E, *self.errors)
-        return finite([self.v, *self.B, *self.dv]) and all(finite(part.entries()) for part in (*parts, *self.da))
+        single = finite([self.v, *self.B, *self.dv]) and (self.lip is None or self.lip.is_finite())
+        return single and all(finite(part.entries()) for part in (*parts, *self.da))
 
     def whatever(self) -> Model:
         """The same without y, whose every value is in the balls."""
@@ -119,7 +143,8 @@ class Model:
         if self.dv and other.dv:
             dv = tuple(p + q for p, q in zip(self.dv, other.dv, strict=True))
             da = tuple(p + q for p, q in zip(self.da, other.da, strict=True))
-        return Model(v, a, Q, K, E, B, self.errors, dv, da)
+        lip = None if self.lip is None or other.lip is None else self.lip + other.lip
+        return Model(v, a, Q, K, E, B, self.errors, dv, da, lip)
 
     def shifted(self, step: arb) -> Model:
         """v + step."""
@@ -131,11 +156,12 @@ class Model:
 
     def __neg__(self) -> Model:
         v, a, B, dv, da = -self.v, -self.a, *(tuple(-p for p in part) for part in (self.B, self.dv, self.da))
-        return Model(v, a, -self.Q, -self.K, self.E, B, self.errors, dv, da)
+        return Model(v, a, -self.Q, -self.K, self.E, B, self.errors, dv, da, self.lip)
 
     def scaled(self, k: arb) -> Model:
         v, a, B, dv = k * self.v, k * self.a, tuple(k * p for p in self.B), tuple(k * p for p in self.dv)
-        return Model(v, a, k * self.Q, k * self.K, abs(k) * self.E, B, self.errors, dv, tuple(k * p for p in self.da))
+        da, lip = tuple(k * p for p in self.da), None if self.lip is None else abs(k) * self.lip
+        return Model(v, a, k * self.Q, k * self.K, abs(k) * self.E, B, self.errors, dv, da, lip)
 
     def __mul__(self, other: Model) -> Model:
         """v w: of the products of a part of v - v(0) with one of w - w(0), those of up to three d are in Q and K."""
@@ -147,12 +173,26 @@ class Model:
         known = v.slope * w.twist + w.slope * v.twist + (v.bend + v.twist) * (w.bend + w.twist)
         E = abs(v.range) * w.E + abs(w.range) * v.E + known * identity(n)
         E += v.radius * w.whole + (w.slope + w.bend + w.twist) * v.whole
+        lip = v.lip_of_product(w)
         if not (v.dv or w.dv):
-            return Model(v.v * w.v, v.v * w.a + w.v * v.a, Q, K, E, B, v.errors)
+            return Model(v.v * w.v, v.v * w.a + w.v * v.a, Q, K, E, B, v.errors, lip=lip)
         value, dv = times((v.v, v.dv), (arb_mat([[w.v]]), tuple(arb_mat([[p]]) for p in w.dv)))
         one, two = times((v.v, v.dv), (w.a, w.da)), times((w.v, w.dv), (v.a, v.da))
         a, da = one[0] + two[0], tuple(p + q for p, q in zip(one[1], two[1], strict=True))
-        return Model(value[0, 0], a, Q, K, E, B, v.errors, tuple(p[0, 0] for p in dv), da)
+        return Model(value[0, 0], a, Q, K, E, B, v.errors, tuple(p[0, 0] for p in dv), da, lip)
+
+    def lip_of_product(self, other: Model) -> arb | None:
+        """Of what v w has beyond K: v(0) of w, (a.d) of what is beyond Q in w, the product of what is beyond a.d.
+
+        A product has the size of each times the other's constant.
+        """
+        v, w = self, other
+        if v.lip is None or w.lip is None:
+            return None
+        result = abs(v.range) * w.lip + abs(w.range) * v.lip
+        result += v.slope * w.beyond_square(w.lip).both + w.slope * v.beyond_square(v.lip).both
+        of_v, of_w = v.beyond_linear(v.lip), w.beyond_linear(w.lip)
+        return result + of_v.size * of_w.steep + of_w.size * of_v.steep
 
     def times_square(self, other: Model) -> arb_mat:
         """(a.d)(d'Qd), a of this model and Q of the other."""
@@ -161,13 +201,14 @@ class Model:
 
     def function(self, name: str) -> Model:
         """phi of v."""
-        value, p, H, C, R = self.expanded(name)
+        value, p, H, C, R, beyond = self.expanded(name)
+        lip = None if self.lip is None or beyond is None else abs(p) * self.lip + beyond
         Q, K, E, B = p * self.Q + H, p * self.K + C, abs(p) * self.E + R, tuple(p * q for q in self.B)
         if not self.dv:
-            return Model(value, p * self.a, Q, K, E, B, self.errors)
+            return Model(value, p * self.a, Q, K, E, B, self.errors, lip=lip)
         v, dv, slope = self.tangent(name)
         a, da = times(slope, (self.a, self.da))
-        return Model(v, a, Q, K, E, B, self.errors, dv, da)
+        return Model(v, a, Q, K, E, B, self.errors, dv, da, lip)
 
     def tangent(self, name: str) -> tuple[arb, tuple[arb, ...], tuple[arb, tuple[arb, ...]]]:
         """phi(v(0)), its coefficients of y, and phi'(v(0)) with its own, where phi is known to be defined on the range.
@@ -180,8 +221,10 @@ class Model:
         v, slope = at[0] + on_range[2] * square / 2, at[1] + on_range[3] * square / 2
         return v, tuple(at[1] * p for p in self.dv), (slope, tuple(at[2] * p for p in self.dv))
 
-    def expanded(self, name: str) -> tuple[arb, arb, arb_mat, arb_mat, arb_mat]:
+    def expanded(self, name: str) -> tuple[arb, arb, arb_mat, arb_mat, arb_mat, arb | None]:
         """phi and phi' at v(0), for every y, and H, C, R: what phi adds to its tangent is d'Hd + C[d] within d'Rd.
+
+        The last is a Lipschitz constant of what phi adds beyond d'Hd + C[d], where this model has one of its own.
 
         Whoever asked for the ball knows the rule and the place of a refusal, and puts them into it.
         """
@@ -193,7 +236,24 @@ class Model:
                 "ball",
                 "a root of what may not be positive" if name == "sqrt" else "a division by what may be 0",
             )
-        return at[0], at[1], *self.beyond_tangent(at[2] / 2, at[3] / 6, most / 24)
+        H, C, R = self.beyond_tangent(at[2] / 2, at[3] / 6, most / 24)
+        return at[0], at[1], H, C, R, self.lip_beyond_tangent(name, at)
+
+    def lip_beyond_tangent(self, name: str, at: tuple[arb, arb, arb, arb]) -> arb | None:
+        """Of phi''/2 (D^2 - y^2 - 2 y d'Qd) + phi'''/6 (D^3 - y^3), D = y + z, y = a.d, and of the rest of the series.
+
+        The derivative of that by D is at most |phi''''|/6 |D|^3.
+        """
+        if self.lip is None:
+            return None
+        most = largest_fourth(name, at[0], self.range, self.radius)
+        if most is None:
+            raise Refused("contraction", "ball", f"{name} may be undefined")
+        beyond, left = self.beyond_linear(self.lip), self.beyond_square(self.lip)
+        y, z, steep = self.slope, beyond.size, beyond.steep
+        second = abs(at[2]) * (y * left.both + z * steep)
+        third = abs(at[3]) / 2 * (y * y * (steep + 2 * z) + y * z * (2 * steep + z) + z * z * steep)
+        return second + third + most / 6 * self.radius**3 * (y + steep)
 
     def beyond_tangent(self, h: arb, g: arb, m: arb) -> tuple[arb_mat, arb_mat, arb_mat]:
         """H, C and R; h = phi''(v(0)) / 2, g = phi'''(v(0)) / 6, m >= |phi''''| / 24 on the range.

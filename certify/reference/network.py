@@ -23,16 +23,22 @@ from .symmetric import half, no_form, whole
 
 @dataclass(frozen=True)
 class Bends:
-    """What the tanhs of some layers add to their tangents, a row for each: d'Hd + C[d] within d'Rd; halves of H, R."""
+    """What the tanhs of some layers add to their tangents, a row for each: d'Hd + C[d] within d'Rd; halves of H, R.
+
+    `lip`, where it is asked for, has the Lipschitz constants of what they add beyond these.
+    """
 
     H: list[list[arb]]
     C: list[list[arb]]
     R: list[list[arb]]
+    lip: list[arb]
 
-    def append(self, H: arb_mat, C: arb_mat, R: arb_mat) -> None:
+    def append(self, H: arb_mat, C: arb_mat, R: arb_mat, lip: arb | None) -> None:
         self.H.append(half(H))
         self.C.append(C.entries())
         self.R.append(half(R))
+        if lip is not None:
+            self.lip.append(lip)
 
 
 @dataclass(frozen=True)
@@ -47,19 +53,22 @@ class Unfolded:
     L: arb_mat | None
     absolute: arb_mat | None
 
-    def on(self, J: arb_mat, bends: Bends) -> list[Model]:
+    def on(self, J: arb_mat, bends: Bends, steady: bool) -> list[Model]:
         """The rows on a ball: sums over the tanhs before with L, and of their bounds with its magnitudes."""
         n = J.ncols()
         a = (self.G * J).tolist()
         if self.L is None or self.absolute is None:
-            return [Model.affine(v, row) for v, row in zip(self.at_0, a, strict=True)]
+            return [Model.affine(v, row, lip=ZERO if steady else None) for v, row in zip(self.at_0, a, strict=True)]
         Q, K, E = (
             (weights * arb_mat(each)).tolist()
             for weights, each in ((self.L, bends.H), (self.L, bends.C), (self.absolute, bends.R))
         )
+        lips: list[arb | None] = [None] * len(a)
+        if steady:
+            lips = list((self.absolute * arb_mat(len(bends.lip), 1, bends.lip)).entries())
         return [
-            Model(v, arb_mat(n, 1, row), whole(q, n), arb_mat(1, len(k), k), whole(e, n))
-            for v, row, q, k, e in zip(self.at_0, a, Q, K, E, strict=True)
+            Model(v, arb_mat(n, 1, row), whole(q, n), arb_mat(1, len(k), k), whole(e, n), lip=lip)
+            for v, row, q, k, e, lip in zip(self.at_0, a, Q, K, E, lips, strict=True)
         ]
 
 
@@ -92,7 +101,7 @@ class Units:
 
 
 class Network:
-    """The policy of a certificate. At the origin it is u_eq, but under `practical` what it is with centring `none`."""
+    """The policy of a certificate. At the origin it is u_eq, but for claims with a floor, with centring `none`."""
 
     def __init__(self, c: Certificate) -> None:
         self.c, self.weights = c, weights(c.policy)
@@ -115,27 +124,34 @@ class Network:
             layers.append(Unfolded(list(at_0.entries()), G, *blocks))
         return layers
 
-    def on(self, J: fmpq_mat, centre: fmpq_mat | None = None) -> tuple[list[Model], Units]:
-        """The inputs before their clip; J may have more columns than rows, and without a centre it is the origin."""
+    def on(self, J: fmpq_mat, centre: fmpq_mat | None = None, steady: bool = False) -> tuple[list[Model], Units]:
+        """The inputs before their clip; J may have more columns than rows, and without a centre it is the origin.
+
+        Models have a Lipschitz constant where they are to be `steady`.
+        """
         ball, n, m = arb_mat(J), J.ncols(), self.c.m
         layers = self.at_origin if centre is None else self.unfolded(arb_mat(centre))
-        bends = Bends([], [], [])
+        bends = Bends([], [], [], [])
         for layer in layers[:-1]:
-            for y in layer.on(ball, bends):
+            for y in layer.on(ball, bends, steady):
                 bends.append(*y.expanded("tanh")[2:])
         squashed, inputs, reached = self.c.policy.squash == "tanh", list[Model](), list[list[arb]]()
         L, hidden = layers[-1].L, len(bends.R)
-        for j, (s, net) in enumerate(zip(map(arb, self.c.policy.scale), layers[-1].on(ball, bends), strict=True)):
+        for j, (s, net) in enumerate(
+            zip(map(arb, self.c.policy.scale), layers[-1].on(ball, bends, steady), strict=True)
+        ):
             y, slope, H, C = replace(net, v=self.before_squash(j, net.v, centre)), ONE, arb_mat(n, n), no_form(n)
-            value, own = y.v, [ZERO] * m
+            value, own, lip = y.v, [ZERO] * m, y.lip
             if squashed:
-                value, slope, H, C, R = y.expanded("tanh")
-                bends.append(H, C, R)
+                value, slope, H, C, R, beyond = y.expanded("tanh")
+                bends.append(H, C, R, None)
                 own[j] = s
+                lip = None if y.lip is None or beyond is None else abs(slope) * y.lip + beyond
             ways = [s * slope * L[j, q] for q in range(hidden)] if L is not None else []
             reached.append(ways + own if squashed else ways)
             Q, K = s * (slope * y.Q + H), s * (slope * y.K + C)
-            inputs.append(Model(self.input_at(j, value, centre), s * slope * y.a, Q, K, arb_mat(n, n)))
+            at_0, lip = self.input_at(j, value, centre), None if lip is None else abs(s) * lip
+            inputs.append(Model(at_0, s * slope * y.a, Q, K, arb_mat(n, n), lip=lip))
         units = Units(n, arb_mat(m, len(bends.R), [v for row in reached for v in row]), bends.R)
         errors = units.errors()
         unit_vectors = [tuple(ONE if i == j else ZERO for i in range(m)) for j in range(m)]

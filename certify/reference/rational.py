@@ -19,7 +19,7 @@ ZERO = fmpq(0)
 
 
 def levels(c: Certificate) -> None:
-    """0 < c1 <= c2; under `practical` 0 < c0 <= c1, and c0 = c1 where no ball lies between them."""
+    """0 < c1 <= c2; with a floor 0 < c0 <= c1, and c0 = c1 where no ball lies between them."""
     require(0 < c.inner <= c.outer, "levels", "levels", f"0 < {c.inner!r} <= {c.outer!r} does not hold")
     if c.floor is not None:
         require(0 < c.floor <= c.inner, "levels", "levels", f"0 < {c.floor!r} <= {c.inner!r} does not hold")

@@ -9,6 +9,7 @@ from flint import ctx
 
 from . import rational
 from .balls import PRECISION
+from .contraction import contraction
 from .document import Certificate, read
 from .evidence import WITH_TUBE, Tree, Trusted
 from .leaves import Leaves, check_leaves, structure
@@ -75,6 +76,8 @@ def check(c: Certificate) -> int | None:
         if loop is None or c.start is None:
             raise Refused("format", "claim.start", "the claim needs a start")
         tube(loop, c.start, c.centre, evidence.tube)
+    if evidence.contraction is not None:
+        contraction(loop or Loop(c), evidence.contraction, evidence.cells)
     return leaves
 
 
@@ -85,10 +88,11 @@ def bearable(c: Certificate, evidence: Tree) -> None:
     inputs, what is uncertain and a period. A series of order r has r products for each of r^2 / 2 coefficients.
     """
     ball, size = evidence.ball, c.n + (c.claim == "reached")
-    thirds = size * (size + 1) * (size + 2) // 6 if ball else 0
+    balls = ball is not None or evidence.contraction is not None
+    thirds = size * (size + 1) * (size + 2) // 6 if balls else 0
     order = max(evidence.order, ball.order if ball else 1)
     plant = len(c.plant.dynamics.steps) * max((c.n + c.m + c.k + c.varies) ** 2, size**2 + thirds) * order**2
-    rule = "local" if ball else "ring"
+    rule = "local" if ball else "contraction" if balls else "ring"
     require(plant <= MAX_PLANT, rule, "plant", "the equations are too large for this checker")
     before, network = 0, 0
     for layer in c.policy.layers:

@@ -17,8 +17,7 @@ from certify.reference.rules import judge
 from tests.checker.test_rules import honest as of_version_3
 from tests.reference.test_practical import scalar
 from tests.support.balls import with_ball
-from tests.support.certificates import Document, edited
-from tests.support.reference import dump, write
+from tests.support.certificates import Document, dump, edited, write
 
 TRUSTED = {"kind": "trusted-solver", "solver": "dReal", "version": "4", "precision": (0.5).hex(), "queries": []}
 KEYS = [
@@ -27,6 +26,9 @@ KEYS = [
     "at",
     "detail",
     "claim",
+    "rate",
+    "sample",
+    "discrete",
     "certificate_sha256",
     "policy_sha256",
     "levels",
@@ -92,6 +94,7 @@ def test_json(tmp_path: Path, path: str, value: Any, status: int, result: str, r
     if rule != "hash":
         assert set(said["levels"]) == {"local", "roa"} and len(said["policy_sha256"]) == 64
         assert (said["leaves"] is not None) == (result == "ACCEPTED")
+        assert (said["rate"], said["sample"], said["discrete"]) == (0.0, None, False)
 
 
 @pytest.mark.parametrize("json_too", [False, True])

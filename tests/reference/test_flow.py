@@ -29,9 +29,8 @@ from certify.reference.refusal import Refused
 from certify.reference.symmetric import orders, triples
 from certify.reference.taylor import Taylor, pairs
 from tests.support.balls import exactly
-from tests.support.certificates import Document, decode, make
+from tests.support.certificates import Document, decode, dump, make
 from tests.support.periods import mean_change, switching
-from tests.support.reference import dump, upgraded
 
 FUNCTIONS: dict[str, Callable[[Any], Any]] = {
     "sin": lambda v: ["sin", v],
@@ -64,12 +63,10 @@ def document(
     bias = np.zeros(3)
     if practical:
         first, bias = [*first, ["*", "1/5", "q"]], np.array([0.3, -0.2, 0.1])
-    data = upgraded(
-        make(
-            [first, second], [(W1, bias), (W2, [0.1 * practical])], np.array([[1.0, 0.25], [0.25, 0.75]]), (0.01, 0.01),
-            states="xy", squash="identity", centre="none", scale=[0.8], input_bounds=[("-9", "9")],
-            domain=[("-3", "3")] * 2, uncertain=ranges or [("q", "3/4", "5/4"), ("p", "-1/2", "1/2")],
-        )
+    data = make(
+        [first, second], [(W1, bias), (W2, [0.1 * practical])], np.array([[1.0, 0.25], [0.25, 0.75]]), (0.01, 0.01),
+        states="xy", squash="identity", centre="none", scale=[0.8], input_bounds=[("-9", "9")],
+        domain=[("-3", "3")] * 2, uncertain=ranges or [("q", "3/4", "5/4"), ("p", "-1/2", "1/2")],
     )  # fmt: skip
     data["evidence"]["local"] |= {"order": order if sample else 1}
     data["evidence"]["order"] = order if sample else 1
@@ -249,7 +246,7 @@ def test_a_leaf_encloses_the_mean_of_every_period(name: str, sample: tuple[str, 
     data["levels"] = {key: (4.0).hex() for key in data["levels"]}
     generator = np.random.default_rng(7)
     with ctx.workprec(PRECISION):
-        for size in (0.01, 0.1):
+        for size in (0.01, 0.02 if name == "tan" else 0.1):  # a pole is near
             centre = generator.uniform(-0.4, 0.4, 2)
             box = Box(0, (centre - size).tolist(), (centre + size).tolist())
             leaves, leaf = leaf_of(data, box)

@@ -20,9 +20,9 @@ from hypothesis import strategies as st
 from certify.reference import local, rules
 from certify.reference.decrease import decreases
 from tests.checker.test_rules import honest as of_version_3
-from tests.support.balls import ball, with_ball
-from tests.support.certificates import Document, decode, edited, encode, make
-from tests.support.reference import dump, judge
+from tests.support.balls import centred, with_ball
+from tests.support.certificates import Document, decode, dump, edited, encode, make
+from tests.support.reference import judge
 
 Edit = Callable[[Document], Document]
 LEAST = 5e-324
@@ -32,7 +32,7 @@ def cubic(c1: float = 0.81, J: float = 0.9375, rows: Any = ((0.0,), (LEAST,), (0
     """P = 1; the square of x has a Q, its cube E = |J|^3: 2 J^2 - 2 J J^3 > 0 for |J| < 1."""
     dynamics = ["+", ["-", "x"], ["**", "x", 3]]
     data = make([dynamics], [([[0.0]], [0.0])], 1.0, (c1, c1), domain=[("-1", "1")])
-    return edited(with_ball(data), "evidence.local", ball([[J]], rows))
+    return edited(with_ball(data), "evidence.local", centred([[J]], rows))
 
 
 @cache

@@ -40,12 +40,12 @@ from certify.roa import RoaOptions, certify_roa
 from certify.systems import get_system
 from tests.reference.test_local import row
 from tests.reference.test_tube import array, at, more, of_tube, times, without, yes
-from tests.support.balls import TINY, around, ball, exactly, slab_of, square, with_ball
-from tests.support.certificates import Document, decode, edited, encode, make
+from tests.support.balls import TINY, around, ball, centred, exactly, slab_of, square, with_ball
+from tests.support.certificates import Document, decode, dump, edited, encode, make, write
 from tests.support.certificates import verdict as verdict_of_the_checker
 from tests.support.models import curves, field, model, numbers, units
 from tests.support.paths import along, follow
-from tests.support.reference import CONTINUOUS, dump, judge, write
+from tests.support.reference import CONTINUOUS, judge
 
 Edit = Callable[[Document], Document]
 LEAST = 5e-324
@@ -702,7 +702,7 @@ def test_some_of_those_tubes_are_accepted() -> None:
         claim = {"kind": "reached", **CONTINUOUS, "start": encode(shapes[0]), "centre": encode(centres[0])}
         tried = edited(edited(data, "claim", claim), "evidence.tube", [along(loop, centres, shapes, h)])
         accepted += judge(edited(tried, "levels", {"local": (16.0).hex(), "roa": (16.0).hex()}) | {
-            "evidence": tried["evidence"] | {"root": encode([4.0]), "local": ball([[4.5]], [[0.0], [1.0], [0.0]])}
+            "evidence": tried["evidence"] | {"root": encode([4.0]), "local": centred([[4.5]], [[0.0], [1.0], [0.0]])}
         }) is None  # fmt: skip
     assert 5 <= accepted < 40
 

@@ -52,11 +52,12 @@ from tests.checker.test_rules import (
     reordered,
     scalar_claim,
 )
-from tests.support.balls import ball, with_ball
+from tests.support.balls import centred, with_ball
 from tests.support.certificates import (
     LEAF,
     Document,
     decode,
+    dump,
     edited,
     encode,
     grow,
@@ -69,7 +70,7 @@ from tests.support.certificates import (
 )
 from tests.support.models import beyond, curved, form, linear, matrix, model
 from tests.support.oracle import policy_in_arb, value_of
-from tests.support.reference import dump, judge, judge_bytes, upgraded
+from tests.support.reference import judge, judge_bytes
 
 SHIPPED = Path(__file__).parents[2] / "examples" / "policies" / "pendulum.pt"
 
@@ -147,7 +148,7 @@ def test_two_inputs_and_three_states_are_accepted(centre: str, v: tuple[str, str
 
 @pytest.mark.parametrize("edit", HARMLESS)
 def test_harmless_edits_stay_accepted(edit: str) -> None:
-    assert judge_bytes(HARMLESS[edit](upgraded(with_ball(honest("linear"))))) is None
+    assert judge_bytes(HARMLESS[edit](with_ball(honest("linear")))) is None
 
 
 @pytest.mark.parametrize("exponent", [-200, 0, 100])  # at 200 what a tanh leaves out has no square in binary64
@@ -692,7 +693,7 @@ def test_the_limit_of_the_local_rule(power: int, states: str) -> None:
         rows = [[0.0] * n, [2.0**-60] * (n - 1) + [beta], [0.0] * n]
         if n == 2 and power == 3:  # jointly
             rows = [[0.0] * n, [0.0] * n, [2.0**-60] * n]
-        assert judge(edited(with_ball(data), "evidence.local", ball(J, rows))) == found
+        assert judge(edited(with_ball(data), "evidence.local", centred(J, rows))) == found
 
 
 def test_the_inputs_on_the_local_ball() -> None:

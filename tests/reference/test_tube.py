@@ -26,8 +26,8 @@ from certify.reference import __main__ as command
 from certify.reference import decrease, rules, tube
 from certify.reference.loop import Loop
 from tests.support.balls import around, ball, enlarge, slab_of, square, with_ball
-from tests.support.certificates import Document, decode, edited, encode, grow, make
-from tests.support.reference import CONTINUOUS, dump, judge, judge_bytes, write
+from tests.support.certificates import Document, decode, dump, edited, encode, grow, make, write
+from tests.support.reference import CONTINUOUS, judge, judge_bytes
 
 Edit = Callable[[Document], Document]
 NONE = 2.0**-60  # a beta of a component that has no Q

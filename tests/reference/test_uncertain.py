@@ -25,9 +25,9 @@ from certify.reference.taylor import Taylor, pairs
 from tests.checker.test_ball import points
 from tests.checker.test_uncertain import HONEST, Edit, forgeries, honest, in_arb, wider
 from tests.support.balls import exactly
-from tests.support.certificates import Document, edited, grow, make
+from tests.support.certificates import Document, dump, edited, grow, make
 from tests.support.oracle import ball
-from tests.support.reference import dump, judge
+from tests.support.reference import judge
 from tests.support.uncertain import FACTORS, drawn, largest, random_plant, ranges_of, refutation
 
 MANY = ("4,096 cells", "64 quantities")  # which take seconds

@@ -17,8 +17,7 @@ from certify.reference.document import read
 from certify.reference.loop import Loop
 from certify.reference.refusal import Refused
 from tests.support.balls import TINY, around, ball, exactly, reached_from, slab_of
-from tests.support.certificates import Document, edited, encode
-from tests.support.reference import dump
+from tests.support.certificates import Document, dump, edited, encode
 
 GRID = np.geomspace(1e-4, 1e4, 65)  # of edge, and of motion as a part of edge / share^2
 SHARE = 0.5

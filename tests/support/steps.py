@@ -23,8 +23,8 @@ from certify.reference.local import cells
 from certify.reference.loop import Loop
 from certify.reference.refusal import Refused
 from tests.support.balls import around, ball, square
-from tests.support.certificates import Document, edited, encode, make
-from tests.support.reference import dump, judge, upgraded
+from tests.support.certificates import Document, dump, edited, encode, make
+from tests.support.reference import judge
 
 TINY = 2.0**-60
 
@@ -52,7 +52,7 @@ def stepping(
     P = (P + P.T) / 2
     T = np.linalg.inv(np.linalg.cholesky(P)).T
     options: dict[str, Any] = {"squash": "identity", "centre": "none", "scale": [1.0], "T": T, **more}
-    data = upgraded(make(dynamics, layers, P, (inner, outer), **options))
+    data = make(dynamics, layers, P, (inner, outer), **options)
     data["plant"]["time"] = "discrete" if discrete else "continuous"
     data["claim"] |= {"rate": rate.hex(), "sample": sample and list(sample)}
     data["evidence"]["order"] = order if sample else 1
