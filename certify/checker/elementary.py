@@ -27,7 +27,7 @@ class Expansion:
     e: Four
     third: Any
     fourth: Any
-    sup: Any  # of |phi''''|/6 over the range: what is left after four terms has a derivative by D of at most sup |D|^3
+    last: Any  # of what is left after four terms the derivative by D is at most last |D|^3
 
 
 def elementary(name: str, c: Any, error: Any, radius: Any) -> Expansion:
@@ -35,7 +35,9 @@ def elementary(name: str, c: Any, error: Any, radius: Any) -> Expansion:
 
     `third` and `fourth` bound |phi'''|/6 and |phi''''|/24, whose suprema are in FORMAT.md, but for 1/v what is left is
     exactly -D^3 / (v0^3 v) and D^4 / (v0^4 v), and for the square root, with s^2 = v0 and w^2 = v, exactly
-    D^3 (3 s + w) / (8 s^3 (s + w)^3) and -D^4 (5 s^2 + 4 s w + w^2) / (16 s^5 (s + w)^4).
+    D^3 (3 s + w) / (8 s^3 (s + w)^3) and -D^4 (5 s^2 + 4 s w + w^2) / (16 s^5 (s + w)^4). Nor is `last` sup|phi''''|/6
+    for these: the derivatives of what is left are D^3 (3 v + v0) / (v0^4 v^2) and, with s - w in the place of
+    D / (s + w), -D^3 (8 s^2 + 9 s w + 3 w^2) / (16 s^5 w (s + w)^3), which fall in magnitude as v rises.
     """
     if name == "tanh":
         t, e = tanh(c)
@@ -58,9 +60,9 @@ def elementary(name: str, c: Any, error: Any, radius: Any) -> Expansion:
         f0 = 1 / c
         f = (f0, -f0 * f0, f0 * f0 * f0, -(f0 * f0) * (f0 * f0))
         moved = (square, 2 * cube, 3 * fourth, 4 * up(fourth / nearest))  # derivatives of f where v0 may be
-        p = up(1 / least)
-        sup = up(4 * up(p * p) * up(p * up(p * p)))
-        return Expansion(f, _moved(f, error, moved), up(cube / least), up(fourth / least), sup)
+        most = up(np.abs(c) + error)
+        last = up(up(fourth / least) * up(up(3 * least + most) / least))
+        return Expansion(f, _moved(f, error, moved), up(cube / least), up(fourth / least), last)
     if name == "exp":
         most = c + up(error + radius)
         f0, e0 = exp(c)
@@ -93,9 +95,10 @@ def elementary(name: str, c: Any, error: Any, radius: Any) -> Expansion:
         # 3 s + w is 2 s + (s + w), and 5 s^2 + 4 s w + w^2 is 2 s^2 + 2 s (s + w) + (s + w)^2
         third = up(up(pq * pq) * up(2 * q + p) / 8)
         fourth = up(up(up(pq * pq) * p) * up(2 * qq + 2 * pq + pp) / 16)
-        r = up(1 / _rounded_down(np.sqrt(least)))
-        sup = up(0.15625 * up(up(r * r) * up(r * up(r * r))) * up(r * r))  # 15/16 w^-7 is the largest derivative
-        return Expansion(f, _moved(f, error, moved), third, fourth, sup)
+        far, w = up(np.sqrt(up(c + error))), up(np.sqrt(least))
+        bent = up(8 * up(far * far) + 9 * up(far * w) + 3 * up(w * w))
+        last = up(up(bent * fifth) / 16 * up(up(1 / _rounded_down(np.sqrt(least))) * up(q * qq)))
+        return Expansion(f, _moved(f, error, moved), third, fourth, last)
     if name not in ("sin", "cos"):
         raise ValueError(f"nothing is known of {name}")
     s, c, s_error, c_error = sin_cos(c)

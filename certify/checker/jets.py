@@ -225,7 +225,7 @@ class Jet:
         h, g = up(np.abs(half) + half_error), up(np.abs(sixth) + sixth_error)
         squares = 2 * h * up(s * up(self.third[0] + self.third[1]) + z * L)
         cubes = 3 * g * up(s * s * up(L + 2 * z) + s * z * up(2 * L + z) + z * z * L)
-        rest = phi.sup * up(self.radius * up(self.radius * self.radius)) * up(s + L)
+        rest = phi.last * up(self.radius * up(self.radius * self.radius)) * up(s + L)
         return up(squares + cubes + rest + 3 * self.mistaken(phi))
 
     def mistaken(self, phi: Expansion) -> Any:
