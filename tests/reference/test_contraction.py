@@ -96,8 +96,10 @@ FORGERIES: list[tuple[str, str, Edit]] = [
     ("contraction", "a clip that acts", lambda d: rehash(edited(d, "policy.clip", [encode([-0.05]), encode([0.05])]))),
     ("format", "no contraction", at("evidence.contraction", None)),
     ("format", "two weights", at("evidence.contraction.weights", encode([1.0, 1.0]))),
-    ("format", "no weights", at("evidence.contraction", {"J": encode([[0.31]])})),
-    ("format", "an edge", at("evidence.contraction", {"J": encode([[0.31]]), "weights": encode([1.0]), "edge": "0"})),
+    ("format", "no weights", at("evidence.contraction", {"J": encode([[0.31]]), "weight": encode([1.0])})),
+    ("format", "no weight", at("evidence.contraction", {"J": encode([[0.31]]), "weights": encode([1.0])})),
+    ("format", "a weight of two rows", at("evidence.contraction.weight", encode(np.eye(2)))),
+    ("format", "an edge", lambda d: edited(d, "evidence.contraction", lambda old: {**old, "edge": (0.0).hex()})),
     ("format", "practical with a contraction", at("claim.kind", "practical")),
     ("format", "asymptotic", at("claim.kind", "asymptotic")),
     ("format", "a sample", at("claim.sample", ["1/100", "1/100"])),
@@ -132,6 +134,12 @@ def test_inputs_are_asked_where_they_are_claimed() -> None:
 def test_the_limit_of_a_square(a: str, rule: str | None) -> None:
     """x' = -a x + x^2 contracts where 2 x < a, and the rule knows it all: |x| <= 1 on the ball."""
     assert judge(bent(["+", ["*", a, ["-", "x"]], ["**", "x", 2], "1/64"], weight=4.0)) == rule
+
+
+@pytest.mark.parametrize(("a", "rule"), [("2", "contraction"), ("299/100", "contraction"), ("301/100", None)])
+def test_the_limit_of_a_cube(a: str, rule: str | None) -> None:
+    """x' = -a x + x^3 contracts where 3 x^2 < a."""
+    assert judge(bent(["+", ["*", a, ["-", "x"]], ["**", "x", 3], "1/64"], weight=1e-3)) == rule
 
 
 POLES = {
