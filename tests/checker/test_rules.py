@@ -125,7 +125,9 @@ def nearby_claim(cubic: str = "0", J: float = 0.2 * (1 + 1e-9), weight: float = 
         [["+", ["-", "x"], "1/100", ["*", cubic, ["**", "x", 3]], ["*", "0", "u"]]], [([[0.0]], [0.0])], 1.0,
         (0.04, 0.09), claim="nearby",
     )  # fmt: skip
-    return edited(data, "evidence.contraction", {"J": encode([J]), "weights": encode([weight])})
+    return edited(
+        data, "evidence.contraction", {"J": encode([J]), "weights": encode([weight]), "weight": encode([1.0])}
+    )
 
 
 def lyapunov(A: np.ndarray) -> np.ndarray:
@@ -348,7 +350,8 @@ MUTANTS: list[tuple[str, str, str, Edit]] = [  # rule, base, what, edit
     ("format", "scalar", "a sample of nothing", at("claim.sample", ["0", "0"])),
     ("format", "scalar", "time by another name", at("plant.time", "sampled")),
     ("format", "nearby", "no contraction", at("evidence.contraction", None)),
-    ("format", "scalar", "a contraction", at("evidence.contraction", {"J": encode([1.0]), "weights": encode([1.0])})),
+    ("format", "scalar", "a contraction", at("evidence.contraction", {
+        "J": encode([1.0]), "weights": encode([1.0]), "weight": encode([1.0])})),
     ("format", "scalar", "a contraction in words", at("evidence.contraction", "null")),
     ("contraction", "nearby", "a ball in the set", array("evidence.contraction.J", lambda a: a * 0.999)),
     ("contraction", "nearby", "a weight of 0", array("evidence.contraction.weights", lambda a: 0 * a)),
@@ -964,5 +967,9 @@ def test_contraction_takes_derivatives_of_what_a_function_leaves(gain: str, verd
         [["-", left, ["+", ["*", gain, "x"], ["*", "0", "u"]]]], [([[0.0]], [0.0])], 1.0, (0.81, 0.8181),
         claim="nearby", domain=[("-97/100", "97/100")],
     )  # fmt: skip
-    data["evidence"]["contraction"] = {"J": encode([0.9 * (1 + 1e-9)]), "weights": encode([1e-9])}
+    data["evidence"]["contraction"] = {
+        "J": encode([0.9 * (1 + 1e-9)]),
+        "weights": encode([1e-9]),
+        "weight": encode([1.0]),
+    }
     assert verdict(grow(data)) == verdict_of
