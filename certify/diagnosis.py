@@ -131,7 +131,7 @@ def _direction(result: RoaResult, proof: Proof | None, point: Array | None, loop
 
 
 def _next(result: RoaResult, options: RoaOptions, proof: Proof | None, name: str | None) -> Step:
-    if result.claim == "practical" and (centre := _centring(result)) is not None:
+    if result.claim in ("practical", "nearby") and (centre := _centring(result)) is not None:
         return Step((("--centre", centre),), "with pi(0) = u_eq the stronger claim can be tried")
     if result.stop is Stop.DOMAIN and name is not None and options.level is None:
         return _wider_domain(result, name)

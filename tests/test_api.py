@@ -348,7 +348,7 @@ def test_the_domain_is_cut_to_where_a_policy_is_valid() -> None:
 def test_a_policy_that_rests_beside_the_origin_gets_the_other_claim_and_says_so(tmp_path: Path) -> None:
     uncentred = Policy(dataclasses.replace(small_pendulum(), centre="none"), "pendulum")
     result = certify_roa("pendulum", uncentred, level=0.05)
-    assert result.claim == "practical" and " practical; " in repr(result) and "practical" in result._repr_html_()
+    assert result.claim == "nearby" and " nearby; " in repr(result) and "nearby" in result._repr_html_()
     save_policy(tmp_path / "p.pt", uncentred)
     for given in (uncentred, tmp_path / "p.pt"):
         mended = certify_roa("pendulum", given, None, QUICK, importing={"centre": "preactivation"})

@@ -378,7 +378,7 @@ def test_a_practical_claim_where_the_clip_acts_at_the_origin() -> None:
     )  # fmt: skip
     document = grow(document)
     assert verdict(document) == "ACCEPTED" and judge(document) is None
-    too_low = edited(document, "levels.floor", (0.875).hex())
+    too_low = edited(edited(document, "levels.floor", (0.875).hex()), "levels.local", (0.875).hex())
     assert verdict(too_low) == "ring" and judge(too_low) == "ring"
 
 

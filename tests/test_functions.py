@@ -203,7 +203,7 @@ def test_models_of_random_equations_contain_them(tree: Any, seed: int, size: flo
         # balls
         n = np.zeros((2, 2))
         jets = [plain(np.float64(c), 0.0, a, 0.0, n, n) for c, a in zip(at_0, slopes, strict=True)]
-        [jet] = checker_expression.evaluate(tape, lambda q: checker_jets.constant(q, np.zeros((1, 2, 2))), jets)
+        [jet] = checker_expression.evaluate(tape, lambda q: checker_jets.constant(q, np.zeros((1, 2, 2)), 0), jets)
         models = {
             name: reference_model.Model.affine(arb(float(c)), [arb(float(v)) for v in a])
             for name, c, a in zip("xy", at_0, slopes, strict=True)

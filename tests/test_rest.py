@@ -76,10 +76,10 @@ def test_practical_stability_is_claimed_where_the_policy_is_not_centred(tmp_path
     policy = load_policy(PLAIN)
     system = get_system("pendulum").with_parameters(policy.parameters)
     result = certify_roa(system, policy.network, tmp_path, RoaOptions(candidate="lqr"))
-    assert result.verdict is Verdict.PROVED and result.claim == "practical"
+    assert result.verdict is Verdict.PROVED and result.claim == "nearby"
     assert result.notice is not None and "not centred" in result.notice
     data = result.to_dict()
-    assert data["claim"] == {"kind": "practical"} and data["rest"]["stable"] is True
+    assert data["claim"] == {"kind": "nearby"} and data["rest"]["stable"] is True
     theta = float(data["rest"]["x"][0])
     loop = ClosedLoop(system, policy.network)
     f = system.function()

@@ -266,7 +266,7 @@ def test_all_kinds_at_once_are_claimed_for_a_line(tmp_path: Path) -> None:
     result = certify_roa(
         line, law, tmp_path, candidate="lyapunov", ranges=K, disturbances={"wind": "0.05"}, input_error="0.001"
     )
-    assert result.verdict is Verdict.PROVED and result.claim == "practical"
+    assert result.verdict is Verdict.PROVED and result.claim == "nearby"
     assert [(q["name"], q["kind"], q["lo"], q["hi"]) for q in result.to_dict()["uncertain"]] == [
         ("k", "parameter", "9/10", "11/10"),
         ("wind", "disturbance", "-1/20", "1/20"),

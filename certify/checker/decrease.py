@@ -25,7 +25,7 @@ from .jets import Jet, triples, unpacked
 from .pairs import bound_of_pairs, in_binary64
 
 _NOTHING = fmpq(0)
-_SHARE = fmpq(1, 4)
+_SHARE = fmpq(1, 4)  # of 1 against d, around a level
 
 
 @dataclass(frozen=True)
@@ -133,10 +133,13 @@ def sides(
     if not all(beta > 0 for beta in by.apart):
         inverse = diagonal([1 / g for g in shares])
         rest += diagonal(shares) + sum((C.transpose() * inverse * C for C in joint), fmpq_mat(k, k))
-    at_0, along = doubts(models, P, h, beyond, [abs(row[0]) if first else fmpq(0) for row in b.tolist()], lengths)
-    f = fmpq_mat(len(models.f), 1, models.f) if first else fmpq_mat(P.nrows(), 1)
-    start = root_above((f.transpose() * P * f)[0, 0])
-    rest += diagonal([along + h * beyond * (beyond + 2 * start)] * k)
+    share = _SHARE if path is None else fmpq(1)
+    size = [abs(row[0]) if first else fmpq(0) for row in b.tolist()]
+    at_0, along = doubts(models, P, h, beyond, size, lengths, share)
+    if h > 0:
+        f = fmpq_mat(len(models.f), 1, models.f) if first else fmpq_mat(P.nrows(), 1)
+        along += h * beyond * (beyond + 2 * root_above((f.transpose() * P * f)[0, 0]))
+    rest += diagonal([along] * k)
     if first:
         rest = fmpq_mat([[at_0, *[0] * k], *([0, *row] for row in rest.tolist())])
     if level is not None:
@@ -148,21 +151,21 @@ def sides(
 
 
 def doubts(
-    models: Models, P: fmpq_mat, h: fmpq, beyond: fmpq, at_0: Sequence[fmpq], lengths: Sequence[fmpq]
+    models: Models, P: fmpq_mat, h: fmpq, beyond: fmpq, at_0: Sequence[fmpq], lengths: Sequence[fmpq], share: fmpq
 ) -> tuple[fmpq, fmpq]:
     """What errors of f and slacks of a come to in the entry of 1, and in each entry of d.
 
     `at_0` and `lengths` are the magnitudes of b_i's first entry, and of the rest of it. Twice a product of 1 and ||d||
-    is at most `_SHARE` + ||d||^2 / `_SHARE`.
+    is at most share + ||d||^2 / share.
     """
-    roots = [root_above(P[i, i]) for i in range(P.nrows())]
+    roots = [root_above(P[i, i]) if h > 0 else fmpq(0) for i in range(P.nrows())]  # of no step P may be any matrix
     e = sum((root * v for root, v in zip(roots, models.error, strict=True)), fmpq(0))
     s = sum((root * v for root, v in zip(roots, models.slack, strict=True)), fmpq(0))
     pairs = list(zip(at_0, lengths, models.error, models.slack, strict=True))
     both = sum((length * wrong + p * slack for p, length, wrong, slack in pairs), h * e * s)
     start = 2 * sum((p * wrong for p, _, wrong, _ in pairs), fmpq(0)) + h * e * e
     along = 2 * sum((length * slack for _, length, _, slack in pairs), fmpq(0)) + h * s * s + 2 * h * beyond * (e + s)
-    return start + _SHARE * both, along + both / _SHARE
+    return start + share * both, along + both / share
 
 
 def size_beyond(models: Models, P: Array) -> float:

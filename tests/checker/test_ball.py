@@ -233,7 +233,10 @@ def test_the_local_margin_is_the_share_that_is_left() -> None:
     data, margins = honest("scalar"), []
     for level in (1e-6, 1e-4, 1e-2, 0.1):
         subject = local.Local(Case(parse(with_ball(edited(data, "levels.local", level.hex())))))
-        [(decay, rest)] = subject.sides
+        assert first(local.decreases(subject)) is None
+        [found] = subject.sides()
+        assert found is not None
+        decay, rest = found
         share = Fraction(int(rest[0, 0].p), int(rest[0, 0].q)) / Fraction(int(decay[0, 0].p), int(decay[0, 0].q))
         assert abs(subject.margin - float(1 - share)) < 1e-12
         margins.append(subject.margin)

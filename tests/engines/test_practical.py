@@ -95,7 +95,7 @@ def test_the_shipped_pendulum_without_its_centring(claim: str, tmp_path: Path) -
         return
     result = certify_roa(system, network, tmp_path, PRACTICAL)
     assert result.verdict is Verdict.PROVED and result.stop is Stop.DOMAIN and result.certificate is not None
-    assert result.levels.floor is not None and result.levels.roa is not None and result.levels.local is None
+    assert result.levels.floor is not None and result.levels.roa is not None and result.levels.local is not None
     assert result.levels.floor < 1e-8 * result.levels.roa
     assert run_checker(result.certificate)["claim"] == "practical"
     assert run_checker(result.certificate, "reference")["result"] == "ACCEPTED"

@@ -247,7 +247,12 @@ def nearby(*, push: bool, rate: float = 0.0) -> Certificate:
     """A practical claim with one condition more."""
     ball = LocalBall(np.eye(2), np.ones((3, 2)), np.eye(2))
     evidence = PartitionTree(
-        np.eye(2), np.ones(2), bytes([255]), ball, cells=(1,) * push, contraction=Contraction(np.eye(2), np.ones(2))
+        np.eye(2),
+        np.ones(2),
+        bytes([255]),
+        ball,
+        cells=(1,) * push,
+        contraction=Contraction(np.eye(2), np.ones(2), np.eye(2)),
     )
     claim = Nearby(roa=2.0, local=0.5, floor=0.125, rate=rate)
     return Certificate(integrator(Timing(), push=push), gain("1", 2), Quadratic(np.eye(2)), claim, evidence)

@@ -137,6 +137,11 @@ def with_level(data: Document, name: str, value: float) -> Document:
     return edited(data, f"levels.{name}", float(value).hex())
 
 
+def with_inner(data: Document, value: float) -> Document:
+    """Both levels that a practical claim without a ball has for its inner one."""
+    return with_level(with_level(data, "floor", value), "local", value)
+
+
 def levels(data: Document) -> tuple[float, float]:
     return float.fromhex(data["levels"]["local"]), float.fromhex(data["levels"]["roa"])
 
@@ -1096,7 +1101,7 @@ def practical() -> Iterator[Mutant]:
             ("tree", "leaf behind", with_tree(data, tree + b"\xff")),
             ("tree", "no such axis", with_tree(data, bytes([n]) + tree)),
             ("tree", "lower half alone", with_tree(data, bytes([0]) + tree)),
-            ("ring", "floor far below the drift", with_level(data, "floor", 1e-9), (1e-4,) if n == 1 else None),
+            ("ring", "floor far below the drift", with_inner(data, 1e-9), (1e-4,) if n == 1 else None),
             ("ring", "drift times 1000", edited(data, f"plant.dynamics.{last}.2", "10")),
             ("ring", "other sign", edited(data, "plant.dynamics", lambda d: [["-", e] for e in d])),
             *[

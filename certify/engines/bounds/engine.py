@@ -42,6 +42,8 @@ class BoundsEngine(Engine):
         """The better of two: a ring from a ball around a level, and one that leaves alone have to carry."""
         start = time.perf_counter()
         first = self._from_ball(task, replace(budget, seconds=_FOR_BALL * budget.seconds), report)
+        if task.exactly and first is not None and first.claim is not None and first.claim.roa < task.target:
+            first = None
         left = replace(budget, seconds=budget.seconds - (time.perf_counter() - start))
         if self.T.shape[0] > FEW:
             return first or Proof(None, None, Stop.LOCAL, "no ball shows V to fall around any level; try another P")
