@@ -128,8 +128,8 @@ def certify_largest(
 def _tried(quantity: Quantity, system: System, network: TanhNetwork, P: Any, level: float) -> Sequence[Fraction]:
     """Shares of the largest value for which no violation is sampled in the set, rounded to a few digits."""
     loop = ClosedLoop(system, network)
-    T = diagonalising_coordinates(P, loop.linearise()[0])
-    modes = np.abs(np.linalg.eigvals(loop.linearise()[0]).real)
+    L = loop.mean_rate()
+    T, modes = diagonalising_coordinates(P, L, loop.step), np.abs(np.linalg.eigvals(L).real)
     most = 8 / float(np.min(modes)) if quantity == "period" else 2 * float(np.max(modes))
 
     def holds(value: float) -> bool:

@@ -26,6 +26,7 @@ _MOST_CORNERS = 2**16  # of all cells
 _MOST_WORK = 2**26  # corners times n^4, which is what an inequality takes
 _ATTEMPTS = 4  # at the a-priori enclosure
 Way = tuple[Array, Array]  # how far each state may move in a period: a number, and one times ||d||
+Enclosed = tuple[Way, list[Jet]]  # and f on the way
 
 
 class Local(Ball):
@@ -52,9 +53,9 @@ class Local(Ball):
         return not self.case.c.practical
 
     @cached_property
-    def way(self) -> Way | None:
-        """The a-priori enclosure of the states during a period, the first that holds of a few attempts: what f may come
-        to there, over the longest period, is less. None if none does."""
+    def enclosed(self) -> Enclosed | None:
+        """The a-priori enclosure of the states during a period, and of f there, the first that holds of a few attempts:
+        what f may come to, over the longest period, is less. None if none does."""
         n, h = len(self.J), self.case.longest
         far, along = np.zeros(n), np.zeros(n)
         for _ in range(1 + _ATTEMPTS):
@@ -62,9 +63,14 @@ class Local(Ball):
             most = up(h * np.array([0.0 if self.at_rest else f.size for f in F]))
             steepest = up(h * np.array([f.radius for f in F]))
             if np.all((most < far) | self.at_rest) and np.all(steepest < along):
-                return far, along
+                return (far, along), F
             far, along = (0 * most if self.at_rest else 1.25 * most), 1.25 * steepest
         return None
+
+    @property
+    def way(self) -> Way | None:
+        """The one of the enclosure, if there is one."""
+        return None if self.enclosed is None else self.enclosed[0]
 
     def during(self, way: Way) -> list[Jet]:
         """The states within a way of the ball's."""
@@ -151,13 +157,13 @@ def fits(local: Local) -> Failures:
 
 def stays(local: Local) -> Failures:
     """`flow`: during a period the state stays in the interior of the domain."""
-    c, way = local.case.c, local.way if local.case.c.sample else None
+    c = local.case.c
     if c.sample is None:
         return 0
-    if way is None:
+    if local.enclosed is None:
         yield local.at, "the state is not shown to stay near during a period"
         return 0
-    F = local.f(local.during(way), local.ranges)
+    _, F = local.enclosed
     for i, (f, name, (lo, hi)) in enumerate(zip(F, c.states, c.domain, strict=True)):
         reach, of_ball = root_above(rational(c.c1) * _fmpq(local.case.P_inverse[i])), float(norm(local.J[i], 0))
         reach = min(reach, rational(of_ball)) if np.isfinite(of_ball) else reach

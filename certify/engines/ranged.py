@@ -1,9 +1,9 @@
 """Jets on a ball where something is uncertain: value and gradient are affine in it, all else is as at its worst.
 
 In a cell of the box of ranges each quantity is its middle plus half its width times y_j in [-1, 1]; the length of a
-period may be one more of them. What decides a stiff
-loop is how the gradients of F move with y: they move in directions that the decay can afford, which a norm of them does
-not know. So `v(0) = c + moves.y` within `error`, the gradient is `a + turns.y` within `slack`, and what moves in the
+period may be one more of them. What decides a stiff loop is how the gradients of F move with y: they move in directions
+that the decay can afford, which a norm of them does not know.
+So `v(0) = c + moves.y` within `error`, the gradient is `a + turns.y` within `slack`, and what moves in the
 second and third order, where the ball is what makes it small, is part of E (checker/FORMAT.md, cells).
 
 An error without a y_j is also what a quantity is that may differ from place to place, and what a state is that is only

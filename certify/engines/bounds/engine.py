@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 _SHARE = 0.6  # of the time, for finding c2 before c0
 _FOR_BALL = 0.5  # of the time, for a ring from a ball, and of that for the ball
 _EQUAL = 0.01  # of a level
-_ABOVE = 1.1  # of the least floor: in many states leaves do not lower it any more
+_ABOVE = (1.5, 1.1)  # of the least floor, in few and in many states, where leaves do not lower it any more
 _TRIES = 4  # inner levels from which c2 is looked for, each with half of the time that is left for it
 
 
@@ -56,7 +56,8 @@ class BoundsEngine(Engine):
     def _from_ball(self, task: Task, budget: Budget, report: Report | None) -> Proof | None:
         """A ring that grows from the ball whose floor is about the least; None without such a ball."""
         start = time.perf_counter()
-        until, above = start + _FOR_BALL * budget.seconds, _ABOVE if len(self.T) > FEW else 1.5
+        above = _ABOVE[len(self.T) > FEW]
+        until = start + _FOR_BALL * budget.seconds
         found = prove_band(task.problem, self.T, task.target, until=until, above=above)
         if found is None:
             return None
