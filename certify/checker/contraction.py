@@ -3,8 +3,6 @@ norm of P. So there is one equilibrium at most, and all trajectories converge to
 
 from __future__ import annotations
 
-from fractions import Fraction
-
 import numpy as np
 from flint import fmpq, fmpq_mat
 
@@ -13,10 +11,10 @@ from .ball import Ball
 from .case import Case, Failures
 from .decrease import Models, are_finite, diagonal, rational
 from .document import Contraction
-from .exact import contains_ball, exactly, is_definite, root_above
+from .exact import exactly, is_definite, root_above
 from .float64 import EPS, Array, norm, up
 from .jets import unpacked
-from .local import too_many_corners
+from .local import is_large_enough
 from .pairs import bound_of_pairs, in_binary64
 
 
@@ -32,11 +30,7 @@ class Contracted(Ball):
 
 def fits(ball_: Contracted) -> Failures:
     """The ball contains {V <= c0}, and its jets take neither too much memory nor too much time."""
-    c = ball_.case.c
-    if not contains_ball(exactly(ball_.J), exactly(c.P), Fraction(c.c0)):
-        yield "levels.floor", "the ball must contain {V <= c0}"
-    if too_many_corners(ball_):
-        yield "evidence.cells", "there are too many cells for this rule"
+    yield from is_large_enough(ball_, "levels.floor", "c0", ball_.case.c.c0)
     if not np.all(ball_.by.weights > 0):
         yield "evidence.contraction.weights", "must be positive"
     yield from ball.fits(ball_)

@@ -134,19 +134,21 @@ def _margin(decay: fmpq_mat, rest: fmpq_mat) -> float:
         return float("nan")
 
 
-def too_many_corners(ball: Ball) -> bool:
-    """Whether deciding an inequality at each corner of each cell would take too long."""
+def is_large_enough(ball: Ball, place: str, name: str, level: float) -> Failures:
+    """The ball contains {V <= level}, whose name and place are these, and deciding an inequality at each corner of each
+    cell does not take too long."""
+    if not contains_ball(exactly(ball.J), exactly(ball.case.c.P), Fraction(level)):
+        yield place, f"the ball must contain {{V <= {name}}}"
     corners = prod(ball.case.partition.cells) * 2**ball.count
-    return bool(corners > _MOST_CORNERS or corners * len(ball.J) ** 4 > _MOST_WORK)
+    if corners > _MOST_CORNERS or corners * len(ball.J) ** 4 > _MOST_WORK:
+        yield "evidence.cells", "there are too many cells for this rule"
+    return 0
 
 
 def fits(local: Local) -> Failures:
     """`local`: the ball contains {V <= c1}, and its jets take neither too much memory nor too much time."""
     c = local.case.c
-    if not contains_ball(exactly(local.J), exactly(c.P), Fraction(c.c1)):
-        yield "levels.local", "the ball must contain {V <= c1}"
-    if too_many_corners(local):
-        yield "evidence.cells", "there are too many cells for this rule"
+    yield from is_large_enough(local, "levels.local", "c1", c.c1)
     if not are_usable(local.case.local.multipliers):
         yield "evidence.local", "no multiplier may be negative, none of g 0 where some beta is"
     if c.step > 0 and Fraction(local.case.local.edge) * c.step > 1:

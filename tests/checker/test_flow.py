@@ -162,6 +162,20 @@ def switching(generator: Generator, lo: float, hi: float, ends: np.ndarray) -> t
     return h, list(zip(times, values, strict=True)), times @ values / h
 
 
+def period_of(
+    data: Document, x: np.ndarray, disturbed: bool, sample: tuple[str, str], ends: np.ndarray, generator: Generator
+) -> tuple[float, list[Any], list[np.ndarray], list[float]]:
+    """A period from x with the input held: how long it is, its pieces, the states on the way, and the numbers y of the
+    means and of the period, if that has a range."""
+    u, (lo, hi) = policy(data, x), (Fraction(end) for end in sample)
+    h, pieces, mean = switching(generator, float(lo), float(hi), ends)
+    path = travelled(x, lambda at, w: field(at, u, w, disturbed), pieces)
+    y = ((2 * mean - ends.sum(0)) / (ends[1] - ends[0])).tolist()
+    if lo != hi:
+        y.append((2 * h - float(lo) - float(hi)) / float(hi - lo))
+    return h, pieces, path, y
+
+
 def within_jet(jet: Jet, y: list[float], d: np.ndarray, true: float, sure: float) -> bool:
     at = given(jet, y)
     with ctx.workprec(120):
@@ -189,12 +203,7 @@ def test_the_ball_holds_the_mean_over_a_period_in_which_what_is_uncertain_switch
         widest = 0.0
         for d in (np.array(p) for _ in range(6) for p in points(generator, 2)[:5]):
             x = local.J @ d
-            u = policy(data, x)
-            h, pieces, mean = switching(generator, float(Fraction(lo)), float(Fraction(hi)), ends)
-            path = travelled(x, lambda at, w, u=u: field(at, u, w, disturbed), pieces)
-            y = ((2 * mean - ends.sum(0)) / (ends[1] - ends[0])).tolist()
-            if lo != hi:
-                y.append((2 * h - float(Fraction(lo)) - float(Fraction(hi))) / float(Fraction(hi) - Fraction(lo)))
+            h, pieces, path, y = period_of(data, x, disturbed, (lo, hi), ends, generator)
             true = (path[-1] - x) / h
             for jet, each in zip(G, true.tolist(), strict=True):
                 assert within_jet(jet, y, d, each, 1e-9), (d, pieces)
@@ -224,12 +233,7 @@ def test_leaves_hold_the_mean_over_a_period_in_which_what_is_uncertain_switches(
         for _ in range(12):
             d = np.where(generator.random(2) < 0.5, np.sign(generator.standard_normal(2)), generator.uniform(-1, 1, 2))
             x = centre[:, index] + radius[:, index] * d
-            u = policy(data, x)
-            h, pieces, mean = switching(generator, float(Fraction(lo)), float(Fraction(hi)), ends)
-            path = travelled(x, lambda at, w, u=u: field(at, u, w, disturbed), pieces)
-            y = ((2 * mean - ends.sum(0)) / (ends[1] - ends[0])).tolist()
-            if lo != hi:
-                y.append((2 * h - float(Fraction(lo)) - float(Fraction(hi))) / float(Fraction(hi) - Fraction(lo)))
+            h, pieces, path, y = period_of(data, x, disturbed, (lo, hi), ends, generator)
             true = (path[-1] - x) / h
             for model, each in zip(G, true.tolist(), strict=True):
                 assert holds(replace_slack(model), index, 2, symbols, [*d, *y], arb(each)), (index, pieces)

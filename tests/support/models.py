@@ -76,6 +76,12 @@ def beyond(value: arb, v: Model, d: Sequence[Any]) -> arb:
     return abs(value - linear(v, d) - curved(v, d)) / (bound * (1 + arb(2) ** -50) + arb(2) ** -130)
 
 
+def may_be(v: Model, true: arb, d: Sequence[Any]) -> bool:
+    """Whether a value at d is not certainly outside; each number of the model is a ball, of which no more is known."""
+    rest = form(v.whole, d)
+    return bool((true - linear(v, d) - curved(v, d)).overlaps(rest.union(-rest)))
+
+
 def numbers(part: arb_mat) -> np.ndarray:
     return np.array([float(v) for v in part.entries()]).reshape(part.nrows(), part.ncols())
 
