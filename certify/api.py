@@ -92,7 +92,8 @@ def certify_roa(
 
     For `xdot = f(x, pi(x))` it looks for the largest set {x'Px <= c2} from which every trajectory converges to the
     origin, writes the proof down as a certificate, and asks the independent checker, in a process of its own. A policy
-    that does not rest at the origin exactly gets another claim, practical stability: `result.claim` says which.
+    that does not rest at the origin exactly gets another claim, a nearby equilibrium or practical stability:
+    `result.claim` says which.
 
     Parameters
     ----------
@@ -107,10 +108,11 @@ def certify_roa(
     importing : what a policy that is not this program's own does not say: an `ImportOptions`, or a mapping with its
         names, such as `{"states": ["theta", "theta_dot"], "normaliser": "none", "action_scale": 6}`. What is missing
         is asked for by name; nothing is guessed. Text means its decimal value, a float its binary value.
-    claim : "asymptotic"; "practical", which asks for no equilibrium at the origin; or "auto" (the default), the first
-        where the loop rests at the origin exactly and the second where it does not.
-    candidate : where P comes from: "auto" (the default: of several the largest proved), "lyapunov", "scaled", "lqr"
-        or "optimised".
+    claim : "asymptotic"; "practical", which asks for no equilibrium at the origin; "nearby", which is that and, if it
+        can be shown, convergence to one equilibrium where what is uncertain is constant; or "auto" (the default), the
+        first where the loop rests at the origin exactly and the last where it does not.
+    candidate : where P comes from: "auto" (the default: of several the largest proved), "lyapunov", "scaled", "lqr",
+        "optimised", "robust", or "peak", which is for practical claims.
     Q, R : diagonals of the weights, n and m positive numbers; ones by default.
     P : a Lyapunov matrix of one's own, (n, n), symmetric; overrides the candidate.
     level : prove exactly this level; by default the largest is looked for.

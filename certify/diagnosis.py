@@ -142,10 +142,8 @@ def _next(result: RoaResult, options: RoaOptions, proof: Proof | None, name: str
         return _longer(result, options, proof)
     if options.claim == "asymptotic" and options.only is not None and options.P is None and options.level is None:
         return Step((("--candidate", "auto"),), f"only the candidate {options.only} was tried")
-    exact = not (
-        result.system.ranges or result.system.in_steps
-    )  # a tube says nothing of what is uncertain, or of steps
-    if result.stop is Stop.STALLED and exact and not options.enlarges and _has_tube(result):
+    knows = not (result.system.ranges or result.system.in_steps)  # a tube says nothing of such things
+    if result.stop is Stop.STALLED and knows and not options.enlarges and _has_tube(result):
         return Step((("--enlarge", ""),), f"a tube leads into this set from one {_LONGER:g} times as long, at least")
     if result.stop is Stop.STALLED:
         worst = ", ".join(one for one, _ in _hurting(result, proof)[:3])

@@ -29,8 +29,8 @@ class RoaOptions:
         can be shown, that all trajectories converge to one equilibrium where what is uncertain is constant. `auto` is
         the first where the loop rests at the origin exactly, and the last where it does not.
     candidate : where P comes from, see `choose_candidate`, or `robust`, which chooses P with the local rule's own
-        bounds; `auto` tries several and keeps the one with which the largest volume is proved. With Q, R or a level it
-        is `lyapunov`, or `lqr` if R is given.
+        bounds, or `peak`, whose floor is small; `auto` tries several and keeps the one with which the largest volume is
+        proved. With Q, R or a level it is `lyapunov`, or `lqr` if R is given.
     Q, R : diagonals of the weights, shapes (n,) and (m,); None means ones.
     P : a Lyapunov matrix of one's own, (n, n); overrides the candidate.
     level : prove exactly this level; None finds the largest.

@@ -49,14 +49,16 @@ def roa(
     claim: Annotated[
         str,
         typer.Option(
-            help="asymptotic (converges to the origin), practical (enters a small set and stays there), or auto: the "
-            "first if the loop rests at the origin exactly."
+            help="asymptotic (converges to the origin), practical (enters a small set and stays there), nearby (that, "
+            "and converges to one equilibrium in it, if that can be shown), or auto: the first if the loop rests at "
+            "the origin exactly, the last if not."
         ),
     ] = "auto",
     candidate: Annotated[
         str,
         typer.Option(
-            help="Lyapunov candidate: auto (of all, the largest proved), lyapunov, scaled, lqr, optimised, robust."
+            help="Lyapunov candidate: auto (of all, the largest proved), lyapunov, scaled, lqr, optimised, robust, "
+            "peak (practical claims, a small floor)."
         ),
     ] = "auto",
     q: Annotated[str | None, typer.Option("--Q", help="Diagonal of Q, as in 1,1.")] = None,

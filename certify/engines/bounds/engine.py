@@ -104,16 +104,8 @@ class BoundsEngine(Engine):
         if not ring.covered:
             why = f"F and its inputs are not enclosed on all of V <= {ring.inner:.6g}"
             return Proof(None, None, Stop.SMOOTH, why, boxes=ring.boxes)
-        return replace(
-            self.stated(
-                task.problem,
-                ring,
-                Practical(roa=ring.outer, local=ring.inner, floor=ring.inner, rate=task.problem.rate),
-                {},
-            ),
-            stop=stop,
-            witness=witness,
-        )
+        claim = Practical(roa=ring.outer, local=ring.inner, floor=ring.inner, rate=task.problem.rate)
+        return replace(self.stated(task.problem, ring, claim, {}), stop=stop, witness=witness)
 
     def _outer_level(
         self, task: Task, band: Band, budget: Budget, report: Report | None
