@@ -175,7 +175,7 @@ def test_models_of_random_equations_contain_them(tree: Any, seed: int, size: flo
     points = [*generator.uniform(-1, 1, (4, 2)).tolist(), [1.0, -1.0], [-1.0, -1.0]]
     with ctx.workprec(200), np.errstate(all="ignore"):
         compiled = reference_expressions.equations([tree], {"x", "y"}, "plant")
-        tape = checker_expression.parse_dynamics([tree], ("x", "y"))
+        tape = checker_expression.parse([tree], ("x", "y"), "plant.dynamics")
         # boxes
         states = [checker_taylor.affine(np.array([c]), g[:, None]) for c, g in zip(centre, slopes, strict=True)]
         [v] = checker_expression.evaluate(tape, lambda q: checker_taylor.constant(q, 2, 1), states)

@@ -32,7 +32,7 @@ from certify.systems import System
 from certify.systems.system import Interval
 
 Array = NDArray[np.float64]
-SCHEMA = "certify-certificate/6"
+SCHEMA = "certify-certificate/7"
 MAX_BYTES = 256 * 2**20
 _LONGEST_UNIT = 40
 _OF_A_BALL = ("J", "multipliers", "weight")

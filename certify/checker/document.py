@@ -14,7 +14,7 @@ from flint import fmpq
 from numpy.typing import NDArray
 
 from .errors import Rejected
-from .expression import Tape, parse_dynamics
+from .expression import Tape, parse
 from .schema import Value
 from .strict import MAX_VALUES, load
 
@@ -48,6 +48,22 @@ class Policy:
             digest.update(struct.pack(f"<{1 + numbers.ndim}Q", numbers.ndim, *numbers.shape))
             digest.update(numbers.astype("<f8").tobytes())
         return digest.hexdigest()
+
+
+@dataclass(frozen=True)
+class Network:
+    """A function of the states: layers with tanh between them, the last of which has one row."""
+
+    weights: tuple[Array, ...]
+    biases: tuple[Array, ...]
+
+
+@dataclass(frozen=True)
+class Outer:
+    """The function N, an expression's tape or a network, and the level n2 of {N <= n2}."""
+
+    function: Tape | Network
+    level: float
 
 
 @dataclass(frozen=True)
@@ -117,6 +133,17 @@ class Partition:
     local: LocalBall | None
     contraction: Contraction | None
     tube: tuple[Slab, ...]
+    outer: OuterTree | None
+
+
+@dataclass(frozen=True)
+class OuterTree:
+    """A partition tree of the box |z| <= root, x = T z, that contains the domain, and one of each of its faces."""
+
+    T: Array
+    root: Array
+    tree: bytes
+    faces: tuple[bytes, ...]
 
 
 @dataclass(frozen=True)
@@ -155,6 +182,7 @@ class Certificate:
     sha256: str
     start: Array | None = None  # P_0 of a claim with a tube
     centre: Array | None = None  # c_0 of a claim whose tube follows a path
+    outer: Outer | None = None  # whose set trajectories leave into {V <= c2} only
 
     @property
     def practical(self) -> bool:
@@ -189,7 +217,7 @@ def certificate(data: Any, sha256: str) -> Certificate:
     """A JSON value as a certificate."""
     keys = "schema claim plant policy lyapunov levels evidence provenance"
     schema, claim, plant, policy, lyapunov, levels, evidence, provenance = Value(data).keys(keys)
-    schema.choice("certify-certificate/6")
+    schema.choice("certify-certificate/7")
     known = isinstance(claim.raw, dict) and claim.raw.get("kind") in CLAIMS
     claim.must(known, f"an object of kind {' or '.join(CLAIMS)}")
     kind = claim.raw["kind"]
@@ -197,12 +225,14 @@ def certificate(data: Any, sha256: str) -> Certificate:
     n, m = len(stated["states"]), len(stated["inputs"])
     stated["policy"] = _policy(policy, n, m)
     stated_of = {"enlarged": " start", "reached": " start centre"}
-    _, rate, sample, *of_tube = claim.keys("kind rate sample" + stated_of.get(kind, ""))
+    _, rate, sample, beyond, *of_tube = claim.keys("kind rate sample outer" + stated_of.get(kind, ""))
     fall, periods = rate.binary64(), _sample(sample)
     rate.must(0 <= fall < math.inf and (fall == 0 or kind not in WITH_TUBE), "0, or a rate where a claim may have one")
     plain = periods is None and not stated["discrete"]
     sample.must(plain or kind not in (*WITH_TUBE, "nearby"), "null, and the plant continuous, under this claim")
     sample.must(periods is None or not stated["discrete"], "null where time is discrete")
+    outer = _outer(beyond, stated["states"])
+    beyond.must(outer is None or (plain and fall == 0 and kind not in WITH_TUBE), "null under this claim")
     form, P = lyapunov.keys("kind P")
     form.choice("quadratic")
     edges = (*(("floor",) if kind in PRACTICAL else ()), "local", "roa")
@@ -215,10 +245,19 @@ def certificate(data: Any, sha256: str) -> Certificate:
         **stated,
         P=P.array(n, n),
         levels=numbers,
-        evidence=_evidence(evidence, n, len(stated["uncertain"]), kind, periods is not None, plain and fall == 0),
+        evidence=_evidence(
+            evidence,
+            n,
+            len(stated["uncertain"]),
+            kind,
+            periods is not None,
+            outer is not None,
+            plain and fall == 0 and outer is None,
+        ),
         sha256=sha256,
         start=of_tube[0].array(n, n) if of_tube else None,
         centre=of_tube[1].array(n) if kind == "reached" else None,
+        outer=outer,
     )
 
 
@@ -237,7 +276,7 @@ def _plant(plant: Value) -> dict[str, Any]:
         "inputs": inputs,
         "uncertain": others,
         "ranges": tuple(interval for _, interval in quantities),
-        "dynamics": parse_dynamics(dynamics.listed(lambda tree: tree.raw, n), everything),
+        "dynamics": parse(dynamics.listed(lambda tree: tree.raw, n), everything, dynamics.at),
         "u_eq": u_eq.listed(Value.rational, m),
         "domain": domain.listed(Value.interval, n),
         "input_bounds": bounds.listed(Value.interval, m),
@@ -259,6 +298,17 @@ def _quantity(value: Value) -> tuple[str, tuple[Fraction, Fraction]]:
 
 def _policy(value: Value, n: int, m: int) -> Policy:
     layers, squash, centre, scale, offset, clip, sha256 = value.keys("layers squash centre scale offset clip sha256")
+    weights, biases = _layers(layers, n, m)
+    words = squash.choice("tanh", "identity"), centre.choice("output", "preactivation", "none")
+    centre.must(words != ("identity", "preactivation"), "another where squash is not 'tanh'")
+    policy = Policy(weights, biases, scale.array(m), offset.array(m), *words, _clip(clip, m))
+    scale.must(bool(np.all(policy.scale != 0)), "nonzero")
+    check_hash(policy, sha256.raw)
+    return policy
+
+
+def _layers(layers: Value, n: int, m: int) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+    """Weights and biases from n numbers to m."""
     read: list[tuple[Array, Array]] = []
     columns = n  # of a layer: the rows of the layer before
     for shape, weight, bias in layers.listed(lambda layer: layer.keys("shape weight bias"), 1, MAX_LAYERS):
@@ -268,13 +318,28 @@ def _policy(value: Value, n: int, m: int) -> Policy:
         read.append((weight.array(rows, columns), bias.array(rows)))
         columns = rows
     layers.must(columns == m, f"a network with {m} outputs")
-    words = squash.choice("tanh", "identity"), centre.choice("output", "preactivation", "none")
-    centre.must(words != ("identity", "preactivation"), "another where squash is not 'tanh'")
     weights, biases = zip(*read, strict=True)
-    policy = Policy(weights, biases, scale.array(m), offset.array(m), *words, _clip(clip, m))
-    scale.must(bool(np.all(policy.scale != 0)), "nonzero")
-    check_hash(policy, sha256.raw)
-    return policy
+    return weights, biases
+
+
+def _outer(value: Value, states: tuple[str, ...]) -> Outer | None:
+    if value.raw is None:
+        return None
+    kinds = ("network", "expression")
+    value.must(isinstance(value.raw, dict) and value.raw.get("kind") in kinds, f"of kind {' or '.join(kinds)}, or null")
+    if value.raw["kind"] == "network":
+        _, layers, level = value.keys("kind layers level")
+        return Outer(Network(*_layers(layers, len(states), 1)), level.binary64())
+    _, tree, level = value.keys("kind expression level")
+    return Outer(parse((tree.raw,), states, tree.at), level.binary64())
+
+
+def _outer_tree(value: Value, n: int, asked: bool) -> OuterTree | None:
+    if not asked:
+        value.must(value.raw is None, "null where the claim has none")
+        return None
+    T, root, tree, faces = value.keys("T root tree faces")
+    return OuterTree(T.array(n, n), root.array(n), tree.octets(), faces.listed(Value.octets, 2 * n))
 
 
 def _local(value: Value, n: int, claim: str, sampled: bool) -> LocalBall | None:
@@ -334,8 +399,11 @@ def check_hash(policy: Policy, stated: Any) -> None:
         raise Rejected("hash", "policy.sha256", "does not match the layers in the file")
 
 
-def _evidence(value: Value, n: int, k: int, claim: str, sampled: bool, plain: bool) -> Partition | Trusted:
-    """k quantities are uncertain; `plain` says that no rate is claimed of a loop without steps."""
+def _evidence(
+    value: Value, n: int, k: int, claim: str, sampled: bool, outer: bool, plain: bool
+) -> Partition | Trusted:
+    """k quantities are uncertain; `outer` says that a function is stated, `plain` that none is, nor a rate, of a loop
+    without steps."""
     kinds = (
         "partition-tree",
         *(("trusted-solver",) if plain and not k and claim not in (*WITH_TUBE, "nearby") else ()),
@@ -343,8 +411,8 @@ def _evidence(value: Value, n: int, k: int, claim: str, sampled: bool, plain: bo
     known = isinstance(value.raw, dict) and value.raw.get("kind") in kinds
     value.must(known, f"an object of kind {' or '.join(kinds)}")
     if value.raw["kind"] == "partition-tree":
-        keys = "kind T root tree order cells local contraction tube"
-        _, T, root, tree, order, cells, local, contraction, tube = value.keys(keys)
+        keys = "kind T root tree order cells local contraction tube outer"
+        _, T, root, tree, order, cells, local, contraction, tube, beyond = value.keys(keys)
         cuts = cells.listed(lambda cut: cut.raw, k)
         whole = all(type(cut) is int and 1 <= cut <= MAX_CUTS for cut in cuts)
         cells.must(whole and math.prod(cuts) <= MAX_CELLS, f"from 1 to {MAX_CUTS} parts each, {MAX_CELLS} in all")
@@ -352,7 +420,8 @@ def _evidence(value: Value, n: int, k: int, claim: str, sampled: bool, plain: bo
         slabs = tube.listed(lambda slab: _slab(slab, n, claim), *((1, MAX_SLABS) if claim in WITH_TUBE else (0, 0)))
         ball = _local(local, n, claim, sampled)
         close = _contraction(contraction, n, claim)
-        return Partition(T.array(n, n), root.array(n), tree.octets(), _order(order, sampled), cuts, ball, close, slabs)
+        by_boxes = T.array(n, n), root.array(n), tree.octets(), _order(order, sampled)
+        return Partition(*by_boxes, cuts, ball, close, slabs, _outer_tree(beyond, n, outer))
     _, solver, version, precision, queries = value.keys("kind solver version precision queries")
     precision.must(precision.binary64() > 0, "positive")
     answers = queries.listed(lambda pair: pair.listed(Value.word, 2), 0, MAX_VALUES)

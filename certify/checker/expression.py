@@ -50,24 +50,24 @@ def evaluate(tape: Tape, constant: Callable[[Fraction], Any], variables: Sequenc
     return [values[i] for i in tape.outputs]
 
 
-def parse_dynamics(trees: Sequence[Any], names: Sequence[str]) -> Tape:
-    """Compile n trees over `names`; raises `Rejected` under rule `format`."""
-    builder = _Builder({name: i for i, name in enumerate(names)})
-    outputs = tuple(builder.build(tree, f"plant.dynamics[{i}]", 0) for i, tree in enumerate(trees))
+def parse(trees: Sequence[Any], names: Sequence[str], at: str) -> Tape:
+    """Compile trees over `names`, which stand at this place; raises `Rejected` under rule `format`."""
+    builder = _Builder({name: i for i, name in enumerate(names)}, at)
+    outputs = tuple(builder.build(tree, f"{at}[{i}]", 0) for i, tree in enumerate(trees))
     return Tape(tuple(operation for _, operation in builder.tape.values()), outputs, tuple(trees))
 
 
 class _Builder:
     """Appends operations; an operation that already stands on the tape is shared."""
 
-    def __init__(self, names: dict[str, int]) -> None:
-        self.names, self.visited = names, 0
+    def __init__(self, names: dict[str, int], at: str) -> None:
+        self.names, self.at, self.visited = names, at, 0
         self.tape: dict[str, tuple[int, Operation]] = {}  # by strings, whose hashes nobody can predict
 
     def push(self, *operation: Any) -> int:
         index, _ = self.tape.setdefault(" ".join(map(str, operation)), (len(self.tape), operation))
         if index >= MAX_OPERATIONS:
-            strict.fail("plant.dynamics", f"more than {MAX_OPERATIONS} operations")
+            strict.fail(self.at, f"more than {MAX_OPERATIONS} operations")
         return index
 
     def build(self, tree: Any, at: str, depth: int) -> int:

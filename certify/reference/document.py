@@ -23,7 +23,7 @@ from .refusal import Refused, require
 MAX_BYTES, MAX_BYTES_BEYOND_ASCII = 256 * 2**20, 16 * 2**20
 MAX_TOKENS = 10**6  # commas and opening brackets
 MAX_NAMES, MAX_LAYERS, MAX_WIDTH = 64, 64, 2**14
-SCHEMA, CLAIMS = "certify-certificate/6", ("asymptotic", *WITH_FLOOR, *WITH_TUBE)
+SCHEMA, CLAIMS = "certify-certificate/7", ("asymptotic", *WITH_FLOOR, *WITH_TUBE)
 IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,63}")
 
 Interval = tuple[fmpq, fmpq]

@@ -27,7 +27,7 @@ from certify.checker import document, rules, strict, words
 from certify.checker.__main__ import main
 from certify.checker.errors import Rejected, Unreadable
 from certify.checker.exact import Exact, Undecided
-from certify.checker.expression import evaluate, parse_dynamics
+from certify.checker.expression import evaluate, parse
 from certify.checker.schema import Value
 from certify.checker.strict import MAX_BYTES
 from tests.support.certificates import Document, dump, edited, encode, grow, make, rehash, write
@@ -336,7 +336,7 @@ def test_depth_and_size_of_the_equations_are_limited(tmp_path: Path) -> None:
 @pytest.mark.parametrize("exponent", [*range(1, 20), 31, 32, 33, 63, 64])
 def test_powers_mean_what_they_say(exponent: int) -> None:
 
-    tape = parse_dynamics([["**", "x", exponent], ["**", "x", -exponent]], ["x"])
+    tape = parse([["**", "x", exponent], ["**", "x", -exponent]], ["x"], "plant.dynamics")
     values = evaluate(tape, Exact, [Exact(Fraction(-3, 2))])
     assert [v.value for v in values] == [Fraction(-3, 2) ** k for k in (exponent, -exponent)]
 
@@ -365,7 +365,7 @@ def expressions() -> st.SearchStrategy[Any]:
 @example(["**", "-3/7", 2])
 def test_the_printed_equations_are_the_parsed_ones(tree: Any) -> None:
     """The text, read as Python over the rationals, and the tape have the same values."""
-    tape = parse_dynamics([tree], ["x", "u"])
+    tape = parse([tree], ["x", "u"], "plant.dynamics")
     exact_text = re.sub(r"(?<![\w*])\d+", lambda m: f"Fraction({m[0]})", words.expression(tape.trees[0]))
     x, u = Fraction(7, 5), Fraction(-2, 3)
     try:

@@ -103,7 +103,7 @@ def make(
     from tests.support.balls import with_ball
 
     return with_ball(rehash({
-        "schema": "certify-certificate/6",
+        "schema": "certify-certificate/7",
         "claim": {"kind": claim, "rate": float(rate).hex(), "sample": sample and list(sample)},
         "plant": {
             "name": "plant",
