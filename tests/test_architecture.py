@@ -29,7 +29,7 @@ EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows th
     "largest": "certificate claims closed_loop engines lyapunov options policies results roa systems",
     "lyapunov": "closed_loop",
     "options": "lyapunov",
-    "policies": "systems",
+    "policies": "plain_file systems",
     "race": "engines lyapunov trials",
     "report": "certificate claims closed_loop lyapunov policies systems",
     "rest": "closed_loop rigorous",
