@@ -1,9 +1,11 @@
-"""Quadratic Lyapunov functions `V(x) = x'Px`: candidates, coordinates, level sets."""
+"""Lyapunov functions, quadratic, neural and polynomial; of quadratic ones candidates, coordinates, level sets."""
 
 from __future__ import annotations
 
 from certify.lyapunov.candidates import slowest_decay, solve_lyapunov
 from certify.lyapunov.choice import SOLVED, Candidate, Chosen, Named, choose_candidate
+from certify.lyapunov.file import StoredLyapunov, load_lyapunov, save_lyapunov
+from certify.lyapunov.function import LyapunovFunction, Quadratic
 from certify.lyapunov.level_sets import (
     are_inside,
     diagonalising_coordinates,
@@ -15,13 +17,20 @@ from certify.lyapunov.level_sets import (
     semi_axes,
     volume,
 )
+from certify.lyapunov.neural import Neural
 from certify.lyapunov.optimised import optimise_candidate, optimise_repeatedly
+from certify.lyapunov.polynomial import Polynomial
 
 __all__ = [
     "SOLVED",
     "Candidate",
     "Chosen",
+    "LyapunovFunction",
     "Named",
+    "Neural",
+    "Polynomial",
+    "Quadratic",
+    "StoredLyapunov",
     "are_inside",
     "choose_candidate",
     "diagonalising_coordinates",
@@ -30,8 +39,10 @@ __all__ = [
     "inverse",
     "is_positive_definite",
     "leaves_domain",
+    "load_lyapunov",
     "optimise_candidate",
     "optimise_repeatedly",
+    "save_lyapunov",
     "semi_axes",
     "slowest_decay",
     "solve_lyapunov",

@@ -1,9 +1,14 @@
-"""Lyapunov functions as values. Quadratic ones are all there is today; claims and engines ask only for what is here."""
+"""Lyapunov functions as values: what claims and engines ask of one, and the quadratic one.
+
+Here stand the numbers and their evaluation in floats, for search and simulation. That a function decreases along
+trajectories is shown by bounds of its own on boxes, never by these evaluations.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +16,20 @@ from numpy.typing import NDArray
 from certify.errors import InputError
 
 Array = NDArray[np.float64]
+
+
+class LyapunovFunction(Protocol):
+    """A function of the state whose sublevel sets a claim speaks of; its numbers are exact binary64."""
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+
+    def __call__(self, x: Array) -> Array:
+        """The function in float64, shape (..., n) to (...)."""
+
+    def gradient(self, x: Array) -> Array:
+        """Its gradient in float64, shape (..., n) to (..., n)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +65,10 @@ class Quadratic:
     def __call__(self, x: Array) -> Array:
         """V in float64, shape (..., n) to (...)."""
         return np.asarray(x @ self.P @ x if x.ndim == 1 else ((x @ self.P) * x).sum(-1))
+
+    def gradient(self, x: Array) -> Array:
+        """2 P x in float64, shape (..., n) to (..., n)."""
+        return np.asarray(2 * (x @ self.P))
 
     def exactly(self, x: Array) -> Fraction:
         """V at a binary64 point, shape (n,), as a rational."""

@@ -1,15 +1,10 @@
 """The policy file `certify-policy/1`, or with a clip or bounds of validity `certify-policy/2`: plain tensors only.
 
-Nothing in a file is executed (`weights_only=True`), and equal policies give equal bytes: the archive is
-written through memory, so that neither a file name nor a clock enters it.
+Nothing in a file is executed, and equal policies give equal bytes (see `certify.plain_file`).
 """
 
 from __future__ import annotations
 
-import io
-import os
-import pickle
-import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -20,13 +15,15 @@ from typing import Any, cast
 import numpy as np
 
 from certify.errors import InputError
+from certify.plain_file import array_in, layers_in, origin_in, read_plain, require_keys, tensors, write_plain
 from certify.policies.network import Array, Centre, Squash, TanhNetwork
 
 FORMAT = "certify-policy/1"
 # The same with `output.clip`, a pair of tensors, or `valid`, a tensor (n, 2), or both; others stay version 1.
 SECOND = "certify-policy/2"
-_KEYS = {"format", "activation", "weights", "biases", "output", "centre", "system", "training"}
-_OPTIONAL = {"beta", "valid"}
+_KEYS = {"format", "activation", "weights", "biases", "output", "centre", "system"}
+_OPTIONAL = {"training", "beta", "valid"}
+_WHAT = "policy file"
 _BETA_ROUNDING = 2.0**-20  # of tanh(beta): a few operations in single precision
 
 
@@ -103,50 +100,27 @@ def save_policy(path: str | Path, policy: Policy) -> None:
     """
     import torch
 
-    network = policy.network
-    # float32 where that loses nothing: the file is smaller, the numbers are the same.
+    network, depth = policy.network, len(policy.network.weights)
     arrays = (*network.weights, *network.biases, network.scale, network.offset, *(network.clip or ()))
-    single = all(np.array_equal(a.astype(np.float32).astype(np.float64), a) for a in arrays)
-
-    def tensor(array: Array) -> torch.Tensor:
-        return torch.tensor(array, dtype=torch.float32 if single else torch.float64)
-
+    numbers = tensors(arrays)
+    scale, offset, *clip = numbers[2 * depth :]
     data: dict[str, Any] = {
         "format": FORMAT if network.clip is None and policy.valid is None else SECOND,
         "activation": "tanh",
-        "weights": [tensor(w) for w in network.weights],
-        "biases": [tensor(b) for b in network.biases],
-        "output": {"squash": network.squash, "scale": tensor(network.scale), "offset": tensor(network.offset)},
+        "weights": numbers[:depth],
+        "biases": numbers[depth : 2 * depth],
+        "output": {"squash": network.squash, "scale": scale, "offset": offset},
         "centre": network.centre,
         "system": {"name": policy.system, "parameters": dict(policy.parameters)},
         "training": dict(policy.training),
     }
     if network.clip is not None:
-        data["output"]["clip"] = [tensor(end) for end in network.clip]
+        data["output"]["clip"] = clip
     if policy.valid is not None:
         data["valid"] = torch.tensor(policy.valid, dtype=torch.float64)
     if policy.beta is not None:
         data["beta"] = torch.tensor(policy.beta, dtype=torch.float64)
-    buffer = io.BytesIO()
-    torch.save(_interned(data), buffer)
-    target = Path(path)
-    temporary = target.with_name(target.name + ".partial")
-    try:
-        temporary.write_bytes(buffer.getvalue())
-        os.replace(temporary, target)
-    except OSError as error:
-        raise InputError(f"policy file {path} cannot be written: {error.strerror}.") from error
-
-
-def _interned(value: Any) -> Any:
-    """Equal strings become one object: pickle writes a repeated object as a reference, so identity shows in bytes."""
-    if isinstance(value, str):
-        return sys.intern(value)
-    if isinstance(value, dict):
-        return {_interned(k): _interned(v) for k, v in value.items()}
-    if isinstance(value, list | tuple):
-        return type(value)(_interned(v) for v in value)
-    return value
+    write_plain(path, data, _WHAT)
 
 
 def load_policy(path: str | Path) -> Policy:
@@ -157,22 +131,7 @@ def load_policy(path: str | Path) -> Policy:
     InputError : the file is missing, is not an archive of plain tensors, or does not follow
         `certify-policy/1` or `certify-policy/2`.
     """
-    import torch
-
-    path = Path(path)
-    try:
-        raw = path.read_bytes()
-    except OSError as error:
-        raise InputError(f"policy file {path} cannot be read: {error.strerror}.") from error
-    try:
-        data = torch.load(io.BytesIO(raw), map_location="cpu", weights_only=True)
-    except pickle.UnpicklingError as error:
-        raise InputError(
-            f"policy file {path} must hold plain tensors only; it holds other objects or is damaged "
-            "(nothing in it was executed)."
-        ) from error
-    except Exception as error:  # torch.load has no closed list of what it raises on a damaged file
-        raise InputError(f"policy file {path} is not a file that torch.load can read: {error}.") from error
+    data = read_plain(path, _WHAT)
     try:
         return _policy(data)
     except InputError as error:
@@ -189,46 +148,27 @@ def _policy(data: Any) -> Policy:
         parts |= {"clip"}  # one of the two is what makes a file version 2
     if found == FORMAT and "valid" in keys:
         raise InputError(f"`valid` must go with format {SECOND!r}; found {FORMAT!r}.")
-    if not _KEYS - {"training"} <= keys <= _KEYS | _OPTIONAL:
-        odd = sorted(map(str, keys - _KEYS - _OPTIONAL))
-        raise InputError(f"missing keys {sorted(_KEYS - {'training'} - keys)}, unknown keys {odd}.")
+    require_keys(data, _KEYS, _OPTIONAL)
     if data["activation"] != "tanh":
         raise InputError(f"`activation` must be 'tanh'; found {data['activation']!r}. Only tanh networks are proved.")
-    system, training = data["system"], data.get("training", {})
     if not isinstance(output, dict) or set(output) != parts:
         raise InputError(f"`output` of {found} must be a dictionary with exactly {', '.join(sorted(parts))}.")
     clip = output.get("clip", ())
     if not isinstance(clip, list | tuple) or len(clip) != (2 if "clip" in parts else 0):
         raise InputError("`output.clip` must be a list of two tensors, lo and hi.")
-    if not isinstance(system, dict) or set(system) != {"name", "parameters"} or not isinstance(system["name"], str):
-        raise InputError("`system` must be a dictionary with name and parameters.")
-    if not isinstance(system["parameters"], dict) or not isinstance(training, dict):
-        raise InputError("`system.parameters` and `training` must be dictionaries.")
-    if not isinstance(data["weights"], list | tuple) or not isinstance(data["biases"], list | tuple):
-        raise InputError("`weights` and `biases` must be lists of tensors.")
+    system, parameters, training = origin_in(data)
+    weights, biases = layers_in(data)
     network = TanhNetwork(
-        weights=tuple(_array(w, f"weights[{k}]") for k, w in enumerate(data["weights"])),
-        biases=tuple(_array(b, f"biases[{k}]") for k, b in enumerate(data["biases"])),
-        scale=_array(output["scale"], "output.scale"),
-        offset=_array(output["offset"], "output.offset"),
+        weights=weights,
+        biases=biases,
+        scale=array_in(output["scale"], "output.scale"),
+        offset=array_in(output["offset"], "output.offset"),
         squash=cast(Squash, output["squash"]),
         centre=cast(Centre, data["centre"]),
-        clip=cast(Any, tuple(_array(end, "output.clip") for end in clip) or None),
+        clip=cast(Any, tuple(array_in(end, "output.clip") for end in clip) or None),
     )
-    beta = _array(data["beta"], "beta") if "beta" in data else None
+    beta = array_in(data["beta"], "beta") if "beta" in data else None
     if beta is not None and (beta.shape != (network.m,) or network.centre != "preactivation"):
         raise InputError(f"`beta` must have shape ({network.m},) and goes with centre 'preactivation'.")
-    valid = _array(data["valid"], "valid") if "valid" in data else None
-    return Policy(network, system["name"], system["parameters"], training, beta, valid)
-
-
-def _array(value: Any, name: str) -> Array:
-    import torch
-
-    if not isinstance(value, torch.Tensor) or value.dtype not in (torch.float32, torch.float64):
-        found = value.dtype if isinstance(value, torch.Tensor) else type(value).__name__
-        raise InputError(f"`{name}` must be a float32 or float64 tensor; found {found}.")
-    if value.layout is not torch.strided:
-        raise InputError(f"`{name}` must be a dense tensor; found {value.layout}.")
-    result: Array = value.detach().to(torch.float64).numpy()
-    return result
+    valid = array_in(data["valid"], "valid") if "valid" in data else None
+    return Policy(network, system, parameters, training, beta, valid)

@@ -27,10 +27,12 @@ from numpy.typing import NDArray
 
 from certify.errors import InputError
 from certify.policies.arithmetic import Arithmetic
+from certify.policies.layers import frozen, frozen_layers, like, tanh, through, widths
 
 Squash = Literal["tanh", "identity"]
 Centre = Literal["output", "preactivation", "none"]
 Array = NDArray[np.float64]
+_WHOSE = "the policy"  # in messages
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,32 +61,17 @@ class TanhNetwork:
     clip: tuple[Array, Array] | None = None
 
     def __post_init__(self) -> None:
-        for name in ("weights", "biases"):
-            arrays = tuple(_frozen(a, name) for a in getattr(self, name))
-            object.__setattr__(self, name, arrays)
+        weights, biases = frozen_layers(self.weights, self.biases, _WHOSE)
+        object.__setattr__(self, "weights", weights)
+        object.__setattr__(self, "biases", biases)
         for name in ("scale", "offset"):
-            object.__setattr__(self, name, _frozen(getattr(self, name), name))
+            object.__setattr__(self, name, frozen(getattr(self, name), name, _WHOSE))
         if self.squash not in get_args(Squash):
             raise InputError(f"`squash` must be one of {get_args(Squash)}; found {self.squash!r}.")
         if self.centre not in get_args(Centre):
             raise InputError(f"`centre` must be one of {get_args(Centre)}; found {self.centre!r}.")
         if self.centre == "preactivation" and self.squash != "tanh":
             raise InputError("`centre` 'preactivation' needs `squash` 'tanh'; found 'identity'. Use 'output'.")
-        if not self.weights or len(self.weights) != len(self.biases):
-            raise InputError(
-                "a policy must have as many weights as biases, at least one; "
-                f"found {len(self.weights)} and {len(self.biases)}."
-            )
-        for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            if weight.ndim != 2 or bias.shape != weight.shape[:1] or 0 in weight.shape:
-                raise InputError(
-                    f"layer {k} must have a weight (out, in) and a bias (out,); found {weight.shape} and {bias.shape}."
-                )
-            if k and weight.shape[1] != self.weights[k - 1].shape[0]:
-                raise InputError(
-                    f"layer {k} must take the {self.weights[k - 1].shape[0]} outputs of layer {k - 1}; "
-                    f"its weight has shape {weight.shape}."
-                )
         if self.scale.shape != (self.m,) or self.offset.shape != (self.m,):
             raise InputError(
                 f"`scale` and `offset` must have shape ({self.m},); found {self.scale.shape} and {self.offset.shape}."
@@ -107,7 +94,7 @@ class TanhNetwork:
     @property
     def layers(self) -> tuple[int, ...]:
         """Widths from state to input, such as (2, 16, 16, 1)."""
-        return (self.n, *(int(w.shape[0]) for w in self.weights))
+        return widths(self.weights)
 
     def ratios(self, u_eq: Sequence[Fraction]) -> tuple[Fraction, ...]:
         """`(u_eq - offset) / scale`, exactly, (m,): what tanh must be at the origin with preactivation centring.
@@ -133,17 +120,13 @@ class TanhNetwork:
 
     def net(self, x: Any) -> Any:
         """`net(x)`, last axis n to m, in the arithmetic of x (numpy array or torch tensor)."""
-        for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
-            if k:
-                x = _tanh(x)
-            x = x @ _like(weight.T, x) + _like(bias, x)
-        return x
+        return through(self.weights, self.biases, x)
 
     def __call__(self, x: Any, u_eq: Sequence[Fraction]) -> Any:
         """pi(x) in float64, shape (..., n) to (..., m); for simulation and search, not for proofs."""
         if self.centre != "none":
             return self.folded(u_eq)(x, u_eq)
-        return self.clipped(_like(self.scale, x) * self.squashed(self.net(x)) + _like(self.offset, x))
+        return self.clipped(like(self.scale, x) * self.squashed(self.net(x)) + like(self.offset, x))
 
     def squashed(self, y: Any, arithmetic: Arithmetic[Any] | None = None) -> Any:
         """What the policy does to the last layer's values before scale and offset; numpy or torch if none is given."""
@@ -159,7 +142,7 @@ class TanhNetwork:
         if self.clip is None:
             return u
         if arithmetic is None:
-            return _clip(u, *(_like(end, u) for end in self.clip))
+            return _clip(u, *(like(end, u) for end in self.clip))
         ends = ([Fraction(float(v)) for v in end] for end in self.clip)
         return [arithmetic.clip(v, lo, hi) for v, lo, hi in zip(u, *ends, strict=True)]
 
@@ -254,7 +237,7 @@ class _Arrays:
         return float(np.arctanh(float(q)))
 
     def tanh(self, v: Any) -> Any:
-        return _tanh(v)
+        return tanh(v)
 
     def clip(self, v: Any, lo: Fraction, hi: Fraction) -> Any:
         return _clip(v, float(lo), float(hi))
@@ -263,18 +246,10 @@ class _Arrays:
 _ARRAYS = _Arrays()
 
 
-def _frozen(array: Any, name: str) -> Array:
-    result = np.array(array, dtype=np.float64)
-    if not np.all(np.isfinite(result)):
-        raise InputError(f"`{name}` of the policy must be finite; found NaN or infinity.")
-    result.setflags(write=False)
-    return result
-
-
 def _limits(clip: Any, m: int) -> tuple[Array, Array]:
     if not isinstance(clip, tuple | list) or len(clip) != 2:
         raise InputError(f"`clip` must be a pair (lo, hi) of arrays of shape ({m},), or None; found {clip!r}.")
-    lo, hi = (_frozen(end, "clip") for end in clip)
+    lo, hi = (frozen(end, "clip", _WHOSE) for end in clip)
     if lo.shape != (m,) or hi.shape != (m,):
         raise InputError(f"`clip` must be two arrays of shape ({m},); found {lo.shape} and {hi.shape}.")
     if not np.all(lo < hi):
@@ -287,15 +262,3 @@ def _clip(x: Any, lo: Any, hi: Any) -> Any:
     if isinstance(x, np.ndarray | float):
         return np.minimum(np.maximum(x, lo), hi)
     return x.clamp(lo, hi)
-
-
-def _tanh(x: Any) -> Any:
-    return np.tanh(x) if isinstance(x, np.ndarray | float) else x.tanh()
-
-
-def _like(array: Array, x: Any) -> Any:
-    if isinstance(x, np.ndarray):
-        return array
-    import torch
-
-    return torch.tensor(array, dtype=x.dtype, device=x.device)

@@ -1,0 +1,74 @@
+"""Neural Lyapunov functions: a tanh network from the states to one number.
+
+Only sublevel sets `{N <= n2}` matter, so whatever increases strictly behind the last layer (a sigmoid, a scale) can be
+left out: it changes the level and not the set. What training made of it (N(0) = 0, N > 0, decrease) is nothing that the
+numbers have to satisfy to be a function; a claim states what it needs, and shows it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.errors import InputError
+from certify.policies.layers import frozen_layers, tanh, through, widths
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Neural:
+    """`N(x)`: affine layers with tanh between them, the last with one output; float32 numbers convert exactly.
+
+    Parameters
+    ----------
+    weights : arrays of shape (out, in); the first `in` is n, the last `out` is 1.
+    biases : arrays of shape (out,).
+
+    Raises
+    ------
+    InputError : shapes do not chain, the last layer has several outputs, or a number is not finite.
+
+    Examples
+    --------
+    >>> N = Neural((np.eye(2), np.ones((1, 2))), (np.zeros(2), np.array([0.5])))
+    >>> N.widths, float(N(np.zeros(2))), N.gradient(np.zeros(2)).tolist()
+    ((2, 2, 1), 0.5, [1.0, 1.0])
+    """
+
+    weights: tuple[Array, ...]
+    biases: tuple[Array, ...]
+
+    def __post_init__(self) -> None:
+        weights, biases = frozen_layers(self.weights, self.biases, "a Lyapunov network")
+        object.__setattr__(self, "weights", weights)
+        object.__setattr__(self, "biases", biases)
+        if self.widths[-1] != 1:
+            raise InputError(f"a Lyapunov network must have one output; its last layer has {self.widths[-1]}.")
+
+    @property
+    def n(self) -> int:
+        """Number of states."""
+        return self.widths[0]
+
+    @property
+    def widths(self) -> tuple[int, ...]:
+        """Widths from the states to 1, such as (2, 16, 16, 1)."""
+        return widths(self.weights)
+
+    def __call__(self, x: Array) -> Array:
+        """N in float64, shape (..., n) to (...)."""
+        return np.asarray(through(self.weights, self.biases, x)[..., 0])
+
+    def gradient(self, x: Array) -> Array:
+        """dN/dx in float64, shape (..., n) to (..., n)."""
+        slopes, h = [], x
+        for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
+            h = tanh(h @ weight.T + bias)
+            slopes.append(1 - h**2)
+        gradient = np.broadcast_to(self.weights[-1][0], (*x.shape[:-1], self.widths[-2]))
+        for weight, slope in zip(self.weights[-2::-1], reversed(slopes), strict=True):
+            gradient = (gradient * slope) @ weight
+        return np.array(gradient)
