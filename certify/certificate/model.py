@@ -13,8 +13,8 @@ from __future__ import annotations
 import base64
 import json
 import re
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -23,10 +23,12 @@ import numpy as np
 import sympy
 from numpy.typing import NDArray
 
-from certify.claims import CLAIMS, Claim, Enlarged, Reached
+from certify.claims import CLAIMS, Claim, Enlarged, Outer, Reached
 from certify.errors import CertificateFormatError
 from certify.expressions import from_tree, to_tree
 from certify.lyapunov.function import Quadratic
+from certify.lyapunov.neural import Neural
+from certify.lyapunov.symbolic import Symbolic
 from certify.policies import TanhNetwork
 from certify.systems import System
 from certify.systems.system import Interval
@@ -105,6 +107,23 @@ class Slab:
 
 
 @dataclass(frozen=True, slots=True)
+class OuterTree:
+    """Evidence of a claim's outer set: a partition of a box around the domain, and one of each of the domain's faces.
+
+    Parameters
+    ----------
+    T, root : (n, n) and (n,), half-widths of the root box in z, x = T z.
+    tree : the partition in preorder, one byte a node.
+    faces : the same for the lower and the upper end of each state, in the order of the states, 2 n in all.
+    """
+
+    T: Array
+    root: Array
+    tree: bytes
+    faces: tuple[bytes, ...]
+
+
+@dataclass(frozen=True, slots=True)
 class PartitionTree:
     """Evidence that the checker replays.
 
@@ -117,6 +136,7 @@ class PartitionTree:
     tube : the slabs, in their order, of a claim that is enlarged by a tube.
     order : of the series in time on its leaves, where the input is held over a period.
     contraction : of a claim of a nearby equilibrium.
+    outer : of a claim with an outer set.
     """
 
     T: Array
@@ -127,6 +147,7 @@ class PartitionTree:
     cells: tuple[int, ...] = ()
     order: int = 1
     contraction: Contraction | None = None
+    outer: OuterTree | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -187,6 +208,7 @@ class Certificate:
                 "kind": self.claim.kind,
                 "rate": float(self.claim.rate).hex(),
                 "sample": None if system.sample is None else [str(h) for h in system.sample],
+                "outer": None if self.claim.outer is None else _outer(self.claim.outer),
             }
             | _start(self.claim),
             "plant": {
@@ -201,10 +223,7 @@ class Certificate:
                 "input_bounds": [[str(lo), str(hi)] for lo, hi in system.input_bounds],
             },
             "policy": {
-                "layers": [
-                    {"shape": list(W.shape), "weight": _encode(W), "bias": _encode(b)}
-                    for W, b in zip(network.weights, network.biases, strict=True)
-                ],
+                "layers": _layers(network.weights, network.biases),
                 "squash": network.squash,
                 "centre": network.centre,
                 "scale": _encode(network.scale),
@@ -290,8 +309,7 @@ def parse_certificate(raw: bytes, name: str) -> Certificate:
             sample=None if sample is None else (Fraction(sample[0]), Fraction(sample[1])),
         )
         network = TanhNetwork(
-            weights=tuple(_decode(x["weight"], tuple(x["shape"])) for x in policy["layers"]),
-            biases=tuple(_decode(x["bias"], (x["shape"][0],)) for x in policy["layers"]),
+            *_read_layers(policy["layers"]),
             scale=_decode(policy["scale"], (m,)),
             offset=_decode(policy["offset"], (m,)),
             squash=policy["squash"],
@@ -302,7 +320,7 @@ def parse_certificate(raw: bytes, name: str) -> Certificate:
             system=system,
             network=network,
             V=Quadratic(_decode(data["lyapunov"]["P"], (n, n))),
-            claim=_read_claim(data, n),
+            claim=_read_claim(data, states),
             evidence=_read_evidence(evidence, n),
             provenance=provenance,
         )
@@ -312,16 +330,46 @@ def parse_certificate(raw: bytes, name: str) -> Certificate:
         raise CertificateFormatError(f"{name} is not a certificate: {type(error).__name__}: {error}.") from error
 
 
-def _read_claim(data: Mapping[str, Any], n: int) -> Claim:
-    levels = {k: float.fromhex(v) for k, v in data["levels"].items()}
+def _read_claim(data: Mapping[str, Any], states: tuple[sympy.Symbol, ...]) -> Claim:
+    n = len(states)
+    levels: dict[str, Any] = {k: float.fromhex(v) for k, v in data["levels"].items()}
     levels["rate"] = float.fromhex(data["claim"]["rate"])
-    kind = data["claim"]["kind"]
+    kind, outer = data["claim"]["kind"], data["claim"]["outer"]
+    if outer is not None:
+        return replace(CLAIMS[kind](**levels), outer=_read_outer(outer, states))
     if kind == Enlarged.kind:
         return Enlarged(**levels, start=Quadratic(_decode(data["claim"]["start"], (n, n))))
     if kind == Reached.kind:
         start, centre = _decode(data["claim"]["start"], (n, n)), _decode(data["claim"]["centre"], (n,))
         return Reached(**levels, start=Quadratic(start), centre=tuple(centre.tolist()))
     return CLAIMS[kind](**levels)
+
+
+def _outer(outer: Outer) -> dict[str, Any]:
+    N = outer.function
+    if isinstance(N, Neural):
+        stated: dict[str, Any] = {"kind": "network", "layers": _layers(N.weights, N.biases)}
+    else:
+        stated = {"kind": "expression", "expression": to_tree(N.expression)}
+    return {**stated, "level": float(outer.level).hex()}
+
+
+def _read_outer(data: Mapping[str, Any], states: tuple[sympy.Symbol, ...]) -> Outer:
+    level = float.fromhex(data["level"])
+    if data["kind"] == "network":
+        return Outer(Neural(*_read_layers(data["layers"])), level)
+    return Outer(Symbolic(from_tree(data["expression"], {s.name: s for s in states}), states), level)
+
+
+def _layers(weights: Sequence[Array], biases: Sequence[Array]) -> list[dict[str, Any]]:
+    return [
+        {"shape": list(W.shape), "weight": _encode(W), "bias": _encode(b)} for W, b in zip(weights, biases, strict=True)
+    ]
+
+
+def _read_layers(layers: Sequence[Mapping[str, Any]]) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
+    weights = tuple(_decode(x["weight"], tuple(x["shape"])) for x in layers)
+    return weights, tuple(_decode(x["bias"], (x["shape"][0],)) for x in layers)
 
 
 def _nominal(interval: Interval, said: str | None) -> Fraction:
@@ -388,6 +436,7 @@ def _evidence(evidence: PartitionTree | TrustedSolver) -> dict[str, Any]:
                 | {"path": None if slab.path is None else _path(slab.path)}
                 for slab in evidence.tube
             ],
+            "outer": None if evidence.outer is None else _outer_tree(evidence.outer),
         }
     return {
         "kind": "trusted-solver",
@@ -419,9 +468,20 @@ def _read_evidence(data: Mapping[str, Any], n: int) -> PartitionTree | TrustedSo
             tuple(map(int, data["cells"])),
             int(data["order"]),
             None if data["contraction"] is None else _read_contraction(data["contraction"], n),
+            None if data["outer"] is None else _read_outer_tree(data["outer"], n),
         )
     queries = tuple((str(name), str(answer)) for name, answer in data["queries"])
     return TrustedSolver(str(data["solver"]), str(data["version"]), float.fromhex(data["precision"]), queries)
+
+
+def _outer_tree(evidence: OuterTree) -> dict[str, Any]:
+    tree, *faces = (base64.b64encode(nodes).decode("ascii") for nodes in (evidence.tree, *evidence.faces))
+    return {"T": _encode(evidence.T), "root": _encode(evidence.root), "tree": tree, "faces": faces}
+
+
+def _read_outer_tree(data: Mapping[str, Any], n: int) -> OuterTree:
+    tree, *faces = (base64.b64decode(nodes) for nodes in (data["tree"], *data["faces"]))
+    return OuterTree(_decode(data["T"], (n, n)), _decode(data["root"], (n,)), tree, tuple(faces))
 
 
 def _ball(evidence: LocalBall | Slab) -> dict[str, str]:

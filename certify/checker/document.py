@@ -399,9 +399,7 @@ def check_hash(policy: Policy, stated: Any) -> None:
         raise Rejected("hash", "policy.sha256", "does not match the layers in the file")
 
 
-def _evidence(
-    value: Value, n: int, k: int, claim: str, sampled: bool, outer: bool, plain: bool
-) -> Partition | Trusted:
+def _evidence(value: Value, n: int, k: int, claim: str, sampled: bool, outer: bool, plain: bool) -> Partition | Trusted:
     """k quantities are uncertain; `outer` says that a function is stated, `plain` that none is, nor a rate, of a loop
     without steps."""
     kinds = (

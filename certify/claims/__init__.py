@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from certify.claims.claim import CLAIMS, Asymptotic, Claim, Enlarged, Nearby, Practical, Problem, Reached
+from certify.claims.claim import CLAIMS, Asymptotic, Claim, Enlarged, Nearby, Outer, Practical, Problem, Reached
 from certify.claims.conditions import BeforeClip, Condition, Guard, OfInput, OfState, Radicand, Vdot, conditions
 
 __all__ = [
@@ -16,6 +16,7 @@ __all__ = [
     "Nearby",
     "OfInput",
     "OfState",
+    "Outer",
     "Practical",
     "Problem",
     "Radicand",

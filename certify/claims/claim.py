@@ -14,6 +14,8 @@ from typing import ClassVar, Literal
 from certify.closed_loop import ClosedLoop
 from certify.errors import InputError
 from certify.lyapunov.function import Quadratic
+from certify.lyapunov.neural import Neural
+from certify.lyapunov.symbolic import Symbolic
 
 Kind = Literal["asymptotic", "practical"]
 
@@ -43,11 +45,30 @@ class Problem:
 
 
 @dataclass(frozen=True, slots=True)
+class Outer:
+    """The set {N <= level} within the domain box, N a `function`: every trajectory that starts in it, or in {V <= c2},
+    stays in the union of both and enters {V <= c2}.
+
+    Raises
+    ------
+    InputError : the level is not finite.
+    """
+
+    function: Neural | Symbolic
+    level: float
+
+    def __post_init__(self) -> None:
+        if not math.isfinite(self.level):
+            raise InputError(f"`level` of an outer set must be a finite number; found {self.level}.")
+
+
+@dataclass(frozen=True, slots=True)
 class Claim:
     """`roa` is c2: the claim is about every trajectory that starts in {V <= c2}.
 
     `local` is c1, the level from which the ring reaches outwards to c2: below it what is shown is shown on a ball.
-    `rate` is lambda: V falls at least as exp(-2 lambda t) where it is claimed to fall.
+    `rate` is lambda: V falls at least as exp(-2 lambda t) where it is claimed to fall. `outer` is a set from which
+    trajectories enter {V <= c2}.
     """
 
     kind: ClassVar[Kind | Literal["nearby", "enlarged", "reached"]]
@@ -55,6 +76,7 @@ class Claim:
     roa: float
     local: float
     rate: float = field(default=0.0, kw_only=True)
+    outer: Outer | None = field(default=None, kw_only=True)
 
     @property
     def inner(self) -> float:

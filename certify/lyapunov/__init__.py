@@ -20,6 +20,7 @@ from certify.lyapunov.level_sets import (
 from certify.lyapunov.neural import Neural
 from certify.lyapunov.optimised import optimise_candidate, optimise_repeatedly
 from certify.lyapunov.polynomial import Polynomial
+from certify.lyapunov.symbolic import Symbolic, of_polynomial
 
 __all__ = [
     "SOLVED",
@@ -31,6 +32,7 @@ __all__ = [
     "Polynomial",
     "Quadratic",
     "StoredLyapunov",
+    "Symbolic",
     "are_inside",
     "choose_candidate",
     "diagonalising_coordinates",
@@ -40,6 +42,7 @@ __all__ = [
     "is_positive_definite",
     "leaves_domain",
     "load_lyapunov",
+    "of_polynomial",
     "optimise_candidate",
     "optimise_repeatedly",
     "save_lyapunov",

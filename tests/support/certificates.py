@@ -29,7 +29,7 @@ from certify.checker.ring import Ring
 Document = dict[str, Any]
 LEAF = 255
 AROUND_A_LEVEL = ("practical", "nearby")
-ASYMPTOTIC: Document = {"kind": "asymptotic", "rate": (0.0).hex(), "sample": None}
+ASYMPTOTIC: Document = {"kind": "asymptotic", "rate": (0.0).hex(), "sample": None, "outer": None}
 
 
 def encode(array: Any) -> str:
@@ -104,7 +104,7 @@ def make(
 
     return with_ball(rehash({
         "schema": "certify-certificate/7",
-        "claim": {"kind": claim, "rate": float(rate).hex(), "sample": sample and list(sample)},
+        "claim": {"kind": claim, "rate": float(rate).hex(), "sample": sample and list(sample), "outer": None},
         "plant": {
             "name": "plant",
             "time": time,
@@ -137,6 +137,7 @@ def make(
             "local": None,
             "contraction": None,
             "tube": [],
+            "outer": None,
         },
         "provenance": {"tool": "written by hand"},
     }))  # fmt: skip

@@ -217,9 +217,10 @@ def _shape(data: Any) -> None:
         _need(isinstance(policy["clip"], list) and len(policy["clip"]) == 2, "clip")
         _need(np.all(_array(policy["clip"][0], m) < _array(policy["clip"][1], m)), "clip: lo < hi")
 
-    _section(data["claim"], "kind", "rate", "sample")
+    _section(data["claim"], "kind", "rate", "sample", "outer")
     _need(data["claim"]["kind"] in tuple(EDGES), "claim")
     _need(data["claim"]["rate"] == (0.0).hex() and data["claim"]["sample"] is None, "neither a rate nor a sample")
+    _need(data["claim"]["outer"] is None, "no outer set")
     _section(data["lyapunov"], "kind", "P")
     _need(data["lyapunov"]["kind"] == "quadratic", "lyapunov")
     _array(data["lyapunov"]["P"], n, n)
@@ -236,8 +237,8 @@ def _shape(data: Any) -> None:
         words = [evidence["solver"], evidence["version"], *(word for pair in pairs for word in pair)]
         _need(all(isinstance(w, str) and w and not set(w) & set(" \n\t") for w in words), "words")
         return
-    _section(evidence, "kind", "T", "root", "tree", "order", "cells", "local", "contraction", "tube")
-    _need(evidence["contraction"] is None, "no contraction")
+    _section(evidence, "kind", "T", "root", "tree", "order", "cells", "local", "contraction", "tube", "outer")
+    _need(evidence["contraction"] is None and evidence["outer"] is None, "no contraction, nor an outer set")
     _need(type(evidence["order"]) is int and evidence["order"] == 1, "order")
     _need(evidence["cells"] == [], "no cells of nothing")
     _need(evidence["kind"] == "partition-tree", "kind")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from certify.reference import rules
 from tests.support.certificates import Document, dump
 
-CONTINUOUS = {"rate": (0.0).hex(), "sample": None}  # of a claim
+CONTINUOUS = {"rate": (0.0).hex(), "sample": None, "outer": None}  # of a claim
 
 
 def judge_bytes(raw: bytes) -> str | None:
