@@ -12,8 +12,9 @@ from functools import cache
 
 from flint import arb, arb_mat
 
-from .document import Certificate, Interval, Layer, Policy
+from .document import Certificate, Interval, Policy
 from .fields import exact
+from .layers import Layer
 
 PRECISION = 128  # bits; single operations of flint cost about the same with 64
 ZERO, ONE = arb(0), arb(1)

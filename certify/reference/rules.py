@@ -52,6 +52,7 @@ def judge(raw: bytes) -> Verdict:
 
 def check(c: Certificate) -> int | None:
     """Every rule in its order; the number of leaves, or None where the evidence cannot be replayed."""
+    require(c.beyond is None, "outer", "claim.outer", "this checker has no rule for another function yet")
     rational.levels(c)
     inverse = rational.inverse_diagonal(c.P, "lyapunov")
     if c.ends_at_origin:
