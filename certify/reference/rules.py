@@ -15,6 +15,7 @@ from .evidence import WITH_TUBE, Tree, Trusted
 from .leaves import Leaves, check_leaves, structure
 from .local import local
 from .loop import Loop
+from .outer import outer
 from .refusal import Refused, require
 from .tube import tube
 
@@ -52,7 +53,6 @@ def judge(raw: bytes) -> Verdict:
 
 def check(c: Certificate) -> int | None:
     """Every rule in its order; the number of leaves, or None where the evidence cannot be replayed."""
-    require(c.beyond is None, "outer", "claim.outer", "this checker has no rule for another function yet")
     rational.levels(c)
     inverse = rational.inverse_diagonal(c.P, "lyapunov")
     if c.ends_at_origin:
@@ -70,7 +70,7 @@ def check(c: Certificate) -> int | None:
     if evidence.ball is not None:
         loop = Loop(c)
         local(loop, evidence.ball, evidence.cells)
-    leaves = structure(evidence.tree, c.n)
+    leaves = structure(evidence.tree, range(c.n))
     if c.inner < c.outer or loop is None:  # no local ball stands in for the leaves
         check_leaves(Leaves(c, evidence.T, S), evidence)
     if c.claim in WITH_TUBE:
@@ -79,6 +79,8 @@ def check(c: Certificate) -> int | None:
         tube(loop, c.start, c.centre, evidence.tube)
     if evidence.contraction is not None:
         contraction(loop or Loop(c), evidence.contraction, evidence.cells)
+    if c.beyond is not None:
+        outer(c, evidence)
     return leaves
 
 
@@ -100,3 +102,9 @@ def bearable(c: Certificate, evidence: Tree) -> None:
         network += layer.rows * (layer.columns + before + size**2 + thirds)
         before += layer.rows
     require(network <= MAX_NETWORK, rule, "policy", "the network is too large for this checker")
+    if c.beyond is not None:
+        squares = (c.n + c.m + c.k) ** 2
+        steps = len(c.beyond.expression.steps) if c.beyond.expression is not None else 0
+        require(steps * squares <= MAX_PLANT, "outer", "claim.outer", "the expression is too large for this checker")
+        units = sum(layer.rows * (layer.columns + squares) for layer in c.beyond.layers)
+        require(units <= MAX_NETWORK, "outer", "claim.outer", "the network is too large for this checker")
