@@ -109,7 +109,7 @@ NONE: dict[str, Any] = {f"lyapunov__layers__{k}".replace(".", "__"): None for k 
 BUFFER, SHIFTED = {"lyapunov__x_equilibrium": torch.zeros(2)}, {"controller__x_equilibrium": torch.tensor([1.0, 0.0])}
 TWO = {"lyapunov__layers__4__weight": torch.ones(2, 5), "lyapunov__layers__4__bias": torch.ones(2)}
 TWO_STAGE_REFUSED: dict[str, tuple[dict[str, Any], str]] = {
-    "no network": (NONE, r"no tensor is called state_dict\.lyapunov\.layers\.0\.weight.*state_dict\.controller\.layers\."),
+    "no network": (NONE, r"no tensor is called state_dict\.lyapunov\.layers\.0\.weight.*controller\.layers\."),
     "a buffer": (BUFFER, r"the file has state_dict\.lyapunov\.x_equilibrium as well"),
     "a scale": ({"lyapunov__scale": torch.ones(1)}, r"lyapunov\.scale as well"),
     "a second network": ({"lyapunov__other__0__weight": torch.ones(1, 2)}, r"other\.0\.weight as well"),
