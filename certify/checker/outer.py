@@ -36,7 +36,8 @@ class Layers:
 
     def is_small(self, symbols: int) -> bool:
         """Whether models in so many symbols are no more than there is room for."""
-        return sum(len(W) * (W.shape[1] + symbols**2) for W in self.net.weights) <= _MOST_NUMBERS
+        numbers: int = sum(len(W) * (W.shape[1] + symbols**2) for W in self.net.weights)
+        return numbers <= _MOST_NUMBERS
 
     def models(self, states: Sequence[Taylor]) -> list[Taylor]:
         """Of each layer; the last of them is N, in one row."""
