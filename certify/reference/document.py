@@ -15,7 +15,7 @@ from flint import fmpq, fmpq_mat
 from .evidence import WITH_FLOOR, WITH_TUBE, Tree, Trusted, read_evidence
 from .expressions import Equations, equations, rational
 from .fields import binary64, column, entries, exact, keys, little_endian, numbers, square
-from .layers import Layer, read_layers
+from .layers import Layer, bytes_of, read_layers
 from .refusal import Refused, require
 
 MAX_BYTES, MAX_BYTES_BEYOND_ASCII = 256 * 2**20, 16 * 2**20
@@ -68,6 +68,11 @@ class Function:
     layers: tuple[Layer, ...]
     expression: Equations | None
     level: float
+
+    @property
+    def sha256(self) -> str:
+        """By which a network is named; the file does not state it."""
+        return hashlib.sha256(b"certify-lyapunov/1\0" + b"".join(bytes_of(self.layers))).hexdigest()
 
 
 @dataclass(frozen=True)
@@ -283,9 +288,8 @@ def read_policy(value: Any, n: int, m: int) -> Policy:
     require(all(s != 0 for s in scale), "format", "policy.scale", "must not be 0")
     clip = read_clip(policy["clip"], m)
     digest = hashlib.sha256(f"certify-policy/1\0{squash}\0{centre}\0".encode())
-    for layer in layers:
-        digest.update(struct.pack("<3Q", 2, layer.rows, layer.columns) + little_endian(layer.weight))
-        digest.update(struct.pack("<2Q", 1, layer.rows) + little_endian(layer.bias))
+    for part in bytes_of(layers):
+        digest.update(part)
     for values in (scale, offset, *(clip or ())):
         digest.update(struct.pack("<2Q", 1, m) + little_endian(values))
     sha256 = digest.hexdigest()

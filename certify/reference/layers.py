@@ -5,11 +5,13 @@ Weights stay binary64 numbers in flat arrays until a rule asks for them: a file 
 
 from __future__ import annotations
 
+import struct
 from array import array
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from .fields import entries, keys, numbers
+from .fields import entries, keys, little_endian, numbers
 from .refusal import require
 
 MAX_LAYERS, MAX_WIDTH = 64, 2**14
@@ -26,6 +28,13 @@ class Layer:
 
     def row(self, i: int) -> array[float]:
         return self.weight[i * self.columns : (i + 1) * self.columns]
+
+
+def bytes_of(layers: Sequence[Layer]) -> Iterator[bytes]:
+    """Of each weight and each bias the axes and the numbers, as a hash is taken over them."""
+    for layer in layers:
+        yield struct.pack("<3Q", 2, layer.rows, layer.columns) + little_endian(layer.weight)
+        yield struct.pack("<2Q", 1, layer.rows) + little_endian(layer.bias)
 
 
 def read_layers(value: Any, at: str, columns: int, rows: int) -> tuple[Layer, ...]:

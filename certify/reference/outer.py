@@ -14,7 +14,7 @@ from itertools import islice
 from flint import arb, arb_mat, fmpq, fmpq_mat
 
 from .balls import ZERO, bounded_by_form, total, within_bounds
-from .document import Certificate
+from .document import Certificate, Function
 from .evidence import Covering, Tree
 from .fields import exact
 from .function import Models
@@ -23,6 +23,8 @@ from .refusal import Refused, require
 from .taylor import Taylor
 
 RULE, FACES = "outer", "faces"
+MAX_NETWORK = 2**22  # rows times columns and the square of symbols, over all layers
+MAX_EXPRESSION = 2**26  # operations times the square of symbols
 
 
 def outer(c: Certificate, evidence: Tree) -> None:
@@ -30,6 +32,7 @@ def outer(c: Certificate, evidence: Tree) -> None:
     N, covering = c.beyond, evidence.covering
     if N is None or covering is None:
         raise Refused("format", "evidence.outer", "the claim needs a tree over the domain")
+    bearable(c, N)
     models = Models(N, c.plant.states)
     for k, tree in enumerate(covering.faces):
         face(c, models, k, tree)
@@ -38,15 +41,24 @@ def outer(c: Certificate, evidence: Tree) -> None:
     check_leaves(c, models, covering)
 
 
+def bearable(c: Certificate, N: Function) -> None:
+    """Refuses what would fill the memory: every unit, or operation, is a model of the second order in all symbols."""
+    square = (c.n + c.m + c.k) ** 2
+    units = sum(layer.rows * (layer.columns + square) for layer in N.layers)
+    require(units <= MAX_NETWORK, RULE, "claim.outer", "the network is too large for this checker")
+    steps = 0 if N.expression is None else len(N.expression.steps)
+    require(steps * square <= MAX_EXPRESSION, RULE, "claim.outer", "the expression is too large for this checker")
+
+
 # ------------------------------------------------------------------------------------------------------------ the faces
 
 
 def face(c: Certificate, models: Models, k: int, tree: bytes) -> None:
-    """N is above its level on the k-th face: there the state of axis k / 2 is at one end, and the others anywhere."""
+    """N is above its level on the k-th face, where a state is at one end of its domain, and the others anywhere."""
     axis, upper = divmod(k, 2)
-    at = f"{c.plant.states[axis]} = {c.plant.domain[axis][upper]}"
+    at = f"face {k}"
     axes = [i for i in range(c.n) if i != axis]
-    structure(tree, axes, FACES, f"{at}, ")
+    structure(tree, axes, FACES, f"{at} ")
     least, most = [0.0] * c.n, [0.0] * c.n
     for i in axes:
         lo, hi = c.plant.domain[i]
@@ -59,7 +71,7 @@ def face(c: Certificate, models: Models, k: int, tree: bytes) -> None:
             for i, (v, r) in enumerate(zip(centre, radius, strict=True))
         ]
         x[axis] = fixed
-        place = f"{at}, leaf {box.number}"
+        place = f"{at} leaf {box.number}"
         try:
             above = models.is_above(x)
         except Refused as no:
@@ -160,4 +172,4 @@ def check_leaves(c: Certificate, models: Models, covering: Covering) -> None:
 
 
 def place(leaf: Leaf) -> str:
-    return f"leaf {leaf.box.number} of the domain"
+    return f"outer leaf {leaf.box.number}"

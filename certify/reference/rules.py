@@ -102,9 +102,3 @@ def bearable(c: Certificate, evidence: Tree) -> None:
         network += layer.rows * (layer.columns + before + size**2 + thirds)
         before += layer.rows
     require(network <= MAX_NETWORK, rule, "policy", "the network is too large for this checker")
-    if c.beyond is not None:
-        squares = (c.n + c.m + c.k) ** 2
-        steps = len(c.beyond.expression.steps) if c.beyond.expression is not None else 0
-        require(steps * squares <= MAX_PLANT, "outer", "claim.outer", "the expression is too large for this checker")
-        units = sum(layer.rows * (layer.columns + squares) for layer in c.beyond.layers)
-        require(units <= MAX_NETWORK, "outer", "claim.outer", "the network is too large for this checker")
