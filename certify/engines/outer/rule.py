@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from certify.claims import Problem
-from certify.claims.claim import Outer
 from certify.enclosures import (
     Models,
     NeuralEnclosure,
@@ -56,15 +55,15 @@ class OuterBounds(NamedTuple):
 
 def enclosure_of(function: Neural | Symbolic, device: torch.device) -> NeuralEnclosure | SymbolicEnclosure:
     """Models of N, whatever it is."""
-    return (
-        NeuralEnclosure(function, device) if isinstance(function, Neural) else SymbolicEnclosure(function, device)
-    )
+    return NeuralEnclosure(function, device) if isinstance(function, Neural) else SymbolicEnclosure(function, device)
 
 
 class FallBound:
     """Whether N falls on boxes in the coordinates z, x = T z, wherever N <= n2 and V >= c2 in the domain."""
 
-    def __init__(self, problem: Problem, c2: float, T: Array, function: Neural | Symbolic, device: torch.device) -> None:
+    def __init__(
+        self, problem: Problem, c2: float, T: Array, function: Neural | Symbolic, device: torch.device
+    ) -> None:
         self.system, self.c2 = problem.loop.system, c2
         self.T = torch.tensor(T, dtype=torch.float64, device=device)
         self.V = FormBound(problem.V.P, T, device)
@@ -79,7 +78,7 @@ class FallBound:
 
     def __call__(self, lo: Tensor, hi: Tensor, inner: float, outer: float) -> OuterBounds:
         """Bounds for the level `outer` on boxes lo, hi (n, B)."""
-        n, batch = lo.shape
+        n = len(lo)
         centre = 0.5 * lo + 0.5 * hi
         radius = torch.maximum(hi - centre, centre - lo) * (1 + EPS)
         x = torch.cat([(self.T @ centre)[:, None], self.T[:, :, None] * radius], 1)
@@ -93,7 +92,7 @@ class FallBound:
             torch.full_like(x[0, 0], torch.inf),
             torch.full_like(x[0, 0], torch.inf),
         )
-        for part in index.split(self.piece):
+        for part in index.tensor_split(_pieces(len(index), self.piece)):
             here = self._judge(x[:, :, part], error[:, part], centre[:, part], radius[:, part], outer)
             for whole, own in zip(found, here, strict=True):
                 whole[..., part] = own
@@ -200,7 +199,9 @@ class FaceBound:
 
     def __call__(self, lo: Tensor, hi: Tensor, inner: float, outer: float) -> OuterBounds:
         """Bounds for the level `outer` on boxes lo, hi (n, B), which have no extent along the face's own axis."""
-        parts = [self._judge(low, high, outer) for low, high in zip(*(v.split(self.piece, 1) for v in (lo, hi)), strict=True)]
+        cut = _pieces(lo.shape[1], self.piece)
+        both = zip(lo.tensor_split(cut, 1), hi.tensor_split(cut, 1), strict=True)
+        parts = [self._judge(low, high, outer) for low, high in both]
         return OuterBounds(*(torch.cat(column, -1) for column in zip(*parts, strict=True)))
 
     def _judge(self, lo: Tensor, hi: Tensor, level: float) -> OuterBounds:
@@ -215,6 +216,11 @@ class FaceBound:
         score[self.axis] = -torch.inf
         violated = torch.where(value.c <= level, value.c, torch.inf)
         return OuterBounds(lowest > level, level - lowest, score, lowest, violated)
+
+
+def _pieces(count: int, most: int) -> int:
+    """Into how many pieces of at most so many boxes these are cut, at least one."""
+    return max(1, -(-count // most))
 
 
 def _negative(model: Taylor) -> Taylor:
