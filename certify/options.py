@@ -105,10 +105,7 @@ class RoaOptions:
             raise InputError("`rate` needs the engine bounds, and a claim without a tube.")
         if self.lyapunov is not None and (self.enlarges or self.rate or self.engine != "bounds"):
             raise InputError("`lyapunov` needs the engine bounds, and a claim without a tube and without a rate.")
-        if self.lyapunov_level is not None and (self.lyapunov is None or not math.isfinite(self.lyapunov_level)):
-            raise InputError(
-                f"`lyapunov_level` must be a finite level of a function `lyapunov`; found {self.lyapunov_level}"
-                f"{' without one' if self.lyapunov is None else ''}."
-            )
+        if self.lyapunov_level is not None and not math.isfinite(self.lyapunov_level):
+            raise InputError(f"`lyapunov_level` must be a finite number; found {self.lyapunov_level}.")
         if not self.time_limit > 0 or not self.max_boxes > 0:
             raise InputError("`time_limit` and `max_boxes` must be positive.")

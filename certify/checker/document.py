@@ -341,9 +341,13 @@ def _outer(value: Value, states: tuple[str, ...]) -> Outer | None:
     value.must(isinstance(value.raw, dict) and value.raw.get("kind") in kinds, f"of kind {' or '.join(kinds)}, or null")
     if value.raw["kind"] == "network":
         _, layers, level = value.keys("kind layers level")
-        return Outer(Network(*_layers(layers, len(states), 1)), level.binary64())
-    _, tree, level = value.keys("kind expression level")
-    return Outer(parse((tree.raw,), states, tree.at), level.binary64())
+        function: Tape | Network = Network(*_layers(layers, len(states), 1))
+    else:
+        _, tree, level = value.keys("kind expression level")
+        function = parse((tree.raw,), states, tree.at)
+    n2 = level.binary64()
+    level.must(math.isfinite(n2), "finite")
+    return Outer(function, n2)
 
 
 def _outer_tree(value: Value, n: int, asked: bool) -> OuterTree | None:
