@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from certify.api import certify_roa
     from certify.closed_loop import ClosedLoop
     from certify.errors import CertifyError, InputError
+    from certify.lyapunov import Neural, Polynomial, load_lyapunov, save_lyapunov
     from certify.options import RoaOptions
     from certify.policies import Policy, TanhNetwork, load_policy, save_policy
     from certify.policies.importers import ImportOptions
@@ -29,6 +30,10 @@ _PUBLIC = {
     "Policy": "certify.policies",
     "load_policy": "certify.policies",
     "save_policy": "certify.policies",
+    "Neural": "certify.lyapunov",
+    "Polynomial": "certify.lyapunov",
+    "load_lyapunov": "certify.lyapunov",
+    "save_lyapunov": "certify.lyapunov",
     "ClosedLoop": "certify.closed_loop",
     "certify_roa": "certify.api",
     "RoaResult": "certify.results",
@@ -42,7 +47,9 @@ __all__ = [
     "ClosedLoop",
     "ImportOptions",
     "InputError",
+    "Neural",
     "Policy",
+    "Polynomial",
     "RoaOptions",
     "RoaResult",
     "System",
@@ -51,7 +58,9 @@ __all__ = [
     "__version__",
     "certify_roa",
     "get_system",
+    "load_lyapunov",
     "load_policy",
+    "save_lyapunov",
     "save_policy",
 ]
 

@@ -27,7 +27,7 @@ EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows th
     "float_error": "closed_loop policies rigorous systems",
     "inputs": "policies systems",
     "largest": "certificate claims closed_loop engines lyapunov options policies results roa systems",
-    "lyapunov": "closed_loop plain_file policies",
+    "lyapunov": "closed_loop plain_file policies systems",
     "options": "lyapunov",
     "policies": "plain_file systems",
     "race": "engines lyapunov trials",

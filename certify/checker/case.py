@@ -10,7 +10,7 @@ from itertools import product
 
 from flint import fmpq_mat
 
-from .document import Certificate, Intervals, LocalBall, Partition, Slab
+from .document import Array, Certificate, Intervals, LocalBall, Outer, OuterTree, Partition, Slab
 from .exact import exactly, gershgorin_lower, inverse_diagonal
 from .float64 import float_with_error, up
 from .network import Folded, fold
@@ -63,6 +63,13 @@ class Case:
         """The slabs, none but for an enlarged claim."""
         return self.partition.tube
 
+    @property
+    def outer(self) -> tuple[Outer, OuterTree]:
+        """The function beyond the ellipsoid, and its evidence, of a claim that has one."""
+        if self.c.outer is None or self.partition.outer is None:
+            raise TypeError("this rule is about an outer set")
+        return self.c.outer, self.partition.outer
+
     @cached_property
     def P_inverse(self) -> list[Fraction]:
         """The diagonal of P^-1."""
@@ -71,8 +78,12 @@ class Case:
     @cached_property
     def S(self) -> fmpq_mat:
         """T'PT."""
-        T = exactly(self.partition.T)
-        return T.transpose() * exactly(self.c.P) * T
+        return self.seen_from(self.partition.T)
+
+    def seen_from(self, T: Array) -> fmpq_mat:
+        """T'PT, for V in coordinates z, x = T z."""
+        exact = exactly(T)
+        return exact.transpose() * exactly(self.c.P) * exact
 
     @cached_property
     def S_inverse(self) -> list[Fraction]:

@@ -30,6 +30,12 @@ class Expansion:
     last: Any  # of what is left after four terms the derivative by D is at most last |D|^3
 
 
+def derivative(phi: Expansion) -> Expansion:
+    """phi' as far as Taylor models ask: `last` bounds what is left of it after three terms, by |D|^3."""
+    (_, f1, f2, f3), (_, e1, e2, e3), unknown = phi.f, phi.e, np.nan
+    return Expansion((f1, 2 * f2, 3 * f3, unknown), (e1, 2 * e2, 3 * e3, unknown), phi.last, unknown, unknown)
+
+
 def elementary(name: str, c: Any, error: Any, radius: Any) -> Expansion:
     """The expansion of a function; NaN where it may be undefined or c is not finite.
 

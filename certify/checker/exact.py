@@ -29,6 +29,14 @@ def inverse_diagonal(A: fmpq_mat) -> list[Fraction]:
     return [fraction(inverse[i, i]) for i in range(A.nrows())]
 
 
+def inverse(A: fmpq_mat) -> fmpq_mat | None:
+    """`A^-1`; None if there is none, or A is too large to tell soon."""
+    numerator, _ = A.numer_denom()
+    if A.nrows() * max(v.height_bits() for v in numerator.entries()) > MAX_MATRIX_BITS or numerator.det() == 0:
+        return None
+    return A.inv()
+
+
 def is_definite(A: fmpq_mat) -> bool:
     """Whether d'A d > 0 for every d but 0; False as well if A is too large to tell soon.
 

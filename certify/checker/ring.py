@@ -2,59 +2,43 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import reduce
-from itertools import islice
 from operator import add
 
 import numpy as np
 from flint import fmpq
 
+from .boxes import Boxes, Leaves, batches, is_whole, middle, multipliers
 from .case import Case, Failures
 from .exact import fraction, root_above
-from .expression import evaluate
-from .float64 import EPS, Array, ends, float_with_error, gamma, norm, total, up, within
+from .float64 import Array, ends, float_with_error, total, up
 from .flow import later
 from .network import enclose_on_boxes
-from .taylor import Taylor, affine, constant, upper_bound
+from .taylor import Taylor, affine, upper_bound
 
-LEAF = 255
-MAX_DEPTH = 4096
 _BATCH_NUMBERS = 4_000_000  # in the largest array of a batch
 _ATTEMPTS = 4  # at the a-priori enclosure
 
 
 @dataclass(frozen=True)
-class Leaves:
-    """The leaves of a batch of which something is asked: those that may meet the ring and, where there is no ball,
-    those inside of it as well, which no other rule covers then."""
+class RingLeaves(Leaves):
+    """Those that may meet the ring and, where there is no ball, those inside of it as well, which no other rule covers
+    then: these hold where every component of F has a finite model, or a step does not lead out."""
 
-    ring: Ring
-    numbers: Array  # in the tree
     meet: Array  # which of them may meet the ring
-    mid: Array  # (m, B): the inputs lie within `reach` of this
-    reach: Array
     ends: Array  # (2, n, B): the state lies between these during a period; none if nothing is held
-    bound: Array  # of D + 2 lambda V
-    hold: Array  # where that is negative, or inside of the ring where every component of F has a finite model
 
 
-class Ring:
+class Ring(Boxes):
     """The bounds on boxes, lo and hi (n, B) in the coordinates z, that the rules for a leaf ask for."""
 
     def __init__(self, case: Case) -> None:
-        self.case, self.c, self.T, self.net = case, case.c, case.partition.T, case.net
-        self.n, self.m, self.k = len(case.c.states), len(case.c.inputs), len(case.c.uncertain)
         lo, hi = case.c.sample or (0, 0)
+        super().__init__(case, case.partition.T, case.S, lo < hi)
         self.c2 = fmpq(*self.c.c2.as_integer_ratio())
-        self.symbols = self.n + self.m + self.k + (lo < hi)
-        value, error = np.moveaxis(
-            np.array([[float_with_error(fraction(v)) for v in row] for row in case.S.tolist()]), 2, 0
-        )
-        self.S = np.diag(value)[:, None]  # the diagonal, (n, 1)
-        self.S_rest = up(np.abs(value - np.diag(self.S[:, 0])) + error)  # bounds what S is beside it
 
     @property
     def batch(self) -> int:
@@ -64,13 +48,17 @@ class Ring:
         numbers = max(width * (self.symbols + 4), self.symbols * self.symbols * (values + 4))
         return int(max(1, min(4096, _BATCH_NUMBERS // numbers)))
 
-    def examine(self, first: int, lo: Array, hi: Array) -> Leaves:
+    def leaves(self) -> Iterator[tuple[int, Array, Array]]:
+        """The tree's leaves in batches."""
+        root = self.case.partition.root
+        return batches(self.case.partition.tree, -root, root, self.batch)
+
+    def examine(self, first: int, lo: Array, hi: Array) -> RingLeaves:
         """The leaves with these corners, numbered from `first`."""
         outside, inside, beyond = self.misses(lo, hi)
         met = np.flatnonzero(np.logical_not(outside | inside if self.case.covered else outside))
         lo, hi, meet, beyond = lo[:, met], hi[:, met], np.logical_not(inside[met]), beyond[met]
-        centre = 0.5 * lo + 0.5 * hi
-        radius = up(np.maximum(hi - centre, centre - lo))
+        centre, radius = middle(lo, hi)
         x, error = self.states(centre, radius)
         mid, slopes, wide = enclose_on_boxes(self.net, x, error)
         states, held = self.affine(x, error, mid, slopes, wide)
@@ -86,45 +74,18 @@ class Ring:
         if not (self.case.covered or self.c.step or np.all(meet)):
             # what divides by a range that holds 0 has no finite model
             hold = np.where(meet, hold, np.all([np.isfinite(g.size + g.r) for g in G], axis=0))
-        return Leaves(self, first + met, meet, mid, up(total(np.abs(slopes), 1) + wide), ends, bound, hold)
+        reach = up(total(np.abs(slopes), 1) + wide)
+        return RingLeaves(self, first + met, mid, reach, bound, hold, meet, ends)
 
     def misses(self, lo: Array, hi: Array) -> tuple[Array, Array, Array]:
-        """Where the box certainly has V > c2 everywhere, where it certainly has V < c1, and where V >= c1.
-
-        A lower bound that has overflowed is none.
-        """
-        far = np.maximum(np.abs(lo), np.abs(hi))
-        near = np.where((lo <= 0) & (hi >= 0), 0.0, np.minimum(np.abs(lo), np.abs(hi)))  # corners are exact
-        cross = self.cross(far)
-        least = np.sum(self.S * near * near, axis=0) * (1 - gamma(self.n + 4)) - cross - 2.0**-960
-        most = up(total(self.S * far * far, 0) + cross)
-        least = least - EPS * np.abs(least) - EPS * cross
-        finite = least < np.inf
-        return (least > self.c.c2) & finite, most < self.c.c1, (least >= self.c.c1) & finite
-
-    def states(self, centre: Array, radius: Array) -> tuple[Array, Array]:
-        """x = T z on the boxes as affine forms (n, n + 1, B), and a bound of their rounding errors (n, B)."""
-        slopes = self.T[:, :, None] * radius[None]
-        x = np.concatenate([np.matmul(self.T, centre)[:, None], slopes], axis=1)
-        error = gamma(self.n) * (norm(self.T, 1)[:, None] * norm(centre, 0)) + EPS * total(np.abs(slopes), 1)
-        return x, up(error)
-
-    def affine(
-        self, x: Array, error: Array, mid: Array, slopes: Array, wide: Array
-    ) -> tuple[list[Taylor], list[Taylor]]:
-        """States and inputs on the boxes; symbols: n box coordinates, m input errors, k uncertain quantities, and the
-        period if it has a range."""
-        batch = wide.shape[1]
-        zeros, errors = np.zeros((self.symbols - self.n, batch)), np.eye(self.m)[:, :, None] * wide[:, None]
-        states = [affine(v[0], np.concatenate([v[1:], zeros]), e) for v, e in zip(x, error, strict=True)]
-        parts = zip(mid, slopes, errors, strict=True)
-        inputs = [affine(v, np.concatenate([slope, own, zeros[self.m :]])) for v, slope, own in parts]
-        return states, inputs
+        """Where the box certainly has V > c2 everywhere, where it certainly has V < c1, and where V >= c1."""
+        least, most = self.levels(lo, hi)
+        return least > self.c.c2, most < self.c.c1, least >= self.c.c1
 
     def increment(self, states: list[Taylor], inputs: list[Taylor]) -> tuple[list[Taylor], Array]:
         """G, and between what a state lies during a period."""
         batch, nothing = len(inputs[0].c), np.zeros((2, 0, 0))
-        ranges = [self.number(pair, self.n + self.m + j, batch) for j, pair in enumerate(self.c.ranges)]
+        ranges = self.quantities(batch)
         if not self.c.sample:
             F = self.f(states, [*inputs, *ranges])
             return [f + -x for f, x in zip(F, states, strict=True)] if self.c.discrete else F, nothing
@@ -136,14 +97,6 @@ class Ring:
             rising = later(self.c.dynamics, self.constant(batch), states, during, loose, h, order, _itself)
             G = [x + h * more for x, more in zip(G, rising, strict=True)]
         return G, self.hull(states, F)
-
-    def constant(self, batch: int) -> Callable[[Fraction], Taylor]:
-        """Of rationals, the models."""
-        return lambda q: constant(q, self.symbols, batch)
-
-    def f(self, states: list[Taylor], held: list[Taylor]) -> list[Taylor]:
-        """f of states, and of inputs and uncertain quantities."""
-        return evaluate(self.c.dynamics, self.constant(len(held[0].c)), [*states, *held])
 
     def way(self, states: list[Taylor], held: list[Taylor]) -> tuple[list[Taylor], list[Taylor]]:
         """Where states may be during a period, and f of them; NaN where none of a few attempts to say so holds."""
@@ -190,13 +143,6 @@ class Ring:
         rows = [reduce(add, [v.scaled(p) for p, v in zip(row, along, strict=True)]) for row in self.c.P.tolist()]
         return reduce(add, [row * g for row, g in zip(rows, G, strict=True)])
 
-    def number(self, pair: tuple[Fraction, Fraction], symbol: int, batch: int) -> Taylor:
-        """A number of a range, by its symbol."""
-        (lo, hi), g = pair, np.zeros((self.symbols, batch))
-        (middle, error), (reach, doubt) = float_with_error((lo + hi) / 2), float_with_error((hi - lo) / 2)
-        g[symbol] = reach
-        return affine(np.full(batch, middle), g, up(error + doubt))
-
     def bound_of_steps(self, rise: Taylor, centre: Array, radius: Array) -> Array:
         """Upper bound of D' + k (V - c0) on boxes for the best of some k between 0 and 1/h: where V >= c0 it bounds D',
         and where V < c0, a step does not lead out of {V <= c0}."""
@@ -215,73 +161,19 @@ class Ring:
         There c2 - V and V - c1 are not negative, so D' is at most D' + k (c2 - V), and at most D' + k (V - c1),
         for any k >= 0. A k that proves a leaf proves it for a lower c2 and a higher c1 too, and is tried again then.
         """
-        bound = upper_bound(rise)
-        for level, sign in ((self.c.c2, 1.0), (self.c.c1, -1.0)):
-            left = np.flatnonzero(np.logical_not(bound < 0))
-            gap, part = self.gap(centre[:, left], radius[:, left], level, sign), rise.at(left)
-            for k in multipliers(part.g[: self.n], gap.g[: self.n], gap.c):
-                still = np.flatnonzero(np.logical_not(bound[left] < 0))
-                other = upper_bound(part.at(still) + gap.at(still).scaled(k[still]))
-                bound[left[still]] = np.fmin(bound[left[still]], other)
-        return bound
-
-    def gap(self, centre: Array, radius: Array, level: float, sign: float) -> Taylor:
-        """sign (level - V) on the boxes, which is not negative on the part of a leaf that lies in the ring."""
-        far = up(np.abs(centre) + radius)
-        size = up(level + total(self.S * far * far, 0))
-        zeros = np.zeros((self.symbols - self.n, centre.shape[1]))
-        g = np.concatenate([-2 * sign * self.S * centre * radius, zeros])
-        q = np.concatenate([-sign * self.S * radius * radius, zeros])
-        c = sign * (level - np.sum(self.S * centre * centre, axis=0))
-        r = up(self.cross(far) + gamma(self.n + 8) * size)
-        return Taylor(c, g, np.eye(len(q))[:, :, None] * q, r)
-
-    def cross(self, far: Array) -> Array:
-        """Upper bound of what S beside its diagonal adds to V in magnitude where |z| <= far."""
-        return total(far * total(self.S_rest[:, :, None] * far[None, :], 1), 0)
+        edges = ((self.c.c2, 1.0), (self.c.c1, -1.0))
+        gaps = [lambda left, e=edge: self.gap(centre[:, left], radius[:, left], *e) for edge in edges]
+        return self.least_bound(rise, gaps)
 
 
-def multipliers(a: Array, b: Array, c: Array) -> Array:
-    """The k at which a term of `c k + sum_i |a_i + k b_i|` vanishes, or 0 if that is negative: (n, B), the best first.
-
-    Any number k >= 0 would do for the proof; an infinite one or NaN makes the bound NaN.
-    """
-    k = np.maximum(np.where(b != 0, -a / b, 0.0), 0.0)
-    value = c * k + np.sum(np.abs(a[:, None] + k * b[:, None]), axis=0)
-    return np.take_along_axis(k, np.argsort(value, axis=0, kind="stable"), 0)
+def is_partition(case: Case) -> Failures:
+    """`tree`: the bytes are a partition of the root box."""
+    return (yield from is_whole(case.partition.tree, range(len(case.c.states))))
 
 
-def is_whole(case: Case) -> Failures:
-    """`tree`: the bytes are a tree of leaves and splits in preorder, and nothing else."""
-    boxes, n, tree = 1, len(case.c.states), case.partition.tree
-    for position, axis in enumerate(tree):
-        if not boxes:
-            yield f"byte {position}", "the tree goes on after its last leaf"
-        if axis >= n and axis != LEAF:
-            yield f"byte {position}", f"must be an axis below {n} or {LEAF}"
-        boxes += -1 if axis == LEAF else 1
-        if boxes > MAX_DEPTH + 1:
-            yield f"byte {position}", f"deeper than {MAX_DEPTH}"
-    if boxes:
-        yield "end", f"the tree ends with {boxes} boxes open"
-    return tree.count(LEAF)
-
-
-def keeps_inputs(leaves: Leaves) -> Failures:
-    """`inputs`: by form, or the policy's enclosure lies in the bounds."""
-    c = leaves.ring.c
-    if leaves.ring.case.bounded:
-        return 0
-    for name, bounds, mid, reach in zip(c.inputs, c.input_bounds, leaves.mid, leaves.reach, strict=True):
-        hold = within(bounds, mid, reach)
-        if not np.all(hold):
-            yield f"leaf {leaves.numbers[np.argmin(hold)]}", f"{name} may leave its bounds"
-    return int(leaves.mid.size)
-
-
-def stays(leaves: Leaves) -> Failures:
+def stays(leaves: RingLeaves) -> Failures:
     """`flow`: during a period the state stays in the interior of the domain."""
-    c = leaves.ring.c
+    c = leaves.boxes.c
     if not c.sample:
         return 0
     for i, (name, (lo, hi)) in enumerate(zip(c.states, c.domain, strict=True)):
@@ -292,13 +184,13 @@ def stays(leaves: Leaves) -> Failures:
     return int(leaves.ends[0].size)
 
 
-def decreases(leaves: Leaves) -> Failures:
+def decreases(leaves: RingLeaves) -> Failures:
     """`ring`: D + 2 lambda V < 0 on leaves that may meet the ring; on others of which anything is asked, F is smooth,
     or a step does not lead out."""
     if not np.all(leaves.hold):
         first = np.argmin(leaves.hold)
         smooth = f"the decrease is not shown: {leaves.bound[first]:.3g}"
-        steps = leaves.ring.c.step > 0
+        steps = leaves.boxes.c.step > 0
         yield f"leaf {leaves.numbers[first]}", smooth if leaves.meet[first] or steps else "F may be undefined"
     return int(np.sum(leaves.meet))
 
@@ -310,26 +202,3 @@ def _between(v: Taylor) -> Taylor:
 
 def _itself(v: Taylor) -> Taylor:
     return v
-
-
-def batches(tree: bytes, root: Array, size: int) -> Iterator[tuple[int, Array, Array]]:
-    """The leaves of a whole tree in preorder: the number of the first of each batch, and their corners (n, B)."""
-    first, leaves = 0, _walk(tree, root.tolist())
-    while corners := list(islice(leaves, size)):
-        lo, hi = np.array(corners).transpose(1, 2, 0)
-        yield first, lo, hi
-        first += len(corners)
-
-
-def _walk(tree: bytes, half: list[float]) -> Iterator[tuple[list[float], list[float]]]:
-    """A byte splits the current box at the middle of that axis, lower half first, or says that it is a leaf. Both
-    halves share the same binary64 midpoint, so the leaves cover the root box."""
-    stack = [([-b for b in half], half)]
-    for axis in tree:
-        lo, hi = stack.pop()
-        if axis == LEAF:
-            yield lo, hi
-            continue
-        left, right = hi.copy(), lo.copy()
-        left[axis] = right[axis] = 0.5 * lo[axis] + 0.5 * hi[axis]
-        stack += [(right, hi), (lo, left)]

@@ -15,7 +15,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from . import ball, contraction, local, ring, tube
+from . import ball, boxes, contraction, local, outer, ring, tube
 from .case import Case, Failures
 from .document import Certificate, Partition
 from .errors import Rejected
@@ -107,8 +107,8 @@ ON_THE_BALL: Table[local.Local] = (
     ("flow", local.stays),
     ("local", local.decreases),
 )
-OF_THE_TREE: Table[Case] = (("tree", ring.is_whole),)
-ON_LEAVES: Table[ring.Leaves] = (("inputs", ring.keeps_inputs), ("flow", ring.stays), ("ring", ring.decreases))
+OF_THE_TREE: Table[Case] = (("tree", ring.is_partition),)
+ON_LEAVES: Table[ring.RingLeaves] = (("inputs", boxes.keeps_inputs), ("flow", ring.stays), ("ring", ring.decreases))
 OF_THE_TUBE: Table[Case] = (("tube", tube.nodes_are_sound),)
 ON_SLABS: Table[tube.Piece] = (
     ("tube", tube.fits),
@@ -121,12 +121,18 @@ OF_CONTRACTION: Table[contraction.Contracted] = (
     ("contraction", ball.is_not_clipped),
     ("contraction", contraction.contracts),
 )
+OF_OUTER: Table[Case] = (
+    ("faces", outer.is_above_on_faces),
+    ("outer", outer.contains_domain),
+    ("outer", outer.is_partition),
+)
+ON_OUTER_LEAVES: Table[boxes.Leaves] = (("inputs", boxes.keeps_inputs), ("outer", outer.falls))
 READ = {"format": 1, "hash": 1}  # rules of document.py, which have held
 RULES = (
     *READ,
     *dict.fromkeys(
         name
-        for table in (STATED, ON_THE_BALL, OF_THE_TREE, ON_LEAVES, OF_THE_TUBE, OF_CONTRACTION)
+        for table in (STATED, ON_THE_BALL, OF_THE_TREE, ON_LEAVES, OF_THE_TUBE, OF_CONTRACTION, OF_OUTER)
         for name, _ in table
     ),
 )
@@ -138,6 +144,7 @@ class Tally:
 
     rules: Counter[str] = field(default_factory=lambda: Counter(dict.fromkeys(RULES, 0) | READ))
     ring_margin: float | None = None  # smallest -Vdot bound over the ring's leaves
+    outer_margin: float | None = None  # smallest -N'F bound over the leaves of which it is asked
     local_margin: float | None = None  # 1 - the remainder's largest part of the decay
 
     def hold(self, table: Table[Subject], subject: Subject) -> None:
@@ -174,7 +181,7 @@ def check(c: Certificate) -> Tally:
         tally.hold(OF_THE_TREE, case)
         if not case.covered or c.c1 != c.c2:
             bounds, margin = ring.Ring(case), np.inf
-            for batch in ring.batches(case.partition.tree, case.partition.root, bounds.batch):
+            for batch in bounds.leaves():
                 leaves = bounds.examine(*batch)
                 tally.hold(ON_LEAVES, leaves)
                 margin = min(margin, float(np.min(-leaves.bound[leaves.meet], initial=np.inf)))
@@ -185,4 +192,12 @@ def check(c: Certificate) -> Tally:
                 tally.hold(ON_SLABS, piece)
         if case.partition.contraction is not None:
             tally.hold(OF_CONTRACTION, contraction.Contracted(case, case.partition.contraction))
+        if case.c.outer is not None:
+            tally.hold(OF_OUTER, case)
+            beyond, margin = outer.Beyond(case), np.inf
+            for batch in beyond.leaves():
+                few = beyond.examine(*batch)
+                tally.hold(ON_OUTER_LEAVES, few)
+                margin = min(margin, float(np.min(-few.bound, initial=np.inf)))
+            tally.outer_margin = margin if margin < np.inf else None
     return tally

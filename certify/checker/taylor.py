@@ -1,9 +1,9 @@
-"""Second-order Taylor models on a box, batched: what the ring rule evaluates the plant in.
+"""Second-order Taylor models on a box, batched: what the rules for leaves evaluate the plant in.
 
 A model of a function v over symbols d in [-1, 1]^N is `v(d) in c + g.d + d'Q d + [-r, r]`. The symbols are the box
 coordinates of the leaf and one error symbol for each input. c, g and Q are numbers that mean themselves;
 the roundings made in computing them, and all terms of third order, are bounded in r. In the bounds below G = sum
-|g_i|, Q = sum |Q_ij| and N = |c| + G + Q. Arrays carry the batch on their last axis.
+|g_i|, Q = sum |Q_ij| and N = |c| + G + Q. Arrays carry the batch on their last axis, or on their last two.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from .elementary import elementary
+from .elementary import Expansion, elementary
 from .float64 import EPS, Array, float_with_error, gamma, total, up
 
 
@@ -44,7 +44,7 @@ class Taylor:
 
     def at(self, index: Array) -> Taylor:
         """The models of some members of the batch."""
-        return Taylor(self.c[index], self.g[:, index], self.Q[:, :, index], self.r[index])
+        return Taylor(self.c[..., index], self.g[..., index], self.Q[..., index], self.r[..., index])
 
     def scaled(self, k: Any) -> Taylor:
         """Product with a number, or with one for each member of the batch (B,)."""
@@ -75,14 +75,28 @@ class Taylor:
         Q = a.c * b.Q + b.c * a.Q + a.g[:, None] * b.g[None, :]
         return Taylor(a.c * b.c, a.c * b.g + b.c * a.g, Q, up(r))
 
+    @property
+    def reach(self) -> Array:
+        """Upper bound of |v - c| on the box."""
+        return up(self.linear + up(self.quadratic + self.r))
+
+    def widened(self, symbols: int) -> Taylor:
+        """The same among so many symbols, of which those that come after its own do not matter to it."""
+        more = symbols - len(self.g)
+        flat = [(0, 0)] * self.c.ndim
+        return Taylor(self.c, np.pad(self.g, [(0, more), *flat]), np.pad(self.Q, [(0, more), (0, more), *flat]), self.r)
+
     def function(self, name: str) -> Taylor:
-        """phi(v) for a function phi that elementary.py knows: f0 + f1 D + f2 D^2 + R, v = c + D, |R| <= third |D|^3.
+        """phi(v) for a function phi that elementary.py knows."""
+        return self.composed(elementary(name, self.c, 0.0, self.reach))
+
+    def composed(self, phi: Expansion) -> Taylor:
+        """phi(v) = f0 + f1 D + f2 D^2 + R, v = c + D, |R| <= third |D|^3, for phi expanded at c where |D| <= `reach`.
 
         |D| <= rho = G + Q + r, and D^2 differs from (g.d)^2 by at most 2 G q + q^2, q = Q + r.
         """
         G, q = self.linear, up(self.quadratic + self.r)
-        rho = up(G + q)
-        phi = elementary(name, self.c, 0.0, rho)
+        rho = self.reach
         (f0, f1, f2, _), (e0, e1, e2, _) = phi.f, phi.e
         r = (
             np.abs(f1) * self.r

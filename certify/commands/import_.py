@@ -8,13 +8,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from certify.commands.importing import imported_policy
+from certify.commands.importing import imported_lyapunov, imported_policy
 from certify.commands.shared import Json
 from certify.commands.terminal import say
+from certify.errors import InputError
 from certify.inputs import lines
 
 if TYPE_CHECKING:
+    from certify.lyapunov import ImportedLyapunov
     from certify.policies.importers import Imported, ImportOptions
+    from certify.policies.importers.comparing import Difference
 
 
 def import_(
@@ -23,34 +26,88 @@ def import_(
     importing: ImportOptions,
     system: Annotated[str | None, typer.Option(help="Plant that the policy controls: a name or a file.")] = None,
     param: Annotated[list[str] | None, typer.Option(help="Parameter of the plant, NAME=VALUE; repeatable.")] = None,
+    lyapunov_out: Annotated[
+        Path | None, typer.Option(help="File to write the Lyapunov network to (.pt) that lies beside the policy.")
+    ] = None,
+    lyapunov_prefix: Annotated[
+        str | None, typer.Option(help="Keys of its layers up to their numbers; two-stage files say it themselves.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Turn a policy file of another program into one of this program; nothing in it is executed."""
+    from certify.lyapunov import save_lyapunov
     from certify.policies import save_policy
 
+    if lyapunov_prefix is not None and lyapunov_out is None:
+        raise InputError("--lyapunov-prefix must go with --lyapunov-out, the file to write the Lyapunov network to.")
+    if lyapunov_out is not None and lyapunov_out.resolve() == out.resolve():
+        raise InputError(f"--out and --lyapunov-out must be two files; both are {out}.")
     imported = imported_policy(file, importing, system, param or [])
+    beside = None
+    if lyapunov_out is not None:
+        beside = imported_lyapunov(file, importing, system, param or [], lyapunov_prefix)
     save_policy(out, imported.policy)
-    say(json.dumps(_summary(imported, out)) if as_json else "\n".join([*lines(imported), f"written  {out}"]))
+    said = [*lines(imported), f"written  {out}"]
+    if beside is not None and lyapunov_out is not None:
+        stored = beside.stored
+        save_lyapunov(lyapunov_out, stored.function, stored.system, stored.parameters, stored.training)
+        said += [*_lyapunov_lines(beside), f"written  {lyapunov_out}"]
+    say(json.dumps(_summary(imported, out, beside, lyapunov_out)) if as_json else "\n".join(said))
 
 
-def _summary(imported: Imported, out: Path) -> dict[str, Any]:
-    policy, difference = imported.policy, imported.difference
+def _lyapunov_lines(found: ImportedLyapunov) -> list[str]:
+    """What the import of a Lyapunov network found, for people."""
+    from certify.lyapunov.file import FORMAT
+
+    difference = found.difference
+    return [
+        f"lyapunov {found.words}, as {FORMAT}: N(x) = net(x), {found.meaning}",
+        f"compared with the framework's own evaluation at {difference.states:,} states: largest difference "
+        f"{difference.largest:.3g} (its rounding explains up to {difference.explained:.3g} there), "
+        f"{difference.in_double:.3g} where it works in double precision",
+        f"N(0)     {found.at_origin:.9g}",
+        "level    none: what the file's makers say of a level is not imported, and nothing is proved of N here",
+    ]
+
+
+def _summary(imported: Imported, out: Path, beside: ImportedLyapunov | None, beside_out: Path | None) -> dict[str, Any]:
+    policy = imported.policy
     return {
         "policy": {"path": str(out), "sha256": policy.network.sha256(), "layers": list(policy.network.layers)},
         "system": policy.system,
         "imported": dict(policy.training["imported"]),
         "formula": imported.formula,
-        "compared": {
-            "states": difference.states,
-            "largest_difference": difference.largest,
-            "rounding_explains": difference.explained,
-            "in_double_precision": difference.in_double,
-        },
+        "compared": _compared(imported.difference),
         "pi_0": imported.at_origin.tolist(),
         "u_eq": imported.u_eq.tolist(),
         "centre": policy.network.centre,
         "centring_changes_u_by": dict(imported.centring),
         "valid": None if policy.valid is None else [[_finite(v) for v in row] for row in policy.valid],
+        "lyapunov": None if beside is None else _lyapunov_summary(beside, beside_out),
+    }
+
+
+def _lyapunov_summary(found: ImportedLyapunov, out: Path | None) -> dict[str, Any]:
+    from certify.lyapunov.file import FORMAT
+
+    return {
+        "path": str(out),
+        "format": FORMAT,
+        "widths": list(found.function.widths),
+        "imported": dict(found.stored.training["imported"]),
+        "meaning": found.meaning,
+        "compared": _compared(found.difference),
+        "N_0": found.at_origin,
+        "level": None,
+    }
+
+
+def _compared(difference: Difference) -> dict[str, Any]:
+    return {
+        "states": difference.states,
+        "largest_difference": difference.largest,
+        "rounding_explains": difference.explained,
+        "in_double_precision": difference.in_double,
     }
 
 

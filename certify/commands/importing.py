@@ -17,6 +17,7 @@ from certify.errors import InputError
 from certify.inputs import policy_in
 
 if TYPE_CHECKING:
+    from certify.lyapunov import ImportedLyapunov
     from certify.policies import Policy
     from certify.policies.importers import Imported, ImportOptions
     from certify.systems import System
@@ -89,6 +90,15 @@ def imported_policy(path: Path, importing: ImportOptions, system: str | None, pa
     from certify.policies.importers import import_policy
 
     return import_policy(path, _plant_for(path, system, params), importing)
+
+
+def imported_lyapunov(
+    path: Path, importing: ImportOptions, system: str | None, params: list[str], prefix: str | None
+) -> ImportedLyapunov:
+    """The Lyapunov network in a file of another program, for the plant that `system` names."""
+    from certify.lyapunov import import_lyapunov
+
+    return import_lyapunov(path, _plant_for(path, system, params), importing, prefix)
 
 
 def _plant_for(path: Path, system: str | None, params: list[str]) -> System:

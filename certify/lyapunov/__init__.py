@@ -6,6 +6,7 @@ from certify.lyapunov.candidates import slowest_decay, solve_lyapunov
 from certify.lyapunov.choice import SOLVED, Candidate, Chosen, Named, choose_candidate
 from certify.lyapunov.file import StoredLyapunov, load_lyapunov, save_lyapunov
 from certify.lyapunov.function import LyapunovFunction, Quadratic
+from certify.lyapunov.importing import ImportedLyapunov, import_lyapunov
 from certify.lyapunov.level_sets import (
     are_inside,
     diagonalising_coordinates,
@@ -26,6 +27,7 @@ __all__ = [
     "SOLVED",
     "Candidate",
     "Chosen",
+    "ImportedLyapunov",
     "LyapunovFunction",
     "Named",
     "Neural",
@@ -38,6 +40,7 @@ __all__ = [
     "diagonalising_coordinates",
     "domain_limit",
     "extents",
+    "import_lyapunov",
     "inverse",
     "is_positive_definite",
     "leaves_domain",

@@ -237,7 +237,7 @@ def test_a_value_of_another_type_is_rejected(path: str, value: Any, tmp_path: Pa
         value = list(value)  # any object would do there
     if path == "policy.clip" and value is None:
         value = "null"  # null says that there is none
-    if path in ("claim.sample", "evidence.contraction") and value is None:
+    if path in ("claim.sample", "claim.outer", "evidence.contraction", "evidence.outer") and value is None:
         value = "null"
     if path in EMPTY and value == []:
         value = [None]

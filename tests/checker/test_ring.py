@@ -11,10 +11,11 @@ from flint import arb, ctx
 from hypothesis import given
 from hypothesis import strategies as st
 
-from certify.checker import ring as checker_ring
+from certify.checker import boxes as checker_boxes
+from certify.checker.boxes import multipliers
 from certify.checker.case import Case
 from certify.checker.exact import exactly, fraction
-from certify.checker.ring import Ring, multipliers
+from certify.checker.ring import Ring
 from certify.checker.taylor import Taylor, upper_bound
 from tests.checker.test_rules import honest, scalar_claim
 from tests.support.certificates import grow, parse, verdict
@@ -194,5 +195,5 @@ def test_a_negative_multiplier_would_accept_what_is_false(monkeypatch: pytest.Mo
     false = scalar_claim(c2=2.2**2, bias=0.0)
     grown = grow(false, max_leaves=400, depth=12)
     assert verdict(grown) == "ring"
-    monkeypatch.setattr(checker_ring, "multipliers", lambda a, b, c: np.full((1, *c.shape), -1e9))
+    monkeypatch.setattr(checker_boxes, "multipliers", lambda a, b, c: np.full((1, *c.shape), -1e9))
     assert verdict(grown) == "ACCEPTED"

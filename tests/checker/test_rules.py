@@ -29,12 +29,13 @@ from hypothesis import strategies as st
 
 import certify.checker
 from certify.checker import network, rules
+from certify.checker.boxes import batches
 from certify.checker.case import Case
 from certify.checker.document import Policy
 from certify.checker.errors import Rejected
 from certify.checker.exact import raw_at_origin
 from certify.checker.float64 import within
-from certify.checker.ring import Ring, batches, is_whole
+from certify.checker.ring import Ring, is_partition
 from certify.checker.rules import Tally
 from tests.support.ablation import checker_without
 from tests.support.balls import enlarge, with_ball
@@ -735,10 +736,10 @@ def test_leaves_cover_the_root_box(marks: list[int], seed: int) -> None:
             break
     generator = np.random.default_rng(seed)
     root = 2.0 ** generator.uniform(-1074, 1023, 2)
-    found = list(batches(bytes(nodes), root, 7))
+    found = list(batches(bytes(nodes), -root, root, 7))
     lo, hi = (np.concatenate([batch[k].T for batch in found]) for k in (1, 2))
     assert [first for first, _, _ in found] == list(range(0, len(lo), 7)) and len(lo) == nodes.count(LEAF)
-    whole = is_whole(Case(parse(with_tree(honest("linear"), bytes(nodes)))))
+    whole = is_partition(Case(parse(with_tree(honest("linear"), bytes(nodes)))))
     with pytest.raises(StopIteration) as done:
         next(whole)
     assert done.value.value == len(lo)

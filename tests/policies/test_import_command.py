@@ -13,8 +13,9 @@ import pytest
 import torch
 
 from certify.cli import _run
+from certify.lyapunov import Neural, load_lyapunov
 from certify.policies import Policy, TanhNetwork, load_policy, save_policy
-from tests.support.foreign import mlp, sb3
+from tests.support.foreign import TWO_STAGE, external, mlp, sb3, values
 
 PLANT = """
 name = "chain"
@@ -145,6 +146,73 @@ def test_roa_reads_another_programs_file_and_keeps_to_where_no_observation_is_cl
         "roa", "--policy", "p.pt", "--system", "plant.toml", "--domain", "x0=0.05", "--claim", "practical", "--out", "r"
     )
     assert "the domain of x0 is cut" not in inside[2]
+
+
+def beside() -> torch.nn.Sequential:
+    """A Lyapunov network; it is written beside the policy."""
+    module = mlp((2, 6, 1), seed=5)
+    state = {f"actor.{k}": v for k, v in mlp().state_dict().items()}
+    torch.save(state | {f"V.{k}": v for k, v in module.state_dict().items()}, "both.pt")
+    return module
+
+
+def test_the_lyapunov_network_beside_the_policy(run: Run) -> None:
+    module, given = (
+        beside(),
+        ("import", "both.pt", "--system", "plant.toml", *SAID, "--prefix", "actor", "--param", "k=3"),
+    )
+    wanted = ("--lyapunov-out", "V.pt", "--lyapunov-prefix", "V")
+    status, out, _ = run(*given, "--out", "p.pt", *wanted)
+    assert status == 0
+    for words in ("lyapunov V 2-6-1, as certify-lyapunov/1", "what increases strictly", "N(0)", "not imported", "V.pt"):
+        assert words in out
+    assert out.count("10,000 states") == 2 and "sigmoid" not in out
+    stored = load_lyapunov("V.pt")
+    assert isinstance(stored.function, Neural) and stored.parameters == {"k": "3"} and stored.system == "chain"
+    x = np.random.default_rng(0).uniform(-1, 1, (20, 2))
+    np.testing.assert_allclose(stored.function(x), values(module, x)[:, 0], rtol=1e-12)
+    # the policy is the one without --lyapunov-out, and so are its words
+    status, plain, _ = run(*given, "--out", "q.pt")
+    assert Path("p.pt").read_bytes() == Path("q.pt").read_bytes()
+    assert plain.replace("q.pt", "p.pt").splitlines() == out.splitlines()[: plain.count("\n")]
+    data = json.loads(run(*given, "--out", "p.pt", *wanted, "--json")[1])
+    found = data["lyapunov"]
+    assert (found["path"], found["format"], found["widths"]) == ("V.pt", "certify-lyapunov/1", [2, 6, 1])
+    assert found["level"] is None and found["N_0"] == stored.function(np.zeros(2))
+    assert found["compared"]["states"] == 10_000 and found["compared"]["in_double_precision"] < 1e-12
+    assert json.loads(run(*given, "--out", "p.pt", "--json")[1])["lyapunov"] is None
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--lyapunov-prefix", "V"], "--lyapunov-prefix must go with --lyapunov-out"),
+        (["--lyapunov-out", "V.pt"], "Give --lyapunov-prefix"),
+        (["--lyapunov-out", "V.pt", "--lyapunov-prefix", "W"], "no tensor is called W.0.weight"),
+        (["--lyapunov-out", "./p.pt", "--lyapunov-prefix", "V"], "must be two files"),
+    ],
+)
+def test_without_a_lyapunov_network_nothing_is_written(run: Run, arguments: list[str], message: str) -> None:
+    beside()
+    status, _, err = run(
+        "import", "both.pt", "--system", "plant.toml", *SAID, "--prefix", "actor", "--out", "p.pt", *arguments
+    )
+    assert status == 2 and message in err
+    assert not Path("p.pt").exists() and not Path("V.pt").exists()
+
+
+@pytest.mark.parametrize("name", TWO_STAGE)
+def test_both_networks_of_the_two_stage_checkpoints(name: str, run: Run) -> None:
+    path = external("two_stage", name)
+    if path is None:
+        pytest.skip("the folder of other people's policies is not beside the project")
+    plant, states, squash, scale, parameters = TWO_STAGE[name]
+    given = ["--from", "two-stage", "--system", plant, "--states", states, "--squash", squash, "--action-scale", scale]
+    given += [part for k, v in parameters.items() for part in ("--param", f"{k}={v}")]
+    status, out, err = run("import", path, *given, "--out", "p.pt", "--lyapunov-out", "V.pt")
+    assert status == 0, err
+    assert "the file's V is sigmoid(N)" in out and "log(v / (1 - v))" in out
+    assert load_lyapunov("V.pt").function.n == load_policy("p.pt").network.n
 
 
 def eval_fraction(text: str) -> float:

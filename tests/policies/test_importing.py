@@ -16,20 +16,15 @@ import torch
 from certify.errors import InputError
 from certify.policies import Policy, TanhNetwork, load_policy, save_policy
 from certify.policies.importers import Clip, Imported, ImportOptions, content_of, import_policy
-from certify.systems import System, get_system
+from certify.systems import get_system
 from tests.support.compiled import Constant, SetsItsState
-from tests.support.foreign import Odd, external, mlp, plant, sb3, values
+from tests.support.foreign import TWO_STAGE, Odd, external, mlp, plant, saved, sb3, two_stage, values
 
 U_EQ = (Fraction(0),)
 X = np.random.default_rng(3).uniform(-1.5, 1.5, (500, 2)).astype(np.float32).astype(np.float64)
 SAID = ImportOptions(states=("x0", "x1"), normaliser="none", action_scale=(Fraction(1),))
 LAYERS = replace(SAID, activation="tanh", squash="identity")
 TIGHT = 1e-12
-
-
-def saved(folder: Path, data: Any, name: str = "policy.pt") -> Path:
-    torch.save(data, folder / name)
-    return folder / name
 
 
 def gap(imported: Imported, theirs: np.ndarray, x: np.ndarray = X) -> float:
@@ -656,18 +651,6 @@ def test_what_a_file_is_follows_from_its_bytes(tmp_path: Path) -> None:
 # ------------------------------------------------------------------------------------------------- other people's files
 
 
-def two_stage(tmp_path: Path, system: System, scale: float, change: float = 0.0) -> tuple[Path, torch.nn.Sequential]:
-    """A file in the form of the two-stage checkpoints, for a plant with two inputs."""
-    module = mlp((system.n, 6, system.m))
-    u_eq = torch.tensor([float(u) for u in system.exact_u_eq()])
-    state = {f"controller.layers.{k}": v for k, v in module.state_dict().items()}
-    state["controller.x_equilibrium"] = torch.zeros(system.n)
-    state["controller.u_equilibrium"] = u_eq
-    state["controller.b"] = torch.atanh(u_eq / scale) + change
-    state |= {f"lyapunov.layers.{k}": v for k, v in mlp((system.n, 4, 1)).state_dict().items()}
-    return saved(tmp_path, {"state_dict": state, "domain": 1.0}), module
-
-
 def test_two_stage_files_are_centred_inside_the_squash(tmp_path: Path) -> None:
     system = get_system("quadrotor2d")
     path, module = two_stage(tmp_path, system, 6.0)
@@ -694,20 +677,12 @@ def test_two_stage_files_are_centred_inside_the_squash(tmp_path: Path) -> None:
         import_policy(two_stage(tmp_path, system, 6.0, 0.01)[0], system, options)
 
 
-EXTERNAL = {
-    "pendulum_bigtorque_seed_0.pth": ("pendulum", "theta,theta_dot", "tanh", 6, {}),
-    "cartpole_seed_0.pth": ("cartpole", "p,theta,p_dot,theta_dot", "tanh", 30, {"l": 1}),
-    "2dquadrotor_seed_0.pth": ("quadrotor2d", "x,y,theta,x_dot,y_dot,theta_dot", "relu-tanh", 6, {}),
-    "3dquad_seed_0.pth": ("quadrotor3d", "x,y,z,phi,theta,psi,vx,vy,vz,p,q,r", "relu-tanh", "3.6", {}),
-}
-
-
-@pytest.mark.parametrize("name", EXTERNAL)
+@pytest.mark.parametrize("name", TWO_STAGE)
 def test_the_two_stage_checkpoints(name: str) -> None:
     path = external("two_stage", name)
     if path is None:
         pytest.skip("the folder of other people's policies is not beside the project")
-    plant_name, states, squash, scale, parameters = EXTERNAL[name]
+    plant_name, states, squash, scale, parameters = TWO_STAGE[name]
     system = get_system(plant_name).with_parameters(parameters)
     options = ImportOptions(states=tuple(states.split(",")), squash=squash, action_scale=(Fraction(scale),))  # type: ignore[arg-type]
     imported = import_policy(path, system, options)

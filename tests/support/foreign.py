@@ -15,6 +15,13 @@ import torch
 
 from certify.systems import System
 
+TWO_STAGE = {
+    "pendulum_bigtorque_seed_0.pth": ("pendulum", "theta,theta_dot", "tanh", 6, {}),
+    "cartpole_seed_0.pth": ("cartpole", "p,theta,p_dot,theta_dot", "tanh", 30, {"l": 1}),
+    "2dquadrotor_seed_0.pth": ("quadrotor2d", "x,y,theta,x_dot,y_dot,theta_dot", "relu-tanh", 6, {}),
+    "3dquad_seed_0.pth": ("quadrotor3d", "x,y,z,phi,theta,psi,vx,vy,vz,p,q,r", "relu-tanh", "3.6", {}),
+}
+"""The checkpoints that somebody else trained: the plant, what the networks read, squash and scale, other parameters."""
 ROOT = Path(__file__).parents[2]
 PLACES = tuple(folder / "shared" / "external" for folder in (ROOT.parent, ROOT.parent.parent))  # beside the project
 
@@ -57,6 +64,23 @@ def values(module: torch.nn.Module, x: np.ndarray) -> np.ndarray:
     with torch.no_grad():
         result: np.ndarray = module.double()(torch.tensor(x, dtype=torch.float64)).numpy()
     return result
+
+
+def saved(folder: Path, data: Any, name: str = "policy.pt") -> Path:
+    torch.save(data, folder / name)
+    return folder / name
+
+
+def two_stage(tmp_path: Path, system: System, scale: float, change: float = 0.0) -> tuple[Path, torch.nn.Sequential]:
+    """A file in the form of the two-stage checkpoints, for a plant with two inputs."""
+    module = mlp((system.n, 6, system.m))
+    u_eq = torch.tensor([float(u) for u in system.exact_u_eq()])
+    state = {f"controller.layers.{k}": v for k, v in module.state_dict().items()}
+    state["controller.x_equilibrium"] = torch.zeros(system.n)
+    state["controller.u_equilibrium"] = u_eq
+    state["controller.b"] = torch.atanh(u_eq / scale) + change
+    state |= {f"lyapunov.layers.{k}": v for k, v in mlp((system.n, 4, 1)).state_dict().items()}
+    return saved(tmp_path, {"state_dict": state, "domain": 1.0}), module
 
 
 class Toy(gymnasium.Env[np.ndarray, np.ndarray]):

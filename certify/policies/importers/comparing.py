@@ -1,4 +1,4 @@
-"""How far the folded policy is from what the framework itself computes, and how far rounding may take the two apart.
+"""How far a folded network is from what the framework itself computes, and how far rounding may take the two apart.
 
 The framework works in single precision as a rule. Its rounding is bounded step by step in the usual way (Higham,
 Accuracy and Stability of Numerical Algorithms, section 3): a sum of k products has the relative error `k u / (1 - k u)`
@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from certify.errors import InputError
+from certify.policies.importers.reading import Reading
 from certify.policies.importers.steps import Affine, Clip, Diagonal, Normalise, Step, Tanh
 from certify.policies.network import Array
 
@@ -48,6 +49,43 @@ def apply(steps: Sequence[Step], x: Array) -> Array:
     return _run(steps, x, np.zeros_like(x), _DOUBLE)[0]
 
 
+def compare_reading(
+    reading: Reading, before: tuple[Step, ...], after: tuple[Step, ...], observed: Array, ours: Array
+) -> Difference:
+    """Compare with the framework in the file's precision, and with the same operations in double precision.
+
+    The first is what its users see; its rounding could hide a small mistake, which the second shows.
+
+    Parameters
+    ----------
+    before, after : what stands before and behind the reading's own steps.
+    observed : what the network reads, without `before`, (k, n).
+    ours : what was folded of all steps, at the same states, (k, m).
+
+    Raises
+    ------
+    InputError : they differ by more than rounding, or the framework cannot evaluate the network.
+    """
+    single, double = (_against(reading, before, after, observed, ours, twice) for twice in (reading.double, True))
+    return Difference(single.states, single.largest, single.explained, double.largest)
+
+
+def _against(
+    reading: Reading, before: tuple[Step, ...], after: tuple[Step, ...], observed: Array, ours: Array, double: bool
+) -> Difference:
+    given = apply(before, observed)
+    given = given if double else given.astype(np.float32)
+    try:
+        theirs = apply(after, np.asarray(reading.evaluate(given, double), dtype=np.float64))
+    except (RuntimeError, ValueError, TypeError, LookupError, AttributeError) as error:
+        raise InputError(f"the framework cannot evaluate the network itself: {error}.") from error
+    if reading.beta is None:
+        return compare(ours, theirs, rounding((*before, *reading.steps, *after), observed, double))
+    end = max(k for k, step in enumerate(reading.steps) if isinstance(step, Tanh))
+    head, tail = (*before, *reading.steps[:end]), (*reading.steps[end:], *after)
+    return compare(ours, theirs, rounding_centred(head, tail, observed, reading.beta, double))
+
+
 def compare(ours: Array, theirs: Any, bound: Array) -> Difference:
     """Compare two evaluations (k, m) with the bound of their rounding.
 
@@ -65,7 +103,7 @@ def compare(ours: Array, theirs: Any, bound: Array) -> Difference:
     i = np.unravel_index(int(np.argmax(excess)), off.shape)
     if not excess[i] <= 0:
         raise InputError(
-            f"the folded policy must agree with the framework's own evaluation up to rounding, {bound[i]:.3g} at most; "
+            f"what is folded must agree with the framework's own evaluation up to rounding, {bound[i]:.3g} at most; "
             f"they differ by {off[i]:.3g}. An option may be wrong for this file, or the file was misread."
         )
     j = np.unravel_index(int(np.argmax(off)), off.shape)

@@ -21,15 +21,17 @@ from certify.errors import InputError
 from certify.policies.exact import require_centred
 from certify.policies.file import Policy
 from certify.policies.importers.archives import MAX_BYTES, Archive
-from certify.policies.importers.comparing import SAMPLES, Difference, apply, compare, rounding, rounding_centred
+from certify.policies.importers.arrays import Numbers
+from certify.policies.importers.comparing import Difference, compare_reading
 from certify.policies.importers.folding import Bounds, Folded, fold
 from certify.policies.importers.normalisers import load_normaliser
+from certify.policies.importers.observing import index_of, over_states, require_equilibrium, sample, shift
 from certify.policies.importers.onnx_graph import read_onnx
 from certify.policies.importers.options import ImportOptions
 from certify.policies.importers.reading import Evaluate, Reading
 from certify.policies.importers.sb3 import read_sb3
 from certify.policies.importers.state_dict import is_two_stage, read_state_dict, read_two_stage
-from certify.policies.importers.steps import Clip, Diagonal, Normalise, Step, Tanh, spread
+from certify.policies.importers.steps import Clip, Diagonal, Normalise, Step, spread
 from certify.policies.importers.tensors import load_safetensors, load_tensors
 from certify.policies.importers.torchfile import TorchFile
 from certify.policies.importers.torchscript import is_torchscript, read_torchscript
@@ -39,7 +41,7 @@ if TYPE_CHECKING:
     from certify.systems import System
 
 Content = Literal["state-dict", "torchscript", "onnx", "sb3", "safetensors", "two-stage", "policy"]
-_OWN = "certify-policy/"
+_OWN, _LYAPUNOV = "certify-policy/", "certify-lyapunov/"
 _ONE, _ZERO = (Fraction(1),), (Fraction(0),)
 
 
@@ -80,6 +82,8 @@ def content_of(raw: bytes, name: str) -> Content | None:
         said = root.get("format") if isinstance(root, dict) else None
         if isinstance(said, str) and said.startswith(_OWN):
             return "policy"
+        if isinstance(said, str) and said.startswith(_LYAPUNOV):
+            raise InputError("it must hold a policy; it is a Lyapunov function of this program.")
         return "two-stage" if is_two_stage(load_tensors(raw, name, file)) else "state-dict"
     if name.endswith(".onnx"):
         return "onnx"
@@ -139,14 +143,14 @@ def import_bytes(
     ------
     InputError : as `import_policy`, without the name.
     """
-    kind = _kind(raw, name, options)
+    kind = kind_of(raw, name, options)
     n = plant.n if options.states is None else len(options.states)
     reading = _read(kind, raw, name, options, n, plant.m)
     if evaluate is not None:
         reading = replace(reading, evaluate=evaluate)
     _require_answers(kind, reading, options, plant)
     states = options.states if options.states is not None else tuple(s.name for s in plant.states)
-    index = _index(states, plant)
+    index = index_of(states, plant)
     if (reading.n, reading.m) != (len(states), plant.m):
         raise InputError(
             f"the policy must read the {len(states)} states {', '.join(states)} and command the {plant.m} inputs of "
@@ -162,12 +166,12 @@ def import_bytes(
         "options": options.given,
     }
     x_eq = [plant.exact_x_eq()[i] for i in index]
-    shift = _shift(x_eq, options)
+    moved = shift(x_eq, options)
     normaliser = _normaliser(reading, options, len(states))
     if isinstance(options.normaliser, Path):
         record["normaliser_sha256"] = hashlib.sha256(read_bytes(options.normaliser)).hexdigest()
-    before = (*shift, *normaliser)
-    _require_equilibrium(reading, x_eq if shift else [Fraction(0)] * len(states))
+    before = (*moved, *normaliser)
+    require_equilibrium(reading, x_eq if moved else [Fraction(0)] * len(states))
     after = _action(options, plant.m)
     steps = (*before, *reading.steps, *after)
     folded = fold(steps, len(states))
@@ -177,10 +181,10 @@ def import_bytes(
         require_centred(network, u_eq)
     # It refuses another plant's beta, before the comparison does with less to say.
     Policy(network, plant.name, beta=reading.beta, valid=valid).beta_shift(u_eq)
-    x = _sample(plant, valid)
+    x = sample(plant, valid)
     bare = network if reading.beta is not None else replace(network, centre="none")
     values = bare(x, u_eq)
-    difference = _compare(reading, before, after, x, index, values)
+    difference = compare_reading(reading, before, after, x[:, index], values)
     record["largest_difference"] = difference.largest
     return Imported(
         policy=Policy(network, plant.name, _parameters(plant), {"imported": record}, reading.beta, valid),
@@ -193,7 +197,13 @@ def import_bytes(
     )
 
 
-def _kind(raw: bytes, name: str, options: ImportOptions) -> Content:
+def kind_of(raw: bytes, name: str, options: ImportOptions) -> Content:
+    """The kind of a file by its bytes, and by `options` where they say it.
+
+    Raises
+    ------
+    InputError : it is of no kind that is read, of this program already, or not what the options say.
+    """
     kind = options.kind if options.kind in ("onnx", "safetensors") else content_of(raw, name)
     if kind is None:
         pickled = raw[:1] in (b"\x80", b"(")
@@ -214,11 +224,16 @@ def _read(kind: Content, raw: bytes, name: str, options: ImportOptions, n: int, 
         "sb3": lambda: read_sb3(Archive(raw, name), name),
         "torchscript": lambda: read_torchscript(TorchFile(raw, name)),
         "onnx": lambda: read_onnx(raw, name),
-        "safetensors": lambda: read_state_dict(load_safetensors(raw, name), options, n, m),
-        "two-stage": lambda: read_two_stage(load_tensors(raw, name), options),
-        "state-dict": lambda: read_state_dict(load_tensors(raw, name), options, n, m),
+        "safetensors": lambda: read_state_dict(tensors_in(kind, raw, name), options, n, m),
+        "two-stage": lambda: read_two_stage(tensors_in(kind, raw, name), options),
+        "state-dict": lambda: read_state_dict(tensors_in(kind, raw, name), options, n, m),
     }
     return readers[kind]()
+
+
+def tensors_in(kind: Content, raw: bytes, name: str) -> dict[str, Numbers]:
+    """The tensors of a state_dict or two-stage file, or of safetensors, by their names."""
+    return load_safetensors(raw, name) if kind == "safetensors" else load_tensors(raw, name)
 
 
 def _require_answers(kind: Content, reading: Reading, options: ImportOptions, plant: System) -> None:
@@ -249,35 +264,6 @@ def _require_answers(kind: Content, reading: Reading, options: ImportOptions, pl
     ):
         if value is not None and not belongs:
             raise InputError(f"{option} must be left out: a file of {kind} says it itself.")
-
-
-def _index(states: tuple[str, ...], plant: System) -> list[int]:
-    """The plant's state for each number that the network reads."""
-    known = [s.name for s in plant.states]
-    for name in states:
-        if name not in known:
-            raise InputError(
-                f"the network must read states of {plant.name}, {', '.join(known)}; --states names {name!r}. "
-                "An observation that is a function of states, such as the cosine of an angle, is not proved."
-            )
-    return [known.index(name) for name in states]
-
-
-def _shift(x_eq: list[Fraction], options: ImportOptions) -> tuple[Step, ...]:
-    """From deviations, which policies here read, to the states' values, if that is what the network reads."""
-    return (Diagonal(_ONE, tuple(x_eq)),) if options.observes == "absolute" and any(x_eq) else ()
-
-
-def _require_equilibrium(reading: Reading, x_eq: list[Fraction]) -> None:
-    """Refuse a policy that is centred at another point than the plant's."""
-    if reading.equilibrium is None:
-        return
-    wanted = np.array([float(v) for v in x_eq])
-    if np.any(np.float32(wanted) != np.float32(reading.equilibrium)):
-        raise InputError(
-            f"a two-stage policy must be centred at the plant's operating point, {wanted.tolist()} as it observes it; "
-            f"its x_equilibrium is {reading.equilibrium.tolist()}."
-        )
 
 
 def _normaliser(reading: Reading, options: ImportOptions, n: int) -> tuple[Step, ...]:
@@ -313,8 +299,7 @@ def _network(
     folded: Folded, index: list[int], n: int, reading: Reading, options: ImportOptions
 ) -> tuple[TanhNetwork, Array | None]:
     """The network over the plant's states, and the states where no observation is clipped, (n, 2), rounded inwards."""
-    first = np.zeros((len(folded.weights[0]), n))
-    first[:, index] = folded.weights[0]
+    first = over_states(folded.weights[0], index, n)
     centre: Centre = "preactivation" if reading.beta is not None else options.centre or "none"
     network = TanhNetwork(
         (first, *folded.weights[1:]), folded.biases, folded.scale, folded.offset, folded.squash, centre, folded.clip
@@ -342,57 +327,9 @@ def _parameters(plant: System) -> dict[str, str]:
     return {name: str(value) for name, value in plant.parameters.items()}
 
 
-def _sample(plant: System, valid: Array | None) -> Array:
-    """States in the domain where no observation is clipped, as numbers of single precision, (k, n)."""
-    box = np.array([[float(lo), float(hi)] for lo, hi in plant.domain])
-    if valid is not None:
-        box = np.stack([np.maximum(box[:, 0], valid[:, 0]), np.minimum(box[:, 1], valid[:, 1])], axis=1)
-        empty = np.flatnonzero(~(box[:, 0] < box[:, 1]))
-        if empty.size:
-            state, (lo, hi) = plant.states[empty[0]], valid[empty[0]]
-            raise InputError(
-                f"the domain of {state} must have a part where its observation is not clipped, [{lo:.6g}, {hi:.6g}]; "
-                "it has none."
-            )
-    lo, hi = box.T
-    # Single precision must not round a state out of the box, where a clip begins to act.
-    margin = 1e-6 * np.maximum(hi - lo, np.maximum(np.abs(lo), np.abs(hi)))
-    inner = np.where(2 * margin < hi - lo, margin, 0)
-    x = np.random.default_rng(0).uniform(lo + inner, hi - inner, (SAMPLES, plant.n))
-    return x.astype(np.float32).astype(np.float64)
-
-
-def _compare(
-    reading: Reading, before: tuple[Step, ...], after: tuple[Step, ...], x: Array, index: list[int], ours: Array
-) -> Difference:
-    """Compare with the framework in the file's precision, and with the same operations in double precision.
-
-    The first is what its users see; its rounding could hide a small mistake, which the second shows.
-    """
-    observed = x[:, index]
-    single, double = (_against(reading, before, after, observed, ours, twice) for twice in (reading.double, True))
-    return Difference(single.states, single.largest, single.explained, double.largest)
-
-
-def _against(
-    reading: Reading, before: tuple[Step, ...], after: tuple[Step, ...], observed: Array, ours: Array, double: bool
-) -> Difference:
-    given = apply(before, observed)
-    given = given if double else given.astype(np.float32)
-    try:
-        theirs = apply(after, np.asarray(reading.evaluate(given, double), dtype=np.float64))
-    except (RuntimeError, ValueError, TypeError, LookupError, AttributeError) as error:
-        raise InputError(f"the framework cannot evaluate the policy itself: {error}.") from error
-    if reading.beta is None:
-        return compare(ours, theirs, rounding((*before, *reading.steps, *after), observed, double))
-    end = max(k for k, step in enumerate(reading.steps) if isinstance(step, Tanh))
-    head, tail = (*before, *reading.steps[:end]), (*reading.steps[end:], *after)
-    return compare(ours, theirs, rounding_centred(head, tail, observed, reading.beta, double))
-
-
 def centring_changes(network: TanhNetwork, plant: System) -> dict[Centre, float]:
     """How much each centring that can be had would change u at most, over samples of the domain."""
-    x, u_eq = _sample(plant, None), plant.exact_u_eq()
+    x, u_eq = sample(plant, None), plant.exact_u_eq()
     bare = replace(network, centre="none")
     return _centrings(bare, u_eq, x, bare(x, u_eq))
 

@@ -87,15 +87,60 @@ def read_state_dict(tensors: Mapping[str, Numbers], options: ImportOptions, n: i
             f"the policy must read {n} states and command {m} inputs; {prefix} is {widths(layers)}. "
             "Name the states that it reads with --states."
         )
-    names = [f"{_dot(prefix)}{k}.weight" for k in _numbers(tensors, prefix)]
-    double = any(tensors[name].dtype == np.float64 for name in names)
     squash: Output = "identity" if options.squash is None else options.squash
     return Reading(
         words=f"state_dict {prefix} {widths(layers)}",
         steps=(*between(layers), *_ENDS[squash]),
         evaluate=perceptron(layers, squash),
         normaliser=rsl_normaliser(tensors, options.epsilon),
-        double=double,
+        double=_is_double(tensors, prefix),
+    )
+
+
+def read_lyapunov(tensors: Mapping[str, Numbers], prefix: str | None) -> Reading:
+    """The layers of a Lyapunov network, without what may stand behind the last one.
+
+    Parameters
+    ----------
+    prefix : its keys up to their numbers; None for where a two-stage file has them.
+
+    Raises
+    ------
+    InputError : there are no such layers, one is of a kind that is not proved, or the network has more to it than its
+        layers.
+    """
+    x_eq = None
+    if prefix is None:
+        root = _root(tensors)
+        if root is None:
+            raise InputError(f"a two-stage file must hold {', '.join(_PARTS)} under one prefix; this one does not.")
+        whole, prefix = f"{root}lyapunov.", f"{root}lyapunov.layers"
+        x_eq = np.asarray(tensors[f"{root}{_PARTS[0]}"]).reshape(-1).astype(np.float64)
+    else:
+        whole = _dot(prefix)
+    if prefix not in _groups(tensors):
+        raise InputError(
+            f"there must be one; no tensor is called {_dot(prefix)}0.weight. "
+            f"The file has layers under {', '.join(g or 'no prefix' for g in _groups(tensors)) or 'no key'}."
+        )
+    inside = [(name, _KEY.fullmatch(name)) for name in tensors if name.startswith(whole)]
+    more = sorted(name for name, match in inside if match is None or (match["prefix"] or "") != prefix)
+    if more:
+        raise InputError(
+            f"it must be its layers {_dot(prefix)}NUMBER alone; the file has {', '.join(more[:3])} as well, and does "
+            "not say what becomes of that."
+        )
+    layers = _layers(tensors, prefix)
+    if x_eq is not None and x_eq.shape != layers[0].weight.shape[1:]:
+        raise InputError(
+            f"it must read a number for each of controller.x_equilibrium's {x_eq.size}; it is {widths(layers)}."
+        )
+    return Reading(
+        words=f"{prefix or 'no prefix'} {widths(layers)}",
+        steps=between(layers),
+        evaluate=perceptron(layers),
+        equilibrium=x_eq,
+        double=_is_double(tensors, prefix),
     )
 
 
@@ -165,6 +210,10 @@ def _root(tensors: Mapping[str, Numbers]) -> str | None:
     if len(roots) != 1 or not all(roots[0] + part in tensors for part in _PARTS):
         return None
     return roots[0]
+
+
+def _is_double(tensors: Mapping[str, Numbers], prefix: str) -> bool:
+    return any(tensors[f"{_dot(prefix)}{k}.weight"].dtype == np.float64 for k in _numbers(tensors, prefix))
 
 
 def _dot(prefix: str) -> str:

@@ -1,0 +1,232 @@
+"""The rules for {N <= n2} beyond {V <= c2}: N is above n2 on the domain's faces, and falls where V >= c2 and N <= n2.
+
+They take models of N, and of its derivative along F, on boxes. A network goes through them layer by layer, its units on
+an axis of their own; an expression as a power series in time.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Sequence
+from fractions import Fraction
+from math import nextafter
+
+import numpy as np
+
+from .boxes import Boxes, Leaves, batches, is_whole, middle
+from .case import Case, Failures
+from .document import Array, Network
+from .elementary import derivative, elementary
+from .exact import exactly, fraction, inverse
+from .expression import Tape, evaluate
+from .float64 import EPS, ends, float_with_error, gamma, total, up
+from .flow import Series
+from .network import enclose_on_boxes
+from .taylor import Taylor, affine, constant, upper_bound
+
+_BATCH_NUMBERS = 1_000_000  # in the largest array of a batch
+
+
+class Layers:
+    """A network's models: what each layer hands to the next tanh, a row for each unit."""
+
+    def __init__(self, net: Network) -> None:
+        self.net, self.values = net, max(len(W) for W in net.weights)
+
+    def models(self, states: Sequence[Taylor]) -> list[Taylor]:
+        """Of each layer; the last of them is N, in one row."""
+        found = [_stacked(states)]
+        for k, (W, b) in enumerate(zip(self.net.weights, self.net.biases, strict=True)):
+            found.append(_through(W, found[-1].function("tanh") if k else found[0], b))
+        return found[1:]
+
+    def value(self, models: Sequence[Taylor]) -> Taylor:
+        """N."""
+        return _row(models[-1])
+
+    def along(self, models: Sequence[Taylor], F: Sequence[Taylor]) -> Taylor:
+        """N'F: y_1 = W_1 F, y_(k+1) = W_(k+1) (tanh'(a_k) y_k)."""
+        first, *later = self.net.weights
+        y = _through(first, _stacked(F))
+        for W, a in zip(later, models, strict=False):
+            slope = a.composed(derivative(elementary("tanh", a.c, 0.0, a.reach)))
+            y = _through(W, slope.widened(len(y.g)) * y)
+        return _row(y)
+
+
+class Formula:
+    """An expression's models are those of the states; N and N'F are the first two coefficients of a series in time."""
+
+    def __init__(self, tape: Tape) -> None:
+        self.tape, self.values = tape, 2 * len(tape.operations)
+
+    def models(self, states: Sequence[Taylor]) -> list[Taylor]:
+        """The states."""
+        return list(states)
+
+    def value(self, models: Sequence[Taylor]) -> Taylor:
+        """N."""
+        N: Taylor = evaluate(self.tape, _numbers(models[0]), models)[0]
+        return N
+
+    def along(self, models: Sequence[Taylor], F: Sequence[Taylor]) -> Taylor:
+        """N'F."""
+        number = _numbers(F[0])
+        series = [Series([x.widened(len(f.g)), f], 2, number) for x, f in zip(models, F, strict=True)]
+        N: Series = evaluate(self.tape, lambda q: Series([number(q)], 2, number), series)[0]
+        rise: Taylor = N.parts[1] if len(N.parts) > 1 else number(Fraction(0))
+        return rise
+
+
+def is_above_on_faces(case: Case) -> Failures:
+    """`faces`: N > n2 on every leaf of every face of the domain."""
+    claim, evidence = case.outer
+    function, n, count = _function(case), len(case.c.states), 0
+    widest = [(_below(lo), _above(hi)) for lo, hi in case.c.domain]
+    for k, tree in enumerate(evidence.faces):
+        i, side = divmod(k, 2)
+        where = f"{case.c.states[i]} {('least', 'largest')[side]}, "
+        yield from is_whole(tree, [j for j in range(n) if j != i], where)
+        end, error = float_with_error(case.c.domain[i][side])
+        lo, hi = np.array([(end, end) if j == i else pair for j, pair in enumerate(widest)]).T
+        doubt = np.where(np.arange(n) == i, error, 0.0)[:, None]
+        for first, lower, upper in batches(tree, lo, hi, _batch(n * n * function.values)):
+            centre, radius = middle(lower, upper)
+            states = _affine(centre, np.eye(n)[:, :, None] * radius, doubt + np.zeros_like(centre))
+            hold = _is_above(function.value(function.models(states)), claim.level)
+            if not np.all(hold):
+                yield f"{where}leaf {first + np.argmin(hold)}", "N must be above its level"
+            count += len(hold)
+    return count
+
+
+def contains_domain(case: Case) -> Failures:
+    """`outer`: |z_i| <= sum_j |(T^-1)_ij| max |x_j| in rationals."""
+    _, evidence = case.outer
+    to_z = inverse(exactly(evidence.T))
+    if to_z is None:
+        yield "evidence.outer.T", "T must be invertible"
+        return 0
+    far = [max(-lo, hi) for lo, hi in case.c.domain]
+    for i, (row, b) in enumerate(zip(to_z.tolist(), evidence.root.tolist(), strict=True)):
+        if not sum((abs(fraction(v)) * x for v, x in zip(row, far, strict=True)), Fraction(0)) <= Fraction(b):
+            yield f"evidence.outer.root, axis {i}", "the root box must contain the domain"
+    return len(far)
+
+
+def is_partition(case: Case) -> Failures:
+    """`outer`: the bytes are a partition of the root box."""
+    return (yield from is_whole(case.outer[1].tree, range(len(case.c.states))))
+
+
+def falls(leaves: Leaves) -> Failures:
+    """`outer`: N'F < 0 on leaves that may have a state of the domain with V >= c2 and N <= n2."""
+    if not np.all(leaves.hold):
+        first = np.argmin(leaves.hold)
+        yield f"leaf {leaves.numbers[first]}", f"that N falls is not shown: {leaves.bound[first]:.3g}"
+    return int(leaves.hold.size)
+
+
+class Beyond(Boxes):
+    """The bounds that rule `outer` asks for, on boxes lo and hi (n, B) in the coordinates z of its tree."""
+
+    def __init__(self, case: Case) -> None:
+        claim, evidence = case.outer
+        super().__init__(case, evidence.T, case.seen_from(evidence.T))
+        self.function, self.level, self.evidence = _function(case), claim.level, evidence
+        ends_of = [[ends(*float_with_error(end))[side] for side, end in enumerate(pair)] for pair in self.c.domain]
+        self.least, self.largest = np.array(ends_of).T[:, :, None]  # at or beyond the domain's ends, (n, 1)
+
+    def leaves(self) -> Iterator[tuple[int, Array, Array]]:
+        """The tree's leaves in batches."""
+        width = max(max(layer.W.shape) for layer in self.net.layers)
+        values = max(self.function.values, len(self.c.dynamics.operations))
+        size = _batch(max(self.symbols**2 * values, (self.symbols + 4) * width))
+        return batches(self.evidence.tree, -self.evidence.root, self.evidence.root, size)
+
+    def examine(self, first: int, lo: Array, hi: Array) -> Leaves:
+        """The leaves with these corners, numbered from `first`, of which N'F is asked."""
+        centre, radius = middle(lo, hi)
+        x, error = self.states(centre, radius)
+        left = np.flatnonzero(np.logical_not(self.is_outside(x, error) | (self.levels(lo, hi)[1] < self.c.c2)))
+        models = self.function.models(_affine(x[:, 0, left], x[:, 1:, left].swapaxes(0, 1), error[:, left]))
+        N = self.function.value(models)
+        asked = np.flatnonzero(np.logical_not(_is_above(N, self.level)))
+        left, N = left[asked], N.at(asked).widened(self.symbols)
+        x, error, centre, radius = x[:, :, left], error[:, left], centre[:, left], radius[:, left]
+        mid, slopes, wide = enclose_on_boxes(self.net, x, error)
+        states, held = self.affine(x, error, mid, slopes, wide)
+        F = self.f(states, [*held, *self.quantities(len(left))])
+        rise = self.function.along([v.at(asked) for v in models], F)
+        below = constant(Fraction(self.level), self.symbols, len(left)) + -N
+        bound = self.least_bound(
+            rise, [below.at, lambda few: self.gap(centre[:, few], radius[:, few], self.c.c2, -1.0)]
+        )
+        finite = np.all([np.isfinite(v.size + v.r) for v in (N, *F)], axis=0)
+        return Leaves(self, first + left, mid, up(total(np.abs(slopes), 1) + wide), bound, (bound < 0) & finite)
+
+    def is_outside(self, x: Array, error: Array) -> Array:
+        """Where some state certainly lies beyond an end of its domain."""
+        lo, hi = ends(x[:, 0], up(total(np.abs(x[:, 1:]), 1) + error))
+        outside: Array = np.any((lo > self.largest) | (hi < self.least), axis=0)
+        return outside
+
+
+def _function(case: Case) -> Layers | Formula:
+    function = case.outer[0].function
+    return Layers(function) if isinstance(function, Network) else Formula(function)
+
+
+def _batch(numbers: int) -> int:
+    """How many boxes are looked at together, each of which takes so many numbers."""
+    return max(1, min(4096, _BATCH_NUMBERS // numbers))
+
+
+def _is_above(N: Taylor, level: float) -> Array:
+    """Where N has a model, whose least value is above the level."""
+    hold: Array = np.isfinite(N.size + N.r) & (upper_bound(-N) < -level)
+    return hold
+
+
+def _affine(c: Array, g: Array, error: Array) -> list[Taylor]:
+    """States as models in the symbols of a box: c (n, B), g (symbols, n, B), error (n, B)."""
+    return [affine(c[i], g[:, i], error[i]) for i in range(len(c))]
+
+
+def _numbers(like: Taylor) -> Callable[[Fraction], Taylor]:
+    """Of rationals, the models."""
+    return lambda q: constant(q, len(like.g), len(like.c))
+
+
+def _stacked(models: Sequence[Taylor]) -> Taylor:
+    """Models as rows of one."""
+    c, r = (np.array([getattr(v, part) for v in models]) for part in ("c", "r"))
+    return Taylor(c, np.stack([v.g for v in models], 1), np.stack([v.Q for v in models], 2), r)
+
+
+def _row(models: Taylor) -> Taylor:
+    """The first of such models."""
+    return Taylor(models.c[0], models.g[:, 0], models.Q[:, :, 0], models.r[0])
+
+
+def _through(W: Array, v: Taylor, b: Array | None = None) -> Taylor:
+    """`W v + b` of models in rows (width, B)."""
+    made, c = gamma(W.shape[1]), np.matmul(W, v.c)
+    r = np.matmul(np.abs(W), v.r + up(made * v.size)) * (1 + made)
+    if b is not None:
+        c = c + b[:, None]
+        r = r + EPS * (np.abs(c) + np.abs(b)[:, None])
+    return Taylor(c, np.matmul(W, v.g), np.matmul(W, v.Q), up(r))
+
+
+def _below(q: Fraction) -> float:
+    """The greatest binary64 number that is not above q."""
+    try:
+        value = float(q)
+    except OverflowError:
+        return sys.float_info.max if q > 0 else -np.inf
+    return value if Fraction(value) <= q else nextafter(value, -np.inf)
+
+
+def _above(q: Fraction) -> float:
+    return -_below(-q)
