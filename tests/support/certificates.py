@@ -24,6 +24,7 @@ from certify.checker.case import Case
 from certify.checker.document import Certificate
 from certify.checker.errors import Rejected
 from certify.checker.float64 import within
+from certify.checker.outer import Beyond
 from certify.checker.ring import Ring
 
 Document = dict[str, Any]
@@ -219,13 +220,13 @@ def halved(root: Any, holds: Callable[..., np.ndarray], max_leaves: int, depth: 
     return bytes(tree)
 
 
-def passes(ring: Ring, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
+def passes(boxes: Ring | Beyond, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
     """The rules for a leaf, box by box, lo and hi (n, B)."""
-    leaves = ring.examine(0, lo, hi)
+    leaves = boxes.examine(0, lo, hi)
     good = np.ones(lo.shape[1], dtype=bool)
     good[leaves.numbers] = leaves.hold
-    if not ring.case.bounded:
-        for bounds, mid, reach in zip(ring.c.input_bounds, leaves.mid, leaves.reach, strict=True):
+    if not boxes.case.bounded:
+        for bounds, mid, reach in zip(boxes.c.input_bounds, leaves.mid, leaves.reach, strict=True):
             good[leaves.numbers] &= within(bounds, mid, reach)
     return good
 

@@ -1,9 +1,10 @@
 """Certificates with an outer set {N <= n2}, by hand: what they say of N, trees for it, and where it is wrong.
 
-The trees come from a small prover in binary64, which looks at a few points of each box and wants a margin: a hint like
-any producer's, of which nothing follows but that a certificate is accepted. What is true of N and of the loop is known
-otherwise: in closed form, or by a search for points whose finds are confirmed in ball arithmetic. N'F comes from one
-complex step, N(x + i t F)/t: neither checker computes it so.
+As in `certificates.py` trees are grown with the checker's own rule for a leaf. A prover in binary64, which looks at a
+few points of each box and wants a margin, makes others. Both are hints like any producer's: nothing follows from them
+but that a certificate is accepted. What is true of N and of the loop is known otherwise: in closed form, or by a search
+for points whose finds are confirmed in ball arithmetic. N'F comes from one complex step, N(x + i t F)/t, as in neither
+checker.
 """
 
 from __future__ import annotations
@@ -18,15 +19,17 @@ from typing import Any
 import numpy as np
 from flint import acb, acb_mat, arb, arb_mat, ctx, fmpq, fmpq_mat
 
+from certify.checker.case import Case
+from certify.checker.outer import Beyond, is_above_on_faces
 from tests.support import claim_oracle
 from tests.support.balls import square
-from tests.support.certificates import LEAF, Document, decode, edited, encode, halved
+from tests.support.certificates import LEAF, Document, decode, edited, encode, halved, parse, passes
 from tests.support.uncertain import corners, held
 
 Array = np.ndarray
 Layers = Sequence[tuple[Any, Any]]
 STEP = 2.0**-200  # of the complex step: its square is nothing beside 1
-MARGIN = 0.3  # of the spread over the points of a box
+MARGINS = (0.3, 1.0, 4.0, 16.0)  # of the spread over the points of a box
 _ARITHMETIC: dict[str, Callable[..., Any]] = {"+": np.add, "*": np.multiply}
 _FUNCTIONS: dict[str, Callable[..., Any]] = {
     "sin": np.sin, "cos": np.cos, "tan": np.tan, "tanh": np.tanh, "exp": np.exp, "atan": np.arctan, "sqrt": np.sqrt,
@@ -132,7 +135,7 @@ def _near(text: str) -> float:
         return np.inf if not text.startswith("-") else -np.inf
 
 
-# ------------------------------------------------------------------------------------------------------- a small prover
+# ------------------------------------------------------------------------------------------------------- trees
 
 
 def around(T: Any, domain: Sequence[Sequence[str]]) -> Array:
@@ -152,13 +155,13 @@ def _points(n: int) -> Array:
     return np.array(list(itertools.product((0.0, -1.0, 1.0), repeat=n))).T
 
 
-def _above(values: Array, level: float) -> Array:
+def _above(values: Array, level: float, margin: float) -> Array:
     """Whether all that lies between a few values (points, B) is above a level, probably."""
     least, most = values.min(axis=0), values.max(axis=0)
-    return np.asarray(least - MARGIN * (most - least) > level)
+    return np.asarray(least - margin * (most - least) > level)
 
 
-def leaf_holds(numbers: Numbers, T: Array, lo: Array, hi: Array) -> Array:
+def leaf_holds(numbers: Numbers, T: Array, lo: Array, hi: Array, margin: float) -> Array:
     """Of boxes (n, B): probably outside of the domain, in {V < c2}, in {N > n2}, or N falls and the inputs are kept."""
     n, batch = lo.shape
     centre, radius = (lo + hi) / 2, (hi - lo) / 2
@@ -175,26 +178,26 @@ def leaf_holds(numbers: Numbers, T: Array, lo: Array, hi: Array) -> Array:
 
     N, V, excess = (each(of(points)) for of in (numbers.N, numbers.V, numbers.excess))
     rises = [each(v) for v in numbers.rises(points)]
-    falls = _above(-excess, 0.0)
-    for rise in rises:
-        found = _above(-rise, 0.0)
-        for gap in (numbers.level - N, V - numbers.c2):
-            for axis in range(n):
-                ends = [np.all(d == (np.arange(n) == axis)[:, None] * s, axis=0).argmax() for s in (-1.0, 1.0)]
-                a, b = (v[ends[1]] - v[ends[0]] for v in (rise, gap))
-                k = np.where(b != 0, -a / np.where(b != 0, b, 1.0), 0.0)
-                found |= _above(-(rise + np.maximum(k, 0.0) * gap), 0.0)
-        falls &= found
+
+    def fall(k: Any, gap: Any) -> Array:
+        return np.all([_above(-(rise + k * gap), 0.0, margin) for rise in rises], axis=0)
+
+    found = fall(0.0, 0.0)
+    for rise, gap, axis in itertools.product(rises, (numbers.level - N, V - numbers.c2), range(n)):
+        ends = [np.all(d == (np.arange(n) == axis)[:, None] * s, axis=0).argmax() for s in (-1.0, 1.0)]
+        a, b = (v[ends[1]] - v[ends[0]] for v in (rise, gap))
+        found |= fall(np.maximum(np.where(b != 0, -a / np.where(b != 0, b, 1.0), 0.0), 0.0), gap)
     away = np.any((x - reach > most) | (x + reach < least), axis=0)
-    return np.asarray(away | inside | _above(N, numbers.level) | falls)
+    kept = _above(-excess, 0.0, margin)
+    return np.asarray(away | inside | _above(N, numbers.level, margin) | (found & kept))
 
 
-def face_holds(numbers: Numbers, axis: int, end: float, lo: Array, hi: Array) -> Array:
+def face_holds(numbers: Numbers, axis: int, end: float, lo: Array, hi: Array, margin: float) -> Array:
     """Of boxes on a face, N > n2, probably."""
     n, d = numbers.n, _points(numbers.n)
     points = ((lo + hi) / 2)[:, None] + ((hi - lo) / 2)[:, None] * d[:, :, None]
     points[axis] = end
-    return _above(numbers.N(points.reshape(n, -1)).reshape(d.shape[1], -1), numbers.level)
+    return _above(numbers.N(points.reshape(n, -1)).reshape(d.shape[1], -1), numbers.level, margin)
 
 
 def packed(tree: bytes) -> str:
@@ -205,21 +208,21 @@ def unpacked(text: str) -> bytes:
     return base64.b64decode(text)
 
 
-def faces(data: Document, max_leaves: int = 2000, depth: int = 14) -> list[bytes]:
+def faces(data: Document, margin: float, max_leaves: int = 400, depth: int = 12) -> Document:
+    """The document with trees for its faces from the prover in binary64."""
     numbers, found = Numbers(data), []
     lowest, most = (
         np.array([outwards(Fraction(pair[side]), side) for pair in data["plant"]["domain"]]) for side in (0, 1)
     )
     for axis, side in itertools.product(range(numbers.n), (0, 1)):
         own = lowest.copy(), most.copy()
-        end = float(Fraction(data["plant"]["domain"][axis][side]))
-        own[0][axis] = own[1][axis] = end
+        end = own[0][axis] = own[1][axis] = float(Fraction(data["plant"]["domain"][axis][side]))
 
         def holds(lo: Array, hi: Array, axis: int = axis, end: float = end) -> Array:
-            return face_holds(numbers, axis, end, lo, hi)
+            return face_holds(numbers, axis, end, lo, hi, margin)
 
-        found.append(halved(own[1], holds, max_leaves, depth, own[0]))
-    return found
+        found.append(packed(halved(own[1], holds, max_leaves, depth, own[0])))
+    return edited(data, "evidence.outer.faces", found)
 
 
 def outwards(q: Fraction, side: int) -> float:
@@ -230,25 +233,46 @@ def outwards(q: Fraction, side: int) -> float:
     return near
 
 
-def with_outer(
-    data: Document, function: Document, *, T: Any = None, root: Any = None, max_leaves: int = 3000, depth: int = 22
-) -> Document:
-    """The document with this outer set and trees from the small prover; T is that of the inner set unless given."""
+def stated(data: Document, function: Document, T: Any = None, root: Any = None) -> Document:
+    """The document with this outer set and a single leaf everywhere; T is that of the inner set unless given."""
     T = square(data["evidence"]["T"]) if T is None else np.atleast_2d(np.asarray(T, dtype=float))
     root = around(T, data["plant"]["domain"]) if root is None else np.asarray(root, dtype=float)
+    leaf = packed(bytes([LEAF]))
     data = edited(data, "claim.outer", function)
-    with np.errstate(all="ignore"):
-        numbers = Numbers(data)
-        tree = halved(root, lambda *box: leaf_holds(numbers, T, *box), max_leaves, depth)
-        sides = faces(data)
-    evidence = {"T": encode(T), "root": encode(root), "tree": packed(tree), "faces": [packed(side) for side in sides]}
+    evidence = {"T": encode(T), "root": encode(root), "tree": leaf, "faces": [leaf] * (2 * len(T))}
     return edited(data, "evidence.outer", evidence)
 
 
+def with_outer(
+    data: Document, function: Document, *, T: Any = None, root: Any = None, max_leaves: int = 3000, depth: int = 22
+) -> Document:
+    """The document with this outer set and trees for it, grown as long as there are few leaves."""
+    data = stated(data, function, T, root)
+    with np.errstate(all="ignore"):
+        for margin in MARGINS:
+            data = faces(data, margin)
+            case = Case(parse(data))
+            if next(is_above_on_faces(case), None) is None:
+                break
+        beyond = Beyond(case)
+        tree = halved(beyond.evidence.root, lambda *box: passes(beyond, *box), max_leaves, depth)
+    return edited(data, "evidence.outer.tree", packed(tree))
+
+
+def proved(data: Document, margin: float = 1.0, max_leaves: int = 400, depth: int = 12) -> Document:
+    """The document with trees from the prover in binary64."""
+    outer = data["evidence"]["outer"]
+    T, root = square(outer["T"]), decode(outer["root"])
+    with np.errstate(all="ignore"):
+        numbers = Numbers(data)
+        tree = halved(root, lambda *box: leaf_holds(numbers, T, *box, margin), max_leaves, depth)
+        return faces(edited(data, "evidence.outer.tree", packed(tree)), margin)
+
+
 def at_level(data: Document, level: float) -> Document:
-    """Another level, and the prover's trees for it."""
-    T, n = decode(data["evidence"]["outer"]["T"]), len(data["plant"]["states"])
-    return with_outer(data, {**data["claim"]["outer"], "level": float(level).hex()}, T=T.reshape(n, n))
+    """Another level, and trees for it."""
+    T = square(data["evidence"]["outer"]["T"])
+    return with_outer(data, {**data["claim"]["outer"], "level": float(level).hex()}, T=T)
 
 
 def uniform(axes: Sequence[int], depth: int) -> bytes:

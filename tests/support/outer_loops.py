@@ -84,13 +84,13 @@ def oscillator(c2: float = 0.25, **more: Any) -> Document:
 
 
 def three_states() -> Document:
-    """x' = -x + y/4, y' = -y - x/4, z' = u, u = -z: N = |x|^2 falls everywhere, and 7/4 is below what a face has."""
+    """x' = -x + y/4, y' = -y - x/4, z' = u, u = -z: x^2 + 3/4 y^2 + 5/4 z^2 falls; 27/16 on a face."""
     data = make(
         [["+", ["-", "x"], ["/", "y", "4"]], ["-", ["-", "y"], ["/", "x", "4"]], "u"], [([[0.0, 0.0, -1.0]], [0.0])],
         np.eye(3), (0.25, 0.25), states=("x", "y", "z"), domain=[("-3/2", "3/2")] * 3,
         input_bounds=[("-3", "3")], squash="identity", centre="none", scale=[1.0],
     )  # fmt: skip
-    return with_outer(data, expression(quadratic(np.eye(3)), 1.75))
+    return with_outer(data, expression(quadratic(np.diag([1.0, 0.75, 1.25])), 1.6))
 
 
 def practical(kind: str = "practical") -> Document:
@@ -166,7 +166,7 @@ BASES: dict[str, Callable[[], Document]] = {
     ),
     "least elsewhere": lambda: with_outer(saturated(), expression(["**", ["+", "x", "1/4"], 2], 2.7)),
     "well": lambda: with_outer(saturated(), network(wells([[1.0]], 2.0), -1.2)),
-    "deep well": lambda: with_outer(saturated(), network(deep(), 0.7)),
+    "deep well": lambda: with_outer(saturated(), network(deep(), 0.65)),
     "oscillator": lambda: with_outer(oscillator(), expression(quadratic(M_OSCILLATOR), 3.2)),
     "rotated": rotated,
     "walls": bent_walls,
