@@ -109,6 +109,8 @@ class Clerk:
 
 def _what_is_lower(first: Certificate, certificate: Certificate) -> str:
     said = []
+    if first.claim.outer is not None and certificate.claim.outer is None:
+        said.append("the set beyond the ellipsoid is left out")
     if first.kind != certificate.kind:
         what = "that trajectories converge to one equilibrium" if isinstance(first.claim, Nearby) else "it"
         said.append(f"{what} is left out" + ("" if isinstance(first.claim, Nearby) else " with its tube"))
@@ -136,6 +138,8 @@ def _lowered(certificate: Certificate, leaf: int | None, problem: Problem, tries
     claim, evidence = certificate.claim, certificate.evidence
     if not isinstance(evidence, PartitionTree):
         return None
+    if claim.outer is not None:
+        return replace(certificate, claim=replace(claim, outer=None), evidence=replace(evidence, outer=None))
     if isinstance(claim, Nearby):
         weaker = Practical(claim.roa, claim.local, claim.floor, rate=claim.rate)
         return replace(certificate, claim=weaker, evidence=replace(evidence, contraction=None))

@@ -25,6 +25,7 @@ from numpy.typing import ArrayLike
 from certify.errors import InputError
 from certify.inputs import (
     centred,
+    function_for,
     lines,
     named_plant,
     policy_in,
@@ -36,7 +37,7 @@ from certify.inputs import (
     with_uncertain_parameters,
 )
 from certify.installation import versions
-from certify.lyapunov import Candidate
+from certify.lyapunov import Candidate, Neural, Polynomial, Symbolic
 from certify.options import Asked, EngineName, RoaOptions
 from certify.policies import Policy, TanhNetwork
 from certify.policies.importers import Clip, ImportOptions, import_module, import_state_dict
@@ -84,6 +85,8 @@ def certify_roa(
     input_error: Exact | Mapping[str, Exact] | None = None,
     sample_time: Exact | Sequence[Exact] | None = None,
     rate: float | None = None,
+    lyapunov: str | os.PathLike[str] | Neural | Polynomial | Symbolic | None = None,
+    lyapunov_level: float | None = None,
     load_seconds: float = 0.0,
     provenance: Mapping[str, Any] | None = None,
     progress: Report | None = None,
@@ -137,6 +140,9 @@ def certify_roa(
         Exact, as those three are. By default the input follows the state at once.
     rate : prove that V falls at least as exp(-2 rate t), in discrete time by the share 2 rate in each step; 0 (the
         default) says only that it falls.
+    lyapunov : a function N of deviations from the operating point, or the path of its file: prove the largest {N <= n2}
+        in the domain from which every trajectory enters {x'Px <= c2}; `result.outer` says what was found.
+    lyapunov_level : prove exactly this n2; by default the largest is looked for.
     load_seconds : time already spent on reading, for the report.
     provenance : entries for the certificate that the checkers ignore; by default the policy's name and versions.
     progress : called with a stage ("candidate", "ring", "check") and where the search stands, or None.
@@ -172,6 +178,7 @@ def certify_roa(
         "claim": claim, "candidate": candidate, "Q": Q, "R": R, "P": P, "level": level, "engine": engine,
         "dreal_precision": dreal_precision, "jobs": jobs, "device": device, "enlarge": enlarge, "box": box,
         "reach_from": reach_from, "time_limit": time_limit, "max_boxes": max_boxes, "rate": rate,
+        "lyapunov_level": lyapunov_level,
     }  # fmt: skip
     notices: list[str] = []
     try:
@@ -183,6 +190,8 @@ def certify_roa(
         _require(progress is None or callable(progress), "progress", "callable", progress)
         stored = _policy(policy, system, _importing(importing), notices.append, unsure)
         plant, network = _closed(stored, system, notices.append, unsure)
+        if lyapunov is not None:
+            chosen = replace(chosen, lyapunov=_function(lyapunov, plant, notices.append))
         folder = _Folder() if out is None else None
         place = folder.path if folder is not None else Path(_path(out, "out"))
         result = run(
@@ -250,12 +259,20 @@ def _options(options: RoaOptions | None, single: dict[str, Any]) -> RoaOptions:
                 "Put them into `options`."
             )
         return options
-    numbers, whole = ("level", "dreal_precision", "time_limit", "rate"), ("jobs", "max_boxes")
+    numbers = ("level", "dreal_precision", "time_limit", "rate", "lyapunov_level")
+    whole = ("jobs", "max_boxes")
     readers: dict[str, Callable[[Any, str], Any]] = dict.fromkeys(single, _text)
     readers |= {"Q": _row, "R": _row, "P": _matrix, "enlarge": _flag, "box": _widths, "reach_from": _state}
     readers |= dict.fromkeys(numbers, _number) | dict.fromkeys(whole, _count)
     read = {name: readers[name](value, name) for name, value in single.items()}
     return RoaOptions(**read)
+
+
+def _function(given: Any, plant: System, tell: Callable[[str], None]) -> Neural | Polynomial | Symbolic:
+    """A function of the states, given as such or by its file."""
+    if isinstance(given, Neural | Polynomial | Symbolic):
+        return given
+    return function_for(Path(_path(given, "lyapunov")), plant, tell)
 
 
 def _uncertainty(ranges: Any, disturbances: Any, input_error: Any, sample_time: Any) -> Change:

@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 from certify.errors import InputError
 
 if TYPE_CHECKING:
+    from certify.lyapunov import Neural, Polynomial
     from certify.policies import Centre, Policy
     from certify.policies.importers import Imported, ImportOptions
     from certify.systems import System
@@ -105,6 +106,25 @@ def tell_of_other(stored: Policy, plant: System, tell: Tell) -> None:
         off = [f"{p} = {v}" for p, v in stored.parameters.items()]
     if off:
         tell(f"the policy was trained with {', '.join(off)}; --system says otherwise, and counts")
+
+
+def function_for(path: Path, plant: System, tell: Tell) -> Neural | Polynomial:
+    """The function in a Lyapunov file, for this plant; says so if the file names another.
+
+    Raises
+    ------
+    InputError : the file cannot be read, or its function has another number of states.
+    """
+    from certify.lyapunov import load_lyapunov
+
+    stored = load_lyapunov(path)
+    if stored.function.n != plant.n:
+        raise InputError(
+            f"Lyapunov file {path} must be of {plant.n} states, those of {plant.name}; it is of {stored.function.n}."
+        )
+    if stored.system != plant.name:
+        tell(f"Lyapunov file {path} is of {stored.system}; it is proved for {plant.name}")
+    return stored.function
 
 
 def where_valid(stored: Policy, plant: System, tell: Tell) -> System:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from certify.lyapunov import Candidate, Named
+from certify.lyapunov import Candidate, Named, Neural, Polynomial, Symbolic
 
 Array = NDArray[np.float64]
 EngineName = Literal["bounds", "dreal", "both"]
@@ -42,6 +42,9 @@ class RoaOptions:
         is not named gets the smallest share of its domain that a named one has.
     reach_from : a state by the states' values, those that are not named at the operating point: look for a tube around
         the trajectory from there into the proved set, the widest multiple of an ellipsoid; of `box`, if it is given.
+    lyapunov : a function N of the states beyond the ellipsoid: prove the largest {N <= n2} from which every trajectory
+        enters {V <= c2}, in the domain box.
+    lyapunov_level : prove exactly this n2; None finds the largest.
     time_limit : seconds for everything up to the verdict, the check included.
     max_boxes : boxes for the ring.
     rate : lambda in `D + 2 lambda V < 0`: V is to fall at least as exp(-2 lambda t), in units of time of the plant, or
@@ -61,6 +64,8 @@ class RoaOptions:
     enlarge: bool = False
     box: Mapping[str, float] | None = None
     reach_from: Mapping[str, Fraction | float] | None = None
+    lyapunov: Neural | Polynomial | Symbolic | None = None
+    lyapunov_level: float | None = None
     time_limit: float = 50.0
     max_boxes: int = 4_000_000
     rate: float = 0.0
@@ -98,5 +103,9 @@ class RoaOptions:
             raise InputError(f"`rate` must be a number of at least 0; found {self.rate}.")
         if self.rate and (self.enlarges or self.engine != "bounds"):
             raise InputError("`rate` needs the engine bounds, and a claim without a tube.")
+        if self.lyapunov is not None and (self.enlarges or self.rate or self.engine != "bounds"):
+            raise InputError("`lyapunov` needs the engine bounds, and a claim without a tube and without a rate.")
+        if self.lyapunov_level is not None and not math.isfinite(self.lyapunov_level):
+            raise InputError(f"`lyapunov_level` must be a finite number; found {self.lyapunov_level}.")
         if not self.time_limit > 0 or not self.max_boxes > 0:
             raise InputError("`time_limit` and `max_boxes` must be positive.")

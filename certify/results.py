@@ -23,6 +23,8 @@ from certify.claims import Problem
 from certify.engines.falsify import Witness
 from certify.errors import InputError
 from certify.lyapunov import are_inside, extents, semi_axes, volume
+from certify.lyapunov.neural import Neural
+from certify.lyapunov.symbolic import Symbolic
 from certify.policies import TanhNetwork
 from certify.report.timing import Timing, reach_time
 from certify.report.words import below, varying, varying_in, volume_name, volume_unit
@@ -34,7 +36,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
-_STAGES = ("load", "candidate", "local", "ring", "tube", "write", "check", "total")
+_STAGES = ("load", "candidate", "local", "ring", "tube", "outer", "write", "check", "total")
 
 
 @dataclass(frozen=True, slots=True)
@@ -110,6 +112,34 @@ class TubeFacts:
         sizes = {"semi_axes": semi_axes(self.start, 1.0).tolist(), "extents": extents(self.start, 1.0).tolist()}
         stated = {"shape": self.shape, "slabs": self.slabs, "duration": self.duration, "start": self.start.tolist()}
         return {**stated, "centre": self.centre and list(self.centre), "volume": volume(self.start, 1.0), **sizes}
+
+
+@dataclass(frozen=True, slots=True)
+class OuterFacts:
+    """A set beyond {V <= c2}: {N <= level} within the domain, N a `function` of deviations from the operating point.
+
+    `volume` is that of its union with {V <= c2}, estimated from samples of the domain, and `deviation` the standard
+    deviation of that estimate; `limit` says what ends the level: `faces`, `witness`, `requested`, or what ran out;
+    `witness` is a state, (n,), at which N is no larger than `witness_level` and does not fall, None if none was met.
+    """
+
+    function: Neural | Symbolic
+    level: float
+    volume: float
+    deviation: float
+    limit: str
+    boxes: int
+    leaves: int
+    face_leaves: int
+    witness: tuple[float, ...] | None = None
+    witness_level: float | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        N = self.function
+        stated = {"kind": "network", "layers": list(N.widths)} if isinstance(N, Neural) else {"kind": "expression"}
+        numbers = {name: getattr(self, name) for name in self.__slots__ if name not in ("function", "witness")}
+        return {**stated, **numbers, "witness": self.witness and list(self.witness)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,6 +224,7 @@ class RoaResult:
     notice: str | None = None
     levels: Levels = field(default_factory=Levels)
     tube: TubeFacts | None = None
+    outer: OuterFacts | None = None
     reach_from: tuple[Fraction, ...] | None = None
     witness: Witness | None = None
     eigenvalues: tuple[str, ...] = ()
@@ -421,6 +452,7 @@ class RoaResult:
             if self.reach_from is None
             else {s.name: str(q) for s, q in zip(system.states, self.reach_from, strict=True)},
             "tube": None if self.tube is None else self.tube.to_dict(),
+            "outer": None if self.outer is None else self.outer.to_dict(),
             "witness": None,
             "eigenvalues": list(self.eigenvalues),
             "rest": None if self.rest is None else asdict(self.rest),

@@ -6,7 +6,7 @@ counts as not shown.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from fractions import Fraction
 from typing import Any
@@ -18,6 +18,8 @@ from numpy.typing import NDArray
 
 from certify.closed_loop import ClosedLoop
 from certify.expressions import Algebra, evaluate, solution_series
+from certify.lyapunov.neural import Neural
+from certify.lyapunov.symbolic import Symbolic
 from certify.policies import TanhNetwork
 
 Array = NDArray[np.float64]
@@ -120,6 +122,38 @@ def evaluate_increment(
             Px, PG = (sum((a * b for a, b in zip(p, by, strict=True)), flint.arb(0)) for by in (state, G))
             total += own * (2 * Px + step * PG) + 2 * lam * v * Px
         return total
+
+
+def evaluate_function(N: Neural | Symbolic, x: Balls) -> flint.arb:
+    """N at balls around a state, n of them, at the precision that is set."""
+    if isinstance(N, Neural):
+        return _layers(N.weights, N.biases, x)[0]
+    return evaluate_arb(N.expression, dict(zip(N.states, x, strict=True)))
+
+
+def evaluate_rise(loop: ClosedLoop, N: Neural | Symbolic, x: Array) -> tuple[flint.arb, flint.arb]:
+    """`N(x)` and `N'(x) F(x)` at a binary64 point (n,), as Arb balls."""
+    with precision():
+        state = _points(x)
+        values = dict(zip(loop.system.states, state, strict=True))
+        values |= zip(loop.system.inputs, evaluate_policy(loop, x), strict=True)
+        F = _field(loop, values)
+        if isinstance(N, Neural):
+            return _layers(N.weights, N.biases, state)[0], _rise(N, state, F)
+        slopes = [evaluate_arb(sympy.diff(N.expression, s), values) for s in N.states]
+        return evaluate_function(N, state), sum((a * b for a, b in zip(slopes, F, strict=True)), flint.arb(0))
+
+
+def _rise(N: Neural, x: Balls, F: Balls) -> flint.arb:
+    """N'F of a network: the layers of the value and of the derivative along F, side by side."""
+    zeros = [np.zeros(len(W)) for W in N.weights]
+    for k, (W, b) in enumerate(zip(N.weights, N.biases, strict=True)):
+        if k:
+            h = [v.tanh() for v in x]
+            F = [(1 - t * t) * y for t, y in zip(h, F, strict=True)]
+            x = h
+        x, F = _affine(W, b, x), _affine(W, zeros[k], F)
+    return F[0]
 
 
 def _field(loop: ClosedLoop, values: Mapping[sympy.Symbol, flint.arb]) -> Balls:
@@ -281,7 +315,11 @@ def _centring(loop: ClosedLoop) -> tuple[Balls, Balls]:
 
 
 def _net(network: TanhNetwork, h: Balls) -> Balls:
-    for k, (W, b) in enumerate(zip(network.weights, network.biases, strict=True)):
+    return _layers(network.weights, network.biases, h)
+
+
+def _layers(weights: Sequence[Array], biases: Sequence[Array], h: Balls) -> Balls:
+    for k, (W, b) in enumerate(zip(weights, biases, strict=True)):
         h = _affine(W, b, [v.tanh() for v in h] if k else h)
     return h
 

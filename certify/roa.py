@@ -28,7 +28,7 @@ from certify.certificate import (
     require_within_limits,
     sole_writer,
 )
-from certify.claims import Asymptotic, Claim, Enlarged, Nearby, Practical, Problem, Reached
+from certify.claims import Asymptotic, Claim, Enlarged, Nearby, Outer, Practical, Problem, Reached
 from certify.claims.claim import Kind
 from certify.closed_loop import ClosedLoop
 from certify.diagnosis import diagnose
@@ -36,13 +36,13 @@ from certify.engines.base import FEW, Attempt, Budget, Progress, Proof, Task
 from certify.engines.contraction import contraction
 from certify.engines.falsify import Witness, refutes
 from certify.errors import BackendError, InputError, SoundnessError
-from certify.lyapunov import are_inside, leaves_domain, slowest_decay, volume
-from certify.lyapunov.function import Quadratic
+from certify.lyapunov import Polynomial, are_inside, leaves_domain, of_polynomial, slowest_decay, volume
+from certify.lyapunov.function import LyapunovFunction, Quadratic
 from certify.options import RoaOptions
 from certify.policies import TanhNetwork
 from certify.race import Contender, Race
 from certify.rest import find_rest
-from certify.results import Levels, RoaResult, Tried, TubeFacts
+from certify.results import Levels, OuterFacts, RoaResult, Tried, TubeFacts
 from certify.rigorous import eigenvalues, instability
 from certify.systems import System
 from certify.trials import OPTIMISING, Trial, blends, by_reach, corrected, named, optimised, peak, robust, solved
@@ -50,10 +50,11 @@ from certify.verdict import Stop, Verdict
 
 if TYPE_CHECKING:
     from certify.engines.dreal.proof import DrealOptions
+    from certify.engines.outer import OuterProof
 
 __all__ = ["RoaOptions", "RoaResult", "certify_roa"]
 Array = NDArray[np.float64]
-Stage = Literal["candidate", "ring", "tube", "check"]
+Stage = Literal["candidate", "ring", "tube", "outer", "check"]
 Report = Callable[[Stage, Progress | None], None]
 _SMALL_NETWORK = 10_000  # weights
 # Shares of the time limit:
@@ -62,6 +63,7 @@ _PATIENCE = 0.1  # for a ring that gains nothing
 _SEARCH = 0.6  # for a search that cannot be interrupted, the rest being its check's
 _KEPT = 0.03  # for what comes after the search: writing, the checker's start
 _BEFORE_TUBE = 0.5  # for candidates and ring, where a tube is to be looked for
+_BEFORE_OUTER = 0.25  # the same, where a set beyond theirs is
 _FOR_SEARCH = 0.5  # of what is left then, the rest being the tube's check
 _FOR_PROOF = 0.4  # of the time limit, that no further candidate is optimised in
 _WORTH = 1.05  # growth of a volume that another candidate must promise
@@ -70,6 +72,7 @@ _SAMPLE = 2000  # leaves whose check is timed
 _START = 0.2  # seconds that a checker takes to start
 _CAUTION = 1.2  # on the time that a check is expected to take
 _YEAR = 3.156e7  # seconds
+_SAMPLED = 400_000  # states of the domain, whose share in a set is its volume
 
 
 def certify_roa(
@@ -175,7 +178,7 @@ class _Run:
                     raise InputError(f"a tube from a state needs a loop that rests at the origin; {self.aside}.")
                 options = replace(options, enlarge=False, box=None)
             self.options = options = replace(options, claim=claim)
-        self.share = _BEFORE_TUBE if options.enlarges else 1.0
+        self.share = _BEFORE_TUBE if options.enlarges else _BEFORE_OUTER if options.lyapunov is not None else 1.0
         kind = _kind_of(options)
         result = RoaResult(
             Verdict.UNKNOWN,
@@ -313,12 +316,10 @@ class _Run:
         report = None if self.progress is None else self._report
         return Race(self._begin, self.left, self.options.max_boxes, report)
 
-    def _report(self, state: Progress) -> None:
+    def _report(self, state: Progress, stage: Stage = "ring") -> None:
         if self.progress is not None:
             known = state.seconds_left
-            self.progress(
-                "ring", replace(state, seconds_left=self.left() if known is None else min(known, self.left()))
-            )
+            self.progress(stage, replace(state, seconds_left=self.left() if known is None else min(known, self.left())))
 
     def _tell(self, stage: Stage) -> None:
         if self.progress is not None:
@@ -409,6 +410,11 @@ class _Run:
             if closer is not None:
                 claim = Nearby(claim.roa, claim.local, claim.floor, rate=claim.rate)
                 evidence = replace(evidence, contraction=closer)
+        beyond = None
+        if self.options.lyapunov is not None and isinstance(evidence, PartitionTree):
+            beyond = self._beyond(best.trial, claim, self.options.lyapunov)
+            if beyond is not None:
+                claim, evidence = replace(claim, outer=beyond.outer), replace(evidence, outer=beyond.evidence)
         certificate = Certificate(self.system, self.network, task.problem.V, claim, evidence, self.provenance)  # type: ignore[arg-type]
         accepted = self._clerk().accepted(certificate, task.problem)
         certificate = accepted.certificate
@@ -432,6 +438,11 @@ class _Run:
             )
         if task.exactly and certificate.roa < task.target:
             return _missed(replace(result, stop=Stop.REFUSED, detail=accepted.mended or ""), task, certificate.claim)
+        if certificate.claim.outer is not None and beyond is not None:
+            facts_beyond = _facts(task.problem, certificate.claim, certificate.claim.outer, beyond)
+            result = replace(result, outer=facts_beyond)
+        elif beyond is not None:
+            self.aside = "the checker refused the set beyond the ellipsoid, which is left out"
         trusted = isinstance(proof.evidence, TrustedSolver)
         if not trusted and self.options.engine == "both":
             result = replace(result, solver=self._confirm(task.problem, certificate.claim))
@@ -504,6 +515,29 @@ class _Run:
         reached = Reached(roa=claim.roa, local=claim.local, start=Quadratic(tube.start), centre=at)
         return facts, reached, replace(evidence, tube=tube.slabs)
 
+    def _beyond(self, trial: Trial, claim: Claim, function: LyapunovFunction) -> OuterProof | None:
+        """The largest set of another function that is proved to lead into {V <= c2} in the time that is left; None, and
+        `aside` says why, if there is none."""
+        import torch
+
+        from certify.engines.outer import prove_outer
+        from certify.running import ThreadRunner
+
+        self.share = 1.0
+        if function.n != self.system.n:
+            raise InputError(f"`lyapunov` must be a function of {self.system.n} states; found one of {function.n}.")
+        N = of_polynomial(function, self.system.states) if isinstance(function, Polynomial) else function
+        level, runner = self.options.lyapunov_level, ThreadRunner(torch.device(self.options.device))
+        report = None if self.progress is None else partial(self._report, stage="outer")
+        with self._stage("outer"):
+            self._tell("outer")
+            budget = Budget(max(1e-3, _FOR_SEARCH * self.left()), self.options.max_boxes)
+            found = prove_outer(trial.task.problem, claim.roa, trial.T, N, level, budget, runner, report)
+        if found.outer is None:
+            self.aside = f"no set of the function reaches beyond the ellipsoid: {found.detail}"
+            return None
+        return found
+
     def _clerk(self) -> Clerk:
         return Clerk(self.out / "certificate.json", self.left, self._stage, lambda: self._tell("check"))
 
@@ -539,6 +573,26 @@ class _Run:
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
 
 
+def _facts(problem: Problem, claim: Claim, outer: Outer, found: OuterProof) -> OuterFacts:
+    """What is said of a proved outer set; its volume, with that of the ellipsoid, is a mean over samples."""
+    lo, hi = np.array([[float(end) for end in pair] for pair in problem.loop.system.domain]).T
+    x = np.random.default_rng(0).uniform(lo, hi, (_SAMPLED, len(lo)))
+    share = float(np.mean((outer.function(x) <= outer.level) | (problem.V(x) <= claim.roa)))
+    size = float(np.prod(hi - lo))
+    return OuterFacts(
+        outer.function,
+        outer.level,
+        size * share,
+        size * math.sqrt(share * (1 - share) / _SAMPLED),
+        found.stop.name.lower(),
+        found.boxes,
+        found.leaves,
+        found.face_leaves,
+        found.witness,
+        found.witness_level,
+    )
+
+
 def _by_proved(race: Race) -> list[Contender]:
     """The contenders, the largest proved volume first."""
     return sorted(race.contenders, key=lambda c: -c.proved)
@@ -570,6 +624,13 @@ def _require_one_that_knows(system: System, options: RoaOptions) -> None:
     ------
     InputError : the option, and what has a range or goes in steps.
     """
+    if options.lyapunov is None and options.lyapunov_level is not None:
+        raise InputError("`lyapunov_level` must be the level of a function; give one as `lyapunov`.")
+    if options.lyapunov is not None and system.in_steps:
+        raise InputError(
+            f"`lyapunov` must be for a plant in continuous time whose input follows the state at once; the time of "
+            f"{system.name} goes in steps. Ask for the set without it."
+        )
     if options.engine == "bounds" and not options.enlarges:
         return
     if system.in_steps:

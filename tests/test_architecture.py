@@ -25,16 +25,16 @@ EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows th
     "enclosures": "closed_loop expressions rigorous systems",
     "engines": "certificate claims closed_loop enclosures expressions lyapunov policies rigorous running systems",
     "float_error": "closed_loop policies rigorous systems",
-    "inputs": "policies systems",
+    "inputs": "lyapunov policies systems",
     "largest": "certificate claims closed_loop engines lyapunov options policies results roa systems",
-    "lyapunov": "closed_loop plain_file policies systems",
+    "lyapunov": "closed_loop expressions plain_file policies systems",
     "options": "lyapunov",
     "policies": "plain_file systems",
     "race": "engines lyapunov trials",
     "report": "certificate claims closed_loop lyapunov policies systems",
     "rest": "closed_loop rigorous",
     "results": "certificate claims engines lyapunov policies report rest systems",
-    "rigorous": "closed_loop expressions policies",
+    "rigorous": "closed_loop expressions lyapunov policies",
     "roa": (
         "acceptance certificate claims closed_loop diagnosis engines lyapunov options policies race rest results "
         "rigorous running systems trials"

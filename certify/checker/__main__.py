@@ -57,8 +57,11 @@ def _examine(path: str) -> tuple[int, dict[str, Any]]:
         answers = [": ".join(pair) for pair in c.evidence.queries]
         answer |= {"solver": c.evidence.solver, "version": c.evidence.version, "answers": answers}
     else:
-        margins = {"local": tally.local_margin, "ring": tally.ring_margin}
+        margins = {"local": tally.local_margin, "ring": tally.ring_margin, "outer": tally.outer_margin}
         answer |= {"leaves": tally.rules["tree"], "ring_leaves": tally.rules["ring"], "margins": margins}
+    if c.outer is not None:
+        leaves = {"leaves": tally.rules["outer"], "face_leaves": tally.rules["faces"]}
+        answer["outer"] = {"level": c.outer.level, **leaves}
     if c.start is not None:
         centre, longest = None if c.centre is None else c.centre.tolist(), words.duration(c)
         answer |= {"start": c.start.tolist(), "centre": centre, "time": longest if math.isfinite(longest) else None}

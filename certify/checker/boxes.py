@@ -27,6 +27,7 @@ class Leaves:
 
     boxes: Boxes
     numbers: Array  # in the tree
+    place: str  # of one, before its number
     mid: Array  # (m, B): the inputs lie within `reach` of this
     reach: Array
     bound: Array  # of what has to be negative
@@ -146,7 +147,7 @@ def keeps_inputs(leaves: Leaves) -> Failures:
     for name, bounds, mid, reach in zip(c.inputs, c.input_bounds, leaves.mid, leaves.reach, strict=True):
         hold = within(bounds, mid, reach)
         if not np.all(hold):
-            yield f"leaf {leaves.numbers[np.argmin(hold)]}", f"{name} may leave its bounds"
+            yield f"{leaves.place}{leaves.numbers[np.argmin(hold)]}", f"{name} may leave its bounds"
     return int(leaves.mid.size)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 import struct
+from collections.abc import Iterable
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
@@ -28,6 +29,15 @@ Array = NDArray[np.float64]
 Intervals = tuple[tuple[Fraction, Fraction], ...]
 
 
+def hashed(heading: str, arrays: Iterable[Array]) -> str:
+    """sha256 of a heading, then shape and little-endian numbers of each array (FORMAT.md)."""
+    digest = hashlib.sha256(heading.encode())
+    for numbers in arrays:
+        digest.update(struct.pack(f"<{1 + numbers.ndim}Q", numbers.ndim, *numbers.shape))
+        digest.update(numbers.astype("<f8").tobytes())
+    return digest.hexdigest()
+
+
 @dataclass(frozen=True)
 class Policy:
     """The network as stated in the file: exact binary64 numbers."""
@@ -41,13 +51,10 @@ class Policy:
     clip: tuple[Array, Array] | None = None  # lo, hi
 
     def sha256(self) -> str:
-        """Hash of squash, centre, then shape and little-endian numbers of each array (FORMAT.md)."""
-        digest = hashlib.sha256(f"certify-policy/1\0{self.squash}\0{self.centre}\0".encode())
+        """Hash of squash, centre, then each array."""
         layers = [array for layer in zip(self.weights, self.biases, strict=True) for array in layer]
-        for numbers in (*layers, self.scale, self.offset, *(self.clip or ())):
-            digest.update(struct.pack(f"<{1 + numbers.ndim}Q", numbers.ndim, *numbers.shape))
-            digest.update(numbers.astype("<f8").tobytes())
-        return digest.hexdigest()
+        arrays = (*layers, self.scale, self.offset, *(self.clip or ()))
+        return hashed(f"certify-policy/1\0{self.squash}\0{self.centre}\0", arrays)
 
 
 @dataclass(frozen=True)
@@ -56,6 +63,11 @@ class Network:
 
     weights: tuple[Array, ...]
     biases: tuple[Array, ...]
+
+    def sha256(self) -> str:
+        """Hash of each array."""
+        layers = zip(self.weights, self.biases, strict=True)
+        return hashed("certify-lyapunov/1\0", [array for layer in layers for array in layer])
 
 
 @dataclass(frozen=True)
@@ -329,9 +341,13 @@ def _outer(value: Value, states: tuple[str, ...]) -> Outer | None:
     value.must(isinstance(value.raw, dict) and value.raw.get("kind") in kinds, f"of kind {' or '.join(kinds)}, or null")
     if value.raw["kind"] == "network":
         _, layers, level = value.keys("kind layers level")
-        return Outer(Network(*_layers(layers, len(states), 1)), level.binary64())
-    _, tree, level = value.keys("kind expression level")
-    return Outer(parse((tree.raw,), states, tree.at), level.binary64())
+        function: Tape | Network = Network(*_layers(layers, len(states), 1))
+    else:
+        _, tree, level = value.keys("kind expression level")
+        function = parse((tree.raw,), states, tree.at)
+    n2 = level.binary64()
+    level.must(math.isfinite(n2), "finite")
+    return Outer(function, n2)
 
 
 def _outer_tree(value: Value, n: int, asked: bool) -> OuterTree | None:

@@ -25,6 +25,7 @@ from .network import enclose_on_boxes
 from .taylor import Taylor, affine, constant, upper_bound
 
 _BATCH_NUMBERS = 1_000_000  # in the largest array of a batch
+_MOST_NUMBERS, _MOST_VALUES = 2**22, 2**26  # of a box: in the models of a network, and of all of an expression's values
 
 
 class Layers:
@@ -32,6 +33,11 @@ class Layers:
 
     def __init__(self, net: Network) -> None:
         self.net, self.values = net, max(len(W) for W in net.weights)
+
+    def is_small(self, symbols: int) -> bool:
+        """Whether models in so many symbols are no more than there is room for."""
+        numbers: int = sum(len(W) * (W.shape[1] + symbols**2) for W in self.net.weights)
+        return numbers <= _MOST_NUMBERS
 
     def models(self, states: Sequence[Taylor]) -> list[Taylor]:
         """Of each layer; the last of them is N, in one row."""
@@ -60,6 +66,10 @@ class Formula:
     def __init__(self, tape: Tape) -> None:
         self.tape, self.values = tape, 2 * len(tape.operations)
 
+    def is_small(self, symbols: int) -> bool:
+        """Whether models in so many symbols are no more than there is time for."""
+        return len(self.tape.operations) * symbols**2 <= _MOST_VALUES
+
     def models(self, states: Sequence[Taylor]) -> list[Taylor]:
         """The states."""
         return list(states)
@@ -78,6 +88,13 @@ class Formula:
         return rise
 
 
+def is_small(case: Case) -> Failures:
+    """`outer`: N is of a size that can be looked at."""
+    if not _function(case).is_small(len(case.c.states) + len(case.c.inputs) + len(case.c.uncertain)):
+        yield "claim.outer", "too many numbers or operations for so many symbols"
+    return 0
+
+
 def is_above_on_faces(case: Case) -> Failures:
     """`faces`: N > n2 on every leaf of every face of the domain."""
     claim, evidence = case.outer
@@ -85,7 +102,7 @@ def is_above_on_faces(case: Case) -> Failures:
     widest = [(_below(lo), _above(hi)) for lo, hi in case.c.domain]
     for k, tree in enumerate(evidence.faces):
         i, side = divmod(k, 2)
-        where = f"{case.c.states[i]} {('least', 'largest')[side]}, "
+        where = f"face {k} "
         yield from is_whole(tree, [j for j in range(n) if j != i], where)
         end, error = float_with_error(case.c.domain[i][side])
         lo, hi = np.array([(end, end) if j == i else pair for j, pair in enumerate(widest)]).T
@@ -123,7 +140,7 @@ def falls(leaves: Leaves) -> Failures:
     """`outer`: N'F < 0 on leaves that may have a state of the domain with V >= c2 and N <= n2."""
     if not np.all(leaves.hold):
         first = np.argmin(leaves.hold)
-        yield f"leaf {leaves.numbers[first]}", f"that N falls is not shown: {leaves.bound[first]:.3g}"
+        yield f"{leaves.place}{leaves.numbers[first]}", f"that N falls is not shown: {leaves.bound[first]:.3g}"
     return int(leaves.hold.size)
 
 
@@ -163,7 +180,9 @@ class Beyond(Boxes):
             rise, [below.at, lambda few: self.gap(centre[:, few], radius[:, few], self.c.c2, -1.0)]
         )
         finite = np.all([np.isfinite(v.size + v.r) for v in (N, *F)], axis=0)
-        return Leaves(self, first + left, mid, up(total(np.abs(slopes), 1) + wide), bound, (bound < 0) & finite)
+        return Leaves(
+            self, first + left, "outer leaf ", mid, up(total(np.abs(slopes), 1) + wide), bound, (bound < 0) & finite
+        )
 
     def is_outside(self, x: Array, error: Array) -> Array:
         """Where some state certainly lies beyond an end of its domain."""

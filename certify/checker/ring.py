@@ -75,7 +75,7 @@ class Ring(Boxes):
             # what divides by a range that holds 0 has no finite model
             hold = np.where(meet, hold, np.all([np.isfinite(g.size + g.r) for g in G], axis=0))
         reach = up(total(np.abs(slopes), 1) + wide)
-        return RingLeaves(self, first + met, mid, reach, bound, hold, meet, ends)
+        return RingLeaves(self, first + met, "leaf ", mid, reach, bound, hold, meet, ends)
 
     def misses(self, lo: Array, hi: Array) -> tuple[Array, Array, Array]:
         """Where the box certainly has V > c2 everywhere, where it certainly has V < c1, and where V >= c1."""

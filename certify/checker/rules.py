@@ -122,6 +122,7 @@ OF_CONTRACTION: Table[contraction.Contracted] = (
     ("contraction", contraction.contracts),
 )
 OF_OUTER: Table[Case] = (
+    ("outer", outer.is_small),
     ("faces", outer.is_above_on_faces),
     ("outer", outer.contains_domain),
     ("outer", outer.is_partition),

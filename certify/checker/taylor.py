@@ -72,7 +72,8 @@ class Taylor:
             + b.r * (Ga + Qa)
             + EPS * ((ca + Ga + Qa) * (cb + Gb + Qb))  # rounding of all coefficients; infinite if one overflows
         )
-        Q = a.c * b.Q + b.c * a.Q + a.g[:, None] * b.g[None, :]
+        joint = 0.5 * (a.g[:, None] * b.g[None, :])
+        Q = a.c * b.Q + b.c * a.Q + (joint + joint.swapaxes(0, 1))
         return Taylor(a.c * b.c, a.c * b.g + b.c * a.g, Q, up(r))
 
     @property

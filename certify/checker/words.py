@@ -6,7 +6,8 @@ import math
 from fractions import Fraction
 from typing import Any
 
-from .document import Array, Certificate, Partition, Policy
+from .document import Array, Certificate, Network, Partition, Policy
+from .expression import Tape
 
 CLAIMS = {
     "asymptotic": "the origin is asymptotically stable, and every trajectory of the closed loop that starts in "
@@ -52,6 +53,11 @@ def claim(c: Certificate) -> list[str]:
         lines.append(f"  the input is held from each sampling instant to the next, for {each} units of time")
     if c.rate:
         lines.append(f"  {_falls(c)}, lambda = {c.rate!r}")
+    if c.outer is not None:
+        lines.append(
+            f"  and every trajectory that starts in the union of V <= {c.c2!r} and of the states of the domain with "
+            f"N <= {c.outer.level!r} stays in this union and enters V <= {c.c2!r} in finite time"
+        )
     said = CLAIMS[c.claim].format(c=c, time=duration(c), when=when)
     return [f"claim: {said}; u stays in its bounds", *lines]
 
@@ -88,6 +94,8 @@ def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
         local, ring = answer["margins"]["local"], answer["margins"]["ring"]
         margins = [] if local is None else [f"local {local:.1%}"]
         margins += [] if ring is None else [f"smallest bound of -{_falling(c)} on a ring's leaf {ring:.3g}"]
+        outer = answer["margins"]["outer"]
+        margins += [] if outer is None else [f"smallest bound of -N'F on a leaf of the outer set {outer:.3g}"]
         rest, verdict = f"margins: {'; '.join(margins)}", "ACCEPTED"
     after = "+" if c.discrete else "'"
     left = "x+" if c.discrete else "xdot"
@@ -106,11 +114,20 @@ def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
         f"V(x) = x'Px with P = {_matrix(c.P)}",
         *([] if c.start is None else [f"S = {_matrix(c.start)}"]),
         *([] if c.centre is None else [f"c = {' '.join(map(repr, c.centre.tolist()))}"]),
+        *([] if c.outer is None else [f"N(x) = {_function(c.outer.function)}"]),
         *claim(c),
         "rules that held: " + ", ".join(f"{rule} {count}" for rule, count in answer["rules"].items()),
         rest,
-        f"{verdict} {f'c0={c.c0!r} ' if c.practical else ''}c1={c.c1!r} c2={c.c2!r} sha256={c.sha256}",
+        f"{verdict} {f'c0={c.c0!r} ' if c.practical else ''}c1={c.c1!r} c2={c.c2!r}"
+        f"{'' if c.outer is None else f' n2={c.outer.level!r}'} sha256={c.sha256}",
     ]
+
+
+def _function(N: Tape | Network) -> str:
+    if isinstance(N, Network):
+        widths = [N.weights[0].shape[1], *map(len, N.weights)]
+        return f"the {'-'.join(map(str, widths))} tanh network with sha256 {N.sha256()}"
+    return expression(N.trees[0])
 
 
 def _matrix(A: Array) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -86,6 +87,14 @@ def roa(
             help="Enlarge for the largest multiple of an ellipsoid with these half-axes, as in x=0.4,phi=0.2."
         ),
     ] = None,
+    lyapunov: Annotated[
+        Path | None,
+        typer.Option(
+            help="File of a function N (certify-lyapunov/1): prove the largest {N <= n2} in the domain from which "
+            "every trajectory enters the proved ellipsoid."
+        ),
+    ] = None,
+    lyapunov_level: Annotated[float | None, typer.Option(help="Prove exactly this n2.")] = None,
     contains: Annotated[
         str | None,
         typer.Option(help="Say whether the proved set contains a state or a box, as in x=1.57,x_dot=-1..1."),
@@ -97,6 +106,7 @@ def roa(
     as_json: Json = False,
 ) -> None:
     """Certify a region of attraction: prove, write a certificate, have it checked, report."""
+    from certify.inputs import function_for
     from certify.options import RoaOptions
 
     start = time.perf_counter()
@@ -126,6 +136,8 @@ def roa(
         time_limit=time_limit,
         max_boxes=max_boxes,
         rate=0.0 if rate == _MOST else _number(rate),
+        lyapunov=None if lyapunov is None else function_for(lyapunov, plant, tell),
+        lyapunov_level=lyapunov_level,
     )
     asked = None if contains is None else region(contains, plant, "--contains")
     certified(context, policy, stored, plant, options, out, start, quiet, as_json, asked, largest)

@@ -55,7 +55,13 @@ def _ring_line(state: Progress) -> str:
     )
 
 
-_STAGES = {"candidate": "choosing candidates", "ring": "proving", "tube": "looking for a tube", "check": "checking"}
+_STAGES = {
+    "candidate": "choosing candidates",
+    "ring": "proving",
+    "tube": "looking for a tube",
+    "outer": "proving beyond the ellipsoid",
+    "check": "checking",
+}
 
 
 class ProgressLine:
