@@ -91,7 +91,8 @@ def roa(
         Path | None,
         typer.Option(
             help="File of a function N (certify-lyapunov/1): prove the largest {N <= n2} in the domain from which "
-            "every trajectory enters the proved ellipsoid."
+            "every trajectory enters the proved ellipsoid, that with which N was learned if the file says so and no "
+            "candidate is named."
         ),
     ] = None,
     lyapunov_level: Annotated[float | None, typer.Option(help="Prove exactly this n2.")] = None,
@@ -106,7 +107,7 @@ def roa(
     as_json: Json = False,
 ) -> None:
     """Certify a region of attraction: prove, write a certificate, have it checked, report."""
-    from certify.inputs import function_for
+    from certify.inputs import ellipsoid_beside, function_for
     from certify.options import RoaOptions
 
     start = time.perf_counter()
@@ -121,11 +122,15 @@ def roa(
         input_error,
         None if sample_time == _MOST else sample_time,
     )
+    P = None
+    if lyapunov is not None and candidate == "auto" and q is None and r is None and level is None:
+        P = ellipsoid_beside(lyapunov, plant)
     options = RoaOptions(
         claim=claim,  # type: ignore[arg-type]
         candidate=candidate,  # type: ignore[arg-type]
         Q=numbers(q, "--Q"),
         R=numbers(r, "--R"),
+        P=P,
         level=level,
         engine=_engine(context, engine),  # type: ignore[arg-type]
         dreal_precision=precision,

@@ -60,6 +60,7 @@ _STAGES = {
     "ring": "proving",
     "tube": "looking for a tube",
     "outer": "proving beyond the ellipsoid",
+    "learn": "learning a function",
     "check": "checking",
 }
 
