@@ -29,6 +29,7 @@ from certify.policies import TanhNetwork
 from certify.report.timing import Timing, reach_time
 from certify.report.words import below, varying, varying_in, volume_name, volume_unit
 from certify.rest import Rest
+from certify.sublevel import Sublevel
 from certify.systems import System
 from certify.verdict import Stop, Verdict
 
@@ -289,7 +290,9 @@ class RoaResult:
     def contains(self, x: ArrayLike, *, deviations: bool = False) -> bool | NDArray[np.bool_]:
         """Whether states lie in the proved set, decided in rationals: no state is let in by rounding.
 
-        The set is {V <= c2}, and with a tube the union of that and the tube's start.
+        The set is {V <= c2}, and with a tube the union of that and the tube's start. With an outer set it is the union
+        of that and {N <= n2} within the domain, decided in balls of growing precision: a state at which N is exactly n2
+        may not be let in.
 
         Parameters
         ----------
@@ -322,6 +325,10 @@ class RoaResult:
         found = are_inside(self.problem.V.P, self.levels.roa, rows)
         if self.tube is not None:
             found = [a or b for a, b in zip(found, self.tube.contains(rows), strict=True)]
+        if self.outer is not None:
+            beyond = Sublevel(self.outer.function, self.outer.level, tuple(self.system.domain))
+            others = iter(beyond.holds(row for row, known in zip(rows, found, strict=True) if not known))
+            found = [known or next(others) for known in found]
         return found[0] if states.ndim == 1 else np.array(found, dtype=np.bool_)
 
     def report(self, path: str | PathLike[str] | None = None) -> Path:
