@@ -2,8 +2,8 @@
 
 The set is {V <= c2}, and under a claim with a tube also the tube's start: ellipsoids, each of them
 convex. So a box of states lies in one of them exactly if its corners do, and the corners' values are rational numbers.
-Under a claim with an outer set {N <= n2} within the domain belongs to it too, which need not be convex: then a box is cut
-into pieces, until each of them lies in one of the sets or a state is found that lies in none.
+Under a claim with an outer set {N <= n2} within the domain belongs to it too, which need not be convex: then a box is
+cut into pieces, until each of them lies in one of the sets or a state is found that lies in none.
 What is said here is about bytes that the checker has accepted; a file that it does not accept has no proved set.
 """
 

@@ -27,7 +27,7 @@ def contains(
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Check a certificate and decide, without rounding, whether a state or every state of a box is in the proved set."""
+    """Check a certificate and decide, exactly, whether a state or every state of a box lies in the proved set."""
     from certify.containment import proved_set
 
     proved = proved_set(certificate)
