@@ -36,8 +36,17 @@ from certify.engines.base import FEW, Attempt, Budget, Progress, Proof, Task
 from certify.engines.contraction import contraction
 from certify.engines.falsify import Witness, refutes
 from certify.errors import BackendError, InputError, SoundnessError
-from certify.lyapunov import Polynomial, are_inside, leaves_domain, of_polynomial, slowest_decay, volume
-from certify.lyapunov.function import LyapunovFunction, Quadratic
+from certify.lyapunov import (
+    Neural,
+    Polynomial,
+    Symbolic,
+    are_inside,
+    leaves_domain,
+    of_polynomial,
+    slowest_decay,
+    volume,
+)
+from certify.lyapunov.function import Quadratic
 from certify.options import RoaOptions
 from certify.policies import TanhNetwork
 from certify.race import Contender, Race
@@ -515,7 +524,7 @@ class _Run:
         reached = Reached(roa=claim.roa, local=claim.local, start=Quadratic(tube.start), centre=at)
         return facts, reached, replace(evidence, tube=tube.slabs)
 
-    def _beyond(self, trial: Trial, claim: Claim, function: LyapunovFunction) -> OuterProof | None:
+    def _beyond(self, trial: Trial, claim: Claim, function: Neural | Polynomial | Symbolic) -> OuterProof | None:
         """The largest set of another function that is proved to lead into {V <= c2} in the time that is left; None, and
         `aside` says why, if there is none."""
         import torch
@@ -533,9 +542,8 @@ class _Run:
             self._tell("outer")
             budget = Budget(max(1e-3, _FOR_SEARCH * self.left()), self.options.max_boxes)
             found = prove_outer(trial.task.problem, claim.roa, trial.T, N, level, budget, runner, report)
-        if found.outer is None:
-            self.aside = f"no set of the function reaches beyond the ellipsoid: {found.detail}"
-            return None
+        if found is None:
+            self.aside = "no set of the function `lyapunov` is proved to lead into the ellipsoid"
         return found
 
     def _clerk(self) -> Clerk:
@@ -587,9 +595,8 @@ def _facts(problem: Problem, claim: Claim, outer: Outer, found: OuterProof) -> O
         found.stop.name.lower(),
         found.boxes,
         found.leaves,
-        found.face_leaves,
-        found.witness,
-        found.witness_level,
+        None if found.witness is None else tuple(found.witness.x.tolist()),
+        None if found.witness is None else found.witness.level,
     )
 
 

@@ -129,7 +129,7 @@ def _sizes(models: Sequence[Taylor]) -> Tensor:
 def _part(model: Taylor, index: Tensor) -> Taylor:
     if len(index) == len(model.c):
         return model
-    return Taylor(model.c[index], model.g[:, index], model.Q[:, :, index], model.r[index])
+    return model.at(index)
 
 
 def _widened(model: Taylor, by: Tensor) -> Taylor:

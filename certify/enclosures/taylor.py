@@ -35,6 +35,10 @@ class Taylor:
         """|c|, sum |g_i|, sum |Q_ij|."""
         return self.c.abs(), self.g.abs().sum(0), self.Q.abs().sum((0, 1))
 
+    def at(self, index: Tensor) -> Taylor:
+        """The models of some boxes of the batch."""
+        return Taylor(self.c[index], self.g[:, index], self.Q[:, :, index], self.r[index])
+
     def __add__(self, other: Taylor) -> Taylor:
         c, g, Q = self.c + other.c, self.g + other.g, self.Q + other.Q
         rounding = self.c.abs() + other.c.abs() + sum(n for v in (self, other) for n in v.norms()[1:])

@@ -35,6 +35,11 @@ def read_once(path: str) -> bytes:
 
 
 def in_words(c: Certificate) -> str:
+    return of_trajectories(c) + further(c)
+
+
+def of_trajectories(c: Certificate) -> str:
+    """What is said of those that start in {V <= c2}, or in the set from which a tube leads there."""
     bounds = f"{', '.join(c.plant.inputs)} within the input bounds{whatever(c)}"
     head = f"{c.plant.name}, policy {c.policy.sha256}{stepping(c)}: every trajectory that starts in V <= {c.outer!r}"
     remains = "stays there" if c.sample is None else "at a sampling instant is there at every later one"
@@ -56,6 +61,20 @@ def in_words(c: Certificate) -> str:
         f"durations ({time_of_tube(c)}) at the latest, stays in the domain on the way, and converges to the origin, "
         f"with {bounds}; "
         f"P_0 = {start_rows(c)}{centre}"
+    )
+
+
+def further(c: Certificate) -> str:
+    """What another function adds, whose network is named by its hash."""
+    N = c.beyond
+    if N is None:
+        return ""
+    is_network = N.expression is None
+    which = f"the network {N.sha256}" if is_network else "the expression that the certificate states"
+    return (
+        f"; and every trajectory that starts in the domain where N <= {N.level!r}, N being {which}, stays in the union "
+        f"of that set and V <= {c.outer!r}, enters V <= {c.outer!r} in finite time, and is one of these from then on, "
+        f"with {', '.join(c.plant.inputs)} within the input bounds{whatever(c)}"
     )
 
 

@@ -12,8 +12,9 @@ from functools import cache
 
 from flint import arb, arb_mat
 
-from .document import Certificate, Interval, Layer, Policy
+from .document import Certificate, Interval
 from .fields import exact
+from .layers import Layer
 
 PRECISION = 128  # bits; single operations of flint cost about the same with 64
 ZERO, ONE = arb(0), arb(1)
@@ -74,7 +75,7 @@ def certainly_definite(A: arb_mat) -> bool:
 
 
 def derivatives(name: str, y: arb) -> tuple[arb, arb, arb, arb]:
-    """phi, phi', phi'', phi''' on a ball."""
+    """phi, phi', phi'', phi''' on a ball; the slope of tanh, which no equation names, is a function of its own."""
     if name == "1/":
         p = 1 / y
         return p, -(p * p), 2 * p * p * p, -6 * p * p * p * p
@@ -82,6 +83,10 @@ def derivatives(name: str, y: arb) -> tuple[arb, arb, arb, arb]:
         t = y.tanh()
         slope = 1 - t * t
         return t, slope, -2 * t * slope, (6 * t * t - 2) * slope
+    if name == "tanh'":
+        t = y.tanh()
+        slope = 1 - t * t
+        return slope, -2 * t * slope, (6 * t * t - 2) * slope, 8 * t * (2 - 3 * t * t) * slope
     if name == "exp":
         e = y.exp()
         return e, e, e, e
@@ -120,11 +125,18 @@ def third(name: str, at: arb, y: arb, reach: arb) -> arb | None:
         return 6 * (3 * s + w) / (8 * s * s * s * (s + w) * (s + w) * (s + w))
     if name in ("tanh", "atan"):
         return arb(2)
+    if name == "tanh'":
+        return fourth_of_tanh(abs(at), reach)
     if name == "exp":
         return (y + reach).exp()
     if name not in ("sin", "cos"):
         raise ValueError(f"nothing is known of {name}")
     return (abs(at) + reach).min(ONE)
+
+
+def fourth_of_tanh(here: arb, reach: arb) -> arb:
+    """A bound of |tanh''''| within a reach of where it is `here`: it is below 4.1, and the fifth is at most 16."""
+    return (here + 16 * reach).min(arb(41) / 10)
 
 
 def fourth(name: str, at: arb, y: arb, reach: arb) -> arb | None:
@@ -145,8 +157,7 @@ def fourth(name: str, at: arb, y: arb, reach: arb) -> arb | None:
         s, w = arb(y.lower()).sqrt(), least.sqrt()
         return 24 * (5 * s * s + 4 * s * w + w * w) / (16 * s**5 * (s + w) ** 4)
     if name == "tanh":
-        here = 8 * at * (2 - 3 * at * at) * (1 - at * at)
-        return (abs(here) + 16 * reach).min(arb(41) / 10)
+        return fourth_of_tanh(abs(8 * at * (2 - 3 * at * at) * (1 - at * at)), reach)
     if name == "atan":
         return arb(47) / 10
     if name == "exp":
@@ -168,8 +179,8 @@ def largest_fourth(name: str, at: arb, y: arb, reach: arb) -> arb | None:
     return 24 / least**5 if name == "1/" else 15 / (16 * least.sqrt() ** 7)
 
 
-def weights(policy: Policy) -> list[arb_mat]:
-    return [arb_mat(layer.rows, layer.columns, [arb(w) for w in layer.weight]) for layer in policy.layers]
+def weights(layers: Sequence[Layer]) -> list[arb_mat]:
+    return [arb_mat(layer.rows, layer.columns, [arb(w) for w in layer.weight]) for layer in layers]
 
 
 def biased(W: arb_mat, layer: Layer, h: arb_mat) -> arb_mat:

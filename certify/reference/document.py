@@ -1,7 +1,4 @@
-"""Rules `format` and `hash`: the bytes of a file, read as FORMAT.md describes them, every number exact.
-
-Weights stay binary64 numbers in flat arrays until a rule asks for them: a file of the largest size holds millions.
-"""
+"""Rules `format` and `hash`: the bytes of a file, read as FORMAT.md describes them, every number exact."""
 
 from __future__ import annotations
 
@@ -18,28 +15,16 @@ from flint import fmpq, fmpq_mat
 from .evidence import WITH_FLOOR, WITH_TUBE, Tree, Trusted, read_evidence
 from .expressions import Equations, equations, rational
 from .fields import binary64, column, entries, exact, keys, little_endian, numbers, square
+from .layers import Layer, bytes_of, read_layers
 from .refusal import Refused, require
 
 MAX_BYTES, MAX_BYTES_BEYOND_ASCII = 256 * 2**20, 16 * 2**20
 MAX_TOKENS = 10**6  # commas and opening brackets
-MAX_NAMES, MAX_LAYERS, MAX_WIDTH = 64, 64, 2**14
+MAX_NAMES = 64
 SCHEMA, CLAIMS = "certify-certificate/7", ("asymptotic", *WITH_FLOOR, *WITH_TUBE)
 IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,63}")
 
 Interval = tuple[fmpq, fmpq]
-
-
-@dataclass(frozen=True)
-class Layer:
-    """`W h + b`: W row by row, all numbers as they stand in the file."""
-
-    rows: int
-    columns: int
-    weight: array[float]
-    bias: array[float]
-
-    def row(self, i: int) -> array[float]:
-        return self.weight[i * self.columns : (i + 1) * self.columns]
 
 
 @dataclass(frozen=True)
@@ -77,11 +62,26 @@ class Policy:
 
 
 @dataclass(frozen=True)
+class Function:
+    """N, of which the claim has the set {N <= level} beside {V <= c2}: `layers` or an `expression`, and not both."""
+
+    layers: tuple[Layer, ...]
+    expression: Equations | None
+    level: float
+
+    @property
+    def sha256(self) -> str:
+        """By which a network is named; the file does not state it."""
+        return hashlib.sha256(b"certify-lyapunov/1\0" + b"".join(bytes_of(self.layers))).hexdigest()
+
+
+@dataclass(frozen=True)
 class Certificate:
     """`inner` and `outer`, between which the leaves show that V falls, are c1 and c2; `floor` is c0, if there is one.
 
     V falls at the `rate` lambda, D + 2 lambda V < 0. With a `sample` inputs are held for a time in this range.
     `start` is P_0 of a claim with a tube, `centre` the column c_0 around which it lies where the tube follows a path.
+    `beyond` is the other function of a claim that goes beyond {V <= c2}, called `outer` in the file.
     """
 
     claim: str
@@ -89,6 +89,7 @@ class Certificate:
     sample: Interval | None
     start: fmpq_mat | None
     centre: fmpq_mat | None
+    beyond: Function | None
     plant: Plant
     policy: Policy
     P: fmpq_mat
@@ -139,7 +140,7 @@ def read(raw: bytes) -> Certificate:
     require(named, "format", "claim.kind", f"one of {', '.join(CLAIMS)} was expected")
     claim = str(said["kind"])
     more = {"enlarged": ("start",), "reached": ("start", "centre")}.get(claim, ())
-    said = keys(said, "claim", "kind", "rate", "sample", *more)
+    said = keys(said, "claim", "kind", "rate", "sample", "outer", *more)
     rate, sample = read_rate(said["rate"], claim), read_sample(said["sample"])
     plant = read_plant(data["plant"])
     n = len(plant.states)
@@ -152,6 +153,10 @@ def read(raw: bytes) -> Certificate:
     require(free, "format", "claim.sample", f"null was expected with claim '{claim}', or in discrete time")
     start = square(said["start"], "claim.start", n) if "start" in said else None
     centre = column(said["centre"], "claim.centre", n) if "centre" in said else None
+    beyond = None if said["outer"] is None else read_function(said["outer"], plant.states)
+    simple = not (claim in WITH_TUBE or rate > 0 or sample is not None or plant.discrete)
+    plainly = beyond is None or simple
+    require(plainly, "format", "claim.outer", "null was expected with a tube, a rate, a sample and in discrete time")
     policy = read_policy(data["policy"], n, len(plant.inputs))
     lyapunov = keys(data["lyapunov"], "lyapunov", "kind", "P")
     require(lyapunov["kind"] == "quadratic", "format", "lyapunov.kind", "'quadratic' was expected")
@@ -160,10 +165,11 @@ def read(raw: bytes) -> Certificate:
     levels = keys(data["levels"], "levels", *named_levels)
     *floor, inner, outer = (binary64(levels[name], f"levels.{name}") for name in named_levels)
     least = floor[0] if floor else None
-    evidence = read_evidence(data["evidence"], n, len(plant.uncertain), claim, sample is not None)
-    replayed = isinstance(evidence, Tree) or not (rate > 0 or sample is not None or plant.discrete)
-    require(replayed, "format", "evidence.kind", "a rate, a sample and discrete time must be replayed")
-    return Certificate(claim, rate, sample, start, centre, plant, policy, P, least, inner, outer, evidence)
+    further = beyond is not None
+    evidence = read_evidence(data["evidence"], n, len(plant.uncertain), claim, sample is not None, further)
+    replayed = isinstance(evidence, Tree) or (simple and not further)
+    require(replayed, "format", "evidence.kind", "a rate, a sample, discrete time and another set must be replayed")
+    return Certificate(claim, rate, sample, start, centre, beyond, plant, policy, P, least, inner, outer, evidence)
 
 
 def read_rate(value: Any, claim: str) -> fmpq:
@@ -179,6 +185,19 @@ def read_sample(value: Any) -> Interval | None:
     lo, hi = (rational(q, "claim.sample") for q in entries(value, "claim.sample", 2))
     require(bool(lo >= 0) and bool(lo <= hi) and bool(hi > 0), "format", "claim.sample", "0 <= lo <= hi and hi > 0")
     return lo, hi
+
+
+def read_function(value: Any, states: tuple[str, ...]) -> Function:
+    """Its values are those at states alone, and its expression is held to the limits of the plant's by itself."""
+    at, network = "claim.outer", isinstance(value, dict) and value.get("kind") == "network"
+    what = "layers" if network else "expression"
+    function = keys(value, at, "kind", what, "level")
+    known = function["kind"] in ("network", "expression")
+    require(known, "format", f"{at}.kind", "'network' or 'expression' was expected")
+    level = binary64(function["level"], f"{at}.level")
+    if network:
+        return Function(read_layers(function["layers"], f"{at}.layers", len(states), 1), None, level)
+    return Function((), equations([function["expression"]], set(states), f"{at}.expression"), level)
 
 
 def parsed(raw: bytes) -> Any:
@@ -264,30 +283,18 @@ def read_policy(value: Any, n: int, m: int) -> Policy:
     require(centre in ("output", "preactivation", "none"), "format", "policy.centre", "an unknown centring")
     both = squash == "tanh" or centre != "preactivation"
     require(both, "format", "policy.centre", "'preactivation' needs squash 'tanh'")
-    digest = hashlib.sha256(f"certify-policy/1\0{squash}\0{centre}\0".encode())
-    layers, width = [], n
-    described = entries(policy["layers"], "policy.layers")
-    require(1 <= len(described) <= MAX_LAYERS, "format", "policy.layers", "1 to 64 layers are allowed")
-    for k, entry in enumerate(described):
-        at = f"policy.layers.{k}"
-        layer = keys(entry, at, "shape", "weight", "bias")
-        rows, columns = entries(layer["shape"], f"{at}.shape", 2)
-        fits = type(rows) is int and type(columns) is int and 1 <= rows <= MAX_WIDTH and columns == width
-        require(fits, "format", f"{at}.shape", f"[rows, {width}] with 1 to {MAX_WIDTH} rows was expected")
-        W, b = numbers(layer["weight"], f"{at}.weight", rows * columns), numbers(layer["bias"], f"{at}.bias", rows)
-        digest.update(struct.pack("<3Q", 2, rows, columns) + little_endian(W))
-        digest.update(struct.pack("<2Q", 1, rows) + little_endian(b))
-        layers.append(Layer(rows, columns, W, b))
-        width = rows
-    require(width == m, "format", "policy.layers", f"the last layer must have {m} rows")
+    layers = read_layers(policy["layers"], "policy.layers", n, m)
     scale, offset = numbers(policy["scale"], "policy.scale", m), numbers(policy["offset"], "policy.offset", m)
     require(all(s != 0 for s in scale), "format", "policy.scale", "must not be 0")
     clip = read_clip(policy["clip"], m)
+    digest = hashlib.sha256(f"certify-policy/1\0{squash}\0{centre}\0".encode())
+    for part in bytes_of(layers):
+        digest.update(part)
     for values in (scale, offset, *(clip or ())):
         digest.update(struct.pack("<2Q", 1, m) + little_endian(values))
     sha256 = digest.hexdigest()
     require(policy["sha256"] == sha256, "hash", "policy.sha256", f"the policy's hash is {sha256}")
-    return Policy(tuple(layers), squash, centre, scale, offset, clip, sha256)
+    return Policy(layers, squash, centre, scale, offset, clip, sha256)
 
 
 def read_clip(value: Any, m: int) -> tuple[array[float], array[float]] | None:

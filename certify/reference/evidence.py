@@ -79,8 +79,20 @@ class Slab:
 
 
 @dataclass(frozen=True)
+class Covering:
+    """Trees over all of the domain, in coordinates x = T z, and over each of its faces."""
+
+    T: fmpq_mat
+    root: array[float]
+    tree: bytes
+    faces: tuple[bytes, ...]
+
+
+@dataclass(frozen=True)
 class Tree:
     """Evidence that can be replayed. `tube` belongs to claims that have a start, `contraction` to `nearby`.
+
+    `covering`, which is `outer` in the file, belongs to claims that go beyond {V <= c2} by another function.
 
     Claims that have a floor may do without a `ball`.
     `cells` has a number for each uncertain quantity: into how many equal parts rule `local` cuts its range. `order` is
@@ -95,6 +107,7 @@ class Tree:
     ball: Ball | None
     contraction: Contraction | None
     tube: tuple[Slab, ...]
+    covering: Covering | None
 
 
 @dataclass(frozen=True)
@@ -105,13 +118,14 @@ class Trusted:
     version: str
 
 
-def read_evidence(value: Any, n: int, k: int, claim: str, sampled: bool) -> Tree | Trusted:
+def read_evidence(value: Any, n: int, k: int, claim: str, sampled: bool, further: bool) -> Tree | Trusted:
+    """`further` says whether the claim has an `outer`."""
     if isinstance(value, dict) and value.get("kind") == "trusted-solver":
         said = claim not in (*WITH_TUBE, "nearby")
         require(said, "format", "evidence.kind", f"claim '{claim}' must be replayed")
         require(k == 0, "format", "evidence.kind", "what is uncertain must be replayed")
         return read_trusted(value)
-    names = ("kind", "T", "root", "tree", "order", "cells", "local", "contraction", "tube")
+    names = ("kind", "T", "root", "tree", "order", "cells", "local", "contraction", "tube", "outer")
     evidence = keys(value, "evidence", *names)
     require(evidence["kind"] == "partition-tree", "format", "evidence.kind", "an unknown kind")
     T, root = square(evidence["T"], "evidence.T", n), numbers(evidence["root"], "evidence.root", n)
@@ -128,7 +142,19 @@ def read_evidence(value: Any, n: int, k: int, claim: str, sampled: bool) -> Tree
     require(fits, "format", "evidence.tube", f"{least} to {most} slabs are allowed with claim '{claim}'")
     moves = claim == "reached"
     slabs = tuple(read_slab(v, f"evidence.tube.{k}", n, moves) for k, v in enumerate(tube))
-    return Tree(T, root, tree, order, cells, ball, contraction, slabs)
+    covering = read_covering(evidence["outer"], n, further)
+    return Tree(T, root, tree, order, cells, ball, contraction, slabs, covering)
+
+
+def read_covering(value: Any, n: int, further: bool) -> Covering | None:
+    at = "evidence.outer"
+    if not further:
+        require(value is None, "format", at, "null was expected, which claim.outer is")
+        return None
+    covering = keys(value, at, "T", "root", "tree", "faces")
+    T, root = square(covering["T"], f"{at}.T", n), numbers(covering["root"], f"{at}.root", n)
+    tree, faces = decoded(covering["tree"], f"{at}.tree"), entries(covering["faces"], f"{at}.faces", 2 * n)
+    return Covering(T, root, tree, tuple(decoded(face, f"{at}.faces.{k}") for k, face in enumerate(faces)))
 
 
 def read_order(value: Any, at: str, sampled: bool) -> int:

@@ -6,7 +6,7 @@ the half-widths of all leaves of a batch. What is left to Python is a few operat
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 
@@ -25,7 +25,7 @@ from .balls import (
     within_bounds,
 )
 from .document import Certificate
-from .evidence import Tree
+from .evidence import Covering, Tree
 from .flow import Moving, constant, mean_on, reached_from
 from .rational import inverse_diagonal
 from .refusal import Refused, require
@@ -37,17 +37,17 @@ MAX_WAITING = 4096  # boxes of the tree beside the one in hand
 BATCH = 2**14  # tanhs of a layer, over all leaves of a batch
 
 
-def structure(tree: bytes, n: int) -> int:
+def structure(tree: bytes, axes: Collection[int], rule: str = "tree", where: str = "") -> int:
     """Rule `tree`: one binary tree in preorder, and nothing behind it; the number of its leaves."""
     waiting = 1
     for position, byte in enumerate(tree):
-        require(waiting > 0, "tree", f"byte {position}", "bytes stand behind the tree")
+        require(waiting > 0, rule, f"{where}byte {position}", "bytes stand behind the tree")
         waiting -= 1  # the box in hand
-        require(waiting <= MAX_WAITING, "tree", f"byte {position}", f"more than {MAX_WAITING} boxes wait")
+        require(waiting <= MAX_WAITING, rule, f"{where}byte {position}", f"more than {MAX_WAITING} boxes wait")
         if byte != LEAF:
-            require(byte < n, "tree", f"byte {position}", "neither an axis nor a leaf")
+            require(byte in axes, rule, f"{where}byte {position}", "neither an axis nor a leaf")
             waiting += 2
-    require(waiting == 0, "tree", f"byte {len(tree)}", "the tree ends too early")
+    require(waiting == 0, rule, f"{where}byte {len(tree)}", "the tree ends too early")
     return tree.count(LEAF)
 
 
@@ -66,10 +66,15 @@ class Box:
         return [0.0 if a <= 0 <= b else min(abs(a), abs(b)) for a, b in zip(self.lo, self.hi, strict=True)]
 
 
-def boxes(evidence: Tree) -> Iterator[Box]:
+def boxes(evidence: Tree | Covering) -> Iterator[Box]:
     """The leaves' boxes of a tree whose structure is sound."""
-    waiting, number = [([-b for b in evidence.root], list(evidence.root))], 0
-    for axis in evidence.tree:
+    return cut([-b for b in evidence.root], list(evidence.root), evidence.tree)
+
+
+def cut(least: list[float], most: list[float], tree: bytes) -> Iterator[Box]:
+    """The leaves' boxes of the root box between these two corners."""
+    waiting, number = [(least, most)], 0
+    for axis in tree:
         lo, hi = waiting.pop()
         if axis == LEAF:
             yield Box(number, lo, hi)
@@ -116,7 +121,7 @@ class Leaves:
         self.S = [arb(S[i, i]) for i in range(c.n)]
         self.cross = [(i, j, arb(2 * abs(S[i, j]))) for j in range(c.n) for i in range(j) if S[i, j] != 0]
         self.inner, self.outer = arb(c.inner), arb(c.outer)
-        self.weights = weights(c.policy)
+        self.weights = weights(c.policy.layers)
         self.absolute = [absolute(W) for W in self.weights]
         self.net_at_0 = net_at_0(c, self.weights)
         self.beta = beta(c) if c.policy.centre == "preactivation" else []
@@ -137,7 +142,10 @@ class Leaves:
 
     def is_inside(self, box: Box) -> bool:
         """Whether V is below the inner level on all of the box, certainly."""
-        return bool(self.diagonal_part(box.largest()) + self.cross_part(box) < self.inner)
+        return self.is_below(self.inner, box)
+
+    def is_below(self, level: arb, box: Box) -> bool:
+        return bool(self.diagonal_part(box.largest()) + self.cross_part(box) < level)
 
     # --------------------------------------------------------------------------------------------------- the policy
 
@@ -343,12 +351,7 @@ class Leaves:
             D += V.scaled(self.rate)
         if self.alone and self.steps and not self.is_beyond_floor(leaf.box):
             return self.stays(D, V + Taylor(-self.inner))
-        if D.bound() < 0:
-            return True
-        for slack in (Taylor(self.outer) + -V, V + Taylor(-self.inner)):
-            if any(k > 0 and (D + slack.scaled(k)).bound() < 0 for k in kinks(D, slack)):
-                return True
-        return False
+        return is_negative(D, [Taylor(self.outer) + -V, V + Taylor(-self.inner)])
 
     def stays(self, D: Taylor, above: Taylor) -> bool:
         """Whether D' + k (V - c0) is certainly negative for some k from 0 to 1/h, where V may be below c0.
@@ -361,6 +364,13 @@ class Leaves:
     def is_beyond_floor(self, box: Box) -> bool:
         """Whether V is at least the inner level on all of the box, certainly."""
         return bool(self.diagonal_part(box.least()) - self.cross_part(box) >= self.inner)
+
+
+def is_negative(D: Taylor, slacks: Sequence[Taylor]) -> bool:
+    """Whether D, or D + k times one of the others for some k > 0, is certainly negative."""
+    if D.bound() < 0:
+        return True
+    return any(k > 0 and (D + slack.scaled(k)).bound() < 0 for slack in slacks for k in kinks(D, slack))
 
 
 def kinks(D: Taylor, slack: Taylor) -> list[arb]:

@@ -104,7 +104,7 @@ class Network:
     """The policy of a certificate. At the origin it is u_eq, but for claims with a floor, with centring `none`."""
 
     def __init__(self, c: Certificate) -> None:
-        self.c, self.weights = c, weights(c.policy)
+        self.c, self.weights = c, weights(c.policy.layers)
         self.net_at_0 = net_at_0(c, self.weights)
         self.beta = beta(c) if c.policy.centre == "preactivation" else []
         self.at_origin = self.unfolded(arb_mat(c.n, 1))

@@ -15,6 +15,7 @@ from .evidence import WITH_TUBE, Tree, Trusted
 from .leaves import Leaves, check_leaves, structure
 from .local import local
 from .loop import Loop
+from .outer import outer
 from .refusal import Refused, require
 from .tube import tube
 
@@ -69,7 +70,7 @@ def check(c: Certificate) -> int | None:
     if evidence.ball is not None:
         loop = Loop(c)
         local(loop, evidence.ball, evidence.cells)
-    leaves = structure(evidence.tree, c.n)
+    leaves = structure(evidence.tree, range(c.n))
     if c.inner < c.outer or loop is None:  # no local ball stands in for the leaves
         check_leaves(Leaves(c, evidence.T, S), evidence)
     if c.claim in WITH_TUBE:
@@ -78,6 +79,8 @@ def check(c: Certificate) -> int | None:
         tube(loop, c.start, c.centre, evidence.tube)
     if evidence.contraction is not None:
         contraction(loop or Loop(c), evidence.contraction, evidence.cells)
+    if c.beyond is not None:
+        outer(c, evidence)
     return leaves
 
 

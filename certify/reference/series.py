@@ -95,6 +95,21 @@ def coefficients(
     return found
 
 
+def along(
+    expressions: Equations, states: Mapping[str, Any], rates: Mapping[str, Any], constant: Constant
+) -> list[list[Coefficient]]:
+    """The value of each expression and its derivative where the states move at these rates."""
+    tape = Tape(constant)
+
+    def moving(name: str) -> Term:
+        return Term(tape, lambda k: rates[name] if k else states[name])
+
+    results = expressions.evaluate({name: moving(name) for name in states}, lambda q: tape.still(constant(q)))
+    for _ in range(2):
+        tape.extend()
+    return [value.c for value in results]
+
+
 # -------------------------------------------------------------------------------------------------- sums without zeros
 
 

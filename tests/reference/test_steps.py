@@ -428,9 +428,8 @@ def test_minus_0_is_0(path: str) -> None:
 
 @pytest.mark.parametrize("key", ["rate", "sample", "time"])
 def test_a_tube_has_neither(key: str) -> None:
-    data = edited(
-        honest("rate"), "claim", {"kind": "enlarged", "rate": (0.0).hex(), "sample": None, "start": encode([1.0])}
-    )
+    claim = {"kind": "enlarged", "rate": (0.0).hex(), "sample": None, "outer": None, "start": encode([1.0])}
+    data = edited(honest("rate"), "claim", claim)
     path, value = {"rate": ("claim.rate", (0.5).hex()), "sample": ("claim.sample", ["0", "1"])}.get(
         key, ("plant.time", "discrete")
     )

@@ -15,13 +15,14 @@ LEAF = 255
 
 
 class Partition:
-    """Halvings of the box |z_i| <= root_i.
+    """Halvings of the box |z_i| <= root_i, or of `lower <= z <= root`.
 
     Boxes are numbered as they appear: the root is 0, the halves of the k-th split are 2k + 1 (lower) and 2k + 2.
     """
 
-    def __init__(self, root: Array) -> None:
+    def __init__(self, root: Array, lower: Array | None = None) -> None:
         self.root = root
+        self.lower = -root if lower is None else lower
         self.splits = 0
         self._parents = np.zeros(1024, dtype=np.uint32)
         self._axes = np.zeros(1024, dtype=np.uint8)
@@ -51,7 +52,7 @@ class Partition:
     def corners(self, boxes: Numbers) -> tuple[Array, Array]:
         """Lower and upper corners (n, B), by the midpoints that made them."""
         count = len(boxes)
-        lo, hi = (np.repeat(side[:, None], count, axis=1) for side in (-self.root, self.root))
+        lo, hi = (np.repeat(side[:, None], count, axis=1) for side in (self.lower, self.root))
         steps: list[tuple[Numbers, Numbers, NDArray[np.bool_]]] = []  # from the box up to the root
         box, column = boxes, np.arange(count)
         while len(column):

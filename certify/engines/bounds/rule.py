@@ -24,10 +24,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from certify.claims import Problem
-from certify.enclosures import Flow, Models, PolicyEnclosure, Taylor, upper_bound
+from certify.enclosures import Flow, Models, PolicyEnclosure, Taylor, loop_models, upper_bound
 from certify.enclosures.taylor import EPS, TINY
+from certify.engines.bounds.form import FormBound
 from certify.expressions import evaluate
 from certify.policies import bounded_by_form
+from certify.systems import System
 
 Array = NDArray[np.float64]
 _SLACK = 1e-9  # relative distance from the inner level at which a box counts as inside
@@ -62,11 +64,7 @@ class VdotBound:
         self.rate = problem.rate
         self.T = torch.tensor(T, dtype=torch.float64, device=device)
         self.P = problem.V.P
-        S = T.T @ self.P @ T
-        cross = np.abs(S - np.diag(np.diag(S))) + 1e-13 * np.sqrt(np.outer(np.diag(S), np.diag(S)))
-        self.S_diagonal = torch.tensor(np.diag(S).copy(), dtype=torch.float64, device=device)[:, None]
-        self.S_cross = torch.tensor(cross, dtype=torch.float64, device=device)
-        self.S = torch.tensor(S, dtype=torch.float64, device=device)
+        self.V = FormBound(self.P, T, device)
         self.policy = PolicyEnclosure(loop, device)
         self.dynamics: tuple[sympy.Expr, ...] = loop.system.uncertain_dynamics()
         self.check_inputs = not bounded_by_form(loop.network, loop.system.input_bounds)
@@ -81,14 +79,11 @@ class VdotBound:
 
     def levels(self, lo: Tensor, hi: Tensor) -> tuple[Tensor, Tensor]:
         """Bounds of V from below and above on boxes (n, B)."""
-        far = torch.maximum(lo.abs(), hi.abs())
-        near = torch.where((lo <= 0) & (hi >= 0), 0.0, torch.minimum(lo.abs(), hi.abs()))
-        cross = (far * (self.S_cross @ far)).sum(0)
-        return (self.S_diagonal * near**2).sum(0) - cross, (self.S_diagonal * far**2).sum(0) + cross
+        return self.V.levels(lo, hi)
 
     def levels_at(self, z: Tensor) -> Tensor:
         """V at points (n, B)."""
-        return (z * (self.S @ z)).sum(0)
+        return self.V.at(z)
 
     def at_points(self, z: Tensor, outer: float) -> Tensor:
         """The bound of D' at points (n, B) in {V <= outer}; infinite where nothing is known of it."""
@@ -123,7 +118,7 @@ class VdotBound:
         mid, slopes, wide, share = self.policy(x, error)
         decrease, kept = self._decrease(x, error, mid, slopes, wide, outer)
         if self.rate:
-            decrease = decrease + self._level(centre, radius, decrease).scaled(2 * self.rate)
+            decrease = decrease + self.V.model(centre, radius, decrease).scaled(2 * self.rate)
         bound, excess = upper_bound(decrease)
         smooth = torch.isfinite(bound)  # a component of F that is not enclosed leaves a NaN in the sum over all
         # At the box's centre, and for the worst values of what is uncertain, only the inputs' errors, what is of second
@@ -143,14 +138,9 @@ class VdotBound:
             score = torch.where(kept, score, slopes_x.abs().sum(0))
             proved, bound = proved & kept, torch.where(kept, bound, torch.inf)
         if self.check_inputs:
-            reach = slopes.abs().sum(1) + wide + 1e-11 * mid.abs()
-            for j, (low, high) in enumerate(self.system.input_bounds):
-                slack = 1e-11 * (abs(float(low)) + abs(float(high)))
-                inside = (mid[j] - reach[j] > float(low) + slack) & (mid[j] + reach[j] < float(high) - slack)
-                outside = (mid[j] - wide[j] > float(high) + slack) | (mid[j] + wide[j] < float(low) - slack)
+            for j, (inside, outside) in enumerate(input_bounds_kept(self.system, mid, slopes, wide)):
                 proved, violated, smooth = proved & inside, violated | outside, smooth & inside
-                spread = slopes[j].abs() + share * wide[j]
-                score = torch.where(inside, score, spread)
+                score = torch.where(inside, score, slopes[j].abs() + share * wide[j])
         if self.inside and self.step:
             smooth = proved
         return BoxBounds(proved, bound, score, violated, smooth)
@@ -162,29 +152,12 @@ class VdotBound:
 
         Symbols: n box coordinates, m input errors, k uncertain quantities, and the period if that is in a range.
         """
-        n, m, batch, k = self.system.n, self.system.m, x.shape[2], len(self.system.uncertain)
-        k += 0 if self.flow is None else self.flow.symbols
-        zeros = torch.zeros(n + m + k, n + m + k, batch, dtype=x.dtype, device=x.device)
-        none = zeros[0, : m + k]
-        states: dict[sympy.Symbol, Taylor] = {}
-        inputs: dict[sympy.Symbol, Taylor] = {}
-        quantities: dict[sympy.Symbol, Taylor] = {}
-        for i, symbol in enumerate(self.system.states):
-            states[symbol] = Taylor(x[i, 0], torch.cat([x[i, 1:], none]), zeros, error[i])
-        for j, symbol in enumerate(self.system.inputs):
-            own = none.clone()
-            own[j] = wide[j]
-            inputs[symbol] = Taylor(mid[j], torch.cat([slopes[j], own]), zeros, zeros[0, 0])
-        for j, (symbol, (lo, hi)) in enumerate(self.system.uncertain):
-            middle, reach = float((lo + hi) / 2), float((hi - lo) / 2)
-            own = zeros[0].clone()
-            own[n + m + j] = reach
-            rounding = EPS * (abs(middle) + reach) + TINY
-            quantities[symbol] = Taylor(zeros[0, 0] + middle, own, zeros, zeros[0, 0] + rounding)
+        more = 0 if self.flow is None else self.flow.symbols
+        states, inputs, quantities = loop_models(self.system, x, error, mid, slopes, wide, more)
         here = list(states.values())
         kept = None
         if self.flow is not None:
-            mean = self.flow(states, inputs, quantities, n + m)
+            mean = self.flow(states, inputs, quantities, self.system.n + self.system.m)
             G, kept = mean.G, mean.exists & self._in_domain(here, mean.least, mean.most, outer)
         else:
             known: dict[sympy.Expr, Taylor] = {}
@@ -222,17 +195,6 @@ class VdotBound:
         inside: Tensor = ((down > low + slack) & (up < high - slack)).all(0)
         return inside
 
-    def _level(self, centre: Tensor, radius: Tensor, like: Taylor) -> Taylor:
-        """V as a model in the box coordinates, among as many symbols as another model has."""
-        n = len(centre)
-        far = centre.abs() + radius
-        g, Q = torch.zeros_like(like.g), torch.zeros_like(like.Q)
-        g[:n] = 2 * self.S_diagonal * centre * radius
-        torch.diagonal(Q, dim1=0, dim2=1)[:, :n] = (self.S_diagonal * radius * radius).T
-        size = (self.S_diagonal * far * far).sum(0)
-        rest = (far * (self.S_cross @ far)).sum(0) + n * EPS * size + TINY
-        return Taylor((self.S_diagonal * centre * centre).sum(0), g, Q, rest)
-
     def _within_ring(
         self,
         bound: Tensor,
@@ -261,24 +223,46 @@ class VdotBound:
             index = torch.nonzero(outside & ~(bound < 0))[:, 0]
             if not len(index):
                 continue
-            # gap = sign (level - V), as a model in the box coordinates; it is >= 0 in the ring
-            V = self._level(centre[:, index], radius[:, index], _part(decrease, index))
-            size = V.c.abs() + V.g.abs().sum(0) + V.Q.abs().sum((0, 1))
-            g, Q = -sign * V.g, -sign * V.Q
-            gap = Taylor(sign * (level - V.c), g, Q, V.r + n * EPS * level + TINY)
-            scale = gap.r + EPS * size
-            tried = _multipliers(decrease.g[:n, index], g[:n], gap.c).clamp(max=most)
-            if most < torch.inf:
-                tried = torch.cat([tried, torch.full_like(tried[:1], most)])
-            for each in tried:
-                left = torch.nonzero(~(bound[index] < 0) & (each > 0))[:, 0]
-                k, still = each[left], index[left]
-                c = k * gap.c[left]
-                added = Taylor(c, k * g[:, left], k * Q[:, :, left], k * scale[left] + EPS * c.abs() + TINY)
-                here = Taylor(decrease.c[still], decrease.g[:, still], decrease.Q[:, :, still], decrease.r[still])
-                tighter, _ = upper_bound(here + added)
-                bound = bound.index_put((still,), torch.fmin(bound[still], tighter))
+            # it is >= 0 in the ring
+            part = decrease.at(index)
+            gap = self.V.gap(centre[:, index], radius[:, index], part, level, sign)
+            bound = bound.index_put((index,), lessened(bound[index], part, gap, n, most))
         return bound
+
+
+def input_bounds_kept(system: System, mid: Tensor, slopes: Tensor, wide: Tensor) -> list[tuple[Tensor, Tensor]]:
+    """For each input, enclosed by `mid + slopes.d` within `wide`, on which boxes (B,) it lies in its bounds, and on
+    which it certainly leaves them at the centre."""
+    reach, kept = slopes.abs().sum(1) + wide + 1e-11 * mid.abs(), []
+    for j, (low, high) in enumerate(system.input_bounds):
+        slack = 1e-11 * (abs(float(low)) + abs(float(high)))
+        inside = (mid[j] - reach[j] > float(low) + slack) & (mid[j] + reach[j] < float(high) - slack)
+        outside = (mid[j] - wide[j] > float(high) + slack) | (mid[j] + wide[j] < float(low) - slack)
+        kept.append((inside, outside))
+    return kept
+
+
+def lessened(bound: Tensor, decrease: Taylor, gap: Taylor, n: int, most: float = torch.inf) -> Tensor:
+    """The bound (B,) of a model, made tighter where it is not negative by multiples of what is >= 0 where it counts.
+
+    Parameters
+    ----------
+    gap : the model of that, whose first n symbols are the box coordinates.
+    most : the largest multiplier, which is tried too if it is finite.
+    """
+    scale = gap.r + EPS * sum(gap.norms())
+    tried = _multipliers(decrease.g[:n], gap.g[:n], gap.c).clamp(max=most)
+    if most < torch.inf:
+        tried = torch.cat([tried, torch.full_like(tried[:1], most)])
+    for each in tried:
+        still = torch.nonzero(~(bound < 0) & (each > 0))[:, 0]
+        k = each[still]
+        c = k * gap.c[still]
+        rest = k * scale[still] + EPS * c.abs() + TINY
+        added = Taylor(c, k * gap.g[:, still], k * gap.Q[:, :, still], rest)
+        tighter, _ = upper_bound(decrease.at(still) + added)
+        bound = bound.index_put((still,), torch.fmin(bound[still], tighter))
+    return bound
 
 
 def _multipliers(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
@@ -286,7 +270,3 @@ def _multipliers(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
     k = torch.nan_to_num(torch.where(b != 0, -a / b, 0.0), 0.0, 0.0, 0.0).clamp(min=0.0)
     value = c * k + (a[:, None] + k * b[:, None]).abs().sum(0)
     return k.gather(0, value.argsort(dim=0, stable=True))
-
-
-def _part(model: Taylor, index: Tensor) -> Taylor:
-    return Taylor(model.c[index], model.g[:, index], model.Q[:, :, index], model.r[index])

@@ -19,8 +19,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from certify.claims import Problem
-from certify.engines.base import Budget, Progress, Report
+from certify.engines.base import Budget, Report
+from certify.engines.bounds.clock import Clock
 from certify.engines.bounds.frontier import Frontier
+from certify.engines.bounds.halving import split
 from certify.engines.bounds.order import choose_order
 from certify.engines.bounds.partition import LEAF, Partition
 from certify.engines.bounds.rule import BoxBounds, VdotBound
@@ -280,7 +282,7 @@ class Pass:
         self.covered = True
         self.halvings = 0.0
         self._stop = Stop.REQUESTED
-        self._clock = _Clock()
+        self._clock = Clock()
         first = torch.zeros(1, dtype=torch.int64, device=runner.device)
         self.frontier.add(-self.half, self.half, sweep.key(*rule.levels(-self.half, self.half)), first)
 
@@ -320,14 +322,15 @@ class Pass:
         centres = 0.5 * lo + 0.5 * hi
         if sweep.violated(centres, self._levels(centres, found)):
             self._stop = Stop.WITNESS
-        halves_lo, halves_hi, halves, small = _split(self.partition, lo, hi, number, found, least_width * self.half)
+        halves = split(self.partition, lo, hi, number, found, least_width * self.half)
+        small = halves.small
         if bool(small.any()):
             self.covered = self.covered and bool(found.smooth[small].all())
             if sweep.stuck(*rule.levels(lo[:, small], hi[:, small])):
                 self._stop = Stop.BOXES
-        lowest, highest = rule.levels(halves_lo, halves_hi)
+        lowest, highest = rule.levels(halves.lo, halves.hi)
         keep = sweep.wanted(lowest, highest)
-        self.frontier.add(halves_lo[:, keep], halves_hi[:, keep], sweep.key(lowest, highest)[keep], halves[keep])
+        self.frontier.add(halves.lo[:, keep], halves.hi[:, keep], sweep.key(lowest, highest)[keep], halves.number[keep])
         self.frontier.drop_above(sweep.last())
 
     def _levels(self, centres: Tensor, found: BoxBounds) -> Tensor:
@@ -378,83 +381,3 @@ class Pass:
             return None
         axis = int(np.argmax(self.partition.halvings()))
         return tuple((self.sweep.T[:, axis] * self.root[axis]).tolist())
-
-
-def _split(
-    partition: Partition, lo: Tensor, hi: Tensor, number: Tensor, found: BoxBounds, least_width: Tensor
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Halve the boxes that are not proved: corners (n, B) and numbers of the halves, and which boxes are too small.
-
-    A half whose bound would stay positive if the split took away three quarters of its axis's share is halved
-    again at once, along the next axis.
-    """
-    undecided = ~found.proved
-    lo, hi, number = lo[:, undecided], hi[:, undecided], number[undecided]
-    bound, score = found.bound[undecided], found.score[:, undecided]
-    # An axis that is already much thinner than the others, or too thin to halve, is not split.
-    width = hi - lo
-    relative = width / least_width
-    score = torch.where((relative * 2.0**12 < relative.amax(0)) | (relative < 2), -torch.inf, score)
-    best = score.amax(0)
-    stuck = best == -torch.inf
-    small = undecided.clone()
-    small[undecided] = stuck
-    if bool(stuck.any()):
-        lo, hi, number, bound, score, best = (a[..., ~stuck] for a in (lo, hi, number, bound, score, best))
-    order = score.argsort(dim=0, descending=True, stable=True)
-    lo, hi, number = _halve(partition, lo, hi, number, order[0])
-    if len(order) > 1:
-        second = score.gather(0, order[1:2])[0]
-        again = ((bound - 0.75 * best > 0) & (second > -torch.inf)).repeat_interleave(2)
-        axis = order[1].repeat_interleave(2)[again]
-        quarters = _halve(partition, lo[:, again], hi[:, again], number[again], axis)
-        halves = lo[:, ~again], hi[:, ~again], number[~again]
-        lo, hi, number = (torch.cat(pair, -1) for pair in zip(halves, quarters, strict=True))
-    return lo, hi, number, small
-
-
-def _halve(partition: Partition, lo: Tensor, hi: Tensor, number: Tensor, axis: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Corners (n, 2B) and numbers (2B,) of the halves along `axis` (B,), lower and upper in turn."""
-    n, count = lo.shape
-    index = torch.arange(count, device=lo.device)
-    middle = 0.5 * lo[axis, index] + 0.5 * hi[axis, index]
-    lower_hi, upper_lo = hi.clone(), lo.clone()
-    lower_hi[axis, index] = middle
-    upper_lo[axis, index] = middle
-    halves = partition.split(number.cpu().numpy(), axis.cpu().numpy())
-    return (
-        torch.stack([lo, upper_lo], 2).reshape(n, 2 * count),
-        torch.stack([lower_hi, hi], 2).reshape(n, 2 * count),
-        torch.tensor(halves, device=lo.device),
-    )
-
-
-class _Clock:
-    """The seconds of a pass while it runs, and an extrapolation of how many are left: they grow about as a power of the
-    volume that is done."""
-
-    def __init__(self) -> None:
-        self.before = self.start = 0.0
-        self.left: float | None = None
-        self.history: list[tuple[float, float]] = []
-
-    def __enter__(self) -> None:
-        self.start = time.monotonic()
-
-    def __exit__(self, *_: object) -> None:
-        self.before += self.spent
-
-    @property
-    def spent(self) -> float:
-        """Seconds since the pass was last set going."""
-        return time.monotonic() - self.start
-
-    def read(self, level: float, target: float, share: float, boxes: int, open_: int) -> Progress:
-        seconds = self.before + self.spent
-        self.history.append((seconds, share))
-        earlier = next((s for t, s in reversed(self.history) if t <= seconds / 2), share)
-        self.left = None
-        if 0 < earlier < share:
-            growth = math.log(2) / math.log(share / earlier)
-            self.left = seconds * math.expm1(min(700.0, -growth * math.log(share)))
-        return Progress(level, target, boxes, open_, share, self.left)

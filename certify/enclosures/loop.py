@@ -1,0 +1,53 @@
+"""What a loop's equations are evaluated at on boxes: its states, inputs and uncertain quantities as Taylor models."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import sympy
+import torch
+from torch import Tensor
+
+from certify.enclosures.taylor import EPS, TINY, Taylor
+from certify.systems import System
+
+
+class LoopModels(NamedTuple):
+    """Models by symbol, each kind in the plant's order."""
+
+    states: Mapping[sympy.Symbol, Taylor]
+    inputs: Mapping[sympy.Symbol, Taylor]
+    quantities: Mapping[sympy.Symbol, Taylor]
+
+
+def loop_models(
+    system: System, x: Tensor, error: Tensor, mid: Tensor, slopes: Tensor, wide: Tensor, more: int = 0
+) -> LoopModels:
+    """Models in n box coordinates, m input errors, the uncertain quantities, and `more` symbols that none of them uses.
+
+    Parameters
+    ----------
+    x, error : (n, n + 1, B) and (n, B): states are `x[:, 0] + x[:, 1:] d` within the error.
+    mid, slopes, wide : (m, B), (m, n, B), (m, B): inputs are `mid + slopes d` within `wide`.
+    """
+    n, m, batch = system.n, system.m, x.shape[2]
+    k = len(system.uncertain) + more
+    zeros = torch.zeros(n + m + k, n + m + k, batch, dtype=x.dtype, device=x.device)
+    none = zeros[0, : m + k]
+    states: dict[sympy.Symbol, Taylor] = {}
+    inputs: dict[sympy.Symbol, Taylor] = {}
+    quantities: dict[sympy.Symbol, Taylor] = {}
+    for i, symbol in enumerate(system.states):
+        states[symbol] = Taylor(x[i, 0], torch.cat([x[i, 1:], none]), zeros, error[i])
+    for j, symbol in enumerate(system.inputs):
+        own = none.clone()
+        own[j] = wide[j]
+        inputs[symbol] = Taylor(mid[j], torch.cat([slopes[j], own]), zeros, zeros[0, 0])
+    for j, (symbol, (lo, hi)) in enumerate(system.uncertain):
+        middle, reach = float((lo + hi) / 2), float((hi - lo) / 2)
+        own = zeros[0].clone()
+        own[n + m + j] = reach
+        rounding = EPS * (abs(middle) + reach) + TINY
+        quantities[symbol] = Taylor(zeros[0, 0] + middle, own, zeros, zeros[0, 0] + rounding)
+    return LoopModels(states, inputs, quantities)

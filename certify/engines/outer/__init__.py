@@ -1,0 +1,8 @@
+"""The engine for a claim's outer set: falsifier, rules for boxes, a pass whose level gives way."""
+
+from __future__ import annotations
+
+from certify.engines.outer.falsify import Rise
+from certify.engines.outer.prove import OuterProof, prove_outer
+
+__all__ = ["OuterProof", "Rise", "prove_outer"]

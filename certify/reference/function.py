@@ -1,0 +1,75 @@
+"""N of a claim that goes beyond {V <= c2}, and how it changes along F, in models on a box.
+
+A network's layers are products of matrices: a row for each model, its coefficients behind each other, its remainder by
+the magnitudes of the weights. An expression is a series in time of which two coefficients are asked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from flint import arb, arb_mat
+
+from .balls import ZERO, absolute, weights
+from .document import Function
+from .flow import constant
+from .layers import Layer
+from .series import along
+from .symmetric import pairs
+from .taylor import Taylor
+
+
+class Models:
+    """The function of a claim on as many boxes as are asked for, given the models of the states there."""
+
+    def __init__(self, N: Function, states: tuple[str, ...]) -> None:
+        self.N, self.states, self.level = N, states, arb(N.level)
+        self.weights = weights(N.layers)
+        self.absolute = [absolute(W) for W in self.weights]
+
+    def value(self, x: Sequence[Taylor]) -> Taylor:
+        """N, or a refusal where it may be undefined."""
+        if self.N.expression is not None:
+            value: Taylor = self.N.expression.evaluate(dict(zip(self.states, x, strict=True)), constant)[0]
+            return value
+        for k, layer in enumerate(self.N.layers):
+            x = self.affine(k, layer, [a.function("tanh") for a in x] if k else x)
+        return x[0]
+
+    def is_above(self, x: Sequence[Taylor]) -> bool:
+        """Whether N is certainly defined, and above its level, on all of the box."""
+        N = self.value(x)
+        return N.is_finite() and bool(-(-N).bound() > self.level)
+
+    def moving(self, x: Sequence[Taylor], F: Sequence[Taylor]) -> tuple[Taylor, Taylor]:
+        """N and N'F, or a refusal where N may be undefined."""
+        if self.N.expression is not None:
+            states, rates = dict(zip(self.states, x, strict=True)), dict(zip(self.states, F, strict=True))
+            ((value, rate),) = along(self.N.expression, states, rates, constant)
+            return value, Taylor(ZERO) if rate is None else rate
+        y = F
+        for k, (layer, W) in enumerate(zip(self.N.layers, self.weights, strict=True)):
+            if k:
+                y = [a.function("tanh'") * v for a, v in zip(x, y, strict=True)]
+                x = [a.function("tanh") for a in x]
+            x, y = self.affine(k, layer, x), mapped(W, self.absolute[k], y)
+        return x[0], y[0]
+
+    def affine(self, k: int, layer: Layer, x: Sequence[Taylor]) -> list[Taylor]:
+        """Layer k."""
+        each = zip(mapped(self.weights[k], self.absolute[k], x), layer.bias, strict=True)
+        return [v + Taylor(arb(b)) for v, b in each]
+
+
+def mapped(W: arb_mat, magnitudes: arb_mat, x: Sequence[Taylor]) -> list[Taylor]:
+    """W times a column of models."""
+    symbols = max(len(v.g or ()) for v in x)
+    bent = any(v.Q is not None for v in x)
+    none, flat = [ZERO] * symbols, [ZERO] * (len(pairs(symbols)) if bent else 0)
+    rows = (W * arb_mat([[v.c, *(v.g or none), *(v.Q or flat)] for v in x])).tolist()
+    rest = (magnitudes * arb_mat([[v.r] for v in x])).entries()
+    end = 1 + symbols
+    return [
+        Taylor(row[0], row[1:end] if symbols else None, row[end:] if bent else None, r)
+        for row, r in zip(rows, rest, strict=True)
+    ]

@@ -1,0 +1,175 @@
+"""Rules `faces`, `outer` and `inputs` of a claim that goes beyond {V <= c2} by a set {N <= n2} of another function.
+
+N is above n2 all over the boundary of the domain, so that no trajectory gets out where N is at most n2. On the leaves
+of a tree over all of the domain N falls along F wherever it is at most n2 and V at least c2: there is no other way out
+of the one set than into the other.
+"""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+from itertools import islice
+
+from flint import arb, arb_mat, fmpq, fmpq_mat
+
+from .balls import ZERO, bounded_by_form, total, within_bounds
+from .document import Certificate, Function
+from .evidence import Covering, Tree
+from .fields import exact
+from .function import Models
+from .leaves import BATCH, Box, Leaf, Leaves, boxes, cut, is_negative, structure
+from .refusal import Refused, require
+from .taylor import Taylor
+
+RULE, FACES = "outer", "faces"
+MAX_NETWORK = 2**22  # rows times columns and the square of symbols, over all layers
+MAX_EXPRESSION = 2**26  # operations times the square of symbols
+
+
+def outer(c: Certificate, evidence: Tree) -> None:
+    """Faces in their order, then T and the root, then the whole tree, then its leaves."""
+    N, covering = c.beyond, evidence.covering
+    if N is None or covering is None:
+        raise Refused("format", "evidence.outer", "the claim needs a tree over the domain")
+    bearable(c, N)
+    models = Models(N, c.plant.states)
+    for k, tree in enumerate(covering.faces):
+        face(c, models, k, tree)
+    covers_domain(c, covering)
+    structure(covering.tree, range(c.n), RULE)
+    check_leaves(c, models, covering)
+
+
+def bearable(c: Certificate, N: Function) -> None:
+    """Refuses what would fill the memory: every unit, or operation, is a model of the second order in all symbols."""
+    square = (c.n + c.m + c.k) ** 2
+    units = sum(layer.rows * (layer.columns + square) for layer in N.layers)
+    require(units <= MAX_NETWORK, RULE, "claim.outer", "the network is too large for this checker")
+    steps = 0 if N.expression is None else len(N.expression.steps)
+    require(steps * square <= MAX_EXPRESSION, RULE, "claim.outer", "the expression is too large for this checker")
+
+
+# ------------------------------------------------------------------------------------------------------------ the faces
+
+
+def face(c: Certificate, models: Models, k: int, tree: bytes) -> None:
+    """N is above its level on the k-th face, where a state is at one end of its domain, and the others anywhere."""
+    axis, upper = divmod(k, 2)
+    at = f"face {k}"
+    axes = [i for i in range(c.n) if i != axis]
+    structure(tree, axes, FACES, f"{at} ")
+    least, most = [0.0] * c.n, [0.0] * c.n
+    for i in axes:
+        lo, hi = c.plant.domain[i]
+        least[i], most[i] = -binary64_above(-lo, at), binary64_above(hi, at)
+    fixed = Taylor(arb(c.plant.domain[axis][upper]))
+    for box in cut(least, most, tree):
+        centre, radius = middles(box)
+        x = [
+            Taylor(v, [r if j == i else ZERO for j in range(c.n)])
+            for i, (v, r) in enumerate(zip(centre, radius, strict=True))
+        ]
+        x[axis] = fixed
+        place = f"{at} leaf {box.number}"
+        try:
+            above = models.is_above(x)
+        except Refused as no:
+            raise Refused(FACES, place, no.detail) from None
+        require(above, FACES, place, "N is not certain to be above its level")
+
+
+def binary64_above(value: fmpq, at: str) -> float:
+    """The least number of binary64 at or above a rational, or a refusal if there is none."""
+    try:
+        nearest = float(Fraction(int(value.p), int(value.q)))
+    except OverflowError:
+        nearest = math.inf
+    above = nearest if not math.isfinite(nearest) or exact(nearest) >= value else math.nextafter(nearest, math.inf)
+    require(math.isfinite(above), FACES, at, "the domain has an end that no binary64 number is beyond")
+    return above
+
+
+def middles(box: Box) -> tuple[list[arb], list[arb]]:
+    """Centre and radius along each axis."""
+    ends = [(arb(a), arb(b)) for a, b in zip(box.lo, box.hi, strict=True)]
+    return [(a + b) / 2 for a, b in ends], [(b - a) / 2 for a, b in ends]
+
+
+# ----------------------------------------------------------------------------------------------------------- the leaves
+
+
+def covers_domain(c: Certificate, covering: Covering) -> None:
+    """The root box holds every z with x = T z in the domain: |z_i| is at most the sum of |(T^-1)_ij| max|x_j|."""
+    try:
+        inverse = covering.T.inv()
+    except ZeroDivisionError:
+        raise Refused(RULE, "T", "it has no inverse") from None
+    far = [max(-lo, hi) for lo, hi in c.plant.domain]
+    for i, (row, b) in enumerate(zip(inverse.tolist(), covering.root, strict=True)):
+        reach = sum((abs(v) * x for v, x in zip(row, far, strict=True)), fmpq(0))
+        require(bool(reach <= exact(b)), RULE, f"axis {i}", "the root box does not contain the domain")
+
+
+class Region:
+    """What the leaves of a covering share; what `leaves` knows of V and the policy is in the covering's coordinates."""
+
+    def __init__(self, c: Certificate, models: Models, covering: Covering) -> None:
+        T = covering.T
+        self.c, self.models = c, models
+        self.leaves = Leaves(c, T, fmpq_mat(T.transpose() * c.P * T))
+        self.T = arb_mat(T).tolist()
+        self.domain = [(arb(lo), arb(hi)) for lo, hi in c.plant.domain]
+
+    def is_free(self, box: Box) -> bool:
+        """Whether the box lies outside of the domain, or V is below c2 or N above n2 on all of it, certainly."""
+        if self.leaves.is_below(self.leaves.outer, box):
+            return True
+        x = self.states(box)
+        if any(v.c - v.first > hi or v.c + v.first < lo for v, (lo, hi) in zip(x, self.domain, strict=True)):
+            return True
+        try:
+            return self.models.is_above(x)
+        except Refused:
+            return False  # N may be undefined somewhere on the box
+
+    def states(self, box: Box) -> list[Taylor]:
+        """x = T z in the symbols of the box."""
+        centre, radius = middles(box)
+        return [
+            Taylor(
+                total(t * v for t, v in zip(row, centre, strict=True)),
+                [t * r for t, r in zip(row, radius, strict=True)],
+            )
+            for row in self.T
+        ]
+
+    def falls(self, leaf: Leaf) -> bool:
+        """Whether N'F, N'F + k (n2 - N) or N'F + k (V - c2) is certainly negative, for some k >= 0."""
+        leaves, F = self.leaves, self.leaves.F(leaf)
+        N, rate = self.models.moving([leaves.affine(row) for row in leaf.x], F)
+        known = N.is_finite() and rate.is_finite()
+        slacks = [Taylor(self.models.level) + -N, leaves.V(leaf) + Taylor(-leaves.outer)]
+        return known and is_negative(rate, slacks)
+
+
+def check_leaves(c: Certificate, models: Models, covering: Covering) -> None:
+    """In each batch of leaves on which something is asked rule `inputs` comes first."""
+    region, bounded = Region(c, models, covering), bounded_by_form(c)
+    size = max(1, BATCH // max(layer.rows for layer in c.policy.layers))
+    asked = (box for box in boxes(covering) if not region.is_free(box))
+    while batch := list(islice(asked, size)):
+        enclosed = region.leaves.enclose(batch)
+        for leaf in enclosed:
+            good = bounded or within_bounds(c, leaf.ranges())
+            require(good, "inputs", place(leaf), "an input is not certain to stay in its bounds")
+        for leaf in enclosed:
+            try:
+                falls = region.falls(leaf)
+            except Refused as no:
+                raise Refused(RULE, place(leaf), no.detail) from None
+            require(falls, RULE, place(leaf), "no bound of what N changes by is certainly negative")
+
+
+def place(leaf: Leaf) -> str:
+    return f"outer leaf {leaf.box.number}"
