@@ -138,7 +138,11 @@ class OuterFacts:
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
         N = self.function
-        stated = {"kind": "network", "layers": list(N.widths)} if isinstance(N, Neural) else {"kind": "expression"}
+        stated: dict[str, Any] = (
+            {"kind": "expression", "expression": str(N.expression)}
+            if isinstance(N, Symbolic)
+            else {"kind": "network", "layers": list(N.widths), "sha256": N.sha256()}
+        )
         numbers = {name: getattr(self, name) for name in self.__slots__ if name not in ("function", "witness")}
         return {**stated, **numbers, "witness": self.witness and list(self.witness)}
 
