@@ -216,7 +216,7 @@ SHAPES: dict[str, tuple[Any, Step]] = {  # that rise with |x|, if need be below 
 
 def reaching(name: str, data: Document, N: Step, function: Callable[[float], Document], limit: float) -> Family:
     """Sets {N <= n2} by how far they reach, which is where F or the domain ends them."""
-    return Family(name, limit, lambda r: with_outer(data, function(N(r)), max_leaves=400), near=0.02)
+    return Family(name, limit, lambda r: with_outer(data, function(N(r)), max_leaves=150), near=0.02)
 
 
 def of_shape(name: str, c: float = 0.5) -> Family:
@@ -257,7 +257,7 @@ def by_gain(scale: float) -> Family:
             scale=[-k],
             input_bounds=[("-9", "9")],
         )
-        return with_outer(data, expression(SQUARE, 2.25), max_leaves=400)
+        return with_outer(data, expression(SQUARE, 2.25), max_leaves=150)
 
     return Family(f"gain, {scale}", limit, claim, near=0.05, falls=True)
 
@@ -268,7 +268,7 @@ def by_range(power: int) -> Family:
 
     def claim(end: float) -> Document:
         data = scalar(tree, uncertain=[("q", exactly(-end), exactly(end))])
-        return with_outer(data, expression(SQUARE, 4.0), max_leaves=400)
+        return with_outer(data, expression(SQUARE, 4.0), max_leaves=150)
 
     return Family(f"range, power {power}", 2.0 ** (1 - power), claim, near=0.05)
 
@@ -279,7 +279,7 @@ def by_bound(sign: int) -> Family:
     def claim(end: float) -> Document:
         bounds = ("-4", exactly(end)) if sign > 0 else (exactly(-end), "4")
         data = scalar(["+", "x", "u"], gain=-2.0, input_bounds=[bounds], domain=[("-2", "2")])
-        return with_outer(data, expression(SQUARE, 2.25), max_leaves=400)
+        return with_outer(data, expression(SQUARE, 2.25), max_leaves=150)
 
     return Family(f"input, {sign}", 3.0, claim, near=0.02, falls=True)
 
@@ -290,7 +290,7 @@ def by_clip(rate: float) -> Family:
 
     def claim(end: float) -> Document:
         data = scalar(tree, c2=0.04, gain=-1.0, clip=([-9.0], [end]), input_bounds=[("-9", "9")])
-        return with_outer(data, expression(SQUARE, 4.0), max_leaves=400)
+        return with_outer(data, expression(SQUARE, 4.0), max_leaves=150)
 
     return Family(f"clip, {rate}", 1 / rate, claim, near=0.05, falls=True)
 
@@ -304,7 +304,7 @@ def by_disturbance() -> Family:
             [tree], [([[0.0]], [0.0])], 1.0, (1.21, 1.44), claim="practical",
             uncertain=[("w", exactly(-min(end, 0.7)), exactly(end))], **PLAIN,
         )  # fmt: skip
-        return with_outer(grow(data), expression(SQUARE, 2.25), max_leaves=400)
+        return with_outer(grow(data), expression(SQUARE, 2.25), max_leaves=150)
 
     return Family("disturbance", 1.5 - 27 / 32, claim, near=0.05)
 
@@ -318,7 +318,7 @@ def linear_beyond(turn: float) -> Family:
     def claim(s: float) -> Document:
         dynamics = [["+", *(["*", exactly(v), name] for v, name in zip(row, "xy", strict=True)), UNUSED] for row in A]
         data = planar(dynamics, [[0.0, 0.0]], np.eye(2), 0.25)
-        return with_outer(data, expression(quadratic(np.eye(2) + s * R), 0.6), max_leaves=600)
+        return with_outer(data, expression(quadratic(np.eye(2) + s * R), 0.6), max_leaves=300)
 
     return Family(f"linear, {turn}", lowest, claim, near=0.05)
 
@@ -334,7 +334,7 @@ def linear_to_a_face(turn: float) -> Family:
     def claim(level: float) -> Document:
         dynamics = [["+", *(["*", exactly(v), name] for v, name in zip(row, "xy", strict=True)), UNUSED] for row in A]
         data = planar(dynamics, [[0.0, 0.0]], np.eye(2), 0.25, domain=domain)
-        return with_outer(data, expression(quadratic(M), level), max_leaves=800)
+        return with_outer(data, expression(quadratic(M), level), max_leaves=300)
 
     return Family(f"linear to a face, {turn}", limit, claim, near=0.02)
 
@@ -362,7 +362,7 @@ def of_chance(seed: int) -> Family:
     least, most = span(edited(data, "claim.outer", N))
 
     def claim(share: float) -> Document:
-        return with_outer(data, {**N, "level": (least + share * (most - least)).hex()}, max_leaves=1200)
+        return with_outer(data, {**N, "level": (least + share * (most - least)).hex()}, max_leaves=300)
 
     return Family(f"chance {seed}", 1.0, claim, near=0.08)
 
@@ -385,7 +385,7 @@ def families() -> Iterator[Family]:
     for centre, c, scale in ((2.0, 0.5, 1.0), (1.0, 0.5, 0.5), (4.0, 0.4, 2.0), (0.5, 0.75, 1.0)):
         yield of_wells(centre, c, scale)
     yield from map(up_to_a_face, ("1", "4/3", "5/7", "3/2", "10/3"))
-    yield from map(by_gain, (0.5, 1.0, 2.0))
+    yield from map(by_gain, (1.0, 2.0, 4.0))
     yield from map(by_range, (2, 3, 5))
     yield from (by_bound(1), by_bound(-1), by_clip(1.0), by_clip(3.0), by_disturbance())
     yield from (linear_beyond(1.0), linear_beyond(2.0), linear_to_a_face(0.5), linear_to_a_face(2.0))

@@ -43,7 +43,7 @@ class Rise:
         names = ", ".join(f"{s} = {v:.6g}" for s, v in zip(system.states, self.x, strict=True))
         names += "".join(f", {name} = {float(q):.6g}" for name, q in self.values.items())
         what = "the input leaves its bounds" if self.kind == "input" else "N does not fall"
-        return f"{what} at {names} with N = {self.level:.6g} (sampled)"
+        return f"{what} at {names} with N = {self.level:.6g}"
 
 
 class Falsifier:
