@@ -27,7 +27,7 @@ from certify.lyapunov.neural import Neural
 from certify.lyapunov.symbolic import Symbolic
 from certify.policies import TanhNetwork
 from certify.report.timing import Timing, reach_time
-from certify.report.words import below, varying, varying_in, volume_name, volume_unit
+from certify.report.words import below, estimated, varying, varying_in, volume_name, volume_unit
 from certify.rest import Rest
 from certify.sublevel import Sublevel
 from certify.systems import System
@@ -276,7 +276,8 @@ class RoaResult:
     def volume(self) -> float | None:
         """A certain lower bound of the proved set's volume, in the product of the states' units; None without a set.
 
-        With a tube it is that of the larger one of {V <= c2} and the tube's start, of which the set is the union.
+        With a tube it is that of the larger one of {V <= c2} and the tube's start, of which the set is the union; with
+        an outer set it is that of {V <= c2} alone: `outer.volume` is an estimate of the union's.
         """
         return None if self.ellipsoid is None else volume(*self.ellipsoid)
 
@@ -382,7 +383,7 @@ class RoaResult:
         shown = [verdict, *(said[name] for name in ("plant", "in time", "set") if name in said)]
         shown += [
             f"{name} {said[name]}"
-            for name in ("rate", "length", "area", "volume", "limited by", "reason")
+            for name in ("rate", "length", "area", "volume", "with N", "limited by", "reason")
             if name in said
         ]
         return f"RoaResult({'; '.join(shown)})"
@@ -407,8 +408,13 @@ class RoaResult:
         if level is not None and size is not None:
             unit = volume_unit([self.system.units.get(s.name, "") for s in self.system.states])
             wider = "" if self.tube is None else ", enlarged by a tube" if self.tube.centre is None else ", and a tube"
+            if self.outer is not None:
+                wider = f", and N <= {below(self.outer.level)} in the domain"
             rows.append(("set", f"V <= {below(level)}{wider}"))
             rows.append((volume_name(self.system.n), f"{below(size)} {unit}".rstrip()))
+            if self.outer is not None:
+                rows[-1] = (rows[-1][0], f"{rows[-1][1]}, of V <= {below(level)}")
+                rows.append(("with N", estimated(self.outer.volume, self.outer.deviation, unit)))
             rows.append(("limited by", self.reason))
         else:
             rows.append(("reason", self.reason))

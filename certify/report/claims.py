@@ -295,11 +295,11 @@ def _with_outer(words: Words) -> Words:
     """The words of a claim that has an outer set besides."""
     return replace(
         words,
-        statement=words.statement + " Moreover every trajectory that starts in the outer set, which is the states x of "
+        statement=words.statement + " Moreover every trajectory that starts in the outer set, the states x of "
         "the domain with N(x) ≤ {beyond} and no others, enters {{V(x) ≤ {outer}}} in finite time, and from then on is "
         "one of those just spoken of; on the way it stays in the union of the two sets.",
         headline=words.headline
-        + "; from every state of the domain with N <= {beyond} {{V <= {outer}}} is entered in finite time",
+        + "; from every state of the domain with N <= {beyond}, {{V <= {outer}}} is entered in finite time",
         decay="V may rise above c₂; that it comes down to c₂ in finite time is {word}. " + words.decay,
         parts=(*words.parts, *_BEYOND),
         excluded=(*words.excluded[:-1], *_NOT_BEYOND, words.excluded[-1]),
