@@ -98,14 +98,15 @@ def status_of(certificate: Certificate, sha256: str, answer: Mapping[str, Any] |
     levels = answer.get("levels")
     given = dict(levels) if isinstance(levels, Mapping) else {}
     beyond, stated = answer.get("outer"), certificate.claim.outer
+    beyond = beyond if beyond is None or (isinstance(beyond, Mapping) and "level" in beyond) else {"level": "none"}
     for what, found, wanted in (
         ("bytes with sha256", answer.get("certificate_sha256"), sha256),
         ("policy with sha256", answer.get("policy_sha256"), certificate.network.sha256()),
         ("levels", given, dict(certificate.claim.levels)),
         (
             "level of the outer set",
-            beyond.get("level", "no level") if isinstance(beyond, Mapping) else beyond,
-            None if stated is None else stated.level,
+            None if beyond is None else [beyond["level"]],
+            None if stated is None else [stated.level],
         ),
         ("evidence to replay", kind == "ACCEPTED", isinstance(certificate.evidence, PartitionTree)),
     ):
