@@ -208,7 +208,8 @@ class RoaResult:
 
     `rest` is where the loop rests, if not at the origin. `candidate` is where P came from, `tried` all that were tried,
     `notice` what is not as it was asked for. `reach_from` is the state that was asked about, by the states' values;
-    where the verdict on it is UNKNOWN by `Stop.PATH`, `certificate` and `levels` are of a proved set without it.
+    where the verdict on it is UNKNOWN by `Stop.PATH`, `certificate` and `levels` are of a proved set without it. Where
+    the verdict is UNKNOWN by `Stop.BEYOND` they, and `outer`, are of a smaller set than was asked for.
     `checker` is what the checker said, None if it was not reached, about `raw`, the certificate's bytes; `solver` has
     dReal's version and every query with its answer, None if it was not asked. `notices` is what had to be known about
     plant and policy before the run, such as a domain that was cut; `folder` keeps a temporary folder of the certificate

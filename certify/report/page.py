@@ -279,14 +279,18 @@ def _matrices(certificate: Certificate) -> list[tuple[str, list[list[str]]]]:
 
 
 def _is_missed(result: Mapping[str, Any] | None) -> bool:
-    """Whether the run's reason is about a state that it was asked about, and not about the certificate's set."""
-    return result is not None and result.get("stop") == "path"
+    """Whether the run's reason is about what it was asked for, a state or a level of N, and not about the certificate's
+    set."""
+    return result is not None and result.get("stop") in ("path", "beyond")
 
 
 def _missed(result: Mapping[str, Any] | None, status: Status) -> str:
-    """That a state was asked about which this certificate says nothing of; nothing if that is not so."""
+    """That a state, or a level of N, was asked about of which this certificate says nothing; else nothing."""
     if result is None or not _is_missed(result):
         return ""
+    if result.get("stop") == "beyond":
+        smaller = " The certificate is about a smaller set." if status.accepted else ""
+        return f"An outer set was asked for that is not proved: {result['reason'].rstrip('.')}.{smaller}"
     asked: Mapping[str, str] = result.get("reach_from") or {}
     units = {s["name"]: s.get("unit") or "" for s in result.get("states") or ()}
     where = point(list(asked), [Fraction(v) for v in asked.values()], [units.get(name, "") for name in asked])

@@ -112,6 +112,10 @@ def _headline(result: Mapping[str, Any], verdict: str) -> str:
         return f"{name}: {_whatever(result)}{stated}{word}"
     if verdict == "REFUTED":
         return f"{name}: a condition of the claim fails for this V and level; another V may show what this one cannot"
+    if _is_missed(result) and result.get("stop") == "beyond":
+        outer = result.get("outer")
+        smaller = f" with the states of the domain where N <= {below(outer['level'])}" if outer else ""
+        return f"{name}: the level of N is NOT proved; what is proved is {{V <= {below(level)}}}{smaller}"
     if _is_missed(result):
         return f"{name}: the state is NOT shown to converge; what is proved is {{V <= {below(level)}}}, without it"
     return f"{name}: nothing was proved"
@@ -137,9 +141,10 @@ def _whatever(result: Mapping[str, Any]) -> str:
 
 
 def _is_missed(result: Mapping[str, Any]) -> bool:
-    """Whether a set is proved, and the state that was asked about not shown to lie in it or to reach it."""
+    """Whether a set is proved, and what was asked about is not: a state that is not shown to lie in it or to reach it,
+    or a level of N."""
     proved = result.get("checked") == "ACCEPTED" and result["levels"].get("roa") is not None
-    return bool(result.get("stop") == "path" and proved)
+    return bool(result.get("stop") in ("path", "beyond") and proved)
 
 
 def _rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
@@ -226,7 +231,10 @@ def _rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
         answers = [q["answer"] for q in solver["queries"]]
         rows.append(("dReal", f"{answers.count('unsat')} of {len(answers)} queries unsat, version {solver['version']}"))
     rows.append(("time", _times(result["seconds"])))
-    about = ", about {V <= c2} alone, in which the state does not lie" if _is_missed(result) else ""
+    about = ""
+    if _is_missed(result):
+        beyond = result.get("stop") == "beyond"
+        about = ", about a smaller set" if beyond else ", about {V <= c2} alone, in which the state does not lie"
     rows.append(("checker", f"{result['checked'] or 'not reached'}{about}"))
     return rows
 
