@@ -29,6 +29,7 @@ from certify.reference.outer import Region, binary64_above
 from certify.reference.refusal import Refused
 from certify.reference.symmetric import pairs
 from certify.reference.taylor import Taylor
+from tests.reference.test_contraction import honest as around_a_level
 from tests.reference.test_practical import practical
 from tests.support.certificates import LEAF, Document, decode, dump, edited, encode, make, rehash, verdict
 from tests.support.oracle import value_of
@@ -203,6 +204,24 @@ CURVED = ["+", ["sqrt", ["+", "1", ["**", "x", 2]]], ["*", "y", ["atan", "y"]], 
           ["*", "1/8", ["-", "1", ["cos", "x"]]],
           ["*", ["tanh", "x"], ["/", "x", ["+", "4", ["sin", "y"]]]]]  # fmt: skip
 
+
+def spatial() -> Document:
+    """Three states, two inputs, a clip and an uncertain quantity."""
+    plant = [
+        ["+", ["-", "x"], ["*", "q", "y"], ["*", "1/4", "u"]],
+        ["+", ["-", "y"], ["*", "-1/4", "x"], ["*", "1/8", "v"]],
+        ["+", ["-", "z"], ["*", "1/8", ["sin", "x"], "u"]],
+    ]
+    layers = [(np.array([[0.5, 0.25, 0.0], [0.0, 0.5, -0.25]]), np.zeros(2))]
+    data = make(
+        plant, layers, np.eye(3), (0.25, 0.25), states="xyz", inputs="uv", u_eq=["0", "0"], scale=[-1.0, -0.5],
+        offset=[0.0, 0.0], domain=[("-2", "2")] * 3, input_bounds=[("-1", "1")] * 2, clip=([-0.75, -1.0], [1.0, 0.25]),
+        uncertain=[("q", "0", "1/4")],
+    )  # fmt: skip
+    rising = [(np.kron(np.eye(3), [[1.0], [-1.0]]), -np.ones(6)), (np.ones((1, 6)), [0.0])]
+    return stated(data, network(rising, -3.35), [[1.0, 0.25, 0.0], [0.0, 1.0, 0.0], [0.0, -0.25, 1.0]])
+
+
 HONEST: dict[str, Callable[[], Document]] = {
     "a state": lambda: scalar(expression(["**", "x", 2], 1.9**2)),
     "close to the edge": lambda: scalar(expression(["**", "x", 2], (EDGE - 1e-6) ** 2)),
@@ -211,6 +230,8 @@ HONEST: dict[str, Callable[[], Document]] = {
     "a clip": clipped,
     "uncertain": uncertain,
     "disturbed": disturbed,
+    "nearby": lambda: stated(around_a_level(), expression(["**", "x", 2], 8.0)),
+    "three states": spatial,
     "two states": lambda: planar(network(BUMPS, -1.25)),
     "in other coordinates": lambda: planar(network(BUMPS, -1.25), SLANTED),
     "a round set": lambda: planar(expression(ROUND, 8.5)),
@@ -289,11 +310,12 @@ def rate_at(data: Document, x: np.ndarray, generator: np.random.Generator) -> fl
     """N'F with what is uncertain drawn from its range."""
     plant, policy = data["plant"], data["policy"]
     W, b = (decode(policy["layers"][0][key]) for key in ("weight", "bias"))
-    scale = decode(policy["scale"])[0]
-    u = scale * np.tanh(W @ x + b[0])
+    u = decode(policy["scale"]) * np.tanh(W.reshape(len(b), len(x)) @ x + b)
     if policy["clip"] is not None:
-        u = np.clip(u, decode(policy["clip"][0])[0], decode(policy["clip"][1])[0])
-    names = {"u": arb(u), **{name: arb(v) for name, v in zip(plant["states"], x, strict=True)}}
+        u = np.clip(u, *map(decode, policy["clip"]))
+    names = {
+        name: arb(v) for name, v in zip(plant["states"] + plant["inputs"], [*x.tolist(), *u.tolist()], strict=True)
+    }
     for each in plant["uncertain"]:
         lo, hi = map(eval_rational, each["range"])
         names[each["name"]] = arb(generator.choice([lo, hi, generator.uniform(lo, hi)]))
@@ -568,6 +590,34 @@ def test_models_enclose_N_and_its_rate(name: str, seed: int) -> None:
                 near = N_in_arb(data, [v - h * f for v, f in zip(at, moved, strict=True)])
                 assert abs((far - near) / (2 * h) - exactly_at(rate, d)) <= rate.r + arb("1e-25")
                 assert not true > value.bound() and not true < -(-value).bound()
+
+
+@pytest.mark.parametrize("name", ["in other coordinates", "an odd domain", "functions"])
+def test_a_free_leaf_holds_no_point_of_which_something_is_said(name: str) -> None:
+    """In the domain, V at least c2 and N at most n2: drawn in boxes that are free, of which many touch an end."""
+    data, generator = HONEST[name](), np.random.default_rng(11)
+    c = read(dump(data))
+    n2, T = float.fromhex(data["claim"]["outer"]["level"]), decode(data["evidence"]["outer"]["T"]).reshape(2, 2)
+    ends = np.array([[eval_rational(end) for end in pair] for pair in data["plant"]["domain"]])
+    with ctx.workprec(PRECISION):
+        region = region_of(c)
+        inverse, kinds = np.linalg.inv(T), {"outside": 0, "below c2": 0, "above n2": 0}
+        for _ in range(400):
+            x = generator.uniform(1.1 * ends[:, 0], 1.1 * ends[:, 1]) * generator.choice([0.3, 1.0])
+            if generator.random() < 0.5:
+                axis = generator.integers(2)
+                x[axis] = ends[axis, generator.integers(2)] * (1 + 0.01 * generator.standard_normal())
+            centre, radius = inverse @ x, 10.0 ** generator.uniform(-3, -0.3, 2)
+            box = Box(0, (centre - radius).tolist(), (centre + radius).tolist())
+            if not region.is_free(box):
+                continue
+            points = (T @ (centre[:, None] + radius[:, None] * generator.choice([-1, 1, 0.3, -0.6], (2, 30)))).T
+            inside = [p for p in points if (ends[:, 0] <= p).all() and (p <= ends[:, 1]).all()]
+            kinds["outside"] += not inside
+            kinds["below c2"] += any(p @ p < 0.25 for p in inside)
+            kinds["above n2"] += any(p @ p >= 0.25 for p in inside)
+            assert all(p @ p < 0.25 + 1e-12 or N_at(data, p) > n2 - 1e-12 for p in inside)
+    assert min(kinds.values()) > 5, kinds
 
 
 def exactly_at(model: Taylor, d: Sequence[float]) -> arb:
