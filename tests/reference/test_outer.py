@@ -405,6 +405,12 @@ FORGED: list[tuple[str, str, str, Edit]] = [
     ("faces", "a level beyond a face", "a state", level(9.0)),
     ("faces", "a level beyond all of them", "a round set", regrown(level(10.0))),
     ("faces", "beyond one face", "an odd domain", regrown(level(2.125**2 + 1e-9))),
+    ("faces", "near the lower end of another state", "a round set",
+     regrown(setting("plant.domain", [["-3", "5/2"], ["-3", "3"]]), level(0.01), setting("claim.outer.expression",
+             ["+", ["**", ["+", "x", "11/4"], 2], ["**", ["-", "y", "3"], 2]]))),
+    ("faces", "near the upper end", "a round set",
+     regrown(setting("plant.domain", [["-5/2", "3"], ["-3", "3"]]), level(0.01), setting("claim.outer.expression",
+             ["+", ["**", ["-", "x", "11/4"], 2], ["**", ["+", "y", "3"], 2]]))),
     ("faces", "on a face, exactly", "a state", setting("claim.outer", expression(["+", "9", ["*", "x", "0"]], 9.0))),
     ("faces", "below a level nowhere", "an affine network", level(0.0)),
     ("faces", "a tree that is too coarse", "two states", setting("evidence.outer.faces.3", "/w==")),
@@ -546,11 +552,18 @@ def test_multipliers_pay(name: str, needed: int, monkeypatch: pytest.MonkeyPatch
 # ---------------------------------------------------------------------------------------------------- models enclose
 
 
-@pytest.mark.parametrize("name", ["two layers", "functions", "two states"])
+def mixed() -> Document:
+    """Three layers with weights of both signs."""
+    generator = np.random.default_rng(17)
+    shapes = ((5, 2), (4, 5), (1, 4))
+    return planar(network([(generator.standard_normal(s), generator.standard_normal(s[0])) for s in shapes], 0.0))
+
+
+@pytest.mark.parametrize("name", ["two layers", "functions", "mixed"])
 @pytest.mark.parametrize("seed", range(3))
 def test_models_enclose_N_and_its_rate(name: str, seed: int) -> None:
     """On boxes of all sizes, along models of F with coefficients of every kind."""
-    data, generator = HONEST[name](), np.random.default_rng(seed)
+    data, generator = mixed() if name == "mixed" else HONEST[name](), np.random.default_rng(seed)
     c = read(dump(data))
     assert c.beyond is not None
     symbols = 4
@@ -626,6 +639,18 @@ def exactly_at(model: Taylor, d: Sequence[float]) -> arb:
     for (i, j), q in zip(pairs(len(d)), model.Q or [], strict=model.Q is not None):
         value += q * arb(d[i]) * arb(d[j])
     return value
+
+
+@pytest.mark.parametrize("bad", ["inf", "-inf", "nan"])
+def test_what_is_not_finite_is_not_accepted(bad: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """+inf > n2 and -inf < 0 are certain, and say nothing."""
+    data, broken = honest("an affine network"), Taylor(arb(bad), [arb(0)])
+    with ctx.workprec(PRECISION):
+        region = region_of(read(dump(data)))
+        assert not region.models.is_above([broken])
+        (leaf,) = region.leaves.enclose([Box(0, [1.0], [1.25])])
+        monkeypatch.setattr(region.leaves, "F", lambda leaf: [broken])
+        assert not region.falls(leaf)
 
 
 def test_the_slope_of_tanh_as_a_function() -> None:
