@@ -119,7 +119,8 @@ class OuterFacts:
     """A set beyond {V <= c2}: {N <= level} within the domain, N a `function` of deviations from the operating point.
 
     `volume` is that of its union with {V <= c2}, estimated from samples of the domain, and `deviation` the standard
-    deviation of that estimate; `leaves` are those of all trees; `limit` says what ends the level: `faces`, `witness`, `requested`, or what ran out;
+    deviation of that estimate; `leaves` are those of all trees; `limit` says what ends the level: `domain` (its faces),
+    `witness`, `requested`, or what ran out;
     `witness` is a state, (n,), at which N is no larger than `witness_level` and does not fall, None if none was met.
     """
 

@@ -52,7 +52,7 @@ from certify.policies import TanhNetwork
 from certify.race import Contender, Race
 from certify.rest import find_rest
 from certify.results import Levels, OuterFacts, RoaResult, Tried, TubeFacts
-from certify.rigorous import eigenvalues, instability
+from certify.rigorous import eigenvalues, evaluate_rise, instability
 from certify.systems import System
 from certify.trials import OPTIMISING, Trial, blends, by_reach, corrected, named, optimised, peak, robust, solved
 from certify.verdict import Stop, Verdict
@@ -430,6 +430,24 @@ class _Run:
         result = replace(result, notice=accepted.mended or result.notice)
         if isinstance(certificate.claim, Nearby):
             result = replace(result, claim=certificate.claim.kind)
+        if certificate.claim.outer is not None and beyond is not None:
+            facts_beyond = _facts(task.problem, certificate.claim, certificate.claim.outer, beyond)
+            result = replace(result, outer=facts_beyond)
+        elif beyond is not None:
+            self.aside = "the checker refused the set beyond the ellipsoid, which is left out"
+        if self.options.lyapunov_level is not None and (
+            certificate.claim.outer is None or certificate.claim.outer.level < self.options.lyapunov_level
+        ):
+            result = _with_levels(result, certificate.claim.levels, witness)
+            return replace(
+                result,
+                stop=Stop.BEYOND,
+                detail=_short_of(task.problem, certificate.claim, self.options, beyond),
+                leaves=proof.leaves,
+                certificate=accepted.path,
+                raw=accepted.data,
+                checker=accepted.answer,  # of a smaller set
+            )
         if isinstance(certificate.claim, Enlarged | Reached):
             result = replace(result, claim=certificate.claim.kind, tube=facts)
         elif self.centre is not None and not _holds(task.problem, certificate.roa, self.centre):
@@ -447,11 +465,6 @@ class _Run:
             )
         if task.exactly and certificate.roa < task.target:
             return _missed(replace(result, stop=Stop.REFUSED, detail=accepted.mended or ""), task, certificate.claim)
-        if certificate.claim.outer is not None and beyond is not None:
-            facts_beyond = _facts(task.problem, certificate.claim, certificate.claim.outer, beyond)
-            result = replace(result, outer=facts_beyond)
-        elif beyond is not None:
-            self.aside = "the checker refused the set beyond the ellipsoid, which is left out"
         trusted = isinstance(proof.evidence, TrustedSolver)
         if not trusted and self.options.engine == "both":
             result = replace(result, solver=self._confirm(task.problem, certificate.claim))
@@ -598,6 +611,26 @@ def _facts(problem: Problem, claim: Claim, outer: Outer, found: OuterProof) -> O
         None if found.witness is None else tuple(found.witness.x.tolist()),
         None if found.witness is None else found.witness.level,
     )
+
+
+def _short_of(problem: Problem, claim: Claim, options: RoaOptions, found: OuterProof | None) -> str:
+    """Why the level of the function that was asked for is not proved."""
+    reached = "nothing beyond V <= " + f"{claim.roa:.6g} is proved"
+    if claim.outer is not None:
+        reached = f"proved only up to N <= {claim.outer.level:.12g}, not {options.lyapunov_level:g}"
+    if found is None or found.witness is None:
+        return reached
+    shown = _rises(problem, claim, found) if options.lyapunov_level is not None else False
+    return f"{reached}; {found.witness.describe(problem.loop.system)}{', shown in Arb' if shown else ''}"
+
+
+def _rises(problem: Problem, claim: Claim, found: OuterProof) -> bool:
+    """Whether N certainly does not fall at the witness, where the certificate has no range to choose a value from."""
+    witness = found.witness
+    if witness is None or witness.kind != "rise" or problem.loop.system.ranges:
+        return False
+    _, rise = evaluate_rise(problem.loop, found.outer.function, witness.x)
+    return bool(rise >= 0) and problem.V.exactly(witness.x) >= Fraction(claim.roa)
 
 
 def _by_proved(race: Race) -> list[Contender]:

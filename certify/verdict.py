@@ -50,6 +50,7 @@ class Stop(Enum):
     FLOOR = "floor"
     SMOOTH = "smooth"
     PATH = "no tube from that state"
+    BEYOND = "the level of the function"
     SOLVER = "solver"
     SPECTRUM = "spectrum"
     UNSTABLE = "unstable linearisation"

@@ -15,13 +15,13 @@ import numpy as np
 
 from .boxes import Boxes, Leaves, batches, is_whole, middle
 from .case import Case, Failures
-from .document import Array, Network
+from .document import Network
 from .elementary import derivative, elementary
 from .exact import exactly, fraction, inverse
 from .expression import Tape, evaluate
-from .float64 import EPS, ends, float_with_error, gamma, total, up
+from .float64 import EPS, Array, ends, float_with_error, gamma, spectral_norm, total, up
 from .flow import Series
-from .network import enclose_on_boxes
+from .network import Folded, Layer, enclose_on_boxes
 from .taylor import Taylor, affine, constant, upper_bound
 
 _BATCH_NUMBERS = 1_000_000  # in the largest array of a batch
@@ -33,6 +33,15 @@ class Layers:
 
     def __init__(self, net: Network) -> None:
         self.net, self.values = net, max(len(W) for W in net.weights)
+        pairs, zero = zip(net.weights, net.biases, strict=True), np.zeros(1)
+        layers = tuple(Layer(W, b, np.zeros_like(b), spectral_norm(W)) for W, b in pairs)
+        self.as_policy = Folded(layers, False, np.ones(1), zero, zero)
+
+    def least(self, x: Array, error: Array) -> Array:
+        """A lower bound of N (B,), affine on the boxes: good where these are large."""
+        mid, slopes, wide = enclose_on_boxes(self.as_policy, x, error)
+        least: Array = ends(mid[0], up(total(np.abs(slopes[0]), 0) + wide[0]))[0]
+        return least
 
     def is_small(self, symbols: int) -> bool:
         """Whether models in so many symbols are no more than there is room for."""
@@ -69,6 +78,10 @@ class Formula:
     def is_small(self, symbols: int) -> bool:
         """Whether models in so many symbols are no more than there is time for."""
         return len(self.tape.operations) * symbols**2 <= _MOST_VALUES
+
+    def least(self, x: Array, error: Array) -> Array:
+        """Nothing is known before there are models."""
+        return np.full(x.shape[2], -np.inf)
 
     def models(self, states: Sequence[Taylor]) -> list[Taylor]:
         """The states."""
@@ -109,11 +122,11 @@ def is_above_on_faces(case: Case) -> Failures:
         doubt = np.where(np.arange(n) == i, error, 0.0)[:, None]
         for first, lower, upper in batches(tree, lo, hi, _batch(n * n * function.values)):
             centre, radius = middle(lower, upper)
-            states = _affine(centre, np.eye(n)[:, :, None] * radius, doubt + np.zeros_like(centre))
-            hold = _is_above(function.value(function.models(states)), claim.level)
-            if not np.all(hold):
-                yield f"{where}leaf {first + np.argmin(hold)}", "N must be above its level"
-            count += len(hold)
+            x = np.concatenate([centre[:, None], np.eye(n)[:, :, None] * radius], axis=1)
+            left = _below_level(function, x, doubt + np.zeros_like(centre), claim.level)[0]
+            if len(left):
+                yield f"{where}leaf {first + left[0]}", "N must be above its level"
+            count += centre.shape[1]
     return count
 
 
@@ -165,16 +178,14 @@ class Beyond(Boxes):
         """The leaves with these corners, numbered from `first`, of which N'F is asked."""
         centre, radius = middle(lo, hi)
         x, error = self.states(centre, radius)
-        left = np.flatnonzero(np.logical_not(self.is_outside(x, error) | (self.levels(lo, hi)[1] < self.c.c2)))
-        models = self.function.models(_affine(x[:, 0, left], x[:, 1:, left].swapaxes(0, 1), error[:, left]))
-        N = self.function.value(models)
-        asked = np.flatnonzero(np.logical_not(_is_above(N, self.level)))
-        left, N = left[asked], N.at(asked).widened(self.symbols)
+        near = np.flatnonzero(np.logical_not(self.is_outside(x, error) | (self.levels(lo, hi)[1] < self.c.c2)))
+        left, models = _below_level(self.function, x[:, :, near], error[:, near], self.level)
+        left, N = near[left], self.function.value(models).widened(self.symbols)
         x, error, centre, radius = x[:, :, left], error[:, left], centre[:, left], radius[:, left]
         mid, slopes, wide = enclose_on_boxes(self.net, x, error)
         states, held = self.affine(x, error, mid, slopes, wide)
         F = self.f(states, [*held, *self.quantities(len(left))])
-        rise = self.function.along([v.at(asked) for v in models], F)
+        rise = self.function.along(models, F)
         below = constant(Fraction(self.level), self.symbols, len(left)) + -N
         bound = self.least_bound(
             rise, [below.at, lambda few: self.gap(centre[:, few], radius[:, few], self.c.c2, -1.0)]
@@ -201,15 +212,15 @@ def _batch(numbers: int) -> int:
     return max(1, min(4096, _BATCH_NUMBERS // numbers))
 
 
-def _is_above(N: Taylor, level: float) -> Array:
-    """Where N has a model, whose least value is above the level."""
-    hold: Array = np.isfinite(N.size + N.r) & (upper_bound(-N) < -level)
-    return hold
-
-
-def _affine(c: Array, g: Array, error: Array) -> list[Taylor]:
-    """States as models in the symbols of a box: c (n, B), g (symbols, n, B), error (n, B)."""
-    return [affine(c[i], g[:, i], error[i]) for i in range(len(c))]
+def _below_level(function: Layers | Formula, x: Array, error: Array, level: float) -> tuple[Array, list[Taylor]]:
+    """The boxes, by their indices, on which N is not certainly above the level, and the function's models on these."""
+    left = np.flatnonzero(np.logical_not(function.least(x, error) > level))
+    states = [affine(own[0], own[1:], e) for own, e in zip(x[:, :, left], error[:, left], strict=True)]
+    models = function.models(states)
+    N = function.value(models)
+    above = np.isfinite(N.size + N.r) & (upper_bound(-N) < -level)
+    still = np.flatnonzero(np.logical_not(above))
+    return left[still], [v.at(still) for v in models]
 
 
 def _numbers(like: Taylor) -> Callable[[Fraction], Taylor]:

@@ -4,6 +4,9 @@ The network goes layer by layer, all units of a layer at once: a row for each co
 one product of matrices. Q is symmetric, and only its coefficients of d_i d_j with i <= j are carried, which is nearly
 half of them. N itself needs the box's symbols only, and most boxes nothing but N; the inputs' errors and what is
 uncertain join in its derivative, `y_1 = W_1 F`, `y_(k+1) = W_(k+1) (tanh'(a_k) y_k)` (FORMAT.md, rule `outer`).
+
+On large boxes a model's remainder knows no end, where tanh itself does: there N is bounded from below as policies are,
+by parallel lines.
 """
 
 from __future__ import annotations
@@ -11,11 +14,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from certify.enclosures.policy import LayersEnclosure
 from certify.enclosures.taylor import EPS, TINY, Taylor
 from certify.lyapunov.neural import Neural
+from certify.policies import TanhNetwork
 
 _FOURTH = 4.1  # above |tanh''''| everywhere
 _FIFTH = 16.0  # as large as the fifth derivative of tanh can be
@@ -81,25 +87,31 @@ class NeuralModels:
     value: Taylor
     layers: Sequence[_Bent]
 
+    @property
+    def share(self) -> Tensor:
+        """How much each axis (n, B) spreads the units of the first layer that err most, in all 1."""
+        return self._share(self.layers[:1], 0.0)
+
+    def _share(self, first: Sequence[_Bent], more: Tensor | float) -> Tensor:
+        """The same on some boxes, where the units err by `more` besides."""
+        if not first:  # an affine N
+            return torch.full_like(self.value.g, 1 / len(self.value.g))
+        layer = first[0]
+        share = ((layer.rest + more) * self.weights.reach / (layer.G + TINY) * layer.a.g.abs()).sum(1)
+        return share / (share.sum(0) + TINY)
+
     def along(self, F: Sequence[Taylor], index: Tensor) -> tuple[Taylor, Tensor]:
         """N'F on the boxes `index`, F being what it is there, and `share` (n, B): how much each axis spreads the units
         of the first layer that err most."""
         layers = self.layers if len(index) == len(self.value.c) else [layer.at(index) for layer in self.layers]
         y, size = _packed(F)
-        share: Tensor | None = None
+        errors: Tensor | float = 0.0
         for k, W in enumerate(self.weights.weights):
             y = _through(W, self.weights.magnitudes[k], None, y, size)
-            if k == len(layers):
-                break
-            layer = layers[k]
-            y, size = _times_slope(layer, y)
-            if share is None:
-                spread = layer.a.g.abs()
-                share = ((y.r + layer.rest) / (layer.G + TINY) * spread).sum(1)
-                share = share / (share.sum(0) + TINY)
-        if share is None:  # an affine N
-            share = torch.full_like(self.value.g[:, index], 1 / self.value.g.shape[0])
-        return y.model(), share
+            if k < len(layers):
+                y, size = _times_slope(layers[k], y)
+                errors = y.r if k == 0 else errors
+        return y.model(), self._share(layers[:1], errors)
 
 
 class NeuralEnclosure:
@@ -113,6 +125,26 @@ class NeuralEnclosure:
         self.magnitudes = [w.abs() for w in self.weights]
         self.biases = [tensor(b) for b in function.biases]
         self.units = max(function.widths)
+        one, zero = np.ones(1), np.zeros(1)
+        network = TanhNetwork(function.weights, function.biases, one, zero, "identity", "none")
+        self.lines = LayersEnclosure(network, (zero, zero, zero, zero), device)
+        reach = self.magnitudes[-1]
+        for magnitude in reversed(self.magnitudes[1:-1]):
+            reach = reach @ magnitude
+        self.reach = reach.T  # how far, at most, N moves with a unit of the first layer (units, 1)
+
+    def least(self, x: Tensor, error: Tensor, level: float) -> Tensor:
+        """A lower bound of N (B,), good where boxes are large; -inf where N is not above the level at the centre."""
+        h = x[:, 0]
+        for k, (W, b) in enumerate(zip(self.weights, self.biases, strict=True)):
+            h = torch.addmm(b[:, None], W, h.tanh() if k else h)
+        found = torch.full_like(h[0], -torch.inf)
+        index = torch.nonzero(h[0] > level)[:, 0]
+        if len(index):
+            mid, slopes, wide, _ = self.lines(x[:, :, index], error[:, index])
+            spread = slopes[0].abs().sum(0) + wide[0]
+            found[index] = mid[0] - spread - 1e-11 * (mid[0].abs() + spread)
+        return found.nan_to_num(-torch.inf, -torch.inf, -torch.inf)
 
     def __call__(self, x: Tensor, error: Tensor) -> NeuralModels:
         """N for states `x[:, 0] + x[:, 1:] d`, (n, n + 1, B), within the error (n, B)."""
@@ -133,7 +165,14 @@ def _block(j: int) -> slice:
 
 
 def _sizes(rows: Tensor) -> Tensor:
-    return rows.abs().sum(0)
+    """The sum of the rows' magnitudes, a row at a time, which stays in a core's cache."""
+    if not len(rows):
+        return rows.new_zeros(rows.shape[1:])
+    total = rows[0].abs()
+    size = torch.empty_like(total)
+    for row in rows[1:]:
+        total += torch.abs(row, out=size)
+    return total
 
 
 def _through(W: Tensor, magnitude: Tensor, bias: Tensor | None, h: _Units, size: Tensor) -> _Units:

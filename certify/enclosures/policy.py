@@ -10,22 +10,31 @@ by two parallel lines as well; where it certainly does nothing, nothing changes.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from certify.closed_loop import ClosedLoop
 from certify.enclosures.taylor import EPS, TINY
+from certify.policies import TanhNetwork
 from certify.rigorous import centring_with_errors
 
+Array = NDArray[np.float64]
 _LIBM = 2.0**-47  # error allowed to torch.tanh, relative to 1
 
 
-class PolicyEnclosure:
-    """Affine enclosures of pi over batches of boxes, on the device that holds its weights."""
+class LayersEnclosure:
+    """Affine enclosures of a network over batches of boxes, on the device that holds its weights.
 
-    def __init__(self, loop: ClosedLoop, device: torch.device) -> None:
-        network = loop.network
+    Parameters
+    ----------
+    centring : what is added to the last layer's bias and to the output, each with its error, (m,) each.
+    """
 
+    def __init__(self, network: TanhNetwork, centring: Sequence[Array], device: torch.device) -> None:
         def tensor(array: object) -> Tensor:
             return torch.tensor(array, dtype=torch.float64, device=device)
 
@@ -36,7 +45,7 @@ class PolicyEnclosure:
         self.norms = [float(torch.linalg.matrix_norm(w, 2)) * min(w.shape) ** (1 / 128) for w in self.weights]
         self.squash = network.squash == "tanh"
         self.scale = tensor(network.scale)
-        shift, shift_error, offset, offset_error = (tensor(a) for a in centring_with_errors(loop))
+        shift, shift_error, offset, offset_error = (tensor(a) for a in centring)
         bias = self.biases[-1]
         self.biases[-1], self.offset = bias + shift, offset
         self.bias_error = torch.where(shift == 0, 0.0, shift_error + EPS * (bias.abs() + shift.abs()))
@@ -44,7 +53,7 @@ class PolicyEnclosure:
         self.clip = None if network.clip is None else tuple(tensor(end)[:, None] for end in network.clip)
 
     def __call__(self, x: Tensor, x_error: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Enclose the policy for states `x[:, 0] + x[:, 1:] d` within x_error.
+        """Enclose the network for states `x[:, 0] + x[:, 1:] d` within x_error.
 
         Parameters
         ----------
@@ -107,6 +116,13 @@ class PolicyEnclosure:
             through = weight if slope is None else slope[:, None] * weight
             weight = (W.T @ through.reshape(len(W), -1)).reshape(-1, m, batch)
         return result + (weight.abs() * x_error[:, None]).sum(0)
+
+
+class PolicyEnclosure(LayersEnclosure):
+    """Affine enclosures of pi."""
+
+    def __init__(self, loop: ClosedLoop, device: torch.device) -> None:
+        super().__init__(loop.network, centring_with_errors(loop), device)
 
 
 def relax_tanh(centre: Tensor, radius: Tensor) -> tuple[Tensor, Tensor, Tensor]:

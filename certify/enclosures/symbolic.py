@@ -27,6 +27,11 @@ class SymbolicModels:
     states: Mapping[sympy.Symbol, Taylor]
     value: Taylor
 
+    @property
+    def share(self) -> Tensor:
+        """How much each axis (n, B) is charged with a remainder: all of them the same."""
+        return torch.full_like(self.value.g, 1 / self.function.n)
+
     def along(self, F: Sequence[Taylor], index: Tensor) -> tuple[Taylor, Tensor]:
         """N'F on the boxes `index`, F being what it is there, and `share` (n, B), the same for each axis."""
         n, symbols = self.function.n, len(F[0].g)
@@ -42,8 +47,7 @@ class SymbolicModels:
         if len(found.coefficients) == 1:  # not a state itself, which has both
             series.advance()
         first = found.coefficients[1]
-        share = self.value.g.new_full((n, len(index)), 1 / n)
-        return models.constant(Fraction(0)) if first is None else first, share
+        return models.constant(Fraction(0)) if first is None else first, self.share[:, index]
 
 
 class SymbolicEnclosure:
@@ -53,6 +57,10 @@ class SymbolicEnclosure:
 
     def __init__(self, function: Symbolic, device: torch.device) -> None:
         self.function, self.device = function, device
+
+    def least(self, x: Tensor, error: Tensor, level: float) -> Tensor:
+        """A lower bound of N (B,): none is known before there are models."""
+        return torch.full_like(x[0, 0], -torch.inf)
 
     def __call__(self, x: Tensor, error: Tensor) -> SymbolicModels:
         """N for states `x[:, 0] + x[:, 1:] d`, (n, n + 1, B), within the error (n, B)."""

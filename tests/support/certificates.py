@@ -24,6 +24,7 @@ from certify.checker.case import Case
 from certify.checker.document import Certificate
 from certify.checker.errors import Rejected
 from certify.checker.float64 import within
+from certify.checker.outer import Beyond
 from certify.checker.ring import Ring
 
 Document = dict[str, Any]
@@ -184,40 +185,48 @@ def grow(data: Document, max_leaves: int = 5000, depth: int = 40) -> Document:
     Leaves that are still not accepted at `depth` or at `max_leaves` stay, and the certificate is then rejected.
     """
     c = parse(data)
-    axes: dict[tuple[int, ...], int] = {}  # path from the root (0 lower, 1 upper) -> axis of the split
     with np.errstate(all="ignore"):
         ring = Ring(Case(c))
-        boxes = [((), -c.evidence.root, c.evidence.root.copy())]
-        for _ in range(depth):
-            if not boxes or len(axes) + len(boxes) > max_leaves:
-                break
-            lows, highs = (np.stack([box[k] for box in boxes], 1) for k in (1, 2))
-            good = passes(ring, lows, highs)
-            halves = []
-            for (path, lo, hi), done in zip(boxes, good, strict=True):
-                if not done:
-                    axis = axes[path] = int(np.argmax((hi - lo) / c.evidence.root))
-                    middle = 0.5 * lo[axis] + 0.5 * hi[axis]
-                    left, right = hi.copy(), lo.copy()
-                    left[axis] = right[axis] = middle
-                    halves += [((*path, 0), lo, left), ((*path, 1), right, hi)]
-            boxes = halves
+        return with_tree(data, halved(c.evidence.root, lambda *box: passes(ring, *box), max_leaves, depth))
+
+
+def halved(root: Any, holds: Callable[..., np.ndarray], max_leaves: int, depth: int, lowest: Any = None) -> bytes:
+    """A tree of the box from `lowest`, which is -root unless it is given, to `root`: boxes of which `holds`, for
+    corners (n, B), does not say so are halved on their widest axis."""
+    root = np.asarray(root)
+    lowest = -root if lowest is None else np.asarray(lowest)
+    widths = np.where(root > lowest, root - lowest, np.inf)
+    axes: dict[tuple[int, ...], int] = {}  # path from the root (0 lower, 1 upper) -> axis of the split
+    boxes = [((), lowest.copy(), root.copy())]
+    for _ in range(depth):
+        if not boxes or len(axes) + len(boxes) > max_leaves:
+            break
+        lows, highs = (np.stack([box[k] for box in boxes], 1) for k in (1, 2))
+        halves = []
+        for (path, lo, hi), done in zip(boxes, holds(lows, highs), strict=True):
+            if not done and np.isfinite(widths).any():
+                axis = axes[path] = int(np.argmax((hi - lo) / widths))
+                middle = 0.5 * lo[axis] + 0.5 * hi[axis]
+                left, right = hi.copy(), lo.copy()
+                left[axis] = right[axis] = middle
+                halves += [((*path, 0), lo, left), ((*path, 1), right, hi)]
+        boxes = halves
     tree, stack = bytearray(), [()]
     while stack:
         path = stack.pop()
         tree.append(axes.get(path, LEAF))
         if path in axes:
             stack += [(*path, 1), (*path, 0)]
-    return with_tree(data, bytes(tree))
+    return bytes(tree)
 
 
-def passes(ring: Ring, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
+def passes(boxes: Ring | Beyond, lo: np.ndarray, hi: np.ndarray) -> np.ndarray:
     """The rules for a leaf, box by box, lo and hi (n, B)."""
-    leaves = ring.examine(0, lo, hi)
+    leaves = boxes.examine(0, lo, hi)
     good = np.ones(lo.shape[1], dtype=bool)
     good[leaves.numbers] = leaves.hold
-    if not ring.case.bounded:
-        for bounds, mid, reach in zip(ring.c.input_bounds, leaves.mid, leaves.reach, strict=True):
+    if not boxes.case.bounded:
+        for bounds, mid, reach in zip(boxes.c.input_bounds, leaves.mid, leaves.reach, strict=True):
             good[leaves.numbers] &= within(bounds, mid, reach)
     return good
 

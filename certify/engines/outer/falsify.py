@@ -22,7 +22,8 @@ from certify.policies import bounded_by_form
 from certify.systems import System
 
 Array = NDArray[np.float64]
-_SAMPLES, _CLIMBERS, _FEW = 65_536, 1024, 192
+_SAMPLES, _CLIMBERS, _FEW = 65_536, 512, 128
+_ON_A_FACE, _FEW_THERE = 4096, 32
 _CLIMB, _DESCENT = 40, 80  # steps
 _APART = 1e-6  # of the domain, between the points of a difference
 _PUSH = 0.05  # away from the edge of what violates, beside a step along it
@@ -43,7 +44,7 @@ class Rise:
         names = ", ".join(f"{s} = {v:.6g}" for s, v in zip(system.states, self.x, strict=True))
         names += "".join(f", {name} = {float(q):.6g}" for name, q in self.values.items())
         what = "the input leaves its bounds" if self.kind == "input" else "N does not fall"
-        return f"{what} at {names} with N = {self.level:.6g} (sampled)"
+        return f"{what} at {names} with N = {self.level:.6g}"
 
 
 class Falsifier:
@@ -158,9 +159,9 @@ class Falsifier:
         least = np.inf
         for axis in range(self.system.n):
             for end in (self.low, self.high):
-                x = generator.uniform(self.low, self.high, (4096, self.system.n))
+                x = generator.uniform(self.low, self.high, (_ON_A_FACE, self.system.n))
                 x[:, axis] = end[axis]
-                x = x[np.argsort(self.N(x), kind="stable")[:_FEW]]
+                x = x[np.argsort(self.N(x), kind="stable")[:_FEW_THERE]]
                 level, step = self.N(x), np.full(len(x), 0.05)
                 for _ in range(_DESCENT):
                     way = -self.N.gradient(x) * self.half

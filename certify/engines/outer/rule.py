@@ -114,15 +114,14 @@ class FallBound:
         return inside
 
     def _judge(self, x: Tensor, error: Tensor, centre: Tensor, radius: Tensor, level: float) -> OuterBounds:
-        known = self.N(x, error)
-        lowest = -upper_bound(_negative(known.value))[0]
-        lowest = torch.where(torch.isnan(lowest), -torch.inf, lowest)
+        lowest, index, known = least_value(self.N, x, error, level)
         proved = lowest > level
         bound = torch.full_like(lowest, -torch.inf)
         score, violated = radius.clone(), torch.full_like(lowest, torch.inf)
-        index = torch.nonzero(~proved)[:, 0]
-        if len(index):
-            here = self._falls(known, index, x[:, :, index], error[:, index], centre[:, index], radius[:, index], level)
+        left = torch.nonzero(~proved[index])[:, 0]
+        if known is not None and len(left):
+            index = index[left]
+            here = self._falls(known, left, x[:, :, index], error[:, index], centre[:, index], radius[:, index], level)
             proved[index], bound[index], score[:, index], violated[index] = here
         return OuterBounds(proved, bound, score, lowest, violated)
 
@@ -153,8 +152,8 @@ class FallBound:
         # What the inputs' errors add is charged to the axes that spread the policy, and what is left to those of N.
         score = excess[:n] + share * excess[n:].sum(0) + spread * fall.r
         smooth = torch.isfinite(bound)
-        for f in F:  # a component that is multiplied by 0 must be enclosed as well
-            smooth = smooth & torch.isfinite(f.r)
+        for model in (N, *F):  # a component that is multiplied by 0 must be enclosed as well
+            smooth = smooth & torch.isfinite(sum(model.norms()) + model.r)
         bound = self._where_asked(bound, fall, N, centre, radius, level)
         bound = torch.where(smooth, bound, torch.inf)
         proved = bound < 0
@@ -209,13 +208,30 @@ class FaceBound:
         radius = torch.maximum(hi - centre, centre - lo) * (1 + EPS)
         centre[self.axis], radius[self.axis] = self.end, 0.0
         error = EPS * (centre.abs() + radius) + TINY
-        value = self.N(torch.cat([centre[:, None], torch.diag_embed(radius.T).permute(1, 2, 0)], 1), error).value
-        highest, score = upper_bound(_negative(value))
-        lowest = torch.where(torch.isnan(highest), -torch.inf, -highest)
-        score = torch.where(torch.isfinite(score), score, radius)
+        x = torch.cat([centre[:, None], torch.diag_embed(radius.T).permute(1, 2, 0)], 1)
+        lowest, index, known = least_value(self.N, x, error, level)
+        score, violated = radius.clone(), torch.full_like(lowest, torch.inf)
+        if known is not None:
+            excess = upper_bound(_negative(known.value))[1] + known.share * known.value.r
+            score[:, index] = torch.where(torch.isfinite(excess), excess, radius[:, index])
+            violated[index] = torch.where(known.value.c <= level, known.value.c, torch.inf)
         score[self.axis] = -torch.inf
-        violated = torch.where(value.c <= level, value.c, torch.inf)
         return OuterBounds(lowest > level, level - lowest, score, lowest, violated)
+
+
+def least_value(
+    N: NeuralEnclosure | SymbolicEnclosure, x: Tensor, error: Tensor, level: float
+) -> tuple[Tensor, Tensor, NeuralModels | SymbolicModels | None]:
+    """A lower bound of N on boxes (B,), and its models on those, by their indices, that a first one leaves."""
+    lowest = N.least(x, error, level)
+    index = torch.nonzero(~(lowest > level))[:, 0]
+    if not len(index):
+        return lowest, index, None
+    whole = len(index) == len(lowest)
+    known = N(x if whole else x[:, :, index], error if whole else error[:, index])
+    by_model = -upper_bound(_negative(known.value))[0]
+    by_model = torch.where(torch.isfinite(by_model), by_model, -torch.inf)
+    return lowest.index_put((index,), torch.maximum(lowest[index], by_model)), index, known
 
 
 def _pieces(count: int, most: int) -> int:
