@@ -11,6 +11,7 @@ shows it first. The last section disables one rule at a time and shows that some
 
 from __future__ import annotations
 
+import base64
 import json
 import re
 from collections.abc import Callable
@@ -37,6 +38,7 @@ from certify.checker.exact import raw_at_origin
 from certify.checker.float64 import within
 from certify.checker.ring import Ring, is_partition
 from certify.checker.rules import Tally
+from tests.support import outer_loops
 from tests.support.ablation import checker_without
 from tests.support.balls import enlarge, with_ball
 from tests.support.certificates import (
@@ -151,12 +153,15 @@ def honest(name: str) -> Document:
     return grow(HONEST[name]())
 
 
+OUTER = ("outer, an expression", "outer, a network")
 HONEST: dict[str, Callable[[], Document]] = {
     "scalar": scalar_claim,
     "scalar, no centring": lambda: scalar_claim(bias=0.0, centre="none"),
     "linear": linear_claim,
     "sampled": sampled_claim,
     "nearby": nearby_claim,
+    "outer, an expression": lambda: outer_loops.base("square"),
+    "outer, a network": lambda: outer_loops.base("walls"),
     "local only": lambda: linear_claim(3.0, 3.0),
     "rotor": rotor_claim,
     "rotor, preactivation": lambda: rotor_claim(c2=0.2, centre="preactivation"),
@@ -177,7 +182,7 @@ def test_honest_certificates_are_accepted(name: str) -> None:
     assert (tally.local_margin is None) if name.startswith(("practical", "nearby")) else 0 < tally.local_margin <= 1
     if name == "scalar":  # bounded by form: no leaf is asked for its inputs
         assert tally.rules["inputs"] == 1
-    if name == "local only":
+    if name in ("local only", *OUTER):
         assert tally.rules["ring"] == 0 and tally.ring_margin is None
     else:
         assert tally.rules["ring"] > 0 and tally.ring_margin is not None and tally.ring_margin > 0
@@ -359,6 +364,26 @@ MUTANTS: list[tuple[str, str, str, Edit]] = [  # rule, base, what, edit
     ("contraction", "nearby", "a weight below 0", array("evidence.contraction.weights", lambda a: -a)),
     ("contraction", "nearby", "a weight that takes all", array("evidence.contraction.weights", lambda a: a + 1)),
     ("contraction", "nearby", "a ball where it rises", lambda d: grow(edited(d, "plant.dynamics.0.3.1", "9"))),
+    ("format", "outer, an expression", "evidence without a claim", at("claim.outer", None)),
+    ("format", "scalar", "a function in words", at("claim.outer", "null")),
+    ("format", "scalar", "a partition in words", at("evidence.outer", "null")),
+    ("format", "scalar", "a claim without evidence", lambda d: edited(
+        d, "claim.outer", outer_loops.base("square")["claim"]["outer"])),
+    ("format", "scalar", "evidence of what is not claimed", lambda d: edited(
+        d, "evidence.outer", outer_loops.base("square")["evidence"]["outer"])),
+    ("format", "outer, an expression", "kind of a function", at("claim.outer.kind", "network")),
+    ("format", "outer, a network", "shape of a layer", at("claim.outer.layers.1.shape", [2, 6])),
+    ("faces", "outer, an expression", "level", at("claim.outer.level", (9.5).hex())),
+    ("faces", "outer, an expression", "another function", at("claim.outer.expression", ["sin", "x"])),
+    ("faces", "outer, a network", "weights", array("claim.outer.layers.0.weight", lambda a: a / 8)),
+    ("faces", "outer, a network", "bias", array("claim.outer.layers.1.bias", lambda a: a - 1)),
+    ("faces", "outer, a network", "a leaf for a face", at(
+        "evidence.outer.faces.0", base64.b64encode(bytes([LEAF])).decode())),
+    ("outer", "outer, an expression", "level of what is at rest", at("claim.outer.level", (3.7).hex())),
+    ("outer", "outer, a network", "T", array("evidence.outer.T", lambda a: a / 2)),
+    ("outer", "outer, a network", "root", array("evidence.outer.root", lambda a: a * 0.999)),
+    ("outer", "outer, a network", "a leaf for the tree", at(
+        "evidence.outer.tree", base64.b64encode(bytes([LEAF])).decode())),
     ("flow", "sampled", "held for so long that nothing is known", at("claim.sample", ["1/16", "9"])),
     ("format", "scalar", "the schema of version 5", at("schema", "certify-certificate/5")),
     ("format", "scalar", "J of another size", array("evidence.local.J", lambda a: np.ones(4))),
@@ -551,12 +576,12 @@ def test_every_field_and_every_rule_has_a_mutant() -> None:
     format_page = (Path(certify.checker.__file__).parent / "FORMAT.md").read_text()
     table = format_page.split("| rule | inequality | gives |")[1].split("\n\n")[0]
     documented = {name for row in table.splitlines()[2:] for name in re.findall(r"`(\w+)`", row.split("|")[1])}
-    assert len(documented) == 16 and {rule for rule, *_ in MUTANTS} == documented
+    assert len(documented) == 18 and {rule for rule, *_ in MUTANTS} == documented
     touched = set()
     for _, base, _, edit in MUTANTS:
         before, after = dict(leaves_of(honest(base))), dict(leaves_of(edit(honest(base))))
         touched |= {general(path) for path in before.keys() | after.keys() if before.get(path) != after.get(path)}
-    fields = {general(path) for base in ("rotor", "enlarged") for path, _ in leaves_of(honest(base))}
+    fields = {general(path) for base in ("rotor", "enlarged", *OUTER) for path, _ in leaves_of(honest(base))}
     fields |= {"evidence.contraction.J", "evidence.contraction.weights"}
     assert fields - touched == {"provenance.tool"}
 
@@ -852,6 +877,8 @@ ABLATED: dict[str, Callable[[], Document]] = {
     "inputs": lambda: at("plant.input_bounds", [["-9/10", "1"]])(honest("scalar")),
     "flow": held_too_long,
     "contraction": lambda: grow(nearby_claim("9")),
+    "faces": lambda: outer_loops.up_to_a_face("1").beyond(0.2),
+    "outer": lambda: outer_loops.of_shape("x^2").beyond(0.02),
 }
 
 

@@ -81,6 +81,7 @@ def test_blends_lie_between() -> None:
         assert ends[0] <= one.P[0, 0] <= ends[1] and "a with" in one.name and one.name.endswith("of b")
 
 
+@pytest.mark.slow
 def test_several_are_tried_and_the_largest_proved_volume_counts(tmp_path: Path) -> None:
     """With Q = I a violation comes far earlier than with the LQR cost, and with the optimised P later still."""
     policy = load_policy(SHIPPED / "cartpole.pt")

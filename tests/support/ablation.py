@@ -34,7 +34,10 @@ def checker_without(rule: str, folder: Path) -> Iterator[ModuleType]:
         for module in ("case", "document", "exact", "rules", "strict"):
             importlib.import_module(f"{name}.{module}")
         removed = 0
-        for table in ("STATED", "ON_THE_BALL", "OF_THE_TREE", "ON_LEAVES", "OF_THE_TUBE", "ON_SLABS", "OF_CONTRACTION"):
+        for table in (
+            "STATED", "ON_THE_BALL", "OF_THE_TREE", "ON_LEAVES", "OF_THE_TUBE", "ON_SLABS", "OF_CONTRACTION",
+            "OF_OUTER", "ON_OUTER_LEAVES",
+        ):  # fmt: skip
             rows = getattr(package.rules, table)
             kept = tuple(row for row in rows if row[0] != rule)
             setattr(package.rules, table, kept)

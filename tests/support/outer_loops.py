@@ -385,7 +385,7 @@ def families() -> Iterator[Family]:
     for centre, c, scale in ((2.0, 0.5, 1.0), (1.0, 0.5, 0.5), (4.0, 0.4, 2.0), (0.5, 0.75, 1.0)):
         yield of_wells(centre, c, scale)
     yield from map(up_to_a_face, ("1", "4/3", "5/7", "3/2", "10/3"))
-    yield from map(by_gain, (1.0, 2.0, 4.0))
+    yield from map(by_gain, (1.0, 1.5, 2.0))
     yield from map(by_range, (2, 3, 5))
     yield from (by_bound(1), by_bound(-1), by_clip(1.0), by_clip(3.0), by_disturbance())
     yield from (linear_beyond(1.0), linear_beyond(2.0), linear_to_a_face(0.5), linear_to_a_face(2.0))
