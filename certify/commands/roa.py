@@ -59,7 +59,7 @@ def roa(
         str,
         typer.Option(
             help="Lyapunov candidate: auto (of all, the largest proved), lyapunov, scaled, lqr, optimised, robust, "
-            "peak (practical claims, a small floor), neural or polynomial (auto, and a function that is learned for a set "
+            "peak (practical claims, a small floor), neural or polynomial (auto, and a function learned for a set "
             "beyond its ellipsoid)."
         ),
     ] = "auto",
