@@ -21,6 +21,7 @@ from certify.lyapunov.level_sets import (
 from certify.lyapunov.neural import Neural
 from certify.lyapunov.optimised import optimise_candidate, optimise_repeatedly
 from certify.lyapunov.polynomial import Polynomial
+from certify.lyapunov.sampled import sampled_volume
 from certify.lyapunov.symbolic import Symbolic, of_polynomial
 
 __all__ = [
@@ -48,6 +49,7 @@ __all__ = [
     "of_polynomial",
     "optimise_candidate",
     "optimise_repeatedly",
+    "sampled_volume",
     "save_lyapunov",
     "semi_axes",
     "slowest_decay",
