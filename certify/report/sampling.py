@@ -27,6 +27,7 @@ from certify.systems.ode import eigenvalues_of, rk4_step
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Field = Callable[[Array], Array]
+Holds = Callable[[Array], Mask]
 SETTLED = 1e-3
 """A run has settled when V is at most this share of the certified level: a thirtieth of the set's radius."""
 _STEP = 1.0  # of the time constant of the fastest eigenvalue
@@ -245,17 +246,18 @@ class Runs:
 
 def runs_of(flow: Flow, starts: Array, P: Array, level: float, target: float, step: float, steps: int,
             deadline: float = math.inf, start: Array | None = None,
-            centre: Array | None = None) -> Runs:  # fmt: skip
+            centre: Array | None = None, beyond: Holds | None = None) -> Runs:  # fmt: skip
     """Simulate and tell the fates.
 
     A run settles if it comes to `V <= target`, and leaves if it leaves the domain, or rises well above `level` from a
-    start below it. Runs from below the level, or from a tube's `start` {(x - c)'P(x - c) <= 1}, c = `centre` or 0, that
-    seem to leave are simulated again in much smaller steps: the first suspect is the integration.
+    start below it. Runs from below the level, or from a tube's `start` {(x - c)'P(x - c) <= 1}, c = `centre` or 0, or
+    from a set `beyond`, that seem to leave are simulated again in much smaller steps: the first suspect is the
+    integration.
     """
     path, apart = simulate(flow, starts, step, steps, deadline), flow.steps_between(step)
     begins = quadratic(P, path[0]) <= level
     settled, left = _fates(path, begins, P, level, target, apart)
-    suspects = np.flatnonzero(left & _in_sets(path[0], P, level, start, centre))
+    suspects = np.flatnonzero(left & _in_sets(path[0], P, level, start, centre, beyond))
     if suspects.size and not flow.discrete and time.monotonic() < deadline:
         finer = simulate(flow, path[0, suspects], step / _FINER, _FINER * (len(path) - 1), deadline)[::_FINER]
         if len(finer) == len(path):
@@ -264,9 +266,11 @@ def runs_of(flow: Flow, starts: Array, P: Array, level: float, target: float, st
     return Runs(path, step, settled, left)
 
 
-def _in_sets(x: Array, P: Array, level: float, start: Array | None, centre: Array | None) -> Mask:
-    """Which states (N, n) lie in {V <= level}, or in a tube's start if there is one, around `centre` or 0."""
+def _in_sets(x: Array, P: Array, level: float, start: Array | None, centre: Array | None, beyond: Holds | None) -> Mask:
+    """Which states (N, n) lie in {V <= level}, in a tube's start if there is one, around `centre` or 0, or `beyond`."""
     inside = quadratic(P, x) <= level
+    if beyond is not None:
+        inside |= beyond(x)
     return inside if start is None else inside | (quadratic(start, x if centre is None else x - centre) <= 1.0)
 
 
@@ -292,6 +296,7 @@ def simulated_roa_fraction(
     deadline: float = math.inf,
     start: Array | None = None,
     centre: Array | None = None,
+    beyond: Holds | None = None,
 ) -> SimulatedRoa:
     """Simulate the closed loop from a grid over the domain and compare with `{x'Px <= level}`.
 
@@ -308,6 +313,7 @@ def simulated_roa_fraction(
     deadline : a reading of `time.monotonic` at which the simulation ends wherever it is.
     start, centre : (n, n) and (n,), of the ellipsoid {(x - c)'P(x - c) <= 1} that belongs to the certified set too,
         where a tube leads from it; c = 0 without a centre.
+    beyond : which states (N, n) of the domain belong to it besides, (N,).
 
     Raises
     ------
@@ -326,7 +332,7 @@ def simulated_roa_fraction(
     centres = (np.arange(points) + 0.5) / points
     axes = tuple(a + (b - a) * centres for a, b in zip(flow.lo, flow.hi, strict=True))
     x = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, system.n)
-    certified = _in_sets(x, P, level, start, centre)
+    certified = _in_sets(x, P, level, start, centre, beyond)
     target = SETTLED * level if settled is None else settled
     attracted, left, reached = _run(flow, x, P, target, step, horizon, deadline)
     suspects = np.flatnonzero(certified & left)
