@@ -150,7 +150,7 @@ def _text(learned: Learned, area: float, out: Path, command: str) -> str:
     return "\n".join([
         f"ellipsoid  of the volume {area:.6g}, proved",
         f"learned    {words}, in {len(learned.history)} rounds, {last.seconds:.0f} s",
-        f"sampled    {{N <= {learned.level:.6g}}} with the ellipsoid holds {learned.cover:.1%} of what converges in the domain",
+        f"sampled    {{N <= {learned.level:.6g}}} with the ellipsoid holds {learned.cover:.1%} of what converges",
         "           nothing is proved of N yet",
         f"written    {out}",
         f"next       {command}",

@@ -61,7 +61,6 @@ _STAGES = {
     "tube": "looking for a tube",
     "learn": "learning beyond the ellipsoid",
     "outer": "proving beyond the ellipsoid",
-    "learn": "learning a function",
     "check": "checking",
 }
 
