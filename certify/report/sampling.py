@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from certify.errors import InputError
 from certify.policies import TanhNetwork
 from certify.systems import System
-from certify.systems.ode import rk4_step
+from certify.systems.ode import eigenvalues_of, rk4_step
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -175,7 +175,7 @@ def time_scales(flow: Flow, samples: int = _RATE_SAMPLES, reach: Array | None = 
     """
     lo, hi = (flow.lo, flow.hi) if reach is None else (np.maximum(flow.lo, -reach), np.minimum(flow.hi, reach))
     x = np.random.default_rng(0).uniform(lo, hi, (samples, len(lo)))
-    rates = _eigenvalues(flow, np.concatenate([np.zeros((1, len(flow.lo))), x]))
+    rates = eigenvalues_of(flow.field, np.concatenate([np.zeros((1, len(flow.lo))), x]), flow.hi - flow.lo)
     if flow.discrete:
         with np.errstate(divide="ignore"):
             slowest = -float(np.max(np.log(np.abs(rates[:1])), initial=-math.inf))
@@ -184,16 +184,6 @@ def time_scales(flow: Flow, samples: int = _RATE_SAMPLES, reach: Array | None = 
     slowest = float(np.min(np.abs(rates[:1].real), initial=math.inf))
     step = _STEP / fastest if fastest > 0 else 1.0
     return step, min(_HORIZON / slowest if slowest > 0 else math.inf, _MAX_STEPS * flow.fitting(step))
-
-
-def _eigenvalues(flow: Flow, x: Array) -> NDArray[np.complex128]:
-    """Eigenvalues of the Jacobians (central differences) at states (N, n), without those states that have none."""
-    delta = 1e-5 * (flow.hi - flow.lo)
-    shifted = x[:, None, None, :] + np.array([1.0, -1.0])[:, None, None] * np.diag(delta)
-    with np.errstate(all="ignore"):
-        F = flow.field(shifted)
-        J = (F[:, 0] - F[:, 1]) / (2 * delta)[:, None]  # transposed; the eigenvalues are the same
-    return np.asarray(np.linalg.eigvals(J[np.all(np.isfinite(J), axis=(1, 2))]), dtype=np.complex128)
 
 
 def simulate(flow: Flow, starts: Array, step: float, steps: int, deadline: float = math.inf) -> Array:

@@ -6,6 +6,7 @@ the other. Neither remedy starts anew: the tree stays, with one leaf more finely
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -28,23 +29,27 @@ def split_again(problem: Problem, evidence: PartitionTree, claim: Claim, leaf: i
     """The tree with the leaf of this number, counted in preorder, cut into eight along the axes that matter most."""
     lo, hi = leaves(evidence.tree, evidence.root)
     rule = VdotBound(problem, evidence.T, torch.device("cpu"), order=evidence.order)
-    nodes = np.frombuffer(evidence.tree, dtype=np.uint8)
-    at = int(np.flatnonzero(nodes == LEAF)[leaf])
-    lower, upper = (torch.tensor(corner[leaf][:, None]) for corner in (lo, hi))
-    subtree = _cut(rule, lower, upper, claim, _DEPTH)
-    return replace(evidence, tree=evidence.tree[:at] + subtree + evidence.tree[at + 1 :])
+    tree = cut_leaf(evidence.tree, leaf, lo[leaf], hi[leaf], lambda a, b: rule(a, b, claim.inner, claim.roa).score)
+    return replace(evidence, tree=tree)
 
 
-def _cut(rule: VdotBound, lo: Tensor, hi: Tensor, claim: Claim, depth: int) -> bytes:
+def cut_leaf(tree: bytes, leaf: int, lo: Array, hi: Array, score: Callable[[Tensor, Tensor], Tensor]) -> bytes:
+    """The tree with this leaf, of corners (n,), cut into eight, along the axes of the highest score (n, 1)."""
+    at = int(np.flatnonzero(np.frombuffer(tree, dtype=np.uint8) == LEAF)[leaf])
+    lower, upper = (torch.tensor(corner[:, None]) for corner in (lo, hi))
+    return tree[:at] + _cut(score, lower, upper, _DEPTH) + tree[at + 1 :]
+
+
+def _cut(score: Callable[[Tensor, Tensor], Tensor], lo: Tensor, hi: Tensor, depth: int) -> bytes:
     """A box (n, 1) as a subtree of this depth."""
-    axis = int(rule(lo, hi, claim.inner, claim.roa).score[:, 0].argmax())
+    axis = int(score(lo, hi)[:, 0].argmax())
     middle = 0.5 * lo[axis] + 0.5 * hi[axis]
     if depth == 0 or not bool(lo[axis] < middle) or not bool(middle < hi[axis]):
         return bytes([LEAF])
     lower_hi, upper_lo = hi.clone(), lo.clone()
     lower_hi[axis] = upper_lo[axis] = middle
     halves = ((lo, lower_hi), (upper_lo, hi))
-    return bytes([axis]) + b"".join(_cut(rule, low, high, claim, depth - 1) for low, high in halves)
+    return bytes([axis]) + b"".join(_cut(score, low, high, depth - 1) for low, high in halves)
 
 
 def below_leaf(problem: Problem, evidence: PartitionTree, leaf: int) -> float:

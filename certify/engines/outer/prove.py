@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass, replace
+from fractions import Fraction
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +24,7 @@ from certify.errors import InputError
 from certify.lyapunov.neural import Neural
 from certify.lyapunov.symbolic import Symbolic
 from certify.running import Runner
+from certify.systems import System
 from certify.verdict import Stop
 
 Array = NDArray[np.float64]
@@ -145,21 +147,25 @@ def root_around(problem: Problem, T: Array) -> Array:
     return np.asarray(np.abs(inverse) @ widest * (1 + doubt))
 
 
+def face_box(system: System, axis: int, side: int) -> tuple[Array, Array]:
+    """Corners (n,) of a box around the lower (side 0) or the upper end of a state, in binary64 numbers."""
+    lo = np.array([_outwards(float(low), low, -math.inf) for low, _ in system.domain])
+    hi = np.array([_outwards(float(high), high, math.inf) for _, high in system.domain])
+    lo[axis] = hi[axis] = float(system.domain[axis][side])
+    return lo, hi
+
+
 def _faces(
     problem: Problem, function: Neural | Symbolic, level: float, floor: float, budget: Budget, runner: Runner
 ) -> tuple[int, tuple[bytes, ...], float, Stop] | None:
     """Boxes, trees of all faces, the level below which N is on none of them, and what limits it."""
     system, start = problem.loop.system, time.monotonic()
-    lower = np.array([_outwards(float(lo), lo, -math.inf) for lo, _ in system.domain])
-    upper = np.array([_outwards(float(hi), hi, math.inf) for _, hi in system.domain])
     trees: list[bytes] = []
     boxes, stop = 0, Stop.DOMAIN
     for axis in range(system.n):
         for side in range(2):
-            end = float(system.domain[axis][side])
-            lo, hi = lower.copy(), upper.copy()
-            lo[axis] = hi[axis] = end
             rule = FaceBound(system, axis, side, function, runner.device)
+            lo, hi = face_box(system, axis, side)
             cover = Cover(rule, lo, hi, runner, level, floor, _BESIDE_FACE * (level - floor))
             left = (budget.seconds - (time.monotonic() - start)) / (2 * system.n - len(trees))
             ended = cover.advance(replace(budget, seconds=left, check=0.0))
@@ -172,9 +178,9 @@ def _faces(
     return boxes, tuple(trees), level, stop
 
 
-def _outwards(value: float, exact: object, towards: float) -> float:
+def _outwards(value: float, exact: Fraction, towards: float) -> float:
     """The binary64 number next to an exact one, on the side of `towards`."""
-    beyond = value > exact if towards < 0 else value < exact  # type: ignore[operator]
+    beyond = value > exact if towards < 0 else value < exact
     return math.nextafter(value, towards) if beyond else value
 
 
