@@ -216,8 +216,12 @@ class Rule:
 
     def models(self, J: Array, level: float) -> list[Models]:
         """Of a step on a ball that holds {V <= level}, in each cell."""
-        reach = np.minimum(np.linalg.norm(J, axis=1), extents(self.problem.V.P, level) * _WIDER)
-        return self.steps.models(J, self.cells, reach)
+        return self.models_on(J[None], level)[0]
+
+    def models_on(self, balls: Array, level: float) -> list[list[Models]]:
+        """The same on each of several balls, (N, n, n); if one has no finite models, none has."""
+        reach = np.minimum(np.linalg.norm(balls, axis=2), extents(self.problem.V.P, level) * _WIDER)
+        return self.steps.models_on(balls, self.cells, reach)
 
     def _corners(self, level: float) -> list[Corner] | None:
         """The inequality at the corners of all cells; None where something has no finite model, or may leave its

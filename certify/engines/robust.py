@@ -35,6 +35,7 @@ _WIDER, _NARROWER = 1.5, 0.5  # the next trust region, after a gain as foretold 
 _FORETOLD = 0.5  # of the gain that the program promises
 _WORTH = 0.005  # of the logarithm of a volume: less is no gain
 _DIFFERENCE = 1e-3
+_TOGETHER = 16  # balls that are looked at in one go
 _FAR = -1.0  # of a margin
 _AT_ONCE = 0.8  # of the time, for the loop whose input follows at once, where one is held
 _LEFT = 3e-3  # share of the decay that is to be left
@@ -155,12 +156,14 @@ def _linearised(known: Paths, P: Array, end: float) -> _Linearised | None:
         if not shown.margin > _FAR:
             return None
         roots = [np.linalg.inv(np.linalg.cholesky(corner.decay)) for corner in corners]
-        here, values = _asked(rule, J, np.zeros_like(P), shown.multipliers, roots), []
-        for X in _directions(len(P)):
+        changes = np.array([np.zeros_like(P), *(_DIFFERENCE * X for X in _directions(len(P)))])
+        values = list[Array]()
+        for start in range(0, len(changes), _TOGETHER):
             if time.perf_counter() > end:
                 return None
-            values.append(_asked(rule, J, _DIFFERENCE * X, shown.multipliers, roots))
-    slopes = (np.array(values) - here) / _DIFFERENCE
+            values += _asked(rule, J, changes[start : start + _TOGETHER], shown.multipliers, roots)
+    here = values[0]
+    slopes = (np.array(values[1:]) - here) / _DIFFERENCE
     half = [float(min(-lo, hi)) for lo, hi in known.loop.system.domain]
     room = np.append(models[0].inputs.room, half)
     return _Linearised(J, here, slopes, room) if np.all(np.isfinite(slopes)) else None
@@ -180,14 +183,17 @@ def _directions(n: int) -> list[Array]:
     return found
 
 
-def _asked(rule: Rule, J: Array, X: Array, multipliers: Multipliers, roots: Sequence[Array]) -> Array:
-    """What `_Linearised` has in a row, at 1 + X; `roots` are the inverses of the roots of the decays at X = 0."""
-    values, vectors = np.linalg.eigh(np.eye(len(J)) + X)
-    ball = J @ (vectors / np.sqrt(values)) @ vectors.T
-    models, inverse = rule.models(ball, 1.0), np.linalg.inv(J)
-    corners = _corners(rule, models, ball, rule.problem.V.P + inverse.T @ X @ inverse)
-    rests = rests_of(corners, multipliers)
-    left = [root @ (c.decay - rest) @ root.T for root, c, rest in zip(roots, corners, rests, strict=True)]
-    inputs = models[0].inputs
-    moved = np.linalg.norm(inputs.A, axis=1) + inputs.curve
-    return np.concatenate([np.ravel(left), moved, np.linalg.norm(ball, axis=1)])
+def _asked(rule: Rule, J: Array, changes: Array, multipliers: Multipliers, roots: Sequence[Array]) -> list[Array]:
+    """What `_Linearised` has in a row, at 1 + X for each X of `changes`, (N, n, n); `roots` are the inverses of the
+    roots of the decays at X = 0."""
+    values, vectors = np.linalg.eigh(np.eye(len(J)) + changes)
+    balls = J @ (vectors / np.sqrt(values)[:, None]) @ np.swapaxes(vectors, 1, 2)
+    inverse, found = np.linalg.inv(J), []
+    for ball, X, models in zip(balls, changes, rule.models_on(balls, 1.0), strict=True):
+        corners = _corners(rule, models, ball, rule.problem.V.P + inverse.T @ X @ inverse)
+        rests = rests_of(corners, multipliers)
+        left = [root @ (c.decay - rest) @ root.T for root, c, rest in zip(roots, corners, rests, strict=True)]
+        inputs = models[0].inputs
+        moved = np.linalg.norm(inputs.A, axis=1) + inputs.curve
+        found.append(np.concatenate([np.ravel(left), moved, np.linalg.norm(ball, axis=1)]))
+    return found
