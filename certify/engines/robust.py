@@ -35,6 +35,7 @@ _WIDER, _NARROWER = 1.5, 0.5  # the next trust region, after a gain as foretold 
 _FORETOLD = 0.5  # of the gain that the program promises
 _WORTH = 0.005  # of the logarithm of a volume: less is no gain
 _DIFFERENCE = 1e-3
+_AS_ASKED = 1.05  # a level above which there is little hope, where 1 was asked for
 _TOGETHER = 16  # balls that are looked at in one go
 _FAR = -1.0  # of a margin
 _AT_ONCE = 0.8  # of the time, for the loop whose input follows at once, where one is held
@@ -70,7 +71,7 @@ def robust_candidate(loop: ClosedLoop, seconds: float = math.inf) -> Array:
         if about is None:
             break
         asked = about.largest(trust)
-        found = None if asked is None else _scaled(known, asked, end)
+        found = None if asked is None else _scaled(known, asked, end, best)
         gain = -math.inf if found is None else _log_volume(found) - _log_volume(best)
         as_foretold = asked is not None and gain > _FORETOLD * (_log_volume(asked) - _log_volume(best))
         trust = min(_WIDER * trust, _MOST_TRUST) if as_foretold else _NARROWER * trust
@@ -83,12 +84,16 @@ def _log_volume(P: Array) -> float:
     return math.log(volume(P, 1.0))
 
 
-def _scaled(known: Paths, P: Array, until: float = math.inf) -> Array | None:
-    """P over the largest level that the local rule proves with it; None if there is none."""
+def _scaled(known: Paths, P: Array, until: float = math.inf, best: Array | None = None) -> Array | None:
+    """P over the largest level that the local rule proves with it; None if there is none, or none with a set that is
+    larger than that of `best`, when the level should be about 1."""
     if not np.linalg.eigvalsh(P)[0] > 0:
         return None
-    limit = domain_limit(P, known.loop.system.domain) * _BELOW
-    level = prove_local(*_problem(known, P), limit, known, until)
+    limit, between = domain_limit(P, known.loop.system.domain) * _BELOW, None
+    if best is not None:
+        least = math.exp(2 / len(P) * (_WORTH + _log_volume(best) - _log_volume(P)))
+        between = least, _AS_ASKED
+    level = prove_local(*_problem(known, P), limit, known, until, between)
     return None if level is None else P / level
 
 
