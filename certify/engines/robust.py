@@ -65,18 +65,22 @@ def robust_candidate(loop: ClosedLoop, seconds: float = math.inf) -> Array:
     proved = [P for P in starts if P is not None]
     if not proved:
         raise BackendError("the local rule proves nothing with the candidates that solve a Lyapunov equation")
-    best, trust, about = max(proved, key=_log_volume), _TRUST, None
+    best, trust, about, fresh = max(proved, key=_log_volume), _TRUST, None, True
     while trust > _LEAST_TRUST and time.perf_counter() < end:
-        about = about or _linearised(known, best, end)
+        if about is None:
+            about, fresh = _linearised(known, best, end), True
         if about is None:
             break
         asked = about.largest(trust)
         found = None if asked is None else _scaled(known, asked, end, best)
         gain = -math.inf if found is None else _log_volume(found) - _log_volume(best)
         as_foretold = asked is not None and gain > _FORETOLD * (_log_volume(asked) - _log_volume(best))
-        trust = min(_WIDER * trust, _MOST_TRUST) if as_foretold else _NARROWER * trust
+        if fresh:  # what older derivatives foretell says little of how far new ones reach
+            trust = min(_WIDER * trust, _MOST_TRUST) if as_foretold else _NARROWER * trust
         if found is not None and gain > _WORTH:
-            best, about = found, None
+            best, about, fresh = found, about.at(found) if as_foretold else None, False
+        elif not fresh:
+            about = None
     return best
 
 
@@ -104,47 +108,65 @@ def _problem(known: Paths, P: Array) -> tuple[Problem, Array]:
 
 @dataclass(frozen=True, slots=True)
 class _Linearised:
-    """The rule around {x'Px <= 1}, x = J d.
+    """The rule around {x'Px <= 1}, x = J d where X = 0.
 
-    A row holds what the decay leaves at each corner of what is uncertain, (n, n) each, relative to the decay at X = 0,
-    and how far inputs and states move, who have that `room`, (m + n,); `slopes` are its derivatives by the entries of X
-    on and above the diagonal.
+    A row holds what the decay leaves at each corner of what is uncertain, (n, n) each, between the `roots`, the
+    inverses of those of the decays at X = 0, and how far inputs and states move, who have that `room`, (m + n,): `here`
+    at this X. `slopes` are its derivatives at 0 by the entries of X on and above the diagonal.
     """
 
+    rule: Rule
     J: Array
+    roots: tuple[Array, ...]
+    X: Array
     here: Array
     slopes: Array
     room: Array
 
+    def at(self, P: Array) -> _Linearised | None:
+        """From P on, with the same derivatives, which cost much more than a row; None if the rule is far from
+        holding."""
+        X = self.J.T @ P @ self.J - np.eye(len(P))
+        X = (X + X.T) / 2
+        ball = _balls(self.J, X[None])[0]
+        with np.errstate(all="ignore"):
+            models = self.rule.models(ball, 1.0)
+            if not (models and all(one.finite for one in models)):
+                return None
+            corners = _corners(self.rule, models, ball, P)
+            shown = best_at(corners)
+            here = _row(models, corners, ball, shown.multipliers, self.roots) if shown.margin > _FAR else self.here
+        return replace(self, X=X, here=here) if shown.margin > _FAR and np.all(np.isfinite(here)) else None
+
     def largest(self, trust: float) -> Array | None:
-        """P (n, n) of the largest set with X between -trust and trust; None if there is none."""
+        """P (n, n) of the largest set with (1 + X) up to `trust` of itself from where it is; None if there is none."""
         try:
             import cvxpy
         except ImportError as error:
             raise BackendError(f"the candidate 'robust' needs cvxpy: {error}. Install it, or use another.") from error
 
-        n = len(self.J)
+        n, now = len(self.J), np.eye(len(self.J)) + self.X
         x = cvxpy.Variable(len(self.slopes))
-        X = cvxpy.reshape(np.reshape(_directions(n), (-1, n * n)).T @ x, (n, n), order="C")
+        change = cvxpy.reshape(np.reshape(_directions(n), (-1, n * n)).T @ x, (n, n), order="C")
         asked = self.here + self.slopes.T @ x
-        within = [X << trust * np.eye(n), X >> -trust * np.eye(n)]
+        within = [change << trust * now, change >> -trust * now]
         after = len(self.here) - len(self.room)
         for start in range(0, after, n * n):
             left = cvxpy.reshape(asked[start : start + n * n], (n, n), order="C")
             least = min(_LEFT, float(np.linalg.eigvalsh(self.here[start : start + n * n].reshape(n, n))[0]))
             within.append(left + left.T >> 2 * least * np.eye(n))
         within += [asked[after + j] <= _INSIDE * room for j, room in enumerate(self.room) if math.isfinite(room)]
-        problem = cvxpy.Problem(cvxpy.Minimize(cvxpy.trace(X)), within)
+        problem = cvxpy.Problem(cvxpy.Minimize(cvxpy.trace(np.linalg.inv(now) @ change)), within)
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # of a solution that may be inaccurate: the local rule judges it
                 problem.solve(solver=cvxpy.CLARABEL)
         except cvxpy.SolverError:
             return None
-        if X.value is None or not np.all(np.isfinite(X.value)):
+        if change.value is None or not np.all(np.isfinite(change.value)):
             return None
         inverse = np.linalg.inv(self.J)
-        found = inverse.T @ (np.eye(n) + X.value) @ inverse
+        found = inverse.T @ (now + change.value) @ inverse
         return np.asarray((found + found.T) / 2)
 
 
@@ -160,18 +182,22 @@ def _linearised(known: Paths, P: Array, end: float) -> _Linearised | None:
         shown = best_at(corners)
         if not shown.margin > _FAR:
             return None
-        roots = [np.linalg.inv(np.linalg.cholesky(corner.decay)) for corner in corners]
+        roots = tuple(np.linalg.inv(np.linalg.cholesky(corner.decay)) for corner in corners)
         changes = np.array([np.zeros_like(P), *(_DIFFERENCE * X for X in _directions(len(P)))])
-        values = list[Array]()
+        rows, inverse = list[Array](), np.linalg.inv(J)
         for start in range(0, len(changes), _TOGETHER):
             if time.perf_counter() > end:
                 return None
-            values += _asked(rule, J, changes[start : start + _TOGETHER], shown.multipliers, roots)
-    here = values[0]
-    slopes = (np.array(values[1:]) - here) / _DIFFERENCE
+            some = changes[start : start + _TOGETHER]
+            balls = _balls(J, some)
+            for X, ball, found in zip(some, balls, rule.models_on(balls, 1.0), strict=True):
+                corners = _corners(rule, found, ball, P + inverse.T @ X @ inverse)
+                rows.append(_row(found, corners, ball, shown.multipliers, roots))
+    here = rows[0]
+    slopes = (np.array(rows[1:]) - here) / _DIFFERENCE
     half = [float(min(-lo, hi)) for lo, hi in known.loop.system.domain]
     room = np.append(models[0].inputs.room, half)
-    return _Linearised(J, here, slopes, room) if np.all(np.isfinite(slopes)) else None
+    return _Linearised(rule, J, roots, changes[0], here, slopes, room) if np.all(np.isfinite(slopes)) else None
 
 
 def _corners(rule: Rule, models: Sequence[Models], J: Array, P: Array) -> list[Corner]:
@@ -188,17 +214,18 @@ def _directions(n: int) -> list[Array]:
     return found
 
 
-def _asked(rule: Rule, J: Array, changes: Array, multipliers: Multipliers, roots: Sequence[Array]) -> list[Array]:
-    """What `_Linearised` has in a row, at 1 + X for each X of `changes`, (N, n, n); `roots` are the inverses of the
-    roots of the decays at X = 0."""
+def _balls(J: Array, changes: Array) -> Array:
+    """Those of 1 + X for each X of `changes`, (N, n, n) both."""
     values, vectors = np.linalg.eigh(np.eye(len(J)) + changes)
-    balls = J @ (vectors / np.sqrt(values)[:, None]) @ np.swapaxes(vectors, 1, 2)
-    inverse, found = np.linalg.inv(J), []
-    for ball, X, models in zip(balls, changes, rule.models_on(balls, 1.0), strict=True):
-        corners = _corners(rule, models, ball, rule.problem.V.P + inverse.T @ X @ inverse)
-        rests = rests_of(corners, multipliers)
-        left = [root @ (c.decay - rest) @ root.T for root, c, rest in zip(roots, corners, rests, strict=True)]
-        inputs = models[0].inputs
-        moved = np.linalg.norm(inputs.A, axis=1) + inputs.curve
-        found.append(np.concatenate([np.ravel(left), moved, np.linalg.norm(ball, axis=1)]))
-    return found
+    return np.asarray(J @ (vectors / np.sqrt(values)[:, None]) @ np.swapaxes(vectors, 1, 2))
+
+
+def _row(
+    models: Sequence[Models], corners: Sequence[Corner], ball: Array, multipliers: Multipliers, roots: Sequence[Array]
+) -> Array:
+    """As `_Linearised` has it."""
+    rests = rests_of(corners, multipliers)
+    left = [root @ (c.decay - rest) @ root.T for root, c, rest in zip(roots, corners, rests, strict=True)]
+    inputs = models[0].inputs
+    moved = np.linalg.norm(inputs.A, axis=1) + inputs.curve
+    return np.concatenate([np.ravel(left), moved, np.linalg.norm(ball, axis=1)])
