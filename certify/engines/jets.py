@@ -157,8 +157,8 @@ def of_inputs(B: Array, errors: Array, like: Array) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class Jet:
-    """A value on N balls around the same middle: a is (N, k), Q, K and E are rows in their basis, B (1, m), and `errors`
-    the E of each e_j, m rows, in each those of the N balls one after the other."""
+    """A value on N balls around the same middle: a is (N, k), Q, K and E are rows in their basis, and B is (1, m).
+    `errors` has the E of each e_j: m rows, in each those of all balls one after the other."""
 
     c: float
     a: Array
@@ -196,7 +196,7 @@ class Jet:
         return Jet(x.c * y.c, x.c * y.a + y.c * x.a, Q, K, x.c * y.B + y.c * x.B, E, x.errors)
 
     def compose(self, f0: float, f1: float, f2: float, f3: float, fourth: Array) -> Jet:
-        """A function's value and derivatives at c, and at least |phi''''|/24 on the ranges, one for each or for all."""
+        """A function's value and derivatives at c, and at least |phi''''|/24 on each ball's range or on all."""
         a, Q, K = self.a, self.Q, self.K
         second, third = np.array([f2 / 2]), np.array([f3 / 6])
         squares = basis(a.shape[1]).square(a)

@@ -56,13 +56,11 @@ def robust_candidate(loop: ClosedLoop, seconds: float = math.inf) -> Array:
     BackendError : cvxpy is missing, or the local rule proves nothing with any candidate to begin with.
     InputError : the network is larger than the checker's local rule allows.
     """
-    end, known = time.perf_counter() + seconds, paths(loop)
-    solved = [choose_candidate(loop, name).P for name in SOLVED]
+    end, known, proved = time.perf_counter() + seconds, paths(loop), list[Array]()
     if loop.system.sample is not None:  # a period is short, and the rule without one is cheap
         at_once = replace(loop, system=loop.system.with_sample(None))
-        solved.append(robust_candidate(at_once, _AT_ONCE * (end - time.perf_counter())))
-    starts = [_scaled(known, P) for P in solved]
-    proved = [P for P in starts if P is not None]
+        proved = _all_scaled(known, [robust_candidate(at_once, _AT_ONCE * (end - time.perf_counter()))])
+    proved = proved or _all_scaled(known, [choose_candidate(loop, name).P for name in SOLVED])
     if not proved:
         raise BackendError("the local rule proves nothing with the candidates that solve a Lyapunov equation")
     best, trust, about, fresh = max(proved, key=_log_volume), _TRUST, None, True
@@ -86,6 +84,11 @@ def robust_candidate(loop: ClosedLoop, seconds: float = math.inf) -> Array:
 
 def _log_volume(P: Array) -> float:
     return math.log(volume(P, 1.0))
+
+
+def _all_scaled(known: Paths, candidates: Sequence[Array]) -> list[Array]:
+    """Those with which the local rule proves a level, over it."""
+    return [P for P in (_scaled(known, P) for P in candidates) if P is not None]
 
 
 def _scaled(known: Paths, P: Array, until: float = math.inf, best: Array | None = None) -> Array | None:
