@@ -63,20 +63,27 @@ def robust_candidate(loop: ClosedLoop, seconds: float = math.inf) -> Array:
     proved = proved or _all_scaled(known, [choose_candidate(loop, name).P for name in SOLVED])
     if not proved:
         raise BackendError("the local rule proves nothing with the candidates that solve a Lyapunov equation")
-    best, trust, about, fresh = max(proved, key=_log_volume), _TRUST, None, True
+    start = max(proved, key=_log_volume)
+    return max((_climbed(known, start, end, quick) for quick in (True, False)), key=_log_volume)
+
+
+def _climbed(known: Paths, best: Array, end: float, quick: bool) -> Array:
+    """From {x'Px <= 1}, P = `best`, on, as far as steps gain and time allows; `quick`: with old derivatives as long as
+    what they foretell comes, and levels about those that were asked for. Either way may end far below the other."""
+    trust, about, fresh = _TRUST, None, True
     while trust > _LEAST_TRUST and time.perf_counter() < end:
         if about is None:
             about, fresh = _linearised(known, best, end), True
         if about is None:
             break
         asked = about.largest(trust)
-        found = None if asked is None else _scaled(known, asked, end, best)
+        found = None if asked is None else _scaled(known, asked, end, best if quick else None)
         gain = -math.inf if found is None else _log_volume(found) - _log_volume(best)
         as_foretold = asked is not None and gain > _FORETOLD * (_log_volume(asked) - _log_volume(best))
         if fresh:  # what older derivatives foretell says little of how far new ones reach
             trust = min(_WIDER * trust, _MOST_TRUST) if as_foretold else _NARROWER * trust
         if found is not None and gain > _WORTH:
-            best, about, fresh = found, about.at(found) if as_foretold else None, False
+            best, about, fresh = found, about.at(found) if quick and as_foretold else None, False
         elif not fresh:
             about = None
     return best
