@@ -36,6 +36,7 @@ _BELOW = 1e-9  # relative distance from a limit that is itself out of reach (the
 _BELOW_WITNESS = 1e-3
 _SMALLEST = 1e-120  # of levels: squares of states and products of bounds must not underflow
 _BLENDS = (0.05, 0.15, 0.3)
+_MANY = 6  # states, beyond which there is next to nothing but the local set
 OPTIMISING = 0.2  # share of the time that the optimised candidate may take
 _FOR_PEAK = 0.4  # share of the time for a candidate that may be the only one
 _SAMPLES = 4000  # of a search for violations; the proof itself finds others
@@ -153,8 +154,9 @@ def robust(loop: ClosedLoop, options: RoaOptions) -> Trial | None:
 
 
 def _for_robust(loop: ClosedLoop, options: RoaOptions) -> float:
-    """Seconds; where an input is held, as many again as for the loop without a period, which comes first."""
-    return OPTIMISING * options.time_limit * (1 if loop.system.sample is None else 2)
+    """Seconds; where an input is held, in many states, as many again as for the loop without a period, which comes
+    first: there no ring can make up for what is left out."""
+    return OPTIMISING * options.time_limit * (2 if loop.system.sample is not None and loop.system.n > _MANY else 1)
 
 
 def peak(loop: ClosedLoop, options: RoaOptions) -> Trial | None:
