@@ -1,7 +1,9 @@
-"""Whether states lie in the set that a certificate proves, decided in rationals.
+"""Whether states lie in the set that a certificate proves, decided in rationals and, where N is asked, in balls.
 
 The set is {V <= c2}, and under a claim with a tube also the tube's start: ellipsoids, each of them
 convex. So a box of states lies in one of them exactly if its corners do, and the corners' values are rational numbers.
+Under a claim with an outer set {N <= n2} within the domain belongs to it too, which need not be convex: then a box is
+cut into pieces, until each of them lies in one of the sets or a state is found that lies in none.
 What is said here is about bytes that the checker has accepted; a file that it does not accept has no proved set.
 """
 
@@ -10,6 +12,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import tempfile
+from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from enum import Enum
@@ -24,17 +27,19 @@ from certify.certificate import Certificate, parse_certificate, read_raw, run_ch
 from certify.claims import CLAIMS, Enlarged, Reached
 from certify.errors import InputError
 from certify.lyapunov import are_inside
+from certify.sublevel import Sublevel
 from certify.systems import System
 
 Array = NDArray[np.float64]
 Box = tuple[tuple[Fraction, Fraction], ...]
 _CORNERS = 16  # 2 to the power of this many corners are looked at one by one
+_PIECES = 4096  # of a box, that are looked at
 
 
 class Containment(Enum):
     """Whether all states of a box lie in a proved set.
 
-    CONTAINED: all do. NOT_CONTAINED: a corner does not. UNDECIDED: neither was shown.
+    CONTAINED: all do. NOT_CONTAINED: a state of the box does not. UNDECIDED: neither was shown.
     """
 
     CONTAINED = "contained"
@@ -68,10 +73,15 @@ class Ellipsoid:
         """Whether each of the states lies in it."""
         return are_inside(self.P, self.level, points, self.centre)
 
+    def covers(self, box: Box) -> bool:
+        """Whether a bound of (x - c)'P(x - c) shows that all of a box lies in it."""
+        return _largest(self.P, self.around(box)) <= Fraction(float(self.level))
+
 
 @dataclass(frozen=True, slots=True)
 class Located:
-    """Where a box lies: `within` names the ellipsoid that contains it, `outside` is a corner in none of them, (n,)."""
+    """Where a box lies: `within` names the set that contains it, or the sets that do so together, `outside` is a state
+    of it in none of them, (n,)."""
 
     answer: Containment
     within: str | None = None
@@ -84,13 +94,13 @@ NOTHING_PROVED = Located(Containment.UNDECIDED)
 
 @dataclass(frozen=True, slots=True)
 class ProvedSet:
-    """The union of ellipsoids that an accepted certificate proves something about, in deviations from x_eq.
+    """The union of the sets that an accepted certificate proves something about, in deviations from x_eq.
 
     Parameters
     ----------
     system : the plant of the certificate. Its x_eq is what the file says for people; no rule depends on it.
     claim : the claim's kind.
-    ellipsoids : which together are the set.
+    ellipsoids, outer : which together are the set; `outer` is None where the claim has no outer set.
     policy_sha256, certificate_sha256 : of the policy that it is about, and of the file.
     """
 
@@ -99,18 +109,35 @@ class ProvedSet:
     ellipsoids: tuple[Ellipsoid, ...]
     policy_sha256: str
     certificate_sha256: str
+    outer: Sublevel | None = None
 
     def holds(self, states: Iterable[Sequence[Fraction | float]]) -> list[bool]:
-        """Whether each of the states, as deviations from x_eq, lies in the set; a float means its binary value."""
+        """Whether each of the states, as deviations from x_eq, lies in the set; a float means its binary value.
+
+        Where N is asked, whether that is shown: no state is let in by rounding, and one at which N is exactly n2 may
+        not be either.
+        """
         points = list(states)
         found = [e.holds(points) for e in self.ellipsoids]
-        return [any(each) for each in zip(*found, strict=True)]
+        inside = [any(each) for each in zip(*found, strict=True)]
+        if self.outer is None:
+            return inside
+        beyond = iter(self.outer.holds(x for x, known in zip(points, inside, strict=True) if not known))
+        return [known or next(beyond) for known in inside]
+
+    def excludes(self, states: Iterable[Sequence[Fraction | float]]) -> list[bool]:
+        """Whether each of the states, as deviations from x_eq, is shown to lie outside of the set."""
+        points = list(states)
+        found = [[not inside for inside in e.holds(points)] for e in self.ellipsoids]
+        found += [] if self.outer is None else [self.outer.excludes(points)]
+        return [all(each) for each in zip(*found, strict=True)]
 
     def locate(self, box: Box) -> Located:
         """Whether a box of states, as deviations from x_eq, lies in the set.
 
         With at most 16 states that have a width the corners decide, unless one ellipsoid has some of them and another
         one the rest; beyond that a bound of x'Px on the box may show that it is contained, and a corner that it is not.
+        With an outer set that is asked of pieces of the box, at most 4,096.
 
         Raises
         ------
@@ -121,7 +148,7 @@ class ProvedSet:
         wide = [i for i, (lo, hi) in enumerate(box) if lo < hi]
         if len(wide) > _CORNERS:
             corners = [_steepest(e, box) for e in self.ellipsoids]
-            contained = [_largest(e.P, e.around(box)) <= Fraction(float(e.level)) for e in self.ellipsoids]
+            contained = [e.covers(box) for e in self.ellipsoids]
         else:
             ends = (pair if pair[0] < pair[1] else pair[:1] for pair in box)
             corners = list(itertools.product(*ends))
@@ -129,9 +156,31 @@ class ProvedSet:
         for ellipsoid, whole in zip(self.ellipsoids, contained, strict=True):
             if whole:
                 return Located(Containment.CONTAINED, within=ellipsoid.name)
-        for corner, inside in zip(corners, self.holds(corners), strict=True):
-            if not inside:
+        for corner, outside in zip(corners, self.excludes(corners), strict=True):
+            if outside:
                 return Located(Containment.NOT_CONTAINED, outside=corner)
+        return Located(Containment.UNDECIDED) if self.outer is None else self._by_pieces(box, self.outer)
+
+    def _by_pieces(self, box: Box, outer: Sublevel) -> Located:
+        """The same of a box that is cut into pieces, the large ones first, each at its middle along an axis."""
+        waiting, used = deque([box]), set[str]()
+        for _ in range(_PIECES):
+            piece = waiting.popleft()
+            name = next((e.name for e in self.ellipsoids if e.covers(piece)), None)
+            seen = outer.look(piece) if name is None else None
+            if seen is None or seen.covered:
+                used.add(name or outer.name)
+                if not waiting:
+                    named = (one for one in (*(e.name for e in self.ellipsoids), outer.name) if one in used)
+                    return Located(Containment.CONTAINED, within=" and ".join(named))
+                continue
+            middle = tuple((lo + hi) / 2 for lo, hi in piece)
+            if self.excludes([middle])[0]:
+                return Located(Containment.NOT_CONTAINED, outside=middle)
+            if seen.axis is None:
+                break
+            (lo, hi), at = piece[seen.axis], middle[seen.axis]
+            waiting += [(*piece[: seen.axis], half, *piece[seen.axis + 1 :]) for half in ((lo, at), (at, hi))]
         return Located(Containment.UNDECIDED)
 
 
@@ -172,6 +221,7 @@ def set_of(raw: bytes, name: str) -> ProvedSet:
         ellipsoids=_ellipsoids(read),
         policy_sha256=read.network.sha256(),
         certificate_sha256=hashlib.sha256(raw).hexdigest(),
+        outer=_outer(read),
     )
 
 
@@ -183,6 +233,11 @@ def _ellipsoids(read: Certificate) -> tuple[Ellipsoid, ...]:
         return found
     centre = read.claim.centre if isinstance(read.claim, Reached) else ()
     return (*found, Ellipsoid("the tube's start", read.claim.start.P, 1.0, centre))
+
+
+def _outer(read: Certificate) -> Sublevel | None:
+    outer = read.claim.outer
+    return None if outer is None else Sublevel(outer.function, outer.level, tuple(read.system.domain))
 
 
 def _symmetric(P: Array) -> list[list[Fraction]]:

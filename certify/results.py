@@ -27,8 +27,9 @@ from certify.lyapunov.neural import Neural
 from certify.lyapunov.symbolic import Symbolic
 from certify.policies import TanhNetwork
 from certify.report.timing import Timing, reach_time
-from certify.report.words import below, varying, varying_in, volume_name, volume_unit
+from certify.report.words import below, estimated, varying, varying_in, volume_name, volume_unit
 from certify.rest import Rest
+from certify.sublevel import Sublevel
 from certify.systems import System
 from certify.verdict import Stop, Verdict
 
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
-_STAGES = ("load", "candidate", "local", "ring", "tube", "outer", "write", "check", "total")
+_STAGES = ("load", "candidate", "local", "ring", "tube", "learn", "outer", "write", "check", "total")
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,7 +138,11 @@ class OuterFacts:
     def to_dict(self) -> dict[str, Any]:
         """For JSON."""
         N = self.function
-        stated = {"kind": "network", "layers": list(N.widths)} if isinstance(N, Neural) else {"kind": "expression"}
+        stated: dict[str, Any] = (
+            {"kind": "expression", "expression": str(N.expression)}
+            if isinstance(N, Symbolic)
+            else {"kind": "network", "layers": list(N.widths), "sha256": N.sha256()}
+        )
         numbers = {name: getattr(self, name) for name in self.__slots__ if name not in ("function", "witness")}
         return {**stated, **numbers, "witness": self.witness and list(self.witness)}
 
@@ -203,7 +208,8 @@ class RoaResult:
 
     `rest` is where the loop rests, if not at the origin. `candidate` is where P came from, `tried` all that were tried,
     `notice` what is not as it was asked for. `reach_from` is the state that was asked about, by the states' values;
-    where the verdict on it is UNKNOWN by `Stop.PATH`, `certificate` and `levels` are of a proved set without it.
+    where the verdict on it is UNKNOWN by `Stop.PATH`, `certificate` and `levels` are of a proved set without it. Where
+    the verdict is UNKNOWN by `Stop.BEYOND` they, and `outer`, are of a smaller set than was asked for.
     `checker` is what the checker said, None if it was not reached, about `raw`, the certificate's bytes; `solver` has
     dReal's version and every query with its answer, None if it was not asked. `notices` is what had to be known about
     plant and policy before the run, such as a domain that was cut; `folder` keeps a temporary folder of the certificate
@@ -271,7 +277,8 @@ class RoaResult:
     def volume(self) -> float | None:
         """A certain lower bound of the proved set's volume, in the product of the states' units; None without a set.
 
-        With a tube it is that of the larger one of {V <= c2} and the tube's start, of which the set is the union.
+        With a tube it is that of the larger one of {V <= c2} and the tube's start, of which the set is the union; with
+        an outer set it is that of {V <= c2} alone: `outer.volume` is an estimate of the union's.
         """
         return None if self.ellipsoid is None else volume(*self.ellipsoid)
 
@@ -289,7 +296,9 @@ class RoaResult:
     def contains(self, x: ArrayLike, *, deviations: bool = False) -> bool | NDArray[np.bool_]:
         """Whether states lie in the proved set, decided in rationals: no state is let in by rounding.
 
-        The set is {V <= c2}, and with a tube the union of that and the tube's start.
+        The set is {V <= c2}, and with a tube the union of that and the tube's start. With an outer set it is the union
+        of that and {N <= n2} within the domain, decided in balls of growing precision: a state at which N is exactly n2
+        may not be let in.
 
         Parameters
         ----------
@@ -322,6 +331,10 @@ class RoaResult:
         found = are_inside(self.problem.V.P, self.levels.roa, rows)
         if self.tube is not None:
             found = [a or b for a, b in zip(found, self.tube.contains(rows), strict=True)]
+        if self.outer is not None:
+            beyond = Sublevel(self.outer.function, self.outer.level, tuple(self.system.domain))
+            others = iter(beyond.holds(row for row, known in zip(rows, found, strict=True) if not known))
+            found = [known or next(others) for known in found]
         return found[0] if states.ndim == 1 else np.array(found, dtype=np.bool_)
 
     def report(self, path: str | PathLike[str] | None = None) -> Path:
@@ -371,7 +384,7 @@ class RoaResult:
         shown = [verdict, *(said[name] for name in ("plant", "in time", "set") if name in said)]
         shown += [
             f"{name} {said[name]}"
-            for name in ("rate", "length", "area", "volume", "limited by", "reason")
+            for name in ("rate", "length", "area", "volume", "with N", "limited by", "reason")
             if name in said
         ]
         return f"RoaResult({'; '.join(shown)})"
@@ -396,8 +409,13 @@ class RoaResult:
         if level is not None and size is not None:
             unit = volume_unit([self.system.units.get(s.name, "") for s in self.system.states])
             wider = "" if self.tube is None else ", enlarged by a tube" if self.tube.centre is None else ", and a tube"
+            if self.outer is not None:
+                wider = f", and N <= {below(self.outer.level)} in the domain"
             rows.append(("set", f"V <= {below(level)}{wider}"))
             rows.append((volume_name(self.system.n), f"{below(size)} {unit}".rstrip()))
+            if self.outer is not None:
+                rows[-1] = (rows[-1][0], f"{rows[-1][1]}, of V <= {below(level)}")
+                rows.append(("with N", estimated(self.outer.volume, self.outer.deviation, unit)))
             rows.append(("limited by", self.reason))
         else:
             rows.append(("reason", self.reason))

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from fractions import Fraction
+from functools import lru_cache
 from typing import Any
 
 import flint
@@ -37,9 +38,9 @@ class _Balls(Algebra[flint.arb]):
 
 
 @contextmanager
-def precision() -> Iterator[None]:
-    """Arb at the precision of this module."""
-    before, flint.ctx.prec = flint.ctx.prec, _PRECISION
+def precision(bits: int = _PRECISION) -> Iterator[None]:
+    """Arb at the precision of this module, or at another one."""
+    before, flint.ctx.prec = flint.ctx.prec, bits
     try:
         yield
     finally:
@@ -234,6 +235,25 @@ def policy_on(loop: ClosedLoop, x: Balls) -> tuple[Balls, flint.arb_mat]:
     return list(network.clipped(u, _NUMBERS)), gain
 
 
+def function_on(function: Neural | Symbolic, x: Balls) -> tuple[flint.arb, Balls]:
+    """N and its gradient on balls x; whatever is not finite says that N need not be differentiable there."""
+    if isinstance(function, Symbolic):
+        values, known = dict(zip(function.states, x, strict=True)), dict[Any, flint.arb]()
+        parts = (function.expression, *(function.expression.diff(s) for s in function.states))
+        N, *slopes = (evaluate(part, values, _Balls(), known) for part in parts)
+        return N, slopes
+    y, units = list(x), []
+    for k, (W, b) in enumerate(zip(function.weights, function.biases, strict=True)):
+        if k:
+            y = [v.tanh() for v in y]
+            units.append([1 - v * v for v in y])
+        y = _affine(W, b, y)
+    row = _matrix(function.weights[-1])
+    for W, slopes in zip(function.weights[-2::-1], reversed(units), strict=True):
+        row = flint.arb_mat([[row[0, j] * slope for j, slope in enumerate(slopes)]]) * _matrix(W)
+    return y[0], [row[0, j] for j in range(function.n)]
+
+
 def _clip_slopes(network: TanhNetwork, u: Balls) -> Balls:
     if network.clip is None:
         return [flint.arb(1)] * len(u)
@@ -336,7 +356,12 @@ def _through_tanh(y: Balls, J: flint.arb_mat) -> tuple[Balls, flint.arb_mat]:
 
 
 def _matrix(W: Array) -> flint.arb_mat:
-    return flint.arb_mat([_points(row) for row in W])
+    return _balls_of(np.asarray(W, dtype=np.float64).tobytes(), W.shape)
+
+
+@lru_cache(maxsize=32)  # a network's numbers, which are exact at any precision, for all the states that it is asked at
+def _balls_of(raw: bytes, shape: tuple[int, ...]) -> flint.arb_mat:
+    return flint.arb_mat([_points(row) for row in np.frombuffer(raw).reshape(shape)])
 
 
 def _points(x: Array) -> Balls:

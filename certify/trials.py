@@ -118,7 +118,7 @@ def named(loop: ClosedLoop, options: RoaOptions) -> Trial:
     if name == "peak":
         return trial(loop, peak_candidate(loop, OPTIMISING * options.time_limit), name, options)
     if name == "robust":
-        return trial(loop, robust_candidate(loop, OPTIMISING * options.time_limit), name, options)
+        return trial(loop, robust_candidate(loop, _for_robust(loop, options)), name, options)
     chosen = choose_candidate(loop, name, options.Q, options.R, OPTIMISING * options.time_limit)
     return trial(loop, chosen.P, chosen.name, options, chosen.notice)
 
@@ -147,9 +147,14 @@ def optimised(loop: ClosedLoop, options: RoaOptions) -> Trial | None:
 def robust(loop: ClosedLoop, options: RoaOptions) -> Trial | None:
     """The candidate that the local rule likes best, or None if it is not to be had."""
     try:
-        return trial(loop, robust_candidate(loop, OPTIMISING * options.time_limit), "robust", options)
+        return trial(loop, robust_candidate(loop, _for_robust(loop, options)), "robust", options)
     except (BackendError, InputError):
         return None
+
+
+def _for_robust(loop: ClosedLoop, options: RoaOptions) -> float:
+    """Seconds; where an input is held, as many again as for the loop without a period, which comes first."""
+    return OPTIMISING * options.time_limit * (1 if loop.system.sample is None else 2)
 
 
 def peak(loop: ClosedLoop, options: RoaOptions) -> Trial | None:

@@ -20,7 +20,7 @@ EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows th
     "certificate": "claims expressions lyapunov policies systems",
     "claims": "closed_loop expressions lyapunov policies",
     "closed_loop": "expressions policies systems",
-    "containment": "certificate claims lyapunov systems",
+    "containment": "certificate claims lyapunov sublevel systems",
     "diagnosis": "closed_loop engines lyapunov options policies results",
     "enclosures": "closed_loop expressions lyapunov policies rigorous systems",
     "engines": "certificate claims closed_loop enclosures expressions lyapunov policies rigorous running systems",
@@ -33,12 +33,13 @@ EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows th
     "race": "engines lyapunov trials",
     "report": "certificate claims closed_loop lyapunov policies systems",
     "rest": "closed_loop rigorous",
-    "results": "certificate claims engines lyapunov policies report rest systems",
+    "results": "certificate claims engines lyapunov policies report rest sublevel systems",
     "rigorous": "closed_loop expressions lyapunov policies",
     "roa": (
         "acceptance certificate claims closed_loop diagnosis engines lyapunov options policies race rest results "
         "rigorous running systems trials"
     ),
+    "sublevel": "expressions lyapunov rigorous systems",
     "systems": "expressions",
     "trials": "certificate claims closed_loop engines lyapunov options",
     "controllers": "containment policies systems",

@@ -6,6 +6,7 @@ import hashlib
 import json
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -17,11 +18,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from certify import TanhNetwork, certify_roa
+from certify.certificate import parse_certificate
 from certify.cli import _run
 from certify.commands.arguments import region
-from certify.containment import Box, Containment, Ellipsoid, ProvedSet, proved_set
+from certify.containment import Box, Containment, Ellipsoid, Located, ProvedSet, proved_set
 from certify.errors import CertificateFormatError, InputError
+from certify.lyapunov import Neural, Symbolic
+from certify.sublevel import Sublevel
 from certify.systems import System, load_system
+from controllers.evaluate import count_covered
+from tests.support.beyond import line, network, plane
+from tests.support.certificates import write
 from tests.support.loops import box
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
@@ -357,6 +364,123 @@ def test_a_tube_s_start_belongs_to_the_set(enlarged: Path) -> None:
                 names.add(found.within)
                 assert found.within == ellipsoid.name
     assert "the tube's start" in names
+
+
+# ------------------------------------------------------------------------------------------------------- an outer set
+
+
+@pytest.fixture(scope="module")
+def beyond(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """x^2 + y^2 <= 1/4 united with {N <= -2.55}, N a network, both even in x and y."""
+    return write(network(), tmp_path_factory.mktemp("network"))
+
+
+@pytest.fixture(scope="module")
+def by_formula(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """x^2 + y^2 <= 1/4 united with x^2 + y^2/4 <= 0.9 in |x|, |y| <= 2."""
+    return write(plane(), tmp_path_factory.mktemp("formula"))
+
+
+INNER, OUTER = "{V <= c2}", "{N <= n2} within the domain"
+
+
+def test_the_outer_set_belongs_to_it(by_formula: Path) -> None:
+    where = proved_set(by_formula)
+    for states, within in (
+        ("x=0.1,y=0.2", INNER),
+        ("x=0.9", OUTER),
+        ("x=0.95", None),
+        ("y=1.8973", OUTER),
+        ("y=1.8975", None),
+        ("y=2.5", None),  # beyond the domain
+        ("x=-0.3..0.3,y=-0.3..0.3", INNER),
+        ("x=-0.7..0.7,y=-1..1", OUTER),
+        ("x=-0.7..0.7,y=-1.3..1.3", None),
+        ("x=0.8,y=-1..1", OUTER),
+    ):
+        found = where.locate(region(states, where.system, "STATES"))
+        answer = Containment.NOT_CONTAINED if within is None else Containment.CONTAINED
+        assert (found.answer, found.within, found.outside is None) == (answer, within, within is not None), states
+
+
+def test_the_command_knows_it(by_formula: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, data = ask(capsys, "contains", by_formula, "x=0.9")
+    assert (status, data["within"], data["outside"]) == (0, OUTER, None)
+    assert _run(["contains", str(by_formula), "x=0..0.9,y=1"], False) == 1
+    assert capsys.readouterr().out == "NOT CONTAINED  x = 0..0.9, y = 1: not in the set is (0.9, 1)\n"
+
+
+def test_a_state_on_the_boundary_is_decided_in_rationals(tmp_path: Path) -> None:
+    """x^2 is 9/16, which is a binary number, at 3/4."""
+    where = proved_set(write(line(0.5625), tmp_path))
+    assert where.locate(at(F(3, 4))).within == OUTER
+    assert where.locate(at(F(3, 4) + F(1, 10**60))).answer is Containment.NOT_CONTAINED
+    assert where.holds([[F(3, 4)], [F(3, 4) + F(1, 10**60)], [-0.75], [0.1]]) == [True, False, True, True]
+    assert where.excludes([[F(3, 4)], [F(3, 4) + F(1, 10**60)], [-0.75], [0.1]]) == [False, True, False, False]
+
+
+def test_sets_contain_a_box_together() -> None:
+    """The disc is what {N <= 1} leaves out in its middle: neither contains the box, and both of them do."""
+    x0, x1 = sympy.symbols("x0 x1")
+    ring = Sublevel(Symbolic(1 / (sympy.Rational(1, 4) + x0**2 + x1**2), (x0, x1)), 2.0, ((F(-3), F(3)),) * 2)
+    both = replace(union(np.eye(2)), outer=ring)
+    box = ((F(-6, 5), F(6, 5)), (F(-9, 10), F(9, 10)))
+    assert both.locate(box) == Located(Containment.CONTAINED, within=f"E0 and {OUTER}")
+    assert both.locate(((F(-3), F(3)),) * 2).answer is Containment.CONTAINED
+    assert both.locate(((F(-3), F(3)), (F(-3), F(31, 10)))).answer is Containment.NOT_CONTAINED
+    hole = replace(both, ellipsoids=union(np.eye(2), level=0.2).ellipsoids)  # {N <= 2} begins at 1/4
+    found = hole.locate(box)
+    assert found.answer is Containment.NOT_CONTAINED and found.outside is not None
+    assert F(1, 5) < found.outside[0] ** 2 + found.outside[1] ** 2 < F(1, 4)
+
+
+def test_boxes_that_touch_the_boundary_are_not_decided_by_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
+    """sin^2 + cos^2 is 1 on all of the box, and no ball tells: it takes all the pieces there are, and says nothing."""
+    monkeypatch.setattr("certify.containment._PIECES", 100)
+    x0, x1 = sympy.symbols("x0 x1")
+    flat = sympy.sin(x0) ** 2 + sympy.cos(x0) ** 2 + 0 * x1
+    both = replace(union(np.eye(2)), outer=Sublevel(Symbolic(flat, (x0, x1)), 1.0, ((F(-3), F(3)),) * 2))
+    assert both.locate(((F(3, 2), F(2)), (F(0), F(0)))) == Located(Containment.UNDECIDED)
+    assert both.locate(at(2, 0)) == Located(Containment.UNDECIDED)
+
+
+@given(st.integers(0, 10**6))
+def test_what_is_said_of_a_union_is_true(seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    weights = (generator.standard_normal((5, 2)), generator.standard_normal((1, 5)))
+    N = Neural(weights, (generator.standard_normal(5), np.zeros(1)))
+    level = float(np.quantile(N(generator.uniform(-2, 2, (200, 2))), 0.7))
+    where = replace(union(np.eye(2), level=0.5), outer=Sublevel(N, level, ((F(-2), F(2)),) * 2))
+    middle, half = generator.uniform(-1.5, 1.5, 2), generator.uniform(0, 0.6, 2)
+    region = tuple((F(c) - F(h), F(c) + F(h)) for c, h in zip(middle, half, strict=True))
+    found = where.locate(region)
+    points = generator.uniform(middle - half, middle + half, (40, 2))
+    inside = (np.sum(points**2, axis=1) <= 0.5) | ((N(points) <= level) & np.all(np.abs(points) <= 2, axis=1))
+    assert where.holds(points.tolist()) == inside.tolist()
+    assert where.excludes(points.tolist()) == (~inside).tolist()
+    if found.answer is Containment.CONTAINED:
+        assert all(inside)
+    elif found.answer is Containment.NOT_CONTAINED:
+        assert found.outside is not None and where.excludes([found.outside]) == [True]
+        assert all(lo <= v <= hi for v, (lo, hi) in zip(found.outside, region, strict=True))
+
+
+def test_judging_a_policy_counts_the_union(by_formula: Path) -> None:
+    read = parse_certificate(by_formula.read_bytes(), "certificate")
+    x = np.random.default_rng(1).uniform(-2, 2, (500, 2))
+    found = count_covered(proved_set(by_formula), read.network, read.system, x)
+    inside = (x[:, 0] ** 2 + x[:, 1] ** 2 / 4 <= 0.9) | (np.sum(x**2, axis=1) <= 0.25)
+    assert (found.inside, found.states) == (np.count_nonzero(inside), 500) and found.inside > 100
+
+
+def test_a_network_s_set_is_that_of_the_file(beyond: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    where = proved_set(beyond)
+    points = np.random.default_rng(0).uniform(-2, 2, (300, 2))
+    value = sum(np.tanh(v - 1) - np.tanh(v + 1) for v in points.T)
+    inside = (value <= -2.55) | (np.sum(points**2, axis=1) <= 0.25)
+    assert where.holds(points.tolist()) == inside.tolist() and 10 < sum(inside) < 290
+    assert ask(capsys, "contains", beyond, "x=-0.6..0.6,y=-0.5..0.5")[0] == 0
+    assert ask(capsys, "contains", beyond, "x=-0.6..0.6,y=-0.9..0.5")[0] == 1
 
 
 # ------------------------------------------------------------------------------------------------------- certify roa

@@ -45,6 +45,7 @@ def _examine(path: str) -> tuple[int, dict[str, Any]]:
     c = document.read(path)
     start = time.perf_counter()
     from . import rules  # after parsing: a malformed file needs no tables
+    from .boxes import LEAF
 
     ready = time.perf_counter()
     tally = rules.check(c)
@@ -59,9 +60,9 @@ def _examine(path: str) -> tuple[int, dict[str, Any]]:
     else:
         margins = {"local": tally.local_margin, "ring": tally.ring_margin, "outer": tally.outer_margin}
         answer |= {"leaves": tally.rules["tree"], "ring_leaves": tally.rules["ring"], "margins": margins}
-    if c.outer is not None:
-        leaves = {"leaves": tally.rules["outer"], "face_leaves": tally.rules["faces"]}
-        answer["outer"] = {"level": c.outer.level, **leaves}
+        if c.outer is not None and c.evidence.outer is not None:
+            leaves = {"leaves": c.evidence.outer.tree.count(LEAF), "face_leaves": tally.rules["faces"]}
+            answer["outer"] = {"level": c.outer.level, **leaves}
     if c.start is not None:
         centre, longest = None if c.centre is None else c.centre.tolist(), words.duration(c)
         answer |= {"start": c.start.tolist(), "centre": centre, "time": longest if math.isfinite(longest) else None}

@@ -56,7 +56,8 @@ def claim(c: Certificate) -> list[str]:
     if c.outer is not None:
         lines.append(
             f"  and every trajectory that starts in the union of V <= {c.c2!r} and of the states of the domain with "
-            f"N <= {c.outer.level!r} stays in this union and enters V <= {c.c2!r} in finite time"
+            f"N <= {c.outer.level!r} stays in this union, enters V <= {c.c2!r} in finite time, and from then on is one "
+            "of those above; u stays in its bounds; states outside the domain are not meant, whatever N is there"
         )
     said = CLAIMS[c.claim].format(c=c, time=duration(c), when=when)
     return [f"claim: {said}; u stays in its bounds", *lines]
@@ -94,7 +95,7 @@ def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
         local, ring = answer["margins"]["local"], answer["margins"]["ring"]
         margins = [] if local is None else [f"local {local:.1%}"]
         margins += [] if ring is None else [f"smallest bound of -{_falling(c)} on a ring's leaf {ring:.3g}"]
-        outer = answer["margins"]["outer"]
+        outer = None if c.outer is None else answer["margins"]["outer"]
         margins += [] if outer is None else [f"smallest bound of -N'F on a leaf of the outer set {outer:.3g}"]
         rest, verdict = f"margins: {'; '.join(margins)}", "ACCEPTED"
     after = "+" if c.discrete else "'"
@@ -114,7 +115,7 @@ def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
         f"V(x) = x'Px with P = {_matrix(c.P)}",
         *([] if c.start is None else [f"S = {_matrix(c.start)}"]),
         *([] if c.centre is None else [f"c = {' '.join(map(repr, c.centre.tolist()))}"]),
-        *([] if c.outer is None else [f"N(x) = {_function(c.outer.function)}"]),
+        *([] if c.outer is None else [_function(c.outer.function)]),
         *claim(c),
         "rules that held: " + ", ".join(f"{rule} {count}" for rule, count in answer["rules"].items()),
         rest,
@@ -126,8 +127,8 @@ def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
 def _function(N: Tape | Network) -> str:
     if isinstance(N, Network):
         widths = [N.weights[0].shape[1], *map(len, N.weights)]
-        return f"the {'-'.join(map(str, widths))} tanh network with sha256 {N.sha256()}"
-    return expression(N.trees[0])
+        return f"N: the {'-'.join(map(str, widths))} tanh network with sha256 {N.sha256()}"
+    return f"N(x) = {expression(N.trees[0])}"
 
 
 def _matrix(A: Array) -> str:

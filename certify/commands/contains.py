@@ -27,7 +27,7 @@ def contains(
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Check a certificate and decide, in rationals, whether a state or every state of a box lies in the proved set."""
+    """Check a certificate and decide, exactly, whether a state or every state of a box lies in the proved set."""
     from certify.containment import proved_set
 
     proved = proved_set(certificate)
@@ -73,7 +73,7 @@ def text(found: Located, box: Box, system: System) -> str:
             "" if all(lo == hi for lo, hi in box) else f": not in the set is ({corner})"
         )
     else:
-        said = f"UNDECIDED  {shown}: no one ellipsoid was shown to contain the box, and no corner to lie outside"
+        said = f"UNDECIDED  {shown}: it was not shown to lie in the set, and no state of it to lie outside"
     rest = ", ".join(f"{name} = {_number(q)}" for name, q in system.operating_point().items())
     return said + (
         f"\n(values of the states; their operating point, which no rule of the checker knows, is {rest})"

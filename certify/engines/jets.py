@@ -5,7 +5,8 @@ order three, and the e_j are what is left of the inputs beyond their own third o
 components of F stays one error there (checker/FORMAT.md, models).
 
 Symmetric matrices and forms of order three are rows of numbers in an orthonormal basis: less than a fourth of the room
-and of the products, and the norm of a form is that of its row. A layer of a network is a batch of rows.
+and of the products, and the norm of a form is that of its row. A layer of a network is a batch of rows, and so are the
+jets of one value on several balls around the same middle: an operation has few products, and costs more than they do.
 """
 
 from __future__ import annotations
@@ -108,7 +109,7 @@ class Sizes:
 
 def sizes(a: Array, Q: Array, K: Array, E: Array) -> Sizes:
     """Of rows a (N, k), and Q, K, E in their basis."""
-    slope, bend, twist, rest = (np.linalg.norm(part, axis=1) for part in (a, Q, K, E))
+    slope, bend, twist, rest = (np.sqrt(np.einsum("ij,ij->i", part, part)) for part in (a, Q, K, E))
     return Sizes(slope, bend, twist, bend + twist + rest)
 
 
@@ -149,9 +150,15 @@ def fourth_of_tanh(y: Array, radius: Array) -> Array:
     return np.asarray(np.minimum(TANH4, there + TANH5 * radius) / 24)
 
 
+def of_inputs(B: Array, errors: Array, like: Array) -> Array:
+    """The bound of B (1, m) times the e_j, a row for each ball as `like` has them."""
+    return np.asarray((np.abs(B) @ errors).reshape(like.shape))
+
+
 @dataclass(frozen=True, slots=True)
 class Jet:
-    """A value; a is (1, k), Q, K and E are rows in their basis, B (1, m), and `errors` the E of each e_j, m rows."""
+    """A value on N balls around the same middle: a is (N, k), Q, K and E are rows in their basis, and B is (1, m).
+    `errors` has the E of each e_j: m rows, in each those of all balls one after the other."""
 
     c: float
     a: Array
@@ -164,99 +171,101 @@ class Jet:
     @property
     def rest(self) -> Array:
         """The bound of all that is left, the e_j with it."""
-        return self.E + np.abs(self.B) @ self.errors
+        return self.E + of_inputs(self.B, self.errors, self.E)
 
     @property
     def sizes(self) -> Sizes:
         return sizes(self.a, self.Q, self.K, self.rest)
 
     @property
-    def radius(self) -> float:
-        return float(self.sizes.radius[0])
+    def radius(self) -> Array:
+        return self.sizes.radius
 
     def __add__(self, other: Jet) -> Jet:
         x, y = self, other
         return Jet(x.c + y.c, x.a + y.a, x.Q + y.Q, x.K + y.K, x.B + y.B, x.E + y.E, x.errors)
 
     def __mul__(self, other: Jet) -> Jet:
-        x, y, b = self, other, basis(self.a.shape[1])
+        x, y, b, rows = self, other, basis(self.a.shape[1]), np.newaxis
         p, q = x.sizes, y.sizes
         Q = x.c * y.Q + y.c * x.Q + b.between(x.a, y.a)
         K = x.c * y.K + y.c * x.K + b.times(x.a, y.Q) + b.times(y.a, x.Q)
         left = p.slope * q.twist + p.twist * q.slope + (p.bend + p.twist) * (q.bend + q.twist)
-        E = abs(x.c) * y.E + abs(y.c) * x.E + p.radius * y.rest + (q.slope + q.bend + q.twist) * x.rest + left * b.eye
+        both = p.radius[:, rows] * y.rest + (q.slope + q.bend + q.twist)[:, rows] * x.rest
+        E = abs(x.c) * y.E + abs(y.c) * x.E + both + left[:, rows] * b.eye
         return Jet(x.c * y.c, x.c * y.a + y.c * x.a, Q, K, x.c * y.B + y.c * x.B, E, x.errors)
 
-    def compose(self, f0: float, f1: float, f2: float, f3: float, fourth: float) -> Jet:
-        """A function's value and derivatives at c, and at least |phi''''|/24 on the range."""
+    def compose(self, f0: float, f1: float, f2: float, f3: float, fourth: Array) -> Jet:
+        """A function's value and derivatives at c, and at least |phi''''|/24 on each ball's range or on all."""
         a, Q, K = self.a, self.Q, self.K
-        second, third, bound = (np.array([v]) for v in (f2 / 2, f3 / 6, fourth))
+        second, third = np.array([f2 / 2]), np.array([f3 / 6])
         squares = basis(a.shape[1]).square(a)
         H, cubic = beyond_tangent(a, squares, Q, K, second, third)
-        R = remainder(squares, self.sizes, self.rest, np.abs(second), np.abs(third), bound)
+        R = remainder(squares, self.sizes, self.rest, np.abs(second), np.abs(third), fourth)
         return Jet(f0, f1 * a, f1 * Q + H, f1 * K + cubic, f1 * self.B, abs(f1) * self.E + R, self.errors)
 
     def _nowhere(self) -> Jet:
+        """Of all balls, where one of them has no finite model."""
         return Jet(math.nan, self.a, self.Q, self.K, self.B, self.E + math.inf, self.errors)
 
     def inverse(self) -> Jet:
         c, least = self.c, abs(self.c) - self.radius
-        if not least > 0:
+        if not np.all(least > 0):
             return self._nowhere()
         return self.compose(1 / c, -1 / c**2, 2 / c**3, -6 / c**4, 1 / (c**4 * least))  # D^4 / (c^4 v) is what is left
 
     def sqrt(self) -> Jet:
         least = self.c - self.radius
-        if not least > 0:
+        if not np.all(least > 0):
             return self._nowhere()
-        s, w = math.sqrt(self.c), math.sqrt(least)
+        s, w = math.sqrt(self.c), np.sqrt(least)
         fourth = (5 * s**2 + 4 * s * w + w**2) / (16 * s**5 * (s + w) ** 4)  # what is left of a root w, over D^4
         return self.compose(s, 1 / (2 * s), -1 / (4 * s**3), 3 / (8 * s**5), fourth)
 
     def exp(self) -> Jet:
         end = self.c + self.radius
-        if not end < EXP_END:
+        if not np.all(end < EXP_END):
             return self._nowhere()
         e = math.exp(self.c)
-        return self.compose(e, e, e, e, math.exp(end) / 24)
+        return self.compose(e, e, e, e, np.exp(end) / 24)
 
     def tanh(self) -> Jet:
         t = math.tanh(self.c)
         slope = 1 - t * t
-        fourth = fourth_of_tanh(np.array(self.c), np.array(self.radius))
-        return self.compose(t, slope, -2 * t * slope, (6 * t * t - 2) * slope, float(fourth))
+        fourth = fourth_of_tanh(np.array(self.c), self.radius)
+        return self.compose(t, slope, -2 * t * slope, (6 * t * t - 2) * slope, fourth)
 
     def atan(self) -> Jet:
         slope = 1 / (1 + self.c**2)
         f3 = (6 * self.c**2 - 2) * slope**3
-        return self.compose(math.atan(self.c), slope, -2 * self.c * slope**2, f3, ATAN4 / 24)
+        return self.compose(math.atan(self.c), slope, -2 * self.c * slope**2, f3, np.array([ATAN4 / 24]))
 
     def sin(self) -> Jet:
         s, c = math.sin(self.c), math.cos(self.c)
-        return self.compose(s, c, -s, -c, min(1.0, abs(s) + self.radius) / 24)
+        return self.compose(s, c, -s, -c, np.minimum(1.0, abs(s) + self.radius) / 24)
 
     def cos(self) -> Jet:
         s, c = math.sin(self.c), math.cos(self.c)
-        return self.compose(c, -s, -c, s, min(1.0, abs(c) + self.radius) / 24)
+        return self.compose(c, -s, -c, s, np.minimum(1.0, abs(c) + self.radius) / 24)
 
 
 class Jets(Algebra[Jet]):
-    """Jets in k variables, with the errors that they share."""
+    """Jets in k variables on N balls, with the errors that they share."""
 
-    def __init__(self, k: int, errors: Array) -> None:
+    def __init__(self, N: int, k: int, errors: Array) -> None:
         b = basis(k)
-        nothing = (np.zeros((1, k)), np.zeros((1, len(b.eye))), np.zeros((1, len(b.scale3))))
-        self._parts = (*nothing, np.zeros((1, len(errors))), np.zeros((1, len(b.eye))), errors)
+        nothing = (np.zeros((N, k)), np.zeros((N, len(b.eye))), np.zeros((N, len(b.scale3))))
+        self._parts = (*nothing, np.zeros((1, len(errors))), np.zeros((N, len(b.eye))), errors)
 
     def constant(self, q: Fraction) -> Jet:
         return Jet(float(q), *self._parts)
 
-    def state(self, value: float, row: Array) -> Jet:
-        """A value at the middle and its gradient, (k,)."""
+    def state(self, value: float, rows: Array) -> Jet:
+        """A value at the middle and its gradients, (N, k)."""
         _, *others = self._parts
-        return Jet(value, row[None], *others)
+        return Jet(value, rows, *others)
 
     def input(self, number: int, value: float, a: Array, Q: Array, K: Array) -> Jet:
         """An input's model, without its error, which is e of its number."""
         *_, nothing, errors = self._parts
-        return Jet(value, a[None], Q[None], K[None], np.eye(len(errors))[number][None], nothing, errors)
+        return Jet(value, a, Q, K, np.eye(len(errors))[number][None], nothing, errors)

@@ -41,7 +41,12 @@ _ABOVE = 1 + 1e-3  # of the least floor that is shown
 
 
 def prove_local(
-    problem: Problem, T: Array, limit: float, known: Paths | None = None, until: float = math.inf
+    problem: Problem,
+    T: Array,
+    limit: float,
+    known: Paths | None = None,
+    until: float = math.inf,
+    between: tuple[float, float] | None = None,
 ) -> float | None:
     """The largest level up to `limit` that the local proof of a claim at rest reaches, within 2 %; None if there is
     none, or none is found in the time.
@@ -51,6 +56,7 @@ def prove_local(
     T : (n, n), with T'PT about the unit matrix: the ball of the proof is x = T z.
     known : the `paths` of the loop, if they are there already.
     until : the reading of `time.perf_counter` at which the search ends with what it has.
+    between : a level below which nothing is of interest, and a higher one, above which little is expected.
 
     Raises
     ------
@@ -59,7 +65,18 @@ def prove_local(
     rule = Rule.at_rest(problem, T, known)
     if rule.cuts is None:
         return None
-    return _largest(lambda level: rule.shown(level, _ENOUGH).margin > _MARGIN, limit, until)
+
+    def good(level: float) -> bool:
+        return rule.shown(level, _ENOUGH).margin > _MARGIN
+
+    if between is None:
+        return _largest(good, limit, until)
+    low, high = between[0], min(between[1], limit)
+    if not (low < high and good(low)):
+        return None
+    while high < limit and time.perf_counter() < until and good(high):
+        low, high = high, min(high * high / low, limit)
+    return _closer(good, low, high, until)
 
 
 def prove_band(
@@ -216,8 +233,12 @@ class Rule:
 
     def models(self, J: Array, level: float) -> list[Models]:
         """Of a step on a ball that holds {V <= level}, in each cell."""
-        reach = np.minimum(np.linalg.norm(J, axis=1), extents(self.problem.V.P, level) * _WIDER)
-        return self.steps.models(J, self.cells, reach)
+        return self.models_on(J[None], level)[0]
+
+    def models_on(self, balls: Array, level: float) -> list[list[Models]]:
+        """The same on each of several balls, (N, n, n); if one has no finite models, none has."""
+        reach = np.minimum(np.linalg.norm(balls, axis=2), extents(self.problem.V.P, level) * _WIDER)
+        return self.steps.models_on(balls, self.cells, reach)
 
     def _corners(self, level: float) -> list[Corner] | None:
         """The inequality at the corners of all cells; None where something has no finite model, or may leave its
@@ -245,6 +266,11 @@ def _largest(good: Callable[[float], bool], limit: float, until: float, fall: fl
         high, low = low, low * fall
         if low <= 1e-30 * limit or low < _LEAST or time.perf_counter() > until:
             return None
+    return _closer(good, low, high, until)
+
+
+def _closer(good: Callable[[float], bool], low: float, high: float, until: float) -> float:
+    """A good level, within 2 % of one that is not, from a good one and one that is not."""
     while high > 1.02 * low and time.perf_counter() < until:
         middle = math.sqrt(low * high)
         low, high = (middle, high) if good(middle) else (low, middle)

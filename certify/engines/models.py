@@ -144,18 +144,23 @@ class Driven:
     curve: Array
     room: Array
 
-    def of(self, j: int) -> tuple[Array, Array, Array]:
-        """The model of an input but for its value."""
-        return self.G[j], self.Q[j], self.K[j]
-
-    def models(self, F: Sequence[Jet | RangedJet], spread: Spread | None = None, stays: bool = True) -> Models:
-        """Those with these components."""
-        form = basis(self.G.shape[1])
-        a, Q, K, B, E = (np.concatenate([getattr(v, part) for v in F]) for part in ("a", "Q", "K", "B", "E"))
+    def models(
+        self, F: Sequence[Jet | RangedJet], number: int, spread: Spread | None = None, stays: bool = True
+    ) -> Models:
+        """Those with these components, which are of several balls, on the one of this number."""
+        form, B = basis(self.G.shape[1]), np.concatenate([v.B for v in F])
+        a, Q, K, E = (np.array([getattr(v, part)[number] for v in F]) for part in ("a", "Q", "K", "E"))
         inputs = Inputs(self.G, form.matrices(self.Q), form.forms(self.K), self.curve, self.room, B)
         parts = form.matrices(Q), form.forms(K), form.matrices(E)
         f = np.array([v.c for v in F])
         return Models(f, a, *parts, B @ self.shares, self.R, self.squares, inputs, spread, stays)
+
+
+def of_all(driven: Sequence[Driven]) -> tuple[list[tuple[Array, Array, Array]], Array]:
+    """For jets on several balls: for each input its model's rows but for its value, and the `errors` of all inputs."""
+    G, Q, K = (np.array([getattr(one, part) for one in driven]) for part in ("G", "Q", "K"))
+    models = [(G[:, j], Q[:, j], K[:, j]) for j in range(G.shape[1])]
+    return models, np.concatenate([one.errors for one in driven], axis=1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -173,13 +178,19 @@ class Paths:
 
     def models(self, J: Array) -> Models:
         """F on the ball x = middle + J d, ||d|| <= 1; J is (n, k)."""
-        driven, loop = self.driven(J), self.loop
-        algebra = Jets(J.shape[1], driven.errors)
-        states = [algebra.state(float(m), row) for m, row in zip(self.middle, J, strict=True)]
-        inputs = [algebra.input(j, float(u), *driven.of(j)) for j, u in enumerate(self.u)]
+        return self.models_on(J[None])[0]
+
+    def models_on(self, balls: Array) -> list[Models]:
+        """The same on several balls, (N, n, k); if one has no finite models, none has."""
+        driven, loop = [self.driven(J) for J in balls], self.loop
+        models, errors = of_all(driven)
+        algebra = Jets(len(balls), balls.shape[2], errors)
+        states = [algebra.state(float(m), balls[:, i]) for i, m in enumerate(self.middle)]
+        inputs = [algebra.input(j, float(u), *models[j]) for j, u in enumerate(self.u)]
         values = dict(zip((*loop.system.states, *loop.system.inputs), (*states, *inputs), strict=True))
         shared = dict[Any, Jet]()
-        return driven.models([evaluate(e, values, algebra, shared) for e in loop.dynamics])
+        F = [evaluate(e, values, algebra, shared) for e in loop.dynamics]
+        return [one.models(F, number) for number, one in enumerate(driven)]
 
     def driven(self, J: Array) -> Driven:
         """The inputs on that ball."""

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.enclosures.taylor import EXP_END
-from certify.engines.jets import ATAN4, TANH4, TANH5, Sizes, basis, beyond_tangent, remainder, sizes
+from certify.engines.jets import ATAN4, TANH4, TANH5, Sizes, basis, beyond_tangent, of_inputs, remainder, sizes
 from certify.expressions import Algebra
 
 Array = NDArray[np.float64]
@@ -31,15 +31,15 @@ Four = tuple[float, float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class RangedJet:
-    """A value: c, `moves` (N,) and `error` of v(0); a (1, k), `turns` (N, k) and `slack` of the gradient; the rest as a
-    Jet has it."""
+    """A value on M balls around the same middle: c, `moves` (N,) and `error` (M,) of v(0); a (M, k), `turns` (N, M, k)
+    and `slack` (M,) of the gradient; the rest as a Jet has it."""
 
     c: float
     moves: Array
-    error: float
+    error: Array
     a: Array
     turns: Array
-    slack: float
+    slack: Array
     Q: Array
     K: Array
     B: Array
@@ -47,18 +47,25 @@ class RangedJet:
     errors: Array
 
     @property
-    def away(self) -> float:
-        """How far v(0) may be from c."""
-        return float(np.sum(np.abs(self.moves))) + self.error
+    def away(self) -> Array:
+        """How far v(0) may be from c, (M,)."""
+        return np.asarray(np.sum(np.abs(self.moves)) + self.error)
 
     @property
-    def turned(self) -> float:
-        """How far the gradient may be from a."""
-        return float(np.sum(np.linalg.norm(self.turns, axis=1))) + self.slack
+    def tilt(self) -> Array:
+        """How far y may turn the gradient, (M,)."""
+        if not len(self.turns):
+            return np.zeros_like(self.slack)
+        return np.asarray(np.sum(np.linalg.norm(self.turns, axis=2), axis=0))
+
+    @property
+    def turned(self) -> Array:
+        """How far the gradient may be from a, (M,)."""
+        return self.tilt + self.slack
 
     @property
     def rest(self) -> Array:
-        return self.E + np.abs(self.B) @ self.errors
+        return self.E + of_inputs(self.B, self.errors, self.E)
 
     @property
     def sizes(self) -> Sizes:
@@ -67,17 +74,18 @@ class RangedJet:
         return replace(found, slope=found.slope + self.turned)
 
     @property
-    def radius(self) -> float:
-        return float(self.sizes.radius[0])
+    def radius(self) -> Array:
+        return self.sizes.radius
 
     @property
-    def value(self) -> float:
-        """No |v(0)| is larger."""
+    def value(self) -> Array:
+        """No |v(0)| is larger, (M,)."""
         return abs(self.c) + self.away
 
-    def _spread(self, size: Sizes) -> float:
+    def _spread(self, size: Sizes) -> Array:
         """What Q, K and the errors e_j come to together."""
-        return float(size.bend[0] + size.twist[0] + np.linalg.norm(np.abs(self.B) @ self.errors))
+        e = np.linalg.norm(of_inputs(self.B, self.errors, self.E), axis=1)
+        return np.asarray(size.bend + size.twist + e)
 
     def __add__(self, other: RangedJet) -> RangedJet:
         x, y = self, other
@@ -117,51 +125,50 @@ class RangedJet:
         )
 
     def __mul__(self, other: RangedJet) -> RangedJet:
-        x, y, b = self, other, basis(self.a.shape[1])
-        p, q = x.sizes, y.sizes
+        x, y, b, rows = self, other, basis(self.a.shape[1]), np.newaxis
+        p, q, xv, yv = x.sizes, y.sizes, x.value, y.value
         xm, ym = (float(np.sum(np.abs(v.moves))) for v in (x, y))
-        xt, yt = (v.turned - v.slack for v in (x, y))
-        ps, qs = float(p.slope[0]), float(q.slope[0])
-        error = x.value * y.error + y.value * x.error + xm * ym  # the last is of second order in y
-        slack = x.value * y.slack + x.error * qs + y.value * x.slack + y.error * ps + xm * yt + ym * xt
+        xt, yt = x.tilt, y.tilt
+        error = xv * y.error + yv * x.error + xm * ym  # the last is of second order in y
+        slack = xv * y.slack + x.error * q.slope + yv * x.slack + y.error * p.slope + xm * yt + ym * xt
         Q = x.c * y.Q + y.c * x.Q + b.between(x.a, y.a)
         K = x.c * y.K + y.c * x.K + b.times(x.a, y.Q) + b.times(y.a, x.Q)
         left = p.slope * q.twist + p.twist * q.slope + (p.bend + p.twist) * (q.bend + q.twist)
         moved = x.away * y._spread(q) + y.away * x._spread(p)
-        moved += x.turned * (qs + float(q.bend[0])) + y.turned * (ps + float(p.bend[0]))
-        E = x.value * y.E + y.value * x.E + p.radius * y.rest + (q.slope + q.bend + q.twist) * x.rest
+        moved += (xt + x.slack) * (q.slope + q.bend) + (yt + y.slack) * (p.slope + p.bend)
+        E = xv[:, rows] * y.E + yv[:, rows] * x.E
+        E += p.radius[:, rows] * y.rest + (q.slope + q.bend + q.twist)[:, rows] * x.rest
         return RangedJet(
             x.c * y.c,
             x.c * y.moves + y.c * x.moves,
             error,
             x.c * y.a + y.c * x.a,
-            x.c * y.turns + y.c * x.turns + x.moves[:, None] * y.a + y.moves[:, None] * x.a,
+            x.c * y.turns + y.c * x.turns + x.moves[:, rows, rows] * y.a + y.moves[:, rows, rows] * x.a,
             slack,
             Q,
             K,
             x.c * y.B + y.c * x.B,
-            E + (left + moved) * b.eye,
+            E + (left + moved)[:, rows] * b.eye,
             x.errors,
         )
 
-    def compose(self, f: Four, e: Four, fourth: float) -> RangedJet:
+    def compose(self, f: Four, e: Sequence[Array], fourth: Array) -> RangedJet:
         """A function's phi, phi', phi''/2 and phi'''/6 at c, how far they are from those at v(0), and at least
-        |phi''''|/24 on the range."""
+        |phi''''|/24 on the ranges, one for each ball or for all."""
         (f0, f1, half, sixth), (e0, e1, e2, e3) = f, e
-        size, far = self.sizes, self.away
-        slope, bend = float(size.slope[0]), float(size.bend[0])
+        size, far, rows = self.sizes, self.away, np.newaxis
+        slope, bend = size.slope, size.bend
         h, g = abs(half) + e2, abs(sixth) + e3
-        each = (np.array([v]) for v in (half, sixth, h, g, fourth))
-        second, third, *bounds = each
+        second, third = np.array([half]), np.array([sixth])
         squares = basis(self.a.shape[1]).square(self.a)
         H, cubic = beyond_tangent(self.a, squares, self.Q, self.K, second, third)
-        R = remainder(squares, size, self.rest, *bounds)
+        R = remainder(squares, size, self.rest, h, g, fourth)
         moved = e1 * self._spread(size) + e2 * (slope**2 + 2 * slope * bend) + e3 * slope**3
-        bent = 2 * (h + fourth * float(size.radius[0]) ** 2) * slope + 2 * h * bend + 3 * g * slope**2
+        bent = 2 * (h + fourth * size.radius**2) * slope + 2 * h * bend + 3 * g * slope**2
         if len(self.moves):
-            tilt, by_y = self.turned - self.slack, 2 * abs(half) * float(np.sum(np.abs(self.moves)))
+            by_y = 2 * abs(half) * float(np.sum(np.abs(self.moves)))
             error = abs(f1) * self.error + h * far**2
-            slack = (2 * h * self.error + 3 * g * far**2) * slope + (abs(f1) + by_y) * self.slack + by_y * tilt
+            slack = (2 * h * self.error + 3 * g * far**2) * slope + (abs(f1) + by_y) * self.slack + by_y * self.tilt
         else:
             error, slack = e0, e1 * slope + (abs(f1) + e1) * self.slack
         return RangedJet(
@@ -169,23 +176,24 @@ class RangedJet:
             f1 * self.moves,
             error,
             f1 * self.a,
-            f1 * self.turns + 2 * half * self.moves[:, None] * self.a,
+            f1 * self.turns + 2 * half * self.moves[:, rows, rows] * self.a,
             slack,
             f1 * self.Q + H,
             f1 * self.K + cubic,
             f1 * self.B,
-            (abs(f1) + e1) * self.E + R + (moved + bent * self.turned) * basis(self.a.shape[1]).eye,
+            (abs(f1) + e1)[:, rows] * self.E + R + (moved + bent * self.turned)[:, rows] * basis(self.a.shape[1]).eye,
             self.errors,
         )
 
     def _nowhere(self) -> RangedJet:
+        """Of all balls, where one of them has no finite model."""
         return replace(self, c=math.nan, E=self.E + math.inf)
 
     def inverse(self) -> RangedJet:
         c, far = self.c, self.away
         close = abs(c) - far
         least = close - self.radius
-        if not least > 0:
+        if not np.all(least > 0):
             return self._nowhere()
         f = 1 / c, -1 / c**2, 1 / c**3, -1 / c**4
         e = far / close**2, 2 * far / close**3, 3 * far / close**4, 4 * far / close**5
@@ -194,18 +202,18 @@ class RangedJet:
     def sqrt(self) -> RangedJet:
         far = self.away
         close = self.c - far
-        if not close - self.radius > 0:
+        if not np.all(close - self.radius > 0):
             return self._nowhere()
-        r, s, w = math.sqrt(self.c), math.sqrt(close), math.sqrt(close - self.radius)
+        r, s, w = math.sqrt(self.c), np.sqrt(close), np.sqrt(close - self.radius)
         f = r, 1 / (2 * r), -1 / (8 * r**3), 1 / (16 * r**5)
         e = far / (2 * s), far / (4 * s**3), 0.1875 * far / s**5, 0.15625 * far / s**7
         return self.compose(f, e, (5 * s**2 + 4 * s * w + w**2) / (16 * s**5 * (s + w) ** 4))
 
     def exp(self) -> RangedJet:
         end = self.c + self.away + self.radius
-        if not end < EXP_END:
+        if not np.all(end < EXP_END):
             return self._nowhere()
-        here, most = math.exp(self.c), math.exp(end)
+        here, most = math.exp(self.c), np.exp(end)
         e = self.away * most
         return self.compose((here, here, here / 2, here / 6), (e, e, e, e), most / 24)
 
@@ -215,13 +223,13 @@ class RangedJet:
         e1 = 2 * far * (1 + far)
         e = far, e1, far * (slope + e1) + abs(t) * e1, 1.4 * far
         there = abs(8 * t * (2 - 3 * t**2) * slope)
-        fourth = min(TANH4, there + TANH5 * (far + self.radius)) / 24
+        fourth = np.minimum(TANH4, there + TANH5 * (far + self.radius)) / 24
         return self.compose((t, slope, -t * slope, (t * t - 1 / 3) * slope), e, fourth)
 
     def atan(self) -> RangedJet:
         slope, far = 1 / (1 + self.c**2), self.away
         f = math.atan(self.c), slope, -self.c * slope**2, (self.c**2 - 1 / 3) * slope**3
-        return self.compose(f, (far, far, far, far), ATAN4 / 24)
+        return self.compose(f, (far, far, far, far), np.array([ATAN4 / 24]))
 
     def sin(self) -> RangedJet:
         return self._wave(math.sin(self.c), math.cos(self.c))
@@ -231,29 +239,28 @@ class RangedJet:
 
     def _wave(self, value: float, slope: float) -> RangedJet:
         far = self.away
-        fourth = min(1.0, abs(value) + far + self.radius) / 24
+        fourth = np.minimum(1.0, abs(value) + far + self.radius) / 24
         return self.compose((value, slope, -value / 2, -slope / 6), (far, far, far, far), fourth)
 
 
 class RangedJets(Algebra[RangedJet]):
-    """Such jets in k variables and N uncertain quantities, with the errors that they share."""
+    """Such jets on M balls, in k variables and N uncertain quantities, with the errors that they share."""
 
-    def __init__(self, k: int, N: int, errors: Array) -> None:
+    def __init__(self, M: int, k: int, N: int, errors: Array) -> None:
         b = basis(k)
-        nothing = RangedJet(
+        self._nothing = RangedJet(
             0.0,
             np.zeros(N),
-            0.0,
-            np.zeros((1, k)),
-            np.zeros((N, k)),
-            0.0,
-            np.zeros((1, len(b.eye))),
-            np.zeros((1, len(b.scale3))),
+            np.zeros(M),
+            np.zeros((M, k)),
+            np.zeros((N, M, k)),
+            np.zeros(M),
+            np.zeros((M, len(b.eye))),
+            np.zeros((M, len(b.scale3))),
             np.zeros((1, len(errors))),
-            np.zeros((1, len(b.eye))),
+            np.zeros((M, len(b.eye))),
             errors,
         )
-        self._nothing = nothing
 
     def constant(self, q: Fraction) -> RangedJet:
         return replace(self._nothing, c=float(q))
@@ -270,17 +277,18 @@ class RangedJets(Algebra[RangedJet]):
         """One of [lo, hi], at the same place as y of its number; None: at any place."""
         middle, half = float((lo + hi) / 2), float((hi - lo) / 2)
         if number is None:
-            return replace(self._nothing, c=middle, error=half)
+            return replace(self._nothing, c=middle, error=np.full_like(self._nothing.error, half))
         moves = np.zeros_like(self._nothing.moves)
         moves[number] = half
         return replace(self._nothing, c=middle, moves=moves)
 
-    def state(self, value: float, row: Array, error: float = 0.0, slack: float = 0.0) -> RangedJet:
-        """A value at the middle and its gradient (k,), or one that is near."""
-        return replace(self._nothing, c=value, a=row[None], error=error, slack=slack)
+    def state(self, value: float, rows: Array, error: Array | None = None, slack: Array | None = None) -> RangedJet:
+        """A value at the middle and its gradients (M, k), or one that is near, (M,) each."""
+        error, slack = (self._nothing.error if v is None else v for v in (error, slack))
+        return replace(self._nothing, c=value, a=rows, error=error, slack=slack)
 
     def input(self, number: int, value: float, a: Array, Q: Array, K: Array) -> RangedJet:
         """An input's model, without its error, which is e of its number."""
         B = np.zeros_like(self._nothing.B)
         B[0, number] = 1.0
-        return replace(self._nothing, c=value, a=a[None], Q=Q[None], K=K[None], B=B)
+        return replace(self._nothing, c=value, a=a, Q=Q, K=K, B=B)

@@ -17,7 +17,7 @@ import sympy
 from numpy.typing import NDArray
 
 from certify.closed_loop import ClosedLoop
-from certify.engines.models import Driven, Models, Paths, Spread
+from certify.engines.models import Driven, Models, Paths, Spread, of_all
 from certify.engines.ranged import RangedJet, RangedJets
 from certify.expressions import evaluate, solution_series
 from certify.systems.system import Interval
@@ -56,16 +56,22 @@ class Steps:
 
     def models(self, J: Array, cells: Sequence[Cell], reach: Array) -> list[Models]:
         """Of G on the ball x = J d for each cell; no state of interest there is larger than `reach`, (n,)."""
+        return self.models_on(J[None], cells, reach[None])[0]
+
+    def models_on(self, balls: Array, cells: Sequence[Cell], reach: Array) -> list[list[Models]]:
+        """The same on each of several balls, (N, n, k), `reach` being (N, n); if one has no finite models, none has."""
         if self.is_plain:
-            return [self.known.models(J)]
-        driven, sample = self.known.driven(J), self.known.loop.system.sample
-        walks = [_Walk(self, J, driven, cell) for cell in cells]
+            return [[models] for models in self.known.models_on(balls)]
+        driven, sample = [self.known.driven(J) for J in balls], self.known.loop.system.sample
+        walks = [_Walk(self, balls, driven, cell) for cell in cells]
         # what comes after x_1 is of the whole ranges, and so the same for every cell
         later = None if sample is None else _later(walks[0], self.order, sample, reach)
-        return [self._in_cell(walk, driven, later) for walk in walks]
+        in_cells = [self._in_cell(walk, driven, later) for walk in walks]
+        return [list(of_ball) for of_ball in zip(*in_cells, strict=True)]
 
-    def _in_cell(self, walk: _Walk, driven: Driven, later: _Later | None) -> Models:
-        system, G, stays = self.known.loop.system, [walk.still(v) for v in walk.rates()], True
+    def _in_cell(self, walk: _Walk, driven: Sequence[Driven], later: _Later | None) -> list[Models]:
+        """On each ball."""
+        system, G, stays = self.known.loop.system, [walk.still(v) for v in walk.rates()], np.ones(len(driven), bool)
         if later is not None:
             G, stays = [v + more for v, more in zip(G, later.terms, strict=True)], later.stays
         if system.time == "discrete":
@@ -73,7 +79,12 @@ class Steps:
         moves, turns, error, slack = (
             np.array([getattr(v, part) for v in G]) for part in ("moves", "turns", "error", "slack")
         )
-        return driven.models(G, Spread(moves.T, np.swapaxes(turns, 0, 1), error, slack), stays)
+        return [
+            one.models(
+                G, b, Spread(moves.T, np.swapaxes(turns[:, :, b], 0, 1), error[:, b], slack[:, b]), bool(stays[b])
+            )
+            for b, one in enumerate(driven)
+        ]
 
 
 def steps_of(known: Paths, at_rest: bool, order: int) -> Steps:
@@ -83,26 +94,27 @@ def steps_of(known: Paths, at_rest: bool, order: int) -> Steps:
 
 
 class _Walk:
-    """The equations on a ball, in a cell."""
+    """The equations on balls (N, n, k), in a cell."""
 
-    def __init__(self, steps: Steps, J: Array, driven: Driven, cell: Cell) -> None:
-        self.steps, self.J, self.cell = steps, J, cell
+    def __init__(self, steps: Steps, balls: Array, driven: Sequence[Driven], cell: Cell) -> None:
+        self.steps, self.balls, self.cell = steps, balls, cell
         sample = self.loop.system.sample
         self.varies = sample is not None and sample[0] < sample[1]
-        self.algebra = RangedJets(J.shape[1], len(cell) + self.varies, driven.errors)
+        models, errors = of_all(driven)
+        self.algebra = RangedJets(len(balls), balls.shape[2], len(cell) + self.varies, errors)
         u = enumerate(steps.known.u)
-        self._inputs = [self.algebra.input(j, float(value), *driven.of(j)) for j, value in u]
+        self._inputs = [self.algebra.input(j, float(value), *models[j]) for j, value in u]
 
     @property
     def loop(self) -> ClosedLoop:
         return self.steps.known.loop
 
     def states(self, near: tuple[Array, Array] | None = None) -> list[RangedJet]:
-        """x, or what is as `near` to it: v(0) and gradients within these, (n,) each."""
-        n = len(self.J)
-        errors, slacks = (np.zeros(n), np.zeros(n)) if near is None else near
-        rows = zip(self.J, errors, slacks, strict=True)
-        return [self.algebra.state(0.0, row, float(e), float(s)) for row, e, s in rows]
+        """x, or what is as `near` to it: v(0) and gradients within these, (n, N) each."""
+        rows = np.swapaxes(self.balls, 0, 1)
+        if near is None:
+            return [self.algebra.state(0.0, of_state) for of_state in rows]
+        return [self.algebra.state(0.0, *of_state) for of_state in zip(rows, *near, strict=True)]
 
     def rates(self, near: tuple[Array, Array] | None = None, fixed: bool = True) -> list[RangedJet]:
         """f at these states; the quantities are one point of the cell, or anywhere at every place if not `fixed`."""
@@ -117,7 +129,9 @@ class _Walk:
 
     def still(self, v: RangedJet) -> RangedJet:
         """At rest what vanishes at d = 0 does so exactly."""
-        return replace(v, c=0.0, moves=np.zeros_like(v.moves), error=0.0) if self.steps.at_rest else v
+        if not self.steps.at_rest:
+            return v
+        return replace(v, c=0.0, moves=np.zeros_like(v.moves), error=np.zeros_like(v.error))
 
     def _states_by_name(self, near: tuple[Array, Array] | None) -> dict[sympy.Symbol, RangedJet]:
         return dict(zip(self.loop.system.states, self.states(near), strict=True))
@@ -132,10 +146,10 @@ class _Walk:
 
 @dataclass(frozen=True, slots=True)
 class _Later:
-    """`h x_2 + ... + h^(r-1) x_r` for every h of the sample, and whether the states stay in the domain."""
+    """`h x_2 + ... + h^(r-1) x_r` for every h of the sample, and on which balls the states stay in the domain, (N,)."""
 
     terms: list[RangedJet]
-    stays: bool
+    stays: NDArray[np.bool_]
 
 
 def _later(walk: _Walk, order: int, sample: Interval, reach: Array) -> _Later:
@@ -143,10 +157,10 @@ def _later(walk: _Walk, order: int, sample: Interval, reach: Array) -> _Later:
     hi = float(sample[1])
     moved = _within_a_period(walk, hi)
     if moved is None:
-        return _Later([replace(x, c=math.nan) for x in walk.states()], False)
+        return _Later([replace(x, c=math.nan) for x in walk.states()], np.zeros(len(walk.balls), bool))
     near, rate = moved
-    ends = [(float(a), float(b)) for a, b in walk.loop.system.domain]
-    stays = all(a < -r - hi * v and r + hi * v < b for (a, b), r, v in zip(ends, reach, rate, strict=True))
+    low, high = np.array([[float(end) for end in pair] for pair in walk.loop.system.domain]).T
+    stays = np.all((low < -reach - hi * rate.T) & (reach + hi * rate.T < high), axis=1)
     last = [row[-1] for row in walk.series(order, near)]
     early = walk.series(order - 1) if order > 2 else [[]] * len(last)
     h = walk.algebra.quantity(*sample, len(walk.cell) if walk.varies else None)
@@ -160,17 +174,18 @@ def _later(walk: _Walk, order: int, sample: Interval, reach: Array) -> _Later:
 
 
 def _within_a_period(walk: _Walk, hi: float) -> tuple[tuple[Array, Array], Array] | None:
-    """Bounds, (n,), of how far v(0) and gradients of the states move from x within a period, and their rates; None if
-    none is found."""
-    n, at_rest = len(walk.J), walk.steps.at_rest
-    near = np.zeros(n), np.zeros(n)
+    """Bounds, (n, N), of how far v(0) and gradients of the states move from x within a period, and their rates; None if
+    none is found on some ball. What is found for one ball does not depend on the others."""
+    balls, n, _ = walk.balls.shape
+    at_rest, far, along = walk.steps.at_rest, np.zeros((n, balls)), np.zeros((n, balls))
     for _ in range(_ATTEMPTS + 1):
-        rates = walk.rates(near, fixed=False)
-        first = np.array([0.0 if at_rest else v.value for v in rates])
+        rates = walk.rates((far, along), fixed=False)
         steep = np.array([v.radius for v in rates])
+        first = np.zeros_like(steep) if at_rest else np.array([v.value for v in rates])
         if not (np.all(np.isfinite(first)) and np.all(np.isfinite(steep))):
             return None
-        if (at_rest or np.all(hi * first < near[0])) and np.all(hi * steep < near[1]):
-            return near, first + steep
-        near = _FURTHER * hi * first, _FURTHER * hi * steep
+        found = np.all((at_rest | (hi * first < far)) & (hi * steep < along), axis=0)
+        if np.all(found):
+            return (far, along), first + steep
+        far, along = np.where(found, far, _FURTHER * hi * first), np.where(found, along, _FURTHER * hi * steep)
     return None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from certify.lyapunov.candidates import slowest_decay, solve_lyapunov
-from certify.lyapunov.choice import SOLVED, Candidate, Chosen, Named, choose_candidate
+from certify.lyapunov.choice import BEYOND, SOLVED, Beyond, Candidate, Chosen, Named, choose_candidate
 from certify.lyapunov.file import StoredLyapunov, load_lyapunov, save_lyapunov
 from certify.lyapunov.function import LyapunovFunction, Quadratic
 from certify.lyapunov.importing import ImportedLyapunov, import_lyapunov
@@ -21,10 +21,13 @@ from certify.lyapunov.level_sets import (
 from certify.lyapunov.neural import Neural
 from certify.lyapunov.optimised import optimise_candidate, optimise_repeatedly
 from certify.lyapunov.polynomial import Polynomial
+from certify.lyapunov.sampled import sampled_volume
 from certify.lyapunov.symbolic import Symbolic, of_polynomial
 
 __all__ = [
+    "BEYOND",
     "SOLVED",
+    "Beyond",
     "Candidate",
     "Chosen",
     "ImportedLyapunov",
@@ -48,6 +51,7 @@ __all__ = [
     "of_polynomial",
     "optimise_candidate",
     "optimise_repeatedly",
+    "sampled_volume",
     "save_lyapunov",
     "semi_axes",
     "slowest_decay",

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from certify.policies.layers import frozen_layers, tanh, through, widths
+from certify.policies.layers import frozen_layers, sha256_of, tanh, through, widths
 
 Array = NDArray[np.float64]
 
@@ -57,6 +57,11 @@ class Neural:
     def widths(self) -> tuple[int, ...]:
         """Widths from the states to 1, such as (2, 16, 16, 1)."""
         return widths(self.weights)
+
+    def sha256(self) -> str:
+        """Hash by which a network is named: of each layer's weight and bias, as `sha256_of` has them."""
+        pairs = [a for pair in zip(self.weights, self.biases, strict=True) for a in pair]
+        return sha256_of(b"certify-lyapunov/1\0", pairs)
 
     def __call__(self, x: Array) -> Array:
         """N in float64, shape (..., n) to (...)."""

@@ -84,7 +84,7 @@ class Polynomial:
 
     def __call__(self, x: Array) -> Array:
         """N in float64, shape (..., n) to (...)."""
-        return np.asarray(_monomials(x, self.exponents) @ self.coefficients)
+        return np.asarray(monomials(x, self.exponents) @ self.coefficients)
 
     def gradient(self, x: Array) -> Array:
         """dN/dx in float64, shape (..., n) to (..., n)."""
@@ -92,7 +92,7 @@ class Polynomial:
         for i, unit in enumerate(np.eye(self.n, dtype=np.int64)):
             rows = self.exponents[:, i] > 0
             factors = self.coefficients[rows] * self.exponents[rows, i]
-            columns.append(_monomials(x, self.exponents[rows] - unit) @ factors)
+            columns.append(monomials(x, self.exponents[rows] - unit) @ factors)
         return np.stack(columns, axis=-1)
 
     def exactly(self, x: Array) -> Fraction:
@@ -102,7 +102,7 @@ class Polynomial:
         return sum((Fraction(c) * prod(v**a for v, a in zip(exact, row, strict=True)) for row, c in terms), Fraction(0))
 
 
-def _monomials(x: Array, exponents: NDArray[np.int64]) -> Array:
+def monomials(x: Array, exponents: NDArray[np.int64]) -> Array:
     """Products of powers, shapes (..., n) and (k, n) to (..., k)."""
     result = np.ones((*x.shape[:-1], len(exponents)))
     for i, column in enumerate(exponents.T):

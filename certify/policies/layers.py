@@ -6,7 +6,9 @@ them.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+import struct
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -67,6 +69,19 @@ def frozen_layers(
 def widths(weights: Sequence[Array]) -> tuple[int, ...]:
     """Numbers in front of the first layer and behind each, such as (2, 16, 16, 1)."""
     return (int(weights[0].shape[1]), *(int(w.shape[0]) for w in weights))
+
+
+def sha256_of(head: bytes, arrays: Iterable[Array]) -> str:
+    """Hash of `head` and then of each array's shape and little-endian binary64.
+
+    Every array contributes its number of axes and its axes as unsigned 64-bit little-endian integers, then its numbers
+    in row order.
+    """
+    digest = hashlib.sha256(head)
+    for array in arrays:
+        digest.update(struct.pack(f"<{1 + array.ndim}Q", array.ndim, *array.shape))
+        digest.update(np.ascontiguousarray(array, dtype="<f8").tobytes())
+    return digest.hexdigest()
 
 
 def through(weights: Sequence[Array], biases: Sequence[Array], x: Any) -> Any:

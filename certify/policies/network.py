@@ -15,8 +15,6 @@ hi) the policy is `min(max(., lo), hi)` of that: the last step, behind the centr
 
 from __future__ import annotations
 
-import hashlib
-import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -27,7 +25,7 @@ from numpy.typing import NDArray
 
 from certify.errors import InputError
 from certify.policies.arithmetic import Arithmetic
-from certify.policies.layers import frozen, frozen_layers, like, tanh, through, widths
+from certify.policies.layers import frozen, frozen_layers, like, sha256_of, tanh, through, widths
 
 Squash = Literal["tanh", "identity"]
 Centre = Literal["output", "preactivation", "none"]
@@ -213,18 +211,13 @@ class TanhNetwork:
         return np.asarray(self.scale[:, None] * ((slope * np.ones(self.m))[:, None] * jacobian))
 
     def sha256(self) -> str:
-        """Hash of the canonical bytes: squash, centre, then each array's shape and little-endian binary64.
+        """Hash of the canonical bytes: squash, centre, then the arrays as `sha256_of` has them.
 
-        Every array (layers in order as weight, bias; scale; offset; with a clip lo and hi) contributes its number
-        of axes and its axes as unsigned 64-bit little-endian integers, then its numbers in row order.
+        They are the layers in order as weight, bias; scale; offset; with a clip lo and hi.
         """
-        digest = hashlib.sha256(b"certify-policy/1\0")
-        digest.update(f"{self.squash}\0{self.centre}\0".encode())
         pairs = [a for pair in zip(self.weights, self.biases, strict=True) for a in pair]
-        for array in (*pairs, self.scale, self.offset, *(self.clip or ())):
-            digest.update(struct.pack(f"<{1 + array.ndim}Q", array.ndim, *array.shape))
-            digest.update(np.ascontiguousarray(array, dtype="<f8").tobytes())
-        return digest.hexdigest()
+        head = f"certify-policy/1\0{self.squash}\0{self.centre}\0".encode()
+        return sha256_of(head, (*pairs, self.scale, self.offset, *(self.clip or ())))
 
 
 class _Arrays:

@@ -23,7 +23,7 @@ Part = tuple[str, str, str]
 class Words:
     """One kind of claim in words. In texts, {inner} and {outer} stand for its levels in digits, {duration} for how long
     its tube is, {centre} for the state that it begins around, {speed} for what a rate says (Timing.speed),
-    {constant} for the words that ask what is uncertain to be constant.
+    {constant} for the words that ask what is uncertain to be constant, {beyond} for the level of N.
 
     Parameters
     ----------
@@ -261,8 +261,57 @@ _AROUND_A_LEVEL = (
 )
 
 
-def words_for(kind: str, timing: Timing = PLAIN, *, ball: bool = False) -> Words:
-    """The words of a claim about a loop in which time passes so; `ball` says that its evidence has one.
+_BEYOND = (
+    (
+        "Faces",
+        "N(x) > n₂ for all x on the boundary of the domain, so that the outer set does not touch it",
+        "leaf by leaf of a partition of each face",
+    ),
+    (
+        "Outer set",
+        "For all x of the domain with V(x) ≥ c₂ and N(x) ≤ n₂, N is continuously differentiable, N′(x)F(x) < 0, the "
+        "closed loop is locally Lipschitz, and what the policy asks for stays in the bounds of the input",
+        "leaf by leaf of a partition that covers the domain by construction",
+    ),
+)
+_NOT_BEYOND = (
+    (
+        "Other parts of {N ≤ n₂}.",
+        "Only states of the domain belong to the outer set. Outside the domain nothing is said, whatever N is there.",
+    ),
+    (
+        "What V and N do on the way.",
+        "N falls along a trajectory from the outer set until {V ≤ c₂} is entered; V may rise meanwhile. From then on "
+        "nothing is said of N, which need not be positive, nor least at the origin.",
+    ),
+    (
+        "When {V ≤ c₂} is entered.",
+        "The time is finite for each trajectory from the outer set; how long it is, is not stated.",
+    ),
+)
+
+
+def _with_outer(words: Words) -> Words:
+    """The words of a claim that has an outer set besides."""
+    return replace(
+        words,
+        statement=words.statement + " Moreover every trajectory that starts in the outer set, the states x of "
+        "the domain with N(x) ≤ {beyond} and no others, enters {{V(x) ≤ {outer}}} in finite time, and from then on is "
+        "one of those just spoken of; on the way it stays in the union of the two sets.",
+        headline=words.headline
+        + "; from every state of the domain with N <= {beyond}, {{V <= {outer}}} is entered in finite time",
+        decay="V may rise above c₂; that it comes down to c₂ in finite time is {word}. " + words.decay,
+        parts=(*words.parts, *_BEYOND),
+        excluded=(*words.excluded[:-1], *_NOT_BEYOND, words.excluded[-1]),
+        sets="{V ≤ c₂} and the outer set",
+    )
+
+
+def words_for(kind: str, timing: Timing = PLAIN, *, ball: bool = False, beyond: bool = False) -> Words:
+    """The words of a claim about a loop in which time passes so.
+
+    `ball` says that its evidence has one, `beyond` that the claim has an outer set.
+
 
     Raises
     ------
@@ -270,7 +319,7 @@ def words_for(kind: str, timing: Timing = PLAIN, *, ball: bool = False) -> Words
     """
     if kind not in CLAIMS:
         raise CertificateFormatError(f"reports know the claims {', '.join(CLAIMS)}; found {kind!r}.")
-    words = CLAIMS[kind]
+    words = _with_outer(CLAIMS[kind]) if beyond else CLAIMS[kind]
     words = replace(words, parts=tuple(_in_steps(kind, _with_ball(kind, words.parts, ball), timing)))
     return Words(**{f.name: _filled(getattr(words, f.name), timing.phrases) for f in fields(Words)})
 

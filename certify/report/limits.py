@@ -18,6 +18,13 @@ _LIMITS = {
     "boxes": "the limit on boxes: more may be provable",
     "requested": "the level that was asked for",
 }
+_OF_OUTER = {
+    "domain": "the domain: a larger one reaches its edge",
+    "witness": "a state at which N does not fall",
+    "time": "the time limit: more may be provable",
+    "boxes": "the limit on boxes: more may be provable",
+    "requested": "the level that was asked for",
+}
 _TOUCHING = Fraction(1, 10**6)  # relative distance from the domain's limit below which a set is said to touch it
 
 
@@ -40,6 +47,18 @@ def limited_by(result: Mapping[str, Any]) -> str:
                 return f"a margin that the engine keeps: {apart}"
             return f"the precision of {solver['solver']} (delta {number(precision)}), which stops {apart}"
     return limit_in_words(reason, Timing.of_result(result))
+
+
+def outer_limited_by(outer: Mapping[str, Any]) -> str:
+    """What limits the level of an outer set, in words, from what a result says of it.
+
+    >>> outer_limited_by({"limit": "boxes"})
+    'the limit on boxes: more may be provable'
+    """
+    reason = str(outer["limit"])
+    said = _OF_OUTER.get(reason, reason)
+    met = outer.get("witness_level")
+    return said + (f", where N = {number(met)}" if reason == "witness" and met is not None else "")
 
 
 def limit_in_words(reason: str, timing: Timing = PLAIN) -> str:

@@ -22,15 +22,15 @@ import sympy
 from numpy.typing import NDArray
 
 from certify.certificate import Certificate, PartitionTree, TrustedSolver
-from certify.claims import Asymptotic, Enlarged, Reached
+from certify.claims import Asymptotic, Enlarged, Outer, Reached
 from certify.closed_loop import ClosedLoop
 from certify.errors import CertifyError, InputError, SoundnessError
-from certify.lyapunov import domain_limit, extents, semi_axes, volume
+from certify.lyapunov import Neural, domain_limit, extents, sampled_volume, semi_axes, volume
 from certify.report.claims import CHECKED_ALWAYS, INPUTS, Words, words_for
 from certify.report.figures import Picture, draw
 from certify.report.figures.scene import centre_of, inner_of, is_ellipsoid, is_local_enough, slabs_of, start_of
 from certify.report.figures.style import legend_style
-from certify.report.limits import limit_in_words, limited_by
+from certify.report.limits import limit_in_words, limited_by, outer_limited_by
 from certify.report.sampling import SimulatedRoa
 from certify.report.timing import Timing
 from certify.report.words import (
@@ -42,10 +42,12 @@ from certify.report.words import (
     at_rest,
     below,
     deviation,
+    estimated,
     held_at,
     inner_level,
     kept_apart,
     listed,
+    network_name,
     number,
     point,
     pretty_unit,
@@ -60,6 +62,7 @@ from certify.report.words import (
 from certify.systems import System
 
 _LONG = 10**6  # numerators and denominators beyond it are shown rounded
+_MOST_OPERATIONS = 200  # of an expression N that is shown
 _SECONDS, _SHARE = 10.0, 0.1  # the drawing takes no longer than the one, or than this share of the run
 
 
@@ -94,10 +97,17 @@ def status_of(certificate: Certificate, sha256: str, answer: Mapping[str, Any] |
         return Status("NOT CHECKED", "The checker gave no verdict. Nothing here is proved.")
     levels = answer.get("levels")
     given = dict(levels) if isinstance(levels, Mapping) else {}
+    beyond, stated = answer.get("outer"), certificate.claim.outer
+    beyond = beyond if beyond is None or (isinstance(beyond, Mapping) and "level" in beyond) else {"level": "none"}
     for what, found, wanted in (
         ("bytes with sha256", answer.get("certificate_sha256"), sha256),
         ("policy with sha256", answer.get("policy_sha256"), certificate.network.sha256()),
         ("levels", given, dict(certificate.claim.levels)),
+        (
+            "level of the outer set",
+            None if beyond is None else [beyond["level"]],
+            None if stated is None else [stated.level],
+        ),
         ("evidence to replay", kind == "ACCEPTED", isinstance(certificate.evidence, PartitionTree)),
     ):
         if found != wanted:
@@ -122,7 +132,7 @@ def _timing(certificate: Certificate) -> Timing:
 def _words(certificate: Certificate) -> Words:
     evidence = certificate.evidence
     ball = isinstance(evidence, PartitionTree) and evidence.local is not None
-    return words_for(certificate.kind, _timing(certificate), ball=ball)
+    return words_for(certificate.kind, _timing(certificate), ball=ball, beyond=certificate.claim.outer is not None)
 
 
 def _checked(kind: str) -> str:
@@ -168,11 +178,13 @@ def render_html(
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
     source = resources.files("certify.report").joinpath("template.html").read_text(encoding="utf-8")
     status = status_of(certificate, sha256, answer)
-    if result is not None and (result["policy"]["sha256"], result["levels"].get("roa")) != (
-        certificate.network.sha256(),
-        certificate.roa,
-    ):
-        raise InputError("`result` must be of the run that made the certificate; its policy or level is another.")
+    beyond = certificate.claim.outer
+    if result is not None and (
+        result["policy"]["sha256"],
+        result["levels"].get("roa"),
+        (result.get("outer") or {}).get("level"),
+    ) != (certificate.network.sha256(), certificate.roa, None if beyond is None else beyond.level):
+        raise InputError("`result` must be of the run that made the certificate; its policy or a level is another.")
     words = _words(certificate)
     pictures: list[Picture] = []
     roa, trouble = None, ""
@@ -267,14 +279,18 @@ def _matrices(certificate: Certificate) -> list[tuple[str, list[list[str]]]]:
 
 
 def _is_missed(result: Mapping[str, Any] | None) -> bool:
-    """Whether the run's reason is about a state that it was asked about, and not about the certificate's set."""
-    return result is not None and result.get("stop") == "path"
+    """Whether the run's reason is about what it was asked for, a state or a level of N, and not about the certificate's
+    set."""
+    return result is not None and result.get("stop") in ("path", "beyond")
 
 
 def _missed(result: Mapping[str, Any] | None, status: Status) -> str:
-    """That a state was asked about which this certificate says nothing of; nothing if that is not so."""
+    """That a state, or a level of N, was asked about of which this certificate says nothing; else nothing."""
     if result is None or not _is_missed(result):
         return ""
+    if result.get("stop") == "beyond":
+        smaller = " The certificate is about a smaller set." if status.accepted else ""
+        return f"An outer set was asked for that is not proved: {result['reason'].rstrip('.')}.{smaller}"
     asked: Mapping[str, str] = result.get("reach_from") or {}
     units = {s["name"]: s.get("unit") or "" for s in result.get("states") or ()}
     where = point(list(asked), [Fraction(v) for v in asked.values()], [units.get(name, "") for name in asked])
@@ -304,6 +320,7 @@ def _limits(certificate: Certificate, result: Mapping[str, Any] | None) -> dict[
         "modes": ""
         if _timing(certificate).discrete
         else _modes(found, "with " * bool(system.ranges) + held_at(system)),
+        "outer": _outer_limit(result),
         "sets": len(sets),
         "shares": [
             {
@@ -325,6 +342,12 @@ def _limits(certificate: Certificate, result: Mapping[str, Any] | None) -> dict[
         "why": str(step.get("why", "")).rstrip("."),
         "command": step.get("command") or options,
     }
+
+
+def _outer_limit(result: Mapping[str, Any] | None) -> str:
+    """What the run says of what limits its outer set; nothing where there is none."""
+    found: Mapping[str, Any] = (result or {}).get("outer") or {}
+    return outer_limited_by(found) if found else ""
 
 
 def _modes(found: Mapping[str, Any], held: str) -> str:
@@ -368,7 +391,15 @@ def _plant(certificate: Certificate) -> dict[str, Any]:
 
 
 def _equation(state: sympy.Symbol, expression: sympy.Expr, names: Sequence[sympy.Symbol], *, steps: bool) -> Any:
-    """`state' = expression`, or by steps `state+ = expression`, as MathML, which browsers typeset without help."""
+    """`state' = expression`, or by steps `state+ = expression`."""
+    left = f"<mfrac><mrow><mi>d</mi>{_identifier(state.name)}</mrow><mrow><mi>d</mi><mi>t</mi></mrow></mfrac>"
+    if steps:
+        left = f"<msup>{_identifier(state.name)}<mo>+</mo></msup>"
+    return _typeset(left, expression, names)
+
+
+def _typeset(left: str, expression: sympy.Expr, names: Sequence[sympy.Symbol]) -> Any:
+    """`left = expression` as MathML, which browsers typeset without help."""
     from markupsafe import Markup
     from sympy.printing.mathml import MathMLPresentationPrinter
 
@@ -380,11 +411,23 @@ def _equation(state: sympy.Symbol, expression: sympy.Expr, names: Sequence[sympy
         text = text.replace(f"<mi>NAME{k}NAME</mi>", _identifier(s.name))
     text = text.replace("<mo>-</mo>", f"<mo>{MINUS}</mo>")
     text = text.replace("<mo>&InvisibleTimes;</mo>", '<mspace width="0.15em"/>')
-    left = f"<mfrac><mrow><mi>d</mi>{_identifier(state.name)}</mrow><mrow><mi>d</mi><mi>t</mi></mrow></mfrac>"
-    if steps:
-        left = f"<msup>{_identifier(state.name)}<mo>+</mo></msup>"
     inner = text.removeprefix("<math>").removesuffix("</math>")
     return Markup(f'<math display="block">{left}<mo>=</mo>{inner}</math>')
+
+
+def _beyond(certificate: Certificate, outer: Outer | None) -> dict[str, Any] | None:
+    """What N is: a network by its widths and hash, an expression itself unless it is long."""
+    if outer is None:
+        return None
+    N, level = outer.function, below(outer.level)
+    if isinstance(N, Neural):
+        return {"level": level, "name": network_name(N.widths), "sha256": N.sha256(), "formula": ""}
+    operations = int(sympy.count_ops(N.expression))
+    shown = operations <= _MOST_OPERATIONS
+    name = "this expression" if shown else f"an expression of {operations:,} operations, which stands in the file"
+    left = "<mi>N</mi><mo>(</mo><mi>x</mi><mo>)</mo>"
+    formula = _typeset(left, N.expression, certificate.system.states) if shown else ""
+    return {"level": level, "name": name, "sha256": "", "formula": formula}
 
 
 def _identifier(name: str) -> str:
@@ -438,7 +481,7 @@ def _claim(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict[s
     elif answer:
         shown = f"Shown on {answer.get('ring_leaves', 0):,} of {answer.get('leaves', 0):,} leaves"
         notes["Ring"] = f"{shown}; {_smallest(timing)} is {below(ring, 3)}." if ring is not None else shown
-    notes |= _tube_notes(certificate)
+    notes |= _tube_notes(certificate) | _outer_notes(answer)
     parts = []
     for name, condition, shown_by in _with_errors(words.parts, system):
         note = notes.get(name, "")
@@ -450,10 +493,12 @@ def _claim(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict[s
             text = f"{condition}, {shown_by}." if shown_by else condition
         parts.append((name, text, note))
     inner, outer = inner_level(certificate.kind, inner_of(certificate)), below(certificate.roa)
+    beyond = _beyond(certificate, certificate.claim.outer)
     practical = not certificate.claim.at_rest
     statement = words.statement.format(
         inner=inner,
         outer=outer,
+        beyond="" if beyond is None else beyond["level"],
         duration=_duration(certificate),
         centre=_centre(certificate),
         speed=timing.speed(inner_of(certificate) if practical else None, certificate.roa) if drawable else "",
@@ -465,6 +510,7 @@ def _claim(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict[s
         "middle": below(certificate.inner) if practical and certificate.inner != inner_of(certificate) else "",
         "enlarged": isinstance(certificate.claim, Enlarged | Reached),
         "centre": isinstance(certificate.claim, Reached),
+        "beyond": beyond,
         "level": outer,
         "inner": inner,
         "bounds": bounds,
@@ -544,6 +590,19 @@ def _tube_notes(certificate: Certificate) -> dict[str, str]:
     }
 
 
+def _outer_notes(answer: Mapping[str, Any] | None) -> dict[str, str]:
+    """Of the outer set's parts: on how many leaves the checker has shown them."""
+    beyond = (answer or {}).get("outer")
+    if not isinstance(beyond, Mapping):
+        return {}
+    margin = (answer or {}).get("margins", {}).get("outer")
+    least = "" if margin is None else f"; the smallest bound on {MINUS}N′F is {below(margin, 3)}"
+    return {
+        "Faces": f"Shown on {beyond.get('face_leaves', 0):,} leaves.",
+        "Outer set": f"Shown on {beyond.get('leaves', 0):,} leaves{least}.",
+    }
+
+
 def _not_proved(certificate: Certificate, words: Words) -> list[tuple[str, str]]:
     items = [
         *words.excluded[:-1],
@@ -562,6 +621,14 @@ def _not_proved(certificate: Certificate, words: Words) -> list[tuple[str, str]]
             + (f", all of them with {held} from beginning to end." if (held := held_at(certificate.system)) else "."),
         ),
     ]
+    if certificate.claim.outer is not None:
+        items.append(
+            (
+                "The size of the outer set.",
+                "Its volume is estimated from samples, and its outline in the figures is drawn from a grid; only the "
+                "inequality N(x) ≤ n₂ within the domain says which states belong to it.",
+            )
+        )
     if certificate.system.n > 2:
         items.append(
             (
@@ -682,9 +749,14 @@ def _tables(
             heads, columns = ["c₀", *heads], [[shortest(v) for v in centre.tolist()], *columns]
         domain = [f"[{below(lo)}, {above(hi)}]" for lo, hi in system.domain]
         reach = list(zip(names, *columns, domain, strict=True))
+    beyond = certificate.claim.outer
+    if beyond is not None:
+        levels.append(("n₂, of N", repr(beyond.level)))
     if result is not None:
         if not _is_missed(result):
             levels.append(("limited by", limited_by(result)))
+        if result.get("outer"):
+            levels.append(("n₂ limited by", outer_limited_by(result["outer"])))
         sampled = result["levels"].get("sampled_limit")
         if sampled is not None:
             levels.append(("lowest V of a violation found", number(sampled, 10)))
@@ -707,6 +779,8 @@ def _tables(
     ]
     if size is not None:
         evidence.append(("certificate size", f"{size:,} bytes"))
+    if beyond is not None:
+        evidence += _outer_rows(beyond, answer if status.accepted else None)
     if slabs:
         evidence.append(("tube", f"{len(slabs):,} slabs, {_duration(certificate)}"))
     if isinstance(certificate.evidence, TrustedSolver):
@@ -741,6 +815,7 @@ def _tables(
     return {
         "levels": levels,
         "size": size_of_set,
+        "estimated": _estimated(certificate, result) if is_ellipsoid(certificate) else "",
         "geometry": geometry,
         "reach": reach,
         "reach_heads": heads,
@@ -750,6 +825,31 @@ def _tables(
         "run": run,
         "candidates": candidates,
     }
+
+
+def _outer_rows(beyond: Outer, answer: Mapping[str, Any] | None) -> list[tuple[str, str]]:
+    """N, and on how many leaves the checker has looked at it."""
+    N = beyond.function
+    rows = [("N", network_name(N.widths)), ("sha256 of N", N.sha256())] if isinstance(N, Neural) else []
+    found = (answer or {}).get("outer")
+    if isinstance(found, Mapping):
+        leaves = f"{found.get('leaves', 0):,}, and {found.get('face_leaves', 0):,} on the faces of the domain"
+        rows.append(("leaves of the outer set", leaves))
+    return rows
+
+
+def _estimated(certificate: Certificate, result: Mapping[str, Any] | None) -> str:
+    """The volume of the union with the outer set, as the run has it or from samples; nothing without one."""
+    beyond, system = certificate.claim.outer, certificate.system
+    if beyond is None:
+        return ""
+    found: Mapping[str, Any] = (result or {}).get("outer") or {}
+    if found:
+        size = float(found["volume"]), float(found["deviation"])
+    else:
+        N, n2, V, c2 = beyond.function, beyond.level, certificate.V, certificate.roa
+        size = sampled_volume(lambda x: (N(x) <= n2) | (V(x) <= c2), system.domain)
+    return estimated(*size, volume_unit([system.units.get(s.name, "") for s in system.states]))
 
 
 def _lengths(certificate: Certificate, sets: Sequence[_Ellipsoid]) -> tuple[list[str], list[list[str]]]:

@@ -22,11 +22,12 @@ from numpy.typing import NDArray
 from certify.errors import InputError
 from certify.policies import TanhNetwork
 from certify.systems import System
-from certify.systems.ode import rk4_step
+from certify.systems.ode import eigenvalues_of, rk4_step
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 Field = Callable[[Array], Array]
+Holds = Callable[[Array], Mask]
 SETTLED = 1e-3
 """A run has settled when V is at most this share of the certified level: a thirtieth of the set's radius."""
 _STEP = 1.0  # of the time constant of the fastest eigenvalue
@@ -174,7 +175,7 @@ def time_scales(flow: Flow, samples: int = _RATE_SAMPLES, reach: Array | None = 
     """
     lo, hi = (flow.lo, flow.hi) if reach is None else (np.maximum(flow.lo, -reach), np.minimum(flow.hi, reach))
     x = np.random.default_rng(0).uniform(lo, hi, (samples, len(lo)))
-    rates = _eigenvalues(flow, np.concatenate([np.zeros((1, len(flow.lo))), x]))
+    rates = eigenvalues_of(flow.field, np.concatenate([np.zeros((1, len(flow.lo))), x]), flow.hi - flow.lo)
     if flow.discrete:
         with np.errstate(divide="ignore"):
             slowest = -float(np.max(np.log(np.abs(rates[:1])), initial=-math.inf))
@@ -183,16 +184,6 @@ def time_scales(flow: Flow, samples: int = _RATE_SAMPLES, reach: Array | None = 
     slowest = float(np.min(np.abs(rates[:1].real), initial=math.inf))
     step = _STEP / fastest if fastest > 0 else 1.0
     return step, min(_HORIZON / slowest if slowest > 0 else math.inf, _MAX_STEPS * flow.fitting(step))
-
-
-def _eigenvalues(flow: Flow, x: Array) -> NDArray[np.complex128]:
-    """Eigenvalues of the Jacobians (central differences) at states (N, n), without those states that have none."""
-    delta = 1e-5 * (flow.hi - flow.lo)
-    shifted = x[:, None, None, :] + np.array([1.0, -1.0])[:, None, None] * np.diag(delta)
-    with np.errstate(all="ignore"):
-        F = flow.field(shifted)
-        J = (F[:, 0] - F[:, 1]) / (2 * delta)[:, None]  # transposed; the eigenvalues are the same
-    return np.asarray(np.linalg.eigvals(J[np.all(np.isfinite(J), axis=(1, 2))]), dtype=np.complex128)
 
 
 def simulate(flow: Flow, starts: Array, step: float, steps: int, deadline: float = math.inf) -> Array:
@@ -255,17 +246,18 @@ class Runs:
 
 def runs_of(flow: Flow, starts: Array, P: Array, level: float, target: float, step: float, steps: int,
             deadline: float = math.inf, start: Array | None = None,
-            centre: Array | None = None) -> Runs:  # fmt: skip
+            centre: Array | None = None, beyond: Holds | None = None) -> Runs:  # fmt: skip
     """Simulate and tell the fates.
 
     A run settles if it comes to `V <= target`, and leaves if it leaves the domain, or rises well above `level` from a
-    start below it. Runs from below the level, or from a tube's `start` {(x - c)'P(x - c) <= 1}, c = `centre` or 0, that
-    seem to leave are simulated again in much smaller steps: the first suspect is the integration.
+    start below it. Runs from below the level, or from a tube's `start` {(x - c)'P(x - c) <= 1}, c = `centre` or 0, or
+    from a set `beyond`, that seem to leave are simulated again in much smaller steps: the first suspect is the
+    integration.
     """
     path, apart = simulate(flow, starts, step, steps, deadline), flow.steps_between(step)
     begins = quadratic(P, path[0]) <= level
     settled, left = _fates(path, begins, P, level, target, apart)
-    suspects = np.flatnonzero(left & _in_sets(path[0], P, level, start, centre))
+    suspects = np.flatnonzero(left & _in_sets(path[0], P, level, start, centre, beyond))
     if suspects.size and not flow.discrete and time.monotonic() < deadline:
         finer = simulate(flow, path[0, suspects], step / _FINER, _FINER * (len(path) - 1), deadline)[::_FINER]
         if len(finer) == len(path):
@@ -274,9 +266,11 @@ def runs_of(flow: Flow, starts: Array, P: Array, level: float, target: float, st
     return Runs(path, step, settled, left)
 
 
-def _in_sets(x: Array, P: Array, level: float, start: Array | None, centre: Array | None) -> Mask:
-    """Which states (N, n) lie in {V <= level}, or in a tube's start if there is one, around `centre` or 0."""
+def _in_sets(x: Array, P: Array, level: float, start: Array | None, centre: Array | None, beyond: Holds | None) -> Mask:
+    """Which states (N, n) lie in {V <= level}, in a tube's start if there is one, around `centre` or 0, or `beyond`."""
     inside = quadratic(P, x) <= level
+    if beyond is not None:
+        inside |= beyond(x)
     return inside if start is None else inside | (quadratic(start, x if centre is None else x - centre) <= 1.0)
 
 
@@ -302,6 +296,7 @@ def simulated_roa_fraction(
     deadline: float = math.inf,
     start: Array | None = None,
     centre: Array | None = None,
+    beyond: Holds | None = None,
 ) -> SimulatedRoa:
     """Simulate the closed loop from a grid over the domain and compare with `{x'Px <= level}`.
 
@@ -318,6 +313,7 @@ def simulated_roa_fraction(
     deadline : a reading of `time.monotonic` at which the simulation ends wherever it is.
     start, centre : (n, n) and (n,), of the ellipsoid {(x - c)'P(x - c) <= 1} that belongs to the certified set too,
         where a tube leads from it; c = 0 without a centre.
+    beyond : which states (N, n) of the domain belong to it besides, (N,).
 
     Raises
     ------
@@ -336,7 +332,7 @@ def simulated_roa_fraction(
     centres = (np.arange(points) + 0.5) / points
     axes = tuple(a + (b - a) * centres for a, b in zip(flow.lo, flow.hi, strict=True))
     x = np.stack(np.meshgrid(*axes, indexing="ij"), -1).reshape(-1, system.n)
-    certified = _in_sets(x, P, level, start, centre)
+    certified = _in_sets(x, P, level, start, centre, beyond)
     target = SETTLED * level if settled is None else settled
     attracted, left, reached = _run(flow, x, P, target, step, horizon, deadline)
     suspects = np.flatnonzero(certified & left)

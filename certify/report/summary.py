@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from unicodedata import normalize
 
 from certify.report.claims import Words, words_for
-from certify.report.limits import limited_by
+from certify.report.limits import limited_by, outer_limited_by
 from certify.report.timing import Timing, reach_time
 from certify.report.words import (
     ABSENT,
@@ -20,8 +20,10 @@ from certify.report.words import (
     above,
     at_rest,
     below,
+    estimated,
     inner_level,
     label,
+    network_name,
     number,
     point,
     pretty_unit,
@@ -36,7 +38,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
 _COLOURS = {"PROVED": "bold green", "REFUTED": "bold red", "UNKNOWN": "bold yellow", "TRUSTED": "bold yellow"}
-_STAGES = ("load", "candidate", "local", "ring", "tube", "write", "check")
+_STAGES = ("load", "candidate", "local", "ring", "tube", "learn", "outer", "write", "check")
 
 
 def summary(result: Mapping[str, Any]) -> RenderableType:
@@ -69,7 +71,7 @@ def summary(result: Mapping[str, Any]) -> RenderableType:
     parts: list[RenderableType] = [head, Text(), grid]
     if shown and result.get("extents"):
         parts += [Text(), _reach(result)]
-    if shown and result.get("tube"):
+    if shown and (result.get("tube") or result.get("outer")):
         parts.append(Text(f"lengths{_of_which(result)}", style="dim"))
     return Group(*parts, Text())
 
@@ -92,7 +94,7 @@ def _inner(result: Mapping[str, Any]) -> float | None:
 
 
 def _words(result: Mapping[str, Any]) -> Words:
-    return words_for(_kind(result), Timing.of_result(result))
+    return words_for(_kind(result), Timing.of_result(result), beyond=bool(result.get("outer")))
 
 
 def _headline(result: Mapping[str, Any], verdict: str) -> str:
@@ -103,17 +105,23 @@ def _headline(result: Mapping[str, Any], verdict: str) -> str:
             outer=below(level),
             inner="?" if inner is None else inner_level(kind, inner),
             speed=Timing.of_result(result).headline_rate(),
+            beyond=below(result["outer"]["level"]) if result.get("outer") else "",
             constant="where what is uncertain is constant in time, " if result.get("uncertain") else "",
         )
         word = ", if the solver is right: nothing checked its answers" if verdict == "TRUSTED" else ""
         return f"{name}: {_whatever(result)}{stated}{word}"
     if verdict == "REFUTED":
         return f"{name}: a condition of the claim fails for this V and level; another V may show what this one cannot"
+    if _is_missed(result) and result.get("stop") == "beyond":
+        outer = result.get("outer")
+        smaller = f" with the states of the domain where N <= {below(outer['level'])}" if outer else ""
+        return f"{name}: the level of N is NOT proved; what is proved is {{V <= {below(level)}}}{smaller}"
     if _is_missed(result):
         return f"{name}: the state is NOT shown to converge; what is proved is {{V <= {below(level)}}}, without it"
     return f"{name}: nothing was proved"
 
 
+_LONG = 200  # characters of an expression, beyond which it is not shown
 _FEW = 3  # uncertain quantities that a headline names
 
 
@@ -133,9 +141,10 @@ def _whatever(result: Mapping[str, Any]) -> str:
 
 
 def _is_missed(result: Mapping[str, Any]) -> bool:
-    """Whether a set is proved, and the state that was asked about not shown to lie in it or to reach it."""
+    """Whether a set is proved, and what was asked about is not: a state that is not shown to lie in it or to reach it,
+    or a level of N."""
     proved = result.get("checked") == "ACCEPTED" and result["levels"].get("roa") is not None
-    return bool(result.get("stop") == "path" and proved)
+    return bool(result.get("stop") in ("path", "beyond") and proved)
 
 
 def _rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
@@ -174,10 +183,15 @@ def _rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
         rows.append(("state", f"{asked}, which lies in {{V <= c2}}" if shown and not result.get("tube") else asked))
     if result.get("tube"):
         rows.append(("tube", _tube(result)))
+    if result.get("outer"):
+        rows += _outer(result["outer"])
     if result.get("volume") is not None:
         unit = volume_unit(units)
         size = f"{below(result['volume'])} {unit}".rstrip()
         rows.append((volume_name(len(units)), size + _of_which(result)))
+        if result.get("outer"):
+            union = estimated(result["outer"]["volume"], result["outer"]["deviation"], unit)
+            rows.append(("with outer set", union))
     if len(result.get("candidates", [])) > 1:
         unit = volume_unit(units)
         tried = [
@@ -217,7 +231,10 @@ def _rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
         answers = [q["answer"] for q in solver["queries"]]
         rows.append(("dReal", f"{answers.count('unsat')} of {len(answers)} queries unsat, version {solver['version']}"))
     rows.append(("time", _times(result["seconds"])))
-    about = ", about {V <= c2} alone, in which the state does not lie" if _is_missed(result) else ""
+    about = ""
+    if _is_missed(result):
+        beyond = result.get("stop") == "beyond"
+        about = ", about a smaller set" if beyond else ", about {V <= c2} alone, in which the state does not lie"
     rows.append(("checker", f"{result['checked'] or 'not reached'}{about}"))
     return rows
 
@@ -264,6 +281,18 @@ def _tube(result: Mapping[str, Any]) -> str:
     )
 
 
+def _outer(outer: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """What N is, which of its states belong to the set, and what limits its level."""
+    if outer["kind"] == "network":
+        name, named = network_name(outer["layers"]), [("sha256 of N", str(outer["sha256"]))]
+    else:
+        text = str(outer["expression"])
+        name, named = text if len(text) <= _LONG else f"an expression of {len(text):,} characters", []
+    about = f"{{N <= {below(outer['level'])}}} in the domain, and nothing outside of it, N being {name}"
+    work = f"{outer['boxes']:,} boxes, {outer['leaves']:,} leaves"
+    return [("outer set", about), *named, ("its limit", outer_limited_by(outer)), ("its work", work)]
+
+
 def _diagnosis_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
     """How stiff the loop is, where the proof had most to do, and what to try next."""
     found, rows = result.get("diagnosis"), []
@@ -295,6 +324,8 @@ def _times(spent: Mapping[str, float | None]) -> str:
 def _of_which(result: Mapping[str, Any]) -> str:
     """Of which of two sets the sizes are, those of the larger one; nothing where there is but one."""
     tube = result.get("tube")
+    if result.get("outer"):
+        return ", of {V <= c2} alone"
     if not tube:
         return ""
     return (

@@ -174,6 +174,24 @@ def volume_name(n: int) -> str:
     return {1: "length", 2: "area"}.get(n, "volume")
 
 
+def network_name(widths: Sequence[int]) -> str:
+    """What a network without a squash is called.
+
+    >>> network_name((2, 16, 1))
+    'the 2-16-1 tanh network'
+    """
+    return f"the {'-'.join(map(str, widths))} tanh network"
+
+
+def estimated(volume: float, deviation: float, unit: str) -> str:
+    """A volume that samples give, with the standard deviation of the estimate.
+
+    >>> estimated(3.14159, 0.0123, "m · m/s"), estimated(2.0, 0.0, "")
+    ('about 3.142 m · m/s, estimated (standard deviation 0.013)', 'about 2, estimated (standard deviation 0)')
+    """
+    return f"about {number(volume, 4)} {unit}".rstrip() + f", estimated (standard deviation {above(deviation, 2)})"
+
+
 def volume_unit(units: Sequence[str]) -> str:
     """Unit of the product of the states, or nothing if a state has none."""
     return " · ".join(pretty_unit(u) for u in units) if all(units) and len(units) <= 3 else ""

@@ -20,9 +20,10 @@ from flint import acb, arb, ctx
 
 from certify.checker.boxes import middle
 from certify.checker.case import Case
-from certify.checker.document import Certificate
-from certify.checker.outer import Beyond
-from certify.checker.taylor import Taylor
+from certify.checker.document import Certificate, Network
+from certify.checker.elementary import derivative, elementary
+from certify.checker.outer import Beyond, Layers
+from certify.checker.taylor import Taylor, affine
 from tests.checker.test_cubic_attack import climb, random_loop, random_tree, sizes
 from tests.support.certificates import LEAF, Document, edited, encode, parse, verdict
 from tests.support.leaves import beyond_on_boxes
@@ -124,7 +125,7 @@ def test_no_point_of_a_box_leaves_its_models(count: int) -> None:
         data, beyond, lo, hi = random_case(seed)
         generator, n, k = np.random.default_rng(seed), beyond.n, beyond.k
         centre, radius = middle(lo, hi)
-        N, rise, mid, slopes, wide = beyond_on_boxes(beyond, lo, hi)
+        N, rise, least, mid, slopes, wide = beyond_on_boxes(beyond, lo, hi)
         finite = [np.isfinite(v.c) & np.isfinite(v.size) & np.isfinite(v.r) for v in (N, rise)]
         asked = [i for i in range(lo.shape[1]) if finite[0][i]]
         known += sum(int(v[asked].sum()) for v in finite)
@@ -133,7 +134,7 @@ def test_no_point_of_a_box_leaves_its_models(count: int) -> None:
         def use(
             d: Array, truth: Truth = truth, T: Any = T, N: Taylor = N, rise: Taylor = rise, mid: Array = mid,
             slopes: Array = slopes, wide: Array = wide, centre: Array = centre, radius: Array = radius,
-            asked: Any = asked, finite: Any = finite, n: int = n,
+            asked: Any = asked, least: Array = least, finite: Any = finite, n: int = n,
         ) -> float:  # fmt: skip
             spread = np.clip(2 * d, -1, 1)
             s, own = [arb(v) for v in spread[:n].tolist()], [arb(v) for v in spread[n:].tolist()]
@@ -146,6 +147,7 @@ def test_no_point_of_a_box_leaves_its_models(count: int) -> None:
                 ]
                 x = [dot([arb(t) for t in row], z) for row in T]
                 value, falling, u = truth.at(x, q)
+                assert not np.isfinite(least[i]) or value >= arb(float(least[i]))
                 left = left_over(N, i, value, s)
                 assert left <= arb(float(N.r[i])), (i, d.tolist())
                 most = max(most, float(left / arb(float(N.r[i]))))
@@ -166,6 +168,47 @@ def test_no_point_of_a_box_leaves_its_models(count: int) -> None:
         if asked:
             closest = max(closest, climb(generator, n + k, use, 8))
     assert 0.5 < closest <= 1 and known > count
+
+
+@pytest.mark.parametrize("radius", [1e-300, 1e-12, 1e-6, 1e-3, 0.1, 1.0, 30.0])
+def test_what_the_derivative_of_tanh_leaves(radius: float) -> None:
+    """Within all that is said of it, and next to it where the fourth derivative of tanh is largest near c."""
+    closest = 0.0
+    for c in np.linspace(-3, 3, 61):
+        phi = derivative(elementary("tanh", np.array(c), 0.0, np.array(radius)))
+        f, e = ([float(v) for v in part[:3]] for part in (phi.f, phi.e))
+        for share in (-1.0, -0.5, 0.0, 0.3, 1.0):
+            D = arb(float(share * radius))
+            size = abs(D)
+            true = 1 - (arb(float(c)) + D).tanh() ** 2
+            left = abs(true - arb(f[0]) - arb(f[1]) * D - arb(f[2]) * D**2)
+            rounding = arb(e[0]) + arb(e[1]) * size + arb(e[2]) * size**2
+            assert left <= rounding + arb(float(phi.third)) * size**3
+            if share:
+                closest = max(closest, float((left - rounding) / (arb(float(phi.third)) * size**3)))
+    assert closest > 0.5 or not 1e-4 < radius < 0.02
+
+
+@pytest.mark.parametrize("width", [2, 5, 40])
+def test_layers_that_cancel_leave_roundings_alone(width: int) -> None:
+    """States that are known exactly, and weights whose sum of products is as good as 0."""
+    generator, closest = np.random.default_rng(width), 0.0
+    for size in (1e-200, 1e-3, 1.0, 1e9, 1e150):
+        x, W = generator.normal(size=(width, 50)), size * generator.normal(size=(1, width))
+        x[-1] = -(W[0, :-1] @ x[:-1]) / W[0, -1]
+        states = [affine(v, np.zeros((1, 50))) for v in x]
+        model = Layers(Network((W,), (np.zeros(1),))).models(states)[-1]
+        for k in range(50):
+            each = zip(W[0].tolist(), x[:, k].tolist(), strict=True)
+            off = abs(Fraction(float(model.c[0, k])) - sum(Fraction(a) * Fraction(b) for a, b in each))
+            assert off <= Fraction(float(model.r[0, k]))
+            closest = max(closest, float(off / Fraction(float(model.r[0, k]))))
+    assert closest > 1e-3
+
+
+def test_networks_of_more_numbers_than_there_is_room_for() -> None:
+    many, few = (Layers(Network((np.ones((k, 1)), np.ones((1, k))), (np.zeros(k), np.zeros(1)))) for k in (1000, 9))
+    assert few.is_small(66) and not many.is_small(66) and many.is_small(3)
 
 
 # ----------------------------------------------------------------------------------------------- certificates of chance
@@ -230,6 +273,22 @@ def test_a_face_at_a_rational_is_decided_by_its_exact_value(end: str, kind: str)
             refused = verdict(stated(data, N)) == "faces"
             assert refused or Fraction(level) < value
             assert not (refused and level < float(value) - 0.9e-9 * abs(float(value)))
+
+
+@pytest.mark.parametrize("kind", ["layer", "expression"])
+def test_faces_reach_into_the_corners_of_the_domain(kind: str) -> None:
+    """N = 8 - a x - b y is least at a corner, whose coordinates are no binary64 numbers."""
+    a, b, x, y = Fraction(3, 4), Fraction(5, 8), Fraction(4, 3), Fraction(5, 7)
+    value = 8 - a * x - b * y
+    data = planar([["-", "x"], ["-", ["+", "y", UNUSED]]], [[0.0, 0.0]], np.eye(2), 0.01,
+                  domain=(("-4/3", "4/3"), ("-6/7", "5/7")))  # fmt: skip
+    tree = ["+", "8", ["*", str(-a), "x"], ["*", str(-b), "y"]]
+    for level in (value, value + Fraction(1, 10**9), value + Fraction(1, 10**4), value - Fraction(1, 10**9)):
+        near = float(level)
+        N = network([([[-float(a), -float(b)]], [8.0])], near) if kind == "layer" else expression(tree, near)
+        found = verdict(stated(data, N))
+        assert found == "faces" or level < value
+        assert found != "faces" or level >= value
 
 
 @pytest.mark.parametrize("c", ["1", "7/5", "1/3"])

@@ -127,6 +127,32 @@ def test_what_has_no_finite_model_says_so() -> None:
         assert paths(loop).models(np.array([[size / 10]])).finite
 
 
+@pytest.mark.parametrize("name", list(loops()))
+@pytest.mark.parametrize("moved", [False, True])
+def test_models_on_several_balls_are_those_on_each(name: str, moved: bool) -> None:
+    """Of shapes and sizes that differ: none takes anything from its neighbours."""
+    loop, generator = loops()[name], np.random.default_rng(2)
+    n = loop.system.n
+    known = paths(loop, 0.1 * generator.uniform(-1, 1, n)) if moved else paths(loop)
+    size = (0.05 if name == "quadrotor2d" else 0.3) * np.array([1.0, 0.03, 0.5, 0.9])[:, None, None]
+    balls = size / math.sqrt(n) * generator.standard_normal((4, n, n + moved))
+    for J, models in zip(balls, known.models_on(balls), strict=True):
+        alone = known.models(J)
+        assert alone.finite and models.finite
+        for part in ("f", "A", "Q", "K", "E", "shares", "R", "squares"):
+            mine, other = getattr(models, part), getattr(alone, part)
+            assert np.allclose(mine, other, rtol=1e-12, atol=1e-14 * np.max(np.abs(other), initial=0.0))
+        assert np.allclose(models.inputs.curve, alone.inputs.curve, rtol=1e-12)
+
+
+@pytest.mark.parametrize(("name", "size"), [("tank", 17.0), ("inverse", 2.5)])
+def test_a_ball_without_finite_models_leaves_none_to_the_others(name: str, size: float) -> None:
+    loop = loops()[name]
+    with np.errstate(all="ignore"):
+        found = paths(loop).models_on(np.array([[[size / 10]], [[size]]]))
+    assert not any(models.finite for models in found)
+
+
 def check_in_floats(name: str, tube: Tube, goal: np.ndarray) -> None:
     """At points of the ellipsoids of each slab x'P(t)x falls; the slabs hang together, inside of the domain."""
     system, network = loop_of(name)

@@ -220,6 +220,34 @@ def test_models_enclose_what_a_step_does(name: str, order: int) -> None:
             assert np.all(error <= bound * (1 + 1e-9) + 1e-10)
 
 
+@pytest.mark.parametrize("name", list(loops()))
+def test_models_of_steps_on_several_balls_are_those_on_each(name: str) -> None:
+    """A small ball's states are near after fewer attempts than a large one's, and stay in the domain for certain."""
+    loop, size, at_rest = loops()[name]
+    n, generator = loop.system.n, np.random.default_rng(6)
+    balls = np.array([1.0, 0.02, 0.4])[:, None, None] * (np.eye(n) + 0.3 * generator.standard_normal((3, n, n)))
+    balls *= size / math.sqrt(n)
+    ends = np.array([[float(v) for v in pair] for pair in loop.system.domain])
+    reach = np.array([1.0 - 1e-9, 0.01, 0.5])[:, None] * np.min(np.abs(ends), axis=1)
+    ranges = list(loop.system.ranges.values())
+    cells = cut(ranges, (2 if loop.system.sample is None else 1,) * len(ranges))
+    steps = steps_of(paths(loop, resting=at_rest), at_rest, 3)
+    together = steps.models_on(balls, cells, reach)
+    for J, far, of_ball in zip(balls, reach, together, strict=True):
+        for models, alone in zip(of_ball, steps.models(J, cells, far), strict=True):
+            assert alone.finite and models.stays == alone.stays
+            assert alone.spread is not None and models.spread is not None
+            for mine, other, parts in (
+                (models, alone, ("f", "A", "Q", "K", "E", "shares", "R")),
+                (models.spread, alone.spread, ("moves", "turns", "error", "slack")),
+            ):
+                for part in parts:
+                    a, b = getattr(mine, part), getattr(other, part)
+                    assert np.allclose(a, b, rtol=1e-12, atol=1e-14 * np.max(np.abs(b), initial=0.0)), part
+    if loop.system.sample is not None:
+        assert [of_ball[0].stays for of_ball in together] == [False, True, True]
+
+
 def test_models_without_ranges_are_those_of_the_plain_rule() -> None:
     """The two arithmetics share no product."""
     loop = shipped("cartpole")

@@ -253,6 +253,40 @@ def test_robust_is_larger_than_what_it_starts_from() -> None:
     assert local(P) > 300 * max(local(choose_candidate(loop, name).P) for name in SOLVED)
 
 
+def test_robust_of_a_held_input_gains_on_that_of_the_loop_without_a_period() -> None:
+    """By the rule of the held input, which judges both."""
+    network = load_policy(CURVED / "quadrotor2d_curved.pt").network
+    plain, held = (get_system("quadrotor2d").with_sample(h) for h in (None, (Fraction(1, 50), Fraction(1, 50))))
+    loop = ClosedLoop(held, network)
+
+    def local(P: Array) -> float:
+        T = diagonalising_coordinates(P, loop.mean_rate(), loop.step)
+        level = prove_local(Problem(loop, Quadratic(P)), T, domain_limit(P, held.domain) * (1 - 1e-9))
+        return 0.0 if level is None else volume(P, level)
+
+    before, after = robust_candidate(ClosedLoop(plain, network)), robust_candidate(loop)
+    assert volume(after, 1.0) == pytest.approx(local(after), rel=0.3)  # in other coordinates
+    assert local(after) > 1.5 * local(before) > 0
+
+
+def test_a_level_is_looked_for_where_it_is_expected() -> None:
+    """Whether the highest good one lies between the two, above both or below both."""
+    case, goal = pendulum()
+    problem, known = Problem(case.loop, Quadratic(goal)), paths(case.loop)
+    T = diagonalising_coordinates(goal, case.loop.linearise()[0])
+    limit = domain_limit(goal, case.loop.system.domain) * (1 - 1e-9)
+    level = prove_local(problem, T, limit, known)
+    assert level is not None and level < limit / 2
+    for low, high in ((0.7, 1.3), (0.1, 0.2), (0.9, 0.95)):
+        near = prove_local(problem, T, limit, known, between=(low * level, high * level))
+        assert near == pytest.approx(level, rel=0.03)
+        assert local_margin(problem, T, near or 0.0, known) > 0
+    assert prove_local(problem, T, limit, known, between=(1.1 * level, 2 * level)) is None
+    assert prove_local(problem, T, limit, known, between=(2 * limit, 3 * limit)) is None
+    top = prove_local(problem, T, 0.5 * level, known, between=(0.3 * level, 0.4 * level))
+    assert top is not None and 0.48 * level < top <= 0.5 * level
+
+
 def test_robust_minds_the_bounds_of_inputs() -> None:
     """Where these are what limits the set, P gives way along the policy's gradient and gains elsewhere."""
     wide = get_system("quadrotor2d")

@@ -21,14 +21,14 @@ def on_boxes(ring: Ring, centre: Array, radius: Array) -> tuple[list[Taylor], li
     return states, G, ends
 
 
-def beyond_on_boxes(beyond: Beyond, lo: Array, hi: Array) -> tuple[Taylor, Taylor, Array, Array, Array]:
-    """What rule `outer` has on boxes (n, B): models of N and N'F, and the inputs' enclosures: mid, slopes, error."""
+def beyond_on_boxes(beyond: Beyond, lo: Array, hi: Array) -> tuple[Taylor, Taylor, Array, Array, Array, Array]:
+    """What rule `outer` has on boxes (n, B): models of N and N'F, N's least value by other means, and mid, slopes
+    and error of the inputs' enclosures."""
     centre, radius = middle(lo, hi)
     x, error = beyond.states(centre, radius)
-    models = beyond.function.models(
-        [affine(x[i, 0], np.moveaxis(x, 1, 0)[1:, i], error[i]) for i in range(beyond.n)]
-    )  # fmt: skip
+    models = beyond.function.models([affine(own[0], own[1:], e) for own, e in zip(x, error, strict=True)])
     mid, slopes, wide = enclose_on_boxes(beyond.net, x, error)
     states, held = beyond.affine(x, error, mid, slopes, wide)
     F = beyond.f(states, [*held, *beyond.quantities(lo.shape[1])])
-    return beyond.function.value(models), beyond.function.along(models, F), mid, slopes, wide
+    N, rise = beyond.function.value(models), beyond.function.along(models, F)
+    return N, rise, beyond.function.least(x, error) + np.zeros_like(N.c), mid, slopes, wide

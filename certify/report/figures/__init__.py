@@ -62,6 +62,7 @@ def simulated_roa(scene: Scene) -> SimulatedRoa | None:
         deadline=deadline,
         start=scene.start,
         centre=scene.centre,
+        beyond=scene.in_outer,
     )
 
 

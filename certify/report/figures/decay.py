@@ -28,8 +28,9 @@ def decay(scene: Scene, paths: NDArray[np.float64], step: float) -> Picture:
     for level, name, colour in ((scene.outer, "c₂", SET), (scene.inner, scene.words.inner, INNER))[: 1 + apart]:
         axes.annotate(name, (time[-1], level), (2, 2), textcoords="offset points", color=colour, fontsize=9)
     highest = scene.outer
-    if scene.start is not None:
+    if scene.start is not None or scene.beyond is not None:
         highest = max(highest, float(np.nanmax(V)))
+    if scene.start is not None:
         axes.axvline(scene.duration, color=START, lw=1.4, ls="--")
         axes.annotate(
             "end of the tube",
@@ -48,6 +49,7 @@ def decay(scene: Scene, paths: NDArray[np.float64], step: float) -> Picture:
     axes.set_ylabel("V(x(t))")
     begin = f"on and in the {scene.word} set" if scene.start is None else "on the edge of the tube's start"
     begin += "" if scene.centre is None else " around c₀"
+    begin = begin if scene.beyond is None else "at the edge of the outer set, in planes through the origin"
     return Picture(
         "V along trajectories",
         f"V from starting points {begin}: simulated{scene.held}, not proved{_dots(scene)}. "

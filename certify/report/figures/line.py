@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from certify.report.figures.scene import Scene
 from certify.report.figures.style import (
@@ -30,11 +31,14 @@ def line_figure(scene: Scene, roa: SimulatedRoa | None) -> Picture:
     figure, axes = figure_of(5.0, 3.4)
     legend = draw_line(axes, scene, roa)
     wider = "" if scene.start is None else ", and around it the start of the tube that leads into it"
+    if scene.beyond is not None:
+        wider = ", and the outer set {N ≤ n₂} in the domain, from which every trajectory enters it"
+        wider += (", if the claim is true" if scene.proved == "claimed" else "") + ", drawn from a grid"
     if scene.centre is not None:
         wider = ", and the start of the tube that leads into it; nothing is said of what lies between them"
     return Picture(
-        f"{scene.timing.derivative} along the state",
-        f"Shaded: the {scene.word} interval, {scene.meaning}{wider}. The curve of {scene.timing.derivative} and the "
+        f"{scene.falling} along the state",
+        f"Shaded: the {scene.word} interval, {scene.meaning}{wider}. The curve of {scene.falling} and the "
         f"interval of the runs that "
         f"{scene.words.settles} come from floating point and simulation{scene.held}; they are not proved. "
         f"{scene.timing.simulated.definition}".rstrip(),
@@ -45,11 +49,18 @@ def line_figure(scene: Scene, roa: SimulatedRoa | None) -> Picture:
     )
 
 
+def add_outer(axes: Any, scene: Scene, x: NDArray[np.float64]) -> None:
+    """Shade the states (N, 1) of a grid that lie in the outer set."""
+    axes.fill_between(
+        x[:, 0], 0, 1, where=scene.in_outer(x), color=START_FILL, lw=0, transform=axes.get_xaxis_transform(), zorder=0.5
+    )
+
+
 def draw_line(axes: Any, scene: Scene, roa: SimulatedRoa | None) -> tuple[Key, ...]:
     """Fill the axes; their legend."""
     x = np.linspace(scene.lo[0], scene.hi[0], 601)[:, None]
     outer, inner = scene.reach[0], scene.inner_reach[0]
-    change, symbol = scene.growth(x), scene.timing.derivative
+    change, symbol = scene.growth(x), scene.falling
     keys = [
         Key(f"{scene.word} set", SET_FILL, 0, fill=SET_FILL),
         Key(scene.words.inner_set, INNER_FILL, 0, fill=INNER_FILL),
@@ -60,6 +71,9 @@ def draw_line(axes: Any, scene: Scene, roa: SimulatedRoa | None) -> tuple[Key, .
     if scene.start_reach is not None:
         keys.insert(0, Key(f"{scene.word} {scene.words.start}", START_FILL, 0, fill=START_FILL))
         axes.axvspan(*scene.start_on_line, color=START_FILL, lw=0)
+    if scene.beyond is not None:
+        keys.insert(0, Key(f"{scene.word} outer set", START_FILL, 0, fill=START_FILL))
+        add_outer(axes, scene, x)
     axes.axvspan(-outer, outer, color=SET_FILL, lw=0)
     axes.axvspan(-inner, inner, color=INNER_FILL, lw=0)
     axes.plot(x[:, 0], change, color=INK)

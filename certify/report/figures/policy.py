@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from certify.report.figures.geometry import ellipse, shadows
+from certify.report.figures.line import add_outer
 from certify.report.figures.scene import Scene
 from certify.report.figures.style import (
     GROWTH,
@@ -30,11 +31,14 @@ def curves(scene: Scene) -> Picture:
         axes.plot(x[:, 0], u[:, k], color=(INK, SET, INNER, GROWTH)[k % 4], label=name)
     if scene.start_reach is not None:
         axes.axvspan(*scene.start_on_line, color=START_FILL, lw=0, zorder=-1)
-    axes.axvspan(-scene.reach[0], scene.reach[0], color=SET_FILL, lw=0, zorder=0)
+    if scene.beyond is not None:
+        add_outer(axes, scene, x)
+    axes.axvspan(-scene.reach[0], scene.reach[0], color=SET_FILL, lw=0, zorder=0.6)
     axes.set_xlim(scene.lo[0], scene.hi[0])
     axes.set_xlabel(scene.labels[0])
     axes.set_ylabel(", ".join(scene.input_labels))
     what = "interval" if scene.start is None else "interval (blue) and the start of its tube"
+    what = what if scene.beyond is None else "interval (blue) and the outer set"
     caption = f"u = π(x) over the domain; shaded: the {scene.word} {what}."
     return Picture("The policy", caption, to_svg(figure), simulated=False)
 
@@ -51,7 +55,7 @@ def surface(scene: Scene, pair: tuple[int, int]) -> Picture:
     u = scene.flow.policy(x)
     colours = LinearSegmentedColormap.from_list("input", ["#2f5d8a", "#a9c4dd", "#f7f6f2", "#e5c08a", "#a4652a"])
     boundary = ellipse(scene.P, pair, scene.outer)
-    start = _start(scene, pair)
+    start, outline = _start(scene, pair), scene.outline(pair)
     for k, centre in enumerate([float(v) for v in scene.system.exact_u_eq()[:shown]]):
         left, bottom = 4.2 * (k % 2), 3.6 * (rows - 1 - k // 2)
         axes = add_axes(figure, left + 0.66, bottom + 0.52, 2.54, 2.96)
@@ -70,6 +74,8 @@ def surface(scene: Scene, pair: tuple[int, int]) -> Picture:
         axes.plot(*boundary, color=SET, lw=1.6)
         if start is not None:
             axes.plot(*start, color=START, lw=1.6)
+        if outline is not None:
+            axes.contour(*outline, levels=[0.0], colors=[START], linewidths=1.6)
         axes.set_xlim(a[0], a[-1])
         axes.set_ylim(b[0], b[-1])
         bar = figure.colorbar(image, cax=add_axes(figure, left + 3.3, bottom + 0.52, 0.1, 2.96))
@@ -78,11 +84,12 @@ def surface(scene: Scene, pair: tuple[int, int]) -> Picture:
         axes.set_xlabel(scene.labels[pair[0]])
         axes.set_ylabel(scene.labels[pair[1]])
     where = "over the domain" if scene.n == 2 else "around the set, all other states being 0,"
-    outline = "boundary" if start is None else "boundaries of the start (magenta) and"
+    edges = "boundary" if start is None else "boundaries of the start (magenta) and"
+    edges = edges if outline is None else "boundaries of the outer set (magenta) and"
     more = "" if shown == scene.system.m else f" The first {shown} of {scene.system.m} inputs."
     return Picture(
         "The policy's surface",
-        f"u = π(x) {where} with the {outline} of the {scene.word} set.{more}",
+        f"u = π(x) {where} with the {edges} of the {scene.word} set.{more}",
         to_svg(figure),
         simulated=False,
         wide=shown > 1,

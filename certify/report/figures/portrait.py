@@ -55,6 +55,12 @@ _ABOUT_A_PATH = (
     "shown of it, its start and its path are projections, and where they overlap {V ≤ c₂} here the states need not lie "
     "in it. Trajectories start over the edge of the start's projection, and are projected like it."
 )
+_ABOUT_AN_OUTER_SET = (
+    "Each picture shows two states over their domain. Of the outer set, and of {V ≤ c₂}, the section holds the states "
+    "in which all others are 0; the outline of the former is drawn from a grid. The projection of {V ≤ c₂} holds the "
+    "values that the two take anywhere in it; of the outer set there is none. Trajectories start in the plane, at the "
+    "outlines of the sections, and are projected."
+)
 _MOMENTS, _AROUND = 64, 32  # of a tube's time that are drawn, and points around each ellipse
 
 
@@ -72,13 +78,19 @@ def portraits(scene: Scene, runs: Runs, region: Region | None) -> list[Picture]:
         )
     elif scene.start is not None:
         meaning += "Magenta: the start of the tube that leads into it. "
-    about = (_ABOUT if scene.centre is None else _ABOUT_A_PATH) if len(scene.pairs) > 1 else ""
+    elif scene.beyond is not None:
+        meaning += (
+            f"Magenta: the {scene.word} outer set {{N ≤ n₂}} in the domain, from which every trajectory enters the "
+            f"blue one{'' if scene.proved == 'proved' else ', if the claim is true'}; its outline is that on a grid. "
+        )
+    about = _ABOUT if scene.centre is None else _ABOUT_A_PATH
+    about = (about if scene.beyond is None else _ABOUT_AN_OUTER_SET) if len(scene.pairs) > 1 else ""
     pictures = []
     for pair, growing, svg in drawn:
         if scene.n > 2:
             names = [symbol(scene.system.states[k].name) for k in pair]
             title = ", ".join(names)
-            which = "the set takes" if scene.centre is None else "{V ≤ c₂} takes"
+            which = "the set takes" if scene.centre is None and scene.beyond is None else "{V ≤ c₂} takes"
             meaning = f"Of its domain {which} {_takes(scene.shares, names, pair)}. "
             if scene.start_shares is not None:
                 both = _takes(scene.start_shares, names, pair), _takes(scene.shares, names, pair)
@@ -86,7 +98,7 @@ def portraits(scene: Scene, runs: Runs, region: Region | None) -> list[Picture]:
         sign = (
             ""
             if growing or not _shows_sign(scene)
-            else f"{scene.timing.derivative} < 0 at every grid point of the picture{scene.held}. "
+            else f"{scene.falling} < 0 at every grid point of the picture{_but_inside(scene)}{scene.held}. "
         )
         if growing and scene.start is not None:
             sign = "V need not fall outside the blue set: along the tube another function does. "
@@ -95,6 +107,11 @@ def portraits(scene: Scene, runs: Runs, region: Region | None) -> list[Picture]:
         caption = f"{meaning}{sign}*\N{NO-BREAK SPACE}Simulated or evaluated on a grid{scene.held}, not proved."
         pictures.append(Picture(title, caption, svg, simulated=True, wide=scene.n == 2, legend=legend, about=about))
     return pictures
+
+
+def _but_inside(scene: Scene) -> str:
+    """Where the sign is not shown."""
+    return "" if scene.beyond is None else " outside {V ≤ c₂}"
 
 
 def _shows_sign(scene: Scene) -> bool:
@@ -130,10 +147,14 @@ def keys(scene: Scene, runs: Runs, region: Region | None, growing: bool) -> tupl
         found = [*begin, *found]
     elif scene.start is not None:
         found = [Key(start, START, 1.8), *found]
+    elif scene.beyond is not None:
+        shown = ": section through the origin" if scene.n > 2 else ""
+        level = below(scene.beyond.level, 4)
+        found.insert(0, Key(f"{scene.word} outer set, N = {level}{shown}", START, 1.8, fill=START_FILL))
     if scene.shows_inner:
         found.append(Key(inner + (": section" if scene.n > 2 else ""), INNER, 1.4, fill=INNER_FILL))
     if growing:
-        found.append(Key(f"{scene.timing.derivative} ≥ 0 on a grid*", GROWTH, 1.0, fill=GROWTH_FILL))
+        found.append(Key(f"{scene.falling} ≥ 0 on a grid*", GROWTH, 1.0, fill=GROWTH_FILL))
     found += [Key(text, colour, 1.4, style) for _, colour, style, text in _kinds(scene, runs)]
     if region is not None:
         found.append(Key("edge of the simulated region*", REGION, 1.4, "--"))
@@ -169,6 +190,10 @@ def draw_plane(axes: Any, scene: Scene, pair: Pair, runs: Runs, region: Region |
     change = scene.growth(x)
     section = ellipse(scene.P, pair, scene.outer)
     axes.fill(*section, color=SET_FILL, lw=0, zorder=1)
+    outline = scene.outline(pair)
+    if outline is not None:
+        axes.contourf(*outline, levels=[-np.inf, 0], colors=[START_FILL], zorder=0.5)
+        axes.contour(*outline, levels=[0.0], colors=[START], linewidths=1.8 if scene.n == 2 else 1.5, zorder=4)
     growing = (change >= 0) & np.any(x != 0, axis=-1) & _shows_sign(scene)
     if np.any(growing):
         axes.contourf(a, b, change, levels=[0, np.inf], colors=[GROWTH_FILL], zorder=0)

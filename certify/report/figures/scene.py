@@ -23,7 +23,7 @@ from certify.policies import TanhNetwork
 from certify.report.claims import words_for
 from certify.report.figures.geometry import PARTS, Box, circle, over_level, refine
 from certify.report.figures.pairs import Pair, pairs_of
-from certify.report.sampling import SETTLED, Flow, Runs, growth, runs_of, time_scales
+from certify.report.sampling import SETTLED, Flow, Runs, growth, quadratic, runs_of, time_scales
 from certify.report.timing import Timing
 from certify.report.words import deviation, exact_number, held_at, label
 
@@ -41,6 +41,11 @@ _GRIDS, _RUNS, _RATES = 2e9, 1e10, 5e8  # operations for grids, trajectories and
 _SHARE = 0.45  # of the time, after which nothing is simulated any more: the rest is for drawing
 _LEAST = 25  # points along a grid
 _POINTS = 240  # of a tube's edge over time, about
+_FINE, _SEVERAL = (
+    241,
+    121,
+)  # points along a grid on which the outline of an outer set is drawn, in one plane and in each
+_ALONG = 400  # points of a ray, of which the last one in the sets is where a trajectory starts
 _VIEW = 1.3  # of the set's reach, in pictures of more than two states
 
 
@@ -183,7 +188,8 @@ class Scene:
         if not is_ellipsoid(certificate):
             raise CertificateFormatError("P must be positive definite and the levels positive and in order.")
         self.timing = Timing.of(certificate.system, certificate.claim.rate)
-        self.certificate, self.words = certificate, words_for(certificate.kind, self.timing)
+        self.certificate, self.beyond = certificate, certificate.claim.outer
+        self.words = words_for(certificate.kind, self.timing, beyond=self.beyond is not None)
         self.kind = "practical" if isinstance(certificate.claim, Practical) else "asymptotic"
         self.word, self.proved = ("certified", "proved") if accepted else ("claimed", "claimed")
         self.system, self.P = certificate.system, certificate.P
@@ -278,9 +284,58 @@ class Scene:
         return self.words.meaning + ("" if self.proved == "proved" else ", if the claim is true")
 
     def growth(self, x: Array) -> Array:
-        """V's change by time in float64, Vdot or what takes its place; NaN where the equations have a pole."""
-        value = growth(self.flow, self.P, x, self.step)
+        """V's change by time in float64, Vdot or what takes its place; NaN where the equations have a pole.
+
+        With an outer set it is N's, and NaN in {V <= c2}, where N is nobody's concern.
+        """
+        if self.beyond is None:
+            value = growth(self.flow, self.P, x, self.step)
+        else:
+            with np.errstate(all="ignore"):
+                value = np.sum(self.beyond.function.gradient(x) * self.flow.field(x), axis=-1)
+            value = np.where(quadratic(self.P, x) <= self.outer, np.nan, value)
         return np.where(np.isfinite(value), value, np.nan)
+
+    @property
+    def falling(self) -> str:
+        """The symbol of what `growth` gives."""
+        return self.timing.derivative if self.beyond is None else "N′F"
+
+    def in_outer(self, x: Array) -> NDArray[np.bool_]:
+        """Which states (..., n) lie in the outer set, in float64; none without one."""
+        if self.beyond is None:
+            return np.zeros(x.shape[:-1], dtype=np.bool_)
+        with np.errstate(all="ignore"):
+            low = self.beyond.function(x) <= self.beyond.level
+        return np.asarray(low & np.all((x >= self.lo) & (x <= self.hi), axis=-1))
+
+    def outline(self, pair: Pair) -> tuple[Array, Array, Array] | None:
+        """Axes of a fine grid over the domain along two states and N less its level there, all other states 0.
+
+        None without an outer set, and where it has no point on the grid.
+        """
+        if self.beyond is None:
+            return None
+        (i, j), points = pair, _FINE if self.n == 2 else _SEVERAL
+        a, b = (np.linspace(self.lo[k], self.hi[k], points) for k in pair)
+        x = np.zeros((points, points, self.n))
+        x[..., i], x[..., j] = a[None, :], b[:, None]
+        with np.errstate(all="ignore"):
+            excess = self.beyond.function(x) - self.beyond.level
+        return (a, b, np.where(np.isfinite(excess), excess, np.nan)) if np.any(excess <= 0) else None
+
+    def farthest(self, pair: Pair, count: int) -> Array:
+        """The last state of the outer set, or of {V <= c2}, along rays from the origin in a plane, (count, n)."""
+        directions = np.zeros((count, self.n))
+        directions[:, list(pair)] = circle(count)
+        with np.errstate(divide="ignore"):
+            far = np.min(
+                np.maximum(self.lo / directions, self.hi / directions), axis=1, where=directions != 0, initial=np.inf
+            )
+        x = far[:, None, None] * np.linspace(0, 1, _ALONG)[:, None] * directions[:, None]
+        inside = self.in_outer(x) | (quadratic(self.P, x) <= self.outer)
+        last = _ALONG - 1 - np.argmax(inside[:, ::-1], axis=1)
+        return np.asarray(x[np.arange(count), last])
 
     def simulate(self, begin: ArrayLike, steps: int | None = None) -> Runs:
         """Trajectories with their fates, by default over the tube and half the horizon; smooth for a picture."""
@@ -291,16 +346,17 @@ class Scene:
         )  # of short periods some are kept
         count = steps or min(int((self.duration + 0.5 * self.horizon) / step) + 1, every * self.effort.steps)
         starts, target = np.asarray(begin, dtype=np.float64), self.settling_level
-        begins = self.start, self.centre
+        begins = self.start, self.centre, self.in_outer
         runs = runs_of(self.flow, starts, self.P, self.outer, target, step, count, self.deadline, *begins)
         if not self.timing.is_plain:  # the rate of change jumps where the input does
             return Runs(runs.path[::every], every * step, runs.settled, runs.left)
         return Runs(refine(runs.path, self.flow.field, step), step / PARTS, runs.settled, runs.left)
 
     def view(self, pair: Pair) -> Box:
-        """What a picture of two states shows: the domain of a plane, else the sets with some room within the domain."""
+        """What a picture of two states shows: the sets with some room within the domain; the domain itself where there
+        are no other states, or there is an outer set."""
         lo, hi = self.lo[list(pair)], self.hi[list(pair)]
-        if self.n == 2:
+        if self.n == 2 or self.beyond is not None:
             margin = 0.03 * (hi - lo)
             return Box(lo - margin, hi + margin)
         if self.centre is not None and self.band is not None:
@@ -329,12 +385,15 @@ class Scene:
 def starts(scene: Scene) -> Array:
     """Starting points: around the outline of a set in each plane and, for two states, along the domain's edge.
 
-    The set is that of a tube's start if there is one, wherever it lies, else {V <= c2}.
+    The set is that of a tube's start if there is one, wherever it lies, else {V <= c2}; with an outer set it is the
+    union of the two, and its outline that in the plane through the origin.
     """
     count = scene.effort.starts
     P, level = (scene.P, scene.outer) if scene.start is None else (scene.start, 1.0)
     middle = 0.0 if scene.centre is None else scene.centre
     blocks = [middle + over_level(P, pair, circle(count), 0.999 * level) for pair in scene.pairs]
+    if scene.beyond is not None:
+        blocks = [scene.farthest(pair, count) for pair in scene.pairs]
     if scene.n == 2:
         edge = 2 * np.pi * (np.arange(22) + 0.25) / 22
         ring = np.stack([np.cos(edge), np.sin(edge)], -1)

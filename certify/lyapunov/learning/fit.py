@@ -1,0 +1,125 @@
+"""Least squares with one-sided residuals: values between bounds, derivatives along the flow below bounds.
+
+A row that keeps its bound costs nothing, so that a fit can be exact where the shape is free, and every row that is
+found violated later can be added as it stands. Steps are those of Levenberg and Marquardt, damped by the diagonal
+(D. Marquardt, J. SIAM 11 (1963)), on the rows that are violated at the moment.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from certify.errors import InputError
+from certify.lyapunov.function import LyapunovFunction
+from certify.lyapunov.learning.models import Model
+
+Array = NDArray[np.float64]
+_TRIES = 8  # of a step, with more damping each time
+_MORE, _LESS, _LEAST = 3.0, 0.4, 1e-8  # damping
+_ENOUGH = 1e-5  # relative gain of a step, below which the fit ends
+_DECAY = 1e-6  # of the parameters: small weights make smooth functions
+
+
+@dataclass(frozen=True, slots=True)
+class Values:
+    """Rows `low <= N(z) <= high`: states (B, n), bounds (B,) that may be infinite, weights (B,)."""
+
+    z: Array
+    low: Array
+    high: Array
+    weight: Array
+
+    def __post_init__(self) -> None:
+        if not len(self.z) == len(self.low) == len(self.high) == len(self.weight):
+            raise InputError("rows must have a state, two bounds and a weight each; their counts differ.")
+
+    def residuals(self, values: Array) -> Array:
+        """How far the values (B,) are out of bounds, weighted and with its sign."""
+        return np.asarray((values - np.clip(values, self.low, self.high)) * self.weight)
+
+
+@dataclass(frozen=True, slots=True)
+class Slopes:
+    """Rows `dN/dz v <= most`: states and vectors (B, n), bounds and weights (B,)."""
+
+    z: Array
+    v: Array
+    most: Array
+    weight: Array
+
+    def __post_init__(self) -> None:
+        if not len(self.z) == len(self.v) == len(self.most) == len(self.weight):
+            raise InputError("rows must have a state, a vector, a bound and a weight each; their counts differ.")
+
+    def residuals(self, slopes: Array) -> Array:
+        """How far the slopes (B,) are above their bounds, weighted."""
+        return np.asarray(np.maximum(slopes - self.most, 0.0) * self.weight)
+
+
+@dataclass(frozen=True, slots=True)
+class Fit:
+    """Parameters (k,) with the sum of squares there, and the damping with which a further fit may begin."""
+
+    p: Array
+    cost: float
+    damping: float
+
+
+def fit(
+    model: Model, p: Array, values: Values, slopes: Slopes, steps: int, damping: float = 1.0, deadline: float = np.inf
+) -> Fit:
+    """Least squares from the parameters p, in at most so many steps, or until `deadline` by `time.monotonic`."""
+
+    def cost(q: Array) -> float:
+        function = model.function(q)
+        r = values.residuals(function(values.z))
+        s = slopes.residuals(along(function, slopes.z, slopes.v))
+        return float(r @ r + s @ s + _DECAY * (q @ q))
+
+    least = cost(p)
+    for _ in range(steps):
+        normal, downhill = _normal_equations(model, p, values, slopes)
+        diagonal = np.diag(normal)
+        floor = 1e-6 * diagonal.max()
+        for _ in range(_TRIES):
+            try:
+                damped = normal + np.diag(damping * (diagonal + floor))
+                step = scipy.linalg.solve(damped, downhill, assume_a="pos")
+                found = cost(p + step)
+            except (scipy.linalg.LinAlgError, InputError):  # no longer positive definite, or not finite: damp
+                found = np.inf
+            if found < least:
+                break
+            damping *= _MORE
+        else:
+            break
+        gain, p, least = (least - found) / least, p + step, found
+        damping = max(damping * _LESS, _LEAST)
+        if gain < _ENOUGH or time.monotonic() > deadline:
+            break
+    return Fit(p, least, damping)
+
+
+def _normal_equations(model: Model, p: Array, values: Values, slopes: Slopes) -> tuple[Array, Array]:
+    """(J'J, -J'r) of the rows that are violated, the decay of the parameters included."""
+    function = model.function(p)
+    r, s = values.residuals(function(values.z)), slopes.residuals(along(function, slopes.z, slopes.v))
+    high, rising = r != 0, s != 0
+    normal, downhill = _DECAY * np.eye(len(p)), -_DECAY * p
+    for residual, rows in (
+        (r[high], model.value_rows(p, values.z[high]) * values.weight[high, None]),
+        (s[rising], model.slope_rows(p, slopes.z[rising], slopes.v[rising]) * slopes.weight[rising, None]),
+    ):
+        normal += rows.T @ rows
+        downhill -= rows.T @ residual
+    return normal, downhill
+
+
+def along(function: LyapunovFunction, z: Array, v: Array) -> Array:
+    """Derivatives of a function at states (B, n) along vectors (B, n), shape (B,)."""
+    return np.asarray((function.gradient(z) * v).sum(-1))

@@ -1,0 +1,133 @@
+"""The closed loop for learning: rates in floats, at the nominal plant and at the corners of what is uncertain.
+
+What a run reports is its fate, and integrals along its way. A run converges if it enters the inner ellipsoid; whoever
+has left the domain, or asked for an input out of bounds, is lost, because no set that a claim allows holds it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.closed_loop import ClosedLoop
+from certify.lyapunov.function import Quadratic
+from certify.policies import bounded_by_form
+from certify.systems.ode import eigenvalues_of, rk4_step
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+_STEP = 0.5  # of the time constant of the fastest eigenvalue
+_HORIZON = 12.0  # time constants of the slowest
+_MAX_STEPS = 3000
+_RATE_SAMPLES = 300
+_NEAR = 0.93  # of a domain's half-width: from here on its faces are near
+
+
+class Fate(IntEnum):
+    """What becomes of a run until the horizon."""
+
+    UNDECIDED = 0
+    CONVERGED = 1
+    LOST = 2
+
+
+@dataclass(frozen=True, slots=True)
+class Runs:
+    """What became of runs from B states.
+
+    Parameters
+    ----------
+    fate : of each run, values of `Fate`, (B,).
+    length : of its way to the inner ellipsoid, in scaled states, (B,).
+    nearness : the largest nearness to the domain's faces on its way, from 0 (not near) to 1 (on one), (B,).
+    """
+
+    fate: NDArray[np.int64]
+    length: Array
+    nearness: Array
+
+    @property
+    def converged(self) -> Mask:
+        """Which runs entered the inner ellipsoid, (B,)."""
+        return np.asarray(self.fate == Fate.CONVERGED)
+
+
+class LearningFlow:
+    """The loop on its domain, with the inner ellipsoid {V <= c}.
+
+    Parameters
+    ----------
+    loop : in continuous time, its input following the state at once.
+    inner, c : of the ellipsoid.
+    """
+
+    def __init__(self, loop: ClosedLoop, inner: Quadratic, c: float) -> None:
+        system = loop.system
+        self.loop, self.V, self.c, self.n = loop, inner, c, system.n
+        self.low, self.high = np.array([[float(end) for end in pair] for pair in system.domain]).T
+        nominal, general = system.function(), system.uncertain_function()
+        folded, u_eq = loop.folded, loop.u_eq  # once, not in every step
+        policy: Callable[[Array], Array] = lambda x: np.asarray(folded(x, u_eq))  # noqa: E731
+        self.policy = policy
+        self.rate: Callable[[Array], Array] = lambda x: np.asarray(nominal(x, policy(x)))
+        self._general, self._corners = general, [list(map(float, at.values())) for at in system.corners()]
+        self._limits = None
+        if not bounded_by_form(loop.network, system.input_bounds):
+            self._limits = np.array([[float(end) for end in pair] for pair in system.input_bounds]).T
+        generator = np.random.default_rng(0)
+        rates = eigenvalues_of(self.rate, self.uniform(_RATE_SAMPLES, generator), self.high - self.low)
+        at_rest = eigenvalues_of(self.rate, np.zeros((1, self.n)), self.high - self.low)
+        fastest, slowest = float(np.max(np.abs(rates), initial=1e-9)), float(np.min(-at_rest.real, initial=math.inf))
+        self.step = _STEP / fastest
+        self.steps = min(_MAX_STEPS, math.ceil(_HORIZON / max(slowest, 1e-9) / self.step))
+
+    def uniform(self, count: int, generator: np.random.Generator) -> Array:
+        """States of the domain, (count, n)."""
+        return generator.uniform(self.low, self.high, (count, self.n))
+
+    def faces(self, count: int, generator: np.random.Generator) -> Array:
+        """States of the domain's faces, (count, n), as many of each."""
+        x, each = self.uniform(count, generator), np.arange(count)
+        axis = each % self.n
+        x[each, axis] = np.where(each // self.n % 2 == 0, self.low[axis], self.high[axis])
+        return x
+
+    def inside(self, x: Array) -> Mask:
+        """Which states lie in the domain and have their input in bounds, (B,)."""
+        within = np.all((x >= self.low) & (x <= self.high), axis=-1)
+        if self._limits is not None:
+            u = self.policy(x)
+            within &= np.all((u >= self._limits[0]) & (u <= self._limits[1]), axis=-1)
+        return np.asarray(within)
+
+    def directions(self, x: Array, scale: Array) -> Array:
+        """Unit vectors of the rates in z = x / scale at each corner of what is uncertain, (C, B, n)."""
+        u = self.policy(x)
+        rates = np.stack([np.asarray(self._general(x, u, values)) for values in self._corners]) / scale
+        return np.asarray(rates / (np.linalg.norm(rates, axis=-1, keepdims=True) + 1e-12))
+
+    def run(self, starts: Array, scale: Array) -> Runs:
+        """Simulate from states (B, n)."""
+        middle, half = (self.low + self.high) / 2, (self.high - self.low) / 2
+        fate = np.full(len(starts), Fate.UNDECIDED, dtype=np.int64)
+        length, nearness = np.zeros(len(starts)), np.zeros(len(starts))
+        x, alive = starts, np.arange(len(starts))
+        with np.errstate(all="ignore"):
+            for _ in range(self.steps):
+                home, kept = self.V(x) <= self.c, self.inside(x)
+                fate[alive[home & kept]], fate[alive[~kept]] = Fate.CONVERGED, Fate.LOST
+                on = kept & ~home
+                x, alive = x[on], alive[on]
+                if not alive.size:
+                    break
+                relative = np.max(np.abs((x - middle) / half), axis=-1)
+                close = np.clip((relative - _NEAR) / (1 - _NEAR), 0.0, 1.0) ** 2
+                nearness[alive] = np.maximum(nearness[alive], close)
+                length[alive] += self.step * np.linalg.norm(self.rate(x) / scale, axis=-1)
+                x = rk4_step(self.rate, x, self.step)
+        return Runs(fate, length, nearness)

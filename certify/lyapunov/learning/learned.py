@@ -1,0 +1,246 @@
+"""A function N whose sublevel set, united with a proved ellipsoid, is to be a larger region of attraction.
+
+A fit to values along simulated runs gives the shape; rounds of counterexamples then see to it that N falls along the
+flow wherever it is low, and is high where nothing converges. In later rounds the values are let go: what counts is
+which side of the level a state is on, and that N falls. The ellipsoid is taken smaller than it is, so that N goes on
+falling well inside, and a somewhat different one serves as well.
+
+Everything here is in floats and proves nothing: the level is where samples found no violation. With the same seed and
+enough time the result is the same.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.closed_loop import ClosedLoop
+from certify.errors import InputError
+from certify.lyapunov.function import Quadratic
+from certify.lyapunov.learning.counterexamples import Search
+from certify.lyapunov.learning.fit import Slopes, Values, fit
+from certify.lyapunov.learning.flow import LearningFlow
+from certify.lyapunov.learning.models import Model, Network, Terms
+from certify.lyapunov.learning.samples import Samples, draw
+from certify.lyapunov.neural import Neural
+from certify.lyapunov.polynomial import Polynomial
+
+Array = NDArray[np.float64]
+_WITHIN = 0.5  # of c2: the ellipsoid outside of which N is to fall
+_SHELL = 0.75  # of that, inside of which nothing is asked
+_ROUNDS, _FIRST, _STEPS = 20, 36, 12  # of counterexamples; steps of the first fit and of each other
+_RELAXED = 0.4  # of the rounds, after which values may be anything below the level
+_MARGIN = 0.1  # how fast N falls at least, per scaled length,
+_NATURAL = 0.3  # or this share of how fast the value does
+_TOLERANCE = 0.02  # of values
+_ABOVE = 0.05  # the level, for states that do not belong to the set
+_ROWS = 1500  # of values and of slopes for each state of the plant
+_FACES = 300  # for each state
+_KEPT = 3000  # counterexamples
+_NEW = 600  # of them at most in a round
+_SLOPE_WEIGHT, _EDGE_WEIGHT = 3.0, 2.0
+_BESIDE = 0.003  # the lowest violation
+
+
+@dataclass(frozen=True, slots=True)
+class Round:
+    """One fit: the cost, the level below which samples show no violation, the share of the region of attraction that
+    lies below it (sampled), the counterexamples found, and the seconds since the beginning."""
+
+    cost: float
+    level: float
+    cover: float
+    found: int
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True)
+class Learned:
+    """A function with what samples say of it; nothing of this is proved.
+
+    Parameters
+    ----------
+    function : N, of the plant's states.
+    level : below which no violation was sampled.
+    cover : sampled share of the region of attraction in {N <= level} united with the smaller ellipsoid.
+    history : the rounds, in order.
+    """
+
+    function: Neural | Polynomial
+    level: float
+    cover: float
+    history: tuple[Round, ...]
+
+
+Report = Callable[[Round], None]
+
+
+def learn(
+    loop: ClosedLoop,
+    inner: Quadratic,
+    c2: float,
+    hidden: Sequence[int] = (16, 16),
+    seed: int = 0,
+    seconds: float = 120.0,
+    progress: Report | None = None,
+) -> Learned:
+    """Learn a tanh network for a loop on its domain.
+
+    Parameters
+    ----------
+    loop : in continuous time, its input following the state at once.
+    inner, c2 : a region of attraction {V <= c2}.
+    hidden : widths of the layers between the states and the output.
+    seed : of everything random.
+    seconds : after which no further round begins.
+    progress : called after each round.
+
+    Raises
+    ------
+    InputError : the loop goes in steps, the ellipsoid is none of its states, or too little converges to learn from.
+    """
+    return _learned(loop, inner, c2, Network(loop.system.n, tuple(hidden)), seed, seconds, progress)
+
+
+def fit_polynomial(
+    loop: ClosedLoop,
+    inner: Quadratic,
+    c2: float,
+    degree: int = 4,
+    seed: int = 0,
+    seconds: float = 120.0,
+    progress: Report | None = None,
+) -> Learned:
+    """Fit a polynomial of an even degree for a loop on its domain; the arguments are those of `learn`.
+
+    Raises
+    ------
+    InputError : as `learn`, or the degree is odd or out of range.
+    """
+    return _learned(loop, inner, c2, Terms(loop.system.n, degree), seed, seconds, progress)
+
+
+def _learned(
+    loop: ClosedLoop, inner: Quadratic, c2: float, model: Model, seed: int, seconds: float, progress: Report | None
+) -> Learned:
+    start = time.monotonic()
+    system = loop.system
+    if system.in_steps:
+        raise InputError(
+            f"a function is learned for plants in continuous time whose input follows the state at once; the time of "
+            f"{system.name} goes in steps."
+        )
+    if inner.n != system.n or not (math.isfinite(c2) and c2 > 0):
+        raise InputError(
+            f"the ellipsoid must be of the {system.n} states of {system.name}, at a positive level; "
+            f"found {inner.n} states and the level {c2}."
+        )
+    generator = np.random.default_rng(seed)
+    flow = LearningFlow(loop, inner, _WITHIN * c2)
+    samples = draw(flow, generator)
+    lesson = _Lesson(flow, samples, generator)
+    search = Search(flow, samples)
+    p, damping = model.initial(generator), 1.0
+    best, history = p, list[Round]()
+    while len(history) < _ROUNDS and (not history or time.monotonic() < start + seconds):
+        done = len(history)
+        steps = _STEPS if done else _FIRST
+        fitted = fit(model, p, lesson.values(), lesson.slopes(model.function(p)), steps, damping, start + seconds)
+        p, damping = fitted.p, max(fitted.damping, 1e-4) if done else 1.0
+        function = model.function(p)
+        z, v, slope = search.rising(function, lesson.top, -_NATURAL * _MARGIN, lesson.risen, generator)
+        low = search.low(function, lesson.top + _ABOVE / 2, generator)
+        level = min(
+            float(function(z[slope >= 0]).min(initial=math.inf)),
+            float(function(low).min(initial=math.inf)),
+            lesson.top + _ABOVE / 2,
+        )
+        level -= _BESIDE * abs(level)
+        cover = samples.inner + (1 - samples.inner) * float(np.mean(function(search.region / samples.scale) <= level))
+        if not history or cover > max(each.cover for each in history):
+            best = p
+        history.append(Round(fitted.cost, level, cover, len(z) + len(low), time.monotonic() - start))
+        if progress is not None:
+            progress(history[-1])
+        lesson.add(z, v, low, relax=done + 1 >= _RELAXED * _ROUNDS)
+    reached = max(history, key=lambda each: each.cover)
+    return Learned(model.function(best, samples.scale), reached.level, reached.cover, tuple(history))
+
+
+class _Lesson:
+    """The rows of the fits: those of the samples, and those of counterexamples."""
+
+    def __init__(self, flow: LearningFlow, samples: Samples, generator: np.random.Generator) -> None:
+        n, scale = flow.n, samples.scale
+        self.flow, self.scale, self.generator, self.relaxed = flow, scale, generator, False
+        # Of several states the rim holds most of the volume, and to follow it costs a proof dearly.
+        self.top = (0.95 if n <= 2 else 0.65) ** (1 / n)
+        mixed = generator.permutation(len(samples.x))
+        some = mixed[: _ROWS * n]
+        faces = flow.faces(_FACES * n, generator) / scale
+        self._z = np.concatenate([samples.x[some] / scale, faces])
+        self._value = np.concatenate([samples.value[some], np.full(len(faces), math.inf)])
+        self._weight = np.concatenate(
+            [np.full(len(some), len(some) ** -0.5), np.full(len(faces), _EDGE_WEIGHT * len(faces) ** -0.5)]
+        )
+        self._edge = _EDGE_WEIGHT * (_FACES * n) ** -0.5
+        falls = mixed[: _ROWS * n]
+        falls = falls[samples.attracted[falls]]
+        shell = _shell(flow, max(_ROWS * n // 5, 1), generator)
+        x = np.concatenate([samples.x[falls], shell])
+        self._falls = x / scale
+        self._flow = _drawn(flow.directions(x, scale), generator)
+        self._most = -np.concatenate(
+            [np.minimum(_MARGIN, _NATURAL * samples.slope[falls]), np.full(len(shell), _NATURAL * _MARGIN)]
+        )
+        self._slope_weight = _SLOPE_WEIGHT * (_ROWS * n) ** -0.5
+        self.risen, self._risen_flow = np.zeros((0, n)), np.zeros((0, n))
+        self._rounds = 0
+
+    def values(self) -> Values:
+        """Bounds of N: near the values at first, and then below or above the level."""
+        beyond = self._value > self.top
+        low = np.where(beyond, np.minimum(self._value, self.top + _ABOVE), self._value - _TOLERANCE)
+        high = np.where(beyond, math.inf, self._value + _TOLERANCE)
+        if self.relaxed:
+            low = np.where(beyond, low, -math.inf)
+            high = np.where(beyond, high, np.minimum(np.maximum(high, 0.9 * self.top), self.top - 0.01))
+        return Values(self._z, low, high, self._weight)
+
+    def slopes(self, function: Neural | Polynomial) -> Slopes:
+        """Bounds of N's derivative where N is low now; none before the first fit, and heavier with each round."""
+        most = np.concatenate([self._most, np.full(len(self.risen), -_NATURAL * _MARGIN)])
+        z, v = np.concatenate([self._falls, self.risen]), np.concatenate([self._flow, self._risen_flow])
+        some = (function(z) < self.top + _ABOVE) if self._rounds else np.zeros(len(z), dtype=bool)
+        weight = self._slope_weight * min(1.0, (self._rounds + 0.3) / (0.4 * _ROUNDS))
+        return Slopes(z[some], v[some], most[some], np.full(int(some.sum()), weight))
+
+    def add(self, z: Array, v: Array, low: Array, relax: bool) -> None:
+        """Take in counterexamples: where N rises, with the flow there, and where it is low."""
+        self._rounds, self.relaxed = self._rounds + 1, relax
+        some = self.generator.permutation(len(z))[:_NEW]
+        self.risen = np.concatenate([self.risen, z[some]])[-_KEPT:]
+        self._risen_flow = np.concatenate([self._risen_flow, v[some]])[-_KEPT:]
+        low = low[self.generator.permutation(len(low))[:_NEW]]
+        self._z = np.concatenate([self._z, low])
+        self._value = np.concatenate([self._value, np.full(len(low), math.inf)])
+        self._weight = np.concatenate([self._weight, np.full(len(low), self._edge)])
+
+
+def _shell(flow: LearningFlow, count: int, generator: np.random.Generator) -> Array:
+    """States (count, n) of the inner ellipsoid near its boundary."""
+    y = generator.normal(size=(count, flow.n))
+    y *= np.sqrt(generator.uniform(_SHELL, 1.0, (count, 1))) / np.linalg.norm(y, axis=1, keepdims=True)
+    return np.asarray(y @ np.linalg.inv(np.linalg.cholesky(flow.V.P / flow.c)))
+
+
+def _drawn(directions: Array, generator: np.random.Generator) -> Array:
+    """Of the directions (C, B, n) at each corner of what is uncertain one for each state, (B, n)."""
+    corners, count = directions.shape[:2]
+    drawn = np.zeros(count, dtype=np.int64) if corners == 1 else generator.integers(corners, size=count)
+    return np.asarray(directions[drawn, np.arange(count)])
