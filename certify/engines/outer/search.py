@@ -97,6 +97,7 @@ class Cover:
         return Stop.TIME if spent > budget.seconds else None
 
     def _step(self, bound: Bound, budget: Budget) -> None:
+        least = self.frontier.least()  # what a box's bound leaves unknown, its place in the order still says
         lo, hi, number = self.frontier.take(budget.batch, math.inf)
         self.boxes += lo.shape[1]
         found: OuterBounds = bound(lo, hi, -math.inf, self.level)
@@ -115,7 +116,7 @@ class Cover:
         whole = torch.where(hi > lo, (hi - lo) / (2 * self.width), 1.0).prod(0)
         self.done_share += float(whole[found.proved].sum())
         self.leaves += int(found.proved.sum())
-        self.frontier.add(halves.lo, halves.hi, found.lowest[halves.origin], halves.number)
+        self.frontier.add(halves.lo, halves.hi, found.lowest[halves.origin].clamp(min=least), halves.number)
 
     def tree(self) -> bytes:
         """The partition in preorder."""
