@@ -87,6 +87,9 @@ def certify_roa(
     rate: float | None = None,
     lyapunov: str | os.PathLike[str] | Neural | Polynomial | Symbolic | None = None,
     lyapunov_level: float | None = None,
+    hidden: Sequence[int] | None = None,
+    degree: int | None = None,
+    seed: int | None = None,
     load_seconds: float = 0.0,
     provenance: Mapping[str, Any] | None = None,
     progress: Report | None = None,
@@ -115,7 +118,8 @@ def certify_roa(
         can be shown, convergence to one equilibrium where what is uncertain is constant; or "auto" (the default), the
         first where the loop rests at the origin exactly and the last where it does not.
     candidate : where P comes from: "auto" (the default: of several the largest proved), "lyapunov", "scaled", "lqr",
-        "optimised", "robust", or "peak", which is for practical claims.
+        "optimised", "robust", or "peak", which is for practical claims; "neural" and "polynomial" do as "auto" does,
+        and learn a function whose set reaches beyond the ellipsoid.
     Q, R : diagonals of the weights, n and m positive numbers; ones by default.
     P : a Lyapunov matrix of one's own, (n, n), symmetric; overrides the candidate.
     level : prove exactly this level; by default the largest is looked for.
@@ -143,6 +147,8 @@ def certify_roa(
     lyapunov : a function N of deviations from the operating point, or the path of its file: prove the largest {N <= n2}
         in the domain from which every trajectory enters {x'Px <= c2}; `result.outer` says what was found.
     lyapunov_level : prove exactly this n2; by default the largest is looked for.
+    hidden, degree, seed : of what the candidates "neural" and "polynomial" learn: widths of the layers, (16, 16) by
+        default, the even degree, 4, and the seed, 0.
     load_seconds : time already spent on reading, for the report.
     provenance : entries for the certificate that the checkers ignore; by default the policy's name and versions.
     progress : called with a stage ("candidate", "ring", "check") and where the search stands, or None.
@@ -178,7 +184,7 @@ def certify_roa(
         "claim": claim, "candidate": candidate, "Q": Q, "R": R, "P": P, "level": level, "engine": engine,
         "dreal_precision": dreal_precision, "jobs": jobs, "device": device, "enlarge": enlarge, "box": box,
         "reach_from": reach_from, "time_limit": time_limit, "max_boxes": max_boxes, "rate": rate,
-        "lyapunov_level": lyapunov_level,
+        "lyapunov_level": lyapunov_level, "hidden": hidden, "degree": degree, "seed": seed,
     }  # fmt: skip
     notices: list[str] = []
     try:
@@ -260,9 +266,10 @@ def _options(options: RoaOptions | None, single: dict[str, Any]) -> RoaOptions:
             )
         return options
     numbers = ("level", "dreal_precision", "time_limit", "rate", "lyapunov_level")
-    whole = ("jobs", "max_boxes")
+    whole = ("jobs", "max_boxes", "degree", "seed")
     readers: dict[str, Callable[[Any, str], Any]] = dict.fromkeys(single, _text)
     readers |= {"Q": _row, "R": _row, "P": _matrix, "enlarge": _flag, "box": _widths, "reach_from": _state}
+    readers |= {"hidden": _counts}
     readers |= dict.fromkeys(numbers, _number) | dict.fromkeys(whole, _count)
     read = {name: readers[name](value, name) for name, value in single.items()}
     return RoaOptions(**read)
@@ -492,6 +499,10 @@ def _count(value: Any, name: str) -> int:
     if isinstance(value, bool) or not isinstance(value, int):
         raise InputError(f"`{name}` must be a whole number; found {value!r:.60}, {_kind(value)}.")
     return value
+
+
+def _counts(value: Any, name: str) -> tuple[int, ...]:
+    return tuple(_count(v, name) for v in _list(value, name))
 
 
 def _text(value: Any, name: str) -> str:

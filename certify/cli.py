@@ -21,6 +21,7 @@ from certify.commands.export_smt2 import export_smt2
 from certify.commands.float_error import float_error
 from certify.commands.import_ import import_
 from certify.commands.importing import takes_import_options
+from certify.commands.learn_lyapunov import learn_lyapunov
 from certify.commands.plant import plant
 from certify.commands.plot import plot
 from certify.commands.reach import reach
@@ -44,6 +45,7 @@ app.command("contains")(contains)
 app.command("report")(report)
 app.command("plot")(plot)
 app.command("import")(takes_import_options(import_))
+app.command("learn-lyapunov")(takes_import_options(learn_lyapunov))
 app.command("plant")(plant)
 app.command("systems")(systems)
 app.command("export-smt2")(export_smt2)

@@ -19,11 +19,16 @@ from typing import TYPE_CHECKING, Any
 from certify.errors import InputError
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from certify.lyapunov import Neural, Polynomial
     from certify.policies import Centre, Policy
     from certify.policies.importers import Imported, ImportOptions
     from certify.systems import System
     from certify.systems.system import Interval
+
+    Array = NDArray[np.float64]
 
 Tell = Callable[[str], None]
 
@@ -125,6 +130,23 @@ def function_for(path: Path, plant: System, tell: Tell) -> Neural | Polynomial:
     if stored.system != plant.name:
         tell(f"Lyapunov file {path} is of {stored.system}; it is proved for {plant.name}")
     return stored.function
+
+
+def ellipsoid_beside(path: Path, plant: System) -> Array | None:
+    """P (n, n) of the ellipsoid beyond which the function in a Lyapunov file was learned; None if it does not say.
+
+    A file that says something else than a symmetric matrix says nothing: P is a hint, and what is proved with it is
+    proved like any other.
+    """
+    from certify.lyapunov import load_lyapunov
+    from certify.lyapunov.function import Quadratic
+
+    learned = load_lyapunov(path).training.get("learned")
+    try:
+        P = Quadratic(learned["P"]).P if isinstance(learned, dict) else None
+    except (InputError, KeyError, ValueError, TypeError):
+        return None
+    return P if P is not None and len(P) == plant.n else None
 
 
 def where_valid(stored: Policy, plant: System, tell: Tell) -> System:

@@ -6,13 +6,13 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Literal, get_args
+from typing import Literal, cast, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from certify.lyapunov import Candidate, Named, Neural, Polynomial, Symbolic
+from certify.lyapunov import BEYOND, Beyond, Candidate, Named, Neural, Polynomial, Symbolic
 
 Array = NDArray[np.float64]
 EngineName = Literal["bounds", "dreal", "both"]
@@ -30,7 +30,8 @@ class RoaOptions:
         the first where the loop rests at the origin exactly, and the last where it does not.
     candidate : where P comes from, see `choose_candidate`, or `robust`, which chooses P with the local rule's own
         bounds, or `peak`, whose floor is small; `auto` tries several and keeps the one with which the largest volume is
-        proved. With Q, R or a level it is `lyapunov`, or `lqr` if R is given.
+        proved. `neural` and `polynomial` do that too, and learn a function N whose set reaches beyond the ellipsoid.
+        With Q, R or a level it is `lyapunov`, or `lqr` if R is given.
     Q, R : diagonals of the weights, shapes (n,) and (m,); None means ones.
     P : a Lyapunov matrix of one's own, (n, n); overrides the candidate.
     level : prove exactly this level; None finds the largest.
@@ -45,6 +46,9 @@ class RoaOptions:
     lyapunov : a function N of the states beyond the ellipsoid: prove the largest {N <= n2} from which every trajectory
         enters {V <= c2}, in the domain box.
     lyapunov_level : prove exactly this n2; None finds the largest.
+    hidden, degree : of what the candidates `neural` and `polynomial` learn: the widths of the layers between states and
+        output, and the degree.
+    seed : of that learning.
     time_limit : seconds for everything up to the verdict, the check included.
     max_boxes : boxes for the ring.
     rate : lambda in `D + 2 lambda V < 0`: V is to fall at least as exp(-2 lambda t), in units of time of the plant, or
@@ -66,6 +70,9 @@ class RoaOptions:
     reach_from: Mapping[str, Fraction | float] | None = None
     lyapunov: Neural | Polynomial | Symbolic | None = None
     lyapunov_level: float | None = None
+    hidden: tuple[int, ...] = (16, 16)
+    degree: int = 4
+    seed: int = 0
     time_limit: float = 50.0
     max_boxes: int = 4_000_000
     rate: float = 0.0
@@ -76,10 +83,20 @@ class RoaOptions:
         return self.enlarge or self.box is not None or self.reach_from is not None
 
     @property
+    def learned(self) -> Beyond | None:
+        """What is learned for a set beyond the ellipsoid, if anything is."""
+        return next((name for name in BEYOND if name == self.candidate), None)
+
+    @property
+    def goes_beyond(self) -> bool:
+        """Whether a set beyond the ellipsoid is looked for."""
+        return self.lyapunov is not None or self.learned is not None
+
+    @property
     def only(self) -> Named | None:
         """The one candidate that is asked for, if P is not given; None if several are tried."""
-        if self.candidate != "auto":
-            return self.candidate
+        if self.candidate != "auto" and self.candidate not in BEYOND:
+            return cast(Named, self.candidate)
         return "lqr" if self.R is not None else "lyapunov" if self.Q is not None or self.level is not None else None
 
     def __post_init__(self) -> None:
@@ -103,8 +120,16 @@ class RoaOptions:
             raise InputError(f"`rate` must be a number of at least 0; found {self.rate}.")
         if self.rate and (self.enlarges or self.engine != "bounds"):
             raise InputError("`rate` needs the engine bounds, and a claim without a tube.")
-        if self.lyapunov is not None and (self.enlarges or self.rate or self.engine != "bounds"):
-            raise InputError("`lyapunov` needs the engine bounds, and a claim without a tube and without a rate.")
+        if self.goes_beyond and (self.enlarges or self.rate or self.engine != "bounds"):
+            what = "lyapunov" if self.learned is None else f"candidate` `{self.learned}"
+            raise InputError(f"`{what}` needs the engine bounds, and a claim without a tube and without a rate.")
+        if self.lyapunov is not None and self.learned is not None:
+            raise InputError(f"the candidate `{self.learned}` is learned; leave `lyapunov` out, or ask for another.")
+        if any(width < 1 for width in self.hidden) or self.degree not in range(2, 13, 2):
+            raise InputError(
+                "`hidden` must be widths of at least 1, and `degree` even, 2 to 12; "
+                f"found {self.hidden}, {self.degree}."
+            )
         if self.lyapunov_level is not None and not math.isfinite(self.lyapunov_level):
             raise InputError(f"`lyapunov_level` must be a finite number; found {self.lyapunov_level}.")
         if not self.time_limit > 0 or not self.max_boxes > 0:

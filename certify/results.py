@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
-_STAGES = ("load", "candidate", "local", "ring", "tube", "outer", "write", "check", "total")
+_STAGES = ("load", "candidate", "local", "ring", "tube", "learn", "outer", "write", "check", "total")
 
 
 @dataclass(frozen=True, slots=True)

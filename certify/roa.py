@@ -39,7 +39,6 @@ from certify.errors import BackendError, InputError, SoundnessError
 from certify.lyapunov import (
     Neural,
     Polynomial,
-    Symbolic,
     are_inside,
     leaves_domain,
     of_polynomial,
@@ -63,7 +62,7 @@ if TYPE_CHECKING:
 
 __all__ = ["RoaOptions", "RoaResult", "certify_roa"]
 Array = NDArray[np.float64]
-Stage = Literal["candidate", "ring", "tube", "outer", "check"]
+Stage = Literal["candidate", "ring", "tube", "learn", "outer", "check"]
 Report = Callable[[Stage, Progress | None], None]
 _SMALL_NETWORK = 10_000  # weights
 # Shares of the time limit:
@@ -73,6 +72,7 @@ _SEARCH = 0.6  # for a search that cannot be interrupted, the rest being its che
 _KEPT = 0.03  # for what comes after the search: writing, the checker's start
 _BEFORE_TUBE = 0.5  # for candidates and ring, where a tube is to be looked for
 _BEFORE_OUTER = 0.25  # the same, where a set beyond theirs is
+_FOR_LEARNING = 0.4  # of what is left then, the rest being the proof's and its check's
 _FOR_SEARCH = 0.5  # of what is left then, the rest being the tube's check
 _FOR_PROOF = 0.4  # of the time limit, that no further candidate is optimised in
 _WORTH = 1.05  # growth of a volume that another candidate must promise
@@ -187,7 +187,7 @@ class _Run:
                     raise InputError(f"a tube from a state needs a loop that rests at the origin; {self.aside}.")
                 options = replace(options, enlarge=False, box=None)
             self.options = options = replace(options, claim=claim)
-        self.share = _BEFORE_TUBE if options.enlarges else _BEFORE_OUTER if options.lyapunov is not None else 1.0
+        self.share = _BEFORE_TUBE if options.enlarges else _BEFORE_OUTER if options.goes_beyond else 1.0
         kind = _kind_of(options)
         result = RoaResult(
             Verdict.UNKNOWN,
@@ -420,8 +420,8 @@ class _Run:
                 claim = Nearby(claim.roa, claim.local, claim.floor, rate=claim.rate)
                 evidence = replace(evidence, contraction=closer)
         beyond = None
-        if self.options.lyapunov is not None and isinstance(evidence, PartitionTree):
-            beyond = self._beyond(best.trial, claim, self.options.lyapunov)
+        if self.options.goes_beyond and isinstance(evidence, PartitionTree):
+            beyond = self._beyond(best.trial, claim)
             if beyond is not None:
                 claim, evidence = replace(claim, outer=beyond.outer), replace(evidence, outer=beyond.evidence)
         certificate = Certificate(self.system, self.network, task.problem.V, claim, evidence, self.provenance)  # type: ignore[arg-type]
@@ -537,7 +537,19 @@ class _Run:
         reached = Reached(roa=claim.roa, local=claim.local, start=Quadratic(tube.start), centre=at)
         return facts, reached, replace(evidence, tube=tube.slabs)
 
-    def _beyond(self, trial: Trial, claim: Claim, function: Neural | Polynomial | Symbolic) -> OuterProof | None:
+    def _learned(self, trial: Trial, claim: Claim) -> Neural | Polynomial:
+        """A function whose set may reach beyond the ellipsoid, learned in a share of what is left of the time."""
+        from certify.lyapunov.learning import fit_polynomial, learn
+
+        options, loop, V = self.options, trial.task.problem.loop, trial.task.problem.V
+        with self._stage("learn"):
+            self._tell("learn")
+            seconds = _FOR_LEARNING * self.left()
+            if options.learned == "neural":
+                return learn(loop, V, claim.roa, options.hidden, options.seed, seconds).function
+            return fit_polynomial(loop, V, claim.roa, options.degree, options.seed, seconds).function
+
+    def _beyond(self, trial: Trial, claim: Claim) -> OuterProof | None:
         """The largest set of another function that is proved to lead into {V <= c2} in the time that is left; None, and
         `aside` says why, if there is none."""
         import torch
@@ -546,6 +558,7 @@ class _Run:
         from certify.running import ThreadRunner
 
         self.share = 1.0
+        function = self.options.lyapunov or self._learned(trial, claim)
         if function.n != self.system.n:
             raise InputError(f"`lyapunov` must be a function of {self.system.n} states; found one of {function.n}.")
         N = of_polynomial(function, self.system.states) if isinstance(function, Polynomial) else function
@@ -666,10 +679,10 @@ def _require_one_that_knows(system: System, options: RoaOptions) -> None:
     """
     if options.lyapunov is None and options.lyapunov_level is not None:
         raise InputError("`lyapunov_level` must be the level of a function; give one as `lyapunov`.")
-    if options.lyapunov is not None and system.in_steps:
+    if options.goes_beyond and system.in_steps:
         raise InputError(
-            f"`lyapunov` must be for a plant in continuous time whose input follows the state at once; the time of "
-            f"{system.name} goes in steps. Ask for the set without it."
+            "a set beyond the ellipsoid must be of a plant in continuous time whose input follows the state at once; "
+            f"the time of {system.name} goes in steps. Ask for the set without it."
         )
     if options.engine == "bounds" and not options.enlarges:
         return

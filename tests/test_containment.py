@@ -18,6 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from certify import TanhNetwork, certify_roa
+from certify.certificate import parse_certificate
 from certify.cli import _run
 from certify.commands.arguments import region
 from certify.containment import Box, Containment, Ellipsoid, Located, ProvedSet, proved_set
@@ -25,6 +26,7 @@ from certify.errors import CertificateFormatError, InputError
 from certify.lyapunov import Neural, Symbolic
 from certify.sublevel import Sublevel
 from certify.systems import System, load_system
+from controllers.evaluate import count_covered
 from tests.support.beyond import line, network, plane
 from tests.support.certificates import write
 from tests.support.loops import box
@@ -461,6 +463,14 @@ def test_what_is_said_of_a_union_is_true(seed: int) -> None:
     elif found.answer is Containment.NOT_CONTAINED:
         assert found.outside is not None and where.excludes([found.outside]) == [True]
         assert all(lo <= v <= hi for v, (lo, hi) in zip(found.outside, region, strict=True))
+
+
+def test_judging_a_policy_counts_the_union(by_formula: Path) -> None:
+    read = parse_certificate(by_formula.read_bytes(), "certificate")
+    x = np.random.default_rng(1).uniform(-2, 2, (500, 2))
+    found = count_covered(proved_set(by_formula), read.network, read.system, x)
+    inside = (x[:, 0] ** 2 + x[:, 1] ** 2 / 4 <= 0.9) | (np.sum(x**2, axis=1) <= 0.25)
+    assert (found.inside, found.states) == (np.count_nonzero(inside), 500) and found.inside > 100
 
 
 def test_a_network_s_set_is_that_of_the_file(beyond: Path, capsys: pytest.CaptureFixture[str]) -> None:

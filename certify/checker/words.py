@@ -95,7 +95,7 @@ def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
         local, ring = answer["margins"]["local"], answer["margins"]["ring"]
         margins = [] if local is None else [f"local {local:.1%}"]
         margins += [] if ring is None else [f"smallest bound of -{_falling(c)} on a ring's leaf {ring:.3g}"]
-        outer = answer["margins"]["outer"]
+        outer = None if c.outer is None else answer["margins"]["outer"]
         margins += [] if outer is None else [f"smallest bound of -N'F on a leaf of the outer set {outer:.3g}"]
         rest, verdict = f"margins: {'; '.join(margins)}", "ACCEPTED"
     after = "+" if c.discrete else "'"

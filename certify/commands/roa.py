@@ -59,7 +59,8 @@ def roa(
         str,
         typer.Option(
             help="Lyapunov candidate: auto (of all, the largest proved), lyapunov, scaled, lqr, optimised, robust, "
-            "peak (practical claims, a small floor)."
+            "peak (practical claims, a small floor), neural or polynomial (auto, and a function learned for a set "
+            "beyond its ellipsoid)."
         ),
     ] = "auto",
     q: Annotated[str | None, typer.Option("--Q", help="Diagonal of Q, as in 1,1.")] = None,
@@ -91,10 +92,14 @@ def roa(
         Path | None,
         typer.Option(
             help="File of a function N (certify-lyapunov/1): prove the largest {N <= n2} in the domain from which "
-            "every trajectory enters the proved ellipsoid."
+            "every trajectory enters the proved ellipsoid, that with which N was learned if the file says so and no "
+            "candidate is named."
         ),
     ] = None,
     lyapunov_level: Annotated[float | None, typer.Option(help="Prove exactly this n2.")] = None,
+    hidden: Annotated[str, typer.Option(help="Widths of the layers that the candidate neural learns.")] = "16,16",
+    degree: Annotated[int, typer.Option(help="Degree of the candidate polynomial, even.")] = 4,
+    seed: Annotated[int, typer.Option(help="Seed of what is learned.")] = 0,
     contains: Annotated[
         str | None,
         typer.Option(help="Say whether the proved set contains a state or a box, as in x=1.57,x_dot=-1..1."),
@@ -106,7 +111,7 @@ def roa(
     as_json: Json = False,
 ) -> None:
     """Certify a region of attraction: prove, write a certificate, have it checked, report."""
-    from certify.inputs import function_for
+    from certify.inputs import ellipsoid_beside, function_for
     from certify.options import RoaOptions
 
     start = time.perf_counter()
@@ -121,11 +126,15 @@ def roa(
         input_error,
         None if sample_time == _MOST else sample_time,
     )
+    P = None
+    if lyapunov is not None and candidate == "auto" and q is None and r is None and level is None:
+        P = ellipsoid_beside(lyapunov, plant)
     options = RoaOptions(
         claim=claim,  # type: ignore[arg-type]
         candidate=candidate,  # type: ignore[arg-type]
         Q=numbers(q, "--Q"),
         R=numbers(r, "--R"),
+        P=P,
         level=level,
         engine=_engine(context, engine),  # type: ignore[arg-type]
         dreal_precision=precision,
@@ -138,6 +147,9 @@ def roa(
         rate=0.0 if rate == _MOST else _number(rate),
         lyapunov=None if lyapunov is None else function_for(lyapunov, plant, tell),
         lyapunov_level=lyapunov_level,
+        hidden=_widths(hidden),
+        degree=degree,
+        seed=seed,
     )
     asked = None if contains is None else region(contains, plant, "--contains")
     certified(context, policy, stored, plant, options, out, start, quiet, as_json, asked, largest)
@@ -155,6 +167,13 @@ def _number(rate: str) -> float:
         return float(rate)
     except ValueError as error:
         raise InputError(f"--rate takes a number of at least 0, or max; found {rate!r}.") from error
+
+
+def _widths(text: str) -> tuple[int, ...]:
+    try:
+        return tuple(int(part) for part in text.split(","))
+    except ValueError as error:
+        raise InputError(f"--hidden takes widths, as in 16,16; found {text!r}.") from error
 
 
 def _device(name: str) -> str:

@@ -59,6 +59,7 @@ _STAGES = {
     "candidate": "choosing candidates",
     "ring": "proving",
     "tube": "looking for a tube",
+    "learn": "learning beyond the ellipsoid",
     "outer": "proving beyond the ellipsoid",
     "check": "checking",
 }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from certify.lyapunov.candidates import slowest_decay, solve_lyapunov
-from certify.lyapunov.choice import SOLVED, Candidate, Chosen, Named, choose_candidate
+from certify.lyapunov.choice import BEYOND, SOLVED, Beyond, Candidate, Chosen, Named, choose_candidate
 from certify.lyapunov.file import StoredLyapunov, load_lyapunov, save_lyapunov
 from certify.lyapunov.function import LyapunovFunction, Quadratic
 from certify.lyapunov.importing import ImportedLyapunov, import_lyapunov
@@ -25,7 +25,9 @@ from certify.lyapunov.sampled import sampled_volume
 from certify.lyapunov.symbolic import Symbolic, of_polynomial
 
 __all__ = [
+    "BEYOND",
     "SOLVED",
+    "Beyond",
     "Candidate",
     "Chosen",
     "ImportedLyapunov",

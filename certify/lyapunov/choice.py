@@ -17,9 +17,12 @@ from certify.lyapunov.optimised import largest_sampled, optimise_repeatedly
 Array = NDArray[np.float64]
 Solved = Literal["lyapunov", "scaled", "lqr"]
 Named = Literal["lyapunov", "scaled", "lqr", "optimised", "robust", "peak"]
-Candidate = Literal["auto", "lyapunov", "scaled", "lqr", "optimised", "robust", "peak"]
+Beyond = Literal["neural", "polynomial"]
+Candidate = Literal["auto", "lyapunov", "scaled", "lqr", "optimised", "robust", "peak", "neural", "polynomial"]
 SOLVED: tuple[Solved, ...] = ("lyapunov", "scaled", "lqr")
 """The candidates that solve a Lyapunov equation."""
+BEYOND: tuple[Beyond, ...] = ("neural", "polynomial")
+"""Those that are learned for a set beyond the ellipsoid of another one."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,8 @@
 """N of a claim that goes beyond {V <= c2}, and how it changes along F, in models on a box.
 
 A network's layers are products of matrices: a row for each model, its coefficients behind each other, its remainder by
-the magnitudes of the weights. An expression is a series in time of which two coefficients are asked.
+the magnitudes of the weights. An expression is a series in time of which two coefficients are asked. Where a box is
+wide, the tanhs of a network are far from their tangents, and lie better between two lines.
 """
 
 from __future__ import annotations
@@ -10,7 +11,8 @@ from collections.abc import Sequence
 
 from flint import arb, arb_mat
 
-from .balls import ZERO, absolute, weights
+from .affine import Network
+from .balls import ZERO, total
 from .document import Function
 from .flow import constant
 from .layers import Layer
@@ -24,8 +26,7 @@ class Models:
 
     def __init__(self, N: Function, states: tuple[str, ...]) -> None:
         self.N, self.states, self.level = N, states, arb(N.level)
-        self.weights = weights(N.layers)
-        self.absolute = [absolute(W) for W in self.weights]
+        self.network = Network(N.layers)
 
     def value(self, x: Sequence[Taylor]) -> Taylor:
         """N, or a refusal where it may be undefined."""
@@ -37,9 +38,19 @@ class Models:
         return x[0]
 
     def is_above(self, x: Sequence[Taylor]) -> bool:
-        """Whether N is certainly defined, and above its level, on all of the box."""
+        """Whether N is certainly defined, and above its level, on all of the box; x without remainders."""
         N = self.value(x)
-        return N.is_finite() and bool(-(-N).bound() > self.level)
+        if N.is_finite() and bool(-(-N).bound() > self.level):
+            return True
+        return self.N.expression is None and self.is_above_by_lines(x)
+
+    def is_above_by_lines(self, x: Sequence[Taylor]) -> bool:
+        """The same of a network by the least value of its affine form."""
+        symbols = max(len(v.g or ()) for v in x)
+        forms = arb_mat([[v.c, *(v.g or [ZERO] * symbols)] for v in x])
+        (((mid, slopes, error),),) = self.network.outputs(forms, 1)
+        least = mid - total(abs(v) for v in slopes) - error
+        return bool(least.is_finite()) and bool(least > self.level)
 
     def moving(self, x: Sequence[Taylor], F: Sequence[Taylor]) -> tuple[Taylor, Taylor]:
         """N and N'F, or a refusal where N may be undefined."""
@@ -48,16 +59,16 @@ class Models:
             ((value, rate),) = along(self.N.expression, states, rates, constant)
             return value, Taylor(ZERO) if rate is None else rate
         y = F
-        for k, (layer, W) in enumerate(zip(self.N.layers, self.weights, strict=True)):
+        for k, (layer, W) in enumerate(zip(self.N.layers, self.network.weights, strict=True)):
             if k:
                 y = [a.function("tanh'") * v for a, v in zip(x, y, strict=True)]
                 x = [a.function("tanh") for a in x]
-            x, y = self.affine(k, layer, x), mapped(W, self.absolute[k], y)
+            x, y = self.affine(k, layer, x), mapped(W, self.network.absolute[k], y)
         return x[0], y[0]
 
     def affine(self, k: int, layer: Layer, x: Sequence[Taylor]) -> list[Taylor]:
         """Layer k."""
-        each = zip(mapped(self.weights[k], self.absolute[k], x), layer.bias, strict=True)
+        each = zip(mapped(self.network.weights[k], self.network.absolute[k], x), layer.bias, strict=True)
         return [v + Taylor(arb(b)) for v, b in each]
 
 

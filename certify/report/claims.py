@@ -270,7 +270,7 @@ _BEYOND = (
     (
         "Outer set",
         "For all x of the domain with V(x) ≥ c₂ and N(x) ≤ n₂, N is continuously differentiable, N′(x)F(x) < 0, the "
-        "closed loop is locally Lipschitz, and the input stays in its bounds",
+        "closed loop is locally Lipschitz, and what the policy asks for stays in the bounds of the input",
         "leaf by leaf of a partition that covers the domain by construction",
     ),
 )

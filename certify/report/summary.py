@@ -38,7 +38,7 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
 
 _COLOURS = {"PROVED": "bold green", "REFUTED": "bold red", "UNKNOWN": "bold yellow", "TRUSTED": "bold yellow"}
-_STAGES = ("load", "candidate", "local", "ring", "tube", "outer", "write", "check")
+_STAGES = ("load", "candidate", "local", "ring", "tube", "learn", "outer", "write", "check")
 
 
 def summary(result: Mapping[str, Any]) -> RenderableType:

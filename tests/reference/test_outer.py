@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from flint import arb, ctx, fmpq, fmpq_mat
+from flint import arb, arb_mat, ctx, fmpq, fmpq_mat
 
 from certify.reference import outer, rules
 from certify.reference.__main__ import in_words
@@ -233,6 +233,7 @@ HONEST: dict[str, Callable[[], Document]] = {
     "nearby": lambda: stated(around_a_level(), expression(["**", "x", 2], 8.0)),
     "three states": spatial,
     "two states": lambda: planar(network(BUMPS, -1.25)),
+    "up to a face": lambda: planar(network(BUMPS, -1.127)),
     "in other coordinates": lambda: planar(network(BUMPS, -1.25), SLANTED),
     "a round set": lambda: planar(expression(ROUND, 8.5)),
     "functions": lambda: planar(expression(CURVED, 1.75), SLANTED),
@@ -413,7 +414,7 @@ FORGED: list[tuple[str, str, str, Edit]] = [
              ["+", ["**", ["-", "x", "11/4"], 2], ["**", ["+", "y", "3"], 2]]))),
     ("faces", "on a face, exactly", "a state", setting("claim.outer", expression(["+", "9", ["*", "x", "0"]], 9.0))),
     ("faces", "below a level nowhere", "an affine network", level(0.0)),
-    ("faces", "a tree that is too coarse", "two states", setting("evidence.outer.faces.3", "/w==")),
+    ("faces", "a tree that is too coarse", "up to a face", setting("evidence.outer.faces.3", "/w==")),
     ("faces", "a split of the axis without extent", "two states", tree(lambda old: b"\x01\xff\xff", "faces.2")),
     ("faces", "no such axis", "two states", tree(lambda old: b"\x02\xff\xff", "faces.0")),
     ("faces", "any split with one state", "a state", tree(lambda old: b"\x00\xff\xff", "faces.1")),
@@ -475,7 +476,7 @@ HARMLESS: list[tuple[str, str, Edit]] = [
     ("a negative level", "a state", level(-1.0)),
     ("a level that is -0", "a state", level(-0.0)),
     ("a larger root", "a state", regrown(root(1.5))),
-    ("a finer face", "two states", tree(lambda old: b"\x00" + old + old if len(old) == 1 else old, "faces.2")),
+    ("a finer face", "two states", tree(lambda old: halves(4), "faces.2")),
     ("a T that turns", "a state", regrown(setting("evidence.outer.T", encode([-1.0])))),
     ("words", "a state", setting("provenance", {"outer": None})),
 ]
@@ -501,7 +502,7 @@ def test_every_leaf_counts() -> None:
 
 
 def test_places_have_names() -> None:
-    data = honest("two states")
+    data = honest("up to a face")
     for k in range(4):
         answer = rules.judge(dump(edited(data, f"evidence.outer.faces.{k}", text(b""))))
         assert (answer.rule, answer.at) == ("faces", f"face {k} byte 0")
@@ -549,6 +550,13 @@ def test_multipliers_pay(name: str, needed: int, monkeypatch: pytest.MonkeyPatch
     assert 2 * both < none and alone[needed] < alone[1 - needed], sizes
 
 
+def test_lines_pay(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a face that is one leaf the tanhs are far from their tangents."""
+    assert judge(honest("three states")) is None
+    monkeypatch.setattr(Models, "is_above_by_lines", lambda self, x: False)
+    assert judge(honest("three states")) == "faces"
+
+
 # ---------------------------------------------------------------------------------------------------- models enclose
 
 
@@ -573,7 +581,7 @@ def test_models_enclose_N_and_its_rate(name: str, seed: int) -> None:
         radius = 10.0 ** generator.uniform(-4, -0.3, 2)
         box = Box(0, (centre - radius).tolist(), (centre + radius).tolist())
         with ctx.workprec(PRECISION):
-            models = Models(c.beyond, c.plant.states)
+            models, lined = Models(c.beyond, c.plant.states), Taylor(arb(0), None, None, arb("inf"))
             x = affine(box, T, symbols)
             F = [
                 Taylor(
@@ -587,6 +595,10 @@ def test_models_enclose_N_and_its_rate(name: str, seed: int) -> None:
             try:
                 value, rate = models.moving(x, F)
                 alone = models.value(affine(box, T))
+                if models.N.layers:
+                    forms = arb_mat([[v.c, *(v.g or [])] for v in affine(box, T)])
+                    (((mid, slopes, error),),) = models.network.outputs(forms, 1)
+                    lined = Taylor(mid, slopes, None, error)
             except Refused:
                 assert name == "functions"
                 continue
@@ -596,7 +608,7 @@ def test_models_enclose_N_and_its_rate(name: str, seed: int) -> None:
                 at = [exactly_at(v, d) for v in x]
                 moved = [exactly_at(f, d) + f.r * generator.uniform(-1, 1) for f in F]
                 true = N_in_arb(data, at)
-                for model, e in ((value, d), (alone, d[:2])):
+                for model, e in ((value, d), (alone, d[:2]), (lined, d[:2])):
                     assert abs(true - exactly_at(model, e)) <= model.r + arb("1e-25")
                 h = arb(2) ** -60
                 far = N_in_arb(data, [v + h * f for v, f in zip(at, moved, strict=True)])

@@ -25,7 +25,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from certify.policies import load_policy
-from certify.reference import balls, leaves, local, rational
+from certify.reference import affine, balls, leaves, local, rational
 from certify.reference.document import Certificate
 from certify.reference.document import read as read_certificate
 from certify.reference.evidence import Ball, Tree
@@ -386,7 +386,7 @@ def test_it_leaves_the_document_and_the_precision_as_they_are() -> None:
 @example(-3.0, 1e-12)
 def test_a_tanh_lies_between_its_two_lines(lo: float, width: float) -> None:
     with ctx.workprec(160):
-        slope, shift, gap = leaves.lines(arb(lo), arb(lo + width))
+        slope, shift, gap = affine.lines(arb(lo), arb(lo + width))
         for t in np.linspace(0, 1, 33).tolist():
             y = arb(lo) + arb(t) * (arb(lo + width) - arb(lo))
             assert abs(y.tanh() - slope * y - shift) <= arb((gap * (1 + arb(2) ** -100)).upper() + arb(2) ** -140)
@@ -792,13 +792,14 @@ def test_what_a_batch_shares_loses_no_error(monkeypatch: pytest.MonkeyPatch) -> 
     """
     seen: list[arb] = []
 
-    def line(y: leaves.Affine) -> tuple[leaves.Affine, arb, arb]:
+    def line(y: affine.Affine) -> tuple[affine.Affine, arb, arb]:
         mid, slopes, error = y
         seen.append(error)
         slope = 1 / (1 + mid * mid)
         return (slope * mid, [slope * v for v in slopes], slope * error + slope / 4), slope, slope / 4
 
-    monkeypatch.setattr(leaves, "tanh", line)
+    for module in (affine, leaves):
+        monkeypatch.setattr(module, "tanh", line)
     data = edited(deep("tanh", "output"), "evidence.root", encode([0.5, 0.75]))
     shared, each = leaves_of(with_tree(data, bytes([0, LEAF, 1, LEAF, 0, LEAF, 1, LEAF, LEAF])))
     with ctx.workprec(128):

@@ -39,6 +39,7 @@ from certify.report.page import _beyond, status_of
 from certify.report.sampling import quadratic
 from certify.results import RoaResult
 from certify.systems import System
+from certify.verdict import Stop, Verdict
 from tests.report.test_report import ONE_LEAF, Page, exactly
 from tests.support.beyond import line, network, plane, well
 from tests.support.certificates import Document, write
@@ -390,6 +391,24 @@ def test_the_terminal_says_what_it_is(proved: RoaResult) -> None:
     assert "N <= 0.9 in the domain" in repr(proved) and "estimated" in repr(proved)
     assert "estimated" in proved._repr_html_()
     json.dumps(data)
+
+
+def test_a_level_that_was_asked_for_and_missed_is_told_from_what_is_proved(proved: RoaResult) -> None:
+    assert proved.certificate is not None and proved.checker is not None and proved.raw is not None
+    missed = replace(proved, verdict=Verdict.UNKNOWN, stop=Stop.BEYOND, detail="only up to N <= 0.9, not 0.95")
+    data = missed.to_dict()
+    text = rendered(data)
+    assert text.startswith("UNKNOWN plane: the level of N is NOT proved; what is proved is {V <= 0.25} with the states")
+    assert "of the domain where N <= 0.9 reason" in text and "ACCEPTED, about a smaller set" in text
+    alone = rendered({**data, "outer": None})
+    assert "NOT proved; what is proved is {V <= 0.25} reason" in alone
+    certificate, sha256 = parse_certificate(proved.raw, "certificate"), hashlib.sha256(proved.raw).hexdigest()
+    page = Page(render_html(certificate, dict(proved.checker), data, proved.certificate, sha256=sha256)).text
+    assert (
+        "An outer set was asked for that is not proved: the level of the function: only up to N <= 0.9, not 0.95."
+        in page
+    )
+    assert "The certificate is about a smaller set." in page and "N(x) ≤ 0.9 and no others" in page
 
 
 def test_the_page_of_a_run_has_the_run_s_words(proved: RoaResult) -> None:

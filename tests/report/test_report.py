@@ -916,7 +916,7 @@ def practical_case(tmp_path_factory: pytest.TempPathFactory) -> Case:
 
 def test_the_practical_claim_survives_the_file(practical_case: Case) -> None:
     data, read = json.loads(practical_case.raw), practical_case.certificate
-    assert data["claim"] == {"kind": "practical", "rate": "0x0.0p+0", "sample": None}
+    assert data["claim"] == {"kind": "practical", "rate": "0x0.0p+0", "sample": None, "outer": None}
     assert set(data["levels"]) == {"floor", "local", "roa"}
     assert (read.kind, read.inner, read.to_json()) == ("practical", 1 / 3, practical_case.raw.decode())
     for kind in ("other", ["practical"], None):

@@ -7,6 +7,7 @@ N's model, then the policy, the plant and N'F. What is proved for a level n2 is 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -92,10 +93,19 @@ class FallBound:
             torch.full_like(x[0, 0], torch.inf),
             torch.full_like(x[0, 0], torch.inf),
         )
+        opened = []
         for part in index.tensor_split(_pieces(len(index), self.piece)):
-            here = self._judge(x[:, :, part], error[:, part], centre[:, part], radius[:, part], outer)
-            for whole, own in zip(found, here, strict=True):
-                whole[..., part] = own
+            lowest, own, known = least_value(self.N, x[:, :, part], error[:, part], outer)
+            proved = lowest > outer
+            found.lowest[part], found.proved[part] = lowest, proved
+            left = torch.nonzero(~proved[own])[:, 0]
+            if known is not None and len(left):
+                opened.append((known, left, part[own[left]]))
+        if opened:
+            models, lefts, parts = zip(*opened, strict=True)
+            left = torch.cat(parts)
+            here = self._falls(models, lefts, x[:, :, left], error[:, left], centre[:, left], radius[:, left], outer)
+            found.proved[left], found.bound[left], found.score[:, left], found.violated[left] = here
         return found
 
     def _outside(self, x: Tensor, error: Tensor) -> Tensor:
@@ -113,29 +123,18 @@ class FallBound:
         inside: Tensor = ((x > low + slack) & (x < high - slack)).all(0)
         return inside
 
-    def _judge(self, x: Tensor, error: Tensor, centre: Tensor, radius: Tensor, level: float) -> OuterBounds:
-        lowest, index, known = least_value(self.N, x, error, level)
-        proved = lowest > level
-        bound = torch.full_like(lowest, -torch.inf)
-        score, violated = radius.clone(), torch.full_like(lowest, torch.inf)
-        left = torch.nonzero(~proved[index])[:, 0]
-        if known is not None and len(left):
-            index = index[left]
-            here = self._falls(known, left, x[:, :, index], error[:, index], centre[:, index], radius[:, index], level)
-            proved[index], bound[index], score[:, index], violated[index] = here
-        return OuterBounds(proved, bound, score, lowest, violated)
-
     def _falls(
         self,
-        known: NeuralModels | SymbolicModels,
-        index: Tensor,
+        known: Sequence[NeuralModels | SymbolicModels],
+        lefts: Sequence[Tensor],
         x: Tensor,
         error: Tensor,
         centre: Tensor,
         radius: Tensor,
         level: float,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """`proved`, `bound`, `score` and `violated` of the boxes `index`, on which N may be at most the level."""
+        """`proved`, `bound`, `score` and `violated` of the boxes on which N may be at most the level: those at the
+        indices `lefts` of pieces, whose models are known."""
         n = len(x)
         mid, slopes, wide, share = self.policy(x, error)
         models = loop_models(self.system, x, error, mid, slopes, wide)
@@ -143,9 +142,14 @@ class FallBound:
         algebra = Models(next(iter(models.states.values())))
         terms: dict[object, Taylor] = {}
         F = [evaluate(expression, values, algebra, terms) for expression in self.dynamics]
-        fall, spread = known.along(F, index)
+        first, pieces = 0, []
+        for piece, left in zip(known, lefts, strict=True):
+            part = torch.arange(first, first := first + len(left), device=left.device)
+            pieces.append((*piece.along([f.at(part) for f in F], left), piece.value.at(left)))
+        falls, spreads, values_of_n = zip(*pieces, strict=True)
+        fall, spread = _joined(falls), torch.cat(spreads, -1)
         bound, excess = upper_bound(fall)
-        N = _widened(known.value.at(index), fall)
+        N = _widened(_joined(values_of_n), fall)
         inputs = n + self.system.m
         doubt = fall.g[n:inputs].abs().sum(0) + fall.Q[n:, n:].abs().sum((0, 1)) + fall.r
         rises = fall.c + fall.g[inputs:].abs().sum(0) - doubt >= 0
@@ -241,6 +245,13 @@ def _pieces(count: int, most: int) -> int:
 
 def _negative(model: Taylor) -> Taylor:
     return Taylor(-model.c, -model.g, -model.Q, model.r)
+
+
+def _joined(models: Sequence[Taylor]) -> Taylor:
+    """Models of several batches as one."""
+    if len(models) == 1:
+        return models[0]
+    return Taylor(*(torch.cat([getattr(v, part) for v in models], -1) for part in ("c", "g", "Q", "r")))
 
 
 def _widened(model: Taylor, like: Taylor) -> Taylor:

@@ -41,7 +41,10 @@ _GRIDS, _RUNS, _RATES = 2e9, 1e10, 5e8  # operations for grids, trajectories and
 _SHARE = 0.45  # of the time, after which nothing is simulated any more: the rest is for drawing
 _LEAST = 25  # points along a grid
 _POINTS = 240  # of a tube's edge over time, about
-_FINE = 241  # points along a grid on which the outline of an outer set is drawn
+_FINE, _SEVERAL = (
+    241,
+    121,
+)  # points along a grid on which the outline of an outer set is drawn, in one plane and in each
 _ALONG = 400  # points of a ray, of which the last one in the sets is where a trajectory starts
 _VIEW = 1.3  # of the set's reach, in pictures of more than two states
 
@@ -313,9 +316,9 @@ class Scene:
         """
         if self.beyond is None:
             return None
-        i, j = pair
-        a, b = (np.linspace(self.lo[k], self.hi[k], _FINE) for k in pair)
-        x = np.zeros((_FINE, _FINE, self.n))
+        (i, j), points = pair, _FINE if self.n == 2 else _SEVERAL
+        a, b = (np.linspace(self.lo[k], self.hi[k], points) for k in pair)
+        x = np.zeros((points, points, self.n))
         x[..., i], x[..., j] = a[None, :], b[:, None]
         with np.errstate(all="ignore"):
             excess = self.beyond.function(x) - self.beyond.level
