@@ -21,7 +21,7 @@ from tests.support.reference import judge
 from tests.support.stepped_loops import Family
 
 FAMILIES = {family.name: family for family in families()}
-SAMPLE, OF_THE_REFERENCE = 7, 6  # one of so many forgeries
+SAMPLE, OF_THE_REFERENCE = 9, 6  # one of so many forgeries
 REFUSED = ("faces", "outer", "inputs")
 ALL = pytest.param(1, marks=pytest.mark.slow)
 
@@ -88,7 +88,7 @@ def test_forgeries_are_refused_by_the_rule_that_is_meant(every: int) -> None:
     assert not wrong, "\n".join(wrong)
     assert len({what for _, what, _ in each}) == len(each)
     apart = [what for rule, what, _ in each if rule != "format"]
-    assert len(each) - len(apart) >= 300 and len(apart) >= (200 if every > 1 else 1000)
+    assert len(each) - len(apart) >= 300 and len(apart) >= (100 if every > 1 else 1000)
     assert {rule for rule, *_ in each} == {"format", *REFUSED}
 
 
@@ -117,7 +117,7 @@ def test_what_is_planted_is_refused_and_what_lies_within_is_accepted(name: str, 
     for number, share in enumerate(shares(count, np.random.default_rng(len(name)))):
         false, true = family.beyond(share), family.within(family.near * (1 + number / count))
         assert refutation(false) is not None, share
-        for trees in (false, proved(false), with_uniform_trees(false, 6)):
+        for trees in (false, proved(false), with_uniform_trees(false, 5)):
             assert verdict(trees) in REFUSED, share
         assert verdict(true) == "ACCEPTED", share
         if number == 0:

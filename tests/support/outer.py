@@ -254,7 +254,7 @@ def stated(data: Document, function: Document, T: Any = None, root: Any = None) 
 
 
 def with_outer(
-    data: Document, function: Document, *, T: Any = None, root: Any = None, max_leaves: int = 3000, depth: int = 22
+    data: Document, function: Document, *, T: Any = None, root: Any = None, max_leaves: int = 3000, depth: int = 14
 ) -> Document:
     """The document with this outer set and trees for it, grown as long as there are few leaves."""
     data = with_faces(stated(data, function, T, root))
@@ -278,6 +278,13 @@ def at_level(data: Document, level: float, max_leaves: int = 3000) -> Document:
     """Another level, and trees for it."""
     T = square(data["evidence"]["outer"]["T"])
     return with_outer(data, {**data["claim"]["outer"], "level": float(level).hex()}, T=T, max_leaves=max_leaves)
+
+
+def finer(data: Document) -> Document:
+    """The document with each leaf of its tree halved on each axis, so that no checker accepts it by little only."""
+    leaf = uniform(range(len(data["plant"]["states"])), len(data["plant"]["states"]))
+    tree = b"".join(leaf if axis == LEAF else bytes([axis]) for axis in unpacked(data["evidence"]["outer"]["tree"]))
+    return edited(data, "evidence.outer.tree", packed(tree))
 
 
 def uniform(axes: Sequence[int], depth: int) -> bytes:

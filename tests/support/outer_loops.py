@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from tests.support.certificates import Document, edited, encode, grow, make
-from tests.support.outer import Layers, Numbers, expression, network, quadratic, wells, with_outer
+from tests.support.outer import Layers, Numbers, expression, finer, network, quadratic, wells, with_outer
 from tests.support.stepped_loops import Family, exactly
 
 SQUARE = ["**", "x", 2]
@@ -115,7 +115,7 @@ def bent_walls() -> Document:
     domain = (("-2", "5/2"), ("-9/4", "7/3"))
     data = planar(dynamics, [[0.0, -1.0]], np.eye(2), 0.25, domain=domain)
     N = wells([[1.0, 0.0], [-0.5, 0.875], [-0.5, -0.875]], 0.75)
-    return with_outer(data, network(N, -2.25))
+    return finer(with_outer(data, network(N, -2.25)))
 
 
 def van_der_pol() -> Document:
