@@ -30,12 +30,12 @@ from certify.lyapunov.function import Quadratic
 from certify.policies import TanhNetwork
 from certify.report import render_html, summary
 from certify.report.claims import CLAIMS, words_for
-from certify.report.figures import draw
+from certify.report.figures import draw, simulated_roa
 from certify.report.figures.paper import set_figure
 from certify.report.figures.scene import Scene, starts
 from certify.report.figures.style import START
 from certify.report.limits import outer_limited_by
-from certify.report.page import _beyond, status_of
+from certify.report.page import Status, _beyond, _claim, _missed, status_of
 from certify.report.sampling import quadratic
 from certify.results import RoaResult
 from certify.systems import System
@@ -175,12 +175,15 @@ def test_the_area_is_an_estimate_and_says_so(by_formula: Case, by_network: Case)
 
 
 def test_a_practical_claim_keeps_its_words(practical: Case) -> None:
-    text = practical.page().text
     assert practical.answer["result"] == "ACCEPTED"
-    assert "enters the smaller set {V(x) ≤ 0.0625} in finite time, and stays there from then on." in text
-    assert "Moreover every trajectory that starts in the outer set" in text and "N(x) ≤ 0.9 and no others" in text
-    assert "Anything inside {V ≤ c₀}." in text
-    assert "V may rise above c₂; that it comes down to c₂ in finite time is proved. That V falls below c₀" in text
+    claim = _claim(practical.certificate, practical.answer)
+    assert "enters the smaller set {V(x) ≤ 0.0625} in finite time, and stays there from then on." in claim["statement"]
+    assert "Moreover every trajectory that starts in the outer set" in claim["statement"]
+    assert "N(x) ≤ 0.9 and no others" in claim["statement"] and len(claim["parts"]) == 7
+    words = words_for("practical", beyond=True)
+    assert "Anything inside {V ≤ c₀}." in dict(words.excluded)
+    said = "V may rise above c₂; that it comes down to c₂ in finite time is proved. That V falls below c₀"
+    assert words.decay.format(word="proved").startswith(said)
 
 
 @pytest.mark.parametrize("kind", ["asymptotic", "practical", "nearby"])
@@ -262,7 +265,7 @@ def test_runs_from_the_outer_set_settle_and_its_share_counts(by_formula: Case) -
     inside = scene.in_outer(runs.path[0])
     assert np.sum(inside & (quadratic(scene.P, runs.path[0]) > scene.outer)) >= 10
     assert np.all(runs.settled[inside]) and np.any(runs.left)
-    _, roa = draw(certificate, accepted=True)
+    roa = simulated_roa(scene)
     assert roa is not None and roa.contradictions == 0
     x, y = np.meshgrid(*roa.axes, indexing="ij")
     assert np.array_equal(roa.certified, (x**2 + y**2 / 4 <= 0.9) | (x**2 + y**2 <= 0.25))
@@ -313,12 +316,17 @@ def test_an_interval_of_one_state(tmp_path: Path) -> None:
     assert roa.fraction == pytest.approx(math.sqrt(0.9), abs=0.01)
 
 
-def test_a_function_without_a_value_somewhere_still_has_a_page(tmp_path: Path) -> None:
-    """A rejected file may have any N; nothing warns, and nothing fails."""
-    tree = ["+", ["/", "1", "x"], ["sqrt", "y"], ["exp", ["*", "800", "x"]], ["**", "x", -3]]
-    data = plane(function={"kind": "expression", "expression": tree})
-    case = Case(data, write(data, tmp_path), {"result": "REJECTED", "rule": "outer", "at": "outer leaf 0"})
-    assert "claimed outer set" in case.page().text
+def test_a_function_without_a_value_somewhere_can_be_drawn(by_formula: Case) -> None:
+    """A rejected file may have any N; nothing warns, and what has no value is not in the set."""
+    x, y = by_formula.certificate.system.states
+    odd = Symbolic(1 / x + sympy.sqrt(y) + sympy.exp(800 * x) + x**-3, (x, y))
+    claim = replace(by_formula.certificate.claim, outer=Outer(odd, 1.0))
+    scene = Scene(replace(by_formula.certificate, claim=claim), accepted=False)
+    points = np.array([[0.0, 1.0], [-1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]])
+    assert scene.in_outer(points).tolist() == [False, False, True, False]
+    outline, change = scene.outline((0, 1)), scene.growth(points)
+    assert outline is not None and np.isnan(outline[2]).any() and np.isnan(change[:2]).all()
+    assert np.all(np.isfinite(scene.farthest((0, 1), 8)))
 
 
 def test_samples_find_the_volume_of_a_ball() -> None:
@@ -394,7 +402,6 @@ def test_the_terminal_says_what_it_is(proved: RoaResult) -> None:
 
 
 def test_a_level_that_was_asked_for_and_missed_is_told_from_what_is_proved(proved: RoaResult) -> None:
-    assert proved.certificate is not None and proved.checker is not None and proved.raw is not None
     missed = replace(proved, verdict=Verdict.UNKNOWN, stop=Stop.BEYOND, detail="only up to N <= 0.9, not 0.95")
     data = missed.to_dict()
     text = rendered(data)
@@ -402,13 +409,12 @@ def test_a_level_that_was_asked_for_and_missed_is_told_from_what_is_proved(prove
     assert "of the domain where N <= 0.9 reason" in text and "ACCEPTED, about a smaller set" in text
     alone = rendered({**data, "outer": None})
     assert "NOT proved; what is proved is {V <= 0.25} reason" in alone
-    certificate, sha256 = parse_certificate(proved.raw, "certificate"), hashlib.sha256(proved.raw).hexdigest()
-    page = Page(render_html(certificate, dict(proved.checker), data, proved.certificate, sha256=sha256)).text
-    assert (
-        "An outer set was asked for that is not proved: the level of the function: only up to N <= 0.9, not 0.95."
-        in page
+    accepted, rejected = Status("ACCEPTED", ""), Status("REJECTED", "")
+    assert _missed(data, accepted) == (
+        "An outer set was asked for that is not proved: the level of the function: only up to N <= 0.9, not 0.95. The "
+        "certificate is about a smaller set."
     )
-    assert "The certificate is about a smaller set." in page and "N(x) ≤ 0.9 and no others" in page
+    assert "smaller" not in _missed(data, rejected) and not _missed(proved.to_dict(), accepted)
 
 
 def test_the_page_of_a_run_has_the_run_s_words(proved: RoaResult) -> None:
