@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.acceptance import Clerk
+from certify.beyond import outer_facts, short_of
 from certify.certificate import (
     Certificate,
     PartitionTree,
@@ -28,7 +29,7 @@ from certify.certificate import (
     require_within_limits,
     sole_writer,
 )
-from certify.claims import Asymptotic, Claim, Enlarged, Nearby, Outer, Practical, Problem, Reached
+from certify.claims import Asymptotic, Claim, Enlarged, Nearby, Practical, Problem, Reached
 from certify.claims.claim import Kind
 from certify.closed_loop import ClosedLoop
 from certify.diagnosis import diagnose
@@ -50,8 +51,8 @@ from certify.options import RoaOptions
 from certify.policies import TanhNetwork
 from certify.race import Contender, Race
 from certify.rest import find_rest
-from certify.results import Levels, OuterFacts, RoaResult, Tried, TubeFacts
-from certify.rigorous import eigenvalues, evaluate_rise, instability
+from certify.results import Levels, RoaResult, Tried, TubeFacts
+from certify.rigorous import eigenvalues, instability
 from certify.systems import System
 from certify.trials import OPTIMISING, Trial, blends, by_reach, corrected, named, optimised, peak, robust, solved
 from certify.verdict import Stop, Verdict
@@ -81,7 +82,6 @@ _SAMPLE = 2000  # leaves whose check is timed
 _START = 0.2  # seconds that a checker takes to start
 _CAUTION = 1.2  # on the time that a check is expected to take
 _YEAR = 3.156e7  # seconds
-_SAMPLED = 400_000  # states of the domain, whose share in a set is its volume
 
 
 def certify_roa(
@@ -431,7 +431,7 @@ class _Run:
         if isinstance(certificate.claim, Nearby):
             result = replace(result, claim=certificate.claim.kind)
         if certificate.claim.outer is not None and beyond is not None:
-            facts_beyond = _facts(task.problem, certificate.claim, certificate.claim.outer, beyond)
+            facts_beyond = outer_facts(task.problem, certificate.claim, certificate.claim.outer, beyond)
             result = replace(result, outer=facts_beyond)
         elif beyond is not None:
             self.aside = "the checker refused the set beyond the ellipsoid, which is left out"
@@ -442,7 +442,7 @@ class _Run:
             return replace(
                 result,
                 stop=Stop.BEYOND,
-                detail=_short_of(task.problem, certificate.claim, self.options, beyond),
+                detail=short_of(task.problem, certificate.claim, self.options, beyond),
                 leaves=proof.leaves,
                 certificate=accepted.path,
                 raw=accepted.data,
@@ -605,45 +605,6 @@ class _Run:
             yield
         finally:
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
-
-
-def _facts(problem: Problem, claim: Claim, outer: Outer, found: OuterProof) -> OuterFacts:
-    """What is said of a proved outer set; its volume, with that of the ellipsoid, is a mean over samples."""
-    lo, hi = np.array([[float(end) for end in pair] for pair in problem.loop.system.domain]).T
-    x = np.random.default_rng(0).uniform(lo, hi, (_SAMPLED, len(lo)))
-    share = float(np.mean((outer.function(x) <= outer.level) | (problem.V(x) <= claim.roa)))
-    size = float(np.prod(hi - lo))
-    return OuterFacts(
-        outer.function,
-        outer.level,
-        size * share,
-        size * math.sqrt(share * (1 - share) / _SAMPLED),
-        found.stop.name.lower(),
-        found.boxes,
-        found.leaves,
-        None if found.witness is None else tuple(found.witness.x.tolist()),
-        None if found.witness is None else found.witness.level,
-    )
-
-
-def _short_of(problem: Problem, claim: Claim, options: RoaOptions, found: OuterProof | None) -> str:
-    """Why the level of the function that was asked for is not proved."""
-    reached = "nothing beyond V <= " + f"{claim.roa:.6g} is proved"
-    if claim.outer is not None:
-        reached = f"proved only up to N <= {claim.outer.level:.12g}, not {options.lyapunov_level:g}"
-    if found is None or found.witness is None:
-        return reached
-    shown = _rises(problem, claim, found) if options.lyapunov_level is not None else False
-    return f"{reached}; {found.witness.describe(problem.loop.system)}{', shown in Arb' if shown else ''}"
-
-
-def _rises(problem: Problem, claim: Claim, found: OuterProof) -> bool:
-    """Whether N certainly does not fall at the witness, where the certificate has no range to choose a value from."""
-    witness = found.witness
-    if witness is None or witness.kind != "rise" or problem.loop.system.ranges:
-        return False
-    _, rise = evaluate_rise(problem.loop, found.outer.function, witness.x)
-    return bool(rise >= 0) and problem.V.exactly(witness.x) >= Fraction(claim.roa)
 
 
 def _by_proved(race: Race) -> list[Contender]:
