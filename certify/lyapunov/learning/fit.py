@@ -88,10 +88,13 @@ def fit(
         floor = 1e-6 * diagonal.max()
         for _ in range(_TRIES):
             try:
-                damped = normal + np.diag(damping * (diagonal + floor))
-                step = scipy.linalg.solve(damped, downhill, assume_a="pos")
+                damped = scipy.linalg.cho_factor(normal + np.diag(damping * (diagonal + floor)))
+                step = scipy.linalg.cho_solve(damped, downhill)
                 found = cost(p + step)
-            except (scipy.linalg.LinAlgError, InputError):  # no longer positive definite, or not finite: damp
+            except (
+                scipy.linalg.LinAlgError,
+                InputError,
+            ):  # not positive definite by rounding, or not finite: damp more
                 found = np.inf
             if found < least:
                 break

@@ -128,6 +128,7 @@ class LearningFlow:
                 relative = np.max(np.abs((x - middle) / half), axis=-1)
                 close = np.clip((relative - _NEAR) / (1 - _NEAR), 0.0, 1.0) ** 2
                 nearness[alive] = np.maximum(nearness[alive], close)
-                length[alive] += self.step * np.linalg.norm(self.rate(x) / scale, axis=-1)
-                x = rk4_step(self.rate, x, self.step)
+                after = rk4_step(self.rate, x, self.step)
+                length[alive] += np.linalg.norm((after - x) / scale, axis=-1)
+                x = after
         return Runs(fate, length, nearness)

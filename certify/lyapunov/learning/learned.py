@@ -153,12 +153,12 @@ def _learned(
         fitted = fit(model, p, lesson.values(), lesson.slopes(model.function(p)), steps, damping, start + seconds)
         p, damping = fitted.p, max(fitted.damping, 1e-4) if done else 1.0
         function = model.function(p)
-        z, v, slope = search.rising(function, lesson.top, -_NATURAL * _MARGIN, lesson.risen, generator)
-        low = search.low(function, lesson.top + _ABOVE / 2, generator)
+        z, v, slope = search.rising(function, lesson.sought, -_NATURAL * _MARGIN, lesson.risen, generator)
+        low = search.low(function, lesson.sought, generator)
         level = min(
             float(function(z[slope >= 0]).min(initial=math.inf)),
             float(function(low).min(initial=math.inf)),
-            lesson.top + _ABOVE / 2,
+            lesson.sought,
         )
         level -= _BESIDE * abs(level)
         cover = samples.inner + (1 - samples.inner) * float(np.mean(function(search.region / samples.scale) <= level))
@@ -180,6 +180,7 @@ class _Lesson:
         self.flow, self.scale, self.generator, self.relaxed = flow, scale, generator, False
         # Of several states the rim holds most of the volume, and to follow it costs a proof dearly.
         self.top = (0.95 if n <= 2 else 0.65) ** (1 / n)
+        self.sought = self.top + _ABOVE / 2  # below which counterexamples are looked for
         mixed = generator.permutation(len(samples.x))
         some = mixed[: _ROWS * n]
         faces = flow.faces(_FACES * n, generator) / scale
