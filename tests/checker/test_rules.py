@@ -377,8 +377,7 @@ MUTANTS: list[tuple[str, str, str, Edit]] = [  # rule, base, what, edit
     ("faces", "outer, an expression", "another function", at("claim.outer.expression", ["sin", "x"])),
     ("faces", "outer, a network", "weights", array("claim.outer.layers.0.weight", lambda a: a / 8)),
     ("faces", "outer, a network", "bias", array("claim.outer.layers.1.bias", lambda a: a - 1)),
-    ("faces", "outer, a network", "a leaf for a face", at(
-        "evidence.outer.faces.0", base64.b64encode(bytes([LEAF])).decode())),
+    ("faces", "outer, a network", "a face without a leaf", at("evidence.outer.faces.0", "")),
     ("outer", "outer, an expression", "level of what is at rest", at("claim.outer.level", (3.7).hex())),
     ("outer", "outer, a network", "T", array("evidence.outer.T", lambda a: a / 2)),
     ("outer", "outer, a network", "root", array("evidence.outer.root", lambda a: a * 0.999)),

@@ -398,7 +398,7 @@ def _violations(numbers: Numbers, fine: int) -> list[tuple[str, Array]]:
 
 
 def _lowest_outside(numbers: Numbers) -> Array:
-    """Where N is least on the boundary of the domain, nearly."""
+    """Where N is least on the boundary of the domain, nearly, or undefined."""
     lo, hi = numbers.domain.T
     fine = {1: 1, 2: 2001}.get(numbers.n, 41)
     sides = []
@@ -408,7 +408,7 @@ def _lowest_outside(numbers: Numbers) -> Array:
         sides.append(np.array([v.ravel() for v in np.meshgrid(*spans, indexing="ij")]))
     x = np.concatenate(sides, axis=1)
     N = numbers.N(x)
-    return np.asarray(x[:, np.argmin(np.where(np.isfinite(N), N, np.inf))])
+    return np.asarray(x[:, np.argmin(np.where(np.isfinite(N), N, -np.inf))])
 
 
 def _confirmed(data: Document, where: str, x: Array) -> str | None:
@@ -427,6 +427,8 @@ def _confirmed(data: Document, where: str, x: Array) -> str | None:
         for q in corners(data):
             balls = Balls(data, q)
             N = balls.N(point)
+            if boundary and not N.is_finite():
+                return f"N is undefined at {x} on the boundary"
             if not (N.real <= level):
                 return None
             if boundary:

@@ -266,8 +266,6 @@ def _faces(name: str, data: Document, n: int) -> Iterator[Forgery]:
             if n < 3 or k in (0, 3) or what == "split on its own axis":
                 yield "faces", f"{name}: face {k}, {what}", edited(data, f"{EVIDENCE}.faces.{k}", packed(other))
     if name == "walls":
-        for k in range(2 * n):
-            yield "faces", f"{name}: face {k}, one leaf", at(f"{EVIDENCE}.faces.{k}", packed(bytes([LEAF])))(data)
         swapped = edited(data, f"{EVIDENCE}.faces", lambda f: [f[2], f[3], f[0], f[1]])
         yield "faces", f"{name}: faces of the other state", swapped
         yield "faces", f"{name}: faces moved by one", edited(data, f"{EVIDENCE}.faces", lambda f: [*f[1:], f[0]])
