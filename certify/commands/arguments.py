@@ -143,6 +143,14 @@ def numbers(text: str | None, option: str) -> tuple[float, ...] | None:
         raise InputError(f"{option} takes numbers separated by commas, as in 1,1; found {text!r}.") from error
 
 
+def layers(text: str, option: str) -> tuple[int, ...]:
+    """Widths of layers, separated by commas."""
+    try:
+        return tuple(int(part) for part in text.split(","))
+    except ValueError as error:
+        raise InputError(f"{option} takes widths separated by commas, as in 16,16; found {text!r}.") from error
+
+
 def widths(text: str | None, option: str) -> dict[str, float] | None:
     """Numbers by name, separated by commas."""
     if text is None:

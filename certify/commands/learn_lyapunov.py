@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from certify.commands.arguments import plant_of
+from certify.commands.arguments import layers, plant_of
 from certify.commands.importing import policy_of
 from certify.commands.shared import Domain, Json, PlantName, PolicyFile, Quiet
 from certify.commands.terminal import ProgressLine, say
@@ -61,7 +61,7 @@ def learn_lyapunov(
     start = time.monotonic()
     if hidden is not None and degree is not None:
         raise InputError("--hidden must stand without --degree; found both. A polynomial has no layers.")
-    widths = _widths(hidden or _HIDDEN)
+    widths = layers(hidden or _HIDDEN, "--hidden")
     if not time_limit > 0:
         raise InputError(f"--time-limit must be positive; found {time_limit}.")
     stored = policy_of(policy, importing, system, param or [])
@@ -92,13 +92,6 @@ def learn_lyapunov(
     data = {"lyapunov": str(out), "function": _described(learned.function), **record}
     data["seconds"] = time.monotonic() - start
     say(json.dumps(data) if as_json else _text(learned, volume(P, c2), out, _next(policy, system, param, domain, out)))
-
-
-def _widths(text: str) -> tuple[int, ...]:
-    try:
-        return tuple(int(part) for part in text.split(","))
-    except ValueError as error:
-        raise InputError(f"--hidden takes widths separated by commas, as in {_HIDDEN}; found {text!r}.") from error
 
 
 def _ellipsoid(plant: System, stored: Policy, seconds: float, progress: ProgressLine | None) -> tuple[Array, float]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from certify.commands.arguments import numbers, plant_of, region, widths
+from certify.commands.arguments import layers, numbers, plant_of, region, widths
 from certify.commands.certifying import certified
 from certify.commands.importing import policy_of
 from certify.commands.shared import Domain, Json, PlantName, PolicyFile, Quiet, Results, TimeLimit
@@ -147,7 +147,7 @@ def roa(
         rate=0.0 if rate == _MOST else _number(rate),
         lyapunov=None if lyapunov is None else function_for(lyapunov, plant, tell),
         lyapunov_level=lyapunov_level,
-        hidden=_widths(hidden),
+        hidden=layers(hidden, "--hidden"),
         degree=degree,
         seed=seed,
     )
@@ -167,13 +167,6 @@ def _number(rate: str) -> float:
         return float(rate)
     except ValueError as error:
         raise InputError(f"--rate takes a number of at least 0, or max; found {rate!r}.") from error
-
-
-def _widths(text: str) -> tuple[int, ...]:
-    try:
-        return tuple(int(part) for part in text.split(","))
-    except ValueError as error:
-        raise InputError(f"--hidden takes widths, as in 16,16; found {text!r}.") from error
 
 
 def _device(name: str) -> str:
