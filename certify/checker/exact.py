@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from .document import Policy
 
 MAX_BITS = 2**14  # of a number on the tape
+MAX_INVERSE_BITS = 2**14  # of a number in a matrix all of whose inverse is wanted, times the matrix's size
 MAX_MATRIX_BITS = 2**16  # of a number in a matrix, times the matrix's size: beyond, a decision takes minutes
 
 
@@ -32,7 +33,7 @@ def inverse_diagonal(A: fmpq_mat) -> list[Fraction]:
 def inverse(A: fmpq_mat) -> fmpq_mat | None:
     """`A^-1`; None if there is none, or A is too large to tell soon."""
     numerator, _ = A.numer_denom()
-    if A.nrows() * max(v.height_bits() for v in numerator.entries()) > MAX_MATRIX_BITS or numerator.det() == 0:
+    if A.nrows() * max(v.height_bits() for v in numerator.entries()) > MAX_INVERSE_BITS or numerator.det() == 0:
         return None
     return A.inv()
 

@@ -12,12 +12,13 @@ from fractions import Fraction
 from math import nextafter
 
 import numpy as np
+from flint import fmpq, fmpq_mat
 
 from .boxes import Boxes, Leaves, batches, is_whole, middle
 from .case import Case, Failures
 from .document import Network
 from .elementary import derivative, elementary
-from .exact import exactly, fraction, inverse
+from .exact import exactly, inverse
 from .expression import Tape, evaluate
 from .float64 import EPS, Array, ends, float_with_error, gamma, spectral_norm, total, up
 from .flow import Series
@@ -138,8 +139,10 @@ def contains_domain(case: Case) -> Failures:
         yield "evidence.outer.T", "T must be invertible"
         return 0
     far = [max(-lo, hi) for lo, hi in case.c.domain]
-    for i, (row, b) in enumerate(zip(to_z.tolist(), evidence.root.tolist(), strict=True)):
-        if not sum((abs(fraction(v)) * x for v, x in zip(row, far, strict=True)), Fraction(0)) <= Fraction(b):
+    sizes = fmpq_mat([[abs(v) for v in row] for row in to_z.tolist()])
+    reach = sizes * fmpq_mat([[fmpq(x.numerator, x.denominator)] for x in far])
+    for i, b in enumerate(evidence.root.tolist()):
+        if not reach[i, 0] <= fmpq(*b.as_integer_ratio()):
             yield f"evidence.outer.root, axis {i}", "the root box must contain the domain"
     return len(far)
 
