@@ -117,7 +117,7 @@ def test_what_is_planted_is_refused_and_what_lies_within_is_accepted(name: str, 
     for number, share in enumerate(shares(count, np.random.default_rng(len(name)))):
         false, true = family.beyond(share), family.within(family.near * (1 + number / count))
         assert refutation(false) is not None, share
-        for trees in (false, proved(false), with_uniform_trees(false, 5)):
+        for trees in (false, with_uniform_trees(false, 5) if number % 2 else proved(false, max_leaves=60)):
             assert verdict(trees) in REFUSED, share
         assert verdict(true) == "ACCEPTED", share
         if number == 0:

@@ -318,7 +318,7 @@ def linear_beyond(turn: float) -> Family:
     def claim(s: float) -> Document:
         dynamics = [["+", *(["*", exactly(v), name] for v, name in zip(row, "xy", strict=True)), UNUSED] for row in A]
         data = planar(dynamics, [[0.0, 0.0]], np.eye(2), 0.25)
-        return with_outer(data, expression(quadratic(np.eye(2) + s * R), 0.6), max_leaves=300)
+        return with_outer(data, expression(quadratic(np.eye(2) + s * R), 0.6), max_leaves=200)
 
     return Family(f"linear, {turn}", lowest, claim, near=0.05)
 
@@ -334,7 +334,7 @@ def linear_to_a_face(turn: float) -> Family:
     def claim(level: float) -> Document:
         dynamics = [["+", *(["*", exactly(v), name] for v, name in zip(row, "xy", strict=True)), UNUSED] for row in A]
         data = planar(dynamics, [[0.0, 0.0]], np.eye(2), 0.25, domain=domain)
-        return with_outer(data, expression(quadratic(M), level), max_leaves=300)
+        return with_outer(data, expression(quadratic(M), level), max_leaves=200)
 
     return Family(f"linear to a face, {turn}", limit, claim, near=0.02)
 
@@ -362,7 +362,7 @@ def of_chance(seed: int) -> Family:
     least, most = span(edited(data, "claim.outer", N))
 
     def claim(share: float) -> Document:
-        return with_outer(data, {**N, "level": (least + share * (most - least)).hex()}, max_leaves=300)
+        return with_outer(data, {**N, "level": (least + share * (most - least)).hex()}, max_leaves=200)
 
     return Family(f"chance {seed}", 1.0, claim, near=0.08)
 
