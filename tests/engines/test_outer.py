@@ -414,6 +414,14 @@ def test_nothing_is_proved_of_what_rises_or_lies_inside(N: Symbolic, c2: float) 
     assert prove(planar(), N, c2=c2) is None
 
 
+def test_an_expression_without_a_value_somewhere_in_the_domain() -> None:
+    """sqrt(2 + x) has none for x < -2, and N is not known to be above any level there."""
+    assert prove(scalar(), Symbolic(X**2 + sympy.sqrt(2 + X), (X,))) is None
+    found = prove(scalar(domain=box("3/2")), Symbolic(X**2 + sympy.sqrt(2 + X) / 8, (X,)))
+    assert found is not None and found.stop is Stop.DOMAIN
+    holds(scalar(domain=box("3/2")), found)
+
+
 def test_other_plants_and_functions_are_refused() -> None:
     N = Symbolic(X**2 + Y**2, (X, Y))
     for system in (plane(time="discrete"), plane(sample=(Fraction(0), Fraction(1, 10)))):

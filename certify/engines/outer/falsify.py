@@ -67,11 +67,14 @@ class Falsifier:
         rows = [(gradient * self.f(x, u, [float(q) for q in values.values()])).sum(-1) for values in self.corners]
         return np.stack(rows), np.maximum(self.least - u, u - self.most).max(-1)
 
+    def value(self, x: Array) -> Array:
+        """N (B,); infinite where it has no value, which is for the rules to find."""
+        return np.nan_to_num(self.N(x), nan=np.inf, posinf=np.inf, neginf=-np.inf)
+
     def violation(self, x: Array) -> Array:
         """What is at least 0 where a condition fails (B,)."""
-        with np.errstate(all="ignore"):
-            rates, excess = self.rates(x)
-            worst = np.nan_to_num(rates.max(0), nan=-np.inf)
+        rates, excess = self.rates(x)
+        worst = np.nan_to_num(rates.max(0), nan=-np.inf)
         # Either counts, and where both fail the input's stays out of the way of a difference.
         return np.where(self.check_inputs & (worst < 0) & (excess > 0), excess, worst)
 
@@ -84,12 +87,19 @@ class Falsifier:
         """Points of the domain, (B, n)."""
         return np.asarray(generator.uniform(self.low, self.high, (_SAMPLES, self.system.n)))
 
+    @np.errstate(all="ignore")
+    def least_value(self, seed: int = 1) -> float:
+        """The least N of samples of the domain outside of {V < c2}; infinite if there is none."""
+        x = self.sample(np.random.default_rng(seed))
+        return float(np.min(self.value(x[self.asked(x)]), initial=np.inf))
+
+    @np.errstate(all="ignore")
     def search(self, cap: float, seed: int = 0) -> Rise | None:
         """The lowest violation found with N <= cap; None if there is none."""
         generator = np.random.default_rng(seed)
         x = self.sample(generator)
         x = x[self.asked(x)]
-        x = x[self.N(x) <= cap]
+        x = x[self.value(x) <= cap]
         if not len(x):
             return None
         violation = self.violation(x)
@@ -101,19 +111,20 @@ class Falsifier:
         found = self.lowest(np.concatenate([bad, climbed]))
         return found if found is not None and found.level <= cap else None
 
+    @np.errstate(all="ignore")
     def lowest(self, x: Array) -> Rise | None:
         """The lowest violation reached from violating points (B, n)."""
         x = x[self.asked(x)]
         x = x[self.violation(x) >= 0]
         if not len(x):
             return None
-        x = x[np.argsort(self.N(x), kind="stable")[:_FEW]]
-        level, step = self.N(x), np.full(len(x), 0.05)
+        x = x[np.argsort(self.value(x), kind="stable")[:_FEW]]
+        level, step = self.value(x), np.full(len(x), 0.05)
         for _ in range(_DESCENT):
             moved, lower = x, level
             for direction in self._ways_down(x):
                 tried = np.clip(x + step[:, None] * direction * self.half, self.low, self.high)
-                value = self.N(tried)
+                value = self.value(tried)
                 value = np.where(self.asked(tried) & (self.violation(tried) >= 0), value, np.inf)
                 better = value < lower
                 moved, lower = np.where(better[:, None], tried, moved), np.where(better, value, lower)
@@ -125,7 +136,7 @@ class Falsifier:
 
     def _rise(self, x: Array) -> Rise:
         rates, _ = self.rates(x[None])
-        level = float(self.N(x))
+        level = float(self.value(x))
         if rates.max() >= 0:
             return Rise(x, level, "rise", self.corners[int(rates[:, 0].argmax())])
         return Rise(x, level, "input")
@@ -153,6 +164,7 @@ class Falsifier:
             step *= 0.94
         return x
 
+    @np.errstate(all="ignore")
     def lowest_on_faces(self, seed: int = 0) -> float:
         """The least N found on the domain's boundary."""
         generator = np.random.default_rng(seed)
@@ -161,13 +173,13 @@ class Falsifier:
             for end in (self.low, self.high):
                 x = generator.uniform(self.low, self.high, (_ON_A_FACE, self.system.n))
                 x[:, axis] = end[axis]
-                x = x[np.argsort(self.N(x), kind="stable")[:_FEW_THERE]]
-                level, step = self.N(x), np.full(len(x), 0.05)
+                x = x[np.argsort(self.value(x), kind="stable")[:_FEW_THERE]]
+                level, step = self.value(x), np.full(len(x), 0.05)
                 for _ in range(_DESCENT):
                     way = -self.N.gradient(x) * self.half
                     way[:, axis] = 0.0
                     tried = np.clip(x + step[:, None] * _unit(way) * self.half, self.low, self.high)
-                    value = self.N(tried)
+                    value = self.value(tried)
                     better = value < level
                     x, level = np.where(better[:, None], tried, x), np.where(better, value, level)
                     step = np.where(better, 1.5 * step, 0.4 * step)

@@ -81,11 +81,9 @@ def prove_outer(
     _require(problem, function)
     start = time.monotonic()
     search = Falsifier(problem, c2, T, function)
-    x = search.sample(np.random.default_rng(1))
-    beyond = search.N(x[search.asked(x)])
-    if not len(beyond) or not np.any(np.isfinite(beyond)):
+    floor = search.least_value()
+    if not math.isfinite(floor):
         return None
-    floor = float(np.nanmin(beyond))
     top = min(search.lowest_on_faces(), math.inf if level is None else level)
     if not top > floor:
         return None
