@@ -9,6 +9,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from fractions import Fraction
+from functools import cached_property
 from math import nextafter
 
 import numpy as np
@@ -34,9 +35,13 @@ class Layers:
 
     def __init__(self, net: Network) -> None:
         self.net, self.values = net, max(len(W) for W in net.weights)
-        pairs, zero = zip(net.weights, net.biases, strict=True), np.zeros(1)
+
+    @cached_property
+    def as_policy(self) -> Folded:
+        """The same network as what rule `ring` encloses."""
+        pairs, zero = zip(self.net.weights, self.net.biases, strict=True), np.zeros(1)
         layers = tuple(Layer(W, b, np.zeros_like(b), spectral_norm(W)) for W, b in pairs)
-        self.as_policy = Folded(layers, False, np.ones(1), zero, zero)
+        return Folded(layers, False, np.ones(1), zero, zero)
 
     def least(self, x: Array, error: Array) -> Array:
         """A lower bound of N (B,), affine on the boxes: good where these are large."""
@@ -117,7 +122,10 @@ def is_above_on_faces(case: Case) -> Failures:
     for k, tree in enumerate(evidence.faces):
         i, side = divmod(k, 2)
         where = f"face {k} "
-        yield from is_whole(tree, [j for j in range(n) if j != i], where)
+        others = [j for j in range(n) if j != i]
+        yield from is_whole(tree, others, where)
+        if not all(np.all(np.isfinite(widest[j])) for j in others):
+            yield f"{where}root", "no binary64 numbers enclose the domain"
         end, error = float_with_error(case.c.domain[i][side])
         lo, hi = np.array([(end, end) if j == i else pair for j, pair in enumerate(widest)]).T
         doubt = np.where(np.arange(n) == i, error, 0.0)[:, None]

@@ -299,7 +299,7 @@ def _with_outer(words: Words) -> Words:
         "the domain with N(x) ≤ {beyond} and no others, enters {{V(x) ≤ {outer}}} in finite time, and from then on is "
         "one of those just spoken of; on the way it stays in the union of the two sets.",
         headline=words.headline
-        + "; from every state of the domain with N <= {beyond}, {{V <= {outer}}} is entered in finite time",
+        + "; from every state of the domain with N(x) <= {beyond}, {{V <= {outer}}} is entered in finite time",
         decay="V may rise above c₂; that it comes down to c₂ in finite time is {word}. " + words.decay,
         parts=(*words.parts, *_BEYOND),
         excluded=(*words.excluded[:-1], *_NOT_BEYOND, words.excluded[-1]),

@@ -114,7 +114,7 @@ def _headline(result: Mapping[str, Any], verdict: str) -> str:
         return f"{name}: a condition of the claim fails for this V and level; another V may show what this one cannot"
     if _is_missed(result) and result.get("stop") == "beyond":
         outer = result.get("outer")
-        smaller = f" with the states of the domain where N <= {below(outer['level'])}" if outer else ""
+        smaller = f" with the states of the domain where N(x) <= {below(outer['level'])}" if outer else ""
         return f"{name}: the level of N is NOT proved; what is proved is {{V <= {below(level)}}}{smaller}"
     if _is_missed(result):
         return f"{name}: the state is NOT shown to converge; what is proved is {{V <= {below(level)}}}, without it"
@@ -288,7 +288,7 @@ def _outer(outer: Mapping[str, Any]) -> list[tuple[str, str]]:
     else:
         text = str(outer["expression"])
         name, named = text if len(text) <= _LONG else f"an expression of {len(text):,} characters", []
-    about = f"{{N <= {below(outer['level'])}}} in the domain, and nothing outside of it, N being {name}"
+    about = f"{{N(x) <= {below(outer['level'])}}} in the domain, and nothing outside of it, N being {name}"
     work = f"{outer['boxes']:,} boxes, {outer['leaves']:,} leaves"
     return [("outer set", about), *named, ("its limit", outer_limited_by(outer)), ("its work", work)]
 

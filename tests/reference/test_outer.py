@@ -754,9 +754,9 @@ def test_words_name_the_network_and_its_level() -> None:
         digest.update(struct.pack("<3Q", 2, rows, columns) + base64.b64decode(layer["weight"]))
         digest.update(struct.pack("<2Q", 1, rows) + base64.b64decode(layer["bias"]))
     said = in_words(read(dump(data)))
-    assert "converges to the origin" in said and f"N <= -1.25, N being the network {digest.hexdigest()}" in said
+    assert "converges to the origin" in said and f"N(x) <= -1.25, N being the network {digest.hexdigest()}" in said
     said = in_words(read(dump(honest("uncertain"))))
-    assert "N <= 2.25, N being the expression" in said and said.endswith("these have at any time: q in [-1/2, 1/2]")
+    assert "N(x) <= 2.25, N being the expression" in said and said.endswith("these have at any time: q in [-1/2, 1/2]")
 
 
 def test_the_practical_claim_with_another_function() -> None:

@@ -119,7 +119,7 @@ def test_the_checker_says_what_the_format_says(by_network: Case, by_formula: Cas
         said = text[next(k for k, one in enumerate(text) if one.startswith("claim:")) + 1]
         assert said == (
             "  and every trajectory that starts in the union of V <= 0.25 and of the states of the domain with "
-            f"N <= {level} stays in this union, enters V <= 0.25 in finite time, and from then on is one of those "
+            f"N(x) <= {level} stays in this union, enters V <= 0.25 in finite time, and from then on is one of those "
             "above; u stays in its bounds; states outside the domain are not meant, whatever N is there"
         )
         found = case.answer["outer"]
@@ -384,8 +384,8 @@ def test_a_result_contains_the_union(proved: RoaResult) -> None:
 def test_the_terminal_says_what_it_is(proved: RoaResult) -> None:
     data = proved.to_dict()
     text = rendered(data)
-    assert "from every state of the domain with N <= 0.9, {V <= 0.25} is entered in finite time" in text
-    assert "outer set {N <= 0.9} in the domain, and nothing outside of it, N being x**2 + y**2/4" in text
+    assert "from every state of the domain with N(x) <= 0.9, {V <= 0.25} is entered in finite time" in text
+    assert "outer set {N(x) <= 0.9} in the domain, and nothing outside of it, N being x**2 + y**2/4" in text
     assert "of {V <= c2} alone" in text and "estimated (standard deviation" in text
     assert f"its limit {outer_limited_by(data['outer'])}" in text
     as_network = copy.deepcopy(data)
@@ -406,7 +406,7 @@ def test_a_level_that_was_asked_for_and_missed_is_told_from_what_is_proved(prove
     data = missed.to_dict()
     text = rendered(data)
     assert text.startswith("UNKNOWN plane: the level of N is NOT proved; what is proved is {V <= 0.25} with the states")
-    assert "of the domain where N <= 0.9 reason" in text and "ACCEPTED, about a smaller set" in text
+    assert "of the domain where N(x) <= 0.9 reason" in text and "ACCEPTED, about a smaller set" in text
     alone = rendered({**data, "outer": None})
     assert "NOT proved; what is proved is {V <= 0.25} reason" in alone
     accepted, rejected = Status("ACCEPTED", ""), Status("REJECTED", "")
