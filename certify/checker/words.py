@@ -56,8 +56,8 @@ def claim(c: Certificate) -> list[str]:
     if c.outer is not None:
         lines.append(
             f"  and every trajectory that starts in the union of V <= {c.c2!r} and of the states of the domain with "
-            f"N(x) <= {c.outer.level!r} stays in this union, enters V <= {c.c2!r} in finite time, and from then on is one "
-            "of those above; u stays in its bounds; states outside the domain are not meant, whatever N is there"
+            f"N(x) <= {c.outer.level!r} stays in this union, enters V <= {c.c2!r} in finite time, and from then on is "
+            "one of those above; u stays in its bounds; states outside the domain are not meant, whatever N is there"
         )
     said = CLAIMS[c.claim].format(c=c, time=duration(c), when=when)
     return [f"claim: {said}; u stays in its bounds", *lines]
