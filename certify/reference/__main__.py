@@ -73,8 +73,8 @@ def further(c: Certificate) -> str:
     which = f"the network {N.sha256}" if is_network else "the expression that the certificate states"
     return (
         f"; and every trajectory that starts in the domain where N(x) <= {N.level!r}, N being {which}, stays in the "
-        f"union of that set and V <= {c.outer!r}, enters V <= {c.outer!r} in finite time, and is one of these from then "
-        "on, "
+        f"union of that set and V <= {c.outer!r}, enters V <= {c.outer!r} in finite time, and is one of these from "
+        f"then on, "
         f"with {', '.join(c.plant.inputs)} within the input bounds{whatever(c)}"
     )
 
