@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -27,17 +28,17 @@ class Taylor:
     Q: Array
     r: Array
 
-    @property
+    @cached_property
     def linear(self) -> Array:
         """Upper bound of the linear part on the box."""
         return total(np.abs(self.g), 0)
 
-    @property
+    @cached_property
     def quadratic(self) -> Array:
         """Upper bound of the quadratic part on the box."""
         return total(total(np.abs(self.Q), 0), 0)
 
-    @property
+    @cached_property
     def size(self) -> Array:
         """Upper bound of |c| + G + Q."""
         return up(np.abs(self.c) + self.linear + self.quadratic)
@@ -76,7 +77,7 @@ class Taylor:
         Q = a.c * b.Q + b.c * a.Q + (joint + joint.swapaxes(0, 1))
         return Taylor(a.c * b.c, a.c * b.g + b.c * a.g, Q, up(r))
 
-    @property
+    @cached_property
     def reach(self) -> Array:
         """Upper bound of |v - c| on the box."""
         return up(self.linear + up(self.quadratic + self.r))
