@@ -142,6 +142,11 @@ def test_options_by_name_are_those_of_the_options() -> None:
         "P": [[1.0, 2.0], [0.0, 1.0]],
         "Q": (1.0,),
         "R": (1.0, 2.0),
+        "lyapunov": 3,
+        "lyapunov_level": float("inf"),
+        "hidden": (0,),
+        "degree": 3,
+        "seed": 0.5,
     }
     assert set(bad) == {f.name for f in dataclasses.fields(RoaOptions)}
     for name, value in bad.items():

@@ -173,7 +173,9 @@ def test_the_shipped_policy(tmp_path: Path, pendulum: System) -> None:
     assert roa >= 0.95 * min(limit, sampled if sampled is not None else np.inf)
     data = json.loads(json.dumps(result.to_dict()))
     assert data["checked"] == "ACCEPTED" and data["levels"]["roa"] == roa
-    assert set(data["seconds"]) == {"load", "candidate", "local", "ring", "tube", "write", "check", "total"}
+    assert set(data["seconds"]) == {
+        "load", "candidate", "local", "ring", "tube", "learn", "outer", "write", "check", "total"
+    }  # fmt: skip
     assert run_checker(tmp_path / "certificate.json")["policy_sha256"] == policy.network.sha256()
 
 

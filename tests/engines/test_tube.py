@@ -253,6 +253,7 @@ def test_robust_is_larger_than_what_it_starts_from() -> None:
     assert local(P) > 300 * max(local(choose_candidate(loop, name).P) for name in SOLVED)
 
 
+@pytest.mark.slow
 def test_robust_of_a_held_input_gains_on_that_of_the_loop_without_a_period() -> None:
     """By the rule of the held input, which judges both."""
     network = load_policy(CURVED / "quadrotor2d_curved.pt").network
@@ -287,6 +288,7 @@ def test_a_level_is_looked_for_where_it_is_expected() -> None:
     assert top is not None and 0.48 * level < top <= 0.5 * level
 
 
+@pytest.mark.slow
 def test_robust_minds_the_bounds_of_inputs() -> None:
     """Where these are what limits the set, P gives way along the policy's gradient and gains elsewhere."""
     wide = get_system("quadrotor2d")
