@@ -136,6 +136,7 @@ def test_a_report_and_the_terminal_say_the_operating_point(tmp_path: Path, capsy
     system = load_system(write(tmp_path))
     save_policy(tmp_path / "p.pt", Policy(gain(system, (-1.0, -1.0)), "tank", {"tau": 2, "rest": "1/3"}))
     arguments = ["roa", "--policy", str(tmp_path / "p.pt"), "--system", str(tmp_path / "tank.toml")]
+    arguments += ["--candidate", "lyapunov"]
     assert _run([*arguments, "--out", str(tmp_path / "o"), "--time-limit", "20"], False) == 0
     out, err = capsys.readouterr()
     assert "operating point" in out and "level = 0.333333 m" in out and "level (m)" in out

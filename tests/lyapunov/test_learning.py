@@ -190,6 +190,7 @@ def test_values_are_shares_of_the_region() -> None:
     assert samples.inner == pytest.approx(0.04, abs=0.01)
 
 
+@pytest.mark.slow
 def test_a_small_region_of_several_states_is_walked_through() -> None:
     """The unit ball is 0.4 % of its domain here; the walk's states fill it evenly."""
     flow = LearningFlow(disc(5.0, 3), Quadratic(np.eye(3)), 0.04)

@@ -123,7 +123,8 @@ def test_wrong_options_end_with_status_2_and_one_sentence(run: Run, arguments: l
 def test_roa_reads_another_programs_file_and_keeps_to_where_no_observation_is_clipped(run: Run, tmp_path: Path) -> None:
     sb3("PPO", tmp_path)
     given = ("--system", "plant.toml", "--states", "x0,x1", "--normaliser", "normaliser.pkl", "--claim", "practical")
-    status, out, err = run("roa", "--policy", "PPO.zip", *given, "--out", "o", "--json")
+    quick = ("--candidate", "lyapunov")
+    status, out, err = run("roa", "--policy", "PPO.zip", *given, *quick, "--out", "o", "--json")
     assert status == 0 and json.loads(out)["verdict"] == "PROVED"
     assert "the domain of x0 is cut to" in err and "largest difference" in err
     certificate = json.loads(Path("o/certificate.json").read_text())
@@ -136,7 +137,7 @@ def test_roa_reads_another_programs_file_and_keeps_to_where_no_observation_is_cl
     # the same through a policy file
     assert run("import", "PPO.zip", *given[:6], "--out", "p.pt")[0] == 0
     status, out, err = run(
-        "roa", "--policy", "p.pt", "--system", "plant.toml", "--claim", "practical", "--out", "q", "--json"
+        "roa", "--policy", "p.pt", "--system", "plant.toml", "--claim", "practical", *quick, "--out", "q", "--json"
     )
     assert status == 0 and "is cut to" in err
     again = json.loads(Path("q/certificate.json").read_text())
