@@ -6,6 +6,7 @@ The plant is x' = -x + x^3 under no input, whose region of attraction is |x| < 1
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 
@@ -15,7 +16,7 @@ import sympy
 
 from certify import Neural, Polynomial, System, TanhNetwork, certify_roa, save_lyapunov
 from certify.acceptance import Clerk
-from certify.certificate import Certificate
+from certify.certificate import Certificate, PartitionTree
 from certify.engines.outer import Rise
 from certify.errors import InputError
 from certify.lyapunov import Symbolic
@@ -94,8 +95,6 @@ def test_what_the_checker_refuses_is_left_out(tmp_path: Path, monkeypatch: pytes
     def wrong(clerk: Clerk, certificate: Certificate) -> object:
         outer = certificate.claim.outer
         if outer is not None:
-            from dataclasses import replace
-
             claim = replace(certificate.claim, outer=replace(outer, level=1.1))
             certificate = replace(certificate, claim=claim)
         return ask(clerk, certificate)
@@ -104,6 +103,26 @@ def test_what_the_checker_refuses_is_left_out(tmp_path: Path, monkeypatch: pytes
     result = proved(tmp_path)
     assert result.verdict is Verdict.PROVED and result.outer is None
     assert result.notice is not None and "left out" in result.notice
+
+
+def test_a_leaf_that_is_refused_is_split_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The first file that is asked about has too coarse a tree; the next one has a leaf cut into eight."""
+    ask, asked = Clerk.ask, []
+
+    def coarse(clerk: Clerk, certificate: Certificate) -> object:
+        evidence = certificate.evidence
+        assert isinstance(evidence, PartitionTree)
+        if evidence.outer is not None and not asked:
+            outer = replace(evidence.outer, tree=bytes([255]))
+            certificate = replace(certificate, evidence=replace(evidence, outer=outer))
+        data, answer = ask(clerk, certificate)
+        asked.append(answer)
+        return data, answer
+
+    monkeypatch.setattr(Clerk, "ask", coarse)
+    result = proved(tmp_path, lyapunov_level=0.3)
+    assert asked[0]["at"] == "outer leaf 0" and asked[-1]["result"] == "ACCEPTED"
+    assert result.verdict is Verdict.PROVED and result.outer is not None and result.outer.level == 0.3
 
 
 def test_a_file_of_another_plant_is_said(tmp_path: Path) -> None:
