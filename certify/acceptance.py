@@ -15,8 +15,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from certify.certificate import Certificate, OuterTree, PartitionTree, TrustedSolver, run_checker, write_beside
-from certify.claims import Asymptotic, Claim, Enlarged, Nearby, Practical, Problem, Reached
+from certify.certificate import Certificate, PartitionTree, TrustedSolver, run_checker, write_beside
+from certify.claims import Asymptotic, Enlarged, Nearby, Practical, Problem, Reached
 from certify.engines.bounds.mend import below_leaf, split_again
 from certify.errors import SoundnessError
 
@@ -64,15 +64,12 @@ class Clerk:
             data, answer = self.ask(certificate)
             if answer["result"] == _wanted(certificate):
                 return Accepted(certificate, self.path, data, answer, mended)
-            leaf, evidence = _leaf_of(answer), certificate.evidence
-            beyond = _outer_leaf_of(answer)
-            if beyond is not None and isinstance(evidence, PartitionTree) and splits < _SPLITS and self.left() > 0:
+            leaf, finer = _leaf_of(answer), None
+            if splits < _SPLITS and self.left() > 0:
+                finer = _finer(certificate, problem, answer)
+            if finer is not None:
                 splits += 1
-                outer = _split_beyond(problem, evidence, certificate.claim, *beyond)
-                certificate = replace(certificate, evidence=replace(evidence, outer=outer))
-            elif leaf is not None and isinstance(evidence, PartitionTree) and splits < _SPLITS and self.left() > 0:
-                splits += 1
-                certificate = replace(certificate, evidence=split_again(problem, evidence, certificate.claim, leaf))
+                certificate = replace(certificate, evidence=finer)
             elif (lower := _lowered(certificate, leaf, problem, lowerings)) is not None and lowerings < _LOWERINGS:
                 lowerings += 1
                 certificate = lower
@@ -137,23 +134,22 @@ def _leaf_of(answer: Mapping[str, Any]) -> int | None:
     return int(found[1]) if found and answer.get("rule") in ("ring", "inputs", "flow") else None
 
 
-def _outer_leaf_of(answer: Mapping[str, Any]) -> tuple[int | None, int] | None:
-    """The face, None for the tree, and the number of the leaf of an outer set that the checker refuses."""
-    found = re.fullmatch(r"(?:outer|face (\d+)) leaf (\d+)", str(answer.get("at", "")))
-    return None if found is None else (None if found[1] is None else int(found[1]), int(found[2]))
+def _finer(certificate: Certificate, problem: Problem, answer: Mapping[str, Any]) -> PartitionTree | None:
+    """The evidence with the leaf split that the checker refuses, of the tree, of an outer set's tree or of a face; None
+    if it refuses something else."""
+    from certify.engines.outer import mend as outer
 
-
-def _split_beyond(
-    problem: Problem, evidence: PartitionTree, claim: Claim, face: int | None, leaf: int
-) -> OuterTree | None:
-    from certify.engines.outer.mend import split_again as split_outer
-    from certify.engines.outer.mend import split_face_again
-
-    if evidence.outer is None:
+    evidence, claim, leaf = certificate.evidence, certificate.claim, _leaf_of(answer)
+    if not isinstance(evidence, PartitionTree):
         return None
-    if face is None:
-        return split_outer(problem, evidence.outer, claim, leaf)
-    return split_face_again(problem, evidence.outer, claim, face, leaf)
+    if leaf is not None:
+        return split_again(problem, evidence, claim, leaf)
+    found = re.fullmatch(r"(?:outer|face (\d+)) leaf (\d+)", str(answer.get("at", "")))
+    if found is None or evidence.outer is None:
+        return None
+    if found[1] is None:
+        return replace(evidence, outer=outer.split_again(problem, evidence.outer, claim, int(found[2])))
+    return replace(evidence, outer=outer.split_face_again(problem, evidence.outer, claim, int(found[1]), int(found[2])))
 
 
 def _lowered(certificate: Certificate, leaf: int | None, problem: Problem, tries: int) -> Certificate | None:

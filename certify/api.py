@@ -25,7 +25,7 @@ from numpy.typing import ArrayLike
 from certify.errors import InputError
 from certify.inputs import (
     centred,
-    function_for,
+    function_in,
     lines,
     named_plant,
     policy_in,
@@ -279,7 +279,7 @@ def _function(given: Any, plant: System, tell: Callable[[str], None]) -> Neural 
     """A function of the states, given as such or by its file."""
     if isinstance(given, Neural | Polynomial | Symbolic):
         return given
-    return function_for(Path(_path(given, "lyapunov")), plant, tell)
+    return function_in(Path(_path(given, "lyapunov")), plant, tell).function
 
 
 def _uncertainty(ranges: Any, disturbances: Any, input_error: Any, sample_time: Any) -> Change:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from certify.lyapunov import Neural, Polynomial
+    from certify.lyapunov import StoredLyapunov
     from certify.policies import Centre, Policy
     from certify.policies.importers import Imported, ImportOptions
     from certify.systems import System
@@ -113,8 +113,8 @@ def tell_of_other(stored: Policy, plant: System, tell: Tell) -> None:
         tell(f"the policy was trained with {', '.join(off)}; --system says otherwise, and counts")
 
 
-def function_for(path: Path, plant: System, tell: Tell) -> Neural | Polynomial:
-    """The function in a Lyapunov file, for this plant; says so if the file names another.
+def function_in(path: Path, plant: System, tell: Tell) -> StoredLyapunov:
+    """What is in a Lyapunov file, for this plant; says so if the file names another.
 
     Raises
     ------
@@ -129,19 +129,18 @@ def function_for(path: Path, plant: System, tell: Tell) -> Neural | Polynomial:
         )
     if stored.system != plant.name:
         tell(f"Lyapunov file {path} is of {stored.system}; it is proved for {plant.name}")
-    return stored.function
+    return stored
 
 
-def ellipsoid_beside(path: Path, plant: System) -> Array | None:
-    """P (n, n) of the ellipsoid beyond which the function in a Lyapunov file was learned; None if it does not say.
+def ellipsoid_beside(stored: StoredLyapunov, plant: System) -> Array | None:
+    """P (n, n) of the ellipsoid beyond which a function in a Lyapunov file was learned; None if it does not say.
 
     A file that says something else than a symmetric matrix says nothing: P is a hint, and what is proved with it is
     proved like any other.
     """
-    from certify.lyapunov import load_lyapunov
     from certify.lyapunov.function import Quadratic
 
-    learned = load_lyapunov(path).training.get("learned")
+    learned = stored.training.get("learned")
     try:
         P = Quadratic(learned["P"]).P if isinstance(learned, dict) else None
     except (InputError, KeyError, ValueError, TypeError):

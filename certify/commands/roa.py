@@ -111,7 +111,7 @@ def roa(
     as_json: Json = False,
 ) -> None:
     """Certify a region of attraction: prove, write a certificate, have it checked, report."""
-    from certify.inputs import ellipsoid_beside, function_for
+    from certify.inputs import ellipsoid_beside, function_in
     from certify.options import RoaOptions
 
     start = time.perf_counter()
@@ -126,9 +126,9 @@ def roa(
         input_error,
         None if sample_time == _MOST else sample_time,
     )
-    P = None
-    if lyapunov is not None and candidate == "auto" and q is None and r is None and level is None:
-        P = ellipsoid_beside(lyapunov, plant)
+    beyond, P = None if lyapunov is None else function_in(lyapunov, plant, tell), None
+    if beyond is not None and candidate == "auto" and q is None and r is None and level is None:
+        P = ellipsoid_beside(beyond, plant)
     options = RoaOptions(
         claim=claim,  # type: ignore[arg-type]
         candidate=candidate,  # type: ignore[arg-type]
@@ -145,7 +145,7 @@ def roa(
         time_limit=time_limit,
         max_boxes=max_boxes,
         rate=0.0 if rate == _MOST else _number(rate),
-        lyapunov=None if lyapunov is None else function_for(lyapunov, plant, tell),
+        lyapunov=None if beyond is None else beyond.function,
         lyapunov_level=lyapunov_level,
         hidden=layers(hidden, "--hidden"),
         degree=degree,

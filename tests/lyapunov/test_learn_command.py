@@ -75,7 +75,7 @@ def test_the_ellipsoid_of_a_file_is_a_hint_that_may_be_missing(
 ) -> None:
     path = tmp_path / "V.pt"
     save_lyapunov(path, FUNCTION, "pendulum", training={} if learned is None else {"learned": learned})
-    P = ellipsoid_beside(path, pendulum)
+    P = ellipsoid_beside(load_lyapunov(path), pendulum)
     assert (P is not None) == known
     if P is not None:
         assert P.tolist() == [[2.0, 0.5], [0.5, 1.0]]
