@@ -16,7 +16,7 @@ import math
 import random
 import re
 from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from decimal import Decimal, InvalidOperation
 from fractions import Fraction
 from types import MappingProxyType
@@ -156,6 +156,11 @@ class System:
         self.exact_x_eq()
         self._check_ranges()
         self._check_time()
+
+    def __reduce__(self) -> tuple[type[System], tuple[Any, ...]]:
+        """Pickled by its fields, read-only mappings as dictionaries, and checked anew where it is unpickled."""
+        values = (getattr(self, each.name) for each in fields(self))
+        return System, tuple(dict(v) if isinstance(v, MappingProxyType) else v for v in values)
 
     def _check_ranges(self) -> None:
         acting, fixed = {s.name for s in self.disturbances}, {s.name for e in self.x_eq for s in e.free_symbols}
