@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import itertools
 import math
+import pickle
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -331,3 +332,11 @@ def test_bad_toml(tmp_path: Path, old: str, new: str, message: str) -> None:
 def test_missing_toml(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="cannot be read"):
         get_system(str(tmp_path / "nothing.toml"))
+
+
+def test_plants_are_pickled_by_their_fields() -> None:
+    plant = load_system(VAN_DER_POL)
+    again = pickle.loads(pickle.dumps(plant))
+    assert again == plant and type(again.parameters) is type(plant.parameters)
+    with pytest.raises(TypeError):
+        again.parameters["mu"] = Fraction(2)
