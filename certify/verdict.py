@@ -46,6 +46,7 @@ class Stop(Enum):
     STALLED = "nothing gained"
     REFUSED = "refused by the checker"
     BOXES = "boxes"
+    CLUSTER = "the cluster went away"
     LOCAL = "local"
     FLOOR = "floor"
     SMOOTH = "smooth"

@@ -7,10 +7,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
+import numpy as np
+from numpy.typing import NDArray
+
 from certify.certificate import PartitionTree, TrustedSolver
 from certify.claims import Claim, Problem
 from certify.claims.claim import Kind
 from certify.engines.falsify import Witness
+from certify.errors import InputError
 from certify.verdict import Stop
 
 FEW = 3
@@ -84,6 +88,20 @@ class Proof:
     seconds_left: float | None = None
 
 
+@dataclass(frozen=True, slots=True)
+class SearchState:
+    """A search that can be gone on with: the levels, boxes bounded and proved so far, the lowest violation met, and the
+    tree in preorder, in which 254 is an open leaf, with the keys (B,) of these, by which they are taken."""
+
+    inner: float
+    outer: float
+    boxes: int
+    proved: int
+    witness: Witness | None
+    tree: bytes
+    keys: NDArray[np.float64]
+
+
 Report = Callable[[Progress], None]
 
 
@@ -115,6 +133,17 @@ class Attempt(Protocol):
 
     def proof(self) -> Proof:
         """The best claim of the task's kind so far."""
+
+    def state(self) -> SearchState | None:
+        """The search, to go on with another time; None if there is nothing to go on with."""
+
+    def restore(self, state: SearchState) -> None:
+        """Go on with a search for the same task in the same coordinates.
+
+        Raises
+        ------
+        InputError : it does not fit.
+        """
 
 
 class Engine(ABC):
@@ -170,3 +199,9 @@ class Once:
     def proof(self) -> Proof:
         """What was found."""
         return self.found or Proof(None, None, Stop.TIME)
+
+    def state(self) -> None:
+        """None: there is no going on."""
+
+    def restore(self, state: SearchState) -> None:
+        raise InputError("a search for this claim, or of this engine, cannot be gone on with; begin it anew.")

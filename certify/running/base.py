@@ -1,8 +1,8 @@
-"""A place to run: it takes a bound of boxes and gives back one that does the same work there."""
+"""A place to run: it takes a bound of boxes and gives back one that does the same work there, or does whole jobs."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
 from typing import Any, Protocol
 
@@ -10,6 +10,29 @@ import torch
 from torch import Tensor
 
 Bound = Callable[[Tensor, Tensor, float, float], Any]
+Work = Callable[[bytes], bytes]
+
+
+class Jobs(Protocol):
+    """Work that is done elsewhere, a job at a time at each of several places."""
+
+    @property
+    def places(self) -> int:
+        """How many jobs are done at once now; 0 if nobody is there."""
+
+    def give(self, job: bytes) -> int:
+        """Have a job done; its number."""
+
+    def ended(self, seconds: float) -> list[tuple[int, bytes | None]]:
+        """Numbers and answers of the jobs that have ended, after waiting so long for one; None for one that failed.
+
+        Raises
+        ------
+        BackendError : nobody will ever answer.
+        """
+
+    def forget(self, numbers: Iterable[int]) -> None:
+        """Do without the answers to these jobs."""
 
 
 class Runner(Protocol):
@@ -21,3 +44,6 @@ class Runner(Protocol):
 
     def start(self, bound: Bound) -> AbstractContextManager[Bound]:
         """`bound`, a function of corners (n, B) and two levels to a named tuple of tensors (..., B), as run here."""
+
+    def jobs(self, work: Work) -> AbstractContextManager[Jobs | None]:
+        """Where `work`, which can be pickled, is done elsewhere; None if all is done here."""

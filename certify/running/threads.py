@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from certify.running.base import Bound
+from certify.running.base import Bound, Work
 
 _CHUNK = 256  # boxes that make a thread worth its while
 
@@ -51,3 +51,7 @@ class ThreadRunner:
                 yield cut
         finally:
             torch.set_num_threads(threads)
+
+    def jobs(self, work: Work) -> nullcontext[None]:
+        """Nothing is done elsewhere."""
+        return nullcontext()

@@ -77,7 +77,7 @@ def test_boxes_come_in_the_order_of_their_lowest_level(seed: int, capacity: int)
             break
         assert frontier.least() == model[0][0]
         count = int(generator.integers(1, 5))
-        lo, hi, number = frontier.take(count, np.inf)
+        lo, hi, number, _ = frontier.take(count, np.inf)
         assert 1 <= len(number) <= count
         expected = [heapq.heappop(model) for _ in range(len(number))]
         taken = [levels[k] for k in number.tolist()]

@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 
 from certify.certificate import PartitionTree
 from certify.claims import Asymptotic, Practical, Problem
-from certify.engines.base import FEW, Attempt, Budget, Engine, Once, Proof, Report, Task
+from certify.engines.base import FEW, Attempt, Budget, Engine, Once, Proof, Report, SearchState, Task
 from certify.engines.bounds.search import Pass, RingProof, empty_ring, outwards, prove_inwards, prove_outwards
 from certify.engines.falsify import Band, Witness, survey
 from certify.engines.local import local_ball, prove_band, prove_local
+from certify.errors import InputError
 from certify.running import Runner
 from certify.verdict import Stop
 
@@ -191,6 +192,14 @@ class _Outwards:
         if self.ring is not None:
             self.stop = self.ring.advance(budget, report)
         self.seconds["ring"] += time.perf_counter() - start
+
+    def state(self) -> SearchState | None:
+        return None if self.ring is None or self.ring.done else self.ring.state()
+
+    def restore(self, state: SearchState) -> None:
+        if self.ring is None or self.inner is None or self.inner < state.inner:
+            raise InputError("the search cannot be gone on with: the local set is another one here.")
+        self.ring.restore(state)
 
     def proof(self) -> Proof:
         if self.inner is None:

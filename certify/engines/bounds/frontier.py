@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -11,6 +13,15 @@ from certify.engines.bounds.partition import Partition
 
 Array = NDArray[np.float64]
 _HANDFUL = 64  # boxes that cost hardly more together than one alone
+
+
+class Boxes(NamedTuple):
+    """Corners (n, B), numbers (B,) and keys (B,) of boxes."""
+
+    lo: Tensor
+    hi: Tensor
+    number: Tensor
+    key: Tensor
 
 
 class Frontier:
@@ -46,8 +57,8 @@ class Frontier:
             self._away.append((self.key[far].cpu().numpy(), self.number[far].cpu().numpy().astype(np.uint32)))
             self._keep(near)
 
-    def take(self, count: int, limit: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Remove and return corners and numbers of up to `count` boxes, those with the smallest keys.
+    def take(self, count: int, limit: float) -> Boxes:
+        """Remove and return up to `count` boxes, those with the smallest keys.
 
         More than `_HANDFUL` are taken only if their keys are at most `limit`.
         """
@@ -58,9 +69,15 @@ class Frontier:
         wanted = max(_HANDFUL, int((self.key <= limit).sum()))
         allowed = min(wanted, int((self.key <= least_away).sum()))
         now = order[: min(count, allowed)]
-        taken = self.lo[:, now], self.hi[:, now], self.number[now]
+        taken = Boxes(self.lo[:, now], self.hi[:, now], self.number[now], self.key[now])
         self._keep(order[len(now) :])
         return taken
+
+    def waiting(self) -> tuple[NDArray[np.int64], Array]:
+        """Numbers (B,) and keys (B,) of all boxes."""
+        numbers = [self.number.cpu().numpy(), *(number for _, number in self._away)]
+        keys = [self.key.cpu().numpy(), *(lowest for lowest, _ in self._away)]
+        return np.concatenate(numbers).astype(np.int64), np.concatenate(keys)
 
     def drop_above(self, level: float) -> None:
         """Forget boxes with keys above `level`."""

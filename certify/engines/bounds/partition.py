@@ -1,28 +1,54 @@
 """The partition that a pass grows, bounded in memory.
 
 A split is five bytes (parent and axis), because everything else follows from them: the certificate is written from it,
-and corners are rebuilt by replaying the same midpoints.
+and corners are rebuilt by replaying the same midpoints. What was grown elsewhere comes as the bytes of its trees.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from typing import NamedTuple
+
 import numpy as np
+import torch
 from numpy.typing import NDArray
+from torch import Tensor
+
+from certify.errors import CertificateFormatError
 
 Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 LEAF = 255
+MAX_DEPTH = 4096  # of a certificate's tree
+OPEN, LOOK = 254, 253  # leaves of a tree that grows still: not bounded yet; to be looked at by whoever asked for it
+
+
+class Grafted(NamedTuple):
+    """Boxes of one mark that came with trees: numbers (B,), corners (n, B), and places (B,) among the leaves of both
+    marks, in the order of the trees."""
+
+    number: Numbers
+    lo: Array
+    hi: Array
+    place: Numbers
+
+    def tensors(self) -> tuple[Tensor, Tensor, Tensor]:
+        """Corners and numbers for torch."""
+        return torch.tensor(self.lo), torch.tensor(self.hi), torch.tensor(self.number)
 
 
 class Partition:
-    """Halvings of the box |z_i| <= root_i, or of `lower <= z <= root`.
+    """Halvings of the box |z_i| <= root_i, or of `lower <= z <= root`; or of K boxes, if these are (n, K).
 
-    Boxes are numbered as they appear: the root is 0, the halves of the k-th split are 2k + 1 (lower) and 2k + 2.
+    Boxes are numbered as they appear: the first K are whole, the halves of the k-th split are K + 2k (lower) and
+    K + 2k + 1.
     """
 
     def __init__(self, root: Array, lower: Array | None = None) -> None:
         self.root = root
         self.lower = -root if lower is None else lower
+        self._lo, self._hi = (side.reshape(len(root), -1) for side in (self.lower, self.root))
+        self._whole = self._lo.shape[1]
         self.splits = 0
         self._parents = np.zeros(1024, dtype=np.uint32)
         self._axes = np.zeros(1024, dtype=np.uint8)
@@ -37,7 +63,7 @@ class Partition:
         self._parents[first : self.splits] = boxes
         self._axes[first : self.splits] = axes
         self._calls.append(self.splits)
-        return np.arange(2 * first + 1, 2 * self.splits + 1)
+        return np.arange(2 * first + self._whole, 2 * self.splits + self._whole)
 
     def halvings(self) -> Numbers:
         """How often each axis was halved, (n,)."""
@@ -45,39 +71,110 @@ class Partition:
 
     def leaves(self) -> Numbers:
         """The numbers of the boxes that are not split, ascending."""
-        whole = np.ones(2 * self.splits + 1, dtype=bool)
+        whole = np.ones(2 * self.splits + self._whole, dtype=bool)
         whole[self._parents[: self.splits]] = False
         return np.flatnonzero(whole)
 
     def corners(self, boxes: Numbers) -> tuple[Array, Array]:
         """Lower and upper corners (n, B), by the midpoints that made them."""
-        count = len(boxes)
-        lo, hi = (np.repeat(side[:, None], count, axis=1) for side in (self.lower, self.root))
-        steps: list[tuple[Numbers, Numbers, NDArray[np.bool_]]] = []  # from the box up to the root
-        box, column = boxes, np.arange(count)
+        steps: list[tuple[Numbers, Numbers, NDArray[np.bool_]]] = []  # from the box up to a whole one
+        first, box, column = boxes.copy(), boxes, np.arange(len(boxes))
         while len(column):
-            below = box > 0
-            box, column = box[below], column[below]
-            split = (box - 1) // 2
-            steps.append((column, self._axes[split].astype(np.int64), box % 2 == 0))
+            first[column] = box
+            below = box >= self._whole
+            box, column = box[below] - self._whole, column[below]
+            split = box // 2
+            steps.append((column, self._axes[split].astype(np.int64), box % 2 == 1))
             box = self._parents[split].astype(np.int64)
+        lo, hi = self._lo[:, first], self._hi[:, first]
         for column, axis, upper in reversed(steps):
-            middle = 0.5 * lo[axis, column] + 0.5 * hi[axis, column]
-            lo[axis[upper], column[upper]] = middle[upper]
-            hi[axis[~upper], column[~upper]] = middle[~upper]
+            _halve(lo, hi, column, axis, upper)
         return lo, hi
 
-    def preorder(self) -> bytes:
-        """The tree in preorder: an axis for a split, 255 for a leaf."""
+    def preorder(self, marks: Iterable[tuple[int, Numbers]] = ()) -> bytes:
+        """The tree in preorder, or those of all whole boxes in turn: an axis for a split, 255 for a leaf, or the mark
+        of those with these numbers."""
+        place, whole = self._place(), self._whole
+        tree = np.full(2 * self.splits + whole, LEAF, dtype=np.uint8)
+        tree[place[self._parents[: self.splits]]] = self._axes[: self.splits]
+        for mark, numbers in marks:
+            tree[place[numbers]] = mark
+        return tree.tobytes()
+
+    def order(self, boxes: Numbers) -> Numbers:
+        """The order (B,) of boxes (B,), none of them within another, in preorder."""
+        return np.argsort(self._place()[boxes])
+
+    def _place(self) -> NDArray[np.uint32]:
+        """Where each box is in preorder."""
         calls = [slice(a, b) for a, b in zip(self._calls[:-1], self._calls[1:], strict=True)]
-        size = np.ones(2 * self.splits + 1, dtype=np.uint32)
-        lower, upper = size[1::2], size[2::2]  # of the halves of each split
+        whole = self._whole
+        size = np.ones(2 * self.splits + whole, dtype=np.uint32)
+        lower, upper = size[whole::2], size[whole + 1 :: 2]  # of the halves of each split
         for call in reversed(calls):
             size[self._parents[call]] = 1 + lower[call] + upper[call]
-        place = np.zeros(2 * self.splits + 1, dtype=np.uint32)
+        place = np.zeros(2 * self.splits + whole, dtype=np.uint32)
+        place[1:whole] = np.cumsum(size[: whole - 1])
         for call in calls:
             after = place[self._parents[call]] + np.uint32(1)
-            place[1::2][call], place[2::2][call] = after, after + lower[call]
-        tree = np.full(2 * self.splits + 1, LEAF, dtype=np.uint8)
-        tree[place[self._parents[: self.splits]]] = self._axes[: self.splits]
-        return tree.tobytes()
+            place[whole::2][call], place[whole + 1 :: 2][call] = after, after + lower[call]
+        return place
+
+    def graft(self, boxes: Numbers, lo: Array, hi: Array, trees: bytes) -> tuple[Grafted, Grafted]:
+        """Split boxes (B,), of corners (n, B), as their trees say, which follow each other; the leaves that are `OPEN`,
+        and those to `LOOK` at.
+
+        Raises
+        ------
+        CertificateFormatError : the bytes are not one tree for each of the boxes.
+        """
+        nodes = np.frombuffer(trees, dtype=np.uint8)
+        at, upper = _links(nodes, len(self.root), len(boxes))
+        ends: list[tuple[Numbers, Numbers, Array, Array]] = []
+        while len(at):
+            split = nodes[at] < len(self.root)
+            marked = (nodes[at] == OPEN) | (nodes[at] == LOOK)
+            ends.append((at[marked], boxes[marked], lo[:, marked], hi[:, marked]))
+            above = at[split]
+            axis = nodes[above].astype(np.int64)
+            boxes = self.split(boxes[split], axis) if len(above) else boxes[:0]
+            at = np.stack([above + 1, upper[above]], 1).reshape(-1)
+            lo, hi = (np.repeat(side[:, split], 2, axis=1) for side in (lo, hi))
+            _halve(lo, hi, np.arange(len(at)), np.repeat(axis, 2), np.arange(len(at)) % 2 == 1)
+        place, number, lo, hi = (np.concatenate(parts, -1) for parts in zip(*ends, strict=True))
+        order = np.argsort(place)
+        place, number, lo, hi = place[order], number[order], lo[:, order], hi[:, order]
+        is_open = nodes[place] == OPEN
+        opened, looked = (
+            Grafted(number[one], lo[:, one], hi[:, one], np.flatnonzero(one)) for one in (is_open, ~is_open)
+        )
+        return opened, looked
+
+
+def _halve(lo: Array, hi: Array, column: Numbers, axis: Numbers, upper: NDArray[np.bool_]) -> None:
+    """In the place of boxes, columns of lo and hi (n, B), their upper or lower halves along an axis."""
+    middle = 0.5 * lo[axis, column] + 0.5 * hi[axis, column]
+    lo[axis[upper], column[upper]] = middle[upper]
+    hi[axis[~upper], column[~upper]] = middle[~upper]
+
+
+def _links(nodes: NDArray[np.uint8], n: int, count: int) -> tuple[Numbers, Numbers]:
+    """Where each of so many trees begins (count,), and for each split where its upper half does.
+
+    Before a node in preorder, a tree has as many boxes open as splits less leaves so far: the upper half is the next
+    node before which there are as many as before the split.
+    """
+    ends = nodes >= LOOK
+    if np.any((nodes >= n) & ~ends):
+        raise CertificateFormatError(f"a tree splits an axis that does not exist; it has {n}.")
+    after = np.cumsum(np.where(ends, -1, 1))
+    if not len(nodes) or after[-1] != -count or np.any(after[:-1] <= -count):
+        raise CertificateFormatError(f"{len(nodes)} bytes are not {count} trees.")
+    before = np.concatenate([[0], after[:-1]])
+    if before.max() > MAX_DEPTH:
+        raise CertificateFormatError(f"a tree must not be deeper than {MAX_DEPTH}; found {before.max()}.")
+    first = np.flatnonzero(np.concatenate([[True], before[1:] < np.minimum.accumulate(before)[:-1]]))
+    upper = np.zeros(len(nodes), dtype=np.int64)
+    order = np.argsort(before, kind="stable")
+    upper[order[:-1]] = order[1:]
+    return first, upper

@@ -8,9 +8,12 @@ violation, a budget, or because nothing is left. No trial level is ever proved a
 
 from __future__ import annotations
 
+import copy
 import math
 import time
 from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -19,14 +22,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from certify.claims import Problem
-from certify.engines.base import Budget, Report
+from certify.engines.base import Budget, Report, SearchState
 from certify.engines.bounds.clock import Clock
 from certify.engines.bounds.frontier import Frontier
-from certify.engines.bounds.halving import split
+from certify.engines.bounds.halving import Halves, split
 from certify.engines.bounds.order import choose_order
-from certify.engines.bounds.partition import LEAF, Partition
+from certify.engines.bounds.partition import LEAF, OPEN, Partition
 from certify.engines.bounds.rule import BoxBounds, VdotBound
+from certify.engines.bounds.subtrees import Abroad, Growth, Subtrees
 from certify.engines.falsify import Witness, descend
+from certify.errors import BackendError, CertificateFormatError, InputError
 from certify.running import Bound, Runner
 from certify.verdict import Stop
 
@@ -270,70 +275,31 @@ class _Inwards(_Sweep):
         return level, self.inner, self.share(level, self.outer)
 
 
-class Pass:
-    """A pass that can be asked at any time for what it has proved, and go on."""
+class _RingGrowth(Growth):
+    """The ring's rule at a sweep's levels."""
 
-    def __init__(self, sweep: _Sweep, root: Array, runner: Runner, rule: VdotBound) -> None:
-        self.sweep, self.root, self.runner, self.rule = sweep, root, runner, rule
-        self.partition = Partition(root)
-        self.frontier = Frontier(self.partition, runner.device)
-        self.half = torch.tensor(root, device=runner.device)[:, None]
-        self.boxes = self.proved = 0
-        self.covered = True
-        self.halvings = 0.0
-        self._stop = Stop.REQUESTED
-        self._clock = Clock()
-        first = torch.zeros(1, dtype=torch.int64, device=runner.device)
-        self.frontier.add(-self.half, self.half, sweep.key(*rule.levels(-self.half, self.half)), first)
-
-    @property
-    def done(self) -> bool:
-        """Whether no box is open: the pass has nothing left to gain."""
-        return not len(self.frontier)
+    def __init__(self, sweep: _Sweep, rule: VdotBound, half: Tensor) -> None:
+        super().__init__(rule, half)
+        self.sweep, self.rule = sweep, rule
 
     @property
     def levels(self) -> tuple[float, float]:
-        """(inner, outer) between which all is proved; equal if nothing is."""
-        inner, outer = self.sweep.reached(self.frontier.least())
-        return inner, max(inner, outer)
+        return self.sweep.inner, self.sweep.outer
 
-    def advance(self, budget: Budget, report: Report | None = None) -> Stop | None:
-        """Take boxes, bound them, give way to violations, halve what is undecided; what ran out, or None if done."""
-        most = self.boxes + budget.boxes
-        with self._clock, self.runner.start(self.rule) as bound:
-            while not self.done:
-                if self.boxes >= most or self.partition.splits + 3 * budget.batch > _MOST_SPLITS:
-                    return Stop.BOXES
-                if self._clock.spent + self.proved * budget.check > budget.seconds:
-                    return Stop.TIME
-                self._step(bound, min(budget.batch, most - self.boxes), budget.least_width)
-                if report is not None:
-                    stand = self.sweep.stand(self.frontier.least())
-                    report(self._clock.read(*stand, self.boxes, len(self.frontier)))
-        return None
+    def at(self, inner: float, outer: float) -> _RingGrowth:
+        sweep = copy.copy(self.sweep)
+        sweep.inner, sweep.outer = inner, outer
+        return _RingGrowth(sweep, self.rule, self.half)
 
-    def _step(self, bound: Bound, count: int, least_width: float) -> None:
-        sweep, rule = self.sweep, self.rule
-        lo, hi, number = self.frontier.take(count, sweep.reach(self.frontier.least()))
-        self.boxes += lo.shape[1]
-        found = bound(lo, hi, sweep.inner, sweep.outer)
-        self.proved += int(found.proved.sum())
-        self._expect(found)
-        centres = 0.5 * lo + 0.5 * hi
-        if sweep.violated(centres, self._levels(centres, found)):
-            self._stop = Stop.WITNESS
-        halves = split(self.partition, lo, hi, number, found, least_width * self.half)
-        small = halves.small
-        if bool(small.any()):
-            self.covered = self.covered and bool(found.smooth[small].all())
-            if sweep.stuck(*rule.levels(lo[:, small], hi[:, small])):
-                self._stop = Stop.BOXES
-        lowest, highest = rule.levels(halves.lo, halves.hi)
-        keep = sweep.wanted(lowest, highest)
-        self.frontier.add(halves.lo[:, keep], halves.hi[:, keep], sweep.key(lowest, highest)[keep], halves.number[keep])
-        self.frontier.drop_above(sweep.last())
+    def gives_way(self, lo: Tensor, hi: Tensor, found: BoxBounds) -> Tensor:
+        levels = self.levels_of(0.5 * lo + 0.5 * hi, found)
+        return (levels <= self.sweep.outer) & (levels >= self.sweep.inner)
 
-    def _levels(self, centres: Tensor, found: BoxBounds) -> Tensor:
+    def opened(self, halves: Halves, found: BoxBounds, key: Tensor) -> tuple[Tensor, Tensor]:
+        lowest, highest = self.rule.levels(halves.lo, halves.hi)
+        return self.sweep.wanted(lowest, highest), self.sweep.key(lowest, highest)
+
+    def levels_of(self, centres: Tensor, found: BoxBounds) -> Tensor:
         """V at violations, infinite elsewhere; where a step leads from within the outer level to a higher V, that, but
         no more than just above the outer level."""
         levels = torch.where(found.violated, self.rule.levels_at(centres), math.inf)
@@ -342,6 +308,126 @@ class Pass:
             return levels
         after = self.rule.levels_after(centres[:, index], self.sweep.outer).clamp(max=self.sweep.outer)
         return levels.index_put((index,), torch.maximum(levels[index], after))
+
+
+class Pass:
+    """A pass that can be asked at any time for what it has proved, and go on."""
+
+    def __init__(self, sweep: _Sweep, root: Array, runner: Runner, rule: VdotBound) -> None:
+        self.sweep, self.root, self.runner, self.rule = sweep, root, runner, rule
+        self.partition = Partition(root)
+        self.frontier = Frontier(self.partition, runner.device)
+        self.half = torch.tensor(root, device=runner.device)[:, None]
+        self.growth = _RingGrowth(sweep, rule, self.half)
+        self.abroad: Abroad | None = None
+        self.boxes = self.proved = 0
+        self.covered = True
+        self.halvings = 0.0
+        self.lost = ""  # what is said of a cluster that went away
+        self._stop = Stop.REQUESTED
+        self._clock = Clock()
+        first = torch.zeros(1, dtype=torch.int64, device=runner.device)
+        self.frontier.add(-self.half, self.half, sweep.key(*rule.levels(-self.half, self.half)), first)
+
+    @property
+    def done(self) -> bool:
+        """Whether no box is open: the pass has nothing left to gain."""
+        return not self._open()
+
+    @property
+    def levels(self) -> tuple[float, float]:
+        """(inner, outer) between which all is proved; equal if nothing is."""
+        inner, outer = self.sweep.reached(self._least())
+        return inner, max(inner, outer)
+
+    def _open(self) -> int:
+        return len(self.frontier) + (0 if self.abroad is None else len(self.abroad))
+
+    def _least(self) -> float:
+        return min(self.frontier.least(), math.inf if self.abroad is None else self.abroad.least())
+
+    def advance(self, budget: Budget, report: Report | None = None) -> Stop | None:
+        """Take boxes, bound them, give way to violations, halve what is undecided; what ran out, or None if done."""
+        most = self.boxes + budget.boxes
+        with self._clock, self.runner.start(self.rule) as bound, self._elsewhere(budget):
+            while not self.done:
+                if self.boxes >= most or self.partition.splits + 3 * budget.batch > _MOST_SPLITS:
+                    return Stop.BOXES
+                left = budget.seconds - self._clock.spent - self.proved * budget.check
+                if left < 0:
+                    return Stop.TIME
+                if not self._exchanged(bound, left, budget):
+                    self._step(bound, min(budget.batch, most - self.boxes), budget.least_width)
+                elif self.lost:
+                    return Stop.CLUSTER
+                if report is not None:
+                    stand = self.sweep.stand(self._least())
+                    report(self._clock.read(*stand, self.boxes, self._open()))
+        return None
+
+    @contextmanager
+    def _elsewhere(self, budget: Budget) -> Iterator[None]:
+        """Have boxes grown elsewhere, where that can be; what is out at the end comes back."""
+        with self.runner.jobs(Subtrees(self.growth)) as jobs:
+            if jobs is not None:
+                self.abroad = Abroad(jobs, self.growth, self.partition, budget.batch, budget.least_width)
+            try:
+                yield
+            finally:
+                self._recall()
+
+    def _recall(self) -> None:
+        if self.abroad is not None:
+            self.abroad.recall(self.frontier)
+        self.abroad = None
+
+    def _exchanged(self, bound: Bound, left: float, budget: Budget) -> bool:
+        """Send boxes out, and take in what has been grown; False if that is not worth it."""
+        if self.abroad is None:
+            return False
+        sweep = self.sweep
+        try:
+            if not self.abroad.is_worth(self.frontier):
+                return False
+            self.abroad.send((sweep.inner, sweep.outer), self.frontier, sweep.reach(self._least()), left)
+            back = self.abroad.collect(left)
+        except BackendError as error:
+            self.lost = str(error)
+            self._recall()
+            return True
+        for _, answer, opened, looked in back:
+            self.boxes += answer.boxes
+            self.proved += answer.proved
+            lo, hi, number = opened.tensors()
+            self.frontier.add(lo, hi, torch.tensor(answer.keys), number)
+            if len(looked.number):
+                self._examine(bound, *looked.tensors(), budget.least_width)
+        self.abroad.forget_above(sweep.last())
+        self.frontier.drop_above(sweep.last())
+        return True
+
+    def _step(self, bound: Bound, count: int, least_width: float) -> None:
+        lo, hi, number, _ = self.frontier.take(count, self.sweep.reach(self._least()))
+        self._examine(bound, lo, hi, number, least_width)
+
+    def _examine(self, bound: Bound, lo: Tensor, hi: Tensor, number: Tensor, least_width: float) -> None:
+        sweep, rule = self.sweep, self.rule
+        self.boxes += lo.shape[1]
+        found = bound(lo, hi, sweep.inner, sweep.outer)
+        self.proved += int(found.proved.sum())
+        self._expect(found)
+        centres = 0.5 * lo + 0.5 * hi
+        if sweep.violated(centres, self.growth.levels_of(centres, found)):
+            self._stop = Stop.WITNESS
+        halves = split(self.partition, lo, hi, number, found, least_width * self.half)
+        small = halves.small
+        if bool(small.any()):
+            self.covered = self.covered and bool(found.smooth[small].all())
+            if sweep.stuck(*rule.levels(lo[:, small], hi[:, small])):
+                self._stop = Stop.BOXES
+        keep, key = self.growth.opened(halves, found, number)
+        self.frontier.add(halves.lo[:, keep], halves.hi[:, keep], key[keep], halves.number[keep])
+        self.frontier.drop_above(sweep.last())
 
     def _expect(self, found: BoxBounds) -> None:
         """How often a box of this batch that is not proved has to be halved, so that what its axes add to the bound is
@@ -359,7 +445,42 @@ class Pass:
 
     def settle(self) -> None:
         """Take the levels that are proved for good: what is open lies outside of them, and needs at most one look."""
-        self.sweep.inner, self.sweep.outer = self.sweep.reached(self.frontier.least())
+        self.sweep.inner, self.sweep.outer = self.sweep.reached(self._least())
+
+    def state(self) -> SearchState:
+        """The search as it stands; boxes that are out are open."""
+        waiting, keys = self.frontier.waiting()
+        if self.abroad is not None:
+            numbers, their_keys = self.abroad.waiting()
+            waiting, keys = np.concatenate([waiting, numbers]), np.concatenate([keys, their_keys])
+        tree = self.partition.preorder([(OPEN, waiting)])
+        sweep = self.sweep
+        keys = keys[self.partition.order(waiting)]
+        return SearchState(sweep.inner, sweep.outer, self.boxes, self.proved, sweep.witness, tree, keys)
+
+    def restore(self, state: SearchState) -> None:
+        """Go on from a state, before the first box of this pass.
+
+        Raises
+        ------
+        InputError : it is not of a ring between these levels.
+        """
+        sweep = self.sweep
+        try:
+            opened, looked = self.partition.graft(
+                np.zeros(1, np.int64), *self.partition.corners(np.zeros(1, np.int64)), state.tree
+            )
+        except CertificateFormatError as error:
+            raise InputError(f"the search cannot be gone on with: {error}") from error
+        fits = sweep.inner >= state.inner and state.outer <= sweep.outer and not len(looked.number)
+        if not fits or len(opened.number) != len(state.keys) or np.isnan(state.keys).any():
+            raise InputError("the search cannot be gone on with: it is of another ring.")
+        self.frontier = Frontier(self.partition, self.runner.device)
+        lo, hi, number = (a.to(self.runner.device) for a in opened.tensors())
+        self.frontier.add(lo, hi, torch.tensor(state.keys, device=self.runner.device), number)
+        sweep.inner, sweep.outer, sweep.witness = state.inner, state.outer, state.witness
+        self.boxes, self.proved = state.boxes, state.proved
+        self._stop = Stop.REQUESTED if state.witness is None else Stop.WITNESS
 
     def proof(self, stop: Stop | None = None) -> RingProof:
         """What is proved, `stop` being what ran out."""
