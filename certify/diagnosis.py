@@ -138,8 +138,13 @@ def _next(result: RoaResult, options: RoaOptions, proof: Proof | None, name: str
     if result.stop is Stop.PATH:
         why = "the set that the tube has to reach grows with the time, and so do the widths that are tried"
         return Step((("--time-limit", _round(4 * options.time_limit)),), why)
+    if result.stop is Stop.CLUSTER:
+        kept = result.search is not None
+        why = "what was done is kept" if kept else "the search was not kept"
+        return Step((("--resume", ""),) if kept else (), f"{why}; see to the cluster first, or leave it out")
     if result.stop in (Stop.TIME, Stop.BOXES):
-        return _longer(result, options, proof)
+        step = _longer(result, options, proof)
+        return step if result.search is None else replace(step, options=(*step.options, ("--resume", "")))
     if options.claim == "asymptotic" and options.only is not None and options.P is None and options.level is None:
         return Step((("--candidate", "auto"),), f"only the candidate {options.only} was tried")
     knows = not (result.system.ranges or result.system.in_steps)  # a tube says nothing of such things

@@ -38,6 +38,9 @@ class RoaOptions:
     engine : `bounds`, `dreal` (its word is trusted, not checked), or `both`: bounds prove, dReal is asked as well.
     dreal_precision, jobs : dReal's delta and threads.
     device : where boxes are bounded, `cpu` or `cuda`.
+    cluster : whose workers grow boxes: `local:N` for N processes of this machine, or the address of a Dask scheduler,
+        such as tcp://host:8786; None for the threads of this process.
+    resume : go on with the search that an earlier run for the largest level left in the folder.
     enlarge : look for a tube of ellipsoids from a larger set into the proved one.
     box : half-widths by state; `enlarge` for the largest multiple of the ellipsoid with these half-axes. A state that
         is not named gets the smallest share of its domain that a named one has.
@@ -65,6 +68,8 @@ class RoaOptions:
     dreal_precision: float = 1e-3
     jobs: int = 1
     device: str = "cpu"
+    cluster: str | None = None
+    resume: bool = False
     enlarge: bool = False
     box: Mapping[str, float] | None = None
     reach_from: Mapping[str, Fraction | float] | None = None
@@ -105,6 +110,13 @@ class RoaOptions:
                 raise InputError(f"`{name}` must be one of {get_args(known)}; found {getattr(self, name)!r}.")
         if not 0 < self.dreal_precision < 1 or self.jobs < 1:
             raise InputError("`dreal_precision` must lie between 0 and 1, and `jobs` be at least 1.")
+        if self.cluster is not None and (self.engine != "bounds" or self.device != "cpu"):
+            raise InputError("`cluster` needs the engine bounds, and the device cpu.")
+        if self.resume and (self.engine != "bounds" or self.P is not None or self.only is not None):
+            raise InputError(
+                "`resume` goes on with the candidate of the search; leave `P`, `Q`, `R`, `level` and `candidate` out, "
+                "and use the engine bounds."
+            )
         if self.level is not None and not (math.isfinite(self.level) and self.level > 0):
             raise InputError(f"`level` must be a positive number; found {self.level}.")
         if self.box is not None and not all(math.isfinite(v) and v > 0 for v in self.box.values()):

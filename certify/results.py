@@ -213,7 +213,7 @@ class RoaResult:
     `checker` is what the checker said, None if it was not reached, about `raw`, the certificate's bytes; `solver` has
     dReal's version and every query with its answer, None if it was not asked. `notices` is what had to be known about
     plant and policy before the run, such as a domain that was cut; `folder` keeps a temporary folder of the certificate
-    alive.
+    alive. `search` is a file with the search, if more time could go on with it (`resume`).
 
     In Python: `contains`, `volume`, `plot`, `report`, `certificate` (the file's path), `to_dict`.
     """
@@ -238,6 +238,7 @@ class RoaResult:
     leaves: int = 0
     seconds: Mapping[str, float] = field(default_factory=dict)
     certificate: Path | None = None
+    search: Path | None = None
     raw: bytes | None = field(default=None, repr=False)
     checker: Mapping[str, Any] | None = None
     engine: str = "bounds"
@@ -494,6 +495,7 @@ class RoaResult:
             "leaves": self.leaves,
             "seconds": {name: self.seconds.get(name) for name in _STAGES},
             "certificate": None if self.certificate is None else str(self.certificate),
+            "search": None if self.search is None else str(self.search),
             "certificate_sha256": None if self.checker is None else self.checker.get("certificate_sha256"),
             "checked": None if self.checker is None else self.checker.get("result"),
             "contains": None,  # the answer to `certify roa --contains`

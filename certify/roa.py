@@ -55,11 +55,13 @@ from certify.results import Levels, RoaResult, Tried, TubeFacts
 from certify.rigorous import eigenvalues, instability
 from certify.systems import System
 from certify.trials import OPTIMISING, Trial, blends, by_reach, corrected, named, optimised, peak, robust, solved
+from certify.unfinished import Unfinished, load, save
 from certify.verdict import Stop, Verdict
 
 if TYPE_CHECKING:
     from certify.engines.dreal.proof import DrealOptions
     from certify.engines.outer import OuterProof
+    from certify.running import Runner
 
 __all__ = ["RoaOptions", "RoaResult", "certify_roa"]
 Array = NDArray[np.float64]
@@ -82,6 +84,8 @@ _SAMPLE = 2000  # leaves whose check is timed
 _START = 0.2  # seconds that a checker takes to start
 _CAUTION = 1.2  # on the time that a check is expected to take
 _YEAR = 3.156e7  # seconds
+_SEARCH_FILE = "search.json"
+_SAVING = 60.0  # seconds between two savings of a search
 
 
 def certify_roa(
@@ -116,8 +120,25 @@ def certify_roa(
     BackendError : the checker process failed.
     SoundnessError : the checker rejects what the engine proved, and no smaller set mends it.
     """
-    with _threads_for(network), sole_writer(out):
-        return _Run(system, network, out, options or RoaOptions(), load_seconds, provenance or {}, progress).result()
+    options = options or RoaOptions()
+    with _threads_for(network), sole_writer(out), _runner_for(options) as runner:
+        return _Run(system, network, out, options, runner, load_seconds, provenance or {}, progress).result()
+
+
+@contextmanager
+def _runner_for(options: RoaOptions) -> Iterator[Runner]:
+    """Where boxes are bounded."""
+    if options.cluster is not None:
+        from certify.running.cluster import ClusterRunner, connect
+
+        with connect(options.cluster) as client:
+            yield ClusterRunner(client)
+        return
+    import torch
+
+    from certify.running import ThreadRunner
+
+    yield ThreadRunner(torch.device(options.device))
 
 
 @contextmanager
@@ -142,6 +163,7 @@ class _Run:
     network: TanhNetwork
     out: Path
     options: RoaOptions
+    runner: Runner
     load: float
     provenance: Mapping[str, Any]
     progress: Report | None
@@ -160,6 +182,8 @@ class _Run:
         result = replace(result, seconds={"load": self.load, **self.seconds, "total": self.spent})
         notices = [text for text in (self.aside, result.notice) if text is not None]
         result = replace(result, notice="; ".join(notices) or None)
+        search = self.out / _SEARCH_FILE
+        result = replace(result, search=search if search.exists() else None)
         return replace(result, diagnosis=diagnose(result, self.options, self.proof))
 
     @property
@@ -208,7 +232,11 @@ class _Run:
         elif self.aside is not None and not self.system.in_steps:
             with self._stage("candidate"):
                 result = replace(result, rest=find_rest(loop))
-        if options.P is None and options.only is None:
+        if not options.resume:
+            (self.out / _SEARCH_FILE).unlink(missing_ok=True)
+        if options.resume:
+            race = self._resumed(loop, kind)
+        elif options.P is None and options.only is None:
             race = self._race(loop)
         else:
             with self._stage("candidate"):
@@ -339,12 +367,9 @@ class _Run:
             from certify.engines.dreal.proof import DrealEngine
 
             return DrealEngine(trial.T, self.options.dreal_precision, self.options.jobs).begin(trial.task)
-        import torch
-
         from certify.engines.bounds.engine import BoundsEngine
-        from certify.running import ThreadRunner
 
-        return BoundsEngine(trial.T, ThreadRunner(torch.device(self.options.device))).begin(trial.task)
+        return BoundsEngine(trial.T, self.runner).begin(trial.task)
 
     def _finish(self, race: Race) -> None:
         """What is left of the time for the best contender, less what the check of its proof will take."""
@@ -361,7 +386,46 @@ class _Run:
         if winner.attempt.done or not winner.attempt.gained or not self.interruptible:
             return
         each = self._seconds_of_a_leaf(winner)
-        winner.advance(Budget(self._within(math.inf), boxes, check=_CAUTION * each), report)
+        with self._kept(winner) as keep:
+            winner.advance(Budget(self._within(math.inf), boxes, check=_CAUTION * each), keep)
+
+    @contextmanager
+    def _kept(self, contender: Contender) -> Iterator[Callable[[Progress], None]]:
+        """Keep the search in a file now and then, and at the end if it is not done; gives who reports on the way."""
+        path, last = self.out / _SEARCH_FILE, time.monotonic()
+
+        def keep() -> None:
+            state = contender.attempt.state()
+            if state is not None:
+                save(path, Unfinished(contender.trial, state))
+
+        def report(progress: Progress) -> None:
+            nonlocal last
+            if time.monotonic() - last > _SAVING:
+                keep()
+                last = time.monotonic()
+            self._report(progress)
+
+        try:
+            yield report
+        finally:
+            if contender.attempt.done:
+                path.unlink(missing_ok=True)
+            else:
+                keep()
+
+    def _resumed(self, loop: ClosedLoop, kind: Kind) -> Race:
+        """A race of the one contender whose search an earlier run has left."""
+        if kind != "asymptotic":
+            raise InputError("a search for a practical claim cannot be gone on with; run without --resume.")
+        found = load(self.out / _SEARCH_FILE, loop, self.options.rate)
+        with self._stage("candidate"):
+            race = self._contest()
+            attempt = self._begin(found.trial)
+            attempt.restore(found.state)
+            race.contenders.append(Contender(found.trial, attempt))
+            race.contenders[0].advance(Budget(1e-3, self.options.max_boxes), race.report)
+        return race
 
     def _within(self, seconds: float) -> float:
         return max(1e-3, min(seconds, self.left()))
@@ -552,22 +616,19 @@ class _Run:
     def _beyond(self, trial: Trial, claim: Claim) -> OuterProof | None:
         """The largest set of another function that is proved to lead into {V <= c2} in the time that is left; None, and
         `aside` says why, if there is none."""
-        import torch
-
         from certify.engines.outer import prove_outer
-        from certify.running import ThreadRunner
 
         self.share = 1.0
         function = self.options.lyapunov or self._learned(trial, claim)
         if function.n != self.system.n:
             raise InputError(f"`lyapunov` must be a function of {self.system.n} states; found one of {function.n}.")
         N = of_polynomial(function, self.system.states) if isinstance(function, Polynomial) else function
-        level, runner = self.options.lyapunov_level, ThreadRunner(torch.device(self.options.device))
+        level = self.options.lyapunov_level
         report = None if self.progress is None else partial(self._report, stage="outer")
         with self._stage("outer"):
             self._tell("outer")
             budget = Budget(max(1e-3, _FOR_SEARCH * self.left()), self.options.max_boxes)
-            found = prove_outer(trial.task.problem, claim.roa, trial.T, N, level, budget, runner, report)
+            found = prove_outer(trial.task.problem, claim.roa, trial.T, N, level, budget, self.runner, report)
         if found is None:
             self.aside = "no set of the function `lyapunov` is proved to lead into the ellipsoid"
         return found

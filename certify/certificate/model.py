@@ -211,33 +211,40 @@ class Certificate:
                 "outer": None if self.claim.outer is None else _outer(self.claim.outer),
             }
             | _start(self.claim),
-            "plant": {
-                "name": system.name,
-                "time": system.time,
-                "states": [s.name for s in system.states],
-                "inputs": [s.name for s in system.inputs],
-                "uncertain": [{"name": s.name, "range": [str(lo), str(hi)]} for s, (lo, hi) in system.uncertain],
-                "dynamics": [to_tree(e) for e in system.uncertain_dynamics()],
-                "u_eq": [str(u) for u in system.exact_u_eq()],
-                "domain": [[str(lo), str(hi)] for lo, hi in system.domain],
-                "input_bounds": [[str(lo), str(hi)] for lo, hi in system.input_bounds],
-            },
-            "policy": {
-                "layers": _layers(network.weights, network.biases),
-                "squash": network.squash,
-                "centre": network.centre,
-                "scale": _encode(network.scale),
-                "offset": _encode(network.offset),
-                "clip": None if network.clip is None else [_encode(end) for end in network.clip],
-                "sha256": network.sha256(),
-            },
-            "lyapunov": {"kind": "quadratic", "P": _encode(self.V.P)},
+            **loop_sections(system, network),
+            "lyapunov": {"kind": "quadratic", "P": encode(self.V.P)},
             "levels": {name: float(level).hex() for name, level in self.claim.levels.items()},
             "evidence": _evidence(self.evidence),
             "provenance": {k: str(v) for k, v in self.provenance.items()} | _for_people(system),
         }
         lines = [f"{json.dumps(k)}: {json.dumps(v)}" for k, v in sections.items()]
         return "{\n" + ",\n".join(lines) + "\n}\n"
+
+
+def loop_sections(system: System, network: TanhNetwork) -> dict[str, Any]:
+    """The file's sections `plant` and `policy`."""
+    return {
+        "plant": {
+            "name": system.name,
+            "time": system.time,
+            "states": [s.name for s in system.states],
+            "inputs": [s.name for s in system.inputs],
+            "uncertain": [{"name": s.name, "range": [str(lo), str(hi)]} for s, (lo, hi) in system.uncertain],
+            "dynamics": [to_tree(e) for e in system.uncertain_dynamics()],
+            "u_eq": [str(u) for u in system.exact_u_eq()],
+            "domain": [[str(lo), str(hi)] for lo, hi in system.domain],
+            "input_bounds": [[str(lo), str(hi)] for lo, hi in system.input_bounds],
+        },
+        "policy": {
+            "layers": _layers(network.weights, network.biases),
+            "squash": network.squash,
+            "centre": network.centre,
+            "scale": encode(network.scale),
+            "offset": encode(network.offset),
+            "clip": None if network.clip is None else [encode(end) for end in network.clip],
+            "sha256": network.sha256(),
+        },
+    }
 
 
 def read_raw(path: Path) -> bytes:
@@ -310,8 +317,8 @@ def parse_certificate(raw: bytes, name: str) -> Certificate:
         )
         network = TanhNetwork(
             *_read_layers(policy["layers"]),
-            scale=_decode(policy["scale"], (m,)),
-            offset=_decode(policy["offset"], (m,)),
+            scale=decode(policy["scale"], (m,)),
+            offset=decode(policy["offset"], (m,)),
             squash=policy["squash"],
             centre=policy["centre"],
             clip=_read_clip(policy["clip"], m),
@@ -319,7 +326,7 @@ def parse_certificate(raw: bytes, name: str) -> Certificate:
         return Certificate(
             system=system,
             network=network,
-            V=Quadratic(_decode(data["lyapunov"]["P"], (n, n))),
+            V=Quadratic(decode(data["lyapunov"]["P"], (n, n))),
             claim=_read_claim(data, states),
             evidence=_read_evidence(evidence, n),
             provenance=provenance,
@@ -338,9 +345,9 @@ def _read_claim(data: Mapping[str, Any], states: tuple[sympy.Symbol, ...]) -> Cl
     if outer is not None:
         return replace(CLAIMS[kind](**levels), outer=_read_outer(outer, states))
     if kind == Enlarged.kind:
-        return Enlarged(**levels, start=Quadratic(_decode(data["claim"]["start"], (n, n))))
+        return Enlarged(**levels, start=Quadratic(decode(data["claim"]["start"], (n, n))))
     if kind == Reached.kind:
-        start, centre = _decode(data["claim"]["start"], (n, n)), _decode(data["claim"]["centre"], (n,))
+        start, centre = decode(data["claim"]["start"], (n, n)), decode(data["claim"]["centre"], (n,))
         return Reached(**levels, start=Quadratic(start), centre=tuple(centre.tolist()))
     return CLAIMS[kind](**levels)
 
@@ -363,13 +370,13 @@ def _read_outer(data: Mapping[str, Any], states: tuple[sympy.Symbol, ...]) -> Ou
 
 def _layers(weights: Sequence[Array], biases: Sequence[Array]) -> list[dict[str, Any]]:
     return [
-        {"shape": list(W.shape), "weight": _encode(W), "bias": _encode(b)} for W, b in zip(weights, biases, strict=True)
+        {"shape": list(W.shape), "weight": encode(W), "bias": encode(b)} for W, b in zip(weights, biases, strict=True)
     ]
 
 
 def _read_layers(layers: Sequence[Mapping[str, Any]]) -> tuple[tuple[Array, ...], tuple[Array, ...]]:
-    weights = tuple(_decode(x["weight"], tuple(x["shape"])) for x in layers)
-    return weights, tuple(_decode(x["bias"], (x["shape"][0],)) for x in layers)
+    weights = tuple(decode(x["weight"], tuple(x["shape"])) for x in layers)
+    return weights, tuple(decode(x["bias"], (x["shape"][0],)) for x in layers)
 
 
 def _nominal(interval: Interval, said: str | None) -> Fraction:
@@ -423,15 +430,15 @@ def _evidence(evidence: PartitionTree | TrustedSolver) -> dict[str, Any]:
     if isinstance(evidence, PartitionTree):
         return {
             "kind": "partition-tree",
-            "T": _encode(evidence.T),
-            "root": _encode(evidence.root),
+            "T": encode(evidence.T),
+            "root": encode(evidence.root),
             "tree": base64.b64encode(evidence.tree).decode("ascii"),
             "cells": list(evidence.cells),
             "order": evidence.order,
             "local": None if evidence.local is None else _local(evidence.local),
             "contraction": None if evidence.contraction is None else _contraction(evidence.contraction),
             "tube": [
-                {"middle": _encode(slab.middle), "end": _encode(slab.end), "duration": float(slab.duration).hex()}
+                {"middle": encode(slab.middle), "end": encode(slab.end), "duration": float(slab.duration).hex()}
                 | _ball(slab)
                 | {"path": None if slab.path is None else _path(slab.path)}
                 for slab in evidence.tube
@@ -449,16 +456,16 @@ def _evidence(evidence: PartitionTree | TrustedSolver) -> dict[str, Any]:
 
 def _read_evidence(data: Mapping[str, Any], n: int) -> PartitionTree | TrustedSolver:
     if data["kind"] == "partition-tree":
-        root, local = _decode(data["root"], (n,)), data["local"]
+        root, local = decode(data["root"], (n,)), data["local"]
         return PartitionTree(
-            _decode(data["T"], (n, n)),
+            decode(data["T"], (n, n)),
             root,
             base64.b64decode(data["tree"]),
             None if local is None else _read_local(local, n),
             tuple(
                 Slab(
-                    _decode(slab["middle"], (n, n)),
-                    _decode(slab["end"], (n, n)),
+                    decode(slab["middle"], (n, n)),
+                    decode(slab["end"], (n, n)),
                     float.fromhex(slab["duration"]),
                     *_read_ball(slab, n, n + (slab["path"] is not None)),
                     None if slab["path"] is None else _read_path(slab["path"], n),
@@ -476,24 +483,24 @@ def _read_evidence(data: Mapping[str, Any], n: int) -> PartitionTree | TrustedSo
 
 def _outer_tree(evidence: OuterTree) -> dict[str, Any]:
     tree, *faces = (base64.b64encode(nodes).decode("ascii") for nodes in (evidence.tree, *evidence.faces))
-    return {"T": _encode(evidence.T), "root": _encode(evidence.root), "tree": tree, "faces": faces}
+    return {"T": encode(evidence.T), "root": encode(evidence.root), "tree": tree, "faces": faces}
 
 
 def _read_outer_tree(data: Mapping[str, Any], n: int) -> OuterTree:
     tree, *faces = (base64.b64decode(nodes) for nodes in (data["tree"], *data["faces"]))
-    return OuterTree(_decode(data["T"], (n, n)), _decode(data["root"], (n,)), tree, tuple(faces))
+    return OuterTree(decode(data["T"], (n, n)), decode(data["root"], (n,)), tree, tuple(faces))
 
 
 def _ball(evidence: LocalBall | Slab) -> dict[str, str]:
-    return {name: _encode(getattr(evidence, name)) for name in _OF_A_BALL}
+    return {name: encode(getattr(evidence, name)) for name in _OF_A_BALL}
 
 
 def _contraction(ball: Contraction) -> dict[str, str]:
-    return {name: _encode(getattr(ball, name)) for name in ("J", "weights", "weight")}
+    return {name: encode(getattr(ball, name)) for name in ("J", "weights", "weight")}
 
 
 def _read_contraction(data: Mapping[str, str], n: int) -> Contraction:
-    return Contraction(_decode(data["J"], (n, n)), _decode(data["weights"], (n,)), _decode(data["weight"], (n, n)))
+    return Contraction(decode(data["J"], (n, n)), decode(data["weights"], (n,)), decode(data["weight"], (n, n)))
 
 
 def _local(ball: LocalBall) -> dict[str, Any]:
@@ -507,34 +514,34 @@ def _read_local(data: Mapping[str, Any], n: int) -> LocalBall:
 def _read_ball(data: Mapping[str, str], n: int, k: int) -> tuple[Array, Array, Array]:
     """k is how many entries d has."""
     J, multipliers, weight = (data[name] for name in _OF_A_BALL)
-    return _decode(J, (n, n)), _decode(multipliers, (3, n)), _decode(weight, (k, k))
+    return decode(J, (n, n)), decode(multipliers, (3, n)), decode(weight, (k, k))
 
 
 def _path(path: Waypoint) -> dict[str, str]:
     numbers = {name: float(getattr(path, name)).hex() for name in _OF_A_PATH}
-    return {"centre": _encode(path.centre), **numbers}
+    return {"centre": encode(path.centre), **numbers}
 
 
 def _read_path(data: Mapping[str, str], n: int) -> Waypoint:
-    return Waypoint(_decode(data["centre"], (n,)), *(float.fromhex(data[name]) for name in _OF_A_PATH))
+    return Waypoint(decode(data["centre"], (n,)), *(float.fromhex(data[name]) for name in _OF_A_PATH))
 
 
 def _start(claim: Claim) -> dict[str, str]:
     if isinstance(claim, Reached):
-        return {"start": _encode(claim.start.P), "centre": _encode(np.array(claim.centre))}
-    return {"start": _encode(claim.start.P)} if isinstance(claim, Enlarged) else {}
+        return {"start": encode(claim.start.P), "centre": encode(np.array(claim.centre))}
+    return {"start": encode(claim.start.P)} if isinstance(claim, Enlarged) else {}
 
 
 def _read_clip(data: Any, m: int) -> tuple[Array, Array] | None:
     if data is None:
         return None
     lo, hi = data
-    return _decode(lo, (m,)), _decode(hi, (m,))
+    return decode(lo, (m,)), decode(hi, (m,))
 
 
-def _encode(array: Array) -> str:
+def encode(array: Array) -> str:
     return base64.b64encode(np.ascontiguousarray(array, dtype="<f8").tobytes()).decode("ascii")
 
 
-def _decode(text: str, shape: tuple[int, ...]) -> Array:
+def decode(text: str, shape: tuple[int, ...]) -> Array:
     return np.frombuffer(base64.b64decode(text), dtype="<f8").reshape(shape).astype(np.float64)

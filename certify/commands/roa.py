@@ -79,6 +79,16 @@ def roa(
     precision: Annotated[float, typer.Option(help="dReal's delta.")] = 1e-3,
     jobs: Annotated[int, typer.Option(help="dReal's threads.")] = 1,
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
+    cluster: Annotated[
+        str | None,
+        typer.Option(
+            help="Have boxes grown by the workers of a Dask cluster: local:N for N processes of this machine, or a "
+            "scheduler's address, such as tcp://host:8786."
+        ),
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with the search that an earlier run left in the folder.")
+    ] = False,
     enlarge: Annotated[
         bool, typer.Option("--enlarge", help="Look for a tube that leads from a larger set into the proved one.")
     ] = False,
@@ -115,7 +125,7 @@ def roa(
     from certify.options import RoaOptions
 
     start = time.perf_counter()
-    largest = _largest(sample_time, rate)
+    largest = _largest(sample_time, rate, resume)
     stored = policy_of(policy, importing, system, param or [])
     plant = plant_of(
         stored,
@@ -140,6 +150,8 @@ def roa(
         dreal_precision=precision,
         jobs=jobs,
         device=_device(device),
+        cluster=cluster,
+        resume=resume,
         enlarge=enlarge,
         box=widths(box, "--box"),
         time_limit=time_limit,
@@ -155,8 +167,10 @@ def roa(
     certified(context, policy, stored, plant, options, out, start, quiet, as_json, asked, largest)
 
 
-def _largest(sample_time: str | None, rate: str) -> Quantity | None:
+def _largest(sample_time: str | None, rate: str, resume: bool) -> Quantity | None:
     """What is to be as large as can be proved, if anything is."""
+    if resume and (sample_time == _MOST or rate == _MOST):
+        raise InputError("--resume goes on with one search; ask for a period or a rate in the place of max.")
     if sample_time == _MOST and rate != "0":
         raise InputError("--sample-time max must stand without --rate; found both. Ask for one of them at a time.")
     return "period" if sample_time == _MOST else "rate" if rate == _MOST else None

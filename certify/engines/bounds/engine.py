@@ -210,4 +210,5 @@ class _Outwards:
         else:
             ring = self.ring.proof(self.stop)
         claim = Asymptotic(roa=ring.outer, local=self.inner, rate=self.task.problem.rate)
-        return self.engine.stated(self.task.problem, ring, claim, dict(self.seconds))
+        lost = "" if self.ring is None else self.ring.lost
+        return replace(self.engine.stated(self.task.problem, ring, claim, dict(self.seconds)), detail=lost)
