@@ -81,6 +81,15 @@ ROWS = (
         "0.01 <= V <= 0.989, alpha,beta-CROWN 76,443 s on a GPU, dReal timed out",
         {"l": "1"},
     ),
+    Row(
+        "2dquadrotor_seed_0",
+        "quadrotor2d",
+        {"x": "12", "y": "13.2", "theta": "12", "x_dot": "19.2", "y_dot": "20.4", "theta_dot": "88.8"},
+        "6",
+        "verified on a GPU with 32 GB",
+        {},
+        "relu-tanh",
+    ),
 )
 
 
@@ -112,6 +121,8 @@ def run(row: Row, folder: Path, out: Path, limit: float) -> RoaResult | None:
     stages = ", ".join(f"{name} {s:.2f}" for name, s in result.seconds.items())
     print(f"  seconds    {stages}")
     print(f"  ellipsoid  {result.volume:.6g}" if result.volume is not None else "  ellipsoid  none")
+    if result.outer is None:
+        print(f"  set        none beyond it: {result.notice}")
     if result.outer is not None:
         o = result.outer
         print(f"  set        N <= {o.level:.8g}, V = {1 / (1 + math.exp(-o.level)):.6f}, ended by {o.limit}")

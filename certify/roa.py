@@ -616,7 +616,7 @@ class _Run:
     def _beyond(self, trial: Trial, claim: Claim) -> OuterProof | None:
         """The largest set of another function that is proved to lead into {V <= c2} in the time that is left; None, and
         `aside` says why, if there is none."""
-        from certify.engines.outer import prove_outer
+        from certify.engines.outer import Nothing, prove_outer
 
         self.share = 1.0
         function = self.options.lyapunov or self._learned(trial, claim)
@@ -629,8 +629,9 @@ class _Run:
             self._tell("outer")
             budget = Budget(max(1e-3, _FOR_SEARCH * self.left()), self.options.max_boxes)
             found = prove_outer(trial.task.problem, claim.roa, trial.T, N, level, budget, self.runner, report)
-        if found is None:
-            self.aside = "no set of the function `lyapunov` is proved to lead into the ellipsoid"
+        if isinstance(found, Nothing):
+            self.aside = f"no set of the function `lyapunov` is proved to lead into the ellipsoid: {found.why}"
+            return None
         return found
 
     def _clerk(self) -> Clerk:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -20,7 +21,7 @@ from certify.closed_loop import ClosedLoop
 from certify.enclosures import NeuralEnclosure, SymbolicEnclosure, Taylor, upper_bound
 from certify.engines.base import Budget, Progress, Task
 from certify.engines.bounds.engine import BoundsEngine
-from certify.engines.outer import OuterProof, prove_outer, split_again, split_face_again
+from certify.engines.outer import Nothing, OuterProof, prove_outer, split_again, split_face_again
 from certify.engines.outer.falsify import Falsifier
 from certify.engines.outer.rule import FaceBound, FallBound
 from certify.errors import InputError
@@ -81,10 +82,15 @@ def planar(system: System | None = None) -> Problem:
     return Problem(ClosedLoop(plane() if system is None else system, minus_y()), Quadratic(np.eye(2)))
 
 
-def prove(problem: Problem, N: Neural | Symbolic, level: float | None = None, **more: Any) -> OuterProof | None:
+def attempt(problem: Problem, N: Neural | Symbolic, level: float | None = None, **more: Any) -> OuterProof | Nothing:
     n = problem.loop.system.n
     T = more.pop("T", np.eye(n))
     return prove_outer(problem, more.pop("c2", 0.25), T, N, level, Budget(**more), RUNNER)
+
+
+def prove(problem: Problem, N: Neural | Symbolic, level: float | None = None, **more: Any) -> OuterProof | None:
+    found = attempt(problem, N, level, **more)
+    return found if isinstance(found, OuterProof) else None
 
 
 def rises(problem: Problem, c2: float, N: Neural | Symbolic, level: float, count: int = 200_000) -> np.ndarray:
@@ -383,11 +389,26 @@ def test_no_time_proves_nothing() -> None:
     assert prove(planar(), wells([[1.0, 0.0], [0.0, 1.0]], 0.75), seconds=1e-9) is None
 
 
+@pytest.mark.parametrize(
+    ("N", "more", "why"),
+    [
+        (Symbolic(X**2 + Y**2, (X, Y)), {"c2": 99.0}, "every sampled state of the domain lies in the ellipsoid"),
+        (Symbolic(X**2 + Y**2, (X, Y)), {"level": 0.1}, "the level that was asked for, 0.1, is not above the least"),
+        (Symbolic(-(X**2) - Y**2, (X, Y)), {}, "N somewhere on the faces, .*, is not above the least"),
+        (wells([[1.0, 0.0], [0.0, 1.0]], 0.75), {"seconds": 1e-9}, "where x = -2; the time for that ended"),
+        (Symbolic(X**2 + Y**2 - 3 * X * Y, (X, Y)), {"c2": 0.01}, "not above|smaller level"),
+    ],
+)
+def test_why_nothing_is_proved_is_said(N: Neural | Symbolic, more: dict[str, Any], why: str) -> None:
+    found = attempt(planar(), N, **more)
+    assert isinstance(found, Nothing) and re.search(why, found.why), found
+
+
 def test_progress_is_told() -> None:
     told: list[Progress] = []
     N = wells([[1.0, 0.0], [0.0, 1.0]], 0.75)
     found = prove_outer(planar(), 0.25, np.eye(2), N, None, Budget(batch=16), RUNNER, told.append)
-    assert found is not None and told[-1].open == 0 and told[-1].proved == pytest.approx(1.0)
+    assert isinstance(found, OuterProof) and told[-1].open == 0 and told[-1].proved == pytest.approx(1.0)
     for numbers in ([p.proved for p in told], [p.level for p in told]):
         assert numbers == sorted(numbers)
     assert all(p.level <= p.target for p in told)

@@ -4,6 +4,6 @@ from __future__ import annotations
 
 from certify.engines.outer.falsify import Rise
 from certify.engines.outer.mend import split_again, split_face_again
-from certify.engines.outer.prove import OuterProof, prove_outer
+from certify.engines.outer.prove import Nothing, OuterProof, prove_outer
 
-__all__ = ["OuterProof", "Rise", "prove_outer", "split_again", "split_face_again"]
+__all__ = ["Nothing", "OuterProof", "Rise", "prove_outer", "split_again", "split_face_again"]

@@ -51,6 +51,13 @@ class OuterProof:
     seconds: dict[str, float]
 
 
+@dataclass(frozen=True, slots=True)
+class Nothing:
+    """That nothing beyond {V <= c2} is proved, and `why`."""
+
+    why: str
+
+
 def prove_outer(
     problem: Problem,
     c2: float,
@@ -60,7 +67,7 @@ def prove_outer(
     budget: Budget,
     runner: Runner,
     report: Report | None = None,
-) -> OuterProof | None:
+) -> OuterProof | Nothing:
     """Prove that N falls in the domain wherever N <= n2 and V >= c2, for the largest n2 up to `level`.
 
     Parameters
@@ -72,7 +79,7 @@ def prove_outer(
 
     Returns
     -------
-    OuterProof, or None where nothing beyond {V <= c2} is proved.
+    OuterProof, or Nothing where nothing beyond {V <= c2} is proved.
 
     Raises
     ------
@@ -83,10 +90,11 @@ def prove_outer(
     search = Falsifier(problem, c2, T, function)
     floor = search.least_value()
     if not math.isfinite(floor):
-        return None
+        return Nothing("every sampled state of the domain lies in the ellipsoid")
     top = min(search.lowest_on_faces(), math.inf if level is None else level)
     if not top > floor:
-        return None
+        what = "the level that was asked for" if level is not None and top == level else "N somewhere on the faces"
+        return Nothing(f"{what}, {top:.6g}, is not above the least value of N that was sampled beyond it, {floor:.6g}")
     stop = Stop.DOMAIN if level is None or top < level else Stop.REQUESTED
     span = top - floor
     top = level if stop is Stop.REQUESTED and level is not None else top - _BESIDE_FACE * span
@@ -97,8 +105,8 @@ def prove_outer(
 
     share = replace(budget, seconds=_FOR_FACES * budget.seconds)
     found = _faces(problem, function, top, floor, share, runner)
-    if found is None:
-        return None
+    if isinstance(found, Nothing):
+        return found
     boxes, faces, on_faces, stopped = found
     if on_faces < top:
         top, stop = on_faces, stopped
@@ -117,12 +125,12 @@ def prove_outer(
     cover = Cover(rule, -root, root, runner, top, floor, _BESIDE_RISE * span, deepen)
     stopped = cover.advance(left, report)
     if not cover.level > floor:
-        return None
+        return Nothing(f"{cover.boxes:,} boxes did not show that N falls at any level; {_ended_by(stopped)}")
     if cover.level < top:
         stop = stopped
     if cover.level < top - _AGAIN * span:
         again = _faces(problem, function, cover.level, floor, share, runner)
-        if again is not None and again[2] == cover.level:
+        if not isinstance(again, Nothing) and again[2] == cover.level:
             boxes, faces = boxes + again[0], again[1]
     seconds["leaves"] = time.monotonic() - start - seconds["falsify"] - seconds["faces"]
     tree = cover.tree()
@@ -155,7 +163,7 @@ def face_box(system: System, axis: int, side: int) -> tuple[Array, Array]:
 
 def _faces(
     problem: Problem, function: Neural | Symbolic, level: float, floor: float, budget: Budget, runner: Runner
-) -> tuple[int, tuple[bytes, ...], float, Stop] | None:
+) -> tuple[int, tuple[bytes, ...], float, Stop] | Nothing:
     """Boxes, trees of all faces, the level below which N is on none of them, and what limits it."""
     system, start = problem.loop.system, time.monotonic()
     trees: list[bytes] = []
@@ -169,11 +177,21 @@ def _faces(
             ended = cover.advance(replace(budget, seconds=left, check=0.0))
             boxes += cover.boxes
             if not cover.level > floor:
-                return None
+                where = f"{system.states[axis]} = {float(system.domain[axis][side]):g}"
+                return Nothing(
+                    f"{cover.boxes:,} boxes did not show that N is above any level where {where}; {_ended_by(ended)}"
+                )
             if cover.level < level:
                 level, stop = cover.level, Stop.DOMAIN if ended is Stop.WITNESS else ended
             trees.append(cover.tree())
     return boxes, tuple(trees), level, stop
+
+
+def _ended_by(stop: Stop) -> str:
+    """What ended a pass that proved nothing, and what may help."""
+    if stop is Stop.TIME:
+        return "the time for that ended: more of it, or a cluster, may do"
+    return "a smaller level, or another function, is needed" if stop is Stop.WITNESS else f"it ended by {stop.value}"
 
 
 def _outwards(value: float, exact: Fraction, towards: float) -> float:
