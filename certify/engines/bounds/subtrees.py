@@ -33,11 +33,23 @@ Array = NDArray[np.float64]
 _MAGIC = b"subtree1"
 _JOB = struct.Struct("<8sQQQdddd")  # n, boxes, batch; inner and outer level, seconds, relative least width
 _ANSWER = struct.Struct("<8sQQQQ")  # boxes bounded, boxes proved, bytes of the trees, open leaves
-_TURN = 2.0  # seconds of a job
 _QUEUE = 2  # jobs a place, so that none waits for the next
-_FEW = 16  # boxes a place, below which growing them elsewhere is not worth a message
-_LEAST = 16  # boxes of a job, if there are as many
+_LEAST = 256  # boxes of a job, if there are as many
+_FEW, _ENOUGH = 32, 2048  # boxes a place, or in all, from which on growing them elsewhere is worth a message
+_TURN, _EACH = (0.25, 4.0), 8e-3  # seconds of a job, the shortest and the longest, and between them for each place
 _POLL = 0.25  # seconds
+
+
+def turn(places: int) -> float:
+    """Seconds of a job: those of many places are longer, so that whoever gives them keeps up, at some milliseconds
+    each."""
+    shortest, longest = _TURN
+    return min(longest, max(shortest, _EACH * places))
+
+
+def enough(places: int) -> int:
+    """Boxes from which on growing them elsewhere is worth a message."""
+    return min(_FEW * places, _ENOUGH)
 
 
 class Growth(ABC):
@@ -183,17 +195,20 @@ class Abroad:
         places = self.jobs.places
         if not places:
             self.recall(frontier)
-        return places > 0 and (bool(self._held) or len(frontier) >= _FEW * places)
+        return places > 0 and (bool(self._held) or len(frontier) >= enough(places))
 
     def send(self, levels: tuple[float, float], frontier: Frontier, limit: float, seconds: float) -> None:
         """Share out boxes with keys up to about `limit`, until all places are busy, in jobs that end well within so
         many seconds."""
-        most = _QUEUE * self.jobs.places
+        places = self.jobs.places
+        most = _QUEUE * places
         while len(self._held) < most and len(frontier):
             count = min(self.batch, max(_LEAST, len(frontier) // most))
             boxes = frontier.take(count, limit)
             n, count = boxes.lo.shape
-            head = _JOB.pack(_MAGIC, n, count, self.batch, *levels, min(_TURN, seconds / _QUEUE), self.least_width)
+            head = _JOB.pack(
+                _MAGIC, n, count, self.batch, *levels, min(turn(places), seconds / _QUEUE), self.least_width
+            )
             job = head + b"".join(a.cpu().numpy().tobytes() for a in (boxes.lo, boxes.hi, boxes.key))
             self._held[self.jobs.give(job)] = boxes, job
 
