@@ -19,7 +19,7 @@ from .flow import later
 from .network import enclose_on_boxes
 from .taylor import Taylor, affine, upper_bound
 
-_BATCH_NUMBERS = 4_000_000  # in the largest array of a batch
+_BATCH_NUMBERS = 800_000  # in the largest array of a batch: more would not stay in a cache
 _ATTEMPTS = 4  # at the a-priori enclosure
 
 
