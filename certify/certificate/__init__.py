@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from certify.certificate.checking import run_checker
+from certify.certificate.checking import join_parts, run_checker, run_part
 from certify.certificate.limits import require_short, require_within_limits
 from certify.certificate.model import (
     Certificate,
@@ -34,6 +34,7 @@ __all__ = [
     "Waypoint",
     "decode",
     "encode",
+    "join_parts",
     "leaves",
     "loop_sections",
     "parse_certificate",
@@ -42,6 +43,7 @@ __all__ = [
     "require_short",
     "require_within_limits",
     "run_checker",
+    "run_part",
     "sole_writer",
     "write_atomically",
     "write_beside",

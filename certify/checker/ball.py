@@ -208,7 +208,7 @@ def enclose_on_ball(net: Folded, states: Sequence[Jet]) -> Jet:
     H, C, R = np.zeros((0, k, k)), np.zeros((0, len(triples(k)[0]))), np.zeros((0, k, k))
     sizes = steep = lips = np.zeros(0)
     for number, layer in enumerate(net.layers):
-        y, rounding = layer.affine(y)
+        y, rounding = layer.affine(y, np.abs(y[:, 0]))
         error = up(layer.widest(error) + rounding)
         width = layer.W.shape[1]
         doubt = up(layer.norm2 * doubt + gamma(width) * (frobenius(layer.W) * norm(X, 0)))

@@ -15,6 +15,7 @@ from .case import Case, Failures
 from .exact import fraction
 from .expression import evaluate
 from .float64 import EPS, Array, float_with_error, gamma, norm, total, up, within
+from .parts import Batch
 from .taylor import Taylor, affine, constant, upper_bound
 
 LEAF = 255
@@ -167,7 +168,7 @@ def is_whole(tree: bytes, axes: Sequence[int], where: str = "") -> Failures:
     return tree.count(LEAF)
 
 
-def batches(tree: bytes, lo: Array, hi: Array, size: int) -> Iterator[tuple[int, Array, Array]]:
+def batches(tree: bytes, lo: Array, hi: Array, size: int) -> Iterator[Batch]:
     """The leaves of a tree over the box lo, hi (n,), in preorder: the number of the first of each batch, and their
     corners (n, B)."""
     first, leaves = 0, _walk(tree, lo.tolist(), hi.tolist())

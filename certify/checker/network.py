@@ -7,13 +7,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from fractions import Fraction
+from functools import cached_property
 
 import numpy as np
 
 from .document import Policy
 from .float64 import EPS, Array, atanh_with_error, ends, float_with_error, gamma, norm, spectral_norm, tanh, total, up
-
-_SLOPE_ERROR = 2.0**-46  # of 1 - t^2 - s, computed from t = tanh(y) within 2^-47.5
 
 
 @dataclass(frozen=True)
@@ -25,15 +24,21 @@ class Layer:
     b_error: Array
     norm2: float
 
-    def affine(self, h: Array) -> tuple[Array, Array]:
+    @cached_property
+    def rows(self) -> Array:
+        """Upper bounds of the rows' 2-norms, (rows, 1)."""
+        return norm(self.W, 1)[:, None]
+
+    def affine(self, h: Array, size: Array) -> tuple[Array, Array]:
         """(y, rounding): W h (width, k, B) with b added to its first column, and for each row the error made.
 
-        With |d_j| <= 1, `rounding` (rows, B) bounds the errors of the affine form y_0 + sum_j y_j d_j.
+        With |d_j| <= 1, `rounding` (rows, B) bounds the errors of the affine form y_0 + sum_j y_j d_j: those of its
+        products are at most gamma sum_l |W_il| sum_j |h_lj|, and `size` (width, B) is not below the inner sum.
         """
         rows, width = self.W.shape
         y = np.matmul(self.W, h.reshape(width, -1)).reshape(rows, *h.shape[1:])
         y[:, 0] += self.b[:, None]
-        made = gamma(width) * (norm(self.W, 1)[:, None] * total(norm(h, 0), 0))
+        made = gamma(width) * (self.rows * norm(size, 0))
         return y, up(made + EPS * (np.abs(y[:, 0]) + np.abs(self.b)[:, None]) + self.b_error[:, None])
 
     def widest(self, error: Array) -> Array:
@@ -91,33 +96,37 @@ def _at_origin(net: Folded) -> tuple[Array, Array]:
 def relax_tanh(centre: Array, radius: Array) -> tuple[Array, Array, Array]:
     """Parallel lines around tanh: (s, m, gap) with |tanh(y) - s y - m| <= gap for all |y - centre| <= radius.
 
-    The slope s is *any* number in [0, 1] (here near the chord's). With D(y) = tanh(y) - s y: on y >= 0 tanh is
-    concave, so D lies below its tangent at any point p >= 0; on y <= 0 D is convex, so it is largest at an end. Hence
-    sup D <= max(D(lo), D(hi), and if hi > 0 the tangent's larger end over [max(lo, 0), hi]). D is odd, so inf D
-    over [lo, hi] is -sup D over [-hi, -lo]. p should be near the critical point, but nothing depends on that.
+    The slope s is *any* number in [0, 1] (here near the chord's). D(y) = tanh(y) - s y is odd: what is shown of
+    [lo, hi] around |centre|, where hi > 0 and |lo| <= hi, holds around -|centre| with the signs changed. On y >= 0
+    tanh is concave, so D lies below its tangent at any p >= 0 and is least at an end; on y <= 0 it is convex, so D is
+    largest at an end. Hence sup D is at most D(lo) or the larger end of the tangent over [max(lo, 0), hi]. And inf D
+    is at least D(hi) or, if lo >= 0, D(lo), else, as D is odd, minus the larger end over [0, -lo] of the tangent at any
+    p >= 0 (at 0 the tangent is not below D(0) = 0). p should be the critical point, or the end that is nearest to it,
+    but nothing depends on that.
+
+    Roundings, with |y| <= hi and so |t| <= t_hi (1 + 14u): `t - s y` is within 9u t_hi + 3u s hi, and `excess` within
+    18u (7u of t twice, and three roundings); the product with a part of the width adds 2u of it, and the last sum u of
+    all: 10u t_hi + 4u s hi + 21u (hi - start) is less than `slack`.
     """
-    lo, hi = ends(centre, radius)
-    (t_lo, e_lo), (t_hi, e_hi) = tanh(lo), tanh(hi)
-    t, _ = tanh(centre)
-    slope = np.clip(np.where(radius > 1e-4, (t_hi - t_lo) / (hi - lo), 1 - t * t), 0.0, 1.0)
-    critical = np.arctanh(np.sqrt(np.clip(1 - slope, 0.0, 1 - EPS)))
+    lo, hi = ends(np.abs(centre), radius)
+    (t_lo, _), (t_hi, error) = tanh(lo), tanh(hi)
+    slope = np.maximum(np.minimum((t_hi - t_lo) / (hi - lo), 1.0), 0.0)
+    start = np.maximum(lo, 0.0)
+    p = np.minimum(np.maximum(np.arctanh(np.sqrt(1 - slope)), start), hi)
+    t, _ = tanh(p)
 
-    def end(y: Array, t: Array, error: Array) -> Array:
-        return t - slope * y + up(error + EPS * (np.abs(t) + slope * np.abs(y)))
-
-    def supremum(lo: Array, hi: Array, at_ends: Array) -> Array:
-        start = np.maximum(lo, 0.0)
-        width = up(hi - start)
-        p = np.clip(critical, start, np.maximum(hi, 0.0))
-        t, error = tanh(p)
+    def tangent(p: Array, t: Array, start: Array | float, end: Array) -> Array:
         excess = 1 - t * t - slope
-        rise = np.maximum(excess * (start - p), excess * (hi - p))
-        slack = error + _SLOPE_ERROR * width + EPS * (np.abs(t) + slope * p + np.abs(excess) * width)
-        return np.where(hi > 0, np.maximum(at_ends, t - slope * p + rise + up(slack)), at_ends)
+        return t - slope * p + np.maximum(excess * (start - p), excess * (end - p))
 
-    upper = supremum(lo, hi, np.maximum(end(lo, t_lo, e_lo), end(hi, t_hi, e_hi)))
-    lower = -supremum(-hi, -lo, np.maximum(end(-hi, -t_hi, e_hi), end(-lo, -t_lo, e_lo)))
-    return slope, (upper + lower) / 2, up((upper - lower) / 2 + EPS * (np.abs(upper) + np.abs(lower)))
+    at_lo, at_hi, below = t_lo - slope * lo, t_hi - slope * hi, -lo
+    upper = np.maximum(at_lo, tangent(p, t, start, hi))
+    least = -tangent(np.minimum(p, below), np.where(p < below, t, -t_lo), 0.0, below)
+    lower = np.minimum(at_hi, np.where(lo < 0, least, at_lo))
+    slack = up(error + 4 * EPS * (t_hi + slope * hi + (hi - start)))
+    upper, lower = upper + slack, lower - slack
+    gap = up((upper - lower) / 2 + EPS * (np.abs(upper) + np.abs(lower)))
+    return slope, np.where(centre < 0, -0.5, 0.5) * (upper + lower), gap
 
 
 def enclose_on_boxes(net: Folded, x: Array, x_error: Array) -> tuple[Array, Array, Array]:
@@ -134,20 +143,21 @@ def enclose_on_boxes(net: Folded, x: Array, x_error: Array) -> tuple[Array, Arra
     each layer's fresh error times the magnitude of the weight with which it reaches the output, so that errors cancel
     through W as they do in truth.
     """
-    h, fresh, old, ball = x, x_error, np.zeros_like(x_error), np.zeros(x.shape[2])
+    h, size, fresh, old, ball = x, total(np.abs(x), 1), x_error, np.zeros_like(x_error), np.zeros(x.shape[2])
     passed: list[tuple[Array, Array, Array]] = []  # W, slope of the relaxation, fresh error behind it
     for k, layer in enumerate(net.layers):
-        y, rounding = layer.affine(h)
+        y, rounding = layer.affine(h, size)
         if k == len(net.layers) - 1 and not net.squash:
             passed.append((layer.W, np.ones_like(rounding), rounding))
             h = y
             break
-        through = np.minimum(layer.widest(old), norm(layer.W, 1)[:, None] * ball)
+        through = np.minimum(layer.widest(old), layer.rows * ball)
         error = up(layer.widest(fresh) + through + rounding)
         ball = up(layer.norm2 * up(ball + norm(fresh, 0)) + norm(rounding, 0))
         spread = total(np.abs(y[:, 1:]), 1)
         slope, shift, gap = relax_tanh(y[:, 0], up(spread + error))
-        fresh = up(gap + slope * rounding + EPS * (slope * (np.abs(y[:, 0]) + spread) + np.abs(shift)))
+        size = up(slope * up(np.abs(y[:, 0]) + spread) + np.abs(shift))
+        fresh = up(gap + slope * rounding + EPS * size)
         h = slope[:, None] * y
         h[:, 0] += shift
         old = up(slope * error)

@@ -24,6 +24,7 @@ from .expression import Tape, evaluate
 from .float64 import EPS, Array, ends, float_with_error, gamma, spectral_norm, total, up
 from .flow import Series
 from .network import Folded, Layer, enclose_on_boxes
+from .parts import Batch
 from .taylor import Taylor, affine, constant, upper_bound
 
 _BATCH_NUMBERS = 1_000_000  # in the largest array of a batch
@@ -129,7 +130,7 @@ def is_above_on_faces(case: Case) -> Failures:
         end, error = float_with_error(case.c.domain[i][side])
         lo, hi = np.array([(end, end) if j == i else pair for j, pair in enumerate(widest)]).T
         doubt = np.where(np.arange(n) == i, error, 0.0)[:, None]
-        for first, lower, upper in batches(tree, lo, hi, _batch(n * n * function.values)):
+        for first, lower, upper in case.part.own(batches(tree, lo, hi, _batch(n * n * function.values))):
             centre, radius = middle(lower, upper)
             x = np.concatenate([centre[:, None], np.eye(n)[:, :, None] * radius], axis=1)
             left = _below_level(function, x, doubt + np.zeros_like(centre), claim.level)[0]
@@ -178,12 +179,12 @@ class Beyond(Boxes):
         ends_of = [[ends(*float_with_error(end))[side] for side, end in enumerate(pair)] for pair in self.c.domain]
         self.least, self.largest = np.array(ends_of).T[:, :, None]  # at or beyond the domain's ends, (n, 1)
 
-    def leaves(self) -> Iterator[tuple[int, Array, Array]]:
-        """The tree's leaves in batches."""
+    def leaves(self) -> Iterator[Batch]:
+        """The tree's leaves in batches, those of this part."""
         width = max(max(layer.W.shape) for layer in self.net.layers)
         values = max(self.function.values, len(self.c.dynamics.operations))
         size = _batch(max(self.symbols**2 * values, (self.symbols + 4) * width))
-        return batches(self.evidence.tree, -self.evidence.root, self.evidence.root, size)
+        return self.case.part.own(batches(self.evidence.tree, -self.evidence.root, self.evidence.root, size))
 
     def examine(self, first: int, lo: Array, hi: Array) -> Leaves:
         """The leaves with these corners, numbered from `first`, of which N'F is asked."""

@@ -17,9 +17,10 @@ from .exact import fraction, root_above
 from .float64 import Array, ends, float_with_error, total, up
 from .flow import later
 from .network import enclose_on_boxes
+from .parts import Batch
 from .taylor import Taylor, affine, upper_bound
 
-_BATCH_NUMBERS = 4_000_000  # in the largest array of a batch
+_BATCH_NUMBERS = 800_000  # in the largest array of a batch: more would not stay in a cache
 _ATTEMPTS = 4  # at the a-priori enclosure
 
 
@@ -48,10 +49,10 @@ class Ring(Boxes):
         numbers = max(width * (self.symbols + 4), self.symbols * self.symbols * (values + 4))
         return int(max(1, min(4096, _BATCH_NUMBERS // numbers)))
 
-    def leaves(self) -> Iterator[tuple[int, Array, Array]]:
-        """The tree's leaves in batches."""
+    def leaves(self) -> Iterator[Batch]:
+        """The tree's leaves in batches, those of this part."""
         root = self.case.partition.root
-        return batches(self.case.partition.tree, -root, root, self.batch)
+        return self.case.part.own(batches(self.case.partition.tree, -root, root, self.batch))
 
     def examine(self, first: int, lo: Array, hi: Array) -> RingLeaves:
         """The leaves with these corners, numbered from `first`."""

@@ -10,6 +10,9 @@ import typer
 
 from certify.commands.shared import Json
 from certify.commands.terminal import say, tell
+from certify.errors import InputError
+
+_MOST_PARTS = 2**16
 
 
 def check(
@@ -20,6 +23,11 @@ def check(
     reference: Annotated[
         bool, typer.Option("--reference", help="Ask the second checker (fractions and balls): slower, shares no code.")
     ] = False,
+    jobs: Annotated[int, typer.Option(min=1, max=256, help="Processes that examine the leaves.")] = 1,
+    part: Annotated[
+        str | None,
+        typer.Option(metavar="K/N", help="Of the leaves, examine part K of N only: status 4 if nothing is refused."),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Check a certificate with the independent checker, in a process of its own."""
@@ -30,7 +38,9 @@ def check(
         from certify.policies import load_policy
 
         wanted = load_policy(policy).network.sha256()
-    status, answer = ask(certificate, "reference" if reference else "checker")
+    status, answer = ask(
+        certificate, "reference" if reference else "checker", jobs, None if part is None else _part(part)
+    )
     lines = answer.pop("text", [])
     if wanted is not None and "policy_sha256" in answer and answer["policy_sha256"] != wanted:
         detail = f"the certificate is about policy {answer['policy_sha256']}, not about {policy} ({wanted})"
@@ -41,3 +51,10 @@ def check(
         raise typer.Exit(status)
     say(json.dumps(answer) if as_json else "\n".join(lines))
     raise typer.Exit(status)
+
+
+def _part(text: str) -> tuple[int, int]:
+    number, _, of = text.partition("/")
+    if not (number.isdecimal() and of.isdecimal() and 1 <= int(number) <= int(of) <= _MOST_PARTS):
+        raise InputError(f"`--part` must be K/N with 1 <= K <= N <= {_MOST_PARTS}, as in 2/8; found {text[:40]!r}.")
+    return int(number), int(of)

@@ -36,7 +36,7 @@ def checker_without(rule: str, folder: Path) -> Iterator[ModuleType]:
         removed = 0
         for table in (
             "STATED", "ON_THE_BALL", "OF_THE_TREE", "ON_LEAVES", "OF_THE_TUBE", "ON_SLABS", "OF_CONTRACTION",
-            "OF_OUTER", "ON_OUTER_LEAVES",
+            "OF_OUTER", "ON_FACES", "OF_OUTER_TREE", "ON_OUTER_LEAVES",
         ):  # fmt: skip
             rows = getattr(package.rules, table)
             kept = tuple(row for row in rows if row[0] != rule)

@@ -1,0 +1,76 @@
+"""Which leaves a process examines, and several processes at once.
+
+Whether a leaf holds depends on no other leaf. So the batches of leaves can be dealt out like cards: everybody walks all
+of the certificate's batches in the order of the file, and examines those of his own part. A process that does not
+answer, or not about its own part, makes the whole examination fail, and says neither yes nor no.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+from .float64 import Array
+
+Batch = tuple[int, Array, Array]  # the number of the first leaf, and their corners (n, B)
+
+
+@dataclass
+class Part:
+    """Of all batches, counted from 0 through the whole examination, those whose number leaves `number - 1` when it is
+    divided by `of`."""
+
+    number: int = 1
+    of: int = 1
+    passed: int = 0  # batches before the one in hand, of whatever part
+    leaves: int = 0  # in the batches of this part
+    all_leaves: int = 0  # in all of them
+
+    def own(self, batches: Iterable[Batch]) -> Iterator[Batch]:
+        """Those of this part."""
+        for batch in batches:
+            size = batch[1].shape[1]
+            self.all_leaves += size
+            if self.passed % self.of == self.number - 1:
+                self.leaves += size
+                yield batch
+            self.passed += 1
+
+    def split(self, index: int, count: int) -> tuple[int, int]:
+        """Number and `of` of one of the parts, counted from 0, that this one falls into."""
+        return self.number + index * self.of, count * self.of
+
+
+def in_processes(count: int, work: Callable[[int], Any]) -> list[Any]:
+    """`work(0)` to `work(count - 1)`, what JSON can say of them, each made in a process that is a copy of this one.
+
+    Raises
+    ------
+    ChildProcessError : a process did not come to its end, or could not answer.
+    """
+    children = []
+    for index in range(count):
+        reading, writing = os.pipe()
+        child = os.fork()
+        if child == 0:
+            status = 1
+            try:
+                os.close(reading)
+                with open(writing, "w", encoding="ascii") as pipe:
+                    json.dump(work(index), pipe)
+                status = 0
+            finally:
+                os._exit(status)
+        os.close(writing)
+        children.append((child, reading))
+    said = []
+    for child, reading in children:
+        with open(reading, encoding="ascii") as pipe:
+            said.append(pipe.read())
+        _, status = os.waitpid(child, 0)
+        if status != 0:
+            raise ChildProcessError(f"one of {count} processes ended with wait status {status}")
+    return [json.loads(answer) for answer in said]
