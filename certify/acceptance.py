@@ -44,12 +44,14 @@ class Clerk:
     left : seconds that may still be spent on a leaf that was refused; after that only the level is lowered.
     stage : times the stages `write` and `check`.
     tell : called before each check.
+    check : the checker's answer about a file.
     """
 
     path: Path
     left: Callable[[], float]
     stage: Callable[[str], AbstractContextManager[None]]
     tell: Callable[[], None]
+    check: Callable[[Path], Mapping[str, Any]] = run_checker
 
     def accepted(self, certificate: Certificate, problem: Problem) -> Accepted:
         """This certificate, or one with a refused leaf split again or a lower level.
@@ -95,7 +97,7 @@ class Clerk:
         self.tell()
         try:
             with self.stage("check"):
-                answer = run_checker(unchecked)
+                answer = self.check(unchecked)
             if answer["result"] == _wanted(certificate):
                 for what, said, meant in (
                     ("bytes", answer["certificate_sha256"], hashlib.sha256(data).hexdigest()),

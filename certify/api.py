@@ -75,6 +75,9 @@ def certify_roa(
     dreal_precision: float | None = None,
     jobs: int | None = None,
     device: str | None = None,
+    cluster: str | None = None,
+    cluster_checks: bool | None = None,
+    resume: bool | None = None,
     enlarge: bool | None = None,
     box: Mapping[str, float] | None = None,
     reach_from: Mapping[str, Fraction | float | str] | None = None,
@@ -124,8 +127,14 @@ def certify_roa(
     P : a Lyapunov matrix of one's own, (n, n), symmetric; overrides the candidate.
     level : prove exactly this level; by default the largest is looked for.
     engine : "bounds" (the default), "dreal" (its word is trusted, not checked), or "both".
-    dreal_precision, jobs : dReal's delta, 1e-3 by default, and its threads, 1.
+    dreal_precision : dReal's delta, 1e-3 by default.
+    jobs : processes of the checker, and threads of dReal; by default one of these, and where there are many leaves as
+        many of those as there are cores.
     device : where boxes are bounded: "cpu" (the default) or "cuda".
+    cluster : have boxes grown by the workers of a Dask cluster: "local:4" for four processes of this machine, or a
+        scheduler's address, such as "tcp://host:8786"; by default by the threads of this process.
+    cluster_checks : have the workers run the checker as well, each on a part of the leaves, and believe them.
+    resume : go on with the search that an earlier run, which was given more than it had time for, left in `out`.
     enlarge : look for a tube of ellipsoids from a larger set into the proved one; not by default.
     box : half-widths by state: `enlarge` for the largest multiple of the ellipsoid with these half-axes.
     reach_from : a state by the states' values, those that are not named at the operating point: prove that it converges
@@ -183,13 +192,15 @@ def certify_roa(
     single = {
         "claim": claim, "candidate": candidate, "Q": Q, "R": R, "P": P, "level": level, "engine": engine,
         "dreal_precision": dreal_precision, "jobs": jobs, "device": device, "enlarge": enlarge, "box": box,
+        "cluster": cluster, "cluster_checks": cluster_checks, "resume": resume,
         "reach_from": reach_from, "time_limit": time_limit, "max_boxes": max_boxes, "rate": rate,
         "lyapunov_level": lyapunov_level, "hidden": hidden, "degree": degree, "seed": seed,
     }  # fmt: skip
     notices: list[str] = []
     try:
         unsure = _uncertainty(ranges, disturbances, input_error, sample_time)
-        chosen = _options(options, {name: value for name, value in single.items() if value is not None})
+        named = single | ({} if options is None else {"lyapunov": lyapunov})
+        chosen = _options(options, {name: value for name, value in named.items() if value is not None})
         _require_device(chosen.device)
         seconds = _number(load_seconds, "load_seconds")
         _require(provenance is None or isinstance(provenance, Mapping), "provenance", "a mapping", provenance)
@@ -269,7 +280,7 @@ def _options(options: RoaOptions | None, single: dict[str, Any]) -> RoaOptions:
     whole = ("jobs", "max_boxes", "degree", "seed")
     readers: dict[str, Callable[[Any, str], Any]] = dict.fromkeys(single, _text)
     readers |= {"Q": _row, "R": _row, "P": _matrix, "enlarge": _flag, "box": _widths, "reach_from": _state}
-    readers |= {"hidden": _counts}
+    readers |= {"hidden": _counts} | dict.fromkeys(("cluster_checks", "resume"), _flag)
     readers |= dict.fromkeys(numbers, _number) | dict.fromkeys(whole, _count)
     read = {name: readers[name](value, name) for name, value in single.items()}
     return RoaOptions(**read)

@@ -16,6 +16,7 @@ from certify.lyapunov import BEYOND, Beyond, Candidate, Named, Neural, Polynomia
 
 Array = NDArray[np.float64]
 EngineName = Literal["bounds", "dreal", "both"]
+_MOST_JOBS = 256  # of the checker
 Asked = Literal["auto", "asymptotic", "practical", "nearby"]
 
 
@@ -36,10 +37,13 @@ class RoaOptions:
     P : a Lyapunov matrix of one's own, (n, n); overrides the candidate.
     level : prove exactly this level; None finds the largest.
     engine : `bounds`, `dreal` (its word is trusted, not checked), or `both`: bounds prove, dReal is asked as well.
-    dreal_precision, jobs : dReal's delta and threads.
+    dreal_precision : dReal's delta.
+    jobs : processes of the checker, and threads of dReal; None is one of these, and where there are many leaves as many
+        of those as there are cores.
     device : where boxes are bounded, `cpu` or `cuda`.
     cluster : whose workers grow boxes: `local:N` for N processes of this machine, or the address of a Dask scheduler,
         such as tcp://host:8786; None for the threads of this process.
+    cluster_checks : the cluster's workers run the checker as well, each on a part of the leaves, and are believed.
     resume : go on with the search that an earlier run for the largest level left in the folder.
     enlarge : look for a tube of ellipsoids from a larger set into the proved one.
     box : half-widths by state; `enlarge` for the largest multiple of the ellipsoid with these half-axes. A state that
@@ -66,9 +70,10 @@ class RoaOptions:
     level: float | None = None
     engine: EngineName = "bounds"
     dreal_precision: float = 1e-3
-    jobs: int = 1
+    jobs: int | None = None
     device: str = "cpu"
     cluster: str | None = None
+    cluster_checks: bool = False
     resume: bool = False
     enlarge: bool = False
     box: Mapping[str, float] | None = None
@@ -108,8 +113,10 @@ class RoaOptions:
         for name, known in (("claim", Asked), ("candidate", Candidate), ("engine", EngineName)):
             if getattr(self, name) not in get_args(known):
                 raise InputError(f"`{name}` must be one of {get_args(known)}; found {getattr(self, name)!r}.")
-        if not 0 < self.dreal_precision < 1 or self.jobs < 1:
-            raise InputError("`dreal_precision` must lie between 0 and 1, and `jobs` be at least 1.")
+        if not 0 < self.dreal_precision < 1 or (self.jobs is not None and not 1 <= self.jobs <= _MOST_JOBS):
+            raise InputError("`dreal_precision` must lie between 0 and 1, and `jobs` be 1 to 256.")
+        if self.cluster_checks and self.cluster is None:
+            raise InputError("`cluster_checks` must have a `cluster`; found none.")
         if self.cluster is not None and (self.engine != "bounds" or self.device != "cpu"):
             raise InputError("`cluster` needs the engine bounds, and the device cpu.")
         if self.resume and (self.engine != "bounds" or self.P is not None or self.only is not None):

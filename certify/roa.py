@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -27,6 +28,7 @@ from certify.certificate import (
     PartitionTree,
     TrustedSolver,
     require_within_limits,
+    run_checker,
     sole_writer,
 )
 from certify.claims import Asymptotic, Claim, Enlarged, Nearby, Practical, Problem, Reached
@@ -83,6 +85,8 @@ _MISLED = 0.9  # of its reach: a violation below it is one that the samples miss
 _SAMPLE = 2000  # leaves whose check is timed
 _START = 0.2  # seconds that a checker takes to start
 _CAUTION = 1.2  # on the time that a check is expected to take
+_LONG = 1_000_000  # bytes of a certificate, from which on several processes check it
+_MOST_JOBS = 64
 _YEAR = 3.156e7  # seconds
 _SEARCH_FILE = "search.json"
 _SAVING = 60.0  # seconds between two savings of a search
@@ -366,7 +370,7 @@ class _Run:
         if self.options.engine == "dreal":
             from certify.engines.dreal.proof import DrealEngine
 
-            return DrealEngine(trial.T, self.options.dreal_precision, self.options.jobs).begin(trial.task)
+            return DrealEngine(trial.T, self.options.dreal_precision, self.options.jobs or 1).begin(trial.task)
         from certify.engines.bounds.engine import BoundsEngine
 
         return BoundsEngine(trial.T, self.runner).begin(trial.task)
@@ -635,7 +639,19 @@ class _Run:
         return found
 
     def _clerk(self) -> Clerk:
-        return Clerk(self.out / "certificate.json", self.left, self._stage, lambda: self._tell("check"))
+        return Clerk(self.out / "certificate.json", self.left, self._stage, lambda: self._tell("check"), self._checked)
+
+    def _checked(self, path: Path) -> Mapping[str, Any]:
+        """The checker's answer about a file; where many leaves make a long file, several processes share them."""
+        if self.options.cluster_checks:
+            from certify.parts import check_in_parts
+
+            status, answer = check_in_parts(path, self.runner)
+            if "error" in answer:
+                raise BackendError(f"the checker ended with status {status} and no verdict: {answer['error']}")
+            return answer
+        cores = len(os.sched_getaffinity(0)) if path.stat().st_size > _LONG else 1
+        return run_checker(path, jobs=self.options.jobs or min(cores, _MOST_JOBS))
 
     def _confirm(self, problem: Problem, claim: Claim) -> dict[str, Any]:
         """dReal's answers about what the bounds engine proved.
@@ -651,7 +667,9 @@ class _Run:
             backend = find_backend()
         except BackendError as error:
             return {"solver": "dreal", "missing": str(error)}
-        allowed: DrealOptions = DrealOptions(self.options.dreal_precision, self.options.jobs, self.options.time_limit)
+        allowed: DrealOptions = DrealOptions(
+            self.options.dreal_precision, self.options.jobs or 1, self.options.time_limit
+        )
         asked, witness = confirm_with_dreal(problem, claim, backend, allowed)
         if witness is not None:
             path = self.out / "contradiction.json"

@@ -136,6 +136,9 @@ def test_options_by_name_are_those_of_the_options() -> None:
         "max_boxes": 0,
         "rate": -1.0,
         "device": "tpu",
+        "cluster": "nowhere",
+        "cluster_checks": True,  # without a cluster
+        "resume": "yes",
         "enlarge": "yes",
         "box": {"theta": -1.0},
         "reach_from": {"theta": float("nan")},
@@ -173,6 +176,8 @@ def test_options_by_name_are_those_of_the_options() -> None:
 def test_options_at_once_or_by_name() -> None:
     with pytest.raises(InputError, match="not both; found `options` and level"):
         certify_roa("pendulum", SHIPPED, options=QUICK, level=1.0)
+    with pytest.raises(InputError, match="found `options` and lyapunov"):
+        certify_roa("pendulum", SHIPPED, options=QUICK, lyapunov="V.pt")
     one = certify_roa("pendulum", SHIPPED, options=QUICK)
     other = certify_roa("pendulum", SHIPPED, candidate="lyapunov", level=0.05)
     assert one.raw is not None and one.raw == other.raw

@@ -30,6 +30,7 @@ EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows th
     "largest": "certificate claims closed_loop engines lyapunov options policies results roa systems",
     "lyapunov": "closed_loop expressions plain_file policies systems",
     "options": "lyapunov",
+    "parts": "certificate running",
     "policies": "plain_file systems",
     "race": "engines lyapunov trials",
     "report": "certificate claims closed_loop lyapunov policies systems",
@@ -37,12 +38,13 @@ EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows th
     "results": "certificate claims engines lyapunov policies report rest sublevel systems",
     "rigorous": "closed_loop expressions lyapunov policies",
     "roa": (
-        "acceptance beyond certificate claims closed_loop diagnosis engines lyapunov options policies race rest "
-        "results rigorous running systems trials"
+        "acceptance beyond certificate claims closed_loop diagnosis engines lyapunov options parts policies race rest "
+        "results rigorous running systems trials unfinished"
     ),
     "sublevel": "expressions lyapunov rigorous systems",
     "systems": "expressions",
     "trials": "certificate claims closed_loop engines lyapunov options",
+    "unfinished": "certificate claims closed_loop engines lyapunov policies systems trials",
     "controllers": "containment policies systems",
 }
 

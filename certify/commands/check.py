@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
@@ -28,6 +28,13 @@ def check(
         str | None,
         typer.Option(metavar="K/N", help="Of the leaves, examine part K of N only: status 4 if nothing is refused."),
     ] = None,
+    cluster: Annotated[
+        str | None,
+        typer.Option(
+            help="Have the parts checked by the workers of a Dask cluster, which are trusted with that: local:N, or a "
+            "scheduler's address."
+        ),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Check a certificate with the independent checker, in a process of its own."""
@@ -38,9 +45,13 @@ def check(
         from certify.policies import load_policy
 
         wanted = load_policy(policy).network.sha256()
-    status, answer = ask(
-        certificate, "reference" if reference else "checker", jobs, None if part is None else _part(part)
-    )
+    if cluster is not None and (reference or part is not None or jobs != 1):
+        raise InputError("`--cluster` must stand without --reference, --jobs and --part.")
+    if cluster is not None:
+        status, answer = _by_cluster(certificate, cluster)
+    else:
+        share = None if part is None else _part(part)
+        status, answer = ask(certificate, "reference" if reference else "checker", jobs, share)
     lines = answer.pop("text", [])
     if wanted is not None and "policy_sha256" in answer and answer["policy_sha256"] != wanted:
         detail = f"the certificate is about policy {answer['policy_sha256']}, not about {policy} ({wanted})"
@@ -51,6 +62,14 @@ def check(
         raise typer.Exit(status)
     say(json.dumps(answer) if as_json else "\n".join(lines))
     raise typer.Exit(status)
+
+
+def _by_cluster(certificate: Path, address: str) -> tuple[int, dict[str, Any]]:
+    from certify.parts import check_in_parts
+    from certify.running.cluster import ClusterRunner, connect
+
+    with connect(address) as client:
+        return check_in_parts(certificate, ClusterRunner(client))
 
 
 def _part(text: str) -> tuple[int, int]:

@@ -77,7 +77,10 @@ def roa(
         str, typer.Option(envvar="CERTIFY_ENGINE", help="bounds, dreal (trusted, not checked), or both.")
     ] = "bounds",
     precision: Annotated[float, typer.Option(help="dReal's delta.")] = 1e-3,
-    jobs: Annotated[int, typer.Option(help="dReal's threads.")] = 1,
+    jobs: Annotated[
+        int | None,
+        typer.Option(min=1, max=256, help="Processes of the checker (default: a core each), and dReal's threads (1)."),
+    ] = None,
     device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
     cluster: Annotated[
         str | None,
@@ -86,6 +89,10 @@ def roa(
             "scheduler's address, such as tcp://host:8786."
         ),
     ] = None,
+    cluster_checks: Annotated[
+        bool,
+        typer.Option("--cluster-checks", help="Its workers check the certificate as well, in parts, and are believed."),
+    ] = False,
     resume: Annotated[
         bool, typer.Option("--resume", help="Go on with the search that an earlier run left in the folder.")
     ] = False,
@@ -151,6 +158,7 @@ def roa(
         jobs=jobs,
         device=_device(device),
         cluster=cluster,
+        cluster_checks=cluster_checks,
         resume=resume,
         enlarge=enlarge,
         box=widths(box, "--box"),
