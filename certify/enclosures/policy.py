@@ -128,26 +128,23 @@ class PolicyEnclosure(LayersEnclosure):
 def relax_tanh(centre: Tensor, radius: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Parallel lines: (s, m, gap) with |tanh(y) - s y - m| <= gap for |y - centre| <= radius.
 
-    s is near the chord's slope. With D(y) = tanh(y) - s y, concavity on y >= 0 puts D below its tangent at any
-    p >= 0, and convexity on y <= 0 puts the rest below the ends; D is odd.
+    s is the chord's slope. D(y) = tanh(y) - s y rises up to the p >= 0 at which tanh' is s and falls beyond, among
+    y >= 0; among y <= 0 it is convex and largest at an end; and it is odd. tanh(p) = sqrt(1 - s), so that neither bound
+    needs another tanh. Where p is not exact, |D'(p)| <= 2^-48 and D' is monotone between p and the exact one.
     """
     radius = radius * (1 + EPS) + EPS * centre.abs() + TINY
     lo, hi = centre - radius, centre + radius
-    t_lo, t_hi, t = lo.tanh(), hi.tanh(), centre.tanh()
-    slope = torch.where(radius > 1e-4, (t_hi - t_lo) / (hi - lo), 1 - t * t).clamp(0.0, 1.0)
-    critical = torch.atanh((1 - slope).clamp(0.0, 1 - EPS).sqrt())
-
-    def supremum(lo: Tensor, hi: Tensor, t_lo: Tensor, t_hi: Tensor) -> Tensor:
-        start = lo.clamp(min=0.0)
-        p = torch.minimum(torch.maximum(critical, start), hi)
-        t = p.tanh()
-        excess = 1 - t * t - slope
-        rise = torch.maximum(excess * (start - p), excess * (hi - p)) + _LIBM * (hi - start)
-        ends = torch.maximum(t_lo - slope * lo, t_hi - slope * hi)
-        return torch.where(hi > 0, torch.maximum(ends, t - slope * p + rise), ends) + _LIBM
-
-    upper = supremum(lo, hi, t_lo, t_hi)
-    lower = -supremum(-hi, -lo, -t_hi, -t_lo)
+    t_lo, t_hi = lo.tanh(), hi.tanh()
+    width = hi - lo
+    slope = ((t_hi - t_lo) / width).clamp(0.0, 1.0)
+    t = (1 - slope).clamp(max=1 - EPS).sqrt()
+    p = t.atanh()
+    a, b = t_lo - slope * lo, t_hi - slope * hi
+    slack = _LIBM * (1 + width)
+    above = t.clamp(t_lo, t_hi) - slope * p.clamp(lo, hi)
+    below = (-t).clamp(t_lo, t_hi) - slope * (-p).clamp(lo, hi)
+    upper = torch.maximum(torch.maximum(a, b), above) + slack
+    lower = torch.minimum(torch.minimum(a, b), below) - slack
     gap = (upper - lower) / 2 + EPS * (upper.abs() + lower.abs() + slope * (centre.abs() + radius)) + TINY
     return slope, (upper + lower) / 2, gap
 
