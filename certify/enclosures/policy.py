@@ -18,11 +18,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from certify.closed_loop import ClosedLoop
+from certify.enclosures.compiled import kernels
+from certify.enclosures.fused import FusedLayers, Layer
 from certify.enclosures.taylor import EPS, TINY
 from certify.policies import TanhNetwork
 from certify.rigorous import centring_with_errors
 
 Array = NDArray[np.float64]
+_PIECE = 128
 _LIBM = 2.0**-47  # error allowed to torch.tanh, relative to 1
 
 
@@ -50,6 +53,10 @@ class LayersEnclosure:
         self.biases[-1], self.offset = bias + shift, offset
         self.bias_error = torch.where(shift == 0, 0.0, shift_error + EPS * (bias.abs() + shift.abs()))
         self.offset_error = offset_error
+        none = [torch.zeros_like(b) for b in self.biases[:-1]]
+        rows = (self.weights, self.magnitudes, self.biases, [*none, self.bias_error], self.rows, self.norms)
+        self.layers = [Layer(*row) for row in zip(*rows, strict=True)]
+        self.units = sum(len(w) for w in self.weights)
         self.clip = None if network.clip is None else tuple(tensor(end)[:, None] for end in network.clip)
 
     def __call__(self, x: Tensor, x_error: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -64,8 +71,30 @@ class LayersEnclosure:
         mid (m, B), slopes (m, n, B), error (m, B), share (n, B) : share says how much each axis spreads the
             first layer, which is where a split reduces the error.
         """
+        bounds, batch = self._layers, x.shape[2]
+        pieces = 1
+        if x.device.type == "cpu":
+            compiled = kernels(self.units * batch)
+            pieces = max(1, -(-batch // _PIECE))
+            if compiled is not None:
+                bounds = FusedLayers(compiled, self.layers, self.squash, self.scale, -(-batch // pieces))
+        cut = zip(x.tensor_split(pieces, 2), x_error.tensor_split(pieces, 1), strict=True)
+        parts = [bounds(*part) for part in cut]
+        h, error, share = parts[0] if pieces == 1 else (torch.cat(v, -1) for v in zip(*parts, strict=True))
+        through = self.scale[:, None] * h[:, 0]
+        mid, slopes = through + self.offset[:, None], self.scale[:, None, None] * h[:, 1:]
+        rounding = 4 * EPS * (through.abs() + self.offset.abs()[:, None] + slopes.abs().sum(1)) + TINY
+        rounding = rounding + self.offset_error[:, None]
+        error = (rounding + error) * (1 + 1e-12)
+        if self.clip is not None:
+            mid, slopes, error = clipped(mid, slopes, error, *self.clip)
+        return mid, slopes, error, share
+
+    def _layers(self, x: Tensor, x_error: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The affine form (m, n + 1, B) behind the last layer, the scaled error (m, B) and `share`."""
         n, batch = x.shape[0], x.shape[2]
-        h, fresh, old, ball = x, x_error, torch.zeros_like(x_error), torch.zeros_like(x_error[0])
+        h, ball = x, torch.zeros_like(x_error[0])
+        errors = torch.stack([x_error, torch.zeros_like(x_error)], 1)  # fresh ones and older ones
         size = x.abs().sum(1)  # sum_j |h_ij|; its 2-norm over i, times sqrt(n + 1), bounds the sum of ||h_j||_2
         share = torch.ones(n, batch, dtype=x.dtype, device=x.device) / n
         passed: list[tuple[Tensor, Tensor | None, Tensor]] = []
@@ -78,9 +107,10 @@ class LayersEnclosure:
             rounding = rounding + 8 * EPS * (y[:, 0].abs() + self.biases[k].abs()[:, None]) + TINY
             if last:
                 rounding = rounding + self.bias_error[:, None]
-            through_old = torch.minimum(self.magnitudes[k] @ old, self.rows[k][:, None] * ball)
-            error = (self.magnitudes[k] @ fresh + through_old) * (1 + width * EPS) + rounding
-            ball = (self.norms[k] * (ball + fresh.norm(dim=0)) + rounding.norm(dim=0)) * (1 + width * EPS)
+            through = (self.magnitudes[k] @ errors.reshape(width, -1)).reshape(-1, 2, batch)
+            older = torch.minimum(through[:, 1], self.rows[k][:, None] * ball)
+            error = (through[:, 0] + older) * (1 + width * EPS) + rounding
+            ball = (self.norms[k] * (ball + errors[:, 0].norm(dim=0)) + rounding.norm(dim=0)) * (1 + width * EPS)
             if last and not self.squash:
                 passed.append((W, None, rounding))
                 h = y
@@ -95,17 +125,10 @@ class LayersEnclosure:
             h = slope[:, None] * y
             h[:, 0] += shift
             size = (h[:, 0].abs() + slope * spread) * (1 + n * EPS)
-            old = slope * error
-            ball = torch.minimum(slope.amax(0) * ball, old.norm(dim=0) * (1 + width * EPS))
+            errors = torch.stack([fresh, slope * error], 1)
+            ball = torch.minimum(slope.amax(0) * ball, errors[:, 1].norm(dim=0) * (1 + width * EPS))
             passed.append((W, slope, fresh))
-        through = self.scale[:, None] * h[:, 0]
-        mid, slopes = through + self.offset[:, None], self.scale[:, None, None] * h[:, 1:]
-        rounding = 4 * EPS * (through.abs() + self.offset.abs()[:, None] + slopes.abs().sum(1)) + TINY
-        rounding = rounding + self.offset_error[:, None]
-        error = (rounding + self._error_backwards(passed, x_error)) * (1 + 1e-12)
-        if self.clip is not None:
-            mid, slopes, error = clipped(mid, slopes, error, *self.clip)
-        return mid, slopes, error, share
+        return h, self._error_backwards(passed, x_error), share
 
     def _error_backwards(self, passed: list[tuple[Tensor, Tensor | None, Tensor]], x_error: Tensor) -> Tensor:
         m, batch = len(self.scale), x_error.shape[1]
