@@ -9,19 +9,30 @@ stay torch's, which evaluates many at once: what is compiled here would call lib
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
-Line = Plane = Block = NDArray[np.float64]  # of one, two and three dimensions, in C's order
+from certify.enclosures.tape import ADD, ATAN, CONSTANT, COS, EXP, INVERSE, MULTIPLY, SCALED, SHIFTED, SIN, SQRT, TANH
+
+Line: TypeAlias = NDArray[np.float64]  # of one dimension, in C's order
+Plane: TypeAlias = NDArray[np.float64]  # of two
+Block: TypeAlias = NDArray[np.float64]  # of three
+Steps: TypeAlias = NDArray[np.int64]
+Four: TypeAlias = tuple[float, float, float, float]
+Five: TypeAlias = tuple[float, float, float, float, float]
 F = TypeVar("F", bound=Callable[..., Any])
 EPS, TINY = 2.0**-50, 2.0**-900  # as in taylor.py
 SLACK = 2.0**-47  # as in policy.py
+EXP_END = 64.0  # as in taylor.py
+CHUNK = 32  # boxes at a time in the plant: their models stay in a core's cache
 LOST = 2.0**-500  # more than a 2-norm loses where squares underflow
 _TYPES = {"Line": "f8[::1]", "Plane": "f8[:,::1]", "Block": "f8[:,:,::1]", "float": "f8", "int": "i8", "None": "void"}
+_TYPES |= {"Steps": "i8[:,::1]", "Four": "UniTuple(f8, 4)", "Five": "UniTuple(f8, 5)"}
 
 
 def _compiled(function: F) -> F:
@@ -52,7 +63,7 @@ def ranges(
     rounding: Plane,
     spread: Plane,
 ) -> None:
-    """Add the bias to a layer's affine forms y (H, n + 1, B); their rounding errors, errors, spreads, and ends of range.
+    """Add the bias to a layer's affine forms y (H, n + 1, B); their rounding, errors, spreads, and ends of range.
 
     Parameters
     ----------
@@ -143,13 +154,15 @@ def bend(
             s, centre = slope[i, k], y[i, 0, k]
             a, b = t_lo - s * lo, t_hi - s * hi
             slack = SLACK * (1 + (hi - lo))
-            at, value = (p[i, k], t[i, k]) if p[i, k] < hi else (hi, t_hi)
-            at, value = (at, value) if at > lo else (lo, t_lo)
+            at, value = p[i, k], t[i, k]
+            value = t_lo if at < lo else t_hi if at > hi else value
+            at = lo if at < lo else hi if at > hi else at
             tangent = value - s * at
             upper = a if a > b else b
             upper = (tangent if tangent > upper else upper) + slack
-            at, value = (-p[i, k], -t[i, k]) if -p[i, k] > lo else (lo, t_lo)
-            at, value = (at, value) if at < hi else (hi, t_hi)
+            at, value = -p[i, k], -t[i, k]
+            value = t_lo if at < lo else t_hi if at > hi else value
+            at = lo if at < lo else hi if at > hi else at
             tangent = value - s * at
             lower = a if a < b else b
             lower = (tangent if tangent < lower else lower) - slack
@@ -180,11 +193,163 @@ def bend(
 
 @_compiled
 def backwards(weight: Block, errors: Block, slope: Plane, result: Plane) -> None:
-    """Add what a layer's fresh errors, `errors[:, 0]` of (H, 2, B), weigh in the outputs (m, B), whose weights (H, m, B)
-    then go on through the slopes of tanh."""
+    """Add what a layer's fresh errors, `errors[:, 0]` of (H, 2, B), weigh in the outputs (m, B), whose weights
+    (H, m, B) then go on through the slopes of tanh."""
     units, outputs, batch = weight.shape
     for i in range(units):
         for j in range(outputs):
             for k in range(batch):
                 result[j, k] += abs(weight[i, j, k]) * errors[i, 0, k]
                 weight[i, j, k] *= slope[i, k]
+
+
+@_compiled
+def expansion(operation: int, c: float, reach: float) -> Four:
+    """phi(c), phi'(c), phi''(c)/2 and a bound of |phi'''|/6 within `reach` of c, as `Taylor` takes them; NaN where
+    there is none. libm errs by a few units in the last place at most, `Taylor.compose` allows for sixteen."""
+    if operation == INVERSE:
+        least = abs(c) - reach
+        least = least if least > 0 else np.nan
+        f = 1 / c
+        cube = f * f * f
+        return f, -f * f, cube, abs(cube) / least * (1 + EPS) + TINY
+    if operation == SQRT:
+        least = c - reach
+        s, w = np.sqrt(c), np.sqrt(least if least > 0 else np.nan)
+        p, q = 1 / s, 1 / (s + w)
+        return s, p / 2, -p * p * p / 8, p * p * q * q * (2 * q + p) / 8 * (1 + 32 * EPS) + TINY
+    if operation == EXP:
+        e, most = math.exp(c), c + reach
+        third = math.exp(most) / 6 * (1 + 128 * EPS) + TINY if most < EXP_END else np.nan
+        return e, e, e / 2, third
+    if operation == TANH:
+        t = math.tanh(c)
+        slope = 1 - t * t
+        return t, slope, -t * slope, 1 / 3 + EPS
+    if operation == ATAN:
+        slope = 1 / (1 + c * c)
+        return math.atan(c), slope, -c * slope * slope, 1 / 3 + EPS
+    sine, cosine = math.sin(c), math.cos(c)
+    if operation == SIN:
+        third = abs(cosine) + reach + EPS
+        return sine, cosine, -sine / 2, (1.0 if third > 1.0 else third) / 6
+    if operation == COS:
+        third = abs(sine) + reach + EPS
+        return cosine, -sine, -cosine / 2, (1.0 if third > 1.0 else third) / 6
+    return np.nan, np.nan, np.nan, np.nan
+
+
+@_compiled
+def coefficients(operation: int, k: float, u: Four, v: Four) -> Five:
+    """`alpha`, `beta`, `gamma`, the constant term and the remainder of an operation, as `Taylor` has them; of its
+    operands are given c, sum |g_i|, sum |Q_ij| and r."""
+    (c, G, S, r), (vc, vG, vS, vr) = u, v
+    whole, other = abs(c) + G + S, abs(vc) + vG + vS
+    if operation == ADD:
+        return 1.0, 1.0, 0.0, c + vc, r + vr + EPS * (whole + other) + TINY
+    if operation == SCALED:
+        return k, 0.0, 0.0, k * c, abs(k) * r * (1 + EPS) + EPS * (abs(k) * whole) + TINY
+    if operation == SHIFTED:
+        return 1.0, 0.0, 0.0, c + k, r + EPS * (abs(c) + abs(k)) + TINY
+    if operation == CONSTANT:
+        return 0.0, 0.0, 0.0, k, EPS * abs(k) + TINY
+    if operation == MULTIPLY:
+        rest = abs(c) * vr + abs(vc) * r + G * vS + vG * S + S * vS + r * (vG + vS + vr) + vr * (G + S)
+        return vc, c, 1.0, c * vc, rest + EPS * (whole * other + rest) + TINY
+    q = S + r
+    rho = G + q
+    f0, f1, f2, third = expansion(operation, c, rho * (1 + EPS))
+    rest = abs(f1) * r + abs(f2) * (2 * G * q + q * q) + third * (rho * rho * rho)
+    rest += 2 * EPS * (abs(f0) + abs(f1) * (1 + rho) + abs(f2) * (1 + rho * rho) + rest)
+    return f1, 0.0, f2, f0, rest + TINY
+
+
+@_compiled
+def sizes(model: Plane, symbols: int) -> None:
+    """The last two rows of a model in that many symbols: sums of magnitudes of its linear and its quadratic part."""
+    rest = 1 + symbols + symbols * (symbols + 1) // 2
+    model[rest + 1 :] = 0.0
+    for row in range(1, rest):
+        to = rest + 1 if row <= symbols else rest + 2
+        for b in range(CHUNK):
+            model[to, b] += abs(model[row, b])
+
+
+@_compiled
+def play(
+    steps: Steps,
+    constants: Line,
+    places: int,
+    x: Block,
+    x_error: Plane,
+    middle: Plane,
+    slopes: Block,
+    wide: Plane,
+    quantities: Plane,
+    c: Line,
+    g: Plane,
+    Q: Block,
+    r: Line,
+) -> None:
+    """The result (c, g, Q, r) of a tape whose inputs are n states, m inputs and k uncertain quantities, as
+    `loop_models` makes them; `quantities` (k, 3) are the middle of each, its reach and the rounding of these.
+
+    A place holds a model of CHUNK boxes, a row each: c, g, the coefficients of d_i d_j for i <= j, ordered by i and
+    then by j, then r, sum |g_i| and the sum of the coefficients' magnitudes. Each operation is `alpha u + beta v`, with
+    `gamma` times the product of the linear parts, and a remainder of its own.
+    """
+    n, inputs, batch = x.shape[0], x.shape[0] + len(wide), len(c)
+    N = inputs + len(quantities)
+    R = 1 + N + N * (N + 1) // 2
+    G, S = R + 1, R + 2
+    memory = np.zeros((places, R + 3, CHUNK))
+    alpha, beta, gamma, start = np.zeros(CHUNK), np.zeros(CHUNK), np.zeros(CHUNK), np.zeros(CHUNK)
+    for first in range(0, batch, CHUNK):
+        count = min(CHUNK, batch - first)
+        for i in range(N):
+            w = memory[i]
+            w[:] = 0.0
+            for b in range(count):
+                if i < n:
+                    w[0, b], w[R, b] = x[i, 0, first + b], x_error[i, first + b]
+                elif i < inputs:
+                    w[0, b], w[1 + i, b] = middle[i - n, first + b], wide[i - n, first + b]
+                else:
+                    w[0, b], w[1 + i, b] = quantities[i - inputs, 0], quantities[i - inputs, 1]
+                    w[R, b] = quantities[i - inputs, 2]
+                if i < inputs:
+                    for j in range(n):
+                        w[1 + j, b] = x[i, 1 + j, first + b] if i < n else slopes[i - n, j, first + b]
+            sizes(w, N)
+        for at in range(len(steps)):
+            operation, k = steps[at, 0], constants[at]
+            u, v, w = memory[steps[at, 1]], memory[steps[at, 2]], memory[steps[at, 3]]
+            bent = operation >= MULTIPLY
+            for b in range(CHUNK):
+                mine, other = (u[0, b], u[G, b], u[S, b], u[R, b]), (v[0, b], v[G, b], v[S, b], v[R, b])
+                alpha[b], beta[b], gamma[b], start[b], w[R, b] = coefficients(operation, k, mine, other)
+            for row in range(R):
+                for b in range(CHUNK):
+                    w[row, b] = alpha[b] * u[row, b] + beta[b] * v[row, b]
+            w[0] = start
+            row = 1 + N
+            for i in range(N if bent else 0):
+                for b in range(CHUNK):
+                    w[row, b] += gamma[b] * (u[1 + i, b] * v[1 + i, b])
+                for j in range(i + 1, N):
+                    for b in range(CHUNK):
+                        w[row + j - i, b] += gamma[b] * (u[1 + i, b] * v[1 + j, b] + u[1 + j, b] * v[1 + i, b])
+                row += N - i
+            sizes(w, N)
+        w = memory[steps[-1, 3]]
+        row = 1 + N
+        for b in range(count):
+            c[first + b], r[first + b] = w[0, b], w[R, b]
+        for i in range(N):
+            for b in range(count):
+                g[i, first + b] = w[1 + i, b]
+            for j in range(i, N):
+                for b in range(count):
+                    Q[i, j, first + b] = w[row, b] if i == j else 0.5 * w[row, b]
+                    Q[j, i, first + b] = Q[i, j, first + b]
+                row += 1

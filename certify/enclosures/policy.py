@@ -25,7 +25,7 @@ from certify.policies import TanhNetwork
 from certify.rigorous import centring_with_errors
 
 Array = NDArray[np.float64]
-_PIECE = 128
+_NUMBERS = 2**15  # units of a layer times boxes at a time, which stay in a core's cache
 _LIBM = 2.0**-47  # error allowed to torch.tanh, relative to 1
 
 
@@ -56,7 +56,7 @@ class LayersEnclosure:
         none = [torch.zeros_like(b) for b in self.biases[:-1]]
         rows = (self.weights, self.magnitudes, self.biases, [*none, self.bias_error], self.rows, self.norms)
         self.layers = [Layer(*row) for row in zip(*rows, strict=True)]
-        self.units = sum(len(w) for w in self.weights)
+        self.units, self.widest = sum(network.layers[1:]), max(network.layers)
         self.clip = None if network.clip is None else tuple(tensor(end)[:, None] for end in network.clip)
 
     def __call__(self, x: Tensor, x_error: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -71,16 +71,7 @@ class LayersEnclosure:
         mid (m, B), slopes (m, n, B), error (m, B), share (n, B) : share says how much each axis spreads the
             first layer, which is where a split reduces the error.
         """
-        bounds, batch = self._layers, x.shape[2]
-        pieces = 1
-        if x.device.type == "cpu":
-            compiled = kernels(self.units * batch)
-            pieces = max(1, -(-batch // _PIECE))
-            if compiled is not None:
-                bounds = FusedLayers(compiled, self.layers, self.squash, self.scale, -(-batch // pieces))
-        cut = zip(x.tensor_split(pieces, 2), x_error.tensor_split(pieces, 1), strict=True)
-        parts = [bounds(*part) for part in cut]
-        h, error, share = parts[0] if pieces == 1 else (torch.cat(v, -1) for v in zip(*parts, strict=True))
+        h, error, share = self._in_pieces(x, x_error)
         through = self.scale[:, None] * h[:, 0]
         mid, slopes = through + self.offset[:, None], self.scale[:, None, None] * h[:, 1:]
         rounding = 4 * EPS * (through.abs() + self.offset.abs()[:, None] + slopes.abs().sum(1)) + TINY
@@ -89,6 +80,20 @@ class LayersEnclosure:
         if self.clip is not None:
             mid, slopes, error = clipped(mid, slopes, error, *self.clip)
         return mid, slopes, error, share
+
+    def _in_pieces(self, x: Tensor, x_error: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """`_layers` on as many boxes at a time as stay in a core's cache, compiled where that pays."""
+        batch = x.shape[2]
+        if x.device.type != "cpu" or not batch:
+            return self._layers(x, x_error)
+        compiled, parts = kernels(self.units * batch), []
+        bounds, piece = self._layers, max(1, _NUMBERS // self.widest)
+        for one, its_error in zip(torch.split(x, piece, 2), torch.split(x_error, piece, 1), strict=True):
+            if compiled is not None and not (isinstance(bounds, FusedLayers) and bounds.batch == one.shape[2]):
+                bounds = FusedLayers(compiled, self.layers, self.squash, self.scale, one.shape[2])
+            parts.append(bounds(one, its_error))
+        h, error, share = (torch.cat(column, -1) for column in zip(*parts, strict=True))
+        return h, error, share
 
     def _layers(self, x: Tensor, x_error: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """The affine form (m, n + 1, B) behind the last layer, the scaled error (m, B) and `share`."""
