@@ -2,8 +2,8 @@
 
 numba is optional (`certify[fast]`), takes most of a second to import with what is in its cache, and compiles for
 seconds where nothing is. A process gets the loops once it has done as much without them as their start costs, so that a
-short search never pays for it and no search pays twice. Which of two threads asks first may decide how a batch is bounded:
-either way the bounds hold, and they differ by rounding.
+short search never pays for it and no search pays twice. Which of two threads asks first may decide how a batch is
+bounded: either way the bounds hold, and they differ by rounding.
 """
 
 from __future__ import annotations

@@ -166,7 +166,7 @@ def bend(
             tangent = value - s * at
             lower = a if a < b else b
             lower = (tangent if tangent < lower else lower) - slack
-            reach = abs(centre) + (hi - lo)  # infinite or NaN where an end is, and then the gap is NaN
+            reach = abs(centre) + (hi - lo) / 2  # infinite or NaN where an end is, and then the gap is NaN
             gap = (upper - lower) / 2 + EPS * (abs(upper) + abs(lower) + s * reach) + TINY
             shift = (upper + lower) / 2
             new = gap + s * rounding[i, k] + EPS * (s * (abs(centre) + spread[i, k]) + abs(shift)) + TINY
