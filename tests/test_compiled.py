@@ -16,6 +16,7 @@ from typing import Any
 import numba
 import numpy as np
 import pytest
+import sympy
 import torch
 
 from certify.claims import Problem
@@ -26,6 +27,7 @@ from certify.enclosures.compiled import Compiled
 from certify.engines.base import Budget
 from certify.engines.bounds.rule import BoxBounds, VdotBound
 from certify.engines.bounds.search import prove_outwards
+from certify.expressions.tree import FUNCTIONS
 from certify.policies import load_policy
 from certify.running import ThreadRunner
 from certify.systems import get_system
@@ -225,6 +227,18 @@ def test_a_short_search_does_not_import_numba() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.split() == ["PROVED", "False"]
+
+
+def test_a_tape_knows_every_function_of_the_grammar() -> None:
+    """A new one that only models know would end a search in an error, once loops are compiled."""
+    for name in FUNCTIONS:
+        found = tape.recorded(1, lambda values, algebra, name=name: algebra.function(name, values[0]))
+        assert len(found.steps) == (4 if name == "tan" else 1)
+        given = [np.array([[[0.5], [0.25]]]), np.zeros((1, 1)), np.zeros((0, 1)), np.zeros((0, 1, 1)), np.zeros((0, 1))]
+        result = [np.zeros(1), np.zeros((1, 1)), np.zeros((1, 1, 1)), np.zeros(1)]
+        kernels.play(found.steps, found.k, found.places, *given, np.zeros((0, 3)), *result)
+        at_half = float(FUNCTIONS[name](sympy.Rational(1, 2)))
+        assert abs(result[0][0] - at_half) < 1e-15 and np.isfinite(result[3]).all()
 
 
 def test_a_tape_plays_what_its_result_needs_and_uses_places_again() -> None:
