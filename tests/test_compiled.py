@@ -20,10 +20,11 @@ import sympy
 import torch
 
 from certify.claims import Problem
-from certify.enclosures import compiled, kernels, tape
+from certify.enclosures import compiled, kernels, loop_models, tape
 from certify.enclosures import policy as policies
 from certify.enclosures import taylor as models
 from certify.enclosures.compiled import Compiled
+from certify.enclosures.loop import played
 from certify.engines.base import Budget
 from certify.engines.bounds.rule import BoxBounds, VdotBound
 from certify.engines.bounds.search import prove_outwards
@@ -254,3 +255,28 @@ def test_a_tape_plays_what_its_result_needs_and_uses_places_again() -> None:
     for _, left, right, to in found.steps:
         assert to not in (left, right)
     assert not any(operation == tape.SIN for operation, *_ in found.steps)
+
+
+@pytest.mark.parametrize("place", range(5))
+def test_a_tape_allows_for_the_same_rounding_as_models(place: int) -> None:
+    """States, the input, the uncertain quantities: each alone, in a sum, shifted, where only rounding is left."""
+    system = uncertain_pendulum()
+    n, m = system.n, system.m
+    generator = np.random.default_rng(5)
+    x, error, mid, slopes, wide = (
+        torch.tensor(generator.random((*shape, 40))) for shape in ((n, n + 1), (n,), (m,), (m, n), (m,))
+    )
+    known = loop_models(system, x, 1e-15 * error, mid, slopes, wide)
+    values = [*known.states.values(), *known.inputs.values(), *known.quantities.values()]
+    assert len(values) == 5
+    for calculate in (
+        lambda v: v[place].scaled(1.0),
+        lambda v: v[place] + v[(place + 1) % 5],
+        lambda v: v[place].shifted(0.3),
+    ):
+        found = played(
+            kernels, tape.recorded(5, lambda v, _, f=calculate: f(v)), system, x, 1e-15 * error, mid, slopes, wide
+        )
+        model = calculate(values)
+        assert torch.equal(found.c, model.c) and torch.equal(found.g, model.g) and torch.equal(found.Q, model.Q)
+        assert bool(((found.r - model.r).abs() <= 1e-9 * model.r).all())
