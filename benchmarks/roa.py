@@ -2,7 +2,8 @@
 
 Run with `python benchmarks/roa.py [--runs 5] [--threads 2] [--candidate lqr] [--time-limit 100] [POLICY ...]`. One
 warm-up run is not counted; the figures are medians of the counted runs in this one process. Absolute times are this
-machine's; the ratios are what to compare.
+machine's; the ratios are what to compare. With `--against REV` the working tree and another commit run side by side
+instead (`against.py`).
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
 import torch
+from against import compare
 
 from certify.claims import Problem
 from certify.closed_loop import ClosedLoop
@@ -104,7 +106,13 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--candidate", default="lyapunov", choices=("auto", "lyapunov", "scaled", "lqr", "optimised"))
     parser.add_argument("--time-limit", type=float, default=100.0, help="seconds for a ring")
+    parser.add_argument("--against", metavar="REV", help="another commit, to be compared with")
+    parser.add_argument("--boxes", type=int, default=20_000, help="in a pass of that comparison, at most")
     options = parser.parse_args()
+    if options.against is not None:
+        chosen = ["--candidate", options.candidate, "--time-limit", str(options.time_limit)]
+        compare(options.against, options.policies, options.runs, options.threads, options.boxes, chosen)
+        return
     torch.set_num_threads(options.threads)
     print(f"torch {torch.__version__}, {options.threads} threads, median of {options.runs} runs")
     for path in options.policies:

@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from fractions import Fraction
+from types import SimpleNamespace
+from typing import cast
+
 import flint
 import numpy as np
 import pytest
@@ -11,13 +15,17 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from certify.closed_loop import ClosedLoop
-from certify.enclosures import Models, PolicyEnclosure, Taylor, upper_bound
+from certify.enclosures import Models, PolicyEnclosure, Taylor, kernels, upper_bound
+from certify.enclosures.loop import played
 from certify.enclosures.policy import relax_tanh
+from certify.enclosures.tape import recorded
+from certify.enclosures.taylor import ConstantsLast
 from certify.expressions import evaluate
 from certify.policies import TanhNetwork
 from certify.rigorous import evaluate_arb, evaluate_policy
 from certify.systems import System, get_system
 from tests.support.loops import box, pendulum_network
+from tests.support.ways import WAYS, Way, bounded
 
 CPU = torch.device("cpu")
 
@@ -86,9 +94,10 @@ def _networks() -> list[tuple[System, TanhNetwork]]:
     ]
 
 
+@pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("case", range(5))
 @pytest.mark.parametrize("size", [0.0, 1e-12, 1e-6, 1e-2, 0.5, 10.0, 1e6])
-def test_the_policy_lies_in_its_enclosure(case: int, size: float) -> None:
+def test_the_policy_lies_in_its_enclosure(case: int, size: float, way: Way) -> None:
     system, network = _networks()[case]
     loop = ClosedLoop(system, network)
     generator = np.random.default_rng(case)
@@ -96,7 +105,8 @@ def test_the_policy_lies_in_its_enclosure(case: int, size: float) -> None:
     centre = generator.standard_normal((n, batch))
     slopes = size * generator.standard_normal((n, n, batch))
     x = torch.cat([tensor(centre)[:, None], tensor(slopes)], 1)
-    mid, gradient, error, _ = PolicyEnclosure(loop, CPU)(x, torch.zeros(n, batch, dtype=torch.float64))
+    with bounded(way):
+        mid, gradient, error, _ = PolicyEnclosure(loop, CPU)(x, torch.zeros(n, batch, dtype=torch.float64))
     checked = 0
     for b in range(batch):
         for d in [np.ones(n), *generator.uniform(-1, 1, (3, n))]:
@@ -148,9 +158,21 @@ def on_models(expression: sympy.Expr, x: Taylor, y: Taylor) -> Taylor:
     return evaluate(expression, {X: x, Y: y}, Models(x))
 
 
+def on_tape(expression: sympy.Expr, x: Taylor, y: Taylor) -> Taylor:
+    """The same with the compiled loop, for models without Q and r."""
+    two = recorded(2, lambda v, algebra: evaluate(expression, {X: v[0], Y: v[1]}, algebra))
+    states, none = torch.stack([torch.cat([v.c[None], v.g]) for v in (x, y)]), torch.zeros(2, 1, dtype=torch.float64)
+    system = SimpleNamespace(n=2, m=0, uncertain=())
+    return played(kernels, two, cast(System, system), states, none, none[:0], states[:0, 1:], none[:0])
+
+
+EVALUATED = {"torch": on_models, "compiled": on_tape}
+
+
 coefficient = st.floats(-1, 1).map(lambda v: round(v, 6))
 
 
+@pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("expression", EXPRESSIONS, ids=str)
 @given(
     st.lists(coefficient, min_size=6, max_size=6),
@@ -158,11 +180,11 @@ coefficient = st.floats(-1, 1).map(lambda v: round(v, 6))
     st.lists(st.tuples(st.floats(-1, 1), st.floats(-1, 1)), min_size=1, max_size=4),
 )
 def test_taylor_models_contain_the_function(
-    expression: sympy.Expr, numbers: list[float], size: float, points: list[tuple[float, float]]
+    way: Way, expression: sympy.Expr, numbers: list[float], size: float, points: list[tuple[float, float]]
 ) -> None:
     flint.ctx.prec = 200
     (a, b), g, h = numbers[:2], [size * v for v in numbers[2:4]], [size * v for v in numbers[4:]]
-    result = on_models(expression, model(a, g), model(b, h))
+    result = EVALUATED[way](expression, model(a, g), model(b, h))
     bound = float(upper_bound(result)[0][0])
     assume(bool(torch.isfinite(result.r[0])))  # NaN: a pole could not be excluded, and nothing is claimed
     for d in points:
@@ -180,12 +202,13 @@ def test_taylor_models_contain_the_function(
         assert true <= arb(bound)
 
 
+@pytest.mark.parametrize("way", WAYS)
 @pytest.mark.parametrize("expression", EXPRESSIONS, ids=str)
-def test_taylor_remainder_is_of_third_order(expression: sympy.Expr) -> None:
+def test_taylor_remainder_is_of_third_order(expression: sympy.Expr, way: Way) -> None:
     remainders = []
     for k in range(2, 9):
         size = 0.5 * 2.0**-k
-        result = on_models(expression, model(0.3, [size, -0.4 * size]), model(-0.2, [0.1 * size, size]))
+        result = EVALUATED[way](expression, model(0.3, [size, -0.4 * size]), model(-0.2, [0.1 * size, size]))
         remainders.append(float(result.r[0]))
     if max(remainders) < 1e-13:  # a polynomial of degree two: nothing but rounding
         assert sympy.Poly(expression, X, Y).total_degree() <= 2
@@ -194,10 +217,32 @@ def test_taylor_remainder_is_of_third_order(expression: sympy.Expr) -> None:
     assert np.all(orders[2:] > 2.8)
 
 
-def test_a_pole_in_reach_is_never_bounded() -> None:
+@given(st.lists(st.floats(-1e6, 1e6), min_size=16, max_size=16), st.sampled_from([1.0, 1e-8, 1e8]))
+def test_rows_of_models_contain_their_sums(numbers: list[float], size: float) -> None:
+    """In one product, and row by row as a tape has them, against exact sums of the same coefficients."""
+    matrix = size * np.array(numbers[:4]).reshape(2, 2)
+    values = []
+    for c, g, h, p, q, r in (numbers[4:10], numbers[10:16]):
+        Q = tensor([[p, q], [q, -p]])[:, :, None]
+        values.append(Taylor(tensor([c]), tensor([g, h])[:, None], Q, tensor([abs(r)])))
+    together = Models(values[0]).combined(matrix, values)
+    apart = ConstantsLast.combined(Models(values[0]), matrix, values)
+    for found in (together, apart):
+        for row, result in zip(matrix, found, strict=True):
+            wrong = Fraction(0)
+            for name in ("c", "g", "Q"):
+                parts = [getattr(v, name).flatten().tolist() for v in (*values, result)]
+                for a, b, own in zip(*parts, strict=True):
+                    wrong += abs(Fraction(row[0]) * Fraction(a) + Fraction(row[1]) * Fraction(b) - Fraction(own))
+            rest = sum(abs(Fraction(k)) * Fraction(float(v.r[0])) for k, v in zip(row, values, strict=True))
+            assert wrong + rest <= Fraction(float(result.r[0]))
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_a_pole_in_reach_is_never_bounded(way: Way) -> None:
     roots = ((sympy.sqrt(X), 0.05), (sympy.sqrt(X), -3.0), (X * sympy.sqrt(X), 0.1), (sympy.exp(X), 64.0))
     for expression, centre in ((1 / X, 0.05), (sympy.tan(X), 1.5), (X**-2, 0.0), *roots):
-        result = on_models(expression, model(centre, [0.1, 0.0]), model(0.0, [0.0, 0.0]))
+        result = EVALUATED[way](expression, model(centre, [0.1, 0.0]), model(0.0, [0.0, 0.0]))
         assert not bool(upper_bound(result)[0][0] < float("inf"))
 
 

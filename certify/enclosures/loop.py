@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from types import ModuleType
 from typing import NamedTuple
 
+import numpy as np
 import sympy
 import torch
 from torch import Tensor
 
+from certify.enclosures.tape import Tape
 from certify.enclosures.taylor import EPS, TINY, Taylor
 from certify.systems import System
 
@@ -44,10 +47,26 @@ def loop_models(
         own = none.clone()
         own[j] = wide[j]
         inputs[symbol] = Taylor(mid[j], torch.cat([slopes[j], own]), zeros, zeros[0, 0])
-    for j, (symbol, (lo, hi)) in enumerate(system.uncertain):
-        middle, reach = float((lo + hi) / 2), float((hi - lo) / 2)
+    for j, ((symbol, _), (middle, reach, rounding)) in enumerate(zip(system.uncertain, _ranges(system), strict=True)):
         own = zeros[0].clone()
         own[n + m + j] = reach
-        rounding = EPS * (abs(middle) + reach) + TINY
         quantities[symbol] = Taylor(zeros[0, 0] + middle, own, zeros, zeros[0, 0] + rounding)
     return LoopModels(states, inputs, quantities)
+
+
+def played(
+    kernels: ModuleType, tape: Tape, system: System, x: Tensor, error: Tensor, mid: Tensor, slopes: Tensor, wide: Tensor
+) -> Taylor:
+    """The result of a tape whose inputs are all of `loop_models`, with compiled loops; parameters are those of that."""
+    N, batch = system.n + system.m + len(system.uncertain), x.shape[2]
+    c, g, Q, r = (torch.empty(*shape, batch, dtype=torch.float64) for shape in ((), (N,), (N, N), ()))
+    given = (v.contiguous().numpy() for v in (x, error, mid, slopes, wide))
+    ranges = np.array(_ranges(system)).reshape(-1, 3)
+    kernels.play(tape.steps, tape.k, tape.places, *given, ranges, *(v.numpy() for v in (c, g, Q, r)))
+    return Taylor(c, g, Q, r)
+
+
+def _ranges(system: System) -> list[tuple[float, float, float]]:
+    """The middle of each uncertain quantity, its reach, and the rounding of these."""
+    ends = ((float((lo + hi) / 2), float((hi - lo) / 2)) for _, (lo, hi) in system.uncertain)
+    return [(middle, reach, EPS * (abs(middle) + reach) + TINY) for middle, reach in ends]

@@ -18,11 +18,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from certify.closed_loop import ClosedLoop
+from certify.enclosures.compiled import kernels
+from certify.enclosures.fused import FusedLayers, Layer
 from certify.enclosures.taylor import EPS, TINY
 from certify.policies import TanhNetwork
 from certify.rigorous import centring_with_errors
 
 Array = NDArray[np.float64]
+_NUMBERS = 2**15  # units of a layer times boxes at a time, which stay in a core's cache
 _LIBM = 2.0**-47  # error allowed to torch.tanh, relative to 1
 
 
@@ -50,6 +53,10 @@ class LayersEnclosure:
         self.biases[-1], self.offset = bias + shift, offset
         self.bias_error = torch.where(shift == 0, 0.0, shift_error + EPS * (bias.abs() + shift.abs()))
         self.offset_error = offset_error
+        none = [torch.zeros_like(b) for b in self.biases[:-1]]
+        rows = (self.weights, self.magnitudes, self.biases, [*none, self.bias_error], self.rows, self.norms)
+        self.layers = [Layer(*row) for row in zip(*rows, strict=True)]
+        self.units, self.widest = sum(network.layers[1:]), max(network.layers)
         self.clip = None if network.clip is None else tuple(tensor(end)[:, None] for end in network.clip)
 
     def __call__(self, x: Tensor, x_error: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -64,8 +71,35 @@ class LayersEnclosure:
         mid (m, B), slopes (m, n, B), error (m, B), share (n, B) : share says how much each axis spreads the
             first layer, which is where a split reduces the error.
         """
+        h, error, share = self._in_pieces(x, x_error)
+        through = self.scale[:, None] * h[:, 0]
+        mid, slopes = through + self.offset[:, None], self.scale[:, None, None] * h[:, 1:]
+        rounding = 4 * EPS * (through.abs() + self.offset.abs()[:, None] + slopes.abs().sum(1)) + TINY
+        rounding = rounding + self.offset_error[:, None]
+        error = (rounding + error) * (1 + 1e-12)
+        if self.clip is not None:
+            mid, slopes, error = clipped(mid, slopes, error, *self.clip)
+        return mid, slopes, error, share
+
+    def _in_pieces(self, x: Tensor, x_error: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """`_layers` on as many boxes at a time as stay in a core's cache, compiled where that pays."""
+        batch = x.shape[2]
+        if x.device.type != "cpu" or not batch:
+            return self._layers(x, x_error)
+        compiled, parts = kernels(self.units * batch), []
+        bounds, piece = self._layers, max(1, _NUMBERS // self.widest)
+        for one, its_error in zip(torch.split(x, piece, 2), torch.split(x_error, piece, 1), strict=True):
+            if compiled is not None and not (isinstance(bounds, FusedLayers) and bounds.batch == one.shape[2]):
+                bounds = FusedLayers(compiled, self.layers, self.squash, self.scale, one.shape[2])
+            parts.append(bounds(one, its_error))
+        h, error, share = (torch.cat(column, -1) for column in zip(*parts, strict=True))
+        return h, error, share
+
+    def _layers(self, x: Tensor, x_error: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """The affine form (m, n + 1, B) behind the last layer, the scaled error (m, B) and `share`."""
         n, batch = x.shape[0], x.shape[2]
-        h, fresh, old, ball = x, x_error, torch.zeros_like(x_error), torch.zeros_like(x_error[0])
+        h, ball = x, torch.zeros_like(x_error[0])
+        errors = torch.stack([x_error, torch.zeros_like(x_error)], 1)  # fresh ones and older ones
         size = x.abs().sum(1)  # sum_j |h_ij|; its 2-norm over i, times sqrt(n + 1), bounds the sum of ||h_j||_2
         share = torch.ones(n, batch, dtype=x.dtype, device=x.device) / n
         passed: list[tuple[Tensor, Tensor | None, Tensor]] = []
@@ -78,9 +112,10 @@ class LayersEnclosure:
             rounding = rounding + 8 * EPS * (y[:, 0].abs() + self.biases[k].abs()[:, None]) + TINY
             if last:
                 rounding = rounding + self.bias_error[:, None]
-            through_old = torch.minimum(self.magnitudes[k] @ old, self.rows[k][:, None] * ball)
-            error = (self.magnitudes[k] @ fresh + through_old) * (1 + width * EPS) + rounding
-            ball = (self.norms[k] * (ball + fresh.norm(dim=0)) + rounding.norm(dim=0)) * (1 + width * EPS)
+            through = (self.magnitudes[k] @ errors.reshape(width, -1)).reshape(-1, 2, batch)
+            older = torch.minimum(through[:, 1], self.rows[k][:, None] * ball)
+            error = (through[:, 0] + older) * (1 + width * EPS) + rounding
+            ball = (self.norms[k] * (ball + errors[:, 0].norm(dim=0)) + rounding.norm(dim=0)) * (1 + width * EPS)
             if last and not self.squash:
                 passed.append((W, None, rounding))
                 h = y
@@ -95,17 +130,10 @@ class LayersEnclosure:
             h = slope[:, None] * y
             h[:, 0] += shift
             size = (h[:, 0].abs() + slope * spread) * (1 + n * EPS)
-            old = slope * error
-            ball = torch.minimum(slope.amax(0) * ball, old.norm(dim=0) * (1 + width * EPS))
+            errors = torch.stack([fresh, slope * error], 1)
+            ball = torch.minimum(slope.amax(0) * ball, errors[:, 1].norm(dim=0) * (1 + width * EPS))
             passed.append((W, slope, fresh))
-        through = self.scale[:, None] * h[:, 0]
-        mid, slopes = through + self.offset[:, None], self.scale[:, None, None] * h[:, 1:]
-        rounding = 4 * EPS * (through.abs() + self.offset.abs()[:, None] + slopes.abs().sum(1)) + TINY
-        rounding = rounding + self.offset_error[:, None]
-        error = (rounding + self._error_backwards(passed, x_error)) * (1 + 1e-12)
-        if self.clip is not None:
-            mid, slopes, error = clipped(mid, slopes, error, *self.clip)
-        return mid, slopes, error, share
+        return h, self._error_backwards(passed, x_error), share
 
     def _error_backwards(self, passed: list[tuple[Tensor, Tensor | None, Tensor]], x_error: Tensor) -> Tensor:
         m, batch = len(self.scale), x_error.shape[1]
@@ -128,26 +156,23 @@ class PolicyEnclosure(LayersEnclosure):
 def relax_tanh(centre: Tensor, radius: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Parallel lines: (s, m, gap) with |tanh(y) - s y - m| <= gap for |y - centre| <= radius.
 
-    s is near the chord's slope. With D(y) = tanh(y) - s y, concavity on y >= 0 puts D below its tangent at any
-    p >= 0, and convexity on y <= 0 puts the rest below the ends; D is odd.
+    s is the chord's slope. D(y) = tanh(y) - s y rises up to the p >= 0 at which tanh' is s and falls beyond, among
+    y >= 0; among y <= 0 it is convex and largest at an end; and it is odd. tanh(p) = sqrt(1 - s), so that neither bound
+    needs another tanh. Where p is not exact, |D'(p)| <= 2^-48 and D' is monotone between p and the exact one.
     """
     radius = radius * (1 + EPS) + EPS * centre.abs() + TINY
     lo, hi = centre - radius, centre + radius
-    t_lo, t_hi, t = lo.tanh(), hi.tanh(), centre.tanh()
-    slope = torch.where(radius > 1e-4, (t_hi - t_lo) / (hi - lo), 1 - t * t).clamp(0.0, 1.0)
-    critical = torch.atanh((1 - slope).clamp(0.0, 1 - EPS).sqrt())
-
-    def supremum(lo: Tensor, hi: Tensor, t_lo: Tensor, t_hi: Tensor) -> Tensor:
-        start = lo.clamp(min=0.0)
-        p = torch.minimum(torch.maximum(critical, start), hi)
-        t = p.tanh()
-        excess = 1 - t * t - slope
-        rise = torch.maximum(excess * (start - p), excess * (hi - p)) + _LIBM * (hi - start)
-        ends = torch.maximum(t_lo - slope * lo, t_hi - slope * hi)
-        return torch.where(hi > 0, torch.maximum(ends, t - slope * p + rise), ends) + _LIBM
-
-    upper = supremum(lo, hi, t_lo, t_hi)
-    lower = -supremum(-hi, -lo, -t_hi, -t_lo)
+    t_lo, t_hi = lo.tanh(), hi.tanh()
+    width = hi - lo
+    slope = ((t_hi - t_lo) / width).clamp(0.0, 1.0)
+    t = (1 - slope).clamp(max=1 - EPS).sqrt()
+    p = t.atanh()
+    a, b = t_lo - slope * lo, t_hi - slope * hi
+    slack = _LIBM * (1 + width)
+    above = t.clamp(t_lo, t_hi) - slope * p.clamp(lo, hi)
+    below = (-t).clamp(t_lo, t_hi) - slope * (-p).clamp(lo, hi)
+    upper = torch.maximum(torch.maximum(a, b), above) + slack
+    lower = torch.minimum(torch.minimum(a, b), below) - slack
     gap = (upper - lower) / 2 + EPS * (upper.abs() + lower.abs() + slope * (centre.abs() + radius)) + TINY
     return slope, (upper + lower) / 2, gap
 

@@ -11,12 +11,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from typing import Protocol, Self, TypeVar
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from certify.expressions import Algebra
 
+Array = NDArray[np.float64]
 EPS = 2.0**-50
 TINY = 2.0**-900
 EXP_END = 64.0  # of the exponent, beyond which the checker knows nothing of exp
@@ -58,7 +62,8 @@ class Taylor:
         (ca, Ga, Qa), (cb, Gb, Qb) = a.norms(), b.norms()
         r = ca * b.r + cb * a.r + Ga * Qb + Gb * Qa + Qa * Qb + a.r * (Gb + Qb + b.r) + b.r * (Ga + Qa)
         r = r + EPS * ((ca + Ga + Qa) * (cb + Gb + Qb) + r) + TINY
-        Q = a.c * b.Q + b.c * a.Q + a.g[:, None] * b.g[None]
+        joint = 0.5 * (a.g[:, None] * b.g[None])
+        Q = a.c * b.Q + b.c * a.Q + (joint + joint.transpose(0, 1))
         return Taylor(a.c * b.c, a.c * b.g + b.c * a.g, Q, r)
 
     def compose(self, f0: Tensor, f1: Tensor, f2: Tensor, third: Tensor) -> Taylor:
@@ -119,8 +124,40 @@ class Taylor:
         return self.compose(c, -s, -c / 2, (s.abs() + self.radius() + EPS).clamp(max=1.0) / 6)
 
 
-class Models(Algebra[Taylor]):
-    """Expressions of the plant on Taylor models of the shape of `like`; constants enter sums and products last."""
+class Arithmetic(Protocol):
+    """What models have in common with what stands for them."""
+
+    def __add__(self, other: Self, /) -> Self: ...
+
+    def __mul__(self, other: Self, /) -> Self: ...
+
+    def scaled(self, k: float) -> Self: ...
+
+    def shifted(self, k: float) -> Self: ...
+
+
+V = TypeVar("V", bound=Arithmetic)
+
+
+class ConstantsLast(Algebra[V]):
+    """An arithmetic in which constants enter sums and products last, each by one operation on a value."""
+
+    def total(self, constant: Fraction | None, terms: Sequence[V]) -> V:
+        result = super().total(None, terms)
+        return result if constant is None else result.shifted(float(constant))
+
+    def product(self, constant: Fraction | None, factors: Sequence[V]) -> V:
+        result = super().product(None, factors)
+        return result if constant is None else result.scaled(float(constant))
+
+    def combined(self, matrix: Array, values: Sequence[V]) -> list[V]:
+        """`matrix` (p, q), of numbers up to one rounding, times q values."""
+        rows = [[value.scaled(float(k)) for k, value in zip(row, values, strict=True)] for row in matrix]
+        return [super(ConstantsLast, self).total(None, row) for row in rows]
+
+
+class Models(ConstantsLast[Taylor]):
+    """Expressions of the plant on Taylor models of the shape of `like`."""
 
     def __init__(self, like: Taylor) -> None:
         self.zero = Taylor(*(torch.zeros_like(t) for t in (like.c, like.g, like.Q, like.r)))
@@ -128,13 +165,14 @@ class Models(Algebra[Taylor]):
     def constant(self, q: Fraction) -> Taylor:
         return self.zero.shifted(float(q))
 
-    def total(self, constant: Fraction | None, terms: Sequence[Taylor]) -> Taylor:
-        result = super().total(None, terms)
-        return result if constant is None else result.shifted(float(constant))
-
-    def product(self, constant: Fraction | None, factors: Sequence[Taylor]) -> Taylor:
-        result = super().product(None, factors)
-        return result if constant is None else result.scaled(float(constant))
+    def combined(self, matrix: Array, values: Sequence[Taylor]) -> list[Taylor]:
+        """`matrix` (p, q) times q values, in one product."""
+        parts = zip(*((v.c, v.g, v.Q, v.r + 2 * len(values) * EPS * sum(v.norms())) for v in values), strict=True)
+        c, g, Q, r = (torch.stack(part) for part in parts)
+        weights = torch.tensor(matrix, dtype=c.dtype, device=c.device)
+        c, g, Q = (torch.tensordot(weights, part, 1) for part in (c, g, Q))
+        r = weights.abs() @ r * (1 + len(values) * EPS) + TINY
+        return [Taylor(*row) for row in zip(c, g, Q, r, strict=True)]
 
 
 def upper_bound(model: Taylor) -> tuple[Tensor, Tensor]:

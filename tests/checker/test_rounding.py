@@ -47,6 +47,7 @@ from tests.support.certificates import make, parse
 from tests.support.leaves import on_boxes
 from tests.support.loops import box
 from tests.support.oracle import Array, awkward, policies_in_arb, policy_in_arb, value_of
+from tests.support.ways import Way, bounded
 
 BITS, MANY_BITS = 200, 4000
 CHUNK = 2**15
@@ -507,29 +508,32 @@ def situation(generator: Generator, squash: Squash, centre: Centre, wide: bool, 
     )
 
 
-def producer_bounds(s: Situation, squash: Squash, centre: Centre) -> list[Array]:
+def producer_bounds(s: Situation, squash: Squash, centre: Centre, way: Way = "torch") -> list[Array]:
     loop = ClosedLoop(still_system(len(s.x), s.u_eq), network_of(s.policy, squash, centre))
-    return [v.numpy() for v in PolicyEnclosure(loop, CPU)(torch.from_numpy(s.x), torch.from_numpy(s.x_error))[:3]]
+    with bounded(way):
+        return [v.numpy() for v in PolicyEnclosure(loop, CPU)(torch.from_numpy(s.x), torch.from_numpy(s.x_error))[:3]]
 
 
 @sizes((40, 5), (2000, 50))
 def test_policies_on_boxes(first: int, second: int, report: Report) -> None:
-    """`first` networks, `second` boxes each; both enclosures against the same truth."""
+    """`first` networks, `second` boxes each; all enclosures against the same truth."""
     generator = np.random.default_rng(101)
-    trusted, untrusted = Tally(), Tally()
+    trusted, untrusted, fast = Tally(), Tally(), Tally()
     for number in range(first):
         squash, centre = FORMS[number % len(FORMS)]
         s = situation(generator, squash, centre, number % 20 == 19, second)
         truth = policies_in_arb(s.policy, s.u_eq, [s.state(k, b) for k in range(EACH) for b in range(second)])
         s.judge(trusted, truth, *checker.enclose_on_boxes(checker.fold(s.policy, s.u_eq), s.x, s.x_error))
         s.judge(untrusted, truth, *producer_bounds(s, squash, centre))
+        s.judge(fast, truth, *producer_bounds(s, squash, centre, "compiled"))
     report("checker", trusted, 0.9)
     report("producer", untrusted, 0.9)
+    report("producer, compiled", fast, 0.9)
 
 
 @pytest.mark.parametrize(
     "who",
-    ["checker", "producer"],
+    ["checker", "torch", "compiled"],
 )
 @pytest.mark.parametrize(("squash", "centre"), [form for form in FORMS if form[1] != "none"])
 def test_errors_of_folding_are_enclosed(who: str, squash: Squash, centre: Centre) -> None:
@@ -546,7 +550,7 @@ def test_errors_of_folding_are_enclosed(who: str, squash: Squash, centre: Centre
     if who == "checker":
         s.judge(tally, truth, *checker.enclose_on_boxes(checker.fold(policy, s.u_eq), s.x, s.x_error))
     else:
-        s.judge(tally, truth, *producer_bounds(s, squash, centre))
+        s.judge(tally, truth, *producer_bounds(s, squash, centre, "torch" if who == "torch" else "compiled"))
     assert tally.violations == 0, (tally.worst, tally.examples)
 
 

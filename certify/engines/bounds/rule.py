@@ -15,6 +15,7 @@ Whether a box's centre can be proved at all is therefore asked of the centre alo
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +26,10 @@ from torch import Tensor
 
 from certify.claims import Problem
 from certify.enclosures import Flow, Models, PolicyEnclosure, Taylor, loop_models, upper_bound
-from certify.enclosures.taylor import EPS, TINY
+from certify.enclosures.compiled import kernels
+from certify.enclosures.loop import played
+from certify.enclosures.tape import Tape, recorded
+from certify.enclosures.taylor import EPS, TINY, ConstantsLast, V
 from certify.engines.bounds.form import FormBound
 from certify.expressions import evaluate
 from certify.policies import bounded_by_form
@@ -72,6 +76,7 @@ class VdotBound:
         self.flow = None if sample is None else Flow(self.dynamics, sample, order)
         self.order = 1 if self.flow is None else order
         self.step = loop.step
+        self.tape: Tape | None = None  # of D, recorded when it is first played
         ends = [[float(end) for end in pair] for pair in loop.system.domain]
         self.ends = torch.tensor(ends, dtype=torch.float64, device=device).T[:, :, None]
         extent = np.sqrt(np.diag(np.linalg.inv(self.P))) * (1 + 1e-9)
@@ -152,35 +157,41 @@ class VdotBound:
 
         Symbols: n box coordinates, m input errors, k uncertain quantities, and the period if that is in a range.
         """
+        compiled = kernels(self.policy.units * x.shape[2]) if self.flow is None and x.device.type == "cpu" else None
+        if compiled is not None:
+            if self.tape is None:
+                count = self.system.n + self.system.m + len(self.system.uncertain)
+                self.tape = recorded(count, self._at_rates)
+            return played(compiled, self.tape, self.system, x, error, mid, slopes, wide), None
         more = 0 if self.flow is None else self.flow.symbols
         states, inputs, quantities = loop_models(self.system, x, error, mid, slopes, wide, more)
         here = list(states.values())
-        kept = None
-        if self.flow is not None:
-            mean = self.flow(states, inputs, quantities, self.system.n + self.system.m)
-            G, kept = mean.G, mean.exists & self._in_domain(here, mean.least, mean.most, outer)
-        else:
-            known: dict[sympy.Expr, Taylor] = {}
-            values, models = {**states, **inputs, **quantities}, Models(here[0])
-            G = [evaluate(expression, values, models, known) for expression in self.dynamics]
-            if self.system.time == "discrete":
-                G = [after + before.scaled(-1.0) for after, before in zip(G, here, strict=True)]
-        along, factor = here, 2.0
-        if self.step:  # 2 x + h G, with the period's own symbol where it has one
-            moved = G if self.flow is None else [self.flow.times_period(rate) for rate in G]
-            along, factor = [v.scaled(2.0) + by for v, by in zip(here, moved, strict=True)], 1.0
-        terms = [self._row(i, along, factor) * rate for i, rate in enumerate(G)]
-        result = terms[0]
-        for term in terms[1:]:
-            result = result + term
-        return result, kept
+        models = Models(here[0])
+        if self.flow is None:
+            return self._at_rates([*here, *inputs.values(), *quantities.values()], models), None
+        mean = self.flow(states, inputs, quantities, self.system.n + self.system.m)
+        moved = [self.flow.times_period(rate) for rate in mean.G]
+        kept = mean.exists & self._in_domain(here, mean.least, mean.most, outer)
+        return self._increment(here, mean.G, moved, models), kept
 
-    def _row(self, i: int, models: list[Taylor], factor: float) -> Taylor:
-        """Component i of P v, times the factor."""
-        result = models[0].scaled(factor * float(self.P[i, 0]))
-        for j in range(1, len(models)):
-            result = result + models[j].scaled(factor * float(self.P[i, j]))
-        return result
+    def _at_rates(self, values: Sequence[V], algebra: ConstantsLast[V]) -> V:
+        """D where the input is not held over time, from states, inputs and uncertain quantities."""
+        system = self.system
+        known: dict[sympy.Expr, V] = {}
+        symbols = [*system.states, *system.inputs, *(symbol for symbol, _ in system.uncertain)]
+        named, here = dict(zip(symbols, values, strict=True)), values[: system.n]
+        G: list[V] = [evaluate(expression, named, algebra, known) for expression in self.dynamics]
+        if system.time == "discrete":
+            G = [after + before.scaled(-1.0) for after, before in zip(G, here, strict=True)]
+        return self._increment(here, G, G, algebra)
+
+    def _increment(self, here: Sequence[V], G: Sequence[V], moved: Sequence[V], algebra: ConstantsLast[V]) -> V:
+        """`2 x'P G + h G'P G`, `moved` being h G."""
+        along, factor = here, 2.0
+        if self.step:
+            along, factor = [v.scaled(2.0) + by for v, by in zip(here, moved, strict=True)], 1.0
+        terms = [row * rate for row, rate in zip(algebra.combined(factor * self.P, along), G, strict=True)]
+        return algebra.total(None, terms)
 
     def _in_domain(self, states: list[Taylor], least: Tensor, most: Tensor, outer: float) -> Tensor:
         """Where (B,) the solution from V <= outer stays inside the domain over the longest period."""

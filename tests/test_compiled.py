@@ -1,0 +1,282 @@
+"""Compiled loops against torch: the same bounds up to rounding, nothing proved that is not finite, and who pays for it.
+
+That both contain the truth is tested where that of the bounds is: `test_enclosures.py`, `checker/test_rounding.py`.
+"""
+
+from __future__ import annotations
+
+import importlib
+import pickle
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+import pytest
+import sympy
+import torch
+
+from certify.claims import Problem
+from certify.enclosures import compiled, kernels, loop_models, tape
+from certify.enclosures import policy as policies
+from certify.enclosures import taylor as models
+from certify.enclosures.compiled import Compiled
+from certify.enclosures.loop import played
+from certify.engines.base import Budget
+from certify.engines.bounds.rule import BoxBounds, VdotBound
+from certify.engines.bounds.search import prove_outwards
+from certify.expressions.tree import FUNCTIONS
+from certify.policies import load_policy
+from certify.running import ThreadRunner
+from certify.systems import get_system
+from tests.engines.test_steps import alone, stepped, uncertain_pendulum
+from tests.engines.test_vdot import CASES, cartpole_case
+from tests.support.cases import case_of
+from tests.support.loops import pendulum_network
+from tests.support.ways import Way, bounded
+
+CPU = torch.device("cpu")
+POLICIES = Path(__file__).parent.parent / "examples" / "policies"
+Both = tuple[Problem, np.ndarray]
+
+
+def shipped(name: str) -> Both:
+    policy = load_policy(POLICIES / f"{name}.pt")
+    case = case_of(get_system(policy.system).with_parameters(policy.parameters), policy.network)
+    return case.problem, case.T
+
+
+def small(name: str) -> Both:
+    case = CASES[name]()
+    return case.problem, case.T
+
+
+def with_steps(case: Any) -> Both:
+    return case.problem, case.T
+
+
+LOOPS: dict[str, Callable[[], Both]] = {
+    "quadrotor2d": lambda: shipped("quadrotor2d"),
+    "cartpole": lambda: shipped("cartpole"),
+    "scalar": lambda: small("scalar"),
+    "pendulum": lambda: small("pendulum"),
+    "uncertain": lambda: with_steps(stepped(uncertain_pendulum(), pendulum_network())),
+    "discrete": lambda: with_steps(stepped(*alone("x/2 + u/4"))),
+    "rate": lambda: with_steps(stepped(get_system("pendulum"), pendulum_network(), rate=0.1)),
+}
+
+
+def boxes(n: int, count: int, size: float) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = np.random.default_rng(4)
+    centre = torch.tensor(0.3 * generator.standard_normal((n, count)))
+    radius = torch.tensor(size * generator.random((n, count)))
+    return centre - radius, centre + radius
+
+
+def judged(way: Way, rule: VdotBound, lo: torch.Tensor, hi: torch.Tensor) -> BoxBounds:
+    with bounded(way):
+        return rule(lo, hi, 1e-3, 10.0)
+
+
+@pytest.mark.parametrize("name", LOOPS)
+@pytest.mark.parametrize("size", [0.0, 1e-9, 1e-3, 0.1, 1.0])
+def test_both_ways_bound_alike(name: str, size: float) -> None:
+    """Up to what either allows for tanh's own error, 2^-47 a neuron."""
+    problem, T = LOOPS[name]()
+    rule = VdotBound(problem, T, CPU)
+    lo, hi = boxes(len(T), 333, size)  # not a multiple of any piece
+    plain, fast = judged("torch", rule, lo, hi), judged("compiled", rule, lo, hi)
+    assert bool(torch.isfinite(plain.bound).all())
+    scale = plain.bound.abs() + plain.score.abs().sum(0)
+    assert bool(((plain.bound - fast.bound).abs() <= 1e-9 * scale).all())
+    assert bool(((plain.score - fast.score).abs() <= 1e-9 * scale).all())
+    clear = plain.bound.abs() > 1e-9 * scale
+    assert torch.equal(plain.proved[clear], fast.proved[clear]) and int(clear.sum()) > 300
+    assert torch.equal(plain.smooth, fast.smooth)
+
+
+@pytest.mark.parametrize("name", ["cartpole", "pendulum"])
+def test_both_ways_search_the_same_boxes(name: str) -> None:
+    """A whole pass of the shipped policy: every decision is the same."""
+    problem, T = shipped(name)
+    found = []
+    for way in ("torch", "compiled"):
+        with bounded(way):
+            found.append(prove_outwards(problem, T, 1e-2, 0.2, Budget(boxes=6000), ThreadRunner()))
+    plain, fast = found
+    assert plain.boxes == fast.boxes > 20
+    assert plain.tree == fast.tree and plain.leaves == fast.leaves
+    assert plain.outer == pytest.approx(fast.outer, rel=1e-9) and plain.stop == fast.stop
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
+@pytest.mark.parametrize("way", ["torch", "compiled"])
+def test_what_is_not_finite_is_never_proved_and_spoils_no_other_box(way: Way, bad: float) -> None:
+    case = cartpole_case()
+    rule = VdotBound(case.problem, case.T, CPU)
+    lo, hi = boxes(4, 200, 1e-3)
+    good = judged(way, rule, lo, hi)
+    assert bool(good.proved.any())
+    for axis, number in ((0, 7), (3, 130)):
+        hi[axis, number] = bad
+    found = judged(way, rule, lo, hi)
+    spoilt = torch.tensor([7, 130])
+    assert not bool(found.proved[spoilt].any()) and not bool((found.bound[spoilt] < 0).any())
+    assert not bool(found.violated[spoilt].any()) and not bool(found.smooth[spoilt].any())
+    rest = torch.ones(200, dtype=torch.bool).index_fill(0, spoilt, False)
+    torch.testing.assert_close(found.bound[rest], good.bound[rest], rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("way", ["torch", "compiled"])
+def test_a_network_whose_sums_overflow_is_never_bounded(way: Way) -> None:
+    network = cartpole_case().loop.network
+    first, _, last = network.weights
+    huge = type(network)(
+        (first, np.full((24, 24), 1e308), last), network.biases, network.scale, network.offset, "identity", "none"
+    )
+    lo, hi = boxes(4, 40, 0.1)
+    x = torch.cat([((lo + hi) / 2)[:, None], torch.diag_embed(((hi - lo) / 2).T).permute(1, 2, 0)], 1)
+    with bounded(way):
+        mid, slopes, error, _ = policies.LayersEnclosure(huge, [np.zeros(1)] * 4, CPU)(x, torch.zeros_like(lo))
+    assert not bool(torch.isfinite(mid + slopes.sum(1) + error).any())
+
+
+def test_the_rule_can_be_shipped_after_it_was_used() -> None:
+    problem, T = LOOPS["uncertain"]()
+    rule = VdotBound(problem, T, CPU)
+    lo, hi = boxes(2, 100, 0.01)
+    before = judged("compiled", rule, lo, hi)
+    assert rule.tape is not None
+    copy = pickle.loads(pickle.dumps(rule))
+    for a, b in zip(before, judged("compiled", copy, lo, hi), strict=True):
+        assert torch.equal(a, b)
+
+
+def test_threads_share_the_rule() -> None:
+    problem, T = shipped("cartpole")
+    rule = VdotBound(problem, T, CPU)
+    lo, hi = boxes(4, 1500, 0.05)
+    threads = torch.get_num_threads()
+    torch.set_num_threads(2)
+    try:
+        with bounded("compiled"), ThreadRunner(CPU).start(rule) as bound:
+            pieces = bound(lo, hi, 1e-3, 10.0)
+    finally:
+        torch.set_num_threads(threads)
+    whole = judged("compiled", rule, lo, hi)
+    assert torch.equal(pieces.proved, whole.proved)
+    torch.testing.assert_close(pieces.bound, whole.bound, rtol=1e-10, atol=1e-12)
+
+
+def test_the_loops_are_there_once_enough_was_asked_for() -> None:
+    wanted = Compiled(worth=100.0, least=10.0)
+    assert wanted(9.0) is None and wanted(60.0) is None  # 9 is too little to count
+    assert wanted(39.0) is None
+    assert wanted(10.0) is kernels
+    assert wanted(9.0) is None
+    assert wanted(10.0) is kernels
+
+
+def test_without_numba_torch_does_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "numba", None)
+    monkeypatch.delitem(sys.modules, "certify.enclosures.kernels")
+    with pytest.raises(ImportError):
+        importlib.import_module("certify.enclosures.kernels")
+    wanted = Compiled(worth=0.0, least=0.0)
+    assert wanted(1.0) is None and wanted(1.0) is None
+    monkeypatch.setattr(compiled, "_of_process", wanted)
+    problem, T = LOOPS["pendulum"]()
+    lo, hi = boxes(2, 50, 0.01)
+    assert bool(torch.isfinite(VdotBound(problem, T, CPU)(lo, hi, 1e-3, 10.0).bound).all())
+
+
+def double(x: kernels.Line) -> None:
+    for i in range(len(x)):
+        x[i] = 2 * x[i]
+
+
+def test_a_cache_that_cannot_be_written_is_done_without(monkeypatch: pytest.MonkeyPatch) -> None:
+    njit, asked = numba.njit, []
+
+    def refuses(*arguments: Any, cache: bool = False, **options: Any) -> Any:
+        asked.append(cache)
+        if cache:
+            raise RuntimeError("cannot cache function: no locator available for file")
+        return njit(*arguments, **options)
+
+    monkeypatch.setattr(numba, "njit", refuses)
+    monkeypatch.setitem(double.__annotations__, "x", "Line")
+    numbers = np.arange(3.0)
+    kernels._compiled(double)(numbers)
+    assert asked == [True, False] and numbers.tolist() == [0.0, 2.0, 4.0]
+
+
+def test_the_kernels_know_the_constants_of_the_models() -> None:
+    """numba takes them as they are when it compiles, so that they are written where it does."""
+    assert (kernels.EPS, kernels.TINY, kernels.EXP_END) == (models.EPS, models.TINY, models.EXP_END)
+    assert kernels.SLACK == policies._LIBM
+
+
+def test_a_short_search_does_not_import_numba() -> None:
+    code = (
+        "import sys, tempfile; from pathlib import Path; from certify import certify_roa;"
+        f"found = certify_roa(None, {str(POLICIES / 'pendulum.pt')!r}, out=tempfile.mkdtemp());"
+        "print(found.verdict.value, 'numba' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["PROVED", "False"]
+
+
+def test_a_tape_knows_every_function_of_the_grammar() -> None:
+    """A new one that only models know would end a search in an error, once loops are compiled."""
+    for name in FUNCTIONS:
+        found = tape.recorded(1, lambda values, algebra, name=name: algebra.function(name, values[0]))
+        assert len(found.steps) == (4 if name == "tan" else 1)
+        given = [np.array([[[0.5], [0.25]]]), np.zeros((1, 1)), np.zeros((0, 1)), np.zeros((0, 1, 1)), np.zeros((0, 1))]
+        result = [np.zeros(1), np.zeros((1, 1)), np.zeros((1, 1, 1)), np.zeros(1)]
+        kernels.play(found.steps, found.k, found.places, *given, np.zeros((0, 3)), *result)
+        at_half = float(FUNCTIONS[name](sympy.Rational(1, 2)))
+        assert abs(result[0][0] - at_half) < 1e-15 and np.isfinite(result[3]).all()
+
+
+def test_a_tape_plays_what_its_result_needs_and_uses_places_again() -> None:
+    def calculation(values: Any, algebra: tape.Recording) -> tape.Value:
+        values[0].sin()  # needed by nobody
+        result = values[0]
+        for _ in range(20):
+            result = (result * values[0]).shifted(1.0)
+        return result
+
+    found = tape.recorded(1, calculation)
+    assert len(found.steps) == 40 and found.places == 3
+    for _, left, right, to in found.steps:
+        assert to not in (left, right)
+    assert not any(operation == tape.SIN for operation, *_ in found.steps)
+
+
+@pytest.mark.parametrize("place", range(5))
+def test_a_tape_allows_for_the_same_rounding_as_models(place: int) -> None:
+    """States, the input, the uncertain quantities: each alone, in a sum, shifted, where only rounding is left."""
+    system = uncertain_pendulum()
+    n, m = system.n, system.m
+    generator = np.random.default_rng(5)
+    x, error, mid, slopes, wide = (
+        torch.tensor(generator.random((*shape, 40))) for shape in ((n, n + 1), (n,), (m,), (m, n), (m,))
+    )
+    known = loop_models(system, x, 1e-15 * error, mid, slopes, wide)
+    values = [*known.states.values(), *known.inputs.values(), *known.quantities.values()]
+    assert len(values) == 5
+    for calculate in (
+        lambda v: v[place].scaled(1.0),
+        lambda v: v[place] + v[(place + 1) % 5],
+        lambda v: v[place].shifted(0.3),
+    ):
+        found = played(
+            kernels, tape.recorded(5, lambda v, _, f=calculate: f(v)), system, x, 1e-15 * error, mid, slopes, wide
+        )
+        model = calculate(values)
+        assert torch.equal(found.c, model.c) and torch.equal(found.g, model.g) and torch.equal(found.Q, model.Q)
+        assert bool(((found.r - model.r).abs() <= 1e-9 * model.r).all())
