@@ -106,6 +106,8 @@ class Row:
     def write(self, out: Path) -> None:
         """Put it into the case's folder, in one step: from then on the case is done."""
         folder = _folder(out, self.case)
+        for left in (*folder.glob("*.unchecked.json"), *folder.glob("*.partial")):  # by a sweep that was killed
+            left.unlink(missing_ok=True)
         if self.certificate is None:
             (folder / _CERTIFICATE).unlink(missing_ok=True)  # of other inputs, or of an attempt that was refused
         write_atomically(folder / _ROW, (json.dumps(self.to_dict(), indent=1) + "\n").encode())

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from certify.certificate import sole_writer
-from certify.errors import InputError
+from certify.errors import BackendError, InputError, SoundnessError
 from certify.running.tasks import Outcome, Piece, Place, Processes
 from certify.sweep.case import Case
 from certify.sweep.rows import Row, failed, judged, kept
@@ -115,7 +115,7 @@ def run_sweep(study: Study, out: Path, place: Place, watch: Watch = lambda row, 
 def _done(cases: Sequence[Case], out: Path, place: Place) -> Iterator[Row]:
     """The rows of cases, as they are done. What somebody else's worker refutes is tried again here: unlike a proof, a
     refutation comes without anything that could be checked."""
-    own, again = isinstance(place, Processes), list[Case]()
+    own, again = _is_own(place), list[Case]()
     for case, row in _judged(cases, out, place, own):
         if not own and row.verdict is Verdict.REFUTED:
             again.append(case)
@@ -125,6 +125,11 @@ def _done(cases: Sequence[Case], out: Path, place: Place) -> Iterator[Row]:
     for _, row in _judged(again, out, Processes(1), True):
         row.write(out)
         yield row
+
+
+def _is_own(place: Place) -> bool:
+    """Whether this program does the work there, on this machine."""
+    return isinstance(place, Processes)
 
 
 def _judged(cases: Sequence[Case], out: Path, place: Place, own: bool) -> Iterator[tuple[Case, Row]]:
@@ -137,14 +142,21 @@ def _judged(cases: Sequence[Case], out: Path, place: Place, own: bool) -> Iterat
             for outcome in place.run(Piece(case.name, work, (case,)) for case in cases):
                 if outcome is not None:
                     waiting.add(checks.submit(_row, named[outcome.key], outcome, out, own))
-                patience = None if len(waiting) > 2 * most else 0.0
-                done, waiting = wait(waiting, patience, FIRST_COMPLETED)
-                yield from (future.result() for future in done)
+                yield from _taken(waiting, None if len(waiting) > 2 * most else 0.0)
             while waiting:
-                done, waiting = wait(waiting, None, FIRST_COMPLETED)
-                yield from (future.result() for future in done)
-        finally:
-            checks.shutdown(wait=True, cancel_futures=True)
+                yield from _taken(waiting, None)
+        except (KeyboardInterrupt, BackendError, SoundnessError):
+            found = [future.result() for future in waiting if future.exception() is None]  # what came before the end
+            yield from ((case, row) for case, row in found if not row.failed)  # a checker may have ended with the rest
+            raise
+
+
+def _taken(waiting: set[Future[tuple[Case, Row]]], patience: float | None) -> Iterator[tuple[Case, Row]]:
+    """Take what is done out of `waiting`, after so many seconds at most."""
+    done, _ = wait(waiting, patience, FIRST_COMPLETED)
+    for future in done:
+        waiting.remove(future)
+        yield future.result()
 
 
 def _row(case: Case, outcome: Outcome, out: Path, own: bool) -> tuple[Case, Row]:
