@@ -17,14 +17,13 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from certify import systems
 from certify.arguments import layers, numbers, plant_of, widths
 from certify.errors import InputError
 from certify.inputs import Tell, ellipsoid_beside, function_in
 from certify.installation import source_sha256, version_of
 from certify.options import RoaOptions
 from certify.policies import Policy, load_policy
-from certify.systems import exact
+from certify.systems import exact, plants
 
 if TYPE_CHECKING:
     from certify.systems import System
@@ -211,6 +210,6 @@ def _parts(where: Mapping[str, str], listed: Sequence[str], stems: Mapping[str, 
 def _program() -> dict[str, str | None]:
     """What of this program decides on a case: its version, the checker's source, and the plants that ship."""
     digest = hashlib.sha256()
-    for path in sorted((Path(systems.__file__).parent / "plants").glob("*.py")):
+    for path in sorted(Path(plants.__path__[0]).glob("*.py")):
         digest.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
     return {"certify": version_of("certify"), "checker": source_sha256("checker"), "plants": digest.hexdigest()}
