@@ -18,6 +18,7 @@ import io
 import json
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import astuple, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -239,18 +240,19 @@ def _train_at(
         if _there(run, _path(runs, run, options), system, options) is None
     }
     done, lost = len(wanted) - len(missing), dict[str, str]()
-    for outcome in place.run(_pieces(place, missing, system, runs)):
-        if outcome is None:
-            continue
-        if outcome.result is None:
-            lost[outcome.key] = outcome.reason
-            continue
-        run, options = missing[outcome.key]
-        if outcome.result:
-            _keep(outcome.result, run, _path(runs, run, options), system, options)
-        done, steps = done + 1, _steps(run, options)
-        say(f"{outcome.key}: {steps} of {steps} steps")
-        watch(Doing(f"{NAMES[run]}, seed {options.seed}", done, len(wanted), steps, steps))
+    with closing(place.run(_pieces(place, missing, system, runs))) as outcomes:
+        for outcome in outcomes:
+            if outcome is None:
+                continue
+            if outcome.result is None:
+                lost[outcome.key] = outcome.reason
+                continue
+            run, options = missing[outcome.key]
+            if outcome.result:
+                _keep(outcome.result, run, _path(runs, run, options), system, options)
+            done, steps = done + 1, _steps(run, options)
+            say(f"{outcome.key}: {steps} of {steps} steps")
+            watch(Doing(f"{NAMES[run]}, seed {options.seed}", done, len(wanted), steps, steps))
     if lost:
         what, why = next(iter(lost.items()))
         raise BackendError(

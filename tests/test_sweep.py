@@ -15,6 +15,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from fractions import Fraction
+from itertools import product
+from multiprocessing import forkserver
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +39,7 @@ from certify.sweep.work import Answer, answer_in, work
 from certify.systems import exact
 from certify.verdict import Verdict
 from tests.support import pieces
+from tests.support.browser import Browser, find_browser
 from tests.support.pieces import Here
 
 ROOT = Path(__file__).parent.parent
@@ -332,6 +335,31 @@ def test_words_without_evidence_prove_nothing(study: Study, answer: Answer, tmp_
             answer_in(garbage)
 
 
+def _endless(data: dict[str, Any]) -> None:
+    data["lyapunov"]["P"] = "AAAA8H8AAAAAAADwfwAAAAAAAPB/AAAAAAAA8H8="  # infinities
+
+
+def _nested(data: dict[str, Any]) -> None:
+    for _ in range(400):
+        data["plant"]["dynamics"][0] = ["-", data["plant"]["dynamics"][0]]
+
+
+def _other_kind(data: dict[str, Any]) -> None:
+    data["evidence"] = {"kind": "trusted-solver", "solver": "x", "version": "1", "precision": "0x1p-1", "queries": []}
+
+
+def _by_zero(data: dict[str, Any]) -> None:
+    data["plant"]["u_eq"] = ["1/0"]
+
+
+@pytest.mark.parametrize("change", [_endless, _nested, _other_kind, _by_zero])
+def test_a_file_that_is_made_to_break_the_reader_is_one_case_s_error(
+    study: Study, answer: Answer, tmp_path: Path, change: Callable[[dict[str, Any]], None]
+) -> None:
+    row = judged(study.cases()[0], replace(answer, raw=edited(answer.raw or b"", change)), tmp_path, own=False)
+    assert row.failed and row.verdict is Verdict.UNKNOWN and not list(tmp_path.rglob("certificate*"))
+
+
 def test_a_row_cannot_say_proved_without_a_check() -> None:
     for fields in ({}, {"checked": "REJECTED"}, {"checked": "TRUSTED", "certificate": "x"}, {"checked": "ACCEPTED"}):
         with pytest.raises(InputError, match="must have a certificate that the checker answered"):
@@ -486,11 +514,22 @@ def synthetic(coordinates: dict[str, str], letter: str, name: str, size: float =
     if letter in "PT":
         checked = "ACCEPTED" if letter == "P" else "TRUSTED"
         backed = {"certificate": f"cases/{name}/certificate.json", "certificate_sha256": "0" * 64, "checked": checked}
-        backed |= {"volume": size, "volume_unit": "rad · rad/s", "levels": Levels(local=0.1, roa=0.3)}
+        backed |= {"volume": size, "levels": Levels(local=0.1, roa=0.3)}
     if letter == "E":
         return Row(name, coordinates, "", verdict, "error", error="<b>no</b>")
     units = {"theta": "rad", "theta_dot": "rad/s", "m": "kg"}
-    return Row(name, coordinates, "", verdict, "time", "time", states=("theta", "theta_dot"), units=units, **backed)
+    return Row(
+        name,
+        coordinates,
+        "",
+        verdict,
+        "time",
+        "time",
+        volume_unit="rad · rad/s",
+        states=("theta", "theta_dot"),
+        units=units,
+        **backed,
+    )
 
 
 AXES = {
@@ -504,7 +543,6 @@ AXES = {
 def synthetic_study(*which: str, letters: str = "PPURE") -> tuple[Study, list[Row]]:
     study = Study("made up", tuple(AXES[name] for name in which), {})
     keys = [axis.key for axis in study.axes]
-    from itertools import product
 
     where = [dict(zip(keys, values, strict=True)) for values in product(*(a.values for a in study.axes))]
     return study, [synthetic(w, letters[k % len(letters)], f"case-{k}", 2.0 + k) for k, w in enumerate(where)]
@@ -567,7 +605,6 @@ def test_too_many_figures_are_left_out_and_it_says_so() -> None:
 
     axes = (AXES["m"], AXES["rate"], Axis("options.seed", tuple(map(str, range(14))), True))
     keys = [axis.key for axis in axes]
-    from itertools import product
 
     rows = [
         synthetic(dict(zip(keys, values, strict=True)), "P", str(k))
@@ -580,6 +617,14 @@ def test_too_many_figures_are_left_out_and_it_says_so() -> None:
 # Places
 
 
+@pytest.fixture(scope="module")
+def server() -> None:
+    """The one that forks processes, with what these tests need loaded once."""
+    forkserver.set_forkserver_preload(["certify.sweep.work", "certify.running.tasks", "tests.support.pieces"])
+    forkserver.ensure_running()
+
+
+@pytest.mark.usefixtures("server")
 def test_each_piece_has_a_process_of_its_own_and_a_lost_one_takes_none_with_it() -> None:
     given = [
         Piece("a", pieces.double, ("x",)),
@@ -617,7 +662,7 @@ def test_whoever_stops_asking_ends_the_work_and_what_it_started(tmp_path: Path) 
     running = Processes(2).run(Piece(str(k), pieces.linger, (str(tmp_path),)) for k in range(3))
     while len(list(tmp_path.iterdir())) < 2:
         assert next(running) is None
-    running.close()  # type: ignore[attr-defined]
+    running.close()
     started = [int(pid) for path in tmp_path.iterdir() for pid in path.name.split(".")]
     assert len(started) == 4 and until(lambda: not any(map(alive, started)), 5.0)
 
@@ -641,23 +686,49 @@ def certify(*arguments: object, **options: Any) -> subprocess.CompletedProcess[s
     return subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=ROOT, check=False, **options)
 
 
+@pytest.mark.usefixtures("server")
 def test_the_command_ends_in_one_json_object_and_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    def again(*arguments: object) -> tuple[int, str, str]:
+    def ended(*arguments: object) -> tuple[int, str, str]:
         return _run(["sweep", *map(str, arguments)], "--json" in arguments), *capsys.readouterr()
 
     path, out = written(tmp_path, QUICK.replace("[0.15, 0.2]", "[0.2, 0.9]")), tmp_path / "out"
-    done = certify(path, "--out", out, "--jobs", 2, "--json")  # 0.9 kg are too heavy for the policy
-    found = json.loads(done.stdout)
-    assert done.returncode == 1, done.stderr
+    status, said, told = ended(path, "--out", out, "--jobs", 2, "--json")  # 0.9 kg are too heavy for the policy
+    found = json.loads(said)
+    assert status == 1, told
     assert found["schema"] == "certify-sweep/1" and found["verdicts"]["PROVED"] == found["verdicts"]["REFUTED"] == 1
     assert found["rows"][1]["reason"].startswith("unstable linearisation") and found["kept"] == 0
-    assert " of 2  pendulum_m=0.2_lyapunov  PROVED  area" in done.stderr
+    assert " of 2  pendulum_m=0.2_lyapunov  PROVED  area" in told
     assert all(Path(file).is_file() for file in found["files"].values())
-    status, said, told = again(path, "--out", out, "--quiet")
+    status, said, told = ended(path, "--out", out, "--quiet")
     assert (status, told) == (1, "") and "2, 2 of them done before" in said
-    status, said, _ = again(written(tmp_path, "policy = 1"), "--json")
+    status, said, _ = ended(written(tmp_path, "policy = 1"), "--json")
     assert status == 2 and set(json.loads(said)) == {"error"}
-    assert again(path, "--jobs", 1, "--cluster", "local:1")[0] == 2
+    assert ended(path, "--jobs", 1, "--cluster", "local:1")[0] == 2
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_browser() is None, reason="no browser is installed")
+def test_the_table_can_be_sorted(tmp_path: Path) -> None:
+    study, rows = synthetic_study("m", "policies")
+    page = tmp_path / "sweep.html"
+    page.write_text(page_of(study, rows, len(rows)), encoding="utf-8")
+    with Browser(str(find_browser()), tmp_path / "profile") as browser:
+        browser.show(page, 1280)
+        column = "[...document.querySelectorAll('table.cases tbody tr')].map(r => r.cells[{}].textContent)"
+        press = "document.querySelectorAll('table.cases button')[{}].click()"
+        assert browser.evaluate("document.documentElement.scrollWidth") == 1280
+        for index, key in ((0, float), (2, str)):
+            order = browser.evaluate(column.format(index))
+            browser.evaluate(press.format(index))
+            rising = browser.evaluate(column.format(index))
+            browser.evaluate(press.format(index))
+            falling = browser.evaluate(column.format(index))
+            assert sorted(order) == sorted(rising) == sorted(falling) and len(set(order)) > 1
+            numbers = [float(Fraction(text)) for text in rising] if key is float else []
+            words = [text.split()[-1].lower() for text in rising]
+            assert numbers == sorted(numbers) if key is float else words == sorted(words)
+            back = [float(Fraction(text)) for text in falling] if key is float else []
+            assert back == sorted(back, reverse=True)
 
 
 # Slow: what is killed, joins late, or is gone

@@ -16,7 +16,7 @@ import os
 import queue
 import signal
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from dataclasses import dataclass
 from itertools import islice
 from multiprocessing.connection import Connection, wait
@@ -59,9 +59,9 @@ class Outcome:
 class Place(Protocol):
     """Does pieces of work."""
 
-    def run(self, pieces: Iterable[Piece]) -> Iterator[Outcome | None]:
-        """The outcomes, as they come, and None about once a second where none comes; whoever stops asking ends what is
-        still at work.
+    def run(self, pieces: Iterable[Piece]) -> Generator[Outcome | None, None, None]:
+        """The outcomes, as they come, and None about once a second where none comes; closing it ends what is still at
+        work.
 
         Raises
         ------
@@ -84,7 +84,7 @@ class Processes:
             raise InputError(f"`jobs` must be at least 1; found {jobs}.")
         self.jobs = jobs
 
-    def run(self, pieces: Iterable[Piece]) -> Iterator[Outcome | None]:
+    def run(self, pieces: Iterable[Piece]) -> Generator[Outcome | None, None, None]:
         """The outcomes, as they come."""
         context = multiprocessing.get_context("forkserver")
         waiting, running = iter(pieces), dict[Connection, tuple[str, BaseProcess]]()
@@ -116,7 +116,8 @@ class Processes:
 class Cluster:
     """The workers of a Dask cluster, also those that join while the work is under way.
 
-    A worker that dies takes nothing with it: the scheduler gives its piece to another one, three times at most.
+    A worker that dies takes nothing with it: the scheduler gives its piece to another one. A piece that ends four
+    workers is lost.
 
     Parameters
     ----------
@@ -126,7 +127,7 @@ class Cluster:
     def __init__(self, address: str) -> None:
         self.address = address
 
-    def run(self, pieces: Iterable[Piece]) -> Iterator[Outcome | None]:
+    def run(self, pieces: Iterable[Piece]) -> Generator[Outcome | None, None, None]:
         """The outcomes, as they come.
 
         Raises

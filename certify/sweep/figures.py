@@ -7,6 +7,7 @@ rest; what would be too many is in the table, and the page says so.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
@@ -22,6 +23,7 @@ from certify.systems import exact
 from certify.verdict import Verdict
 
 _MOST_PANELS, _MOST_SERIES, _MOST_TICKS = 12, 6, 12
+_LONG = 14  # characters at a tick
 _LIGHT, _DEEP = np.array([0xDC, 0xE9, 0xF6]) / 255, np.array([0x0F, 0x40, 0x76]) / 255  # the same by day and by night
 _ON_LIGHT, _ON_DEEP = "#10161c", "#fefefe"
 _COLOURS = ("#1d5fa4", "#a3297b", "#14795b", "#c9813b", "#8466ae", "#7a4c13")  # not those that a dark page changes
@@ -192,7 +194,16 @@ def _line(across: Axis, size: str, curves: Sequence[tuple[str, Mapping[str, Row]
                 transform=axes.get_xaxis_transform(),
             )  # fmt: skip
         xs, ys = zip(*points, strict=True)
-        axes.plot(xs, ys, marker=marker, ms=5, ls=style if across.is_numeric else "none", color=colour, label=name)
+        axes.plot(
+            xs,
+            ys,
+            marker=marker,
+            ms=5,
+            ls=style if across.is_numeric else "none",
+            color=colour,
+            label=name,
+            clip_on=False,
+        )
     axes.set_ylim(bottom=0)
     if len(curves) > 1:
         axes.legend()
@@ -200,7 +211,7 @@ def _line(across: Axis, size: str, curves: Sequence[tuple[str, Mapping[str, Row]
         axes.set_xlabel(label_of(across.key, some.units))
     else:
         axes.set_xlim(-0.5, len(at) - 0.5)
-        _ticks(axes.xaxis, across, turned=True)
+        axes.set_xlabel(f"{label_of(across.key, {})} {_ticks(axes.xaxis, across, turned=True)}".rstrip())
     axes.set_ylabel(size)
     signs = ", ".join(f"{_SIGNS[word]} {word}" for word in _SIGNS if word in unproved)
     return Picture(
@@ -213,19 +224,42 @@ def _line(across: Axis, size: str, curves: Sequence[tuple[str, Mapping[str, Row]
     )
 
 
-def _ticks(axis: Any, values: Axis, turned: bool = False) -> None:
-    """The values as they stand in the study, so many that they can be read."""
+def _ticks(axis: Any, values: Axis, turned: bool = False) -> str:
+    """The values as they stand in the study, so many that they can be read; what was cut from all of them alike."""
     every = -(-len(values.values) // _MOST_TICKS)
     places = range(0, len(values.values), every)
-    shown = [_short(values.values[k]) for k in places]
-    axis.set_ticks(list(places), shown, **({"rotation": 30, "ha": "right"} if turned else {}))
+    shown, cut = (_rounded(values.values), "") if values.is_numeric else _distinct(values.values)
+    axis.set_ticks(list(places), [shown[k] for k in places], **({"rotation": 30, "ha": "right"} if turned else {}))
+    return cut
 
 
-def _short(text: str) -> str:
-    try:
-        return f"{float(exact(text)):.4g}"
-    except ValueError:
-        return text if len(text) <= 28 else f"…{text[-27:]}"
+def _rounded(values: Sequence[str]) -> list[str]:
+    return [f"{float(exact(text)):.4g}" for text in values]
+
+
+def _distinct(values: Sequence[str]) -> tuple[list[str], str]:
+    """Names short enough for an axis: without the beginning and end that all of them share, if they are long.
+
+    >>> _distinct(["seeds/seed-1/policy.pt", "seeds/seed-10/policy.pt"]), _distinct(["lqr", "auto"])
+    ((['1', '10'], 'seeds/seed-…/policy.pt'), (['lqr', 'auto'], ''))
+    """
+    if len(values) < 2 or max(map(len, values)) <= _LONG:
+        return list(values), ""
+    parts = [re.findall(r"[A-Za-z0-9]+|[^A-Za-z0-9]", value) for value in values]
+    first = _alike([part[:-1] for part in parts])
+    last = _alike([part[:first:-1] for part in parts])  # at least one part is left of each
+    shown = ["".join(part[first : len(part) - last]) for part in parts]
+    head, tail = "".join(parts[0][:first]), "".join(parts[0][len(parts[0]) - last :])
+    cut = f"{head}…{tail}" if head or tail else ""
+    return [text if len(text) <= _LONG else f"…{text[1 - _LONG :]}" for text in shown], cut
+
+
+def _alike(rows: Sequence[Sequence[str]]) -> int:
+    """How many entries all rows begin with."""
+    count = 0
+    while count < min(map(len, rows)) and len({row[count] for row in rows}) == 1:
+        count += 1
+    return count
 
 
 def _size(row: Row) -> str:

@@ -85,10 +85,10 @@ class Row:
 
     def __post_init__(self) -> None:
         backed = _ANSWERS.get(self.verdict)
-        if backed is not None and (self.checked != backed or self.certificate is None):
+        if backed is not None and (self.checked != backed or None in (self.certificate, self.volume, self.levels.roa)):
             raise InputError(
                 f"a row that says {self.verdict.value} must have a certificate that the checker answered with "
-                f"{backed}; found {self.checked}."
+                f"{backed}, and the set that it states; found {self.checked}."
             )
         if (self.stop == ERROR) != bool(self.error) or (self.error and self.verdict is not Verdict.UNKNOWN):
             raise InputError("a row has an error where its stop says so and nothing is known, and nowhere else.")
@@ -170,6 +170,10 @@ def judged(case: Case, answer: Answer, out: Path, *, own: bool) -> Row:
         return failed(case, f"what the worker sent is refused here: {error}")
     except BackendError as error:
         return failed(case, str(error))
+    except Exception as error:  # whatever a file that somebody made to that end can raise
+        if own:
+            raise
+        return failed(case, f"what the worker sent cannot be read: {type(error).__name__}: {error}")
 
 
 class _Refused(CertifyError):
@@ -197,6 +201,7 @@ def _stated(case: Case, answer: Answer, plant: System) -> Row:
             claim=_text(data["claim"]["kind"]),
             candidate=None if used is None else _text(used),
             levels=Levels(sampled_limit=_optional(said["sampled_limit"]), domain_limit=_optional(said["domain_limit"])),
+            volume_unit=volume_unit([plant.units.get(s.name, "") for s in plant.states]),
             states=tuple(s.name for s in plant.states),
             units={name: plant.units.get(name, "") for name in (*names, *plant.parameters)},
             boxes=int(data["boxes"]),
@@ -247,7 +252,6 @@ def _checked(row: Row, answer: Answer, loop: tuple[Policy, System, RoaOptions], 
         claim=claim.kind,
         levels=replace(row.levels, **claim.levels),
         volume=volume(P, level),
-        volume_unit=volume_unit([plant.units.get(s.name, "") for s in plant.states]),
         semi_axes=tuple(semi_axes(P, level).tolist()),
         extents=tuple(extents(P, level).tolist()),
         certificate=f"cases/{row.case}/{_CERTIFICATE}",

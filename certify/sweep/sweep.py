@@ -11,6 +11,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -137,9 +138,10 @@ def _judged(cases: Sequence[Case], out: Path, place: Place, own: bool) -> Iterat
     named = {case.name: case for case in cases}
     waiting: set[Future[tuple[Case, Row]]] = set()
     most = os.cpu_count() or 1
-    with ThreadPoolExecutor(most) as checks:
+    pieces = (Piece(case.name, work, (case,)) for case in cases)
+    with ThreadPoolExecutor(most) as checks, closing(place.run(pieces)) as outcomes:
         try:
-            for outcome in place.run(Piece(case.name, work, (case,)) for case in cases):
+            for outcome in outcomes:
                 if outcome is not None:
                     waiting.add(checks.submit(_row, named[outcome.key], outcome, out, own))
                 yield from _taken(waiting, None if len(waiting) > 2 * most else 0.0)

@@ -6,7 +6,7 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable
 from pathlib import Path
 
 from certify.running.tasks import Outcome, Piece
@@ -54,7 +54,7 @@ class Here:
     def __init__(self, do: Callable[[Piece], bytes | str | BaseException] | None = None) -> None:
         self.do, self.done = do, list[str]()
 
-    def run(self, pieces: Iterable[Piece]) -> Iterator[Outcome | None]:
+    def run(self, pieces: Iterable[Piece]) -> Generator[Outcome | None, None, None]:
         for piece in pieces:
             self.done.append(piece.key)
             found = piece.work(*piece.arguments) if self.do is None else self.do(piece)
