@@ -12,7 +12,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
 from fractions import Fraction
 from itertools import product
@@ -28,6 +28,7 @@ from certify.cli import _run
 from certify.errors import BackendError, InputError, SoundnessError
 from certify.lyapunov import volume
 from certify.results import Levels
+from certify.running import tasks
 from certify.running.tasks import Cluster, Piece, Processes, place_for
 from certify.sweep import Row, Study, read_study, run_sweep
 from certify.sweep import sweep as flow
@@ -678,6 +679,33 @@ def test_a_place_is_processes_or_a_cluster() -> None:
         next(iter(Cluster("here").run([Piece("a", pieces.double, ("x",))])))
 
 
+def test_workers_that_are_gone_for_good_are_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Deserted:
+        left, futures = 5, 0
+
+        def submit(self, *_: object, **__: object) -> Deserted:
+            return self
+
+        def add_done_callback(self, _: object) -> None:
+            self.futures += 1
+
+        def nthreads(self) -> dict[str, int]:
+            self.left -= 1
+            return {"a": 1} if self.left > 0 else {}
+
+    monkeypatch.setattr(tasks, "connect", lambda address: nullcontext(Deserted()))
+    monkeypatch.setattr(tasks, "_PULSE", 0.01)
+    monkeypatch.setattr(tasks, "_DESERTED", 0.05)
+    found = Cluster("local:2").run([Piece("a", pieces.double, ("x",))])
+    pulses = []
+    with pytest.raises(BackendError, match="no worker is left of local:2"):
+        pulses.extend(found)
+    assert set(pulses) == {None} and len(pulses) >= 8
+    elsewhere = Cluster("tcp://somewhere:1").run([Piece("a", pieces.double, ("x",))])
+    assert [next(elsewhere) for _ in range(30)] == [None] * 30  # one may yet join
+    elsewhere.close()
+
+
 # The command
 
 
@@ -803,15 +831,16 @@ def test_a_worker_that_is_killed_loses_nothing_and_one_that_joins_late_works(tmp
 
 
 @pytest.mark.slow
-def test_a_piece_that_kills_its_workers_or_raises_is_lost_alone() -> None:
-    given = [
-        Piece("dies", pieces.die, ("",)),
-        Piece("raises", pieces.fail, ("way",)),
-        Piece("a", pieces.double, ("x",)),
-    ]
-    found = {o.key: o for o in Cluster("local:2").run(given) if o is not None}
-    assert found["a"].result == b"xx" and found["raises"].reason == "ValueError: no way"
-    assert found["dies"].result is None and "KilledWorker" in found["dies"].reason
+def test_a_piece_that_kills_its_workers_or_raises_is_lost_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A scheduler that blames a piece at its first worker's death blames the others that were there too."""
+    monkeypatch.setenv("DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES", "0")
+    given = [Piece("dies", pieces.die, ("",)), Piece("raises", pieces.fail, ("way",))]
+    given += [Piece(text, pieces.double, (text,)) for text in "abcdef"]
+    with scheduler(18804) as (address, _), worker(address), worker(address), worker(address):
+        found = {outcome.key: outcome for outcome in Cluster(address).run(given) if outcome is not None}
+    assert {text: found[text].result for text in "abcdef"} == {text: 2 * text.encode() for text in "abcdef"}
+    assert found["raises"].reason == "ValueError: no way" and found["dies"].result is None
+    assert "KilledWorker" in found["dies"].reason and len(found) == len(given)
 
 
 @pytest.mark.slow

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 _IN_FLIGHT = 256  # pieces that a scheduler holds at a time: arguments stay here until their turn is near
 _PULSE = 1.0  # seconds
+_DESERTED = 60.0  # seconds without a worker, after which none is expected that was not to join from elsewhere
 _DONE, _RAISED = b"\0", b"\1"
 _ALONE = threading.Lock()
 
@@ -116,8 +117,8 @@ class Processes:
 class Cluster:
     """The workers of a Dask cluster, also those that join while the work is under way.
 
-    A worker that dies takes nothing with it: the scheduler gives its piece to another one. A piece that ends four
-    workers is lost.
+    A worker that dies takes nothing with it: the scheduler gives its pieces to others. Pieces that have been with four
+    workers that died come back; whichever of them is to blame is not known, and each is tried once more, alone.
 
     Parameters
     ----------
@@ -134,24 +135,42 @@ class Cluster:
         ------
         InputError, BackendError : those of `connect`; the scheduler is gone.
         """
-        waiting, flying = iter(pieces), dict["Future", str]()
+        waiting, flying = iter(pieces), dict["Future", Piece]()
         ended: queue.SimpleQueue[Future] = queue.SimpleQueue()
+        suspects, alone, deserted = list[Piece](), set[str](), 0
         with _quiet(), connect(self.address) as client:
+
+            def submit(piece: Piece) -> None:
+                future = client.submit(_on_a_worker, piece.work, piece.arguments, pure=False)
+                flying[future] = piece
+                future.add_done_callback(ended.put)
+
             while True:
                 for piece in islice(waiting, _IN_FLIGHT - len(flying)):
-                    future = client.submit(_on_a_worker, piece.work, piece.arguments, pure=False)
-                    flying[future] = piece.key
-                    future.add_done_callback(ended.put)
+                    submit(piece)
+                if not flying and suspects:
+                    alone.add(suspects[-1].key)
+                    submit(suspects.pop())
                 if not flying:
                     return
-                yield self._next(flying, ended)
+                try:
+                    future = ended.get(timeout=_PULSE)
+                except queue.Empty:
+                    deserted = deserted + 1 if self.address.startswith("local:") and not client.nthreads() else 0
+                    if deserted * _PULSE > _DESERTED:
+                        raise BackendError(
+                            f"no worker is left of {self.address}, and none came back. What was done is kept; give the "
+                            "same command again."
+                        ) from None
+                    yield None
+                    continue
+                piece = flying.pop(future)
+                if _killed(future) and piece.key not in alone:
+                    suspects.append(piece)
+                else:
+                    yield self._outcome(piece.key, future)
 
-    def _next(self, flying: dict[Future, str], ended: queue.SimpleQueue[Future]) -> Outcome | None:
-        try:
-            future = ended.get(timeout=_PULSE)
-        except queue.Empty:
-            return None
-        key = flying.pop(future)
+    def _outcome(self, key: str, future: Future) -> Outcome:
         if future.status == "finished":
             return _unpacked(key, future.result())
         if future.status != "error":  # cancelled or lost: the client has no scheduler any more, or another one
@@ -223,6 +242,11 @@ def _done(work: Callable[..., bytes], arguments: tuple[Any, ...]) -> bytes:
         return _DONE + work(*arguments)
     except Exception as error:
         return _RAISED + _one_line(error).encode("utf-8", "replace")
+
+
+def _killed(future: Future) -> bool:
+    """Whether the workers that had a piece died."""
+    return future.status == "error" and type(future.exception()).__name__ == "KilledWorker"
 
 
 def _unpacked(key: str, sent: Any) -> Outcome:
