@@ -27,6 +27,7 @@ from certify.commands.plot import plot
 from certify.commands.reach import reach
 from certify.commands.report import report
 from certify.commands.roa import roa
+from certify.commands.sweep import sweep
 from certify.commands.systems import systems
 from certify.commands.terminal import closed_pipe, say, tell
 from certify.commands.version import certify
@@ -40,6 +41,7 @@ app = typer.Typer(
 app.callback()(certify)
 app.command("roa")(takes_import_options(roa))
 app.command("reach")(takes_import_options(reach, kind_is="--kind"))
+app.command("sweep")(sweep)
 app.command("check")(check)
 app.command("contains")(contains)
 app.command("report")(report)

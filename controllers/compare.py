@@ -3,7 +3,9 @@
 A folder of runs holds `<run>/seed-<k>/` with the file that each run ends in: `policy.pt`, as `controllers train`
 writes it, in `ours`, `before` and `uncentred`; `checkpoint.pt`, as `--checkpoint-dir` keeps it, in `sac`, the same SAC
 without the gain; `model.zip`, as `controllers train-baseline` writes it, in `sb3-sac` and `sb3-ppo`. What is missing
-is trained, what is there is used; our own runs also go on from a checkpoint that lies there.
+is trained, what is there is used; our own runs also go on from a checkpoint that lies there. Where a run is trained,
+in this process, in others of this machine or on a cluster, changes nothing in it: what comes back is its file, which is
+read as any other before it gets its name.
 
 Everything is simulated from the plant's box of initial states, with the action held over the training step and
 clipped to the input's bounds; a run goes on outside the domain. These are figures for a report, never a proof.
@@ -14,7 +16,9 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Callable, Sequence
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing
 from dataclasses import astuple, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -22,8 +26,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.errors import InputError
+from certify.errors import BackendError, InputError
 from certify.policies import load_policy, save_policy
+from certify.running.tasks import Piece, Place, Processes
 from certify.systems import System
 from controllers.baselines import (
     Trained,
@@ -80,6 +85,7 @@ def compare(
     options: CompareOptions | None = None,
     say: Callable[[str], None] = lambda line: None,
     watch: Callable[[Doing], None] = lambda doing: None,
+    place: Place | None = None,
 ) -> dict[str, Any]:
     """Train what is missing in `runs`, simulate all, write three figures and the table to `out`.
 
@@ -88,6 +94,8 @@ def compare(
     training : the plant's preset with the steps of every run; its seed is replaced.
     say : takes a line of progress, ten times in a run that is trained.
     watch : is told of every step that is trained, and of every run that is there.
+    place : where runs are trained, several at a time; None trains one after the other in this process. Then progress
+        is told of whole runs.
 
     Returns
     -------
@@ -97,6 +105,7 @@ def compare(
     ------
     InputError : the plant has no file among `controllers.plants`, stable-baselines3 is missing, a file in `runs`
         is of another plant, seed or budget, or a folder cannot be written.
+    BackendError : a run could not be trained at the place; those that were are kept.
     """
     options = options or CompareOptions()
     x0 = initial_states(system, options.states, options.start_seed)
@@ -106,6 +115,8 @@ def compare(
     make_folder(out)
     responses = []
     kinds = list(dict.fromkeys(method.run for method in options.methods))
+    if place is not None:
+        _train_at(place, kinds, options.seeds, system, training, runs, say, watch)
     for k, run in enumerate(kinds):
         for seed in range(options.seeds):
             number, what = k * options.seeds + seed + 1, f"{NAMES[run]}, seed {seed}"
@@ -160,20 +171,141 @@ def obtain(
     ------
     InputError : the file is of another plant, seed or budget, or damaged, or the folder cannot be written.
     """
-    folder = runs / run / f"seed-{training.seed}"
-    path, what = folder / _FILES[run], f"{run} seed {training.seed}"
-    steps = budget("ppo" if run == "sb3-ppo" else "sac", training.steps)[0]
-    trained = _load(run, path, system, training) if path.is_file() else None
-    if trained is None or (run == "sac" and trained.steps < steps and trained.seed == training.seed):
-        make_folder(folder)
-        _train(run, system, training, path, _progress(what, steps, say, tell))
+    path, steps = _path(runs, run, training), _steps(run, training)
+    trained = _there(run, path, system, training)
+    if trained is None:
+        make_folder(path.parent)
+        _train(run, system, training, path, _progress(f"{run} seed {training.seed}", steps, say, tell))
         trained = _load(run, path, system, training)
+    return _required(trained, run, path, training)
+
+
+def _path(runs: Path, run: Run, training: TrainingOptions) -> Path:
+    """The file that a run ends in."""
+    return runs / run / f"seed-{training.seed}" / _FILES[run]
+
+
+def _steps(run: Run, training: TrainingOptions) -> int:
+    """The steps that a run of this budget makes."""
+    return budget("ppo" if run == "sb3-ppo" else "sac", training.steps)[0]
+
+
+def _there(run: Run, path: Path, system: System, training: TrainingOptions) -> Trained | None:
+    """The run in the file; None if there is none, or a checkpoint from which it goes on."""
+    trained = _load(run, path, system, training) if path.is_file() else None
+    unfinished = trained is not None and run == "sac" and trained.steps < _steps(run, training)
+    return None if trained is None or (unfinished and trained.seed == training.seed) else trained
+
+
+def _required(trained: Trained, run: Run, path: Path, training: TrainingOptions) -> Trained:
+    """The run, if it has the budget and the seed that are asked for.
+
+    Raises
+    ------
+    InputError : it has others.
+    """
+    steps = _steps(run, training)
     if (trained.steps, trained.seed) != (steps, training.seed):
         raise InputError(
             f"{path} must be a run of {steps} steps with seed {training.seed}; it has {trained.steps} steps with "
             f"seed {trained.seed}. Compare with its number of steps, or in another folder of runs."
         )
     return trained
+
+
+def _train_at(
+    place: Place,
+    kinds: Sequence[Run],
+    seeds: int,
+    system: System,
+    training: TrainingOptions,
+    runs: Path,
+    say: Callable[[str], None],
+    watch: Callable[[Doing], None],
+) -> None:
+    """Train the runs that are missing at a place.
+
+    Processes of this machine work in the folder of runs, and leave checkpoints there; a cluster gets the checkpoint
+    that is there, and its file is written here.
+
+    Raises
+    ------
+    BackendError : one could not be trained; the others are kept.
+    InputError : what came back is no such run.
+    """
+    wanted = [(run, replace(training, seed=seed)) for run in kinds for seed in range(seeds)]
+    missing = {
+        f"{run} seed {options.seed}": (run, options)
+        for run, options in wanted
+        if _there(run, _path(runs, run, options), system, options) is None
+    }
+    done, lost = len(wanted) - len(missing), dict[str, str]()
+    with closing(place.run(_pieces(place, missing, system, runs))) as outcomes:
+        for outcome in outcomes:
+            if outcome is None:
+                continue
+            if outcome.result is None:
+                lost[outcome.key] = outcome.reason
+                continue
+            run, options = missing[outcome.key]
+            if outcome.result:
+                _keep(outcome.result, run, _path(runs, run, options), system, options)
+            done, steps = done + 1, _steps(run, options)
+            say(f"{outcome.key}: {steps} of {steps} steps")
+            watch(Doing(f"{NAMES[run]}, seed {options.seed}", done, len(wanted), steps, steps))
+    if lost:
+        what, why = next(iter(lost.items()))
+        raise BackendError(
+            f"{len(lost)} of {len(missing)} runs could not be trained, {what} among them: {why}. "
+            "What was trained is kept; the same command goes on."
+        )
+
+
+def _pieces(
+    place: Place, missing: dict[str, tuple[Run, TrainingOptions]], system: System, runs: Path
+) -> Iterator[Piece]:
+    for key, (run, options) in missing.items():
+        path = _path(runs, run, options)
+        if isinstance(place, Processes):
+            make_folder(path.parent)
+            yield Piece(key, train_here, (run, system, options, path))
+        else:
+            checkpoint = path.with_name("checkpoint.pt")
+            content = checkpoint.read_bytes() if checkpoint.is_file() else None
+            yield Piece(key, train_elsewhere, (run, system, options, content))
+
+
+def train_here(run: Run, system: System, training: TrainingOptions, path: Path) -> bytes:
+    """Train a run into its file; nothing is sent back."""
+    _train(run, system, training, path, lambda done: None)
+    return b""
+
+
+def train_elsewhere(run: Run, system: System, training: TrainingOptions, checkpoint: bytes | None) -> bytes:
+    """Train a run, from a checkpoint if there is one; the bytes of its file."""
+    with tempfile.TemporaryDirectory(prefix="controllers-run-") as folder:
+        if checkpoint is not None:
+            write_atomically(Path(folder) / "checkpoint.pt", checkpoint)
+        path = Path(folder) / _FILES[run]
+        _train(run, system, training, path, lambda done: None)
+        return path.read_bytes()
+
+
+def _keep(content: bytes, run: Run, path: Path, system: System, training: TrainingOptions) -> None:
+    """Give what came back its name, once it was read as the run that was asked for.
+
+    Raises
+    ------
+    InputError : it is none.
+    """
+    with tempfile.TemporaryDirectory(prefix="controllers-run-") as folder:
+        received = Path(folder) / _FILES[run]
+        received.write_bytes(content)
+        _required(_load(run, received, system, training), run, path, training)
+    make_folder(path.parent)
+    write_atomically(path, content)
+    if run != "sac":
+        path.with_name("checkpoint.pt").unlink(missing_ok=True)
 
 
 def variant(run: Run, training: TrainingOptions) -> TrainingOptions:

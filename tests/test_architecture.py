@@ -17,6 +17,7 @@ ENTRY = {"cli", "commands", "__main__"}  # these may import anything of certify
 EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows that exist
     "acceptance": "certificate claims engines",
     "api": "inputs installation lyapunov options policies results roa systems",
+    "arguments": "inputs policies systems",
     "beyond": "claims engines lyapunov options results rigorous",
     "certificate": "claims expressions lyapunov policies systems",
     "claims": "closed_loop expressions lyapunov policies",
@@ -42,10 +43,13 @@ EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows th
         "results rigorous running systems trials unfinished"
     ),
     "sublevel": "expressions lyapunov rigorous systems",
+    "sweep": (
+        "arguments certificate claims inputs installation lyapunov options policies report results roa running systems"
+    ),
     "systems": "expressions",
     "trials": "certificate claims closed_loop engines lyapunov options",
     "unfinished": "certificate claims closed_loop engines lyapunov policies systems trials",
-    "controllers": "containment policies systems",
+    "controllers": "containment policies running systems",
 }
 
 

@@ -12,7 +12,6 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from importlib import resources
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -29,9 +28,9 @@ from certify.lyapunov import Neural, domain_limit, extents, sampled_volume, semi
 from certify.report.claims import CHECKED_ALWAYS, INPUTS, Words, words_for
 from certify.report.figures import Picture, draw
 from certify.report.figures.scene import centre_of, inner_of, is_ellipsoid, is_local_enough, slabs_of, start_of
-from certify.report.figures.style import legend_style
 from certify.report.limits import limit_in_words, limited_by, outer_limited_by
 from certify.report.sampling import SimulatedRoa
+from certify.report.sheet import filled
 from certify.report.timing import Timing
 from certify.report.words import (
     ABSENT,
@@ -169,14 +168,9 @@ def render_html(
     SoundnessError : the answer is not about these bytes.
     InputError : the result is not of the run that made the certificate.
     """
-    import jinja2
-    from markupsafe import Markup
-
     if sha256 is None:
         raw = certificate.to_json().encode("utf-8")
         sha256, size = hashlib.sha256(raw).hexdigest(), len(raw)
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
-    source = resources.files("certify.report").joinpath("template.html").read_text(encoding="utf-8")
     status = status_of(certificate, sha256, answer)
     beyond = certificate.claim.outer
     if result is not None and (
@@ -197,8 +191,9 @@ def render_html(
             raise
         trouble = f"There are no figures: {error}"  # a rejected file need not make sense
     limits = _limits(certificate, result)
-    page = environment.from_string(source).render(
-        legend_style=Markup(legend_style()),
+    return filled(
+        "certify.report",
+        "template.html",
         contents=_contents(status, limits),
         limits=limits,
         one_plane=certificate.system.n <= 2,
@@ -218,7 +213,6 @@ def render_html(
         file=certificate_path.name,
         not_proved=_not_proved(certificate, words),
     )
-    return str(page).encode("utf-8", "replace").decode("utf-8")  # a file's text may hold half a surrogate pair
 
 
 def _time_for(result: Mapping[str, Any] | None) -> float:

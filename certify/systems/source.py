@@ -22,7 +22,7 @@ _ENTRY = re.compile(r"""\s*((?:["']?[A-Za-z0-9_-]+["']?\s*\.\s*)*["']?[A-Za-z0-9
 
 @dataclass(frozen=True, slots=True)
 class PlantFile:
-    """A TOML file of a plant: its values, and where they stand.
+    """A TOML file of a plant, or of a study: its values, and where they stand.
 
     Parameters
     ----------
@@ -61,8 +61,8 @@ class PlantFile:
                 raise self.refuse(f"{key!r} is no {what}{close}", name, key)
 
 
-def read_plant_file(path: Path) -> PlantFile:
-    """Read a TOML file.
+def read_plant_file(path: Path, what: str = "system file") -> PlantFile:
+    """Read a TOML file; `what` is what messages call it.
 
     Raises
     ------
@@ -71,7 +71,7 @@ def read_plant_file(path: Path) -> PlantFile:
     try:
         text = path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"system file {path} cannot be read: {error}.") from error
+        raise InputError(f"{what} {path} cannot be read: {error}.") from error
     odd: list[str] = []
 
     def number(literal: str) -> Any:
@@ -84,12 +84,12 @@ def read_plant_file(path: Path) -> PlantFile:
     try:
         data = tomllib.loads(text, parse_float=number)
     except tomllib.TOMLDecodeError as error:
-        raise InputError(f"system file {path} is not valid TOML: {error}.") from error
+        raise InputError(f"{what} {path} is not valid TOML: {error}.") from error
     except InputError as error:
         line = next(i for i, content in enumerate(text.splitlines(), 1) if odd[0] in content)
         raise InputError(f"{path}, line {line}: {error}") from error
     except ValueError as error:  # an integer of thousands of digits
-        raise InputError(f"system file {path} cannot be read: {error}.") from error
+        raise InputError(f"{what} {path} cannot be read: {error}.") from error
     return PlantFile(path, data, _lines(text))
 
 

@@ -29,19 +29,32 @@ def compare(
         list[str] | None, typer.Option("--without", help="A kind of run to leave out, such as sb3-sac; repeatable.")
     ] = None,
     steps: Steps = None,
+    jobs: Annotated[
+        int | None, typer.Option("--jobs", help="Runs trained at a time, in processes of this machine.")
+    ] = None,
+    cluster: Annotated[
+        str | None,
+        typer.Option(
+            "--cluster",
+            help="Dask cluster to train on: a scheduler's address, tcp://HOST:8786, or local:N.",
+            metavar="ADDRESS",
+        ),
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Compare our policy with SAC without the gain and with SAC and PPO of stable-baselines3: figures and a table."""
     with errors(as_json):
         training = options_of(plant, seed=0, steps=steps)
+        from certify.running.tasks import place_for
         from certify.systems import get_system
         from controllers.compare import compare as run
         from controllers.responses import ABLATIONS, BASELINES, CompareOptions, remaining
 
         methods = remaining(ABLATIONS if ablations else BASELINES, without or [])
         options = CompareOptions(methods=methods, seeds=seeds, duration=duration, states=states)
+        place = None if jobs is None and cluster is None else place_for(jobs, cluster)
         with _progress() as (say, watch):
-            result = run(get_system(plant), training, runs, out, options, say, watch)
+            result = run(get_system(plant), training, runs, out, options, say, watch, place)
         if as_json:
             emit(result, as_json)
             return

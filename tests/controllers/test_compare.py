@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from certify.errors import InputError
+from certify.errors import BackendError, InputError
 from certify.policies import load_policy
+from certify.running.tasks import Cluster, Processes
 from certify.systems import available_systems, get_system
 from controllers import baselines, compare, figures, simulation
 from controllers.cli import app
@@ -32,6 +33,7 @@ from controllers.responses import (
     remaining,
     table,
 )
+from tests.support.pieces import Here
 
 TINY = replace(preset("pendulum"), steps=160, warm_up=60, n_A=25, n_B=25, batch=8, actor=(6, 5), critic=(7,))
 SHORT = CompareOptions(seeds=1, states=4, duration=1.2)
@@ -308,6 +310,8 @@ def test_the_command_prints_the_table_or_one_json_object(finished, tmp_path, mon
         (["pendulum", "--duration", "0.5"], "`window` at most `duration`"),
         (["pendulum", "--duration", "nan"], "`duration`"),
         (["pendulum", "--without", "ours"], "`without` must be one of sac, sb3-ppo, sb3-sac"),
+        (["pendulum", "--jobs", "0"], "`jobs` must be at least 1"),
+        (["pendulum", "--jobs", "2", "--cluster", "local:2"], "--jobs must stand without --cluster"),
         (["pendulum", "--ablations", "--without", "sb3-sac"], "`without` must be one of before, sac, uncentred"),
     ],
 )
@@ -365,3 +369,68 @@ def test_a_policy_that_is_called_by_another_s_name_is_refused(finished, pendulum
     (tmp_path / "before" / "seed-0").symlink_to(finished[0] / "ours" / "seed-0")
     with pytest.raises(InputError, match="`identification` must be 'before' for the run before; it is 'during'"):
         compare.obtain("before", pendulum_system, TINY, tmp_path)
+
+
+OF_OURS = replace(SHORT, methods=(OURS, SAC))
+
+
+class Elsewhere(Here):
+    """A place that is not this machine's processes: what is sent there comes back as bytes."""
+
+
+@pytest.mark.parametrize("place", [Processes(2), Elsewhere()], ids=["processes", "elsewhere"])
+def test_where_runs_are_trained_changes_nothing(finished, pendulum_system, tmp_path, place):
+    runs, lines, told = tmp_path / "runs", [], []
+    result = compare.compare(pendulum_system, TINY, runs, tmp_path, OF_OURS, lines.append, told.append, place)
+    before = {row["method"]: row for row in finished[2]["rows"]}
+    assert all(row == before[row["method"]] for row in result["rows"] if row["seed"] is None) and result["rows"]
+    ours = "ours/seed-0/policy.pt"
+    assert (runs / ours).read_bytes() == (finished[0] / ours).read_bytes()
+    kept = sorted(str(path.relative_to(runs)) for path in runs.rglob("*") if path.is_file())
+    assert kept == [ours, "sac/seed-0/checkpoint.pt"]
+    assert sorted(lines) == ["ours seed 0: 160 of 160 steps", "sac seed 0: 160 of 160 steps"]
+    assert {(d.run, d.runs) for d in told} == {(1, 2), (2, 2)}
+    nothing = Elsewhere()
+    compare.compare(pendulum_system, TINY, runs, tmp_path, OF_OURS, place=nothing)
+    assert nothing.done == []
+
+
+def test_a_cluster_goes_on_from_the_checkpoint_that_is_here(finished, pendulum_system, tmp_path):
+    trainer = compare.Trainer(pendulum_system, TINY)
+    while trainer.steps_done < 90:
+        trainer.advance()
+    checkpoint = tmp_path / "runs" / "ours" / "seed-0" / "checkpoint.pt"
+    checkpoint.parent.mkdir(parents=True)
+    checkpoint.write_bytes(trainer.snapshot())
+    sent = []
+    place = Elsewhere(lambda piece: sent.append(piece.arguments[-1]) or piece.work(*piece.arguments))
+    options = replace(SHORT, methods=(OURS,))
+    compare.compare(pendulum_system, TINY, tmp_path / "runs", tmp_path, options, place=place)
+    assert sent == [trainer.snapshot()] and not checkpoint.exists()
+    ours = "ours/seed-0/policy.pt"
+    assert (tmp_path / "runs" / ours).read_bytes() == (finished[0] / ours).read_bytes()
+
+
+@pytest.mark.parametrize("sent", ["another seed", b"no policy", b"\x80\x04N."])
+def test_what_comes_back_and_is_no_such_run_gets_no_name(finished, pendulum_system, tmp_path, sent):
+    content = (finished[0] / "ours" / "seed-0" / "policy.pt").read_bytes() if sent == "another seed" else sent
+    place = Elsewhere(lambda piece: content if "seed 1" in piece.key else piece.work(*piece.arguments))
+    options = replace(SHORT, methods=(OURS,), seeds=2)
+    with pytest.raises(InputError, match="with seed 1; it has" if sent == "another seed" else "policy"):
+        compare.compare(pendulum_system, TINY, tmp_path / "runs", tmp_path, options, place=place)
+    assert [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.pt")] == ["runs/ours/seed-0/policy.pt"]
+
+
+def test_a_run_that_is_lost_takes_none_with_it(pendulum_system, tmp_path):
+    place = Elsewhere(lambda piece: "its worker died" if piece.key.startswith("ours") else piece.work(*piece.arguments))
+    with pytest.raises(BackendError, match="1 of 2 runs could not be trained, ours seed 0 among them: its worker died"):
+        compare.compare(pendulum_system, TINY, tmp_path / "runs", tmp_path, OF_OURS, place=place)
+    assert [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.pt")] == ["runs/sac/seed-0/checkpoint.pt"]
+
+
+@pytest.mark.slow
+def test_a_cluster_trains_the_same_runs(finished, pendulum_system, tmp_path):
+    result = compare.compare(pendulum_system, TINY, tmp_path / "runs", tmp_path, SHORT, place=Cluster("local:2"))
+    assert result["rows"] == finished[2]["rows"]
+    for name in ("ours/seed-0/policy.pt", "sac/seed-0/checkpoint.pt"):
+        assert (tmp_path / "runs" / name).read_bytes() == (finished[0] / name).read_bytes()
