@@ -787,6 +787,21 @@ def test_parallel_lines_enclose_tanh_at_extremes_on_every_side() -> None:
                     assert certainly_within(y.tanh() - arb(s) * y, m, g), (c, r, y)
 
 
+@pytest.mark.parametrize("wrong", [0.0, 0.5, 1.1, 50.0, np.inf])
+def test_parallel_lines_do_not_depend_on_where_a_library_puts_the_critical_point(
+    wrong: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    honestly, generator = np.arctanh, np.random.default_rng(8)
+    monkeypatch.setattr(np, "arctanh", lambda x: wrong * honestly(x) if wrong < np.inf else np.full_like(x, wrong))
+    centre, radius = 2 * generator.standard_normal(300), np.abs(generator.standard_normal(300))
+    slope, shift, gap = relax_tanh(centre, radius)
+    with ctx.workprec(200):
+        for c, r, s, m, g in zip(*(a.tolist() for a in (centre, radius, slope, shift, gap)), strict=True):
+            for t in np.linspace(-1, 1, 33).tolist():
+                y = arb(c) + arb(r) * arb(t)
+                assert certainly_within(y.tanh() - arb(s) * y, m, g), (c, r, t)
+
+
 def test_parallel_lines_are_as_close_as_their_slope_allows() -> None:
     """Whichever of the critical points the interval holds: one, both, or one beyond an end."""
     centre, radius = extremes()
