@@ -30,8 +30,8 @@ def main(arguments: list[str]) -> int:
         options = parser.parse_args(arguments)
     except SystemExit as stop:
         return int(stop.code or 0)
-    if options.jobs > 1:  # each has one core; numpy reads this when it is first imported, below
-        os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    # Threads of several processes would wait for each other. numpy reads this when it is first imported: below.
+    os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     try:
         status, answer = _examine(options.file, options.part, options.jobs)
     except Rejected as no:

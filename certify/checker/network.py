@@ -158,8 +158,9 @@ def enclose_on_boxes(net: Folded, x: Array, x_error: Array) -> tuple[Array, Arra
         slope, shift, gap = relax_tanh(y[:, 0], up(spread + error))
         size = up(slope * up(np.abs(y[:, 0]) + spread) + np.abs(shift))
         fresh = up(gap + slope * rounding + EPS * size)
-        h = slope[:, None] * y
-        h[:, 0] += shift
+        y *= slope[:, None]
+        y[:, 0] += shift
+        h = y
         old = up(slope * error)
         ball = np.minimum(up(np.max(slope, axis=0) * ball), norm(old, 0))
         passed.append((layer.W, slope, fresh))

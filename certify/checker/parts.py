@@ -69,8 +69,8 @@ def in_processes(count: int, work: Callable[[int], Any]) -> list[Any]:
     said = []
     for child, reading in children:
         with open(reading, encoding="ascii") as pipe:
-            said.append(pipe.read())
-        _, status = os.waitpid(child, 0)
-        if status != 0:
-            raise ChildProcessError(f"one of {count} processes ended with wait status {status}")
-    return [json.loads(answer) for answer in said]
+            text = pipe.read()
+        said.append((text, os.waitpid(child, 0)[1]))
+    if any(status != 0 for _, status in said):
+        raise ChildProcessError(f"of {count} processes, not all came to their end: {[status for _, status in said]}")
+    return [json.loads(text) for text, _ in said]

@@ -126,6 +126,7 @@ OF_OUTER: Table[Case] = (("outer", outer.is_small),)
 ON_FACES: Table[Case] = (("faces", outer.is_above_on_faces),)
 OF_OUTER_TREE: Table[Case] = (("outer", outer.contains_domain), ("outer", outer.is_partition))
 ON_OUTER_LEAVES: Table[boxes.Leaves] = (("inputs", boxes.keeps_inputs), ("outer", outer.falls))
+_KEPT = 4_000_000  # numbers, just below the 2^25 bytes up to which glibc adapts
 READ = {"format": 1, "hash": 1}  # rules of document.py, which have held
 RULES = (
     *READ,
@@ -172,6 +173,7 @@ def check(c: Certificate, part: Part | None = None, jobs: int = 1) -> Tally:
     leaf on, each of `jobs` processes does with a part of its own what one would do.
     """
     self_test()
+    np.empty(_KEPT)  # given back at once: an allocator that adapts then keeps arrays, and need not ask for each anew
     replayed = isinstance(c.evidence, Partition)
     spared = {"equilibrium": c.practical, "coordinates": not replayed, "root": not replayed}
     with np.errstate(all="ignore"):  # overflow becomes infinity or NaN, and every test then fails

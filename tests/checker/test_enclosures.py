@@ -747,7 +747,76 @@ def test_parallel_lines_enclose_tanh() -> None:
                 assert certainly_within(y.tanh() - arb(s) * y, m, g), (c, r, t)
 
 
-@pytest.mark.parametrize("first", [2.0**-3, 2.0**-14])  # chords, then tangents
+def best_gap(c: float, r: float, s: float) -> arb:
+    """Half of what tanh(y) - s y spans over |y - c| <= r: of its ends and its critical points in there."""
+    ends = arb(c) - arb(r), arb(c) + arb(r)
+    critical = (1 - arb(s)).sqrt().atanh() if 0 < s < 1 else arb(0)
+    inside = [p for p in (critical, -critical) if ends[0] < p < ends[1]]
+    values = [y.tanh() - arb(s) * y for y in (*ends, *inside)]
+    greatest = least = values[0]
+    for value in values[1:]:
+        greatest, least = greatest.max(value), least.min(value)
+    return (greatest - least) / 2
+
+
+def extremes() -> tuple[np.ndarray, np.ndarray]:
+    """Centres with radii: around 0 and off it by shares of the radius, saturated, subnormal, near overflow."""
+    radii = [5e-324, 1e-310, 1e-160, 1e-30, 1e-12, 1e-8, 1e-4, 0.03, 0.25, 1.0, 3.0, 19.0, 40.0, 1e6, 1e150, 1e307]
+    shares = [0.0, 1e-300, 1e-16, 1e-3, 0.2, 1 / 3, 0.5, 0.577, 0.58, 0.9, 1 - 1e-9, 1.0, 1 + 1e-9, 1.1, 2.0, 7.0]
+    pairs = [(sign * r * share, r) for r in radii for share in shares for sign in (1, -1)]
+    pairs += [
+        (sign * c, r) for c in (1e-320, 1e-5, 0.5, 2.0, 18.9, 25.0, 1e8, 1e307) for r in radii for sign in (1, -1)
+    ]
+    centre, radius = np.array(pairs).T
+    return centre, radius
+
+
+def test_parallel_lines_enclose_tanh_at_extremes_on_every_side() -> None:
+    """At the ends, at the critical points and between them: exactly the places where a line would be crossed first."""
+    centre, radius = extremes()
+    with np.errstate(all="ignore"):
+        slope, shift, gap = relax_tanh(centre, radius)
+    assert np.all((slope >= 0) & (slope <= 1) & (gap >= 0))
+    with ctx.workprec(2400):
+        for c, r, s, m, g in zip(*(a.tolist() for a in (centre, radius, slope, shift, gap)), strict=True):
+            lo, hi = arb(c) - arb(r), arb(c) + arb(r)
+            critical = (1 - arb(s)).sqrt().atanh() if 0 < s < 1 else arb(0)
+            places = [lo, hi, *(lo + (hi - lo) * k / 16 for k in range(1, 16)), arb(0), critical, -critical]
+            for y in (*places, *(p * (1 + sign * arb(2) ** -20) for p in places for sign in (1, -1))):
+                if lo <= y <= hi:
+                    assert certainly_within(y.tanh() - arb(s) * y, m, g), (c, r, y)
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.5, 1.1, 50.0, np.inf])
+def test_parallel_lines_do_not_depend_on_where_a_library_puts_the_critical_point(
+    wrong: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    honestly, generator = np.arctanh, np.random.default_rng(8)
+    monkeypatch.setattr(np, "arctanh", lambda x: wrong * honestly(x) if wrong < np.inf else np.full_like(x, wrong))
+    centre, radius = 2 * generator.standard_normal(300), np.abs(generator.standard_normal(300))
+    slope, shift, gap = relax_tanh(centre, radius)
+    with ctx.workprec(200):
+        for c, r, s, m, g in zip(*(a.tolist() for a in (centre, radius, slope, shift, gap)), strict=True):
+            for t in np.linspace(-1, 1, 33).tolist():
+                y = arb(c) + arb(r) * arb(t)
+                assert certainly_within(y.tanh() - arb(s) * y, m, g), (c, r, t)
+
+
+def test_parallel_lines_are_as_close_as_their_slope_allows() -> None:
+    """Whichever of the critical points the interval holds: one, both, or one beyond an end."""
+    centre, radius = extremes()
+    generator = np.random.default_rng(5)
+    radii = 10.0 ** generator.uniform(-3, 0.7, 1500)
+    fine = (radius > 1e-4) & (radius < 20) & (np.abs(centre) < 20)
+    centre = np.concatenate([centre[fine], radii * generator.uniform(-3, 3, 1500)])
+    radius = np.concatenate([radius[fine], radii])
+    slope, _, gap = relax_tanh(centre, radius)
+    with ctx.workprec(300):
+        for c, r, s, g in zip(*(a.tolist() for a in (centre, radius, slope, gap)), strict=True):
+            assert arb(g) <= best_gap(c, r, s) * (1 + arb(2) ** -30) + 2.0**-46 * (1 + r), (c, r)
+
+
+@pytest.mark.parametrize("first", [2.0**-3, 2.0**-14])
 @pytest.mark.parametrize("centre", [0.3, -0.7, 2.0])
 def test_the_gap_is_of_second_order(first: float, centre: float) -> None:
     radius = first / 2.0 ** np.arange(4)
