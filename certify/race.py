@@ -6,7 +6,7 @@ sampled set is of no use if its proof takes a week.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
 from certify.engines.base import Attempt, Budget, Once, Progress
@@ -68,9 +68,18 @@ class Race:
         can = [c for c in self.contenders if c is self.best or c.trial.volume > _WORTH * most]
         return sorted((c for c in can if not c.attempt.done), key=lambda c: -c.proved)
 
+    def is_settled_by(self, trials: Sequence[Trial], seconds: float, most: float) -> bool:
+        """Whether after a heat of so many seconds the trial with the largest reach leaves no other one worth its time,
+        because no set has a larger volume than `most`; it is entered only where its reach lets that be hoped for."""
+        first = by_reach(trials)[:1]
+        if not first or most > _WORTH * first[0].volume:
+            return False
+        self.enter(first, seconds)
+        return most <= _WORTH * self.best.proved
+
     def enter(self, trials: Iterable[Trial], seconds: float) -> None:
-        """A heat of so many seconds for each trial within whose reach lies more than is proved already."""
-        for trial in by_reach(list(trials)):
+        """A heat of so many seconds for each new trial within whose reach lies more than is proved already."""
+        for trial in by_reach([t for t in trials if all(t is not c.trial for c in self.contenders)]):
             if self.contenders and trial.volume <= _WORTH * self.best.proved:
                 continue
             self.contenders.append(Contender(trial, self.begin(trial)))

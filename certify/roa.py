@@ -249,12 +249,15 @@ class _Run:
         if self.options.claim == "practical" and options.engine != "dreal" and loop.system.n > FEW:
             return self._around_a_level(loop, trials, options)
         large = self._optimised(partial(optimised, loop, options)) if options.engine != "dreal" else None
-        certain = self._optimised(partial(robust, loop, options)) if self.interruptible else None
-        trials += [one for one in (certain, large) if one is not None]
-        race = self._contest()
+        trials += [] if large is None else [large]
+        race, most = self._contest(), volume(_ellipsoid_in(self.system), 1.0)
         if not self.interruptible:
             race.enter(by_reach(trials)[:1], heat)
             return race
+        if race.is_settled_by(trials, heat, most):  # the candidate `robust` takes longest to make
+            return race
+        certain = self._optimised(partial(robust, loop, options))
+        trials += [] if certain is None else [certain]
         race.enter(trials, heat)
         self._improve(race, loop, heat)
         unproved = [c for c in race.open if c.trial.name == "optimised"]
