@@ -64,7 +64,10 @@ def main(arguments: list[str] | None = None) -> None:
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     given = sys.argv[1:] if arguments is None else arguments
-    sys.exit(_run(given, "--json" in given))
+    status = _run(given, "--json" in given)
+    if arguments is None:
+        gc.freeze()  # the end of the process frees all, and a last search for circles of objects takes longer than that
+    sys.exit(status)
 
 
 def _run(arguments: list[str], as_json: bool) -> int:
