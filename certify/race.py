@@ -6,7 +6,7 @@ sampled set is of no use if its proof takes a week.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 
 from certify.engines.base import Attempt, Budget, Once, Progress
@@ -68,13 +68,12 @@ class Race:
         can = [c for c in self.contenders if c is self.best or c.trial.volume > _WORTH * most]
         return sorted((c for c in can if not c.attempt.done), key=lambda c: -c.proved)
 
-    def is_settled_by(self, trials: Sequence[Trial], seconds: float, most: float) -> bool:
-        """Whether after a heat of so many seconds the trial with the largest reach leaves no other one worth its time,
-        because no set has a larger volume than `most`; it is entered only where its reach lets that be hoped for."""
-        first = by_reach(trials)[:1]
-        if not first or most > _WORTH * first[0].volume:
+    def is_settled_by(self, trial: Trial, seconds: float, most: float) -> bool:
+        """Whether after a heat of so many seconds this trial leaves no other one worth its time, because no set has a
+        larger volume than `most`; it is entered only where its reach lets that be hoped for."""
+        if most > _WORTH * trial.volume:
             return False
-        self.enter(first, seconds)
+        self.enter([trial], seconds)
         return most <= _WORTH * self.best.proved
 
     def enter(self, trials: Iterable[Trial], seconds: float) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 import sys
-import threading
 import time
 from typing import TYPE_CHECKING, Any
 
@@ -76,10 +75,6 @@ class ProgressLine:
         self.shown = 0
 
     def __call__(self, stage: str, state: Progress | None) -> None:
-        if stage == "check":  # the checker works in a process of its own: load the drawing libraries meanwhile
-            from certify.report import warm_up
-
-            threading.Thread(target=warm_up, daemon=True).start()
         now = time.monotonic()
         if now - self.last < self.every:
             return

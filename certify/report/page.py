@@ -7,6 +7,7 @@ is an error, not a page. Every text that comes from a file passes through jinja2
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,7 +16,7 @@ from fractions import Fraction
 from importlib import resources
 from itertools import groupby
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import sympy
@@ -61,6 +62,10 @@ from certify.report.words import (
 )
 from certify.systems import System
 
+if TYPE_CHECKING:
+    import jinja2
+
+Figures = tuple[list[Picture], SimulatedRoa | None]
 _LONG = 10**6  # numerators and denominators beyond it are shown rounded
 _MOST_OPERATIONS = 200  # of an expression N that is shown
 _SECONDS, _SHARE = 10.0, 0.1  # the drawing takes no longer than the one, or than this share of the run
@@ -149,6 +154,7 @@ def render_html(
     *,
     sha256: str | None = None,
     size: int | None = None,
+    figures: Figures | None = None,
 ) -> str:
     """The report as one HTML document.
 
@@ -163,20 +169,18 @@ def render_html(
     certificate_path : for its name alone; nothing is read from it.
     sha256, size : of the bytes that the certificate was parsed from. Without them, those of the bytes that
         `write_certificate` writes for it: the answer must then be about exactly such a file.
+    figures : `figures_of` this certificate as accepted, if they are there already.
 
     Raises
     ------
     SoundnessError : the answer is not about these bytes.
     InputError : the result is not of the run that made the certificate.
     """
-    import jinja2
     from markupsafe import Markup
 
     if sha256 is None:
         raw = certificate.to_json().encode("utf-8")
         sha256, size = hashlib.sha256(raw).hexdigest(), len(raw)
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
-    source = resources.files("certify.report").joinpath("template.html").read_text(encoding="utf-8")
     status = status_of(certificate, sha256, answer)
     beyond = certificate.claim.outer
     if result is not None and (
@@ -189,7 +193,9 @@ def render_html(
     pictures: list[Picture] = []
     roa, trouble = None, ""
     try:
-        pictures, roa = draw(certificate, status.accepted, seconds=_time_for(result))
+        if figures is None or not status.accepted:
+            figures = figures_of(certificate, status.accepted, result)
+        pictures, roa = figures
     except np.linalg.LinAlgError as error:
         trouble = f"There are no figures: floating point cannot draw them: {error}"
     except (CertifyError, ValueError, ArithmeticError) as error:
@@ -197,7 +203,7 @@ def render_html(
             raise
         trouble = f"There are no figures: {error}"  # a rejected file need not make sense
     limits = _limits(certificate, result)
-    page = environment.from_string(source).render(
+    page = template().render(
         legend_style=Markup(legend_style()),
         contents=_contents(status, limits),
         limits=limits,
@@ -219,6 +225,26 @@ def render_html(
         not_proved=_not_proved(certificate, words),
     )
     return str(page).encode("utf-8", "replace").decode("utf-8")  # a file's text may hold half a surrogate pair
+
+
+@functools.cache
+def template() -> jinja2.Template:
+    """The page without its content; to read it takes as long as a figure."""
+    import jinja2
+
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
+    source = resources.files("certify.report").joinpath("template.html").read_text(encoding="utf-8")
+    return environment.from_string(source)
+
+
+def figures_of(certificate: Certificate, accepted: bool, result: Mapping[str, Any] | None) -> Figures:
+    """The figures, in the time that they may take after a run that has taken what `result` says.
+
+    Raises
+    ------
+    CertifyError, ValueError, ArithmeticError : the certificate makes no sense, which one that is accepted does.
+    """
+    return draw(certificate, accepted, seconds=_time_for(result))
 
 
 def _time_for(result: Mapping[str, Any] | None) -> float:
