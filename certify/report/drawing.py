@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import base64
 import json
+import os
 import subprocess
 import sys
 from contextlib import suppress
@@ -19,7 +20,8 @@ from pathlib import Path
 from typing import Any, Self
 
 _LAUNCH = """
-import json, sys
+import gc, json, sys
+gc.set_threshold(100_000)
 sys.path[:] = json.loads(sys.argv[1])
 from certify.report.drawing import draw_one
 draw_one()
@@ -117,3 +119,5 @@ def draw_one() -> None:
     known = json.loads(sys.stdin.buffer.readline())
     made = drawn.page_of(raw, path, known["answer"], known["data"], figures)
     sys.stdout.buffer.write(made.encode("utf-8"))
+    sys.stdout.buffer.flush()
+    os._exit(0)  # somebody waits for the end, and what is in memory goes with it

@@ -85,7 +85,7 @@ def test_a_certificate_that_came_later_is_the_one_that_is_drawn(asked: Asked, he
 
 def test_figures_begun_early_say_nothing_before_the_checker_does(asked: Asked) -> None:
     """A refusal after figures were drawn: the page is the one that a refusal has, drawn anew."""
-    raw, path, answer, data = asked
+    raw, path, _answer, data = asked
     refused = {"result": "REJECTED", "rule": "ring", "at": "leaf 3", "detail": "positive"}
     with Drawing() as one:
         one.begin(raw, path, 1.0)
