@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+import threading
 import time
 from collections.abc import Mapping
 from functools import partial
@@ -14,7 +15,7 @@ import typer
 
 from certify.commands.contains import stated, text
 from certify.commands.shared import write
-from certify.commands.terminal import ProgressLine, say, show, tell
+from certify.commands.terminal import ProgressLine, load_tables, say, show, tell
 
 if TYPE_CHECKING:
     from certify.containment import Box
@@ -63,6 +64,8 @@ def certified(
 
     def draw(raw: bytes) -> None:
         drawing.begin(raw, folder / "certificate.json", time.perf_counter() - start)
+        if not as_json:  # this process waits for the checker's
+            threading.Thread(target=load_tables, daemon=True).start()
 
     run = partial(certify_roa, show=draw)
     if largest is not None:

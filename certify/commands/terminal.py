@@ -6,6 +6,7 @@ import os
 import shutil
 import sys
 import time
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -39,6 +40,12 @@ def show(renderable: Any) -> None:
     with console.capture() as captured:
         console.print(renderable)
     say(captured.get().rstrip("\n"))
+
+
+def load_tables() -> None:
+    """Import what tables are printed with, while there is time to."""
+    for module in ("rich.box", "rich.console", "rich.table", "rich.text"):
+        import_module(module)
 
 
 def tell(line: str) -> None:
