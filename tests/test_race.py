@@ -9,33 +9,37 @@ import numpy as np
 import pytest
 
 import certify.roa
+from certify.certificate import TrustedSolver
+from certify.claims import Asymptotic
 from certify.closed_loop import ClosedLoop
 from certify.engines.base import Budget, Proof, Report
-from certify.lyapunov import solve_lyapunov, volume
+from certify.lyapunov import solve_lyapunov
 from certify.options import RoaOptions
 from certify.policies import load_policy
 from certify.race import Race
 from certify.roa import certify_roa
 from certify.systems import System
 from certify.trials import Trial, trial
+from certify.verdict import Stop
 from tests.support.loops import chain, scalar_tanh
 
 SHIPPED = Path(__file__).parent.parent / "examples" / "policies" / "pendulum.pt"
 
 
 class Reaches:
-    """An attempt that proves a share of what is asked for in its first heat."""
+    """An attempt that proves a share of what is asked for in its first heat, and of that one by the local rule."""
 
     boxes, expected, gained, done = 1, 0.0, True, True
 
-    def __init__(self, target: float, share: float) -> None:
-        self.target, self.share, self.level = target, share, None
+    def __init__(self, target: float, share: float, local: float) -> None:
+        self.target, self.share, self.local, self.level = target, share, local, None
 
     def advance(self, budget: Budget, report: Report | None = None) -> None:
         self.level = self.share * self.target
 
     def proof(self) -> Proof:
-        raise AssertionError("nobody asks")
+        claim = Asymptotic(self.share * self.target, self.local * self.share * self.target)
+        return Proof(claim, TrustedSolver("nobody", "1", 0.0, ()), Stop.REQUESTED)
 
 
 def trials() -> list[Trial]:
@@ -48,13 +52,13 @@ def trials() -> list[Trial]:
     return [small, large]
 
 
-def race(share: float) -> tuple[Race, list[str]]:
+def race(share: float, local: float = 0.1) -> tuple[Race, list[str]]:
     """A race whose attempts prove this share of their levels, and the names in the order in which they began."""
     began: list[str] = []
 
     def begin(one: Trial) -> Reaches:
         began.append(one.name)
-        return Reaches(one.task.target, share)
+        return Reaches(one.task.target, share, local)
 
     return Race(begin, lambda: 1.0, 100), began  # type: ignore[arg-type]
 
@@ -78,12 +82,29 @@ def test_a_race_is_settled_where_no_other_could_be_let_in(
     assert began == entered
 
 
-def test_what_has_run_is_not_entered_again() -> None:
-    run, began = race(0.4)
+@pytest.mark.parametrize("local", [0.1, 0.5, 0.51, 1.0])
+def test_the_candidate_for_the_local_rule_may_be_ahead_where_that_rule_proves_most(local: float) -> None:
+    run, began = race(1.0, local)
+    large = trials()[1]
+    assert run.is_settled_by(large, 1.0, large.volume) is (local <= 0.5) and began == ["large"]
+
+
+def test_a_race_that_is_not_settled_goes_on_as_if_it_began() -> None:
+    """The larger of two that are both worth no other comes first, and nothing is begun twice."""
+    run, began = race(1.0, 1.0)
+    _, large = trials()
+    larger = replace(large, name="larger", volume=1.01 * large.volume)
+    assert not run.is_settled_by(large, 1.0, large.volume)
+    early = run.early
+    assert run.contenders == [] and early is not None and early.proved > 0
+    run.enter([large, larger], 1.0)
+    assert [c.trial.name for c in run.contenders] == ["larger"] and began == ["large", "larger"]
+    again, began = race(0.4)
     given = trials()
-    assert not run.is_settled_by(given[1], 1.0, volume(given[1].P, given[1].limit))
-    run.enter(given, 1.0)
-    assert began == ["large", "small"]
+    assert not again.is_settled_by(given[1], 1.0, given[1].volume)
+    early = again.early
+    again.enter(given, 1.0)
+    assert began == ["large", "small"] and again.contenders[0] is early
 
 
 def test_no_candidate_is_made_that_could_not_win(
