@@ -44,6 +44,7 @@ class Clerk:
     left : seconds that may still be spent on a leaf that was refused; after that only the level is lowered.
     stage : times the stages `write` and `check`.
     tell : called before each check.
+    show : called with the bytes of a certificate that the run ends with if they are accepted, before they are checked.
     check : the checker's answer about a file.
     """
 
@@ -51,6 +52,7 @@ class Clerk:
     left: Callable[[], float]
     stage: Callable[[str], AbstractContextManager[None]]
     tell: Callable[[], None]
+    show: Callable[[bytes], None]
     check: Callable[[Path], Mapping[str, Any]] = run_checker
 
     def accepted(self, certificate: Certificate, problem: Problem) -> Accepted:
@@ -63,7 +65,7 @@ class Clerk:
         splits = lowerings = 0
         mended, first = None, certificate
         while True:
-            data, answer = self.ask(certificate)
+            data, answer = self.ask(certificate, final=True)
             if answer["result"] == _wanted(certificate):
                 return Accepted(certificate, self.path, data, answer, mended)
             leaf, finer = _leaf_of(answer), None
@@ -84,8 +86,10 @@ class Clerk:
                 _what_is_lower(first, certificate) if lowerings else "split again, it is accepted"
             )
 
-    def ask(self, certificate: Certificate) -> tuple[bytes, Mapping[str, Any]]:
+    def ask(self, certificate: Certificate, *, final: bool = False) -> tuple[bytes, Mapping[str, Any]]:
         """The certificate's bytes and the checker's answer; the file gets its name only if that is not a refusal.
+
+        `final` : whether the run ends with this certificate if it is accepted.
 
         Raises
         ------
@@ -95,6 +99,8 @@ class Clerk:
             data = certificate.to_json().encode()
             unchecked = write_beside(self.path, data, ".unchecked.json")
         self.tell()
+        if final and _wanted(certificate) == "ACCEPTED":
+            self.show(data)
         try:
             with self.stage("check"):
                 answer = self.check(unchecked)

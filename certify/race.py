@@ -15,6 +15,7 @@ from certify.trials import Trial, by_reach
 
 _FIRST_LOOK = 0.25  # of a heat, after which it may end
 _HOPELESS = 1e9  # boxes that a first gain may need, at a hundred thousand a second some hours
+_RING = 0.5  # share of a set's level, up to which the local rule proves little of it
 _WORTH = 1.02  # of the best proved volume: what a candidate's reach must exceed to be given time
 
 
@@ -55,6 +56,7 @@ class Race:
     boxes: int
     report: Callable[[Progress], None] | None = None
     contenders: list[Contender] = field(default_factory=list)
+    early: Contender | None = None  # one that has begun, but is not entered
 
     @property
     def best(self) -> Contender:
@@ -68,12 +70,29 @@ class Race:
         can = [c for c in self.contenders if c is self.best or c.trial.volume > _WORTH * most]
         return sorted((c for c in can if not c.attempt.done), key=lambda c: -c.proved)
 
+    def is_settled_by(self, trial: Trial, seconds: float, most: float) -> bool:
+        """Whether after a heat of so many seconds this trial leaves no other one worth its time, because no set has a
+        larger volume than `most`; it is entered only where its reach lets that be hoped for.
+
+        Where the local rule proves most of the set, the candidate that is made for this rule could still be ahead by a
+        little. If the race goes on, it does so as if this trial had not been entered, which keeps what it has proved.
+        """
+        if most > _WORTH * trial.volume:
+            return False
+        self.enter([trial], seconds)
+        claim = self.best.attempt.proof().claim
+        if most <= _WORTH * self.best.proved and claim is not None and claim.local <= _RING * claim.roa:
+            return True
+        self.early = self.contenders.pop()
+        return False
+
     def enter(self, trials: Iterable[Trial], seconds: float) -> None:
         """A heat of so many seconds for each trial within whose reach lies more than is proved already."""
         for trial in by_reach(list(trials)):
             if self.contenders and trial.volume <= _WORTH * self.best.proved:
                 continue
-            self.contenders.append(Contender(trial, self.begin(trial)))
+            known = self.early if self.early is not None and self.early.trial is trial else None
+            self.contenders.append(known or Contender(trial, self.begin(trial)))
             self._heat(self.contenders[-1], seconds)
 
     @property

@@ -56,7 +56,19 @@ from certify.rest import find_rest
 from certify.results import Levels, RoaResult, Tried, TubeFacts
 from certify.rigorous import eigenvalues, instability
 from certify.systems import System
-from certify.trials import OPTIMISING, Trial, blends, by_reach, corrected, named, optimised, peak, robust, solved
+from certify.trials import (
+    OPTIMISING,
+    Trial,
+    blends,
+    by_reach,
+    corrected,
+    named,
+    optimised,
+    peak,
+    robust,
+    solutions,
+    solved,
+)
 from certify.unfinished import Unfinished, load, save
 from certify.verdict import Stop, Verdict
 
@@ -101,6 +113,7 @@ def certify_roa(
     load_seconds: float = 0.0,
     provenance: Mapping[str, Any] | None = None,
     progress: Report | None = None,
+    show: Callable[[bytes], None] | None = None,
 ) -> RoaResult:
     """Certify a region of attraction of `system` under `network`.
 
@@ -113,6 +126,7 @@ def certify_roa(
     provenance : entries for the certificate that the checker ignores.
     progress : called with ("candidate", None), with ("ring", where the pass stands) after every batch, and with
         ("check", None).
+    show : called with the bytes of a certificate that the run ends with if they are accepted, before they are checked.
 
     Returns
     -------
@@ -126,7 +140,7 @@ def certify_roa(
     """
     options = options or RoaOptions()
     with _threads_for(network), sole_writer(out), _runner_for(options) as runner:
-        return _Run(system, network, out, options, runner, load_seconds, provenance or {}, progress).result()
+        return _Run(system, network, out, options, runner, load_seconds, provenance or {}, progress, show).result()
 
 
 @contextmanager
@@ -171,6 +185,7 @@ class _Run:
     load: float
     provenance: Mapping[str, Any]
     progress: Report | None
+    show: Callable[[bytes], None] | None = None
     seconds: dict[str, float] = field(default_factory=dict)
     start: float = field(default_factory=time.perf_counter)
     proof: Proof | None = None
@@ -277,16 +292,22 @@ class _Run:
         heat, options = self._heat(), replace(self.options, time_limit=self.share * self.options.time_limit)
         self._tell("candidate")
         with self._stage("candidate"):
-            trials = solved(loop, options)
+            found = solutions(loop, options)
         if self.options.claim == "practical" and options.engine != "dreal" and loop.system.n > FEW:
+            with self._stage("candidate"):
+                trials = solved(loop, found, options)
             return self._around_a_level(loop, trials, options)
         large = self._optimised(partial(optimised, loop, options)) if options.engine != "dreal" else None
-        certain = self._optimised(partial(robust, loop, options)) if self.interruptible else None
-        trials += [one for one in (certain, large) if one is not None]
-        race = self._contest()
+        race, most = self._contest(), volume(_ellipsoid_in(self.system), 1.0)
+        if self.interruptible and large is not None and race.is_settled_by(large, heat, most):
+            return race  # before the others are made, of which `robust` takes longest
+        with self._stage("candidate"):
+            trials = [*solved(loop, found, options), *([] if large is None else [large])]
         if not self.interruptible:
             race.enter(by_reach(trials)[:1], heat)
             return race
+        certain = self._optimised(partial(robust, loop, options))
+        trials += [] if certain is None else [certain]
         race.enter(trials, heat)
         self._improve(race, loop, heat)
         unproved = [c for c in race.open if c.trial.name == "optimised"]
@@ -639,7 +660,9 @@ class _Run:
         return found
 
     def _clerk(self) -> Clerk:
-        return Clerk(self.out / "certificate.json", self.left, self._stage, lambda: self._tell("check"), self._checked)
+        show = self.show or (lambda _: None)
+        tell = partial(self._tell, "check")
+        return Clerk(self.out / "certificate.json", self.left, self._stage, tell, show, self._checked)
 
     def _checked(self, path: Path) -> Mapping[str, Any]:
         """The checker's answer about a file; where many leaves make a long file, several processes share them."""

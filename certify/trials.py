@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -124,9 +124,19 @@ def named(loop: ClosedLoop, options: RoaOptions) -> Trial:
     return trial(loop, chosen.P, chosen.name, options, chosen.notice)
 
 
-def solved(loop: ClosedLoop, options: RoaOptions) -> list[Trial]:
-    """The candidates that solve a Lyapunov equation."""
-    return [trial(loop, choose_candidate(loop, name, options.Q, options.R).P, name, options) for name in SOLVED]
+def solutions(loop: ClosedLoop, options: RoaOptions) -> dict[str, Array]:
+    """P of each candidate that solves a Lyapunov equation, (n, n).
+
+    Raises
+    ------
+    InputError : a weight is not positive, or the linearisation is not stable.
+    """
+    return {name: choose_candidate(loop, name, options.Q, options.R).P for name in SOLVED}
+
+
+def solved(loop: ClosedLoop, found: Mapping[str, Array], options: RoaOptions) -> list[Trial]:
+    """What these `solutions` could give."""
+    return [trial(loop, P, name, options) for name, P in found.items()]
 
 
 def optimised(loop: ClosedLoop, options: RoaOptions) -> Trial | None:

@@ -121,7 +121,9 @@ def test_what_the_core_takes_is_taken(tmp_path: Path) -> None:
     assert json.loads((result.raw or b"").decode())["provenance"] == {"mine": "yes"}
     core = inspect.signature(__import__("certify.roa", fromlist=["certify_roa"]).certify_roa).parameters
     ours = list(inspect.signature(certify_roa).parameters)
-    assert ours[:4] == ["system", "policy", "out", "options"] and set(core) - {"network"} <= set(ours)
+    assert ours[:4] == ["system", "policy", "out", "options"] and set(core) - {"network", "show"} <= set(
+        ours
+    )  # `show` is for whoever draws meanwhile
 
 
 def test_options_by_name_are_those_of_the_options() -> None:

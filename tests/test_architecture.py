@@ -166,12 +166,47 @@ def test_certify_never_imports_controllers() -> None:
         ("import certify.systems", ["torch", "scipy", "matplotlib"]),
         ("import certify.policies.importers", ["torch", "onnx", "safetensors", "stable_baselines3"]),
         ("import certify.report", ["matplotlib", "jinja2"]),
+        ("import certify.certificate.checking", ["numpy", "sympy", "scipy", "torch", "flint"]),
     ],
 )
 def test_start_up_is_light(statement: str, absent: list[str]) -> None:
     code = f"{statement}; import sys; sys.exit(' '.join(set({absent}) & set(sys.modules)) or 0)"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
+
+
+SHIPPED = ROOT / "examples" / "policies" / "pendulum.pt"
+NOT_FOR_A_VERDICT = [
+    *("matplotlib", "jinja2", "cvxpy", "onnx", "safetensors", "distributed", "numba", "pyarrow"),
+    *("scipy.optimize", "scipy.stats", "scipy.ndimage", "scipy.interpolate", "scipy.spatial"),
+    *("torch._dynamo", "torch._inductor", "certify.engines.dreal", "certify.lyapunov.learning", "certify.largest"),
+    *("certify.report.page", "certify.report.figures", "certify.checker", "certify.reference"),
+]
+
+
+@pytest.mark.parametrize("arguments", [[], ["--candidate", "lyapunov"]])
+def test_a_proof_loads_no_more_than_it_needs(arguments: list[str], tmp_path: Path) -> None:
+    """The whole command as a user has it; what draws its report, and what checks it, are other processes."""
+    code = (
+        "import sys\nfrom certify.cli import _run\n"
+        "status = _run(sys.argv[1:], False)\n"
+        f"sys.exit(' '.join(set({NOT_FOR_A_VERDICT}) & set(sys.modules)) or status)"
+    )
+    command = [sys.executable, "-c", code, "roa", "--policy", str(SHIPPED), "--out", str(tmp_path), *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("PROVED") and "Figures" in (tmp_path / "report.html").read_text()
+
+
+@pytest.mark.parametrize("command", [["--help"], ["roa", "--help"], ["check", "no such file"]])
+def test_help_and_a_check_load_no_arithmetic(command: list[str]) -> None:
+    """A check's is in the checker's own process."""
+    code = (
+        "import sys\nfrom certify.cli import _run\nstatus = _run(sys.argv[1:], False)\n"
+        "print(' '.join({'numpy', 'sympy', 'scipy', 'torch', 'flint'} & set(sys.modules)) or 'none', status)"
+    )
+    done = subprocess.run([sys.executable, "-c", code, *command], capture_output=True, text=True, check=False)
+    assert done.stdout.splitlines()[-1] == f"none {2 if 'check' in command else 0}", done.stderr
 
 
 def test_no_checks_by_assert_and_no_bare_except() -> None:

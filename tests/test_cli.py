@@ -649,3 +649,24 @@ def test_plants_list_disturbances_and_ranges(tmp_path: Path, capsys: pytest.Capt
     assert "  disturbance torque N m, 0 unless asked for" in listed
     known = json.loads(run(capsys, "systems", "--json")[1])["systems"]
     assert all(s["disturbances"] and s["ranges"] == {} for s in known)
+
+
+@pytest.mark.parametrize("watch", ["", "sys.setprofile(lambda *_: None); "])
+@pytest.mark.parametrize(
+    ("arguments", "status", "said"),
+    [(["--help"], 0, "float-error"), (["systems", "--json"], 0, "}}]}\n"), (["prove"], 2, "No such command")],
+)
+def test_a_command_that_ends_at_once_has_said_everything(
+    watch: str, arguments: list[str], status: int, said: str
+) -> None:
+    """Into a pipe, which is not flushed line by line; what is left for the end is done, and a profiler sees the end."""
+    code = (
+        "import atexit, sys; from certify.cli import main\n"
+        "atexit.register(lambda: sys.stderr.write('left\\n'))\n"
+        f"{watch}\n"
+        "try:\n    main()\nfinally:\n    sys.stderr.write('ended\\n')"
+    )
+    done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False)
+    assert done.returncode == status and said in done.stdout + done.stderr
+    assert done.stderr.endswith("ended\nleft\n" if watch else "left\n")
+    assert watch or "ended" not in done.stderr

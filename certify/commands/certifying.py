@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
+import threading
 import time
 from collections.abc import Mapping
 from functools import partial
@@ -13,14 +14,15 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from certify.commands.contains import stated, text
-from certify.commands.shared import page_of, write
-from certify.commands.terminal import ProgressLine, say, show, tell
+from certify.commands.shared import write
+from certify.commands.terminal import ProgressLine, load_tables, say, show, tell
 
 if TYPE_CHECKING:
     from certify.containment import Box
     from certify.largest import Quantity
     from certify.options import RoaOptions
     from certify.policies import Policy
+    from certify.report.drawing import Drawing
     from certify.results import RoaResult
     from certify.systems import System
 
@@ -33,6 +35,7 @@ def certified(
     options: RoaOptions,
     out: Path | None,
     start: float,
+    drawing: Drawing,
     quiet: bool,
     as_json: bool,
     asked: Box | None = None,
@@ -45,20 +48,30 @@ def certified(
     stored, plant : the policy in the file `policy`, and the plant that it is certified on.
     out : folder for the results.
     start : when the command began, by `time.perf_counter`.
+    drawing : draws the report.
     asked : of which it is to be said whether the proved set contains it.
     largest : what is to be as large as can be proved for the set.
     """
-    from certify.largest import certify_largest
     from certify.report import summary
     from certify.roa import certify_roa
 
-    run = certify_roa if largest is None else partial(certify_largest, largest)
     note = (lambda _: None) if quiet else tell
     note(_plant_line(stored, plant, context.params["system"] is not None))
     shift = stored.beta_shift(plant.exact_u_eq())
     if shift:
         note(f"the file's rounded beta is read as the real number; this shifts u(0) by {shift:.3g}")
     folder = out if out is not None else Path("out") / policy.stem
+
+    def draw(raw: bytes) -> None:
+        drawing.begin(raw, folder / "certificate.json", time.perf_counter() - start)
+        if not as_json:  # this process waits for the checker's
+            threading.Thread(target=load_tables, daemon=True).start()
+
+    run = partial(certify_roa, show=draw)
+    if largest is not None:
+        from certify.largest import certify_largest
+
+        run = partial(certify_largest, largest)
     progress = None if quiet else ProgressLine()
     try:
         result = run(
@@ -80,7 +93,7 @@ def certified(
         note(result.notice)
     if result.certificate is not None and result.raw is not None:
         answer = None if result.checker is None else dict(result.checker)
-        write(folder / "report.html", page_of(result.raw, result.certificate, answer, data))
+        write(folder / "report.html", drawing.page_of(result.raw, result.certificate, answer, data))
     where = None if asked is None else _where(result, asked)
     if where is not None:
         data["contains"] = where[0]

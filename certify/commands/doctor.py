@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 State = Literal["ok", "missing", "warning", "fault"]
 _CORE = {  # package of the registry, module to import
     "numpy": "numpy", "scipy": "scipy", "sympy": "sympy", "torch": "torch", "python-flint": "flint", "typer": "typer",
-    "rich": "rich", "matplotlib": "matplotlib", "jinja2": "jinja2", "cvxpy": "cvxpy",
+    "rich": "rich", "matplotlib": "matplotlib", "jinja2": "jinja2", "cvxpy": "cvxpy", "clarabel": "clarabel",
 }  # fmt: skip
 _EXTRAS = {  # package: module, extra, what for
     "onnx": ("onnx", "onnx", "policies of ONNX"),
@@ -120,7 +120,7 @@ def _torch() -> Finding:
 
 
 def _cvxpy() -> Finding:
-    """cvxpy with Clarabel, the solver that candidate `optimised` asks."""
+    """cvxpy with Clarabel, the solver that the candidates `robust` and `peak` ask through it."""
     found = _package("cvxpy", "cvxpy")
     if found.state != "ok":
         return found

@@ -11,6 +11,7 @@ from certify.commands.arguments import plant_of, state, widths
 from certify.commands.certifying import certified
 from certify.commands.importing import policy_of
 from certify.commands.shared import Domain, Json, PlantName, PolicyFile, Quiet, Results, TimeLimit
+from certify.report.drawing import Drawing
 
 if TYPE_CHECKING:
     from certify.policies.importers import ImportOptions
@@ -37,10 +38,10 @@ def reach(
     as_json: Json = False,
 ) -> None:
     """Prove that a state, with what lies around it, converges: a tube around its trajectory into a certified set."""
+    start, drawing = time.perf_counter(), context.with_resource(Drawing())
     from certify.options import RoaOptions
 
-    start = time.perf_counter()
     stored = policy_of(policy, importing, system, param or [])
     plant = plant_of(stored, system, param or [], domain or [])
     options = RoaOptions(reach_from=state(from_, "--from"), box=widths(box, "--box"), time_limit=time_limit)
-    certified(context, policy, stored, plant, options, out, start, quiet, as_json)
+    certified(context, policy, stored, plant, options, out, start, drawing, quiet, as_json)

@@ -14,6 +14,7 @@ from certify.commands.importing import policy_of
 from certify.commands.shared import Domain, Json, PlantName, PolicyFile, Quiet, Results, TimeLimit
 from certify.commands.terminal import tell
 from certify.errors import BackendError, InputError
+from certify.report.drawing import Drawing
 
 if TYPE_CHECKING:
     from certify.largest import Quantity
@@ -128,10 +129,10 @@ def roa(
     as_json: Json = False,
 ) -> None:
     """Certify a region of attraction: prove, write a certificate, have it checked, report."""
+    start, drawing = time.perf_counter(), context.with_resource(Drawing())
     from certify.inputs import ellipsoid_beside, function_in
     from certify.options import RoaOptions
 
-    start = time.perf_counter()
     largest = _largest(sample_time, rate, resume)
     stored = policy_of(policy, importing, system, param or [])
     plant = plant_of(
@@ -172,7 +173,7 @@ def roa(
         seed=seed,
     )
     asked = None if contains is None else region(contains, plant, "--contains")
-    certified(context, policy, stored, plant, options, out, start, quiet, as_json, asked, largest)
+    certified(context, policy, stored, plant, options, out, start, drawing, quiet, as_json, asked, largest)
 
 
 def _largest(sample_time: str | None, rate: str, resume: bool) -> Quantity | None:
@@ -192,19 +193,21 @@ def _number(rate: str) -> float:
 
 
 def _device(name: str) -> str:
+    if name == "cpu":
+        return name
     import torch
 
-    if name == "cpu" or (name.startswith("cuda") and torch.cuda.is_available()):
+    if name.startswith("cuda") and torch.cuda.is_available():
         return name
     raise InputError(f"--device must be cpu, or cuda on a machine that has it; found {name!r}.")
 
 
 def _engine(context: typer.Context, name: str) -> str:
     """The engine; without dReal, one that only the environment names falls back to bounds with a notice."""
-    from certify.engines.dreal.backend import find_backend
-
     source = context.get_parameter_source("engine")
     if name in ("dreal", "both") and source is not None and source.name == "ENVIRONMENT":
+        from certify.engines.dreal.backend import find_backend
+
         try:
             find_backend()
         except BackendError as error:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import shutil
 import sys
-import threading
 import time
+from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -40,6 +40,12 @@ def show(renderable: Any) -> None:
     with console.capture() as captured:
         console.print(renderable)
     say(captured.get().rstrip("\n"))
+
+
+def load_tables() -> None:
+    """Import what tables are printed with, while there is time to."""
+    for module in ("rich.box", "rich.console", "rich.table", "rich.text"):
+        import_module(module)
 
 
 def tell(line: str) -> None:
@@ -76,10 +82,6 @@ class ProgressLine:
         self.shown = 0
 
     def __call__(self, stage: str, state: Progress | None) -> None:
-        if stage == "check":  # the checker works in a process of its own: load the drawing libraries meanwhile
-            from certify.report import warm_up
-
-            threading.Thread(target=warm_up, daemon=True).start()
         now = time.monotonic()
         if now - self.last < self.every:
             return

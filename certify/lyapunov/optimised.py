@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import math
 import time
-import warnings
 from collections.abc import Sequence
 
 import numpy as np
@@ -25,6 +24,7 @@ from certify.closed_loop import ClosedLoop
 from certify.errors import BackendError
 from certify.lyapunov.candidates import slowest_decay, solve_lyapunov
 from certify.lyapunov.level_sets import domain_limit, volume
+from certify.lyapunov.programs import Inequality, smallest_trace
 
 Array = NDArray[np.float64]
 _RADII = np.linspace(0.1, 1.1, 12)  # of the samples on a ray, where 1 is the edge of the present set
@@ -67,7 +67,7 @@ def optimise_candidate(
 
     Raises
     ------
-    BackendError : cvxpy is missing, its solver gave no usable answer, or the sampled set is not larger than start's.
+    BackendError : Clarabel is missing or gave no usable answer, or the sampled set is not larger than start's.
 
     Notes
     -----
@@ -260,24 +260,27 @@ class _Samples:
 
 
 def _solve(samples: _Samples, P: Array, A: Array, alpha: float, radius: float) -> Array | None:
-    """The next P, (n, n), which is `L M L'` for the present `P = LL'`; None if the solver's status is not optimal."""
-    try:
-        import cvxpy
-    except ImportError as error:
-        raise BackendError("the optimised candidate needs cvxpy, which cannot be imported. Install cvxpy.") from error
+    """The next P, (n, n), which is `L M L'` for the present `P = LL'`; None if the solver does not solve for it."""
     n = len(P)
     L = np.linalg.cholesky(P)
     inverse = np.linalg.inv(L)
-    M = cvxpy.Variable((n, n), symmetric=True)
     h = samples.step
     along = L.T @ A @ inverse.T
-    rate = M @ along
-    twice = rate + rate.T + (h * (along.T @ M @ along) if h else 0.0)
-    constraints = [M >> (1 - radius) * np.eye(n), M << (1 + radius) * np.eye(n)]
-    constraints.append(twice + 2 * _LINEAR * alpha * M << 0)
+
+    def falls(M: Array) -> Array:
+        rate = M @ along
+        twice = rate + np.swapaxes(rate, -1, -2) + (h * _between(M, along) if h else 0.0)
+        return np.asarray(-(twice + 2 * _LINEAR * alpha * M))
+
+    matrices: list[Inequality] = [
+        (lambda M: M, (1 - radius) * np.eye(n)),
+        (lambda M: -M, -(1 + radius) * np.eye(n)),
+        (falls, np.zeros((n, n))),
+    ]
     for (lo, hi), column in zip(samples.loop.system.domain, inverse.T, strict=True):
         e = column / min(float(-lo), float(hi))
-        constraints.append(M >> np.outer(e, e))  # (P^-1)_ii <= d_i^2
+        matrices.append((lambda M: M, np.outer(e, e)))  # (P^-1)_ii <= d_i^2
+    held, least = list[Array](), list[Array]()
     for margin in (_SCORED * alpha, alpha):
         level, mu = samples.crossings(P, margin)
         inside = np.flatnonzero(_form(P, samples.x, samples.x) * (1 - radius) < 1)  # the others cannot come in
@@ -288,21 +291,20 @@ def _solve(samples: _Samples, P: Array, A: Array, alpha: float, radius: float) -
         if h:
             v = samples.F[rows] @ L
             G = G - h * mu[rows, None, None] * v[:, :, None] * v[:, None, :]
-        G = G.reshape(len(rows), n * n)
-        size = np.linalg.norm(G, axis=1)
-        least = np.minimum(1.0, level[rows]) - _SLACK
-        constraints.append((G / size[:, None]) @ cvxpy.vec(M, order="C") >= least / size)
-    problem = cvxpy.Problem(cvxpy.Minimize(cvxpy.trace(M)), constraints)
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # cvxpy warns of inaccurate answers, which the status says too
-            problem.solve(solver=cvxpy.CLARABEL, tol_gap_abs=_TOLERANCE, tol_gap_rel=_TOLERANCE, tol_feas=_TOLERANCE)
-    except cvxpy.error.SolverError:
+        size = np.linalg.norm(G.reshape(len(rows), n * n), axis=1)
+        held.append(G / size[:, None, None])
+        least.append((np.minimum(1.0, level[rows]) - _SLACK) / size)
+    M = smallest_trace(matrices, np.concatenate(held), np.concatenate(least), _TOLERANCE)
+    if M is None:
         return None
-    if problem.status != cvxpy.OPTIMAL:
-        return None
-    new = L @ np.asarray(M.value, dtype=np.float64) @ L.T
+    new = L @ M @ L.T
     return np.asarray((new + new.T) / 2)
+
+
+def _between(M: Array, B: Array) -> Array:
+    """`B'MB` for each M (..., n, n), each product rounded before it is added: `@` rounds as the processor likes."""
+    left = (B.T[:, :, None] * M[..., None, :, :]).sum(-2)
+    return np.asarray((left[..., None] * B).sum(-2))
 
 
 def _unit(z: Array) -> Array:

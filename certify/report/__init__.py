@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from certify.report.page import render_html
     from certify.report.sampling import SimulatedRoa, simulated_roa_fraction
 
-__all__ = ["SimulatedRoa", "render_html", "simulated_roa_fraction", "summary", "warm_up"]
+__all__ = ["SimulatedRoa", "render_html", "simulated_roa_fraction", "summary"]
 
 _PUBLIC = {
     "render_html": "certify.report.page",
@@ -29,9 +29,3 @@ def __getattr__(name: str) -> Any:
     if name in _PUBLIC:
         return getattr(import_module(_PUBLIC[name]), name)
     raise AttributeError(f"module 'certify.report' has no attribute {name!r}")
-
-
-def warm_up() -> None:
-    """Import what `render_html` needs; in a thread beside the checker process this costs no time."""
-    for module in ("matplotlib.figure", "matplotlib.backends.backend_svg", "jinja2", "certify.report.page"):
-        import_module(module)

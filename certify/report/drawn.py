@@ -7,17 +7,42 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from certify.certificate import Certificate, parse_certificate
+from certify.errors import CertifyError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from certify.report.page import Figures
 
-def page_of(raw: bytes, path: Path, answer: dict[str, Any] | None, data: dict[str, Any] | None) -> str:
-    """The report on a certificate's bytes, with the checker's answer about them and what the run says, if there are."""
+
+def page_of(
+    raw: bytes,
+    path: Path,
+    answer: dict[str, Any] | None,
+    data: dict[str, Any] | None,
+    figures: Figures | None = None,
+) -> str:
+    """The report on a certificate's bytes, with the checker's answer about them and what the run says, if there are.
+
+    `figures` are those of `figures_if_accepted` for the same bytes.
+    """
     from certify.report.page import render_html
 
     read, sha256 = parse_certificate(raw, str(path)), hashlib.sha256(raw).hexdigest()
-    return render_html(read, answer, data, path, sha256=sha256, size=len(raw))
+    return render_html(read, answer, data, path, sha256=sha256, size=len(raw), figures=figures)
+
+
+def figures_if_accepted(raw: bytes, path: Path, spent: float) -> Figures | None:
+    """The figures of a page that says that the checker accepted these bytes, before it has; None if there are none.
+
+    `spent` are the seconds that the run has taken.
+    """
+    from certify.report.page import figures_of
+
+    try:
+        return figures_of(parse_certificate(raw, str(path)), True, {"seconds": {"total": spent}})
+    except (CertifyError, ValueError, ArithmeticError):  # the page comes upon it again, and says so
+        return None
 
 
 def figure_of(certificate: Certificate, accepted: bool) -> Figure:

@@ -60,6 +60,8 @@ from certify.report.words import (
 )
 from certify.systems import System
 
+Figures = tuple[list[Picture], SimulatedRoa | None]
+TEMPLATE = "certify.report", "template.html"
 _LONG = 10**6  # numerators and denominators beyond it are shown rounded
 _MOST_OPERATIONS = 200  # of an expression N that is shown
 _SECONDS, _SHARE = 10.0, 0.1  # the drawing takes no longer than the one, or than this share of the run
@@ -148,6 +150,7 @@ def render_html(
     *,
     sha256: str | None = None,
     size: int | None = None,
+    figures: Figures | None = None,
 ) -> str:
     """The report as one HTML document.
 
@@ -162,6 +165,7 @@ def render_html(
     certificate_path : for its name alone; nothing is read from it.
     sha256, size : of the bytes that the certificate was parsed from. Without them, those of the bytes that
         `write_certificate` writes for it: the answer must then be about exactly such a file.
+    figures : `figures_of` this certificate as accepted, if they are there already.
 
     Raises
     ------
@@ -183,7 +187,9 @@ def render_html(
     pictures: list[Picture] = []
     roa, trouble = None, ""
     try:
-        pictures, roa = draw(certificate, status.accepted, seconds=_time_for(result))
+        if figures is None or not status.accepted:
+            figures = figures_of(certificate, status.accepted, result)
+        pictures, roa = figures
     except np.linalg.LinAlgError as error:
         trouble = f"There are no figures: floating point cannot draw them: {error}"
     except (CertifyError, ValueError, ArithmeticError) as error:
@@ -192,8 +198,7 @@ def render_html(
         trouble = f"There are no figures: {error}"  # a rejected file need not make sense
     limits = _limits(certificate, result)
     return filled(
-        "certify.report",
-        "template.html",
+        *TEMPLATE,
         contents=_contents(status, limits),
         limits=limits,
         one_plane=certificate.system.n <= 2,
@@ -213,6 +218,16 @@ def render_html(
         file=certificate_path.name,
         not_proved=_not_proved(certificate, words),
     )
+
+
+def figures_of(certificate: Certificate, accepted: bool, result: Mapping[str, Any] | None) -> Figures:
+    """The figures, in the time that they may take after a run that has taken what `result` says.
+
+    Raises
+    ------
+    CertifyError, ValueError, ArithmeticError : the certificate makes no sense, which one that is accepted does.
+    """
+    return draw(certificate, accepted, seconds=_time_for(result))
 
 
 def _time_for(result: Mapping[str, Any] | None) -> float:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import sys
+from types import SimpleNamespace
 from typing import Any
 
+import clarabel
+import cvxpy
 import numpy as np
 import pytest
 import sympy
@@ -12,6 +15,8 @@ import sympy
 from certify.closed_loop import ClosedLoop
 from certify.errors import BackendError
 from certify.lyapunov import domain_limit, extents, optimise_candidate, solve_lyapunov, volume
+from certify.lyapunov.optimised import _between
+from certify.lyapunov.programs import smallest_trace
 from certify.policies import TanhNetwork
 from certify.systems import System, get_system
 from tests.support.loops import box, pendulum_network, scalar_tanh
@@ -133,26 +138,61 @@ def test_not_larger_than_the_start() -> None:
         optimise_candidate(loop, np.eye(1))
 
 
-def test_cvxpy_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "cvxpy", None)
-    with pytest.raises(BackendError, match="cvxpy"):
+def test_clarabel_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "clarabel", None)
+    with pytest.raises(BackendError, match="clarabel"):
         optimise_candidate(van_der_pol(), np.array([[1.5, -0.5], [-0.5, 1.0]]))
 
 
-def test_a_solver_that_fails(monkeypatch: pytest.MonkeyPatch) -> None:
-    import cvxpy
+@pytest.mark.parametrize("status", ["AlmostSolved", "NumericalError", "MaxIterations", "PrimalInfeasible"])
+def test_an_answer_that_is_not_solved_is_no_answer(status: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not even where the solver's numbers are those of the solution."""
+    solver = clarabel.DefaultSolver
 
-    def solve(*_: Any, **__: Any) -> None:
-        raise cvxpy.error.SolverError("no")
+    class Doubtful:
+        def __init__(self, *program: Any) -> None:
+            self.found = solver(*program).solve()
 
-    monkeypatch.setattr(cvxpy.Problem, "solve", solve)
+        def solve(self) -> SimpleNamespace:
+            return SimpleNamespace(x=self.found.x, status=getattr(clarabel.SolverStatus, status))
+
+    monkeypatch.setattr(clarabel, "DefaultSolver", Doubtful)
     with pytest.raises(BackendError, match="no optimised candidate"):
         optimise_candidate(van_der_pol(), np.array([[1.5, -0.5], [-0.5, 1.0]]))
 
 
-def test_an_inaccurate_answer_is_no_answer(monkeypatch: pytest.MonkeyPatch) -> None:
-    import cvxpy
+@pytest.mark.parametrize("step", [0.0, 0.3])
+@pytest.mark.parametrize("n", [1, 2, 3, 5])
+def test_the_program_is_the_one_that_a_modelling_language_finds(n: int, step: float) -> None:
+    """To the last bit of the solution: the rows, their order and their rounding are the same."""
+    generator = np.random.default_rng(n)
+    along = 0.2 * generator.standard_normal((n, n)) - np.eye(n)
+    F, corner = generator.standard_normal((7, n, n)), generator.standard_normal(n)
+    rows = (F + np.swapaxes(F, 1, 2)) / 2
+    least = np.einsum("kii->k", rows) - 0.1  # holds at M = 1, so that the program has a solution
+    edge = 0.5 * np.outer(corner, corner) / (corner @ corner)
 
-    monkeypatch.setattr(cvxpy.Problem, "status", "optimal_inaccurate")
-    with pytest.raises(BackendError, match="no optimised candidate"):
-        optimise_candidate(van_der_pol(), np.array([[1.5, -0.5], [-0.5, 1.0]]))
+    def falls(M: np.ndarray) -> np.ndarray:
+        rate = M @ along
+        return -(rate + np.swapaxes(rate, -1, -2) + (step * _between(M, along) if step else 0.0) + 0.2 * M)
+
+    matrices = [(lambda M: M, 0.2 * np.eye(n)), (lambda M: M, edge), (lambda M: -M, -3 * np.eye(n))]
+    found = smallest_trace([*matrices, (falls, np.zeros((n, n)))], rows, least, 1e-7)
+
+    M = cvxpy.Variable((n, n), symmetric=True)
+    rate = M @ along
+    rate = rate + rate.T + (step * (along.T @ M @ along) if step else 0.0) + 0.2 * M
+    within = [M >> 0.2 * np.eye(n), M >> edge, M << 3 * np.eye(n), rate << 0]
+    within.append(rows.reshape(7, n * n) @ cvxpy.vec(M, order="C") >= least)
+    problem = cvxpy.Problem(cvxpy.Minimize(cvxpy.trace(M)), within)
+    problem.solve(solver=cvxpy.CLARABEL, tol_gap_abs=1e-7, tol_gap_rel=1e-7, tol_feas=1e-7)
+    assert problem.status == cvxpy.OPTIMAL and found is not None
+    np.testing.assert_array_equal(found, M.value)
+
+
+def test_a_program_with_a_number_that_is_not_finite_has_no_answer() -> None:
+    one = (lambda M: M, np.eye(2))
+    rows = np.array([[[1.0, 0.0], [0.0, np.nan]]])
+    assert smallest_trace([one], rows, np.array([1.0]), 1e-7) is None
+    assert smallest_trace([one], np.ones((1, 2, 2)), np.array([np.inf]), 1e-7) is None
+    assert smallest_trace([one], np.ones((1, 2, 2)), np.array([1.0]), 1e-7) is not None

@@ -1,0 +1,137 @@
+"""Which candidate is given time, and when the race is over before all of them are made."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import certify.roa
+from certify.certificate import TrustedSolver
+from certify.claims import Asymptotic
+from certify.closed_loop import ClosedLoop
+from certify.engines.base import Budget, Proof, Report
+from certify.lyapunov import solve_lyapunov
+from certify.options import RoaOptions
+from certify.policies import load_policy
+from certify.race import Race
+from certify.roa import certify_roa
+from certify.systems import System
+from certify.trials import Trial, trial
+from certify.verdict import Stop
+from tests.support.loops import chain, scalar_tanh
+
+SHIPPED = Path(__file__).parent.parent / "examples" / "policies" / "pendulum.pt"
+
+
+class Reaches:
+    """An attempt that proves a share of what is asked for in its first heat, and of that one by the local rule."""
+
+    boxes, expected, gained, done = 1, 0.0, True, True
+
+    def __init__(self, target: float, share: float, local: float) -> None:
+        self.target, self.share, self.local, self.level = target, share, local, None
+
+    def advance(self, budget: Budget, report: Report | None = None) -> None:
+        self.level = self.share * self.target
+
+    def proof(self) -> Proof:
+        claim = Asymptotic(self.share * self.target, self.local * self.share * self.target)
+        return Proof(claim, TrustedSolver("nobody", "1", 0.0, ()), Stop.REQUESTED)
+
+
+def trials() -> list[Trial]:
+    """Two ellipses that only the domain limits, the smaller one first."""
+    loop = ClosedLoop(*chain(2, [-1, -2]))
+    A = loop.linearise()[0]
+    pair = [(name, solve_lyapunov(A, np.diag(Q))) for name, Q in (("small", [1.0, 1.0]), ("large", [1.0, 3.0]))]
+    small, large = (trial(loop, P, name, RoaOptions()) for name, P in pair)
+    assert small.limited_by == large.limited_by == "domain" and 0.5 * large.volume < small.volume < 0.9 * large.volume
+    return [small, large]
+
+
+def race(share: float, local: float = 0.1) -> tuple[Race, list[str]]:
+    """A race whose attempts prove this share of their levels, and the names in the order in which they began."""
+    began: list[str] = []
+
+    def begin(one: Trial) -> Reaches:
+        began.append(one.name)
+        return Reaches(one.task.target, share, local)
+
+    return Race(begin, lambda: 1.0, 100), began  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("share", "most", "settled", "entered"),
+    [
+        (1.0, 1.0, True, ["large"]),
+        (0.99, 1.0, True, ["large"]),  # its volume is a hundredth less than there could be
+        (0.95, 1.0, False, ["large"]),
+        (1.0, 1.015, True, ["large"]),
+        (1.0, 1.03, False, []),  # it is not made to run for nothing
+    ],
+)
+def test_a_race_is_settled_where_no_other_could_be_let_in(
+    share: float, most: float, settled: bool, entered: list[str]
+) -> None:
+    run, began = race(share)
+    largest = trials()[1].volume
+    assert run.is_settled_by(trials()[1], 1.0, most * largest) is settled
+    assert began == entered
+
+
+@pytest.mark.parametrize("local", [0.1, 0.5, 0.51, 1.0])
+def test_the_candidate_for_the_local_rule_may_be_ahead_where_that_rule_proves_most(local: float) -> None:
+    run, began = race(1.0, local)
+    large = trials()[1]
+    assert run.is_settled_by(large, 1.0, large.volume) is (local <= 0.5) and began == ["large"]
+
+
+def test_a_race_that_is_not_settled_goes_on_as_if_it_began() -> None:
+    """The larger of two that are both worth no other comes first, and nothing is begun twice."""
+    run, began = race(1.0, 1.0)
+    _, large = trials()
+    larger = replace(large, name="larger", volume=1.01 * large.volume)
+    assert not run.is_settled_by(large, 1.0, large.volume)
+    early = run.early
+    assert run.contenders == [] and early is not None and early.proved > 0
+    run.enter([large, larger], 1.0)
+    assert [c.trial.name for c in run.contenders] == ["larger"] and began == ["large", "larger"]
+    again, began = race(0.4)
+    given = trials()
+    assert not again.is_settled_by(given[1], 1.0, given[1].volume)
+    early = again.early
+    again.enter(given, 1.0)
+    assert began == ["large", "small"] and again.contenders[0] is early
+
+
+def test_no_candidate_is_made_that_could_not_win(
+    tmp_path: Path, pendulum: System, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The pendulum's set fills its domain, and the slow candidate is not made; that changes no byte."""
+    made = list[str]()
+    robust = certify.roa.robust
+
+    def counted(loop: ClosedLoop, options: RoaOptions) -> Trial | None:
+        made.append(loop.system.name)
+        return robust(loop, options)
+
+    monkeypatch.setattr(certify.roa, "robust", counted)
+    network = load_policy(SHIPPED).network
+    quick = certify_roa(pendulum, network, tmp_path / "quick")
+    assert not made and quick.verdict.value == "PROVED"
+    monkeypatch.setattr(Race, "is_settled_by", lambda *_: False)
+    slow = certify_roa(pendulum, network, tmp_path / "slow")
+    assert made == ["pendulum"]
+    assert quick.raw == slow.raw and quick.tried == slow.tried
+
+
+def test_a_candidate_that_could_win_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The origin attracts two thirds of this domain: nothing that is proved of it could settle the race."""
+    made = list[str]()
+    monkeypatch.setattr(certify.roa, "robust", lambda loop, _: made.append(loop.system.name))
+    system, network = scalar_tanh()
+    found = certify_roa(replace(system), network, tmp_path)
+    assert found.verdict.value == "PROVED" and made == ["scalar"]
