@@ -18,7 +18,7 @@ from typing import Any
 from certify.certificate import Certificate, PartitionTree, TrustedSolver, run_checker, write_beside
 from certify.claims import Asymptotic, Enlarged, Nearby, Practical, Problem, Reached
 from certify.engines.bounds.mend import below_leaf, split_again
-from certify.errors import SoundnessError
+from certify.errors import BackendError, SoundnessError
 
 _SPLITS, _LOWERINGS = 3, 9  # of what the checker refuses
 _HIGHER = 1.5  # the next floor, after one that is refused
@@ -44,12 +44,14 @@ class Clerk:
     left : seconds that may still be spent on a leaf that was refused; after that only the level is lowered.
     stage : times the stages `write` and `check`.
     tell : called before each check.
+    cluster : the address of those whose boxes are among what is proved; they may not have done what they were asked.
     """
 
     path: Path
     left: Callable[[], float]
     stage: Callable[[str], AbstractContextManager[None]]
     tell: Callable[[], None]
+    cluster: str | None = None
 
     def accepted(self, certificate: Certificate, problem: Problem) -> Accepted:
         """This certificate, or one with a refused leaf split again or a lower level.
@@ -57,6 +59,7 @@ class Clerk:
         Raises
         ------
         SoundnessError : the checker refuses what cannot be mended so.
+        BackendError : the same, where a cluster had a part in it.
         """
         splits = lowerings = 0
         mended, first = None, certificate
@@ -75,12 +78,19 @@ class Clerk:
                 certificate = lower
             else:
                 reproduces = write_beside(self.path, first.to_json().encode(), ".unchecked.json")
+                if self.cluster is not None:
+                    raise BackendError(
+                        f"the checker rejects what was proved with the workers of {self.cluster}, who may be at fault: "
+                        f"{answer}. The certificate {reproduces} reproduces it; run without the cluster."
+                    )
                 raise SoundnessError(
                     f"the checker rejects what the engine proved: {answer}. The certificate {reproduces} reproduces it."
                 )
             mended = f"the checker refused {answer.get('at')} (rule {answer.get('rule')}): " + (
                 _what_is_lower(first, certificate) if lowerings else "split again, it is accepted"
             )
+            if self.cluster is not None and lowerings:
+                mended += f"; boxes were bounded by the workers of {self.cluster}, who may be at fault"
 
     def ask(self, certificate: Certificate) -> tuple[bytes, Mapping[str, Any]]:
         """The certificate's bytes and the checker's answer; the file gets its name only if that is not a refusal.

@@ -117,7 +117,8 @@ def certify_roa(
     Raises
     ------
     InputError : the closed loop or an option cannot be used, or `out` cannot be written or is another run's.
-    BackendError : the checker process failed.
+    BackendError : the checker process failed, no scheduler answers, or the checker rejects what was proved with a
+        cluster, and no smaller set mends it.
     SoundnessError : the checker rejects what the engine proved, and no smaller set mends it.
     """
     options = options or RoaOptions()
@@ -180,7 +181,7 @@ class _Run:
     def result(self) -> RoaResult:
         result = self._decide()
         result = replace(result, seconds={"load": self.load, **self.seconds, "total": self.spent})
-        notices = [text for text in (self.aside, result.notice) if text is not None]
+        notices = [text for text in (self.aside, result.notice, self.runner.remark) if text is not None]
         result = replace(result, notice="; ".join(notices) or None)
         search = self.out / _SEARCH_FILE
         result = replace(result, search=search if search.exists() else None)
@@ -377,13 +378,23 @@ class _Run:
             return
         winner, report = race.open[0], race.report
         boxes = self.options.max_boxes
+
+        def lost() -> bool:
+            return self.options.cluster is not None and winner.attempt.proof().stop is Stop.CLUSTER
+
         while (
             not (winner.attempt.gained or winner.attempt.done or winner.hopeless)
             and self.left() > 0
             and winner.attempt.boxes < boxes
+            and not lost()
         ):
             winner.advance(Budget(self._within(_PATIENCE * self.options.time_limit), boxes), report)
-        if winner.attempt.done or not winner.attempt.gained or not self.interruptible:
+        if winner.attempt.done or not self.interruptible:
+            return
+        if lost():
+            with self._kept(winner):
+                return
+        if not winner.attempt.gained:
             return
         each = self._seconds_of_a_leaf(winner)
         with self._kept(winner) as keep:
@@ -634,7 +645,8 @@ class _Run:
         return found
 
     def _clerk(self) -> Clerk:
-        return Clerk(self.out / "certificate.json", self.left, self._stage, lambda: self._tell("check"))
+        path, tell = self.out / "certificate.json", lambda: self._tell("check")
+        return Clerk(path, self.left, self._stage, tell, self.options.cluster)
 
     def _confirm(self, problem: Problem, claim: Claim) -> dict[str, Any]:
         """dReal's answers about what the bounds engine proved.

@@ -106,6 +106,7 @@ class BoundsEngine(Engine):
             why = f"F and its inputs are not enclosed on all of V <= {ring.inner:.6g}"
             return Proof(None, None, Stop.SMOOTH, why, boxes=ring.boxes)
         claim = Practical(roa=ring.outer, local=ring.inner, floor=ring.inner, rate=task.problem.rate)
+        stop = Stop.CLUSTER if ring.stop is Stop.CLUSTER else stop
         return replace(self.stated(task.problem, ring, claim, {}), stop=stop, witness=witness)
 
     def _outer_level(
@@ -197,8 +198,10 @@ class _Outwards:
         return None if self.ring is None or self.ring.done else self.ring.state()
 
     def restore(self, state: SearchState) -> None:
-        if self.ring is None or self.inner is None or self.inner < state.inner:
-            raise InputError("the search cannot be gone on with: the local set is another one here.")
+        if self.inner is None or self.inner < state.inner:
+            raise InputError("the search cannot be gone on with: the local set is smaller here; run without --resume.")
+        if self.ring is None or state.outer <= self.inner:
+            return  # the local set is as large as what the search could still reach, or larger
         self.ring.restore(state)
 
     def proof(self) -> Proof:
