@@ -375,6 +375,7 @@ class _Run:
     def _finish(self, race: Race) -> None:
         """What is left of the time for the best contender, less what the check of its proof will take."""
         if not race.open:
+            (self.out / _SEARCH_FILE).unlink(missing_ok=True)  # of a search that is at its end now
             return
         winner, report = race.open[0], race.report
         boxes = self.options.max_boxes
@@ -389,9 +390,9 @@ class _Run:
             and not lost()
         ):
             winner.advance(Budget(self._within(_PATIENCE * self.options.time_limit), boxes), report)
-        if winner.attempt.done or not self.interruptible:
+        if not self.interruptible:
             return
-        if lost():
+        if winner.attempt.done or lost():
             with self._kept(winner):
                 return
         if not winner.attempt.gained:
