@@ -69,9 +69,13 @@ def connect(address: str, patience: float = 30.0) -> Iterator[Client]:
     with _quiet(), ExitStack() as stack:
         if local is not None:
             count = int(local[1])
-            address = stack.enter_context(
-                LocalCluster(n_workers=count, threads_per_worker=1, dashboard_address=None, silence_logs=50)
-            ).scheduler_address
+            local_one = LocalCluster(
+                n_workers=count,
+                threads_per_worker=1,
+                dashboard_address="127.0.0.1:0",  # None is Dask's own port, with a warning where that is taken
+                silence_logs=logging.CRITICAL,
+            )
+            address = stack.enter_context(local_one).scheduler_address
         try:
             client = Client(address, timeout=patience, deserializers=_PLAIN, set_as_default=False)
         except (OSError, ValueError, TypeError, RuntimeError) as error:  # TLS without certificates is a TypeError
