@@ -39,6 +39,7 @@ from tests.support.loops import box, chain, pendulum_network
 HERE = ThreadRunner()
 ADDRESS = "tcp://nowhere:1"
 SMALL = Budget(batch=16, seconds=60)
+SLOW = pytest.mark.slow
 DEEP = 10**6
 WIDE = dataclasses.replace(get_system("pendulum"), domain=box(7, 30))  # whose level ends at a violation
 CASES: dict[str, tuple[Callable[[], Any], float, float]] = {
@@ -87,7 +88,9 @@ def stands(proof: RingProof, other: RingProof) -> bool:
 # -------------------------------------------------------------------------------------------------------- the same tree
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=SLOW) if name in ("four states", "any period") else name for name in CASES]
+)
 def test_the_tree_is_the_same_whoever_grows_it(name: str) -> None:
     make, inner, outer = CASES[name]
     case, troupe = make(), Troupe(places=lambda _: 3)
@@ -311,7 +314,7 @@ def accepted(result: RoaResult) -> bool:
     return result.certificate is not None and run_checker(result.certificate)["result"] == "ACCEPTED"
 
 
-@pytest.mark.parametrize("name", LIES)
+@pytest.mark.parametrize("name", [name if name == "all is proved" else pytest.param(name, marks=SLOW) for name in LIES])
 def test_a_lie_never_makes_a_larger_set(
     name: str, honest: RoaResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -329,6 +332,7 @@ def test_a_lie_never_makes_a_larger_set(
         assert found.levels.roa >= expected.levels.roa * 0.99
 
 
+@SLOW
 def test_a_level_that_was_asked_for_is_not_had_by_lying(
     honest: RoaResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -340,6 +344,7 @@ def test_a_level_that_was_asked_for_is_not_had_by_lying(
     assert found.verdict is Verdict.UNKNOWN and found.stop is Stop.REFUSED and troupe.answered
 
 
+@SLOW
 def test_what_cannot_be_mended_is_not_called_a_fault_of_this_program(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -352,7 +357,7 @@ def test_what_cannot_be_mended_is_not_called_a_fault_of_this_program(
 
 def test_a_worker_that_hardly_works_does_not_outlive_the_time() -> None:
     begin, troupe = time.monotonic(), Troupe(play=nothing_done)
-    found = proved_by(troupe, Budget(batch=16, seconds=2.0))
+    found = proved_by(troupe, Budget(batch=16, seconds=1.0))
     assert time.monotonic() - begin < 10 and troupe.answered > 3
     assert stands(found, alone()) or found.outer <= 3.0
 
@@ -431,7 +436,9 @@ def test_so_it_is_of_a_set_inwards_and_beyond() -> None:
     assert outer is None or outer.outer.level <= -2.4
 
 
-@pytest.mark.parametrize(("answers", "again"), [(0, False), (2, True), (6, False)])
+@pytest.mark.parametrize(
+    ("answers", "again"), [(6, False), pytest.param(0, False, marks=SLOW), pytest.param(2, True, marks=SLOW)]
+)
 def test_a_run_that_lost_its_cluster_is_gone_on_with(
     answers: int, again: bool, honest: RoaResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -461,7 +468,7 @@ class Cut(Exception):
     """Like Ctrl-C, where a test wants it."""
 
 
-@pytest.mark.parametrize("after", [2, 3, 8])
+@pytest.mark.parametrize("after", [2, 8])
 @pytest.mark.parametrize("abroad", [False, True])
 @pytest.mark.parametrize("where", ["levels", "split", "add"])
 def test_what_is_cut_short_leaves_every_box_where_it_was(

@@ -62,7 +62,9 @@ class Cluster:
         command = [sys.executable, "-m", f"distributed.cli.{name}", *more]
         environment = self.environment | (environment or {})
         quiet = subprocess.DEVNULL
-        process = subprocess.Popen(command, stdout=quiet, stderr=quiet, env=environment, start_new_session=True)
+        process = subprocess.Popen(
+            command, stdout=quiet, stderr=quiet, env=environment, cwd="/", start_new_session=True
+        )
         self.processes.append(process)
         return process
 
