@@ -18,7 +18,7 @@ from typing import Any
 from certify.certificate import Certificate, PartitionTree, TrustedSolver, run_checker, write_beside
 from certify.claims import Asymptotic, Enlarged, Nearby, Practical, Problem, Reached
 from certify.engines.bounds.mend import below_leaf, split_again
-from certify.errors import SoundnessError
+from certify.errors import BackendError, SoundnessError
 
 _SPLITS, _LOWERINGS = 3, 9  # of what the checker refuses
 _HIGHER = 1.5  # the next floor, after one that is refused
@@ -46,6 +46,7 @@ class Clerk:
     tell : called before each check.
     show : called with the bytes of a certificate that the run ends with if they are accepted, before they are checked.
     check : the checker's answer about a file.
+    cluster : the address of those whose boxes are among what is proved; they may not have done what they were asked.
     """
 
     path: Path
@@ -54,6 +55,7 @@ class Clerk:
     tell: Callable[[], None]
     show: Callable[[bytes], None]
     check: Callable[[Path], Mapping[str, Any]] = run_checker
+    cluster: str | None = None
 
     def accepted(self, certificate: Certificate, problem: Problem) -> Accepted:
         """This certificate, or one with a refused leaf split again or a lower level.
@@ -61,6 +63,7 @@ class Clerk:
         Raises
         ------
         SoundnessError : the checker refuses what cannot be mended so.
+        BackendError : the same, where a cluster had a part in it.
         """
         splits = lowerings = 0
         mended, first = None, certificate
@@ -79,12 +82,19 @@ class Clerk:
                 certificate = lower
             else:
                 reproduces = write_beside(self.path, first.to_json().encode(), ".unchecked.json")
+                if self.cluster is not None:
+                    raise BackendError(
+                        f"the checker rejects what was proved with the workers of {self.cluster}, who may be at fault: "
+                        f"{answer}. The certificate {reproduces} reproduces it; run without the cluster."
+                    )
                 raise SoundnessError(
                     f"the checker rejects what the engine proved: {answer}. The certificate {reproduces} reproduces it."
                 )
             mended = f"the checker refused {answer.get('at')} (rule {answer.get('rule')}): " + (
                 _what_is_lower(first, certificate) if lowerings else "split again, it is accepted"
             )
+            if self.cluster is not None and lowerings:
+                mended += f"; boxes were bounded by the workers of {self.cluster}, who may be at fault"
 
     def ask(self, certificate: Certificate, *, final: bool = False) -> tuple[bytes, Mapping[str, Any]]:
         """The certificate's bytes and the checker's answer; the file gets its name only if that is not a refusal.

@@ -135,7 +135,8 @@ def certify_roa(
     Raises
     ------
     InputError : the closed loop or an option cannot be used, or `out` cannot be written or is another run's.
-    BackendError : the checker process failed.
+    BackendError : the checker process failed, no scheduler answers, or the checker rejects what was proved with a
+        cluster, and no smaller set mends it.
     SoundnessError : the checker rejects what the engine proved, and no smaller set mends it.
     """
     options = options or RoaOptions()
@@ -199,7 +200,7 @@ class _Run:
     def result(self) -> RoaResult:
         result = self._decide()
         result = replace(result, seconds={"load": self.load, **self.seconds, "total": self.spent})
-        notices = [text for text in (self.aside, result.notice) if text is not None]
+        notices = [text for text in (self.aside, result.notice, self.runner.remark) if text is not None]
         result = replace(result, notice="; ".join(notices) or None)
         search = self.out / _SEARCH_FILE
         result = replace(result, search=search if search.exists() else None)
@@ -399,16 +400,27 @@ class _Run:
     def _finish(self, race: Race) -> None:
         """What is left of the time for the best contender, less what the check of its proof will take."""
         if not race.open:
+            (self.out / _SEARCH_FILE).unlink(missing_ok=True)  # of a search that is at its end now
             return
         winner, report = race.open[0], race.report
         boxes = self.options.max_boxes
+
+        def lost() -> bool:
+            return self.options.cluster is not None and winner.attempt.proof().stop is Stop.CLUSTER
+
         while (
             not (winner.attempt.gained or winner.attempt.done or winner.hopeless)
             and self.left() > 0
             and winner.attempt.boxes < boxes
+            and not lost()
         ):
             winner.advance(Budget(self._within(_PATIENCE * self.options.time_limit), boxes), report)
-        if winner.attempt.done or not winner.attempt.gained or not self.interruptible:
+        if not self.interruptible:
+            return
+        if winner.attempt.done or lost():
+            with self._kept(winner):
+                return
+        if not winner.attempt.gained:
             return
         each = self._seconds_of_a_leaf(winner)
         with self._kept(winner) as keep:
@@ -662,7 +674,9 @@ class _Run:
     def _clerk(self) -> Clerk:
         show = self.show or (lambda _: None)
         tell = partial(self._tell, "check")
-        return Clerk(self.out / "certificate.json", self.left, self._stage, tell, show, self._checked)
+        return Clerk(
+            self.out / "certificate.json", self.left, self._stage, tell, show, self._checked, self.options.cluster
+        )
 
     def _checked(self, path: Path) -> Mapping[str, Any]:
         """The checker's answer about a file; where many leaves make a long file, several processes share them."""

@@ -1,6 +1,8 @@
 """Searches that can be gone on with: a file beside the certificate, with the candidate and the tree as far as it is.
 
-Nothing here is trusted. What a search that was gone on with proves, the checker sees leaf by leaf like any other.
+Nothing here is trusted. What a search that was gone on with proves, the checker sees leaf by leaf like any other. A
+hash tells a damaged file. Numbers and violations are looked at all the same: whoever wrote the file may have been
+somebody else.
 """
 
 from __future__ import annotations
@@ -8,6 +10,8 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import math
+import re
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -21,15 +25,21 @@ from certify.certificate import decode, encode, loop_sections, write_atomically
 from certify.claims import Problem
 from certify.closed_loop import ClosedLoop
 from certify.engines.base import SearchState, Task
-from certify.engines.falsify import Witness
+from certify.engines.bounds.partition import MOST_SPLITS
+from certify.engines.falsify import Witness, confirm
 from certify.errors import InputError
+from certify.lyapunov import is_positive_definite, leaves_domain
 from certify.lyapunov.function import Quadratic
 from certify.policies import TanhNetwork
 from certify.systems import System
 from certify.trials import Trial
 
 _FORMAT = "certify-search/1"
-_MOST = 2**30  # bytes of a tree, or of its keys
+_LARGEST = 2**30  # bytes of a file
+_MOST = 2 * MOST_SPLITS + 1  # bytes of a tree
+_RATIONAL = re.compile(r"-?\d{1,1000}(/[1-9]\d{0,999})?")
+_NAME = 80  # characters of a candidate's
+_SAME = 1e-9  # relative, of a level
 _LIMITS = ("domain", "sampled")
 
 
@@ -75,7 +85,7 @@ def save(path: Path, unfinished: Unfinished) -> None:
         "tree": _packed(state.tree),
         "keys": _packed(state.keys.astype("<f8").tobytes()),
     }
-    write_atomically(path, (json.dumps(data) + "\n").encode())
+    write_atomically(path, (json.dumps(data | {"sha256": _digest(data)}) + "\n").encode())
 
 
 def load(path: Path, loop: ClosedLoop, rate: float) -> Unfinished:
@@ -86,24 +96,32 @@ def load(path: Path, loop: ClosedLoop, rate: float) -> Unfinished:
     InputError : it is not there, is about another loop or rate, or is damaged.
     """
     try:
+        if path.stat().st_size > _LARGEST:
+            raise ValueError(f"it is larger than {_LARGEST} bytes")
         data = json.loads(path.read_bytes())
     except FileNotFoundError as error:
         raise InputError(f"there is no search to go on with in {path.parent}; run without --resume.") from error
-    except (OSError, ValueError) as error:
+    except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"the search in {path} cannot be read: {error}. Run without --resume.") from error
     try:
         if data["format"] != _FORMAT:
-            raise InputError(f"{path} must be of the format {_FORMAT}; found {data['format']!r:.40}.")
+            raise _Unfit(f"{path} must be of the format {_FORMAT}; found {data['format']!r:.40}.")
+        if data.pop("sha256") != _digest(data):
+            raise ValueError("it has another hash than when it was written")
         if data["about"] != identity(loop.system, loop.network, rate):
-            raise InputError(
+            raise _Unfit(
                 f"the search in {path} is about another policy, plant, domain or rate; run without --resume, or into "
                 "another folder."
             )
         return _read(data, loop, rate)
-    except InputError:
-        raise
-    except (KeyError, TypeError, ValueError, OverflowError, zlib.error) as error:
-        raise InputError(f"the search in {path} is damaged ({error!r:.80}); run without --resume.") from error
+    except _Unfit as error:
+        raise InputError(str(error)) from error
+    except (KeyError, TypeError, AttributeError, ValueError, ArithmeticError, RecursionError, zlib.error) as error:
+        raise InputError(f"the search in {path} is damaged ({error!r:.200}); run without --resume.") from error
+
+
+class _Unfit(Exception):
+    """A file that is in order, and not what is asked for."""
 
 
 def _read(data: Mapping[str, Any], loop: ClosedLoop, rate: float) -> Unfinished:
@@ -111,20 +129,32 @@ def _read(data: Mapping[str, Any], loop: ClosedLoop, rate: float) -> Unfinished:
     P, T = decode(data["P"], (n, n)), decode(data["T"], (n, n))
     target, limit, volume = (float.fromhex(data[name]) for name in ("target", "limit", "volume"))
     inner, outer = (float.fromhex(data[name]) for name in ("inner", "outer"))
-    if not 0 < inner <= outer <= target or not np.all(np.isfinite(T)) or data["limited_by"] not in _LIMITS:
+    problem, name, boxes, proved = Problem(loop, Quadratic(P), rate), data["candidate"], data["boxes"], data["proved"]
+    if not (
+        0 < inner <= outer <= target <= limit < math.inf
+        and 0 <= volume < math.inf
+        and data["limited_by"] in _LIMITS
+        and type(name) is str
+        and name.isprintable()
+        and len(name) <= _NAME
+        and type(data["exactly"]) is bool
+        and type(boxes) is type(proved) is int
+        and 0 <= proved <= boxes < 2**62
+        and is_positive_definite(P)
+        and not leaves_domain(P, target, loop.system.domain)
+        and np.linalg.cond(T) < 1 / np.finfo(np.float64).eps
+    ):
         raise ValueError("its numbers do not fit together")
-    task = Task(
-        Problem(loop, Quadratic(P), rate),
-        "asymptotic",
-        target,
-        bool(data["exactly"]),
-        _read_witness(data["witness"], n),
-    )
-    trial = Trial(str(data["candidate"]), task, T, limit, data["limited_by"], volume)
-    keys = np.frombuffer(_unpacked(data["keys"]), dtype="<f8").astype(np.float64)
-    counts = int(data["boxes"]), int(data["proved"])
-    met = _read_witness(data["met"], n)
-    return Unfinished(trial, SearchState(inner, outer, *counts, met, _unpacked(data["tree"]), keys))
+    task = Task(problem, "asymptotic", target, data["exactly"], _read_witness(data["witness"], problem))
+    trial = Trial(name, task, T, limit, data["limited_by"], volume)
+    tree = _unpacked(data["tree"], _MOST)
+    keys = np.frombuffer(_unpacked(data["keys"], 8 * len(tree)), dtype="<f8").astype(np.float64)
+    return Unfinished(trial, SearchState(inner, outer, boxes, proved, _read_witness(data["met"], problem), tree, keys))
+
+
+def _digest(data: Mapping[str, Any]) -> str:
+    """A hash of all that is said."""
+    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
 
 
 def _stated(witness: Witness | None) -> dict[str, Any] | None:
@@ -136,23 +166,40 @@ def _stated(witness: Witness | None) -> dict[str, Any] | None:
     return {"x": encode(witness.x), "level": level, "kind": witness.kind, "values": values, "period": period}
 
 
-def _read_witness(data: Mapping[str, Any] | None, n: int) -> Witness | None:
+def _read_witness(data: Mapping[str, Any] | None, problem: Problem) -> Witness | None:
+    """A violation, which is shown again."""
     if data is None:
         return None
-    if data["kind"] not in ("vdot", "input"):
-        raise ValueError("a violation of no kind")
-    values = {str(name): Fraction(q) for name, q in data["values"].items()}
-    period = None if data["period"] is None else Fraction(data["period"])
-    return Witness(decode(data["x"], (n,)), float.fromhex(data["level"]), data["kind"], values, period)
+    system, x = problem.loop.system, decode(data["x"], (problem.V.n,))
+    values = {name: _rational(q) for name, q in data["values"].items()}
+    period = None if data["period"] is None else _rational(data["period"])
+    witness = Witness(x, float.fromhex(data["level"]), data["kind"], values, period)
+    if not (
+        witness.kind in ("vdot", "input")
+        and np.all(np.isfinite(x))
+        and all(system.ranges[name][0] <= q <= system.ranges[name][1] for name, q in values.items())
+        and (period is None) == (system.sample is None or witness.kind == "input")
+        and (period is None or system.sample is None or system.sample[0] <= period <= system.sample[1])
+        and math.isclose(witness.level, float(problem.V(x)), rel_tol=_SAME)
+        and confirm(problem, witness)
+    ):
+        raise ValueError("a violation that is none")
+    return witness
+
+
+def _rational(text: str) -> Fraction:
+    if not _RATIONAL.fullmatch(text):
+        raise ValueError("a rational number must be P or P/Q")
+    return Fraction(text)
 
 
 def _packed(data: bytes) -> str:
     return base64.b64encode(zlib.compress(data, 1)).decode()
 
 
-def _unpacked(text: str) -> bytes:
+def _unpacked(text: str, most: int) -> bytes:
     reader = zlib.decompressobj()
-    data = reader.decompress(base64.b64decode(text, validate=True), _MOST)
-    if reader.unconsumed_tail:
-        raise ValueError("it is too large")
+    data = reader.decompress(base64.b64decode(text, validate=True), most + 1)
+    if not reader.eof or len(data) > most or reader.unused_data:
+        raise ValueError("what is packed in it has no end, or is too large")
     return data

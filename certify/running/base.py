@@ -31,6 +31,9 @@ class Jobs(Protocol):
         BackendError : nobody will ever answer.
         """
 
+    def refuse(self) -> None:
+        """Take note that an answer was refused."""
+
     def forget(self, numbers: Iterable[int]) -> None:
         """Do without the answers to these jobs."""
 
@@ -41,6 +44,10 @@ class Runner(Protocol):
     @property
     def device(self) -> torch.device:
         """Where the boxes of a batch lie."""
+
+    @property
+    def remark(self) -> str | None:
+        """What a person should know of the places; None if there is nothing to say."""
 
     def start(self, bound: Bound) -> AbstractContextManager[Bound]:
         """`bound`, a function of corners (n, B) and two levels to a named tuple of tensors (..., B), as run here."""

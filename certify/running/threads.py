@@ -29,6 +29,10 @@ class ThreadRunner:
         """Where the boxes of a batch lie."""
         return self._device
 
+    @property
+    def remark(self) -> None:
+        """Nothing: all is done here."""
+
     @contextmanager
     def start(self, bound: Bound) -> Iterator[Bound]:
         """`bound` on the threads; torch's own are one while it is in use."""

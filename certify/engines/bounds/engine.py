@@ -101,11 +101,13 @@ class BoundsEngine(Engine):
         left = replace(budget, seconds=budget.seconds - (time.perf_counter() - start))
         ring = prove_inwards(task.problem, self.T, band.below, outer, left, self.runner, report)
         if not ring.inner < ring.outer:
-            return Proof(None, None, Stop.FLOOR, f"no ring below V = {outer:.6g} is proved", boxes=ring.boxes)
+            stop = Stop.CLUSTER if ring.stop is Stop.CLUSTER else Stop.FLOOR
+            return Proof(None, None, stop, f"no ring below V = {outer:.6g} is proved", boxes=ring.boxes)
         if not ring.covered:
             why = f"F and its inputs are not enclosed on all of V <= {ring.inner:.6g}"
             return Proof(None, None, Stop.SMOOTH, why, boxes=ring.boxes)
         claim = Practical(roa=ring.outer, local=ring.inner, floor=ring.inner, rate=task.problem.rate)
+        stop = Stop.CLUSTER if ring.stop is Stop.CLUSTER else stop
         return replace(self.stated(task.problem, ring, claim, {}), stop=stop, witness=witness)
 
     def _outer_level(
@@ -197,8 +199,10 @@ class _Outwards:
         return None if self.ring is None or self.ring.done else self.ring.state()
 
     def restore(self, state: SearchState) -> None:
-        if self.ring is None or self.inner is None or self.inner < state.inner:
-            raise InputError("the search cannot be gone on with: the local set is another one here.")
+        if self.inner is None or self.inner < state.inner:
+            raise InputError("the search cannot be gone on with: the local set is smaller here; run without --resume.")
+        if self.ring is None or state.outer <= self.inner:
+            return  # the local set is as large as what the search could still reach, or larger
         self.ring.restore(state)
 
     def proof(self) -> Proof:
@@ -210,5 +214,5 @@ class _Outwards:
         else:
             ring = self.ring.proof(self.stop)
         claim = Asymptotic(roa=ring.outer, local=self.inner, rate=self.task.problem.rate)
-        lost = "" if self.ring is None else self.ring.lost
+        lost = "" if self.ring is None or self.stop is not Stop.CLUSTER else self.ring.lost
         return replace(self.engine.stated(self.task.problem, ring, claim, dict(self.seconds)), detail=lost)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import NamedTuple
 
 import numpy as np
@@ -38,6 +39,12 @@ class Frontier:
         self.key = torch.zeros(0, dtype=torch.float64, device=device)
         self.number = torch.zeros(0, dtype=torch.int64, device=device)
         self._away: list[tuple[Array, NDArray[np.uint32]]] = []  # keys, ascending, and numbers
+
+    def copy(self) -> Frontier:
+        """The same boxes; what is done with one of the two does not show in the other."""
+        other = copy.copy(self)
+        other._away = list(self._away)  # its arrays are never written to
+        return other
 
     def __len__(self) -> int:
         return len(self.key) + sum(len(lowest) for lowest, _ in self._away)

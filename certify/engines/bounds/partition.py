@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 Numbers = NDArray[np.int64]
 LEAF = 255
 MAX_DEPTH = 4096  # of a certificate's tree
+MOST_SPLITS = 40_000_000  # what a certificate can hold, and two gibibytes
+_ROUNDING = 1e-12  # relative, of a width
 OPEN, LOOK = 254, 253  # leaves of a tree that grows still: not bounded yet; to be looked at by whoever asked for it
 
 
@@ -120,26 +122,52 @@ class Partition:
             place[whole::2][call], place[whole + 1 :: 2][call] = after, after + lower[call]
         return place
 
-    def graft(self, boxes: Numbers, lo: Array, hi: Array, trees: bytes) -> tuple[Grafted, Grafted]:
+    def mark(self) -> tuple[int, int]:
+        """Where it stands, for `back_to`."""
+        return self.splits, len(self._calls)
+
+    def back_to(self, mark: tuple[int, int]) -> None:
+        """Forget all splits since then."""
+        self.splits, calls = mark
+        del self._calls[calls:]
+
+    def graft(
+        self, boxes: Numbers, lo: Array, hi: Array, trees: bytes, least: Array | None = None
+    ) -> tuple[Grafted, Grafted]:
         """Split boxes (B,), of corners (n, B), as their trees say, which follow each other; the leaves that are `OPEN`,
         and those to `LOOK` at.
 
+        Parameters
+        ----------
+        least : (n,), the width that a half must have along the axis of its split; None for any.
+
         Raises
         ------
-        CertificateFormatError : the bytes are not one tree for each of the boxes.
+        CertificateFormatError : the bytes are not one tree for each of the boxes, or one of them is too deep or too
+            fine; then the partition is as it was.
         """
         nodes = np.frombuffer(trees, dtype=np.uint8)
         at, upper = _links(nodes, len(self.root), len(boxes))
         ends: list[tuple[Numbers, Numbers, Array, Array]] = []
+        begin = self.mark()
         while len(at):
             split = nodes[at] < len(self.root)
             marked = (nodes[at] == OPEN) | (nodes[at] == LOOK)
             ends.append((at[marked], boxes[marked], lo[:, marked], hi[:, marked]))
             above = at[split]
             axis = nodes[above].astype(np.int64)
+            lo, hi = lo[:, split], hi[:, split]
+            column = np.arange(len(above))
+            width = hi[axis, column] - lo[axis, column]
+            # A chain of upper halves leaves no box open behind it: its depth shows only on the way.
+            deep = len(ends) > MAX_DEPTH and len(above) > 0
+            if deep or (least is not None and np.any(width < 2 * least[axis] * (1 - _ROUNDING))):
+                self.back_to(begin)
+                what = f"deeper than {MAX_DEPTH}" if deep else "finer than the least width"
+                raise CertificateFormatError(f"a tree must not be {what}.")
             boxes = self.split(boxes[split], axis) if len(above) else boxes[:0]
             at = np.stack([above + 1, upper[above]], 1).reshape(-1)
-            lo, hi = (np.repeat(side[:, split], 2, axis=1) for side in (lo, hi))
+            lo, hi = (np.repeat(side, 2, axis=1) for side in (lo, hi))
             _halve(lo, hi, np.arange(len(at)), np.repeat(axis, 2), np.arange(len(at)) % 2 == 1)
         place, number, lo, hi = (np.concatenate(parts, -1) for parts in zip(*ends, strict=True))
         order = np.argsort(place)

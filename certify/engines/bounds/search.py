@@ -27,7 +27,7 @@ from certify.engines.bounds.clock import Clock
 from certify.engines.bounds.frontier import Frontier
 from certify.engines.bounds.halving import Halves, split
 from certify.engines.bounds.order import choose_order
-from certify.engines.bounds.partition import LEAF, OPEN, Partition
+from certify.engines.bounds.partition import LEAF, MOST_SPLITS, OPEN, Partition
 from certify.engines.bounds.rule import BoxBounds, VdotBound
 from certify.engines.bounds.subtrees import Abroad, Growth, Subtrees
 from certify.engines.falsify import Witness, descend
@@ -40,7 +40,6 @@ _SLACK = 1e-9  # relative distance kept from every level, so that the checker's 
 _BESIDE_WITNESS = 1e-3  # relative distance kept from a violation
 _SHELL = 16.0  # a batch reaches up to this multiple of the nearest open level
 _HIGHER = 8.0  # an inner level over one from below which a step may lead out
-_MOST_SPLITS = 40_000_000  # what a certificate can hold, and two gibibytes
 
 
 @dataclass(frozen=True, slots=True)
@@ -351,14 +350,16 @@ class Pass:
         most = self.boxes + budget.boxes
         with self._clock, self.runner.start(self.rule) as bound, self._elsewhere(budget):
             while not self.done:
-                if self.boxes >= most or self.partition.splits + 3 * budget.batch > _MOST_SPLITS:
+                if self.boxes >= most or self.partition.splits + 3 * budget.batch > MOST_SPLITS:
                     return Stop.BOXES
                 left = budget.seconds - self._clock.spent - self.proved * budget.check
                 if left < 0:
                     return Stop.TIME
-                if not self._exchanged(bound, left, budget):
-                    self._step(bound, min(budget.batch, most - self.boxes), budget.least_width)
-                elif self.lost:
+                with self._whole():
+                    exchanged = self._exchanged(bound, left, budget)
+                    if not exchanged:
+                        self._step(bound, min(budget.batch, most - self.boxes), budget.least_width)
+                if exchanged and self.lost:
                     return Stop.CLUSTER
                 if report is not None:
                     stand = self.sweep.stand(self._least())
@@ -369,12 +370,29 @@ class Pass:
     def _elsewhere(self, budget: Budget) -> Iterator[None]:
         """Have boxes grown elsewhere, where that can be; what is out at the end comes back."""
         with self.runner.jobs(Subtrees(self.growth)) as jobs:
-            if jobs is not None:
+            if jobs is not None and not self.lost:
                 self.abroad = Abroad(jobs, self.growth, self.partition, budget.batch, budget.least_width)
             try:
                 yield
             finally:
                 self._recall()
+
+    @contextmanager
+    def _whole(self) -> Iterator[None]:
+        """Do all of a step or nothing: what Ctrl-C cuts short leaves every box where it was, so that the search can be
+        kept."""
+        frontier, mark, abroad = self.frontier.copy(), self.partition.mark(), self.abroad
+        held = None if abroad is None else dict(abroad.held)
+        done = False
+        try:
+            yield
+            done = True
+        finally:
+            if not done:
+                self.frontier, self.abroad = frontier, abroad
+                self.partition.back_to(mark)
+                if abroad is not None and held is not None:
+                    abroad.held = held
 
     def _recall(self) -> None:
         if self.abroad is not None:
@@ -459,7 +477,7 @@ class Pass:
         return SearchState(sweep.inner, sweep.outer, self.boxes, self.proved, sweep.witness, tree, keys)
 
     def restore(self, state: SearchState) -> None:
-        """Go on from a state, before the first box of this pass.
+        """Go on from a state, before the first box of this pass, whose inner level may have grown since.
 
         Raises
         ------
@@ -478,7 +496,7 @@ class Pass:
         self.frontier = Frontier(self.partition, self.runner.device)
         lo, hi, number = (a.to(self.runner.device) for a in opened.tensors())
         self.frontier.add(lo, hi, torch.tensor(state.keys, device=self.runner.device), number)
-        sweep.inner, sweep.outer, sweep.witness = state.inner, state.outer, state.witness
+        sweep.outer, sweep.witness = state.outer, state.witness
         self.boxes, self.proved = state.boxes, state.proved
         self._stop = Stop.REQUESTED if state.witness is None else Stop.WITNESS
 

@@ -6,12 +6,15 @@ level has to give way, which is not decided elsewhere. Boxes do not know of each
 tree is the same whoever grows which, how far, and in which order. A job ends after its seconds: what it leaves open
 comes back, and is shared out anew. That is all there is of balancing loads.
 
-An answer is bytes, and is believed nothing: lengths and trees are checked, a key that is no number is refused, and what
-a tree calls proved the checker sees again. An answer that is refused, or never comes, is worked out here.
+An answer is bytes, and is believed nothing: it must be sealed for its job, lengths, counts and trees must fit, and a
+key that is no number is refused, as is a box that is halved beyond the least width, or an answer that left all boxes as
+they were. What a tree calls proved the checker sees again. An answer that is refused, or never comes, is worked out
+here.
 """
 
 from __future__ import annotations
 
+import hashlib
 import math
 import struct
 import time
@@ -25,19 +28,20 @@ from torch import Tensor
 
 from certify.engines.bounds.frontier import Boxes, Frontier
 from certify.engines.bounds.halving import Halves, split
-from certify.engines.bounds.partition import LOOK, OPEN, Grafted, Partition
-from certify.errors import CertificateFormatError
+from certify.engines.bounds.partition import LEAF, LOOK, MOST_SPLITS, OPEN, Grafted, Partition
+from certify.errors import BackendError, CertificateFormatError
 from certify.running import Bound, Jobs
 
 Array = NDArray[np.float64]
 _MAGIC = b"subtree1"
 _JOB = struct.Struct("<8sQQQdddd")  # n, boxes, batch; inner and outer level, seconds, relative least width
-_ANSWER = struct.Struct("<8sQQQQ")  # boxes bounded, boxes proved, bytes of the trees, open leaves
+_ANSWER = struct.Struct("<8sQQQQ16s")  # boxes bounded, boxes proved, bytes of the trees, open leaves, seal
 _QUEUE = 2  # jobs a place, so that none waits for the next
 _LEAST = 256  # boxes of a job, if there are as many
 _FEW, _ENOUGH = 32, 2048  # boxes a place, or in all, from which on growing them elsewhere is worth a message
 _TURN, _EACH = (0.25, 4.0), 8e-3  # seconds of a job, the shortest and the longest, and between them for each place
 _POLL = 0.25  # seconds
+_LATE = 300.0  # seconds after which a job is worked out here
 
 
 def turn(places: int) -> float:
@@ -108,8 +112,14 @@ class Subtrees:
         waiting, keys = frontier.waiting()
         look = np.concatenate(looks)
         trees = partition.preorder([(OPEN, waiting), (LOOK, look)])
-        order = partition.order(waiting)
-        return _ANSWER.pack(_MAGIC, boxes, proved, len(trees), len(keys)) + trees + keys[order].tobytes()
+        body = trees + keys[partition.order(waiting)].tobytes()
+        counts = boxes, proved, len(trees), len(keys)
+        return _ANSWER.pack(_MAGIC, *counts, _seal(job, counts, body)) + body
+
+
+def _seal(job: bytes, counts: tuple[int, ...], body: bytes) -> bytes:
+    """What ties an answer to its job: a damaged answer, or another job's, has another one."""
+    return hashlib.blake2b(job + struct.pack("<4Q", *counts) + body, digest_size=16).digest()
 
 
 def _grow(
@@ -134,8 +144,8 @@ class Answer(NamedTuple):
     keys: Array
 
 
-def _read(answer: bytes) -> Answer:
-    """An answer whose lengths and keys are in order.
+def _read(job: bytes, answer: bytes) -> Answer:
+    """An answer to a job whose seal, lengths, counts and keys are in order.
 
     Raises
     ------
@@ -143,13 +153,21 @@ def _read(answer: bytes) -> Answer:
     """
     if len(answer) < _ANSWER.size:
         raise CertificateFormatError(f"an answer must have {_ANSWER.size} bytes at least; found {len(answer)}.")
-    magic, boxes, proved, length, opened = _ANSWER.unpack_from(answer)
-    if magic != _MAGIC or len(answer) != _ANSWER.size + length + 8 * opened:
+    magic, *counts, seal = _ANSWER.unpack_from(answer)
+    boxes, proved, length, opened = counts
+    body = answer[_ANSWER.size :]
+    if magic != _MAGIC or len(body) != length + 8 * opened:
         raise CertificateFormatError(f"an answer must be {_MAGIC!r} and as long as it says; found {len(answer)} bytes.")
-    trees, keys = answer[_ANSWER.size : _ANSWER.size + length], answer[_ANSWER.size + length :]
-    known = np.frombuffer(keys)
+    if seal != _seal(job, tuple(counts), body):
+        raise CertificateFormatError("an answer must have the seal of its job; it is damaged, or another job's.")
+    trees, known = body[:length], np.frombuffer(body[length:])
     if np.isnan(known).any() or trees.count(OPEN) != opened:
         raise CertificateFormatError("an answer must have a number for each open leaf.")
+    # Each node is bounded once at most, and what is proved is a leaf.
+    if not proved <= boxes <= length or proved > trees.count(LEAF):
+        raise CertificateFormatError(f"{boxes} boxes bounded and {proved} proved are not those of {length} nodes.")
+    if opened == length:
+        raise CertificateFormatError("an answer must have something done; all its boxes are open.")
     return Answer(boxes, proved, trees, known)
 
 
@@ -163,6 +181,14 @@ class Return(NamedTuple):
     looked: Grafted
 
 
+class Held(NamedTuple):
+    """Boxes that are out, the job that they are out with, and since when, in seconds of a clock that only rises."""
+
+    boxes: Boxes
+    job: bytes
+    since: float
+
+
 class Abroad:
     """The boxes of a pass that are being grown elsewhere.
 
@@ -174,19 +200,19 @@ class Abroad:
     def __init__(self, jobs: Jobs, growth: Growth, partition: Partition, batch: int, least_width: float) -> None:
         self.jobs, self.growth, self.partition = jobs, growth, partition
         self.batch, self.least_width = batch, least_width
-        self.refused = 0
-        self._held: dict[int, tuple[Boxes, bytes]] = {}
+        self.held: dict[int, Held] = {}
+        self._least = least_width * growth.half.cpu().numpy()[:, 0]
 
     def __len__(self) -> int:
-        return sum(len(boxes.key) for boxes, _ in self._held.values())
+        return sum(len(boxes.key) for boxes, _, _ in self.held.values())
 
     def least(self) -> float:
         """The smallest key of a box that is being grown; infinite if there is none."""
-        return min((float(boxes.key.min()) for boxes, _ in self._held.values()), default=math.inf)
+        return min((float(boxes.key.min()) for boxes, _, _ in self.held.values()), default=math.inf)
 
     def waiting(self) -> tuple[NDArray[np.int64], Array]:
         """Numbers (B,) and keys (B,) of the boxes."""
-        held = [boxes for boxes, _ in self._held.values()]
+        held = [boxes for boxes, _, _ in self.held.values()]
         numbers = np.concatenate([np.zeros(0, np.int64), *(boxes.number.cpu().numpy() for boxes in held)])
         return numbers, np.concatenate([np.zeros(0), *(boxes.key.cpu().numpy() for boxes in held)])
 
@@ -195,14 +221,14 @@ class Abroad:
         places = self.jobs.places
         if not places:
             self.recall(frontier)
-        return places > 0 and (bool(self._held) or len(frontier) >= enough(places))
+        return places > 0 and (bool(self.held) or len(frontier) >= enough(places))
 
     def send(self, levels: tuple[float, float], frontier: Frontier, limit: float, seconds: float) -> None:
         """Share out boxes with keys up to about `limit`, until all places are busy, in jobs that end well within so
         many seconds."""
         places = self.jobs.places
         most = _QUEUE * places
-        while len(self._held) < most and len(frontier):
+        while len(self.held) < most and len(frontier):
             count = min(self.batch, max(_LEAST, len(frontier) // most))
             boxes = frontier.take(count, limit)
             n, count = boxes.lo.shape
@@ -210,38 +236,50 @@ class Abroad:
                 _MAGIC, n, count, self.batch, *levels, min(turn(places), seconds / _QUEUE), self.least_width
             )
             job = head + b"".join(a.cpu().numpy().tobytes() for a in (boxes.lo, boxes.hi, boxes.key))
-            self._held[self.jobs.give(job)] = boxes, job
+            try:
+                self.held[self.jobs.give(job)] = Held(boxes, job, time.monotonic())
+            except BackendError:
+                frontier.add(boxes.lo, boxes.hi, boxes.key, boxes.number)
+                raise
 
     def collect(self, seconds: float) -> list[Return]:
         """What has ended, after waiting so long for something."""
         found = []
-        for number, answer in self.jobs.ended(min(_POLL, seconds)):
-            if number in self._held:
-                found.append(self._planted(*self._held[number], answer))
-                del self._held[number]
+        ended = self.jobs.ended(min(_POLL, seconds))
+        oldest = min(self.held, key=lambda number: self.held[number].since, default=None)
+        if not ended and oldest is not None and time.monotonic() - self.held[oldest].since > _LATE:
+            self.jobs.forget([oldest])
+            ended = [(oldest, None)]
+        for number, answer in ended:
+            if number in self.held:
+                found.append(self._planted(self.held[number], answer))
+                del self.held[number]
         return found
 
-    def _planted(self, boxes: Boxes, job: bytes, answer: bytes | None) -> Return:
+    def _planted(self, held: Held, answer: bytes | None) -> Return:
+        boxes, job, _ = held
         number, lo, hi = (a.cpu().numpy() for a in (boxes.number, boxes.lo, boxes.hi))
         if answer is not None:
             try:
-                read = _read(answer)
-                return Return(boxes, read, *self.partition.graft(number, lo, hi, read.trees))
+                read = _read(job, answer)
+                if self.partition.splits + len(read.trees) // 2 > MOST_SPLITS:
+                    raise CertificateFormatError("an answer must not have more splits than a certificate can hold.")
+                return Return(boxes, read, *self.partition.graft(number, lo, hi, read.trees, self._least))
             except CertificateFormatError:
-                self.refused += 1
-        read = _read(Subtrees(self.growth)(job))
+                self.jobs.refuse()
+        read = _read(job, Subtrees(self.growth)(job))
         return Return(boxes, read, *self.partition.graft(number, lo, hi, read.trees))
 
     def forget_above(self, level: float) -> None:
         """Do without boxes with keys above `level`."""
-        gone = [number for number, (boxes, _) in self._held.items() if float(boxes.key.min()) > level]
+        gone = [number for number, (boxes, _, _) in self.held.items() if float(boxes.key.min()) > level]
         self.jobs.forget(gone)
         for number in gone:
-            del self._held[number]
+            del self.held[number]
 
     def recall(self, frontier: Frontier) -> None:
         """Put all boxes that are out back into the frontier."""
-        for boxes, _ in self._held.values():
+        for boxes, _, _ in self.held.values():
             frontier.add(boxes.lo, boxes.hi, boxes.key, boxes.number)
-        held, self._held = list(self._held), {}
+        held, self.held = list(self.held), {}
         self.jobs.forget(held)

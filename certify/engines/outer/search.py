@@ -23,7 +23,7 @@ from certify.engines.base import Budget, Report
 from certify.engines.bounds.clock import Clock
 from certify.engines.bounds.frontier import Frontier
 from certify.engines.bounds.halving import Halves, split
-from certify.engines.bounds.partition import LEAF, Partition
+from certify.engines.bounds.partition import LEAF, MOST_SPLITS, Partition
 from certify.engines.bounds.subtrees import Abroad, Growth, Subtrees
 from certify.engines.outer.rule import OuterBounds
 from certify.errors import BackendError
@@ -32,7 +32,6 @@ from certify.verdict import Stop
 
 Array = NDArray[np.float64]
 _SLACK = 1e-9  # of the level's span: how far below a bound the level stays
-_MOST_SPLITS = 40_000_000  # what a certificate can hold, and two gibibytes
 _LAST_LOOK = 0.5  # seconds of a box that a lower level settles, in those of one of all that were looked at
 
 
@@ -150,7 +149,7 @@ class Cover:
         self.abroad = None
 
     def _ended(self, budget: Budget, most: int) -> Stop | None:
-        if self.boxes >= most or self.partition.splits + 3 * budget.batch + self._open() > _MOST_SPLITS:
+        if self.boxes >= most or self.partition.splits + 3 * budget.batch + self._open() > MOST_SPLITS:
             return Stop.BOXES
         each = _LAST_LOOK * self._clock.spent / max(1, self.boxes)
         spent = self._clock.spent + each * self._open() + budget.check * self.leaves
