@@ -22,7 +22,7 @@ from certify.engines.base import Budget
 from certify.engines.bounds import search, subtrees
 from certify.engines.bounds.partition import MAX_DEPTH, Partition
 from certify.engines.bounds.search import Pass, RingProof, outwards, prove_inwards, prove_outwards
-from certify.engines.outer import prove_outer
+from certify.engines.outer import Nothing, prove_outer
 from certify.errors import BackendError, CertificateFormatError
 from certify.results import RoaResult
 from certify.roa import RoaOptions, certify_roa
@@ -433,7 +433,7 @@ def test_so_it_is_of_a_set_inwards_and_beyond() -> None:
     problem, N = planar(), wells([[1.0, 0.0], [-0.5, 0.875], [-0.5, -0.875]], 0.75)
     troupe = Troupe(lost_after=8)
     outer = prove_outer(problem, 0.25, np.eye(2), N, -2.4, Budget(batch=16), PlayedRunner(troupe))
-    assert outer is None or outer.outer.level <= -2.4
+    assert isinstance(outer, Nothing) or outer.outer.level <= -2.4
 
 
 @pytest.mark.parametrize(
