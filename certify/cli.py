@@ -99,8 +99,10 @@ def _run(arguments: list[str], as_json: bool) -> int:
         return _fail(as_json, error.format_message() if hasattr(error, "format_message") else str(error), 2)
     except (typer.Abort, KeyboardInterrupt):
         return _fail(as_json, _STOPPED, _INTERRUPTED)
-    except (SoundnessError, BackendError) as error:
+    except SoundnessError as error:
         return _fail(as_json, f"internal error: {error}", 70)
+    except BackendError as error:  # another program's: a checker, a solver, a scheduler
+        return _fail(as_json, str(error), 70)
     except CertifyError as error:
         return _fail(as_json, str(error), 2)
     except BrokenPipeError:

@@ -22,7 +22,7 @@ from certify.engines.base import Budget
 from certify.engines.bounds import search, subtrees
 from certify.engines.bounds.partition import MAX_DEPTH, Partition
 from certify.engines.bounds.search import Pass, RingProof, outwards, prove_inwards, prove_outwards
-from certify.engines.outer import Nothing, prove_outer
+from certify.engines.outer import Nothing, OuterProof, prove_outer
 from certify.errors import BackendError, CertificateFormatError
 from certify.results import RoaResult
 from certify.roa import RoaOptions, certify_roa
@@ -114,7 +114,7 @@ def test_so_it_is_of_a_set_beyond_the_ellipsoid() -> None:
         prove_outer(problem, 0.25, np.eye(2), N, level, Budget(batch=16), runner)
         for runner in (HERE, PlayedRunner(troupe))
     )
-    assert expected is not None and found is not None and troupe.answered > 3
+    assert isinstance(expected, OuterProof) and isinstance(found, OuterProof) and troupe.answered > 3
     assert expected.outer.level == found.outer.level == level
     assert expected.evidence.tree == found.evidence.tree and expected.evidence.faces == found.evidence.faces
 
@@ -375,7 +375,7 @@ def test_a_set_beyond_the_ellipsoid_ends_with_workers_that_leave_all_open() -> N
         troupe = Troupe(play=play)
         budget = Budget(batch=4, boxes=150)
         found = prove_outer(problem, 0.25, np.eye(2), N, -2.4, budget, PlayedRunner(troupe))
-        assert troupe.answered and (found is None or found.outer.level <= -2.4)
+        assert troupe.answered and (isinstance(found, Nothing) or found.outer.level <= -2.4)
 
 
 # ----------------------------------------------------------------------------------------------------- coming and going
