@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from certify.certificate import Certificate, PartitionTree, TrustedSolver, run_checker, write_beside
+from certify.certificate import Certificate, PartitionTree, TrustedSolver, write_beside
 from certify.claims import Asymptotic, Enlarged, Nearby, Practical, Problem, Reached
 from certify.engines.bounds.mend import below_leaf, split_again
 from certify.errors import BackendError, SoundnessError
@@ -54,7 +54,7 @@ class Clerk:
     stage: Callable[[str], AbstractContextManager[None]]
     tell: Callable[[], None]
     show: Callable[[bytes], None]
-    check: Callable[[Path], Mapping[str, Any]] = run_checker
+    check: Callable[[Path], Mapping[str, Any]]
     cluster: str | None = None
 
     def accepted(self, certificate: Certificate, problem: Problem) -> Accepted:

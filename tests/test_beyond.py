@@ -92,7 +92,7 @@ def test_what_the_checker_refuses_is_left_out(tmp_path: Path, monkeypatch: pytes
     """A claim beyond the ellipsoid that is false, as if the engine had been wrong."""
     ask = Clerk.ask
 
-    def wrong(clerk: Clerk, certificate: Certificate) -> object:
+    def wrong(clerk: Clerk, certificate: Certificate, **_: object) -> object:
         outer = certificate.claim.outer
         if outer is not None:
             claim = replace(certificate.claim, outer=replace(outer, level=1.1))
@@ -109,7 +109,7 @@ def test_a_leaf_that_is_refused_is_split_again(tmp_path: Path, monkeypatch: pyte
     """The first file that is asked about has too coarse a tree; the next one has a leaf cut into eight."""
     ask, asked = Clerk.ask, []
 
-    def coarse(clerk: Clerk, certificate: Certificate) -> object:
+    def coarse(clerk: Clerk, certificate: Certificate, **_: object) -> object:
         evidence = certificate.evidence
         assert isinstance(evidence, PartitionTree)
         if evidence.outer is not None and not asked:

@@ -254,13 +254,13 @@ def test_an_interrupt_leaves_nothing_half_written(
 ) -> None:
     from certify.engines.bounds.rule import VdotBound
 
-    def interrupt(*_: object) -> None:
+    def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
 
     if where == "ring":
         monkeypatch.setattr(VdotBound, "__call__", interrupt)
     else:
-        monkeypatch.setattr("certify.acceptance.run_checker", interrupt)
+        monkeypatch.setattr("certify.roa.run_checker", interrupt)
     status, out, err = run(capsys, "roa", "--policy", policy_file, "--out", tmp_path / "o")
     assert status == 130 and out == "" and "interrupted" in err
     assert list((tmp_path / "o").iterdir()) == []

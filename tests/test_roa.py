@@ -228,7 +228,7 @@ def test_whatever_the_checker_refuses_a_run_ends_with_what_it_accepts(
 
 def test_what_cannot_be_mended_is_a_soundness_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        "certify.acceptance.run_checker", lambda _: {"result": "REJECTED", "rule": "hash", "at": "policy"}
+        "certify.roa.run_checker", lambda *_, **__: {"result": "REJECTED", "rule": "hash", "at": "policy"}
     )
     with pytest.raises(SoundnessError, match=r"rejects what the engine proved.*unchecked\.json reproduces"):
         certify_roa(*scalar_tanh(), tmp_path, RoaOptions(candidate="lyapunov"))
@@ -282,7 +282,7 @@ def test_an_answer_about_other_bytes_is_no_proof(tmp_path: Path, monkeypatch: py
     """Another run's certificate is accepted in the place of this one's."""
     other = certify_roa(*scalar_tanh(), tmp_path / "other", RoaOptions(level=1.0)).certificate
     assert other is not None
-    monkeypatch.setattr("certify.acceptance.run_checker", lambda _: run_checker(other))
+    monkeypatch.setattr("certify.roa.run_checker", lambda *_, **__: run_checker(other))
     with pytest.raises(SoundnessError, match="other bytes"):
         certify_roa(*scalar_tanh(), tmp_path / "mine", RoaOptions(level=2.0))
     assert not (tmp_path / "mine" / "certificate.json").exists()

@@ -64,7 +64,14 @@ def choose_candidate(
         return Chosen(solve_lyapunov(A, weight + (M + M.T) / 2, h), "lqr")
     if name == "scaled":
         nearer = np.array([min(-float(lo), float(hi)) for lo, hi in loop.system.domain])
-        return Chosen(solve_lyapunov(A, np.diag(nearer**-2), h), "scaled")
+        with np.errstate(over="ignore", under="ignore"):
+            weights = nearer**-2.0
+        if not np.all((weights > 0) & np.isfinite(weights)):
+            raise InputError(
+                "the domain's half-widths must have squares within the range of binary64; found "
+                f"{', '.join(f'{d:g}' for d in nearer)}. Scale the states."
+            )
+        return Chosen(solve_lyapunov(A, np.diag(weights), h), "scaled")
     P = solve_lyapunov(A, weight, h)
     if name == "lyapunov":
         return Chosen(P, "lyapunov")
