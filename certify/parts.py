@@ -22,7 +22,7 @@ _JOB = struct.Struct("<QQ")  # K, N
 _LEAVES = 5_000  # of a part, so that its checker's start is not the most of it
 _EACH = 2  # parts a place
 _POLL = 0.5  # seconds
-_RESULTS = ("PART", "REJECTED", "TRUSTED")
+_STATUS = {"PART": 4, "REJECTED": 1}
 
 
 class Part:
@@ -41,7 +41,8 @@ class Part:
 
 
 def check_in_parts(path: Path, runner: Runner) -> tuple[int, dict[str, Any]]:
-    """Exit status and answer of the checker about a file, as its parts were checked by a cluster's workers.
+    """Exit status and answer of the checker about a file, as its parts were checked by a cluster's workers: a refusal
+    by one of them, or what all of them together have accepted.
 
     Raises
     ------
@@ -59,16 +60,14 @@ def check_in_parts(path: Path, runner: Runner) -> tuple[int, dict[str, Any]]:
         leaves = sum(tree.count(b"\xff") for tree in trees)
         of = max(1, min(_EACH * jobs.places, leaves // _LEAVES))
         answers = _gathered(jobs, work, [_JOB.pack(number, of) for number in range(1, of + 1)])
-    for status, answer in answers:
-        if "error" in answer or answer["result"] != "PART":
-            return status, answer
-    return 0, join_parts(raw, [answer for _, answer in answers])
+    refused = next((answer for answer in answers if answer["result"] == "REJECTED"), None)
+    return (1, refused) if refused is not None else (0, join_parts(raw, answers))
 
 
-def _gathered(jobs: Jobs, work: Part, wanted: list[bytes]) -> list[tuple[int, dict[str, Any]]]:
+def _gathered(jobs: Jobs, work: Part, wanted: list[bytes]) -> list[dict[str, Any]]:
     """What is said of each part, in their order; one that nobody could check is checked here."""
     given = {jobs.give(job): k for k, job in enumerate(wanted)}
-    found: dict[int, tuple[int, dict[str, Any]]] = {}
+    found: dict[int, dict[str, Any]] = {}
     while len(found) < len(wanted):
         for number, said in jobs.ended(_POLL):
             if number in given:
@@ -79,17 +78,18 @@ def _gathered(jobs: Jobs, work: Part, wanted: list[bytes]) -> list[tuple[int, di
     return [found[k] for k in range(len(wanted))]
 
 
-def _read(said: bytes) -> tuple[int, dict[str, Any]]:
-    """Status and answer.
+def _read(said: bytes) -> dict[str, Any]:
+    """The answer, which must be one about a part, and be what the exit status says.
 
     Raises
     ------
-    BackendError : it is neither.
+    BackendError : it is not, or the worker's checker came to no verdict.
     """
     try:
         status, answer = json.loads(said)
-        if type(status) is int and isinstance(answer, dict) and ("error" in answer or answer["result"] in _RESULTS):
-            return status, answer
+        sound = isinstance(answer, dict) and "error" not in answer and type(status) is int
+        if sound and _STATUS.get(answer["result"]) == status:
+            return dict(answer)
     except (ValueError, TypeError, KeyError, RecursionError) as error:
         raise BackendError(f"a worker's answer about a part cannot be read: {error!r:.80}.") from error
-    raise BackendError(f"a worker's answer about a part must be a status and an answer; found {said[:80]!r}.")
+    raise BackendError(f"a worker's answer about a part must be PART or REJECTED; found {said[:200]!r}.")

@@ -128,7 +128,26 @@ def test_answers_that_do_not_make_one(lie: Answer) -> None:
         check_in_parts(CERTIFICATE, Workers(2, lie))
 
 
-@pytest.mark.parametrize("garbage", [b"", b"[4]", b"[4, {}]", b'["4", {"result": "PART"}]', b"[" * 10**5, b"null"])
+@pytest.mark.parametrize(
+    "garbage",
+    [
+        b"",
+        b"[4]",
+        b"[4, {}]",
+        b'["4", {"result": "PART"}]',
+        b"[" * 10**5,
+        b"null",
+        b'[0, {"result": "REJECTED"}]',
+        b'[0, {"error": "x", "result": "ACCEPTED"}]',
+        b'[0, {"error": "internal"}]',
+        b'[0, {"result": "ACCEPTED"}]',
+        b'[3, {"result": "TRUSTED"}]',
+        b'[4, {"result": "REJECTED"}]',
+        b'[1, {"result": "PART"}]',
+        b'[true, {"result": "REJECTED"}]',
+        b'[4, {"result": ["PART"]}]',
+    ],
+)
 def test_garbage_is_no_answer(garbage: bytes) -> None:
     with pytest.raises(BackendError, match="a worker's answer"):
         check_in_parts(CERTIFICATE, Workers(2, lambda work, job, number: garbage))

@@ -13,9 +13,13 @@ from typing import Any
 
 from certify.certificate.model import Certificate, PartitionTree, parse_certificate
 from certify.certificate.tree import LEAF
+from certify.claims import Claim, Enlarged, Reached
 from certify.errors import BackendError
 
-_OF_A_PART = ("part", "by_leaf", "examined", "leaves_in_all")
+_STATED = (  # of an answer, what is the same of all parts and of the whole
+    "certificate_sha256", "policy_sha256", "claim", "rate", "sample", "discrete", "levels", "leaves",
+    "start", "centre", "time",
+)  # fmt: skip
 
 
 def join_parts(raw: bytes, parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -41,9 +45,9 @@ def join_parts(raw: bytes, parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]
     certificate = parse_certificate(raw, "the file whose parts were checked")
     try:
         return _joined(_stated(certificate, raw), [dict(part) for part in parts])
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError, RecursionError) as error:
         raise BackendError(
-            f"the answers of {len(parts)} parts cannot be read: {type(error).__name__}: {error}."
+            f"the answers of {len(parts)} parts cannot be read: {type(error).__name__}: {str(error)[:200]}."
         ) from error
 
 
@@ -65,7 +69,18 @@ def _stated(certificate: Certificate, raw: bytes) -> dict[str, Any]:
         "levels": levels,
         "leaves": leaves,
         "leaves_in_all": ring + sum(tree.count(LEAF) for tree in outer),
+        "faces": 0 if evidence.outer is None else sum(tree.count(LEAF) for tree in evidence.outer.faces),
+        "outer": None if claim.outer is None else [claim.outer.level, *(tree.count(LEAF) for tree in outer[:1])],
+        **_started(claim),
     }
+
+
+def _started(claim: Claim) -> dict[str, Any]:
+    """The set from which a tube leads, as an answer has it."""
+    if not isinstance(claim, Enlarged | Reached):
+        return {"start": None, "centre": None}
+    centre = list(claim.centre) if isinstance(claim, Reached) else None
+    return {"start": claim.start.P.tolist(), "centre": centre}
 
 
 def _joined(stated: dict[str, Any], parts: list[dict[str, Any]]) -> dict[str, Any]:
@@ -78,32 +93,45 @@ def _joined(stated: dict[str, Any], parts: list[dict[str, Any]]) -> dict[str, An
     if not parts or sorted(numbers) != sorted(wanted):
         raise BackendError(f"each part must be there exactly once; of {len(parts)} answers these are {numbers}.")
     first = parts[0]
-    stated |= {key: first.get(key) for key in ("start", "centre", "time")}
-    stated["elsewhere"] = _elsewhere(first)
-    stated["level of the outer set"] = first["outer"]["level"] if "outer" in first else None
+    faces, total = stated.pop("faces"), stated["leaves_in_all"]
+    stated |= {"time": first.get("time"), "elsewhere": _elsewhere(first)}
     for answer in parts:
         said = answer | {"elsewhere": _elsewhere(answer)}
-        said["level of the outer set"] = answer["outer"]["level"] if "outer" in answer else None
+        said["outer"] = [answer["outer"]["level"], answer["outer"]["leaves"]] if "outer" in answer else None
         for key, value in stated.items():
             if _text(said.get(key)) != _text(value):
                 raise BackendError(f"`{key}` of each part must be {value}; part {answer['part']} says {said.get(key)}.")
-    examined = sum(_count(answer["examined"]) for answer in parts)
-    if examined != stated["leaves_in_all"] or stated["elsewhere"].get("tree") != stated["leaves"]:
-        raise BackendError(f"all {stated['leaves_in_all']} leaves must be examined; the parts have done {examined}.")
+    _require_all(parts, total)
     rules = Counter(stated["elsewhere"])
     for answer in parts:
         rules.update(answer["by_leaf"])
+    if stated["elsewhere"].get("tree") != stated["leaves"] or rules["faces"] != faces:
+        raise BackendError(f"each rule must have looked at what the file has; the parts say {dict(rules)}.")
     margins = {
         name: min((float(own) for answer in parts if (own := answer["margins"][name]) is not None), default=None)
         for name in ("local", "ring", "outer")
     }
     seconds = {name: sum(answer["seconds"][name] for answer in parts) for name in ("start", "check")}
-    joined = {key: value for key, value in first.items() if key not in _OF_A_PART}
-    joined |= {"result": "ACCEPTED", "rules": dict(rules), "ring_leaves": rules["ring"], "margins": margins}
+    joined = {"result": "ACCEPTED"} | {key: stated[key] for key in _STATED if stated[key] is not None or key in first}
+    joined |= {"rules": dict(rules), "ring_leaves": rules["ring"], "margins": margins}
     joined |= {"seconds": seconds, "parts": len(parts)}
-    if "outer" in first:
-        joined["outer"] = first["outer"] | {"face_leaves": rules["faces"]}
+    if stated["outer"] is not None:
+        level, leaves = stated["outer"]
+        joined["outer"] = {"level": level, "leaves": leaves, "face_leaves": faces}
     return joined | {"text": [f"ACCEPTED by {len(parts)} parts together sha256={stated['certificate_sha256']}"]}
+
+
+def _require_all(parts: list[dict[str, Any]], total: int) -> None:
+    """That the parts have looked at leaf after leaf, whatever batches each of them was dealt."""
+    spans = sorted([_count(first), _count(beyond)] for answer in parts for first, beyond in answer["spans"])
+    reached = 0
+    for first, beyond in spans:
+        if first != reached or beyond <= first:
+            raise BackendError(f"all {total} leaves must be examined, each once; after leaf {reached} comes {first}.")
+        reached = beyond
+    said = sum(_count(answer["examined"]) for answer in parts)
+    if reached != total or said != total:
+        raise BackendError(f"all {total} leaves must be examined; the parts have done {min(reached, said)}.")
 
 
 def _elsewhere(answer: Mapping[str, Any]) -> dict[str, int]:

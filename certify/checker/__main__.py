@@ -41,7 +41,11 @@ def main(arguments: list[str]) -> int:
     except Exception as error:
         status, answer = 70, {"error": f"internal error: {type(error).__name__}: {error}", "text": []}
     lines = [json.dumps(answer)] if options.json else answer["text"]
-    sys.stdout.write("".join(f"{line}\n" for line in lines))
+    try:
+        sys.stdout.write("".join(f"{line}\n" for line in lines))
+        sys.stdout.flush()
+    except (AttributeError, OSError, ValueError):  # nobody heard it
+        os._exit(70)
     sys.stderr.write("" if options.json or "error" not in answer else f"{answer['error']}\n")
     return status
 
@@ -94,7 +98,7 @@ def _examine(path: str, share: tuple[int, int] | None, jobs: int) -> tuple[int, 
     elif share is not None:
         status, result = 4, "PART"
         answer |= {"part": list(share), "by_leaf": tally.by_leaf}
-        answer |= {"examined": part.leaves, "leaves_in_all": part.all_leaves}
+        answer |= {"examined": part.leaves, "leaves_in_all": part.all_leaves, "spans": part.spans}
     else:
         status, result = 0, "ACCEPTED"
     answer = {"result": result, **answer}

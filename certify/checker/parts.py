@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, NoReturn
 
 from .float64 import Array
 
@@ -28,14 +29,16 @@ class Part:
     passed: int = 0  # batches before the one in hand, of whatever part
     leaves: int = 0  # in the batches of this part
     all_leaves: int = 0  # in all of them
+    spans: list[list[int]] = field(default_factory=list)  # [first, beyond] of this part's, counted through them all
 
     def own(self, batches: Iterable[Batch]) -> Iterator[Batch]:
         """Those of this part."""
         for batch in batches:
-            size = batch[1].shape[1]
+            first, size = self.all_leaves, batch[1].shape[1]
             self.all_leaves += size
             if self.passed % self.of == self.number - 1:
                 self.leaves += size
+                self.spans.append([first, first + size])
                 yield batch
             self.passed += 1
 
@@ -51,26 +54,38 @@ def in_processes(count: int, work: Callable[[int], Any]) -> list[Any]:
     ------
     ChildProcessError : a process did not come to its end, or could not answer.
     """
-    children = []
-    for index in range(count):
-        reading, writing = os.pipe()
-        child = os.fork()
-        if child == 0:
-            status = 1
-            try:
-                os.close(reading)
-                with open(writing, "w", encoding="ascii") as pipe:
-                    json.dump(work(index), pipe)
-                status = 0
-            finally:
-                os._exit(status)
-        os.close(writing)
-        children.append((child, reading))
-    said = []
-    for child, reading in children:
-        with open(reading, encoding="ascii") as pipe:
-            text = pipe.read()
-        said.append((text, os.waitpid(child, 0)[1]))
+    signal.signal(signal.SIGCHLD, signal.SIG_DFL)  # a caller may have had it ignored, and then no status is kept
+    children: list[tuple[int, int]] = []
+    said: list[tuple[str, int]] = []
+    try:
+        for index in range(count):
+            reading, writing = os.pipe()
+            child = os.fork()
+            if child == 0:
+                _answer(work, index, reading, writing)
+            os.close(writing)
+            children.append((child, reading))
+        while children:
+            with open(children[0][1], encoding="ascii") as pipe:
+                text = pipe.read()
+            said.append((text, os.waitpid(children[0][0], 0)[1]))
+            del children[0]
+    finally:
+        for child, _ in children:  # of an examination that has failed
+            os.kill(child, signal.SIGKILL)
+            os.waitpid(child, 0)
     if any(status != 0 for _, status in said):
         raise ChildProcessError(f"of {count} processes, not all came to their end: {[status for _, status in said]}")
     return [json.loads(text) for text, _ in said]
+
+
+def _answer(work: Callable[[int], Any], index: int, reading: int, writing: int) -> NoReturn:
+    """What the copy does."""
+    status = 1
+    try:
+        os.close(reading)
+        with open(writing, "w", encoding="ascii") as pipe:
+            json.dump(work(index), pipe)
+        status = 0
+    finally:
+        os._exit(status)

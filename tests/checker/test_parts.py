@@ -8,7 +8,10 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import shlex
 import signal
+import subprocess
+import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from copy import deepcopy
@@ -18,7 +21,7 @@ from typing import Any
 
 import pytest
 
-from certify.certificate import checking, join_parts, run_checker, run_part
+from certify.certificate import checking, join_parts, joining, run_checker, run_part
 from certify.checker import outer, rules
 from certify.checker.__main__ import main
 from certify.checker.errors import Rejected
@@ -342,6 +345,12 @@ EDITS: dict[str, tuple[str, Any]] = {
     "levels, null": ("levels", None),
     "leaves": ("leaves", lambda n: n - 1),
     "leaves in all": ("leaves_in_all", lambda n: n - 1),
+    "no spans": ("spans", []),
+    "a span more": ("spans", lambda spans: [*spans, [0, 1]]),
+    "spans, the other way": ("spans", lambda spans: [span[::-1] for span in spans]),
+    "spans, not so far": ("spans", lambda spans: [[first, beyond - 1] for first, beyond in spans]),
+    "spans, as truth": ("spans", [[False, True]]),
+    "a margin beyond binary64": ("margins.ring", 10**400),
     "fewer examined": ("examined", lambda n: n - 1),
     "more examined": ("examined", lambda n: n + 1),
     "less than none": ("examined", lambda n: -n),
@@ -376,7 +385,7 @@ def test_answers_that_are_altered_are_not_joined(what: str, which: int) -> None:
 
 
 NEEDED = ("part", "certificate_sha256", "policy_sha256", "claim", "rate", "discrete", "levels", "leaves", "rules",
-          "by_leaf", "examined", "leaves_in_all", "margins", "seconds", "result")  # fmt: skip
+          "by_leaf", "examined", "leaves_in_all", "spans", "margins", "seconds", "result")  # fmt: skip
 
 
 @pytest.mark.parametrize("key", NEEDED)
@@ -403,6 +412,40 @@ def test_fewer_leaves_than_the_file_has_are_not_enough() -> None:
     lied[0]["examined"] = 0
     with pytest.raises(BackendError):
         join_parts(raw, lied)
+
+
+@pytest.mark.parametrize("sizes", [(4, 3), (3, 4), (1, 5)])
+def test_parts_that_were_dealt_differently_are_not_joined(
+    sizes: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two versions of the checker may differ in the size of a batch: each is honest, and between them lie leaves that
+    nobody has looked at, while others are looked at twice."""
+    raw = dump(with_tree(honest("scalar"), uniform([0], 5)))
+    certificate, met = parse(json.loads(raw)), []
+    for number, size in enumerate(sizes, 1):
+        monkeypatch.setattr(Ring, "batch", property(lambda _, size=size: size))
+        part = Part(number, 2)
+        tally = rules.check(certificate, part)
+        met.append((part, tally))
+    spans = [span for part, _ in met for span in part.spans]
+    assert sorted(spans) != [[k, k + 1] for k in range(32)]
+    with pytest.raises(BackendError, match=r"each once|have done"):
+        joining._require_all([{"spans": part.spans, "examined": part.leaves} for part, _ in met], met[0][0].all_leaves)
+
+
+def test_what_is_not_of_the_file_is_not_handed_on() -> None:
+    for name, what, value in (
+        ("enlarged", "start", [[1e-4]]),
+        ("outer, a network", "outer.level", 1e9),
+        ("outer, a network", "outer.leaves", 1),
+        ("outer, a network", "by_leaf.faces", 1),
+    ):
+        raw, parts = parts_of(name, 2)
+        with pytest.raises(BackendError):
+            join_parts(raw, [edited(part, what, value) for part in parts])
+    raw, parts = parts_of("scalar", 2)
+    joined = join_parts(raw, [part | {"solver": "ours", "error": "none", "text": ["PROVED"]} for part in parts])
+    assert not {"solver", "error"} & set(joined) and joined["text"][0].startswith("ACCEPTED by 2 parts")
 
 
 def test_another_file_with_the_same_claim_is_another_file() -> None:
@@ -443,3 +486,39 @@ def test_an_answer_of_another_kind_is_no_verdict(
     monkeypatch.setattr(checking, "command", lambda program_, arguments: ["python3", "-c", program])
     with pytest.raises(BackendError, match=said):
         checking.ask(tmp_path, part=part)
+
+
+def test_no_process_outlives_an_examination_that_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    fork, started = os.fork, []
+
+    def scarce() -> int:
+        if len(started) == 2:
+            raise OSError("no more processes")
+        child = fork()
+        if child:
+            started.append(child)
+        return child
+
+    monkeypatch.setattr(os, "fork", scarce)
+    with pytest.raises(OSError, match="no more"):
+        in_processes(3, lambda _: time.sleep(60))
+    assert len(started) == 2
+    for child in started:
+        with pytest.raises(ChildProcessError):
+            os.waitpid(child, os.WNOHANG)
+
+
+def test_a_caller_that_ignores_its_children_changes_nothing() -> None:
+    before = signal.signal(signal.SIGCHLD, signal.SIG_IGN)
+    try:
+        assert in_processes(2, lambda index: index) == [0, 1]
+    finally:
+        signal.signal(signal.SIGCHLD, before)
+
+
+def test_an_answer_that_nobody_hears_is_no_refusal(tmp_path: Path) -> None:
+    line = checking.command("checker", [str(write(honest("scalar"), tmp_path))])
+    with open("/dev/full", "wb") as full:
+        assert subprocess.run(line, stdout=full, stderr=subprocess.DEVNULL, check=False).returncode == 70
+    shell = f"exec {shlex.join(line)} >&-"
+    assert subprocess.run(["sh", "-c", shell], stderr=subprocess.DEVNULL, check=False).returncode == 70
