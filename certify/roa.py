@@ -196,11 +196,13 @@ class _Run:
     missed: str = ""  # why there is no such tube
     converging: bool = False  # of a practical claim: to ask for one equilibrium as well
     share: float = 1.0  # of the time, up to which a stage may go on
+    checked: str | None = None  # by whom, where a cluster was asked
 
     def result(self) -> RoaResult:
         result = self._decide()
         result = replace(result, seconds={"load": self.load, **self.seconds, "total": self.spent})
-        notices = [text for text in (self.aside, result.notice, self.runner.remark) if text is not None]
+        said = self.aside, result.notice, self.runner.remark, self.checked
+        notices = [text for text in said if text is not None]
         result = replace(result, notice="; ".join(notices) or None)
         search = self.out / _SEARCH_FILE
         result = replace(result, search=search if search.exists() else None)
@@ -683,10 +685,16 @@ class _Run:
         if self.options.cluster_checks:
             from certify.parts import check_in_parts
 
-            status, answer = check_in_parts(path, self.runner)
-            if "error" in answer:
-                raise BackendError(f"the checker ended with status {status} and no verdict: {answer['error']}")
-            return answer
+            try:
+                _, answer = check_in_parts(path, self.runner)
+            except BackendError as error:
+                self.checked = f"checked here, and not by the cluster: {str(error).rstrip('.')}"
+            else:
+                if "parts" in answer:
+                    self.checked = (
+                        f"checked in {answer['parts']} parts by the workers of {self.options.cluster}, whose word it is"
+                    )
+                return answer
         cores = len(os.sched_getaffinity(0)) if path.stat().st_size > _LONG else 1
         return run_checker(path, jobs=self.options.jobs or min(cores, _MOST_JOBS))
 

@@ -14,8 +14,12 @@ import torch
 from certify.certificate import run_checker
 from certify.certificate.checking import ask
 from certify.errors import BackendError
+from certify.options import RoaOptions
 from certify.parts import Part, check_in_parts
+from certify.roa import certify_roa
 from certify.running import Work
+from certify.verdict import Verdict
+from tests.support.loops import scalar_tanh
 
 CERTIFICATE = Path(__file__).parent.parent / "docs" / "published" / "two_machines.json"
 Answer = Callable[[Work, bytes, int], bytes | None]
@@ -151,3 +155,50 @@ def test_answers_that_do_not_make_one(lie: Answer) -> None:
 def test_garbage_is_no_answer(garbage: bytes) -> None:
     with pytest.raises(BackendError, match="a worker's answer"):
         check_in_parts(CERTIFICATE, Workers(2, lambda work, job, number: garbage))
+
+
+def certified(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, workers: Workers) -> Any:
+    """A run whose cluster these workers are; they grow nothing, and check."""
+
+    @contextmanager
+    def runner(_: RoaOptions) -> Iterator[Workers]:
+        yield workers
+
+    monkeypatch.setattr("certify.roa._runner_for", runner)
+    plant, law = scalar_tanh()
+    options = RoaOptions(candidate="lyapunov", level=1.0, cluster="tcp://head:8786", cluster_checks=True)
+    return certify_roa(plant, law, tmp_path, options)
+
+
+class Checkers(Workers):
+    """Workers that only check."""
+
+    remark = None
+
+    @contextmanager
+    def start(self, bound: Any) -> Iterator[Any]:
+        yield bound
+
+    @contextmanager
+    def jobs(self, work: Work) -> Iterator[Any]:
+        self.work = work
+        yield self if isinstance(work, Part) else None
+
+
+def test_a_run_says_whose_word_its_check_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    result = certified(tmp_path, monkeypatch, Checkers(2, honest))
+    assert result.verdict is Verdict.PROVED and "parts" in result.checker
+    assert "parts by the workers of tcp://head:8786, whose word it is" in result.notice
+
+
+def lost(work: Work, job: bytes, number: int) -> bytes:
+    raise BackendError("the scheduler at tcp://head:8786 is gone.")
+
+
+@pytest.mark.parametrize("lie", [hasty, accepted, lost])
+def test_where_no_answer_comes_of_it_the_checker_here_decides(
+    lie: Answer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    result = certified(tmp_path, monkeypatch, Checkers(2, lie))
+    assert result.verdict is Verdict.PROVED and "parts" not in result.checker
+    assert result.notice is not None and "checked here, and not by the cluster" in result.notice
