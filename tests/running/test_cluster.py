@@ -149,7 +149,8 @@ def test_a_worker_that_is_killed_takes_no_job_with_it() -> None:
 
 
 @pytest.mark.slow
-def test_an_answer_that_died_with_its_worker_is_made_again() -> None:
+def test_an_answer_that_died_with_its_worker_is_made_again_or_said_to_be_lost() -> None:
+    """Lost is what it is called if it dies while it is fetched: whoever asked then does the job."""
     with cluster(1) as dask, connect(dask.address) as client, ClusterRunner(client).jobs(echo) as jobs:
         wait_for(lambda: jobs.places == 1)
         jobs.give(b"0.1")
@@ -157,9 +158,10 @@ def test_an_answer_that_died_with_its_worker_is_made_again() -> None:
         dask.processes[1].kill()
         dask.processes[1].wait()
         begin = time.monotonic()
-        assert answers(jobs, 1, 1.0) == {} and time.monotonic() - begin < 25
+        found = answers(jobs, 1, 1.0)
+        assert found in ({}, {0: None}) and time.monotonic() - begin < 25
         dask.worker()
-        assert answers(jobs, 1) == {0: b"0.1"}
+        assert found == {0: None} or answers(jobs, 1) == {0: b"0.1"}
 
 
 @pytest.mark.slow
