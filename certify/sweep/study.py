@@ -26,6 +26,7 @@ from certify.sweep.case import OPTIONS, PLANT_OPTIONS, Case, File, readable_ids
 from certify.systems import System, available_systems, exact
 from certify.systems.equations import nearest
 from certify.systems.source import PlantFile, read_plant_file
+from certify.systems.toml import number_at
 
 _LISTS = ("policies", "systems", "candidates")
 _TABLES = ("parameters", "disturbances", "domain", "options")
@@ -222,20 +223,11 @@ def _range(file: PlantFile, value: Mapping[str, Any], *keys: str) -> list[str]:
             f"a range must be {{ from = 0.1, to = 0.2, points = 5 }}; found the keys {', '.join(value) or 'none'}.",
             *keys,
         )
-    lo, hi = (_exact(file, value[end], *keys) for end in ("from", "to"))
+    lo, hi = (number_at(file, value[end], *keys) for end in ("from", "to"))
     points = value["points"]
     if isinstance(points, bool) or not isinstance(points, int) or not 2 <= points <= _MOST_POINTS:
         raise file.refuse(f"`points` must be a whole number from 2 to {_MOST_POINTS:,}; found {points!r}.", *keys)
     return [plain(lo + (hi - lo) * k / (points - 1)) for k in range(points)]
-
-
-def _exact(file: PlantFile, value: Any, *keys: str) -> Fraction:
-    if isinstance(value, bool) or not isinstance(value, int | str | Fraction):
-        raise file.refuse(f"must be a number such as 0.15 or the text '3/20'; found {value!r}.", *keys)
-    try:
-        return exact(value, keys[-1])
-    except InputError as error:
-        raise file.refuse(str(error), *keys) from error
 
 
 def _text(file: PlantFile, value: Any, *keys: str) -> str:

@@ -57,7 +57,7 @@ def build_system(file: PlantFile) -> System:
         raise file.refuse(f"missing keys: a plant must have {', '.join(missing)}.")
     name, description, time = _text(file, "name"), _text(file, "description"), _time(file)
     states, inputs = _names(file, "states"), _names(file, "inputs")
-    parameters = {p: _number(file, value, "parameters", p) for p, value in file.table("parameters").items()}
+    parameters = {p: number_at(file, value, "parameters", p) for p, value in file.table("parameters").items()}
     acting = {w: _disturbance(file, w) for w in file.table("disturbances")}
     everything = [*states, *inputs, *parameters, *acting]
     for key, names in (
@@ -223,7 +223,7 @@ def _disturbance(file: PlantFile, name: str) -> Interval | None:
     value = file.table("disturbances")[name]
     if isinstance(value, list):
         return _interval(file, "disturbances", name)
-    half = _number(file, value, "disturbances", name)
+    half = number_at(file, value, "disturbances", name)
     if half < 0:
         raise file.refuse(
             f"must be a half-width that is not negative, or a pair [lo, hi]; found {value!r}.", "disturbances", name
@@ -237,7 +237,7 @@ def _interval(file: PlantFile, table: str, name: str) -> Interval:
         raise file.refuse(f"there must be bounds of {name}; none were found. Write {name} = [lo, hi].", table)
     if not isinstance(value, list) or len(value) != 2:
         raise file.refuse(f"the bounds of {name} must be a pair [lo, hi]; found {value!r}.", table, name)
-    lo, hi = (_number(file, end, table, name) for end in value)
+    lo, hi = (number_at(file, end, table, name) for end in value)
     if not lo < hi:
         where = "interior: the bounds" if table == "domain" else "bounds"
         raise file.refuse(
@@ -246,7 +246,13 @@ def _interval(file: PlantFile, table: str, name: str) -> Interval:
     return lo, hi
 
 
-def _number(file: PlantFile, value: Any, *keys: str) -> Fraction:
+def number_at(file: PlantFile, value: Any, *keys: str) -> Fraction:
+    """The exact number that stands in a file at this key.
+
+    Raises
+    ------
+    InputError : it is none.
+    """
     if isinstance(value, bool) or not isinstance(value, int | str | Fraction):
         raise file.refuse(f"must be a number such as 0.15 or the text '3/20'; found {value!r}.", *keys)
     try:
