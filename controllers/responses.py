@@ -82,6 +82,8 @@ class CompareOptions:
     states, start_seed : number and seed of the initial states, which all methods share.
     duration, window : seconds simulated, and the last seconds in which the floor of ||x|| is measured.
     tolerance : bound on ||x|| in the window for a trajectory that has settled.
+    to_floor : baselines learn until they no longer improve, not for as many steps as ours.
+    budget, patience : of that rule, where they are not `controllers.runs.RULES`'s.
     """
 
     methods: tuple[Method, ...] = BASELINES
@@ -91,6 +93,9 @@ class CompareOptions:
     duration: float = 20.0
     window: float = 1.0
     tolerance: float = 1e-6
+    to_floor: bool = False
+    budget: int | None = None
+    patience: int | None = None
 
     def __post_init__(self) -> None:
         for name in ("seeds", "states", "duration", "window", "tolerance"):
@@ -101,11 +106,22 @@ class CompareOptions:
 
 
 @dataclass(frozen=True, slots=True)
+class Spent:
+    """What a run took: the steps that were made in all, and seconds of wall and processor time, evaluations with it."""
+
+    steps: int
+    wall: float
+    cpu: float
+
+
+@dataclass(frozen=True, slots=True)
 class Response:
     """One trained run, simulated.
 
     Parameters
     ----------
+    steps : after which the policy was taken.
+    spent : by the whole run; None where nobody counted.
     x : states (T + 1, N, n); NaN after a divergence.
     cost : accumulated cost (T + 1, N), 0 at first; infinite after a divergence.
     """
@@ -115,6 +131,7 @@ class Response:
     steps: int
     x: Array
     cost: Array
+    spent: Spent | None = None
 
     @property
     def norm(self) -> Array:
@@ -127,6 +144,9 @@ class Response:
 class Row:
     """A line of the table; `seed` is None for all seeds together.
 
+    `steps` are those after which the policy was taken, `made` those of its whole run, both the largest of the seeds';
+    `wall` and `cpu` are seconds of the runs, the seeds' median, NaN where nobody counted.
+
     `floor` is the median over the trajectories of the largest ||x|| in the window; `settled`, `diverged` and
     `left_domain` count trajectories out of `trajectories`; the costs are quartiles at the end.
     """
@@ -134,6 +154,9 @@ class Row:
     method: str
     seed: int | None
     steps: int
+    made: int
+    wall: float
+    cpu: float
     trajectories: int
     settled: int
     diverged: int
@@ -144,7 +167,7 @@ class Row:
     cost_upper: float
 
     def as_json(self) -> dict[str, Any]:
-        """Plain values; infinity becomes None."""
+        """Plain values; infinity and NaN become None."""
         values = {column.name: getattr(self, column.name) for column in fields(self)}
         return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()}
 
@@ -184,10 +207,14 @@ def _row(system: System, dt: float, responses: Sequence[Response], seed: int | N
     cost = np.concatenate([response.cost[-1] for response in responses])
     largest = norm[-1 - math.ceil(options.window / dt - 1e-9) :].max(axis=0)
     lower, median, upper = quartiles(cost)
+    spent = [response.spent or Spent(response.steps, math.nan, math.nan) for response in responses]
     return Row(
         method=responses[0].method.name,
         seed=seed,
         steps=max(response.steps for response in responses),
+        made=max(each.steps for each in spent),
+        wall=float(np.median([each.wall for each in spent])),
+        cpu=float(np.median([each.cpu for each in spent])),
         trajectories=len(largest),
         settled=int((largest < options.tolerance).sum()),
         diverged=int(np.isnan(x[-1]).any(axis=1).sum()),

@@ -18,7 +18,7 @@ from certify.policies import TanhNetwork
 from certify.systems import System
 from certify.systems.ode import rk4_step
 from controllers.environments import Stepper
-from controllers.options import Plant, get_plant
+from controllers.options import Plant, TrainingOptions, get_plant
 
 Array = NDArray[np.float64]
 Action = Callable[[Array], Array]
@@ -101,6 +101,22 @@ def initial_states(system: System, count: int, seed: int, plant: Plant | None = 
     plant.check(system)
     half_widths = np.array(plant.initial_states)
     return np.random.default_rng(seed).uniform(-half_widths, half_widths, (count, system.n))
+
+
+def simulate(system: System, training: TrainingOptions, act: Action, x0: Array, duration: float) -> tuple[Array, Array]:
+    """States (T + 1, N, n) and accumulated cost (T + 1, N) of the held closed loop from x0 (N, n).
+
+    Parameters
+    ----------
+    training : dt, and the weights of `x'Qx + (u - u_eq)'R(u - u_eq)`, which is summed times dt.
+    act : states (N, n) to inputs (N, m), which are clipped to their bounds.
+    duration : seconds; T is the number of steps that cover it.
+    """
+    Q, R = np.array(training.state_weights), np.array(training.input_weights)
+    u_lo, u_hi = np.array(system.input_bounds, dtype=np.float64).T
+    loop = held_loop(system, training.dt, lambda x: np.clip(act(x), u_lo, u_hi), Q, R)
+    states, costs = zip(*loop.run(x0, duration), strict=True)
+    return np.stack(states), np.stack(costs)
 
 
 def _cost(system: System, Q: Array, R: Array) -> Callable[[Array, Array], Array]:

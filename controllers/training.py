@@ -76,6 +76,7 @@ class Trainer:
         self.replay = Replay(min(options.replay, options.steps), system.n, system.m, device)
         self.steps_done = 0
         self._prelude = 0  # steps of the identification before the warm-up
+        self._closing: tuple[int, int] | None = None
         self.episodes: list[Episode] = []
         self.monitored: list[Monitored] = []
         self._K: torch.Tensor | None = None
@@ -109,6 +110,10 @@ class Trainer:
         if self.steps_done > self._prelude + options.warm_up:
             batch = self.replay.sample(options.batch, self.generator)
             self.sac.update(batch, self._K, self._actor_step())
+
+    def close(self, begin: int, end: int) -> None:
+        """Let the actor's step fall linearly to zero between these two steps, whatever `anneal` says."""
+        self._closing = begin, end
 
     def distance(self) -> tuple[float, float]:
         """||J_mu(0) + K||, NaN without a gain, and ||mu(0) - u_eq|| of the actor as it is."""
@@ -144,7 +149,7 @@ class Trainer:
         return Policy(
             network=self.sac.actor.network(),
             system=self.system.name,
-            parameters=_parameters(self.system),
+            parameters=parameters_of(self.system),
             training=self._record(found),
         )
 
@@ -158,10 +163,11 @@ class Trainer:
         self._require_finite(self.distance()[1])
         state = {
             "format": CHECKPOINT_FORMAT,
-            "system": [self.system.name, _parameters(self.system)],
+            "system": [self.system.name, parameters_of(self.system)],
             "options": self.options.record(),
             "steps_done": self.steps_done,
             "prelude": self._prelude,
+            "closing": None if self._closing is None else list(self._closing),
             "sac": self.sac.state(),
             "gain": self.gain.state(),
             "replay": {"rows": self.replay.table[: len(self.replay)].cpu().clone(), "count": self.replay.count},
@@ -185,7 +191,7 @@ class Trainer:
         InputError : the bytes are no checkpoint, or one of a run with other options or another plant.
         """
         state = read_checkpoint(checkpoint)
-        if state.get("system") != [self.system.name, _parameters(self.system)]:
+        if state.get("system") != [self.system.name, parameters_of(self.system)]:
             raise InputError(f"the checkpoint must be of {self.system.name}; it is of {state['system']}.")
         mine = self.options.record()
         theirs = {**default_record(), **state.get("options", {})}  # a run had no options that came later
@@ -203,6 +209,8 @@ class Trainer:
 
     def _load(self, state: dict[str, Any]) -> None:
         self.steps_done, self._prelude = state["steps_done"], state["prelude"]
+        closing = state.get("closing")
+        self._closing = None if closing is None else (closing[0], closing[1])
         self.sac.load_state(state["sac"])
         self.gain.load_state(state["gain"])
         if self.gain.identified is not None:
@@ -230,6 +238,9 @@ class Trainer:
         return self.interface.to_action(normalised), normalised
 
     def _actor_step(self) -> float:
+        if self._closing is not None:
+            begin, end = self._closing
+            return min(1.0, max(0.0, (end - self.steps_done) / max(1, end - begin)))
         anneal = self.options.anneal * self.options.steps
         return min(1.0, (self.options.steps - self.steps_done) / anneal) if anneal > 0 else 1.0
 
@@ -324,8 +335,8 @@ def read_checkpoint(content: bytes) -> dict[str, Any]:
     return state
 
 
-def _parameters(system: System) -> dict[str, str]:
-    """Parameters as text, which stands for the exact value: decimal where that is exact, else a fraction."""
+def parameters_of(system: System) -> dict[str, str]:
+    """A plant's parameters as text, which stands for the exact value: decimal where that is exact, else a fraction."""
     texts = {}
     for name, value in system.parameters.items():
         decimal = str(Decimal(value.numerator) / Decimal(value.denominator))

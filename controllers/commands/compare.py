@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from controllers.commands.shared import Json, PlantName, Steps, emit, errors, options_of
+from certify.errors import InputError
+from controllers.commands.shared import Json, PlantName, emit, errors, options_of
 
 if TYPE_CHECKING:
-    from controllers.compare import Doing
+    from controllers.runs import Doing
 
 
 def compare(
@@ -28,7 +29,16 @@ def compare(
     without: Annotated[
         list[str] | None, typer.Option("--without", help="A kind of run to leave out, such as sb3-sac; repeatable.")
     ] = None,
-    steps: Steps = None,
+    steps: Annotated[
+        int | None,
+        typer.Option("--steps", help="Steps of every run; default: ours by the preset, baselines to their floor."),
+    ] = None,
+    budget: Annotated[
+        int | None, typer.Option("--budget", help="Steps after which a baseline ends that still improves.")
+    ] = None,
+    patience: Annotated[
+        int | None, typer.Option("--patience", help="Evaluations without an improvement that end a baseline.")
+    ] = None,
     jobs: Annotated[
         int | None, typer.Option("--jobs", help="Runs trained at a time, in processes of this machine.")
     ] = None,
@@ -42,7 +52,10 @@ def compare(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Compare our policy with SAC without the gain and with SAC and PPO of stable-baselines3: figures and a table."""
+    """Compare our policy with SAC without the gain and with SAC and PPO of stable-baselines3: figures and a table.
+
+    A baseline is trained until its evaluation stops improving, and goes on from its checkpoint when it was cut off.
+    """
     with errors(as_json):
         training = options_of(plant, seed=0, steps=steps)
         from certify.running.tasks import place_for
@@ -51,7 +64,17 @@ def compare(
         from controllers.responses import ABLATIONS, BASELINES, CompareOptions, remaining
 
         methods = remaining(ABLATIONS if ablations else BASELINES, without or [])
-        options = CompareOptions(methods=methods, seeds=seeds, duration=duration, states=states)
+        if steps is not None and (budget is not None or patience is not None):
+            raise InputError("`--steps` is for runs of one length; `--budget` and `--patience` are for the others.")
+        options = CompareOptions(
+            methods=methods,
+            seeds=seeds,
+            duration=duration,
+            states=states,
+            to_floor=steps is None and not ablations,
+            budget=budget,
+            patience=patience,
+        )
         place = None if jobs is None and cluster is None else place_for(jobs, cluster)
         with _progress() as (say, watch):
             result = run(get_system(plant), training, runs, out, options, say, watch, place)
@@ -101,6 +124,8 @@ def _table(rows: Sequence[dict[str, Any]]) -> str:
             "method",
             "seed",
             "steps",
+            "made",
+            "cpu (s)",
             "settled",
             "diverged",
             "left domain",
@@ -114,7 +139,8 @@ def _table(rows: Sequence[dict[str, Any]]) -> str:
             for name in ("floor", "cost_lower", "cost_median", "cost_upper")
         )
         seed = "all" if row["seed"] is None else str(row["seed"])
+        made = (str(row["steps"]), str(row["made"]), "-" if row["cpu"] is None else f"{row['cpu']:.0f}")
         counts = [f"{row[name]} of {row['trajectories']}" for name in ("settled", "diverged", "left_domain")]
-        lines.append((row["method"], seed, str(row["steps"]), *counts, floor, f"{lower} {median} {upper}"))
+        lines.append((row["method"], seed, *made, *counts, floor, f"{lower} {median} {upper}"))
     widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
     return "\n".join("  ".join(f"{cell:<{w}}" for cell, w in zip(line, widths, strict=True)).rstrip() for line in lines)

@@ -23,7 +23,7 @@ def train_baseline(
     with errors(as_json):
         options = options_of(plant, seed=seed, steps=steps)
         from certify.systems import get_system
-        from controllers.baselines import Algorithm, train_reference
+        from controllers.sb3 import Algorithm, train_reference
 
         require_writable(out)
         system = get_system(plant)
