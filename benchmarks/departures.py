@@ -1,13 +1,14 @@
 """What each departure from the paper is worth: the preset with one of them undone, and with all, beside ours.
 
 Run with `python benchmarks/departures.py [PLANT] [--seeds 2] [--only NAME ...] [--runs runs/departures] [--steps N]
-[--time-limit 60]`. Runs are trained one at a time; what is in the folder of runs is used, a run that was cut off goes
-on from its checkpoint, and the table is printed of all rows that were asked for. `ours` is the plant's preset, `paper`
-its preset of that name, every other row the preset with the departure of that name in `controllers.paper` undone; those
-that a plant does not depart in are left out. A policy is simulated with its action held, from 100 states of the plant's
-box for 20 s: the floor is the median of the largest ||x|| in the last second, settled is below 1e-6 there. Then
-`certify roa` gets its time, and what is proved is what the checker accepted. A run without a gain ends with the policy
-that it has, and says so: a row that failed stays in the table.
+[--time-limit 60] [--table FILE] [--no-training]`. Runs are trained one at a time; what is in the folder of runs is
+used, a run that was cut off goes on from its checkpoint, and the table is printed of all rows that were asked for.
+`ours` is the plant's preset, `paper` its preset of that name, every other row the preset with the departure of that
+name in `controllers.paper` undone; those that a plant does not depart in are left out. A policy is simulated with its
+action held, from 100 states of the plant's box for 20 s: the floor is the median of the largest ||x|| in the last
+second, settled is below 1e-6 there. Then `certify roa` gets its time, and what is proved is what the checker accepted.
+A run without a gain ends with the policy that it has, and says so: a row that failed stays in the table. With
+`--no-training` so does one that was not made, and says that.
 """
 
 from __future__ import annotations
@@ -44,6 +45,18 @@ from controllers.training import Trainer, parameters_of
 
 EVERY = 5_000  # steps between checkpoints
 JUDGED = CompareOptions(states=100, start_seed=1)
+HEAD = (
+    "undone",
+    "floor",
+    "settled",
+    "left the domain",
+    "median cost",
+    "‖J + K‖/‖K‖",
+    "error of K",
+    "proved volume",
+    "processor seconds",
+    "remark",
+)
 
 
 def cases(name: str, only: Sequence[str]) -> Iterator[tuple[str, TrainingOptions]]:
@@ -111,8 +124,10 @@ def measured(system: System, options: TrainingOptions, folder: Path, seconds: fl
     }
 
 
-def rows(folder: Path, system: System, options: TrainingOptions, seeds: int, limit: float) -> list[dict[str, Any]]:
-    """The rows of all seeds, made where they are not there or of other options."""
+def rows(
+    folder: Path, system: System, options: TrainingOptions, seeds: int, limit: float, training: bool
+) -> list[dict[str, Any]]:
+    """The rows of all seeds that are there; with `training` the others are made."""
     found = []
     for seed in range(seeds):
         place, own = folder / f"seed-{seed}", replace(options, seed=seed)
@@ -121,6 +136,8 @@ def rows(folder: Path, system: System, options: TrainingOptions, seeds: int, lim
         there = json.loads(path.read_text("utf-8")) if path.is_file() else None
         if there is not None and there["asked"] != asked:
             raise SystemExit(f"{path} is of other options. Move it away, or give another folder by --runs.")
+        if there is None and not training:
+            continue
         if there is None:
             make_folder(place)
             there = {"asked": asked, "row": measured(system, own, place, limit)}
@@ -137,6 +154,8 @@ def line(name: str, found: Sequence[dict[str, Any]]) -> str:
     def every(key: str, form: str, none: str = "-") -> str:
         return ", ".join(none if row.get(key) is None else format(row[key], form) for row in found)
 
+    if not found:
+        return f"| {name} | not measured yet |{' |' * (len(HEAD) - 2)}"
     settled = ", ".join(f"{row['settled']} of {row['trajectories']}" if "settled" in row else "-" for row in found)
     volume = ", ".join("none" if row.get("volume") is None else below(row["volume"], 4) for row in found)
     trouble = "; ".join(dict.fromkeys(row["trouble"] for row in found if row["trouble"]))
@@ -164,16 +183,20 @@ def main() -> None:
     parser.add_argument("--runs", type=Path, default=Path("runs") / "departures")
     parser.add_argument("--steps", type=int, help="of every run; default: the preset's")
     parser.add_argument("--time-limit", type=float, default=60.0, help="seconds for a certificate")
+    parser.add_argument("--table", type=Path, help="a file for the table")
+    parser.add_argument("--no-training", action="store_true", help="the table of what is there")
     asked = parser.parse_args()
     torch.set_num_threads(1)
-    system, head = get_system(asked.plant), ["undone", "floor", "settled", "left the domain", "median cost"]
-    head += ["‖J + K‖/‖K‖", "error of K", "proved volume", "CPU s", "remark"]
-    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    system = get_system(asked.plant)
+    lines = [f"| {' | '.join(HEAD)} |", "|---" * len(HEAD) + "|"]
     for name, options in cases(asked.plant, asked.only):
         chosen = options if asked.steps is None else replace(options, steps=asked.steps)
         folder = asked.runs / asked.plant / name
-        lines.append(line(name, rows(folder, system, chosen, asked.seeds, asked.time_limit)))
+        made = rows(folder, system, chosen, asked.seeds, asked.time_limit, not asked.no_training)
+        lines.append(line(name, made))
     print("\n".join(lines))
+    if asked.table is not None:
+        write_atomically(asked.table, ("\n".join(lines) + "\n").encode())
 
 
 if __name__ == "__main__":
