@@ -8,8 +8,8 @@ Values: cart 1 kg, pole 0.1 kg, length 0.5 m, gravity 9.81 m/s^2, |u| <= 30 N, d
 |theta| <= 1.2 rad, rates within 8 m/s and 8 rad/s.
 
 Source: equations of Tedrake, "Underactuated Robotics", section "Cart-Pole", with the angle from upright; masses, g and
-30 N as in Li et al., "Two-Stage Learning of Stabilizing Neural Controllers", NeurIPS 2025, whose pole is 1 m long. Length
-and domain are chosen here. `docs/plants.md` says what differs elsewhere.
+30 N as in Li et al., "Two-Stage Learning of Stabilizing Neural Controllers", NeurIPS 2025, whose pole is 1 m long.
+Length and domain are chosen here. `docs/plants.md` says what differs elsewhere.
 """
 
 from __future__ import annotations

@@ -7,8 +7,8 @@ Values: mass 0.15 kg, length 0.5 m, friction 0.1 N m s, gravity 9.81 m/s^2, |u| 
 domain |theta| <= 3.14 rad, |theta_dot| <= 20 rad/s.
 
 Source: equation, m, l, b and g are those of Chang, Roohi and Gao, "Neural Lyapunov Control", NeurIPS 2019 (repository
-YaChienChang/Neural-Lyapunov-Control, `Inverted _Pendulum.ipynb`); Zhou, Quartz, De Sterck and Liu, NeurIPS 2022, have the
-same. 6 N m is in Yang et al., ICML 2024. The domain is chosen here. `docs/plants.md` says what differs elsewhere.
+YaChienChang/Neural-Lyapunov-Control, `Inverted _Pendulum.ipynb`); Zhou, Quartz, De Sterck and Liu, NeurIPS 2022, have
+the same. 6 N m is in Yang et al., ICML 2024. The domain is chosen here. `docs/plants.md` says what differs elsewhere.
 """
 
 from __future__ import annotations

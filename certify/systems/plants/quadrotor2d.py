@@ -6,9 +6,9 @@ u1, u2: absolute thrusts in N; hover is u1 = u2 = m g / 2.
 Values: mass 0.486 kg, arm 0.25 m, inertia 0.00383 kg m^2, gravity 9.81 m/s^2, 0 <= u_i <= 6 N, domain
 |x|, |y| <= 3 m, |theta| <= 1.2 rad, rates within 8.
 
-Source: equations, m, l, I and g are those of `underactuated/quadrotor2d.py` (repository RussTedrake/underactuated), "based
-on" Bouadi, Bouchoucha and Tadjine, 2007; Dai et al., "Lyapunov-stable neural-network control", RSS 2021, have the same.
-6 N is in Li et al., NeurIPS 2025. The domain is chosen here. `docs/plants.md` says what differs elsewhere.
+Source: equations, m, l, I and g are those of `underactuated/quadrotor2d.py` (repository RussTedrake/underactuated),
+"based on" Bouadi, Bouchoucha and Tadjine, 2007; Dai et al., "Lyapunov-stable neural-network control", RSS 2021, have
+the same. 6 N is in Li et al., NeurIPS 2025. The domain is chosen here. `docs/plants.md` says what differs elsewhere.
 """
 
 from __future__ import annotations

@@ -13,9 +13,9 @@ Values: mass 0.486 kg, arm a 0.225 m, torque per thrust k 1.1/29 m, inertia (4.9
 rates within 12.
 
 Source: equations and all numbers but the mass are those of Dai et al., RSS 2021 (repository
-StanfordASL/neural-network-lyapunov, `examples/quadrotor3d/quadrotor.py`), after Tayebi and McGilvray, 2006. There the mass
-is 0.468 kg; 0.486 kg and 3.6 N are in Li et al., NeurIPS 2025. The domain is chosen here. `docs/plants.md` says what
-differs elsewhere.
+StanfordASL/neural-network-lyapunov, `examples/quadrotor3d/quadrotor.py`), after Tayebi and McGilvray, 2006. There the
+mass is 0.468 kg; 0.486 kg and 3.6 N are in Li et al., NeurIPS 2025. The domain is chosen here. `docs/plants.md` says
+what differs elsewhere.
 """
 
 from __future__ import annotations
