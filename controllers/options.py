@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 Centre = Literal["preactivation", "output", "none"]
 Identification = Literal["during", "before", "never"]
 Transitions = Literal["all", "latest"]
+Terms = Literal["linear", "quadratic"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,6 +87,9 @@ class TrainingOptions:
     transitions: Annotated[
         Transitions, "Which transitions fit A and B: those of all rounds so far, or of the latest round only."
     ] = "all"
+    terms_A: Annotated[
+        Terms, "What is fitted to x+ for A: linear terms, or quadratic ones as well, of which nothing is kept."
+    ] = "linear"
     gain_weight: Annotated[float, "Weight of ||J_mu(0) + K|| + ||mu(0) - u_eq|| in the actor's loss; 0 drops the term."]
     state_weights: Annotated[tuple[float, ...], "Diagonal of Q_c, the LQR's state weights."]
     input_weights: Annotated[tuple[float, ...], "Diagonal of R_c, the LQR's input weights."]
@@ -110,8 +114,9 @@ class TrainingOptions:
             self._require(name, all(w >= 0 for w in getattr(self, name)), "at least 0")
         for name in ("input_weights", "proof_box"):
             self._require(name, all(w > 0 for w in getattr(self, name)), "positive")
-        choices_of = {"centre": Centre, "identification": Identification, "transitions": Transitions}
-        for name, choices in ((name, get_args(literal)) for name, literal in choices_of.items()):
+        choices_of = (("centre", Centre), ("identification", Identification), ("transitions", Transitions))
+        for name, literal in (*choices_of, ("terms_A", Terms)):
+            choices = get_args(literal)
             self._require(name, getattr(self, name) in choices, f"one of {choices}")
         for option in fields(self):
             value = getattr(self, option.name)
