@@ -170,11 +170,11 @@ def evaluate(
         )
     x0 = initial_states(system, options.states, options.seed, plant)
     covered = None if proved is None else count_covered(proved, network, system, x0)
-    dt = _recorded(policy, "dt", ())
+    dt = recorded(policy, "dt", ())
     if not dt > 0:
         raise InputError(f"`training.dt` of the policy must be positive; found {dt}.")
-    Q = np.asarray(_recorded(policy, "state_weights", (system.n,)))
-    R = np.asarray(_recorded(policy, "input_weights", (system.m,)))
+    Q = np.asarray(recorded(policy, "state_weights", (system.n,)))
+    R = np.asarray(recorded(policy, "input_weights", (system.m,)))
 
     eigenvalues = np.linalg.eigvals(_closed_loop_jacobian(system, policy))
     fastest = float(np.abs(eigenvalues).max())
@@ -186,7 +186,7 @@ def evaluate(
     learned = (math.nan, math.nan, math.nan)
     if {"A", "B", "K"} <= set(policy.training):
         n, m = system.n, system.m
-        A, B, K = (_recorded(policy, *entry) for entry in (("A", (n, n)), ("B", (n, m)), ("K", (m, n))))
+        A, B, K = (recorded(policy, *entry) for entry in (("A", (n, n)), ("B", (n, m)), ("K", (m, n))))
         distance = float(np.linalg.norm(network.jacobian_at_origin(system.exact_u_eq()) + K))
         relative = distance / float(np.linalg.norm(K))
         learned = errors_of(Identified(A, B, K), system, dt, *_gain_weights(policy, Q, R))
@@ -195,7 +195,7 @@ def evaluate(
         sha256=network.sha256(),
         gain_distance=distance,
         gain_relative=relative,
-        curvature=curvature(network, system, _recorded(policy, "eta", ())) if "eta" in policy.training else math.nan,
+        curvature=curvature(network, system, recorded(policy, "eta", ())) if "eta" in policy.training else math.nan,
         A_relative_error=learned[0],
         B_relative_error=learned[1],
         K_relative_error=learned[2],
@@ -208,6 +208,18 @@ def evaluate(
 
 def count_covered(proved: ProvedSet, network: TanhNetwork, system: System, x0: Array) -> Covered:
     """How many of the states (N, n), deviations from x_eq, lie in a set that is proved about this very closed loop.
+
+    Raises
+    ------
+    InputError : as `require_same_loop`.
+    """
+    require_same_loop(proved, network, system)
+    inside = sum(proved.holds(x0.tolist()))
+    return Covered(inside, len(x0), proved.claim, proved.certificate_sha256)
+
+
+def require_same_loop(proved: ProvedSet, network: TanhNetwork, system: System) -> None:
+    """Refuse a set that is proved about another closed loop.
 
     Raises
     ------
@@ -225,8 +237,6 @@ def count_covered(proved: ProvedSet, network: TanhNetwork, system: System, x0: A
             f"the certificate must be about the plant that is simulated, {system.name} with these parameters; it is "
             f"about {theirs.name} with other equations. Certify the policy on this plant."
         )
-    inside = sum(proved.holds(x0.tolist()))
-    return Covered(inside, len(x0), proved.claim, proved.certificate_sha256)
 
 
 def settle(
@@ -314,7 +324,7 @@ def _gain_weights(policy: Policy, Q: Array, R: Array) -> tuple[Array, Array]:
     if not isinstance(flattened, dict) or "K" not in flattened:
         return Q, R
     record = replace(policy, training=flattened)
-    return np.asarray(_recorded(record, "Q", Q.shape)), np.asarray(_recorded(record, "R", R.shape))
+    return np.asarray(recorded(record, "Q", Q.shape)), np.asarray(recorded(record, "R", R.shape))
 
 
 def _closed_loop_jacobian(system: System, policy: Policy) -> Array:
@@ -346,7 +356,7 @@ def _settling(loop: Loop, system: System, x0: Array, options: EvaluationOptions)
     )
 
 
-def _recorded(policy: Policy, name: str, shape: Sequence[int]) -> Any:
+def recorded(policy: Policy, name: str, shape: Sequence[int]) -> Any:
     """`training[name]`, which is not trusted: finite numbers of the given shape, or InputError."""
     try:
         value = np.array(policy.training[name], dtype=np.float64)
