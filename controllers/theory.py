@@ -5,8 +5,9 @@ discounted sum of q along the closed loop. If V <= a_V q, then V falls along the
 gamma* = 1 - 1/a_V, since V(x+) - V(x) = ((1 - gamma) V(x) - q(x)) / gamma. a_V is to serve every discount, so it is
 that of the sum without one; for the discount that was used the sum with it will do.
 
-*May the gain be off?* Training makes ||J_mu(0) + K|| small, never zero. epsilon_K is a size below which that difference cannot matter: for every matrix D
-with ||D|| <= epsilon_K in the spectral norm the linear loop with the Jacobian -K + D is asymptotically stable.
+*May the gain be off?* Training makes ||J_mu(0) + K|| small, never zero. epsilon_K is a size up to which that difference
+cannot matter: for every matrix D with ||D|| <= epsilon_K in the spectral norm the linear loop with the Jacobian -K + D
+is asymptotically stable.
 
 Both are matrix inequalities. Their solutions are found in floats and count for nothing until the inequality itself
 holds in Arb balls, for the plant's nominal equations, which are exact, the policy's numbers and the very float that
