@@ -57,12 +57,11 @@ _FILES: dict[Run, str] = {
 RULES: dict[Run, Stopping] = {
     "sac": Stopping(budget=150_000, every=5_000),
     "sb3-sac": Stopping(budget=150_000, every=5_000),
-    "sb3-ppo": Stopping(budget=1_000_000, every=10 * ROLLOUT, patience=10),
+    "sb3-ppo": Stopping(budget=500_000, every=10 * ROLLOUT, patience=10),
 }
 """When a baseline has reached its floor."""
 
 _EVERY = 5_000  # steps between evaluations of a run of a fixed number of steps
-_COPIES = 8  # of the plant, side by side, for PPO on its way to the floor
 _JUDGED = CompareOptions(states=100, start_seed=1)  # during a run: other states than those of a table
 
 
@@ -318,9 +317,8 @@ def learner_of(run: Run, system: System, training: TrainingOptions, plan: Plan) 
     if run == "sb3-sac":
         return Reference("sac", system, training)
     if run == "sb3-ppo":
-        if isinstance(plan, Stopping):
-            return Reference("ppo", system, training, ROLLOUT, _COPIES)
-        return Reference("ppo", system, training, budget("ppo", training.steps)[1])
+        rollout = ROLLOUT if isinstance(plan, Stopping) else budget("ppo", training.steps)[1]
+        return Reference("ppo", system, training, rollout)
     return OwnRun(Trainer(system, variant(run, training)), whole=run == "sac")
 
 

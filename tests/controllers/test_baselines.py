@@ -101,9 +101,9 @@ def test_training_leaves_torch_s_generator_alone(pendulum_system, tmp_path):
 
 
 def test_two_runs_in_a_process_know_nothing_of_each_other(pendulum_system):
-    alone = sb3.Reference("ppo", pendulum_system, TINY, 40, copies=2)
+    alone = sb3.Reference("ppo", pendulum_system, TINY, 40)
     alone.advance(120)
-    one, other = (sb3.Reference("ppo", pendulum_system, replace(TINY, seed=k), 40, copies=2) for k in (3, 4))
+    one, other = (sb3.Reference("ppo", pendulum_system, replace(TINY, seed=k), 40) for k in (3, 4))
     for steps in (40, 80, 120):
         one.advance(steps)
         other.advance(steps)
