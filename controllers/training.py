@@ -135,6 +135,11 @@ class Trainer:
         bend = curvature(network, self.system, options.eta)
         self.monitored.append(Monitored(self.steps_done, *self.distance(), bend, settled, cost))
 
+    @property
+    def ships(self) -> bool:
+        """Whether there is a policy to ship: the gain is learned, or is not to be."""
+        return self.gain.identified is not None or self.options.identification == "never"
+
     def policy(self) -> Policy:
         """The mean action, centred, with the record of how it was made.
 
@@ -144,7 +149,7 @@ class Trainer:
         """
         self._require_finite(self.distance()[1])
         found = self.gain.identified
-        if found is None and self.options.identification != "never":
+        if not self.ships:
             raise InputError(f"the run ended after {self.steps_done} steps without a gain; it needs more `steps`.")
         return Policy(
             network=self.sac.actor.network(),
