@@ -67,7 +67,6 @@ def compare(
     training.check_sizes(system)
     if any(method.run in ("sb3-sac", "sb3-ppo") for method in options.methods):
         require_stable_baselines()
-    make_folder(out)
     responses, courses = list[Response](), list[tuple[Run, int, Course]]()
     kinds = list(dict.fromkeys(method.run for method in options.methods))
     wanted = [
@@ -75,6 +74,7 @@ def compare(
         for run in kinds
         for seed in range(options.seeds)
     ]
+    make_folder(out)
     if place is not None:
         train_at(place, wanted, system, runs, say, watch)
     for number, one in enumerate(wanted, 1):

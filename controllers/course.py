@@ -108,8 +108,8 @@ class Stopping:
         """The step after which learning ends, and why; None while it goes on."""
         floor = cost = math.inf
         since = 0
-        for row in rows:
-            better = row.floor < (1 - self.share) * floor or row.cost < (1 - self.share) * cost
+        for k, row in enumerate(rows):
+            better = k == 0 or row.floor < (1 - self.share) * floor or row.cost < (1 - self.share) * cost
             since = 0 if better else since + 1
             floor, cost = min(floor, row.floor), min(cost, row.cost)
             if row.step >= self.budget:

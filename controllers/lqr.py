@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
+from controllers.options import Transitions
 
 Array = NDArray[np.float64]
 
@@ -62,13 +63,16 @@ class Identified:
 
 
 Phase = Literal["A", "B", "idle"]
+Row = tuple[Array, Array, Array]
 
 
 class GainLearner:
     """Collects transitions in the ball ||x|| <= eta and keeps the gain up to date: A always before B.
 
-    A round first asks for `n_A` transitions with zero action, then for `n_B` with the actor's actions;
-    `refresh` starts the next round, and the gain of the last complete round stays in force until then.
+    A round first asks for `n_A` new transitions with zero action, then for `n_B` with the actor's actions;
+    `refresh` starts the next round, and the gain of the last complete round stays in force until then. A is fitted to
+    the transitions with zero action of all rounds so far, and B, given the newest A, to the others of all rounds: each
+    round improves the estimate, whose random part falls with the number of transitions.
 
     Parameters
     ----------
@@ -76,17 +80,30 @@ class GainLearner:
     n_A, n_B : transitions that fit A and B.
     Q, R : LQR weights, shapes (n, n) and (m, m).
     phase : what it asks for first; `idle` waits for a `refresh`.
+    transitions : "latest" forgets those of earlier rounds, for a plant that changes.
     """
 
-    def __init__(self, eta: float, n_A: int, n_B: int, Q: Array, R: Array, phase: Phase = "A") -> None:
+    def __init__(
+        self,
+        eta: float,
+        n_A: int,
+        n_B: int,
+        Q: Array,
+        R: Array,
+        phase: Phase = "A",
+        transitions: Transitions = "all",
+    ) -> None:
         n, m = len(Q), len(R)
         if n_A < n or n_B < m:
             raise InputError(f"`n_A` and `n_B` must be at least {n} and {m}; found {n_A} and {n_B}.")
         self.eta, self.n_A, self.n_B, self.Q, self.R = eta, n_A, n_B, Q, R
         self.phase: Phase = phase
+        self.transitions = transitions
         self.identified: Identified | None = None
         self._A: Array | None = None
-        self._rows: list[tuple[Array, Array, Array]] = []
+        self._wanted: dict[Phase, int] = {"A": n_A, "B": n_B, "idle": 0}
+        self._rows: dict[Phase, list[Row]] = {"A": [], "B": []}
+        self._missing = self._wanted[phase]  # transitions that the phase still asks for
 
     def inside(self, x: Array) -> bool:
         """Whether x lies in the ball."""
@@ -96,13 +113,15 @@ class GainLearner:
         """Take one transition, v = u - u_eq; it counts when x is in the ball and the phase asks for it."""
         if self.phase == "idle" or not self.inside(x) or (self.phase == "A" and np.any(v != 0)):
             return
-        self._rows.append((x, v, x_next))
-        if self.phase == "A" and len(self._rows) >= self.n_A:
-            states, _, successors = self._stacked()
+        self._rows[self.phase].append((x, v, x_next))
+        self._missing -= 1
+        if self._missing > 0:
+            return
+        states, inputs, successors = (np.array(part) for part in zip(*self._rows[self.phase], strict=True))
+        if self.phase == "A":
             self._A = fit_A(states, successors)
             self._begin("B")
-        elif self.phase == "B" and len(self._rows) >= self.n_B and self._A is not None:
-            states, inputs, successors = self._stacked()
+        elif self._A is not None:
             B = fit_B(states, inputs, successors, self._A)
             self.identified = Identified(self._A, B, riccati_gain(self._A, B, self.Q, self.R))
             self._begin("idle")
@@ -118,25 +137,31 @@ class GainLearner:
         return {
             "phase": self.phase,
             "A": None if self._A is None else self._A.tolist(),
-            "rows": [[part.tolist() for part in row] for row in self._rows],
+            "rows": {phase: [[part.tolist() for part in row] for row in rows] for phase, rows in self._rows.items()},
+            "missing": self._missing,
             "identified": None if found is None else [found.A.tolist(), found.B.tolist(), found.K.tolist()],
         }
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Continue from `state()`."""
+        """Continue from `state()`, or from that of a run before `transitions`: the rows of the phase alone."""
         self.phase = state["phase"]
         self._A = None if state["A"] is None else np.array(state["A"])
-        self._rows = [(np.array(x), np.array(v), np.array(y)) for x, v, y in state["rows"]]
+        rows = state["rows"]
+        if isinstance(rows, list):
+            rows, missing = {self.phase: rows}, self._wanted[self.phase] - len(rows)
+        else:
+            missing = state["missing"]
+        self._rows = {"A": [], "B": []}
+        for phase in self._rows:
+            self._rows[phase] = [(np.array(x), np.array(v), np.array(y)) for x, v, y in rows.get(phase, [])]
+        self._missing = missing
         found = state["identified"]
         self.identified = None if found is None else Identified(*(np.array(part) for part in found))
 
     def _begin(self, phase: Phase) -> None:
-        self.phase = phase
-        self._rows = []
-
-    def _stacked(self) -> tuple[Array, Array, Array]:
-        x, v, x_next = zip(*self._rows, strict=True)
-        return np.array(x), np.array(v), np.array(x_next)
+        self.phase, self._missing = phase, self._wanted[phase]
+        if self.transitions == "latest":
+            self._rows = {"A": [], "B": []}
 
 
 def _least_squares(regressors: Array, targets: Array, name: str) -> Array:

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 
 Centre = Literal["preactivation", "output", "none"]
 Identification = Literal["during", "before", "never"]
+Transitions = Literal["all", "latest"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,6 +83,9 @@ class TrainingOptions:
     n_A: Annotated[int, "Transitions with zero action that fit A."]
     n_B: Annotated[int, "Transitions with actions that fit B given A."]
     refresh: Annotated[int, "Steps between two identifications during the run."]
+    transitions: Annotated[
+        Transitions, "Which transitions fit A and B: those of all rounds so far, or of the latest round only."
+    ] = "all"
     gain_weight: Annotated[float, "Weight of ||J_mu(0) + K|| + ||mu(0) - u_eq|| in the actor's loss; 0 drops the term."]
     state_weights: Annotated[tuple[float, ...], "Diagonal of Q_c, the LQR's state weights."]
     input_weights: Annotated[tuple[float, ...], "Diagonal of R_c, the LQR's input weights."]
@@ -106,7 +110,8 @@ class TrainingOptions:
             self._require(name, all(w >= 0 for w in getattr(self, name)), "at least 0")
         for name in ("input_weights", "proof_box"):
             self._require(name, all(w > 0 for w in getattr(self, name)), "positive")
-        for name, choices in (("centre", get_args(Centre)), ("identification", get_args(Identification))):
+        choices_of = {"centre": Centre, "identification": Identification, "transitions": Transitions}
+        for name, choices in ((name, get_args(literal)) for name, literal in choices_of.items()):
             self._require(name, getattr(self, name) in choices, f"one of {choices}")
         for option in fields(self):
             value = getattr(self, option.name)
@@ -130,9 +135,17 @@ class TrainingOptions:
         return _plain({option.name: getattr(self, option.name) for option in fields(self)})
 
 
+_FORMER = {"transitions": "latest"}
+"""Of an option that came later, what runs before it did, where that is not its default."""
+
+
 def default_record() -> dict[str, Any]:
-    """The options that have a default, as `TrainingOptions.record` writes them."""
-    return _plain({option.name: option.default for option in fields(TrainingOptions) if option.default is not MISSING})
+    """What a record means that lacks one of the options with a default, as `TrainingOptions.record` writes it.
+
+    It is the default, except where runs did something else before the option was there.
+    """
+    defaults = {option.name: option.default for option in fields(TrainingOptions) if option.default is not MISSING}
+    return _plain(defaults) | _FORMER
 
 
 def _plain(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -145,7 +145,7 @@ class Row:
     """A line of the table; `seed` is None for all seeds together.
 
     `steps` are those after which the policy was taken, `made` those of its whole run, both the largest of the seeds';
-    `wall` and `cpu` are seconds of the runs, the seeds' median, NaN where nobody counted.
+    `wall` and `cpu` are seconds of the runs, the seeds' median, None where nobody counted.
 
     `floor` is the median over the trajectories of the largest ||x|| in the window; `settled`, `diverged` and
     `left_domain` count trajectories out of `trajectories`; the costs are quartiles at the end.
@@ -155,8 +155,8 @@ class Row:
     seed: int | None
     steps: int
     made: int
-    wall: float
-    cpu: float
+    wall: float | None
+    cpu: float | None
     trajectories: int
     settled: int
     diverged: int
@@ -167,7 +167,7 @@ class Row:
     cost_upper: float
 
     def as_json(self) -> dict[str, Any]:
-        """Plain values; infinity and NaN become None."""
+        """Plain values; infinity becomes None."""
         values = {column.name: getattr(self, column.name) for column in fields(self)}
         return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()}
 
@@ -207,14 +207,15 @@ def _row(system: System, dt: float, responses: Sequence[Response], seed: int | N
     cost = np.concatenate([response.cost[-1] for response in responses])
     largest = norm[-1 - math.ceil(options.window / dt - 1e-9) :].max(axis=0)
     lower, median, upper = quartiles(cost)
-    spent = [response.spent or Spent(response.steps, math.nan, math.nan) for response in responses]
+    steps = max(response.steps for response in responses)
+    spent = [response.spent for response in responses if response.spent is not None]
     return Row(
         method=responses[0].method.name,
         seed=seed,
-        steps=max(response.steps for response in responses),
-        made=max(each.steps for each in spent),
-        wall=float(np.median([each.wall for each in spent])),
-        cpu=float(np.median([each.cpu for each in spent])),
+        steps=steps,
+        made=max((each.steps for each in spent), default=steps),
+        wall=float(np.median([each.wall for each in spent])) if spent else None,
+        cpu=float(np.median([each.cpu for each in spent])) if spent else None,
         trajectories=len(largest),
         settled=int((largest < options.tolerance).sum()),
         diverged=int(np.isnan(x[-1]).any(axis=1).sum()),

@@ -57,13 +57,12 @@ _FILES: dict[Run, str] = {
 RULES: dict[Run, Stopping] = {
     "sac": Stopping(budget=150_000, every=5_000),
     "sb3-sac": Stopping(budget=150_000, every=5_000),
-    "sb3-ppo": Stopping(budget=1_000_000, every=10 * ROLLOUT, patience=10),
+    "sb3-ppo": Stopping(budget=500_000, every=10 * ROLLOUT, patience=10),
 }
 """When a baseline has reached its floor."""
 
 _EVERY = 5_000  # steps between evaluations of a run of a fixed number of steps
-_COPIES = 8  # of the plant, side by side, for PPO on its way to the floor
-_JUDGED = 100  # states in an evaluation during a run, other ones than those of the table
+_JUDGED = CompareOptions(states=100, start_seed=1)  # during a run: other states than those of a table
 
 
 @dataclass(frozen=True, slots=True)
@@ -318,17 +317,16 @@ def learner_of(run: Run, system: System, training: TrainingOptions, plan: Plan) 
     if run == "sb3-sac":
         return Reference("sac", system, training)
     if run == "sb3-ppo":
-        if isinstance(plan, Stopping):
-            return Reference("ppo", system, training, copies=_COPIES)
-        return Reference("ppo", system, training, budget("ppo", training.steps)[1])
+        rollout = ROLLOUT if isinstance(plan, Stopping) else budget("ppo", training.steps)[1]
+        return Reference("ppo", system, training, rollout)
     return OwnRun(Trainer(system, variant(run, training)), whole=run == "sac")
 
 
 def judged(system: System, training: TrainingOptions, mean: Action) -> Judged:
     """What is found of a policy while its run goes on, from other states than those of the table."""
-    options = CompareOptions(states=_JUDGED, start_seed=1)
-    x, cost = simulate(system, training, mean, initial_states(system, options.states, options.start_seed), 20.0)
-    [row, _] = table(system, training.dt, [Response(OURS, 0, 0, x, cost)], options)
+    x0 = initial_states(system, _JUDGED.states, _JUDGED.start_seed)
+    x, cost = simulate(system, training, mean, x0, _JUDGED.duration)
+    [row, _] = table(system, training.dt, [Response(OURS, 0, 0, x, cost)], _JUDGED)
     return Judged(row.floor, row.cost_median, row.left_domain)
 
 

@@ -18,10 +18,9 @@ import io
 import json
 import warnings
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Literal, get_args
@@ -59,25 +58,22 @@ class Reference:
     system : the plant.
     options : the plant's preset with the seed of this run; `steps` bounds the replay buffer.
     rollout : steps between two updates of PPO, which learns in whole ones; SAC learns in each step.
-    copies : of the plant, from which PPO gathers a rollout side by side.
 
     Raises
     ------
     InputError : stable-baselines3 is missing, the algorithm is unknown, or the weights do not fit the plant.
     """
 
-    def __init__(
-        self, algorithm: Algorithm, system: System, options: TrainingOptions, rollout: int = ROLLOUT, copies: int = 1
-    ) -> None:
+    def __init__(self, algorithm: Algorithm, system: System, options: TrainingOptions, rollout: int = ROLLOUT) -> None:
         if algorithm not in get_args(Algorithm):
             raise InputError(f"the baseline must be one of {', '.join(get_args(Algorithm))}; found {algorithm!r}.")
         options.check_sizes(system)
         self.algorithm, self.system, self.options = algorithm, system, options
         self._closing: tuple[int, int] | None = None
         self._generators = _globals()
-        self.plants = [PlantEnvironment(system, options) for _ in range(copies)]
+        self.plant = PlantEnvironment(system, options)
         with self._own_generators():
-            self.model = _model(algorithm, options, self.plants, rollout)
+            self.model = _model(algorithm, options, self.plant, rollout)
         self.model.lr_schedule = lambda _: options.learning_rate * self._share()
 
     @property
@@ -152,7 +148,7 @@ class Reference:
 
     def snapshot(self) -> bytes:
         """Everything that the rest of the run depends on, as plain tensors and values."""
-        model = self.model
+        model, plant = self.model, self.plant
         state: dict[str, Any] = {
             "format": CHECKPOINT_FORMAT,
             "algorithm": self.algorithm,
@@ -163,7 +159,8 @@ class Reference:
             "closing": None if self._closing is None else list(self._closing),
             "parameters": model.get_parameters(),
             "generators": self._generators,
-            "plants": [_state_of(plant) for plant in self.plants],
+            "plant": [list(plant.snapshot().x), plant.snapshot().elapsed],
+            "plant_generator": json.dumps(plant.np_random.bit_generator.state),  # 128-bit integers, as text
             "action_generator": json.dumps(model.action_space.np_random.bit_generator.state),
             "seen": None if model._last_obs is None else torch.from_numpy(model._last_obs.copy()),
         }
@@ -204,7 +201,7 @@ class Reference:
             raise InputError(f"the checkpoint is damaged: {error}.") from error
 
     def _load(self, state: dict[str, Any]) -> None:
-        model = self.model
+        model, plant = self.model, self.plant
         model.set_parameters(state["parameters"], exact_match=True, device="cpu")
         model.num_timesteps, model._n_updates = int(state["steps"]), int(state["updates"])
         self._closing = None if state["closing"] is None else (int(state["closing"][0]), int(state["closing"][1]))
@@ -212,10 +209,10 @@ class Reference:
         model.env._reset_seeds()
         if state["seen"] is not None:
             model._last_obs = state["seen"].numpy()
-            for plant, (x, elapsed, generator) in zip(self.plants, state["plants"], strict=True):
-                plant.reset(seed=0)  # makes its generator
-                plant.np_random.bit_generator.state = json.loads(generator)
-                plant.restore(Snapshot(tuple(x), int(elapsed)))
+            plant.reset(seed=0)  # makes its generator
+            plant.np_random.bit_generator.state = json.loads(state["plant_generator"])
+            x, elapsed = state["plant"]
+            plant.restore(Snapshot(tuple(x), int(elapsed)))
         model.action_space.np_random.bit_generator.state = json.loads(state["action_generator"])
         if self.algorithm == "ppo":
             model._last_episode_starts = None if state["starts"] is None else np.array(state["starts"], dtype=bool)
@@ -339,7 +336,7 @@ def budget(algorithm: Algorithm, steps: int) -> tuple[int, int]:
     return rollouts * (steps // rollouts), steps // rollouts
 
 
-def _model(algorithm: Algorithm, options: TrainingOptions, plants: Sequence[PlantEnvironment], rollout: int) -> Any:
+def _model(algorithm: Algorithm, options: TrainingOptions, plant: PlantEnvironment, rollout: int) -> Any:
     library = _stable_baselines()
     common: dict[str, Any] = {
         "learning_rate": options.learning_rate,
@@ -350,7 +347,7 @@ def _model(algorithm: Algorithm, options: TrainingOptions, plants: Sequence[Plan
     shape: dict[str, Any] = {"pi": list(options.actor)}
     if algorithm == "ppo":
         shape["vf"] = list(options.critic)
-        common["n_steps"], common["batch_size"] = rollout // len(plants), min(64, rollout)
+        common["n_steps"], common["batch_size"] = rollout, min(64, rollout)
         make = library.PPO
     else:
         shape["qf"] = list(options.critic)
@@ -358,8 +355,8 @@ def _model(algorithm: Algorithm, options: TrainingOptions, plants: Sequence[Plan
         common["buffer_size"], common["learning_starts"] = min(options.replay, options.steps), options.warm_up
         make = library.SAC
     networks = {"net_arch": shape, "activation_fn": nn.Tanh}
-    # As a vector: then the library puts nothing of its own around a plant that a checkpoint would have to hold.
-    vector = _stable_baselines("common.vec_env").DummyVecEnv([partial(scaled_environment, plant) for plant in plants])
+    # As a vector of one: then the library puts nothing of its own around it that a checkpoint would have to hold.
+    vector = _stable_baselines("common.vec_env").DummyVecEnv([lambda: scaled_environment(plant)])
     with warnings.catch_warnings():
         # PPO's last batch of a rollout may not be full; it is used all the same.
         warnings.filterwarnings("ignore", message="You have specified a mini-batch size of", category=UserWarning)
@@ -390,12 +387,6 @@ def _trained(algorithm: Algorithm, policy: Any, system: System, steps: int, seed
         mean=lambda x: interface.to_action(normalised(x, 0.0)),
         sample=lambda x, generator: interface.to_action(normalised(x, generator.standard_normal((len(x), system.m)))),
     )
-
-
-def _state_of(plant: PlantEnvironment) -> list[Any]:
-    """Where its episode stands, and its generator, whose 128-bit integers are text here."""
-    where = plant.snapshot()
-    return [list(where.x), where.elapsed, json.dumps(plant.np_random.bit_generator.state)]
 
 
 def _globals() -> dict[str, Any]:

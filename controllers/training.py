@@ -68,7 +68,7 @@ class Trainer:
         self.interface = Interface(system)
         Q_c, R_c = np.diag(options.state_weights), np.diag(options.input_weights)
         first: Phase = "idle" if options.identification == "never" else "A"
-        self.gain = GainLearner(options.eta, options.n_A, options.n_B, Q_c, R_c, first)
+        self.gain = GainLearner(options.eta, options.n_A, options.n_B, Q_c, R_c, first, options.transitions)
         self.generator = torch.Generator(CPU).manual_seed(options.seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(options.seed)

@@ -17,8 +17,9 @@ from typer.testing import CliRunner
 from certify.errors import InputError
 from certify.policies import load_policy
 from certify.systems import get_system
-from controllers import baselines
+from controllers import baselines, sb3
 from controllers.cli import app
+from controllers.environments import PlantEnvironment
 from controllers.options import preset
 from controllers.sac import Interface
 from controllers.training import Trainer
@@ -39,7 +40,7 @@ def pendulum_system():
 def reference(request, pendulum_system, tmp_path_factory):
     """Bytes of a trained baseline."""
     path = tmp_path_factory.mktemp(request.param) / "model"  # no suffix: the file is written where it was asked for
-    baselines.train_reference(request.param, pendulum_system, TINY, path)
+    sb3.train_reference(request.param, pendulum_system, TINY, path)
     return request.param, path.read_bytes()
 
 
@@ -56,7 +57,7 @@ def test_a_baseline_is_read_back_as_stable_baselines_itself_would(reference, pen
     import stable_baselines3
 
     algorithm, content = reference
-    trained = baselines.from_reference(content, pendulum_system, TINY)
+    trained = sb3.from_reference(content, pendulum_system, TINY)
     assert (trained.system, trained.steps, trained.seed) == ("pendulum", 150, 3)
     model = {"ppo": stable_baselines3.PPO, "sac": stable_baselines3.SAC}[algorithm].load(io.BytesIO(content))
     factors = Interface(pendulum_system).state_factors
@@ -68,7 +69,7 @@ def test_a_baseline_is_read_back_as_stable_baselines_itself_would(reference, pen
 
 def test_samples_are_spread_around_the_mean_and_stay_in_the_bounds(reference, pendulum_system):
     algorithm, content = reference
-    trained = baselines.from_reference(content, pendulum_system, TINY)
+    trained = sb3.from_reference(content, pendulum_system, TINY)
     many = np.repeat(X[:1], 4000, axis=0)
     u = trained.sample(many, np.random.default_rng(1))
     assert u.shape == (4000, 1) and np.abs(u).max() <= 6.0
@@ -82,11 +83,11 @@ def test_samples_are_spread_around_the_mean_and_stay_in_the_bounds(reference, pe
 
 def test_training_a_baseline_twice_gives_the_same_networks(reference, pendulum_system, tmp_path):
     algorithm, content = reference
-    baselines.train_reference(algorithm, pendulum_system, TINY, tmp_path / "again.zip")
-    baselines.train_reference(algorithm, pendulum_system, replace(TINY, seed=4), tmp_path / "other.zip")
-    first = baselines.from_reference(content, pendulum_system, TINY).mean(X)
+    sb3.train_reference(algorithm, pendulum_system, TINY, tmp_path / "again.zip")
+    sb3.train_reference(algorithm, pendulum_system, replace(TINY, seed=4), tmp_path / "other.zip")
+    first = sb3.from_reference(content, pendulum_system, TINY).mean(X)
     again, other = (
-        baselines.from_reference((tmp_path / name).read_bytes(), pendulum_system, TINY).mean(X)
+        sb3.from_reference((tmp_path / name).read_bytes(), pendulum_system, TINY).mean(X)
         for name in ("again.zip", "other.zip")
     )
     np.testing.assert_array_equal(again, first)
@@ -95,12 +96,25 @@ def test_training_a_baseline_twice_gives_the_same_networks(reference, pendulum_s
 
 def test_training_leaves_torch_s_generator_alone(pendulum_system, tmp_path):
     before = torch.random.get_rng_state()
-    baselines.train_reference("ppo", pendulum_system, replace(TINY, steps=20), tmp_path / "m.zip")
+    sb3.train_reference("ppo", pendulum_system, replace(TINY, steps=20), tmp_path / "m.zip")
     assert torch.equal(before, torch.random.get_rng_state())
 
 
+def test_two_runs_in_a_process_know_nothing_of_each_other(pendulum_system):
+    alone = sb3.Reference("ppo", pendulum_system, TINY, 40)
+    alone.advance(120)
+    one, other = (sb3.Reference("ppo", pendulum_system, replace(TINY, seed=k), 40) for k in (3, 4))
+    for steps in (40, 80, 120):
+        one.advance(steps)
+        other.advance(steps)
+        np.random.seed(steps)  # noqa: NPY002  # what others draw makes no difference
+        torch.rand(3)
+    np.testing.assert_array_equal(one.trained().mean(X), alone.trained().mean(X))
+    assert np.abs(other.trained().mean(X) - alone.trained().mean(X)).max() > 1e-3
+
+
 def test_the_scaled_environment_is_the_plant_s(pendulum_system):
-    scaled = baselines.scaled_environment(pendulum_system, TINY)
+    scaled = sb3.scaled_environment(PlantEnvironment(pendulum_system, TINY))
     plant, factors = scaled.unwrapped, Interface(pendulum_system).state_factors
     seen, _ = scaled.reset(seed=5)
     start = np.array(plant.snapshot().x)
@@ -114,11 +128,11 @@ def test_the_scaled_environment_is_the_plant_s(pendulum_system):
 
 
 def test_ppo_makes_whole_rollouts_within_the_budget(pendulum_system, tmp_path, monkeypatch):
-    monkeypatch.setattr(baselines, "_ROLLOUT", 20)
+    monkeypatch.setattr(sb3, "ROLLOUT", 20)
     seen = []
-    made = baselines.train_reference("ppo", pendulum_system, replace(TINY, steps=45), tmp_path / "m.zip", seen.append)
+    made = sb3.train_reference("ppo", pendulum_system, replace(TINY, steps=45), tmp_path / "m.zip", seen.append)
     assert seen == list(range(1, 45)) and made == 44  # two rollouts of 22
-    assert baselines.from_reference((tmp_path / "m.zip").read_bytes(), pendulum_system, TINY).steps == 44
+    assert sb3.from_reference((tmp_path / "m.zip").read_bytes(), pendulum_system, TINY).steps == 44
 
 
 def test_without_the_gain_everything_else_is_the_same():
@@ -164,16 +178,16 @@ def test_an_exported_policy_is_taken_as_it_ships(pendulum_system):
 def test_files_of_another_plant_other_widths_or_no_file_at_all_are_refused(reference, checkpoint, pendulum_system):
     _, content = reference
     with pytest.raises(InputError, match="of cartpole; it is"):
-        baselines.from_reference(content, get_system("cartpole"), TINY)
+        sb3.from_reference(content, get_system("cartpole"), TINY)
     with pytest.raises(InputError, match="preset's widths"):
-        baselines.from_reference(content, pendulum_system, preset("pendulum"))
+        sb3.from_reference(content, pendulum_system, preset("pendulum"))
     with pytest.raises(InputError, match="must be of cartpole; it is of pendulum"):
         baselines.from_checkpoint(checkpoint[1], get_system("cartpole"))
     with pytest.raises(InputError, match="at the same parameters"):
         baselines.from_checkpoint(checkpoint[1], pendulum_system.with_parameters({"m": "0.2"}))
     for rubbish in (b"", b"rubbish", content[:1000]):
         with pytest.raises(InputError, match="cannot be read"):
-            baselines.from_reference(rubbish, pendulum_system, TINY)
+            sb3.from_reference(rubbish, pendulum_system, TINY)
         with pytest.raises(InputError, match="checkpoint cannot be read"):
             baselines.from_checkpoint(rubbish, pendulum_system)
 
@@ -191,8 +205,8 @@ def test_nothing_in_a_baseline_s_file_is_unpickled(reference, pendulum_system):
                         entry[":serialized:"] = "AAAA"
                 data = json.dumps(record).encode()
             new.writestr(name, data)
-    changed = baselines.from_reference(hostile.getvalue(), pendulum_system, TINY)
-    expected = baselines.from_reference(content, pendulum_system, TINY)
+    changed = sb3.from_reference(hostile.getvalue(), pendulum_system, TINY)
+    expected = sb3.from_reference(content, pendulum_system, TINY)
     np.testing.assert_array_equal(changed.mean(X), expected.mean(X))
 
 
@@ -208,8 +222,43 @@ def test_the_command_writes_the_file_and_says_what_it_did(tmp_path):
         "steps": 60,
         "seed": 2,
     }
-    trained = baselines.from_reference(out.read_bytes(), get_system("pendulum"), preset("pendulum"))
+    trained = sb3.from_reference(out.read_bytes(), get_system("pendulum"), preset("pendulum"))
     assert (trained.steps, trained.seed) == (60, 2)
+
+
+@pytest.mark.parametrize("algorithm", ["ppo", "sac"])
+def test_the_mean_is_a_policy_file_with_the_same_numbers(pendulum_system, tmp_path, algorithm):
+    """Exact numbers of the library's networks: its own forward pass differs by rounding, the clip not at all."""
+    learner = sb3.Reference(algorithm, pendulum_system, TINY, 50)
+    learner.advance(100)
+    with torch.no_grad():  # far from 0, so that the clip acts
+        (learner.model.policy.action_net if algorithm == "ppo" else learner.model.policy.actor.mu).weight.mul_(200)
+    learner.keep(tmp_path)
+    policy, trained = load_policy(tmp_path / "policy.pt"), learner.trained()
+    u = policy.network(X, pendulum_system.exact_u_eq())
+    np.testing.assert_allclose(u, trained.mean(X), rtol=0, atol=1e-4)
+    assert (policy.network.clip is not None) == (algorithm == "ppo") and policy.network.centre == "none"
+    if algorithm == "ppo":
+        assert 0 < (np.abs(u) == 6.0).mean() < 1
+    kept = sb3.from_reference((tmp_path / "model.zip").read_bytes(), pendulum_system, TINY)
+    np.testing.assert_array_equal(kept.mean(X), trained.mean(X))
+
+
+def test_a_checkpoint_of_another_run_or_none_is_refused(pendulum_system):
+    learner = sb3.Reference("ppo", pendulum_system, TINY, 50)
+    learner.advance(50)
+    content = learner.snapshot()
+    others = [
+        sb3.Reference("sac", pendulum_system, TINY),
+        sb3.Reference("ppo", pendulum_system, replace(TINY, seed=4), 50),
+        sb3.Reference("ppo", pendulum_system, replace(TINY, gamma=0.9), 50),
+    ]
+    for other in others:
+        with pytest.raises(InputError, match="the same algorithm on the same plant with the same options"):
+            other.restore(content)
+    for rubbish in (b"", content[:1000]):
+        with pytest.raises(InputError, match="checkpoint cannot be read"):
+            learner.restore(rubbish)
 
 
 @pytest.mark.parametrize(

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import math
 import sys
+import zipfile
 from dataclasses import replace
 
 import numpy as np
@@ -16,9 +18,9 @@ from certify.errors import BackendError, InputError
 from certify.policies import load_policy
 from certify.running.tasks import Cluster, Processes
 from certify.systems import available_systems, get_system
-from controllers import baselines, compare, figures, simulation
+from controllers import baselines, compare, figures, runs, simulation
 from controllers.cli import app
-from controllers.compare import simulate
+from controllers.course import Stopping
 from controllers.environments import PlantEnvironment
 from controllers.options import get_plant, preset
 from controllers.plants import pendulum
@@ -33,11 +35,16 @@ from controllers.responses import (
     remaining,
     table,
 )
+from controllers.simulation import simulate
+from controllers.training import Trainer
 from tests.support.pieces import Here
 
 TINY = replace(preset("pendulum"), steps=160, warm_up=60, n_A=25, n_B=25, batch=8, actor=(6, 5), critic=(7,))
 SHORT = CompareOptions(seeds=1, states=4, duration=1.2)
 SAC = Method("sac", False)
+
+KEPT = {"ours": (), "sac": ("actor.pt",), "sb3-ppo": ("model.zip",), "sb3-sac": ("model.zip",)}
+COMMON = ("course.json", "curve.csv", "policy.pt")
 
 runner = CliRunner()
 
@@ -47,13 +54,20 @@ def pendulum_system():
     return get_system("pendulum")
 
 
+@pytest.fixture(scope="module", autouse=True)
+def _judged_in_little_time():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(runs, "_JUDGED", CompareOptions(states=3, start_seed=1, duration=1.2))
+        yield
+
+
 @pytest.fixture(scope="module")
 def finished(pendulum_system, tmp_path_factory):
     """A whole comparison: its folder of runs, of results, and what it returned."""
-    runs, out = tmp_path_factory.mktemp("runs"), tmp_path_factory.mktemp("results") / "new"
+    folder, out = tmp_path_factory.mktemp("runs"), tmp_path_factory.mktemp("results") / "new"
     lines = []
-    result = compare.compare(pendulum_system, TINY, runs, out, SHORT, lines.append)
-    return runs, out, result, lines
+    result = compare.compare(pendulum_system, TINY, folder, out, SHORT, lines.append)
+    return folder, out, result, lines
 
 
 def test_accumulated_cost_is_the_sum_over_the_environment_s_own_steps(pendulum_system):
@@ -162,12 +176,11 @@ def test_the_floor_is_the_median_of_the_largest_norm_in_the_last_second(pendulum
 
 
 def test_a_comparison_trains_every_run_and_writes_figures_and_table(finished):
-    runs, out, result, lines = finished
-    assert sorted(str(path.relative_to(runs)) for path in runs.rglob("*") if path.is_file()) == [
-        "ours/seed-0/policy.pt",
-        "sac/seed-0/checkpoint.pt",
-        "sb3-ppo/seed-0/model.zip",
-        "sb3-sac/seed-0/model.zip",
+    folder, out, result, lines = finished
+    assert sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()) == [
+        f"{run}/seed-0/{name}"
+        for run in ("ours", "sac", "sb3-ppo", "sb3-sac")
+        for name in sorted((*COMMON, *KEPT[run]))
     ]
     assert "sac seed 0: 160 of 160 steps" in lines and "sb3-ppo seed 0: 16 of 160 steps" in lines
     for name in ("cost", "norm", "states"):
@@ -188,8 +201,8 @@ def test_sampled_actions_give_other_figures_than_means(finished):
 
 
 def test_sac_without_the_gain_is_not_centred_and_ours_is(finished, pendulum_system):
-    runs = finished[0]
-    ours, sac = (compare.obtain(run, pendulum_system, TINY, runs) for run in ("ours", "sac"))
+    folder = finished[0]
+    ours, sac = (runs.obtain(run, pendulum_system, TINY, folder).trained for run in ("ours", "sac"))
     origin = np.zeros((1, 2))
     assert ours.mean(origin) == pytest.approx(0.0, abs=1e-15)
     assert abs(sac.mean(origin)[0, 0]) > 1e-6
@@ -199,7 +212,7 @@ def test_what_is_there_is_not_trained_again(finished, pendulum_system, tmp_path,
     def refuse(*_):
         raise AssertionError("nothing is missing")
 
-    monkeypatch.setattr(compare, "_train", refuse)
+    monkeypatch.setattr(runs, "_train", refuse)
     again = compare.compare(pendulum_system, TINY, finished[0], tmp_path, SHORT)
     assert again["rows"] == finished[2]["rows"]
     assert (tmp_path / "pendulum-table.csv").read_bytes() == (finished[1] / "pendulum-table.csv").read_bytes()
@@ -210,31 +223,40 @@ def test_what_is_there_is_not_trained_again(finished, pendulum_system, tmp_path,
 @pytest.mark.parametrize("run", ["ours", "sac"])
 def test_an_interrupted_run_of_ours_goes_on_from_its_checkpoint(finished, pendulum_system, tmp_path, run):
     chosen = TINY if run == "ours" else baselines.without_gain(TINY)
-    trainer = compare.Trainer(pendulum_system, chosen)
+    trainer = Trainer(pendulum_system, chosen)
     while trainer.steps_done < 90:
         trainer.advance()
     folder = tmp_path / run / "seed-0"
     folder.mkdir(parents=True)
     (folder / "checkpoint.pt").write_bytes(trainer.snapshot())
     lines = []
-    trained = compare.obtain(run, pendulum_system, TINY, tmp_path, lines.append)
+    trained = runs.obtain(run, pendulum_system, TINY, tmp_path, say=lines.append).trained
     assert lines[0] == f"{run} seed 0: 96 of 160 steps"
     x = np.random.default_rng(0).uniform(-1, 1, (5, 2))
-    expected = compare.obtain(run, pendulum_system, TINY, finished[0])
+    expected = runs.obtain(run, pendulum_system, TINY, finished[0]).trained
     np.testing.assert_array_equal(trained.mean(x), expected.mean(x))
 
 
-def test_runs_of_another_budget_or_seed_are_refused(finished, pendulum_system, tmp_path):
-    runs = finished[0]
-    for run in ("ours", "sb3-sac", "sb3-ppo"):
-        with pytest.raises(InputError, match="must be a run of 170 steps with seed 0; it has 160"):
-            compare.obtain(run, pendulum_system, replace(TINY, steps=170), runs)
-    with pytest.raises(InputError, match="`steps` was 160, now it is 170"):  # it would have gone on
-        compare.obtain("sac", pendulum_system, replace(TINY, steps=170), runs)
+def test_runs_of_another_plan_or_seed_are_refused(finished, pendulum_system, tmp_path):
+    for run in ("ours", "sac", "sb3-sac", "sb3-ppo"):
+        with pytest.raises(InputError, match="another plan: its `steps` is 160, and 170 is asked for"):
+            runs.obtain(run, pendulum_system, replace(TINY, steps=170), finished[0])
+    rule = Stopping(budget=300, every=50)
+    with pytest.raises(InputError, match="its `kind` is fixed, and to the floor is asked for"):
+        runs.obtain("sac", pendulum_system, TINY, finished[0], rule)
     (tmp_path / "ours").mkdir()
-    (tmp_path / "ours" / "seed-1").symlink_to(runs / "ours" / "seed-0")
-    with pytest.raises(InputError, match="with seed 1; it has 160 steps with seed 0"):
-        compare.obtain("ours", pendulum_system, replace(TINY, seed=1), tmp_path)
+    (tmp_path / "ours" / "seed-1").symlink_to(finished[0] / "ours" / "seed-0")
+    with pytest.raises(InputError, match="with seed 1 after 160 steps; it is of 160 steps with seed 0"):
+        runs.obtain("ours", pendulum_system, replace(TINY, seed=1), tmp_path)
+
+
+def test_a_policy_of_unknown_origin_is_not_written_over(finished, pendulum_system, tmp_path):
+    folder = tmp_path / "ours" / "seed-0"
+    folder.mkdir(parents=True)
+    (folder / "policy.pt").write_bytes(b"somebody's")
+    with pytest.raises(InputError, match="would be written over"):
+        runs.obtain("ours", pendulum_system, TINY, tmp_path)
+    assert (folder / "policy.pt").read_bytes() == b"somebody's"
 
 
 def test_figures_hold_when_everything_diverges(finished, pendulum_system, tmp_path, monkeypatch):
@@ -292,7 +314,8 @@ def _compare(*arguments):
 
 def test_the_command_prints_the_table_or_one_json_object(finished, tmp_path, monkeypatch):
     monkeypatch.setattr(pendulum, "PLANT", replace(get_plant("pendulum"), preset=TINY))
-    arguments = ["pendulum", "--runs", finished[0], "--out", tmp_path, "--seeds", 1, "--duration", 1.2, "--states", 4]
+    sizes = ["--seeds", 1, "--duration", 1.2, "--states", 4, "--steps", 160]
+    arguments = ["pendulum", "--runs", finished[0], "--out", tmp_path, *sizes]
     result = _compare(*arguments, "--json")
     assert result.exit_code == 0, result.stderr
     assert json.loads(result.stdout)["rows"] == finished[2]["rows"]
@@ -312,6 +335,8 @@ def test_the_command_prints_the_table_or_one_json_object(finished, tmp_path, mon
         (["pendulum", "--without", "ours"], "`without` must be one of sac, sb3-ppo, sb3-sac"),
         (["pendulum", "--jobs", "0"], "`jobs` must be at least 1"),
         (["pendulum", "--jobs", "2", "--cluster", "local:2"], "--jobs must stand without --cluster"),
+        (["pendulum", "--budget", "0"], "`budget` must be at least 1"),
+        (["pendulum", "--steps", "20", "--budget", "50"], "`--steps` is for runs of one length"),
         (["pendulum", "--ablations", "--without", "sb3-sac"], "`without` must be one of before, sac, uncentred"),
     ],
 )
@@ -342,11 +367,11 @@ def test_a_kind_of_run_can_be_left_out(finished, pendulum_system, tmp_path, monk
 
 
 def test_ablations_change_one_part_of_our_own_training(finished, pendulum_system, tmp_path):
-    runs = tmp_path / "runs"
+    folder = tmp_path / "runs"
     for run in ("ours", "sac"):
-        (runs / run).mkdir(parents=True)
-        (runs / run / "seed-0").symlink_to(finished[0] / run / "seed-0")
-    result = compare.compare(pendulum_system, TINY, runs, tmp_path / "out", replace(SHORT, methods=ABLATIONS))
+        (folder / run).mkdir(parents=True)
+        (folder / run / "seed-0").symlink_to(finished[0] / run / "seed-0")
+    result = compare.compare(pendulum_system, TINY, folder, tmp_path / "out", replace(SHORT, methods=ABLATIONS))
     rows = {row["method"]: row for row in result["rows"]}
     assert list(rows) == ["ours", "sac mean", "before mean", "uncentred mean"]
     assert rows["ours"] == next(row for row in finished[2]["rows"] if row["method"] == "ours" and row["seed"] is None)
@@ -355,12 +380,12 @@ def test_ablations_change_one_part_of_our_own_training(finished, pendulum_system
         *(f"pendulum-ablations-table.{kind}" for kind in ("csv", "json")),
     }
     records = {
-        run: load_policy(runs / run / "seed-0" / "policy.pt").training for run in ("ours", "before", "uncentred")
+        run: load_policy(folder / run / "seed-0" / "policy.pt").training for run in ("ours", "before", "uncentred")
     }
     assert [records[run]["identification"] for run in records] == ["during", "before", "during"]
     assert [records[run]["centre"] for run in records] == ["preactivation", "preactivation", "none"]
     origin = np.zeros((1, 2))
-    drift = {run: compare.obtain(run, pendulum_system, TINY, runs).mean(origin)[0, 0] for run in records}
+    drift = {run: runs.obtain(run, pendulum_system, TINY, folder).trained.mean(origin)[0, 0] for run in records}
     assert abs(drift["before"]) < 1e-15 and abs(drift["uncentred"]) > 1e-6
 
 
@@ -368,7 +393,7 @@ def test_a_policy_that_is_called_by_another_s_name_is_refused(finished, pendulum
     (tmp_path / "before").mkdir()
     (tmp_path / "before" / "seed-0").symlink_to(finished[0] / "ours" / "seed-0")
     with pytest.raises(InputError, match="`identification` must be 'before' for the run before; it is 'during'"):
-        compare.obtain("before", pendulum_system, TINY, tmp_path)
+        runs.obtain("before", pendulum_system, TINY, tmp_path)
 
 
 OF_OURS = replace(SHORT, methods=(OURS, SAC))
@@ -380,52 +405,67 @@ class Elsewhere(Here):
 
 @pytest.mark.parametrize("place", [Processes(2), Elsewhere()], ids=["processes", "elsewhere"])
 def test_where_runs_are_trained_changes_nothing(finished, pendulum_system, tmp_path, place):
-    runs, lines, told = tmp_path / "runs", [], []
-    result = compare.compare(pendulum_system, TINY, runs, tmp_path, OF_OURS, lines.append, told.append, place)
+    folder, lines, told = tmp_path / "runs", [], []
+    result = compare.compare(pendulum_system, TINY, folder, tmp_path, OF_OURS, lines.append, told.append, place)
     before = {row["method"]: row for row in finished[2]["rows"]}
-    assert all(row == before[row["method"]] for row in result["rows"] if row["seed"] is None) and result["rows"]
+    for row in result["rows"]:
+        if row["seed"] is None:  # but for the time that it took
+            assert {**row, "wall": 0, "cpu": 0} == {**before[row["method"]], "wall": 0, "cpu": 0}
+    assert result["rows"] and all(row["wall"] > 0 and row["cpu"] > 0 for row in result["rows"])
     ours = "ours/seed-0/policy.pt"
-    assert (runs / ours).read_bytes() == (finished[0] / ours).read_bytes()
-    kept = sorted(str(path.relative_to(runs)) for path in runs.rglob("*") if path.is_file())
-    assert kept == [ours, "sac/seed-0/checkpoint.pt"]
+    assert (folder / ours).read_bytes() == (finished[0] / ours).read_bytes()
+    kept = sorted(str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file())
+    assert kept == sorted(f"{run}/seed-0/{name}" for run in ("ours", "sac") for name in (*COMMON, *KEPT[run]))
     assert sorted(lines) == ["ours seed 0: 160 of 160 steps", "sac seed 0: 160 of 160 steps"]
     assert {(d.run, d.runs) for d in told} == {(1, 2), (2, 2)}
     nothing = Elsewhere()
-    compare.compare(pendulum_system, TINY, runs, tmp_path, OF_OURS, place=nothing)
+    compare.compare(pendulum_system, TINY, folder, tmp_path, OF_OURS, place=nothing)
     assert nothing.done == []
 
 
 def test_a_cluster_goes_on_from_the_checkpoint_that_is_here(finished, pendulum_system, tmp_path):
-    trainer = compare.Trainer(pendulum_system, TINY)
+    trainer = Trainer(pendulum_system, TINY)
     while trainer.steps_done < 90:
         trainer.advance()
     checkpoint = tmp_path / "runs" / "ours" / "seed-0" / "checkpoint.pt"
     checkpoint.parent.mkdir(parents=True)
     checkpoint.write_bytes(trainer.snapshot())
     sent = []
-    place = Elsewhere(lambda piece: sent.append(piece.arguments[-1]) or piece.work(*piece.arguments))
+    place = Elsewhere(lambda piece: sent.append(piece.arguments[3]) or piece.work(*piece.arguments))
     options = replace(SHORT, methods=(OURS,))
     compare.compare(pendulum_system, TINY, tmp_path / "runs", tmp_path, options, place=place)
-    assert sent == [trainer.snapshot()] and not checkpoint.exists()
+    with zipfile.ZipFile(io.BytesIO(sent[0])) as archive:
+        assert archive.read("checkpoint.pt") == trainer.snapshot()
+    assert len(sent) == 1 and not checkpoint.exists()
     ours = "ours/seed-0/policy.pt"
     assert (tmp_path / "runs" / ours).read_bytes() == (finished[0] / ours).read_bytes()
 
 
-@pytest.mark.parametrize("sent", ["another seed", b"no policy", b"\x80\x04N."])
-def test_what_comes_back_and_is_no_such_run_gets_no_name(finished, pendulum_system, tmp_path, sent):
-    content = (finished[0] / "ours" / "seed-0" / "policy.pt").read_bytes() if sent == "another seed" else sent
+@pytest.mark.parametrize("sent", ["another seed", "unfinished", b"no files", b"\x80\x04N."])
+def test_what_comes_back_and_is_no_such_run_is_not_written(finished, pendulum_system, tmp_path, sent):
+    content, source = sent, finished[0] / "ours" / "seed-0"
+    if isinstance(sent, str):
+        packed = io.BytesIO()
+        with zipfile.ZipFile(packed, "w") as archive:
+            for name in COMMON if sent == "another seed" else COMMON[1:]:
+                archive.write(source / name, name)
+            archive.writestr("../outside", b"")
+        content = packed.getvalue()
     place = Elsewhere(lambda piece: content if "seed 1" in piece.key else piece.work(*piece.arguments))
     options = replace(SHORT, methods=(OURS,), seeds=2)
-    with pytest.raises(InputError, match="with seed 1; it has" if sent == "another seed" else "policy"):
+    message = {"another seed": "with seed 1 after", "unfinished": "would be written over|must be a run that is over"}
+    with pytest.raises(InputError, match=message.get(sent, "cannot be read") if isinstance(sent, str) else "be read"):
         compare.compare(pendulum_system, TINY, tmp_path / "runs", tmp_path, options, place=place)
-    assert [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.pt")] == ["runs/ours/seed-0/policy.pt"]
+    kept = tmp_path / "runs" / "ours"
+    assert sorted(path.name for path in kept.iterdir()) == ["seed-0"] and not list(tmp_path.rglob("outside"))
 
 
 def test_a_run_that_is_lost_takes_none_with_it(pendulum_system, tmp_path):
     place = Elsewhere(lambda piece: "its worker died" if piece.key.startswith("ours") else piece.work(*piece.arguments))
     with pytest.raises(BackendError, match="1 of 2 runs could not be trained, ours seed 0 among them: its worker died"):
         compare.compare(pendulum_system, TINY, tmp_path / "runs", tmp_path, OF_OURS, place=place)
-    assert [str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.pt")] == ["runs/sac/seed-0/checkpoint.pt"]
+    kept = sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.pt"))
+    assert kept == ["runs/sac/seed-0/actor.pt", "runs/sac/seed-0/policy.pt"]
 
 
 @pytest.mark.slow

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 import scipy.linalg
@@ -73,24 +75,85 @@ def test_the_learner_asks_for_A_before_B_and_takes_only_what_fits():
     np.testing.assert_allclose(learner.identified.B, B, atol=1e-11)
 
 
+def _round(learner, x, v, plant=1.0):
+    """One round: zero action on the first rows, v on the others; the plant's A may have changed by a factor."""
+    for k, state in enumerate(x):
+        action = v[k] * (learner.phase == "B")
+        learner.observe(state, action, plant * A @ state + B @ action)
+
+
 def test_a_refresh_begins_with_A_and_keeps_the_old_gain_meanwhile():
-    learner = GainLearner(1.0, 4, 3, np.eye(2), np.eye(2))
+    learner = GainLearner(1.0, 4, 3, np.eye(2), np.eye(2), transitions="latest")
     x, v = _transitions(7, spread=0.2)
-    for k in range(7):
-        action = v[k] * (k >= 4)
-        learner.observe(x[k], action, A @ x[k] + B @ action)
+    _round(learner, x, v)
     old = learner.identified
     learner.refresh()
     assert learner.phase == "A" and learner.identified is old and old is not None
-    copy = GainLearner(1.0, 4, 3, np.eye(2), np.eye(2))
-    copy.load_state(learner.state())
-    for k in range(7):  # the plant has changed since
-        action = v[k] * (k >= 4)
-        for one in (learner, copy):
-            one.observe(x[k], action, 0.9 * A @ x[k] + B @ action)
-    assert learner.identified is not None and copy.identified is not None
+    _round(learner, x, v, plant=0.9)  # the plant has changed since
+    assert learner.identified is not None
     np.testing.assert_allclose(learner.identified.A, 0.9 * A, atol=1e-12)
-    np.testing.assert_array_equal(learner.identified.K, copy.identified.K)
+
+
+def test_each_round_adds_to_the_transitions_that_are_fitted_or_replaces_them():
+    generator = np.random.default_rng(3)
+    learners = {which: GainLearner(1.0, 4, 3, np.eye(2), np.eye(2), transitions=which) for which in ("all", "latest")}
+    free: list[list[np.ndarray]] = []
+    driven: list[list[np.ndarray]] = []
+    for _ in range(3):
+        x, v = generator.uniform(-0.5, 0.5, (7, 2)), generator.standard_normal((7, 2))
+        noise = 0.01 * generator.standard_normal((7, 2))
+        v[:4] = 0.0
+        x_next = x @ A.T + v @ B.T + noise
+        for learner in learners.values():
+            learner.refresh()  # goes on with the first round
+            for row in zip(x, v, x_next, strict=True):
+                learner.observe(*row)
+            assert learner.phase == "idle"
+        free.append([x[:4], x_next[:4]])
+        driven.append([x[4:], v[4:], x_next[4:]])
+        for which, rounds in (("all", slice(None)), ("latest", slice(-1, None))):
+            found = learners[which].identified
+            wanted = fit_A(*(np.vstack(part) for part in zip(*free[rounds], strict=True)))
+            np.testing.assert_array_equal(found.A, wanted)
+            rows = (np.vstack(part) for part in zip(*driven[rounds], strict=True))
+            np.testing.assert_array_equal(found.B, fit_B(*rows, wanted))
+    errors = {which: np.linalg.norm(learner.identified.A - A) for which, learner in learners.items()}
+    assert errors["all"] < errors["latest"]
+
+
+@pytest.mark.parametrize("which", ["all", "latest"])
+@pytest.mark.parametrize("seen", [0, 2, 4, 5, 7, 9, 12])
+def test_a_learner_goes_on_from_its_state(which, seen):
+    x, v = _transitions(14, spread=0.2)
+    rows = [(state, v[k] * (k % 7 >= 4), A @ state + state**2 + B @ (v[k] * (k % 7 >= 4))) for k, state in enumerate(x)]
+
+    def feed(learner, begin, end):
+        for k in range(begin, end):
+            if k == 7:
+                learner.refresh()
+            learner.observe(*rows[k])
+
+    whole, first, resumed = (GainLearner(9.0, 4, 3, np.eye(2), np.eye(2), transitions=which) for _ in range(3))
+    feed(whole, 0, 14)
+    feed(first, 0, seen)
+    resumed.load_state(json.loads(json.dumps(first.state())))
+    feed(resumed, seen, 14)
+    assert resumed.state() == whole.state() and whole.phase == "idle"
+    np.testing.assert_array_equal(resumed.identified.K, whole.identified.K)
+
+
+@pytest.mark.parametrize("seen", [2, 5])
+def test_a_state_of_a_run_that_kept_the_rows_of_its_phase_alone_is_read(seen):
+    x, v = _transitions(7, spread=0.2)
+    whole, resumed = (GainLearner(1.0, 4, 3, np.eye(2), np.eye(2), transitions="latest") for _ in range(2))
+    _round(whole, x[:seen], v[:seen])
+    state = whole.state()
+    resumed.load_state(
+        {name: state[name] for name in ("phase", "A", "identified")} | {"rows": state["rows"][whole.phase]}
+    )
+    for learner in (whole, resumed):
+        _round(learner, x[seen:], v[seen:])
+    assert resumed.state() == whole.state() and whole.phase == "idle"
 
 
 # Rows of the continuous [A B], written out for each plant.

@@ -122,6 +122,21 @@ def test_an_option_that_came_later_had_its_default(short, whole):
         _trainer(replace(short, proof_weight=1.0)).restore(older.getvalue())
 
 
+def test_a_run_that_could_not_choose_its_transitions_fitted_those_of_the_latest_round(whole, short):
+    state = torch.load(io.BytesIO(whole[2][50]), weights_only=True)
+    del state["options"]["transitions"], state["gain"]["missing"]
+    state["gain"]["rows"] = state["gain"]["rows"][state["gain"]["phase"]]
+    older = io.BytesIO()
+    torch.save(state, older)
+    with pytest.raises(InputError, match="`transitions` was latest, now it is all"):
+        _trainer(short).restore(older.getvalue())
+    resumed = _trainer(replace(short, transitions="latest"))
+    resumed.restore(older.getvalue())
+    assert resumed.gain.transitions == "latest"
+    now = torch.load(io.BytesIO(whole[2][50]), weights_only=True)["gain"]
+    assert resumed.gain.state() == now and len(now["rows"]["A"]) == 50
+
+
 def test_a_damaged_checkpoint_is_refused(short, whole):
     for content in (b"", b"not a checkpoint", whole[2][50][:5000]):
         with pytest.raises(InputError, match="checkpoint"):
