@@ -110,11 +110,11 @@ def distances(history: Sequence[Kept], system: System) -> list[Distances]:
         A, B = discrete_linearisation(system, dt)
         K = riccati_gain(A, B, Q, R)
         J = policy.network.jacobian_at_origin(system.exact_u_eq())
-        learned = [
-            _relative(_recorded(policy, name, true.shape), true) if name in policy.training else math.nan
+        learned = {
+            name: _relative(_recorded(policy, name, true.shape), true) if name in policy.training else math.nan
             for name, true in (("A", A), ("B", B), ("K", K))
-        ]
-        found.append(Distances(kept.step, *learned, _relative(-J, K)))
+        }
+        found.append(Distances(step=kept.step, **learned, mean=_relative(-J, K)))
     return found
 
 

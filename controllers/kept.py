@@ -61,9 +61,7 @@ class Keeper:
             return
         policy, step = trainer.policy(), trainer.steps_done
         # `steps` of the record is what the run was to make, on which its annealing depends.
-        save_policy(
-            self._folder / f"{step:07d}.pt", replace(policy, training={**policy.training, "steps_done": step})
-        )
+        save_policy(self._folder / f"{step:07d}.pt", replace(policy, training={**policy.training, "steps_done": step}))
 
 
 def read_kept(folder: Path) -> list[Kept]:

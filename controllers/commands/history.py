@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,10 +17,10 @@ def history(
     out: Annotated[Path, typer.Option("--out", help="Folder for the figures, the table and the certificates.")],
     evaluations: Annotated[
         Path | None,
-        typer.Option("--evaluations", help="The run's CSV file of `train --evaluations`: which share settled is drawn."),
+        typer.Option("--evaluations", help="The run's CSV file of `train --evaluations`: draws which share settled."),
     ] = None,
     time_limit: Annotated[float, typer.Option("--time-limit", help="Seconds for the proof of one policy.")] = 50.0,
-    candidate: Annotated[str, typer.Option("--candidate", help="Where P comes from, as `certify roa` says it.")] = "auto",
+    candidate: Annotated[str, typer.Option("--candidate", help="Where P comes from, as of `certify roa`.")] = "auto",
     every: Annotated[int, typer.Option("--every", help="Prove each policy of so many; the last one always.")] = 1,
     no_proofs: Annotated[bool, typer.Option("--no-proofs", help="Draw the gain only, and prove nothing.")] = False,
     system: Annotated[
@@ -80,4 +81,4 @@ def history(
 
 
 def _finite(value: float) -> float | None:
-    return value if value == value else None
+    return value if math.isfinite(value) else None

@@ -43,7 +43,7 @@ def draw_curves(system: System, curves: Sequence[tuple[Run, int, Sequence[Evalua
         for panel, (name, label) in zip(panels, what, strict=True):
             ends = [_draw_kind(panel, name, run, [rows for kind, _, rows in begun if kind == run]) for run in runs]
             panel.set_ylabel(label)
-            panel.grid(axis="y", color="#eceff2", lw=0.6)
+            panel.grid(axis="y")
             log_scale(panel)
             panel.set_xscale("log")
             name_lines(panel, ends)

@@ -48,7 +48,7 @@ def draw_gain(
             ends.append((float(values[-1]), f"{label} {values[-1]:.1e}", colour))
         log_scale(above)
         above.set_ylabel("relative distance, Frobenius")
-        above.grid(axis="y", color="#eceff2", lw=0.6)
+        above.grid(axis="y")
         name_lines(above, ends)
         if settled:
             panels[1].plot(*zip(*settled, strict=True), color=MUTED, marker=".", ms=5)

@@ -55,10 +55,11 @@ def _draw_sets(figure: Any, panel: Any, system: System, proofs: Sequence[Proof])
     from matplotlib.colors import Normalize
 
     colours = matplotlib.colormaps[_MAP].reversed()
-    scale = Normalize(min(proof.step for proof in proofs), max(proof.step for proof in proofs))
-    for proof in proofs:
-        if proof.P is not None:
-            panel.plot(*_outline(proof.P, proof.level), color=colours(scale(proof.step)), lw=1.2)
+    shown = [proof for proof in proofs if proof.P is not None]
+    steps = [proof.step for proof in shown or proofs]
+    scale = Normalize(min(steps), max(steps))
+    for proof in shown:
+        panel.plot(*_outline(proof.P, proof.level), color=colours(scale(proof.step)), lw=1.2)
     (left, right), (bottom, top) = (tuple(map(float, side)) for side in system.domain)
     panel.plot(
         [left, right, right, left, left], [bottom, bottom, top, top, bottom], color=INK, lw=1.0, label="domain's edge"
@@ -66,7 +67,9 @@ def _draw_sets(figure: Any, panel: Any, system: System, proofs: Sequence[Proof])
     panel.plot(0, 0, color=INK, marker="x", ls="", label="equilibrium")
     panel.set_xlabel(named(system, 0))
     panel.set_ylabel(named(system, 1))
-    panel.legend(loc="upper right")
+    panel.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
+    panel.set_xlim(1.04 * left, 1.04 * right)
+    panel.set_ylim(1.04 * bottom, 1.04 * top)
     figure.colorbar(ScalarMappable(scale, colours), ax=panel, label="environment steps", pad=0.01)
 
 
@@ -94,8 +97,8 @@ def _draw_volumes(panel: Any, system: System, proofs: Sequence[Proof]) -> None:
     panel.set_xlabel("environment steps")
     unit = "units of the states"
     panel.set_ylabel(f"area ({unit})" if system.n == 2 else f"volume in {system.n} states\n({unit})")
-    panel.grid(axis="y", color="#eceff2", lw=0.6)
-    panel.legend(loc="best")
+    panel.grid(axis="y")
+    panel.legend(loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2)
 
 
 def _outline(P: Array, level: float) -> tuple[Array, Array]:

@@ -14,6 +14,7 @@ from controllers.responses import NAMES, OURS, Response, Row, quartiles
 
 Array = NDArray[np.float64]
 
+_AXES = {"cost": "∫ x'Qx + ũ'Rũ dt,  ũ = u − u_eq", "norm": "‖x‖ (units of the states)"}
 _SMALLEST = 1e-16  # norms are drawn from here on: a logarithmic axis has no 0
 
 
@@ -39,8 +40,8 @@ def draw_over_time(
                 named.append(_draw_band(panel, what, dt, own, row))
             ends.append(named)
             panel.set_title("stochastic actions (ours: its mean)" if sampled else "mean actions")
-            panel.set_ylabel("∫ x'Qx + ũ'Rũ dt,  ũ = u − u_eq" if what == "cost" else "‖x‖ (units of the states)")
-            panel.grid(axis="y", color="#eceff2", lw=0.6)
+            panel.set_ylabel(_AXES[what])
+            panel.grid(axis="y")
         panels[-1].set_xlim(0, dt * (len(responses[0].x) - 1))
         panels[-1].set_xlabel("time (s)")
         for panel in panels:
@@ -50,7 +51,9 @@ def draw_over_time(
         seeds = sorted({response.seed for response in responses})
         title = "accumulated cost" if what == "cost" else "distance from the equilibrium"
         told = f"{system.name}, {seeds_of(seeds)}: {title}\nmedian and quartiles of "
-        told += f"{count(len(seeds), 'seed')} × {count(responses[0].x.shape[1], 'initial state')}, actions held {dt:g} s"
+        told += (
+            f"{count(len(seeds), 'seed')} × {count(responses[0].x.shape[1], 'initial state')}, actions held {dt:g} s"
+        )
         if what == "norm":
             told += "\ndotted: floor, the median of the largest in the last second"
         figure.suptitle(told, x=0.01, ha="left")

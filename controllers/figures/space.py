@@ -48,8 +48,11 @@ def draw_space(system: System, dt: float, responses: Sequence[Response]) -> byte
             if len(axes) == 3:
                 panel = figure.add_subplot(rows, columns, number, projection="3d")
                 panel.view_init(elev=22, azim=-58)
-                panel.set_box_aspect((1, 1, 0.85), zoom=0.92)
+                panel.set_box_aspect((1, 1, 0.9), zoom=0.9)
                 panel.tick_params(pad=-1)
+                for axis in (panel.xaxis, panel.yaxis, panel.zaxis):
+                    axis.pane.set_facecolor("white")
+                    axis.pane.set_edgecolor(PALE)
                 panel.set_zlim(-reaches[2], reaches[2])
                 panel.set_zlabel(named(system, axes[2]), labelpad=-2)
             else:
@@ -68,7 +71,7 @@ def draw_space(system: System, dt: float, responses: Sequence[Response]) -> byte
         seconds = dt * (len(responses[0].x) - 1)
         figure.suptitle(
             f"{system.name}, seed {seed}: {count(number, 'trajectory', 'trajectories')} of {seconds:g} s in space, mean "
-            "actions, held\nsmall dots: where they begin; large ones: where they are at the end; cross: the equilibrium",
+            "actions, held\nsmall dots: where they begin; large ones: where they end; cross: the equilibrium",
             x=0.01,
             ha="left",
         )
@@ -82,7 +85,7 @@ def _draw_paths(panel: Any, paths: Array, reaches: Array, colour: str) -> int:
 
     A path is drawn up to where it leaves: three-dimensional axes do not cut what is beyond them.
     """
-    inside = (np.abs(paths) <= reaches).all(axis=2)  # not so for NaN
+    inside = np.asarray((np.abs(paths) <= reaches).all(axis=2))  # not so for NaN
     leaving = 0
     for k in range(paths.shape[1]):
         ends = len(paths) if inside[:, k].all() else int((~inside[:, k]).argmax())
