@@ -18,13 +18,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from packaging.requirements import Requirement
 
 import certify
 from certify.certificate import checking
 from certify.cli import _run
 from certify.commands import doctor as doctor_command
+from certify.engines.dreal import backend
 from certify.errors import BackendError
 from certify.installation import found_by_import, source_sha256, version_of
+from certify.options import RoaOptions
 
 ROOT = Path(__file__).parent.parent
 POLICY = ROOT / "examples" / "policies" / "pendulum.pt"
@@ -166,6 +169,40 @@ def test_whatever_is_needed_is_declared_and_pinned() -> None:
         assert package in extras[extra]
     pinned = {_bare(line) for line in (ROOT / "constraints.txt").read_text().splitlines() if "==" in line}
     assert not {*bare, *(d for of in extras.values() for d in of)} - pinned - {"certify"}  # its own extra
+
+
+@pytest.mark.parametrize(
+    ("python", "machine", "asked"), [("3.11", "x86_64", True), ("3.12", "x86_64", False), ("3.11", "aarch64", False)]
+)
+def test_the_extra_of_dreal_asks_only_for_a_wheel_that_there_is(python: str, machine: str, asked: bool) -> None:
+    """Elsewhere pip would build dReal from its source, or find no version of it, and the installation would fail."""
+    (text,) = PROJECT["project"]["optional-dependencies"]["dreal"]
+    wanted = Requirement(text)
+    assert wanted.marker is not None
+    where = {"python_version": python, "platform_machine": machine, "sys_platform": "linux"}
+    assert wanted.marker.evaluate(where) is asked
+    (pinned,) = (line for line in (ROOT / "constraints.txt").read_text().splitlines() if line.startswith("dreal=="))
+    assert wanted.specifier.contains(pinned.removeprefix("dreal=="))
+
+
+def test_the_doctor_says_what_dreal_is(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """With the extra's command, what pip does not bring, and that the default engine does without."""
+
+    def missing() -> None:
+        raise BackendError(f"dReal cannot be used: no module. {backend._INSTALL}")
+
+    monkeypatch.setattr(backend, "find_backend", missing)
+    status, found = findings(capsys)
+    assert status == 0 and found["dReal"]["state"] == "missing"
+    assert found["dReal"]["found"] == "--engine dreal and both; bounds, the default, needs no solver"
+    for said in (
+        "installs oneself",
+        "pip install 'certify[dreal]'",
+        "IBEX 2.7.4 (libibex.so)",
+        "the default, needs neither",
+    ):
+        assert said in found["dReal"]["advice"]
+    assert RoaOptions().engine == "bounds"
 
 
 def _bare(requirement: str) -> str:

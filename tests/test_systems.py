@@ -6,6 +6,7 @@ import importlib
 import itertools
 import math
 import pickle
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -340,3 +341,24 @@ def test_plants_are_pickled_by_their_fields() -> None:
     assert again == plant and type(again.parameters) is type(plant.parameters)
     with pytest.raises(TypeError):
         again.parameters["mu"] = Fraction(2)
+
+
+SECTIONS = {
+    "pendulum": "Pendulum",
+    "cartpole": "Cartpole",
+    "quadrotor2d": "Planar quadrotor",
+    "quadrotor3d": "Quadrotor in space",
+}
+
+
+@pytest.mark.parametrize("name", available_systems())
+def test_the_page_of_the_plants_says_where_each_number_is_from(name: str) -> None:
+    """A parameter, an input's bound or a side of the domain that is changed must be changed there, with its source."""
+    page = (VAN_DER_POL.parent.parent / "docs" / "plants.md").read_text("utf-8")
+    section = page.split(f"\n## {SECTIONS[name]}\n")[1].split("\n## ")[0]
+    said = {Fraction(number) for number in re.findall(r"(?<![\w.])\d+(?:\.\d+)?(?![\w.]*\d)", section)}
+    said |= {Fraction("1.1") / 29} if "1.1/29 m" in section else set()
+    said |= {q / 1000 for q in said} if "× 10⁻³ kg m²" in section else set()
+    system = get_system(name)
+    bounds = {abs(side) for pair in (*system.domain, *system.input_bounds) for side in pair}
+    assert {*system.parameters.values(), *bounds} - {0} <= said

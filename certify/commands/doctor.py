@@ -150,7 +150,8 @@ def _optional() -> list[Finding]:
         backend = find_backend()
         findings.append(Finding("optional", "dReal", "ok", f"{backend.version}, as a {backend.kind}"))
     except BackendError as error:
-        findings.append(Finding("optional", "dReal", "missing", "--engine dreal", str(error)))
+        purpose = "--engine dreal and both; bounds, the default, needs no solver"
+        findings.append(Finding("optional", "dReal", "missing", purpose, str(error)))
     return findings
 
 

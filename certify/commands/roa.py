@@ -73,7 +73,10 @@ def roa(
             "largest for which the set proved without one can still be proved."
         ),
     ] = "0",
-    level: Annotated[float | None, typer.Option(help="Prove exactly this level; less is not PROVED.")] = None,
+    level: Annotated[
+        float | None,
+        typer.Option(help="Prove exactly this level c2, of the reachability-enlarged set; less is not PROVED."),
+    ] = None,
     engine: Annotated[
         str, typer.Option(envvar="CERTIFY_ENGINE", help="bounds, dreal (trusted, not checked), or both.")
     ] = "bounds",

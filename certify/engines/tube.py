@@ -1,4 +1,4 @@
-"""A tube of ellipsoids from a large set into the certified one: the reachability-enlarged region, in any dimension.
+"""A tube of ellipsoids from a large set into the certified one, in any dimension.
 
 V(t, x) = x'P(t)x, P(t) of degree 2 in t on each slab, must decrease along every trajectory with V <= 1. P moves at the
 rate at which the closed loop moves the ellipsoid, and faster by what the models' remainders ask for: the matrix

@@ -6,6 +6,10 @@ force on the cart in N. With s = sin(theta), c = cos(theta):
 `theta'' = (-u c - mp l theta'^2 c s + (mc + mp) g s) / (l (mc + mp s^2))`.
 Values: cart 1 kg, pole 0.1 kg, length 0.5 m, gravity 9.81 m/s^2, |u| <= 30 N, domain |p| <= 3 m,
 |theta| <= 1.2 rad, rates within 8 m/s and 8 rad/s.
+
+Source: equations of Tedrake, "Underactuated Robotics", section "Cart-Pole", with the angle from upright; masses, g and
+30 N as in Li et al., "Two-Stage Learning of Stabilizing Neural Controllers", NeurIPS 2025, whose pole is 1 m long.
+Length and domain are chosen here. `docs/plants.md` says what differs elsewhere.
 """
 
 from __future__ import annotations
@@ -16,7 +20,7 @@ from certify.systems.system import System, exact, symbols
 
 
 def cartpole() -> System:
-    """The cart with a pole at its published parameters."""
+    """The cart with a pole: masses as in Li et al., a length chosen here."""
     p, theta, p_dot, theta_dot, u = symbols(["p", "theta", "p_dot", "theta_dot", "u"])
     mc, mp, length, g, force = symbols(["mc", "mp", "l", "g", "force"])
     s, c = sympy.sin(theta), sympy.cos(theta)

@@ -5,6 +5,10 @@ torque in N m. `theta'' = (g/l) sin(theta) - b/(m l^2) theta' + (u + torque)/(m 
 disturbance `torque` acts at the joint.
 Values: mass 0.15 kg, length 0.5 m, friction 0.1 N m s, gravity 9.81 m/s^2, |u| <= 6 N m,
 domain |theta| <= 3.14 rad, |theta_dot| <= 20 rad/s.
+
+Source: equation, m, l, b and g are those of Chang, Roohi and Gao, "Neural Lyapunov Control", NeurIPS 2019 (repository
+YaChienChang/Neural-Lyapunov-Control, `Inverted _Pendulum.ipynb`); Zhou, Quartz, De Sterck and Liu, NeurIPS 2022, have
+the same. 6 N m is in Yang et al., ICML 2024. The domain is chosen here. `docs/plants.md` says what differs elsewhere.
 """
 
 from __future__ import annotations
@@ -15,7 +19,7 @@ from certify.systems.system import System, exact, symbols
 
 
 def pendulum() -> System:
-    """The inverted pendulum at its published parameters."""
+    """The inverted pendulum with the parameters of Chang, Roohi and Gao."""
     theta, theta_dot, u, m, length, b, g = symbols(["theta", "theta_dot", "u", "m", "l", "b", "g"])
     (torque,) = symbols(["torque"])
     inertia = m * length**2

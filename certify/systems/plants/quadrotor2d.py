@@ -5,6 +5,10 @@ u1, u2: absolute thrusts in N; hover is u1 = u2 = m g / 2.
 `x'' = -sin(theta) (u1 + u2) / m`, `y'' = cos(theta) (u1 + u2) / m - g`, `theta'' = (l / I) (u1 - u2)`.
 Values: mass 0.486 kg, arm 0.25 m, inertia 0.00383 kg m^2, gravity 9.81 m/s^2, 0 <= u_i <= 6 N, domain
 |x|, |y| <= 3 m, |theta| <= 1.2 rad, rates within 8.
+
+Source: equations, m, l, I and g are those of `underactuated/quadrotor2d.py` (repository RussTedrake/underactuated),
+"based on" Bouadi, Bouchoucha and Tadjine, 2007; Dai et al., "Lyapunov-stable neural-network control", RSS 2021, have
+the same. 6 N is in Li et al., NeurIPS 2025. The domain is chosen here. `docs/plants.md` says what differs elsewhere.
 """
 
 from __future__ import annotations
@@ -15,7 +19,7 @@ from certify.systems.system import System, exact, symbols
 
 
 def quadrotor2d() -> System:
-    """The planar quadrotor at its published parameters."""
+    """The planar quadrotor with the parameters of Bouadi, Bouchoucha and Tadjine, as Tedrake rounds them."""
     states = symbols(["x", "y", "theta", "x_dot", "y_dot", "theta_dot"])
     _, _, theta, x_dot, y_dot, theta_dot = states
     u1, u2, m, length, inertia, g = symbols(["u1", "u2", "m", "l", "I", "g"])

@@ -11,6 +11,11 @@ With F = u1 + u2 + u3 + u4 and the body's z axis in the world, R e3:
 Values: mass 0.486 kg, arm a 0.225 m, torque per thrust k 1.1/29 m, inertia (4.9e-3, 4.9e-3, 8.8e-3) kg m^2, gravity
 9.81 m/s^2, 0 <= u_i <= 3.6 N; domain: position within 3, phi and theta within 1, psi within 3, velocity within 6, body
 rates within 12.
+
+Source: equations and all numbers but the mass are those of Dai et al., RSS 2021 (repository
+StanfordASL/neural-network-lyapunov, `examples/quadrotor3d/quadrotor.py`), after Tayebi and McGilvray, 2006. There the
+mass is 0.468 kg; 0.486 kg and 3.6 N are in Li et al., NeurIPS 2025. The domain is chosen here. `docs/plants.md` says
+what differs elsewhere.
 """
 
 from __future__ import annotations
@@ -21,7 +26,7 @@ from certify.systems.system import System, exact, symbols
 
 
 def quadrotor3d() -> System:
-    """The quadrotor at its published parameters."""
+    """The quadrotor with the parameters of Tayebi and McGilvray, but the mass of Li et al."""
     states = symbols(["x", "y", "z", "phi", "theta", "psi", "vx", "vy", "vz", "p", "q", "r"])
     _, _, _, phi, theta, psi, vx, vy, vz, p, q, r = states
     inputs = symbols(["u1", "u2", "u3", "u4"])
