@@ -55,11 +55,11 @@ def _draw_sets(figure: Any, panel: Any, system: System, proofs: Sequence[Proof])
     from matplotlib.colors import Normalize
 
     colours = matplotlib.colormaps[_MAP].reversed()
-    shown = [proof for proof in proofs if proof.P is not None]
-    steps = [proof.step for proof in shown or proofs]
+    outlines = {proof.step: _outline(proof.P, proof.level) for proof in proofs if proof.P is not None}
+    steps = list(outlines) or [proof.step for proof in proofs]
     scale = Normalize(min(steps), max(steps))
-    for proof in shown:
-        panel.plot(*_outline(proof.P, proof.level), color=colours(scale(proof.step)), lw=1.2)
+    for step, outline in outlines.items():
+        panel.plot(*outline, color=colours(scale(step)), lw=1.2)
     (left, right), (bottom, top) = (tuple(map(float, side)) for side in system.domain)
     panel.plot(
         [left, right, right, left, left], [bottom, bottom, top, top, bottom], color=INK, lw=1.0, label="domain's edge"

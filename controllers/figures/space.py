@@ -69,9 +69,10 @@ def draw_space(system: System, dt: float, responses: Sequence[Response]) -> byte
             panel.set_title(title, color=DEEP[method.run])
         number = next(iter(chosen.values())).shape[1]
         seconds = dt * (len(responses[0].x) - 1)
+        what = f"{count(number, 'trajectory', 'trajectories')} of {seconds:g} s in space"
         figure.suptitle(
-            f"{system.name}, seed {seed}: {count(number, 'trajectory', 'trajectories')} of {seconds:g} s in space, mean "
-            "actions, held\nsmall dots: where they begin; large ones: where they end; cross: the equilibrium",
+            f"{system.name}, seed {seed}: {what}, mean actions, held\n"
+            "small dots: where they begin; large ones: where they end; cross: the equilibrium",
             x=0.01,
             ha="left",
         )

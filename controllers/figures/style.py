@@ -110,8 +110,8 @@ def spread(places: Sequence[float], room: float) -> list[float]:
 
     Places that come too close are moved apart around their middle; their order stays.
 
-    >>> spread([0.0, 1.0, 1.0, 5.0], 1.0)
-    [-0.333..., 0.666..., 1.666..., 5.0]
+    >>> spread([0.0, 4.0, 0.0], 1.0)
+    [-0.5, 4.0, 0.5]
     """
     order = sorted(range(len(places)), key=lambda k: places[k])
     groups: list[tuple[list[int], float]] = []  # labels, and the place of the first
@@ -164,7 +164,7 @@ def name_lines(panel: Any, named: Sequence[tuple[float, str, str]], height: floa
 
 
 def _share(panel: Any, value: float) -> float:
-    """Where a value is between the panel's bottom, 0, and its top, 1; what is beyond them, or not finite, at the edge."""
+    """Where a value is between the panel's bottom, 0, and its top, 1; all else at an edge."""
     lo, hi = panel.get_ylim()
     if not math.isfinite(value):
         return 1.0
