@@ -13,14 +13,14 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from certify.containment import ProvedSet, proved_set, set_of
-from certify.errors import CertifyError, InputError
-from certify.lyapunov import volume
+from certify.errors import CertificateFormatError, InputError
+from certify.lyapunov import Candidate, volume
 from certify.policies import Policy
 from certify.systems import System
 from certify.verdict import Verdict
@@ -79,15 +79,21 @@ class ProvingOptions:
     Parameters
     ----------
     time_limit : seconds for one policy.
-    candidate : where P comes from, as `certify roa` names it.
+    candidate : where P comes from, as `certify_roa` names it.
+
+    Raises
+    ------
+    InputError : the limit is not positive and finite, or there is no such candidate.
     """
 
     time_limit: float = 50.0
-    candidate: str = "auto"
+    candidate: Candidate = "auto"
 
     def __post_init__(self) -> None:
         if not 0 < self.time_limit < math.inf:
             raise InputError(f"`time_limit` must be positive and finite; found {self.time_limit}.")
+        if self.candidate not in get_args(Candidate):
+            raise InputError(f"`candidate` must be one of {', '.join(get_args(Candidate))}; found {self.candidate!r}.")
 
 
 def distances(history: Sequence[Kept], system: System) -> list[Distances]:
@@ -135,9 +141,11 @@ def read_settled(path: Path) -> list[tuple[int, float]]:
 def prove(kept: Kept, system: System, folder: Path, options: ProvingOptions) -> Proof:
     """Prove one policy and keep its certificate in `folder`; one that is there about this loop is checked again.
 
+    A loop with which nothing can be begun, such as one with an eigenvalue on the imaginary axis, is UNKNOWN: it is one
+    policy of many.
+
     Raises
     ------
-    InputError : the closed loop cannot be used, or the folder cannot be written.
     BackendError : the checker is missing or failed.
     """
     from certify.api import certify_roa
@@ -147,12 +155,14 @@ def prove(kept: Kept, system: System, folder: Path, options: ProvingOptions) -> 
         try:
             proved = proved_set(path)
             require_about(proved, network, system)
-        except CertifyError:  # it is damaged, or of another policy: it is written anew
+        except (InputError, CertificateFormatError):  # refused, damaged, or of another policy: it is written anew
             path.unlink()
         else:
             return _proof(kept.step, proved)
-    candidate: Any = options.candidate  # `certify_roa` says which there are
-    result = certify_roa(system, kept.policy, folder, candidate=candidate, time_limit=options.time_limit)
+    try:
+        result = certify_roa(system, kept.policy, folder, candidate=options.candidate, time_limit=options.time_limit)
+    except InputError as error:
+        return Proof(kept.step, Verdict.UNKNOWN, str(error))
     if result.verdict is not Verdict.PROVED or result.raw is None:
         verdict = Verdict.UNKNOWN if result.verdict is Verdict.PROVED else result.verdict
         return Proof(kept.step, verdict, result.reason)

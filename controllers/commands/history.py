@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
 from certify.errors import InputError
 from controllers.commands.shared import Json, emit, errors
+
+if TYPE_CHECKING:
+    from certify.lyapunov import Candidate
 
 
 def history(
@@ -44,7 +47,7 @@ def history(
 
         if every < 1:
             raise InputError(f"`every` must be at least 1; found {every}.")
-        options = ProvingOptions(time_limit=time_limit, candidate=candidate)
+        options = ProvingOptions(time_limit=time_limit, candidate=cast("Candidate", candidate))
         policies = read_kept(kept)
         first = policies[0].policy
         plant = (

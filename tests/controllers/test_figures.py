@@ -37,7 +37,7 @@ TIME = 0.5 * np.arange(41)  # 20 s
 
 @pytest.fixture
 def kept(monkeypatch):
-    """The figures that are drawn, as objects, laid out as they are saved; their pixels take more time than a test has."""
+    """The figures that are drawn, as objects, laid out as they are saved; their pixels take too much time."""
     figures = []
 
     def keep(figure, file, **options):
