@@ -19,7 +19,7 @@ from certify.errors import InputError
 from certify.policies import Policy, save_policy
 from certify.systems import System
 from controllers.files import write_atomically
-from controllers.options import TrainingOptions
+from controllers.options import TrainingOptions, default_record
 from controllers.sac import Actor, Interface
 from controllers.training import CHECKPOINT_FORMAT, Trainer, parameters_of, read_checkpoint
 
@@ -151,9 +151,9 @@ def from_checkpoint(checkpoint: bytes, system: System) -> Trained:
     state = read_checkpoint(checkpoint)
     interface = Interface(system)
     try:
-        (name, parameters), options = state["system"], state["options"]
+        (name, parameters), options = state["system"], {**default_record(), **state["options"]}
         _require_plant("checkpoint", name, parameters, system)
-        actor = Actor(interface, options["actor"], options["centre"])
+        actor = Actor(interface, options["actor"], options["centre"], options["log_std"])
         actor.load_state_dict(state["sac"]["actor"])
         steps, seed = int(state["steps_done"]), int(options["seed"])
     except InputError:

@@ -69,8 +69,9 @@ class PlantEnvironment(gymnasium.Env):  # type: ignore[misc]  # gymnasium is unt
     """A plant as a gymnasium environment.
 
     Observation: the raw, unwrapped state in float64. Action: the physical input; outside its bounds it is
-    clipped, as an actuator would. Reward: `r0 - x'Q_r x` at the state reached, less `c` when that state lies
-    outside the domain, which is `terminated`; the time limit is `truncated`.
+    clipped, as an actuator would. Reward: `r0 - x'Q_r x` at the state reached, or with `reward_at` "current" at the
+    state left; less `c` when the state reached lies outside the domain, which is `terminated`; the time limit is
+    `truncated`.
 
     Parameters
     ----------
@@ -113,10 +114,12 @@ class PlantEnvironment(gymnasium.Env):  # type: ignore[misc]  # gymnasium is unt
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
         """Hold `action` for dt."""
         u = np.clip(np.asarray(action, dtype=np.float64), self._u_lo, self._u_hi)
-        x = self._x = self._step(self._x, u)
+        left = self._x
+        x = self._x = self._step(left, u)
         self._elapsed += 1
         terminated = bool(((x < self._lo) | (x > self._hi)).any())
-        reward = self.options.reward_offset - float((self._Q_r * x * x).sum())
+        judged = x if self.options.reward_at == "next" else left
+        reward = self.options.reward_offset - float((self._Q_r * judged * judged).sum())
         if terminated:
             reward -= self.options.penalty
         return x.copy(), reward, terminated, self._elapsed >= self.options.horizon, {}

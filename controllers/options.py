@@ -25,6 +25,10 @@ if TYPE_CHECKING:
 Centre = Literal["preactivation", "output", "none"]
 Identification = Literal["during", "before", "never"]
 Transitions = Literal["all", "latest"]
+IdentificationStarts = Literal["ball", "domain"]
+RewardAt = Literal["next", "current"]
+GainNorm = Literal["frobenius", "spectral"]
+PresetName = Literal["ours", "paper"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -48,6 +52,9 @@ class TrainingOptions:
     start: Annotated[float, "Episodes start uniformly in this share of the domain."] = 1.0
     reward_offset: Annotated[float, "r0 of the reward r0 - x'Q_r x."]
     reward_weights: Annotated[tuple[float, ...], "Diagonal of Q_r."]
+    reward_at: Annotated[
+        RewardAt, "Whose cost x'Q_r x the reward of a step has: that of the next state, or of the current one."
+    ] = "next"
     penalty: Annotated[float, "c: subtracted from the reward when the state leaves the domain."]
     # Soft actor-critic
     learning_rate: Annotated[float, "Step of Adam, actor and critics."] = 3e-4
@@ -60,6 +67,9 @@ class TrainingOptions:
     warm_up: Annotated[int, "First steps, with uniform random actions and without gradient steps."] = 1000
     actor: Annotated[tuple[int, ...], "Hidden widths of the actor."]
     critic: Annotated[tuple[int, ...], "Hidden widths of the value and Q networks."]
+    log_std: Annotated[
+        tuple[float, ...], "Lower and upper bound of the log standard deviation; none means that it has no bounds."
+    ] = (-5.0, 2.0)
     anneal: Annotated[float, "Last share of the run in which the actor's step falls linearly to zero."] = 0.2
     curvature_weight: Annotated[
         float, "Weight of the mean ||J_mu(x) - J_mu(0)|| / ||x|| in the ball in the actor's loss; 0 drops the term."
@@ -83,10 +93,18 @@ class TrainingOptions:
     n_A: Annotated[int, "Transitions with zero action that fit A."]
     n_B: Annotated[int, "Transitions with actions that fit B given A."]
     refresh: Annotated[int, "Steps between two identifications during the run."]
+    identification_starts: Annotated[
+        IdentificationStarts,
+        "Where episodes start while A or B is being learned: in the ball, which ends them when they leave it, or in "
+        "the domain as always, so that only what passes through the ball counts.",
+    ] = "ball"
     transitions: Annotated[
         Transitions, "Which transitions fit A and B: those of all rounds so far, or of the latest round only."
     ] = "all"
     gain_weight: Annotated[float, "Weight of ||J_mu(0) + K|| + ||mu(0) - u_eq|| in the actor's loss; 0 drops the term."]
+    gain_norm: Annotated[
+        GainNorm, "Norm of J_mu(0) + K: frobenius, or spectral, the largest singular value; one for a single input."
+    ] = "frobenius"
     state_weights: Annotated[tuple[float, ...], "Diagonal of Q_c, the LQR's state weights."]
     input_weights: Annotated[tuple[float, ...], "Diagonal of R_c, the LQR's input weights."]
     centre: Annotated[Centre, "How the mean action is centred: preactivation, output, or none."] = "preactivation"
@@ -110,7 +128,16 @@ class TrainingOptions:
             self._require(name, all(w >= 0 for w in getattr(self, name)), "at least 0")
         for name in ("input_weights", "proof_box"):
             self._require(name, all(w > 0 for w in getattr(self, name)), "positive")
-        choices_of = {"centre": Centre, "identification": Identification, "transitions": Transitions}
+        rising = len(self.log_std) == 2 and self.log_std[0] < self.log_std[1]
+        self._require("log_std", not self.log_std or rising, "two rising numbers, or none")
+        choices_of = {
+            "centre": Centre,
+            "identification": Identification,
+            "transitions": Transitions,
+            "identification_starts": IdentificationStarts,
+            "reward_at": RewardAt,
+            "gain_norm": GainNorm,
+        }
         for name, choices in ((name, get_args(literal)) for name, literal in choices_of.items()):
             self._require(name, getattr(self, name) in choices, f"one of {choices}")
         for option in fields(self):
@@ -165,6 +192,7 @@ class Plant:
     preset : the options that it trains with unless told otherwise.
     initial_states : n half-widths, in the states' units, of the box from which simulations start, uniformly.
     positions : names of the states whose trajectories are drawn, from the top of the figure to its bottom.
+    paper : those that follow the paper where it is definite; None for a plant that the paper does not have.
 
     Raises
     ------
@@ -174,6 +202,7 @@ class Plant:
     preset: TrainingOptions
     initial_states: tuple[float, ...]
     positions: tuple[str, ...]
+    paper: TrainingOptions | None = None
 
     def __post_init__(self) -> None:
         if not self.initial_states or not all(0 < width < math.inf for width in self.initial_states):
@@ -183,7 +212,8 @@ class Plant:
 
     def check(self, system: System) -> None:
         """Raise InputError unless weights, box and positions are those of a plant with the states of `system`."""
-        self.preset.check_sizes(system)
+        for options in filter(None, (self.preset, self.paper)):
+            options.check_sizes(system)
         if len(self.initial_states) != system.n:
             raise InputError(
                 f"`initial_states` of {system.name} must have {system.n} half-widths; found {len(self.initial_states)}."
@@ -192,6 +222,21 @@ class Plant:
         unknown = [name for name in self.positions if name not in names]
         if unknown:
             raise InputError(f"`positions` of {system.name} must be among its states {names}; found {unknown[0]!r}.")
+
+    def named(self, name: str) -> TrainingOptions:
+        """The preset of that name, `ours` or `paper`.
+
+        Raises
+        ------
+        InputError : there is none.
+        """
+        if name not in get_args(PresetName):
+            raise InputError(f"the preset must be one of {', '.join(get_args(PresetName))}; found {name!r}.")
+        if name == "ours":
+            return self.preset
+        if self.paper is None:
+            raise InputError("this plant has no preset `paper`, since the paper does not have the plant; use `ours`.")
+        return self.paper
 
 
 def available_plants() -> tuple[str, ...]:

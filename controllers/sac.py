@@ -35,11 +35,10 @@ from certify.errors import InputError
 from certify.policies import TanhNetwork
 from certify.systems import System
 from controllers.departure import departure
-from controllers.options import Centre, TrainingOptions
+from controllers.options import Centre, GainNorm, TrainingOptions
 
 Array = NDArray[np.float64]
 
-LOG_STD_RANGE = (-5.0, 2.0)
 CURVATURE_POINTS = 8  # states of the ball in the curvature's term, new ones in each gradient step
 CPU = torch.device("cpu")
 
@@ -102,6 +101,7 @@ class Actor(nn.Module):
     interface : the action's scale and offset, u_eq, and the states' factors.
     widths : hidden widths.
     centre : how the mean will be centred, if at all; decides which Jacobian is compared with -K.
+    log_std : lower and upper bound of the log standard deviation, or none.
     """
 
     scale: Tensor
@@ -110,14 +110,14 @@ class Actor(nn.Module):
     factors: Tensor
     rest: Tensor
 
-    def __init__(self, interface: Interface, widths: Sequence[int], centre: Centre) -> None:
+    def __init__(self, interface: Interface, widths: Sequence[int], centre: Centre, log_std: Sequence[float]) -> None:
         super().__init__()
         n, m = len(interface.state_factors), len(interface.scale)
         sizes = [n, *widths]
         self.hidden = nn.ModuleList(nn.Linear(a, b, device=CPU) for a, b in pairwise(sizes))
         self.mean = nn.Linear(sizes[-1], m, device=CPU)
         self.log_std = nn.Linear(sizes[-1], m, device=CPU)
-        self.centre = centre
+        self.centre, self.bounds = centre, tuple(log_std)
         for name, numbers in (
             ("scale", interface.scale),
             ("offset", interface.offset),
@@ -132,7 +132,8 @@ class Actor(nn.Module):
         h = x * self.factors
         for layer in self.hidden:
             h = torch.tanh(layer(h))
-        return self.mean(h), self.log_std(h).clamp(*LOG_STD_RANGE)
+        log_std = self.log_std(h)
+        return self.mean(h), log_std.clamp(*self.bounds) if self.bounds else log_std
 
     def sample(self, x: Tensor, noise: Tensor) -> tuple[Tensor, Tensor]:
         """`tanh(w)` and the log-likelihood of the physical input, with `noise` ~ N(0, 1)."""
@@ -198,10 +199,16 @@ class Actor(nn.Module):
         weights = [layer.weight for layer in layers]
         return departure([weights[0] * self.factors, *weights[1:]], [layer.bias for layer in layers], box)
 
-    def gain_loss(self, K: Tensor) -> Tensor:
-        """`||J_mu(0) + K|| + ||mu(0) - u_eq||`, Frobenius norm; the sign is that of u = u_eq - K x."""
+    def gain_loss(self, K: Tensor, norm: GainNorm = "frobenius") -> Tensor:
+        """`||J_mu(0) + K|| + ||mu(0) - u_eq||`, the first norm as chosen; the sign is that of u = u_eq - K x.
+
+        The spectral norm is never larger than the Frobenius norm, and its gradient has rank 1: it pulls at the one
+        direction in which the Jacobian is furthest from -K. With one input the two norms are the same.
+        """
         mean, jacobian = self.at_origin()
-        loss: Tensor = torch.linalg.vector_norm(jacobian + K) + torch.linalg.vector_norm(mean - self.u_eq)
+        difference = jacobian + K
+        distance = torch.linalg.vector_norm(difference) if norm == "frobenius" else _largest_singular(difference)
+        loss: Tensor = distance + torch.linalg.vector_norm(mean - self.u_eq)
         return loss
 
     def network(self) -> TanhNetwork:
@@ -294,7 +301,7 @@ class SAC:
     ) -> None:
         n, m = len(interface.state_factors), len(interface.scale)
         self.options, self.generator, self.device = options, generator, device
-        self.actor = Actor(interface, options.actor, options.centre).to(device)
+        self.actor = Actor(interface, options.actor, options.centre, options.log_std).to(device)
         self.value = Critic(n, options.critic, 1, options.critic_scale).to(device)
         self.value_target = Critic(n, options.critic, 1, options.critic_scale).to(device)
         self.value_target.load_state_dict(self.value.state_dict())
@@ -331,7 +338,7 @@ class SAC:
         q_fresh = self.q(torch.cat((scaled, fresh), 1)).amin(0)
         actor_loss = (log_likelihood - q_fresh).mean()
         if K is not None and options.gain_weight > 0:
-            actor_loss = actor_loss + options.gain_weight * self.actor.gain_loss(K)
+            actor_loss = actor_loss + options.gain_weight * self.actor.gain_loss(K, options.gain_norm)
         if options.rest_weight > 0:
             actor_loss = actor_loss + options.rest_weight * self.actor.rest_loss()
         if options.curvature_weight > 0:
@@ -384,6 +391,11 @@ def _apply(optimiser: torch.optim.Adam, weights: list[nn.Parameter], gradients: 
     for weight, gradient in zip(weights, gradients, strict=True):
         weight.grad = gradient
     optimiser.step()
+
+
+def _largest_singular(matrix: Tensor) -> Tensor:
+    value: Tensor = torch.linalg.matrix_norm(matrix, 2)
+    return value
 
 
 def _exact(tensor: Tensor) -> Array:

@@ -1,9 +1,9 @@
 """The training run: Algorithm 1 of the paper around `sac.SAC` and `lqr.GainLearner`, with exact resumption.
 
-While a round of identification is under way, episodes start in the ball and end on leaving it, so that the
-transitions it needs are gathered within a few hundred steps; otherwise episodes start anywhere in
-the domain. Every transition also goes into the replay buffer. With `identification` "before" there is one
-round, at the beginning and with random actions, and the warm-up is counted from its end; with "never" there is
+While a round of identification is under way, episodes start in the ball and end on leaving it, so that the transitions
+it needs are gathered within a few hundred steps; otherwise, and with `identification_starts` "domain" always, episodes
+start anywhere in the domain. Every transition also goes into the replay buffer. With `identification` "before" there is
+one round, at the beginning and with random actions, and the warm-up is counted from its end; with "never" there is
 none, and no gain.
 
 A checkpoint holds everything that the rest of the run depends on (networks, optimisers, replay buffer, random
@@ -150,7 +150,11 @@ class Trainer:
         self._require_finite(self.distance()[1])
         found = self.gain.identified
         if not self.ships:
-            raise InputError(f"the run ended after {self.steps_done} steps without a gain; it needs more `steps`.")
+            passing = self.options.identification_starts == "domain"
+            instead = ", or `identification_starts` ball, which goes where the gain is learned" if passing else ""
+            raise InputError(
+                f"the run ended after {self.steps_done} steps without a gain; it needs more `steps`{instead}."
+            )
         return Policy(
             network=self.sac.actor.network(),
             system=self.system.name,
@@ -254,7 +258,7 @@ class Trainer:
             self._K = torch.from_numpy(self.gain.identified.K).float().to(self.sac.device)
 
     def _begin_episode(self) -> None:
-        self._near = self.gain.phase != "idle"
+        self._near = self.gain.phase != "idle" and self.options.identification_starts == "ball"
         self._x, _ = self.environment.reset(options={"radius": self.options.eta} if self._near else None)
         self._total, self._length = 0.0, 0
 

@@ -25,6 +25,9 @@ if TYPE_CHECKING:
 def train(
     plant: Annotated[str, typer.Argument(help="A plant that ships, FILE.toml, or FILE.py:NAME, whose code is run.")],
     out: Annotated[Path, typer.Option("--out", help="The policy file to write.")],
+    preset: Annotated[
+        str, typer.Option("--preset", help="What is not given: ours, or paper, which follows the paper where it can.")
+    ] = "ours",
     log: Annotated[Path | None, typer.Option("--log", help="CSV file of episodes and returns.")] = None,
     checkpoint_dir: Annotated[
         Path | None, typer.Option("--checkpoint-dir", help="Folder that keeps checkpoint.pt.")
@@ -54,7 +57,7 @@ def train(
         from controllers.own import chosen_plant
 
         system, own = chosen_plant(plant)
-        options = overridden(own.preset, _given(chosen))
+        options = overridden(own.named(preset), _given(chosen))
         from certify.policies import save_policy
         from controllers.kept import Keeper
         from controllers.logs import Episode, Log, Monitored
@@ -118,10 +121,10 @@ def _given(chosen: dict[str, Any]) -> dict[str, Any]:
         if get_origin(hints[name]) is tuple:
             number = get_args(hints[name])[0]
             try:
-                values[name] = tuple(number(part) for part in value.split(","))
+                values[name] = () if value == "none" else tuple(number(part) for part in value.split(","))
             except ValueError as error:
                 raise InputError(
-                    f"`{name}` must be numbers separated by commas, such as 1,2; found {value!r}."
+                    f"`{name}` must be numbers separated by commas, such as 1,2, or none; found {value!r}."
                 ) from error
     return values
 

@@ -9,27 +9,30 @@ set without Vdot >= 0 that is among the largest of those compared.
 from __future__ import annotations
 
 from controllers.options import Plant, TrainingOptions
+from controllers.paper import as_in_paper
 
+PRESET = TrainingOptions(
+    steps=40_000,
+    dt=0.02,
+    horizon=250,
+    start=0.5,
+    reward_offset=1.0,
+    reward_weights=(1.0, 1.0, 0.1, 0.1),
+    penalty=100.0,
+    actor=(256, 256),
+    critic=(128, 128),
+    curvature_weight=0.1,
+    eta=0.1,
+    n_A=400,
+    n_B=400,
+    refresh=10_000,
+    gain_weight=3.0,
+    state_weights=(1.0, 1.0, 0.1, 0.1),
+    input_weights=(0.1,),
+)
 PLANT = Plant(
-    preset=TrainingOptions(
-        steps=40_000,
-        dt=0.02,
-        horizon=250,
-        start=0.5,
-        reward_offset=1.0,
-        reward_weights=(1.0, 1.0, 0.1, 0.1),
-        penalty=100.0,
-        actor=(256, 256),
-        critic=(128, 128),
-        curvature_weight=0.1,
-        eta=0.1,
-        n_A=400,
-        n_B=400,
-        refresh=10_000,
-        gain_weight=3.0,
-        state_weights=(1.0, 1.0, 0.1, 0.1),
-        input_weights=(0.1,),
-    ),
+    preset=PRESET,
+    paper=as_in_paper(PRESET, but=("start",)),
     initial_states=(1.0, 0.5, 1.0, 1.0),
     positions=("p", "theta"),
 )

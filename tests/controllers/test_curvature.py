@@ -33,7 +33,7 @@ def test_the_jacobian_anywhere_is_that_of_the_exported_policy(plant, centre):
     system = get_system(plant)
     with torch.random.fork_rng():
         torch.manual_seed(1)
-        actor = Actor(Interface(system), (16, 16), centre)
+        actor = Actor(Interface(system), (16, 16), centre, (-5.0, 2.0))
         for layer in actor.hidden:
             torch.nn.init.normal_(layer.bias)
     network, u_eq, h = actor.network(), system.exact_u_eq(), 1e-5

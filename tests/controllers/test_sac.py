@@ -21,7 +21,7 @@ K = torch.tensor([[1.76, 0.59]])
 def _actor(centre="preactivation", seed=0, plant="pendulum") -> Actor:
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        return Actor(Interface(get_system(plant)), (16, 16), centre)
+        return Actor(Interface(get_system(plant)), (16, 16), centre, (-5.0, 2.0))
 
 
 def _sac(options, seed=0) -> SAC:
