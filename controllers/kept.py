@@ -6,13 +6,14 @@ the file that `controllers train` would have written then. Before there is a gai
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from certify.errors import InputError
 from certify.policies import Policy, load_policy, save_policy
 from controllers.files import make_folder, require_writable
+from controllers.options import TrainingOptions
 
 if TYPE_CHECKING:
     from controllers.training import Trainer
@@ -101,7 +102,6 @@ def _read(path: Path) -> Kept:
 
 
 def _run(policy: Policy) -> dict[str, object]:
-    """What all policies of a run have in common: the plant, and the options, but not what was measured."""
-    measured = {"A", "B", "K", "distance", "offset_before_centring", "curvature", "steps_done", "versions", "device"}
-    options = {name: value for name, value in policy.training.items() if name not in measured}
+    """What all policies of a run have in common: the plant and the options, but not what was learned or measured."""
+    options = {option.name: policy.training.get(option.name) for option in fields(TrainingOptions)}
     return {"system": policy.system, "parameters": dict(policy.parameters), **options}
