@@ -140,6 +140,11 @@ class Trainer:
             errors = errors_of(known, self.system, options.dt, Q, R)
         self.monitored.append(Monitored(self.steps_done, *self.distance(), bend, settled, cost, *errors))
 
+    @property
+    def ships(self) -> bool:
+        """Whether there is a policy to ship: the gain is learned, or is not to be."""
+        return self.gain.identified is not None or self.options.identification == "never"
+
     def policy(self) -> Policy:
         """The mean action, centred, with the record of how it was made.
 
@@ -149,7 +154,7 @@ class Trainer:
         """
         self._require_finite(self.distance()[1])
         found = self.gain.identified
-        if found is None and self.options.identification != "never":
+        if not self.ships:
             passing = self.options.identification_starts == "domain"
             instead = ", or `identification_starts` ball, which goes where the gain is learned" if passing else ""
             raise InputError(
