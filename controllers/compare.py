@@ -21,7 +21,7 @@ from certify.running.tasks import Place
 from certify.systems import System
 from controllers.baselines import Trained
 from controllers.course import Course
-from controllers.figures import draw_over_time, draw_states
+from controllers.figures import draw_curves, draw_over_time, draw_positions, draw_space, draw_states
 from controllers.files import make_folder, write_atomically
 from controllers.options import TrainingOptions
 from controllers.responses import NAMES, CompareOptions, Response, Row, Run, Spent, table
@@ -42,7 +42,7 @@ def compare(
     watch: Callable[[Doing], None] = lambda doing: None,
     place: Place | None = None,
 ) -> dict[str, Any]:
-    """Train what is missing in `runs`, simulate all, write three figures and the table to `out`.
+    """Train what is missing in `runs`, simulate all, write the figures and the table to `out`.
 
     Parameters
     ----------
@@ -97,8 +97,12 @@ def compare(
     drawings = {
         "cost": draw_over_time("cost", system, training.dt, responses, rows),
         "norm": draw_over_time("norm", system, training.dt, responses, rows),
+        "positions": draw_positions(system, training.dt, responses),
         "states": draw_states(system, training.dt, responses),
+        "curves": draw_curves(system, [(run, seed, course.rows) for run, seed, course in courses]),
     }
+    if (space := draw_space(system, training.dt, responses)) is not None:
+        drawings["space"] = space
     ablations = {method.run for method in options.methods} & {"before", "uncentred"}
     stem = system.name + ("-ablations" if ablations else "")
     result: dict[str, Any] = {

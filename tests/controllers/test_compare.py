@@ -263,7 +263,7 @@ def test_figures_hold_when_everything_diverges(finished, pendulum_system, tmp_pa
     monkeypatch.setattr(simulation, "DIVERGED", 1e-3)
     result = compare.compare(pendulum_system, TINY, finished[0], tmp_path, SHORT)
     assert all(row["diverged"] == 4 and row["floor"] is None and row["settled"] == 0 for row in result["rows"])
-    assert len(list(tmp_path.glob("*.png"))) == 3
+    assert len(list(tmp_path.glob("*.png"))) == 5
     assert "inf" in (tmp_path / "pendulum-table.csv").read_text()
 
 
@@ -348,7 +348,7 @@ def test_ablations_change_one_part_of_our_own_training(finished, pendulum_system
     assert list(rows) == ["ours", "sac mean", "before mean", "uncentred mean"]
     assert rows["ours"] == next(row for row in finished[2]["rows"] if row["method"] == "ours" and row["seed"] is None)
     assert {path.name for path in (tmp_path / "out").iterdir()} == {
-        *(f"pendulum-ablations-{name}.png" for name in ("cost", "norm", "states")),
+        *(f"pendulum-ablations-{name}.png" for name in ("cost", "curves", "norm", "positions", "states")),
         *(f"pendulum-ablations-table.{kind}" for kind in ("csv", "json")),
     }
     records = {
