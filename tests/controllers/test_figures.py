@@ -133,13 +133,13 @@ def test_what_diverges_is_said_and_everything_may(kept):
 
 
 def test_the_figure_of_the_states_shows_every_one_of_them(kept):
-    responses = _responses(get_system("pendulum"))
-    draw_states(get_system("pendulum"), 0.5, responses)
+    methods = BASELINES[:4]
+    draw_states(get_system("pendulum"), 0.5, _responses(get_system("pendulum"), methods))
     panels = kept[-1].axes
-    assert len(panels) == 2 * len(BASELINES)
+    assert len(panels) == 2 * len(methods)
     assert [axes.get_ylabel() for axes in panels if axes.get_ylabel()] == ["theta (rad)", "theta_dot (rad/s)"]
     width, height = kept[-1].get_size_inches()
-    assert width / len(BASELINES) >= 2 and height / 2 >= 1.5  # inches a panel
+    assert width / len(methods) >= 2 and height / 2 >= 1.5  # inches a panel
     for axes in panels:
         title = axes.title.get_window_extent()
         assert title.width <= axes.get_window_extent().width * 1.25, axes.get_title()
