@@ -94,15 +94,7 @@ def compare(
                 x, cost = simulate(system, training, act, x0, options.duration)
                 responses.append(Response(method, seed, trained.steps, x, cost, spent))
     rows = table(system, training.dt, responses, options)
-    drawings = {
-        "cost": draw_over_time("cost", system, training.dt, responses, rows),
-        "norm": draw_over_time("norm", system, training.dt, responses, rows),
-        "positions": draw_positions(system, training.dt, responses),
-        "states": draw_states(system, training.dt, responses),
-        "curves": draw_curves(system, [(run, seed, course.rows) for run, seed, course in courses]),
-    }
-    if (space := draw_space(system, training.dt, responses)) is not None:
-        drawings["space"] = space
+    drawings = _drawings(system, training.dt, responses, rows, courses)
     ablations = {method.run for method in options.methods} & {"before", "uncentred"}
     stem = system.name + ("-ablations" if ablations else "")
     result: dict[str, Any] = {
@@ -126,6 +118,25 @@ def compare(
         write_atomically(out / f"{stem}-table.{kind}", content)
         result["files"][kind] = str(out / f"{stem}-table.{kind}")
     return result
+
+
+def _drawings(
+    system: System,
+    dt: float,
+    responses: Sequence[Response],
+    rows: Sequence[Row],
+    courses: Sequence[tuple[Run, int, Course]],
+) -> dict[str, bytes]:
+    """The figures by their names."""
+    drawings = {
+        "cost": draw_over_time("cost", system, dt, responses, rows),
+        "norm": draw_over_time("norm", system, dt, responses, rows),
+        "positions": draw_positions(system, dt, responses),
+        "states": draw_states(system, dt, responses),
+        "curves": draw_curves(system, [(run, seed, course.rows) for run, seed, course in courses]),
+    }
+    space = draw_space(system, dt, responses)
+    return drawings if space is None else {**drawings, "space": space}
 
 
 def _action(trained: Trained, sampled: bool, start_seed: int) -> Callable[[Array], Array]:

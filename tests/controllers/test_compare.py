@@ -61,6 +61,16 @@ def _judged_in_little_time():
         yield
 
 
+DRAW = compare._drawings
+
+
+@pytest.fixture(autouse=True)
+def _drawn_in_no_time(monkeypatch):
+    """Figures are drawn by `finished`, and where a test is about them: they take longer than all the rest."""
+    names = ("cost", "curves", "norm", "positions", "states")
+    monkeypatch.setattr(compare, "_drawings", lambda *_: dict.fromkeys(names, b"\x89PNG"))
+
+
 @pytest.fixture(scope="module")
 def finished(pendulum_system, tmp_path_factory):
     """A whole comparison: its folder of runs, of results, and what it returned."""
@@ -261,6 +271,7 @@ def test_a_policy_of_unknown_origin_is_not_written_over(finished, pendulum_syste
 
 def test_figures_hold_when_everything_diverges(finished, pendulum_system, tmp_path, monkeypatch):
     monkeypatch.setattr(simulation, "DIVERGED", 1e-3)
+    monkeypatch.setattr(compare, "_drawings", DRAW)
     result = compare.compare(pendulum_system, TINY, finished[0], tmp_path, SHORT)
     assert all(row["diverged"] == 4 and row["floor"] is None and row["settled"] == 0 for row in result["rows"])
     assert len(list(tmp_path.glob("*.png"))) == 5
