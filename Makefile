@@ -2,7 +2,7 @@
 PYTHON ?= python3.11
 BIN := .venv/bin
 
-.PHONY: setup roa test lint docs gallery shares tradeoff clean
+.PHONY: setup roa test lint docs gallery shares tradeoff paper paper-proved clean
 
 setup: .venv/.installed
 
@@ -34,6 +34,15 @@ shares: setup
 
 tradeoff: setup
 	$(BIN)/python docs/how-to/tradeoff.py
+
+RUNS ?= runs
+
+paper: setup
+	$(BIN)/python docs/paper/draw.py $(RUNS)
+	$(BIN)/python docs/paper/table.py
+
+paper-proved: setup
+	$(BIN)/python docs/paper/proved.py $(RUNS)
 
 clean:
 	rm -rf .venv out build *.egg-info

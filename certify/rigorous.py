@@ -278,29 +278,60 @@ def field_on(loop: ClosedLoop, x: Balls) -> tuple[Balls, flint.arb_mat]:
     return F, A + B * gain
 
 
-def _jacobian(loop: ClosedLoop) -> flint.arb_mat:
-    """The closed loop's Jacobian at the origin and u_eq."""
-    _, gain = policy_on(loop, [flint.arb(0)] * loop.network.n)
+def gain_at_origin(loop: ClosedLoop) -> flint.arb_mat:
+    """The policy's Jacobian J (m, n) at the origin."""
+    return policy_on(loop, [flint.arb(0)] * loop.network.n)[1]
+
+
+def plant_at_origin(loop: ClosedLoop) -> tuple[flint.arb_mat, flint.arb_mat]:
+    """A (n, n) and B (n, m) of the plant at the origin and u_eq."""
     A, B = (
         flint.arb_mat([[evaluate_arb(M[i, j], {}) for j in range(M.shape[1])] for i in range(M.shape[0])])
         for M in loop.plant_jacobians()
     )
-    return A + B * gain
+    return A, B
+
+
+def held_at_origin(loop: ClosedLoop, period: Fraction) -> tuple[flint.arb_mat, flint.arb_mat]:
+    """A (n, n) and B (n, m) of the map over a period of the linearised plant whose input is held."""
+    n, m = loop.system.n, loop.system.m
+    A, B = plant_at_origin(loop)
+    block = flint.arb_mat(n + m, n + m)
+    for i in range(n):
+        for j in range(n + m):
+            block[i, j] = ball(period) * (A[i, j] if j < n else B[i, j - n])
+    motion = block.exp()
+    free = flint.arb_mat([[motion[i, j] for j in range(n)] for i in range(n)])
+    forced = flint.arb_mat([[motion[i, n + j] for j in range(m)] for i in range(n)])
+    return free, forced
+
+
+def is_definite(M: flint.arb_mat) -> bool:
+    """Whether a symmetric matrix, of which the lower triangle is read, is certainly positive definite.
+
+    Its pivots are: they lie in those of the balls, and a pivot that is not certainly positive shows nothing.
+    """
+    rows = [[M[i, j] for j in range(i + 1)] for i in range(M.nrows())]
+    for k, top in enumerate(rows):
+        if not top[k] > 0:
+            return False
+        for row in rows[k + 1 :]:
+            factor = row[k] / top[k]
+            for j in range(k + 1, len(row)):
+                row[j] -= factor * rows[j][k]
+    return True
+
+
+def _jacobian(loop: ClosedLoop) -> flint.arb_mat:
+    """The closed loop's Jacobian at the origin and u_eq."""
+    A, B = plant_at_origin(loop)
+    return A + B * gain_at_origin(loop)
 
 
 def _held_map(loop: ClosedLoop, period: Fraction) -> flint.arb_mat:
     """The map over a period of the linearised plant whose input `-K x` is held."""
-    n, m = loop.system.n, loop.system.m
-    _, gain = policy_on(loop, [flint.arb(0)] * n)
-    A, B = loop.plant_jacobians()
-    block = flint.arb_mat(n + m, n + m)
-    for i in range(n):
-        for j in range(n + m):
-            block[i, j] = ball(period) * evaluate_arb(A[i, j] if j < n else B[i, j - n], {})
-    motion = block.exp()
-    free = flint.arb_mat([[motion[i, j] for j in range(n)] for i in range(n)])
-    forced = flint.arb_mat([[motion[i, n + j] for j in range(m)] for i in range(n)])
-    return free + forced * gain
+    free, forced = held_at_origin(loop, period)
+    return free + forced * gain_at_origin(loop)
 
 
 def _unclipped(loop: ClosedLoop) -> bool:

@@ -13,6 +13,8 @@ import typer
 from controllers.commands.compare import compare
 from controllers.commands.evaluate import evaluate
 from controllers.commands.flatten import flatten
+from controllers.commands.history import history
+from controllers.commands.theory import theory
 from controllers.commands.train import train
 from controllers.commands.train_baseline import train_baseline
 
@@ -25,8 +27,10 @@ app = typer.Typer(
 app.command("train")(train)
 app.command("flatten")(flatten)
 app.command("evaluate")(evaluate)
+app.command("theory")(theory)
 app.command("train-baseline")(train_baseline)
 app.command("compare")(compare)
+app.command("history")(history)
 
 
 def main() -> None:

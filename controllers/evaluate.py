@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -22,6 +22,7 @@ from certify.errors import InputError
 from certify.policies import Policy, TanhNetwork
 from certify.systems import System, shipped_system
 from controllers.environments import Stepper
+from controllers.lqr import Identified, riccati_gain
 from controllers.options import Plant
 from controllers.simulation import Loop, continuous_loop, held_loop, initial_states, mean_action
 
@@ -93,6 +94,7 @@ class Covered:
 class Evaluation:
     """Figures of one policy. A, B, K are the learned ones of its record; NaN where the record has none.
 
+    `K_relative_error` is against the gain of the true plant, for the weights that the record says K was made for.
     `curvature` is that of `curvature()` in the ball in which the plant was identified; NaN without `training.eta`.
     `covered` is None without a certificate.
     """
@@ -104,6 +106,7 @@ class Evaluation:
     curvature: float
     A_relative_error: float
     B_relative_error: float
+    K_relative_error: float
     eigenvalues: tuple[complex, ...]
     continuous: Settling
     held: Settling
@@ -127,7 +130,11 @@ class Evaluation:
             "policy": {"sha256": self.sha256},
             "gain": {"distance": _finite(self.gain_distance), "relative": _finite(self.gain_relative)},
             "curvature": _finite(self.curvature),
-            "identification": {"A": _finite(self.A_relative_error), "B": _finite(self.B_relative_error)},
+            "identification": {
+                "A": _finite(self.A_relative_error),
+                "B": _finite(self.B_relative_error),
+                "K": _finite(self.K_relative_error),
+            },
             "eigenvalues": [[e.real, e.imag] for e in self.eigenvalues],
             "continuous": settling(self.continuous),
             "held": settling(self.held),
@@ -163,11 +170,11 @@ def evaluate(
         )
     x0 = initial_states(system, options.states, options.seed, plant)
     covered = None if proved is None else count_covered(proved, network, system, x0)
-    dt = _recorded(policy, "dt", ())
+    dt = recorded(policy, "dt", ())
     if not dt > 0:
         raise InputError(f"`training.dt` of the policy must be positive; found {dt}.")
-    Q = np.asarray(_recorded(policy, "state_weights", (system.n,)))
-    R = np.asarray(_recorded(policy, "input_weights", (system.m,)))
+    Q = np.asarray(recorded(policy, "state_weights", (system.n,)))
+    R = np.asarray(recorded(policy, "input_weights", (system.m,)))
 
     eigenvalues = np.linalg.eigvals(_closed_loop_jacobian(system, policy))
     fastest = float(np.abs(eigenvalues).max())
@@ -175,23 +182,23 @@ def evaluate(
     continuous = _settling(continuous_loop(system, h, mean_action(network, system), Q, R), system, x0, options)
     held = settle(network, system, dt, Q, R, options, plant)
 
-    distance = relative = A_error = B_error = math.nan
+    distance = relative = math.nan
+    learned = (math.nan, math.nan, math.nan)
     if {"A", "B", "K"} <= set(policy.training):
         n, m = system.n, system.m
-        A, B, K = (_recorded(policy, *entry) for entry in (("A", (n, n)), ("B", (n, m)), ("K", (m, n))))
+        A, B, K = (recorded(policy, *entry) for entry in (("A", (n, n)), ("B", (n, m)), ("K", (m, n))))
         distance = float(np.linalg.norm(network.jacobian_at_origin(system.exact_u_eq()) + K))
         relative = distance / float(np.linalg.norm(K))
-        A_true, B_true = discrete_linearisation(system, dt)
-        A_error = float(np.linalg.norm(A - A_true) / np.linalg.norm(A_true))
-        B_error = float(np.linalg.norm(B - B_true) / np.linalg.norm(B_true))
+        learned = errors_of(Identified(A, B, K), system, dt, *_gain_weights(policy, Q, R))
     return Evaluation(
         system=system.name,
         sha256=network.sha256(),
         gain_distance=distance,
         gain_relative=relative,
-        curvature=curvature(network, system, _recorded(policy, "eta", ())) if "eta" in policy.training else math.nan,
-        A_relative_error=A_error,
-        B_relative_error=B_error,
+        curvature=curvature(network, system, recorded(policy, "eta", ())) if "eta" in policy.training else math.nan,
+        A_relative_error=learned[0],
+        B_relative_error=learned[1],
+        K_relative_error=learned[2],
         eigenvalues=tuple(complex(e) for e in eigenvalues),
         continuous=continuous,
         held=held,
@@ -204,8 +211,27 @@ def count_covered(proved: ProvedSet, network: TanhNetwork, system: System, x0: A
 
     Raises
     ------
+    InputError : as `require_same_loop`.
+    """
+    require_same_loop(proved, network, system)
+    inside = sum(proved.holds(x0.tolist()))
+    return Covered(inside, len(x0), proved.claim, proved.certificate_sha256)
+
+
+def require_same_loop(proved: ProvedSet, network: TanhNetwork, system: System) -> None:
+    """Refuse a set that is proved about another closed loop.
+
+    Raises
+    ------
     InputError : the certificate is about another policy, or about other equations.
     """
+    require_about(proved, network, system)
+    inside = sum(proved.holds(x0.tolist()))
+    return Covered(inside, len(x0), proved.claim, proved.certificate_sha256)
+
+
+def require_about(proved: ProvedSet, network: TanhNetwork, system: System) -> None:
+    """Raise InputError unless a certificate is about this policy and this plant."""
     if proved.policy_sha256 != network.sha256():
         raise InputError(
             f"the certificate must be about the policy that is evaluated, {network.sha256()}; it is about "
@@ -218,8 +244,6 @@ def count_covered(proved: ProvedSet, network: TanhNetwork, system: System, x0: A
             f"the certificate must be about the plant that is simulated, {system.name} with these parameters; it is "
             f"about {theirs.name} with other equations. Certify the policy on this plant."
         )
-    inside = sum(proved.holds(x0.tolist()))
-    return Covered(inside, len(x0), proved.claim, proved.certificate_sha256)
 
 
 def settle(
@@ -279,6 +303,37 @@ def discrete_linearisation(system: System, dt: float) -> tuple[Array, Array]:
     return A.numpy(), B.numpy()
 
 
+def errors_of(learned: Identified, system: System, dt: float, Q: Array, R: Array) -> tuple[float, float, float]:
+    """Relative errors of A, B and K in the Frobenius norm, against the simulator's own linearisation and its gain.
+
+    NaN where what is true is 0, and for K where the true plant has no gain for these weights.
+
+    Parameters
+    ----------
+    Q, R : diagonals of the weights that K was made for, shapes (n,) and (m,).
+    """
+    A, B = discrete_linearisation(system, dt)
+    try:
+        K = riccati_gain(A, B, np.diag(Q), np.diag(R))
+    except InputError:
+        K = np.full_like(learned.K, math.nan)
+    return _relative(learned.A, A), _relative(learned.B, B), _relative(learned.K, K)
+
+
+def _relative(found: Array, true: Array) -> float:
+    size = float(np.linalg.norm(true))
+    return float(np.linalg.norm(found - true)) / size if size > 0 else math.nan
+
+
+def _gain_weights(policy: Policy, Q: Array, R: Array) -> tuple[Array, Array]:
+    """The weights of the record's K: those of training, or those for which `controllers flatten` gave it another."""
+    flattened = policy.training.get("flattened")
+    if not isinstance(flattened, dict) or "K" not in flattened:
+        return Q, R
+    record = replace(policy, training=flattened)
+    return np.asarray(recorded(record, "Q", Q.shape)), np.asarray(recorded(record, "R", R.shape))
+
+
 def _closed_loop_jacobian(system: System, policy: Policy) -> Array:
     f, u_eq = system.function("torch"), system.exact_u_eq()
     x = torch.zeros(system.n, dtype=torch.float64)
@@ -308,7 +363,7 @@ def _settling(loop: Loop, system: System, x0: Array, options: EvaluationOptions)
     )
 
 
-def _recorded(policy: Policy, name: str, shape: Sequence[int]) -> Any:
+def recorded(policy: Policy, name: str, shape: Sequence[int]) -> Any:
     """`training[name]`, which is not trusted: finite numbers of the given shape, or InputError."""
     try:
         value = np.array(policy.training[name], dtype=np.float64)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
@@ -30,7 +31,8 @@ class Monitored:
 
     `distance` and `offset` are those of `Episode`, `curvature` is that of `controllers.evaluate`. `settled` is the
     share of the initial states from which the policy as it would ship settles in the sense of `MONITORING`, and
-    `cost` the median of their costs; both are NaN for a plant without a box of initial states.
+    `cost` the median of their costs; both are NaN for a plant without a box of initial states. `A_error`, `B_error`,
+    `K_error` are the relative errors of `controllers.evaluate.errors_of`; NaN as long as there is no gain.
     """
 
     step: int
@@ -39,6 +41,9 @@ class Monitored:
     curvature: float
     settled: float
     cost: float
+    A_error: float = math.nan  # rows of earlier checkpoints end before it
+    B_error: float = math.nan
+    K_error: float = math.nan
 
 
 class Log:

@@ -1,7 +1,9 @@
 """The LQR gain of an unknown plant: A, then B, by least squares on transitions near the origin; then K.
 
 Near the equilibrium `x+ = A x + B (u - u_eq)`. Transitions with zero action, u = u_eq, show A alone; B is
-then fitted to what A leaves unexplained. K solves the *discrete* Riccati equation at the training step, and
+then fitted to what A leaves unexplained. In a ball of radius eta the linear fit of A is wrong by what the plant's
+second-order terms look like on the states that were seen, of the order of eta; fitted along, they take that error
+with them, and what is left is of the order of eta^2. K solves the *discrete* Riccati equation at the training step, and
 the control law is `u = u_eq - K x`: the Jacobian of a matching policy is -K (the paper writes +K, with the
 other sign in K).
 """
@@ -15,19 +17,30 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from controllers.options import Transitions
+from controllers.options import Terms, Transitions
 
 Array = NDArray[np.float64]
 
 
-def fit_A(x: Array, x_next: Array) -> Array:
+def fit_A(x: Array, x_next: Array, terms: Terms = "linear") -> Array:
     """Least-squares A of `x+ = A x`; rows of `x` and `x_next` (N, n) are transitions with u = u_eq.
+
+    With quadratic terms it is that of `x+ = A x + (a quadratic form of x)`, which takes n + n (n + 1) / 2 rows.
 
     >>> fit_A(np.array([[1.0, 0.0], [0.0, 2.0]]), np.array([[1.0, 3.0], [4.0, 0.0]]))
     array([[1., 2.],
            [3., 0.]])
     """
-    return _least_squares(x, x_next, "A")
+    if terms == "linear":
+        return _least_squares(x, x_next, "A")
+    n = x.shape[1]
+    i, j = np.triu_indices(n)
+    regressors = np.hstack([x, x[:, i] * x[:, j]])
+    # In one unit: products are so much smaller than states that small ones would pass for zero.
+    size = np.linalg.norm(regressors, axis=0)
+    size[size == 0] = 1.0
+    fitted = _least_squares(regressors / size, x_next, "A and the quadratic terms")
+    return np.asarray(fitted[:, :n] / size[:n])
 
 
 def fit_B(x: Array, v: Array, x_next: Array, A: Array) -> Array:
@@ -81,6 +94,7 @@ class GainLearner:
     Q, R : LQR weights, shapes (n, n) and (m, m).
     phase : what it asks for first; `idle` waits for a `refresh`.
     transitions : "latest" forgets those of earlier rounds, for a plant that changes.
+    terms_A : what A is fitted with.
     """
 
     def __init__(
@@ -92,13 +106,15 @@ class GainLearner:
         R: Array,
         phase: Phase = "A",
         transitions: Transitions = "all",
+        terms_A: Terms = "linear",
     ) -> None:
         n, m = len(Q), len(R)
-        if n_A < n or n_B < m:
-            raise InputError(f"`n_A` and `n_B` must be at least {n} and {m}; found {n_A} and {n_B}.")
+        least = n if terms_A == "linear" else n + n * (n + 1) // 2
+        if n_A < least or n_B < m:
+            raise InputError(f"`n_A` and `n_B` must be at least {least} and {m}; found {n_A} and {n_B}.")
         self.eta, self.n_A, self.n_B, self.Q, self.R = eta, n_A, n_B, Q, R
         self.phase: Phase = phase
-        self.transitions = transitions
+        self.transitions, self.terms_A = transitions, terms_A
         self.identified: Identified | None = None
         self._A: Array | None = None
         self._wanted: dict[Phase, int] = {"A": n_A, "B": n_B, "idle": 0}
@@ -119,7 +135,7 @@ class GainLearner:
             return
         states, inputs, successors = (np.array(part) for part in zip(*self._rows[self.phase], strict=True))
         if self.phase == "A":
-            self._A = fit_A(states, successors)
+            self._A = fit_A(states, successors, self.terms_A)
             self._begin("B")
         elif self._A is not None:
             B = fit_B(states, inputs, successors, self._A)

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
 Centre = Literal["preactivation", "output", "none"]
 Identification = Literal["during", "before", "never"]
 Transitions = Literal["all", "latest"]
+Terms = Literal["linear", "quadratic"]
 IdentificationStarts = Literal["ball", "domain"]
 RewardAt = Literal["next", "current"]
 GainNorm = Literal["frobenius", "spectral"]
@@ -101,6 +102,9 @@ class TrainingOptions:
     transitions: Annotated[
         Transitions, "Which transitions fit A and B: those of all rounds so far, or of the latest round only."
     ] = "all"
+    terms_A: Annotated[
+        Terms, "What is fitted to x+ for A: linear terms, or quadratic ones as well, of which nothing is kept."
+    ] = "linear"
     gain_weight: Annotated[float, "Weight of ||J_mu(0) + K|| + ||mu(0) - u_eq|| in the actor's loss; 0 drops the term."]
     gain_norm: Annotated[
         GainNorm, "Norm of J_mu(0) + K: frobenius, or spectral, the largest singular value; one for a single input."
@@ -134,6 +138,7 @@ class TrainingOptions:
             "centre": Centre,
             "identification": Identification,
             "transitions": Transitions,
+            "terms_A": Terms,
             "identification_starts": IdentificationStarts,
             "reward_at": RewardAt,
             "gain_norm": GainNorm,

@@ -31,7 +31,7 @@ from certify.errors import InputError
 from certify.policies import Policy
 from certify.systems import System
 from controllers.environments import PlantEnvironment, Snapshot
-from controllers.evaluate import curvature, settle
+from controllers.evaluate import curvature, errors_of, settle
 from controllers.files import write_atomically
 from controllers.logs import Episode, Monitored
 from controllers.lqr import GainLearner, Identified, Phase
@@ -68,7 +68,9 @@ class Trainer:
         self.interface = Interface(system)
         Q_c, R_c = np.diag(options.state_weights), np.diag(options.input_weights)
         first: Phase = "idle" if options.identification == "never" else "A"
-        self.gain = GainLearner(options.eta, options.n_A, options.n_B, Q_c, R_c, first, options.transitions)
+        self.gain = GainLearner(
+            options.eta, options.n_A, options.n_B, Q_c, R_c, first, options.transitions, options.terms_A
+        )
         self.generator = torch.Generator(CPU).manual_seed(options.seed)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(options.seed)
@@ -127,13 +129,21 @@ class Trainer:
     def monitor(self) -> None:
         """Judge the policy as it is, in a second or so; draws none of the run's random numbers."""
         network, options = self.sac.actor.network(), self.options
+        Q, R = np.array(options.state_weights), np.array(options.input_weights)
         settled = cost = float("nan")
         if self.plant is not None or self.system.name in available_plants():
-            Q, R = np.array(options.state_weights), np.array(options.input_weights)
             found = settle(network, self.system, options.dt, Q, R, plant=self.plant)
             settled, cost = found.settled / found.states, found.cost
         bend = curvature(network, self.system, options.eta)
-        self.monitored.append(Monitored(self.steps_done, *self.distance(), bend, settled, cost))
+        known, errors = self.gain.identified, (float("nan"),) * 3
+        if known is not None:
+            errors = errors_of(known, self.system, options.dt, Q, R)
+        self.monitored.append(Monitored(self.steps_done, *self.distance(), bend, settled, cost, *errors))
+
+    @property
+    def ships(self) -> bool:
+        """Whether there is a policy to ship: the gain is learned, or is not to be."""
+        return self.gain.identified is not None or self.options.identification == "never"
 
     def policy(self) -> Policy:
         """The mean action, centred, with the record of how it was made.
@@ -144,7 +154,7 @@ class Trainer:
         """
         self._require_finite(self.distance()[1])
         found = self.gain.identified
-        if found is None and self.options.identification != "never":
+        if not self.ships:
             passing = self.options.identification_starts == "domain"
             instead = ", or `identification_starts` ball, which goes where the gain is learned" if passing else ""
             raise InputError(

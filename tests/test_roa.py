@@ -358,7 +358,11 @@ def test_input_bounds_are_decided_in_rationals(tmp_path: Path) -> None:
     [
         (lambda x, u: u - x**65, "largest exponent"),
         (lambda x, u: u - x * sympy.Rational(1, 10**1300), "digits"),
-        (lambda x, u: u - sum((x + k) * sympy.sin(x + k * x**2) for k in range(1, 3000)) * x**2, "nodes"),
+        pytest.param(
+            lambda x, u: u - sum((x + k) * sympy.sin(x + k * x**2) for k in range(1, 3000)) * x**2,
+            "nodes",
+            marks=pytest.mark.slow,  # 3,000 terms take sympy a quarter of a minute
+        ),
         (lambda x, u: u - nested(x, 101), "nesting"),
     ],
 )

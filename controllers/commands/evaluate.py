@@ -48,14 +48,15 @@ def _table(result: Evaluation) -> dict[str, Any]:
             f"largest final norm {s.largest:.1e}, median cost {s.cost:.4g}"
         )
 
-    A_error, B_error = 100 * result.A_relative_error, 100 * result.B_relative_error
+    errors = (result.A_relative_error, result.B_relative_error, result.K_relative_error)
+    A_error, B_error, K_error = ("?" if math.isnan(error) else f"{100 * error:.2g} %" for error in errors)
     covered = result.covered
     learned = not math.isnan(result.gain_relative)
     return {
         "system": result.system,
         "sha256": result.sha256,
         "||J+K||/||K||": f"{100 * result.gain_relative:.3g} %" if learned else None,
-        "learned A, B": f"off by {A_error:.2g} % and {B_error:.2g} %" if learned else None,
+        "learned A, B, K": f"off by {A_error}, {B_error} and {K_error}" if learned else None,
         "curvature": None if math.isnan(result.curvature) else f"{result.curvature:.4g}",
         "eigenvalues": ", ".join(f"{e:.4g}" for e in result.eigenvalues),
         "continuous": settling(result.continuous),

@@ -39,6 +39,10 @@ def train(
     evaluate_every: Annotated[
         int, typer.Option("--evaluate-every", help="Steps between evaluations during the run; 0 means none.")
     ] = 10_000,
+    keep: Annotated[
+        Path | None,
+        typer.Option("--keep", help="Folder that gets the policy as it would ship at each of these evaluations."),
+    ] = None,
     device: Annotated[str, typer.Option("--device", help="Where the networks live: cpu or cuda.")] = "cpu",
     resume: Annotated[bool, typer.Option("--resume", help="Go on from checkpoint.pt in --checkpoint-dir.")] = False,
     as_json: Json = False,
@@ -55,6 +59,7 @@ def train(
         system, own = chosen_plant(plant)
         options = overridden(own.named(preset), _given(chosen))
         from certify.policies import save_policy
+        from controllers.kept import Keeper
         from controllers.logs import Episode, Log, Monitored
         from controllers.sac import find_device
         from controllers.training import Trainer
@@ -64,12 +69,14 @@ def train(
             raise InputError(f"`checkpoint_every` must be positive; found {checkpoint_every}.")
         if evaluate_every < 0:
             raise InputError(f"`evaluate_every` must be at least 0; found {evaluate_every}.")
-        if evaluations is not None and not evaluate_every:
-            raise InputError("`--evaluations` needs an `--evaluate-every` above 0.")
+        for option, path in (("--evaluations", evaluations), ("--keep", keep)):
+            if path is not None and not evaluate_every:
+                raise InputError(f"`{option}` needs an `--evaluate-every` above 0.")
         for path in filter(None, (out, log, evaluations)):
             require_writable(path)
         trainer = Trainer(system, options, find_device(device), own)
         checkpoint = _checkpoint(checkpoint_dir, resume)
+        keeper = None if keep is None else Keeper(keep, resume)
         if resume and checkpoint is not None:
             trainer.restore(read(checkpoint))
         with ExitStack() as stack:
@@ -82,6 +89,8 @@ def train(
                     episodes.extend(trainer.episodes)
                 if rows is not None:
                     rows.extend(trainer.monitored)
+                if keeper is not None:
+                    keeper(trainer)
                 show(trainer)
 
             policy = run(trainer, report, checkpoint, checkpoint_every, evaluate_every)

@@ -43,6 +43,39 @@ def test_transitions_in_one_direction_do_not_determine_A():
         fit_A(x, x @ A.T)
 
 
+def test_quadratic_terms_of_the_plant_spoil_a_linear_fit_of_A_and_not_one_that_has_them():
+    generator = np.random.default_rng(1)
+    M, N = generator.standard_normal((2, 2, 2)), generator.standard_normal((2, 2, 2))
+    errors: dict[str, list[float]] = {"linear": [], "quadratic": []}
+    where = generator.uniform(-1, 1, (40, 2))
+    for radius in (1e-3, 5e-4):
+        x = radius * where
+        quadratic = x @ A.T + np.einsum("ijk,nj,nk->ni", M, x, x)
+        np.testing.assert_allclose(fit_A(x, quadratic, "quadratic"), A, rtol=0, atol=1e-12)
+        cubic = quadratic + np.einsum("ijk,nj,nk->ni", N, x, x**2)
+        for terms, found in errors.items():
+            found.append(np.linalg.norm(fit_A(x, cubic, terms) - A))
+    assert errors["linear"][0] > 100 * errors["quadratic"][0]
+    orders = {terms: np.log2(found[0] / found[1]) for terms, found in errors.items()}
+    assert orders == pytest.approx({"linear": 1, "quadratic": 2}, abs=0.01)
+
+
+def test_states_in_tiny_units_determine_A_and_the_quadratic_terms():
+    x, _ = _transitions(20)
+    units = np.array([1e-9, 1e3])
+    scaled = A * units[:, None] / units
+    found = fit_A(x * units, (x @ A.T + x**2) * units, "quadratic")
+    np.testing.assert_allclose(found, scaled, rtol=1e-9)
+
+
+def test_quadratic_terms_take_rows_of_their_own():
+    x, _ = _transitions(4)
+    with pytest.raises(InputError, match=r"A and the quadratic terms: they span 4 of 5"):
+        fit_A(x, x @ A.T, "quadratic")
+    with pytest.raises(InputError, match=r"at least 5 and 2; found 4 and 3"):
+        GainLearner(1.0, 4, 3, np.eye(2), np.eye(2), terms_A="quadratic")
+
+
 def test_the_gain_stabilises_with_a_minus_sign_and_solves_the_discrete_riccati_equation():
     Q, R = np.diag([1.0, 0.5]), np.diag([1.0, 2.0])
     K = riccati_gain(A, B, Q, R)

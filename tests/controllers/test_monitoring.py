@@ -16,7 +16,9 @@ from certify.errors import InputError
 from certify.policies import load_policy
 from certify.systems import get_system
 from controllers.cli import app
-from controllers.evaluate import MONITORING, curvature, evaluate, settle
+from controllers.evaluate import MONITORING, curvature, discrete_linearisation, errors_of, evaluate, settle
+from controllers.logs import Monitored
+from controllers.lqr import Identified, riccati_gain
 from controllers.options import TrainingOptions, preset
 from controllers.training import Trainer, train
 
@@ -58,6 +60,36 @@ def test_the_share_is_that_of_the_evaluation_and_needs_a_policy_that_stabilises(
     assert _settle(backwards, options).settled == 0
 
 
+def test_as_long_as_nothing_is_learned_there_is_no_error_of_it(short):
+    trainer = Trainer(PENDULUM, replace(short, identification="never"))
+    trainer.monitor()
+    assert all(math.isnan(error) for error in astuple(trainer.monitored[0])[-3:])
+    assert Monitored(*astuple(trainer.monitored[0])[:6]).step == 0  # a row of a checkpoint that had no errors
+
+
+def test_the_errors_are_those_of_the_true_plant_and_of_its_gain_for_the_same_weights():
+    options = preset("pendulum")
+    Q, R = np.array(options.state_weights), np.array(options.input_weights)
+    A, B = discrete_linearisation(PENDULUM, options.dt)
+    K = riccati_gain(A, B, np.diag(Q), np.diag(R))
+    assert errors_of(Identified(A, B, K), PENDULUM, options.dt, Q, R) == (0, 0, 0)
+    found = errors_of(Identified(1.25 * A, 0.5 * B, 3 * K), PENDULUM, options.dt, Q, R)
+    np.testing.assert_allclose(found, (0.25, 0.5, 2.0), rtol=1e-12)
+    assert errors_of(Identified(A, B, K), PENDULUM, options.dt, 10 * Q, R)[2] > 0.1
+    nothing = errors_of(Identified(A, B, K), PENDULUM, options.dt, 0 * Q, R)  # the least input still stabilises
+    assert math.isfinite(nothing[2]) and nothing[2] > 1e-3
+
+
+def test_a_policy_that_was_given_another_gain_is_measured_by_the_weights_of_that_gain():
+    policy, options = load_policy(SHIPPED), replace(MONITORING, states=1, duration=1.0)
+    assert 4e-4 < evaluate(policy, options).K_relative_error < 6e-4
+    other = {"K": policy.training["K"], "Q": [10.0, 0.5], "R": [1.0]}
+    given = replace(policy, training={**policy.training, "flattened": other})
+    assert evaluate(given, options).K_relative_error > 0.1
+    with pytest.raises(InputError, match="'Q'"):
+        evaluate(replace(policy, training={**policy.training, "flattened": {"K": []}}), options)
+
+
 def test_a_plant_without_initial_states_is_monitored_without_a_simulation(short):
     system = replace(PENDULUM, name="a_pendulum_of_my_own")
     trainer = Trainer(system, short)
@@ -80,7 +112,11 @@ def test_the_command_shows_and_writes_them_and_a_resumed_run_writes_the_same(tmp
     whole, result = run("whole", "--evaluate-every", 100)
     rows = list(csv.DictReader(whole.splitlines()))
     assert [row["step"] for row in rows] == ["100", "200", "250"]
-    assert list(rows[0]) == ["step", "distance", "offset", "curvature", "settled", "cost"]
+    figures = ["step", "distance", "offset", "curvature", "settled", "cost", "A_error", "B_error", "K_error"]
+    assert list(rows[0]) == figures
+    identified = [float(rows[-1][name]) for name in figures[-3:]]
+    judged = CliRunner().invoke(app, ["evaluate", str(tmp_path / "whole.pt"), "--states", "1", "--json"])
+    assert list(json.loads(judged.stdout)["identification"].values()) == identified and 0 < max(identified) < 0.01
     assert f"settled {float(rows[-1]['settled']):.0%}" in result.stderr
     assert json.loads(result.stdout)["distance"] == float(rows[-1]["distance"])
     assert run("resumed", "--evaluate-every", 100, "--resume")[0] == whole

@@ -132,7 +132,8 @@ def test_a_run_that_could_not_choose_its_transitions_fitted_those_of_the_latest_
         _trainer(short).restore(older.getvalue())
     resumed = _trainer(replace(short, transitions="latest"))
     resumed.restore(older.getvalue())
-    assert resumed.gain.transitions == "latest"
+    assert resumed.gain.transitions == "latest" and resumed.gain.terms_A == "linear"
+    assert _trainer(replace(short, terms_A="quadratic")).gain.terms_A == "quadratic"
     now = torch.load(io.BytesIO(whole[2][50]), weights_only=True)["gain"]
     assert resumed.gain.state() == now and len(now["rows"]["A"]) == 50
 
@@ -225,6 +226,8 @@ def test_the_log_holds_every_episode_once_also_after_a_resume(short, whole, tmp_
         ({"actor": ()}, "actor"),
         ({"centre": "nowhere"}, "centre"),
         ({"identification": "always"}, "identification"),
+        ({"transitions": "some"}, "transitions"),
+        ({"terms_A": "cubic"}, "terms_A"),
         ({"input_weights": (0.0,)}, "input_weights"),
         ({"seed": -1}, "seed"),
     ],

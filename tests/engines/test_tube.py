@@ -237,6 +237,7 @@ def test_enlarge_asks_for_more_than_it_is_worth() -> None:
     assert enlarge(paths(case.loop), goal, {"goal": goal}, lambda: 20.0, worth=1e9) is None
 
 
+@pytest.mark.slow
 def test_robust_is_larger_than_what_it_starts_from() -> None:
     """By the local rule, on the planar quadrotor, where Q = I and LQR are far from the best."""
     system = get_system("quadrotor2d")

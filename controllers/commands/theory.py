@@ -1,0 +1,76 @@
+"""`controllers theory`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from controllers.commands.shared import Json, emit, errors
+
+if TYPE_CHECKING:
+    from controllers.theory import Constant, Theory
+
+
+def theory(
+    policy: Annotated[Path, typer.Argument(help="The policy file.")],
+    system: Annotated[
+        str | None, typer.Option(help="A plant of your own, FILE.toml or FILE.py:NAME; default: what the policy says.")
+    ] = None,
+    certificate: Annotated[
+        Path | None, typer.Option(help="A certificate of this policy: how far its P lets the gain at the origin move.")
+    ] = None,
+    states: Annotated[int, typer.Option(help="Number of initial states of the estimate of a_V.")] = 200,
+    seed: Annotated[int, typer.Option(help="Seed of the initial states.")] = 0,
+    as_json: Json = False,
+) -> None:
+    """Show the constants on which the theory of the method rests, each proved or estimated, for one policy."""
+    with errors(as_json):
+        from certify.containment import proved_set
+        from certify.policies import load_policy
+        from controllers.own import chosen_plant
+        from controllers.theory import theory as constants_of
+
+        stored, own = load_policy(policy), None if system is None else chosen_plant(system)
+        proved = None if certificate is None else proved_set(certificate)
+        result = constants_of(stored, own, proved, states, seed)
+        emit(result.as_json() if as_json else _table(result), as_json)
+
+
+def _table(result: Theory) -> dict[str, Any]:
+    rows: dict[str, Any] = {"system": result.system, "sha256": result.sha256}
+    rows |= {constant.name: _shown(constant) for constant in result.constants}
+    rows["discount"] = _discount(result)
+    rows["gain"] = _gain(result)
+    return rows
+
+
+def _shown(constant: Constant) -> str:
+    number = "none" if constant.value is None else f"{constant.relation} {constant.value:.6g}"
+    return f"{number}  {constant.how}: {constant.by}"
+
+
+def _discount(result: Theory) -> str:
+    """What the discount's bound says; what was only sampled may take the word back, and never gives it."""
+    gamma = result["gamma"].value or 0.0
+    names = ("gamma_star", "gamma_star_at_gamma", "gamma_star_sampled")
+    star, at_gamma, sampled = (result[name].value for name in names)
+    if at_gamma is None or gamma <= at_gamma:
+        return f"{gamma:g} is not shown to be above gamma*: this theory says nothing of the run"
+    if star is None or gamma <= star:
+        return f"{gamma:g} is above gamma* at gamma (proved, linear part), not above that for every discount"
+    if sampled is None or gamma <= sampled:
+        return f"{gamma:g} is above gamma* (proved, linear part), not above that of the simulated states"
+    return f"{gamma:g} is above gamma* (proved, linear part), and above that of the simulated states"
+
+
+def _gain(result: Theory) -> str:
+    distance = result["distance"].value
+    if distance is None:
+        return "there is no gain to compare with"
+    allowed = {name: result[name].value for name in ("epsilon_K", "epsilon_K_held")}
+    within = [name for name, value in allowed.items() if value is not None and distance <= value]
+    if not within:
+        return "||J_mu(0) + K|| is not shown to be within epsilon_K"
+    return f"||J_mu(0) + K|| is within {' and '.join(within)} (proved)"
