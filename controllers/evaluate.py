@@ -225,13 +225,6 @@ def require_same_loop(proved: ProvedSet, network: TanhNetwork, system: System) -
     ------
     InputError : the certificate is about another policy, or about other equations.
     """
-    require_about(proved, network, system)
-    inside = sum(proved.holds(x0.tolist()))
-    return Covered(inside, len(x0), proved.claim, proved.certificate_sha256)
-
-
-def require_about(proved: ProvedSet, network: TanhNetwork, system: System) -> None:
-    """Raise InputError unless a certificate is about this policy and this plant."""
     if proved.policy_sha256 != network.sha256():
         raise InputError(
             f"the certificate must be about the policy that is evaluated, {network.sha256()}; it is about "

@@ -24,7 +24,7 @@ from certify.lyapunov import Candidate, volume
 from certify.policies import Policy
 from certify.systems import System
 from certify.verdict import Verdict
-from controllers.evaluate import discrete_linearisation, require_about
+from controllers.evaluate import discrete_linearisation, require_same_loop
 from controllers.files import read
 from controllers.kept import Kept
 from controllers.lqr import riccati_gain
@@ -154,7 +154,7 @@ def prove(kept: Kept, system: System, folder: Path, options: ProvingOptions) -> 
     if path.is_file():
         try:
             proved = proved_set(path)
-            require_about(proved, network, system)
+            require_same_loop(proved, network, system)
         except (InputError, CertificateFormatError):  # refused, damaged, or of another policy: it is written anew
             path.unlink()
         else:
@@ -167,7 +167,7 @@ def prove(kept: Kept, system: System, folder: Path, options: ProvingOptions) -> 
         verdict = Verdict.UNKNOWN if result.verdict is Verdict.PROVED else result.verdict
         return Proof(kept.step, verdict, result.reason)
     proved = set_of(result.raw, str(path))
-    require_about(proved, network, system)
+    require_same_loop(proved, network, system)
     return _proof(kept.step, proved)
 
 
