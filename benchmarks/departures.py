@@ -37,7 +37,7 @@ from certify.verdict import Verdict
 from controllers.evaluate import discrete_linearisation
 from controllers.files import make_folder, write_atomically
 from controllers.lqr import riccati_gain
-from controllers.options import TrainingOptions, get_plant
+from controllers.options import TrainingOptions, default_record, get_plant
 from controllers.paper import DEPARTURES
 from controllers.responses import OURS, CompareOptions, Response, table
 from controllers.simulation import initial_states, mean_action, simulate
@@ -134,6 +134,8 @@ def rows(
         path = place / "row.json"
         asked = {"options": own.record(), "time_limit": limit}
         there = json.loads(path.read_text("utf-8")) if path.is_file() else None
+        if there is not None:  # runs had no options that came later
+            there["asked"]["options"] = {**default_record(), **there["asked"]["options"]}
         if there is not None and there["asked"] != asked:
             raise SystemExit(f"{path} is of other options. Move it away, or give another folder by --runs.")
         if there is None and not training:
