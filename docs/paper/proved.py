@@ -55,17 +55,18 @@ def proved(plant: str, folder: Path) -> Proved | None:
     out = OUT / plant / folder.parent.name / folder.name
     said, path = out / "said.json", out / "certificate.json"
     sha = load_policy(policy).network.sha256()
-    if not said.exists() or json.loads(said.read_text("utf-8"))["policy"]["sha256"] != sha:
+    if not said.exists() or json.loads(said.read_text("utf-8"))["about"] != sha:
         out.mkdir(parents=True, exist_ok=True)
         path.unlink(missing_ok=True)
         program = str(Path(sys.executable).parent / "certify")
         full = [program, *command(policy, SECONDS[plant])[1:], "--out", str(out), "--quiet", "--json"]
         done = subprocess.run(full, cwd=ROOT, stdout=subprocess.PIPE, text=True, check=False)
-        if done.returncode not in (0, 1, 3):
+        if done.returncode not in (0, 1, 2, 3):  # 2: refused, as where the clip acts at the origin
             raise SystemExit(f"{' '.join(full)} ended with {done.returncode}.")
-        said.write_text(done.stdout, "utf-8")
-    found = json.loads(said.read_text("utf-8"))
-    if found["verdict"] != "PROVED":
+        said.write_text(json.dumps({"about": sha, "said": json.loads(done.stdout)}), "utf-8")
+    found = json.loads(said.read_text("utf-8"))["said"]
+    if found.get("verdict") != "PROVED":
+        print(policy, found.get("error") or found["reason"])
         return None
     answer = run_checker(path)
     if answer["result"] != "ACCEPTED":
