@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import astuple, dataclass, fields
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,10 +21,9 @@ from numpy.typing import NDArray
 from certify.containment import ProvedSet, proved_set, set_of
 from certify.errors import CertificateFormatError, InputError
 from certify.lyapunov import Candidate, volume
-from certify.policies import Policy
 from certify.systems import System
 from certify.verdict import Verdict
-from controllers.evaluate import discrete_linearisation, require_same_loop
+from controllers.evaluate import discrete_linearisation, recorded, require_same_loop
 from controllers.files import read
 from controllers.kept import Kept
 from controllers.lqr import riccati_gain
@@ -111,13 +110,13 @@ def distances(history: Sequence[Kept], system: System) -> list[Distances]:
                 f"the policies must map {n} states to {m} inputs for {system.name}; found {policy.network.n} and "
                 f"{policy.network.m}."
             )
-        dt = float(_recorded(policy, "dt", ()))
-        Q, R = (np.diag(_recorded(policy, f"{of}_weights", (k,))) for of, k in (("state", n), ("input", m)))
+        dt = float(recorded(policy, "dt", ()))
+        Q, R = (np.diag(recorded(policy, f"{of}_weights", (k,))) for of, k in (("state", n), ("input", m)))
         A, B = discrete_linearisation(system, dt)
         K = riccati_gain(A, B, Q, R)
         J = policy.network.jacobian_at_origin(system.exact_u_eq())
         learned = {
-            name: _relative(_recorded(policy, name, true.shape), true) if name in policy.training else math.nan
+            name: _relative(recorded(policy, name, true.shape), true) if name in policy.training else math.nan
             for name, true in (("A", A), ("B", B), ("K", K))
         }
         found.append(Distances(step=kept.step, **learned, mean=_relative(-J, K)))
@@ -216,14 +215,3 @@ def _proof(step: int, proved: ProvedSet) -> Proof:
 
 def _relative(found: Array, true: Array) -> float:
     return float(np.linalg.norm(found - true) / np.linalg.norm(true))
-
-
-def _recorded(policy: Policy, name: str, shape: Sequence[int]) -> Any:
-    """A matrix or a number of the record, which is not trusted."""
-    try:
-        value = np.array(policy.training[name], dtype=np.float64)
-    except (KeyError, TypeError, ValueError) as error:
-        raise InputError(f"the policy's `training` record must have {name!r} in numbers.") from error
-    if value.shape != tuple(shape) or not np.all(np.isfinite(value)):
-        raise InputError(f"`training.{name}` must hold finite numbers of shape {tuple(shape)}.")
-    return value
