@@ -165,7 +165,7 @@ def test_distances_are_zero_for_what_is_true_and_known_for_what_is_not():
 @pytest.mark.parametrize(
     "record, message",
     [
-        ({"dt": "fast"}, "must have 'dt'"),
+        ({"dt": "fast"}, "must hold numbers"),
         ({"dt": None}, "`training.dt` must hold finite numbers"),
         ({"state_weights": [1.0]}, "`training.state_weights` must hold finite numbers of shape"),
         ({"K": [[float("nan"), 0.0]]}, "`training.K` must hold finite numbers"),
