@@ -18,7 +18,7 @@ import io
 import json
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, astuple, dataclass, fields
 from pathlib import Path
 from typing import Any, Literal, Protocol
@@ -172,7 +172,6 @@ def follow(
     folder: Path,
     judge: Callable[[], Judged],
     tell: Callable[[int], None] = lambda done: None,
-    about: Mapping[str, Any] | None = None,
 ) -> Course:
     """Take a run to its end, from the checkpoint in `folder` if one is there.
 
@@ -180,7 +179,6 @@ def follow(
     ----------
     judge : evaluates the learner's policy as it is; draws none of its random numbers.
     tell : told of the number of steps that are done, after each.
-    about : what the run depends on beside its plan, as plain values; kept with it, and asked for when it is read.
 
     Raises
     ------
@@ -206,31 +204,18 @@ def follow(
     turn = plan.turn(rows) if isinstance(plan, Stopping) else None
     why: Why = "steps" if turn is None else turn[1]
     course = Course(tuple(rows), why, rows[-1].step if isinstance(plan, Fixed) else best(rows).step)
-    record = {
-        "plan": _plan(plan),
-        "about": dict(about or {}),
-        "why": course.why,
-        "kept": course.kept,
-        "steps": course.steps,
-    }
+    record = {"plan": _plan(plan), "why": course.why, "kept": course.kept, "steps": course.steps}
     write_atomically(folder / ENDED, (json.dumps(record, indent=1) + "\n").encode())
     (folder / CHECKPOINT).unlink(missing_ok=True)
     return course
 
 
-def read_course(
-    folder: Path, plan: Plan, about: Mapping[str, Any] | None = None, before: Mapping[str, Any] | None = None
-) -> Course | None:
+def read_course(folder: Path, plan: Plan) -> Course | None:
     """The run in `folder`, if it is over.
-
-    Parameters
-    ----------
-    about : what it has to depend on; see `follow`.
-    before : what an entry of `about` was in runs that do not have it.
 
     Raises
     ------
-    InputError : it went by another plan or depends on something else, or its files are damaged.
+    InputError : it went by another plan, or its files are damaged.
     """
     path = folder / ENDED
     if not path.is_file():
@@ -238,7 +223,6 @@ def read_course(
     try:
         record = json.loads(read(path))
         theirs, why, kept = dict(record["plan"]), record["why"], int(record["kept"])
-        about_theirs = {**(before or {}), **record["about"]}
     except (KeyError, TypeError, ValueError) as error:
         raise InputError(f"{path} is damaged: {error}.") from error
     mine = _plan(plan)
@@ -248,12 +232,6 @@ def read_course(
             f"{folder} is a run by another plan: its `{name}` is {theirs.get(name)}, and {mine.get(name)} is asked "
             "for. Compare by its plan, or in another folder of runs."
         )
-    for name, value in (about or {}).items():
-        if about_theirs.get(name) != value:
-            raise InputError(
-                f"{folder} is a run with other options: its `{name}` is {about_theirs.get(name)}, and {value} is asked "
-                "for. Compare with its options, or in another folder of runs."
-            )
     rows = read_curve(folder / CURVE)
     if not rows:
         raise InputError(f"{folder / CURVE} must have a row; it has none.")

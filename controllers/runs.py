@@ -19,7 +19,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from certify.errors import BackendError, InputError
 from certify.policies import load_policy
@@ -39,11 +38,11 @@ from controllers.course import (
     read_course,
 )
 from controllers.files import make_folder, read, write_atomically
-from controllers.options import TrainingOptions, default_record
+from controllers.options import TrainingOptions
 from controllers.responses import NAMES, OURS, CompareOptions, Response, Run, table
 from controllers.sb3 import MODEL, ROLLOUT, Reference, budget, from_reference
 from controllers.simulation import Action, initial_states, simulate
-from controllers.training import Trainer, parameters_of
+from controllers.training import Trainer
 
 POLICY = "policy.pt"
 
@@ -156,8 +155,7 @@ def _there(run: Run, folder: Path, system: System, training: TrainingOptions, pl
     ------
     InputError : it is another one, or the folder holds a policy and nothing that says where it is from.
     """
-    course = read_course(folder, plan, _about(system, training), default_record())
-    path = folder / _FILES[run]
+    course, path = read_course(folder, plan), folder / _FILES[run]
     if course is None:
         if path.is_file() and not (folder / CHECKPOINT).is_file():
             raise InputError(
@@ -308,14 +306,7 @@ def _train(
     run: Run, system: System, training: TrainingOptions, folder: Path, plan: Plan, tell: Callable[[int], None]
 ) -> None:
     learner = learner_of(run, system, training, plan)
-    about = _about(system, training)
-    follow(learner, plan, folder, lambda: judged(system, training, learner.trained().mean), tell, about)
-
-
-def _about(system: System, training: TrainingOptions) -> dict[str, Any]:
-    """What a run depends on beside its plan, which says its steps; threads are of no account."""
-    record = {name: value for name, value in training.record().items() if name not in ("steps", "threads")}
-    return {"system": system.name, "parameters": parameters_of(system), **record}
+    follow(learner, plan, folder, lambda: judged(system, training, learner.trained().mean), tell)
 
 
 def learner_of(run: Run, system: System, training: TrainingOptions, plan: Plan) -> OwnRun | Reference:
