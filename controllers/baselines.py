@@ -69,6 +69,11 @@ class OwnRun:
         """Environment steps so far."""
         return self.trainer.steps_done
 
+    @property
+    def closing(self) -> tuple[int, int] | None:
+        """The two steps of `close`; None before it."""
+        return self.trainer.closing
+
     def advance(self, steps: int, tell: Callable[[int], None] = lambda done: None) -> None:
         """Go on until so many steps are made in all; `tell` hears of each."""
         torch.set_num_threads(self.trainer.options.threads)
@@ -131,7 +136,7 @@ def from_policy(policy: Policy, system: System) -> Trained:
     ------
     InputError : the policy is of another plant or other parameters, or its record lacks `steps` or `seed`.
     """
-    _require_plant("policy", policy.system, policy.parameters, system)
+    require_plant("policy", policy.system, policy.parameters, system)
     u_eq = system.exact_u_eq()
     network = policy.network.folded(u_eq)
     try:
@@ -152,7 +157,7 @@ def from_checkpoint(checkpoint: bytes, system: System) -> Trained:
     interface = Interface(system)
     try:
         (name, parameters), options = state["system"], {**default_record(), **state["options"]}
-        _require_plant("checkpoint", name, parameters, system)
+        require_plant("checkpoint", name, parameters, system)
         actor = Actor(interface, options["actor"], options["centre"], options["log_std"])
         actor.load_state_dict(state["sac"]["actor"])
         steps, seed = int(state["steps_done"]), int(options["seed"])
@@ -171,7 +176,8 @@ def from_checkpoint(checkpoint: bytes, system: System) -> Trained:
     return Trained(system.name, steps, seed, lambda x: np.asarray(network(x, u_eq)), sample)
 
 
-def _require_plant(what: str, name: str, parameters: Mapping[str, float | int | str], system: System) -> None:
+def require_plant(what: str, name: str, parameters: Mapping[str, float | int | str], system: System) -> None:
+    """Raise InputError unless what a record says is this plant with these parameters; `what` is what has the record."""
     if name != system.name:
         raise InputError(f"the {what} must be of {system.name}; it is of {name}.")
     if system.with_parameters(parameters).parameters != system.parameters:

@@ -7,8 +7,8 @@ learning rate falls to zero over a further share of the steps, as ours does at i
 is that of the evaluation with the smallest floor, the choice that is kindest to it. A run of a fixed number of steps is
 evaluated alike and ends with the policy it has.
 
-In a run's folder lie `curve.csv`, a row an evaluation; while it goes on, `checkpoint.pt`; when it is over,
-`course.json`, which says why; and always the files of the policy that is kept.
+In a run's folder lie `curve.csv`, a row an evaluation; from its beginning until it is over `checkpoint.pt`, then
+`course.json`, which says why it ended; and from the first evaluation on the files of the policy that is kept.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, astuple, dataclass, fields
 from pathlib import Path
-from typing import Any, Literal, Protocol
+from typing import Any, Literal, Protocol, get_args
 
 from certify.errors import InputError
 from controllers.files import make_folder, read, write_atomically
@@ -37,6 +37,10 @@ class Learner(Protocol):
     @property
     def steps_done(self) -> int:
         """Environment steps so far."""
+
+    @property
+    def closing(self) -> tuple[int, int] | None:
+        """The two steps of `close`; None before it."""
 
     def advance(self, steps: int, tell: Callable[[int], None]) -> None:
         """Go on until at least so many steps are made in all; `tell` is told the number after each."""
@@ -182,7 +186,8 @@ def follow(
 
     Raises
     ------
-    InputError : the checkpoint or the curve is damaged or of another run, or the folder cannot be written.
+    InputError : the checkpoint or the curve is damaged, of another run or by another plan, or the folder cannot be
+        written.
     """
     make_folder(folder)
     rows = list[Evaluated]()
@@ -190,6 +195,9 @@ def follow(
         learner.restore(read(folder / CHECKPOINT))
         if (folder / CURVE).is_file():  # its last row may be of a step after the checkpoint, and is made again
             rows = [row for row in read_curve(folder / CURVE) if row.step <= learner.steps_done]
+        _require_same_course(plan, rows, learner, folder)
+    else:  # from here on the folder says that a run is under way in it
+        write_atomically(folder / CHECKPOINT, learner.snapshot())
     wall, cpu = (rows[-1].wall, rows[-1].cpu) if rows else (0.0, 0.0)
     began = time.perf_counter(), time.process_time()
     while (last := _next(plan, rows, learner)) > learner.steps_done:
@@ -222,8 +230,9 @@ def read_course(folder: Path, plan: Plan) -> Course | None:
         return None
     try:
         record = json.loads(read(path))
-        theirs, why, kept = dict(record["plan"]), record["why"], int(record["kept"])
-    except (KeyError, TypeError, ValueError) as error:
+        theirs, why = dict(record["plan"]), record["why"]
+        kept, steps = int(record["kept"]), int(record["steps"])
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{path} is damaged: {error}.") from error
     mine = _plan(plan)
     if theirs != mine:
@@ -235,6 +244,11 @@ def read_course(folder: Path, plan: Plan) -> Course | None:
     rows = read_curve(folder / CURVE)
     if not rows:
         raise InputError(f"{folder / CURVE} must have a row; it has none.")
+    if why not in get_args(Why) or rows[-1].step != steps or kept not in {row.step for row in rows}:
+        raise InputError(
+            f"{path} must be of the run of {CURVE} beside it; it says that the policy after {kept} of {steps} steps "
+            f"was kept, and the curve ends after {rows[-1].step}. Move the folder away, and the run is made again."
+        )
     return Course(tuple(rows), why, kept)
 
 
@@ -258,7 +272,7 @@ def read_curve(path: Path) -> list[Evaluated]:
             )
             for row in table
         ]
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, csv.Error) as error:
         raise InputError(f"{path} is no curve of a run: {error}.") from error
 
 
@@ -273,6 +287,33 @@ def _next(plan: Plan, rows: Sequence[Evaluated], learner: Learner) -> int:
         return min(following, max(plan.budget, done + 1))
     learner.close(*end)
     return min(following, end[1])
+
+
+def _require_same_course(plan: Plan, rows: Sequence[Evaluated], learner: Learner, folder: Path) -> None:
+    """Refuse a checkpoint that this plan would not have led to: another patience would end a run in its past.
+
+    Raises
+    ------
+    InputError : the rule has nothing to go by, or would have closed the run elsewhere.
+    """
+    expected = None
+    if isinstance(plan, Stopping) and learner.steps_done:
+        if not rows or rows[-1].step != learner.steps_done:
+            raise InputError(
+                f"{folder / CURVE} must have the evaluation after {learner.steps_done} steps, where {CHECKPOINT} "
+                "stands: when the run ends follows from all of them. Move the folder away, and the run is made again."
+            )
+        expected = plan.end(rows[:-1])  # the last one was made on the way there
+    if learner.closing != expected:
+        raise InputError(
+            f"{folder} is a run by another plan: after {learner.steps_done} steps its closing phase is "
+            f"{_phase(learner.closing)}, and by this plan {_phase(expected)}. Go on by its plan, or in another folder "
+            "of runs."
+        )
+
+
+def _phase(closing: tuple[int, int] | None) -> str:
+    return "not begun" if closing is None else f"that from {closing[0]} to {closing[1]}"
 
 
 def _plan(plan: Plan) -> dict[str, Any]:

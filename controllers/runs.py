@@ -5,8 +5,9 @@ rules of `RULES`, unless one number of steps is asked for all: a baseline that w
 
 A folder of runs holds `<run>/seed-<k>/` with what `controllers.course` writes, and the policy: `policy.pt`, the mean
 action as `controllers train` writes it; in `sac`, the same SAC without the gain, beside it `actor.pt`, the whole actor;
-in `sb3-sac` and `sb3-ppo` `model.zip`, the library's own file. What is missing is trained, what is there is used, and a
-run that was cut off goes on from its checkpoint. Where a run is trained, in this process, in others of this machine or
+in `sb3-sac` and `sb3-ppo` `model.zip`, the library's own file. What is missing is trained, what is there is used if it
+was made with the options that are asked for, and a run that was cut off goes on from its checkpoint, in one process at
+a time. Where a run is trained, in this process, in others of this machine or
 on a cluster, changes nothing in it: what comes back are its files, which are read as any other.
 """
 
@@ -15,16 +16,18 @@ from __future__ import annotations
 import io
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from certify.certificate import sole_writer
 from certify.errors import BackendError, InputError
 from certify.policies import load_policy
 from certify.running.tasks import Piece, Place, Processes
 from certify.systems import System
-from controllers.baselines import ACTOR, OwnRun, Trained, from_checkpoint, from_policy, without_gain
+from controllers.baselines import ACTOR, OwnRun, Trained, from_checkpoint, from_policy, require_plant, without_gain
 from controllers.course import (
     CHECKPOINT,
     CURVE,
@@ -37,8 +40,8 @@ from controllers.course import (
     follow,
     read_course,
 )
-from controllers.files import make_folder, read, write_atomically
-from controllers.options import TrainingOptions
+from controllers.files import read, write_atomically
+from controllers.options import TrainingOptions, default_record
 from controllers.responses import NAMES, OURS, CompareOptions, Response, Run, table
 from controllers.sb3 import MODEL, ROLLOUT, Reference, budget, from_reference
 from controllers.simulation import Action, initial_states, simulate
@@ -61,6 +64,23 @@ RULES: dict[Run, Stopping] = {
 }
 """When a baseline has reached its floor."""
 
+_NO_MATTER = frozenset({"steps", "seed"})  # what a run's record may differ in: both are asked for elsewhere
+_GAIN = frozenset(
+    {
+        *("identification", "eta", "n_A", "n_B", "refresh", "identification_starts", "transitions", "terms_A"),
+        *("gain_weight", "gain_norm", "centre"),
+    }
+)
+_OUR_LEARNER = frozenset(
+    {
+        *("reward_scale", "critic_scale", "log_std", "anneal"),
+        *("curvature_weight", "rest_weight", "proof_weight", "proof_box"),
+    }
+)
+_UNUSED: dict[Run, frozenset[str]] = {"sac": _GAIN, "sb3-sac": _GAIN | _OUR_LEARNER, "sb3-ppo": _GAIN | _OUR_LEARNER}
+"""Options that change nothing in a run of this kind."""
+
+_MOST_BYTES = 2**31  # of a run's files that come back: a checkpoint with a full replay buffer has a tenth of it
 _EVERY = 5_000  # steps between evaluations of a run of a fixed number of steps
 _JUDGED = CompareOptions(states=100, start_seed=1)  # during a run: other states than those of a table
 
@@ -117,7 +137,8 @@ def obtain(
 
     Raises
     ------
-    InputError : what is there is of another plant, seed or plan, or damaged, or the folder cannot be written.
+    InputError : what is there is of another plant, seed, plan or other options, or damaged, or the folder cannot be
+        written, or another process is at work in it.
     """
     plan = plan or fixed(run, training)
     folder = _folder(runs, run, training)
@@ -169,7 +190,28 @@ def _there(run: Run, folder: Path, system: System, training: TrainingOptions, pl
             f"{path} must be of a run with seed {training.seed} after {course.kept} steps; it is of {trained.steps} "
             f"steps with seed {trained.seed}. Compare in another folder of runs."
         )
+    _require_asked(run, folder / POLICY, system, training, plan)
     return Obtained(trained, course)
+
+
+def _require_asked(run: Run, path: Path, system: System, training: TrainingOptions, plan: Plan) -> None:
+    """Refuse a run by the record of its policy file: one that a changed preset or plant would have led elsewhere.
+
+    Raises
+    ------
+    InputError : its plant has other parameters, or an option that matters to this kind of run was another one.
+    """
+    policy = load_policy(path)
+    require_plant(str(path), policy.system, policy.parameters, system)
+    asked = _options_of(run, training, plan).record()
+    used = {**default_record(), **policy.training}  # a run had no options that came later
+    for name in sorted(asked.keys() - _NO_MATTER - _UNUSED.get(run, frozenset())):
+        if used.get(name) != asked[name]:
+            raise InputError(
+                f"{path} must be of a run with the options that are asked for; its `{name}` was {used.get(name)}, and "
+                f"{asked[name]} is asked for. Compare in another folder of runs, or move {path.parent} away and it is "
+                "trained again."
+            )
 
 
 def train_at(
@@ -187,8 +229,8 @@ def train_at(
 
     Raises
     ------
-    BackendError : one could not be trained; the others are kept.
-    InputError : what came back is no such run.
+    BackendError : one could not be trained, or what came back is no such run; the others are kept.
+    InputError : what is there is another run.
     """
     missing = {
         f"{one.run} seed {one.training.seed}": one
@@ -205,9 +247,13 @@ def train_at(
                 continue
             one = missing[outcome.key]
             run, training, plan = one.run, one.training, one.plan
-            if outcome.result:
-                _keep(outcome.result, run, _folder(runs, run, training), system, training, plan)
-            found = _there(run, _folder(runs, run, training), system, training, plan)
+            try:
+                if outcome.result:
+                    _keep(outcome.result, run, _folder(runs, run, training), system, training, plan)
+                found = _there(run, _folder(runs, run, training), system, training, plan)
+            except InputError as error:  # of this run: those that are under way go on
+                lost[outcome.key] = str(error)
+                continue
             steps = 0 if found is None else found.course.steps
             done += 1
             say(f"{outcome.key}: {steps} of {steps} steps")
@@ -215,7 +261,7 @@ def train_at(
     if lost:
         what, why = next(iter(lost.items()))
         raise BackendError(
-            f"{len(lost)} of {len(missing)} runs could not be trained, {what} among them: {why}. "
+            f"{len(lost)} of {len(missing)} runs could not be trained, {what} among them: {why.rstrip('.')}. "
             "What was trained is kept; the same command goes on."
         )
 
@@ -227,7 +273,10 @@ def _pieces(place: Place, missing: dict[str, Wanted], system: System, runs: Path
         if isinstance(place, Processes):
             yield Piece(key, train_here, (run, system, training, folder, plan))
         else:
-            yield Piece(key, train_elsewhere, (run, system, training, _packed(folder, (CHECKPOINT, CURVE)), plan))
+            begun = _packed(
+                folder, (CHECKPOINT, *_all_files(run))
+            )  # the policy that is kept may be the best to the end
+            yield Piece(key, train_elsewhere, (run, system, training, begun, plan))
 
 
 def train_here(run: Run, system: System, training: TrainingOptions, folder: Path, plan: Plan) -> bytes:
@@ -257,10 +306,10 @@ def _keep(content: bytes, run: Run, folder: Path, system: System, training: Trai
         _unpack(content, received)
         if _there(run, received, system, training, plan) is None:
             raise InputError(f"what came back for {run}, seed {training.seed}, must be a run that is over; it is not.")
-        make_folder(folder)
-        for file in _all_files(run):  # what says that the run is over comes last
-            write_atomically(folder / file, (received / file).read_bytes())
-    (folder / CHECKPOINT).unlink(missing_ok=True)
+        with sole_writer(folder):
+            for file in _all_files(run):  # what says that the run is over comes last
+                write_atomically(folder / file, (received / file).read_bytes())
+            (folder / CHECKPOINT).unlink(missing_ok=True)
 
 
 def _all_files(run: Run) -> tuple[str, ...]:
@@ -282,19 +331,30 @@ def _unpack(content: bytes, folder: Path) -> None:
 
     Raises
     ------
-    InputError : it is no archive.
+    InputError : it is no archive, or more than any run.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            for name in archive.namelist():
-                if name in (CHECKPOINT, CURVE, ENDED, POLICY, ACTOR, MODEL):
-                    (folder / name).write_bytes(archive.read(name))
-    except (zipfile.BadZipFile, OSError, EOFError, ValueError) as error:
+            wanted = [
+                entry
+                for entry in archive.infolist()
+                if entry.filename in (CHECKPOINT, CURVE, ENDED, POLICY, ACTOR, MODEL)
+            ]
+            size = sum(entry.file_size for entry in wanted)  # no more of an entry is read than it says of itself
+            if size > _MOST_BYTES:
+                raise InputError(
+                    f"the files of a run must have at most {_MOST_BYTES} bytes; what came back has {size}."
+                )
+            for entry in wanted:
+                (folder / entry.filename).write_bytes(archive.read(entry))
+    except InputError:
+        raise
+    except (zipfile.BadZipFile, zlib.error, OSError, EOFError, ValueError, RuntimeError) as error:
         raise InputError(f"the files of a run that came back cannot be read: {error}.") from error
 
 
 def variant(run: Run, training: TrainingOptions) -> TrainingOptions:
-    """The options of one of our own runs."""
+    """The options of a run; of stable-baselines3 those of the preset."""
     if run == "sac":
         return without_gain(training)
     if run == "before":
@@ -305,21 +365,30 @@ def variant(run: Run, training: TrainingOptions) -> TrainingOptions:
 def _train(
     run: Run, system: System, training: TrainingOptions, folder: Path, plan: Plan, tell: Callable[[int], None]
 ) -> None:
-    learner = learner_of(run, system, training, plan)
-    follow(learner, plan, folder, lambda: judged(system, training, learner.trained().mean), tell)
+    with sole_writer(folder):
+        if (folder / ENDED).is_file():  # another process has ended it since it was looked for
+            return
+        learner = learner_of(run, system, training, plan)
+        follow(learner, plan, folder, lambda: judged(system, training, learner.trained().mean), tell)
 
 
 def learner_of(run: Run, system: System, training: TrainingOptions, plan: Plan) -> OwnRun | Reference:
     """A run at its beginning."""
-    if isinstance(plan, Stopping):  # its own closing phase takes the place of the preset's
-        most = plan.budget + round(plan.closing * plan.budget)
-        training = replace(training, steps=most, anneal=0.0)
+    training = _options_of(run, training, plan)
     if run == "sb3-sac":
         return Reference("sac", system, training)
     if run == "sb3-ppo":
         rollout = ROLLOUT if isinstance(plan, Stopping) else budget("ppo", training.steps)[1]
         return Reference("ppo", system, training, rollout)
-    return OwnRun(Trainer(system, variant(run, training)), whole=run == "sac")
+    return OwnRun(Trainer(system, training), whole=run == "sac")
+
+
+def _options_of(run: Run, training: TrainingOptions, plan: Plan) -> TrainingOptions:
+    """What a run is trained with."""
+    if isinstance(plan, Stopping):  # its own closing phase takes the place of the preset's
+        most = plan.budget + round(plan.closing * plan.budget)
+        training = replace(training, steps=most, anneal=0.0)
+    return variant(run, training)
 
 
 def judged(system: System, training: TrainingOptions, mean: Action) -> Judged:

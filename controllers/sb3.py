@@ -81,6 +81,11 @@ class Reference:
         """Environment steps so far."""
         return int(self.model.num_timesteps)
 
+    @property
+    def closing(self) -> tuple[int, int] | None:
+        """The two steps of `close`; None before it."""
+        return self._closing
+
     def advance(self, steps: int, tell: Callable[[int], None] = lambda done: None) -> None:
         """Go on until at least so many steps are made in all, PPO to the end of a rollout; `tell` hears of each."""
 
@@ -206,8 +211,8 @@ class Reference:
         model.num_timesteps, model._n_updates = int(state["steps"]), int(state["updates"])
         self._closing = None if state["closing"] is None else (int(state["closing"][0]), int(state["closing"][1]))
         self._generators = state["generators"]
-        model.env._reset_seeds()
-        if state["seen"] is not None:
+        if state["seen"] is not None:  # else it has not begun, and what it was made with stands
+            model.env._reset_seeds()
             model._last_obs = state["seen"].numpy()
             plant.reset(seed=0)  # makes its generator
             plant.np_random.bit_generator.state = json.loads(state["plant_generator"])

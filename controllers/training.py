@@ -113,6 +113,11 @@ class Trainer:
             batch = self.replay.sample(options.batch, self.generator)
             self.sac.update(batch, self._K, self._actor_step())
 
+    @property
+    def closing(self) -> tuple[int, int] | None:
+        """The steps between which `close` lets the actor's step fall; None before it."""
+        return self._closing
+
     def close(self, begin: int, end: int) -> None:
         """Let the actor's step fall linearly to zero between these two steps, whatever `anneal` says."""
         self._closing = begin, end

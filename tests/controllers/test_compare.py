@@ -14,13 +14,14 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from certify.certificate import sole_writer
 from certify.errors import BackendError, InputError
 from certify.policies import load_policy
 from certify.running.tasks import Cluster, Processes
 from certify.systems import available_systems, get_system
 from controllers import baselines, compare, runs, simulation
 from controllers.cli import app
-from controllers.course import Stopping
+from controllers.course import Judged, Stopping
 from controllers.environments import PlantEnvironment
 from controllers.options import get_plant, preset
 from controllers.plants import pendulum
@@ -437,7 +438,8 @@ def test_what_comes_back_and_is_no_such_run_is_not_written(finished, pendulum_sy
     place = Elsewhere(lambda piece: content if "seed 1" in piece.key else piece.work(*piece.arguments))
     options = replace(SHORT, methods=(OURS,), seeds=2)
     message = {"another seed": "with seed 1 after", "unfinished": "would be written over|must be a run that is over"}
-    with pytest.raises(InputError, match=message.get(sent, "cannot be read") if isinstance(sent, str) else "be read"):
+    message = message.get(sent, "cannot be read") if isinstance(sent, str) else "be read"
+    with pytest.raises(BackendError, match=f"1 of 2 runs could not be trained, ours seed 1 among them: .*({message})"):
         compare.compare(pendulum_system, TINY, tmp_path / "runs", tmp_path, options, place=place)
     kept = tmp_path / "runs" / "ours"
     assert sorted(path.name for path in kept.iterdir()) == ["seed-0"] and not list(tmp_path.rglob("outside"))
@@ -449,6 +451,99 @@ def test_a_run_that_is_lost_takes_none_with_it(pendulum_system, tmp_path):
         compare.compare(pendulum_system, TINY, tmp_path / "runs", tmp_path, OF_OURS, place=place)
     kept = sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*.pt"))
     assert kept == ["runs/sac/seed-0/actor.pt", "runs/sac/seed-0/policy.pt"]
+
+
+def test_more_bytes_than_a_run_has_are_not_unpacked(tmp_path, monkeypatch):
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("policy.pt", bytes(10**6))
+        archive.writestr("curve.csv", b"step")
+    monkeypatch.setattr(runs, "_MOST_BYTES", 10**6)
+    with pytest.raises(InputError, match="must have at most 1000000 bytes; what came back has 1000004"):
+        runs._unpack(packed.getvalue(), tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("damage", ["a password", "its bytes"])
+def test_files_that_cannot_be_unpacked_are_one_sentence(tmp_path, damage):
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("curve.csv", bytes(range(256)) * 4)
+    content = bytearray(packed.getvalue())
+    if damage == "a password":
+        content[content.index(b"PK\x01\x02") + 8] |= 1
+        content[6] |= 1
+    else:
+        content[39:45] = b"\xff" * 6
+    with pytest.raises(InputError, match="the files of a run that came back cannot be read"):
+        runs._unpack(bytes(content), tmp_path)
+
+
+def test_the_best_policy_of_a_run_that_goes_on_elsewhere_comes_back_with_it(pendulum_system, tmp_path, monkeypatch):
+    """It may be older than the checkpoint: then no evaluation elsewhere writes it again."""
+    rule, count = Stopping(budget=120, every=40, closing=0.0), iter(range(100))
+    monkeypatch.setattr(runs, "judged", lambda *_: Judged(1.0 + next(count), 1.0, 0))  # the first one is the best
+
+    def cut(done):
+        if done == 90:
+            raise KeyboardInterrupt
+
+    folder = tmp_path / "sac" / "seed-0"
+    with pytest.raises(KeyboardInterrupt):
+        runs._train("sac", pendulum_system, TINY, folder, rule, cut)
+    kept = (folder / "actor.pt").read_bytes()
+    runs.train_at(
+        Elsewhere(), [runs.Wanted("sac", TINY, rule)], pendulum_system, tmp_path, lambda line: None, lambda doing: None
+    )
+    found = runs.obtain("sac", pendulum_system, TINY, tmp_path, rule)
+    assert (found.course.kept, found.course.steps, found.trained.steps) == (40, 120, 40)
+    assert (folder / "actor.pt").read_bytes() == kept
+
+
+CHANGED = {"learning_rate": 1e-3, "reward_weights": (1.0, 3.0), "dt": 0.01, "state_weights": (2.0, 0.5), "batch": 9}
+
+
+@pytest.mark.parametrize("run", ["ours", "sac", "sb3-sac", "sb3-ppo"])
+@pytest.mark.parametrize("name", CHANGED)
+def test_a_run_of_other_options_is_not_used_in_silence(finished, pendulum_system, run, name):
+    """As after a change of the preset."""
+    message = f"policy.pt must be of a run with the options that are asked for; its `{name}` was"
+    with pytest.raises(InputError, match=message):
+        runs.obtain(run, pendulum_system, replace(TINY, **{name: CHANGED[name]}), finished[0])
+
+
+def test_options_that_change_nothing_in_a_run_do_not_part_it_from_the_preset(finished, pendulum_system):
+    ours, learner = {"gain_weight": 2.0, "transitions": "latest"}, {"curvature_weight": 0.5, "anneal": 0.0}
+    for run in ("sac", "sb3-sac", "sb3-ppo"):
+        assert runs.obtain(run, pendulum_system, replace(TINY, **ours), finished[0]).course.steps == 160
+    for run in ("sb3-sac", "sb3-ppo"):
+        assert runs.obtain(run, pendulum_system, replace(TINY, **learner), finished[0]).course.steps == 160
+    for run, changes in (("ours", ours), ("ours", learner), ("sac", learner)):
+        with pytest.raises(InputError, match="the options that are asked for"):
+            runs.obtain(run, pendulum_system, replace(TINY, **changes), finished[0])
+
+
+@pytest.mark.parametrize("run", ["ours", "sac", "sb3-sac", "sb3-ppo"])
+def test_a_run_on_another_pendulum_is_not_used_in_silence(finished, pendulum_system, run):
+    heavier = pendulum_system.with_parameters({"m": "0.2"})
+    with pytest.raises(InputError, match="must be of pendulum at the same parameters"):
+        runs.obtain(run, heavier, TINY, finished[0])
+
+
+def test_two_processes_do_not_train_one_run(pendulum_system, tmp_path):
+    folder = tmp_path / "ours" / "seed-0"
+    with (
+        sole_writer(folder),
+        pytest.raises(InputError, match=r"another run is writing into .*seed-0; wait for it"),
+    ):
+        runs.obtain("ours", pendulum_system, TINY, tmp_path)
+    assert not list(folder.iterdir())
+
+
+def test_a_run_that_another_process_ended_meanwhile_is_not_begun_again(finished, pendulum_system, monkeypatch):
+    monkeypatch.setattr(runs, "learner_of", lambda *_: pytest.fail("it is over"))
+    plan = runs.fixed("ours", TINY)
+    runs._train("ours", pendulum_system, TINY, finished[0] / "ours" / "seed-0", plan, lambda done: None)
 
 
 @pytest.mark.slow

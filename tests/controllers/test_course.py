@@ -152,3 +152,97 @@ def test_damaged_records_of_a_run_are_refused(tmp_path: Path) -> None:
     assert read_curve(tmp_path / "curve.csv") == []
     with pytest.raises(InputError, match="must have a row"):
         read_course(tmp_path, plan)
+
+
+LONG = Stopping(budget=80, every=20, patience=3, closing=0.5)
+
+
+def cut_off(plan: Stopping, folder: Path, floors: Sequence[float]) -> None:
+    """A run with these floors, cut off in the evaluation after them."""
+    learner, told = learner_of("sac", PENDULUM, TINY, plan), iter(floors)
+
+    def judge() -> Judged:
+        floor = next(told, None)
+        if floor is None:
+            raise Cut
+        return Judged(floor, 1.0, 0)
+
+    with pytest.raises(Cut):
+        follow(learner, plan, folder, judge)
+
+
+def test_a_run_does_not_go_on_by_a_rule_that_would_have_ended_it_before(tmp_path: Path) -> None:
+    """Its closing phase would be skipped, and its record would say that there was one."""
+    cut_off(LONG, tmp_path, [3.0, 3.0, 3.0])
+    hasty = replace(LONG, patience=1)
+    with pytest.raises(
+        InputError, match=r"another plan: after 60 steps its closing phase is not begun, .* from 40 to 60"
+    ):
+        follow(learner_of("sac", PENDULUM, TINY, hasty), hasty, tmp_path, lambda: Judged(1.0, 1.0, 0))
+    assert not (tmp_path / "course.json").exists()
+
+
+def test_a_run_in_its_closing_phase_is_not_taken_for_one_that_learns(tmp_path: Path) -> None:
+    hasty, patient = replace(LONG, patience=2, closing=0.9), replace(LONG, patience=9, closing=0.9)
+    cut_off(hasty, tmp_path, [3.0, 3.0, 3.0, 3.0])
+    with pytest.raises(InputError, match="its closing phase is that from 60 to 114, and by this plan not begun"):
+        follow(learner_of("sac", PENDULUM, TINY, patient), patient, tmp_path, lambda: Judged(1.0, 1.0, 0))
+
+
+def test_a_rule_that_has_not_come_to_another_answer_yet_may_change(tmp_path: Path) -> None:
+    cut_off(LONG, tmp_path, [3.0, 2.0])
+    patient = replace(LONG, patience=9)
+    assert (
+        follow(learner_of("sac", PENDULUM, TINY, patient), patient, tmp_path, lambda: Judged(1.0, 1.0, 0)).steps == 120
+    )
+
+
+def test_a_rule_without_the_curve_has_nothing_to_go_by(tmp_path: Path) -> None:
+    cut_off(LONG, tmp_path, [3.0, 3.0])
+    whole = (tmp_path / "curve.csv").read_text()
+    for less in (None, whole[: whole.index("\n40,") + 1]):
+        (tmp_path / "curve.csv").unlink() if less is None else (tmp_path / "curve.csv").write_text(less)
+        with pytest.raises(InputError, match=r"curve\.csv must have the evaluation after 40 steps"):
+            follow(learner_of("sac", PENDULUM, TINY, LONG), LONG, tmp_path, lambda: Judged(1.0, 1.0, 0))
+
+
+@pytest.mark.parametrize("run", ["ours", "sac", "sb3-sac", "sb3-ppo"])
+def test_a_run_that_ends_in_writing_its_first_files_goes_on(
+    tmp_path: Path, run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A policy that is there without a checkpoint is somebody's; one of a run has its checkpoint from the beginning."""
+    monkeypatch.setattr(runs, "ROLLOUT", 40)
+    monkeypatch.setattr(runs, "judged", lambda *_: Judged(1.0, 1.0, 0))
+    plan = Fixed(steps=80, every=40)
+    training = replace(TINY, steps=80)
+    expected = runs.obtain(run, PENDULUM, training, tmp_path / "whole", plan)
+    kind = type(learner_of(run, PENDULUM, training, plan))
+    keep = kind.keep
+
+    def fail(self: object, folder: Path) -> None:
+        keep(self, folder)  # type: ignore[arg-type]
+        raise Cut
+
+    monkeypatch.setattr(kind, "keep", fail)
+    with pytest.raises(Cut):
+        runs.obtain(run, PENDULUM, training, tmp_path / "parts", plan)
+    monkeypatch.setattr(kind, "keep", keep)
+    found = runs.obtain(run, PENDULUM, training, tmp_path / "parts", plan)
+    x = np.array([[0.5, -1.0]])
+    np.testing.assert_array_equal(found.trained.mean(x), expected.trained.mean(x))
+
+
+def test_a_record_of_another_curve_is_refused(tmp_path: Path) -> None:
+    """Two processes in one folder, or files moved between folders."""
+    plan = Fixed(steps=60, every=20)
+    followed("ours", plan, tmp_path)
+    lines = (tmp_path / "curve.csv").read_text().splitlines(keepends=True)
+    (tmp_path / "curve.csv").write_text("".join(lines[:-1]))
+    with pytest.raises(InputError, match=r"after 60 of 60 steps was kept, and the curve ends after 40"):
+        read_course(tmp_path, plan)
+    (tmp_path / "curve.csv").write_text("".join(lines))
+    record = (tmp_path / "course.json").read_text()
+    for old, new in (('"kept": 60', '"kept": 50'), ('"why": "steps"', '"why": "tired"')):
+        (tmp_path / "course.json").write_text(record.replace(old, new))
+        with pytest.raises(InputError, match=r"must be of the run of curve\.csv beside it"):
+            read_course(tmp_path, plan)
