@@ -9,11 +9,12 @@ eigenvalue of the closed loop, and with the action held over the training step. 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
+import sympy
 import torch
 from numpy.typing import NDArray
 
@@ -223,7 +224,7 @@ def require_same_loop(proved: ProvedSet, network: TanhNetwork, system: System) -
 
     Raises
     ------
-    InputError : the certificate is about another policy, or about other equations.
+    InputError : the certificate is about another policy, about other equations, or about less of what is uncertain.
     """
     if proved.policy_sha256 != network.sha256():
         raise InputError(
@@ -231,12 +232,45 @@ def require_same_loop(proved: ProvedSet, network: TanhNetwork, system: System) -
             f"{proved.policy_sha256}. Certify this one with `certify roa`."
         )
     theirs = proved.system
-    equal = theirs.exact_dynamics() == system.exact_dynamics() and theirs.exact_u_eq() == system.exact_u_eq()
-    if (theirs.states, theirs.inputs) != (system.states, system.inputs) or not equal:
+    for name, (lo, hi) in system.ranges.items():
+        known = theirs.ranges.get(name)
+        if known is None or not known[0] <= lo <= hi <= known[1]:
+            said = "one value of it" if known is None else f"[{float(known[0]):g}, {float(known[1]):g}]"
+            raise InputError(
+                f"the certificate must hold for all that is uncertain of {system.name}, `{name}` in [{float(lo):g}, "
+                f"{float(hi):g}]; it is about {said}. Certify the policy on this plant."
+            )
+    equal = _dynamics(theirs, system.ranges) == _dynamics(system, system.ranges)
+    alike = (theirs.states, theirs.inputs, theirs.time) == (system.states, system.inputs, system.time)
+    if not alike or not equal or theirs.exact_u_eq() != system.exact_u_eq():
         raise InputError(
             f"the certificate must be about the plant that is simulated, {system.name} with these parameters; it is "
             f"about {theirs.name} with other equations. Certify the policy on this plant."
         )
+
+
+def require_same_question(proved: ProvedSet, network: TanhNetwork, system: System) -> None:
+    """Refuse a set that is proved about another closed loop, or is not what would be proved of this one today.
+
+    Raises
+    ------
+    InputError : as `require_same_loop`; or domain, bounds of the inputs, what is uncertain, or how long inputs are held
+        were others.
+    """
+    require_same_loop(proved, network, system)
+    for name in ("domain", "input_bounds", "ranges", "sample"):
+        theirs, mine = getattr(proved.system, name), getattr(system, name)
+        if theirs != mine:
+            raise InputError(
+                f"the certificate must be about {system.name} as it is; its `{name}` was another one. Certify the "
+                "policy on this plant."
+            )
+
+
+def _dynamics(system: System, acting: Iterable[str]) -> tuple[sympy.Expr, ...]:
+    """The equations with these uncertain quantities free, and all others at their nominal values."""
+    still = {name: None for name in system.ranges if name not in set(acting)}
+    return system.with_ranges(still).uncertain_dynamics()
 
 
 def settle(

@@ -23,7 +23,7 @@ from certify.errors import CertificateFormatError, InputError
 from certify.lyapunov import Candidate, volume
 from certify.systems import System
 from certify.verdict import Verdict
-from controllers.evaluate import discrete_linearisation, recorded, require_same_loop
+from controllers.evaluate import discrete_linearisation, recorded, require_same_question
 from controllers.files import read
 from controllers.kept import Kept
 from controllers.lqr import riccati_gain
@@ -153,7 +153,7 @@ def prove(kept: Kept, system: System, folder: Path, options: ProvingOptions) -> 
     if path.is_file():
         try:
             proved = proved_set(path)
-            require_same_loop(proved, network, system)
+            require_same_question(proved, network, system)
         except (InputError, CertificateFormatError):  # refused, damaged, or of another policy: it is written anew
             path.unlink()
         else:
@@ -166,7 +166,7 @@ def prove(kept: Kept, system: System, folder: Path, options: ProvingOptions) -> 
         verdict = Verdict.UNKNOWN if result.verdict is Verdict.PROVED else result.verdict
         return Proof(kept.step, verdict, result.reason)
     proved = set_of(result.raw, str(path))
-    require_same_loop(proved, network, system)
+    require_same_question(proved, network, system)
     return _proof(kept.step, proved)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from dataclasses import replace
+from fractions import Fraction
 from functools import partial
 
 import numpy as np
@@ -203,6 +204,10 @@ def test_a_certificate_that_is_there_is_believed_only_if_it_is_accepted_and_abou
             (kept, PENDULUM, raw[:-40]),
             (Kept(10, _law([[8.5, 2.0]])), PENDULUM, raw),
             (kept, heavier, raw),
+            (kept, PENDULUM.with_domain({"theta": (Fraction(-1), Fraction(1))}), raw),
+            (kept, replace(PENDULUM, input_bounds=((Fraction(-1), Fraction(1)),)), raw),
+            (kept, PENDULUM.with_input_errors({"u": Fraction(1, 10)}), raw),
+            (kept, PENDULUM.with_sample((Fraction(0), Fraction(1, 50))), raw),
         ):
             path.write_bytes(content)
             found = prove(which, plant, tmp_path, QUICK)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 
 import flint
@@ -22,7 +23,7 @@ from certify.rigorous import is_definite
 from certify.systems import System, get_system
 from controllers import theory as module
 from controllers.cli import app
-from controllers.evaluate import discrete_linearisation
+from controllers.evaluate import discrete_linearisation, require_same_loop
 from controllers.options import Plant, preset
 from controllers.theory import Constant, theory
 
@@ -162,9 +163,24 @@ def test_a_set_of_another_loop_is_refused():
         _constants(policy, own, _proved_set(other, own[0], [[7.0]]))
     with pytest.raises(InputError, match="about the plant that is simulated"):
         _constants(policy, own, _proved_set(policy, _scalar(a=1.1)[1][0], [[7.0]]))
+    with pytest.raises(InputError, match="about the plant that is simulated"):
+        _constants(policy, own, _proved_set(policy, replace(own[0], time="discrete"), [[7.0]]))
     held = own[0].with_sample((0, sympy.Rational(1, 10)))
     said = _constants(policy, (held, own[1]), _proved_set(policy, held, [[7.0]]))["epsilon_P"]
     assert said.value is None and "held action" in said.by
+
+
+def test_a_set_that_is_proved_for_less_of_what_is_uncertain_is_refused():
+    policy, (nominal, _) = _scalar()
+    little, pushed = (nominal.with_input_errors({"u": Fraction(1, size)}) for size in (100, 10))
+    for less in (nominal, little):
+        with pytest.raises(InputError, match=r"for all that is uncertain of line, `error_u` in \[-0\.1, 0\.1\]"):
+            require_same_loop(_proved_set(policy, less, [[7.0]]), policy.network, pushed)
+    for plant in (nominal, little, pushed):  # what holds for more holds for these
+        require_same_loop(_proved_set(policy, pushed, [[7.0]]), policy.network, plant)
+    backwards = replace(little, dynamics=tuple(e.subs("error_u", "-error_u") for e in little.dynamics))
+    with pytest.raises(InputError, match="about the plant that is simulated"):
+        require_same_loop(_proved_set(policy, backwards, [[7.0]]), policy.network, little)
 
 
 @pytest.mark.parametrize(
