@@ -165,13 +165,19 @@ def _bounding_cost(F: flint.arb_mat, Q: Array, discount: float) -> tuple[float |
     """`V <= x'Sx <= a_V x'Q_r x` if S, `S - discount F'SF - Q_r` and `a_V Q_r - S` are positive definite."""
     if not (Q > 0).all():
         return None, ": the reward must weigh every state"
-    middle = math.sqrt(discount) * _floats(F)
-    if not np.abs(np.linalg.eigvals(middle)).max() < 1:
-        return None, ": there is none"
-    S = scipy.linalg.solve_discrete_lyapunov(middle.T, (1 + _SLACK) * np.diag(Q))
-    S = (S + S.T) / 2
-    root = np.sqrt(Q)
-    value = (1 + _SLACK) * float(np.linalg.eigvalsh(S / root[:, None] / root).max())
+    middle, root = math.sqrt(discount) * _floats(F), np.sqrt(Q)
+    try:
+        if not np.abs(np.linalg.eigvals(middle)).max() < 1:
+            return None, ": not shown, since in floats the sum has no end"
+        with warnings.catch_warnings(), np.errstate(all="ignore"):  # what comes out is checked
+            warnings.simplefilter("ignore", scipy.linalg.LinAlgWarning)
+            S = scipy.linalg.solve_discrete_lyapunov(middle.T, (1 + _SLACK) * np.diag(Q))
+            S = (S + S.T) / 2
+            value = (1 + _SLACK) * float(np.linalg.eigvalsh(S / root[:, None] / root).max())
+    except (np.linalg.LinAlgError, ValueError):  # numbers beyond floats, or a matrix at the edge of stability
+        return None, ": not shown, floats do not hold it"
+    if not math.isfinite(value):
+        return None, ": not shown, floats do not hold it"
     weights, bound = _exactly(np.diag(Q)), _exactly(S)
     falls = bound - flint.arb(discount) * (F.transpose() * bound * F) - weights
     if all(map(is_definite, (bound, falls, flint.arb(value) * weights - bound))):
@@ -207,7 +213,9 @@ def _distance(J: flint.arb_mat, K: Array | None) -> Constant:
     if K is None:
         return Constant("distance", None, "<=", "proved", "the record has no gain")
     off = J + _exactly(K)
-    square = sum((off[i, j] ** 2 for i in range(off.nrows()) for j in range(off.ncols())), flint.arb(0))
+    sizes = [off[i, j].abs_upper() for i in range(off.nrows()) for j in range(off.ncols())]
+    # Of the sizes, which are numbers: a ball around 0 has no square in Arb, and no root of one.
+    square = sum((size * size for size in sizes), flint.arb(0))
     return Constant(
         "distance", rounded_up(square.sqrt().abs_upper()), "<=", "proved", "||J_mu(0) + K||, Frobenius norm"
     )

@@ -49,7 +49,7 @@ EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows th
     "systems": "expressions",
     "trials": "certificate claims closed_loop engines lyapunov options",
     "unfinished": "certificate claims closed_loop engines lyapunov policies systems trials",
-    "controllers": "api certificate closed_loop containment lyapunov policies rigorous running systems",
+    "controllers": "api certificate closed_loop containment lyapunov policies report rigorous running systems",
 }
 
 

@@ -47,8 +47,16 @@ def _table(result: Theory) -> dict[str, Any]:
 
 
 def _shown(constant: Constant) -> str:
-    number = "none" if constant.value is None else f"{constant.relation} {constant.value:.6g}"
-    return f"{number}  {constant.how}: {constant.by}"
+    if constant.value is None:
+        return f"none  {constant.by}"
+    return f"{constant.relation} {_digits(constant, constant.value)}  {constant.how}: {constant.by}"
+
+
+def _digits(constant: Constant, value: float) -> str:
+    """What is shown of a bound is one too: rounded away from the true constant."""
+    from certify.report.words import above, below
+
+    return above(value) if constant.relation == "<=" else below(value) if constant.relation == ">=" else f"{value:g}"
 
 
 def _discount(result: Theory) -> str:

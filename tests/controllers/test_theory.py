@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from certify.closed_loop import ClosedLoop
 from certify.containment import Ellipsoid, ProvedSet
 from certify.errors import InputError
-from certify.policies import Policy, TanhNetwork, load_policy
+from certify.policies import Policy, TanhNetwork, load_policy, save_policy
 from certify.rigorous import is_definite
 from certify.systems import System, get_system
 from controllers import theory as module
@@ -240,6 +240,47 @@ def test_the_command_says_which_numbers_are_proved():
     assert found["constants"]["a_V_sampled"]["how"] == "estimated"
     refused = CliRunner().invoke(app, ["theory", str(POLICIES / "without_gain" / "pendulum.pt"), "--json"])
     assert refused.exit_code == 2 and "error" in json.loads(refused.stdout)
+
+
+def test_the_numbers_that_are_shown_are_bounds_as_well():
+    """Six digits of an upper bound that were rounded to the nearest would claim more than was proved."""
+    arguments = ["theory", str(POLICIES / "pendulum.pt"), "--states", "5"]
+    exact = json.loads(CliRunner().invoke(app, [*arguments, "--json"]).stdout)["constants"]
+    shown = dict(line.split(maxsplit=1) for line in CliRunner().invoke(app, arguments).stdout.splitlines())
+    assert {constant["relation"] for constant in exact.values()} == {"<=", ">=", "="}
+    for name, constant in exact.items():
+        words = shown[name].split("  ")[0].removeprefix(f"{constant['relation']} ").removeprefix("= ")
+        digits = Fraction(words.replace(" × 10", "e").translate(str.maketrans("⁰¹²³⁴⁵⁶⁷⁸⁹⁻", "0123456789-")))
+        gap = digits - Fraction(constant["value"])
+        assert abs(gap) < Fraction(constant["value"]) / 10**5
+        assert {"<=": gap >= 0, ">=": gap <= 0, "=": True}[constant["relation"]], name
+
+
+def test_of_what_is_absent_nothing_is_called_proved(tmp_path):
+    policy = load_policy(POLICIES / "pendulum.pt")
+    record = {name: value for name, value in policy.training.items() if name != "K"}
+    save_policy(tmp_path / "p.pt", replace(policy, training=record | {"reward_weights": [0.0, 1.0]}))
+    shown = CliRunner().invoke(app, ["theory", str(tmp_path / "p.pt"), "--states", "2"])
+    assert shown.exit_code == 0, shown.stderr
+    lines = [line for line in shown.stdout.splitlines() if " none " in line]
+    assert len(lines) >= 6 and not any("proved" in line for line in lines)
+
+
+@pytest.mark.parametrize("change", [{"dt": 1000.0}, {"reward_weights": [1e-300, 1e300]}])
+def test_numbers_beyond_floats_show_nothing_and_end_nothing(change):
+    """exp(A dt) of a plant that falls over has no float at such a dt."""
+    policy = load_policy(POLICIES / "pendulum.pt")
+    found = _constants(replace(policy, training={**policy.training, **change}), None)
+    assert found["a_V"].value is None and "not shown" in found["a_V"].by
+
+
+def test_a_gain_that_is_met_but_for_rounding_has_a_distance():
+    """An entry whose ball has 0 within it has no square in Arb."""
+    off = flint.arb_mat([[flint.arb(0, 1e-20), flint.arb(3)]])
+    found = module._distance(off, np.array([[0.0, 1.0]]))
+    assert 4.0 <= found.value < 4.0 + 1e-14
+    with pytest.raises(InputError, match="`distance` must be finite"):
+        module._distance(flint.arb_mat([[flint.arb.nan()]]), np.array([[0.0]]))
 
 
 @pytest.mark.parametrize(
