@@ -3,8 +3,9 @@
 A comparison with a baseline that was not trained to its end proves nothing, and nobody knows beforehand how many steps
 its end takes. So a run is evaluated every so many steps, and the rule is a function of these evaluations alone: where
 neither floor nor cost has become better by a share for so many evaluations in a row, or the budget is spent, the
-learning rate falls to zero over a further share of the steps, as ours does at its end, and the run is over. Its policy
-is that of the evaluation with the smallest floor, the choice that is kindest to it. A run of a fixed number of steps is
+learning rate falls to zero over a further share of the steps, as ours does at its end, and the run is over. An
+evaluation most of whose trajectories leave the domain is none of these: such a policy has no floor yet, and its run
+goes on. The policy of a run is that of the evaluation with the smallest floor, the choice that is kindest to it. A run of a fixed number of steps is
 evaluated alike and ends with the policy it has.
 
 In a run's folder lie `curve.csv`, a row an evaluation; from its beginning until it is over `checkpoint.pt`, then
@@ -61,11 +62,12 @@ class Learner(Protocol):
 @dataclass(frozen=True, slots=True)
 class Judged:
     """What an evaluation finds: `floor`, the median over states of the largest ||x|| in the last second under held mean
-    actions; `cost`, the median accumulated cost; how many trajectories left the domain."""
+    actions; `cost`, the median accumulated cost; from how many states, and how many trajectories left the domain."""
 
     floor: float
     cost: float
     left_domain: int
+    states: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,8 +79,14 @@ class Evaluated:
     floor: float
     cost: float
     left_domain: int
+    states: int
     wall: float
     cpu: float
+
+    @property
+    def lost(self) -> bool:
+        """Whether most trajectories left the domain."""
+        return 2 * self.left_domain > self.states
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,7 +97,7 @@ class Stopping:
     ----------
     budget : steps after which it ends whatever it does, before the closing phase.
     every : steps between evaluations.
-    patience : evaluations in a row without an improvement that end it.
+    patience : evaluations in a row without an improvement that end it, those not counted that are lost.
     share : by which floor or cost has to fall below its smallest value so far to count as an improvement.
     closing : share of the steps made so far that the closing phase takes.
     """
@@ -111,11 +119,12 @@ class Stopping:
     def turn(self, rows: Sequence[Evaluated]) -> tuple[int, Why] | None:
         """The step after which learning ends, and why; None while it goes on."""
         floor = cost = math.inf
-        since = 0
-        for k, row in enumerate(rows):
-            better = k == 0 or row.floor < (1 - self.share) * floor or row.cost < (1 - self.share) * cost
-            since = 0 if better else since + 1
-            floor, cost = min(floor, row.floor), min(cost, row.cost)
+        since, first = 0, True
+        for row in rows:
+            if not row.lost:
+                better = first or row.floor < (1 - self.share) * floor or row.cost < (1 - self.share) * cost
+                since, first = 0 if better else since + 1, False
+                floor, cost = min(floor, row.floor), min(cost, row.cost)
             if row.step >= self.budget:
                 return row.step, "budget"
             if since >= self.patience:
@@ -166,8 +175,9 @@ class Course:
 
 
 def best(rows: Sequence[Evaluated]) -> Evaluated:
-    """The evaluation with the smallest floor, of equal ones that with the smallest cost, then the first."""
-    return min(rows, key=lambda row: tuple(math.inf if math.isnan(v) else v for v in (row.floor, row.cost)))
+    """The evaluation with the smallest floor, of equal ones that with the smallest cost, then the first; one that is
+    lost only where all are."""
+    return min(rows, key=lambda row: (row.lost, *(math.inf if math.isnan(v) else v for v in (row.floor, row.cost))))
 
 
 def follow(
@@ -204,7 +214,7 @@ def follow(
         learner.advance(last, tell)
         found = judge()
         spent = wall + time.perf_counter() - began[0], cpu + time.process_time() - began[1]
-        rows.append(Evaluated(learner.steps_done, found.floor, found.cost, found.left_domain, *spent))
+        rows.append(Evaluated(learner.steps_done, found.floor, found.cost, found.left_domain, found.states, *spent))
         if isinstance(plan, Fixed) or best(rows) is rows[-1]:
             learner.keep(folder)
         write_atomically(folder / CURVE, _table(rows))
@@ -267,6 +277,7 @@ def read_curve(path: Path) -> list[Evaluated]:
                 float(row["floor"]),
                 float(row["cost"]),
                 int(row["left_domain"]),
+                int(row["states"]),
                 float(row["wall"]),
                 float(row["cpu"]),
             )

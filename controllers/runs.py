@@ -396,7 +396,7 @@ def judged(system: System, training: TrainingOptions, mean: Action) -> Judged:
     x0 = initial_states(system, _JUDGED.states, _JUDGED.start_seed)
     x, cost = simulate(system, training, mean, x0, _JUDGED.duration)
     [row, _] = table(system, training.dt, [Response(OURS, 0, 0, x, cost)], _JUDGED)
-    return Judged(row.floor, row.cost_median, row.left_domain)
+    return Judged(row.floor, row.cost_median, row.left_domain, row.trajectories)
 
 
 def _load(run: Run, path: Path, system: System, training: TrainingOptions) -> Trained:

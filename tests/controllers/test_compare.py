@@ -482,7 +482,7 @@ def test_files_that_cannot_be_unpacked_are_one_sentence(tmp_path, damage):
 def test_the_best_policy_of_a_run_that_goes_on_elsewhere_comes_back_with_it(pendulum_system, tmp_path, monkeypatch):
     """It may be older than the checkpoint: then no evaluation elsewhere writes it again."""
     rule, count = Stopping(budget=120, every=40, closing=0.0), iter(range(100))
-    monkeypatch.setattr(runs, "judged", lambda *_: Judged(1.0 + next(count), 1.0, 0))  # the first one is the best
+    monkeypatch.setattr(runs, "judged", lambda *_: Judged(1.0 + next(count), 1.0, 0, 1))  # the first one is the best
 
     def cut(done):
         if done == 90:

@@ -26,7 +26,7 @@ RULE = Stopping(budget=1000, every=10, patience=3, share=0.1, closing=0.5)
 
 def curve(floors: Sequence[float], costs: Sequence[float] | None = None) -> list[Evaluated]:
     costs = [1.0] * len(floors) if costs is None else costs
-    return [Evaluated(10 * k, f, c, 0, 0.0, 0.0) for k, (f, c) in enumerate(zip(floors, costs, strict=True), 1)]
+    return [Evaluated(10 * k, f, c, 0, 1, 0.0, 0.0) for k, (f, c) in enumerate(zip(floors, costs, strict=True), 1)]
 
 
 def test_a_run_ends_after_so_many_evaluations_without_an_improvement() -> None:
@@ -50,6 +50,21 @@ def test_the_budget_ends_a_run_that_still_improves_and_divergence_is_no_improvem
     gone = curve([math.inf] * 4, [math.inf] * 4)
     assert RULE.turn(gone) == (40, "no improvement")
     assert RULE.turn(curve([math.nan] * 4, [math.nan] * 4)) == (40, "no improvement")
+
+
+def test_an_evaluation_most_of_whose_trajectories_are_lost_counts_neither_way() -> None:
+    """A policy that throws most of its trajectories out has no floor yet; half of them are not most."""
+    rows = curve([4.0] * 12)
+    lost = [replace(row, left_domain=51, states=100) for row in rows]
+    half = [replace(row, left_domain=50, states=100) for row in rows]
+    assert RULE.turn(half) == (40, "no improvement")
+    assert RULE.turn(lost) is None
+    assert RULE.turn([*lost[:6], *rows[6:]]) == (100, "no improvement")  # the first that is not lost is the first
+    assert RULE.turn([*rows[:3], *lost[3:9], *rows[9:]]) == (100, "no improvement")  # two before, the third after
+    assert RULE.turn([*rows[:2], replace(lost[2], floor=1.0), *rows[3:]]) == (50, "no improvement")  # no smallest value
+    assert replace(RULE, budget=60).turn(lost) == (60, "budget")
+    assert best([replace(lost[0], floor=1.0), rows[1]]) == rows[1]
+    assert best(lost).step == 10
 
 
 def test_the_best_is_the_smallest_floor_and_no_number_is_none() -> None:
@@ -81,7 +96,7 @@ def followed(run: Run, plan: Plan, folder: Path, cut_at: int = 10**9) -> Course:
         if count == cut_at:
             raise Cut
         u = learner.trained().mean(np.array([[0.5, -1.0], [0.1, 3.0]]))
-        return Judged(float(np.abs(u[0]).sum()), float(np.abs(u[1]).sum()), 0)
+        return Judged(float(np.abs(u[0]).sum()), float(np.abs(u[1]).sum()), 0, 1)
 
     return follow(learner, plan, folder, judge)
 
@@ -165,7 +180,7 @@ def cut_off(plan: Stopping, folder: Path, floors: Sequence[float]) -> None:
         floor = next(told, None)
         if floor is None:
             raise Cut
-        return Judged(floor, 1.0, 0)
+        return Judged(floor, 1.0, 0, 1)
 
     with pytest.raises(Cut):
         follow(learner, plan, folder, judge)
@@ -178,7 +193,7 @@ def test_a_run_does_not_go_on_by_a_rule_that_would_have_ended_it_before(tmp_path
     with pytest.raises(
         InputError, match=r"another plan: after 60 steps its closing phase is not begun, .* from 40 to 60"
     ):
-        follow(learner_of("sac", PENDULUM, TINY, hasty), hasty, tmp_path, lambda: Judged(1.0, 1.0, 0))
+        follow(learner_of("sac", PENDULUM, TINY, hasty), hasty, tmp_path, lambda: Judged(1.0, 1.0, 0, 1))
     assert not (tmp_path / "course.json").exists()
 
 
@@ -186,14 +201,15 @@ def test_a_run_in_its_closing_phase_is_not_taken_for_one_that_learns(tmp_path: P
     hasty, patient = replace(LONG, patience=2, closing=0.9), replace(LONG, patience=9, closing=0.9)
     cut_off(hasty, tmp_path, [3.0, 3.0, 3.0, 3.0])
     with pytest.raises(InputError, match="its closing phase is that from 60 to 114, and by this plan not begun"):
-        follow(learner_of("sac", PENDULUM, TINY, patient), patient, tmp_path, lambda: Judged(1.0, 1.0, 0))
+        follow(learner_of("sac", PENDULUM, TINY, patient), patient, tmp_path, lambda: Judged(1.0, 1.0, 0, 1))
 
 
 def test_a_rule_that_has_not_come_to_another_answer_yet_may_change(tmp_path: Path) -> None:
     cut_off(LONG, tmp_path, [3.0, 2.0])
     patient = replace(LONG, patience=9)
     assert (
-        follow(learner_of("sac", PENDULUM, TINY, patient), patient, tmp_path, lambda: Judged(1.0, 1.0, 0)).steps == 120
+        follow(learner_of("sac", PENDULUM, TINY, patient), patient, tmp_path, lambda: Judged(1.0, 1.0, 0, 1)).steps
+        == 120
     )
 
 
@@ -203,7 +219,7 @@ def test_a_rule_without_the_curve_has_nothing_to_go_by(tmp_path: Path) -> None:
     for less in (None, whole[: whole.index("\n40,") + 1]):
         (tmp_path / "curve.csv").unlink() if less is None else (tmp_path / "curve.csv").write_text(less)
         with pytest.raises(InputError, match=r"curve\.csv must have the evaluation after 40 steps"):
-            follow(learner_of("sac", PENDULUM, TINY, LONG), LONG, tmp_path, lambda: Judged(1.0, 1.0, 0))
+            follow(learner_of("sac", PENDULUM, TINY, LONG), LONG, tmp_path, lambda: Judged(1.0, 1.0, 0, 1))
 
 
 @pytest.mark.parametrize("run", ["ours", "sac", "sb3-sac", "sb3-ppo"])
@@ -212,7 +228,7 @@ def test_a_run_that_ends_in_writing_its_first_files_goes_on(
 ) -> None:
     """A policy that is there without a checkpoint is somebody's; one of a run has its checkpoint from the beginning."""
     monkeypatch.setattr(runs, "ROLLOUT", 40)
-    monkeypatch.setattr(runs, "judged", lambda *_: Judged(1.0, 1.0, 0))
+    monkeypatch.setattr(runs, "judged", lambda *_: Judged(1.0, 1.0, 0, 1))
     plan = Fixed(steps=80, every=40)
     training = replace(TINY, steps=80)
     expected = runs.obtain(run, PENDULUM, training, tmp_path / "whole", plan)

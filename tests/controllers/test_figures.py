@@ -195,7 +195,7 @@ def test_space_has_a_panel_a_method_and_ends_paths_at_the_frame(kept, name, dime
 
 
 def _rows(values, every=10):
-    return [Evaluated(every * (k + 1), floor, 2 * floor, 0, 1.0, 1.0) for k, floor in enumerate(values)]
+    return [Evaluated(every * (k + 1), floor, 2 * floor, 0, 1, 1.0, 1.0) for k, floor in enumerate(values)]
 
 
 def test_curves_have_a_line_a_seed_their_median_and_a_ring_where_a_run_ended(kept):
