@@ -157,8 +157,14 @@ Record claim (rate : R) : Prop := {
   (* 3, 4 *) decreases : forall x, inside x -> x <> zeros states -> Vdot x < 0 /\ Vdot x + rate * V x <= 0;
   (* 5 *) in_bounds : forall x, inside x ->
       Forall2 (fun one ch => ratio (least ch) <= one <= ratio (greatest ch)) (policy x) (channels c);
-  (* what follows of trajectories *)
+  (* what follows of trajectories: none leaves the set, and V decays along each *)
   trajectories : forall x T, 0 < T -> solution x T -> V (x 0) <= real (level c) -> forall t, 0 <= t < T ->
-      inside (x t) /\ V (x t) <= V (x 0) * exp (- rate * t)
+      inside (x t) /\ V (x t) <= V (x 0) * exp (- rate * t);
+  (* the origin is stable, and after some time all that start in the set are near it *)
+  stable : forall eps, 0 < eps -> exists delta, 0 < delta /\ forall x, (forall T, 0 < T -> solution x T) ->
+      (forall i, (i < states)%nat -> Rabs (nth i (x 0) 0) < delta) ->
+      forall t, 0 <= t -> forall i, (i < states)%nat -> Rabs (nth i (x t) 0) < eps;
+  attractive : forall eps, 0 < eps -> exists time, 0 <= time /\ forall x, (forall T, 0 < T -> solution x T) ->
+      V (x 0) <= real (level c) -> forall t, time <= t -> forall i, (i < states)%nat -> Rabs (nth i (x t) 0) < eps
 }.
 End Loop.
