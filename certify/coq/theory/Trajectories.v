@@ -321,6 +321,35 @@ Qed.
 Lemma dot_zeros (n : nat) : forall a, dot (zeros n) a = 0.
 Proof. induction n as [| n IH]; intros [| p a]; cbn; try reflexivity. rewrite IH. ring. Qed.
 
+(** The sum of the absolute values. *)
+Fixpoint size (a : list R) : R := match a with [] => 0 | p :: a => Rabs p + size a end.
+
+Lemma size_nonnegative (a : list R) : 0 <= size a.
+Proof. induction a as [| p a IH]; cbn; [lra |]. pose proof (Rabs_pos p). lra. Qed.
+
+Lemma dot_small (d : R) : 0 <= d -> forall a x, Forall (fun v => Rabs v <= d) x -> Rabs (dot a x) <= size a * d.
+Proof.
+  intros Hd. induction a as [| p a IH]; intros x Hx; cbn; [rewrite Rabs_R0; lra |]. destruct Hx as [| v x Hv Hx].
+  - rewrite Rabs_R0. apply Rmult_le_pos; [| exact Hd]. pose proof (Rabs_pos p). pose proof (size_nonnegative a). lra.
+  - apply (Rle_trans _ _ _ (Rabs_triang _ _)). specialize (IH x Hx). rewrite Rabs_mult.
+    pose proof (Rmult_le_compat_l _ _ _ (Rabs_pos p) Hv). lra.
+Qed.
+
+(** A form is small near the origin. *)
+Lemma form_small (M : list (list R)) : exists k, 0 < k /\
+  forall d x, 0 <= d -> Forall (fun v => Rabs v <= d) x -> form M x <= k * d ^ 2.
+Proof.
+  enough (H : exists k, 0 < k /\ forall d x, 0 <= d -> Forall (fun v => Rabs v <= d) x -> size (apply M x) <= k * d).
+  { destruct H as (k & Hk & H). exists k. split; [exact Hk |]. intros d x Hd Hx. unfold form. rewrite dot_commutes.
+    apply (Rle_trans _ _ _ (Rle_abs _)), (Rle_trans _ _ _ (dot_small d Hd _ x Hx)).
+    replace (k * d ^ 2) with (k * d * d) by ring. apply Rmult_le_compat_r; auto. }
+  induction M as [| row M (k & Hk & IH)].
+  { exists 1. split; [lra |]. intros d x Hd _. change (0 <= 1 * d). lra. }
+  exists (size row + k). pose proof (size_nonnegative row). split; [lra |]. intros d x Hd Hx.
+  change (Rabs (dot row x) + size (apply M x) <= (size row + k) * d).
+  pose proof (dot_small d Hd row x Hx). specialize (IH d x Hd Hx). lra.
+Qed.
+
 Section Trajectories.
 Variable c : certificate.
 Variable rate : R.
@@ -452,26 +481,108 @@ Proof.
     apply (derivable_pt_lim_locally_ext (fun s => nth i (x s) 0) _ t 0 b); [exact Ht | | apply Hd; [exact Hi | lra]].
     intros s Hs. rewrite Hbetween by lra. reflexivity.
 Qed.
-End Trajectories.
-
 (** No trajectory leaves {V <= c2}, and V falls at the rate. *)
-Theorem trajectories_decay (c : certificate) (rate : R) :
-  length (field c) = states c /\ square (states c) (P c) ->
-  symmetric (matrix c) ->
-  0 < real (level c) ->
-  (forall x, inside c x -> Forall (defined x (policy c x)) (field c)) ->
-  (forall x, inside c x -> x <> zeros (states c) -> Vdot c x < 0 /\ Vdot c x + rate * V c x <= 0) ->
-  forall x T, 0 < T -> solution c x T -> V c (x 0) <= real (level c) -> forall t, 0 <= t < T ->
-  inside c (x t) /\ V c (x t) <= V c (x 0) * exp (- rate * t).
+Theorem trajectories_decay (x : R -> list R) (T : R) : 0 < T -> solution c x T -> V c (x 0) <= real (level c) ->
+  forall t, 0 <= t < T -> inside c (x t) /\ V c (x t) <= V c (x 0) * exp (- rate * t).
 Proof.
-  intros Hfits Hsym Hlevel Hsmooth Hdec x T HT Hx H0 t [Hlow Hhigh].
-  destruct (Rle_lt_or_eq_dec _ _ Hlow) as [Hpos | <-].
-  - pose proof (solution_path c x T t Hx (conj Hpos Hhigh)) as Hpath.
+  intros HT Hx H0 t [Hlow Hhigh]. destruct (Rle_lt_or_eq_dec _ _ Hlow) as [Hpos | <-].
+  - pose proof (solution_path x T t Hx (conj Hpos Hhigh)) as Hpath.
     assert (Hstart : held t 0 = 0) by (unfold held; rewrite Rmin_left, Rmax_left; lra).
     assert (Hend : held t t = t) by (unfold held; rewrite Rmin_left, Rmax_right; lra).
-    split; [split; [apply Hx; lra |] |].
-    + rewrite <- Hend at 1. apply (path_inside c rate) with (y := fun s => x (held t s)); try assumption. rewrite Hstart. exact H0.
-    + pose proof (path_decays c rate Hfits Hsym Hlevel Hsmooth Hdec _ t Hpath Hpos) as H. cbn beta in H.
-      rewrite Hstart, Hend in H. apply H, H0.
+    pose proof (path_inside _ t Hpath Hpos) as Hin. pose proof (path_decays _ t Hpath Hpos) as Hdecay.
+    cbn beta in Hin, Hdecay. rewrite Hstart, Hend in Hin, Hdecay.
+    split; [split; [apply Hx; lra |] |]; auto.
   - split; [split; [apply Hx; lra | exact H0] |]. rewrite Rmult_0_r, exp_0. lra.
 Qed.
+
+(** Hence so does every linear function a'x of the state that is bounded by b on the set: c2 (a'x)^2 <= b^2 V. *)
+Theorem direction_decays (a : list R) (b : R) :
+  (forall x, length x = states c -> real (level c) * dot a x ^ 2 <= b ^ 2 * V c x) ->
+  forall x T, 0 < T -> solution c x T -> V c (x 0) <= real (level c) -> forall t, 0 <= t < T ->
+  real (level c) * dot a (x t) ^ 2 <= b ^ 2 * V c (x 0) * exp (- rate * t).
+Proof.
+  intros Hb x T HT Hx H0 t Ht. destruct (trajectories_decay x T HT Hx H0 t Ht) as [[Hn _] Hdecay].
+  apply (Rle_trans _ _ _ (Hb (x t) Hn)). rewrite Rmult_assoc. apply Rmult_le_compat_l; [apply pow2_ge_0 | exact Hdecay].
+Qed.
+
+(** The bounds of several states have one in common. *)
+Lemma common_bound (n : nat) :
+  (forall i, (i < n)%nat -> exists b, 0 < b /\
+    forall x, length x = states c -> real (level c) * nth i x 0 ^ 2 <= b ^ 2 * V c x) ->
+  exists b, 0 < b /\ forall i, (i < n)%nat ->
+    forall x, length x = states c -> real (level c) * nth i x 0 ^ 2 <= b ^ 2 * V c x.
+Proof.
+  induction n as [| n IH]; intros H; [exists 1; split; [lra | intros; lia] |].
+  destruct IH as (b & Hb & Hbound); [intros i Hi; apply H; lia |]. destruct (H n) as (d & Hd & Hlast); [lia |].
+  exists (b + d). split; [lra |]. intros i Hi x Hx. specialize (Hlast x Hx).
+  assert (HV : 0 <= V c x).
+  { apply (Rmult_le_reg_l (d ^ 2)); [apply pow_lt, Hd |]. rewrite Rmult_0_r. refine (Rle_trans _ _ _ _ Hlast).
+    apply Rmult_le_pos; [lra | apply pow2_ge_0]. }
+  assert (Hcross : 0 <= b * d * V c x) by (repeat apply Rmult_le_pos; lra).
+  pose proof (Rmult_le_pos _ _ (pow2_ge_0 b) HV). pose proof (Rmult_le_pos _ _ (pow2_ge_0 d) HV).
+  replace ((b + d) ^ 2 * V c x) with (b ^ 2 * V c x + d ^ 2 * V c x + 2 * (b * d * V c x)) by ring.
+  destruct (Nat.eq_dec i n) as [-> | Hne]; [lra |]. specialize (Hbound i ltac:(lia) x Hx). lra.
+Qed.
+
+(** Asymptotic stability in the usual words, for solutions at all times: those that start near the origin stay near it, and all
+    that start in the set come near it, together. *)
+Theorem trajectories_converge : 0 < rate ->
+  (forall i, (i < states c)%nat -> exists b, 0 < b /\
+    forall x, length x = states c -> real (level c) * nth i x 0 ^ 2 <= b ^ 2 * V c x) ->
+  forall eps, 0 < eps ->
+  (exists delta, 0 < delta /\ forall x, (forall T, 0 < T -> solution c x T) ->
+    (forall i, (i < states c)%nat -> Rabs (nth i (x 0) 0) < delta) ->
+    forall t, 0 <= t -> forall i, (i < states c)%nat -> Rabs (nth i (x t) 0) < eps)
+  /\ (exists time, 0 <= time /\ forall x, (forall T, 0 < T -> solution c x T) -> V c (x 0) <= real (level c) ->
+    forall t, time <= t -> forall i, (i < states c)%nat -> Rabs (nth i (x t) 0) < eps).
+Proof.
+  intros Hrate Hbounds eps Heps. destruct (common_bound _ Hbounds) as (b & Hb & Hbound).
+  assert (Hb2 : 0 < b ^ 2) by (apply pow_lt, Hb). assert (Heps2 : 0 < eps ^ 2) by (apply pow_lt, Heps).
+  assert (Hcoordinate : forall x t i, (forall T, 0 < T -> solution c x T) -> V c (x 0) <= real (level c) -> 0 <= t ->
+    (i < states c)%nat -> b ^ 2 * (V c (x 0) * exp (- rate * t)) < real (level c) * eps ^ 2 -> Rabs (nth i (x t) 0) < eps).
+  { intros x t i Hx H0 Ht Hi Hsmall.
+    destruct (trajectories_decay x (t + 1) ltac:(lra) (Hx (t + 1) ltac:(lra)) H0 t ltac:(lra)) as [[Hn _] Hdecay].
+    specialize (Hbound i Hi (x t) Hn). apply (Rmult_le_compat_l (b ^ 2)) in Hdecay; [| lra].
+    rewrite <- (Rabs_pos_eq eps) by lra. apply Rsqr_lt_abs_0. rewrite !Rsqr_pow2.
+    apply (Rmult_lt_reg_l (real (level c))); [exact positive_level | lra]. }
+  split.
+  - destruct (form_small (matrix c)) as (k & Hk & Hform).
+    set (q := Rmin (real (level c)) (real (level c) * eps ^ 2 / (2 * b ^ 2))).
+    assert (Hhalf : b ^ 2 * (real (level c) * eps ^ 2 / (2 * b ^ 2)) = real (level c) * eps ^ 2 / 2) by (field; lra).
+    assert (Hpos : 0 < real (level c) * eps ^ 2) by (apply Rmult_lt_0_compat; assumption).
+    assert (Hq : 0 < q) by (apply Rmin_glb_lt; [exact positive_level | apply Rdiv_lt_0_compat; lra]).
+    exists (sqrt (q / k)). split; [apply sqrt_lt_R0, Rdiv_lt_0_compat; assumption |]. intros x Hx Hnear t Ht i Hi.
+    destruct (Hx 1 ltac:(lra)) as [Hn _]. specialize (Hn 0 ltac:(lra)).
+    assert (Hq0 : V c (x 0) <= q).
+    { replace q with (k * sqrt (q / k) ^ 2); [| rewrite pow2_sqrt; [field; lra | apply Rlt_le, Rdiv_lt_0_compat; assumption]].
+      apply Hform; [apply sqrt_pos | apply Forall_forall]. intros v Hv. destruct (In_nth _ _ 0 Hv) as (j & Hj & <-). rewrite Hn in Hj.
+      apply Rlt_le, Hnear, Hj. }
+    assert (HV0 : 0 <= V c (x 0)).
+    { apply (Rmult_le_reg_l (b ^ 2)); [exact Hb2 |]. rewrite Rmult_0_r. refine (Rle_trans _ _ _ _ (Hbound i Hi (x 0) Hn)).
+      apply Rmult_le_pos; [lra | apply pow2_ge_0]. }
+    assert (Hle1 : exp (- rate * t) <= 1).
+    { rewrite <- exp_0. pose proof (Rmult_le_pos rate t ltac:(lra) Ht). destruct (Req_dec (rate * t) 0) as [Hz | Hnz].
+      - replace (- rate * t) with 0 by lra. lra.
+      - apply Rlt_le, exp_increasing. lra. }
+    apply Hcoordinate; try assumption; [apply (Rle_trans _ _ _ Hq0), Rmin_l |].
+    apply (Rle_lt_trans _ (real (level c) * eps ^ 2 / 2)); [| lra]. rewrite <- Hhalf.
+    apply Rmult_le_compat_l; [lra |]. apply (Rle_trans _ (V c (x 0) * 1)); [apply Rmult_le_compat_l; assumption |].
+    rewrite Rmult_1_r. apply (Rle_trans _ _ _ Hq0), Rmin_r.
+  - exists (b ^ 2 / (eps ^ 2 * rate)).
+    assert (Htime : 0 < b ^ 2 / (eps ^ 2 * rate)) by (apply Rdiv_lt_0_compat; [exact Hb2 | apply Rmult_lt_0_compat; assumption]).
+    split; [lra |]. intros x Hx H0 t Ht i Hi. apply Hcoordinate; try assumption; [lra |].
+    assert (Hgrown : b ^ 2 < eps ^ 2 * exp (rate * t)).
+    { apply (Rle_lt_trans _ (eps ^ 2 * (rate * t))).
+      - apply (Rmult_le_compat_l (eps ^ 2 * rate)) in Ht; [| apply Rmult_le_pos; lra].
+        replace (eps ^ 2 * rate * (b ^ 2 / (eps ^ 2 * rate))) with (b ^ 2) in Ht by (field; lra). lra.
+      - apply Rmult_lt_compat_l; [exact Heps2 |]. pose proof (exp_ineq1 (rate * t)) as H.
+        pose proof (Rmult_lt_0_compat rate t Hrate ltac:(lra)). specialize (H ltac:(lra)). lra. }
+    pose proof (exp_pos (- rate * t)) as He.
+    assert (Hfallen : b ^ 2 * exp (- rate * t) < eps ^ 2).
+    { apply (Rmult_lt_compat_r (exp (- rate * t))) in Hgrown; [| exact He]. rewrite (Rmult_assoc (eps ^ 2)), <- exp_plus in Hgrown.
+      replace (rate * t + - rate * t) with 0 in Hgrown by ring. rewrite exp_0 in Hgrown. lra. }
+    apply (Rle_lt_trans _ (real (level c) * (b ^ 2 * exp (- rate * t)))); [| apply Rmult_lt_compat_l; assumption].
+    rewrite <- Rmult_assoc, (Rmult_comm (b ^ 2)), Rmult_assoc. apply Rmult_le_compat_r; [| exact H0].
+    apply Rmult_le_pos; lra.
+Qed.
+End Trajectories.
