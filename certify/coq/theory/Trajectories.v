@@ -1,5 +1,5 @@
-(** What the conditions of a certificate say of trajectories: none that starts in {V <= c2} leaves it, and V falls along it at the
-    rate that was shown. No solution has to be the only one through its start. *)
+(** What the conditions of a certificate say of trajectories: none that starts in {V <= c2} leaves it, and V falls along
+    it at the rate that was shown. No solution has to be the only one from its start. *)
 From Coq Require Import Reals List Lra Lia.
 Require Import Vectors Spec.
 Import ListNotations.
@@ -64,14 +64,17 @@ Lemma continuous_entries (g : R -> R) (x : R -> list R) (t : R) :
   (forall v, continuity_pt g v) -> continuous x t -> continuous (fun s => map g (x s)) t.
 Proof.
   intros Hg (fs & Hfs & Hx). exists (map (fun f s => g (f s)) fs). split.
-  - clear Hx. induction Hfs as [| f fs Hf _ IH]; constructor; [| exact IH]. apply (continuity_pt_comp f g); [exact Hf | apply Hg].
+  - clear Hx. induction Hfs as [| f fs Hf _ IH]; constructor; [| exact IH].
+    apply (continuity_pt_comp f g); [exact Hf | apply Hg].
   - intros s. rewrite Hx. unfold along. rewrite !map_map. reflexivity.
 Qed.
 
 Lemma continuity_nth (x : R -> list R) (t : R) (i : nat) : continuous x t -> continuity_pt (fun s => nth i (x s) 0) t.
 Proof.
-  intros (fs & Hfs & Hx). apply (continuity_same (fun s => nth i (along fs s) 0)); [intros s; rewrite Hx; reflexivity |].
-  clear Hx. revert i. induction Hfs as [| f fs Hf _ IH]; intros [| i]; cbn; try apply continuity_constant; [exact Hf | apply IH].
+  intros (fs & Hfs & Hx).
+  apply (continuity_same (fun s => nth i (along fs s) 0)); [intros s; rewrite Hx; reflexivity |].
+  clear Hx. revert i. induction Hfs as [| f fs Hf _ IH]; intros [| i]; cbn; try apply continuity_constant;
+    [exact Hf | apply IH].
 Qed.
 
 Lemma continuity_dot (x y : R -> list R) (t : R) :
@@ -84,31 +87,40 @@ Proof.
   apply (continuity_pt_plus (fun s => f s * g s)); [apply continuity_pt_mult; assumption | apply IH, Hgs].
 Qed.
 
-Lemma continuity_row (row : list R) (x : R -> list R) (t : R) : continuous x t -> continuity_pt (fun s => dot row (x s)) t.
+Lemma continuity_row (row : list R) (x : R -> list R) (t : R) :
+  continuous x t -> continuity_pt (fun s => dot row (x s)) t.
 Proof.
   intros Hx. apply continuity_dot; [| exact Hx]. exists (map (fun a _ => a) row). split.
   - apply Forall_map, Forall_forall. intros a _. apply continuity_constant.
   - intros s. unfold along. rewrite map_map, map_id. reflexivity.
 Qed.
 
-Lemma continuous_apply (M : list (list R)) (x : R -> list R) (t : R) : continuous x t -> continuous (fun s => apply M (x s)) t.
-Proof. intros Hx. apply (continuous_map (fun row s => dot row (x s))), Forall_forall. intros row _. apply continuity_row, Hx. Qed.
+Lemma continuous_apply (M : list (list R)) (x : R -> list R) (t : R) :
+  continuous x t -> continuous (fun s => apply M (x s)) t.
+Proof.
+  intros Hx. apply (continuous_map (fun row s => dot row (x s))), Forall_forall. intros row _. apply continuity_row, Hx.
+Qed.
 
 (** * The loop is continuous where it is smooth *)
 
-Lemma continuous_affine (l : layer) (x : R -> list R) (t : R) : continuous x t -> continuous (fun s => affine l (x s)) t.
+Lemma continuous_affine (l : layer) (x : R -> list R) (t : R) :
+  continuous x t -> continuous (fun s => affine l (x s)) t.
 Proof.
-  intros Hx. apply (continuous_map (fun row s => dot (map real (fst row)) (x s) + real (snd row))), Forall_forall. intros row _.
-  apply (continuity_pt_plus (fun s => dot (map real (fst row)) (x s))); [apply continuity_row, Hx | apply continuity_constant].
+  intros Hx. apply (continuous_map (fun row s => dot (map real (fst row)) (x s) + real (snd row))), Forall_forall.
+  intros row _.
+  apply (continuity_pt_plus (fun s => dot (map real (fst row)) (x s)));
+    [apply continuity_row, Hx | apply continuity_constant].
 Qed.
 
 Lemma continuous_net (ls : list layer) (t : R) : forall x, continuous x t -> continuous (fun s => net ls (x s)) t.
 Proof.
   induction ls as [| l [| l' ls] IH]; intros x Hx; [exact Hx | apply continuous_affine, Hx |].
-  apply (IH (fun s => map tanh (affine l (x s)))), (continuous_entries tanh); [apply continuity_tanh | apply continuous_affine, Hx].
+  apply (IH (fun s => map tanh (affine l (x s)))), (continuous_entries tanh);
+    [apply continuity_tanh | apply continuous_affine, Hx].
 Qed.
 
-Lemma continuity_act (s : squashing) (how : centring) (ch : channel) (w v : R) : continuity_pt (fun v => act s how ch v w) v.
+Lemma continuity_act (s : squashing) (how : centring) (ch : channel) (w v : R) :
+  continuity_pt (fun v => act s how ch v w) v.
 Proof.
   assert (Hsquash : forall v, continuity_pt (squash s) v).
   { intros u. destruct s; [apply continuity_tanh | apply derivable_continuous_pt, derivable_pt_id]. }
@@ -116,12 +128,14 @@ Proof.
   { intros b u. apply (continuity_pt_plus (fun v => real (scale ch) * squash s v)); [| apply continuity_constant].
     apply (continuity_pt_scal (squash s)), Hsquash. }
   destruct how; cbn.
-  - apply (continuity_same (fun v => real (scale ch) * squash s v + (- (real (scale ch) * squash s w) + ratio (rest ch))));
+  - apply (continuity_same
+      (fun v => real (scale ch) * squash s v + (- (real (scale ch) * squash s w) + ratio (rest ch))));
       [intros; ring | apply Hscaled].
   - apply (continuity_pt_comp (fun v => v - w + artanh ((ratio (rest ch) - real (offset ch)) / real (scale ch)))
       (fun v => real (scale ch) * squash s v + real (offset ch))); [| apply Hscaled].
     apply (continuity_pt_plus (fun v => v - w)); [| apply continuity_constant].
-    apply (continuity_pt_minus (fun v => v)); [apply derivable_continuous_pt, derivable_pt_id | apply continuity_constant].
+    apply (continuity_pt_minus (fun v => v));
+      [apply derivable_continuous_pt, derivable_pt_id | apply continuity_constant].
   - apply Hscaled.
 Qed.
 
@@ -134,7 +148,8 @@ Proof.
   { destruct H as (gs & Hgs & H). exists gs. split; [exact Hgs | intros r; rewrite Hv; apply H]. }
   clear Hv. revert chs w. induction Hfs as [| f fs Hf _ IH]; intros [| ch chs] [| q w]; try exact Hnone.
   destruct (IH chs w) as (gs & Hgs & H). exists ((fun r => act s how ch (f r) q) :: gs). split.
-  - constructor; [| exact Hgs]. apply (continuity_pt_comp f (fun v => act s how ch v q)); [exact Hf | apply continuity_act].
+  - constructor; [| exact Hgs]. apply (continuity_pt_comp f (fun v => act s how ch v q));
+      [exact Hf | apply continuity_act].
   - intros r. cbn. f_equal. apply H.
 Qed.
 
@@ -191,13 +206,16 @@ Proof.
 Qed.
 
 Lemma sum_plus (n : nat) : forall f g, sum n (fun i => f i + g i) = sum n f + sum n g.
-Proof. induction n as [| n IH]; intros f g; cbn; [ring |]. rewrite (IH (fun i => f (S i)) (fun i => g (S i))). ring. Qed.
+Proof.
+  induction n as [| n IH]; intros f g; cbn; [ring |]. rewrite (IH (fun i => f (S i)) (fun i => g (S i))). ring.
+Qed.
 
 Lemma sum_times (n : nat) (a : R) : forall f, sum n (fun i => a * f i) = a * sum n f.
 Proof. induction n as [| n IH]; intros f; cbn; [ring |]. rewrite (IH (fun i => f (S i))). ring. Qed.
 
 (** The order of two sums does not matter. *)
-Lemma sum_swap (n m : nat) : forall f : nat -> nat -> R, sum n (fun i => sum m (f i)) = sum m (fun j => sum n (fun i => f i j)).
+Lemma sum_swap (n m : nat) : forall f : nat -> nat -> R,
+  sum n (fun i => sum m (f i)) = sum m (fun j => sum n (fun i => f i j)).
 Proof.
   induction n as [| n IH]; intros f; cbn.
   - rewrite (sum_same m _ (fun i => 0 * 0)), sum_times; [ring | intros; ring].
@@ -226,7 +244,8 @@ Proof.
 Qed.
 
 (** a'M b = b'M a for a symmetric M. *)
-Lemma bilinear_symmetric (n : nat) (M : list (list R)) (a b : list R) : square n M -> symmetric M -> length a = n -> length b = n ->
+Lemma bilinear_symmetric (n : nat) (M : list (list R)) (a b : list R) :
+  square n M -> symmetric M -> length a = n -> length b = n ->
   dot a (apply M b) = dot b (apply M a).
 Proof.
   intros HM Hsym Ha Hb. rewrite (bilinear n M a b), (bilinear n M b a), sum_swap by assumption.
@@ -234,7 +253,8 @@ Proof.
   rewrite (Hsym i j); [ring | |]; destruct HM as [-> _]; assumption.
 Qed.
 
-Definition derivatives (fs : list (R -> R)) (t : R) (ds : list R) : Prop := Forall2 (fun f d => derivable_pt_lim f t d) fs ds.
+Definition derivatives (fs : list (R -> R)) (t : R) (ds : list R) : Prop :=
+  Forall2 (fun f d => derivable_pt_lim f t d) fs ds.
 
 (** The product rule for lists. *)
 Lemma derivative_dot (t : R) : forall fs ds gs es, derivatives fs t ds -> derivatives gs t es ->
@@ -268,7 +288,8 @@ Proof.
   pose proof (derivative_dot t _ _ _ _ H Hrows) as HV. rewrite <- Happly in HV.
   rewrite (bilinear_symmetric n M (along fs t) ds) in HV;
     [| exact HM | exact Hsym | unfold along; rewrite map_length; exact Hfs | exact Hds].
-  rewrite (dot_commutes (apply M (along fs t)) ds). replace (2 * _) with (dot ds (apply M (along fs t)) + dot ds (apply M (along fs t))) by ring.
+  rewrite (dot_commutes (apply M (along fs t)) ds).
+  replace (2 * _) with (dot ds (apply M (along fs t)) + dot ds (apply M (along fs t))) by ring.
   revert HV. apply derivable_pt_lim_ext. intros s. unfold form. rewrite Happly. reflexivity.
 Qed.
 
@@ -306,7 +327,8 @@ Proof.
   - assert (Hm : 0 <= m <= b) by (split; [apply Hup; lra | apply Hleast; intros s [Hs _]; lra]).
     assert (Hvm : v m <= l).
     { destruct (Rle_or_lt (v m) l) as [H | H]; [exact H | exfalso].
-      destruct (stays_below (fun s => - v s) m (- l)) as (delta & Hd & Hnear); [apply (continuity_pt_opp v), Hv | lra |].
+      destruct (stays_below (fun s => - v s) m (- l)) as (delta & Hd & Hnear);
+        [apply (continuity_pt_opp v), Hv | lra |].
       assert (m <= m - delta); [| lra]. apply Hleast. intros s [Hs Hvs]. specialize (Hup s (conj Hs Hvs)).
       destruct (Rle_or_lt s (m - delta)) as [Hd' | Hd']; [exact Hd' | exfalso].
       assert (- v s < - l); [| lra]. apply Hnear, Rabs_def1; lra. }
@@ -354,6 +376,9 @@ Section Trajectories.
 Variable c : certificate.
 Variable rate : R.
 
+(** What is asked of the certificate. The level is above 0: at 0 the set is the origin alone, and that nothing leaves it
+    would need unique solutions. The plant is smooth: from the edge of the set, beyond which nothing is shown of it, a
+    solution falls back by continuity. *)
 Hypothesis fits : length (field c) = states c /\ square (states c) (P c).
 Hypothesis symmetric_P : symmetric (matrix c).
 Hypothesis positive_level : 0 < real (level c).
@@ -378,7 +403,8 @@ Qed.
 Definition path (y : R -> list R) (b : R) : Prop :=
   (forall t, length (y t) = states c)
   /\ (forall i, (i < states c)%nat -> forall t, continuity_pt (fun s => nth i (y s) 0) t)
-  /\ (forall i, (i < states c)%nat -> forall t, 0 < t < b -> derivable_pt_lim (fun s => nth i (y s) 0) t (nth i (F c (y t)) 0)).
+  /\ (forall i, (i < states c)%nat -> forall t, 0 < t < b ->
+      derivable_pt_lim (fun s => nth i (y s) 0) t (nth i (F c (y t)) 0)).
 
 Lemma path_continuous (y : R -> list R) (b t : R) : path y b -> continuous y t.
 Proof.
@@ -387,15 +413,16 @@ Proof.
 Qed.
 
 (** Along it V has the derivative Vdot. *)
-Lemma derivative_V (y : R -> list R) (b t : R) : path y b -> 0 < t < b -> derivable_pt_lim (fun s => V c (y s)) t (Vdot c (y t)).
+Lemma derivative_V (y : R -> list R) (b t : R) :
+  path y b -> 0 < t < b -> derivable_pt_lim (fun s => V c (y s)) t (Vdot c (y t)).
 Proof.
   intros (Hn & _ & Hd) Ht. destruct fits as [Hfield [HP Hrows]]. pose proof (entries_along y (states c) Hn) as Hy.
   set (fs := map _ _) in Hy.
   assert (HF : length (F c (y t)) = states c) by (unfold F; rewrite map_length; exact Hfield).
   apply (derivable_pt_lim_ext (fun s => V c (along fs s))); [intros s; rewrite <- Hy; reflexivity |].
   unfold Vdot. rewrite (Hy t) at 1. apply (derivative_form (states c)); [| exact symmetric_P | | exact HF |].
-  - split; [unfold matrix; rewrite map_length; exact HP |]. unfold matrix. apply Forall_map. revert Hrows. apply Forall_impl.
-    intros row Hrow. rewrite map_length. exact Hrow.
+  - split; [unfold matrix; rewrite map_length; exact HP |]. unfold matrix. apply Forall_map.
+    revert Hrows. apply Forall_impl. intros row Hrow. rewrite map_length. exact Hrow.
   - unfold fs. rewrite map_length, seq_length. reflexivity.
   - unfold derivatives, fs. rewrite (entries (F c (y t))), HF. clear Hy fs.
     assert (Hall : Forall (fun i => (i < states c)%nat) (seq 0 (states c))).
@@ -403,11 +430,14 @@ Proof.
     induction Hall as [| i l Hi _ IH]; cbn; [constructor |]. constructor; [apply Hd; assumption | exact IH].
 Qed.
 
-(** It stays inside. Where V was at most the level for the last time, V falls, or the state is at the origin, far below the level. *)
-Lemma path_inside (y : R -> list R) (b : R) : path y b -> 0 < b -> V c (y 0) <= real (level c) -> V c (y b) <= real (level c).
+(** It stays inside: when V is at most the level for the last time, it falls, or the state is at the origin, where V is
+    below the level. *)
+Lemma path_inside (y : R -> list R) (b : R) :
+  path y b -> 0 < b -> V c (y 0) <= real (level c) -> V c (y b) <= real (level c).
 Proof.
   intros Hy Hb H0. destruct (Rle_or_lt (V c (y b)) (real (level c))) as [H | H]; [exact H | exfalso].
-  assert (Hv : forall t, continuity_pt (fun s => V c (y s)) t) by (intros t; apply continuity_V, (path_continuous y b), Hy).
+  assert (Hv : forall t, continuity_pt (fun s => V c (y s)) t)
+    by (intros t; apply continuity_V, (path_continuous y b), Hy).
   destruct (last_below (fun s => V c (y s)) (real (level c)) b Hb Hv H0 H) as (m & Hm & Hvm & Habove). cbn beta in *.
   assert (Hinside : inside c (y m)) by (split; [apply Hy | exact Hvm]).
   assert (Hstep : forall delta, 0 < delta -> exists s, m < s <= b /\ s - m < delta).
@@ -415,11 +445,13 @@ Proof.
     pose proof (Rmin_l (delta / 2) (b - m)). pose proof (Rmin_r (delta / 2) (b - m)).
     assert (0 < Rmin (delta / 2) (b - m)) by (apply Rmin_glb_lt; lra). lra. }
   destruct (list_eq_dec Req_EM_T (y m) (zeros (states c))) as [Hzero | Hne].
-  - destruct (stays_below (fun s => V c (y s)) m (real (level c)) (Hv m)) as (delta & Hd & Hnear); [rewrite Hzero, V_zeros; lra |].
+  - destruct (stays_below (fun s => V c (y s)) m (real (level c)) (Hv m)) as (delta & Hd & Hnear);
+      [rewrite Hzero, V_zeros; lra |].
     destruct (Hstep delta Hd) as (s & Hs & Hsm). specialize (Habove s Hs).
     assert (V c (y s) < real (level c)); [apply Hnear, Rabs_def1; lra | lra].
   - destruct (stays_below (fun s => Vdot c (y s)) m 0) as (delta & Hd & Hnear);
-      [apply continuity_Vdot; [apply (path_continuous y b), Hy | apply smooth_inside, Hinside] | apply decreasing; assumption |].
+      [apply continuity_Vdot; [apply (path_continuous y b), Hy | apply smooth_inside, Hinside] |
+       apply decreasing; assumption |].
     destruct (Hstep delta Hd) as (s & Hs & Hsm). specialize (Habove s Hs).
     destruct (mean_value (fun s => V c (y s)) (fun s => Vdot c (y s)) m s) as (r & Hr & Hmean);
       [lra | exact Hv | intros r Hr; apply (derivative_V y b); [exact Hy | lra] |].
@@ -439,7 +471,8 @@ Proof.
     (fun t => Vdot c (y t) * exp (rate * t) + V c (y t) * (exp (rate * t) * rate)) 0 b Hb) as (t & Ht & Hmean).
   - intros t. apply (continuity_pt_mult (fun s => V c (y s))); [apply continuity_V, (path_continuous y b), Hy |].
     apply derivable_continuous_pt. exists (exp (rate * t) * rate). apply Hexp.
-  - intros t Ht. apply (derivable_pt_lim_mult (fun s => V c (y s)) (fun s => exp (rate * s))); [apply (derivative_V y b); assumption | apply Hexp].
+  - intros t Ht. apply (derivable_pt_lim_mult (fun s => V c (y s)) (fun s => exp (rate * s)));
+      [apply (derivative_V y b); assumption | apply Hexp].
   - assert (Hinside : inside c (y t)).
     { split; [apply Hy |]. apply path_inside; [| lra | exact H0].
       destruct Hy as (Hn & Hc & Hd). repeat split; try assumption. intros i Hi s Hs. apply Hd; [exact Hi | lra]. }
@@ -471,16 +504,19 @@ Proof.
     destruct (Rle_lt_or_eq_dec _ _ Hlow) as [Hpos | Hzero].
     + assert (Hcont : continuity_pt (fun s => nth i (x s) 0) (held b t)).
       { apply derivable_continuous_pt. exists (nth i (F c (x (held b t))) 0). apply Hd; [exact Hi | lra]. }
-      destruct (proj1 (continuity_near _ _) Hcont eps Heps) as (delta & Hdelta & H). exists delta. split; [exact Hdelta |].
+      destruct (proj1 (continuity_near _ _) Hcont eps Heps) as (delta & Hdelta & H). exists delta.
+      split; [exact Hdelta |].
       intros s Hs. apply H. apply (Rle_lt_trans _ _ _ (Hclose s t) Hs).
     + rewrite <- Hzero. destruct (Hstart i Hi eps Heps) as (delta & Hdelta & H). exists delta. split; [exact Hdelta |].
       intros s Hs. destruct (Hheld s) as [Hlow' Hhigh']. destruct (Rle_lt_or_eq_dec _ _ Hlow') as [Hpos' | <-].
-      * apply H; [lra |]. pose proof (Hclose s t) as Hnear. rewrite <- Hzero, Rminus_0_r, (Rabs_pos_eq _ Hlow') in Hnear. lra.
+      * apply H; [lra |]. pose proof (Hclose s t) as Hnear.
+        rewrite <- Hzero, Rminus_0_r, (Rabs_pos_eq _ Hlow') in Hnear. lra.
       * rewrite Rminus_diag_eq, Rabs_R0; [exact Heps | reflexivity].
   - intros i Hi t Ht. rewrite (Hbetween t) by lra.
     apply (derivable_pt_lim_locally_ext (fun s => nth i (x s) 0) _ t 0 b); [exact Ht | | apply Hd; [exact Hi | lra]].
     intros s Hs. rewrite Hbetween by lra. reflexivity.
 Qed.
+
 (** No trajectory leaves {V <= c2}, and V falls at the rate. *)
 Theorem trajectories_decay (x : R -> list R) (T : R) : 0 < T -> solution c x T -> V c (x 0) <= real (level c) ->
   forall t, 0 <= t < T -> inside c (x t) /\ V c (x t) <= V c (x 0) * exp (- rate * t).
@@ -495,7 +531,8 @@ Proof.
   - split; [split; [apply Hx; lra | exact H0] |]. rewrite Rmult_0_r, exp_0. lra.
 Qed.
 
-(** Hence so does every linear function a'x of the state that is bounded by b on the set: c2 (a'x)^2 <= b^2 V. *)
+(** Hence so does the square of every linear function a'x of the state of which |a'x| <= b on the set, in that
+    c2 (a'x)^2 <= b^2 V everywhere. *)
 Theorem direction_decays (a : list R) (b : R) :
   (forall x, length x = states c -> real (level c) * dot a x ^ 2 <= b ^ 2 * V c x) ->
   forall x T, 0 < T -> solution c x T -> V c (x 0) <= real (level c) -> forall t, 0 <= t < T ->
@@ -524,8 +561,8 @@ Proof.
   destruct (Nat.eq_dec i n) as [-> | Hne]; [lra |]. specialize (Hbound i ltac:(lia) x Hx). lra.
 Qed.
 
-(** Asymptotic stability in the usual words, for solutions at all times: those that start near the origin stay near it, and all
-    that start in the set come near it, together. *)
+(** Asymptotic stability in the usual words, for solutions at all times: those that start near the origin stay near it,
+    and all that start in the set come near it, together. *)
 Theorem trajectories_converge : 0 < rate ->
   (forall i, (i < states c)%nat -> exists b, 0 < b /\
     forall x, length x = states c -> real (level c) * nth i x 0 ^ 2 <= b ^ 2 * V c x) ->
@@ -539,7 +576,8 @@ Proof.
   intros Hrate Hbounds eps Heps. destruct (common_bound _ Hbounds) as (b & Hb & Hbound).
   assert (Hb2 : 0 < b ^ 2) by (apply pow_lt, Hb). assert (Heps2 : 0 < eps ^ 2) by (apply pow_lt, Heps).
   assert (Hcoordinate : forall x t i, (forall T, 0 < T -> solution c x T) -> V c (x 0) <= real (level c) -> 0 <= t ->
-    (i < states c)%nat -> b ^ 2 * (V c (x 0) * exp (- rate * t)) < real (level c) * eps ^ 2 -> Rabs (nth i (x t) 0) < eps).
+    (i < states c)%nat -> b ^ 2 * (V c (x 0) * exp (- rate * t)) < real (level c) * eps ^ 2 ->
+    Rabs (nth i (x t) 0) < eps).
   { intros x t i Hx H0 Ht Hi Hsmall.
     destruct (trajectories_decay x (t + 1) ltac:(lra) (Hx (t + 1) ltac:(lra)) H0 t ltac:(lra)) as [[Hn _] Hdecay].
     specialize (Hbound i Hi (x t) Hn). apply (Rmult_le_compat_l (b ^ 2)) in Hdecay; [| lra].
@@ -554,11 +592,13 @@ Proof.
     exists (sqrt (q / k)). split; [apply sqrt_lt_R0, Rdiv_lt_0_compat; assumption |]. intros x Hx Hnear t Ht i Hi.
     destruct (Hx 1 ltac:(lra)) as [Hn _]. specialize (Hn 0 ltac:(lra)).
     assert (Hq0 : V c (x 0) <= q).
-    { replace q with (k * sqrt (q / k) ^ 2); [| rewrite pow2_sqrt; [field; lra | apply Rlt_le, Rdiv_lt_0_compat; assumption]].
-      apply Hform; [apply sqrt_pos | apply Forall_forall]. intros v Hv. destruct (In_nth _ _ 0 Hv) as (j & Hj & <-). rewrite Hn in Hj.
-      apply Rlt_le, Hnear, Hj. }
+    { replace q with (k * sqrt (q / k) ^ 2);
+        [| rewrite pow2_sqrt; [field; lra | apply Rlt_le, Rdiv_lt_0_compat; assumption]].
+      apply Hform; [apply sqrt_pos | apply Forall_forall]. intros v Hv. destruct (In_nth _ _ 0 Hv) as (j & Hj & <-).
+      rewrite Hn in Hj. apply Rlt_le, Hnear, Hj. }
     assert (HV0 : 0 <= V c (x 0)).
-    { apply (Rmult_le_reg_l (b ^ 2)); [exact Hb2 |]. rewrite Rmult_0_r. refine (Rle_trans _ _ _ _ (Hbound i Hi (x 0) Hn)).
+    { apply (Rmult_le_reg_l (b ^ 2)); [exact Hb2 |]. rewrite Rmult_0_r.
+      refine (Rle_trans _ _ _ _ (Hbound i Hi (x 0) Hn)).
       apply Rmult_le_pos; [lra | apply pow2_ge_0]. }
     assert (Hle1 : exp (- rate * t) <= 1).
     { rewrite <- exp_0. pose proof (Rmult_le_pos rate t ltac:(lra) Ht). destruct (Req_dec (rate * t) 0) as [Hz | Hnz].
@@ -569,7 +609,8 @@ Proof.
     apply Rmult_le_compat_l; [lra |]. apply (Rle_trans _ (V c (x 0) * 1)); [apply Rmult_le_compat_l; assumption |].
     rewrite Rmult_1_r. apply (Rle_trans _ _ _ Hq0), Rmin_r.
   - exists (b ^ 2 / (eps ^ 2 * rate)).
-    assert (Htime : 0 < b ^ 2 / (eps ^ 2 * rate)) by (apply Rdiv_lt_0_compat; [exact Hb2 | apply Rmult_lt_0_compat; assumption]).
+    assert (Htime : 0 < b ^ 2 / (eps ^ 2 * rate))
+      by (apply Rdiv_lt_0_compat; [exact Hb2 | apply Rmult_lt_0_compat; assumption]).
     split; [lra |]. intros x Hx H0 t Ht i Hi. apply Hcoordinate; try assumption; [lra |].
     assert (Hgrown : b ^ 2 < eps ^ 2 * exp (rate * t)).
     { apply (Rle_lt_trans _ (eps ^ 2 * (rate * t))).
@@ -579,7 +620,8 @@ Proof.
         pose proof (Rmult_lt_0_compat rate t Hrate ltac:(lra)). specialize (H ltac:(lra)). lra. }
     pose proof (exp_pos (- rate * t)) as He.
     assert (Hfallen : b ^ 2 * exp (- rate * t) < eps ^ 2).
-    { apply (Rmult_lt_compat_r (exp (- rate * t))) in Hgrown; [| exact He]. rewrite (Rmult_assoc (eps ^ 2)), <- exp_plus in Hgrown.
+    { apply (Rmult_lt_compat_r (exp (- rate * t))) in Hgrown; [| exact He].
+      rewrite (Rmult_assoc (eps ^ 2)), <- exp_plus in Hgrown.
       replace (rate * t + - rate * t) with 0 in Hgrown by ring. rewrite exp_0 in Hgrown. lra. }
     apply (Rle_lt_trans _ (real (level c) * (b ^ 2 * exp (- rate * t)))); [| apply Rmult_lt_compat_l; assumption].
     rewrite <- Rmult_assoc, (Rmult_comm (b ^ 2)), Rmult_assoc. apply Rmult_le_compat_r; [| exact H0].
