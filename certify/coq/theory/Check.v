@@ -17,6 +17,8 @@ Definition dyadicQ (d : dyadic) : Q :=
 
 Definition ratioQ (q : rational) : Q := Qmake (numerator q) (denominator q).
 
+Fixpoint powerQ (q : Q) (k : nat) : Q := match k with O => 1%Q | S k => (q * powerQ q k)%Q end.
+
 (** The value of an expression at the origin with inputs u, where it is rational by its form. *)
 Fixpoint exactQ (u : list Q) (e : expr) : option Q :=
   match e with
@@ -27,7 +29,7 @@ Fixpoint exactQ (u : list Q) (e : expr) : option Q :=
   | Mul a b => bind (exactQ u a) (fun p => bind (exactQ u b) (fun q => Some (Qred (p * q)%Q)))
   | Neg a => bind (exactQ u a) (fun p => Some (- p)%Q)
   | Inv a => bind (exactQ u a) (fun p => if Qeq_bool p 0 then None else Some (Qred (/ p)%Q))
-  | Pow a k => bind (exactQ u a) (fun p => Some (Qred (Qpower p (Z.of_nat k))))
+  | Pow a k => bind (exactQ u a) (fun p => Some (Qred (powerQ p k)))
   | Sin a | Tanh a | Atan a => bind (exactQ u a) (fun p => if Qeq_bool p 0 then Some 0%Q else None)
   | Cos a | Exp a => bind (exactQ u a) (fun p => if Qeq_bool p 0 then Some 1%Q else None)
   | Sqrt a => bind (exactQ u a) (fun p => if Qeq_bool p 1 then Some 1%Q else None)
@@ -132,7 +134,7 @@ Definition well_formed : bool :=
   && forallb (channel_fits (squashed c) (centred c)) (channels c)
   && forallb rests_here (channels c) && unbiased
   && forallb (fun f => is_zero (exactQ (map (fun ch => ratioQ (rest ch)) (channels c)) f)) (field c)
-  && squareb n (T e) && inverse n (T e) (W e)
+  && squareb n (T e) && squareb n (W e) && inverse n (T e) (W e)
   && Nat.eqb (length (root e)) n && Nat.eqb (length (core e)) n.
 
 (** What is computed once. *)
@@ -168,7 +170,7 @@ Definition keeps (a : list I.type) (r : I.type) : bool :=
 Definition unitI (k : nat) : list I.type := map (fun j => whole (if Nat.eqb k j then 1 else 0)) (seq 0 n).
 
 Definition set_fits : bool :=
-  positiveI (levelI p) && squareb n (shape p) && definite n (shape p)
+  positiveI (levelI p) && squareb n (gradient p) && squareb n (shape p) && definite n (shape p)
   && forallb (fun k => let r := nth k (root e) PrimFloat.zero in atleast0 (point r) && keeps (unitI k) (point r)) (seq 0 n)
   && forallb (fun one => let '(a, (lo, hi)) := one in
        positiveI (I.neg (ratioI lo)) && positiveI (ratioI hi) && keeps a (ratioI lo) && keeps a (ratioI hi))
