@@ -67,6 +67,39 @@ def from_tree(tree: Any, states: Mapping[str, int], inputs: Mapping[str, int]) -
     return _Reader(names, iter(range(_MOST_NODES))).read(tree, _DEEPEST)
 
 
+def at_rest(e: Expression, u: Mapping[int, Fraction]) -> Fraction | None:
+    """The value at the origin with inputs u, if it is rational by its form; None if it is not, or is not decided.
+
+    >>> at_rest(Expression("cos", (Expression("state"),)), {})
+    Fraction(1, 1)
+    """
+    values = [at_rest(operand, u) for operand in e.operands]
+    if e.kind == "state":
+        return Fraction(0)
+    if e.kind == "input":
+        return u[e.index]
+    if e.kind == "const":
+        return e.number
+    known = [v for v in values if v is not None]
+    if len(known) < len(values):
+        return None
+    first = known[0]
+    match e.kind:
+        case "add":
+            return first + known[1]
+        case "mul":
+            return first * known[1]
+        case "neg":
+            return -first
+        case "inv":
+            return 1 / first if first else None
+        case "pow":
+            return first**e.index
+        case "sqrt":
+            return Fraction(1) if first == 1 else None
+    return None if first else Fraction(e.kind in ("cos", "exp"))
+
+
 @dataclass(frozen=True, slots=True)
 class _Reader:
     names: Mapping[str, Expression]

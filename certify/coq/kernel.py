@@ -23,21 +23,42 @@ from certify.errors import BackendError, InputError
 
 THEORY = Path(__file__).resolve().parent / "theory"
 PROJECT = "_CoqProject"
-WRITTEN = ("Claim.v", "Evidence.v", "Proof.v")  # beside the theory, in this order
+WRITTEN = ("Claim.v", "Evidence.v", "Proof.v", "Assumptions.v")  # beside the theory, in this order
 INSTALL = (
     "Debian: apt install coq libcoq-interval; opam: opam install coq coq-interval. CERTIFY_COQC names a coqc that is "
     "not on the PATH."
 )
-AXIOMS = frozenset(
-    {
-        # Coq's real numbers, and what they bring along
-        "ClassicalDedekindReals.sig_not_dec",
-        "ClassicalDedekindReals.sig_forall_dec",
-        "FunctionalExtensionality.functional_extensionality_dep",
-        "Classical_Prop.classic",
-    }
+_LIBRARY = {  # module of Coq's library: its axioms and primitives
+    # the real numbers, and what they bring along
+    "ClassicalDedekindReals": "sig_not_dec sig_forall_dec",
+    "FunctionalExtensionality": "functional_extensionality_dep",
+    "Classical_Prop": "classic",
+    # numbers of the processor: their operations, and that these are those of IEEE 754 and of integers mod 2^63
+    "PrimFloat": (
+        "float classify abs sqrt opp eqb ltb leb compare mul add sub div of_uint63 normfr_mantissa frshiftexp "
+        "ldshiftexp next_up next_down"
+    ),
+    "FloatAxioms": (
+        "Prim2SF_valid SF2Prim_Prim2SF Prim2SF_SF2Prim opp_spec abs_spec eqb_spec ltb_spec leb_spec compare_spec "
+        "classify_spec mul_spec add_spec sub_spec div_spec sqrt_spec of_uint63_spec normfr_mantissa_spec "
+        "frshiftexp_spec ldshiftexp_spec next_up_spec next_down_spec"
+    ),
+    "PrimInt63": (
+        "int lsl lsr land lor lxor asr add sub mul mulc div mod eqb ltb leb addc addcarryc subc subcarryc diveucl "
+        "diveucl_21 addmuldiv compare head0 tail0"
+    ),
+    "Uint63": (
+        "of_to_Z lsl_spec lsr_spec land_spec lor_spec lxor_spec add_spec sub_spec mul_spec mulc_spec div_spec mod_spec "
+        "eqb_correct eqb_refl ltb_spec leb_spec compare_def_spec head0_spec tail0_spec addc_def_spec "
+        "addcarryc_def_spec subc_def_spec subcarryc_def_spec diveucl_def_spec diveucl_21_spec addmuldiv_def_spec"
+    ),
+}
+AXIOMS = frozenset(f"{module}.{name}" for module, names in _LIBRARY.items() for name in names.split())
+"""On which a theorem may rest, as Coq prints them where nothing is imported."""
+_ASSUMING = re.compile(  # what a theory could take for granted, or switch off
+    r"\b(Axioms?|Conjectures?|Parameters?|Admitted|admit|Primitive|Declare|bypass_check|Unset|Load|Redirect)\b",
+    re.ASCII,
 )
-"""On which a theorem may rest."""
 _FILE = re.compile(r"[A-Z][A-Za-z0-9_]*\.v", re.ASCII)
 _AXIOM = re.compile(r"([A-Za-z_][A-Za-z0-9_'.]*)(?: : \S.*)?", re.ASCII)
 _CLOSED = "Closed under the global context"
@@ -99,14 +120,19 @@ def theory_files() -> dict[str, bytes]:
 
     Raises
     ------
-    BackendError : the list or a file is missing, or the list has something else than names of files.
+    BackendError : the list or a file is missing, the list has something else than names of files, or a file has a word
+        that assumes something.
     """
     try:
         lines = [line.strip() for line in (THEORY / PROJECT).read_text(encoding="utf-8").splitlines()]
         names = [line for line in lines if line and not line.startswith(("#", "-"))]
         if len(set(names)) != len(names) or any(_FILE.fullmatch(n) is None or n in WRITTEN for n in names):
             raise BackendError(f"{PROJECT} of the theory must list its files, each once; found {names}.")
-        return {name: (THEORY / name).read_bytes() for name in names}
+        files = {name: (THEORY / name).read_bytes() for name in names}
+        for name, data in files.items():
+            if (found := _ASSUMING.search(data.decode("utf-8"))) is not None:
+                raise BackendError(f"the theory must take nothing for granted; found {found[1]} in {name}.")
+        return files
     except (OSError, ValueError) as error:
         raise BackendError(f"the theory must be beside this package; found {error}.") from error
 

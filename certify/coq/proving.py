@@ -14,7 +14,7 @@ from pathlib import Path
 from certify.coq.data import read_claim
 from certify.coq.kernel import WRITTEN, compile_folder, find_coqc, theory_files, theory_sha256, write_folder
 from certify.coq.search import Limits, search
-from certify.coq.text import PROOF, claim_text, evidence_text
+from certify.coq.text import ASSUMPTIONS, PROOF, claim_text, evidence_text
 from certify.errors import BackendError, InputError
 from certify.verdict import Verdict
 
@@ -112,7 +112,7 @@ def prove_in_coq(
 
     if found.evidence is None:
         return result(Verdict.UNKNOWN, f"the search found nothing at the rate {found.rate}: {found.reason}")
-    texts = (claim_text(claimed, found.rate), evidence_text(found.evidence), PROOF)
+    texts = (claim_text(claimed, found.rate), evidence_text(found.evidence), PROOF, ASSUMPTIONS)
     files = theory | {name: text.encode("ascii") for name, text in zip(WRITTEN, texts, strict=True)}
     write_folder(folder, files)
     if not options.run:

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from certify.coq.data import Claimed
 from certify.coq.evidence import Evidence, Leaf, Matrix, Split, Tree, inverse
+from certify.coq.expression import at_rest
 from certify.coq.slopes import Bounds, Boxes, Interval, bounds, field_of, inputs_of
 from certify.errors import InputError
 
@@ -80,13 +81,15 @@ def search(claimed: Claimed, rate: Fraction | None = None, limits: Limits | None
 
     Raises
     ------
-    InputError : the rate is not positive, or less than the certificate's.
+    InputError : the rate is not positive, or less than the certificate's; or that the loop rests at the origin does not
+        follow from its form.
     """
     limits = limits or Limits()
     least = 2 * Fraction(claimed.rate)
     if rate is not None and not (rate > 0 and rate >= least):
         raise InputError(f"the rate must be positive and at least {float(least):.6g}; found {rate}.")
     start = time.monotonic()
+    _require_rest(claimed)
     slowest = -float(np.linalg.eigvals(jacobian(claimed)).real.max())
     boxes, reason, tried = 0, "the linearised loop does not decay", rate or Fraction(1)
     for tried in [rate] if rate is not None else _rates(slowest, least):
@@ -97,6 +100,26 @@ def search(claimed: Claimed, rate: Fraction | None = None, limits: Limits | None
             except _NotFound as why:
                 boxes, reason = boxes + attempt.boxes, str(why)
     return Found(tried, None, boxes, time.monotonic() - start, reason)
+
+
+def _require_rest(claimed: Claimed) -> None:
+    """Refuse a loop of which Coq's check does not see that it rests at the origin: it decides that in rationals."""
+    network, u_eq = claimed.network, dict(enumerate(claimed.u_eq))
+    for i, e in enumerate(claimed.field):
+        value = at_rest(e, u_eq)
+        if value != 0:
+            found = "no rational number" if value is None else str(value)
+            raise InputError(
+                f"f(0, u_eq) must be 0 by its form, as Coq decides it in rationals; found {found} in entry {i}."
+            )
+    if network.centre == "preactivation":
+        network.ratios(claimed.u_eq)
+    offsets = tuple(Fraction(float(o)) for o in network.offset)
+    if network.centre == "none" and (any(b.any() for b in network.biases) or offsets != claimed.u_eq):
+        raise InputError(
+            "a policy without centring must have no biases and the offset u_eq, for Coq to see that it is u_eq at the "
+            "origin; found others. Centre it."
+        )
 
 
 def jacobian(claimed: Claimed) -> Array:
@@ -160,7 +183,6 @@ class _Attempt:
         self.T = np.array([[float(v) for v in row] for row in T])
         self.S = self.T.T @ claimed.P @ self.T
         self.deadline, self.most, self.boxes = deadline, leaves, 0
-        self.limits = np.array([[float(v) for v in pair] for pair in claimed.bounds])
 
     def run(self) -> Evidence:
         """The evidence.
@@ -216,9 +238,15 @@ class _Attempt:
         return np.asarray(_definite(negated) & self._within(found))
 
     def _within(self, found: Bounds) -> NDArray[np.bool_]:
-        """Where the inputs are within their bounds."""
-        fits = [(u.range.lo >= lo) & (u.range.hi <= hi) for u, (lo, hi) in zip(found.inputs, self.limits, strict=True)]
-        return np.asarray(np.logical_and.reduce(fits))
+        """Where the inputs are within their bounds: everywhere if tanh keeps them there, which Coq decides exactly."""
+        network, fits = self.claimed.network, np.ones(len(found.V.value), dtype=bool)
+        by_form = network.squash == "tanh" and network.centre != "output"
+        for j, (u, (lo, hi)) in enumerate(zip(found.inputs, self.claimed.bounds, strict=True)):
+            scale, offset = abs(Fraction(float(network.scale[j]))), Fraction(float(network.offset[j]))
+            if not (by_form and lo <= offset - scale and offset + scale <= hi):
+                margin = _MARGIN * float(hi - lo)
+                fits &= (u.range.lo >= float(lo) + margin) & (u.range.hi <= float(hi) - margin)
+        return fits
 
     # The ring
 
@@ -255,7 +283,7 @@ class _Attempt:
             found = bounds(self.claimed, self.T, Boxes((lo + hi) / 2, (hi - lo) / 2))
             self._require_decrease(found)
             level = self.claimed.level
-            outside = found.V.range.lo > level * (1 + _MARGIN)
+            outside = found.V_plain.lo > level * (1 + _MARGIN)
             inner = np.all((lo >= -core) & (hi <= core), axis=1)
             k, largest, slopes = self._multiplier(found)
             size = np.abs(found.Vdot.value) + (self.rate + k) * level

@@ -1,7 +1,7 @@
 """Bounds on boxes by slopes, in plain floats: what Coq's check computes with outward rounding, for the search.
 
 A quantity q on a box with centre c has a range, its value at c, and slopes g: `q(z) - q(c)` is `sum of g_k (z_k - c_k)`
-with g_k in an interval, for every z of the box. After sums and products the range is cut with what the slopes say. Many
+with g_k in an interval, for every z of the box. The range is cut with what the slopes say. Many
 boxes are looked at at once: the first axis of every array is that of the boxes. Nothing here is a proof.
 """
 
@@ -9,6 +9,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import reduce
+from operator import add
 from typing import Any
 
 import numpy as np
@@ -118,9 +120,8 @@ class Quantity:
         )
 
     def __add__(self, other: Quantity) -> Quantity:
-        return Quantity(
-            self.boxes, self.range + other.range, self.value + other.value, self.slopes + other.slopes
-        ).cut()
+        """The sum, whose range is not cut."""
+        return Quantity(self.boxes, self.range + other.range, self.value + other.value, self.slopes + other.slopes)
 
     def __mul__(self, other: Quantity) -> Quantity:
         wide = Interval(other.range.lo[..., None], other.range.hi[..., None])
@@ -136,7 +137,7 @@ class Quantity:
     def after(self, outer: Interval, value: Array, derivative: Interval) -> Quantity:
         """A function of it: its range, its values, and the range of its slopes."""
         wide = Interval(derivative.lo[..., None], derivative.hi[..., None])
-        return Quantity(self.boxes, outer, value, self.slopes * wide)
+        return Quantity(self.boxes, outer, value, self.slopes * wide).cut()
 
     def tanh(self) -> Quantity:
         lo, hi = np.tanh(self.range.lo), np.tanh(self.range.hi)
@@ -206,12 +207,13 @@ def _sine(a: Interval, shift: float = 0.0) -> Interval:
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """What is known of a loop on boxes: the inputs, F and `V`, and `Vdot`."""
+    """What is known of a loop on boxes: the inputs, F, V and Vdot, and V from its formula alone."""
 
     inputs: tuple[Quantity, ...]
     F: tuple[Quantity, ...]
     V: Quantity
     Vdot: Quantity
+    V_plain: Interval
 
 
 def inputs_of(claimed: Claimed, x: Quantity) -> tuple[Quantity, ...]:
@@ -253,7 +255,7 @@ def _value(e: Expression, operands: list[Quantity], x: Quantity, inputs: Sequenc
         case "const":
             return x[0].constant(float(e.number))
         case "add":
-            return operands[0] + operands[1]
+            return (operands[0] + operands[1]).cut()
         case "neg":
             return operands[0].times(-1.0)
         case "mul":
@@ -270,8 +272,18 @@ def bounds(claimed: Claimed, T: Array, boxes: Boxes) -> Bounds:
     inputs = inputs_of(claimed, x)
     F = field_of(claimed, x, inputs)
     Y = claimed.P @ T
-    y, Sz = z.through(Y), z.through(T.T @ Y)
-    Vdot, V = y[0] * F[0], z[0] * Sz[0]
-    for i in range(1, claimed.n):
-        Vdot, V = Vdot + y[i] * F[i], V + z[i] * Sz[i]
-    return Bounds(inputs, F, V, Vdot.times(2.0))
+    S = T.T @ Y
+    y, Sz = z.through(Y), z.through(S)
+    Vdot = reduce(add, [y[i] * F[i] for i in range(claimed.n)])
+    V = reduce(add, [z[i] * Sz[i] for i in range(claimed.n)])
+    plain = _form(S, z.range)
+    return Bounds(inputs, F, Quantity(boxes, plain.cut(V.range), V.value, V.slopes).cut(), Vdot.times(2.0), plain)
+
+
+def _form(S: Array, z: Interval) -> Interval:
+    """z'S z, product by product."""
+    products = z[:, :, None] * z[:, None, :]
+    square = _square(z)
+    eye = np.eye(len(S), dtype=bool)
+    lo, hi = np.where(eye, square.lo[:, :, None], products.lo), np.where(eye, square.hi[:, :, None], products.hi)
+    return Interval(lo, hi).scaled(S).total().total()

@@ -1,4 +1,4 @@
-"""The three files that Coq reads beside the theory: what is claimed, what leads the proof, and the theorem.
+"""The files that Coq reads beside the theory: what is claimed, what leads the proof, the theorem, and its axioms.
 
 Every character of code in them is a fixed word or made of a number. Of what people have named, only plain words get
 in, and into comments alone: whatever a certificate says, it says nothing to Coq but numbers.
@@ -112,8 +112,10 @@ Proof.
   refine (sound _ _ evidence _).
   vm_cast_no_check (eq_refl true).
 Qed.
-
-Print Assumptions proved.
+"""
+ASSUMPTIONS = """(** The axioms that the proof rests on. Nothing is imported here: each is printed with its module. *)
+Require Proof.
+Print Assumptions Proof.proved.
 """
 
 
