@@ -104,12 +104,11 @@ def evidence_text(evidence: Evidence) -> str:
 
 
 PROOF = """(** The proof: the check says true, and what it says true of is so. *)
-From Coq Require Import List ZArith Floats Reals.
-Require Import Vectors Spec Data Check Soundness Claim Evidence.
+Require Spec Soundness Claim Evidence.
 
-Theorem proved : claim certificate (ratio rate).
+Theorem proved : Spec.claim Claim.certificate (Spec.ratio Claim.rate).
 Proof.
-  refine (sound _ _ evidence _).
+  refine (Soundness.sound _ _ Evidence.evidence _).
   vm_cast_no_check (eq_refl true).
 Qed.
 """
