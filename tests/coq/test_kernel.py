@@ -284,8 +284,8 @@ needs_coq = pytest.mark.skipif(shutil.which("coqc") is None, reason="needs coqc"
 def test_the_axioms_are_those_that_coq_prints(tmp_path: Path) -> None:
     """Of a lemma about each function in intervals of primitive floats, and of one that rests on more."""
     (tmp_path / "A.v").write_text(
-        "From Coq Require Import Reals.\nFrom Interval Require Import Tactic.\nOpen Scope R_scope.\n"
-        "Theorem a : exp 1 <= 3 /\\ sin 1 <= 0.9 /\\ atan 1 <= 0.8 /\\ sqrt 2 <= 1.5 /\\ ln 2 <= 0.7 /\\ cos 1 <= 0.6.\n"
+        "From Coq Require Import Reals.\nFrom Interval Require Import Tactic.\nOpen Scope R_scope.\nTheorem a : "
+        "exp 1 <= 3 /\\ sin 1 <= 0.9 /\\ atan 1 <= 0.8 /\\ sqrt 2 <= 1.5 /\\ ln 2 <= 0.7 /\\ cos 1 <= 0.6.\n"
         "Proof. repeat split; interval. Qed.\n"
         "Axiom more : False.\nTheorem b : 1 = 2. destruct more. Qed.\nTheorem c : True. exact I. Qed.\n"
         "Unset Guard Checking.\nFixpoint d (n : nat) : False := d n.\n"
