@@ -24,7 +24,7 @@ def prove_in_coq(
     ] = None,
     time_limit: Annotated[float, typer.Option(help="Seconds for the search and Coq together.")] = 600.0,
     boxes: Annotated[int, typer.Option(min=1, help="Boxes of the partition, at most.")] = 20_000,
-    run: Annotated[bool, typer.Option("--run/--no-run", help="Run Coq, or only write its files.")] = True,
+    no_run: Annotated[bool, typer.Option("--no-run", help="Only write Coq's files.")] = False,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
@@ -32,7 +32,7 @@ def prove_in_coq(
     from certify.certificate import read_raw
     from certify.coq.proving import CoqOptions, prove_in_coq
 
-    options = CoqOptions(None if rate is None else _rate(rate), time_limit, boxes, run)
+    options = CoqOptions(None if rate is None else _rate(rate), time_limit, boxes, not no_run)
     result = prove_in_coq(read_raw(certificate), out, options, None if quiet or as_json else tell)
     if as_json:
         say(json.dumps(_plain(result)))
