@@ -28,7 +28,8 @@ _MARGIN = 1e-9  # relative; Coq's rounding needs far less
 _BITS = 20  # of the coordinates
 _DEEPEST = 60
 _BATCH = 2_000
-_TRIALS = 8
+_TRIALS = 6
+_WORTHWHILE = 0.7  # of the boxes: a smaller rate that needs more is not worth it
 _SHARE = Fraction(1, 20)  # of the slowest rate of the linearised loop
 
 
@@ -75,8 +76,8 @@ def search(claimed: Claimed, rate: Fraction | None = None, limits: Limits | None
 
     Parameters
     ----------
-    rate : of V, that is claimed; None for one that costs little, a small share of the slowest rate of the linearised
-        loop, and then ever smaller ones.
+    rate : of V, that is claimed; None for one that costs little: a small share of the slowest rate of the linearised
+        loop, or a smaller one if nothing is found with it or far fewer boxes are enough then.
     limits : of the whole search.
 
     Raises
@@ -91,15 +92,32 @@ def search(claimed: Claimed, rate: Fraction | None = None, limits: Limits | None
     start = time.monotonic()
     _require_rest(claimed)
     slowest = -float(np.linalg.eigvals(jacobian(claimed)).real.max())
+    deadline, most = start + limits.seconds, limits.boxes
     boxes, reason, tried = 0, "the linearised loop does not decay", rate or Fraction(1)
+    best: tuple[Fraction, Evidence] | None = None
     for tried in [rate] if rate is not None else _rates(slowest, least):
-        for T in _coordinates(claimed):
-            attempt = _Attempt(claimed, T, tried, start + limits.seconds, limits.boxes)
-            try:
-                return Found(tried, attempt.run(), boxes + attempt.boxes, time.monotonic() - start)
-            except _NotFound as why:
-                boxes, reason = boxes + attempt.boxes, str(why)
-    return Found(tried, None, boxes, time.monotonic() - start, reason)
+        attempts = [_Attempt(claimed, T, tried, deadline, most) for T in _coordinates(claimed)]
+        evidence, why = _first(attempts)
+        boxes, reason = boxes + sum(attempt.boxes for attempt in attempts), why or reason
+        if evidence is not None:
+            best, most = (tried, evidence), math.floor(_WORTHWHILE * evidence.leaves)
+        elif best is not None:
+            break
+        if most < 1:
+            break
+    seconds = time.monotonic() - start
+    return Found(tried, None, boxes, seconds, reason) if best is None else Found(*best, boxes, seconds)
+
+
+def _first(attempts: list[_Attempt]) -> tuple[Evidence | None, str]:
+    """The evidence of the first attempt that finds one, and why the last that failed did not."""
+    reason = ""
+    for attempt in attempts:
+        try:
+            return attempt.run(), reason
+        except _NotFound as why:
+            reason = str(why)
+    return None, reason
 
 
 def _require_rest(claimed: Claimed) -> None:
