@@ -215,7 +215,7 @@ def axioms_in(printed: str) -> tuple[str, ...] | None:
         if name is None or name[1] in found:
             return None
         found.append(name[1])
-    return tuple(found) or None
+    return tuple(found)
 
 
 def _script(names: list[str]) -> str:
@@ -242,14 +242,15 @@ def _run(command: list[str], folder: Path, seconds: float) -> tuple[int | None, 
             )
         except OSError as error:
             return -1, f"{command[0]} cannot be run: {error.strerror}"
+        status: int | None = None
         try:
-            status: int | None = process.wait(max(seconds, 0.01))
-        except subprocess.TimeoutExpired:
-            status = None
-        finally:
+            status = process.wait(max(seconds, 0.01))
+        except BaseException as stop:  # also where the user ends it
             with contextlib.suppress(ProcessLookupError, PermissionError):
                 os.killpg(process.pid, signal.SIGKILL)
             process.wait()
+            if not isinstance(stop, subprocess.TimeoutExpired):
+                raise
         out.seek(0)
         errors.seek(0)
         printed = out.read().decode("utf-8", "replace")

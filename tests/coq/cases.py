@@ -10,7 +10,7 @@ import numpy as np
 
 from certify.certificate import loop_sections
 from certify.policies import load_policy
-from certify.systems import get_system
+from certify.systems import get_system, load_system
 from tests.support.certificates import make
 
 Document = dict[str, Any]
@@ -30,6 +30,16 @@ def pendulum(level: float = 0.999999) -> Document:
         "levels": {"local": (0.1).hex(), "roa": level.hex()},
         "evidence": NOTHING,
         "provenance": {},
+    }
+
+
+def van_der_pol() -> Document:
+    """Van der Pol's oscillator in reversed time under the policy of the examples; just beyond the level V increases
+    somewhere."""
+    network = load_policy(ROOT / "examples" / "policies" / "van_der_pol.pt").network
+    return pendulum(float.fromhex("0x1.0195ba0d914e0p+0")) | {
+        **loop_sections(load_system(ROOT / "examples" / "plants" / "van_der_pol.toml"), network),
+        "lyapunov": {"kind": "quadratic", "P": "QIsBytoP4z9YzrRRitjJv1jOtFGK2Mm/CacyC7q61z8="},
     }
 
 

@@ -17,7 +17,7 @@ from certify.coq.search import Found, Limits, jacobian, search
 from certify.coq.slopes import Boxes, Interval, Quantity, bounds
 from certify.coq.text import evidence_text
 from certify.errors import InputError
-from tests.coq.cases import Document, everything, pendulum, raw, scalar
+from tests.coq.cases import Document, everything, pendulum, raw, scalar, van_der_pol
 from tests.coq.test_data import in_file
 from tests.support.certificates import edited, encode, make, rehash
 
@@ -97,6 +97,35 @@ def test_the_pendulums_evidence_holds() -> None:
 def test_the_pendulum_takes_few_boxes() -> None:
     """585 with plain bounds, 271 with slopes and no multipliers (of the level 0.999999)."""
     assert evidence_of(pendulums()).leaves <= 140
+
+
+def test_multipliers_show_what_holds_in_the_set_alone() -> None:
+    """Beyond the level V increases somewhere, and without multipliers 309 boxes are needed."""
+    found = search(claim_of(van_der_pol()), Fraction(1, 4000))
+    replay(van_der_pol(), evidence_of(found), 1 / 4000)
+    assert evidence_of(found).leaves <= 200
+
+
+@pytest.mark.parametrize("data", [pendulum(), van_der_pol()], ids=["pendulum", "van der pol"])
+def test_the_bounds_show_every_leaf(data: Document) -> None:
+    """The search's own bounds, box by box as Coq looks at them, with the multiplier that is written."""
+    claimed, rate = claim_of(data), Fraction(1, 4000)
+    evidence = evidence_of(search(claimed, rate))
+    root, core = np.array(evidence.root), np.array(evidence.core)
+    used = 0
+    for leaf, lo, hi in boxes_of(evidence.splits, -root, root):
+        found = bounds(claimed, np.array(evidence.T, dtype=float), Boxes((lo + hi)[None] / 2, (hi - lo)[None] / 2))
+        decay = found.Vdot + found.V.times(float(rate)) + found.V.plus(-claimed.level).times(-leaf.k)
+        falls = leaf.k >= 0 and decay.cut().range.hi[0] < 0
+        assert falls or found.V_plain.lo[0] > claimed.level or (np.all(lo >= -core) and np.all(hi <= core))
+        used += leaf.k > 0
+    assert used > 0
+
+
+def test_a_rate_that_hardly_holds() -> None:
+    """Near the origin V decays at the rate 1."""
+    data = edited(scalar(), "levels.roa", (0.01).hex())
+    replay(data, evidence_of(search(claim_of(data), Fraction(99, 100))), 0.99)
 
 
 def test_the_text_has_every_leaf_and_split() -> None:
