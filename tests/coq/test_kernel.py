@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 from certify.cli import _run
+from certify.commands import doctor
 from certify.coq import kernel
 from certify.coq.kernel import AXIOMS, axioms_in, compile_folder, find_coqc, theory_files, theory_sha256, write_folder
 from certify.coq.proving import CoqOptions, CoqResult, prove_in_coq
@@ -169,6 +170,15 @@ def test_without_coq_the_files_are_there(
     assert (tmp_path / "out" / "Proof.v").is_file()
 
 
+def test_the_doctor_says_whether_coq_is_there(proving: Prove, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    proving("exit 0")
+    (found,) = (f for f in doctor._optional() if f.name == "Coq")
+    assert (found.state, found.found) == ("ok", "8.16.1 with its library Interval")
+    monkeypatch.setenv("CERTIFY_COQC", str(tmp_path / "none"))
+    (found,) = (f for f in doctor._optional() if f.name == "Coq")
+    assert (found.state, found.found) == ("missing", "certify prove-in-coq") and "opam install" in found.advice
+
+
 def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], proving: Prove) -> None:
     path = tmp_path / "certificate.json"
     path.write_bytes(raw(scalar()))
@@ -231,7 +241,7 @@ def test_the_script_says_what_the_command_does(proving: Prove, tmp_path: Path) -
     done = subprocess.run(["sh", str(out / "check.sh")], env=environment, capture_output=True, text=True, check=False)
     assert done.returncode == 0 and done.stdout == GOOD
     assert (out / "order").read_text() == (out / "_CoqProject").read_text()
-    (folder / "coqc").write_text("#!/bin/sh\nexit 1\n")
+    (folder / "coqc").write_text("#!/bin/sh\n[ $2 != Proof.v ]\n")
     assert subprocess.run(["sh", str(out / "check.sh")], env=environment, check=False).returncode == 1
 
 
