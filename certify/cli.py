@@ -26,6 +26,7 @@ from certify.commands.importing import takes_import_options
 from certify.commands.learn_lyapunov import learn_lyapunov
 from certify.commands.plant import plant
 from certify.commands.plot import plot
+from certify.commands.prove_in_coq import prove_in_coq
 from certify.commands.reach import reach
 from certify.commands.report import report
 from certify.commands.roa import roa
@@ -53,6 +54,7 @@ app.command("learn-lyapunov")(takes_import_options(learn_lyapunov))
 app.command("plant")(plant)
 app.command("systems")(systems)
 app.command("export-smt2")(export_smt2)
+app.command("prove-in-coq")(prove_in_coq)
 app.command("float-error")(float_error)
 app.command("doctor")(doctor)
 

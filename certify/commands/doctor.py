@@ -134,6 +134,7 @@ def _cvxpy() -> Finding:
 
 
 def _optional() -> list[Finding]:
+    from certify.coq.kernel import find_coqc
     from certify.engines.dreal.backend import find_backend
     from certify.errors import BackendError
     from certify.installation import version_of
@@ -152,6 +153,10 @@ def _optional() -> list[Finding]:
     except BackendError as error:
         purpose = "--engine dreal and both; bounds, the default, needs no solver"
         findings.append(Finding("optional", "dReal", "missing", purpose, str(error)))
+    try:
+        findings.append(Finding("optional", "Coq", "ok", f"{find_coqc().version} with its library Interval"))
+    except BackendError as error:
+        findings.append(Finding("optional", "Coq", "missing", "certify prove-in-coq", str(error)))
     return findings
 
 

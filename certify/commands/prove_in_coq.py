@@ -1,0 +1,88 @@
+"""`certify prove-in-coq`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from certify.commands.shared import Json, Quiet
+from certify.commands.terminal import say, show, tell
+
+if TYPE_CHECKING:
+    from certify.coq.proving import CoqResult
+
+
+def prove_in_coq(
+    certificate: Annotated[Path, typer.Argument(help="Certificate file.")],
+    out: Annotated[Path, typer.Option(help="Folder for Coq's files: theory, claim, proof, and check.sh.")],
+    rate: Annotated[
+        str | None,
+        typer.Option(metavar="P/Q", help="Rate at which V must decay; default: a small one that costs little."),
+    ] = None,
+    time_limit: Annotated[float, typer.Option(help="Seconds for the search and Coq together.")] = 600.0,
+    boxes: Annotated[int, typer.Option(min=1, help="Boxes of the partition, at most.")] = 20_000,
+    no_run: Annotated[bool, typer.Option("--no-run", help="Only write Coq's files.")] = False,
+    quiet: Quiet = False,
+    as_json: Json = False,
+) -> None:
+    """Prove the claim of a certificate again in the Coq proof assistant, which trusts none of this program."""
+    from certify.certificate import read_raw
+    from certify.coq.proving import CoqOptions, prove_in_coq
+
+    options = CoqOptions(None if rate is None else _rate(rate), time_limit, boxes, not no_run)
+    result = prove_in_coq(read_raw(certificate), out, options, None if quiet or as_json else tell)
+    if as_json:
+        say(json.dumps(_plain(result)))
+    else:
+        _print(result)
+    raise typer.Exit(result.verdict.exit_status)
+
+
+def _rate(text: str) -> Any:
+    from fractions import Fraction
+
+    from certify.errors import InputError
+
+    try:
+        return Fraction(text)
+    except (ValueError, ZeroDivisionError) as error:
+        raise InputError(f"`--rate` must be a number, as in 1/16 or 0.05; found {text[:40]!r}.") from error
+
+
+def _plain(result: CoqResult) -> dict[str, Any]:
+    from dataclasses import asdict
+
+    folder = None if result.folder is None else str(result.folder)
+    return asdict(result) | {"verdict": result.verdict.value, "rate": str(result.rate), "folder": folder}
+
+
+def _print(result: CoqResult) -> None:
+    from rich.table import Table
+    from rich.text import Text
+
+    from certify.verdict import Verdict
+
+    if result.verdict is Verdict.PROVED:
+        shown = f"{{V <= {result.level:.6g}}} is invariant, and V decays at the rate {result.rate}"
+        say(f"PROVED IN COQ  {result.plant}: {shown}")
+    else:
+        say(f"{result.verdict.value}  {result.plant}: {result.reason}")
+    rows = {
+        "certificate": result.certificate_sha256,
+        "its policy": result.policy_sha256,
+        "theory": result.theory_sha256,
+        "partition": f"{result.boxes} boxes, {result.looked_at} looked at" if result.boxes else "",
+        "axioms": "\n".join(result.axioms) or ("none" if result.verdict is Verdict.PROVED else ""),
+        "time": f"search {result.search_seconds:.2f} s" + (f", Coq {result.coq_seconds:.1f} s" if result.coq else ""),
+        "Coq": result.coq or "",
+        "files": "" if result.folder is None else str(result.folder),
+    }
+    table = Table.grid(padding=(0, 2))
+    for name, value in rows.items():
+        if value:
+            table.add_row(Text(name), Text(value))
+    say("")
+    show(table)

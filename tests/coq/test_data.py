@@ -1,0 +1,323 @@
+"""What Coq is told is what the certificate says: every number is read back from the text and from the file apart."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import math
+import re
+import struct
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import pytest
+
+from certify.coq.data import read_claim
+from certify.coq.text import claim_text, dyadic, number
+from certify.errors import CertifyError, InputError
+from tests.coq.cases import Document, everything, pendulum, raw, scalar
+from tests.support.certificates import edited, encode, policy_hash, rehash
+
+# Reading Coq's text: numbers, names, applications, lists and pairs.
+
+_TOKEN = re.compile(r"\s*(-?[0-9]+|[A-Za-z_][A-Za-z0-9_]*|[\[\]();,])")
+CONSTRUCTORS = {
+    "Dyadic": lambda m, e: Fraction(m) * Fraction(2) ** e,
+    "Ratio": Fraction,
+}
+
+
+def definitions(text: str) -> dict[str, tuple[str, Any]]:
+    """Name to type and body of every definition."""
+    code = re.sub(r"\(\*.*?\*\)", "", text, flags=re.S)
+    found = {}
+    for name, kind, body in re.findall(r"^Definition (\w+) : ([^:]*?) :=\s(.*?)\.$", code, re.M | re.S):
+        assert name not in found
+        found[name] = (kind, read(body))
+    return found
+
+
+def read(body: str) -> Any:
+    tokens, at = [], 0
+    while body[at:].strip():
+        match = _TOKEN.match(body, at)
+        assert match is not None, body[at : at + 40]
+        tokens.append(match[1])
+        at = match.end()
+    value, rest = application(tokens)
+    assert not rest
+    return value
+
+
+def application(tokens: list[str]) -> tuple[Any, list[str]]:
+    parts = []
+    while tokens and tokens[0] not in (")", "]", ";", ","):
+        token, tokens = tokens[0], tokens[1:]
+        if token == "(":
+            inner, tokens = application(tokens)
+            if tokens[0] == ",":
+                other, tokens = application(tokens[1:])
+                inner = ("pair", inner, other)
+            assert tokens[0] == ")"
+            tokens = tokens[1:]
+        elif token == "[":
+            items = []
+            while tokens[0] != "]":
+                item, tokens = application(tokens)
+                items.append(item)
+                assert tokens[0] in (";", "]")
+                tokens = tokens[1:] if tokens[0] == ";" else tokens
+            inner, tokens = items, tokens[1:]
+        else:
+            inner = int(token) if re.fullmatch(r"-?[0-9]+", token) else token
+        parts.append(inner)
+    if isinstance(parts[0], str) and parts[0] in CONSTRUCTORS:
+        return CONSTRUCTORS[parts[0]](*parts[1:]), tokens
+    return (parts[0] if len(parts) == 1 else tuple(parts)), tokens
+
+
+def numbers(text: str) -> list[Fraction]:
+    raw_ = base64.b64decode(text)
+    return [Fraction(v) for v in struct.unpack(f"<{len(raw_) // 8}d", raw_)]
+
+
+def rows(text: str, width: int) -> list[list[Fraction]]:
+    flat = numbers(text)
+    return [flat[i : i + width] for i in range(0, len(flat), width)]
+
+
+def in_coq(e: Any, x: list[float], u: list[float]) -> float:
+    """The value of Coq's expression, as Spec.v has it."""
+    head, *args = e
+    if head in ("State", "Input"):
+        return (x if head == "State" else u)[args[0]]
+    if head == "Const":
+        return float(args[0])
+    if head == "Pow":
+        return in_coq(args[0], x, u) ** args[1]
+    values = [in_coq(a, x, u) for a in args]
+    return {
+        "Add": lambda a, b: a + b, "Mul": lambda a, b: a * b, "Neg": lambda a: -a, "Inv": lambda a: 1 / a,
+        "Sin": math.sin, "Cos": math.cos, "Tanh": math.tanh, "Exp": math.exp, "Atan": math.atan, "Sqrt": math.sqrt,
+    }[head](*values)  # fmt: skip
+
+
+def in_file(tree: Any, values: dict[str, float]) -> float:
+    """The value of the file's tree, as FORMAT.md has it."""
+    if isinstance(tree, str):
+        return values[tree] if tree in values else float(Fraction(tree))
+    if tree[0] == "**":
+        return in_file(tree[1], values) ** tree[2]
+    a = [in_file(t, values) for t in tree[1:]]
+    return {
+        "+": lambda *a: sum(a), "*": lambda *a: math.prod(a), "-": lambda *a: -a[0] if len(a) == 1 else a[0] - a[1],
+        "/": lambda a, b: a / b, "sin": math.sin, "cos": math.cos, "tan": math.tan, "tanh": math.tanh,
+        "exp": math.exp, "atan": math.atan, "sqrt": math.sqrt,
+    }[tree[0]](*a)  # fmt: skip
+
+
+def constants(e: Any) -> set[Fraction]:
+    if not isinstance(e, tuple):
+        return set()
+    return {e[1]} if e[0] == "Const" else {c for a in e[1:] for c in constants(a)}
+
+
+def written(tree: Any) -> set[Fraction]:
+    if isinstance(tree, str):
+        return {Fraction(tree)} if re.fullmatch(r"-?[0-9/]+", tree) else set()
+    return {c for a in tree[1:] if not isinstance(a, int) for c in written(a)}
+
+
+@pytest.mark.parametrize("data", [pendulum(), scalar(), everything()], ids=["pendulum", "scalar", "everything"])
+def test_every_number_of_the_certificate_is_in_coqs_text(data: Document) -> None:
+    found = definitions(claim_text(read_claim(raw(data)), Fraction(3, 64)))
+    plant, policy = data["plant"], data["policy"]
+    n = len(plant["states"])
+    assert found["P"] == ("list (list dyadic)", rows(data["lyapunov"]["P"], n))
+    assert found["level"] == ("dyadic", Fraction(float.fromhex(data["levels"]["roa"])))
+    assert found["rate"] == ("rational", Fraction(3, 64))
+    assert found["domain"][1] == [("pair", Fraction(lo), Fraction(hi)) for lo, hi in plant["domain"]]
+    assert found["channels"][1] == [
+        ("Channel", scale, offset, Fraction(rest), Fraction(least), Fraction(greatest))
+        for scale, offset, rest, (least, greatest) in zip(
+            numbers(policy["scale"]), numbers(policy["offset"]), plant["u_eq"], plant["input_bounds"], strict=True
+        )
+    ]
+    for k, layer in enumerate(policy["layers"], 1):
+        weights = rows(layer["weight"], layer["shape"][1])
+        assert found[f"layer_{k}"][0] == "layer"
+        assert found[f"layer_{k}"][1] == [
+            ("pair", row, bias) for row, bias in zip(weights, numbers(layer["bias"]), strict=True)
+        ]
+    squash = {"tanh": "ByTanh", "identity": "ByIdentity"}[policy["squash"]]
+    centre = {"output": "AtOutput", "preactivation": "AtPreactivation", "none": "NotCentred"}[policy["centre"]]
+    layers = [f"layer_{k}" for k in range(1, len(policy["layers"]) + 1)]
+    assert found["certificate"] == (
+        "certificate",
+        ("Certificate", "field", "domain", "channels", layers, squash, centre, "P", "level"),
+    )
+    assert list(found) == ["field", "domain", "channels", *layers, "P", "level", "certificate", "rate"]
+
+
+@pytest.mark.parametrize("data", [pendulum(), scalar(), everything()], ids=["pendulum", "scalar", "everything"])
+def test_the_equations_have_the_same_values(data: Document) -> None:
+    field = definitions(claim_text(read_claim(raw(data)), Fraction(1)))["field"][1]
+    plant = data["plant"]
+    rng = np.random.default_rng(0)
+    assert len(field) == len(plant["dynamics"])
+    for coq, tree in zip(field, plant["dynamics"], strict=True):
+        assert constants(coq) == written(tree)
+        for _ in range(5):
+            x, u = rng.uniform(-1, 1, len(plant["states"])).tolist(), rng.uniform(-1, 1, len(plant["inputs"])).tolist()
+            values = dict(zip(plant["states"], x, strict=True)) | dict(zip(plant["inputs"], u, strict=True))
+            assert in_coq(coq, x, u) == pytest.approx(in_file(tree, values), rel=1e-12)
+
+
+def test_the_hashes_are_those_of_the_bytes() -> None:
+    given = raw(everything())
+    text = claim_text(read_claim(given), Fraction(1))
+    assert f"sha256 of the certificate: {hashlib.sha256(given).hexdigest()}\n" in text
+    assert f"sha256 of its policy:      {policy_hash(everything()['policy'])}\n" in text
+    assert hashlib.sha256(given + b" ").hexdigest() in claim_text(read_claim(given + b" "), Fraction(1))
+
+
+@pytest.mark.parametrize("value", [0.0, -0.0, 1.0, -0.75, -3.5, 0.1, 5e-324, -1.7976931348623157e308, 2.0**-1074 * 3])
+def test_numbers_are_exact(value: float) -> None:
+    head, mantissa, exponent = dyadic(value).replace("(", "").replace(")", "").split()
+    assert head == "Dyadic" and Fraction(int(mantissa)) * Fraction(2) ** int(exponent) == Fraction(value)
+    assert int(mantissa) % 2 or value == 0
+    sign, text = re.fullmatch(r"(\(-)?(0x[^)%]*)\)?%float", number(value)).groups()  # type: ignore[union-attr]
+    assert (-float.fromhex(text) if sign else float.fromhex(text)) == value
+    assert (sign is not None) == (value < 0)
+
+
+def test_an_infinite_number_is_not_written() -> None:
+    with pytest.raises(InputError, match="must be finite"):
+        number(math.inf)
+
+
+def test_names_say_nothing_to_coq() -> None:
+    """Neither states named as Coq's words nor a plant whose name ends a comment change more than the comment."""
+    plain = everything()
+    odd = rehash(everything())
+    odd["plant"] |= {"name": "p *) Axiom no : False. (*", "states": ["Axiom", "Qed"], "inputs": ["Load", "fun"]}
+    new = dict(zip(("x", "y", "u", "w"), ("Axiom", "Qed", "Load", "fun"), strict=True))
+
+    def renamed(tree: Any) -> Any:
+        return (
+            new.get(tree, tree)
+            if isinstance(tree, str)
+            else [tree[0], *(t if isinstance(t, int) else renamed(t) for t in tree[1:])]
+        )
+
+    odd["plant"]["dynamics"] = [renamed(tree) for tree in odd["plant"]["dynamics"]]
+    texts = [claim_text(read_claim(raw(data)), Fraction(1)) for data in (plain, odd)]
+    bodies = [text.split("*)", 1)[1] for text in texts]
+    assert bodies[0] == bodies[1]
+    assert texts[1].startswith("(** What a certificate claims, as numbers.\n") and "Axiom" not in texts[1]
+    assert texts[0].startswith("(** What a certificate claims, as numbers, of the plant plant.\n")
+
+
+UNSUPPORTED = {
+    "claims of kind practical": ("claim.kind", "practical"),
+    "an outer set": ("claim.outer", {"kind": "network"}),
+    "an input that is held": ("claim.sample", ["0", "1/10"]),
+    "plants in discrete time": ("plant.time", "discrete"),
+    "uncertain quantities": ("plant.uncertain", [{"name": "q", "range": ["0", "1"]}]),
+    "a clip": ("policy.clip", [encode([-1.0]), encode([1.0])]),
+    "functions V of kind network": ("lyapunov.kind", "network"),
+}
+
+
+@pytest.mark.parametrize("found", UNSUPPORTED)
+def test_what_coqs_statement_cannot_say_is_refused(found: str) -> None:
+    with pytest.raises(InputError, match=rf"found {found}.*a proof in Coq is there for"):
+        read_claim(raw(rehash(edited(scalar(), *UNSUPPORTED[found]))))
+
+
+MALFORMED = {
+    "another schema": ("schema", "certify-certificate/6", "must have the schema"),
+    "an unknown key": ("plant", lambda p: p | {"delay": "1"}, "`plant` must have exactly the keys"),
+    "a key less": ("levels", lambda _: {"roa": (1.0).hex()}, "`levels` must have exactly the keys"),
+    "another policy": ("policy.scale", encode([-2.0]), "sha256 must be"),
+    "a decimal level": ("levels.roa", 1, "must be a hex float"),
+    "a level not canonical": ("levels.roa", "0x1p0", "canonical form"),
+    "a level of zero": ("levels.roa", (0.0).hex(), "level must be positive"),
+    "an infinite level": ("levels.roa", "inf", "must be a finite hex float"),
+    "a negative rate": ("claim.rate", (-1.0).hex(), "rate at least 0"),
+    "base64 not canonical": ("lyapunov.P", lambda t: t[:-2] + "9=", "canonical base64"),
+    "P of another shape": ("lyapunov.P", encode([1.0, 1.0]), "canonical base64 of"),
+    "P not finite": ("lyapunov.P", encode([math.nan]), "P must be finite"),
+    "an empty domain": ("plant.domain.0", ["1", "1"], "pairs lo < hi"),
+    "a rational with a leading zero": ("plant.u_eq.0", "01", "must be a rational"),
+    "a rational over zero": ("plant.u_eq.0", "1/0", "must be a rational"),
+    "a decimal rational": ("plant.u_eq.0", "0.5", "must be a rational"),
+    "a state twice": ("plant.states", ["x", "x"], "different names"),
+    "an input named as a state": ("plant.inputs", ["x"], "found x twice"),
+    "a name with a space": ("plant.states", ["x y"], "must be identifiers"),
+    "a name with a line's end": ("plant.states", ["x\n"], "must be identifiers"),
+    "an unknown name in an equation": ("plant.dynamics.0", "v", "must be a rational"),
+    "an unknown operator": ("plant.dynamics.0", ["abs", "x"], "operators must be those"),
+    "an operator with too many operands": ("plant.dynamics.0", ["/", "x", "x", "x"], "operators must be those"),
+    "an operator with none": ("plant.dynamics.0", ["+"], "must be a tree"),
+    "a power of 65": ("plant.dynamics.0", ["**", "x", 65], "integer exponent"),
+    "a power of 0": ("plant.dynamics.0", ["**", "x", 0], "integer exponent"),
+    "a power of True": ("plant.dynamics.0", ["**", "x", True], "integer exponent"),
+    "equations less": ("plant.dynamics", [], "`dynamics` must be a list of 1"),
+    "layers that do not chain": ("policy.layers.0.shape", [1, 2], "layers must lead from"),
+}
+
+
+@pytest.mark.parametrize("name", MALFORMED)
+def test_what_is_no_certificate_is_refused(name: str) -> None:
+    path, value, message = MALFORMED[name]
+    with pytest.raises(CertifyError, match=message):
+        read_claim(raw(edited(scalar(), path, value)))
+
+
+def test_a_matrix_that_is_not_symmetric_is_refused() -> None:
+    data = edited(everything(), "lyapunov.P", encode([[1.0, 0.1], [0.2, 1.0]]))
+    with pytest.raises(InputError, match="`P` must be symmetric"):
+        read_claim(raw(data))
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (b"\xff", "must be JSON"),
+        (b"[" * 100_000, "must be JSON|must be as FORMAT.md"),
+        (b"[]", "schema"),
+        (b'{"schema": 1, "schema": 2}', "each key once"),
+        (b'{"schema": 1.5}', "must not be decimal"),
+        (b'{"schema": NaN}', "must not be decimal"),
+        (b'{"schema": "certify-certificate/7"}', "must be as FORMAT.md has it"),
+    ],
+)
+def test_bytes_that_are_no_certificate_are_refused(given: bytes, message: str) -> None:
+    with pytest.raises(CertifyError, match=message):
+        read_claim(given)
+
+
+def test_equations_have_a_limit() -> None:
+    deep: Any = "x"
+    for _ in range(201):
+        deep = ["sin", deep]
+    with pytest.raises(CertifyError, match="at most 200 deep"):
+        read_claim(raw(edited(scalar(), "plant.dynamics.0", deep)))
+    doubling: Any = "x"
+    for _ in range(20):
+        doubling = ["tan", doubling]  # its operand stands twice
+    with pytest.raises(CertifyError, match="20,000 nodes"):
+        read_claim(raw(edited(scalar(), "plant.dynamics.0", doubling)))
+
+
+def test_the_rate_is_at_least_the_certificates() -> None:
+    """Twice lambda, for V decays twice as fast as its root."""
+    claimed = read_claim(raw(edited(scalar(), "claim.rate", (0.25).hex())))
+    claim_text(claimed, Fraction(1, 2))
+    for rate in (Fraction(499, 1000), Fraction(0), Fraction(-1)):
+        with pytest.raises(InputError, match=r"at least 0\.5"):
+            claim_text(claimed, rate)
+    with pytest.raises(InputError, match="must be positive"):
+        claim_text(read_claim(raw(scalar())), Fraction(0))
