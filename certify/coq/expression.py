@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import reduce
+from math import isqrt
 from typing import Any
 
 from certify.errors import CertificateFormatError
@@ -96,7 +97,8 @@ def at_rest(e: Expression, u: Mapping[int, Fraction]) -> Fraction | None:
         case "pow":
             return first**e.index
         case "sqrt":
-            return Fraction(1) if first == 1 else None
+            root = Fraction(isqrt(first.numerator), isqrt(first.denominator)) if first >= 0 else None
+            return root if root is not None and root * root == first else None
     return None if first else Fraction(e.kind in ("cos", "exp"))
 
 

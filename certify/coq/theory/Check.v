@@ -32,7 +32,9 @@ Fixpoint exactQ (u : list Q) (e : expr) : option Q :=
   | Pow a k => bind (exactQ u a) (fun p => Some (Qred (powerQ p k)))
   | Sin a | Tanh a | Atan a => bind (exactQ u a) (fun p => if Qeq_bool p 0 then Some 0%Q else None)
   | Cos a | Exp a => bind (exactQ u a) (fun p => if Qeq_bool p 0 then Some 1%Q else None)
-  | Sqrt a => bind (exactQ u a) (fun p => if Qeq_bool p 1 then Some 1%Q else None)
+  | Sqrt a => bind (exactQ u a) (fun p =>
+      let r := Qmake (Z.sqrt (Qnum p)) (Z.to_pos (Z.sqrt (Zpos (Qden p)))) in
+      if Qeq_bool (r * r) p && Qle_bool 0 r then Some r else None)
   end.
 
 Definition is_zero (o : option Q) : bool := match o with Some q => Qeq_bool q 0 | None => false end.

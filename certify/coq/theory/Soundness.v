@@ -69,7 +69,9 @@ Proof.
   - destruct (Qeq_bool q 0) eqn:z; [|discriminate]. apply some_inj in h; subst r. rewrite (Qeq_bool_real _ _ z), Q2R_zero. apply tanh_zero.
   - destruct (Qeq_bool q 0) eqn:z; [|discriminate]. apply some_inj in h; subst r. rewrite (Qeq_bool_real _ _ z), Q2R_zero, Q2R_one. apply exp_0.
   - destruct (Qeq_bool q 0) eqn:z; [|discriminate]. apply some_inj in h; subst r. rewrite (Qeq_bool_real _ _ z), Q2R_zero. apply atan_0.
-  - destruct (Qeq_bool q 1) eqn:z; [|discriminate]. apply some_inj in h; subst r. rewrite (Qeq_bool_real _ _ z), Q2R_one. apply sqrt_1.
+  - set (s := Qmake _ _) in h. destruct (Qeq_bool (s * s) q) eqn:z; [|discriminate]. destruct (Qle_bool 0 s) eqn:w; [|discriminate].
+    apply some_inj in h; subst r. rewrite <- (Qeq_bool_real _ _ z), Q2R_mult. apply sqrt_square.
+    generalize (Qle_bool_real _ _ w). now rewrite Q2R_zero.
 Qed.
 
 (** * The inverse *)
