@@ -5,8 +5,8 @@ its end takes. So a run is evaluated every so many steps, and the rule is a func
 neither floor nor cost has become better by a share for so many evaluations in a row, or the budget is spent, the
 learning rate falls to zero over a further share of the steps, as ours does at its end, and the run is over. An
 evaluation most of whose trajectories leave the domain is none of these: such a policy has no floor yet, and its run
-goes on. The policy of a run is that of the evaluation with the smallest floor, the choice that is kindest to it. A run of a fixed number of steps is
-evaluated alike and ends with the policy it has.
+goes on. The policy of a run is that of the evaluation with the smallest floor, the choice that is kindest to it. A run
+of a fixed number of steps is evaluated alike and ends with the policy it has.
 
 In a run's folder lie `curve.csv`, a row an evaluation; from its beginning until it is over `checkpoint.pt`, then
 `course.json`, which says why it ended; and from the first evaluation on the files of the policy that is kept.

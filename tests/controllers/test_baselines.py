@@ -240,8 +240,24 @@ def test_the_mean_is_a_policy_file_with_the_same_numbers(pendulum_system, tmp_pa
     assert (policy.network.clip is not None) == (algorithm == "ppo") and policy.network.centre == "none"
     if algorithm == "ppo":
         assert 0 < (np.abs(u) == 6.0).mean() < 1
-    kept = sb3.from_reference((tmp_path / "model.zip").read_bytes(), pendulum_system, TINY)
+    whole = (tmp_path / "model.zip").read_bytes()
+    kept = sb3.from_reference(whole, pendulum_system, TINY)
     np.testing.assert_array_equal(kept.mean(X), trained.mean(X))
+    lean = sb3.from_reference(_without(whole, "optimizer"), pendulum_system, TINY)
+    np.testing.assert_array_equal(lean.mean(X), trained.mean(X))
+    with pytest.raises(InputError):
+        sb3.from_reference(_without(whole, "policy.pth"), pendulum_system, TINY)
+
+
+def _without(content: bytes, word: str) -> bytes:
+    """The archive less the files with this word in their names, of which there are some."""
+    lean = io.BytesIO()
+    with zipfile.ZipFile(io.BytesIO(content)) as archive, zipfile.ZipFile(lean, "w", zipfile.ZIP_DEFLATED) as out:
+        kept = [name for name in archive.namelist() if word not in name]
+        assert len(kept) < len(archive.namelist())
+        for name in kept:
+            out.writestr(name, archive.read(name))
+    return lean.getvalue()
 
 
 def test_a_checkpoint_of_another_run_or_none_is_refused(pendulum_system):

@@ -771,9 +771,11 @@ Proof.
   assert (smooth : forall x, inside c x -> Forall (defined x (policy c x)) (field c)) by (intros x h; now apply good_all).
   assert (pos : forall x, length x = states c -> x <> zeros (states c) -> 0 < V c x).
   { intros x l h. now apply (V_positive c rate e). }
-  assert (falling : forall x, inside c x -> x <> zeros (states c) -> Vdot c x < 0 /\ Vdot c x + ratio rate * V c x <= 0).
+  assert (strictly : forall x, inside c x -> x <> zeros (states c) -> Vdot c x < 0 /\ Vdot c x + ratio rate * V c x < 0).
   { intros x h nz. destruct (good_all x h) as (_ & _ & g). specialize (g nz).
     assert (0 < V c x) by (apply pos; auto; apply h). assert (0 < ratio rate * V c x) by now apply Rmult_lt_0_compat. lra. }
+  assert (falling : forall x, inside c x -> x <> zeros (states c) -> Vdot c x < 0 /\ Vdot c x + ratio rate * V c x <= 0).
+  { intros x h nz. destruct (strictly x h nz). lra. }
   constructor; auto.
   - destruct (formed_all c rate e formed) as (_ & _ & nl & _). split. apply hf. split. apply hf. split. exact nl.
     now apply (fits_together c rate e).

@@ -1,7 +1,11 @@
 (** What is claimed, in real numbers alone.
 
-    A reader who wants to know what was proved reads this file, the data file of the certificate, and nothing else: no
-    interval, no floating point number and no search occurs here. *)
+    A reader who wants to know what was proved reads this file, the few definitions of `Vectors.v`, and the data file of the
+    certificate: no interval, no floating point number and no search occurs in them.
+
+    What is said of solutions is said of every solution there is. That there is one, that it is the only one and that it
+    lasts for ever is the classical theorem of Picard and Lindeloef for a smooth field on a compact set that is not left
+    (`smooth`, `trajectories`), and is not proved again here. *)
 From Coq Require Import Reals List ZArith.
 Require Import Vectors.
 Import ListNotations.
@@ -148,13 +152,13 @@ Definition solution (x : R -> list R) (T : R) : Prop :=
 (** The claim, for a rate of decay. The numbers are those of the certificate's conditions. *)
 Record claim (rate : R) : Prop := {
   dimensions : shaped;
-  decays : 0 < rate;
+  means_something : 0 < rate /\ 0 < real (level c);
   (* 0 *) smooth : forall x, inside x -> Forall (defined x (policy x)) (field c);
   (* 1 *) positive : symmetric matrix /\ forall x, length x = states -> x <> zeros states -> 0 < V x;
   (* 1' *) rests : policy (zeros states) = map (fun one => ratio (rest one)) (channels c) /\ F (zeros states) = zeros states;
   (* 2 *) in_domain : forall x, inside x ->
       Forall2 (fun one bounds => ratio (fst bounds) < one < ratio (snd bounds)) x (domain c);
-  (* 3, 4 *) decreases : forall x, inside x -> x <> zeros states -> Vdot x < 0 /\ Vdot x + rate * V x <= 0;
+  (* 3, 4 *) decreases : forall x, inside x -> x <> zeros states -> Vdot x < 0 /\ Vdot x + rate * V x < 0;
   (* 5 *) in_bounds : forall x, inside x ->
       Forall2 (fun one ch => ratio (least ch) <= one <= ratio (greatest ch)) (policy x) (channels c);
   (* what follows of trajectories: none leaves the set, and V decays along each *)
