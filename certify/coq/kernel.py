@@ -55,6 +55,9 @@ _LIBRARY = {  # module of Coq's library: its axioms and primitives
 }
 AXIOMS = frozenset(f"{module}.{name}" for module, names in _LIBRARY.items() for name in names.split())
 """On which a theorem may rest, as Coq prints them where nothing is imported."""
+MODULES = tuple(_LIBRARY)
+REALS = frozenset({"ClassicalDedekindReals", "FunctionalExtensionality", "Classical_Prop"})
+"""Of these modules, those that the real numbers need; the others are about the processor."""
 _ASSUMING = re.compile(  # what a theory could take for granted, or switch off
     r"\b(Axioms?|Conjectures?|Parameters?|Admitted|admit|Primitive|Declare|bypass_check|Unset|Load|Redirect)\b",
     re.ASCII,

@@ -227,7 +227,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], proving
     assert _run(arguments, False) == 0
     out = capsys.readouterr().out
     assert out.startswith("PROVED IN COQ  plant: {V <= 1} is invariant, and V decays at the rate 1/50\n")
-    for said in ("FloatAxioms.sub_spec", "8.16.1", theory_sha256(theory_files())):
+    for said in ("8.16.1", theory_sha256(theory_files())):
         assert said in out
     assert _run([*arguments, "--json"], True) == 0
     data = json.loads(capsys.readouterr().out)
@@ -237,6 +237,49 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], proving
     assert not (tmp_path / "new" / "Proof.vo").exists()
     assert _run([*arguments[:4], "--rate", "2"], False) == 3
     assert "UNKNOWN  plant: the search found nothing at the rate 2" in capsys.readouterr().out
+
+
+REALS = "those of Coq's real numbers"
+PROCESSOR = "the processor's floats and integers are as Coq's libraries say"
+
+
+@pytest.mark.parametrize(
+    ("printed", "lines"),
+    [
+        (
+            GOOD + "FloatAxioms.add_spec : x\nPrimInt63.add : x\n",
+            [
+                f"{REALS}; {PROCESSOR}",
+                "ClassicalDedekindReals: sig_forall_dec",
+                "PrimFloat: sub",
+                "FloatAxioms: add_spec sub_spec",
+                "PrimInt63: add",
+            ],
+        ),
+        ("Axioms:\nUint63.add_spec : x\n", [PROCESSOR, "Uint63: add_spec"]),
+        ("Axioms:\nClassical_Prop.classic : x\n", [REALS, "Classical_Prop: classic"]),
+        ("Closed under the global context\n", ["none"]),
+    ],
+)
+def test_axioms_are_shown_by_module(
+    proving: Prove, tmp_path: Path, capsys: pytest.CaptureFixture[str], printed: str, lines: list[str]
+) -> None:
+    """All of them, and what they are in words."""
+    path = tmp_path / "certificate.json"
+    path.write_bytes(raw(scalar()))
+    proving(printing(printed))
+    assert _run(["prove-in-coq", str(path), "--out", str(tmp_path / "new"), "--quiet"], False) == 0
+    shown = re.search(r"^axioms +(.*?)^time", capsys.readouterr().out, re.M | re.S)
+    assert shown is not None
+    assert " ".join(shown[1].split()) == " ".join(lines)
+
+
+def test_a_level_is_shown_rounded_down(proving: Prove, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "certificate.json"
+    path.write_bytes(raw(edited(scalar(), "levels.roa", (1 - 1e-9).hex())))
+    proving(printing(GOOD))
+    assert _run(["prove-in-coq", str(path), "--out", str(tmp_path / "new"), "--quiet"], False) == 0
+    assert capsys.readouterr().out.startswith("PROVED IN COQ  plant: {V <= 0.999999} is invariant")
 
 
 @pytest.mark.parametrize(
