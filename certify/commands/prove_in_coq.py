@@ -59,14 +59,37 @@ def _plain(result: CoqResult) -> dict[str, Any]:
     return asdict(result) | {"verdict": result.verdict.value, "rate": str(result.rate), "folder": folder}
 
 
+def _by_module(axioms: tuple[str, ...]) -> str:
+    """What the axioms are in words, and all of them, a line a module.
+
+    >>> print(_by_module(("PrimFloat.sub", "Classical_Prop.classic", "PrimFloat.add")))
+    those of Coq's real numbers; the processor's floats and integers are as Coq's libraries say
+    Classical_Prop: classic
+    PrimFloat: add sub
+    """
+    from certify.coq.kernel import MODULES, REALS
+
+    names: dict[str, list[str]] = {}
+    for axiom in sorted(axioms, key=lambda axiom: (MODULES.index(axiom.rpartition(".")[0]), axiom)):
+        module, _, name = axiom.rpartition(".")
+        names.setdefault(module, []).append(name)
+    kinds = {
+        "those of Coq's real numbers": any(module in REALS for module in names),
+        "the processor's floats and integers are as Coq's libraries say": any(module not in REALS for module in names),
+    }
+    said = "; ".join(kind for kind, there in kinds.items() if there) or "none"
+    return "\n".join([said, *(f"{module}: {' '.join(of)}" for module, of in names.items())])
+
+
 def _print(result: CoqResult) -> None:
     from rich.table import Table
     from rich.text import Text
 
+    from certify.report.words import below
     from certify.verdict import Verdict
 
     if result.verdict is Verdict.PROVED:
-        shown = f"{{V <= {result.level:.6g}}} is invariant, and V decays at the rate {result.rate}"
+        shown = f"{{V <= {below(result.level)}}} is invariant, and V decays at the rate {result.rate}"
         say(f"PROVED IN COQ  {result.plant}: {shown}")
     else:
         say(f"{result.verdict.value}  {result.plant}: {result.reason}")
@@ -75,7 +98,7 @@ def _print(result: CoqResult) -> None:
         "its policy": result.policy_sha256,
         "theory": result.theory_sha256,
         "partition": f"{result.boxes} boxes, {result.looked_at} looked at" if result.boxes else "",
-        "axioms": "\n".join(result.axioms) or ("none" if result.verdict is Verdict.PROVED else ""),
+        "axioms": _by_module(result.axioms) if result.verdict is Verdict.PROVED else "",
         "time": f"search {result.search_seconds:.2f} s" + (f", Coq {result.coq_seconds:.1f} s" if result.coq else ""),
         "Coq": result.coq or "",
         "files": "" if result.folder is None else str(result.folder),

@@ -10,6 +10,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import json
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -28,6 +29,8 @@ Array = NDArray[np.float64]
 Interval = tuple[Fraction, Fraction]
 SCHEMA = "certify-certificate/7"
 _MOST = 64  # states, inputs, layers
+_MOST_ROWS = 2**14  # of a layer
+_LONGEST = 10  # characters of an integer
 _KEYS = {
     "certificate": ("schema", "claim", "plant", "policy", "lyapunov", "levels", "evidence", "provenance"),
     "claim": ("kind", "rate", "sample", "outer"),
@@ -50,7 +53,7 @@ class Claimed:
     Parameters
     ----------
     sha256 : of the certificate's bytes.
-    name : of the plant; for people, and in no file of Coq unless it is a plain word.
+    name : of the plant, an identifier; for people.
     field : xdot = f(x, u), an expression a state.
     domain, u_eq, bounds : of the states, and of the inputs.
     network : the policy.
@@ -86,7 +89,13 @@ def read_claim(raw: bytes) -> Claimed:
     InputError : it claims what Coq's statement cannot say.
     """
     try:
-        data = json.loads(raw.decode("utf-8"), object_pairs_hook=_once, parse_float=_decimal, parse_constant=_decimal)
+        data = json.loads(
+            raw.decode("utf-8"),
+            object_pairs_hook=_once,
+            parse_int=_integer,
+            parse_float=_decimal,
+            parse_constant=_decimal,
+        )
     except (ValueError, RecursionError) as error:
         if isinstance(error, CertificateFormatError):
             raise
@@ -107,6 +116,8 @@ def _claimed(data: Any, sha256: str) -> Claimed:
             raise CertificateFormatError(
                 f"`{name}` must have exactly the keys {', '.join(_KEYS[name])}; found {str(sorted(section))[:200]}."
             )
+    if not isinstance(data["provenance"], dict):
+        raise CertificateFormatError(f"provenance must be an object; found {str(data['provenance'])[:40]!r}.")
     states, inputs = _names(plant["states"], "states"), _names(plant["inputs"], "inputs")
     if states.keys() & inputs.keys():
         raise CertificateFormatError(f"names must differ; found {sorted(states.keys() & inputs.keys())[0]} twice.")
@@ -116,13 +127,14 @@ def _claimed(data: Any, sha256: str) -> Claimed:
         raise CertificateFormatError(f"the policy's sha256 must be {network.sha256()}; found {policy['sha256']!r}.")
     P = _array(lyapunov["P"], (n, n), "P")
     level, rate = _binary64(levels["roa"], "levels.roa"), _binary64(claim["rate"], "claim.rate")
+    _binary64(levels["local"], "levels.local")  # nothing is claimed of it
     if not np.array_equal(P, P.T):
         raise InputError("`P` must be symmetric; found one that is not.")
     if not (level > 0 and rate >= 0):
         raise InputError(f"the level must be positive and the rate at least 0; found {level} and {rate}.")
     return Claimed(
         sha256=sha256,
-        name=str(plant["name"]),
+        name=_name(plant["name"], "the plant's name"),
         field=tuple(from_tree(tree, states, inputs) for tree in _list(plant["dynamics"], n, "dynamics")),
         domain=_intervals(plant["domain"], n, "domain"),
         u_eq=tuple(rational(u, "u_eq") for u in _list(plant["u_eq"], m, "u_eq")),
@@ -162,6 +174,8 @@ def _network(policy: Mapping[str, Any], n: int, m: int) -> TanhNetwork:
             or any(type(k) is not int or k < 1 for k in shape)
         ):
             raise CertificateFormatError(f"a layer must have a shape [out, in], a weight and a bias; found {shape}.")
+    if any(shape[0] > _MOST_ROWS for shape in shapes):
+        raise CertificateFormatError(f"a layer must have at most {_MOST_ROWS} rows; found the shapes {shapes}.")
     if shapes[0][1] != n or shapes[-1][0] != m or any(b[1] != a[0] for a, b in pairwise(shapes)):
         raise CertificateFormatError(f"the layers must lead from {n} states to {m} inputs; found the shapes {shapes}.")
     return TanhNetwork(
@@ -178,11 +192,16 @@ def _names(value: Any, name: str) -> dict[str, int]:
     if not isinstance(value, list) or not 1 <= len(value) <= _MOST:
         raise CertificateFormatError(f"`{name}` must be a list of 1 to {_MOST} names; found another.")
     for one in value:
-        if not isinstance(one, str) or _NAME.fullmatch(one) is None:
-            raise CertificateFormatError(f"`{name}` must be identifiers; found {str(one)[:70]!r}.")
+        _name(one, f"each of `{name}`")
     if len(set(value)) != len(value):
         raise CertificateFormatError(f"`{name}` must be different names; found one twice.")
     return {one: place for place, one in enumerate(value)}
+
+
+def _name(value: Any, whose: str) -> str:
+    if not isinstance(value, str) or _NAME.fullmatch(value) is None:
+        raise CertificateFormatError(f"{whose} must be an identifier; found {str(value)[:70]!r}.")
+    return value
 
 
 def _list(value: Any, length: int, name: str) -> list[Any]:
@@ -216,7 +235,7 @@ def _array(text: Any, shape: tuple[int, ...], name: str) -> Array:
         raw = base64.b64decode(text, validate=True)
     except (ValueError, TypeError) as error:
         raise CertificateFormatError(f"{name} must be base64; found {str(text)[:40]!r}.") from error
-    if base64.b64encode(raw).decode("ascii") != text or len(raw) != 8 * int(np.prod(shape)):
+    if base64.b64encode(raw).decode("ascii") != text or len(raw) != 8 * math.prod(shape):
         raise CertificateFormatError(f"{name} must be canonical base64 of {shape} numbers; found {len(raw)} bytes.")
     array = np.frombuffer(raw, dtype="<f8").reshape(shape).astype(np.float64)
     if not np.all(np.isfinite(array)):
@@ -239,6 +258,12 @@ def _once(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(found) != len(pairs):
         raise CertificateFormatError("a certificate must have each key once; found one twice.")
     return found
+
+
+def _integer(text: str) -> int:
+    if len(text) > _LONGEST:
+        raise CertificateFormatError(f"integers must have at most {_LONGEST} characters; found {text[:40]}.")
+    return int(text)
 
 
 def _decimal(text: str) -> NoReturn:

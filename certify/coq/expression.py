@@ -65,7 +65,15 @@ def from_tree(tree: Any, states: Mapping[str, int], inputs: Mapping[str, int]) -
     """
     names = {name: Expression("input", index=j) for name, j in inputs.items()}
     names |= {name: Expression("state", index=i) for name, i in states.items()}
-    return _Reader(names, iter(range(_MOST_NODES))).read(tree, _DEEPEST)
+    found = _Reader(names, iter(range(_MOST_NODES))).read(tree, _DEEPEST)
+    nodes, depth = [found], 0
+    while nodes:
+        nodes, depth = [operand for node in nodes for operand in node.operands], depth + 1
+    if depth > _DEEPEST:
+        raise CertificateFormatError(
+            f"an equation must nest at most {_DEEPEST} deep once its sums and products are of two; found {depth}."
+        )
+    return found
 
 
 def at_rest(e: Expression, u: Mapping[int, Fraction]) -> Fraction | None:

@@ -1,7 +1,7 @@
 """Running Coq: which files it compiles, whether it accepted them all, and on which axioms the theorem rests.
 
-A theorem is proved if every file was compiled, the last one afresh, and what Coq prints of it are axioms that are known
-here and nothing else. Whatever is printed, missing, late or unreadable otherwise is no proof.
+A theorem is proved if every file was compiled, in a new folder that has nothing else, and what Coq prints of it are
+axioms that are known here and nothing else. Whatever is printed, missing, late or unreadable otherwise is no proof.
 """
 
 from __future__ import annotations
@@ -55,6 +55,9 @@ _LIBRARY = {  # module of Coq's library: its axioms and primitives
 }
 AXIOMS = frozenset(f"{module}.{name}" for module, names in _LIBRARY.items() for name in names.split())
 """On which a theorem may rest, as Coq prints them where nothing is imported."""
+MODULES = tuple(_LIBRARY)
+REALS = frozenset({"ClassicalDedekindReals", "FunctionalExtensionality", "Classical_Prop"})
+"""Of these modules, those that the real numbers need; the others are about the processor."""
 _ASSUMING = re.compile(  # what a theory could take for granted, or switch off
     r"\b(Axioms?|Conjectures?|Parameters?|Admitted|admit|Primitive|Declare|bypass_check|Unset|Load|Redirect)\b",
     re.ASCII,
@@ -63,7 +66,7 @@ _FILE = re.compile(r"[A-Z][A-Za-z0-9_]*\.v", re.ASCII)
 _AXIOM = re.compile(r"([A-Za-z_][A-Za-z0-9_'.]*)(?: : \S.*)?", re.ASCII)
 _CLOSED = "Closed under the global context"
 _TAIL = 1500
-_COMPILED = (".vo", ".vos", ".vok", ".glob")
+_COMPILED = (".vo", ".vio", ".vos", ".vok", ".glob")
 _PROBE = "From Interval Require Import Interval.Interval.\n"
 
 
@@ -165,6 +168,17 @@ def write_folder(folder: Path, files: dict[str, bytes]) -> None:
     write_atomically(folder / "check.sh", _script(list(files)).encode())
 
 
+def compile_apart(coqc: Coqc, files: dict[str, bytes], seconds: float) -> Compiled:
+    """Compile the files in their order, and judge what Coq prints of the last one.
+
+    That is done in a folder that is made for it and that nobody else can write to: no file that lies about, no link and
+    no other run has a part in the answer. Coq takes files of its own folder before all others of the same name.
+    """
+    with tempfile.TemporaryDirectory(prefix="certify-coq-") as name:
+        write_folder(Path(name), files)
+        return compile_folder(coqc, Path(name), list(files), seconds)
+
+
 def compile_folder(coqc: Coqc, folder: Path, names: list[str], seconds: float) -> Compiled:
     """Compile the files in their order, and judge what Coq prints of the last one.
 
@@ -224,6 +238,9 @@ def _script(names: list[str]) -> str:
 # Compiles the theory, the claim and its proof with Coq alone. At the end it prints the axioms of the theorem.
 set -e
 cd "$(dirname "$0")"
+for file in {words}; do
+  rm -f "$file.vo" "$file.vio"
+done
 for file in {words}; do
   coqc -q "$file.v"
 done

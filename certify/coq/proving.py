@@ -11,8 +11,9 @@ from dataclasses import dataclass, field
 from fractions import Fraction
 from pathlib import Path
 
+from certify.certificate import sole_writer
 from certify.coq.data import read_claim
-from certify.coq.kernel import WRITTEN, compile_folder, find_coqc, theory_files, theory_sha256, write_folder
+from certify.coq.kernel import WRITTEN, compile_apart, find_coqc, theory_files, theory_sha256, write_folder
 from certify.coq.search import Limits, search
 from certify.coq.text import ASSUMPTIONS, PROOF, claim_text, evidence_text
 from certify.errors import BackendError, InputError
@@ -84,7 +85,7 @@ class CoqResult:
 def prove_in_coq(
     raw: bytes, folder: Path, options: CoqOptions | None = None, tell: Callable[[str], None] | None = None
 ) -> CoqResult:
-    """Prove the claim of a certificate in Coq, whose files are left in a folder.
+    """Prove the claim of a certificate in Coq, whose files are left in a folder; what Coq compiles are these bytes.
 
     Parameters
     ----------
@@ -94,7 +95,8 @@ def prove_in_coq(
 
     Raises
     ------
-    CertificateFormatError, InputError : the bytes are no certificate, or claim what Coq's statement cannot say.
+    CertificateFormatError, InputError : the bytes are no certificate, or claim what Coq's statement cannot say; the
+        folder cannot be written, or another run is at work in it.
     """
     options, tell = options or CoqOptions(), tell or (lambda _: None)
     start = time.monotonic()
@@ -114,15 +116,17 @@ def prove_in_coq(
         return result(Verdict.UNKNOWN, f"the search found nothing at the rate {found.rate}: {found.reason}")
     texts = (claim_text(claimed, found.rate), evidence_text(found.evidence), PROOF, ASSUMPTIONS)
     files = theory | {name: text.encode("ascii") for name, text in zip(WRITTEN, texts, strict=True)}
-    write_folder(folder, files)
-    if not options.run:
-        return result(Verdict.UNKNOWN, "Coq was not asked; check.sh in the folder asks it", folder=folder)
-    try:
-        coqc = find_coqc()
-    except BackendError as error:
-        return result(Verdict.UNKNOWN, f"{error} Coq's files are written; check.sh there compiles them", folder=folder)
-    tell(f"Coq {coqc.version} at work")
-    compiled = compile_folder(coqc, folder, list(files), options.time_limit - (time.monotonic() - start))
+    with sole_writer(folder):
+        write_folder(folder, files)
+        if not options.run:
+            return result(Verdict.UNKNOWN, "Coq was not asked; check.sh in the folder asks it", folder=folder)
+        try:
+            coqc = find_coqc()
+        except BackendError as error:
+            said = f"{error} Coq's files are written; check.sh there compiles them"
+            return result(Verdict.UNKNOWN, said, folder=folder)
+        tell(f"Coq {coqc.version} at work")
+        compiled = compile_apart(coqc, files, options.time_limit - (time.monotonic() - start))
     return result(
         Verdict.UNKNOWN if compiled.axioms is None else Verdict.PROVED,
         compiled.reason,

@@ -198,10 +198,10 @@ def test_an_infinite_number_is_not_written() -> None:
 
 
 def test_names_say_nothing_to_coq() -> None:
-    """Neither states named as Coq's words nor a plant whose name ends a comment change more than the comment."""
+    """States named as Coq's words change nothing, and the plant's name the comment alone."""
     plain = everything()
     odd = rehash(everything())
-    odd["plant"] |= {"name": "p *) Axiom no : False. (*", "states": ["Axiom", "Qed"], "inputs": ["Load", "fun"]}
+    odd["plant"] |= {"name": "Admitted", "states": ["Axiom", "Qed"], "inputs": ["Load", "fun"]}
     new = dict(zip(("x", "y", "u", "w"), ("Axiom", "Qed", "Load", "fun"), strict=True))
 
     def renamed(tree: Any) -> Any:
@@ -215,7 +215,8 @@ def test_names_say_nothing_to_coq() -> None:
     texts = [claim_text(read_claim(raw(data)), Fraction(1)) for data in (plain, odd)]
     bodies = [text.split("*)", 1)[1] for text in texts]
     assert bodies[0] == bodies[1]
-    assert texts[1].startswith("(** What a certificate claims, as numbers.\n") and "Axiom" not in texts[1]
+    assert texts[1].startswith("(** What a certificate claims, as numbers, of the plant Admitted.\n")
+    assert "Axiom" not in texts[1]
     assert texts[0].startswith("(** What a certificate claims, as numbers, of the plant plant.\n")
 
 
@@ -240,6 +241,17 @@ MALFORMED = {
     "another schema": ("schema", "certify-certificate/6", "must have the schema"),
     "an unknown key": ("plant", lambda p: p | {"delay": "1"}, "`plant` must have exactly the keys"),
     "a key less": ("levels", lambda _: {"roa": (1.0).hex()}, "`levels` must have exactly the keys"),
+    "a plant's name that ends a comment": ("plant.name", "p *) Axiom no : False. (*", "name must be an identifier"),
+    "a plant's name that is a line of its own": ("plant.name", "x\nPROVED IN COQ  x", "name must be an identifier"),
+    "a plant's name that is a list": ("plant.name", ["x"], "name must be an identifier"),
+    "an inner level that is no number": ("levels.local", "low", "must be a hex float"),
+    "a provenance that is a list": ("provenance", [], "provenance must be an object"),
+    "an integer of eleven digits": ("provenance", {"seed": 10**10}, "integers must have at most 10 characters"),
+    "a layer of 16,385 rows": (
+        "policy.layers",
+        [{"shape": [16385, 1], "weight": "", "bias": ""}],
+        "at most 16384 rows",
+    ),
     "another policy": ("policy.scale", encode([-2.0]), "sha256 must be"),
     "a decimal level": ("levels.roa", 1, "must be a hex float"),
     "a level not canonical": ("levels.roa", "0x1p0", "canonical form"),
@@ -255,8 +267,8 @@ MALFORMED = {
     "a decimal rational": ("plant.u_eq.0", "0.5", "must be a rational"),
     "a state twice": ("plant.states", ["x", "x"], "different names"),
     "an input named as a state": ("plant.inputs", ["x"], "found x twice"),
-    "a name with a space": ("plant.states", ["x y"], "must be identifiers"),
-    "a name with a line's end": ("plant.states", ["x\n"], "must be identifiers"),
+    "a name with a space": ("plant.states", ["x y"], "must be an identifier"),
+    "a name with a line's end": ("plant.states", ["x\n"], "must be an identifier"),
     "an unknown name in an equation": ("plant.dynamics.0", "v", "must be a rational"),
     "an unknown operator": ("plant.dynamics.0", ["abs", "x"], "operators must be those"),
     "an operator with too many operands": ("plant.dynamics.0", ["/", "x", "x", "x"], "operators must be those"),
@@ -305,11 +317,23 @@ def test_equations_have_a_limit() -> None:
         deep = ["sin", deep]
     with pytest.raises(CertifyError, match="at most 200 deep"):
         read_claim(raw(edited(scalar(), "plant.dynamics.0", deep)))
+    for tall in (["+", *["x"] * 600], _subtracted(150)):
+        with pytest.raises(CertifyError, match="at most 200 deep once"):
+            read_claim(raw(edited(scalar(), "plant.dynamics.0", tall)))
+    for low in (["+", *["x"] * 199], _subtracted(99)):
+        claim_text(read_claim(raw(edited(scalar(), "plant.dynamics.0", low))), Fraction(1))
     doubling: Any = "x"
     for _ in range(20):
         doubling = ["tan", doubling]  # its operand stands twice
     with pytest.raises(CertifyError, match="20,000 nodes"):
         read_claim(raw(edited(scalar(), "plant.dynamics.0", doubling)))
+
+
+def _subtracted(times: int) -> Any:
+    tree: Any = "x"
+    for _ in range(times):
+        tree = ["-", "0", tree]
+    return tree
 
 
 def test_the_rate_is_at_least_the_certificates() -> None:

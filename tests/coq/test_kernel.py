@@ -14,6 +14,7 @@ from pathlib import Path
 
 import pytest
 
+from certify.certificate import sole_writer
 from certify.cli import _run
 from certify.commands import doctor
 from certify.coq import kernel
@@ -39,7 +40,7 @@ FAKE = """#!/bin/sh
 [ "$1" = -q ] || exit 9
 file="$2"
 [ "$file" = Probe.v ] && PROBE
-echo "$file" >> order
+echo "$file" >> "${0%/*}/order"
 LATER
 echo compiled > "${file%.v}.vo"
 """
@@ -73,8 +74,8 @@ def test_a_proof(proving: Prove, tmp_path: Path) -> None:
     assert (result.coq, result.rate) == ("8.16.1", Fraction(1, 40)) and result.boxes > 2
     names = [*theory_files(), "Claim.v", "Evidence.v", "Proof.v", "Assumptions.v"]
     out = tmp_path / "out"
-    assert (out / "order").read_text().split() == names == (out / "_CoqProject").read_text().split()
-    assert {p.name for p in out.iterdir() if p.suffix == ".vo"} == {n + "o" for n in names}
+    assert (tmp_path / "order").read_text().split() == names == (out / "_CoqProject").read_text().split()
+    assert {p.name for p in out.iterdir()} == {*names, "_CoqProject", "check.sh"}
     for name, data in theory_files().items():
         assert (out / name).read_bytes() == data
     assert result.theory_sha256 == theory_sha256(theory_files())
@@ -120,10 +121,10 @@ def test_what_is_no_proof(proving: Prove, name: str) -> None:
 
 def test_what_hangs_is_ended_with_all_that_it_started(proving: Prove, tmp_path: Path) -> None:
     start = time.monotonic()
-    result = proving('[ "$file" = Spec.v ] && { sleep 60 & echo $! > child; wait; }', time_limit=0.8)
+    result = proving('[ "$file" = Spec.v ] && { sleep 60 & echo $! > "${0%/*}/child"; wait; }', time_limit=0.8)
     assert time.monotonic() - start < 10
     assert result.verdict is Verdict.UNKNOWN and result.reason == "the time ended in Spec.v"
-    child = int((tmp_path / "out" / "child").read_text())
+    child = int((tmp_path / "child").read_text())
     for _ in range(50):
         if not _alive(child):
             break
@@ -145,6 +146,45 @@ def test_what_an_earlier_run_compiled_counts_for_nothing(proving: Prove) -> None
     assert proving(printing(GOOD)).verdict is Verdict.PROVED
     result = proving('[ "$file" = Proof.v ] && exit 0\n' + printing(GOOD))
     assert result.verdict is Verdict.UNKNOWN and "refuses Proof.v" in result.reason
+    assert proving(printing(GOOD)).verdict is Verdict.PROVED
+
+
+def test_what_lies_in_the_folder_is_not_what_coq_sees(proving: Prove, tmp_path: Path) -> None:
+    """Coq prefers a `.vio` that is newer than the `.vo`, and follows links; what is there counts for nothing."""
+    out = tmp_path / "out"
+    out.mkdir()
+    (tmp_path / "elsewhere").write_text("Definition certificate := 0.")
+    (out / "Claim.v").symlink_to(tmp_path / "elsewhere")
+    for name in ("Spec.vio", "Spec.vo", "Reals.vo", "Extra.v"):
+        (out / name).write_text("of somebody else")
+        os.utime(out / name, (2**31, 2**31))
+    result = proving('[ "$file" = Vectors.v ] && ls -A > "${0%/*}/seen"\n' + printing(GOOD))
+    assert result.verdict is Verdict.PROVED, result.reason
+    assert set((tmp_path / "seen").read_text().split()) == {
+        *(out / "_CoqProject").read_text().split(),
+        "_CoqProject",
+        "check.sh",
+    }
+    assert (tmp_path / "elsewhere").read_text() == "Definition certificate := 0."
+    assert not (out / "Claim.v").is_symlink() and (out / "Extra.v").exists() and not (out / "Spec.vio").exists()
+
+
+def test_what_is_proved_is_what_was_read(proving: Prove, tmp_path: Path) -> None:
+    """Whoever changes the folder's files while Coq is at work does not change what it compiles."""
+    out = tmp_path / "out"
+    change = f'[ "$file" = Vectors.v ] && for f in "{out}"/*.v; do echo "(* other *)" > "$f"; done\n'
+    result = proving(change + 'cp "$file" "${0%/*}/"\n' + printing(GOOD))
+    assert result.verdict is Verdict.PROVED
+    assert (out / "Claim.v").read_text() == "(* other *)\n"
+    assert f"sha256 of the certificate: {result.certificate_sha256}" in (tmp_path / "Claim.v").read_text()
+    for name, data in theory_files().items():
+        assert (tmp_path / name).read_bytes() == data
+
+
+def test_a_folder_has_one_run_at_a_time(proving: Prove, tmp_path: Path) -> None:
+    with sole_writer(tmp_path / "out"), pytest.raises(InputError, match="another run is writing"):
+        proving(printing(GOOD))
+    assert not (tmp_path / "out" / "Claim.v").exists()
     assert proving(printing(GOOD)).verdict is Verdict.PROVED
 
 
@@ -187,7 +227,7 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], proving
     assert _run(arguments, False) == 0
     out = capsys.readouterr().out
     assert out.startswith("PROVED IN COQ  plant: {V <= 1} is invariant, and V decays at the rate 1/50\n")
-    for said in ("FloatAxioms.sub_spec", "8.16.1", theory_sha256(theory_files())):
+    for said in ("8.16.1", theory_sha256(theory_files())):
         assert said in out
     assert _run([*arguments, "--json"], True) == 0
     data = json.loads(capsys.readouterr().out)
@@ -197,6 +237,49 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str], proving
     assert not (tmp_path / "new" / "Proof.vo").exists()
     assert _run([*arguments[:4], "--rate", "2"], False) == 3
     assert "UNKNOWN  plant: the search found nothing at the rate 2" in capsys.readouterr().out
+
+
+REALS = "those of Coq's real numbers"
+PROCESSOR = "the processor's floats and integers are as Coq's libraries say"
+
+
+@pytest.mark.parametrize(
+    ("printed", "lines"),
+    [
+        (
+            GOOD + "FloatAxioms.add_spec : x\nPrimInt63.add : x\n",
+            [
+                f"{REALS}; {PROCESSOR}",
+                "ClassicalDedekindReals: sig_forall_dec",
+                "PrimFloat: sub",
+                "FloatAxioms: add_spec sub_spec",
+                "PrimInt63: add",
+            ],
+        ),
+        ("Axioms:\nUint63.add_spec : x\n", [PROCESSOR, "Uint63: add_spec"]),
+        ("Axioms:\nClassical_Prop.classic : x\n", [REALS, "Classical_Prop: classic"]),
+        ("Closed under the global context\n", ["none"]),
+    ],
+)
+def test_axioms_are_shown_by_module(
+    proving: Prove, tmp_path: Path, capsys: pytest.CaptureFixture[str], printed: str, lines: list[str]
+) -> None:
+    """All of them, and what they are in words."""
+    path = tmp_path / "certificate.json"
+    path.write_bytes(raw(scalar()))
+    proving(printing(printed))
+    assert _run(["prove-in-coq", str(path), "--out", str(tmp_path / "new"), "--quiet"], False) == 0
+    shown = re.search(r"^axioms +(.*?)^time", capsys.readouterr().out, re.M | re.S)
+    assert shown is not None
+    assert " ".join(shown[1].split()) == " ".join(lines)
+
+
+def test_a_level_is_shown_rounded_down(proving: Prove, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "certificate.json"
+    path.write_bytes(raw(edited(scalar(), "levels.roa", (1 - 1e-9).hex())))
+    proving(printing(GOOD))
+    assert _run(["prove-in-coq", str(path), "--out", str(tmp_path / "new"), "--quiet"], False) == 0
+    assert capsys.readouterr().out.startswith("PROVED IN COQ  plant: {V <= 0.999999} is invariant")
 
 
 @pytest.mark.parametrize(
@@ -236,11 +319,11 @@ def test_the_script_says_what_the_command_does(proving: Prove, tmp_path: Path) -
     out, folder = tmp_path / "out", tmp_path / "bin"
     folder.mkdir()
     shutil.copy(tmp_path / "coqc", folder / "coqc")
-    (out / "order").unlink()
     environment = os.environ | {"PATH": f"{folder}:{os.environ['PATH']}"}
+    (out / "Spec.vio").write_text("newer than what is compiled, and Coq would take it")
     done = subprocess.run(["sh", str(out / "check.sh")], env=environment, capture_output=True, text=True, check=False)
-    assert done.returncode == 0 and done.stdout == GOOD
-    assert (out / "order").read_text() == (out / "_CoqProject").read_text()
+    assert done.returncode == 0 and done.stdout == GOOD and not (out / "Spec.vio").exists()
+    assert (folder / "order").read_text() == (out / "_CoqProject").read_text()
     (folder / "coqc").write_text("#!/bin/sh\n[ $2 != Proof.v ]\n")
     assert subprocess.run(["sh", str(out / "check.sh")], env=environment, check=False).returncode == 1
 
