@@ -2,7 +2,7 @@
 PYTHON ?= python3.11
 BIN := .venv/bin
 
-.PHONY: setup roa test lint docs gallery shares tradeoff paper paper-proved clean
+.PHONY: setup roa test lint docs gallery shares tradeoff paper paper-keep paper-proved coq clean
 
 setup: .venv/.installed
 
@@ -41,8 +41,16 @@ paper: setup
 	$(BIN)/python docs/paper/draw.py $(RUNS)
 	$(BIN)/python docs/paper/table.py
 
+paper-keep: setup
+	$(BIN)/python docs/paper/keep.py $(RUNS)
+
 paper-proved: setup
 	$(BIN)/python docs/paper/proved.py $(RUNS)
+
+# The theory behind `certify prove-in-coq`; needs Coq with its library Interval, which nothing else here does.
+coq:
+	rm -rf build/coq && mkdir -p build/coq && cp certify/coq/theory/* build/coq
+	cd build/coq && for file in $$(grep '[.]v$$' _CoqProject); do coqc -q $$file || exit 1; done
 
 clean:
 	rm -rf .venv out build *.egg-info
