@@ -10,6 +10,7 @@ import contextlib
 import hashlib
 import os
 import re
+import shlex
 import shutil
 import signal
 import subprocess
@@ -67,6 +68,9 @@ _AXIOM = re.compile(r"([A-Za-z_][A-Za-z0-9_'.]*)(?: : \S.*)?", re.ASCII)
 _CLOSED = "Closed under the global context"
 _TAIL = 1500
 _COMPILED = (".vo", ".vio", ".vos", ".vok", ".glob")
+_HOW = ("-q", "-R", ".", "", "-w", "+several-object-files")
+"""Nothing of the user's is loaded first. The folder's own files come before others of their names: without `-R` Coq
+takes what it finds in COQPATH. A half compiled `.vio` in the place of a `.vo` is an error: Coq takes the newer one."""
 _PROBE = "From Interval Require Import Interval.Interval.\n"
 
 
@@ -112,7 +116,7 @@ def find_coqc() -> Coqc:
         if status != 0 or version is None:
             raise BackendError(f"{path} must say its version; it ended with {status} and said {said[-200:]!r}.")
         Path(name, "Probe.v").write_text(_PROBE, encoding="ascii")
-        status, said = _run([path, "-q", "Probe.v"], Path(name), 120.0)
+        status, said = _run([path, *_HOW, "Probe.v"], Path(name), 120.0)
         if status != 0:
             raise BackendError(f"Coq {version[1]} must have the library Interval; it said {said[-300:]!r}. {INSTALL}")
     return Coqc(path, version[1])
@@ -172,7 +176,7 @@ def compile_apart(coqc: Coqc, files: dict[str, bytes], seconds: float) -> Compil
     """Compile the files in their order, and judge what Coq prints of the last one.
 
     That is done in a folder that is made for it and that nobody else can write to: no file that lies about, no link and
-    no other run has a part in the answer. Coq takes files of its own folder before all others of the same name.
+    no other run has a part in the answer.
     """
     with tempfile.TemporaryDirectory(prefix="certify-coq-") as name:
         write_folder(Path(name), files)
@@ -192,7 +196,7 @@ def compile_folder(coqc: Coqc, folder: Path, names: list[str], seconds: float) -
         compiled = (folder / name).with_suffix(".vo")
         if compiled.exists():
             return Compiled(None, time.monotonic() - start, f"{compiled.name} is there before {name} is compiled")
-        status, said = _run([coqc.path, "-q", name], folder, start + seconds - time.monotonic())
+        status, said = _run([coqc.path, *_HOW, name], folder, start + seconds - time.monotonic())
         if status is None:
             return Compiled(None, time.monotonic() - start, f"the time ended in {name}")
         if status != 0 or not compiled.is_file():
@@ -242,7 +246,7 @@ for file in {words}; do
   rm -f "$file.vo" "$file.vio"
 done
 for file in {words}; do
-  coqc -q "$file.v"
+  coqc {shlex.join(_HOW)} "$file.v"
 done
 """
 

@@ -88,14 +88,22 @@ def search(claimed: Claimed, rate: Fraction | None = None, limits: Limits | None
     limits = limits or Limits()
     least = 2 * Fraction(claimed.rate)
     if rate is not None and not (rate > 0 and rate >= least):
-        raise InputError(f"the rate must be positive and at least {float(least):.6g}; found {rate}.")
+        raise InputError(f"the rate must be positive and at least {2 * claimed.rate:.6g}; found {rate}.")
     start = time.monotonic()
     _require_rest(claimed)
+    try:
+        return _searched(claimed, rate, start, limits)
+    except (ArithmeticError, np.linalg.LinAlgError) as error:
+        reason = f"the claim has numbers, or the search found some, that floats cannot hold: {error}"
+        return Found(rate or least or Fraction(1), None, 0, time.monotonic() - start, reason)
+
+
+def _searched(claimed: Claimed, rate: Fraction | None, start: float, limits: Limits) -> Found:
     slowest = -float(np.linalg.eigvals(jacobian(claimed)).real.max())
     deadline, most = start + limits.seconds, limits.boxes
     boxes, reason, tried = 0, "the linearised loop does not decay", rate or Fraction(1)
     best: tuple[Fraction, Evidence] | None = None
-    for tried in [rate] if rate is not None else _rates(slowest, least):
+    for tried in [rate] if rate is not None else _rates(slowest, 2 * Fraction(claimed.rate)):
         attempts = [_Attempt(claimed, T, tried, deadline, most) for T in _coordinates(claimed)]
         evidence, why = _first(attempts)
         boxes, reason = boxes + sum(attempt.boxes for attempt in attempts), why or reason

@@ -224,7 +224,7 @@ def net(p: Pieces, y: np.ndarray) -> np.ndarray:
     return y
 
 
-def value(e: Expression, x: np.ndarray, u: np.ndarray) -> np.ndarray:
+def value(e: Expression, x: np.ndarray, u: np.ndarray) -> Any:
     a = [value(operand, x, u) for operand in e.operands]
     nothing = np.full(len(x), math.nan)
     match e.kind:
@@ -427,6 +427,11 @@ def other_coordinates(T: list[list[int]]) -> Change:
     return all_of(put("T", to=[list(row) for row in exact]), put("W", to=[list(row) for row in inverse(exact)]))
 
 
+def exchanged(p: Pieces) -> None:
+    """T and its inverse."""
+    p.T, p.W = p.W, p.T
+
+
 def mirrored(p: Pieces) -> None:
     """-T, with its inverse: every z changes its sign, and with it each box and each split."""
 
@@ -443,10 +448,6 @@ def evidence_of(other: Callable[[], Pieces]) -> Change:
             setattr(p, name, copy.deepcopy(getattr(other(), name)))
 
     return change
-
-
-def twice(v: Any) -> Any:
-    return 2 * v
 
 
 def minus(v: Any) -> Any:
@@ -612,7 +613,7 @@ PENDULUM = {
     "large multipliers": Control("unshown", multipliers(lambda k: 1e6), multipliers(lambda k: k * (1 + 2.0**-40))),
     "an inverse that is none": Control("unshown", put("W", 0, 0, to=lambda q: q + A_LITTLE)),
     "an inverse transposed": Control("unshown", put("W", to=transposed)),
-    "the inverse in the place of T": Control("unshown", lambda p: (setattr(p, "T", p.W), setattr(p, "W", p.T))[0]),
+    "the inverse in the place of T": Control("unshown", exchanged),
     "a row of the inverse dropped": Control("unshown", drop("W", 1)),
     "T of something else": Control("unshown", other_coordinates([[1, 0], [0, 1]]), mirrored),
     "T doubled": Control(

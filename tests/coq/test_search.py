@@ -217,6 +217,23 @@ def test_a_loop_must_rest_by_its_form(path: str, value: object, message: str) ->
         search(claim_of(edited(scalar(), path, value)))
 
 
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize(
+    ("path", "value"),
+    [
+        ("lyapunov.P", encode([[5e-324]])),
+        ("evidence.T", encode([[1e308]])),
+        ("levels.roa", (5e-324).hex()),
+        ("claim.rate", (1.7e308).hex()),
+        ("plant.domain.0", ["-" + "9" * 1200, "9" * 1200]),
+        ("plant.dynamics.0", ["+", ["*", "9" * 1200, "x"], "u"]),
+    ],
+)
+def test_numbers_beyond_floats_end_the_search(path: str, value: object) -> None:
+    found = search(claim_of(edited(scalar(), path, value)))
+    assert found.evidence is None and "floats cannot hold" in found.reason
+
+
 def test_every_function_at_rest() -> None:
     data = everything()
     _, F, _ = loop(data, np.zeros((1, 2)))
