@@ -12,7 +12,9 @@ from __future__ import annotations
 
 import argparse
 import os
+import shutil
 import subprocess
+import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -177,11 +179,16 @@ def main() -> None:
 
 
 def again(coqc: str, folder: Path) -> float:
-    """Seconds in which Coq compiles what is of the certificate, once more."""
-    began = time.perf_counter()
-    for name in ("Claim", "Evidence", "Proof"):
-        subprocess.run([coqc, "-q", f"{name}.v"], cwd=folder, check=True, stdout=subprocess.DEVNULL)
-    return time.perf_counter() - began
+    """Seconds in which Coq compiles what is of the certificate, once more and elsewhere."""
+    with tempfile.TemporaryDirectory() as name:
+        copy = Path(shutil.copytree(folder, Path(name) / "coq"))
+        took = dict[str, float]()
+        for file in (copy / "_CoqProject").read_text().split():
+            began = time.perf_counter()
+            words = [coqc, "-q", "-R", ".", "", file]
+            subprocess.run(words, cwd=copy, check=True, stdout=subprocess.DEVNULL)
+            took[file] = time.perf_counter() - began
+    return sum(took[f"{name}.v"] for name in ("Claim", "Evidence", "Proof"))
 
 
 if __name__ == "__main__":

@@ -157,8 +157,10 @@ def write_folder(folder: Path, files: dict[str, bytes]) -> None:
 
     Raises
     ------
-    InputError : the folder cannot be written.
+    InputError : the folder cannot be written, or is the theory's own.
     """
+    if folder.resolve() == THEORY:
+        raise InputError(f"the folder for Coq's files must be another than the theory's own; found {folder}.")
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for name in files:

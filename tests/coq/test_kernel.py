@@ -20,6 +20,7 @@ from certify.commands import doctor
 from certify.coq import kernel
 from certify.coq.kernel import (
     AXIOMS,
+    THEORY,
     axioms_in,
     compile_apart,
     compile_folder,
@@ -486,3 +487,10 @@ def test_coq_refuses_forgeries(tmp_path: Path) -> None:
         compiled = compile_folder(coqc, tmp_path, list(files), 120)
         assert compiled.axioms is None and "refuses Proof.v" in compiled.reason, (name, compiled.reason)
     write_folder(tmp_path, {"Claim.v": claim.encode(), "Evidence.v": evidence.encode()})
+
+
+def test_the_theory_is_not_written_over() -> None:
+    before = (THEORY / "_CoqProject").read_bytes()
+    with pytest.raises(InputError, match="another than the theory's own"):
+        write_folder(THEORY, {"Claim.v": b""})
+    assert (THEORY / "_CoqProject").read_bytes() == before and not (THEORY / "Claim.v").exists()
