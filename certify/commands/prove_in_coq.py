@@ -31,25 +31,15 @@ def prove_in_coq(
     """Prove the claim of a certificate again in the Coq proof assistant, which trusts none of this program."""
     from certify.certificate import read_raw
     from certify.coq.proving import CoqOptions, prove_in_coq
+    from certify.systems import exact
 
-    options = CoqOptions(None if rate is None else _rate(rate), time_limit, boxes, not no_run)
+    options = CoqOptions(None if rate is None else exact(rate, "--rate"), time_limit, boxes, not no_run)
     result = prove_in_coq(read_raw(certificate), out, options, None if quiet or as_json else tell)
     if as_json:
         say(json.dumps(_plain(result)))
     else:
         _print(result)
     raise typer.Exit(result.verdict.exit_status)
-
-
-def _rate(text: str) -> Any:
-    from fractions import Fraction
-
-    from certify.errors import InputError
-
-    try:
-        return Fraction(text)
-    except (ValueError, ZeroDivisionError) as error:
-        raise InputError(f"`--rate` must be a number, as in 1/16 or 0.05; found {text[:40]!r}.") from error
 
 
 def _plain(result: CoqResult) -> dict[str, Any]:
