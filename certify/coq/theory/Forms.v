@@ -18,17 +18,8 @@ Qed.
 Lemma dot_scale k a : forall z, dot (map (Rmult k) a) z = k * dot a z.
 Proof. induction a; intros [|q z]; simpl; try ring. rewrite IHa. ring. Qed.
 
-Lemma dot_comm a : forall b, dot a b = dot b a.
-Proof. induction a; intros [|q b]; simpl; auto. rewrite IHa. ring. Qed.
-
-Lemma dot_zeros n : forall a, dot a (zeros n) = 0.
-Proof. induction n; intros [|p a]; simpl; auto. fold (zeros n). rewrite IHn. ring. Qed.
-
 Lemma length_zeros n : length (zeros n) = n.
 Proof. apply repeat_length. Qed.
-
-Lemma dot_ext (a : list R) : forall z y, length z = length y -> (forall k, nth k z 0 = nth k y 0) -> dot a z = dot a y.
-Proof. intros z y l h. replace z with y; auto. apply nth_ext with 0 0; auto. Qed.
 
 (** A row of numbers times a matrix: the sum of its rows, each times its number. *)
 Fixpoint combine_rows {A} (op times : A -> A -> A) (r : list A) (M : list (list A)) : list A :=
@@ -110,16 +101,12 @@ Qed.
 
 (** x'P x in the coordinates z of x = T z. *)
 Definition congruence (n : nat) (P T : list (list R)) : list (list R) := product (transpose 0 n T) (product P T).
-Definition congruenceI (n : nat) (P T : list (list I.type)) := productI (transpose (whole 0) n T) (productI P T).
 
 Lemma form_congruence n P T z : Forall (fun row => length row = n) T ->
   form (congruence n P T) z = form P (apply T z).
 Proof.
   intro h. unfold form, congruence. rewrite !apply_product. now apply dot_transpose.
 Qed.
-
-Lemma congruence_in n P T X Y : encs P X -> encs T Y -> encs (congruenceI n P T) (congruence n X Y).
-Proof. intros. apply product_in, product_in; auto. now apply transpose_in. Qed.
 
 (** * Positive definite forms, by elimination *)
 

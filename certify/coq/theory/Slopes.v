@@ -223,9 +223,6 @@ Proof.
   - destruct (IHall_hold _ _ h). split; auto. lia.
 Qed.
 
-Lemma all_length qs vs ws : all_hold qs vs ws -> length qs = length vs /\ length ws = length vs.
-Proof. induction 1; simpl; auto. lia. Qed.
-
 Lemma value_holds xq uq x u y s e : all_hold xq x y -> all_hold uq u s ->
   forall q, valueQ xq uq e = Some q -> defined x u e /\ holds q (value x u e) (value y s e).
 Proof.

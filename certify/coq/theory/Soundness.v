@@ -299,9 +299,6 @@ Proof. intro h. apply (inverse_sound n); auto. apply formed_all. Qed.
 Lemma length_z x : length (to_z x) = n.
 Proof. unfold to_z, apply, ratios. rewrite !map_length. apply square_W. Qed.
 
-Lemma length_x z : length (apply Tr z) = n.
-Proof. unfold apply, ratios. rewrite !map_length. apply square_T. Qed.
-
 Lemma V_form z : V c (apply Tr z) = form Sr z.
 Proof. unfold V. now rewrite form_congruence; [|apply rows_T]. Qed.
 
@@ -515,12 +512,12 @@ Proof.
     rewrite one, th; auto.
 Qed.
 
-Lemma act_at_rest ch v : rests_here c ch = true -> (centred c = NotCentred -> v = 0) ->
+Lemma act_at_rest ch v : channel_fits (squashed c) (centred c) ch = true -> rests_here c ch = true -> (centred c = NotCentred -> v = 0) ->
   act (squashed c) (centred c) ch v v = ratio (rest ch).
 Proof.
-  unfold rests_here, act. destruct (centred c) eqn:k; intros h h0.
+  unfold rests_here, act. destruct (centred c) eqn:k; intros f h h0.
   - ring.
-  - simpl in h. destruct (squashed c); [|discriminate]. destruct (reachable_sound _ h) as (ns & b & _). unfold share in b.
+  - simpl in f. destruct (squashed c); [|discriminate]. destruct (reachable_sound _ f) as (ns & b & _). unfold share in b.
     simpl. replace (v - v + artanh ((ratio (rest ch) - real (offset ch)) / real (scale ch)))
       with (artanh ((ratio (rest ch) - real (offset ch)) / real (scale ch))) by ring.
     rewrite tanh_of_artanh; auto. field; auto.
@@ -531,13 +528,13 @@ Qed.
 Lemma policy_at_rest : policy c (zeros n) = map (fun one => ratio (rest one)) (channels c).
 Proof.
   unfold policy. generalize (length_outputs (zeros n) (length_zeros n)).
-  destruct formed_all as (_ & _ & _ & _ & _ & _ & _ & hr & hu & _).
+  destruct formed_all as (_ & _ & _ & _ & _ & _ & hf & hr & hu & _).
   assert (z : centred c = NotCentred -> forall v, In v (net (layers c) (zeros n)) -> v = 0).
   { intros k v hv. unfold unbiased in hu. rewrite k in hu. destruct (net_at_zero _ hu n) as [m em]. rewrite em in hv.
     now apply repeat_spec in hv. }
-  revert z hr. generalize (net (layers c) (zeros n)). induction (channels c) as [|ch cs IH]; intros [|v vs] z hr l;
+  revert z hf hr. generalize (net (layers c) (zeros n)). induction (channels c) as [|ch cs IH]; intros [|v vs] z hf hr l;
     simpl in l; try discriminate; simpl; auto.
-  simpl in hr. apply andb_prop in hr. destruct hr as [h0 hr]. f_equal.
+  simpl in hf, hr. apply andb_prop in hf, hr. destruct hf as [f0 hf], hr as [h0 hr]. f_equal.
   - apply act_at_rest; auto. intro k. apply z; simpl; auto.
   - apply IH; auto. intros k w hw. apply z; simpl; auto.
 Qed.

@@ -228,9 +228,6 @@ Proof.
   cbn. f_equal. apply IH; [reflexivity | injection Hb as Hb; exact Hb].
 Qed.
 
-Lemma dot_commutes : forall a b, dot a b = dot b a.
-Proof. induction a as [| p a IH]; intros [| q b]; cbn; try reflexivity. rewrite (IH b). ring. Qed.
-
 Lemma apply_nth (M : list (list R)) (x : list R) (i : nat) : nth i (apply M x) 0 = dot (nth i M []) x.
 Proof. apply (map_nth (fun row => dot row x) M []). Qed.
 
@@ -288,7 +285,7 @@ Proof.
   pose proof (derivative_dot t _ _ _ _ H Hrows) as HV. rewrite <- Happly in HV.
   rewrite (bilinear_symmetric n M (along fs t) ds) in HV;
     [| exact HM | exact Hsym | unfold along; rewrite map_length; exact Hfs | exact Hds].
-  rewrite (dot_commutes (apply M (along fs t)) ds).
+  rewrite (dot_comm (apply M (along fs t)) ds).
   replace (2 * _) with (dot ds (apply M (along fs t)) + dot ds (apply M (along fs t))) by ring.
   revert HV. apply derivable_pt_lim_ext. intros s. unfold form. rewrite Happly. reflexivity.
 Qed.
@@ -306,7 +303,7 @@ Proof. intros Hn s. unfold along. rewrite map_map, <- (Hn s). apply entries. Qed
 (** * Functions of one variable *)
 
 (** The mean value theorem, where a derivative is needed between the ends alone. *)
-Lemma mean_value (f f' : R -> R) (a b : R) : a < b -> (forall t, continuity_pt f t) ->
+Lemma mean_value_within (f f' : R -> R) (a b : R) : a < b -> (forall t, continuity_pt f t) ->
   (forall t, a < t < b -> derivable_pt_lim f t (f' t)) -> exists t, a < t < b /\ f b - f a = f' t * (b - a).
 Proof.
   intros Hab Hf Hd.
@@ -340,9 +337,6 @@ Qed.
 
 (** * Trajectories *)
 
-Lemma dot_zeros (n : nat) : forall a, dot (zeros n) a = 0.
-Proof. induction n as [| n IH]; intros [| p a]; cbn; try reflexivity. rewrite IH. ring. Qed.
-
 (** The sum of the absolute values. *)
 Fixpoint size (a : list R) : R := match a with [] => 0 | p :: a => Rabs p + size a end.
 
@@ -362,7 +356,7 @@ Lemma form_small (M : list (list R)) : exists k, 0 < k /\
   forall d x, 0 <= d -> Forall (fun v => Rabs v <= d) x -> form M x <= k * d ^ 2.
 Proof.
   enough (H : exists k, 0 < k /\ forall d x, 0 <= d -> Forall (fun v => Rabs v <= d) x -> size (apply M x) <= k * d).
-  { destruct H as (k & Hk & H). exists k. split; [exact Hk |]. intros d x Hd Hx. unfold form. rewrite dot_commutes.
+  { destruct H as (k & Hk & H). exists k. split; [exact Hk |]. intros d x Hd Hx. unfold form. rewrite dot_comm.
     apply (Rle_trans _ _ _ (Rle_abs _)), (Rle_trans _ _ _ (dot_small d Hd _ x Hx)).
     replace (k * d ^ 2) with (k * d * d) by ring. apply Rmult_le_compat_r; auto. }
   induction M as [| row M (k & Hk & IH)].
@@ -386,14 +380,14 @@ Hypothesis smooth_inside : forall x, inside c x -> Forall (defined x (policy c x
 Hypothesis decreasing : forall x, inside c x -> x <> zeros (states c) -> Vdot c x < 0 /\ Vdot c x + rate * V c x <= 0.
 
 Lemma V_zeros : V c (zeros (states c)) = 0.
-Proof. apply dot_zeros. Qed.
+Proof. unfold V, form. rewrite dot_comm. apply dot_zeros. Qed.
 
 (** At the origin V and its derivative are both 0. *)
 Lemma decreasing_everywhere (x : list R) : inside c x -> Vdot c x + rate * V c x <= 0.
 Proof.
   intros Hx. destruct (list_eq_dec Req_EM_T x (zeros (states c))) as [-> | Hne]; [| apply decreasing; assumption].
   assert (H : apply (matrix c) (zeros (states c)) = map (fun _ => 0) (matrix c)).
-  { apply map_ext. intros row. rewrite dot_commutes. apply dot_zeros. }
+  { apply map_ext. intros row. apply dot_zeros. }
   assert (H0 : forall (l : list (list R)) b, dot (map (fun _ => 0) l) b = 0).
   { induction l as [| r l IH]; intros [| q b]; cbn; try reflexivity. rewrite IH. ring. }
   rewrite V_zeros. unfold Vdot. rewrite H, H0. lra.
@@ -453,7 +447,7 @@ Proof.
       [apply continuity_Vdot; [apply (path_continuous y b), Hy | apply smooth_inside, Hinside] |
        apply decreasing; assumption |].
     destruct (Hstep delta Hd) as (s & Hs & Hsm). specialize (Habove s Hs).
-    destruct (mean_value (fun s => V c (y s)) (fun s => Vdot c (y s)) m s) as (r & Hr & Hmean);
+    destruct (mean_value_within (fun s => V c (y s)) (fun s => Vdot c (y s)) m s) as (r & Hr & Hmean);
       [lra | exact Hv | intros r Hr; apply (derivative_V y b); [exact Hy | lra] |].
     assert (Hfall : Vdot c (y r) < 0) by (apply Hnear, Rabs_def1; lra).
     pose proof (Rmult_lt_compat_r (s - m) _ _ ltac:(lra) Hfall) as Hproduct. cbn beta in *. lra.
@@ -467,7 +461,7 @@ Proof.
   assert (Hexp : forall t, derivable_pt_lim (fun s => exp (rate * s)) t (exp (rate * t) * rate)).
   { intros t. apply (derivable_pt_lim_comp (fun s => rate * s) exp); [| apply derivable_pt_lim_exp].
     pose proof (derivable_pt_lim_scal id rate t 1 (derivable_pt_lim_id t)) as H. rewrite Rmult_1_r in H. exact H. }
-  destruct (mean_value (fun s => V c (y s) * exp (rate * s))
+  destruct (mean_value_within (fun s => V c (y s) * exp (rate * s))
     (fun t => Vdot c (y t) * exp (rate * t) + V c (y t) * (exp (rate * t) * rate)) 0 b Hb) as (t & Ht & Hmean).
   - intros t. apply (continuity_pt_mult (fun s => V c (y s))); [apply continuity_V, (path_continuous y b), Hy |].
     apply derivable_continuous_pt. exists (exp (rate * t) * rate). apply Hexp.
@@ -529,17 +523,6 @@ Proof.
     cbn beta in Hin, Hdecay. rewrite Hstart, Hend in Hin, Hdecay.
     split; [split; [apply Hx; lra |] |]; auto.
   - split; [split; [apply Hx; lra | exact H0] |]. rewrite Rmult_0_r, exp_0. lra.
-Qed.
-
-(** Hence so does the square of every linear function a'x of the state of which |a'x| <= b on the set, in that
-    c2 (a'x)^2 <= b^2 V everywhere. *)
-Theorem direction_decays (a : list R) (b : R) :
-  (forall x, length x = states c -> real (level c) * dot a x ^ 2 <= b ^ 2 * V c x) ->
-  forall x T, 0 < T -> solution c x T -> V c (x 0) <= real (level c) -> forall t, 0 <= t < T ->
-  real (level c) * dot a (x t) ^ 2 <= b ^ 2 * V c (x 0) * exp (- rate * t).
-Proof.
-  intros Hb x T HT Hx H0 t Ht. destruct (trajectories_decay x T HT Hx H0 t Ht) as [[Hn _] Hdecay].
-  apply (Rle_trans _ _ _ (Hb (x t) Hn)). rewrite Rmult_assoc. apply Rmult_le_compat_l; [apply pow2_ge_0 | exact Hdecay].
 Qed.
 
 (** The bounds of several states have one in common. *)

@@ -21,3 +21,10 @@ Definition symmetric (M : list (list R)) : Prop :=
   forall i j, (i < length M)%nat -> (j < length M)%nat -> nth j (nth i M []) 0 = nth i (nth j M []) 0.
 
 Definition zeros (n : nat) : list R := repeat 0 n.
+
+(** Two facts, for the proofs. *)
+Lemma dot_comm a : forall b, dot a b = dot b a.
+Proof. induction a; intros [|q b]; simpl; auto. rewrite IHa. ring. Qed.
+
+Lemma dot_zeros n : forall a, dot a (zeros n) = 0.
+Proof. induction n; intros [|p a]; simpl; auto. fold (zeros n). rewrite IHn. ring. Qed.
