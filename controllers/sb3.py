@@ -310,9 +310,8 @@ def from_reference(content: bytes, system: System, options: TrainingOptions) -> 
         raise InputError(f"the baseline's file cannot be read: {error}.") from error
     model = Reference(algorithm, system, replace(options, seed=seed, steps=max(steps, 2), replay=1), 2).model
     try:
-        own = (
-            model.get_parameters()
-        )  # a file may lack the optimisers, which are two thirds of it: nobody goes on from it
+        own = model.get_parameters()
+        # A file may lack the optimisers, which are two thirds of it: nobody goes on from there.
         optimisers = {name: own[name] for name in own if name.endswith("optimizer") and name not in parameters}
         model.set_parameters({**parameters, **optimisers}, device="cpu")
     except (ValueError, RuntimeError) as error:
