@@ -1,8 +1,9 @@
 """What each departure from the paper is worth: the preset with one of them undone, and with all, beside ours.
 
-Run with `python benchmarks/departures.py [PLANT] [--seeds 2] [--only NAME ...] [--runs runs/departures] [--steps N]
-[--time-limit 60] [--table FILE] [--no-training]`. Runs are trained one at a time; what is in the folder of runs is
-used, a run that was cut off goes on from its checkpoint, and the table is printed of all rows that were asked for.
+Run with `python benchmarks/departures.py [PLANT ...] [--seeds 2] [--only NAME ...] [--rows docs/departures/rows.json]
+[--runs runs/departures] [--steps N] [--time-limit 60] [--table FILE] [--no-training]`. Runs are trained one at a time;
+what is in the file of rows is not made again, a run that was cut off goes on from its checkpoint in the folder of runs,
+and the table is printed of all rows that were asked for.
 `ours` is the plant's preset, `paper` its preset of that name, every other row the preset with the departure of that
 name in `controllers.paper` undone; those that a plant does not depart in are left out. A policy is simulated with its
 action held, from 100 states of the plant's box for 20 s: the floor is the median of the largest ||x|| in the last
@@ -124,29 +125,48 @@ def measured(system: System, options: TrainingOptions, folder: Path, seconds: fl
     }
 
 
+class Rows:
+    """The rows of a file, by plant, name and seed, each with the options and the time it was asked with."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.known: dict[str, Any] = json.loads(path.read_text("utf-8")) if path.is_file() else {}
+
+    def find(self, name: str, asked: dict[str, Any]) -> dict[str, Any] | None:
+        """The row, None if it is not there; ends the program if it is of other options or another time."""
+        there = self.known.get(name)
+        if there is None:
+            return None
+        before = there["asked"] | {"options": {**default_record(), **there["asked"]["options"]}}  # some came later
+        if before != asked:
+            raise SystemExit(f"{name} in {self.path} is of other options. Give another file by --rows.")
+        row: dict[str, Any] = there["row"]
+        return row
+
+    def add(self, name: str, asked: dict[str, Any], row: dict[str, Any]) -> None:
+        """Write the file with one row more."""
+        self.known = dict(sorted({**self.known, name: {"asked": asked, "row": row}}.items()))
+        write_atomically(self.path, (json.dumps(self.known, indent=1) + "\n").encode())
+
+
 def rows(
-    folder: Path, system: System, options: TrainingOptions, seeds: int, limit: float, training: bool
+    store: Rows, folder: Path, system: System, options: TrainingOptions, seeds: int, limit: float, training: bool
 ) -> list[dict[str, Any]]:
-    """The rows of all seeds that are there; with `training` the others are made."""
+    """The rows of all seeds that are there; with `training` the others are made, in the folder of runs."""
     found = []
     for seed in range(seeds):
-        place, own = folder / f"seed-{seed}", replace(options, seed=seed)
-        path = place / "row.json"
-        asked = {"options": own.record(), "time_limit": limit}
-        there = json.loads(path.read_text("utf-8")) if path.is_file() else None
-        if there is not None:  # runs had no options that came later
-            there["asked"]["options"] = {**default_record(), **there["asked"]["options"]}
-        if there is not None and there["asked"] != asked:
-            raise SystemExit(f"{path} is of other options. Move it away, or give another folder by --runs.")
-        if there is None and not training:
-            continue
-        if there is None:
+        own = replace(options, seed=seed)
+        name, asked = f"{system.name}/{folder.name}/{seed}", {"options": own.record(), "time_limit": limit}
+        row = store.find(name, asked)
+        if row is None and training:
+            place = folder / f"seed-{seed}"
             make_folder(place)
-            there = {"asked": asked, "row": measured(system, own, place, limit)}
-            write_atomically(path, (json.dumps(there, indent=1) + "\n").encode())
+            row = measured(system, own, place, limit)
+            store.add(name, asked, row)
             (place / "checkpoint.pt").unlink(missing_ok=True)
-            print(f"{folder.name} seed {seed}: {json.dumps(there['row'])}", flush=True)
-        found.append(there["row"])
+            print(f"{name}: {json.dumps(row)}", flush=True)
+        if row is not None:
+            found.append(row)
     return found
 
 
@@ -179,9 +199,10 @@ def line(name: str, found: Sequence[dict[str, Any]]) -> str:
 def main() -> None:
     """Parse the arguments, make what is missing, print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("plant", nargs="?", default="pendulum")
+    parser.add_argument("plants", nargs="*", default=["pendulum"], metavar="PLANT")
     parser.add_argument("--seeds", type=int, default=2)
     parser.add_argument("--only", nargs="*", default=[], metavar="NAME")
+    parser.add_argument("--rows", type=Path, default=Path("docs") / "departures" / "rows.json")
     parser.add_argument("--runs", type=Path, default=Path("runs") / "departures")
     parser.add_argument("--steps", type=int, help="of every run; default: the preset's")
     parser.add_argument("--time-limit", type=float, default=60.0, help="seconds for a certificate")
@@ -189,13 +210,16 @@ def main() -> None:
     parser.add_argument("--no-training", action="store_true", help="the table of what is there")
     asked = parser.parse_args()
     torch.set_num_threads(1)
-    system = get_system(asked.plant)
-    lines = [f"| {' | '.join(HEAD)} |", "|---" * len(HEAD) + "|"]
-    for name, options in cases(asked.plant, asked.only):
-        chosen = options if asked.steps is None else replace(options, steps=asked.steps)
-        folder = asked.runs / asked.plant / name
-        made = rows(folder, system, chosen, asked.seeds, asked.time_limit, not asked.no_training)
-        lines.append(line(name, made))
+    several, store = len(asked.plants) > 1, Rows(asked.rows)
+    head = (*("plant",) * several, *HEAD)
+    lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
+    for plant in asked.plants:
+        system = get_system(plant)
+        for name, options in cases(plant, asked.only):
+            chosen = options if asked.steps is None else replace(options, steps=asked.steps)
+            folder = asked.runs / plant / name
+            made = rows(store, folder, system, chosen, asked.seeds, asked.time_limit, not asked.no_training)
+            lines.append(f"| {plant} " * several + line(name, made))
     print("\n".join(lines))
     if asked.table is not None:
         write_atomically(asked.table, ("\n".join(lines) + "\n").encode())
