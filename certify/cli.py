@@ -2,7 +2,7 @@
 
 Standard output carries the result, or with `--json` exactly one JSON object; progress and diagnostics go to
 standard error. Exit status: 0 proved or accepted, 1 refuted or rejected, 2 usage or unusable input, 3 unknown
-or trusted, 70 internal error; 130 and 141 after Ctrl-C and a closed pipe.
+or trusted, 4 one part of a certificate checked, 70 internal error; 130 and 141 after Ctrl-C and a closed pipe.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ HERE = Path(__file__).parent
 
 def main(folder: str | Path = "out/examples/van_der_pol") -> RoaResult:
     """Prove, draw, and ask about two states."""
-    # The policy was made by: controllers train examples/plants/van_der_pol.toml --out van_der_pol.pt
+    # The policy was made by `controllers train examples/plants/van_der_pol.toml --transitions latest --out FILE`.
     result = certify_roa(
         HERE / "plants" / "van_der_pol.toml", HERE / "policies" / "van_der_pol.pt", folder, candidate="optimised"
     )

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from graphlib import TopologicalSorter
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -99,6 +100,24 @@ def arrows() -> dict[str, set[str]]:
 def test_the_arrows_are_exactly_these() -> None:
     found = {name: " ".join(sorted(to - LEAVES)) for name, to in arrows().items() if name not in ENTRY | {"__init__"}}
     assert {name: to for name, to in found.items() if to} == EDGES
+
+
+def test_the_picture_shows_these_arrows() -> None:
+    """Of `docs/house.md`: all but those that follow from others, and what `commands` may see anyway."""
+    picture = (ROOT / "docs" / "house.md").read_text("utf-8").split("```mermaid")[1].split("```")[0]
+    shown: dict[str, set[str]] = {}
+    for line in picture.splitlines():
+        units = [[name.strip() for name in part.split("&")] for part in line.split("-->")]
+        for sources, targets in pairwise(units):
+            for source in sources:
+                shown.setdefault(source, set()).update(targets)
+    edges = {name: set(to.split()) for name, to in EDGES.items()}
+
+    def beyond(name: str) -> set[str]:
+        return {far for to in edges.get(name, ()) for far in (to, *beyond(to))}
+
+    needed = {name: to - {far for near in to for far in beyond(near)} for name, to in edges.items()}
+    assert {name: to for name, to in shown.items() if name not in ENTRY} == needed
 
 
 def module_arrows() -> dict[str, set[str]]:

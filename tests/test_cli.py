@@ -592,6 +592,14 @@ def test_a_disturbance_that_always_acts_is_refused_where_it_would_be_left_out(
     assert not (tmp_path / "o").exists() or not any((tmp_path / "o").glob("*.[js]*"))
 
 
+def test_no_condition_is_exported_that_was_not_proved(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Of a policy that rests beside the origin Vdot < 0 is false around it, and nothing may say that it was proved."""
+    policy = Path(__file__).parents[1] / "examples" / "policies" / "without_gain" / "pendulum.pt"
+    status, out, err = run(capsys, "export-smt2", "--policy", policy, "--out", tmp_path / "o")
+    assert status == 2 and "pi(0)" in err and out == ""
+    assert not list(tmp_path.rglob("*.smt2"))
+
+
 def test_a_disturbance_of_the_file_can_be_switched_off(
     tmp_path: Path, ranged: tuple[str | Path, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -35,7 +35,8 @@ _EXTRAS = {  # package: module, extra, what for
     "safetensors": ("safetensors", "safetensors", "policies of safetensors"),
     "gymnasium": ("gymnasium", "controllers", "training with controllers train"),
     "control": ("control", "controllers", "training with controllers train"),
-    "distributed": ("distributed", "cluster", "certify sweep --cluster"),
+    "distributed": ("distributed", "cluster", "--cluster of certify and controllers"),
+    "numba": ("numba", "fast", "compiled loops, which large proofs gain from"),
     "pyarrow": ("pyarrow", "parquet", "Parquet tables of certify sweep"),
     "stable-baselines3": ("stable_baselines3", "baselines", "baselines of controllers compare; not needed to import"),
 }

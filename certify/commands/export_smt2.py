@@ -16,7 +16,7 @@ from certify.errors import InputError
 
 def export_smt2(
     policy: Annotated[Path, typer.Option(help="Policy file (certify-policy/1 or /2, .pt).")],
-    out: Annotated[Path, typer.Option(help="Folder for the files, one a claim.")],
+    out: Annotated[Path, typer.Option(help="Folder for the files, one a condition.")],
     system: Annotated[str | None, typer.Option(help="Plant, as for roa; default: what the policy file says.")] = None,
     param: Annotated[list[str] | None, typer.Option(help="Parameter of the plant, NAME=VALUE; repeatable.")] = None,
     domain: Annotated[list[str] | None, typer.Option(help="Half-width NAME=D or interval NAME=LO:HI.")] = None,
@@ -25,7 +25,7 @@ def export_smt2(
     time_limit: Annotated[float, typer.Option(help="Seconds for everything up to the verdict.")] = 50.0,
     as_json: Json = False,
 ) -> None:
-    """Prove levels with the bounds engine and write its claims as SMT-LIB 2 for another solver."""
+    """Prove an asymptotic claim with the bounds engine and write its conditions as SMT-LIB 2 for another solver."""
     from certify.claims import Asymptotic, conditions
     from certify.claims.queries import query
     from certify.engines.dreal.backend import to_smt2
@@ -44,7 +44,12 @@ def export_smt2(
         raise InputError(
             f"export-smt2 must have a plant in continuous time; found {plant.name}, whose time is discrete."
         )
-    options = RoaOptions(candidate=candidate, level=level, time_limit=time_limit)  # type: ignore[arg-type]
+    options = RoaOptions(
+        claim="asymptotic",  # what is written are its conditions
+        candidate=candidate,  # type: ignore[arg-type]
+        level=level,
+        time_limit=time_limit,
+    )
     result = certify_roa(plant, stored.network, out, options)
     inner, outer = result.levels.local, result.levels.roa
     if result.verdict is not Verdict.PROVED or result.problem is None or inner is None or outer is None:

@@ -59,9 +59,9 @@ def roa(
     candidate: Annotated[
         str,
         typer.Option(
-            help="Lyapunov candidate: auto (of all, the largest proved), lyapunov, scaled, lqr, optimised, robust, "
-            "peak (practical claims, a small floor), neural or polynomial (auto, and a function learned for a set "
-            "beyond its ellipsoid)."
+            help="Lyapunov candidate: auto (of all, the largest proved; with --Q or --level lyapunov, with --R lqr), "
+            "lyapunov, scaled, lqr, optimised, robust, peak (practical claims, a small floor), neural or polynomial "
+            "(auto, and a function learned for a set beyond its ellipsoid)."
         ),
     ] = "auto",
     q: Annotated[str | None, typer.Option("--Q", help="Diagonal of Q, as in 1,1.")] = None,

@@ -54,7 +54,7 @@ def tell(line: str) -> None:
 
 
 def _ring_line(state: Progress) -> str:
-    left = "" if state.seconds_left is None else f", at most {state.seconds_left:.0f} s left"
+    left = "" if state.seconds_left is None else f", at most {max(state.seconds_left, 0):.0f} s left"
     return (
         f"{state.name}: proved to V = {state.level:.4g} of {state.target:.4g} ({state.proved:.1%} of the volume), "
         f"{state.boxes} boxes, {state.open} open{left}"
