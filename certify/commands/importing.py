@@ -102,12 +102,12 @@ def imported_lyapunov(
 
 
 def _plant_for(path: Path, system: str | None, params: list[str]) -> System:
-    """The plant that a policy of another program controls."""
+    """The plant that is named for a file to import, which does not say what it controls."""
     from certify.systems import chosen_system
 
     if system is None:
         raise InputError(
-            f"policy file {path} is another program's and does not say what it controls: name the plant with --system."
+            f"what is imported from {path} does not say which plant it controls: name the plant with --system."
         )
     return with_params(chosen_system(system), params)
 

@@ -61,7 +61,7 @@ ENTRIES = (
     Entry("furuta", "rotary pendulum, four states", "furuta", "furuta", OPTIMISED),
     Entry("cartpole", "four states, 256 units a layer", "cartpole", options=("--candidate", "optimised")),
     Entry("satellite", "attitude, six states and three inputs", "satellite", "satellite", OPTIMISED),
-    Entry("quadrotor2d", "six states, five layers of 256 units", "quadrotor2d"),
+    Entry("quadrotor2d", "six states, four layers of 256 units", "quadrotor2d"),
     Entry("quadrotor3d", "twelve states on their true equations", "quadrotor3d", options=QUADROTOR),
 )
 
