@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import os
 import re
+import runpy
 import shlex
 import subprocess
 import sys
@@ -183,3 +184,12 @@ def test_the_sites_packages_are_pinned() -> None:
         "l2m4m",
         "latex2mathml",
     } <= pinned
+
+
+def test_the_tables_of_the_comparison_are_of_the_figures_beside_them() -> None:
+    """In the README too: what `make paper` would write is what stands there."""
+    script = runpy.run_path(str(ROOT / "docs" / "paper" / "table.py"))
+    long, short = script["tables"]()
+    assert (ROOT / "docs" / "paper" / "baselines.txt").read_text("utf-8") == long
+    readme = (ROOT / "README.md").read_text("utf-8")
+    assert script["between"](readme, short) == readme != script["between"](readme, "another table")
