@@ -107,7 +107,7 @@ def _plant_for(path: Path, system: str | None, params: list[str]) -> System:
 
     if system is None:
         raise InputError(
-            f"to import the policy file {path}, which plant it controls must be said: name the plant with --system."
+            f"importing the policy file {path} takes the plant that it controls: name the plant with --system."
         )
     return with_params(chosen_system(system), params)
 

@@ -76,7 +76,7 @@ def brief(found: Mapping[str, Any]) -> list[str]:
             NAMES[both[0]["method"]] + sampled,
             str(len(runs)),
             _thousands(median(run["steps"] for run in runs)),
-            "; ".join(f"{row['settled']} of {row['trajectories']}" for row in both),
+            "; ".join(map(_settled, both)),
             "; ".join(_short(row["floor"]) for row in both),
             "; ".join(_short(row["cost_median"]) for row in both),
         )
@@ -92,6 +92,11 @@ def between(text: str, block: str) -> str:
 
 def _kind(method: str) -> str:
     return method.removesuffix(" mean").removesuffix(" stochastic")
+
+
+def _settled(row: Mapping[str, Any]) -> str:
+    left = f" ({row['left_domain']} left the domain)" if row["left_domain"] else ""
+    return f"{row['settled']} of {row['trajectories']}{left}"
 
 
 def _short(value: float | None) -> str:
