@@ -23,8 +23,9 @@ from certify.engines.tube import find_tube
 from certify.errors import InputError
 from certify.lyapunov import diagonalising_coordinates, domain_limit, extents, volume
 from certify.options import RoaOptions
-from certify.policies import Centre
+from certify.policies import Centre, TanhNetwork
 from certify.results import Diagnosis, RoaResult, Share, Step
+from certify.systems import System
 from certify.verdict import Stop
 
 Array = NDArray[np.float64]
@@ -35,8 +36,14 @@ _LONGER, _SECONDS = 1.1, 5.0  # of a tube's start, relative to the proved set; f
 _TOUCHES = 1e-6  # relative distance from the domain's limit
 
 
-def diagnose(result: RoaResult, options: RoaOptions, proof: Proof | None) -> Diagnosis:
-    """What limits `result`, `proof` being what its engine found."""
+def diagnose(
+    result: RoaResult,
+    options: RoaOptions,
+    proof: Proof | None,
+    asked: tuple[System, TanhNetwork] | None = None,
+) -> Diagnosis:
+    """What limits `result`, `proof` being what its engine found, and `asked` the plant and the policy as they were
+    given, if the result is about them as seen from where they rest."""
     system = result.system
     loop = ClosedLoop(system, result.network)
     fastest, slowest = _modes(loop)
@@ -61,7 +68,7 @@ def diagnose(result: RoaResult, options: RoaOptions, proof: Proof | None) -> Dia
         fastest,
         slowest,
         tuple(pair for pair in hurts if pair[1] >= 0.1),
-        _next(result, options, proof, name),
+        _next(result, options, proof, name, asked or (system, result.network)),
     )
 
 
@@ -130,8 +137,10 @@ def _direction(result: RoaResult, proof: Proof | None, point: Array | None, loop
     return np.asarray(np.abs(vectors[:, np.argmax(values.real)]))
 
 
-def _next(result: RoaResult, options: RoaOptions, proof: Proof | None, name: str | None) -> Step:
-    if result.claim in ("practical", "nearby") and (centre := _centring(result)) is not None:
+def _next(
+    result: RoaResult, options: RoaOptions, proof: Proof | None, name: str | None, asked: tuple[System, TanhNetwork]
+) -> Step:
+    if result.claim in ("practical", "nearby") and (centre := _centring(*asked)) is not None:
         return Step((("--centre", centre),), "with pi(0) = u_eq the stronger claim can be tried")
     if result.stop is Stop.DOMAIN and name is not None and options.level is None:
         return _wider_domain(result, name)
@@ -171,14 +180,14 @@ def _has_tube(result: RoaResult) -> bool:
     return find_tube(paths(ClosedLoop(result.system, result.network)), goal / _LONGER**2, goal, _SECONDS) is not None
 
 
-def _centring(result: RoaResult) -> str | None:
+def _centring(system: System, network: TanhNetwork) -> str | None:
     """A centring with which the loop rests at the origin, exactly; None if it has one, or none can be had."""
-    if result.network.centre != "none":
+    if network.centre != "none":
         return None
     centres: tuple[Centre, ...] = ("preactivation", "output")
     for centre in centres:
         try:
-            ClosedLoop(result.system, replace(result.network, centre=centre)).require_rest()
+            ClosedLoop(system, replace(network, centre=centre)).require_rest()
         except InputError:
             continue
         return centre

@@ -18,6 +18,7 @@ Array = NDArray[np.float64]
 EngineName = Literal["bounds", "dreal", "both"]
 _MOST_JOBS = 256  # of the checker
 Asked = Literal["auto", "asymptotic", "practical", "nearby"]
+Around = Literal["auto", "origin", "rest"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +30,9 @@ class RoaOptions:
     claim : `asymptotic`; `practical`, which asks for no equilibrium at the origin; `nearby`, which is that and, if it
         can be shown, that all trajectories converge to one equilibrium where what is uncertain is constant. `auto` is
         the first where the loop rests at the origin exactly, and the last where it does not.
+    around : the point at which V is 0, under a claim that needs no equilibrium at the origin: the `origin`, or where
+        the loop does `rest`, which then is the operating point, and states are deviations from there. `auto` is where
+        it rests if that is a stable point and nothing is given in deviations from the origin: `P`, `level`, `lyapunov`.
     candidate : where P comes from, see `choose_candidate`, or `robust`, which chooses P with the local rule's own
         bounds, or `peak`, whose floor is small; `auto` tries several and keeps the one with which the largest volume is
         proved. `neural` and `polynomial` do that too, and learn a function N whose set reaches beyond the ellipsoid.
@@ -63,6 +67,7 @@ class RoaOptions:
     """
 
     claim: Asked = "auto"
+    around: Around = "auto"
     candidate: Candidate = "auto"
     Q: tuple[float, ...] | None = None
     R: tuple[float, ...] | None = None
@@ -110,7 +115,7 @@ class RoaOptions:
         return "lqr" if self.R is not None else "lyapunov" if self.Q is not None or self.level is not None else None
 
     def __post_init__(self) -> None:
-        for name, known in (("claim", Asked), ("candidate", Candidate), ("engine", EngineName)):
+        for name, known in (("claim", Asked), ("around", Around), ("candidate", Candidate), ("engine", EngineName)):
             if getattr(self, name) not in get_args(known):
                 raise InputError(f"`{name}` must be one of {get_args(known)}; found {getattr(self, name)!r}.")
         if not 0 < self.dreal_precision < 1 or (self.jobs is not None and not 1 <= self.jobs <= _MOST_JOBS):
@@ -124,6 +129,8 @@ class RoaOptions:
                 "`resume` goes on with the candidate of the search; leave `P`, `Q`, `R`, `level` and `candidate` out, "
                 "and use the engine bounds."
             )
+        if self.around == "rest" and self.claim == "asymptotic":
+            raise InputError("`around` the rest needs another claim than `asymptotic`, under which that is the origin.")
         if self.level is not None and not (math.isfinite(self.level) and self.level > 0):
             raise InputError(f"`level` must be a positive number; found {self.level}.")
         if self.box is not None and not all(math.isfinite(v) and v > 0 for v in self.box.values()):

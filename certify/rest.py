@@ -1,16 +1,21 @@
 """Where a closed loop really rests when that is not the origin: enclosed by Krawczyk's test, with its eigenvalues.
 
 A policy that nobody centred has pi(0) near u_eq at best, and its loop rests beside the origin, if anywhere. Newton's
-method finds the point in floats; the test shows in Arb that exactly one point of rest lies in a box around it:
+method finds the point in floats, from the origin or from where a trajectory from there comes to; the test shows in Arb
+that exactly one point of rest lies in a box around it:
 `K = x0 - Y F(x0) + (I - Y J)(X - x0)` lies inside X, J being mean slopes of F on X and Y about the inverse of one.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from fractions import Fraction
 
 import flint
 import numpy as np
+import scipy.integrate
 from numpy.typing import NDArray
 
 from certify.closed_loop import ClosedLoop
@@ -21,6 +26,8 @@ _STEPS, _HALVINGS = 100, 30  # of Newton's method, and of a step that does not r
 _REFINEMENTS = 8  # in Arb, each by some ten digits
 _RADIUS = 1e-20  # of the box of the test, in the states' units
 _DIGITS = 12
+_BITS = 40  # of a point from which a loop is looked at
+_WHILE = 100.0  # in the plant's unit of time
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +37,7 @@ class Rest:
     Parameters
     ----------
     x, u : decimals with 12 digits that are certain up to the last, or 0 for less than 1e-18, (n,) and (m,); x is in
-        deviations.
+        deviations from the plant's operating point.
     eigenvalues : of the Jacobian there, enclosed, in digits; empty if Arb cannot isolate them.
     stable : whether all of them are certain to lie left of the axis.
     """
@@ -42,10 +49,37 @@ class Rest:
 
 
 def find_rest(loop: ClosedLoop) -> Rest | None:
-    """The point of rest that Newton's method reaches from the origin, enclosed; None if there is none to be shown."""
-    start = _newton(loop)
-    if start is None:
-        return None
+    """The point of rest that Newton's method reaches from the origin, or else from the end of a trajectory that starts
+    there, enclosed; None if there is none to be shown."""
+    for begin in (_origin, _end):
+        x0 = begin(loop)
+        start = None if x0 is None else _newton(loop, x0)
+        if start is not None:
+            return _enclosed(loop, start)
+    return None
+
+
+def seen_from(loop: ClosedLoop, rest: Rest) -> ClosedLoop:
+    """The same loop in deviations from where it rests, as near as 40 bits of the domain's widths come to it.
+
+    Raises
+    ------
+    InputError : the policy is centred, or the point does not lie in the interior of the domain.
+    """
+    system, network = loop.system, loop.network
+    by = [_short(Fraction(v), hi - lo) for v, (lo, hi) in zip(rest.x, system.domain, strict=True)]
+    u = [_short(Fraction(v), hi - lo) for v, (lo, hi) in zip(rest.u, system.input_bounds, strict=True)]
+    origin = network.origin + np.array([float(q) for q in by])
+    return ClosedLoop(system.seen_from(by, u), replace(network, origin=origin))
+
+
+def _short(q: Fraction, width: Fraction) -> Fraction:
+    """q to a multiple of 2^-40 times the power of 2 next to a width."""
+    unit = Fraction(2) ** (math.frexp(float(width))[1] - _BITS)
+    return round(q / unit) * unit
+
+
+def _enclosed(loop: ClosedLoop, start: Array) -> Rest | None:
     with precision():
         x = [flint.arb(float(v)) for v in start]
         for _ in range(_REFINEMENTS):
@@ -64,16 +98,34 @@ def find_rest(loop: ClosedLoop) -> Rest | None:
     return Rest(_decimals(box), _decimals(u), eigenvalues, stable)
 
 
-def _newton(loop: ClosedLoop) -> Array | None:
-    """A root of F in floats inside the domain, by Newton's method with halved steps; None if it finds none."""
+def _rates(loop: ClosedLoop) -> Callable[[Array], Array]:
+    """F in floats, (n,) to (n,)."""
     f = loop.system.function()
-    lo, hi = np.array([[float(a), float(b)] for a, b in loop.system.domain]).T
 
     def F(x: Array) -> Array:
         with np.errstate(all="ignore"):
             return np.asarray(f(x, loop.policy(x[None])[0]), dtype=np.float64)
 
-    x = np.zeros(loop.system.n)
+    return F
+
+
+def _origin(loop: ClosedLoop) -> Array:
+    return np.zeros(loop.system.n)
+
+
+def _end(loop: ClosedLoop) -> Array | None:
+    """Where the trajectory from the origin is after a while, however stiff the loop; None if it leaves the domain."""
+    F = _rates(loop)
+    solved = scipy.integrate.solve_ivp(lambda _, x: F(x), (0.0, _WHILE), _origin(loop), method="LSODA", rtol=1e-6)
+    x = np.asarray(solved.y[:, -1])
+    inside = all(lo < Fraction(float(v)) < hi for v, (lo, hi) in zip(x, loop.system.domain, strict=True))
+    return x if solved.success and np.all(np.isfinite(x)) and inside else None
+
+
+def _newton(loop: ClosedLoop, x: Array) -> Array | None:
+    """A root of F in floats inside the domain, by Newton's method with halved steps; None if it finds none."""
+    F = _rates(loop)
+    lo, hi = np.array([[float(a), float(b)] for a, b in loop.system.domain]).T
     value = F(x)
     for _ in range(_STEPS):
         steps = 1e-7 * np.maximum(1e-3, np.abs(x)) + 1e-9

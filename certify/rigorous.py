@@ -219,7 +219,7 @@ def policy_on(loop: ClosedLoop, x: Balls) -> tuple[Balls, flint.arb_mat]:
     Where it is not certain on which side of a bound of the clip its argument lies, the slope is the ball of all slopes
     between 0 and 1: good for mean values, and for nothing else.
     """
-    network, y = loop.network, list(x)
+    network, y = loop.network, _read(loop.network, x)
     J = flint.arb_mat([[int(i == j) for j in range(network.n)] for i in range(network.n)])
     for k, (W, b) in enumerate(zip(network.weights, network.biases, strict=True)):
         if k:
@@ -365,8 +365,13 @@ def _centring(loop: ClosedLoop) -> tuple[Balls, Balls]:
     return loop.network.centring(loop.u_eq, at_0, _NUMBERS)
 
 
-def _net(network: TanhNetwork, h: Balls) -> Balls:
-    return _layers(network.weights, network.biases, h)
+def _net(network: TanhNetwork, x: Balls) -> Balls:
+    return _layers(network.weights, network.biases, _read(network, x))
+
+
+def _read(network: TanhNetwork, x: Balls) -> Balls:
+    """What the layers read at a state."""
+    return [v + at for v, at in zip(x, _points(network.origin), strict=True)] if network.is_moved else list(x)
 
 
 def _layers(weights: Sequence[Array], biases: Sequence[Array], h: Balls) -> Balls:

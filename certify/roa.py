@@ -52,7 +52,7 @@ from certify.lyapunov.function import Quadratic
 from certify.options import RoaOptions
 from certify.policies import TanhNetwork
 from certify.race import Contender, Race
-from certify.rest import find_rest
+from certify.rest import Rest, find_rest, seen_from
 from certify.results import Levels, RoaResult, Tried, TubeFacts
 from certify.rigorous import eigenvalues, instability
 from certify.systems import System
@@ -197,6 +197,10 @@ class _Run:
     converging: bool = False  # of a practical claim: to ask for one equilibrium as well
     share: float = 1.0  # of the time, up to which a stage may go on
     checked: str | None = None  # by whom, where a cluster was asked
+    asked: tuple[System, TanhNetwork] = field(init=False)  # the loop as it was given
+
+    def __post_init__(self) -> None:
+        self.asked = self.system, self.network
 
     def result(self) -> RoaResult:
         result = self._decide()
@@ -206,7 +210,7 @@ class _Run:
         result = replace(result, notice="; ".join(notices) or None)
         search = self.out / _SEARCH_FILE
         result = replace(result, search=search if search.exists() else None)
-        return replace(result, diagnosis=diagnose(result, self.options, self.proof))
+        return replace(result, diagnosis=diagnose(result, self.options, self.proof, self.asked))
 
     @property
     def spent(self) -> float:
@@ -233,6 +237,7 @@ class _Run:
                     raise InputError(f"a tube from a state needs a loop that rests at the origin; {self.aside}.")
                 options = replace(options, enlarge=False, box=None)
             self.options = options = replace(options, claim=claim)
+            rest, loop = self._rest(loop)
         self.share = _BEFORE_TUBE if options.enlarges else _BEFORE_OUTER if options.goes_beyond else 1.0
         kind = _kind_of(options)
         result = RoaResult(
@@ -251,9 +256,7 @@ class _Run:
                 verdict, stop, shown = unstable
                 detail = f"eigenvalues {', '.join(shown)}" + (" touch the axis" if stop is Stop.SPECTRUM else "")
                 return replace(result, verdict=verdict, stop=stop, detail=detail, eigenvalues=shown)
-        elif self.aside is not None and not self.system.in_steps:
-            with self._stage("candidate"):
-                result = replace(result, rest=find_rest(loop))
+        result = replace(result, rest=rest)
         if not options.resume:
             (self.out / _SEARCH_FILE).unlink(missing_ok=True)
         if options.resume:
@@ -289,6 +292,32 @@ class _Run:
             self.aside = f"practical stability is claimed, because {_first_sentence(error)}"
             return "practical"
         return "asymptotic"
+
+    def _rest(self, loop: ClosedLoop) -> tuple[Rest | None, ClosedLoop]:
+        """Where the loop rests, if that is worth saying, and the loop as seen from where V is to be 0: from now on
+        that is the run's.
+
+        Raises
+        ------
+        InputError : V is to be 0 where the loop rests, and no stable point of rest is found.
+        """
+        options = self.options
+        if options.claim != "practical" or loop.system.time == "discrete" or loop.network.centre != "none":
+            if options.around == "rest" and options.claim == "practical":
+                raise InputError("`around` the rest needs a policy without centring and a plant in continuous time.")
+            return None, loop
+        rest = find_rest(loop)
+        given = options.P is not None or options.level is not None or options.lyapunov is not None
+        if options.around == "rest" and (rest is None or not rest.stable):
+            found = "none was found" if rest is None else f"the one at {', '.join(rest.x)} is not"
+            raise InputError(f"`around` the rest needs a stable point of rest; {found}.")
+        if rest is None or not rest.stable or options.around == "origin" or (options.around == "auto" and given):
+            return rest, loop
+        moved = seen_from(loop, rest)
+        if not moved.network.is_moved:
+            return rest, loop
+        self.system, self.network = moved.system, moved.network
+        return rest, moved
 
     def _race(self, loop: ClosedLoop) -> Race:
         """Every candidate for a little time, and more for the better ones."""

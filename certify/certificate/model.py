@@ -24,7 +24,7 @@ import sympy
 from numpy.typing import NDArray
 
 from certify.claims import CLAIMS, Claim, Enlarged, Outer, Reached
-from certify.errors import CertificateFormatError
+from certify.errors import CertificateFormatError, InputError
 from certify.expressions import from_tree, to_tree
 from certify.lyapunov.function import Quadratic
 from certify.lyapunov.neural import Neural
@@ -34,7 +34,7 @@ from certify.systems import System
 from certify.systems.system import Interval
 
 Array = NDArray[np.float64]
-SCHEMA = "certify-certificate/7"
+SCHEMA = "certify-certificate/8"
 MAX_BYTES = 256 * 2**20
 _LONGEST_UNIT = 40
 _OF_A_BALL = ("J", "multipliers", "weight")
@@ -170,6 +170,10 @@ class Certificate:
     V : the Lyapunov function.
     claim : what is said about them, with its levels.
     provenance : anything that helps people; the checker ignores it.
+
+    Raises
+    ------
+    InputError : the policy's layers read from another origin, under a claim or with a centring that is about 0.
     """
 
     system: System
@@ -178,6 +182,13 @@ class Certificate:
     claim: Claim
     evidence: PartitionTree | TrustedSolver
     provenance: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if self.network.is_moved and (self.claim.at_rest or self.network.centre != "none"):
+            raise InputError(
+                f"`origin` of a policy must be 0 with centre {self.network.centre!r} and claim {self.kind!r}; found "
+                f"{self.network.origin.tolist()}."
+            )
 
     @property
     def P(self) -> Array:
@@ -242,6 +253,7 @@ def loop_sections(system: System, network: TanhNetwork) -> dict[str, Any]:
             "scale": encode(network.scale),
             "offset": encode(network.offset),
             "clip": None if network.clip is None else [encode(end) for end in network.clip],
+            "origin": encode(network.origin),
             "sha256": network.sha256(),
         },
     }
@@ -322,6 +334,7 @@ def parse_certificate(raw: bytes, name: str) -> Certificate:
             squash=policy["squash"],
             centre=policy["centre"],
             clip=_read_clip(policy["clip"], m),
+            origin=decode(policy["origin"], (n,)),
         )
         return Certificate(
             system=system,

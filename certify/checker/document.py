@@ -48,7 +48,13 @@ class Policy:
     offset: Array
     squash: str
     centre: str
-    clip: tuple[Array, Array] | None = None  # lo, hi
+    clip: tuple[Array, Array] | None  # lo, hi
+    origin: Array  # the layers read origin + x
+
+    @property
+    def is_moved(self) -> bool:
+        """Whether the layers read anything else than x."""
+        return bool(np.any(self.origin != 0))
 
     def sha256(self) -> str:
         """Hash of squash, centre, then each array."""
@@ -229,13 +235,13 @@ def certificate(data: Any, sha256: str) -> Certificate:
     """A JSON value as a certificate."""
     keys = "schema claim plant policy lyapunov levels evidence provenance"
     schema, claim, plant, policy, lyapunov, levels, evidence, provenance = Value(data).keys(keys)
-    schema.choice("certify-certificate/7")
+    schema.choice("certify-certificate/8")
     known = isinstance(claim.raw, dict) and claim.raw.get("kind") in CLAIMS
     claim.must(known, f"an object of kind {' or '.join(CLAIMS)}")
     kind = claim.raw["kind"]
     stated = _plant(plant)
     n, m = len(stated["states"]), len(stated["inputs"])
-    stated["policy"] = _policy(policy, n, m)
+    stated["policy"] = _policy(policy, n, m, kind in PRACTICAL)
     stated_of = {"enlarged": " start", "reached": " start centre"}
     _, rate, sample, beyond, *of_tube = claim.keys("kind rate sample outer" + stated_of.get(kind, ""))
     fall, periods = rate.binary64(), _sample(sample)
@@ -308,13 +314,15 @@ def _quantity(value: Value) -> tuple[str, tuple[Fraction, Fraction]]:
     return name.name(), interval.interval()
 
 
-def _policy(value: Value, n: int, m: int) -> Policy:
-    layers, squash, centre, scale, offset, clip, sha256 = value.keys("layers squash centre scale offset clip sha256")
+def _policy(value: Value, n: int, m: int, practical: bool) -> Policy:
+    names = "layers squash centre scale offset clip origin sha256"
+    layers, squash, centre, scale, offset, clip, origin, sha256 = value.keys(names)
     weights, biases = _layers(layers, n, m)
     words = squash.choice("tanh", "identity"), centre.choice("output", "preactivation", "none")
     centre.must(words != ("identity", "preactivation"), "another where squash is not 'tanh'")
-    policy = Policy(weights, biases, scale.array(m), offset.array(m), *words, _clip(clip, m))
+    policy = Policy(weights, biases, scale.array(m), offset.array(m), *words, _clip(clip, m), origin.array(n))
     scale.must(bool(np.all(policy.scale != 0)), "nonzero")
+    origin.must(not policy.is_moved or (practical and policy.centre == "none"), "0 under this claim and centring")
     check_hash(policy, sha256.raw)
     return policy
 

@@ -60,10 +60,11 @@ class Folded:
 
 
 def fold(policy: Policy, u_eq: tuple[Fraction, ...]) -> Folded:
-    """Fold the centring into the last bias or the offset; rule `centring` has to hold."""
+    """Fold the origin into the first bias, the centring into the last or the offset; rule `centring` has to hold."""
     zeros, ones = np.zeros_like(policy.offset), np.ones_like(policy.offset)
     pairs = zip(policy.weights, policy.biases, strict=True)
-    layers = tuple(Layer(W, b, np.zeros_like(b), spectral_norm(W)) for W, b in pairs)
+    first, *others = (Layer(W, b, np.zeros_like(b), spectral_norm(W)) for W, b in pairs)
+    layers = (_moved(first, policy.origin) if policy.is_moved else first, *others)
     plain = Folded(layers, policy.squash == "tanh", policy.scale, policy.offset, zeros, policy.clip)
     if policy.centre == "none":
         return plain
@@ -78,6 +79,13 @@ def fold(policy: Policy, u_eq: tuple[Fraction, ...]) -> Folded:
     shift = policy.scale * h
     wrong = up(np.abs(policy.scale) * error + centre_error + EPS * (np.abs(shift) + np.abs(centre)))
     return replace(plain, offset=centre - shift, offset_error=wrong)
+
+
+def _moved(layer: Layer, origin: Array) -> Layer:
+    """`W (origin + x) + b` as a layer that reads x."""
+    b = layer.b + layer.W @ origin
+    wrong = up(gamma(len(origin)) * (layer.rows[:, 0] * norm(origin, 0)) + EPS * np.abs(b))
+    return replace(layer, b=b, b_error=wrong)
 
 
 def reaches(policy: Policy, u_eq: tuple[Fraction, ...]) -> list[Fraction]:

@@ -229,6 +229,10 @@ def _neurons(loop: ClosedLoop, prefix: str, inputs: list[Tree]) -> list[tuple[st
     """tanh of each layer but the last, at the states `inputs`; none of them means the origin."""
     network = loop.network
     result: list[tuple[str, Tree]] = []
+    if inputs and network.is_moved:
+        moved = [["+", exact(float(at)), x] if at else x for x, at in zip(inputs, network.origin, strict=True)]
+        result += [(f"{prefix}.0.{i}", tree) for i, tree in enumerate(moved)]
+        inputs = [name for name, _ in result]
     for k, (W, b) in enumerate(zip(network.weights, network.biases, strict=True), start=1):
         trees = [combination(row if inputs else [], inputs, float(c)) for row, c in zip(W, b, strict=True)]
         inputs = [f"{prefix}.{k}.{i}" for i in range(len(b))]

@@ -56,6 +56,13 @@ def roa(
             "the origin exactly, the last if not."
         ),
     ] = "auto",
+    around: Annotated[
+        str,
+        typer.Option(
+            help="Where V is 0 if the loop does not rest at the origin: origin, rest (the point at which it does), or "
+            "auto: the point of rest, if it is stable."
+        ),
+    ] = "auto",
     candidate: Annotated[
         str,
         typer.Option(
@@ -152,6 +159,7 @@ def roa(
         P = ellipsoid_beside(beyond, plant)
     options = RoaOptions(
         claim=claim,  # type: ignore[arg-type]
+        around=around,  # type: ignore[arg-type]
         candidate=candidate,  # type: ignore[arg-type]
         Q=numbers(q, "--Q"),
         R=numbers(r, "--R"),

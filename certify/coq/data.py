@@ -27,7 +27,7 @@ from certify.policies import TanhNetwork
 
 Array = NDArray[np.float64]
 Interval = tuple[Fraction, Fraction]
-SCHEMA = "certify-certificate/7"
+SCHEMA = "certify-certificate/8"
 _MOST = 64  # states, inputs, layers
 _MOST_ROWS = 2**14  # of a layer
 _LONGEST = 10  # characters of an integer
@@ -35,7 +35,7 @@ _KEYS = {
     "certificate": ("schema", "claim", "plant", "policy", "lyapunov", "levels", "evidence", "provenance"),
     "claim": ("kind", "rate", "sample", "outer"),
     "plant": ("name", "time", "states", "inputs", "uncertain", "dynamics", "u_eq", "domain", "input_bounds"),
-    "policy": ("layers", "squash", "centre", "scale", "offset", "clip", "sha256"),
+    "policy": ("layers", "squash", "centre", "scale", "offset", "clip", "origin", "sha256"),
     "lyapunov": ("kind", "P"),
     "levels": ("local", "roa"),
 }
@@ -122,6 +122,8 @@ def _claimed(data: Any, sha256: str) -> Claimed:
     if states.keys() & inputs.keys():
         raise CertificateFormatError(f"names must differ; found {sorted(states.keys() & inputs.keys())[0]} twice.")
     n, m = len(states), len(inputs)
+    if np.any(_array(policy["origin"], (n,), "origin") != 0):
+        raise InputError(f"the policy's layers must read x itself; found another origin. {_WHAT_IS}.")
     network = _network(policy, n, m)
     if policy["sha256"] != network.sha256():
         raise CertificateFormatError(f"the policy's sha256 must be {network.sha256()}; found {policy['sha256']!r}.")

@@ -44,6 +44,12 @@ class LayersEnclosure:
         self.weights = [tensor(w) for w in network.weights]
         self.magnitudes = [w.abs() for w in self.weights]
         self.biases = [tensor(b) for b in network.biases]
+        self.bias_errors = [torch.zeros_like(b) for b in self.biases]
+        if network.is_moved:
+            W, at = self.weights[0], tensor(network.origin)
+            self.biases[0] = self.biases[0] + W @ at
+            size = W.abs() @ at.abs() + self.biases[0].abs()
+            self.bias_errors[0] = (len(at) + 2) * EPS * size + TINY
         self.rows = [w.norm(dim=1) for w in self.weights]
         self.norms = [float(torch.linalg.matrix_norm(w, 2)) * min(w.shape) ** (1 / 128) for w in self.weights]
         self.squash = network.squash == "tanh"
@@ -51,10 +57,10 @@ class LayersEnclosure:
         shift, shift_error, offset, offset_error = (tensor(a) for a in centring)
         bias = self.biases[-1]
         self.biases[-1], self.offset = bias + shift, offset
-        self.bias_error = torch.where(shift == 0, 0.0, shift_error + EPS * (bias.abs() + shift.abs()))
+        made = torch.where(shift == 0, 0.0, shift_error + EPS * (bias.abs() + shift.abs()))
+        self.bias_errors[-1] = self.bias_errors[-1] + made
         self.offset_error = offset_error
-        none = [torch.zeros_like(b) for b in self.biases[:-1]]
-        rows = (self.weights, self.magnitudes, self.biases, [*none, self.bias_error], self.rows, self.norms)
+        rows = (self.weights, self.magnitudes, self.biases, self.bias_errors, self.rows, self.norms)
         self.layers = [Layer(*row) for row in zip(*rows, strict=True)]
         self.units, self.widest = sum(network.layers[1:]), max(network.layers)
         self.clip = None if network.clip is None else tuple(tensor(end)[:, None] for end in network.clip)
@@ -110,8 +116,7 @@ class LayersEnclosure:
             y[:, 0] += self.biases[k][:, None]
             rounding = (width + 2) * EPS * (n + 1) ** 0.5 * self.rows[k][:, None] * size.norm(dim=0)
             rounding = rounding + 8 * EPS * (y[:, 0].abs() + self.biases[k].abs()[:, None]) + TINY
-            if last:
-                rounding = rounding + self.bias_error[:, None]
+            rounding = rounding + self.bias_errors[k][:, None]
             through = (self.magnitudes[k] @ errors.reshape(width, -1)).reshape(-1, 2, batch)
             older = torch.minimum(through[:, 1], self.rows[k][:, None] * ball)
             error = (through[:, 0] + older) * (1 + width * EPS) + rounding

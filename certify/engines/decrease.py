@@ -83,9 +83,13 @@ def _corner(
     decay = -(whole + whole.T) - (h * A.T @ P @ A if h else 0.0) - (0.0 if R is None else J.T @ R @ J)
     charge = h * (gamma**2 + 2 * math.sqrt(max(float(f @ moved), 0.0)) * gamma)
     start = h * float(f @ moved)
+    error, slack = models.rounding, np.zeros_like(f)
     if models.spread is not None:
-        error, slack, roots = models.spread.error, models.spread.slack, np.sqrt(np.diag(P))
-        e, s, lengths, p = float(roots @ error), float(roots @ slack), np.linalg.norm(b, axis=1), h * np.abs(moved)
+        error, slack = error + models.spread.error, models.spread.slack
+    if np.any(error) or np.any(slack):
+        roots = np.sqrt(np.diag(P))
+        e, s, p = float(roots @ error), float(roots @ slack), h * np.abs(moved)
+        lengths = np.linalg.norm(b, axis=1)
         both = float(lengths @ error + p @ slack) + h * e * s
         charge += 2 * float(lengths @ slack) + h * s * s + 2 * h * gamma * (e + s) + both / _SHARE
         start += 2 * float(p @ error) + h * e * e + _SHARE * both

@@ -29,6 +29,10 @@ from certify.policies import bounded_by_form
 Array = NDArray[np.float64]
 _MOST_NUMBERS, _MOST_PRODUCTS = 2**25, 2**33  # of the sums over paths: the checker refuses more
 _MARGIN = 1e-3  # of an input's range, left to the checker's rounding where a clip begins
+_UNIT, _ROUNDED = (
+    2.0**-52,
+    2.0**-50,
+)  # of a sum, for each of its terms; of whatever else is computed, as a checker has it
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +69,7 @@ class Models:
 
     Those are N numbers |e_q| <= d'R_q d, R (N, k, k), which enter F as `shares` (n, N) times e; `squares` are R_q'R_q.
     `spread` says what is uncertain of f and A, None that nothing is; `stays` whether the states are certain to stay in
-    the domain over a sampling period.
+    the domain over a sampling period; `rounding` (n,) is about what a checker does not know of f for its roundings.
     """
 
     f: Array
@@ -77,6 +81,7 @@ class Models:
     R: Array
     squares: Array
     inputs: Inputs
+    rounding: Array
     spread: Spread | None = None
     stays: bool = True
 
@@ -143,6 +148,7 @@ class Driven:
     squares: Array
     curve: Array
     room: Array
+    rounding: Array
 
     def models(
         self, F: Sequence[Jet | RangedJet], number: int, spread: Spread | None = None, stays: bool = True
@@ -153,7 +159,8 @@ class Driven:
         inputs = Inputs(self.G, form.matrices(self.Q), form.forms(self.K), self.curve, self.room, B)
         parts = form.matrices(Q), form.forms(K), form.matrices(E)
         f = np.array([v.c for v in F])
-        return Models(f, a, *parts, B @ self.shares, self.R, self.squares, inputs, spread, stays)
+        wrong = np.abs(B) @ self.rounding
+        return Models(f, a, *parts, B @ self.shares, self.R, self.squares, inputs, wrong, spread, stays)
 
 
 def of_all(driven: Sequence[Driven]) -> tuple[list[tuple[Array, Array, Array]], Array]:
@@ -167,12 +174,14 @@ def of_all(driven: Sequence[Driven]) -> tuple[list[tuple[Array, Array, Array]], 
 class Paths:
     """The closed loop at a state `middle`, (n,): all of its models that does not depend on the ball around it.
 
-    `u` are the inputs there, before a clip; `squashed` says whether a tanh comes after the last layer.
+    `u` are the inputs there, before a clip, and `rounding` (m,) is about what a checker does not know of them for its
+    roundings; `squashed` says whether a tanh comes after the last layer.
     """
 
     loop: ClosedLoop
     middle: Array
     u: Array
+    rounding: Array
     layers: tuple[_Layer, ...]
     squashed: bool
 
@@ -199,7 +208,7 @@ class Paths:
         G, Q, K, each = scale * policy.G, scale * policy.Q, scale * policy.K, scale * policy.shares
         errors, R = np.abs(each) @ policy.R, form.matrices(policy.R)
         curve = sizes(G, Q, K, errors).curve
-        return Driven(G, Q, K, errors, each, R, R @ R, curve, _room(loop, self.u))
+        return Driven(G, Q, K, errors, each, R, R @ R, curve, _room(loop, self.u), self.rounding)
 
     def _policy(self, J: Array) -> _Policy:
         n, k = J.shape
@@ -240,19 +249,27 @@ def paths(loop: ClosedLoop, at: Array | None = None, resting: bool = True) -> Pa
         if columns * (len(W) + numbers) > _MOST_NUMBERS or products > _MOST_PRODUCTS:
             raise InputError("The network is too large for the local proof: use fewer or narrower layers.")
     folded, middle = loop.folded, np.zeros(n) if at is None else at
-    h, X = middle, np.eye(n)
+    h, X, wrong = middle, np.eye(n), np.zeros(n)
     layers = []
     for number, (W, b) in enumerate(zip(folded.weights, folded.biases, strict=True)):
         y, X = W @ h + b, W @ X
+        terms = _UNIT * (W.shape[1] + 2) * np.linalg.norm(W, axis=1) * np.linalg.norm(h)
+        wrong = np.abs(W) @ wrong + terms + _ROUNDED * (np.abs(y) + np.abs(b))
         if number:
             X = np.concatenate([X, W], axis=1)
         layers.append(_Layer(y, X, W))
         h = np.tanh(y)
         X = layers[-1].slope[:, None] * X
+        if squashed or number < len(folded.weights) - 1:
+            wrong = wrong + _ROUNDED * np.abs(h)
     u = np.array([float(q) for q in loop.u_eq])
+    wrong = np.abs(folded.scale) * wrong
     if at is not None or (not resting and network.centre == "none"):
         u = folded.scale * (h if squashed else y) + folded.offset
-    return Paths(loop, middle, u, tuple(layers), squashed)
+    else:
+        wrong = np.zeros_like(u)
+    rounding = np.zeros_like(u) if resting else wrong + _ROUNDED * (np.abs(u) + np.abs(folded.offset))
+    return Paths(loop, middle, u, rounding, tuple(layers), squashed)
 
 
 def _room(loop: ClosedLoop, u: Array) -> Array:

@@ -29,11 +29,11 @@ def bounded_by_form(network: TanhNetwork, bounds: Sequence[tuple[Fraction, Fract
 
 
 def raw_at_origin(network: TanhNetwork) -> tuple[Fraction | None, ...]:
-    """raw(0) as rationals, (m,); None where a tanh stands at another point than exact 0.
+    """raw(0) as rationals, (m,), x = 0 being the network's origin; None where a tanh stands at another point than 0.
 
     A weight of exact 0 removes a value that is not known.
     """
-    h: list[Fraction | None] = [Fraction(0)] * network.n
+    h: list[Fraction | None] = [Fraction(float(v)) for v in network.origin]
     last = len(network.weights) - 1
     for k, (W, b) in enumerate(zip(network.weights, network.biases, strict=True)):
         y = [_affine(row, h, float(c)) for row, c in zip(W, b, strict=True)]

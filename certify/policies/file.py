@@ -101,6 +101,8 @@ def save_policy(path: str | Path, policy: Policy) -> None:
     import torch
 
     network, depth = policy.network, len(policy.network.weights)
+    if network.is_moved:
+        raise InputError("a policy must be written as its layers read it; found one that is looked at from elsewhere.")
     arrays = (*network.weights, *network.biases, network.scale, network.offset, *(network.clip or ()))
     numbers = tensors(arrays)
     scale, offset, *clip = numbers[2 * depth :]

@@ -11,12 +11,15 @@
 So `pi(x) = scale * squash(net(x) + shift) + offset'` with numbers shift and offset', which `centring` gives in any
 arithmetic: floats, Arb balls and the terms of formulas put their own numbers into the same lines. With a `clip` (lo,
 hi) the policy is `min(max(., lo), hi)` of that: the last step, behind the centring, which it must leave as it is at 0.
+
+A policy that nobody centred may be looked at from where its loop rests: with an `origin` the layers read
+`origin + x`, exactly, x being the deviation from there. The network's numbers, and so its hash, stay what they are.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from typing import Any, Literal, get_args
 
@@ -44,6 +47,7 @@ class TanhNetwork:
     squash, centre : see the module's docstring.
     scale, offset : arrays of shape (m,), in the input's units; scale is nonzero.
     clip : (lo, hi), arrays of shape (m,) in the input's units with lo < hi, between which each input is kept; or None.
+    origin : where x = 0 lies among the states that the layers read, shape (n,); empty for 0.
 
     Raises
     ------
@@ -57,6 +61,7 @@ class TanhNetwork:
     squash: Squash = "tanh"
     centre: Centre = "preactivation"
     clip: tuple[Array, Array] | None = None
+    origin: Array = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         weights, biases = frozen_layers(self.weights, self.biases, _WHOSE)
@@ -78,6 +83,15 @@ class TanhNetwork:
             raise InputError("`scale` must be nonzero.")
         if self.clip is not None:
             object.__setattr__(self, "clip", _limits(self.clip, self.m))
+        origin = self.origin if np.size(self.origin) else np.zeros(self.n)
+        object.__setattr__(self, "origin", frozen(origin, "origin", _WHOSE))
+        if self.origin.shape != (self.n,):
+            raise InputError(f"`origin` must have shape ({self.n},); found {self.origin.shape}.")
+
+    @property
+    def is_moved(self) -> bool:
+        """Whether x = 0 is another state than 0 for the layers."""
+        return bool(np.any(self.origin != 0))
 
     @property
     def n(self) -> int:
@@ -118,7 +132,7 @@ class TanhNetwork:
 
     def net(self, x: Any) -> Any:
         """`net(x)`, last axis n to m, in the arithmetic of x (numpy array or torch tensor)."""
-        return through(self.weights, self.biases, x)
+        return through(self.weights, self.biases, x + like(self.origin, x) if self.is_moved else x)
 
     def __call__(self, x: Any, u_eq: Sequence[Fraction]) -> Any:
         """pi(x) in float64, shape (..., n) to (..., m); for simulation and search, not for proofs."""
@@ -180,7 +194,10 @@ class TanhNetwork:
         return shift, offset
 
     def folded(self, u_eq: Sequence[Fraction]) -> TanhNetwork:
-        """A network without centring that is pi up to rounding: for search and simulation."""
+        """A network without centring that reads x and is pi up to rounding: for search and simulation."""
+        if self.is_moved:
+            first = self.biases[0] + self.weights[0] @ self.origin
+            return replace(self, biases=(first, *self.biases[1:]), origin=np.zeros(self.n)).folded(u_eq)
         if self.centre == "none":
             return self
         shift, offset = self.centring(u_eq, self.net(np.zeros(self.n)).tolist(), _ARRAYS)
@@ -198,7 +215,7 @@ class TanhNetwork:
         ------
         InputError : the clip may act at the origin.
         """
-        x = np.zeros(self.n)
+        x = self.origin
         jacobian = np.eye(self.n)
         for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
             if k:
@@ -213,7 +230,8 @@ class TanhNetwork:
     def sha256(self) -> str:
         """Hash of the canonical bytes: squash, centre, then the arrays as `sha256_of` has them.
 
-        They are the layers in order as weight, bias; scale; offset; with a clip lo and hi.
+        They are the layers in order as weight, bias; scale; offset; with a clip lo and hi. From where a policy is
+        looked at, its origin, is no part of it.
         """
         pairs = [a for pair in zip(self.weights, self.biases, strict=True) for a in pair]
         head = f"certify-policy/1\0{self.squash}\0{self.centre}\0".encode()

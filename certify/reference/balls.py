@@ -192,9 +192,14 @@ def tanhs(column: arb_mat) -> arb_mat:
     return arb_mat(column.nrows(), 1, [v.tanh() for v in column.entries()])
 
 
+def origin(c: Certificate) -> arb_mat:
+    """What the layers read at x = 0, a column."""
+    return arb_mat(c.n, 1, [arb(v) for v in c.policy.origin])
+
+
 def net_at_0(c: Certificate, matrices: Sequence[arb_mat]) -> list[arb]:
-    """net(0), given the weights."""
-    h = arb_mat(c.n, 1)
+    """What the network has at x = 0, given the weights."""
+    h = origin(c)
     for k, (W, layer) in enumerate(zip(matrices, c.policy.layers, strict=True)):
         h = biased(W, layer, tanhs(h) if k else h)
     return list(h.entries())

@@ -21,7 +21,7 @@ from .refusal import Refused, require
 MAX_BYTES, MAX_BYTES_BEYOND_ASCII = 256 * 2**20, 16 * 2**20
 MAX_TOKENS = 10**6  # commas and opening brackets
 MAX_NAMES = 64
-SCHEMA, CLAIMS = "certify-certificate/7", ("asymptotic", *WITH_FLOOR, *WITH_TUBE)
+SCHEMA, CLAIMS = "certify-certificate/8", ("asymptotic", *WITH_FLOOR, *WITH_TUBE)
 IDENTIFIER = re.compile(r"[A-Za-z_][A-Za-z0-9_]{0,63}")
 
 Interval = tuple[fmpq, fmpq]
@@ -54,6 +54,7 @@ class Policy:
     scale: array[float]
     offset: array[float]
     clip: tuple[array[float], array[float]] | None
+    origin: array[float]  # the layers read origin + x
     sha256: str
 
     def limits(self, j: int) -> tuple[fmpq, fmpq] | None:
@@ -158,6 +159,8 @@ def read(raw: bytes) -> Certificate:
     plainly = beyond is None or simple
     require(plainly, "format", "claim.outer", "null was expected with a tube, a rate, a sample and in discrete time")
     policy = read_policy(data["policy"], n, len(plant.inputs))
+    still = all(v == 0 for v in policy.origin) or (claim in WITH_FLOOR and policy.centre == "none")
+    require(still, "format", "policy.origin", "must be 0 where the origin is an equilibrium, or by centring u_eq")
     lyapunov = keys(data["lyapunov"], "lyapunov", "kind", "P")
     require(lyapunov["kind"] == "quadratic", "format", "lyapunov.kind", "'quadratic' was expected")
     P = square(lyapunov["P"], "lyapunov.P", n)
@@ -277,7 +280,7 @@ def interval(value: Any, at: str) -> Interval:
 
 def read_policy(value: Any, n: int, m: int) -> Policy:
     """The hash is taken over the very bytes that were decoded."""
-    policy = keys(value, "policy", "layers", "squash", "centre", "scale", "offset", "clip", "sha256")
+    policy = keys(value, "policy", "layers", "squash", "centre", "scale", "offset", "clip", "origin", "sha256")
     squash, centre = policy["squash"], policy["centre"]
     require(squash in ("tanh", "identity"), "format", "policy.squash", "'tanh' or 'identity' was expected")
     require(centre in ("output", "preactivation", "none"), "format", "policy.centre", "an unknown centring")
@@ -294,7 +297,8 @@ def read_policy(value: Any, n: int, m: int) -> Policy:
         digest.update(struct.pack("<2Q", 1, m) + little_endian(values))
     sha256 = digest.hexdigest()
     require(policy["sha256"] == sha256, "hash", "policy.sha256", f"the policy's hash is {sha256}")
-    return Policy(layers, squash, centre, scale, offset, clip, sha256)
+    origin = numbers(policy["origin"], "policy.origin", n)
+    return Policy(layers, squash, centre, scale, offset, clip, origin, sha256)
 
 
 def read_clip(value: Any, m: int) -> tuple[array[float], array[float]] | None:

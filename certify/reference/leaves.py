@@ -17,6 +17,7 @@ from .balls import (
     beta,
     bounded_by_form,
     net_at_0,
+    origin,
     total,
     within_bounds,
 )
@@ -170,8 +171,10 @@ class Leaves:
         ]
 
     def policy(self, x: arb_mat, count: int) -> list[list[Affine]]:
-        """For each input and each leaf, given x on the leaves."""
-        return [[self.output(j, net) for net in nets] for j, nets in enumerate(self.network.outputs(x, count))]
+        """For each input and each leaf, given x on the leaves; the layers read x from their origin."""
+        at, further = origin(self.c).entries(), [ZERO] * self.n
+        read = x + arb_mat(self.n, x.ncols(), [v for row in at for v in (row, *further) * count])
+        return [[self.output(j, net) for net in nets] for j, nets in enumerate(self.network.outputs(read, count))]
 
     def output(self, j: int, net: Affine) -> Affine:
         """Input j from its net output."""

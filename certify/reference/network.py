@@ -15,7 +15,7 @@ from functools import cached_property
 
 from flint import arb, arb_mat, fmpq_mat
 
-from .balls import ONE, ZERO, absolute, beta, biased, columns_scaled, finite, net_at_0, tanhs, weights
+from .balls import ONE, ZERO, absolute, beta, biased, columns_scaled, finite, net_at_0, origin, tanhs, weights
 from .document import Certificate
 from .model import Model
 from .symmetric import half, no_form, whole
@@ -111,7 +111,7 @@ class Network:
 
     def unfolded(self, centre: arb_mat) -> list[Unfolded]:
         """The layers at a centre, a column."""
-        layers, at_0, G, L = list[Unfolded](), centre, arb_mat(self.c.n, self.c.n), arb_mat(0, 0)
+        layers, at_0, G, L = list[Unfolded](), origin(self.c) + centre, arb_mat(self.c.n, self.c.n), arb_mat(0, 0)
         for k, (W, layer) in enumerate(zip(self.weights, self.c.policy.layers, strict=True)):
             if k:
                 at_0 = tanhs(at_0)

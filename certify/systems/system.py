@@ -222,6 +222,26 @@ class System:
         domain = tuple((lo + shift, hi + shift) for (lo, hi), shift in zip(self.domain, shifts, strict=True))
         return replace(self, parameters=parameters, domain=domain)
 
+    def seen_from(self, origin: Sequence[Fraction], u: Sequence[Fraction]) -> System:
+        """The same plant in deviations from another point, `origin` (n,) in today's deviations, with u_eq = u, (m,),
+        the inputs there: the operating point and the box keep their places.
+
+        Raises
+        ------
+        InputError : the point does not lie in the interior of the domain.
+        """
+        by = [sympy.Rational(q.numerator, q.denominator) for q in origin]
+        dynamics = in_deviations(self.dynamics, self.states, by)
+        if self.time == "discrete":
+            dynamics = tuple(e - q for e, q in zip(dynamics, by, strict=True))
+        return replace(
+            self,
+            dynamics=dynamics,
+            u_eq=tuple(sympy.Rational(q.numerator, q.denominator) for q in u),
+            x_eq=tuple(e + q for e, q in zip(self.x_eq, by, strict=True)),
+            domain=tuple((lo - q, hi - q) for (lo, hi), q in zip(self.domain, origin, strict=True)),
+        )
+
     def with_domain(self, bounds: Mapping[str, Interval]) -> System:
         """The same plant on another box; unknown state names are refused."""
         names = [s.name for s in self.states]

@@ -23,7 +23,7 @@ def pendulum(level: float = 0.999999) -> Document:
     """The pendulum under the policy that ships, with the largest set that is proved of it."""
     network = load_policy(ROOT / "examples" / "policies" / "pendulum.pt").network
     return {
-        "schema": "certify-certificate/7",
+        "schema": "certify-certificate/8",
         "claim": {"kind": "asymptotic", "rate": (0.0).hex(), "sample": None, "outer": None},
         **loop_sections(get_system("pendulum"), network),
         "lyapunov": {"kind": "quadratic", "P": PENDULUM_P},

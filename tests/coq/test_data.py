@@ -303,7 +303,7 @@ def test_a_matrix_that_is_not_symmetric_is_refused() -> None:
         (b'{"schema": 1, "schema": 2}', "each key once"),
         (b'{"schema": 1.5}', "must not be decimal"),
         (b'{"schema": NaN}', "must not be decimal"),
-        (b'{"schema": "certify-certificate/7"}', "must be as FORMAT.md has it"),
+        (b'{"schema": "certify-certificate/8"}', "must be as FORMAT.md has it"),
     ],
 )
 def test_bytes_that_are_no_certificate_are_refused(given: bytes, message: str) -> None:

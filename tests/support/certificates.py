@@ -104,7 +104,7 @@ def make(
     from tests.support.balls import with_ball
 
     return with_ball(rehash({
-        "schema": "certify-certificate/7",
+        "schema": "certify-certificate/8",
         "claim": {"kind": claim, "rate": float(rate).hex(), "sample": sample and list(sample), "outer": None},
         "plant": {
             "name": "plant",

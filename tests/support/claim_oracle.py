@@ -176,7 +176,7 @@ def _expression(node: Any, names: set[str]) -> None:
 def _shape(data: Any) -> None:
     """Every section, key, count and number."""
     _section(data, "schema", "claim", "plant", "policy", "lyapunov", "levels", "evidence", "provenance")
-    _need(data["schema"] == "certify-certificate/7", "schema")
+    _need(data["schema"] == "certify-certificate/8", "schema")
     _need(isinstance(data["provenance"], dict), "provenance")
     plant, policy, evidence = data["plant"], data["policy"], data["evidence"]
     _section(plant, "name", "time", "states", "inputs", "uncertain", "dynamics", "u_eq", "domain", "input_bounds")
