@@ -102,6 +102,8 @@ class ProvedSet:
     claim : the claim's kind.
     ellipsoids, outer : which together are the set; `outer` is None where the claim has no outer set.
     policy_sha256, certificate_sha256 : of the policy that it is about, and of the file.
+    origin : where x = 0 lies among the states that the policy's layers read, (n,); empty for 0. The plant is in
+        deviations from there, and so are the states that are asked about.
     """
 
     system: System
@@ -110,6 +112,23 @@ class ProvedSet:
     policy_sha256: str
     certificate_sha256: str
     outer: Sublevel | None = None
+    origin: tuple[float, ...] = ()
+
+    def seen_from_there(self, system: System) -> System:
+        """A plant whose states the policy's layers read, in deviations from where x = 0 lies for this set.
+
+        Raises
+        ------
+        InputError : that does not lie in the interior of the plant's domain.
+        """
+        if not any(self.origin):
+            return system
+        return system.seen_from([Fraction(v) for v in self.origin], self.system.exact_u_eq())
+
+    def deviations(self, states: Iterable[Sequence[Fraction | float]]) -> list[list[Fraction]]:
+        """States that the policy's layers read, as deviations from where x = 0 lies for this set."""
+        at = [Fraction(v) for v in self.origin] or [Fraction(0)] * self.system.n
+        return [[Fraction(v) - q for v, q in zip(x, at, strict=True)] for x in states]
 
     def holds(self, states: Iterable[Sequence[Fraction | float]]) -> list[bool]:
         """Whether each of the states, as deviations from x_eq, lies in the set; a float means its binary value.
@@ -222,6 +241,7 @@ def set_of(raw: bytes, name: str) -> ProvedSet:
         policy_sha256=read.network.sha256(),
         certificate_sha256=hashlib.sha256(raw).hexdigest(),
         outer=_outer(read),
+        origin=tuple(read.network.origin.tolist()) if read.network.is_moved else (),
     )
 
 

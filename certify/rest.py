@@ -15,7 +15,6 @@ from fractions import Fraction
 
 import flint
 import numpy as np
-import scipy.integrate
 from numpy.typing import NDArray
 
 from certify.closed_loop import ClosedLoop
@@ -115,11 +114,18 @@ def _origin(loop: ClosedLoop) -> Array:
 
 def _end(loop: ClosedLoop) -> Array | None:
     """Where the trajectory from the origin is after a while, however stiff the loop; None if it leaves the domain."""
-    F = _rates(loop)
-    solved = scipy.integrate.solve_ivp(lambda _, x: F(x), (0.0, _WHILE), _origin(loop), method="LSODA", rtol=1e-6)
-    x = np.asarray(solved.y[:, -1])
-    inside = all(lo < Fraction(float(v)) < hi for v, (lo, hi) in zip(x, loop.system.domain, strict=True))
-    return x if solved.success and np.all(np.isfinite(x)) and inside else None
+    import scipy.integrate
+
+    F, (lo, hi) = _rates(loop), np.array([[float(a), float(b)] for a, b in loop.system.domain]).T
+
+    def inside(_: float, x: Array) -> float:
+        return float(np.min(np.minimum(x - lo, hi - x)))
+
+    inside.terminal = True  # type: ignore[attr-defined]
+    span, start = (0.0, _WHILE), _origin(loop)
+    solved = scipy.integrate.solve_ivp(lambda _, x: F(x), span, start, method="LSODA", rtol=1e-6, events=inside)
+    x = np.asarray(solved.y[:, -1], dtype=np.float64)
+    return x if solved.status == 0 and np.all(np.isfinite(x)) else None
 
 
 def _newton(loop: ClosedLoop, x: Array) -> Array | None:

@@ -215,7 +215,7 @@ def count_covered(proved: ProvedSet, network: TanhNetwork, system: System, x0: A
     InputError : as `require_same_loop`.
     """
     require_same_loop(proved, network, system)
-    inside = sum(proved.holds(x0.tolist()))
+    inside = sum(proved.holds(proved.deviations(x0.tolist())))
     return Covered(inside, len(x0), proved.claim, proved.certificate_sha256)
 
 
@@ -240,9 +240,10 @@ def require_same_loop(proved: ProvedSet, network: TanhNetwork, system: System) -
                 f"the certificate must hold for all that is uncertain of {system.name}, `{name}` in [{float(lo):g}, "
                 f"{float(hi):g}]; it is about {said}. Certify the policy on this plant."
             )
-    equal = _dynamics(theirs, system.ranges) == _dynamics(system, system.ranges)
     alike = (theirs.states, theirs.inputs, theirs.time) == (system.states, system.inputs, system.time)
-    if not alike or not equal or theirs.exact_u_eq() != system.exact_u_eq():
+    mine = proved.seen_from_there(system) if alike else system
+    equal = _dynamics(theirs, system.ranges) == _dynamics(mine, system.ranges)
+    if not alike or not equal or theirs.exact_u_eq() != mine.exact_u_eq():
         raise InputError(
             f"the certificate must be about the plant that is simulated, {system.name} with these parameters; it is "
             f"about {theirs.name} with other equations. Certify the policy on this plant."
@@ -258,8 +259,9 @@ def require_same_question(proved: ProvedSet, network: TanhNetwork, system: Syste
         were others.
     """
     require_same_loop(proved, network, system)
+    seen = proved.seen_from_there(system)
     for name in ("domain", "input_bounds", "ranges", "sample"):
-        theirs, mine = getattr(proved.system, name), getattr(system, name)
+        theirs, mine = getattr(proved.system, name), getattr(seen, name)
         if theirs != mine:
             raise InputError(
                 f"the certificate must be about {system.name} as it is; its `{name}` was another one. Certify the "

@@ -4,22 +4,31 @@ from __future__ import annotations
 
 import json
 import shlex
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
+from typing import Any, Literal
 
+import flint
 import mpmath
 import numpy as np
 import pytest
 import sympy
 
+from certify.certificate import Certificate, PartitionTree, read_certificate, run_checker
+from certify.claims import Asymptotic, Practical
 from certify.cli import _run
 from certify.closed_loop import ClosedLoop
+from certify.containment import proved_set
 from certify.errors import InputError
-from certify.policies import TanhNetwork, load_policy
-from certify.rest import find_rest
+from certify.lyapunov.function import Quadratic
+from certify.policies import Policy, TanhNetwork, load_policy, save_policy
+from certify.rest import Rest, find_rest, seen_from
+from certify.rigorous import field_on, precision
 from certify.roa import RoaOptions, certify_roa
 from certify.systems import System, get_system
 from certify.verdict import Verdict
+from controllers.evaluate import count_covered, require_same_loop, require_same_question
 from tests.support.loops import box
 
 PLAIN = Path(__file__).parent.parent / "examples" / "policies" / "without_gain" / "pendulum.pt"
@@ -75,7 +84,8 @@ def test_what_is_not_shown_is_not_said(f: sympy.Expr) -> None:
 def test_practical_stability_is_claimed_where_the_policy_is_not_centred(tmp_path: Path) -> None:
     policy = load_policy(PLAIN)
     system = get_system("pendulum").with_parameters(policy.parameters)
-    result = certify_roa(system, policy.network, tmp_path, RoaOptions(candidate="lqr"))
+    options = RoaOptions(candidate="lqr", around="origin")
+    result = certify_roa(system, policy.network, tmp_path, options)
     assert result.verdict is Verdict.PROVED and result.claim == "nearby"
     assert result.notice is not None and "not centred" in result.notice
     data = result.to_dict()
@@ -113,3 +123,130 @@ def test_a_loop_that_rests_at_the_origin_gets_the_stronger_claim(tmp_path: Path)
     result = certify_roa(loop.system, loop.network, tmp_path, RoaOptions(candidate="lyapunov"))
     assert result.claim == "asymptotic" and result.rest is None and result.notice is None
     assert loop.system.domain == ((Fraction(-3), Fraction(3)),)
+
+
+# ------------------------------------------------------------------------------------------ seen from where it rests
+
+
+def bent(centre: Literal["none", "output"] = "none", **changes: Any) -> ClosedLoop:
+    """Two states with an operating point, an uncertain parameter, a disturbance and a product of state and input."""
+    a, b, c, d, v = sympy.symbols("a b c d v")
+    f = (b + c * sympy.sin(a) / 8, -2 * b - sympy.sin(a) + v * (1 + a / 4) + d)
+    system = System(
+        "bent", (a, b), (v,), {"c": Fraction(1)}, f, (sympy.Integer(0),), box(2, 3), box(9),
+        x_eq=(sympy.Rational(1, 3), sympy.Integer(0)), disturbances=(d,), **changes,
+    )  # fmt: skip
+    generator = np.random.default_rng(5)
+    layers = (generator.standard_normal((5, 2)), np.array([[0.3, -0.2, 0.1, 0.4, -0.5]]))
+    network = TanhNetwork(layers, (generator.uniform(-1, 1, 5), np.array([0.25])), np.ones(1), np.zeros(1), "identity",
+                          centre)  # fmt: skip
+    return ClosedLoop(system, network)
+
+
+@pytest.mark.parametrize("time", ["continuous", "discrete"])
+def test_seen_from_elsewhere_it_is_the_same_loop(time: Literal["continuous", "discrete"]) -> None:
+    """F_moved(x) = F(origin + x), or less the origin in discrete time, at fifty digits; places keep their values."""
+    ranges = {"c": (Fraction(1, 2), Fraction(2)), "d": (Fraction(-1, 9), Fraction(1, 9))}
+    loop = bent(time=time, ranges=ranges)
+    moved = seen_from(loop, Rest(("0.3125", "-0.75"), ("0.5",), (), True))
+    assert moved.network.origin.tolist() == [0.3125, -0.75] and moved.u_eq == (Fraction(1, 2),)
+    assert moved.system.domain_of_values() == loop.system.domain_of_values()
+    assert moved.system.exact_x_eq() == (Fraction(1, 3) + Fraction(5, 16), Fraction(-3, 4))
+    assert moved.system.ranges == loop.system.ranges and moved.network.sha256() == loop.network.sha256()
+    generator = np.random.default_rng(1)
+    for _ in range(20):
+        at = generator.uniform(-1, 1, 2)
+        x = [Fraction(float(v)) for v in at]
+        there = [v + Fraction(float(o)) for v, o in zip(x, moved.network.origin, strict=True)]
+        with precision(200):
+            here, _ = field_on(moved, [flint.arb(flint.fmpq(v.numerator, v.denominator)) for v in x])
+            before, _ = field_on(loop, [flint.arb(flint.fmpq(v.numerator, v.denominator)) for v in there])
+            shift = [0.0, 0.0] if time == "continuous" else moved.network.origin.tolist()
+            for v, w, o in zip(here, before, shift, strict=True):
+                assert v.overlaps(w - flint.arb(o)) and v.rad() < 1e-50
+        assert np.allclose(moved.policy(at), loop.policy(at + moved.network.origin), rtol=0, atol=1e-14)
+
+
+def test_a_point_of_rest_that_newton_misses_is_found_along_a_trajectory() -> None:
+    """On the way from 0 to the point of rest at 1 the rate rises before it falls, and Newton's steps lead away."""
+    flat = sympy.atan(200 * (1 - x)) + sympy.exp(-40 * x**2) * 3 * x + 0 * u
+    found = find_rest(scalar(flat, 0.0, 0.0))
+    assert found is not None and abs(float(found.x[0]) - 1) < 1e-12 and found.stable
+
+
+@pytest.mark.parametrize("around", ["auto", "rest"])
+def test_the_set_lies_around_where_the_loop_rests(tmp_path: Path, around: Literal["auto", "rest"]) -> None:
+    policy = load_policy(PLAIN)
+    system = get_system("pendulum").with_parameters(policy.parameters)
+    result = certify_roa(system, policy.network, tmp_path, RoaOptions(candidate="lqr", around=around))
+    assert result.verdict is Verdict.PROVED and result.claim == "nearby" and result.certificate is not None
+    assert run_checker(result.certificate, "reference")["result"] == "ACCEPTED"
+    assert result.rest is not None and result.levels.floor is not None and result.P is not None
+    at = np.array([float(v) for v in result.rest.x])
+    values = np.array([float(q) for q in result.system.exact_x_eq()])
+    assert np.abs(values - at).max() < 1e-11 and at[0] < -0.08
+    assert result.system.domain_of_values() == system.domain_of_values()
+    assert result.levels.floor < 1e-9 * result.P[0, 0] * at[0] ** 2  # the small set leaves the origin out
+    assert result.contains(at) and not result.contains([3.1, 19.0])
+    read = read_certificate(result.certificate)
+    assert read.network.origin.tolist() == values.tolist() and read.network.sha256() == policy.network.sha256()
+    f = read.system.function()
+    assert np.abs(f(np.zeros(2), ClosedLoop(read.system, read.network).policy(np.zeros((1, 2)))[0])).max() < 1e-9
+
+
+def test_what_is_given_in_deviations_from_the_origin_stays_there(tmp_path: Path) -> None:
+    policy = load_policy(PLAIN)
+    system = get_system("pendulum").with_parameters(policy.parameters)
+    for given in (RoaOptions(P=np.diag([30.0, 1.0])), RoaOptions(level=2.0)):
+        result = certify_roa(system, policy.network, tmp_path, replace(given, claim="practical"))
+        assert result.rest is not None and not any(result.system.exact_x_eq()) and not result.network.is_moved
+
+
+def test_without_a_stable_point_of_rest_it_is_not_asked_for(tmp_path: Path) -> None:
+    loop = scalar(x + u, 0.5, 0.25)
+    for options in (RoaOptions(around="rest"), RoaOptions(around="rest", claim="practical")):
+        with pytest.raises(InputError, match="stable point of rest"):
+            certify_roa(loop.system, loop.network, tmp_path, options)
+    with pytest.raises(InputError, match="`around` the rest needs another claim"):
+        RoaOptions(around="rest", claim="asymptotic")
+    loop = bent("output")
+    with pytest.raises(InputError, match="without centring"):
+        certify_roa(loop.system, loop.network, tmp_path, RoaOptions(around="rest", claim="practical"))
+
+
+def test_a_policy_seen_from_elsewhere_is_neither_saved_nor_called_centred(tmp_path: Path) -> None:
+    loop = bent()
+    network = replace(loop.network, origin=np.array([0.5, 0.0]))
+    with pytest.raises(InputError, match="as its layers read it"):
+        save_policy(tmp_path / "p.pt", Policy(network, "bent"))
+    for wrong, about in ((replace(network, centre="output"), Practical), (network, Asymptotic)):
+        levels = {"roa": 1.0, "local": 0.5} | ({"floor": 0.1} if about is Practical else {})
+        with pytest.raises(InputError, match="`origin` of a policy must be 0"):
+            Certificate(
+                loop.system, wrong, Quadratic(np.eye(2)), about(**levels), PartitionTree(np.eye(2), np.ones(2), b"\xff")
+            )
+    with pytest.raises(InputError, match=r"`origin` must have shape \(2,\)"):
+        replace(network, origin=np.zeros(3))
+
+
+def test_a_set_around_the_rest_is_told_from_one_around_another_point(tmp_path: Path) -> None:
+    """A policy's hash is the same from wherever it is looked at: what is compared is the loop in its own deviations."""
+    policy = load_policy(PLAIN)
+    system = get_system("pendulum").with_parameters(policy.parameters)
+    result = certify_roa(system, policy.network, tmp_path, RoaOptions(candidate="lqr"))
+    assert result.certificate is not None and result.rest is not None
+    proved = proved_set(result.certificate)
+    require_same_question(proved, policy.network, system)
+    rest = [float(v) for v in result.rest.x]
+    edge = float(
+        np.max(np.abs(np.linalg.inv(proved.ellipsoids[0].P).diagonal()[0] * proved.ellipsoids[0].level)) ** 0.5
+    )
+    states = np.array([rest, [rest[0] + 0.999 * edge, rest[1]], [rest[0] + 1.001 * edge, rest[1]]])
+    expected = [bool(v) for v in result.contains(states)]
+    assert proved.holds(proved.deviations(states.tolist())) == expected and expected[0] and not expected[-1]
+    assert count_covered(proved, policy.network, system, states).inside == sum(expected)
+    for other in (replace(proved, origin=()), replace(proved, origin=(0.0, 0.25)), replace(proved, origin=(9.0, 0.0))):
+        with pytest.raises(InputError):
+            require_same_loop(other, policy.network, system)
+    with pytest.raises(InputError, match="`domain`"):
+        require_same_question(proved, policy.network, system.with_domain({"theta": (Fraction(-3), Fraction(3))}))

@@ -48,13 +48,8 @@ class Policy:
     offset: Array
     squash: str
     centre: str
-    clip: tuple[Array, Array] | None  # lo, hi
-    origin: Array  # the layers read origin + x
-
-    @property
-    def is_moved(self) -> bool:
-        """Whether the layers read anything else than x."""
-        return bool(np.any(self.origin != 0))
+    clip: tuple[Array, Array] | None = None  # lo, hi
+    origin: Array | None = None  # the layers read origin + x; None for 0
 
     def sha256(self) -> str:
         """Hash of squash, centre, then each array."""
@@ -320,9 +315,11 @@ def _policy(value: Value, n: int, m: int, practical: bool) -> Policy:
     weights, biases = _layers(layers, n, m)
     words = squash.choice("tanh", "identity"), centre.choice("output", "preactivation", "none")
     centre.must(words != ("identity", "preactivation"), "another where squash is not 'tanh'")
-    policy = Policy(weights, biases, scale.array(m), offset.array(m), *words, _clip(clip, m), origin.array(n))
+    at = origin.array(n)
+    moved = bool(np.any(at != 0))
+    origin.must(not moved or (practical and words[1] == "none"), "0 under this claim and centring")
+    policy = Policy(weights, biases, scale.array(m), offset.array(m), *words, _clip(clip, m), at if moved else None)
     scale.must(bool(np.all(policy.scale != 0)), "nonzero")
-    origin.must(not policy.is_moved or (practical and policy.centre == "none"), "0 under this claim and centring")
     check_hash(policy, sha256.raw)
     return policy
 

@@ -64,7 +64,7 @@ def fold(policy: Policy, u_eq: tuple[Fraction, ...]) -> Folded:
     zeros, ones = np.zeros_like(policy.offset), np.ones_like(policy.offset)
     pairs = zip(policy.weights, policy.biases, strict=True)
     first, *others = (Layer(W, b, np.zeros_like(b), spectral_norm(W)) for W, b in pairs)
-    layers = (_moved(first, policy.origin) if policy.is_moved else first, *others)
+    layers = (first if policy.origin is None else _moved(first, policy.origin), *others)
     plain = Folded(layers, policy.squash == "tanh", policy.scale, policy.offset, zeros, policy.clip)
     if policy.centre == "none":
         return plain

@@ -116,7 +116,7 @@ def report(c: Certificate, answer: dict[str, Any]) -> list[str]:
         f"policy {'-'.join(map(str, widths))} tanh, squash {c.policy.squash}, centred by {c.policy.centre}, "
         f"{_clip(c.policy)}"
         f"sha256 {c.policy.sha256()}",
-        *([f"  its layers read {_matrix(c.policy.origin[None])} + x"] if c.policy.is_moved else []),
+        *([] if c.policy.origin is None else [f"  its layers read ({_matrix(c.policy.origin[None])}) + x"]),
         f"V(x) = x'Px with P = {_matrix(c.P)}",
         *([] if c.start is None else [f"S = {_matrix(c.start)}"]),
         *([] if c.centre is None else [f"c = {' '.join(map(repr, c.centre.tolist()))}"]),

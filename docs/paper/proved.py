@@ -45,7 +45,7 @@ SECONDS = {"pendulum": 60, "cartpole": 120, "quadrotor2d": 150, "quadrotor3d": 2
 KINDS: tuple[Run, ...] = ("ours", "sac", "sb3-ppo")
 IN_WORDS = {
     "asymptotic": "converges to the origin",
-    "practical": "enters a ball around the origin",
+    "practical": "enters a small set and stays there",
     "nearby": "converges to one equilibrium beside the origin",
 }
 
@@ -96,7 +96,8 @@ def accepted(path: Path, policy: Policy, system: System) -> Proved | None:
     except (InputError, CertificateFormatError):
         return None
     claim = certificate.claim
-    radius = largest_norm(certificate.P, claim.floor) if isinstance(claim, Practical) else 0.0
+    beside = float(np.linalg.norm(certificate.network.origin)) * (1 + 1e-9)  # of the set's middle
+    radius = beside + largest_norm(certificate.P, claim.floor) if isinstance(claim, Practical) else 0.0
     return Proved(certificate.kind, volume(certificate.P, certificate.roa), radius)
 
 

@@ -80,6 +80,14 @@ def clipped_claim(c1: float = 0.2, c2: float = 1.9999**2, **changes: Any) -> Doc
     return make([["+", ["/", "x", "2"], "u"]], [([[-2.0]], [0.0])], [[1.0]], (c1, c2), **{**settings, **changes})
 
 
+def moved_claim(origin: float = 0.25, c2: float = 1.9999**2) -> Document:
+    """The loop of `clipped_claim`, under a policy that rests there if its layers read 1/4 + x."""
+    return make(
+        [["+", ["/", "x", "2"], "u"]], [([[-2.0]], [0.5])], [[1.0]], (1.0, c2), squash="identity", centre="none",
+        scale=[1.0], clip=([-1.0], [1.0]), claim="practical", origin=[origin],
+    )  # fmt: skip
+
+
 def linear_claim(c1: float = 0.5, c2: float = 3.0, **changes: Any) -> Document:
     P, A = np.array([[1.25, 0.25], [0.25, 0.25]]), np.array([[0.0, 1.0], [-2.0, -3.0]])
     settings = {
@@ -169,6 +177,7 @@ HONEST: dict[str, Callable[[], Document]] = {
     "clipped, no centring": lambda: clipped_claim(centre="none"),
     "clipped rotor": lambda: rotor_claim(clip=([-0.75], [1.75])),
     "enlarged": enlarged_claim,
+    "practical, moved": moved_claim,
     "practical, clipped": lambda: clipped_claim(c1=1.0, claim="practical", u_eq=["3/4"]),
 }
 
@@ -310,6 +319,15 @@ def multipliers(where: str, place: tuple[int, int], value: float) -> Edit:
 
 MUTANTS: list[tuple[str, str, str, Edit]] = [  # rule, base, what, edit
     ("format", "scalar", "schema", at("schema", "certify-certificate/2")),
+    ("format", "clipped", "origin where pi(0) is u_eq by form", at("policy.origin", encode([0.25]))),
+    ("format", "clipped, no centring", "origin where 0 is an equilibrium", at("policy.origin", encode([2.0**-1074]))),
+    ("format", "practical, clipped", "origin of a policy that is centred", at("policy.origin", encode([0.25]))),
+    ("format", "practical, moved", "origin of two numbers", at("policy.origin", encode([0.25, 0.0]))),
+    ("format", "practical, moved", "no origin", at("policy.origin", None)),
+    ("format", "practical, moved", "origin with NaN", at("policy.origin", encode([np.nan]))),
+    ("ring", "practical, moved", "origin too low", at("policy.origin", encode([-0.75]))),
+    ("ring", "practical, moved", "origin too high", at("policy.origin", encode([1.25]))),
+    ("ring", "practical, moved", "origin out of reach", at("policy.origin", encode([2.0**1000]))),
     ("format", "clipped", "clip of equal ends", rehashed("clip", [encode([1.0]), encode([1.0])])),
     ("format", "clipped", "clip with its ends exchanged", rehashed("clip", [encode([1.0]), encode([-1.0])])),
     ("format", "clipped", "clip with NaN", rehashed("clip", [encode([-1.0]), encode([np.nan])])),

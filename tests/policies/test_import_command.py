@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import pickle
 from collections.abc import Callable
@@ -128,7 +129,8 @@ def test_roa_reads_another_programs_file_and_keeps_to_where_no_observation_is_cl
     assert status == 0 and json.loads(out)["verdict"] == "PROVED"
     assert "the domain of x0 is cut to" in err and "largest difference" in err
     certificate = json.loads(Path("o/certificate.json").read_text())
-    lo, hi = (eval_fraction(text) for text in certificate["plant"]["domain"][0])
+    [at, _] = np.frombuffer(base64.b64decode(certificate["policy"]["origin"]))  # where the loop rests
+    lo, hi = (eval_fraction(text) + at for text in certificate["plant"]["domain"][0])
     valid = np.array([lo, hi])
     state = pickle.loads(Path("normaliser.pkl").read_bytes())
     reach = state.clip_obs * np.sqrt(state.obs_rms.var[0] + state.epsilon)

@@ -196,7 +196,7 @@ def _shape(data: Any) -> None:
             lo, hi = _rationals(pair, 2)
             _need(lo < hi, "lo < hi")
 
-    _section(policy, "layers", "squash", "centre", "scale", "offset", "clip", "sha256")
+    _section(policy, "layers", "squash", "centre", "scale", "offset", "clip", "origin", "sha256")
     squash, centre = policy["squash"], policy["centre"]
     _need(squash in ("tanh", "identity") and centre in ("output", "preactivation", "none"), "squash and centre")
     _need(centre != "preactivation" or squash == "tanh", "preactivation without tanh")
@@ -216,6 +216,9 @@ def _shape(data: Any) -> None:
     if policy["clip"] is not None:
         _need(isinstance(policy["clip"], list) and len(policy["clip"]) == 2, "clip")
         _need(np.all(_array(policy["clip"][0], m) < _array(policy["clip"][1], m)), "clip: lo < hi")
+
+    still = np.all(_array(policy["origin"], n) == 0)
+    _need(still or (is_practical(data) and centre == "none"), "another origin")
 
     _section(data["claim"], "kind", "rate", "sample", "outer")
     _need(data["claim"]["kind"] in tuple(EDGES), "claim")
@@ -504,6 +507,7 @@ class Loop:
             for layer in policy["layers"]
         ]
         self.scale, self.offset = (_array(policy[key], self.m) for key in ("scale", "offset"))
+        self.origin = _array(policy["origin"], self.n)
         self.limits = [(float(lo), float(hi)) for lo, hi in _limits(policy, self.m)]
         self.u_eq = _rationals(plant["u_eq"], self.m)
         self.bounds = [_rationals(pair, 2) for pair in plant["input_bounds"]]
@@ -519,7 +523,7 @@ class Loop:
 
     def before_clip(self, x: Array) -> Array:
         """What pi clips, at x (n, B)."""
-        h = np.concatenate([x, np.zeros((self.n, 1))], axis=1)
+        h = np.concatenate([x, np.zeros((self.n, 1))], axis=1) + self.origin[:, None]
         for k, (W, b) in enumerate(self.layers):
             h = W @ (np.tanh(h) if k else h) + b[:, None]
         scale, offset = self.scale[:, None], self.offset[:, None]
@@ -558,7 +562,7 @@ class Loop:
     def closed_loop(self, points: Sequence[Sequence[arb]]) -> list[tuple[list[arb], list[arb]]]:
         """(pi(x), F(x)) at each point, at the current precision."""
         columns = [*points, [arb(0)] * self.n]
-        h = arb_mat([[column[i] for column in columns] for i in range(self.n)])
+        h = arb_mat([[column[i] + arb(at) for column in columns] for i, at in enumerate(self.origin.tolist())])
         for k, (W, b) in enumerate(self.layers):
             h = _each(h, arb.tanh) if k else h
             bias = arb_mat([[arb(v)] * len(columns) for v in b.tolist()])
