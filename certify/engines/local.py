@@ -31,7 +31,7 @@ _WIDER = 1 + 1e-9  # of the ball, which has to contain {V <= c1} beyond all roun
 _ORDER = 4  # of the series in time, where an input is held
 _FAR, _NEAR = 1e-2, 0.3  # from one level to the next lower one, where all below one is good, and where not
 _LOWER = 0.5  # from one level to the next, while floors fall with them
-_NOTHING = 1e-12  # of the limit: no floor is asked to be lower
+_NOTHING = 1e-10  # of the limit: no floor is asked to be lower
 _EDGES = 400  # that are tried
 _AMPLE = 0.3  # a margin that is good enough for the multipliers of a floor
 _ROUNDS = 3  # of multipliers and edge, each best for the other

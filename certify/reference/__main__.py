@@ -41,7 +41,9 @@ def in_words(c: Certificate) -> str:
 def of_trajectories(c: Certificate) -> str:
     """What is said of those that start in {V <= c2}, or in the set from which a tube leads there."""
     bounds = f"{', '.join(c.plant.inputs)} within the input bounds{whatever(c)}"
-    head = f"{c.plant.name}, policy {c.policy.sha256}{stepping(c)}: every trajectory that starts in V <= {c.outer!r}"
+    read = "" if not any(c.policy.origin) else f" read at ({', '.join(map(repr, c.policy.origin))}) + x"
+    policy = f"policy {c.policy.sha256}{read}{stepping(c)}"
+    head = f"{c.plant.name}, {policy}: every trajectory that starts in V <= {c.outer!r}"
     remains = "stays there" if c.sample is None else "at a sampling instant is there at every later one"
     between = "" if c.sample is None else ", is in the domain at all times"
     if c.floor is not None:

@@ -109,9 +109,9 @@ CLAIMS: Mapping[str, Words] = {
         "the origin$over{speed}",
         meaning="from which every trajectory enters the green set and $there",
         decay="That V falls below c₀ $within and stays there$always is {word}; $later is not.$kept",
-        simulated="stay in the domain and enter {V ≤ c₀}",
-        settles="enter {V ≤ c₀}",
-        runs="trajectories that enter",
+        simulated="stay in the domain and come near {V ≤ c₀}",
+        settles="come near {V ≤ c₀}",
+        runs="trajectories that settle",
         parts=(
             SMOOTH,
             DEFINITE,

@@ -384,14 +384,14 @@ def _plant(certificate: Certificate) -> dict[str, Any]:
     return {
         "name": system.name,
         "equations": [_equation(s, e, names, steps=steps) for s, e in zip(system.states, expressions, strict=True)],
-        "rounded": any(_is_long(v) for e in expressions for v in e.atoms(sympy.Rational)),
+        "rounded": any(_is_long(v) for e in (*expressions, *system.u_eq) for v in e.atoms(sympy.Rational)),
         "domain": [interval(s.name, b) for s, b in zip(system.states, system.domain, strict=True)],
         "inputs": [interval(s.name, b) for s, b in zip(system.inputs, system.input_bounds, strict=True)],
         "at": at_rest(
             [s.name for s in system.states], system.exact_x_eq(), [units.get(s.name, "") for s in system.states]
         ),
         "centre": _centre(certificate, of_values=True),
-        "u_eq": ", ".join(f"{symbol(s.name)} = {u}" for s, u in equilibrium),
+        "u_eq": ", ".join(f"{symbol(s.name)} = {_short(u)}" for s, u in equilibrium),
         "uncertain": [q.words for q in varying_in(system)],
         "held": held_at(system),
         "listed": ", ".join(symbol(name) for name in system.ranges),
@@ -455,6 +455,10 @@ def _escape(text: str) -> str:
 
 def _is_long(value: sympy.Rational) -> bool:
     return max(abs(int(value.p)), int(value.q)) > _LONG
+
+
+def _short(value: Fraction) -> str:
+    return number(float(value)) if _is_long(sympy.Rational(value.numerator, value.denominator)) else str(value)
 
 
 def _claim(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -783,6 +787,7 @@ def _tables(
     evidence = [
         ("policy", f"{'-'.join(map(str, network.layers))} tanh, squash {network.squash}, centre {network.centre}"),
         *(() if network.clip is None else (("clipped to", _clip(certificate)),)),
+        *((("its layers read", _read(certificate)),) if network.is_moved else ()),
         ("policy sha256", network.sha256()),
         ("certificate sha256", sha256),
     ]
@@ -910,6 +915,13 @@ def _clip(certificate: Certificate) -> str:
     inputs, clip = certificate.system.inputs, certificate.network.clip or ()
     each = zip(inputs, *clip, strict=True)
     return ", ".join(f"{s.name} in [{number(float(lo), 10)}, {number(float(hi), 10)}]" for s, lo, hi in each)
+
+
+def _read(certificate: Certificate) -> str:
+    """From where the layers of a policy read the states, in their units."""
+    states, origin = certificate.system.states, certificate.network.origin.tolist()
+    each = zip(states, origin, strict=True)
+    return f"x from ({', '.join(f'{symbol(s.name)} = {number(v, 10)}' for s, v in each)})"
 
 
 def _eigenvalues(certificate: Certificate) -> str:

@@ -255,8 +255,9 @@ class Scene:
 
     @property
     def settling_level(self) -> float:
-        """V at which a run has done what the claim says of it: near the origin, or in {V <= c0}."""
-        return self.inner if self.kind == "practical" else SETTLED * self.outer
+        """V at which a run has done what the claim says of it: near the origin, or in {V <= c0}, which may be too small
+        for a simulation to come into."""
+        return max(self.inner if self.kind == "practical" else 0.0, SETTLED * self.outer)
 
     @property
     def duration(self) -> float:
