@@ -38,7 +38,7 @@ from certify.inputs import (
 )
 from certify.installation import versions
 from certify.lyapunov import Candidate, Neural, Polynomial, Symbolic
-from certify.options import Asked, EngineName, RoaOptions
+from certify.options import Around, Asked, EngineName, RoaOptions
 from certify.policies import Policy, TanhNetwork
 from certify.policies.importers import Clip, ImportOptions, import_module, import_state_dict
 from certify.results import RoaResult
@@ -66,6 +66,7 @@ def certify_roa(
     *,
     importing: ImportOptions | Mapping[str, Any] | None = None,
     claim: Asked | None = None,
+    around: Around | None = None,
     candidate: Candidate | None = None,
     Q: Sequence[float] | None = None,
     R: Sequence[float] | None = None,
@@ -120,6 +121,9 @@ def certify_roa(
     claim : "asymptotic"; "practical", which asks for no equilibrium at the origin; "nearby", which is that and, if it
         can be shown, convergence to one equilibrium where what is uncertain is constant; or "auto" (the default), the
         first where the loop rests at the origin exactly and the last where it does not.
+    around : the point at which V is 0 where the loop does not rest at the origin: "rest", the stable point at which it
+        does; "origin"; or "auto" (the default), the first if there is one and nothing is given around the origin. What
+        the result says is about its plant, `result.system`, whose operating point that is.
     candidate : where P comes from: "auto" (the default: of several the largest proved), "lyapunov", "scaled", "lqr",
         "optimised", "robust", or "peak", which is for practical claims; "neural" and "polynomial" do as "auto" does,
         and learn a function whose set reaches beyond the ellipsoid.
@@ -190,8 +194,8 @@ def certify_roa(
     """
     start = time.perf_counter()
     single = {
-        "claim": claim, "candidate": candidate, "Q": Q, "R": R, "P": P, "level": level, "engine": engine,
-        "dreal_precision": dreal_precision, "jobs": jobs, "device": device, "enlarge": enlarge, "box": box,
+        "claim": claim, "around": around, "candidate": candidate, "Q": Q, "R": R, "P": P, "level": level,
+        "engine": engine, "dreal_precision": dreal_precision, "jobs": jobs, "device": device, "enlarge": enlarge, "box": box,
         "cluster": cluster, "cluster_checks": cluster_checks, "resume": resume,
         "reach_from": reach_from, "time_limit": time_limit, "max_boxes": max_boxes, "rate": rate,
         "lyapunov_level": lyapunov_level, "hidden": hidden, "degree": degree, "seed": seed,

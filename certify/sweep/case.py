@@ -72,6 +72,7 @@ def _flag(text: str, name: str) -> bool:
 
 OPTIONS: Mapping[str, Option] = {
     "claim": Option("claim", _word),
+    "around": Option("around", _word),
     "Q": Option("Q", numbers),
     "R": Option("R", numbers),
     "rate": Option("rate", _number),

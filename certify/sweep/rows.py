@@ -12,6 +12,7 @@ import json
 import tempfile
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
+from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -229,7 +230,11 @@ def _checked(row: Row, answer: Answer, loop: tuple[Policy, System, RoaOptions], 
     raw = answer.raw or b""
     sha256 = hashlib.sha256(raw).hexdigest()
     certificate = parse_certificate(raw, f"the certificate of {row.case}")
-    _require_about(certificate, raw, replace(certificate, system=plant, network=stored.network))
+    network, at = stored.network, certificate.network.origin
+    if certificate.network.is_moved:  # it is about the same loop in deviations from another point
+        plant = plant.seen_from([Fraction(v) for v in at.tolist()], certificate.system.exact_u_eq())
+        network = replace(network, origin=at)
+    _require_about(certificate, raw, replace(certificate, system=plant, network=network))
     folder = _folder(out, row.case)
     unchecked = write_beside(folder / _CERTIFICATE, raw, ".unchecked.json")
     try:
@@ -283,6 +288,7 @@ def _require_asked(certificate: Certificate, options: RoaOptions) -> None:
     claim, outer = certificate.claim, certificate.claim.outer
     less = {
         "claim": options.claim == "asymptotic" and not claim.at_rest,
+        "around": options.around == "origin" and certificate.network.is_moved,
         "rate": claim.rate < options.rate,
         "level": options.level is not None and claim.roa < options.level,
         "lyapunov_level": options.lyapunov_level is not None
