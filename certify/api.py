@@ -195,7 +195,8 @@ def certify_roa(
     start = time.perf_counter()
     single = {
         "claim": claim, "around": around, "candidate": candidate, "Q": Q, "R": R, "P": P, "level": level,
-        "engine": engine, "dreal_precision": dreal_precision, "jobs": jobs, "device": device, "enlarge": enlarge, "box": box,
+        "engine": engine, "dreal_precision": dreal_precision, "jobs": jobs, "device": device, "enlarge": enlarge,
+        "box": box,
         "cluster": cluster, "cluster_checks": cluster_checks, "resume": resume,
         "reach_from": reach_from, "time_limit": time_limit, "max_boxes": max_boxes, "rate": rate,
         "lyapunov_level": lyapunov_level, "hidden": hidden, "degree": degree, "seed": seed,

@@ -134,6 +134,8 @@ def float_error(network: TanhNetwork, system: System, options: FloatOptions | No
     True
     """
     options = options if options is not None else FloatOptions()
+    if network.is_moved:
+        raise InputError("`network` must be the policy as its layers read it; found one that is seen from elsewhere.")
     loop = ClosedLoop(system, network)
     with precision():
         machine = _Machine.of(loop, options)

@@ -8,7 +8,6 @@ that exactly one point of rest lies in a box around it:
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -18,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.closed_loop import ClosedLoop
+from certify.errors import InputError
 from certify.rigorous import field_on, policy_on, precision
 
 Array = NDArray[np.float64]
@@ -63,18 +63,21 @@ def seen_from(loop: ClosedLoop, rest: Rest) -> ClosedLoop:
 
     Raises
     ------
-    InputError : the policy is centred, or the point does not lie in the interior of the domain.
+    InputError : the policy is centred or seen from elsewhere already, or the point does not lie in the interior of the
+        domain.
     """
     system, network = loop.system, loop.network
+    if network.centre != "none" or network.is_moved:
+        raise InputError("a loop that is to be seen from where it rests must have a policy without centring, as it is.")
     by = [_short(Fraction(v), hi - lo) for v, (lo, hi) in zip(rest.x, system.domain, strict=True)]
     u = [_short(Fraction(v), hi - lo) for v, (lo, hi) in zip(rest.u, system.input_bounds, strict=True)]
-    origin = network.origin + np.array([float(q) for q in by])
+    origin = np.array([float(q) for q in by])
     return ClosedLoop(system.seen_from(by, u), replace(network, origin=origin))
 
 
 def _short(q: Fraction, width: Fraction) -> Fraction:
-    """q to a multiple of 2^-40 times the power of 2 next to a width."""
-    unit = Fraction(2) ** (math.frexp(float(width))[1] - _BITS)
+    """q to a multiple of 2^-40 times about a width."""
+    unit = Fraction(2) ** (width.numerator.bit_length() - width.denominator.bit_length() - _BITS)
     return round(q / unit) * unit
 
 

@@ -178,7 +178,8 @@ def peak(loop: ClosedLoop, options: RoaOptions) -> Trial | None:
 
 
 def _centred(loop: ClosedLoop) -> ClosedLoop:
-    return replace(loop, network=replace(loop.network, centre="output")) if loop.network.centre == "none" else loop
+    """In floats."""
+    return replace(loop, network=replace(loop.folded, centre="output")) if loop.network.centre == "none" else loop
 
 
 def corrected(loop: ClosedLoop, last: Trial, witnesses: Sequence[Witness], options: RoaOptions) -> Trial | None:

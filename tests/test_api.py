@@ -132,7 +132,15 @@ def test_options_by_name_are_those_of_the_options() -> None:
     assert {f.name for f in dataclasses.fields(RoaOptions)} <= keywords
     with pytest.raises(TypeError, match="time_limt"):
         certify_roa("pendulum", SHIPPED, time_limt=3)  # type: ignore[call-arg]
-    bad = {"claim": "x", "candidate": "x", "engine": "x", "dreal_precision": 2.0, "jobs": 0, "level": -1.0}
+    bad = {
+        "claim": "x",
+        "around": "x",
+        "candidate": "x",
+        "engine": "x",
+        "dreal_precision": 2.0,
+        "jobs": 0,
+        "level": -1.0,
+    }
     bad |= {
         "time_limit": 0,
         "max_boxes": 0,

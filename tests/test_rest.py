@@ -16,11 +16,12 @@ import pytest
 import sympy
 
 from certify.certificate import Certificate, PartitionTree, read_certificate, run_checker
-from certify.claims import Asymptotic, Practical
+from certify.claims import Asymptotic
 from certify.cli import _run
 from certify.closed_loop import ClosedLoop
 from certify.containment import proved_set
 from certify.errors import InputError
+from certify.float_error import float_error
 from certify.lyapunov.function import Quadratic
 from certify.policies import Policy, TanhNetwork, load_policy, save_policy
 from certify.rest import Rest, find_rest, seen_from
@@ -219,12 +220,17 @@ def test_a_policy_seen_from_elsewhere_is_neither_saved_nor_called_centred(tmp_pa
     network = replace(loop.network, origin=np.array([0.5, 0.0]))
     with pytest.raises(InputError, match="as its layers read it"):
         save_policy(tmp_path / "p.pt", Policy(network, "bent"))
-    for wrong, about in ((replace(network, centre="output"), Practical), (network, Asymptotic)):
-        levels = {"roa": 1.0, "local": 0.5} | ({"floor": 0.1} if about is Practical else {})
-        with pytest.raises(InputError, match="`origin` of a policy must be 0"):
-            Certificate(
-                loop.system, wrong, Quadratic(np.eye(2)), about(**levels), PartitionTree(np.eye(2), np.ones(2), b"\xff")
-            )
+    with pytest.raises(InputError, match="`origin` must be 0 of a policy that is centred"):
+        replace(network, centre="output")
+    evidence, claim = PartitionTree(np.eye(2), np.ones(2), b"\xff"), Asymptotic(roa=1.0, local=0.5)
+    with pytest.raises(InputError, match="`origin` of a policy must be 0"):
+        Certificate(loop.system, network, Quadratic(np.eye(2)), claim, evidence)
+    with pytest.raises(InputError, match="without centring, as it is"):
+        seen_from(ClosedLoop(loop.system, network), Rest(("0.25", "0"), ("0",), (), True))
+    with pytest.raises(InputError, match="without centring, as it is"):
+        seen_from(bent("output"), Rest(("0.25", "0"), ("0",), (), True))
+    with pytest.raises(InputError, match="as its layers read it"):
+        float_error(network, loop.system)
     with pytest.raises(InputError, match=r"`origin` must have shape \(2,\)"):
         replace(network, origin=np.zeros(3))
 

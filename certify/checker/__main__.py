@@ -80,6 +80,7 @@ def _examine(path: str, share: tuple[int, int] | None, jobs: int) -> tuple[int, 
     answer: dict[str, Any] = {"certificate_sha256": c.sha256, "policy_sha256": c.policy.sha256(), "claim": c.claim}
     sample = None if c.sample is None else [str(h) for h in c.sample]
     answer |= {"rate": c.rate, "sample": sample, "discrete": c.discrete}
+    answer["origin"] = None if c.policy.origin is None else c.policy.origin.tolist()  # the hash does not tell
     answer |= {"levels": c.levels, "rules": tally.rules, "seconds": seconds}
     if isinstance(c.evidence, document.Trusted):
         answers = [": ".join(pair) for pair in c.evidence.queries]

@@ -72,8 +72,8 @@ def peak_candidate(loop: ClosedLoop, seconds: float = math.inf) -> Array:
 def _alone(loop: ClosedLoop) -> ClosedLoop:
     """The loop whose input follows at once, at the nominal values, centred."""
     system = loop.system.with_ranges(dict.fromkeys(loop.system.ranges)).with_sample(None)
-    centre = "output" if loop.network.centre == "none" else loop.network.centre
-    return ClosedLoop(system, replace(loop.network, centre=centre))
+    network = replace(loop.folded, centre="output") if loop.network.centre == "none" else loop.network
+    return ClosedLoop(system, network)
 
 
 def _corners(loop: ClosedLoop) -> list[tuple[Array, Array]]:

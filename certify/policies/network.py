@@ -51,7 +51,8 @@ class TanhNetwork:
 
     Raises
     ------
-    InputError : shapes do not chain, a number is not finite, or an option is unknown.
+    InputError : shapes do not chain, a number is not finite, an option is unknown, or the origin of a policy that is
+        centred is not 0.
     """
 
     weights: tuple[Array, ...]
@@ -87,6 +88,8 @@ class TanhNetwork:
         object.__setattr__(self, "origin", frozen(origin, "origin", _WHOSE))
         if self.origin.shape != (self.n,):
             raise InputError(f"`origin` must have shape ({self.n},); found {self.origin.shape}.")
+        if self.is_moved and self.centre != "none":
+            raise InputError(f"`origin` must be 0 of a policy that is centred; found {self.origin.tolist()}.")
 
     @property
     def is_moved(self) -> bool:
@@ -197,7 +200,7 @@ class TanhNetwork:
         """A network without centring that reads x and is pi up to rounding: for search and simulation."""
         if self.is_moved:
             first = self.biases[0] + self.weights[0] @ self.origin
-            return replace(self, biases=(first, *self.biases[1:]), origin=np.zeros(self.n)).folded(u_eq)
+            return replace(self, biases=(first, *self.biases[1:]), origin=np.zeros(self.n))
         if self.centre == "none":
             return self
         shift, offset = self.centring(u_eq, self.net(np.zeros(self.n)).tolist(), _ARRAYS)

@@ -167,6 +167,7 @@ def as_json(verdict: Verdict, seconds: float) -> dict[str, Any]:
         "discrete": c and c.plant.discrete,
         "certificate_sha256": verdict.certificate_sha256,
         "policy_sha256": c and c.policy.sha256,
+        "origin": list(c.policy.origin) if c and any(c.policy.origin) else None,
         "levels": c and {key: value for key, _, value in level_names(c)},
         "start": c and start_rows(c),
         "centre": c and centre_numbers(c),

@@ -158,9 +158,7 @@ def read(raw: bytes) -> Certificate:
     simple = not (claim in WITH_TUBE or rate > 0 or sample is not None or plant.discrete)
     plainly = beyond is None or simple
     require(plainly, "format", "claim.outer", "null was expected with a tube, a rate, a sample and in discrete time")
-    policy = read_policy(data["policy"], n, len(plant.inputs))
-    still = all(v == 0 for v in policy.origin) or (claim in WITH_FLOOR and policy.centre == "none")
-    require(still, "format", "policy.origin", "must be 0 where the origin is an equilibrium, or by centring u_eq")
+    policy = read_policy(data["policy"], n, len(plant.inputs), claim)
     lyapunov = keys(data["lyapunov"], "lyapunov", "kind", "P")
     require(lyapunov["kind"] == "quadratic", "format", "lyapunov.kind", "'quadratic' was expected")
     P = square(lyapunov["P"], "lyapunov.P", n)
@@ -278,7 +276,7 @@ def interval(value: Any, at: str) -> Interval:
     return lo, hi
 
 
-def read_policy(value: Any, n: int, m: int) -> Policy:
+def read_policy(value: Any, n: int, m: int, claim: str) -> Policy:
     """The hash is taken over the very bytes that were decoded."""
     policy = keys(value, "policy", "layers", "squash", "centre", "scale", "offset", "clip", "origin", "sha256")
     squash, centre = policy["squash"], policy["centre"]
@@ -290,6 +288,9 @@ def read_policy(value: Any, n: int, m: int) -> Policy:
     scale, offset = numbers(policy["scale"], "policy.scale", m), numbers(policy["offset"], "policy.offset", m)
     require(all(s != 0 for s in scale), "format", "policy.scale", "must not be 0")
     clip = read_clip(policy["clip"], m)
+    origin = numbers(policy["origin"], "policy.origin", n)
+    still = all(v == 0 for v in origin) or (claim in WITH_FLOOR and centre == "none")
+    require(still, "format", "policy.origin", "must be 0 where the origin is an equilibrium, or by centring u_eq")
     digest = hashlib.sha256(f"certify-policy/1\0{squash}\0{centre}\0".encode())
     for part in bytes_of(layers):
         digest.update(part)
@@ -297,7 +298,6 @@ def read_policy(value: Any, n: int, m: int) -> Policy:
         digest.update(struct.pack("<2Q", 1, m) + little_endian(values))
     sha256 = digest.hexdigest()
     require(policy["sha256"] == sha256, "hash", "policy.sha256", f"the policy's hash is {sha256}")
-    origin = numbers(policy["origin"], "policy.origin", n)
     return Policy(layers, squash, centre, scale, offset, clip, origin, sha256)
 
 

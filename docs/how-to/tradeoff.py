@@ -69,7 +69,7 @@ def row(weight: str | None) -> Row:
     certificate = read_certificate(path)
     proved = volume(certificate.P, certificate.roa)
     policy = load_policy(file)
-    if certificate.network.sha256() != policy.network.sha256():
+    if certificate.network.sha256() != policy.network.sha256() or certificate.network.is_moved:
         raise SystemExit(f"{path} must be about {file}; it is about another policy. Remove it and run this again.")
     system, plant = shipped_system(policy.system).with_parameters(policy.parameters), get_plant(policy.system)
     ball = math.pi ** (system.n / 2) / math.gamma(system.n / 2 + 1)

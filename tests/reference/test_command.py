@@ -31,6 +31,7 @@ KEYS = [
     "discrete",
     "certificate_sha256",
     "policy_sha256",
+    "origin",
     "levels",
     "start",
     "centre",
