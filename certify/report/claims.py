@@ -111,7 +111,7 @@ CLAIMS: Mapping[str, Words] = {
         decay="That V falls below c₀ $within and stays there$always is {word}; $later is not.$kept",
         simulated="stay in the domain and come near {V ≤ c₀}",
         settles="come near {V ≤ c₀}",
-        runs="trajectories that settle",
+        runs="trajectories that come near",
         parts=(
             SMOOTH,
             DEFINITE,
