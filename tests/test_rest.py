@@ -192,6 +192,15 @@ def test_the_set_lies_around_where_the_loop_rests(tmp_path: Path, around: Litera
     read = read_certificate(result.certificate)
     assert read.network.origin.tolist() == values.tolist() and read.network.sha256() == policy.network.sha256()
     f = read.system.function()
+    if around == "rest":
+        page = result.report(tmp_path / "report.html").read_text("utf-8")
+        assert (
+            f"seen from there: its layers read −{-at[0]:.9f}"[:40] in page
+            and "its layers read" in page.split("Numbers")[-1]
+        )
+        said = [run_checker(result.certificate, program) for program in ("checker", "reference")]
+        assert all(answer["origin"] == values.tolist() for answer in said)
+        assert all(repr(float(values[0])) in "".join(answer["text"]) for answer in said)
     assert np.abs(f(np.zeros(2), ClosedLoop(read.system, read.network).policy(np.zeros((1, 2)))[0])).max() < 1e-9
 
 

@@ -390,6 +390,7 @@ def _plant(certificate: Certificate) -> dict[str, Any]:
         "at": at_rest(
             [s.name for s in system.states], system.exact_x_eq(), [units.get(s.name, "") for s in system.states]
         ),
+        "read": _read(certificate) if certificate.network.is_moved else "",
         "centre": _centre(certificate, of_values=True),
         "u_eq": ", ".join(f"{symbol(s.name)} = {_short(u)}" for s, u in equilibrium),
         "uncertain": [q.words for q in varying_in(system)],
@@ -918,10 +919,10 @@ def _clip(certificate: Certificate) -> str:
 
 
 def _read(certificate: Certificate) -> str:
-    """From where the layers of a policy read the states, in their units."""
+    """What the layers of a policy read that is seen from elsewhere, in the states' units."""
     states, origin = certificate.system.states, certificate.network.origin.tolist()
     each = zip(states, origin, strict=True)
-    return f"x from ({', '.join(f'{symbol(s.name)} = {number(v, 10)}' for s, v in each)})"
+    return ", ".join(f"{number(v, 10)} + {symbol(s.name)}" if v else symbol(s.name) for s, v in each)
 
 
 def _eigenvalues(certificate: Certificate) -> str:
