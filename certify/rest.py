@@ -72,6 +72,8 @@ def seen_from(loop: ClosedLoop, rest: Rest) -> ClosedLoop:
     by = [_short(Fraction(v), hi - lo) for v, (lo, hi) in zip(rest.x, system.domain, strict=True)]
     u = [_short(Fraction(v), hi - lo) for v, (lo, hi) in zip(rest.u, system.input_bounds, strict=True)]
     origin = np.array([float(q) for q in by])
+    if [Fraction(v) for v in origin.tolist()] != by:
+        raise InputError("a point from which a loop is seen must have coordinates in binary64.")
     return ClosedLoop(system.seen_from(by, u), replace(network, origin=origin))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from fractions import Fraction
 
 import flint
@@ -41,6 +42,10 @@ CASES = {
     "valve": valve,
     "pendulum": lambda: (get_system("pendulum"), pendulum_network()),
     "pendulum, output": lambda: (get_system("pendulum"), pendulum_network((16, 16), centre="output")),
+    "pendulum, seen from elsewhere": lambda: (
+        get_system("pendulum"),
+        replace(pendulum_network((16, 16)), centre="none", origin=np.array([0.25, -0.5])),
+    ),
     "chain": lambda: chain(3, [-1, -2, -3]),
     "quadrotor": quadrotor,
 }
