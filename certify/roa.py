@@ -21,7 +21,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.acceptance import Clerk
+from certify.acceptance import Accepted, Clerk
+from certify.asked import ellipsoid_in, require_one_that_knows, state_in, values_of
 from certify.beyond import outer_facts, short_of
 from certify.certificate import (
     Certificate,
@@ -35,26 +36,35 @@ from certify.claims import Asymptotic, Claim, Enlarged, Nearby, Practical, Probl
 from certify.claims.claim import Kind
 from certify.closed_loop import ClosedLoop
 from certify.diagnosis import diagnose
-from certify.engines.base import FEW, Attempt, Budget, Progress, Proof, Task
+from certify.engines.base import FEW, Attempt, Budget, Progress, Proof
 from certify.engines.contraction import contraction
-from certify.engines.falsify import Witness, refutes
+from certify.engines.falsify import Witness
 from certify.errors import BackendError, InputError, SoundnessError
 from certify.lyapunov import (
     Neural,
     Polynomial,
     are_inside,
-    leaves_domain,
     of_polynomial,
-    slowest_decay,
     volume,
 )
 from certify.lyapunov.function import Quadratic
 from certify.options import RoaOptions
+from certify.outcome import (
+    by_spectrum,
+    is_refuted,
+    limit_of,
+    lowest_witness,
+    refuted_at_once,
+    result_about,
+    short_of_target,
+    tried_row,
+    with_levels,
+    with_witness,
+)
 from certify.policies import TanhNetwork
 from certify.race import Contender, Race
 from certify.rest import Rest, find_rest, seen_from
-from certify.results import Levels, RoaResult, Tried, TubeFacts
-from certify.rigorous import eigenvalues, instability
+from certify.results import RoaResult, TubeFacts
 from certify.systems import System
 from certify.trials import (
     OPTIMISING,
@@ -225,10 +235,10 @@ class _Run:
         """Choose, falsify, prove, check."""
         options, loop = self.options, ClosedLoop(self.system, self.network)
         require_within_limits(self.system, self.network)
-        _require_one_that_knows(self.system, options)
+        require_one_that_knows(self.system, options)
         if options.box is not None:
-            _ellipsoid_in(self.system, options.box)
-        self.centre = None if options.reach_from is None else _state_in(self.system, options.reach_from)
+            ellipsoid_in(self.system, options.box)
+        self.centre = None if options.reach_from is None else state_in(self.system, options.reach_from)
         with self._stage("candidate"):
             claim = self._claim(loop)
             if claim == "practical" and options.enlarges:
@@ -247,11 +257,11 @@ class _Run:
             self.network,
             kind,
             engine=options.engine,
-            reach_from=None if self.centre is None else _values(self.system, self.centre),
+            reach_from=None if self.centre is None else values_of(self.system, self.centre),
         )
         if kind == "asymptotic":
             with self._stage("candidate"):
-                unstable = _unstable(loop)
+                unstable = by_spectrum(loop)
             if unstable is not None:
                 verdict, stop, shown = unstable
                 detail = f"eigenvalues {', '.join(shown)}" + (" touch the axis" if stop is Stop.SPECTRUM else "")
@@ -266,7 +276,7 @@ class _Run:
         else:
             with self._stage("candidate"):
                 one = named(loop, options)
-            refuted = _refuted_at_once(result, one)
+            refuted = refuted_at_once(result, one)
             if refuted is not None:
                 return refuted
             race = self._contest()
@@ -330,7 +340,7 @@ class _Run:
                 trials = solved(loop, found, options)
             return self._around_a_level(loop, trials, options)
         large = self._optimised(partial(optimised, loop, options)) if options.engine != "dreal" else None
-        race, most = self._contest(), volume(_ellipsoid_in(self.system), 1.0)
+        race, most = self._contest(), volume(ellipsoid_in(self.system), 1.0)
         if self.interruptible and large is not None and race.is_settled_by(large, heat, most):
             return race  # before the others are made, of which `robust` takes longest
         with self._stage("candidate"):
@@ -521,10 +531,10 @@ class _Run:
         self.proof = proof
         for stage in ("local", "ring"):
             self.seconds[stage] = sum(c.attempt.proof().seconds.get(stage, 0.0) for c in race.contenders)
-        witness = _lowest(task.witness, proof.witness)
-        result = replace(_about(result, best.trial), tried=tuple(_row(c, best) for c in race.contenders))
+        witness = lowest_witness(task.witness, proof.witness)
+        result = replace(result_about(result, best.trial), tried=tuple(tried_row(c, best) for c in race.contenders))
         result = replace(
-            _with_levels(result, proof.partial, witness),
+            with_levels(result, proof.partial, witness),
             stop=proof.stop,
             detail=proof.detail,
             witness=witness,
@@ -539,9 +549,9 @@ class _Run:
             result = replace(result, stop=Stop.STALLED, detail=detail)
         claim = proof.claim
         if claim is None or (task.exactly and claim.roa < task.target):
-            if task.exactly and _refuted(task, witness):
-                return _with_witness(result, task, witness)
-            return result if claim is None else _missed(result, task, claim)
+            if task.exactly and is_refuted(task, witness):
+                return with_witness(result, task, witness)
+            return result if claim is None else short_of_target(result, task, claim)
         evidence, facts = proof.evidence, None
         if self.options.enlarges and isinstance(claim, Asymptotic) and isinstance(evidence, PartitionTree):
             around = self._enlarge if self.centre is None else self._surround
@@ -570,44 +580,27 @@ class _Run:
         if self.options.lyapunov_level is not None and (
             certificate.claim.outer is None or certificate.claim.outer.level < self.options.lyapunov_level
         ):
-            result = _with_levels(result, certificate.claim.levels, witness)
-            return replace(
-                result,
-                stop=Stop.BEYOND,
-                detail=short_of(task.problem, certificate.claim, self.options, beyond),
-                leaves=proof.leaves,
-                certificate=accepted.path,
-                raw=accepted.data,
-                checker=accepted.answer,  # of a smaller set
-            )
+            why = short_of(task.problem, certificate.claim, self.options, beyond)
+            smaller = _with_certificate(result, accepted, witness, proof.leaves)
+            return replace(smaller, stop=Stop.BEYOND, detail=why)
         if isinstance(certificate.claim, Enlarged | Reached):
             result = replace(result, claim=certificate.claim.kind, tube=facts)
         elif self.centre is not None and not _holds(task.problem, certificate.roa, self.centre):
             why = self.missed if facts is None else accepted.mended or "the checker refused the tube"
             self.aside = None
-            result = _with_levels(result, certificate.claim.levels, witness)
-            return replace(
-                result,
-                stop=Stop.PATH,
-                detail=why,
-                leaves=proof.leaves,
-                certificate=accepted.path,
-                raw=accepted.data,
-                checker=accepted.answer,  # of the set without the state, which is all that it accepted
-            )
+            without = _with_certificate(result, accepted, witness, proof.leaves)  # the state
+            return replace(without, stop=Stop.PATH, detail=why)
         if task.exactly and certificate.roa < task.target:
-            return _missed(replace(result, stop=Stop.REFUSED, detail=accepted.mended or ""), task, certificate.claim)
+            return short_of_target(
+                replace(result, stop=Stop.REFUSED, detail=accepted.mended or ""), task, certificate.claim
+            )
         trusted = isinstance(proof.evidence, TrustedSolver)
         if not trusted and self.options.engine == "both":
             result = replace(result, solver=self._confirm(task.problem, certificate.claim))
         return replace(
-            _with_levels(result, certificate.claim.levels, witness),
+            _with_certificate(result, accepted, witness, proof.leaves),
             verdict=Verdict.TRUSTED if trusted else Verdict.PROVED,
-            stop=Stop.REFUSED if certificate.roa < claim.roa else _limit(result.stop, task, witness),
-            leaves=proof.leaves,
-            certificate=accepted.path,
-            raw=accepted.data,
-            checker=accepted.answer,
+            stop=Stop.REFUSED if certificate.roa < claim.roa else limit_of(result.stop, task, witness),
         )
 
     def _enlarge(
@@ -620,10 +613,10 @@ class _Run:
         self.share = 1.0
         P = race.best.trial.P
         shapes = {c.trial.name: c.trial.P for c in (race.best, *_by_proved(race))} | {
-            "domain": _ellipsoid_in(self.system)
+            "domain": ellipsoid_in(self.system)
         }
         if self.options.box is not None:
-            shapes = {"box": _ellipsoid_in(self.system, self.options.box)}
+            shapes = {"box": ellipsoid_in(self.system, self.options.box)}
         end = self.spent + _FOR_SEARCH * self.left()
         with self._stage("tube"):
             self._tell("tube")
@@ -651,8 +644,8 @@ class _Run:
             return None, claim, evidence
         self.share = 1.0
         box = self.options.box
-        shapes = {trial.name: trial.P, "domain": _ellipsoid_in(self.system)}
-        shapes = shapes if box is None else {"box": _ellipsoid_in(self.system, box)}
+        shapes = {trial.name: trial.P, "domain": ellipsoid_in(self.system)}
+        shapes = shapes if box is None else {"box": ellipsoid_in(self.system, box)}
         end = self.spent + _FOR_SEARCH * self.left()
         with self._stage("tube"):
             self._tell("tube")
@@ -766,88 +759,6 @@ def _by_proved(race: Race) -> list[Contender]:
     return sorted(race.contenders, key=lambda c: -c.proved)
 
 
-def _ellipsoid_in(system: System, box: Mapping[str, float] | None = None) -> Array:
-    """P (n, n) of the ellipsoid {x'Px <= 1} with these half-axes; default: the nearer sides of the domain.
-
-    Raises
-    ------
-    InputError : the box has no state, or one that the plant has not.
-    """
-    names = [s.name for s in system.states]
-    sides = {n: min(-float(lo), float(hi)) for n, (lo, hi) in zip(names, system.domain, strict=True)}
-    box = sides if box is None else box
-    if not box or not box.keys() <= sides.keys():
-        raise InputError(
-            f"`box` must name states of {system.name}, {', '.join(names)}; found {', '.join(box) or 'none'}."
-        )
-    least = min(width / sides[name] for name, width in box.items())
-    return np.diag([float(box.get(name, least * sides[name])) ** -2 for name in names])
-
-
-def _require_one_that_knows(system: System, options: RoaOptions) -> None:
-    """Refuse what is about exact equations and Vdot alone, a solver of formulas and a tube, where something has a range
-    or time goes in steps.
-
-    Raises
-    ------
-    InputError : the option, and what has a range or goes in steps.
-    """
-    if options.lyapunov is None and options.lyapunov_level is not None:
-        raise InputError("`lyapunov_level` must be the level of a function; give one as `lyapunov`.")
-    if options.goes_beyond and system.in_steps:
-        raise InputError(
-            "a set beyond the ellipsoid must be of a plant in continuous time whose input follows the state at once; "
-            f"the time of {system.name} goes in steps. Ask for the set without it."
-        )
-    if options.engine == "bounds" and not options.enlarges:
-        return
-    if system.in_steps:
-        what = "a tube" if options.enlarges else "dReal's question"
-        found = "its time is discrete" if system.time == "discrete" else "its input is held over a period"
-        raise InputError(
-            f"{what} must be about a plant in continuous time whose input follows the state at once; of {system.name} "
-            f"{found}. Ask for the set with the engine bounds, without a tube."
-        )
-    if not system.ranges:
-        return
-    found = f"found ranges of {', '.join(system.ranges)} in {system.name}"
-    if options.enlarges:
-        raise InputError(
-            f"a tube must be of exact equations: there is no such claim yet for what is uncertain; {found}. Ask for "
-            "the set without a tube, or leave the ranges out (of a disturbance in the plant's file: the half-width 0)."
-        )
-    raise InputError(
-        f"`engine` must be bounds where something is uncertain: dReal is asked about exact equations; {found}. Use the "
-        "engine bounds, or leave the ranges out."
-    )
-
-
-def _state_in(system: System, values: Mapping[str, Fraction | float]) -> tuple[Fraction, ...]:
-    """A state by the states' values as a deviation from the operating point, at which those are that are not named.
-
-    Raises
-    ------
-    InputError : it names what is no state, or does not lie in the interior of the domain.
-    """
-    names, at = [s.name for s in system.states], system.exact_x_eq()
-    if not values or not values.keys() <= set(names):
-        raise InputError(
-            f"`reach_from` must name states of {system.name}, {', '.join(names)}; found {', '.join(values) or 'none'}."
-        )
-    state = tuple(Fraction(values.get(name, q)) - q for name, q in zip(names, at, strict=True))
-    for name, q, v, (lo, hi) in zip(names, at, state, system.domain, strict=True):
-        if not lo < v < hi:
-            raise InputError(
-                f"`reach_from` must lie in the interior of the domain, {name} between {float(lo + q):g} and "
-                f"{float(hi + q):g}; found {float(v + q):g}."
-            )
-    return state
-
-
-def _values(system: System, deviations: Sequence[Fraction]) -> tuple[Fraction, ...]:
-    return tuple(q + v for q, v in zip(system.exact_x_eq(), deviations, strict=True))
-
-
 def _holds(problem: Problem, level: float, state: Sequence[Fraction]) -> bool:
     return are_inside(problem.V.P, level, [state])[0]
 
@@ -860,79 +771,7 @@ def _first_sentence(error: Exception) -> str:
     return str(error).split(". ")[0].rstrip(".")
 
 
-def _about(result: RoaResult, trial: Trial) -> RoaResult:
-    """The result with the candidate that it is about."""
-    levels = Levels(domain_limit=trial.limit)
-    return replace(result, problem=trial.task.problem, candidate=trial.name, notice=trial.notice, levels=levels)
-
-
-def _row(contender: Contender, best: Contender) -> Tried:
-    trial = contender.trial
-    return Tried(
-        trial.name, trial.task.target, trial.limited_by, trial.volume, contender is best, contender.proved or None
-    )
-
-
-def _refuted_at_once(result: RoaResult, trial: Trial) -> RoaResult | None:
-    """REFUTED where the level that was asked for leaves the domain or holds a witness."""
-    task, result = trial.task, _about(result, trial)
-    if not task.exactly:
-        return None
-    if leaves_domain(trial.P, task.target, result.system.domain):
-        detail = f"{{V <= {task.target:g}}} leaves the domain, whose limit is {trial.limit:.12g}"
-        return replace(result, verdict=Verdict.REFUTED, stop=Stop.DOMAIN, detail=detail)
-    return _with_witness(result, task, task.witness) if _refuted(task, task.witness) else None
-
-
-def _missed(result: RoaResult, task: Task, claim: Claim) -> RoaResult:
-    """UNKNOWN, because only a lower level than the one asked for is proved."""
-    if isinstance(claim, Asymptotic):
-        result = replace(result, levels=replace(result.levels, local=claim.local))
-    missed = f"proved only up to V <= {claim.roa:.12g}, not {task.target:g}"
-    return replace(result, detail=f"{result.detail}; {missed}" if result.detail else missed)
-
-
-def _refuted(task: Task, witness: Witness | None) -> bool:
-    return witness is not None and task.kind == "asymptotic" and refutes(task.problem, witness, task.target)
-
-
-def _with_witness(result: RoaResult, task: Task, witness: Witness | None) -> RoaResult:
-    if witness is None:
-        return result
-    detail = witness.describe(result.system)
-    levels = replace(result.levels, sampled_limit=witness.level)
-    return replace(result, verdict=Verdict.REFUTED, stop=Stop.WITNESS, detail=detail, witness=witness, levels=levels)
-
-
-def _with_levels(result: RoaResult, levels: Mapping[str, float], witness: Witness | None) -> RoaResult:
-    sampled = None if witness is None else witness.level
-    return replace(result, levels=replace(result.levels, sampled_limit=sampled, **levels))
-
-
-def _lowest(*witnesses: Witness | None) -> Witness | None:
-    return min((w for w in witnesses if w is not None), key=lambda w: w.level, default=None)
-
-
-def _limit(stop: Stop, task: Task, witness: Witness | None) -> Stop:
-    """What limits a level, from what stopped its proof."""
-    if stop is not Stop.REQUESTED or task.exactly:
-        return stop
-    return Stop.DOMAIN if witness is None else (Stop.INPUTS if witness.kind == "input" else Stop.WITNESS)
-
-
-def _unstable(loop: ClosedLoop) -> tuple[Verdict, Stop, tuple[str, ...]] | None:
-    """REFUTED or UNKNOWN with the eigenvalues, or None if the spectrum is rigorously stable."""
-    enclosures = eigenvalues(loop)
-    if enclosures is None:
-        L, h = loop.mean_rate(), loop.step
-        approximate = np.linalg.eigvals(np.eye(len(L)) + h * L if h else L)
-        if slowest_decay(L, h) > 0:
-            return None  # nearly multiple eigenvalues: the local proof decides
-        return Verdict.UNKNOWN, Stop.SPECTRUM, tuple(f"{v:.6g}" for v in approximate)
-    shown = tuple(f"{complex(v.mid()):.6g}" for v in enclosures)
-    signs = [instability(loop, v) for v in enclosures]
-    if any(v > 0 for v in signs):
-        return Verdict.REFUTED, Stop.UNSTABLE, shown
-    if not all(v < 0 for v in signs):
-        return Verdict.UNKNOWN, Stop.SPECTRUM, shown
-    return None
+def _with_certificate(result: RoaResult, accepted: Accepted, witness: Witness | None, leaves: int) -> RoaResult:
+    """The result with what the checker accepted, and its answer about these very bytes."""
+    stated = with_levels(result, accepted.certificate.claim.levels, witness)
+    return replace(stated, leaves=leaves, certificate=accepted.path, raw=accepted.data, checker=accepted.answer)

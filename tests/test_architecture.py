@@ -19,6 +19,7 @@ EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows th
     "acceptance": "certificate claims engines",
     "api": "inputs installation lyapunov options policies results roa systems",
     "arguments": "inputs policies systems",
+    "asked": "options systems",
     "beyond": "claims engines lyapunov options results rigorous",
     "certificate": "claims expressions lyapunov policies systems",
     "claims": "closed_loop expressions lyapunov policies",
@@ -33,6 +34,7 @@ EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows th
     "largest": "certificate claims closed_loop engines lyapunov options policies results roa systems",
     "lyapunov": "closed_loop expressions plain_file policies systems",
     "options": "lyapunov",
+    "outcome": "claims closed_loop engines lyapunov race results rigorous trials",
     "parts": "certificate running",
     "policies": "plain_file systems",
     "race": "engines lyapunov trials",
@@ -41,8 +43,8 @@ EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows th
     "results": "certificate claims engines lyapunov policies report rest sublevel systems",
     "rigorous": "closed_loop expressions lyapunov policies",
     "roa": (
-        "acceptance beyond certificate claims closed_loop diagnosis engines lyapunov options parts policies race rest "
-        "results rigorous running systems trials unfinished"
+        "acceptance asked beyond certificate claims closed_loop diagnosis engines lyapunov options outcome parts "
+        "policies race rest results running systems trials unfinished"
     ),
     "sublevel": "expressions lyapunov rigorous systems",
     "sweep": (
