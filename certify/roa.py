@@ -103,6 +103,7 @@ _FOR_LEARNING = 0.4  # of what is left then, the rest being the proof's and its 
 _FOR_SEARCH = 0.5  # of what is left then, the rest being the tube's check
 _FOR_PROOF = 0.4  # of the time limit, that no further candidate is optimised in
 _WORTH = 1.05  # growth of a volume that another candidate must promise
+_SMALL = 0.1  # of the volume within a candidate's reach: less is left for another one to prove
 _MISLED = 0.9  # of its reach: a violation below it is one that the samples missed
 _SAMPLE = 2000  # leaves whose check is timed
 _START = 0.2  # seconds that a checker takes to start
@@ -338,7 +339,8 @@ class _Run:
         if self.options.claim == "practical" and options.engine != "dreal" and loop.system.n > FEW:
             with self._stage("candidate"):
                 trials = solved(loop, found, options)
-            return self._around_a_level(loop, trials, options)
+            rests = self.network.is_moved and not loop.system.ranges
+            return (self._around_its_rest if rests else self._around_a_level)(loop, trials, options)
         large = self._optimised(partial(optimised, loop, options)) if options.engine != "dreal" else None
         race, most = self._contest(), volume(ellipsoid_in(self.system), 1.0)
         if self.interruptible and large is not None and race.is_settled_by(large, heat, most):
@@ -347,6 +349,8 @@ class _Run:
             trials = [*solved(loop, found, options), *([] if large is None else [large])]
         if not self.interruptible:
             race.enter(by_reach(trials)[:1], heat)
+            if self.network.is_moved:
+                self._improve(race, loop, heat)
             return race
         certain = self._optimised(partial(robust, loop, options))
         trials += [] if certain is None else [certain]
@@ -373,6 +377,21 @@ class _Run:
         if race.best.proved and self.left() > _FOR_PROOF * self.options.time_limit:
             large = self._optimised(partial(optimised, loop, options))
             race.enter([] if large is None else [large], self._heat())
+        return race
+
+    def _around_its_rest(self, loop: ClosedLoop, trials: list[Trial], options: RoaOptions) -> Race:
+        """A practical claim in many states of a loop that rests where V is 0: a ball carries there as much as it does
+        of a loop that rests exactly, and the largest candidates come first as they do there."""
+        race, large = self._contest(), self._optimised(partial(optimised, loop, options))
+        race.enter([] if large is None else [large], self._heat())
+        self._improve(race, loop, self._heat())
+        if large is None or race.best.proved < _SMALL * large.volume:
+            certain = self._optimised(partial(robust, loop, options))
+            race.enter([] if certain is None else [certain], self._heat())
+        for one in by_reach(trials):
+            if race.contenders and race.best.proved:
+                break
+            race.enter([one], self._heat())
         return race
 
     def _improve(self, race: Race, loop: ClosedLoop, heat: float) -> None:

@@ -147,7 +147,7 @@ def optimised(loop: ClosedLoop, options: RoaOptions) -> Trial | None:
     period is short, and Vdot cheap.
     """
     try:
-        about = _centred(loop) if options.claim == "practical" else loop
+        about = _at_rest(loop, options)
         about = about if loop.system.sample is None else replace(about, system=about.system.with_sample(None))
         chosen = choose_candidate(about, "optimised", options.Q, options.R, OPTIMISING * options.time_limit)
     except (BackendError, InputError):
@@ -158,7 +158,8 @@ def optimised(loop: ClosedLoop, options: RoaOptions) -> Trial | None:
 def robust(loop: ClosedLoop, options: RoaOptions) -> Trial | None:
     """The candidate that the local rule likes best, or None if it is not to be had."""
     try:
-        return trial(loop, robust_candidate(loop, _for_robust(loop, options)), "robust", options)
+        about = _at_rest(loop, options)
+        return trial(loop, robust_candidate(about, _for_robust(loop, options)), "robust", options)
     except (BackendError, InputError):
         return None
 
@@ -177,16 +178,18 @@ def peak(loop: ClosedLoop, options: RoaOptions) -> Trial | None:
         return None
 
 
-def _centred(loop: ClosedLoop) -> ClosedLoop:
-    """In floats."""
-    return replace(loop, network=replace(loop.folded, centre="output")) if loop.network.centre == "none" else loop
+def _at_rest(loop: ClosedLoop, options: RoaOptions) -> ClosedLoop:
+    """A loop that rests at the origin: itself, or under a practical claim that whose policy is centred, in floats."""
+    if options.claim != "practical" or loop.network.centre != "none":
+        return loop
+    return replace(loop, network=replace(loop.folded, centre="output"))
 
 
 def corrected(loop: ClosedLoop, last: Trial, witnesses: Sequence[Witness], options: RoaOptions) -> Trial | None:
     """An optimised candidate once more, with violations that its samples had missed; None if there is none larger."""
     known = np.array([w.x for w in witnesses]) if witnesses else None
     try:
-        P = optimise_repeatedly(loop, last.P, OPTIMISING * options.time_limit, known)
+        P = optimise_repeatedly(_at_rest(loop, options), last.P, OPTIMISING * options.time_limit, known)
     except BackendError:
         return None
     return trial(loop, P, last.name, options)
