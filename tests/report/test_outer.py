@@ -35,8 +35,9 @@ from certify.report.figures.paper import set_figure
 from certify.report.figures.scene import Scene, starts
 from certify.report.figures.style import START
 from certify.report.limits import outer_limited_by
-from certify.report.page import Status, _beyond, _claim, _missed, status_of
 from certify.report.sampling import quadratic
+from certify.report.sections.claim import _beyond, claim_of
+from certify.report.sections.status import Status, missed_of, status_of
 from certify.results import RoaResult
 from certify.systems import System
 from certify.verdict import Stop, Verdict
@@ -176,7 +177,7 @@ def test_the_area_is_an_estimate_and_says_so(by_formula: Case, by_network: Case)
 
 def test_a_practical_claim_keeps_its_words(practical: Case) -> None:
     assert practical.answer["result"] == "ACCEPTED"
-    claim = _claim(practical.certificate, practical.answer)
+    claim = claim_of(practical.certificate, practical.answer)
     assert "enters the smaller set {V(x) ≤ 0.0625} in finite time, and stays there from then on." in claim["statement"]
     assert "Moreover every trajectory that starts in the outer set" in claim["statement"]
     assert "N(x) ≤ 0.9 and no others" in claim["statement"] and len(claim["parts"]) == 7
@@ -410,11 +411,11 @@ def test_a_level_that_was_asked_for_and_missed_is_told_from_what_is_proved(prove
     alone = rendered({**data, "outer": None})
     assert "NOT proved; what is proved is {V <= 0.25} reason" in alone
     accepted, rejected = Status("ACCEPTED", ""), Status("REJECTED", "")
-    assert _missed(data, accepted) == (
+    assert missed_of(data, accepted) == (
         "An outer set was asked for that is not proved: the level of the function: only up to N <= 0.9, not 0.95. The "
         "certificate is about a smaller set."
     )
-    assert "smaller" not in _missed(data, rejected) and not _missed(proved.to_dict(), accepted)
+    assert "smaller" not in missed_of(data, rejected) and not missed_of(proved.to_dict(), accepted)
 
 
 def test_the_page_of_a_run_has_the_run_s_words(proved: RoaResult) -> None:

@@ -51,7 +51,6 @@ from certify.report.claims import CLAIMS
 from certify.report.figures import draw
 from certify.report.figures.geometry import PARTS, ellipse, refine, shadow
 from certify.report.limits import limited_by
-from certify.report.page import status_of
 from certify.report.sampling import (
     Flow,
     domain_bounds,
@@ -59,6 +58,7 @@ from certify.report.sampling import (
     simulate,
     time_scales,
 )
+from certify.report.sections.status import status_of
 from certify.report.words import above, below, kept_apart, label, number, symbol
 from certify.roa import RoaOptions, certify_roa
 from certify.systems import System, get_system

@@ -1,0 +1,194 @@
+"""What was proved: the claim in words and numbers, N where there is one, and each part with what the checker showed.
+
+The sentences of each kind of claim are those of `certify/report/claims.py`; here they get their numbers and notes.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import sympy
+from numpy.typing import NDArray
+
+from certify.certificate import Certificate, PartitionTree, TrustedSolver
+from certify.claims import Enlarged, Outer, Reached
+from certify.lyapunov import Neural, extents
+from certify.report.claims import CHECKED_ALWAYS, INPUTS
+from certify.report.figures.scene import centre_of, inner_of, is_ellipsoid, is_local_enough, slabs_of, start_of
+from certify.report.mathml import typeset
+from certify.report.sections.shared import centre_in_words, duration_in_words, timing_of, words_of
+from certify.report.timing import Timing
+from certify.report.words import (
+    MINUS,
+    above,
+    below,
+    inner_level,
+    kept_apart,
+    network_name,
+    pretty_unit,
+    shortest,
+    stated_for,
+    symbol,
+    varying_in,
+)
+from certify.systems import System
+
+_MOST_OPERATIONS = 200  # of an expression N that is shown
+
+
+def claim_of(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict[str, Any]:
+    """The claim of FORMAT.md in words and numbers, and what the checker showed of each part.
+
+    Of a solver's word the checker shows only the exact parts; the others say whose word they are.
+    """
+    system, words, evidence, timing = (
+        certificate.system,
+        words_of(certificate),
+        certificate.evidence,
+        timing_of(certificate),
+    )
+    units = {s.name: pretty_unit(system.units.get(s.name, "")) for s in (*system.states, *system.inputs)}
+    drawable = is_ellipsoid(certificate)
+    bounds = [
+        f"{below(lo)} ≤ {symbol(s.name)} ≤ {above(hi)} {units[s.name]}".rstrip()
+        for s, (lo, hi) in zip(system.inputs, system.input_bounds, strict=True)
+    ]
+    margins = answer.get("margins", {}) if answer else {}
+    local, ring = margins.get("local"), margins.get("ring")
+    notes = {
+        "Domain": f"{_sides(certificate, certificate.P, certificate.roa)}." if drawable else "",
+        "Inputs": "; ".join(bounds) + ".",
+    }
+    if local:
+        notes["Local"] = (
+            f"Margin{' of the linear part over the remainder' if certificate.claim.at_rest else ''}: "
+            f"{below(100 * local, 3)} %{_in_cells(evidence)}."
+        )
+    if answer and is_local_enough(certificate):
+        notes["Ring"] = "As c₁ = c₂, the local part covers the whole set."
+    elif answer:
+        shown = f"Shown on {answer.get('ring_leaves', 0):,} of {answer.get('leaves', 0):,} leaves"
+        notes["Ring"] = f"{shown}; {_smallest(timing)} is {below(ring, 3)}." if ring is not None else shown
+    notes |= _tube_notes(certificate) | _outer_notes(answer)
+    parts = []
+    for name, condition, shown_by in _with_errors(words.parts, system):
+        note = notes.get(name, "")
+        if isinstance(evidence, TrustedSolver):
+            text = f"{condition.rstrip('.')}."
+            by = "Checked in exact arithmetic." if name in CHECKED_ALWAYS else f"Not checked: {evidence.solver}'s word."
+            note = f"{by} {note}".rstrip()
+        else:
+            text = f"{condition}, {shown_by}." if shown_by else condition
+        parts.append((name, text, note))
+    inner, outer = inner_level(certificate.kind, inner_of(certificate)), below(certificate.roa)
+    beyond = _beyond(certificate, certificate.claim.outer)
+    practical = not certificate.claim.at_rest
+    statement = words.statement.format(
+        inner=inner,
+        outer=outer,
+        beyond="" if beyond is None else beyond["level"],
+        duration=duration_in_words(certificate),
+        centre=centre_in_words(certificate),
+        speed=timing.speed(inner_of(certificate) if practical else None, certificate.roa) if drawable else "",
+        constant="where what is uncertain is constant in time, " if system.ranges else "",
+    )
+    return {
+        "statement": stated_for(varying_in(system), statement, by_steps=timing.discrete),
+        "definition": timing.definitions,
+        "middle": below(certificate.inner) if practical and certificate.inner != inner_of(certificate) else "",
+        "enlarged": isinstance(certificate.claim, Enlarged | Reached),
+        "centre": isinstance(certificate.claim, Reached),
+        "beyond": beyond,
+        "level": outer,
+        "inner": inner,
+        "bounds": bounds,
+        "parts": parts,
+    }
+
+
+def _beyond(certificate: Certificate, outer: Outer | None) -> dict[str, Any] | None:
+    """What N is: a network by its widths and hash, an expression itself unless it is long."""
+    if outer is None:
+        return None
+    N, level = outer.function, below(outer.level)
+    if isinstance(N, Neural):
+        return {"level": level, "name": network_name(N.widths), "sha256": N.sha256(), "formula": ""}
+    operations = int(sympy.count_ops(N.expression))
+    shown = operations <= _MOST_OPERATIONS
+    name = "this expression" if shown else f"an expression of {operations:,} operations, which stands in the file"
+    left = "<mi>N</mi><mo>(</mo><mi>x</mi><mo>)</mo>"
+    formula = typeset(left, N.expression, certificate.system.states) if shown else ""
+    return {"level": level, "name": name, "sha256": "", "formula": formula}
+
+
+def _smallest(timing: Timing) -> str:
+    """Of what the margin of the ring is the least."""
+    return f"the smallest bound on {MINUS}{f'({timing.decrease})' if timing.rate else timing.decrease}"
+
+
+def _in_cells(evidence: PartitionTree | TrustedSolver) -> str:
+    """Of how many cells of the ranges a margin is the least; nothing where there is but one."""
+    count = math.prod(evidence.cells) if isinstance(evidence, PartitionTree) else 1
+    return f", the least of {count:,} cells of the box of all ranges" if count > 1 else ""
+
+
+def _with_errors(parts: Sequence[tuple[str, str, str]], system: System) -> Iterator[tuple[str, str, str]]:
+    """The parts of a claim, the one on inputs in words that know the error that comes on top of what is asked for."""
+    errors = system.input_errors
+    held = all(lo <= 0 <= hi for lo, hi in (system.ranges[e] for e in errors.values()))
+    on_top = (
+        "On {V ≤ c₂} what the policy asks for, π(x), stays in the bounds of the input; the error comes on top of it. "
+    )
+    clips = "An actuator that clips the two together makes the error no larger, and is covered." if held else ""
+    for part in parts:
+        yield (part[0], (on_top + clips).rstrip(), part[2]) if part == INPUTS and errors else part
+
+
+def _sides(
+    certificate: Certificate, P: NDArray[np.float64], level: float, centre: NDArray[np.float64] | None = None
+) -> str:
+    """How far {(x - c)'P(x - c) <= level} reaches from c along each state, which is less than the domain does."""
+    system = certificate.system
+    around = np.zeros(system.n) if centre is None else centre
+    each = zip(system.states, extents(P, level), system.domain, map(Fraction, around.tolist()), strict=True)
+    units = {s.name: pretty_unit(system.units.get(s.name, "")) for s in system.states}
+    return "; ".join(
+        f"|{_from(s.name, c)}| ≤ {kept_apart(float(e), min(c - lo, hi - c))} {units[s.name]}".rstrip()
+        for s, e, (lo, hi), c in each
+    )
+
+
+def _from(name: str, value: Fraction) -> str:
+    """A state less a value: `θ + 0.1`."""
+    return f"{symbol(name)} {MINUS if value > 0 else '+'} {shortest(float(abs(value)))}" if value else symbol(name)
+
+
+def _tube_notes(certificate: Certificate) -> dict[str, str]:
+    """Of the tube's part of the claim: how many slabs in what time, and how far its start reaches."""
+    start = start_of(certificate)
+    if start is None:
+        return {}
+    sides = _sides(certificate, start, 1.0, centre_of(certificate))
+    count = len(slabs_of(certificate))
+    slabs = f"{count:,} slabs" if count != 1 else "One slab"
+    return {
+        "Tube": f"{slabs}, {duration_in_words(certificate)} in all.",
+        "Along the tube": f"At the start {sides}.",
+    }
+
+
+def _outer_notes(answer: Mapping[str, Any] | None) -> dict[str, str]:
+    """Of the outer set's parts: on how many leaves the checker has shown them."""
+    beyond = (answer or {}).get("outer")
+    if not isinstance(beyond, Mapping):
+        return {}
+    margin = (answer or {}).get("margins", {}).get("outer")
+    least = "" if margin is None else f"; the smallest bound on {MINUS}N′F is {below(margin, 3)}"
+    return {
+        "Faces": f"Shown on {beyond.get('face_leaves', 0):,} leaves.",
+        "Outer set": f"Shown on {beyond.get('leaves', 0):,} leaves{least}.",
+    }

@@ -1,0 +1,81 @@
+"""What limits the set, and what to try next: how much of its domain it takes, where the proof had most to do.
+
+How a limit is called stands in `certify/report/limits.py`, because the terminal calls it the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from certify.certificate import Certificate
+from certify.lyapunov import extents
+from certify.report.figures.scene import centre_of, is_ellipsoid
+from certify.report.limits import limit_in_words, outer_limited_by
+from certify.report.sections.shared import ellipsoids_of, shares_of, timing_of
+from certify.report.sections.status import is_missed
+from certify.report.words import above, held_at, number, pretty_unit, symbol
+
+
+def limits_of(certificate: Certificate, result: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    """How much of its domain the set takes, and what the run says of what limits it; None where there is no set.
+
+    The shares are the certificate's own; only words and the next step come from the run.
+    """
+    if not is_ellipsoid(certificate):
+        return None
+    system = certificate.system
+    sets = ellipsoids_of(certificate)
+    if centre_of(certificate) is not None:  # how far a set that lies elsewhere reaches is no share of a side
+        sets = sets[-1:]
+    reach = [extents(each.P, each.level) for each in sets]
+    shares = [shares_of(certificate, e) for e in reach]
+    found: Mapping[str, Any] = (result or {}).get("diagnosis") or {}
+    names = {s.name: symbol(s.name) for s in system.states}
+    step: Mapping[str, Any] = found.get("next") or {}
+    options = " ".join(f"{name} {value}" for name, value in (step.get("options") or {}).items())
+    return {
+        "binds": "" if is_missed(result) else limit_in_words(str(found.get("binds", "")), timing_of(certificate)),
+        "modes": ""
+        if timing_of(certificate).discrete
+        else _modes(found, "with " * bool(system.ranges) + held_at(system)),
+        "outer": _outer_limit(result),
+        "sets": len(sets),
+        "shares": [
+            {
+                "name": symbol(s.name) if each is sets[0] else "",
+                "of": each.name,
+                "kind": each.kind,
+                "reach": f"{above(float(e[k]), 4)} {pretty_unit(system.units.get(s.name, ''))}".rstrip(),
+                "share": f"{above(100 * share[k], 3)} %",
+                "width": f"{min(100.0, 100 * share[k]):.1f}",
+                "binds": share[k] == max(share),
+            }
+            for k, s in enumerate(system.states)
+            for each, e, share in zip(sets, reach, shares, strict=True)
+        ],
+        "hurts": [
+            (names.get(name, name), f"{100 * weight:.1f}", number(weight, 2))
+            for name, weight in (found.get("hurts") or {}).items()
+        ],
+        "why": str(step.get("why", "")).rstrip("."),
+        "command": step.get("command") or options,
+    }
+
+
+def _outer_limit(result: Mapping[str, Any] | None) -> str:
+    """What the run says of what limits its outer set; nothing where there is none."""
+    found: Mapping[str, Any] = (result or {}).get("outer") or {}
+    return outer_limited_by(found) if found else ""
+
+
+def _modes(found: Mapping[str, Any], held: str) -> str:
+    """How fast the closed loop is at the origin, in a sentence, with the values that are not exact `held`."""
+    if not found.get("stiffness"):
+        return ""
+    fast, slow = number(abs(found["fastest"]), 3), number(abs(found["slowest"]), 3)
+    where = f"At the origin, {held}," if held else "At the origin"
+    return (
+        f"{where} its slowest mode decays at {slow} per second, its fastest at {fast} per second: a stiffness of "
+        f"{number(found['stiffness'], 2)}."
+    )

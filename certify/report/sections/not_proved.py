@@ -1,0 +1,129 @@
+"""What was not proved: what a reader may take the claim to say, and it does not.
+
+What a kind of claim leaves out that its siblings do not stands with its words, in `certify/report/claims.py`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from certify.certificate import Certificate
+from certify.report.claims import Words
+from certify.report.sections.shared import timing_of
+from certify.report.timing import Timing
+from certify.report.words import Varying, held_at, listed, symbol
+from certify.systems import System
+
+
+def not_proved_of(certificate: Certificate, words: Words) -> list[tuple[str, str]]:
+    """Heads and texts of what the claim does not say."""
+    items = [
+        *words.excluded[:-1],
+        (
+            "Anything outside the set.",
+            f"The true set may be larger: what starts outside {words.sets} may do the same or not.",
+        ),
+        *_not_of_the_plant(certificate.system),
+        *_other_times(timing_of(certificate)),
+        _rounding(certificate.system),
+        *words.excluded[-1:],
+        ("Wrapped angles.", "States are real numbers: an angle of a full turn is not the origin."),
+        (
+            "Simulated figures.",
+            "Trajectories, grids and the share of the simulated region are illustrations in floating point"
+            + (f", all of them with {held} from beginning to end." if (held := held_at(certificate.system)) else "."),
+        ),
+    ]
+    if certificate.claim.outer is not None:
+        items.append(
+            (
+                "The size of the outer set.",
+                "Its volume is estimated from samples, and its outline in the figures is drawn from a grid; only the "
+                "inequality N(x) ≤ n₂ within the domain says which states belong to it.",
+            )
+        )
+    if certificate.system.n > 2:
+        items.append(
+            (
+                "The pictures as wholes.",
+                "A section shows two states with all others 0, a projection two states whatever the others are; the "
+                "claim is about all states together.",
+            )
+        )
+    return items
+
+
+def _other_times(timing: Timing) -> Iterator[tuple[str, str]]:
+    """In which other ways than the claim's time may pass in a loop."""
+    if timing.discrete:
+        yield (
+            "Time between the steps.",
+            "The equations say what the state is one step later, and nothing of what lies between two steps. Where "
+            "they come from a plant in continuous time, that they are exact for it, and what it does between them, is "
+            "not part of the claim.",
+        )
+    elif timing.sample is None:
+        yield (
+            "A sampled controller.",
+            "u = π(x) acts in continuous time. An action that is held between samples is another closed loop.",
+        )
+    else:
+        longer = "longer" if timing.from_zero else "longer or shorter"
+        yield (
+            "Other periods, and delay.",
+            f"The input changes at the sampling instants, at once, and is held over {timing.periods}. With a period "
+            f"that is {longer} even once, a sample that is missed, or the time that computing the input takes, it is "
+            "another closed loop.",
+        )
+        if not timing.from_zero:
+            yield (
+                "The set between two sampling instants.",
+                "At the sampling instants the state is in the set; between two of them it is in the domain, and may be "
+                "outside the set.",
+            )
+
+
+def _not_of_the_plant(system: System) -> list[tuple[str, str]]:
+    """What of plant and surroundings the claim does not cover: less, where something has a range."""
+    if not system.ranges:
+        return [
+            (
+                "Any other plant.",
+                "The claim is about the equations above with exactly these numbers: no other mass, no friction, "
+                "flexibility or actuator lag that is not in them.",
+            ),
+            ("Disturbances.", "No wind, no sensor noise, no estimation error, no delay."),
+        ]
+    names = listed([symbol(name) for name in system.ranges])
+    within = "its range" if len(system.ranges) == 1 else "their ranges"
+    return [
+        (
+            "Any other plant.",
+            f"The claim is about the equations above: with every value of {names} in {within} and none outside, and "
+            "with exactly these numbers in all else: no friction, flexibility or actuator lag that is not in them.",
+        ),
+        (
+            "Other disturbances.",
+            f"Only what {names} can be in these equations: no other force, no sensor noise, no estimation error, no "
+            "delay.",
+        ),
+    ]
+
+
+def _rounding(system: System) -> tuple[str, str]:
+    """What is not said of how the policy is evaluated: less, where inputs may be in error."""
+    errors = system.input_errors
+    exact = [s.name for s in system.inputs if s.name not in errors]
+    if len(exact) == system.m:
+        return (
+            "Rounding in the controller.",
+            "The policy is evaluated in exact real arithmetic on its binary64 numbers; an embedded float32 evaluation "
+            "differs by its rounding errors.",
+        )
+    ranges = listed([Varying(e, *system.ranges[e], system.units.get(e, "")).words for e in errors.values()])
+    others = f" {listed([symbol(name) for name in exact])} must be exact." if exact else ""
+    return (
+        "Larger errors of the controller.",
+        f"An evaluation of the policy, in float32 for one, is covered as long as its error is {ranges}, at "
+        f"every state of the set. That a certain program is, is not part of the claim.{others}",
+    )

@@ -1,0 +1,241 @@
+"""The tables of numbers: levels, sizes, the loop near the origin, matrices, what the evidence is, what the run did."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.certificate import Certificate, TrustedSolver
+from certify.claims import Asymptotic, Enlarged, Outer, Reached
+from certify.closed_loop import ClosedLoop
+from certify.errors import CertifyError
+from certify.lyapunov import Neural, domain_limit, extents, sampled_volume, semi_axes, volume
+from certify.report.figures.scene import centre_of, inner_of, is_ellipsoid, is_local_enough, slabs_of
+from certify.report.limits import limited_by, outer_limited_by
+from certify.report.sections.shared import (
+    Ellipsoid,
+    duration_in_words,
+    ellipsoids_of,
+    read_in_words,
+    shares_of,
+    timing_of,
+    words_of,
+)
+from certify.report.sections.status import Status, is_missed
+from certify.report.words import (
+    ABSENT,
+    MINUS,
+    above,
+    below,
+    deviation,
+    estimated,
+    held_at,
+    network_name,
+    number,
+    seconds,
+    shortest,
+    volume_name,
+    volume_unit,
+)
+
+
+def tables_of(
+    certificate: Certificate,
+    status: Status,
+    answer: Mapping[str, Any] | None,
+    result: Mapping[str, Any] | None,
+    sha256: str,
+    size: int | None,
+) -> dict[str, Any]:
+    """All tables but those of the matrices, and what stands at their heads, by their names in the template."""
+    system, P, network, words = certificate.system, certificate.P, certificate.network, words_of(certificate)
+    timing, inner = timing_of(certificate), inner_of(certificate)
+    state_units = [system.units.get(s.name, "") for s in system.states]
+    levels = [(f"{words.inner}, {words.inner_word}", repr(inner))]
+    levels += [("c₁, local", repr(certificate.inner))] if inner != certificate.inner else []
+    levels += [("c₂, enlarged", repr(certificate.roa))]
+    reach: list[tuple[str, ...]] = []
+    heads: list[str] = []
+    size_of_set: list[tuple[str, str]] = []
+    if is_ellipsoid(certificate):
+        limit = domain_limit(P, system.domain)
+        share = below(100 * Fraction(certificate.roa) / Fraction(limit), 4) if limit > 0 else "?"
+        levels.append(("domain's limit", f"{below(limit, 10)}, of which c₂ is {share} %"))
+        sets = ellipsoids_of(certificate)
+        for each in sets:
+            named = volume_name(system.n) + (f" of {each.name}" if len(sets) > 1 else "")
+            size_of_set.append((named, f"{below(volume(each.P, each.level))} {volume_unit(state_units)}".rstrip()))
+        heads, columns = _lengths(certificate, sets)
+        points = zip(system.states, system.exact_x_eq(), state_units, strict=True)
+        names = [deviation(s.name, q, unit) for s, q, unit in points]
+        centre = centre_of(certificate) if len(sets) > 1 else None
+        if centre is not None:
+            heads, columns = ["c₀", *heads], [[shortest(v) for v in centre.tolist()], *columns]
+        domain = [f"[{below(lo)}, {above(hi)}]" for lo, hi in system.domain]
+        reach = list(zip(names, *columns, domain, strict=True))
+    beyond = certificate.claim.outer
+    if beyond is not None:
+        levels.append(("n₂, of N", repr(beyond.level)))
+    if result is not None:
+        if not is_missed(result):
+            levels.append(("limited by", limited_by(result)))
+        if result.get("outer"):
+            levels.append(("n₂ limited by", outer_limited_by(result["outer"])))
+        sampled = result["levels"].get("sampled_limit")
+        if sampled is not None:
+            levels.append(("lowest V of a violation found", number(sampled, 10)))
+    geometry: list[tuple[str, str]] = []
+    if np.all(np.isfinite(P)):
+        geometry.append(("eigenvalues of P", ", ".join(number(float(v)) for v in np.linalg.eigvalsh(P))))
+    if isinstance(certificate.claim, Asymptotic):  # elsewhere the origin need not be an equilibrium
+        held = f" with {held_at(system)}" if system.ranges else ""
+        geometry.append((f"eigenvalues of the closed loop{timing.linearised}{held}", _eigenvalues(certificate)))
+    if timing.sample is not None:
+        geometry.append(("input held over", timing.periods))
+    if timing.rate:
+        geometry.append(("rate λ", f"{certificate.claim.rate!r} per {'step' if timing.discrete else 's'}"))
+    slabs = slabs_of(certificate)
+    evidence = [
+        ("policy", f"{'-'.join(map(str, network.layers))} tanh, squash {network.squash}, centre {network.centre}"),
+        *(() if network.clip is None else (("clipped to", _clip(certificate)),)),
+        *((("its layers read", read_in_words(certificate)),) if network.is_moved else ()),
+        ("policy sha256", network.sha256()),
+        ("certificate sha256", sha256),
+    ]
+    if size is not None:
+        evidence.append(("certificate size", f"{size:,} bytes"))
+    if beyond is not None:
+        evidence += _outer_rows(beyond, answer if status.accepted else None)
+    if slabs:
+        evidence.append(("tube", f"{len(slabs):,} slabs, {duration_in_words(certificate)}"))
+    if isinstance(certificate.evidence, TrustedSolver):
+        solver = certificate.evidence
+        evidence.append(("solver", f"{solver.solver} {solver.version}, delta {number(solver.precision)}"))
+        evidence += [(f"its answer to {name}", said) for name, said in solver.queries]
+    elif answer is not None and status.accepted:
+        leaves = f"{answer.get('leaves', 0):,}, of which {answer.get('ring_leaves', 0):,} in the ring"
+        whole = is_local_enough(certificate)
+        evidence.append(("leaves", "none needed: the local part covers the whole set" if whole else leaves))
+    run: list[tuple[str, str]] = []
+    if result is not None:
+        if result.get("boxes"):
+            run.append(("boxes examined", f"{result['boxes']:,}"))
+        run += [(f"{k}", seconds(v)) for k, v in result["seconds"].items() if v is not None]
+        asked = result.get("solver") or {}
+        for q in asked.get("queries", []):
+            about = f"{asked['solver']} {asked['version']} on {q['query']}, V <= {number(q['level'])}"
+            run.append((about, f"{q['answer']}, {seconds(q['seconds'])}"))
+    unit = volume_unit(state_units)
+    candidates = [
+        (
+            row["candidate"],
+            below(row["level"]),
+            f"{below(row['volume'])} {unit}".rstrip(),
+            "the domain" if row["limited_by"] == "domain" else "a violation found",
+            f"{below(row['proved_volume'])} {unit}".rstrip() if row.get("proved_volume") else ABSENT,
+            "this one" if row["proved"] else "",
+        )
+        for row in (result or {}).get("candidates", [])
+    ]
+    return {
+        "levels": levels,
+        "size": size_of_set,
+        "estimated": _estimated(certificate, result) if is_ellipsoid(certificate) else "",
+        "geometry": geometry,
+        "reach": reach,
+        "reach_heads": heads,
+        "sets": "the set reaches" if len(heads) <= 2 else "each set reaches",
+        "measure": volume_name(system.n),
+        "evidence": evidence,
+        "run": run,
+        "candidates": candidates,
+    }
+
+
+def matrices_of(certificate: Certificate) -> list[tuple[str, list[list[str]]]]:
+    """Names and entries of what the quadratic forms are, as the file has them."""
+    named = [("P", certificate.P)]
+    if isinstance(certificate.claim, Enlarged | Reached):
+        named.append(("P₀ of the tube's start", certificate.claim.start.P))
+    centre = centre_of(certificate)
+    if centre is not None:
+        named.append(("c₀, a row of states as the tube's start lies around them", centre[None]))
+    return [(name, [[repr(float(v)) for v in row] for row in P]) for name, P in named]
+
+
+def _outer_rows(beyond: Outer, answer: Mapping[str, Any] | None) -> list[tuple[str, str]]:
+    """N, and on how many leaves the checker has looked at it."""
+    N = beyond.function
+    rows = [("N", network_name(N.widths)), ("sha256 of N", N.sha256())] if isinstance(N, Neural) else []
+    found = (answer or {}).get("outer")
+    if isinstance(found, Mapping):
+        leaves = f"{found.get('leaves', 0):,}, and {found.get('face_leaves', 0):,} on the faces of the domain"
+        rows.append(("leaves of the outer set", leaves))
+    return rows
+
+
+def _estimated(certificate: Certificate, result: Mapping[str, Any] | None) -> str:
+    """The volume of the union with the outer set, as the run has it or from samples; nothing without one."""
+    beyond, system = certificate.claim.outer, certificate.system
+    if beyond is None:
+        return ""
+    found: Mapping[str, Any] = (result or {}).get("outer") or {}
+    if found:
+        size = float(found["volume"]), float(found["deviation"])
+    else:
+        N, n2, V, c2 = beyond.function, beyond.level, certificate.V, certificate.roa
+        size = sampled_volume(lambda x: (N(x) <= n2) | (V(x) <= c2), system.domain)
+    return estimated(*size, volume_unit([system.units.get(s.name, "") for s in system.states]))
+
+
+def _lengths(certificate: Certificate, sets: Sequence[Ellipsoid]) -> tuple[list[str], list[list[str]]]:
+    """Heads and columns of how far the sets reach along the states: on the axes, rounded down, and at all, up.
+
+    Where there are two sets, their sizes on the axes stand side by side, as shares of the domain too if both lie around
+    the origin.
+    """
+    axes = [[below(float(v)) for v in semi_axes(each.P, each.level)] for each in sets]
+    most = [[above(float(v)) for v in extents(each.P, each.level)] for each in sets]
+    if len(sets) == 1:
+        return ["on its axis, ±", "largest in the set, ±"], [*axes, *most]
+    for column, each in zip(axes, sets, strict=True) if centre_of(certificate) is None else ():
+        shares = shares_of(certificate, semi_axes(each.P, each.level))
+        column[:] = [f"{v} ({below(100 * q, 3)} %)" for v, q in zip(column, shares, strict=True)]
+    heads = [f"{what} {each.name}, ±" for what in ("axis of", "largest in") for each in sets]
+    return heads, [*axes, *most]
+
+
+def _clip(certificate: Certificate) -> str:
+    """Each input's limits, in its unit."""
+    inputs, clip = certificate.system.inputs, certificate.network.clip or ()
+    each = zip(inputs, *clip, strict=True)
+    return ", ".join(f"{s.name} in [{number(float(lo), 10)}, {number(float(hi), 10)}]" for s, lo, hi in each)
+
+
+def _eigenvalues(certificate: Certificate) -> str:
+    try:
+        A, B, K = ClosedLoop(certificate.system, certificate.network).linearise()
+    except CertifyError as error:
+        return str(error)
+    if certificate.system.sample is not None:
+        A = _over_period(A + B @ K, B, K, float(certificate.system.sample[1]))
+    return ", ".join(_complex(complex(v)) for v in sorted(np.linalg.eigvals(A), key=lambda v: (v.real, v.imag)))
+
+
+def _over_period(A: NDArray[np.float64], B: NDArray[np.float64], K: NDArray[np.float64], h: float) -> Any:
+    """What the linear loop x' = A x + B u makes of x over a period, u = -K x held: e^(A h) - int_0^h e^(A s) ds B K."""
+    from scipy.linalg import expm
+
+    n, m = B.shape
+    both = expm(h * np.block([[A, B], [np.zeros((m, n + m))]]))
+    return both[:n, :n] - both[:n, n:] @ K
+
+
+def _complex(value: complex) -> str:
+    if value.imag == 0:
+        return number(value.real, 5)
+    return f"{number(value.real, 5)} {'+' if value.imag > 0 else MINUS} {number(abs(value.imag), 5)}i"

@@ -1,0 +1,57 @@
+"""The plant that a claim is about, within the section on what was proved: its equations, its domain, the bounds of its
+inputs, where it rests, and what of it is uncertain."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from fractions import Fraction
+from typing import Any
+
+import sympy
+
+from certify.certificate import Certificate
+from certify.report.mathml import identifier, is_long, typeset
+from certify.report.sections.shared import centre_in_words, read_in_words
+from certify.report.words import above, at_rest, below, held_at, number, pretty_unit, symbol, varying_in
+
+
+def plant_of(certificate: Certificate) -> dict[str, Any]:
+    """Its equations, its ranges and where it rests, by their names in the template."""
+    system, units = certificate.system, certificate.system.units
+    expressions, steps = system.uncertain_dynamics(), system.time == "discrete"
+
+    def interval(name: str, bounds: tuple[Fraction, Fraction]) -> str:
+        lo, hi = bounds
+        return f"{symbol(name)} ∈ [{below(lo)}, {above(hi)}] {pretty_unit(units.get(name, ''))}".rstrip()
+
+    names = (*system.states, *system.inputs, *(s for s, _ in system.uncertain))
+    equilibrium = zip(system.inputs, system.exact_u_eq(), strict=True)
+    return {
+        "name": system.name,
+        "equations": [_equation(s, e, names, steps=steps) for s, e in zip(system.states, expressions, strict=True)],
+        "rounded": any(is_long(v) for e in (*expressions, *system.u_eq) for v in e.atoms(sympy.Rational)),
+        "domain": [interval(s.name, b) for s, b in zip(system.states, system.domain, strict=True)],
+        "inputs": [interval(s.name, b) for s, b in zip(system.inputs, system.input_bounds, strict=True)],
+        "at": at_rest(
+            [s.name for s in system.states], system.exact_x_eq(), [units.get(s.name, "") for s in system.states]
+        ),
+        "read": read_in_words(certificate) if certificate.network.is_moved else "",
+        "centre": centre_in_words(certificate, of_values=True),
+        "u_eq": ", ".join(f"{symbol(s.name)} = {_short(u)}" for s, u in equilibrium),
+        "uncertain": [q.words for q in varying_in(system)],
+        "held": held_at(system),
+        "listed": ", ".join(symbol(name) for name in system.ranges),
+        "errors": [f"{symbol(u)} + {symbol(e)}" for u, e in system.input_errors.items()],
+    }
+
+
+def _equation(state: sympy.Symbol, expression: sympy.Expr, names: Sequence[sympy.Symbol], *, steps: bool) -> Any:
+    """`state' = expression`, or by steps `state+ = expression`."""
+    left = f"<mfrac><mrow><mi>d</mi>{identifier(state.name)}</mrow><mrow><mi>d</mi><mi>t</mi></mrow></mfrac>"
+    if steps:
+        left = f"<msup>{identifier(state.name)}<mo>+</mo></msup>"
+    return typeset(left, expression, names)
+
+
+def _short(value: Fraction) -> str:
+    return number(float(value)) if is_long(sympy.Rational(value.numerator, value.denominator)) else str(value)

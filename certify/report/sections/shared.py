@@ -1,0 +1,82 @@
+"""What more than one section needs of a certificate: the words for its claim, its ellipsoids, its tube, its policy.
+
+What a single section needs stands in that section.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.certificate import Certificate, PartitionTree
+from certify.report.claims import Words, words_for
+from certify.report.figures.scene import centre_of, slabs_of, start_of
+from certify.report.timing import Timing
+from certify.report.words import ABSENT, above, number, point, symbol
+
+
+def timing_of(certificate: Certificate) -> Timing:
+    """How time passes in its loop, and the rate at which V is claimed to fall."""
+    return Timing.of(certificate.system, certificate.claim.rate)
+
+
+def words_of(certificate: Certificate) -> Words:
+    """Its kind of claim in words."""
+    evidence = certificate.evidence
+    ball = isinstance(evidence, PartitionTree) and evidence.local is not None
+    return words_for(certificate.kind, timing_of(certificate), ball=ball, beyond=certificate.claim.outer is not None)
+
+
+@dataclass(frozen=True, slots=True)
+class Ellipsoid:
+    """{x'Px <= level}, of those that the certificate is about; `kind` is `start` for that of a tube, else `set`.
+
+    It lies around the origin, that of a tube around a path around its c₀.
+    """
+
+    kind: str
+    name: str
+    P: NDArray[np.float64]
+    level: float
+
+
+def ellipsoids_of(certificate: Certificate) -> list[Ellipsoid]:
+    """The start of a tube where there is one, and {V <= c2}."""
+    start = start_of(certificate)
+    inner = Ellipsoid("set", "{V ≤ c₂}", certificate.P, certificate.roa)
+    name = "the start" if centre_of(certificate) is None else "the start, around c₀"
+    return [inner] if start is None else [Ellipsoid("start", name, start, 1.0), inner]
+
+
+def shares_of(certificate: Certificate, lengths: NDArray[np.float64]) -> list[float]:
+    """Lengths along the states (n,) as shares of the nearer sides of the domain; infinite where that has none."""
+    sides = [min(-lo, hi) for lo, hi in certificate.system.domain]
+    each = zip(lengths, sides, strict=True)
+    return [float(Fraction(float(v)) / side) if side > 0 else math.inf for v, side in each]
+
+
+def centre_in_words(certificate: Certificate, *, of_values: bool = False) -> str:
+    """c₀ of a tube around a path in words, as a deviation or by the states' values; a dash where there is none."""
+    system, centre = certificate.system, centre_of(certificate)
+    if centre is None or start_of(certificate) is None:
+        return ABSENT
+    names, units = [s.name for s in system.states], [system.units.get(s.name, "") for s in system.states]
+    shifts = system.exact_x_eq() if of_values else [Fraction(0)] * system.n
+    return point(names, [q + Fraction(c) for q, c in zip(shifts, centre.tolist(), strict=True)], units)
+
+
+def duration_in_words(certificate: Certificate) -> str:
+    """Of the tube, rounded up; a dash where there is none, or a rejected file's is no number."""
+    each = [slab.duration for slab in slabs_of(certificate)]
+    return f"{above(sum(map(Fraction, each)))} s" if each and all(map(math.isfinite, each)) else ABSENT
+
+
+def read_in_words(certificate: Certificate) -> str:
+    """What the layers of a policy read that is seen from elsewhere, in the states' units."""
+    states, origin = certificate.system.states, certificate.network.origin.tolist()
+    each = zip(states, origin, strict=True)
+    return ", ".join(f"{number(v, 10)} + {symbol(s.name)}" if v else symbol(s.name) for s, v in each)

@@ -1,0 +1,43 @@
+"""The share of the simulated region, under the figures: what the grid of runs shows, and how they came about.
+
+The runs themselves are those of `certify/report/sampling.py`; the figures draw them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from certify.certificate import Certificate
+from certify.report.claims import words_for
+from certify.report.sampling import SimulatedRoa
+from certify.report.sections.shared import timing_of
+from certify.report.timing import Timing
+from certify.report.words import ABSENT, TIMES, number, volume_name
+
+
+def simulated_of(roa: SimulatedRoa, certificate: Certificate) -> dict[str, str]:
+    """The counts of a grid of runs, and how they came about."""
+    timing = timing_of(certificate)
+    return {
+        "fraction": ABSENT if np.isnan(roa.fraction) else f"{100 * roa.fraction:.1f} %",
+        "grid": f" {TIMES} ".join(str(len(a)) for a in roa.axes),
+        "attracted": f"{int(roa.attracted.sum()):,} of {roa.attracted.size:,}",
+        "how": _integrated(roa, timing),
+        "horizon": f"{number(roa.horizon, 3)} {timing.unit}",
+        "undecided": f"{roa.undecided:,}",
+        "left": f"{int(roa.left.sum()):,}",
+        "contradictions": f"{roa.contradictions:,}" if roa.contradictions else "",
+        "slow": f"{roa.slow:,}" if roa.slow else "",
+        "of": volume_name(certificate.system.n),
+        "who": words_for(certificate.kind).simulated,
+    }
+
+
+def _integrated(roa: SimulatedRoa, timing: Timing) -> str:
+    """How the runs of a grid come about; {} stands for the values that are held."""
+    step = f"step {number(roa.step, 3)} s"
+    if timing.discrete:
+        return "the loop's own steps{}"
+    if timing.sample is not None:
+        return f"Runge–Kutta of order four with the input held over {number(float(timing.sample[1]), 6)} s{{}}, {step}"
+    return f"Runge–Kutta of order four on the continuous closed loop{{}}, {step}"

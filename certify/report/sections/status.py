@@ -1,0 +1,102 @@
+"""The boxes at the head of the page: what may be said of the certificate, and what was asked for and missed.
+
+Whether a page may speak of a proof is decided here and nowhere else; all other sections are told by a `Status`, or get
+the checker's answer only if it accepts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import Any
+
+from certify.certificate import Certificate, PartitionTree, TrustedSolver
+from certify.errors import SoundnessError
+from certify.report.claims import CHECKED_ALWAYS, words_for
+from certify.report.words import point
+
+
+@dataclass(frozen=True, slots=True)
+class Status:
+    """What may be said of a certificate: kind is ACCEPTED, TRUSTED, REJECTED or NOT CHECKED; note says why."""
+
+    kind: str
+    note: str
+
+    @property
+    def accepted(self) -> bool:
+        """Whether the page may speak of a proof."""
+        return self.kind == "ACCEPTED"
+
+
+def status_of(certificate: Certificate, sha256: str, answer: Mapping[str, Any] | None) -> Status:
+    """What the checker's answer lets be said of the certificate whose bytes have this hash.
+
+    Raises
+    ------
+    SoundnessError : the answer accepts, or trusts, something else than this certificate.
+    """
+    if answer is None:
+        return Status("NOT CHECKED", "The checker was not asked. Until it accepts the file, nothing here is proved.")
+    kind = answer.get("result")
+    if kind == "REJECTED":
+        where = f"rule {answer.get('rule', '?')} at {answer.get('at', '?')}"
+        detail = f": {answer['detail']}" if answer.get("detail") else ""
+        return Status("REJECTED", f"The checker refuses the certificate by {where}{detail}. Nothing here is proved.")
+    if kind not in ("ACCEPTED", "TRUSTED"):
+        return Status("NOT CHECKED", "The checker gave no verdict. Nothing here is proved.")
+    levels = answer.get("levels")
+    given = dict(levels) if isinstance(levels, Mapping) else {}
+    beyond, stated = answer.get("outer"), certificate.claim.outer
+    beyond = beyond if beyond is None or (isinstance(beyond, Mapping) and "level" in beyond) else {"level": "none"}
+    for what, found, wanted in (
+        ("bytes with sha256", answer.get("certificate_sha256"), sha256),
+        ("policy with sha256", answer.get("policy_sha256"), certificate.network.sha256()),
+        ("levels", given, dict(certificate.claim.levels)),
+        (
+            "level of the outer set",
+            None if beyond is None else [beyond["level"]],
+            None if stated is None else [stated.level],
+        ),
+        ("evidence to replay", kind == "ACCEPTED", isinstance(certificate.evidence, PartitionTree)),
+    ):
+        if found != wanted:
+            raise SoundnessError(
+                f"the checker's answer must be about the certificate that the report shows; {what}: the answer has "
+                f"{found}, the certificate {wanted}. Read the file once and check the bytes that were read."
+            )
+    if isinstance(certificate.evidence, TrustedSolver):
+        solver = f"{certificate.evidence.solver} {certificate.evidence.version}"
+        return Status(
+            "TRUSTED",
+            f"The checker checked what is exact: {_checked(certificate.kind)}. All else, above all that V̇ "
+            f"is negative, is the word of {solver}, which nothing here can check. It is not a proof.",
+        )
+    return Status("ACCEPTED", "The independent checker accepted the certificate.")
+
+
+def _checked(kind: str) -> str:
+    """What is checked whatever the evidence is."""
+    names = {"Lyapunov function": "P", "Equilibrium": "P, the equilibrium", "Domain": "the domain"}
+    return ", ".join(names[name] for name, _, _ in words_for(kind).parts if name in CHECKED_ALWAYS)
+
+
+def is_missed(result: Mapping[str, Any] | None) -> bool:
+    """Whether the run's reason is about what it was asked for, a state or a level of N, and not about the certificate's
+    set."""
+    return result is not None and result.get("stop") in ("path", "beyond")
+
+
+def missed_of(result: Mapping[str, Any] | None, status: Status) -> str:
+    """That a state, or a level of N, was asked about of which this certificate says nothing; else nothing."""
+    if result is None or not is_missed(result):
+        return ""
+    if result.get("stop") == "beyond":
+        smaller = " The certificate is about a smaller set." if status.accepted else ""
+        return f"An outer set was asked for that is not proved: {result['reason'].rstrip('.')}.{smaller}"
+    asked: Mapping[str, str] = result.get("reach_from") or {}
+    units = {s["name"]: s.get("unit") or "" for s in result.get("states") or ()}
+    where = point(list(asked), [Fraction(v) for v in asked.values()], [units.get(name, "") for name in asked])
+    proved = "The certificate is about {V ≤ c₂} alone, in which this state does not lie." if status.accepted else ""
+    return f"The state {where} was asked about. It is not shown to converge: {result['reason']}. {proved}".rstrip()
