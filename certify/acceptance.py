@@ -178,9 +178,8 @@ def _lowered(certificate: Certificate, leaf: int | None, problem: Problem, tries
         return None
     if claim.outer is not None:
         return replace(certificate, claim=replace(claim, outer=None), evidence=replace(evidence, outer=None))
-    if isinstance(claim, Nearby):
-        weaker = Practical(claim.roa, claim.local, claim.floor, rate=claim.rate)
-        return replace(certificate, claim=weaker, evidence=replace(evidence, contraction=None))
+    if isinstance(claim, Nearby) and leaf is None:
+        return _without_equilibrium(certificate, claim, evidence)
     if isinstance(claim, Enlarged | Reached):  # without its tube, what is refused may not be asked any more
         return replace(certificate, claim=Asymptotic(claim.roa, claim.local), evidence=replace(evidence, tube=()))
     if leaf is None or claim.inner == claim.roa:
@@ -194,7 +193,14 @@ def _lowered(certificate: Certificate, leaf: int | None, problem: Problem, tries
     level = below_leaf(problem, evidence, leaf) if tries < 2 else math.sqrt(claim.inner * claim.roa)
     if claim.inner < level < claim.roa and tries < 5:
         return replace(certificate, claim=replace(claim, roa=level))
+    if isinstance(claim, Nearby):
+        return _without_equilibrium(certificate, claim, evidence)
     return _local_only(certificate, claim.local) if isinstance(claim, Asymptotic) else None
+
+
+def _without_equilibrium(certificate: Certificate, claim: Nearby, evidence: PartitionTree) -> Certificate:
+    weaker = Practical(claim.roa, claim.local, claim.floor, rate=claim.rate)
+    return replace(certificate, claim=weaker, evidence=replace(evidence, contraction=None))
 
 
 def _local_only(certificate: Certificate, level: float) -> Certificate:

@@ -103,7 +103,8 @@ _FOR_LEARNING = 0.4  # of what is left then, the rest being the proof's and its 
 _FOR_SEARCH = 0.5  # of what is left then, the rest being the tube's check
 _FOR_PROOF = 0.4  # of the time limit, that no further candidate is optimised in
 _WORTH = 1.05  # growth of a volume that another candidate must promise
-_SMALL = 0.1  # of the volume within a candidate's reach: less is left for another one to prove
+_SMALL = 0.1  # of the volume within a candidate's reach: where less is proved, another one is worth its time
+_NEAR = 1e-3  # the same: where less is proved, its own correction is not
 _MISLED = 0.9  # of its reach: a violation below it is one that the samples missed
 _SAMPLE = 2000  # leaves whose check is timed
 _START = 0.2  # seconds that a checker takes to start
@@ -384,8 +385,10 @@ class _Run:
         of a loop that rests exactly, and the largest candidates come first as they do there."""
         race, large = self._contest(), self._optimised(partial(optimised, loop, options))
         race.enter([] if large is None else [large], self._heat())
-        self._improve(race, loop, self._heat())
-        if large is None or race.best.proved < _SMALL * large.volume:
+        if large is not None and race.best.proved > _NEAR * large.volume:
+            self._improve(race, loop, self._heat())
+        little = large is None or race.best.proved < _SMALL * large.volume
+        if little and self.left() > _FOR_PROOF * self.options.time_limit:
             certain = self._optimised(partial(robust, loop, options))
             race.enter([] if certain is None else [certain], self._heat())
         for one in by_reach(trials):

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import sympy
 
+from certify.acceptance import _lowered
 from certify.certificate import Certificate, PartitionTree, read_certificate, run_checker
 from certify.claims import Asymptotic
 from certify.cli import _run
@@ -256,6 +257,13 @@ def test_a_set_around_the_rest_is_told_from_one_around_another_point(tmp_path: P
     edge = float(
         np.max(np.abs(np.linalg.inv(proved.ellipsoids[0].P).diagonal()[0] * proved.ellipsoids[0].level)) ** 0.5
     )
+    certificate, problem = read_certificate(result.certificate), result.problem
+    assert problem is not None and certificate.kind == "nearby"
+    below, without = (
+        _lowered(certificate, leaf, problem, 2) for leaf in (0, None)
+    )  # a leaf refused, or what is beside
+    assert below is not None and below.kind == "nearby" and below.claim.inner < below.roa < certificate.roa
+    assert without is not None and without.kind == "practical" and without.roa == certificate.roa
     states = np.array([rest, [rest[0] + 0.999 * edge, rest[1]], [rest[0] + 1.001 * edge, rest[1]]])
     expected = [bool(v) for v in result.contains(states)]
     assert proved.holds(proved.deviations(states.tolist())) == expected and expected[0] and not expected[-1]
