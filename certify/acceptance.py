@@ -18,6 +18,7 @@ from typing import Any
 from certify.certificate import Certificate, PartitionTree, TrustedSolver, write_beside
 from certify.claims import Asymptotic, Enlarged, Nearby, Practical, Problem, Reached
 from certify.engines.bounds.mend import below_leaf, split_again
+from certify.engines.contraction import contraction
 from certify.errors import BackendError, SoundnessError
 
 _SPLITS, _LOWERINGS = 3, 9  # of what the checker refuses
@@ -71,13 +72,13 @@ class Clerk:
             data, answer = self.ask(certificate, final=True)
             if answer["result"] == _wanted(certificate):
                 return Accepted(certificate, self.path, data, answer, mended)
-            leaf, finer = _leaf_of(answer), None
+            finer = None
             if splits < _SPLITS and self.left() > 0:
                 finer = _finer(certificate, problem, answer)
             if finer is not None:
                 splits += 1
                 certificate = replace(certificate, evidence=finer)
-            elif (lower := _lowered(certificate, leaf, problem, lowerings)) is not None and lowerings < _LOWERINGS:
+            elif (lower := _lowered(certificate, answer, problem, lowerings)) is not None and lowerings < _LOWERINGS:
                 lowerings += 1
                 certificate = lower
             else:
@@ -170,16 +171,22 @@ def _finer(certificate: Certificate, problem: Problem, answer: Mapping[str, Any]
     return replace(evidence, outer=outer.split_face_again(problem, evidence.outer, claim, int(found[1]), int(found[2])))
 
 
-def _lowered(certificate: Certificate, leaf: int | None, problem: Problem, tries: int) -> Certificate | None:
+def _lowered(certificate: Certificate, answer: Mapping[str, Any], problem: Problem, tries: int) -> Certificate | None:
     """The certificate with a lower level: below the refused leaf at first, then halfway to the inner level, then at it,
     and then an inner level that is lower itself; None if there is nothing to lower."""
-    claim, evidence = certificate.claim, certificate.evidence
+    claim, evidence, leaf = certificate.claim, certificate.evidence, _leaf_of(answer)
     if not isinstance(evidence, PartitionTree):
         return None
     if claim.outer is not None:
         return replace(certificate, claim=replace(claim, outer=None), evidence=replace(evidence, outer=None))
     if isinstance(claim, Nearby) and leaf is None:
-        return _without_equilibrium(certificate, claim, evidence)
+        floor = _HIGHER * claim.floor
+        closer = (
+            contraction(problem, evidence.T, floor) if answer.get("rule") == "local" and floor < claim.local else None
+        )
+        if closer is None:
+            return _without_equilibrium(certificate, claim, evidence)
+        return replace(certificate, claim=replace(claim, floor=floor), evidence=replace(evidence, contraction=closer))
     if isinstance(claim, Enlarged | Reached):  # without its tube, what is refused may not be asked any more
         return replace(certificate, claim=Asymptotic(claim.roa, claim.local), evidence=replace(evidence, tube=()))
     if leaf is None or claim.inner == claim.roa:

@@ -259,11 +259,13 @@ def test_a_set_around_the_rest_is_told_from_one_around_another_point(tmp_path: P
     )
     certificate, problem = read_certificate(result.certificate), result.problem
     assert problem is not None and certificate.kind == "nearby"
-    below, without = (
-        _lowered(certificate, leaf, problem, 2) for leaf in (0, None)
-    )  # a leaf refused, or what is beside
+    refused = [
+        {"rule": rule, "at": at} for rule, at in (("ring", "leaf 0"), ("local", "levels.local"), ("contraction", ""))
+    ]
+    below, higher, without = (_lowered(certificate, answer, problem, 2) for answer in refused)
     assert below is not None and below.kind == "nearby" and below.claim.inner < below.roa < certificate.roa
     assert without is not None and without.kind == "practical" and without.roa == certificate.roa
+    assert higher is not None and (higher.kind == "nearby") == (certificate.claim.local > 1.5 * result.levels.floor)  # type: ignore[operator]
     states = np.array([rest, [rest[0] + 0.999 * edge, rest[1]], [rest[0] + 1.001 * edge, rest[1]]])
     expected = [bool(v) for v in result.contains(states)]
     assert proved.holds(proved.deviations(states.tolist())) == expected and expected[0] and not expected[-1]

@@ -29,8 +29,8 @@ from certify.policies import bounded_by_form
 Array = NDArray[np.float64]
 _MOST_NUMBERS, _MOST_PRODUCTS = 2**25, 2**33  # of the sums over paths: the checker refuses more
 _MARGIN = 1e-3  # of an input's range, left to the checker's rounding where a clip begins
-_UNIT = 2.0**-52  # what a checker counts for each term of a sum, relative to the sum's size
-_ROUNDED = 2.0**-50  # and for anything else that it computes
+_UNIT = 2.0**-51  # twice what a checker counts for each term of a sum, relative to the sum's size
+_ROUNDED = 2.0**-49  # and for anything else that it computes
 
 
 @dataclass(frozen=True, slots=True)
