@@ -17,7 +17,7 @@ import sympy
 
 from certify.acceptance import _lowered
 from certify.certificate import Certificate, PartitionTree, read_certificate, run_checker
-from certify.claims import Asymptotic
+from certify.claims import Asymptotic, Nearby
 from certify.cli import _run
 from certify.closed_loop import ClosedLoop
 from certify.containment import proved_set
@@ -259,13 +259,13 @@ def test_a_set_around_the_rest_is_told_from_one_around_another_point(tmp_path: P
     )
     certificate, problem = read_certificate(result.certificate), result.problem
     assert problem is not None and certificate.kind == "nearby"
-    refused = [
-        {"rule": rule, "at": at} for rule, at in (("ring", "leaf 0"), ("local", "levels.local"), ("contraction", ""))
-    ]
-    below, higher, without = (_lowered(certificate, answer, problem, 2) for answer in refused)
+    floor = result.levels.floor or 0.0
+    above = replace(certificate, claim=replace(certificate.claim, local=4 * floor))
+    refusals = [{"rule": rule, "at": at} for rule, at in (("ring", "leaf 0"), ("local", ""), ("contraction", ""))]
+    below, higher, without = (_lowered(above, answer, problem, 2) for answer in refusals)
     assert below is not None and below.kind == "nearby" and below.claim.inner < below.roa < certificate.roa
+    assert higher is not None and isinstance(higher.claim, Nearby) and higher.claim.floor == 1.5 * floor
     assert without is not None and without.kind == "practical" and without.roa == certificate.roa
-    assert higher is not None and (higher.kind == "nearby") == (certificate.claim.local > 1.5 * result.levels.floor)  # type: ignore[operator]
     states = np.array([rest, [rest[0] + 0.999 * edge, rest[1]], [rest[0] + 1.001 * edge, rest[1]]])
     expected = [bool(v) for v in result.contains(states)]
     assert proved.holds(proved.deviations(states.tolist())) == expected and expected[0] and not expected[-1]
