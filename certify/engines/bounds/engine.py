@@ -23,6 +23,7 @@ Array = NDArray[np.float64]
 _SHARE = 0.6  # of the time, for finding c2 before c0
 _FOR_BALL = 0.5  # of the time, for a ring from a ball, and of that for the ball
 _EQUAL = 0.01  # of a level
+_NOTHING = 1e-9  # of a level: no smaller floor is looked for
 _ABOVE = (1.5, 1.1)  # of the least floor, in few and in many states, where leaves do not lower it any more
 _TRIES = 4  # inner levels from which c2 is looked for, each with half of the time that is left for it
 
@@ -45,6 +46,8 @@ class BoundsEngine(Engine):
         first = self._from_ball(task, replace(budget, seconds=_FOR_BALL * budget.seconds), report)
         if task.exactly and first is not None and first.claim is not None and first.claim.roa < task.target:
             first = None
+        if first is not None and _is_ample(first, task.target):
+            return first
         left = replace(budget, seconds=budget.seconds - (time.perf_counter() - start))
         if self.T.shape[0] > FEW:
             return first or Proof(None, None, Stop.LOCAL, "no ball shows V to fall around any level; try another P")
@@ -154,6 +157,12 @@ def _is_better(one: Proof, other: Proof) -> bool:
     if abs(a.roa - b.roa) <= _EQUAL * b.roa:
         return a.floor < b.floor
     return a.roa > b.roa
+
+
+def _is_ample(proof: Proof, target: float) -> bool:
+    """Whether a practical claim is about all that is within reach, with a floor that is next to nothing."""
+    claim = proof.claim
+    return isinstance(claim, Practical) and claim.roa >= (1 - _EQUAL) * target and claim.floor <= _NOTHING * claim.roa
 
 
 class _Outwards:
