@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from certify.certificate import Certificate, read_certificate, run_checker
-from certify.claims import Enlarged
+from certify.claims import Enlarged, Practical
 from certify.lyapunov import semi_axes, volume
 from certify.report.figures import draw
 from certify.report.words import above, below, pretty_unit, symbol
@@ -47,7 +47,7 @@ ENTRIES = (
     Entry("pendulum", "inverted pendulum, up to its domain", "pendulum"),
     Entry(
         "practical",
-        "the same plant under plain SAC, which rests beside the origin: practical stability",
+        "the same plant under plain SAC, seen from where it rests, beside the origin: practical stability",
         "without_gain/pendulum",
         options=("--claim", "practical", "--candidate", "lqr"),
     ),
@@ -102,11 +102,12 @@ def section(entry: Entry, certificate: Certificate) -> str:
     reach = zip(system.states, semi_axes(*shape).tolist(), strict=True)
     units = {name: "" if unit == "1" else pretty_unit(unit) for name, unit in system.units.items()}
     axes = ", ".join(f"{symbol(s.name)} {below(v, 3)} {units.get(s.name, '')}".strip() for s, v in reach)
-    practical = certificate.kind == "practical"
     size = below(volume(*shape), 3)
     whose = " of the tube's start" if isinstance(claim, Enlarged) else ""
     kind = "area" if system.n == 2 else "volume"
-    inner = f"c₀ = {above(certificate.inner, 4)}" if practical else f"c₁ = {below(certificate.inner, 4)}"
+    inner = f"c₁ = {below(certificate.inner, 4)}"
+    if isinstance(claim, Practical):
+        inner = f"c₀ = {above(claim.floor, 4)}"
     return "\n".join(
         [
             f"## {entry.name}",
