@@ -84,7 +84,7 @@ def test_a_line_says_what_holds_for_each_of_its_runs(page: ModuleType, monkeypat
     monkeypatch.setattr(page, "proved", lambda plant, folder: found[folder.name])
     line = page.row("pendulum", "sac", [Path(name) for name in found])
     assert "| 3 of 4 |" in line and line.endswith("| 20.9 | 0.056 |")
-    assert "enters a ball around the origin" in line and "one equilibrium" in line
+    assert "enters a small set and stays there" in line and "one equilibrium" in line
 
 
 @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e9])
@@ -107,12 +107,15 @@ def test_a_matrix_whose_smallest_eigenvalue_is_not_certain_has_no_radius(page: M
 
 
 def test_the_radius_is_that_of_the_floor(page: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Not of the set from which it is reached, nor of the level from which the ring does."""
+    """Not of the set from which it is reached, nor of the level from which the ring does; with how far its middle is."""
     claim = Practical(roa=4.0, local=1.0, floor=0.25)
-    certificate: Any = SimpleNamespace(claim=claim, kind=claim.kind, P=np.eye(2), roa=claim.roa)
+    network = SimpleNamespace(origin=np.zeros(2))
+    certificate: Any = SimpleNamespace(claim=claim, kind=claim.kind, P=np.eye(2), roa=claim.roa, network=network)
     (tmp_path / "certificate.json").write_text("")
     monkeypatch.setattr(page, "proved_set", lambda _: None)
     monkeypatch.setattr(page, "require_same_question", lambda *_: None)
     monkeypatch.setattr(page, "read_certificate", lambda _: certificate)
     found = page.accepted(tmp_path / "certificate.json", _law([[8.0, 2.0]]), PENDULUM)
     assert 0.5 <= found.radius < 0.5 + 1e-8 and found.volume == pytest.approx(4 * np.pi)
+    network.origin = np.array([3.0, -4.0])
+    assert 5.5 <= page.accepted(tmp_path / "certificate.json", _law([[8.0, 2.0]]), PENDULUM).radius < 5.5 + 1e-7
