@@ -107,7 +107,7 @@ def test_a_matrix_whose_smallest_eigenvalue_is_not_certain_has_no_radius(page: M
 
 
 def test_the_radius_is_that_of_the_floor(page: ModuleType, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """Not of the set from which it is reached, nor of the level from which the ring does; with how far its middle is."""
+    """Not of the set from which it is reached, nor of the ring's inner level; and how far its middle is counts."""
     claim = Practical(roa=4.0, local=1.0, floor=0.25)
     network = SimpleNamespace(origin=np.zeros(2))
     certificate: Any = SimpleNamespace(claim=claim, kind=claim.kind, P=np.eye(2), roa=claim.roa, network=network)
