@@ -17,7 +17,7 @@ from certify.claims import Claim, Enlarged, Reached
 from certify.errors import BackendError
 
 _STATED = (  # of an answer, what is the same of all parts and of the whole
-    "certificate_sha256", "policy_sha256", "claim", "rate", "sample", "discrete", "levels", "leaves",
+    "certificate_sha256", "policy_sha256", "claim", "rate", "sample", "discrete", "origin", "levels", "leaves",
     "start", "centre", "time",
 )  # fmt: skip
 
@@ -66,6 +66,7 @@ def _stated(certificate: Certificate, raw: bytes) -> dict[str, Any]:
         "rate": float(claim.rate),
         "sample": None if sample is None else [str(h) for h in sample],
         "discrete": certificate.system.time == "discrete",
+        "origin": certificate.network.origin.tolist() if certificate.network.is_moved else None,
         "levels": levels,
         "leaves": leaves,
         "leaves_in_all": ring + sum(tree.count(LEAF) for tree in outer),
