@@ -87,10 +87,11 @@ def certify_largest(
         best, proved = first, None
         if first.verdict is Verdict.PROVED and first.problem is not None and first.levels.roa is not None:
             P, level = first.problem.V.P, _SET * first.levels.roa
+            plain, network = first.system, first.network  # as seen from where V is 0
             refused: Fraction | None = None
 
             def attempt(value: Fraction) -> RoaResult:
-                return certify_roa(
+                found = certify_roa(
                     plain.with_sample((value, value)) if quantity == "period" else plain,
                     network,
                     Path(folder) / "next",
@@ -104,6 +105,7 @@ def certify_largest(
                     provenance=provenance,
                     progress=progress,
                 )
+                return replace(found, rest=first.rest)
 
             for value in _tried(quantity, plain, network, P, level):
                 if not left() > 0:

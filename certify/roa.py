@@ -314,6 +314,8 @@ class _Run:
         InputError : V is to be 0 where the loop rests, and no stable point of rest is found.
         """
         options = self.options
+        if loop.network.is_moved:
+            return None, loop
         if options.claim != "practical" or loop.system.time == "discrete" or loop.network.centre != "none":
             if options.around == "rest" and options.claim == "practical":
                 raise InputError("`around` the rest needs a policy without centring and a plant in continuous time.")

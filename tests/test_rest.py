@@ -23,6 +23,7 @@ from certify.closed_loop import ClosedLoop
 from certify.containment import proved_set
 from certify.errors import InputError
 from certify.float_error import float_error
+from certify.largest import certify_largest
 from certify.lyapunov.function import Quadratic
 from certify.policies import Policy, TanhNetwork, load_policy, save_policy
 from certify.rest import Rest, find_rest, seen_from
@@ -275,3 +276,26 @@ def test_a_set_around_the_rest_is_told_from_one_around_another_point(tmp_path: P
             require_same_loop(other, policy.network, system)
     with pytest.raises(InputError, match="`domain`"):
         require_same_question(proved, policy.network, system.with_domain({"theta": (Fraction(-3), Fraction(3))}))
+
+
+def test_what_is_asked_of_a_set_is_about_its_own_point(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`--contains` names values: 2.8 lies outside, and would lie inside if it were a deviation; -2.9 the other way."""
+    command = ["roa", "--policy", str(PLAIN), "--candidate", "lqr", "--out", str(tmp_path), "--json", "--contains"]
+    for states, inside in (("theta=2.8", False), ("theta=-2.9", True)):
+        assert _run([*command, states], True) == 0
+        said = json.loads(capsys.readouterr().out)["contains"]
+        assert said["result"] == ("contained" if inside else "not contained")
+        assert said["box"]["theta"] == [str(Fraction(states.split("=")[1]))] * 2
+        assert _run(["contains", str(tmp_path / "certificate.json"), states, "--json"], True) == int(not inside)
+        assert json.loads(capsys.readouterr().out)["result"] == said["result"]
+    assert _run([*command, "omega=1"], True) == 2 and "no state 'omega'" in capsys.readouterr().out
+
+
+def test_the_largest_rate_is_of_the_set_around_the_rest(tmp_path: Path) -> None:
+    policy = load_policy(PLAIN)
+    system = get_system("pendulum").with_parameters(policy.parameters)
+    result = certify_largest("rate", system, policy.network, tmp_path, RoaOptions(candidate="lqr"))
+    assert result.verdict is Verdict.PROVED and result.certificate is not None and result.rest is not None
+    assert result.problem is not None and result.problem.rate > 0.5
+    read = read_certificate(result.certificate)
+    assert read.network.is_moved and read.system.exact_x_eq()[0] < 0 and result.contains([-0.0843, 0.0])

@@ -228,6 +228,25 @@ def answer(study: Study, sent: dict[str, bytes]) -> Answer:
     return answer_in(sent[study.cases()[0].name])
 
 
+def test_a_set_around_another_point_is_of_the_case_if_its_loop_is(tmp_path: Path) -> None:
+    """The policy's hash is the same: plant and origin have to move together, and not where the origin was asked for."""
+    text = f"""
+    policies = ["{POLICIES}/without_gain/pendulum.pt"]
+    candidates = ["lqr"]
+    [options]
+    around = ["auto", "origin"]
+    """
+    auto, origin = read_study(written(tmp_path, text)).cases()
+    answer = answer_in(work(auto))
+    row = judged(auto, answer, tmp_path, own=True)
+    certificate = parse_certificate(answer.raw or b"", "it")
+    assert row.verdict is Verdict.PROVED and row.claim == "nearby" and certificate.network.is_moved
+    assert judged(origin, answer, tmp_path, own=False).verdict is Verdict.UNKNOWN
+    at = replace(certificate.network, origin=certificate.network.origin + 0.25)
+    forged = replace(answer, raw=replace(certificate, network=at).to_json().encode())
+    assert "section `plant`" in str(judged(auto, forged, tmp_path, own=False).error)
+
+
 def test_an_honest_answer_is_a_row_about_the_file_that_was_checked(
     study: Study, answer: Answer, tmp_path: Path
 ) -> None:

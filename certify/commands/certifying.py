@@ -13,18 +13,20 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from certify.commands.arguments import region
 from certify.commands.contains import stated, text
 from certify.commands.shared import write
 from certify.commands.terminal import ProgressLine, load_tables, say, show, tell
 
 if TYPE_CHECKING:
-    from certify.containment import Box
     from certify.largest import Quantity
     from certify.options import RoaOptions
     from certify.policies import Policy
     from certify.report.drawing import Drawing
     from certify.results import RoaResult
     from certify.systems import System
+
+CONTAINS = "--contains"
 
 
 def certified(
@@ -38,7 +40,7 @@ def certified(
     drawing: Drawing,
     quiet: bool,
     as_json: bool,
-    asked: Box | None = None,
+    asked: str | None = None,
     largest: Quantity | None = None,
 ) -> None:
     """Run, write certificate and report, print the result; ends the command with the verdict's exit status.
@@ -49,7 +51,7 @@ def certified(
     out : folder for the results.
     start : when the command began, by `time.perf_counter`.
     drawing : draws the report.
-    asked : of which it is to be said whether the proved set contains it.
+    asked : a state or a box, as people write it, of which it is to be said whether the proved set contains it.
     largest : what is to be as large as can be proved for the set.
     """
     from certify.report import summary
@@ -108,12 +110,16 @@ def certified(
     raise typer.Exit(result.verdict.exit_status)
 
 
-def _where(result: RoaResult, box: Box) -> tuple[dict[str, Any], str]:
-    """Whether the proved set contains a box, for JSON and in words, from the very bytes that were checked."""
+def _where(result: RoaResult, asked: str) -> tuple[dict[str, Any], str]:
+    """Whether the proved set contains a box, for JSON and in words, from the very bytes that were checked.
+
+    The box is read as of the result's plant, in whose deviations the set is: those of the plant that was asked about
+    may be others.
+    """
     from certify.containment import NOTHING_PROVED, set_of
     from certify.verdict import Verdict
 
-    found = NOTHING_PROVED
+    found, box = NOTHING_PROVED, region(asked, result.system, CONTAINS)
     if result.verdict is Verdict.PROVED and result.raw is not None:
         found = set_of(result.raw, str(result.certificate)).locate(box)
     return stated(found, box, result.system), text(found, box, result.system)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from certify.commands.arguments import layers, numbers, plant_of, region, widths
-from certify.commands.certifying import certified
+from certify.commands.certifying import CONTAINS, certified
 from certify.commands.importing import policy_of
 from certify.commands.shared import Domain, Json, PlantName, PolicyFile, Quiet, Results, TimeLimit
 from certify.commands.terminal import tell
@@ -183,8 +183,9 @@ def roa(
         degree=degree,
         seed=seed,
     )
-    asked = None if contains is None else region(contains, plant, "--contains")
-    certified(context, policy, stored, plant, options, out, start, drawing, quiet, as_json, asked, largest)
+    if contains is not None:
+        region(contains, plant, CONTAINS)  # what cannot be read is said before the run
+    certified(context, policy, stored, plant, options, out, start, drawing, quiet, as_json, contains, largest)
 
 
 def _largest(sample_time: str | None, rate: str, resume: bool) -> Quantity | None:
