@@ -7,10 +7,8 @@ become infinite or NaN where numbers are huge, which rules read as a failure, bu
 
 from __future__ import annotations
 
-import base64
 import hashlib
 import json
-import struct
 from collections.abc import Iterator, Sequence
 from itertools import pairwise
 from typing import Any
@@ -31,10 +29,11 @@ from certify.reference import rules as reference
 from certify.reference.document import read
 from certify.reference.leaves import Leaves
 from certify.reference.network import Network
+from tests.support.certificates import LEAF, Document, decode, dump, encode
+from tests.support.certificates import make as stated
+from tests.support.oracle import value_of
 
-Document = dict[str, Any]
 EXACTLY = 6000  # bits: more than any sum of products of two binary64 numbers spans
-LEAF = 255
 
 
 @pytest.fixture(autouse=True)
@@ -47,28 +46,6 @@ def _quiet() -> Iterator[None]:
 # ---------------------------------------------------------------------------------------------------------- documents
 
 
-def encode(numbers: Any) -> str:
-    return base64.b64encode(np.asarray(numbers, dtype="<f8").tobytes()).decode()
-
-
-def decode(text: str) -> np.ndarray:
-    return np.frombuffer(base64.b64decode(text), dtype="<f8").copy()
-
-
-def rehash(data: Document) -> Document:
-    """The policy's hash, by the words of FORMAT.md."""
-    policy = data["policy"]
-    digest = hashlib.sha256(f"certify-policy/1\0{policy['squash']}\0{policy['centre']}\0".encode())
-    for layer in policy["layers"]:
-        digest.update(struct.pack("<3Q", 2, *layer["shape"]) + base64.b64decode(layer["weight"]))
-        digest.update(struct.pack("<2Q", 1, layer["shape"][0]) + base64.b64decode(layer["bias"]))
-    for text in (policy["scale"], policy["offset"], *(policy["clip"] or ())):
-        raw = base64.b64decode(text)
-        digest.update(struct.pack("<2Q", 1, len(raw) // 8) + raw)
-    policy["sha256"] = digest.hexdigest()
-    return data
-
-
 def halved(depth: int) -> bytes:
     """An interval cut into 2^depth equal parts, in preorder."""
     return bytes([LEAF]) if depth == 0 else b"\0" + 2 * halved(depth - 1)
@@ -79,70 +56,21 @@ def looked_at(
     origin: Any,
     dynamics: Sequence[Any] | None = None,
     *,
-    squash: str = "tanh",
-    scale: Any = (1.0,),
-    offset: Any = (0.0,),
-    clip: Any = None,
-    levels: tuple[float, float] = (0.01, 1.0),
     depth: int = 0,
-    local: Document | None = None,
-    claim: str = "practical",
-    centre: str = "none",
-    time: str = "continuous",
-    sample: list[str] | None = None,
-    uncertain: Sequence[tuple[str, str, str]] = (),
     root: float = 1.0,
+    **changes: Any,
 ) -> Document:
     """A document about n states and a policy whose layers read origin + x; V = x'x."""
-    n, m = len(origin), len(scale)
+    settings = {
+        "scale": (1.0,), "offset": (0.0,), "levels": (0.01, 1.0), "claim": "practical", "centre": "none",
+    } | changes  # fmt: skip
+    n, m = len(origin), len(settings["scale"])
     states, inputs = [f"x{i}" for i in range(n)], [f"u{j}" for j in range(m)]
-    arrays = [(np.atleast_2d(np.asarray(W, dtype=float)), np.atleast_1d(np.asarray(b, dtype=float))) for W, b in layers]
-    floor, roa = levels
-    edges = {"floor": floor, "local": floor, "roa": roa} if claim in ("practical", "nearby") else None
-    return rehash({
-        "schema": "certify-certificate/8",
-        "claim": {"kind": claim, "rate": (0.0).hex(), "sample": sample, "outer": None},
-        "plant": {
-            "name": "plant",
-            "time": time,
-            "states": states,
-            "inputs": inputs,
-            "uncertain": [{"name": name, "range": [lo, hi]} for name, lo, hi in uncertain],
-            "dynamics": list(dynamics or [["+", x, inputs[0]] for x in states]),
-            "u_eq": ["0"] * m,
-            "domain": [["-3", "3"]] * n,
-            "input_bounds": [["-9", "9"]] * m,
-        },
-        "policy": {
-            "layers": [{"shape": list(W.shape), "weight": encode(W), "bias": encode(b)} for W, b in arrays],
-            "squash": squash,
-            "centre": centre,
-            "scale": encode(scale),
-            "offset": encode(offset),
-            "clip": None if clip is None else [encode(end) for end in clip],
-            "origin": encode(origin),
-            "sha256": "",
-        },
-        "lyapunov": {"kind": "quadratic", "P": encode(np.eye(n))},
-        "levels": {name: v.hex() for name, v in (edges or {"local": floor, "roa": roa}).items()},
-        "evidence": {
-            "kind": "partition-tree",
-            "T": encode(np.eye(n)),
-            "root": encode([root] * n),
-            "tree": base64.b64encode(halved(depth)).decode(),
-            "order": 1,
-            "cells": [1] * len(uncertain),
-            "local": local,
-            "contraction": None,
-            "tube": [],
-            "outer": None,
-        },
-        "provenance": {},
-    })  # fmt: skip
-
-
-def dump(data: Document) -> bytes:
-    return json.dumps(data).encode()
+    rates = list(dynamics or [["+", x, inputs[0]] for x in states])
+    return stated(
+        rates, layers, np.eye(n), origin=origin, states=states, inputs=inputs, u_eq=["0"] * m,
+        domain=[("-3", "3")] * n, input_bounds=[("-9", "9")] * m, root=[root] * n, tree=halved(depth), **settings,
+    )  # fmt: skip
 
 
 def of_checker(data: Document, jobs: int = 1) -> str:
@@ -371,19 +299,6 @@ def rises(data: Document) -> bool:
     return False
 
 
-def value_of(node: Any, names: dict[str, arb]) -> arb:
-    if isinstance(node, str):
-        return names[node] if node in names else arb(fmpq(*(int(v) for v in (*node.split("/"), "1")[:2])))
-    name, *rest = node
-    values = [value_of(v, names) for v in rest]
-    if name == "/":
-        return values[0] / values[1]
-    result = values[0]
-    for v in values[1:]:
-        result = result + v if name == "+" else result * v
-    return result
-
-
 @pytest.mark.parametrize("make", HONEST)
 def test_an_honest_certificate_with_an_origin_is_accepted(make: Any) -> None:
     assert not rises(make())
@@ -456,13 +371,11 @@ def test_a_centred_policy_has_no_other_origin(centre: str, origin: float) -> Non
 @pytest.mark.parametrize("origin", [1.0, 5e-324])
 def test_a_claim_about_the_origin_has_no_other_one(origin: float) -> None:
     """Not even where pi(0) = u_eq would hold from there as well."""
-    ball = {"J": encode([0.125]), "multipliers": encode([0.0, 0.0, 2.0**-10]), "weight": encode([1.0])}
-    local = {**ball, "edge": (0.0).hex(), "order": 1}
     given = {"squash": "identity", "scale": [1.0], "dynamics": [["+", ["/", "x0", "2"], "u0"]]}
 
     def resting(origin: float) -> Document:
         law = [([[-2.0]], [2.0 * origin])]  # u = -2 x, whatever the origin is
-        return honest(**given, claim="asymptotic", layers=law, origin=[origin], levels=(0.01, 1.0), local=local)
+        return honest(**given, claim="asymptotic", layers=law, origin=[origin], levels=(0.01, 1.0))
 
     assert verdicts(resting(0.0)) == verdicts(resting(-0.0)) == ("ACCEPTED", "ACCEPTED")
     assert verdicts(resting(origin)) == ("format", "format")
