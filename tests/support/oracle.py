@@ -71,7 +71,8 @@ def policy_in_arb(policy: Policy, u_eq: Sequence[Fraction], x: Sequence[arb]) ->
 def policies_in_arb(policy: Policy, u_eq: Sequence[Fraction], states: Sequence[Sequence[arb]]) -> list[list[arb]]:
     """pi at each of the states; the origin goes through the layers as one more column."""
     columns = [*states, [arb(0)] * len(states[0])]
-    h = arb_mat([[column[i] for column in columns] for i in range(len(columns[0]))])
+    origin = [0.0] * len(states[0]) if policy.origin is None else policy.origin.tolist()
+    h = arb_mat([[arb(at) + column[i] for column in columns] for i, at in enumerate(origin)])
     for k, (W, b) in enumerate(zip(policy.weights, policy.biases, strict=True)):
         h = _tanh(h) if k else h
         bias = arb_mat([[arb(v)] * len(columns) for v in b.tolist()])
