@@ -243,7 +243,7 @@ def test_a_policy_seen_from_elsewhere_is_neither_saved_nor_called_centred(tmp_pa
     with pytest.raises(InputError, match="as its layers read it"):
         float_error(network, loop.system)
     with pytest.raises(InputError, match=r"`origin` must have shape \(2,\)"):
-        replace(network, origin=np.zeros(3))
+        replace(network, origin=np.ones(3))
 
 
 def test_a_set_around_the_rest_is_told_from_one_around_another_point(tmp_path: Path) -> None:

@@ -84,7 +84,7 @@ class TanhNetwork:
             raise InputError("`scale` must be nonzero.")
         if self.clip is not None:
             object.__setattr__(self, "clip", _limits(self.clip, self.m))
-        origin = self.origin if np.size(self.origin) else np.zeros(self.n)
+        origin = self.origin if np.any(self.origin) else np.zeros(self.n)  # of whatever n was before `replace`
         object.__setattr__(self, "origin", frozen(origin, "origin", _WHOSE))
         if self.origin.shape != (self.n,):
             raise InputError(f"`origin` must have shape ({self.n},); found {self.origin.shape}.")
