@@ -8,6 +8,7 @@ that exactly one point of rest lies in a box around it:
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from fractions import Fraction
@@ -26,7 +27,8 @@ _REFINEMENTS = 8  # in Arb, each by some ten digits
 _RADIUS = 1e-20  # of the box of the test, in the states' units
 _DIGITS = 12
 _BITS = 40  # of a point from which a loop is looked at
-_WHILE = 100.0  # in the plant's unit of time
+_WHILE = 100.0  # of a trajectory, in the plant's unit of time
+_MOST_STEPS = 10_000  # of one: where F is no number, time stands still
 
 
 @dataclass(frozen=True, slots=True)
@@ -122,15 +124,16 @@ def _end(loop: ClosedLoop) -> Array | None:
     import scipy.integrate
 
     F, (lo, hi) = _rates(loop), np.array([[float(a), float(b)] for a, b in loop.system.domain]).T
-
-    def inside(_: float, x: Array) -> float:
-        return float(np.min(np.minimum(x - lo, hi - x)))
-
-    inside.terminal = True  # type: ignore[attr-defined]
-    span, start = (0.0, _WHILE), _origin(loop)
-    solved = scipy.integrate.solve_ivp(lambda _, x: F(x), span, start, method="LSODA", rtol=1e-6, events=inside)
-    x = np.asarray(solved.y[:, -1], dtype=np.float64)
-    return x if solved.status == 0 and np.all(np.isfinite(x)) else None
+    with warnings.catch_warnings(action="ignore"):  # of steps that fail
+        solver = scipy.integrate.LSODA(lambda _, x: F(x), 0.0, _origin(loop), _WHILE, rtol=1e-6)
+        for _ in range(_MOST_STEPS):
+            solver.step()
+            x = np.asarray(solver.y, dtype=np.float64)
+            if solver.status == "failed" or not np.all((lo < x) & (x < hi)):
+                return None
+            if solver.status == "finished":
+                return x
+    return None
 
 
 def _newton(loop: ClosedLoop, x: Array) -> Array | None:
