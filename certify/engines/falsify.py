@@ -24,7 +24,8 @@ from certify.rigorous import evaluate_increment, evaluate_policy
 from certify.systems import System
 
 Array = NDArray[np.float64]
-_RATIO, _LEVELS, _LOWEST = 1.4, 60, 1e-24  # of a survey: between levels, how many, and the lowest it goes on to
+_RATIO, _LEVELS, _LOWER = 1.4, 60, 13  # of a survey: between levels, how many, and how many steps of 8 further it goes
+_TOGETHER = 15  # levels that are looked at in one batch
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,16 +100,30 @@ def survey(problem: Problem, T: Array, limit: float, samples: int = 512, seed: i
     direction = generator.standard_normal((samples, problem.loop.system.n))
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
 
-    def good(level: float) -> bool:
-        z = torch.tensor(search.climb(np.sqrt(level) * direction, level, steps=steps), dtype=torch.float64)
-        with torch.no_grad():
-            return not bool(search.bad(z).any())
+    def clear(level: Array, steps: int) -> list[bool]:
+        """Of each level (k,), whether its samples show no violation after so many steps of ascent."""
+        found: list[bool] = []
+        for k in range(0, len(level), _TOGETHER):
+            each = np.repeat(level[k : k + _TOGETHER], samples)[:, None]
+            z = search.climb(np.sqrt(each) * np.resize(direction, (len(each), direction.shape[1])), each, steps)
+            with torch.no_grad():
+                bad = search.bad(torch.tensor(z, dtype=torch.float64))
+            found += (~bad.reshape(-1, samples).any(1)).tolist()
+        return found
+
+    def good(levels: list[float]) -> list[bool]:
+        level = np.array(levels)
+        found = np.array(clear(level, 0))
+        found[found] = clear(level[found], steps)
+        return [bool(ok) for ok in found]
 
     levels = [limit * _RATIO**-k for k in range(_LEVELS)]  # from the highest
-    found = [good(level) for level in levels]
-    while found[-1] and levels[-1] > _LOWEST * limit:
-        levels.append(levels[-1] / _RATIO**8)
-        found.append(good(levels[-1]))
+    found = good(levels)
+    if found[-1]:  # on to the first at which one is found
+        lower = [levels[-1] * _RATIO ** (-8 * k) for k in range(1, _LOWER + 1)]
+        further = good(lower)
+        count = next((k + 1 for k, ok in enumerate(further) if not ok), _LOWER)
+        levels, found = levels + lower[:count], found + further[:count]
     runs = [list(run) for ok, run in itertools.groupby(range(len(levels)), key=found.__getitem__) if ok]
     last = len(levels) - 1
     return [Band(levels[min(k[-1] + 1, last)], levels[k[-1]], levels[k[0]], levels[max(k[0] - 1, 0)]) for k in runs]
@@ -241,10 +256,10 @@ class _Search:
                             return witness
         return None
 
-    def climb(self, start: Array, limit: float, steps: int = 60) -> Array:
-        """Gradient ascent of D' on the sphere V = limit."""
+    def climb(self, start: Array, limit: float | Array, steps: int = 60) -> Array:
+        """Gradient ascent of D' from `start` (B, n) on the sphere V = limit, or each point's own, (B, 1)."""
         z = torch.tensor(start, dtype=torch.float64)
-        radius = np.sqrt(limit) * (1 - 1e-9)
+        radius = torch.as_tensor(np.sqrt(limit) * (1 - 1e-9), dtype=torch.float64)
         step = 0.1
         for _ in range(steps):
             z = z.detach().requires_grad_(True)
