@@ -91,7 +91,6 @@ __all__ = ["RoaOptions", "RoaResult", "certify_roa"]
 Array = NDArray[np.float64]
 Stage = Literal["candidate", "ring", "tube", "learn", "outer", "check"]
 Report = Callable[[Stage, Progress | None], None]
-_SMALL_NETWORK = 10_000  # weights
 # Shares of the time limit:
 _HEAT = 0.04  # a candidate's first heat
 _PATIENCE = 0.1  # for a ring that gains nothing
@@ -151,8 +150,10 @@ def certify_roa(
         cluster, and no smaller set mends it.
     SoundnessError : the checker rejects what the engine proved, and no smaller set mends it.
     """
+    from certify.running.threads import threads_for
+
     options = options or RoaOptions()
-    with _threads_for(network), sole_writer(out), _runner_for(options) as runner:
+    with threads_for(network), sole_writer(out), _runner_for(options) as runner:
         return _Run(system, network, out, options, runner, load_seconds, provenance or {}, progress, show).result()
 
 
@@ -170,20 +171,6 @@ def _runner_for(options: RoaOptions) -> Iterator[Runner]:
     from certify.running import ThreadRunner
 
     yield ThreadRunner(torch.device(options.device))
-
-
-@contextmanager
-def _threads_for(network: TanhNetwork) -> Iterator[None]:
-    """One thread for small networks: their operations are shorter than the threads' handshakes."""
-    import torch
-
-    threads = torch.get_num_threads()
-    if sum(W.size for W in network.weights) < _SMALL_NETWORK:
-        torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
 
 
 @dataclass

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from certify.containment import ProvedSet
 from certify.errors import InputError
 from certify.policies import Policy, TanhNetwork
+from certify.running.threads import threads_for
 from certify.systems import System, shipped_system
 from controllers.environments import Stepper
 from controllers.lqr import Identified, riccati_gain
@@ -180,8 +181,9 @@ def evaluate(
     eigenvalues = np.linalg.eigvals(_closed_loop_jacobian(system, policy))
     fastest = float(np.abs(eigenvalues).max())
     h = min(dt, options.resolution / fastest) if fastest > 0 else dt
-    continuous = _settling(continuous_loop(system, h, mean_action(network, system), Q, R), system, x0, options)
-    held = settle(network, system, dt, Q, R, options, plant)
+    with threads_for(network):
+        continuous = _settling(continuous_loop(system, h, mean_action(network, system), Q, R), system, x0, options)
+        held = settle(network, system, dt, Q, R, options, plant)
 
     distance = relative = math.nan
     learned = (math.nan, math.nan, math.nan)

@@ -1,4 +1,4 @@
-"""One thread a process, hypothesis profiles, and the fixture that most tests share."""
+"""One thread a process and its children, hypothesis profiles, and the fixture that most tests share."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from hypothesis import settings
 
 from certify.systems import System, get_system
 
-torch.set_num_threads(1)  # the suite runs one process a core
+# The suite runs one process a core: threads that wait for each other's cores take several times as long.
+torch.set_num_threads(1)
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # of what the tests start
 
 settings.register_profile("ci", deadline=None, derandomize=True, max_examples=50)
 settings.register_profile("fuzz", deadline=None, max_examples=5000)

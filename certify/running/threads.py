@@ -10,9 +10,23 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from certify.policies import TanhNetwork
 from certify.running.base import Bound, Work
 
 _CHUNK = 256  # boxes that make a thread worth its while
+_SMALL_NETWORK = 10_000  # weights
+
+
+@contextmanager
+def threads_for(network: TanhNetwork) -> Iterator[None]:
+    """One thread of torch's for a small network: its operations are shorter than the threads' handshakes."""
+    threads = torch.get_num_threads()
+    if sum(W.size for W in network.weights) < _SMALL_NETWORK:
+        torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
 
 
 class ThreadRunner:

@@ -667,7 +667,7 @@ def campaign(name: str, count: int, path: Path, derandomize: bool) -> None:
 
 @pytest.mark.parametrize("name", STRATEGIES)
 def test_every_file_is_judged(name: str, tmp_path: Path) -> None:
-    campaign(name, 350, tmp_path / "certificate.json", derandomize=True)
+    campaign(name, 120, tmp_path / "certificate.json", derandomize=True)
 
 
 @pytest.mark.slow
@@ -938,7 +938,8 @@ HARD: dict[str, tuple[Callable[[], Document], set[str]]] = {
 
 SLOW = {
     "6,000 products of 64 states and 64 inputs", "one sum of 6,000 products", "one sum of 9,800 rationals",
-    "values that are needed again", "large P", "large P and T",
+    "values that are needed again", "large P", "large P and T", "sums of fractions", "long rationals",
+    "600 products of 64 states and 64 inputs", "towers of powers of a rational",
 }  # fmt: skip
 
 

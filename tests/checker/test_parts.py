@@ -30,6 +30,7 @@ from certify.checker.ring import Ring
 from certify.errors import BackendError, InputError
 from tests.checker.test_rules import HONEST, honest, scalar_claim
 from tests.support.certificates import Document, dump, edited, grow, parse, with_tree, write
+from tests.support.marks import slow_after
 from tests.support.mutants import family
 from tests.support.outer import uniform
 from tests.support.outer_forgeries import forgeries
@@ -55,7 +56,7 @@ def refusal(data: Document, part: Part | None = None, jobs: int = 1) -> Refusal 
 # ---------------------------------------------------------------------------------------------------------- acceptance
 
 
-@pytest.mark.parametrize("jobs", [2, 3, 7])
+@pytest.mark.parametrize("jobs", slow_after(1, [3, 2, 7]))
 @pytest.mark.parametrize("name", HONEST)
 def test_several_processes_count_what_one_counts(name: str, jobs: int) -> None:
     one, several = (rules.check(parse(honest(name)), None, count) for count in (1, jobs))
@@ -65,7 +66,7 @@ def test_several_processes_count_what_one_counts(name: str, jobs: int) -> None:
     assert margins[0] == margins[1]
 
 
-@pytest.mark.parametrize("of", [1, 2, 5, 2**16])
+@pytest.mark.parametrize("of", slow_after(3, [5, 1, 2, 2**16]))
 @pytest.mark.parametrize("name", MANY)
 def test_parts_are_all_of_the_leaves(name: str, of: int) -> None:
     whole = Part()
@@ -109,18 +110,20 @@ def refused() -> dict[str, Document]:
     } | trees | others  # fmt: skip
 
 
-def test_the_first_refusal_of_the_file_is_that_of_several_processes() -> None:
+@pytest.mark.parametrize("each", slow_after(1, [1, 1000]), ids=["one of a rule", "all"])
+def test_the_first_refusal_of_the_file_is_that_of_several_processes(each: int) -> None:
     seen = Counter[str]()
     for what, data in refused().items():
         alone = refusal(data)
         assert alone is not None, what
+        if seen[alone[0]] < each:
+            for jobs in (2, 5):
+                assert refusal(data, None, jobs) == alone, (what, jobs)
         seen[alone[0]] += "leaf " in alone[1]
-        for jobs in (2, 5):
-            assert refusal(data, None, jobs) == alone, (what, jobs)
     assert all(seen[rule] for rule in ("ring", "inputs", "flow", "faces", "outer")), seen
 
 
-@pytest.mark.parametrize("of", [2, 5])
+@pytest.mark.parametrize("of", slow_after(1, [5, 2]))
 def test_what_is_forged_is_refused_in_the_part_that_holds_it(of: int) -> None:
     """The part whose turn it was when one process refused; what is no leaf, in every part."""
     for what, data in refused().items():

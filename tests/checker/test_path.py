@@ -53,6 +53,7 @@ from tests.checker.test_tube import (
 from tests.support.balls import enlarged_from, reached_from
 from tests.support.certificates import ASYMPTOTIC, Document, decode, edited, encode, make, parse, rehash, verdict
 from tests.support.jets import curved, no_units, plain
+from tests.support.marks import slow_after
 from tests.support.oracle import ball as exact
 from tests.support.oracle import policy_in_arb, quadratic
 from tests.support.reached import attracted, field_in_arb, loop_of, nodes_before, rates_outwards, surrounded
@@ -442,7 +443,7 @@ PLANTED: dict[str, tuple[Callable[[], Document], int, Any]] = {  # base, compone
 }
 
 
-@pytest.mark.parametrize("name", PLANTED)
+@pytest.mark.parametrize("name", slow_after(6, PLANTED))
 def test_planted_violations_are_refused(name: str) -> None:
     """The least term that breaks condition 7' where it is looked, by at most 5 % of the largest rate."""
     base, i, tree = PLANTED[name]
@@ -780,7 +781,7 @@ def test_the_models_along_a_path_enclose_the_field(name: str, where: str) -> Non
     assert tight > 0.01 or where not in ("far", "large motion") or name == "linear"
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", slow_after(1, range(4)))
 def test_models_of_random_loops_hold_along_random_paths(seed: int) -> None:
     """Loops, balls and motions of all sizes, at points of the ball: never certainly outside."""
     random, met, tight = np.random.default_rng(seed + 40), 0, 0.0

@@ -47,6 +47,7 @@ from tests.support.certificates import (
     write,
 )
 from tests.support.jets import curved, no_units, plain
+from tests.support.marks import slow_after
 from tests.support.oracle import policy_in_arb, quadratic, value_of
 
 ROOT = Path(__file__).parents[2]
@@ -564,7 +565,7 @@ def random_loop(random: np.random.Generator) -> tuple[Document, np.ndarray]:
     return data, J
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", slow_after(1, range(4)))
 def test_models_hold_on_their_balls(seed: int) -> None:
     """F and the inputs at points of random balls of random loops, in ball arithmetic: never certainly outside."""
     random, met, tight = np.random.default_rng(seed), 0, 0.0

@@ -19,6 +19,7 @@ from controllers.evaluate import EvaluationOptions, discrete_linearisation, eval
 from controllers.logs import Episode, Log
 from controllers.options import TrainingOptions, preset
 from controllers.training import Trainer, train
+from tests.support.marks import slow_after
 
 POLICIES = Path(__file__).parents[2] / "examples" / "policies"
 SHIPPED = POLICIES / "pendulum.pt"
@@ -77,7 +78,7 @@ def whole(runs):
     return runs("pendulum")
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", slow_after(1, CASES))
 def test_training_twice_gives_the_same_bytes_and_another_seed_does_not(runs, tmp_path, case):
     whole, trainer = runs(case), _case(case)
     save_policy(tmp_path / "again.pt", train(trainer))
@@ -86,7 +87,7 @@ def test_training_twice_gives_the_same_bytes_and_another_seed_does_not(runs, tmp
     assert other.network.sha256() != trainer.policy().network.sha256()
 
 
-@pytest.mark.parametrize("step", [50, 333])
+@pytest.mark.parametrize("step", slow_after(1, [333, 50]))
 @pytest.mark.parametrize("case", CASES)
 def test_a_resumed_run_equals_an_uninterrupted_one(runs, tmp_path, case, step):
     whole, trainer = runs(case), _case(case)

@@ -204,12 +204,12 @@ def _check_planted(seed: int) -> bool:
 
 
 def test_planted_counterexamples_are_never_proved() -> None:
-    assert sum(_check_planted(seed) for seed in range(24)) >= 12
+    assert sum(_check_planted(seed) for seed in range(10)) >= 5
 
 
 @pytest.mark.slow
 def test_many_planted_counterexamples_are_never_proved() -> None:
-    assert sum(_check_planted(seed) for seed in range(24, 450)) >= 200
+    assert sum(_check_planted(seed) for seed in range(10, 450)) >= 210
 
 
 def test_an_asymmetric_P_is_named() -> None:

@@ -134,7 +134,7 @@ def _check_planted(seed: int) -> bool:
 
 
 def test_planted_violations_between_the_levels_are_never_proved() -> None:
-    assert sum(_check_planted(seed) for seed in range(3)) >= 1
+    assert sum(_check_planted(seed) for seed in range(2)) >= 1
 
 
 @pytest.mark.slow

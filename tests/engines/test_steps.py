@@ -29,6 +29,7 @@ from certify.systems import System, get_system
 from certify.verdict import Stop
 from tests.engines.test_vdot import boxes, cartpole_case
 from tests.support.loops import box, pendulum_network, scalar_tanh, valve
+from tests.support.marks import slow_after
 
 CPU = torch.device("cpu")
 INNER, OUTER = 0.02, 0.5
@@ -124,7 +125,7 @@ def increment(case: Stepped, x: np.ndarray, generator: np.random.Generator, piec
 
 
 @pytest.mark.parametrize("name", CASES)
-@pytest.mark.parametrize("order", [1, 2, 3])
+@pytest.mark.parametrize("order", slow_after(1, [3, 2, 1]))
 def test_the_bound_holds_wherever_a_box_meets_the_ring(name: str, order: int) -> None:
     case = CASES[name]()
     n = case.loop.system.n
@@ -145,7 +146,7 @@ def test_the_bound_holds_wherever_a_box_meets_the_ring(name: str, order: int) ->
     assert met > 1000 and told[-1] > 0.9
 
 
-@pytest.mark.parametrize("name", ["pendulum", "cartpole", "functions"])
+@pytest.mark.parametrize("name", slow_after(1, ["pendulum", "cartpole", "functions"]))
 def test_a_longer_series_leaves_less_at_a_point(name: str) -> None:
     """What the last coefficient's enclosure adds falls with each order; the falsifier knows D' itself."""
     case = CASES[name]()

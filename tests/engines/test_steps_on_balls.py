@@ -30,6 +30,7 @@ from certify.systems import System, get_system
 from certify.systems.system import Interval
 from tests.support.certificates import verdict
 from tests.support.loops import box
+from tests.support.marks import slow_after
 
 Array = np.ndarray
 POLICIES = Path(__file__).parents[2] / "examples" / "policies"
@@ -187,7 +188,7 @@ def beyond(models: Models, y: Array, d: Array, G: Array) -> tuple[Array, Array]:
     return np.abs(G - polynomial), bound
 
 
-@pytest.mark.parametrize("order", [2, 3, 4])
+@pytest.mark.parametrize("order", slow_after(1, [3, 2, 4]))
 @pytest.mark.parametrize("name", list(loops()))
 def test_models_enclose_what_a_step_does(name: str, order: int) -> None:
     """With quantities that switch within the period: y stands for their mean."""

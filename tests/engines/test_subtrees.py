@@ -35,6 +35,7 @@ from tests.engines.test_vdot import cartpole_case
 from tests.support.cases import case_of
 from tests.support.jobs import LEAF, LOOK, OPEN, Play, PlayedJobs, PlayedRunner, Troupe, boxes_of, parts, sealed
 from tests.support.loops import box, chain, pendulum_network
+from tests.support.marks import slow_after
 
 HERE = ThreadRunner()
 ADDRESS = "tcp://nowhere:1"
@@ -190,7 +191,7 @@ GARBAGE: dict[str, Play] = {
 }
 
 
-@pytest.mark.parametrize("name", GARBAGE)
+@pytest.mark.parametrize("name", slow_after(8, GARBAGE))
 def test_garbage_changes_nothing(name: str) -> None:
     """The second answer, the fourth and so on are garbage: these jobs are done here, and the tree is what it was."""
     troupe = Troupe()

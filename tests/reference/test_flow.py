@@ -29,6 +29,7 @@ from certify.reference.refusal import Refused
 from certify.reference.taylor import Taylor, pairs
 from tests.support.balls import exactly
 from tests.support.certificates import Document, decode, dump, make
+from tests.support.marks import slow_after
 from tests.support.models import may_be
 from tests.support.periods import mean_change, switching
 
@@ -142,7 +143,7 @@ def points_of(generator: np.random.Generator, count: int) -> list[np.ndarray]:
     return list(d)
 
 
-@pytest.mark.parametrize("practical", [False, True])
+@pytest.mark.parametrize("practical", slow_after(1, [False, True]))
 @pytest.mark.parametrize(("sample", "order"), SAMPLES)
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_a_ball_encloses_the_mean_of_every_period(

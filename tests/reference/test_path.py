@@ -43,6 +43,7 @@ from tests.reference.test_tube import array, at, more, of_tube, times, without, 
 from tests.support.balls import TINY, around, ball, centred, exactly, slab_of, square, with_ball
 from tests.support.certificates import Document, decode, dump, edited, encode, make, write
 from tests.support.certificates import verdict as verdict_of_the_checker
+from tests.support.marks import slow_after
 from tests.support.models import curves, field, model, numbers, units
 from tests.support.paths import along, follow
 from tests.support.reference import CONTINUOUS, judge
@@ -738,7 +739,7 @@ EDGES: list[tuple[str, Callable[[Document, float], Document]]] = [  # how an edi
 ]
 
 
-@pytest.mark.parametrize("name", ["bent", "swing"])
+@pytest.mark.parametrize("name", slow_after(1, ["bent", "swing"]))
 @pytest.mark.parametrize(("what", "edit"), EDGES)
 def test_the_checker_draws_the_same_line(what: str, edit: Callable[[Document, float], Document], name: str) -> None:
     """How far a number can be moved before a file is refused: the same for two programs."""

@@ -20,6 +20,7 @@ from certify.reference import decrease, flow, leaves, local, rules
 from certify.reference.__main__ import in_words
 from certify.reference.document import read
 from tests.support.certificates import Document, decode, dump, edited, encode
+from tests.support.marks import slow_after
 from tests.support.periods import mean_change, switching
 from tests.support.reference import judge
 from tests.support.steps import accepted, at_level, grown, stepping, with_ball
@@ -279,7 +280,7 @@ def test_a_period_that_visits_several_cells(monkeypatch: pytest.MonkeyPatch) -> 
 
 @pytest.mark.parametrize("kind", ["discrete", "held", "held 0"])
 @pytest.mark.parametrize("practical", [False, True])
-@pytest.mark.parametrize("seed", [0, 1, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("seed", slow_after(1, range(3)))
 def test_what_is_accepted_of_a_random_loop_is_true(seed: int, practical: bool, kind: str) -> None:
     """Gains are raised until the claim is refused; each that is accepted is held against periods that jump."""
     generator, some = np.random.default_rng([seed, practical]), False
