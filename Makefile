@@ -16,7 +16,7 @@ roa: setup
 	$(BIN)/certify roa --policy examples/policies/pendulum.pt --out out/pendulum
 
 test: setup
-	$(BIN)/pytest -n 2
+	$(BIN)/pytest -n 2 --dist worksteal
 
 lint: setup
 	$(BIN)/ruff check .

@@ -171,7 +171,7 @@ class ProvedSet:
         else:
             ends = (pair if pair[0] < pair[1] else pair[:1] for pair in box)
             corners = list(itertools.product(*ends))
-            contained = [all(e.holds(corners)) for e in self.ellipsoids]
+            contained = [e.covers(box) or all(e.holds(corners)) for e in self.ellipsoids]  # a bound costs no corner
         for ellipsoid, whole in zip(self.ellipsoids, contained, strict=True):
             if whole:
                 return Located(Containment.CONTAINED, within=ellipsoid.name)

@@ -153,7 +153,7 @@ def certify_roa(
     from certify.running.threads import threads_for
 
     options = options or RoaOptions()
-    with threads_for(network), sole_writer(out), _runner_for(options) as runner:
+    with threads_for(network.weights), sole_writer(out), _runner_for(options) as runner:
         return _Run(system, network, out, options, runner, load_seconds, provenance or {}, progress, show).result()
 
 

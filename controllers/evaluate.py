@@ -181,7 +181,7 @@ def evaluate(
     eigenvalues = np.linalg.eigvals(_closed_loop_jacobian(system, policy))
     fastest = float(np.abs(eigenvalues).max())
     h = min(dt, options.resolution / fastest) if fastest > 0 else dt
-    with threads_for(network):
+    with threads_for(network.weights):
         continuous = _settling(continuous_loop(system, h, mean_action(network, system), Q, R), system, x0, options)
         held = settle(network, system, dt, Q, R, options, plant)
 

@@ -12,6 +12,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.support.marks import slow_after
+
 ROOT = Path(__file__).parent.parent
 LEAVES = {"errors", "verdict"}  # anybody may import these, and they import nothing
 ENTRY = {"cli", "commands", "__main__"}  # these may import anything of certify
@@ -206,7 +208,7 @@ NOT_FOR_A_VERDICT = [
 ]
 
 
-@pytest.mark.parametrize("arguments", [[], ["--candidate", "lyapunov"]])
+@pytest.mark.parametrize("arguments", slow_after(1, [[], ["--candidate", "lyapunov"]]))
 def test_a_proof_loads_no_more_than_it_needs(arguments: list[str], tmp_path: Path) -> None:
     """The whole command as a user has it; what draws its report, and what checks it, are other processes."""
     code = (

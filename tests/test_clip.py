@@ -42,6 +42,7 @@ from certify.verdict import Verdict
 from tests.support.cases import case_of
 from tests.support.certificates import edited, encode, grow, make, rehash, verdict
 from tests.support.loops import box, pendulum_network, scalar_clip
+from tests.support.marks import slow_after
 from tests.support.oracle import certainly_within, policy_in_arb
 from tests.support.reference import judge
 
@@ -324,6 +325,7 @@ def accepted_by_both(path: Path) -> dict[str, Any]:
     return dict(json.loads(raw))
 
 
+@pytest.mark.slow
 def test_a_saturated_loop_is_proved_up_to_the_edge_of_its_region(tmp_path: Path) -> None:
     system, network = scalar_clip()
     result = certify_roa(system, network, tmp_path)
@@ -342,6 +344,7 @@ def test_a_saturated_loop_is_proved_up_to_the_edge_of_its_region(tmp_path: Path)
     assert beyond.verdict is Verdict.REFUTED
 
 
+@pytest.mark.slow
 def test_a_rectified_tanh_is_a_clip(tmp_path: Path) -> None:
     """u = 2 relu(tanh(net(x) - net(0) + beta)), u_eq = 1: it reaches 0 on part of the set, and never 2."""
     x, u = get_system("pendulum").states[0], get_system("pendulum").inputs[0]
@@ -356,7 +359,7 @@ def test_a_rectified_tanh_is_a_clip(tmp_path: Path) -> None:
     accepted_by_both(tmp_path / "certificate.json")
 
 
-@pytest.mark.parametrize("claim", ["asymptotic", "practical"])
+@pytest.mark.parametrize("claim", slow_after(1, ["asymptotic", "practical"]))
 def test_a_clipped_pendulum(tmp_path: Path, claim: str) -> None:
     """The clip acts on the proved set: some state of it has an input at the clip's end."""
     network = dataclasses.replace(clipped_pendulum("identity", "output", 3.0, 0.0), scale=np.array([6.0]))

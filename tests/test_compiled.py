@@ -36,6 +36,7 @@ from tests.engines.test_steps import alone, stepped, uncertain_pendulum
 from tests.engines.test_vdot import CASES, cartpole_case
 from tests.support.cases import case_of
 from tests.support.loops import pendulum_network
+from tests.support.marks import slow_after
 from tests.support.ways import Way, bounded
 
 CPU = torch.device("cpu")
@@ -98,7 +99,7 @@ def test_both_ways_bound_alike(name: str, size: float) -> None:
     assert torch.equal(plain.smooth, fast.smooth)
 
 
-@pytest.mark.parametrize("name", ["cartpole", "pendulum"])
+@pytest.mark.parametrize("name", slow_after(1, ["cartpole", "pendulum"]))
 def test_both_ways_search_the_same_boxes(name: str) -> None:
     """A whole pass of the shipped policy: every decision is the same."""
     problem, T = shipped(name)
@@ -220,6 +221,7 @@ def test_the_kernels_know_the_constants_of_the_models() -> None:
     assert kernels.SLACK == policies._LIBM
 
 
+@pytest.mark.slow
 def test_a_short_search_does_not_import_numba() -> None:
     code = (
         "import sys, tempfile; from pathlib import Path; from certify import certify_roa;"

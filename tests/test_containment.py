@@ -30,6 +30,7 @@ from controllers.evaluate import count_covered
 from tests.support.beyond import line, network, plane
 from tests.support.certificates import write
 from tests.support.loops import box
+from tests.support.marks import slow_after
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 F = Fraction
@@ -147,7 +148,9 @@ def test_a_box_across_a_union() -> None:
     assert both.holds([(1, 1), (1, -1), (1, 0)]) == [True, True, False]
 
 
-@pytest.mark.parametrize(("half", "answer"), [(F(1, 5), Containment.CONTAINED), (F(1, 4), Containment.NOT_CONTAINED)])
+@pytest.mark.parametrize(
+    ("half", "answer"), slow_after(1, [(F(1, 5), Containment.CONTAINED), (F(1, 4), Containment.NOT_CONTAINED)])
+)
 def test_more_corners_than_are_looked_at(half: Fraction, answer: Containment) -> None:
     assert union(np.eye(20)).locate(((-half, half),) * 20).answer is answer
     assert union(np.eye(16)).locate(((-half, half),) * 16).answer is Containment.CONTAINED
@@ -350,6 +353,7 @@ def test_a_forged_operating_point_is_shown_and_moves_no_deviation(
         assert ask(capsys, "contains", file, "x0=0.5", "--deviations")[0] == 0
 
 
+@pytest.mark.slow
 def test_a_tube_s_start_belongs_to_the_set(enlarged: Path) -> None:
     proved = proved_set(enlarged)
     inner, start = proved.ellipsoids
@@ -495,10 +499,13 @@ SMALL = ["--level", "1e-6"]
 
 @pytest.mark.parametrize(
     ("states", "result", "word"),
-    [
-        ("h=0.0101", "contained", "CONTAINED  h = 0.0101"),
-        ("h=0.015..0.02", "not contained", "NOT CONTAINED  h = 0.015"),
-    ],
+    slow_after(
+        1,
+        [
+            ("h=0.0101", "contained", "CONTAINED  h = 0.0101"),
+            ("h=0.015..0.02", "not contained", "NOT CONTAINED  h = 0.015"),
+        ],
+    ),
 )
 def test_roa_says_it_too(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], states: str, result: str, word: str

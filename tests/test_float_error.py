@@ -24,10 +24,11 @@ from certify.policies import Policy, TanhNetwork, load_policy, save_policy
 from certify.rigorous import evaluate_policy, precision
 from certify.systems import System, available_systems, get_system, load_system
 from tests.support.loops import box, pendulum_network
+from tests.support.marks import slow_after
 from tests.support.single import Machine, adversarial, by_torch, f32, off_by, units
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
-POLICIES = sorted((EXAMPLES / "policies").rglob("*.pt"))
+POLICIES = sorted((EXAMPLES / "policies").rglob("*.pt"), key=lambda path: path.stat().st_size)
 U = 2.0**-24
 MACHINES = [
     Machine(),
@@ -98,7 +99,7 @@ def shipped(path: Path) -> tuple[TanhNetwork, System]:
     return policy.network, load_system(EXAMPLES / "plants" / f"{path.stem}.toml")
 
 
-@pytest.mark.parametrize("path", POLICIES, ids=lambda p: f"{p.parent.name}-{p.stem}")
+@pytest.mark.parametrize("path", slow_after(5, POLICIES), ids=lambda p: f"{p.parent.name}-{p.stem}")
 def test_no_program_in_binary32_is_further_off_than_the_bound(path: Path) -> None:
     """Corners, random states and ones that were climbed to; torch, and for small networks every order."""
     network, system = shipped(path)
@@ -125,7 +126,7 @@ KINDS = [
 
 
 @pytest.mark.parametrize("clipped", [False, True])
-@pytest.mark.parametrize("size", [0.01, 1.0, 30.0])
+@pytest.mark.parametrize("size", slow_after(2, [0.01, 1.0, 30.0]))
 @pytest.mark.parametrize("kind", KINDS, ids=lambda k: "-".join(k.values()))
 def test_any_network(kind: dict[str, Any], size: float, clipped: bool) -> None:
     """binary64 weights, three states, two inputs; small slopes, ordinary ones, saturated units; a clip that acts."""

@@ -28,6 +28,7 @@ from certify.engines.dreal import backend
 from certify.errors import BackendError
 from certify.installation import found_by_import, source_sha256, version_of
 from certify.options import RoaOptions
+from tests.support.marks import slow_after
 
 ROOT = Path(__file__).parent.parent
 POLICY = ROOT / "examples" / "policies" / "pendulum.pt"
@@ -100,6 +101,7 @@ def test_an_installed_certify_works_from_any_folder(installed: Path, tmp_path: P
     assert {f["name"]: f["state"] for f in found["findings"]}["certify"] == "ok"
 
 
+@pytest.mark.slow
 def test_a_folder_of_that_name_beside_a_script_is_said(installed: Path, tmp_path: Path) -> None:
     """It hides the package from scripts there, and nothing but the doctor would say why; the command is not hidden."""
     (tmp_path / "script.py").write_text("import certify\nprint(certify.certify_roa)\n")
@@ -232,7 +234,7 @@ def test_a_missing_extra_is_named_with_its_command(
     assert found["safetensors"]["state"] == "ok"
 
 
-@pytest.mark.parametrize("module", ["gymnasium", "control"])
+@pytest.mark.parametrize("module", slow_after(1, ["gymnasium", "control"]))
 def test_training_without_its_extra_ends_in_one_sentence(module: str, tmp_path: Path) -> None:
     code = f"import sys; sys.modules[{module!r}] = None; from controllers.cli import main; main()"
     given = ["train", "pendulum", "--steps", "1200", "--out", str(tmp_path / "p.pt"), "--json"]
@@ -261,7 +263,7 @@ def test_a_core_package_that_does_not_load_is_a_fault(
     assert module != "torch" or "Pip and CPU" in found[name]["advice"]
 
 
-@pytest.mark.parametrize("says", ["yes", "no", "nothing"])
+@pytest.mark.parametrize("says", slow_after(2, ["yes", "no", "nothing"]))
 @pytest.mark.parametrize("program", ["checker", "reference"])
 def test_a_checker_that_does_not_check_is_a_fault(
     says: str, program: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

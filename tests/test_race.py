@@ -107,6 +107,7 @@ def test_a_race_that_is_not_settled_goes_on_as_if_it_began() -> None:
     assert began == ["large", "small"] and again.contenders[0] is early
 
 
+@pytest.mark.slow
 def test_no_candidate_is_made_that_could_not_win(
     tmp_path: Path, pendulum: System, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -291,6 +291,7 @@ def test_what_is_asked_of_a_set_is_about_its_own_point(tmp_path: Path, capsys: p
     assert _run([*command, "omega=1"], True) == 2 and "no state 'omega'" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_the_largest_rate_is_of_the_set_around_the_rest(tmp_path: Path) -> None:
     policy = load_policy(PLAIN)
     system = get_system("pendulum").with_parameters(policy.parameters)

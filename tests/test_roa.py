@@ -28,11 +28,12 @@ from certify.roa import RoaOptions, certify_roa
 from certify.systems import System, get_system
 from certify.verdict import Verdict
 from tests.support.loops import box, chain, pendulum_network, scalar_tanh
+from tests.support.marks import slow_after
 
 SHIPPED = Path(__file__).parent.parent / "examples" / "policies" / "pendulum.pt"
 
 
-@pytest.mark.parametrize("n", [2, 3, 4, 5, 6])
+@pytest.mark.parametrize("n", slow_after(1, [3, 2, 4, 5, 6]))
 def test_linear_plants_reach_their_domain(tmp_path: Path, n: int) -> None:
     system, network = chain(n, [-1.0 - k for k in range(n)])
     result = certify_roa(system, network, tmp_path)
@@ -100,7 +101,7 @@ def test_a_level_outside_the_domain(tmp_path: Path) -> None:
     assert certify_roa(*scalar_tanh(), tmp_path, RoaOptions(level=9.5)).verdict is Verdict.REFUTED
 
 
-@pytest.mark.parametrize("centre", ["preactivation", "output"])
+@pytest.mark.parametrize("centre", slow_after(1, ["preactivation", "output"]))
 def test_a_wrong_raw_equilibrium_is_centred(tmp_path: Path, pendulum: System, centre: str) -> None:
     network = pendulum_network(centre=centre)
     result = certify_roa(pendulum, network, tmp_path)
@@ -201,7 +202,7 @@ def test_a_file_that_says_more_than_was_meant_is_a_soundness_error(
     assert not (tmp_path / "certificate.json").exists()
 
 
-@pytest.mark.parametrize("trust", [0.1, 1e6])
+@pytest.mark.parametrize("trust", slow_after(1, [0.1, 1e6]))
 def test_whatever_the_checker_refuses_a_run_ends_with_what_it_accepts(
     tmp_path: Path, pendulum: System, monkeypatch: pytest.MonkeyPatch, trust: float
 ) -> None:

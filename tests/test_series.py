@@ -11,6 +11,7 @@ import scipy.integrate
 import sympy
 
 from certify.expressions import Algebra, PowerSeries, Series, evaluate, solution_series
+from tests.support.marks import slow_after
 
 X, Y, U, T = sympy.symbols("x y u t")
 
@@ -28,19 +29,22 @@ class Numbers(Algebra[float]):
 
 @pytest.mark.parametrize(
     "text",
-    [
-        "sin(x)",
-        "cos(x)*sin(x)",
-        "tan(x)",
-        "tanh(x - 1)",
-        "exp(-x)",
-        "atan(2*x)",
-        "sqrt(1 + x)",
-        "1/(2 + x)",
-        "x**5 - 3*x**3/7 + 2",
-        "x**(-3)",
-        "sqrt(x)*tanh(sin(x) + exp(x)/3)/(1 + atan(x)**2)",
-    ],
+    slow_after(
+        6,
+        [
+            "sin(x)",
+            "cos(x)*sin(x)",
+            "tan(x)",
+            "tanh(x - 1)",
+            "exp(-x)",
+            "atan(2*x)",
+            "sqrt(1 + x)",
+            "1/(2 + x)",
+            "x**5 - 3*x**3/7 + 2",
+            "x**(-3)",
+            "sqrt(x)*tanh(sin(x) + exp(x)/3)/(1 + atan(x)**2)",
+        ],
+    ),
 )
 def test_coefficients_of_a_function_along_a_series(text: str) -> None:
     expression = sympy.sympify(text, locals={"x": X})

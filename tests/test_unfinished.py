@@ -330,6 +330,7 @@ def result_of(folder: Path, **more: Any) -> RoaResult:
     return certify_roa(WIDE, pendulum_network(), folder, options)
 
 
+@pytest.mark.slow
 def test_a_run_out_of_boxes_is_gone_on_with_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for place in ("certify.roa", "certify.race"):
         plain = Budget

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from typing import Any
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
-from certify.policies import TanhNetwork
 from certify.running.base import Bound, Work
 
 _CHUNK = 256  # boxes that make a thread worth its while
@@ -18,10 +19,10 @@ _SMALL_NETWORK = 10_000  # weights
 
 
 @contextmanager
-def threads_for(network: TanhNetwork) -> Iterator[None]:
+def threads_for(weights: Sequence[NDArray[np.float64]]) -> Iterator[None]:
     """One thread of torch's for a small network: its operations are shorter than the threads' handshakes."""
     threads = torch.get_num_threads()
-    if sum(W.size for W in network.weights) < _SMALL_NETWORK:
+    if sum(W.size for W in weights) < _SMALL_NETWORK:
         torch.set_num_threads(1)
     try:
         yield

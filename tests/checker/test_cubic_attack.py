@@ -28,6 +28,7 @@ from certify.checker.jets import Jet
 from tests.support.balls import with_ball
 from tests.support.certificates import Document, decode, edited, encode, make, parse, verdict
 from tests.support.jets import curved
+from tests.support.marks import slow_after
 from tests.support.oracle import ball, policies_in_arb, quadratic
 from tests.support.reached import dot, field_in_arb
 
@@ -450,7 +451,7 @@ def attempts(case: Case, piece: tube.Piece) -> Iterator[tube.Piece]:
             yield replace(piece, slab=replace(slab, path=moving))
 
 
-@pytest.mark.parametrize("name", LIMITS)
+@pytest.mark.parametrize("name", slow_after(5, LIMITS))
 @pytest.mark.parametrize("moving", [False, True])
 @sizes(1, 20)
 def test_slabs_that_are_accepted_next_to_the_flow_are_true(name: str, moving: bool, count: int) -> None:

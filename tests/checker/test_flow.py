@@ -31,6 +31,7 @@ from tests.checker.test_uncertain import holds
 from tests.support.certificates import Document, edited, make, parse
 from tests.support.jets import curved, given, no_units, plain
 from tests.support.leaves import on_boxes
+from tests.support.marks import slow_after
 from tests.support.stepped_loops import fitted
 
 # ------------------------------------------------------------------------------------------ jets with what is uncertain
@@ -188,7 +189,7 @@ CASES = [(False, "1/10", "1/10", 1), (False, "1/10", "1/10", 2), (False, "1/20",
          (True, "1/10", "1/10", 3), (True, "1/20", "1/10", 2), (True, "1/20", "1/10", 4)]  # fmt: skip
 
 
-@pytest.mark.parametrize(("disturbed", "lo", "hi", "order"), CASES)
+@pytest.mark.parametrize(("disturbed", "lo", "hi", "order"), slow_after(4, CASES))
 def test_the_ball_holds_the_mean_over_a_period_in_which_what_is_uncertain_switches(
     disturbed: bool, lo: str, hi: str, order: int
 ) -> None:

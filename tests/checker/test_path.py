@@ -671,7 +671,7 @@ def just_accepted(name: str, edit: Size, seed: int) -> Document:
     return of(low)
 
 
-@pytest.mark.parametrize("what", SIZED)
+@pytest.mark.parametrize("what", slow_after(9, SIZED))
 def test_what_is_just_accepted_of_a_well_is_true(what: str) -> None:
     assert_true(just_accepted("well", SIZED[what], 1), 2)
 

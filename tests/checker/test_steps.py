@@ -13,6 +13,7 @@ import pytest
 
 from certify.checker.document import Certificate
 from tests.support.certificates import Document, dump, parse, verdict
+from tests.support.marks import slow_after
 from tests.support.reference import judge
 from tests.support.step_forgeries import BASES, base, forgeries
 from tests.support.stepped_loops import Family, families, peaked, shares
@@ -84,7 +85,7 @@ def test_there_are_enough_planted_violations() -> None:
     assert EACH * len(FAMILIES) >= 200 and 2 * near >= EACH
 
 
-@pytest.mark.parametrize("name", FAMILIES)
+@pytest.mark.parametrize("name", slow_after(20, FAMILIES))
 def test_what_is_planted_is_refused_and_what_lies_within_is_accepted(name: str) -> None:
     family: Family = FAMILIES[name]
     generator = np.random.default_rng(len(name))

@@ -523,6 +523,7 @@ def test_a_jet_of_a_quantity_alone_is_as_wide_as_its_values() -> None:
             assert not jet.a.any() and not jet.a_y.any() and not jet.slack > 1e-100  # no more than underflow
 
 
+@pytest.mark.slow
 def test_products_of_wide_jets_enclose_what_they_stand_for() -> None:
     """(p + a.d)(q + b.d) and functions of it, p and q wide: at their ends, in fractions and Arb."""
     generator, no_errors = np.random.default_rng(2), np.zeros((0, 2, 2))

@@ -103,6 +103,7 @@ def test_without_centring_the_raw_mean_ships(short):
     assert policy.training["offset_before_centring"] == pytest.approx(abs(mean[0]))
 
 
+@pytest.mark.slow
 def test_the_command_trains_and_evaluates_an_ablation(tmp_path):
     runner, out = CliRunner(), tmp_path / "p.pt"
     small = ["--steps", "60", "--warm-up", "20", "--batch", "8", "--critic", "8"]

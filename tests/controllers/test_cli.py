@@ -156,6 +156,7 @@ def _evaluate(*arguments):
     return runner.invoke(app, ["evaluate", *map(str, arguments), "--json"])
 
 
+@pytest.mark.slow
 def test_evaluate_counts_the_states_in_the_proved_set(certificate):
     """Each decided by itself, in rationals, also where thousands are asked about."""
     done = _evaluate(SHIPPED, "--states", 300, "--seed", 5, "--certificate", certificate)

@@ -38,6 +38,7 @@ from controllers.responses import (
 )
 from controllers.simulation import simulate
 from controllers.training import Trainer
+from tests.support.marks import slow_after
 from tests.support.pieces import Here
 
 TINY = replace(preset("pendulum"), steps=160, warm_up=60, n_A=25, n_B=25, batch=8, actor=(6, 5), critic=(7,))
@@ -270,6 +271,7 @@ def test_a_policy_of_unknown_origin_is_not_written_over(finished, pendulum_syste
     assert (folder / "policy.pt").read_bytes() == b"somebody's"
 
 
+@pytest.mark.slow
 def test_figures_hold_when_everything_diverges(finished, pendulum_system, tmp_path, monkeypatch):
     monkeypatch.setattr(simulation, "DIVERGED", 1e-3)
     monkeypatch.setattr(compare, "_drawings", DRAW)
@@ -387,7 +389,7 @@ class Elsewhere(Here):
     """A place that is not this machine's processes: what is sent there comes back as bytes."""
 
 
-@pytest.mark.parametrize("place", [Processes(2), Elsewhere()], ids=["processes", "elsewhere"])
+@pytest.mark.parametrize("place", slow_after(1, [Processes(2), Elsewhere()]), ids=["processes", "elsewhere"])
 def test_where_runs_are_trained_changes_nothing(finished, pendulum_system, tmp_path, place):
     folder, lines, told = tmp_path / "runs", [], []
     result = compare.compare(pendulum_system, TINY, folder, tmp_path, OF_OURS, lines.append, told.append, place)

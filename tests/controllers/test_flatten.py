@@ -20,6 +20,7 @@ from controllers.cli import app
 from controllers.evaluate import EvaluationOptions, curvature, discrete_linearisation, evaluate
 from controllers.flatten import FACTORS, FlattenOptions, bend, flatten
 from controllers.simulation import initial_states
+from tests.support.marks import slow_after
 
 PENDULUM = get_system("pendulum")
 GAIN = np.array([[0.9, 0.35]])  # of net, before 6 tanh(.): a stable loop
@@ -102,6 +103,7 @@ def test_the_record_says_how_and_the_old_one_stays(result):
     assert flattened["weight"] == 1.0 and flattened["box"] == list(module.get_plant("pendulum").initial_states)
 
 
+@pytest.mark.slow
 def test_what_the_record_says_of_the_numbers_is_said_of_the_new_ones():
     K = [[5.5, 2.0]]
     old = _record(K=K, eta=0.1, distance=-1.0, curvature=-1.0)
@@ -118,6 +120,7 @@ def test_the_same_seed_gives_the_same_policy(result):
     assert again.policy.network.sha256() == result.policy.network.sha256()
 
 
+@pytest.mark.slow
 def test_a_small_weight_changes_less():
     little = flatten(Policy(curved(), "pendulum", training=_record()), replace(QUICK, weight=1e-3))
     much = flatten(Policy(curved(), "pendulum", training=_record()), replace(QUICK, weight=10.0))
@@ -127,11 +130,14 @@ def test_a_small_weight_changes_less():
 
 @pytest.mark.parametrize(
     ("centre", "squash", "scale", "clip"),
-    [
-        ("output", "tanh", 6.0, None),
-        ("output", "identity", 6.0, (np.array([-6.0]), np.array([6.0]))),
-        ("preactivation", "tanh", 12.0, (np.array([-6.0]), np.array([6.0]))),
-    ],
+    slow_after(
+        1,
+        [
+            ("output", "tanh", 6.0, None),
+            ("output", "identity", 6.0, (np.array([-6.0]), np.array([6.0]))),
+            ("preactivation", "tanh", 12.0, (np.array([-6.0]), np.array([6.0]))),
+        ],
+    ),
 )
 def test_every_form_of_a_policy_can_be_flattened(centre, squash, scale, clip):
     teacher = curved(centre, squash, scale, clip=clip)
@@ -144,6 +150,7 @@ def test_every_form_of_a_policy_can_be_flattened(centre, squash, scale, clip):
     np.testing.assert_allclose(network.net(zero), teacher.net(zero), atol=1e-5)  # what enters the squash at 0 stays
 
 
+@pytest.mark.slow
 def test_exact_centring_by_zero_biases_is_kept():
     teacher = curved("none", bias=0.0)
     require_centred(teacher, PENDULUM.exact_u_eq())
@@ -167,6 +174,7 @@ def _chattering(centre="preactivation", bias=0.5) -> TanhNetwork:
     )
 
 
+@pytest.mark.slow
 def test_another_gain_is_the_lqr_gain_of_the_weights_that_judge():
     """A is stable under it, runs settle that did not, and the gain is that of the discrete Riccati equation."""
     old, record = _chattering(), _record(K=[[5.0, 2.0]])
@@ -186,6 +194,7 @@ def test_another_gain_is_the_lqr_gain_of_the_weights_that_judge():
     assert found.policy.training["distance"] == pytest.approx(distance)
 
 
+@pytest.mark.slow
 def test_what_changed_is_said_beside_the_old_policy_and_not_beside_the_goal():
     old = _chattering()
     found = flatten(Policy(old, "pendulum", training=_record()), replace(QUICK, gain="lqr"))
@@ -198,6 +207,7 @@ def test_what_changed_is_said_beside_the_old_policy_and_not_beside_the_goal():
     assert found.largest[0] * (1 + 1e-9) >= change > 1
 
 
+@pytest.mark.slow
 def test_the_gain_stays_unless_it_is_asked_for():
     found = flatten(Policy(_chattering(), "pendulum", training=_record()), QUICK)
     assert found.gain_change < 0.05 and found.after.settled == found.before.settled == 0
@@ -212,6 +222,7 @@ def test_another_gain_is_bound_by_what_the_old_policy_costs(monkeypatch):
     assert calls[0].sha256() == curved().sha256()
 
 
+@pytest.mark.slow
 def test_zero_biases_stay_under_another_gain():
     teacher = _chattering("none", bias=0.0)
     require_centred(teacher, PENDULUM.exact_u_eq())
@@ -227,6 +238,7 @@ def test_an_lqr_gain_needs_input_weights():
     flatten(given, replace(QUICK, gain="lqr", R=(0.1,), steps=0))
 
 
+@pytest.mark.slow
 def test_other_weights_give_another_gain_and_runs_are_judged_as_before():
     """Dearer inputs, less gain; what a run costs is still what the record's weights say."""
     own = flatten(Policy(curved(), "pendulum", training=_record(K=[[5.0, 2.0]])), replace(QUICK, gain="lqr"))
@@ -283,12 +295,15 @@ def _judging(monkeypatch, figures):
 
 @pytest.mark.parametrize(
     "figures",
-    [
-        lambda call: (20, 1.0 if call == 1 else 1.06),  # costs more than it may
-        lambda call: (20 if call == 1 else 19, 0.5),  # one run less settles
-        lambda call: (20, 1.0 if call == 1 else np.inf),
-        lambda call: (20, 1.0 if call == 1 else np.nan),
-    ],
+    slow_after(
+        1,
+        [
+            lambda call: (20, 1.0 if call == 1 else 1.06),  # costs more than it may
+            lambda call: (20 if call == 1 else 19, 0.5),  # one run less settles
+            lambda call: (20, 1.0 if call == 1 else np.inf),
+            lambda call: (20, 1.0 if call == 1 else np.nan),
+        ],
+    ),
 )
 def test_beyond_the_bounds_there_is_no_result(monkeypatch, figures):
     _judging(monkeypatch, figures)
@@ -304,6 +319,7 @@ def test_the_best_iterate_within_the_bounds_is_the_result(monkeypatch):
     assert [found.policy.network.sha256()] == [n.sha256() for n in calls[3:4]]
 
 
+@pytest.mark.slow
 def test_a_huge_weight_with_a_tight_bound_ends_honestly(tmp_path):
     """Of itself: here straight feedback costs more than the policy does, so nothing flatter is within 0 %."""
     save_policy(tmp_path / "p.pt", Policy(curved(), "pendulum", training=_record()))
@@ -387,6 +403,7 @@ def test_the_command_writes_the_policy_and_one_json_object(tmp_path):
     assert text.exit_code == 0 and "10 of 10 settled" in text.stdout and "what to try" not in text.stdout
 
 
+@pytest.mark.slow
 def test_the_command_says_what_to_try_where_no_run_settles(tmp_path):
     save_policy(tmp_path / "p.pt", Policy(_chattering(), "pendulum", training=_record()))
     kept = _flatten(tmp_path / "p.pt", "--out", tmp_path / "q.pt")
@@ -436,6 +453,7 @@ def test_a_plant_of_ones_own_and_a_policy_that_names_it(tmp_path):
     assert found["after"]["departure"] < found["before"]["departure"]
 
 
+@pytest.mark.slow
 def test_an_imported_policy(tmp_path):
     """Weights of another program, a clip from its last step, and no record of a training."""
     network = curved(scale=12.0)

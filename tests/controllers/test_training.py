@@ -88,7 +88,7 @@ def test_training_twice_gives_the_same_bytes_and_another_seed_does_not(runs, tmp
 
 
 @pytest.mark.parametrize("step", slow_after(1, [333, 50]))
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", slow_after(1, CASES))
 def test_a_resumed_run_equals_an_uninterrupted_one(runs, tmp_path, case, step):
     whole, trainer = runs(case), _case(case)
     assert whole[0].gain.identified is not None and whole[0].sac.actor_optimiser.state
@@ -246,7 +246,7 @@ MEMBERS = [
 ]
 
 
-@pytest.mark.parametrize(("name", "layers", "states", "slowest"), MEMBERS)
+@pytest.mark.parametrize(("name", "layers", "states", "slowest"), slow_after(2, MEMBERS))
 def test_the_shipped_policy_matches_its_gain_and_settles(name, layers, states, slowest):
     policy = load_policy(POLICIES / f"{name}.pt")
     assert policy.system == name

@@ -278,14 +278,17 @@ def test_a_period_too_long_for_any_enclosure_has_no_models() -> None:
 
 @pytest.mark.parametrize(
     "loop",
-    [
-        shipped("pendulum", TENTH),
-        shipped("pendulum", TENTH, (HUNDREDTH, HUNDREDTH)),
-        shipped("pendulum", sample=(Fraction(0), Fraction(1, 50))),
-        shipped("cartpole", MASSES),
-        shipped("cartpole", sample=(HUNDREDTH, HUNDREDTH)),
-        in_steps("pendulum", HUNDREDTH, TENTH),
-    ],
+    slow_after(
+        3,
+        [
+            shipped("pendulum", TENTH),
+            shipped("pendulum", TENTH, (HUNDREDTH, HUNDREDTH)),
+            shipped("pendulum", sample=(Fraction(0), Fraction(1, 50))),
+            shipped("cartpole", MASSES),
+            shipped("cartpole", sample=(HUNDREDTH, HUNDREDTH)),
+            in_steps("pendulum", HUNDREDTH, TENTH),
+        ],
+    ),
     ids=["ranges", "ranges sampled", "any period", "masses", "cartpole sampled", "in steps"],
 )
 def test_what_is_proved_at_rest_is_accepted_and_true(loop: ClosedLoop) -> None:
@@ -305,6 +308,7 @@ def test_what_is_proved_at_rest_is_accepted_and_true(loop: ClosedLoop) -> None:
         assert np.all(D < 1e-9 * V)
 
 
+@pytest.mark.slow
 def test_the_cart_under_uncertain_masses_keeps_most_of_its_level() -> None:
     """With charges by norms it had none at all."""
     problem, T, limit = problem_of(shipped("cartpole", MASSES))
@@ -421,13 +425,16 @@ def test_a_policy_that_is_not_centred_has_a_band_around_where_it_rests() -> None
 
 @pytest.mark.parametrize(
     "loop",
-    [
-        shipped("pendulum", TORQUE),
-        shipped("pendulum", TENTH | TORQUE),
-        shipped("pendulum", TORQUE, (HUNDREDTH, HUNDREDTH)),
-        shipped("pendulum", TORQUE, (Fraction(0), HUNDREDTH)),
-        in_steps("pendulum", HUNDREDTH, TORQUE),
-    ],
+    slow_after(
+        2,
+        [
+            shipped("pendulum", TORQUE),
+            shipped("pendulum", TENTH | TORQUE),
+            shipped("pendulum", TORQUE, (HUNDREDTH, HUNDREDTH)),
+            shipped("pendulum", TORQUE, (Fraction(0), HUNDREDTH)),
+            in_steps("pendulum", HUNDREDTH, TORQUE),
+        ],
+    ),
     ids=["torque", "all", "sampled", "any period", "in steps"],
 )
 def test_bands_are_accepted_and_true(loop: ClosedLoop) -> None:

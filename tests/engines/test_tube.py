@@ -223,6 +223,7 @@ def test_a_rate_takes_its_part_of_the_decay() -> None:
     np.testing.assert_allclose(without - with_rate, 0.3 * J.T @ goal @ J, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_enlarge_keeps_the_largest_of_the_shapes() -> None:
     case, goal = pendulum()
     seen: list[float] = []
@@ -348,6 +349,7 @@ def test_the_set_is_the_union(result: RoaResult) -> None:
     assert np.array_equal(result.contains(x), inside) and 0 < inside.sum() < len(x)
 
 
+@pytest.mark.slow
 def test_a_box_asks_for_its_shape(tmp_path: Path) -> None:
     options = RoaOptions(candidate="lqr", box={"theta": 1.0, "theta_dot": 4.0}, max_boxes=1, time_limit=30)
     policy = load_policy(POLICIES / "pendulum.pt")

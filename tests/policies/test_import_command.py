@@ -121,6 +121,7 @@ def test_wrong_options_end_with_status_2_and_one_sentence(run: Run, arguments: l
         assert status == 2 and message in (json.loads(out)["error"] if last else err)
 
 
+@pytest.mark.slow
 def test_roa_reads_another_programs_file_and_keeps_to_where_no_observation_is_clipped(run: Run, tmp_path: Path) -> None:
     sb3("PPO", tmp_path)
     given = ("--system", "plant.toml", "--states", "x0,x1", "--normaliser", "normaliser.pkl", "--claim", "practical")

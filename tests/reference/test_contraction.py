@@ -32,6 +32,7 @@ from tests.reference.test_practical import scalar
 from tests.support.balls import around, exactly, square
 from tests.support.certificates import Document, dump, edited, encode, make, rehash
 from tests.support.claim_oracle import Loop as Plant
+from tests.support.marks import slow_after
 from tests.support.models import curved, linear
 from tests.support.oracle import value_of
 from tests.support.reference import judge
@@ -150,7 +151,7 @@ POLES = {
 }
 
 
-@pytest.mark.parametrize("weight", [0.01, 0.1, 0.3, 0.5, 1.0, 3.0])
+@pytest.mark.parametrize("weight", slow_after(3, [0.01, 0.1, 0.3, 0.5, 1.0, 3.0]))
 @pytest.mark.parametrize("name", POLES)
 def test_trajectories_that_part_at_the_edge(name: str, weight: float) -> None:
     """The slope of F is positive at the left end of {V <= c0}. Near a pole the remainder's own factor is too small."""

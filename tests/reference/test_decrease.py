@@ -24,6 +24,7 @@ from certify.reference.model import Model
 from certify.reference.rational import positive_definite
 from certify.reference.refusal import Refused
 from tests.support.balls import exactly
+from tests.support.marks import slow_after
 from tests.support.models import curves, field, model, units
 
 Rows = tuple[list[float], list[float], list[float]]
@@ -157,7 +158,7 @@ def any_form(generator: np.random.Generator, n: int) -> tuple[list[Model], list[
     return [model(0.0, [0.0] * n, q, e, k) for q, e, k in zip(Q, E, K, strict=True)], Q, E
 
 
-@pytest.mark.parametrize("n", [1, 2, 3, 5])
+@pytest.mark.parametrize("n", slow_after(3, [1, 2, 3, 5]))
 @pytest.mark.parametrize("kind", ["apart", "jointly", "both"])
 def test_the_sums_bound_what_they_stand_for(n: int, kind: str) -> None:
     """At points of the ball, most of them on its edge, with multipliers and weights at random."""
@@ -333,7 +334,7 @@ def test_what_is_not_finite_does_not_decrease(bad: str, part: str, rows: Rows) -
     assert not decreases(ball([[1.0]], *rows), one, zero, field([F], behind))
 
 
-@pytest.mark.parametrize("n", [1, 2, 3])
+@pytest.mark.parametrize("n", slow_after(2, [1, 2, 3]))
 def test_what_decreases_does_so_at_every_point(n: int) -> None:
     """Systems at random, near the edge; the remainder takes the worst sign and size that its bound allows."""
     generator, answers = np.random.default_rng(n), []

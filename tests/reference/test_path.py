@@ -577,7 +577,7 @@ def test_what_is_not_finite_does_not_decrease(bad: str, part: str, multipliers: 
         assert not decreases_along(hints([[1.0]], *multipliers), path, one, zero, field([changed], units_of))
 
 
-@pytest.mark.parametrize("n", [1, 2, 3])
+@pytest.mark.parametrize("n", slow_after(2, [1, 2, 3]))
 @pytest.mark.parametrize("kind", ["apart", "jointly"])
 def test_what_decreases_does_so_at_every_point(n: int, kind: str) -> None:
     """Systems at random, near the edge; remainders and errors take the worst sign and size that their bounds allow.
@@ -740,7 +740,7 @@ EDGES: list[tuple[str, Callable[[Document, float], Document]]] = [  # how an edi
 
 
 @pytest.mark.parametrize("name", slow_after(1, ["bent", "swing"]))
-@pytest.mark.parametrize(("what", "edit"), EDGES)
+@pytest.mark.parametrize(("what", "edit"), slow_after(4, EDGES))
 def test_the_checker_draws_the_same_line(what: str, edit: Callable[[Document, float], Document], name: str) -> None:
     """How far a number can be moved before a file is refused: the same for two programs."""
     ends = []
@@ -754,6 +754,7 @@ def test_the_checker_draws_the_same_line(what: str, edit: Callable[[Document, fl
     assert abs(ends[0] - ends[1]) < 2e-4 < ends[0]
 
 
+@pytest.mark.slow
 def test_a_tube_that_the_engine_finds(tmp_path: Path) -> None:
     """Of the pendulum that ships, from far outside of its local level: both programs accept it, or neither."""
     policy = load_policy(SHIPPED / "pendulum.pt")

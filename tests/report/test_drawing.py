@@ -18,6 +18,7 @@ from certify.results import RoaResult
 from certify.roa import certify_roa
 from certify.systems import get_system
 from tests.support.loops import pendulum_network
+from tests.support.marks import slow_after
 
 Asked = tuple[bytes, Path, dict[str, Any], dict[str, Any]]
 
@@ -59,7 +60,7 @@ def is_gone(pid: int) -> bool:
     return False
 
 
-@pytest.mark.parametrize("begun", [True, False])
+@pytest.mark.parametrize("begun", slow_after(1, [True, False]))
 def test_the_page_is_the_same_and_the_process_ends(begun: bool, asked: Asked, here: list[str]) -> None:
     with Drawing() as one:
         pid = process_of(one).pid
@@ -69,6 +70,7 @@ def test_the_page_is_the_same_and_the_process_ends(begun: bool, asked: Asked, he
     assert len(here) == 1 and is_gone(pid)
 
 
+@pytest.mark.slow
 def test_a_certificate_that_came_later_is_the_one_that_is_drawn(asked: Asked, here: list[str]) -> None:
     with Drawing() as one:
         first = process_of(one).pid
@@ -139,6 +141,7 @@ def test_nothing_waits_for_a_large_certificate(asked: Asked, monkeypatch: pytest
     assert is_gone(pid) and time.monotonic() - start < 60
 
 
+@pytest.mark.slow
 def test_the_process_has_the_import_path_of_this_one(tmp_path: Path, asked: Asked, here: list[str]) -> None:
     """A module of the current folder that bears the name of one that is needed is not imported."""
     (tmp_path / "json.py").write_text("raise SystemExit(1)")

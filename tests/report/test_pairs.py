@@ -31,6 +31,7 @@ from certify.report.sampling import quadratic
 from certify.roa import RoaOptions, certify_roa
 from certify.systems import System, get_system
 from tests.support.loops import box, chain, pendulum_network, scalar_tanh
+from tests.support.marks import slow_after
 
 FOUR = PartitionTree(np.eye(4), np.ones(4), bytes([255]))
 
@@ -197,7 +198,7 @@ def width_of(pdf: bytes) -> float:
     return (right - left) / 72
 
 
-@pytest.mark.parametrize(("columns", "inches"), [(1, 3.4), (2, 7.0)])
+@pytest.mark.parametrize(("columns", "inches"), slow_after(1, [(1, 3.4), (2, 7.0)]))
 def test_the_figure_is_as_wide_as_its_columns(proved: Any, columns: Any, inches: float) -> None:
     options = PaperOptions(columns)
     pdf = paper_figure(proved[0], True, options)

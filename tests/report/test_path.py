@@ -326,6 +326,7 @@ def test_the_simulated_share_counts_the_start_where_it_lies(proved: RoaResult) -
     assert f"covers {100 * both.fraction:.1f} % of the area" in page_of(proved).text
 
 
+@pytest.mark.slow
 def test_one_state_has_an_interval_where_it_lies(tmp_path: Path) -> None:
     options = RoaOptions(candidate="lyapunov", level=0.5, reach_from={"x": 1.5}, time_limit=15)
     result = certify_roa(*scalar_tanh(), tmp_path, options)

@@ -65,6 +65,7 @@ from certify.systems import System, get_system
 from certify.systems.ode import rk4_step
 from certify.verdict import Verdict
 from tests.support.loops import box, chain, pendulum_network, scalar_tanh
+from tests.support.marks import slow_after
 
 ONE_LEAF = PartitionTree(np.eye(2), np.ones(2), bytes([255]))
 
@@ -787,19 +788,22 @@ def test_the_summary_looks_no_plant_up(pendulum_case: Case) -> None:
 
 @pytest.mark.parametrize(
     "provenance",
-    [
-        [],
-        "text",
-        None,
-        {"units": []},
-        {"units": "rad"},
-        {"units": {"theta": 1}},
-        {"units": {"theta": "r" * 41}},
-        {"units": {"nobody": "rad"}},
-        {"units": {"theta": "a\u0000b"}},
-        {"units": {"theta": "\ud800"}},
-        {"units": {"theta": None}, "half": "\ud800", "deep": [[{}]]},
-    ],
+    slow_after(
+        5,
+        [
+            [],
+            "text",
+            None,
+            {"units": []},
+            {"units": "rad"},
+            {"units": {"theta": 1}},
+            {"units": {"theta": "r" * 41}},
+            {"units": {"nobody": "rad"}},
+            {"units": {"theta": "a\u0000b"}},
+            {"units": {"theta": "\ud800"}},
+            {"units": {"theta": None}, "half": "\ud800", "deep": [[{}]]},
+        ],
+    ),
 )
 def test_a_provenance_of_any_kind_does_no_harm(pendulum_case: Case, provenance: Any) -> None:
     data = json.loads(pendulum_case.raw)

@@ -9,5 +9,6 @@ import pytest
 
 
 def slow_after(count: int, cases: Iterable[Any]) -> list[Any]:
-    """Values of one parameter: all after the first `count` bear the mark `slow`."""
-    return [case if k < count else pytest.param(case, marks=pytest.mark.slow) for k, case in enumerate(cases)]
+    """Cases of `parametrize`, a tuple where there are several parameters: all but the first `count` are `slow`."""
+    every = [case if isinstance(case, tuple) else (case,) for case in cases]
+    return [pytest.param(*case, marks=[pytest.mark.slow] if k >= count else []) for k, case in enumerate(every)]
