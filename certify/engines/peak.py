@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import time
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -57,7 +58,9 @@ def peak_candidate(loop: ClosedLoop, seconds: float = math.inf) -> Array:
         size = cvxpy.trace(np.linalg.inv(W) @ P) / n
         problem = cvxpy.Problem(cvxpy.Minimize(c0 + _ROUND * size), within)
         try:
-            problem.solve(solver=cvxpy.CLARABEL)
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # of a solution that may be inaccurate: the rules judge it
+                problem.solve(solver=cvxpy.CLARABEL)
         except cvxpy.SolverError:
             continue
         if P.value is not None and np.all(np.isfinite(P.value)) and float(c0.value) < least:

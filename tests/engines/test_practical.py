@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import warnings
+from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
 
+import cvxpy
 import numpy as np
 import pytest
 import sympy
@@ -17,6 +20,8 @@ from certify.engines.base import Budget, Proof, Task
 from certify.engines.bounds.engine import BoundsEngine
 from certify.engines.bounds.search import prove_inwards
 from certify.engines.falsify import survey
+from certify.engines.peak import peak_candidate
+from certify.engines.robust import robust_candidate
 from certify.errors import InputError
 from certify.lyapunov import domain_limit
 from certify.policies import TanhNetwork, load_policy
@@ -210,3 +215,21 @@ def test_the_optimised_candidate_is_that_of_the_centred_loop() -> None:
     assert found is not None and known is not None and np.array_equal(found.P, known.P)
     assert found.task.kind == "practical" and found.task.problem.loop is loop
     assert 0 < found.volume <= 1.01 * known.volume
+
+
+@pytest.mark.parametrize("candidate", [peak_candidate, robust_candidate])
+def test_a_solution_that_may_be_inaccurate_is_no_warning(
+    candidate: Callable[[ClosedLoop], np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The rules judge what comes of it; a user could do nothing about the solver's word."""
+    solve, said = cvxpy.Problem.solve, []
+
+    def inaccurate(problem: cvxpy.Problem, **options: object) -> object:
+        said.append(problem)
+        warnings.warn("Solution may be inaccurate. Try another solver.", stacklevel=1)
+        return solve(problem, **options)
+
+    monkeypatch.setattr(cvxpy.Problem, "solve", inaccurate)
+    system, network = uncentred() if candidate is peak_candidate else (get_system("pendulum"), pendulum_network())
+    P = candidate(ClosedLoop(system, network))
+    assert said and np.all(np.linalg.eigvalsh(P) > 0)
