@@ -119,7 +119,17 @@ def test_a_plant_of_ones_own(tmp_path: Path, capsys: pytest.CaptureFixture[str])
     network = TanhNetwork((np.array([[-0.5, -0.4]]),), (np.zeros(1),), np.array([6.0]), np.zeros(1))
     save_policy(tmp_path / "v.pt", Policy(network, "somebody's plant"))
     status, out, err = run(
-        capsys, "roa", "--policy", tmp_path / "v.pt", "--system", VAN_DER_POL, "--out", tmp_path, "--json"
+        capsys,
+        "roa",
+        "--policy",
+        tmp_path / "v.pt",
+        "--system",
+        VAN_DER_POL,
+        "--candidate",
+        "lyapunov",
+        "--out",
+        tmp_path,
+        "--json",
     )
     assert status == 0 and json.loads(out)["system"] == "van_der_pol"
     assert "from the command line" in err

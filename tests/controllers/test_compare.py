@@ -389,6 +389,7 @@ class Elsewhere(Here):
     """A place that is not this machine's processes: what is sent there comes back as bytes."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", slow_after(1, [Processes(2), Elsewhere()]), ids=["processes", "elsewhere"])
 def test_where_runs_are_trained_changes_nothing(finished, pendulum_system, tmp_path, place):
     folder, lines, told = tmp_path / "runs", [], []
