@@ -42,6 +42,8 @@ from certify.report.words import (
     volume_unit,
 )
 
+Rows = list[tuple[str, str]]
+
 
 def tables_of(
     certificate: Certificate,
@@ -52,107 +54,21 @@ def tables_of(
     size: int | None,
 ) -> dict[str, Any]:
     """All tables but those of the matrices, and what stands at their heads, by their names in the template."""
-    system, P, network, words = certificate.system, certificate.P, certificate.network, words_of(certificate)
-    timing, inner = timing_of(certificate), inner_of(certificate)
-    state_units = [system.units.get(s.name, "") for s in system.states]
-    levels = [(f"{words.inner}, {words.inner_word}", repr(inner))]
-    levels += [("c₁, local", repr(certificate.inner))] if inner != certificate.inner else []
-    levels += [("c₂, enlarged", repr(certificate.roa))]
-    reach: list[tuple[str, ...]] = []
-    heads: list[str] = []
-    size_of_set: list[tuple[str, str]] = []
-    if is_ellipsoid(certificate):
-        limit = domain_limit(P, system.domain)
-        share = below(100 * Fraction(certificate.roa) / Fraction(limit), 4) if limit > 0 else "?"
-        levels.append(("domain's limit", f"{below(limit, 10)}, of which c₂ is {share} %"))
-        sets = ellipsoids_of(certificate)
-        for each in sets:
-            named = volume_name(system.n) + (f" of {each.name}" if len(sets) > 1 else "")
-            size_of_set.append((named, f"{below(volume(each.P, each.level))} {volume_unit(state_units)}".rstrip()))
-        heads, columns = _lengths(certificate, sets)
-        points = zip(system.states, system.exact_x_eq(), state_units, strict=True)
-        names = [deviation(s.name, q, unit) for s, q, unit in points]
-        centre = centre_of(certificate) if len(sets) > 1 else None
-        if centre is not None:
-            heads, columns = ["c₀", *heads], [[shortest(v) for v in centre.tolist()], *columns]
-        domain = [f"[{below(lo)}, {above(hi)}]" for lo, hi in system.domain]
-        reach = list(zip(names, *columns, domain, strict=True))
-    beyond = certificate.claim.outer
-    if beyond is not None:
-        levels.append(("n₂, of N", repr(beyond.level)))
-    if result is not None:
-        if not is_missed(result):
-            levels.append(("limited by", limited_by(result)))
-        if result.get("outer"):
-            levels.append(("n₂ limited by", outer_limited_by(result["outer"])))
-        sampled = result["levels"].get("sampled_limit")
-        if sampled is not None:
-            levels.append(("lowest V of a violation found", number(sampled, 10)))
-    geometry: list[tuple[str, str]] = []
-    if np.all(np.isfinite(P)):
-        geometry.append(("eigenvalues of P", ", ".join(number(float(v)) for v in np.linalg.eigvalsh(P))))
-    if isinstance(certificate.claim, Asymptotic):  # elsewhere the origin need not be an equilibrium
-        held = f" with {held_at(system)}" if system.ranges else ""
-        geometry.append((f"eigenvalues of the closed loop{timing.linearised}{held}", _eigenvalues(certificate)))
-    if timing.sample is not None:
-        geometry.append(("input held over", timing.periods))
-    if timing.rate:
-        geometry.append(("rate λ", f"{certificate.claim.rate!r} per {'step' if timing.discrete else 's'}"))
-    slabs = slabs_of(certificate)
-    evidence = [
-        ("policy", f"{'-'.join(map(str, network.layers))} tanh, squash {network.squash}, centre {network.centre}"),
-        *(() if network.clip is None else (("clipped to", _clip(certificate)),)),
-        *((("its layers read", read_in_words(certificate)),) if network.is_moved else ()),
-        ("policy sha256", network.sha256()),
-        ("certificate sha256", sha256),
-    ]
-    if size is not None:
-        evidence.append(("certificate size", f"{size:,} bytes"))
-    if beyond is not None:
-        evidence += _outer_rows(beyond, answer if status.accepted else None)
-    if slabs:
-        evidence.append(("tube", f"{len(slabs):,} slabs, {duration_in_words(certificate)}"))
-    if isinstance(certificate.evidence, TrustedSolver):
-        solver = certificate.evidence
-        evidence.append(("solver", f"{solver.solver} {solver.version}, delta {number(solver.precision)}"))
-        evidence += [(f"its answer to {name}", said) for name, said in solver.queries]
-    elif answer is not None and status.accepted:
-        leaves = f"{answer.get('leaves', 0):,}, of which {answer.get('ring_leaves', 0):,} in the ring"
-        whole = is_local_enough(certificate)
-        evidence.append(("leaves", "none needed: the local part covers the whole set" if whole else leaves))
-    run: list[tuple[str, str]] = []
-    if result is not None:
-        if result.get("boxes"):
-            run.append(("boxes examined", f"{result['boxes']:,}"))
-        run += [(f"{k}", seconds(v)) for k, v in result["seconds"].items() if v is not None]
-        asked = result.get("solver") or {}
-        for q in asked.get("queries", []):
-            about = f"{asked['solver']} {asked['version']} on {q['query']}, V <= {number(q['level'])}"
-            run.append((about, f"{q['answer']}, {seconds(q['seconds'])}"))
-    unit = volume_unit(state_units)
-    candidates = [
-        (
-            row["candidate"],
-            below(row["level"]),
-            f"{below(row['volume'])} {unit}".rstrip(),
-            "the domain" if row["limited_by"] == "domain" else "a violation found",
-            f"{below(row['proved_volume'])} {unit}".rstrip() if row.get("proved_volume") else ABSENT,
-            "this one" if row["proved"] else "",
-        )
-        for row in (result or {}).get("candidates", [])
-    ]
+    drawn = is_ellipsoid(certificate)
+    sets = ellipsoids_of(certificate) if drawn else ()
+    heads, reach = _reach(certificate, sets) if drawn else ([], [])
     return {
-        "levels": levels,
-        "size": size_of_set,
-        "estimated": _estimated(certificate, result) if is_ellipsoid(certificate) else "",
-        "geometry": geometry,
+        "levels": _levels(certificate, result),
+        "size": _sizes(certificate, sets),
+        "estimated": _estimated(certificate, result) if drawn else "",
+        "geometry": _geometry(certificate),
         "reach": reach,
         "reach_heads": heads,
         "sets": "the set reaches" if len(heads) <= 2 else "each set reaches",
-        "measure": volume_name(system.n),
-        "evidence": evidence,
-        "run": run,
-        "candidates": candidates,
+        "measure": volume_name(certificate.system.n),
+        "evidence": _evidence(certificate, answer if status.accepted else None, sha256, size),
+        "run": _run(result),
+        "candidates": _candidates(certificate, result),
     }
 
 
@@ -165,6 +81,130 @@ def matrices_of(certificate: Certificate) -> list[tuple[str, list[list[str]]]]:
     if centre is not None:
         named.append(("c₀, a row of states as the tube's start lies around them", centre[None]))
     return [(name, [[repr(float(v)) for v in row] for row in P]) for name, P in named]
+
+
+def _levels(certificate: Certificate, result: Mapping[str, Any] | None) -> Rows:
+    """The levels of V and N, and what limits them, as far as a run has said it."""
+    words, inner, beyond = words_of(certificate), inner_of(certificate), certificate.claim.outer
+    rows = [(f"{words.inner}, {words.inner_word}", repr(inner))]
+    rows += [("c₁, local", repr(certificate.inner))] if inner != certificate.inner else []
+    rows += [("c₂, enlarged", repr(certificate.roa))]
+    if is_ellipsoid(certificate):
+        limit = domain_limit(certificate.P, certificate.system.domain)
+        share = below(100 * Fraction(certificate.roa) / Fraction(limit), 4) if limit > 0 else "?"
+        rows.append(("domain's limit", f"{below(limit, 10)}, of which c₂ is {share} %"))
+    if beyond is not None:
+        rows.append(("n₂, of N", repr(beyond.level)))
+    if result is not None:
+        if not is_missed(result):
+            rows.append(("limited by", limited_by(result)))
+        if result.get("outer"):
+            rows.append(("n₂ limited by", outer_limited_by(result["outer"])))
+        sampled = result["levels"].get("sampled_limit")
+        if sampled is not None:
+            rows.append(("lowest V of a violation found", number(sampled, 10)))
+    return rows
+
+
+def _sizes(certificate: Certificate, sets: Sequence[Ellipsoid]) -> Rows:
+    """The volume of each set."""
+    kind, unit = volume_name(certificate.system.n), _unit_of(certificate)
+    return [
+        (kind + (f" of {one.name}" if len(sets) > 1 else ""), f"{below(volume(one.P, one.level))} {unit}".rstrip())
+        for one in sets
+    ]
+
+
+def _reach(certificate: Certificate, sets: Sequence[Ellipsoid]) -> tuple[list[str], list[tuple[str, ...]]]:
+    """Heads of the columns and, for each state, how far the sets reach along it, beside its domain."""
+    system = certificate.system
+    heads, columns = _lengths(certificate, sets)
+    names = [
+        deviation(s.name, q, system.units.get(s.name, ""))
+        for s, q in zip(system.states, system.exact_x_eq(), strict=True)
+    ]
+    centre = centre_of(certificate) if len(sets) > 1 else None
+    if centre is not None:
+        heads, columns = ["c₀", *heads], [[shortest(v) for v in centre.tolist()], *columns]
+    domain = [f"[{below(lo)}, {above(hi)}]" for lo, hi in system.domain]
+    return heads, list(zip(names, *columns, domain, strict=True))
+
+
+def _geometry(certificate: Certificate) -> Rows:
+    """V's eigenvalues and the loop's, and how time goes."""
+    system, timing, rows = certificate.system, timing_of(certificate), list[tuple[str, str]]()
+    if np.all(np.isfinite(certificate.P)):
+        rows.append(("eigenvalues of P", ", ".join(number(float(v)) for v in np.linalg.eigvalsh(certificate.P))))
+    if isinstance(certificate.claim, Asymptotic):  # elsewhere the origin need not be an equilibrium
+        held = f" with {held_at(system)}" if system.ranges else ""
+        rows.append((f"eigenvalues of the closed loop{timing.linearised}{held}", _eigenvalues(certificate)))
+    if timing.sample is not None:
+        rows.append(("input held over", timing.periods))
+    if timing.rate:
+        rows.append(("rate λ", f"{certificate.claim.rate!r} per {'step' if timing.discrete else 's'}"))
+    return rows
+
+
+def _evidence(certificate: Certificate, accepted: Mapping[str, Any] | None, sha256: str, size: int | None) -> Rows:
+    """What the claim stands on: the policy, the file, and how much of it the checker looked at, where it `accepted`."""
+    network, beyond, slabs = certificate.network, certificate.claim.outer, slabs_of(certificate)
+    rows = [
+        ("policy", f"{'-'.join(map(str, network.layers))} tanh, squash {network.squash}, centre {network.centre}"),
+        *(() if network.clip is None else (("clipped to", _clip(certificate)),)),
+        *((("its layers read", read_in_words(certificate)),) if network.is_moved else ()),
+        ("policy sha256", network.sha256()),
+        ("certificate sha256", sha256),
+    ]
+    if size is not None:
+        rows.append(("certificate size", f"{size:,} bytes"))
+    if beyond is not None:
+        rows += _outer_rows(beyond, accepted)
+    if slabs:
+        rows.append(("tube", f"{len(slabs):,} slabs, {duration_in_words(certificate)}"))
+    if isinstance(certificate.evidence, TrustedSolver):
+        solver = certificate.evidence
+        rows.append(("solver", f"{solver.solver} {solver.version}, delta {number(solver.precision)}"))
+        rows += [(f"its answer to {name}", said) for name, said in solver.queries]
+    elif accepted is not None:
+        leaves = f"{accepted.get('leaves', 0):,}, of which {accepted.get('ring_leaves', 0):,} in the ring"
+        whole = is_local_enough(certificate)
+        rows.append(("leaves", "none needed: the local part covers the whole set" if whole else leaves))
+    return rows
+
+
+def _run(result: Mapping[str, Any] | None) -> Rows:
+    """What the run did and how long it took; nothing without one."""
+    if result is None:
+        return []
+    rows = [("boxes examined", f"{result['boxes']:,}")] if result.get("boxes") else []
+    rows += [(f"{k}", seconds(v)) for k, v in result["seconds"].items() if v is not None]
+    asked = result.get("solver") or {}
+    for q in asked.get("queries", []):
+        about = f"{asked['solver']} {asked['version']} on {q['query']}, V <= {number(q['level'])}"
+        rows.append((about, f"{q['answer']}, {seconds(q['seconds'])}"))
+    return rows
+
+
+def _candidates(certificate: Certificate, result: Mapping[str, Any] | None) -> list[tuple[str, ...]]:
+    """A row for each V that the run tried."""
+    unit = _unit_of(certificate)
+    return [
+        (
+            row["candidate"],
+            below(row["level"]),
+            f"{below(row['volume'])} {unit}".rstrip(),
+            "the domain" if row["limited_by"] == "domain" else "a violation found",
+            f"{below(row['proved_volume'])} {unit}".rstrip() if row.get("proved_volume") else ABSENT,
+            "this one" if row["proved"] else "",
+        )
+        for row in (result or {}).get("candidates", [])
+    ]
+
+
+def _unit_of(certificate: Certificate) -> str:
+    """Of a volume of states."""
+    system = certificate.system
+    return volume_unit([system.units.get(s.name, "") for s in system.states])
 
 
 def _outer_rows(beyond: Outer, answer: Mapping[str, Any] | None) -> list[tuple[str, str]]:
@@ -189,7 +229,7 @@ def _estimated(certificate: Certificate, result: Mapping[str, Any] | None) -> st
     else:
         N, n2, V, c2 = beyond.function, beyond.level, certificate.V, certificate.roa
         size = sampled_volume(lambda x: (N(x) <= n2) | (V(x) <= c2), system.domain)
-    return estimated(*size, volume_unit([system.units.get(s.name, "") for s in system.states]))
+    return estimated(*size, _unit_of(certificate))
 
 
 def _lengths(certificate: Certificate, sets: Sequence[Ellipsoid]) -> tuple[list[str], list[list[str]]]:
