@@ -8,10 +8,11 @@ from pathlib import Path
 import pytest
 
 from certify.certificate import run_checker
+from tests.support.marks import slow_after
 
 DOCS = Path(__file__).parent.parent / "docs"
 CERTIFICATES = sorted((DOCS / "published").glob("*.json"))
-PROGRAMS = ["checker", pytest.param("reference", marks=pytest.mark.slow)]
+PROGRAMS = slow_after(1, ["checker", "reference"])
 
 
 @pytest.mark.parametrize("program", PROGRAMS)

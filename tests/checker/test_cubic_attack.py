@@ -48,9 +48,7 @@ def _quiet() -> Iterator[None]:
 
 def sizes(sample: int, full: int) -> pytest.MarkDecorator:
     """How many loops a campaign takes."""
-    return pytest.mark.parametrize(
-        "count", [sample, pytest.param(full, marks=pytest.mark.slow)], ids=["sample", "full"]
-    )
+    return pytest.mark.parametrize("count", slow_after(1, [sample, full]), ids=["sample", "full"])
 
 
 def quotient(v: float) -> fmpq:

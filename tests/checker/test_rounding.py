@@ -46,6 +46,7 @@ from certify.systems import System, get_system
 from tests.support.certificates import make, parse
 from tests.support.leaves import on_boxes
 from tests.support.loops import box
+from tests.support.marks import slow_after
 from tests.support.oracle import Array, awkward, policies_in_arb, policy_in_arb, value_of
 from tests.support.ways import Way, bounded
 
@@ -134,10 +135,7 @@ def report(request: pytest.FixtureRequest, capsys: pytest.CaptureFixture[str]) -
 
 def sizes(sample: tuple[int, int], full: tuple[int, int]) -> pytest.MarkDecorator:
     """The two sizes of a campaign, as (first, second) of what it counts."""
-    return pytest.mark.parametrize(
-        ("first", "second"),
-        [pytest.param(*sample, id="sample"), pytest.param(*full, id="full", marks=pytest.mark.slow)],
-    )
+    return pytest.mark.parametrize(("first", "second"), slow_after(1, [sample, full]), ids=["sample", "full"])
 
 
 @pytest.mark.parametrize(

@@ -29,6 +29,7 @@ from tests.support.balls import enlarged_from, reached_from, with_ball
 from tests.support.certificates import Document, edited, encode, grow, make, parse, rehash, verdict
 from tests.support.jets import given
 from tests.support.leaves import on_boxes
+from tests.support.marks import slow_after
 from tests.support.oracle import ball, policy_in_arb, value_of
 from tests.support.uncertain import FACTORS, drawn, largest, random_plant, ranges_of, refutation
 
@@ -403,7 +404,7 @@ ACCEPTED: dict[bool, tuple[int, ...]] = {
 
 
 @pytest.mark.parametrize("practical", [False, True])
-@pytest.mark.parametrize("seed", [*range(3), *(pytest.param(s, marks=pytest.mark.slow) for s in range(3, 12))])
+@pytest.mark.parametrize("seed", slow_after(3, range(12)))
 def test_what_is_accepted_of_a_random_plant_is_true(seed: int, practical: bool) -> None:
     """As wide a range as is accepted: Vdot < 0 at corners and inside, and no corner's claim is refuted in Arb."""
     generator, accepted = np.random.default_rng(seed), 0

@@ -437,9 +437,7 @@ def test_so_it_is_of_a_set_inwards_and_beyond() -> None:
     assert isinstance(outer, Nothing) or outer.outer.level <= -2.4
 
 
-@pytest.mark.parametrize(
-    ("answers", "again"), [(6, False), pytest.param(0, False, marks=SLOW), pytest.param(2, True, marks=SLOW)]
-)
+@pytest.mark.parametrize(("answers", "again"), slow_after(1, [(6, False), (0, False), (2, True)]))
 def test_a_run_that_lost_its_cluster_is_gone_on_with(
     answers: int, again: bool, honest: RoaResult, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

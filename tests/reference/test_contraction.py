@@ -309,7 +309,7 @@ def test_the_constant_of_an_input(hidden: bool, squash: str, centre: str) -> Non
 # ----------------------------------------------------------------------------------------------------- plants at random
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2, 3, *(pytest.param(s, marks=pytest.mark.slow) for s in range(4, 24))])
+@pytest.mark.parametrize("seed", slow_after(4, range(24)))
 def test_what_contracts_on_a_random_plant_does(seed: int) -> None:
     """The largest ball that is accepted; on it P DF is negative definite at every q tried."""
     data, generator = random_plant(seed, True), np.random.default_rng(seed)

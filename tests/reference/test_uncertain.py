@@ -25,6 +25,7 @@ from tests.checker.test_ball import points
 from tests.checker.test_uncertain import HONEST, Edit, forgeries, honest, in_arb, wider
 from tests.support.balls import exactly
 from tests.support.certificates import Document, dump, edited, grow, make
+from tests.support.marks import slow_after
 from tests.support.models import may_be
 from tests.support.oracle import ball
 from tests.support.reference import judge
@@ -50,7 +51,7 @@ def test_forgeries_are_refused(rule: str, base: str, edit: Edit) -> None:
 
 
 @pytest.mark.parametrize("practical", [False, True])
-@pytest.mark.parametrize("seed", [20, 21, *(pytest.param(s, marks=pytest.mark.slow) for s in range(22, 26))])
+@pytest.mark.parametrize("seed", slow_after(2, range(20, 26)))
 def test_what_is_accepted_of_a_random_plant_is_true(seed: int, practical: bool) -> None:
     generator, first = np.random.default_rng(seed), True
     for data in wider(random_plant(seed, practical)):
