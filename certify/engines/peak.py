@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import math
 import time
-import warnings
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from certify.closed_loop import ClosedLoop
-from certify.engines.robust import robust_candidate
+from certify.engines.robust import robust_candidate, solve
 from certify.errors import BackendError
 
 Array = NDArray[np.float64]
@@ -57,11 +56,7 @@ def peak_candidate(loop: ClosedLoop, seconds: float = math.inf) -> Array:
             within.append(cvxpy.bmat([[-side, -b], [-b.T, corner]]) >> 0)
         size = cvxpy.trace(np.linalg.inv(W) @ P) / n
         problem = cvxpy.Problem(cvxpy.Minimize(c0 + _ROUND * size), within)
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # of a solution that may be inaccurate: the rules judge it
-                problem.solve(solver=cvxpy.CLARABEL)
-        except cvxpy.SolverError:
+        if not solve(problem):
             continue
         if P.value is not None and np.all(np.isfinite(P.value)) and float(c0.value) < least:
             best, least = np.asarray((P.value + P.value.T) / 2), float(c0.value)

@@ -16,6 +16,7 @@ import time
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +29,9 @@ from certify.engines.models import Models, Paths, paths
 from certify.errors import BackendError
 from certify.lyapunov import SOLVED, choose_candidate, diagonalising_coordinates, domain_limit, volume
 from certify.lyapunov.function import Quadratic
+
+if TYPE_CHECKING:
+    import cvxpy
 
 Array = NDArray[np.float64]
 _TRUST, _MOST_TRUST, _LEAST_TRUST = 0.4, 0.6, 0.01  # of the eigenvalues of X
@@ -65,6 +69,20 @@ def robust_candidate(loop: ClosedLoop, seconds: float = math.inf) -> Array:
         raise BackendError("the local rule proves nothing with the candidates that solve a Lyapunov equation")
     start = max(proved, key=_log_volume)
     return max((_climbed(known, start, end, quick) for quick in (True, False)), key=_log_volume)
+
+
+def solve(problem: cvxpy.Problem) -> bool:
+    """Whether the solver comes to an end with a semidefinite program; what it found may be inaccurate, and is judged by
+    the checker's rules."""
+    import cvxpy
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that it may be inaccurate
+            problem.solve(solver=cvxpy.CLARABEL)
+    except cvxpy.SolverError:
+        return False
+    return True
 
 
 def _climbed(known: Paths, best: Array, end: float, quick: bool) -> Array:
@@ -167,13 +185,7 @@ class _Linearised:
             within.append(left + left.T >> 2 * least * np.eye(n))
         within += [asked[after + j] <= _INSIDE * room for j, room in enumerate(self.room) if math.isfinite(room)]
         problem = cvxpy.Problem(cvxpy.Minimize(cvxpy.trace(np.linalg.inv(now) @ change)), within)
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # of a solution that may be inaccurate: the local rule judges it
-                problem.solve(solver=cvxpy.CLARABEL)
-        except cvxpy.SolverError:
-            return None
-        if change.value is None or not np.all(np.isfinite(change.value)):
+        if not solve(problem) or change.value is None or not np.all(np.isfinite(change.value)):
             return None
         inverse = np.linalg.inv(self.J)
         found = inverse.T @ (now + change.value) @ inverse
