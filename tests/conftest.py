@@ -1,4 +1,4 @@
-"""One thread a process and its children, hypothesis profiles, and the fixture that most tests share."""
+"""One thread a process and its children, hypothesis profiles, reports drawn in the process of the test, a fixture."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ import pytest
 import torch
 from hypothesis import settings
 
+from certify.report.drawing import Drawing
 from certify.systems import System, get_system
 
 # The suite runs one process a core: threads that wait for each other's cores take several times as long.
@@ -17,6 +18,12 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # of what the tests start
 settings.register_profile("ci", deadline=None, derandomize=True, max_examples=50)
 settings.register_profile("fuzz", deadline=None, max_examples=5000)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "ci"))
+
+
+@pytest.fixture(autouse=True)
+def drawn_here(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports are drawn where everything is loaded already; of the process for it tests/report/test_drawing.py."""
+    monkeypatch.setattr(Drawing, "__enter__", lambda self: self)
 
 
 @pytest.fixture

@@ -25,10 +25,29 @@ SHIPPED = Path(__file__).parent.parent / "examples" / "policies" / "pendulum.pt"
 VAN_DER_POL = Path(__file__).parent.parent / "examples" / "van_der_pol.toml"
 
 
+def saved(path: Path) -> Path:
+    save_policy(path, Policy(pendulum_network((8, 8)), "pendulum", {"m": "0.15"}))
+    return path
+
+
 @pytest.fixture
 def policy_file(tmp_path: Path) -> Path:
-    path = tmp_path / "policy.pt"
-    save_policy(path, Policy(pendulum_network((8, 8)), "pendulum", {"m": "0.15"}))
+    return saved(tmp_path / "policy.pt")
+
+
+@pytest.fixture(scope="module")
+def proved(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """The certificate of that policy."""
+    folder = tmp_path_factory.mktemp("proved")
+    assert _run(["roa", "--policy", str(saved(folder / "policy.pt")), "--out", str(folder), "--quiet"], False) == 0
+    return (folder / "certificate.json").read_bytes()
+
+
+@pytest.fixture
+def certificate(tmp_path: Path, proved: bytes) -> Path:
+    """A copy of it, to be changed."""
+    path = tmp_path / "certificate.json"
+    path.write_bytes(proved)
     return path
 
 
@@ -59,10 +78,8 @@ def test_roa_in_words(tmp_path: Path, policy_file: Path, capsys: pytest.CaptureF
 
 
 def test_check_accepts_and_compares_the_policy(
-    tmp_path: Path, policy_file: Path, capfd: pytest.CaptureFixture[str]
+    tmp_path: Path, certificate: Path, policy_file: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    run(capfd, "roa", "--policy", policy_file, "--out", tmp_path)
-    certificate = tmp_path / "certificate.json"
     status, out, _ = run(capfd, "check", certificate, "--policy", policy_file)
     assert status == 0 and out.splitlines()[-1].startswith("ACCEPTED ")
     status, out, _ = run(capfd, "check", certificate, "--policy", SHIPPED)
@@ -80,13 +97,11 @@ def test_check_accepts_and_compares_the_policy(
     assert run(capfd, "check", tmp_path / "missing.json")[0] == 2
 
 
-def test_report_of_a_certificate(tmp_path: Path, policy_file: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run(capsys, "roa", "--policy", policy_file, "--out", tmp_path)
-    (tmp_path / "report.html").unlink()
-    status, out, _ = run(capsys, "report", tmp_path / "certificate.json")
+def test_report_of_a_certificate(tmp_path: Path, certificate: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    status, out, _ = run(capsys, "report", certificate)
     assert status == 0 and "ACCEPTED" in out and (tmp_path / "report.html").exists()
-    (tmp_path / "certificate.json").write_text("{}")
-    status, _, err = run(capsys, "report", tmp_path / "certificate.json")
+    certificate.write_text("{}")
+    status, _, err = run(capsys, "report", certificate)
     assert status == 2 and "not a certificate" in err
 
 
@@ -298,16 +313,10 @@ def test_control_c_ends_a_running_command(tmp_path: Path) -> None:
     assert not [p for p in tmp_path.rglob("*") if p.is_file()]
 
 
-def certified(folder: Path, policy_file: Path, capsys: pytest.CaptureFixture[str]) -> Path:
-    assert run(capsys, "roa", "--policy", policy_file, "--out", folder)[0] == 0
-    return folder / "certificate.json"
-
-
 def test_a_wrong_policy_is_named_however_deep_the_provenance_nests(
-    tmp_path: Path, policy_file: Path, capsys: pytest.CaptureFixture[str]
+    certificate: Path, policy_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The comparison is with what the checker says of the bytes that it read: there is no second reader to fail."""
-    certificate = certified(tmp_path, policy_file, capsys)
     deep = "[" * 985 + "]" * 985
     text = certificate.read_text().replace('"provenance": {', '"provenance": {"deep": ' + deep + ", ", 1)
     certificate.write_text(text)
@@ -317,12 +326,12 @@ def test_a_wrong_policy_is_named_however_deep_the_provenance_nests(
 
 
 def test_a_wrong_policy_is_named_when_the_certificate_comes_through_a_pipe(
-    tmp_path: Path, policy_file: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, proved: bytes, policy_file: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    raw, pipe = certified(tmp_path, policy_file, capsys).read_bytes(), tmp_path / "pipe"
+    pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
     for policy, expected in ((SHIPPED, (1, "REJECTED rule=policy")), (policy_file, (0, "ACCEPTED "))):
-        writer = threading.Thread(target=pipe.write_bytes, args=(raw,), daemon=True)
+        writer = threading.Thread(target=pipe.write_bytes, args=(proved,), daemon=True)
         writer.start()
         status, out, _ = run(capsys, "check", pipe, "--policy", policy)
         writer.join(timeout=10)
@@ -379,9 +388,8 @@ def test_practical_stability_from_the_command_line(tmp_path: Path, capsys: pytes
 
 
 def test_both_checkers_refuse_a_level_that_was_not_proved(
-    tmp_path: Path, policy_file: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, certificate: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    certificate = certified(tmp_path, policy_file, capsys)
     data = json.loads(certificate.read_text())
     data["levels"]["roa"] = (float.fromhex(data["levels"]["roa"]) * 1.5).hex()
     certificate.write_text(json.dumps(data))
@@ -393,17 +401,17 @@ def test_both_checkers_refuse_a_level_that_was_not_proved(
 
 
 def test_a_report_is_about_the_bytes_that_were_checked(
-    tmp_path: Path, policy_file: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, proved: bytes, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A pipe gives each reader other bytes: there is one reader, and the page names what it read."""
-    raw, pipe, page = certified(tmp_path, policy_file, capsys).read_bytes(), tmp_path / "pipe", tmp_path / "page.html"
+    pipe, page = tmp_path / "pipe", tmp_path / "page.html"
     os.mkfifo(pipe)
-    writer = threading.Thread(target=pipe.write_bytes, args=(raw,), daemon=True)
+    writer = threading.Thread(target=pipe.write_bytes, args=(proved,), daemon=True)
     writer.start()
     status, out, _ = run(capsys, "report", pipe, "--out", page)
     writer.join(timeout=10)
     assert status == 0 and out.startswith("ACCEPTED")
-    assert hashlib.sha256(raw).hexdigest() in page.read_text() and "PROVED" in page.read_text()
+    assert hashlib.sha256(proved).hexdigest() in page.read_text() and "PROVED" in page.read_text()
 
 
 SPRING = """

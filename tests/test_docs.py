@@ -25,8 +25,11 @@ from pathlib import Path
 import pytest
 import typer
 
+from tests.support.marks import slow_after
+
 ROOT = Path(__file__).parent.parent
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
+FIRST = ("index.md", "tutorial.md", "how-to/own-policy.md", "how-to/own-plant.md")  # what a newcomer reads
 _BLOCK = re.compile(r"(?:<!-- (?P<mark>[^\n]*?) -->\n)?^```(?P<language>[^\n]*)\n(?P<code>.*?)^```$", re.M | re.S)
 _OUTSIDE = re.compile(r"""<(?:script|link|img|iframe|source|object)\b[^>]*?(?:src|href|data)=["']?(?:https?:)?//""")
 
@@ -119,7 +122,12 @@ def test_commands_exist_with_their_options(page: Path) -> None:
             assert given <= known | {"--help"}, f"{line}: {sorted(given - known)}"
 
 
-@pytest.mark.parametrize("page", [p for p in PAGES if any(b.mark == "run" for b in blocks(p))], ids=named)
+def running() -> list[Path]:
+    """The pages with a command that is run, those that are read first before the others."""
+    return sorted((p for p in PAGES if any(b.mark == "run" for b in blocks(p))), key=lambda p: named(p) not in FIRST)
+
+
+@pytest.mark.parametrize("page", slow_after(len(FIRST), running()), ids=map(named, running()))
 def test_what_a_page_runs_works(page: Path, tmp_path: Path) -> None:
     run_page(page, tmp_path, slow=False)
 

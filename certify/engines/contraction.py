@@ -38,6 +38,6 @@ def contraction(problem: Problem, T: Array, floor: float) -> Contraction | None:
     half = np.einsum("ia,ijb->jab", b, models.Q)
     N = 2 * (half + half.transpose(0, 2, 1))
     weight = np.asarray(np.linalg.inv(decay), dtype=np.float64)
-    spread = np.einsum("jlk,km,jlm->l", N, weight, N, optimize=True)
+    spread = np.sum((N @ weight) * N, axis=(0, 2))
     g = np.sqrt(np.maximum(spread, 0.0) / np.diag(weight))
     return Contraction(J, np.maximum(g, _LEAST * float(np.max(np.diag(decay)))), weight)

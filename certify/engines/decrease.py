@@ -99,9 +99,9 @@ def _corner(
 def _gamma(models: Models, P: Array) -> float:
     """||g||_P is at most this times ||d||^2."""
     size = np.sqrt(np.diag(P))
-    bends = np.einsum("ij,iab,jab->", P, models.Q, models.Q, optimize=True)
-    twists = np.einsum("ij,iabc,jabc->", P, models.K, models.K, optimize=True)
-    units = np.sqrt(np.maximum(np.einsum("iq,ij,jq->q", models.shares, P, models.shares, optimize=True), 0.0))
+    bends = np.sum(np.tensordot(P, models.Q, 1) * models.Q)
+    twists = np.sum(np.tensordot(P, models.K, 1) * models.K)
+    units = np.sqrt(np.maximum(np.sum(models.shares * (P @ models.shares), axis=0), 0.0))
     each = np.linalg.norm(models.R, axis=(1, 2)), np.linalg.norm(models.E, axis=(1, 2))
     return float(math.sqrt(max(bends, 0.0)) + math.sqrt(max(twists, 0.0)) + units @ each[0] + size @ each[1])
 
@@ -188,7 +188,7 @@ def rest_of(models: Models, b: Array, multipliers: Multipliers) -> Array:
         rest += beta[i] * square + Q.T @ Q / beta[i] if beta[i] > 0 else 0.0
     if np.any(beta == 0):
         C = _joint(models, b, beta == 0)
-        rest += np.diag(g) + np.einsum("jmk,m,jml->kl", C, 1 / g, C, optimize=True)
+        rest += np.diag(g) + np.tensordot(C / g[:, None], C, ((0, 1), (0, 1)))
         rest += _by_weight(np.eye(k), _cubic(models, b, beta == 0), multipliers.weight)
     rest += _by_weight(b[beta > 0], _squares(models.K[beta > 0]), multipliers.weight)
     rest += _by_weight(models.shares.T @ b, models.squares, multipliers.weight)
@@ -223,14 +223,13 @@ def _multipliers_of(
     for models, b, weight in parts:
         whole = whole + weight
         size = np.linalg.norm(b, axis=1)
-        along = along + np.einsum("ij,jk,ik->i", b, weight, b)
+        along = along + np.sum((b @ weight) * b, axis=1)
         E2, Q2 = (
-            before + np.einsum("ikj,jl,ikl->i", part, weight, part, optimize=True)
-            for before, part in ((E2, models.E), (Q2, models.Q))
+            before + np.sum((part @ weight) * part, axis=(1, 2)) for before, part in ((E2, models.E), (Q2, models.Q))
         )
         by_size = by_size + size * np.einsum("ijk,jk->i", models.E, weight)
         C = _joint(models, b, np.ones(n, dtype=bool))
-        spread = spread + np.einsum("jmk,kl,jml->m", C, weight, C, optimize=True)
+        spread = spread + np.sum((C @ weight) * C, axis=(0, 2))
         usual = max(usual, float(np.max(size)) * float(np.max(np.linalg.norm(models.A, axis=1))))
     with np.errstate(divide="ignore", invalid="ignore"):
         apart = np.sqrt(E2 * along) < by_size
@@ -272,7 +271,7 @@ def _squares(forms: Array) -> Array:
 def _by_weight(p: Array, squares: Array, weight: Array) -> Array:
     """The sum of the bounds of 2 |p.d| ||T d|| for the rows of p (N, k) and T'T = `squares` (N, k, k)."""
     size = np.einsum("qij,ij->q", squares, weight)
-    along = np.einsum("qi,ij,qj->q", p, weight, p, optimize=True)
+    along = np.sum((p @ weight) * p, axis=1)
     some = ~((size <= 0) | (along <= 0))
     p, tau = p[some], np.sqrt(size[some] / along[some])
     return np.asarray((p.T * tau) @ p + np.tensordot(1 / tau, squares[some], 1))

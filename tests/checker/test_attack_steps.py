@@ -25,6 +25,7 @@ from certify.checker.jets import Jet
 from certify.checker.ring import Ring
 from certify.checker.taylor import upper_bound
 from tests.support.certificates import Document, edited, encode, verdict
+from tests.support.marks import slow_after
 from tests.support.steps import stepping
 
 LINEAR: list[tuple[Any, Any]] = [([[-3.0]], [0.0])]  # u = -3 x
@@ -144,7 +145,7 @@ DRIVES = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", DRIVES)
+@pytest.mark.parametrize("name", slow_after(6, DRIVES))
 def test_nothing_is_accepted_beyond_the_truth(name: str) -> None:
     drive = DRIVES[name]
     assert drive.share * drive.truth <= drive.last() <= drive.truth
@@ -235,12 +236,12 @@ def drives(name: str) -> list[Drive]:
     return [closer(name, sign) for sign in (1, -1) if np.max(sign * slope(x)) > 1e-6]
 
 
-@pytest.mark.parametrize("name", CURVES)
+@pytest.mark.parametrize("name", slow_after(5, CURVES))
 def test_most_of_what_comes_closer_is_accepted(name: str) -> None:
     assert all(drive.share * drive.truth <= drive.last() for drive in drives(name))
 
 
-@pytest.mark.parametrize("name", CURVES)
+@pytest.mark.parametrize("name", slow_after(5, CURVES))
 def test_no_two_trajectories_part_that_are_said_to_come_closer(name: str) -> None:
     assert all(drive.last() <= drive.truth for drive in drives(name))
 

@@ -23,6 +23,7 @@ from tests.checker.test_rules import honest
 from tests.support.balls import with_ball
 from tests.support.certificates import Document, decode, edited, encode, make, parse, rehash
 from tests.support.jets import curved as beyond_linear
+from tests.support.marks import slow_after
 from tests.support.oracle import policy_in_arb, quadratic, value_of
 
 BITS = 3000
@@ -88,7 +89,7 @@ def contains(v: Jet, value: arb, at_0: arb, d: list[float]) -> bool:
 
 
 @pytest.mark.parametrize("name", ["curved", "rotor", "rotor, preactivation", "scalar", "linear", "clipped rotor"])
-@pytest.mark.parametrize("size", [2.0**-100, 1e-6, 0.01, 0.1])
+@pytest.mark.parametrize("size", slow_after(2, [2.0**-100, 1e-6, 0.01, 0.1]))
 def test_the_ball_encloses_F_and_the_inputs(name: str, size: float) -> None:
     data = document_of(name)
     c, plant, generator = parse(data), data["plant"], np.random.default_rng(int(-np.log2(size)))

@@ -33,6 +33,7 @@ from tests.checker.test_rules import honest
 from tests.support.balls import with_ball
 from tests.support.certificates import Document, edited, encode, make, parse, verdict
 from tests.support.jets import curved, plain
+from tests.support.marks import slow_after
 from tests.support.oracle import policy_in_arb, quadratic, value_of
 
 Generator = np.random.Generator
@@ -372,7 +373,7 @@ NETWORKS = [
 ]
 
 
-@pytest.mark.parametrize(("squash", "centre", "widths"), NETWORKS)
+@pytest.mark.parametrize(("squash", "centre", "widths"), slow_after(8, NETWORKS))
 @pytest.mark.parametrize("moving", [False, True])
 def test_units_carry_all_that_their_inputs_leave_out(
     squash: str, centre: str, widths: list[int], moving: bool, monkeypatch: pytest.MonkeyPatch

@@ -44,6 +44,7 @@ from certify.checker.ring import Ring
 from certify.checker.taylor import Taylor, affine, upper_bound
 from certify.checker.taylor import constant as constant_model
 from tests.support.jets import curved, plain
+from tests.support.marks import slow_after
 from tests.support.oracle import awkward, ball, certainly_within, policy_in_arb, quadratic
 
 FLOATS = st.floats(allow_nan=False, allow_infinity=False)
@@ -857,7 +858,7 @@ POLICIES = list(
 )
 
 
-@pytest.mark.parametrize("radius", [0.0, 1e-200, 1e-12, 1e-2, 0.7, 50.0, 1e9])
+@pytest.mark.parametrize("radius", slow_after(4, [0.0, 1e-200, 1e-12, 1e-2, 0.7, 50.0, 1e9]))
 def test_the_policy_on_boxes(radius: float) -> None:
     generator, finite, boxes = np.random.default_rng(int(radius) % 97 + 31), 0, 4
     for widths, size, (squash, centre) in POLICIES:

@@ -374,7 +374,7 @@ def test_gamma_bounds_what_models_have_beyond_their_first_order(n: int) -> None:
 
 @pytest.mark.parametrize("n", [1, 2])
 @pytest.mark.parametrize("level", [False, True])
-@pytest.mark.parametrize("h", [0.0, 0.25, 1.0])
+@pytest.mark.parametrize("h", slow_after(2, [0.0, 0.25, 1.0]))
 def test_the_sides_of_a_step_bound_what_they_stand_for(n: int, level: bool, h: float) -> None:
     """D + 2 lambda V + k (V - c0) at points is at most what the matrices say, at every corner and between them."""
     generator, closest = np.random.default_rng(n), np.inf

@@ -46,6 +46,7 @@ from tests.checker.test_path import glide, waypoint
 from tests.support.balls import ball as ball_of
 from tests.support.balls import centred, enlarge, enlarged_from, reached_from, with_ball
 from tests.support.certificates import LEAF, Document, decode, dump, edited, encode, grow, make, rehash
+from tests.support.marks import slow_after
 from tests.support.oracle import ball, policies_in_arb, value_of
 
 CHECKER = Path(certify.checker.__file__).parent
@@ -665,7 +666,7 @@ def campaign(name: str, count: int, path: Path, derandomize: bool) -> None:
     one()
 
 
-@pytest.mark.parametrize("name", STRATEGIES)
+@pytest.mark.parametrize("name", slow_after(3, STRATEGIES))
 def test_every_file_is_judged(name: str, tmp_path: Path) -> None:
     campaign(name, 120, tmp_path / "certificate.json", derandomize=True)
 

@@ -27,6 +27,7 @@ from certify.checker.taylor import Taylor, affine
 from tests.checker.test_cubic_attack import climb, random_loop, random_tree, sizes
 from tests.support.certificates import LEAF, Document, edited, encode, parse, verdict
 from tests.support.leaves import beyond_on_boxes
+from tests.support.marks import slow_after
 from tests.support.oracle import ball, policies_in_arb, value_of
 from tests.support.outer import (
     Balls,
@@ -254,7 +255,7 @@ FACES = ("1/3", "2/3", "1/10", "5/7", "1", "4/3", "123456789/987654321", "3/2", 
 
 
 @pytest.mark.parametrize("end", FACES)
-@pytest.mark.parametrize("kind", ["slope", "layer", "square", "inverse"])
+@pytest.mark.parametrize("kind", slow_after(2, ["slope", "layer", "square", "inverse"]))
 def test_a_face_at_a_rational_is_decided_by_its_exact_value(end: str, kind: str) -> None:
     """x' = -x: N at this end against the binary64 numbers next to it; at the other end N is far above."""
     q, generator = Fraction(end), np.random.default_rng(len(end))
@@ -309,7 +310,7 @@ def test_a_state_at_rest_beyond_the_ellipsoid_is_refused(c: str) -> None:
         assert e < 0 or {verdict(proved(claim)), verdict(with_uniform_trees(claim, 8))} == {"outer"}
 
 
-@pytest.mark.parametrize("share", [0.0, 1e-12, 1e-6, 0.01, 0.3])
+@pytest.mark.parametrize("share", slow_after(2, [0.0, 1e-12, 1e-6, 0.01, 0.3]))
 @pytest.mark.parametrize("tree", ["root", "pole", "both", "nothing times a pole"])
 def test_a_function_that_is_undefined_beyond_the_ellipsoid_is_refused(tree: str, share: float) -> None:
     """A hole of N at x^2 = a: where it ends within {V < c2} the claim is true, and beyond that it is not."""
@@ -338,7 +339,7 @@ def test_a_pole_of_the_loop_beyond_the_ellipsoid_is_refused(at: str) -> None:
 # -------------------------------------------------------------------------------------- huge, tiny, as good as singular
 
 
-@pytest.mark.parametrize("power", [-300, -100, 0, 100, 150])
+@pytest.mark.parametrize("power", slow_after(3, [-300, -100, 0, 100, 150]))
 def test_states_of_any_size(power: int) -> None:
     """x' = -x + x^3/s^2 attracts |x| < s; whatever can be told in binary64 is the truth."""
     s = Fraction(2) ** power

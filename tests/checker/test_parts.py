@@ -57,7 +57,7 @@ def refusal(data: Document, part: Part | None = None, jobs: int = 1) -> Refusal 
 
 
 @pytest.mark.parametrize("jobs", slow_after(1, [3, 2, 7]))
-@pytest.mark.parametrize("name", HONEST)
+@pytest.mark.parametrize("name", slow_after(8, HONEST))
 def test_several_processes_count_what_one_counts(name: str, jobs: int) -> None:
     one, several = (rules.check(parse(honest(name)), None, count) for count in (1, jobs))
     assert several.rules == one.rules and list(several.rules) == list(one.rules)
@@ -67,7 +67,7 @@ def test_several_processes_count_what_one_counts(name: str, jobs: int) -> None:
 
 
 @pytest.mark.parametrize("of", slow_after(1, [5, 1, 2, 2**16]))
-@pytest.mark.parametrize("name", MANY)
+@pytest.mark.parametrize("name", slow_after(6, MANY))
 def test_parts_are_all_of_the_leaves(name: str, of: int) -> None:
     whole = Part()
     one = rules.check(parse(honest(name)), whole)
@@ -159,7 +159,7 @@ def _exits() -> None:
     raise SystemExit(0)
 
 
-@pytest.mark.parametrize("index", [0, 2])
+@pytest.mark.parametrize("index", slow_after(1, [0, 2]))
 @pytest.mark.parametrize("fault", [_dies, _is_killed, _leaves_quietly, _raises, _exits])
 @pytest.mark.parametrize("name", ["scalar", "refused"])
 def test_a_process_that_does_not_answer_is_an_internal_error(
@@ -210,7 +210,7 @@ GARBAGE: dict[str, Callable[[Any], Any]] = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("what", GARBAGE)
+@pytest.mark.parametrize("what", slow_after(9, GARBAGE))
 def test_an_answer_that_cannot_be_is_an_internal_error(
     what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -282,7 +282,9 @@ def parts_of(name: str, of: int) -> tuple[bytes, list[dict[str, Any]]]:
     return raw, deepcopy(list(found))
 
 
-@pytest.mark.parametrize("name", ["scalar", "sampled", "outer, a network", "enlarged", "practical, clipped"])
+@pytest.mark.parametrize(
+    "name", slow_after(3, ["scalar", "sampled", "outer, a network", "enlarged", "practical, clipped"])
+)
 def test_all_parts_together_are_the_answer_of_one(name: str, tmp_path: Path) -> None:
     raw, parts = parts_of(name, 3)
     whole = run_checker(write(raw, tmp_path))

@@ -166,7 +166,7 @@ HONEST: dict[str, Callable[[], Document]] = {
 }
 
 
-@pytest.mark.parametrize("name", HONEST)
+@pytest.mark.parametrize("name", slow_after(4, HONEST))
 def test_honest_tubes_around_a_path_are_accepted(name: str) -> None:
     data = HONEST[name]()
     assert verdicts(data) == {"ACCEPTED"}
@@ -671,7 +671,7 @@ def just_accepted(name: str, edit: Size, seed: int) -> Document:
     return of(low)
 
 
-@pytest.mark.parametrize("what", slow_after(9, SIZED))
+@pytest.mark.parametrize("what", slow_after(5, SIZED))
 def test_what_is_just_accepted_of_a_well_is_true(what: str) -> None:
     assert_true(just_accepted("well", SIZED[what], 1), 2)
 
@@ -739,7 +739,7 @@ def left_over(jet: Jet, change: arb, d: list[float]) -> tuple[arb, arb]:
     return change - curved(jet, d) - linear, arb(float(jet.slack)) * size + quadratic(jet.whole.tolist(), d)
 
 
-@pytest.mark.parametrize("where", WHERE)
+@pytest.mark.parametrize("where", slow_after(2, WHERE))
 @pytest.mark.parametrize("name", ENCLOSED)
 def test_the_models_along_a_path_enclose_the_field(name: str, where: str) -> None:
     """F and the inputs at points of balls whose middles and steps binary64 does not hold, without any tolerance."""

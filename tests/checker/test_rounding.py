@@ -363,7 +363,7 @@ ELEMENTARY = {
 
 
 @pytest.mark.parametrize("name", ELEMENTARY)
-@sizes((40_000, 20_000), (10_000_000, 100_000))
+@sizes((20_000, 10_000), (10_000_000, 100_000))
 def test_elementary_enclosures(name: str, first: int, second: int, report: Report) -> None:
     case, tally = ELEMENTARY[name], Tally()
     for hard, total in ((False, first), (True, second)):

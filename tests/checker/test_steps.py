@@ -85,7 +85,7 @@ def test_there_are_enough_planted_violations() -> None:
     assert EACH * len(FAMILIES) >= 200 and 2 * near >= EACH
 
 
-@pytest.mark.parametrize("name", slow_after(20, FAMILIES))
+@pytest.mark.parametrize("name", slow_after(10, FAMILIES))
 def test_what_is_planted_is_refused_and_what_lies_within_is_accepted(name: str) -> None:
     family: Family = FAMILIES[name]
     generator = np.random.default_rng(len(name))

@@ -32,6 +32,7 @@ from certify.running import ThreadRunner
 from certify.systems import System
 from certify.verdict import Stop
 from tests.support.loops import box, scalar_tanh
+from tests.support.marks import slow_after
 
 CPU = torch.device("cpu")
 RUNNER = ThreadRunner()
@@ -165,7 +166,7 @@ def enclosure(N: Neural | Symbolic) -> NeuralEnclosure | SymbolicEnclosure:
     return NeuralEnclosure(N, CPU) if isinstance(N, Neural) else SymbolicEnclosure(N, CPU)
 
 
-@pytest.mark.parametrize("size", [1e-9, 0.01, 0.1, 0.5])
+@pytest.mark.parametrize("size", slow_after(2, [1e-9, 0.01, 0.1, 0.5]))
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_models_contain_n_and_its_derivative(name: str, size: float) -> None:
     N, batch, more = FUNCTIONS[name], 40, 2
@@ -372,7 +373,7 @@ def test_a_planted_rise_is_not_proved(monkeypatch: pytest.MonkeyPatch) -> None:
     holds(problem, found)
 
 
-@pytest.mark.parametrize("boxes", [1, 40, 80, 150, 300, 600])
+@pytest.mark.parametrize("boxes", slow_after(3, [1, 40, 80, 150, 300, 600]))
 def test_an_end_of_the_budget_leaves_a_lower_level(boxes: int) -> None:
     problem, N = planar(), wells([[1.0, 0.0], [-0.5, 0.875], [-0.5, -0.875]], 0.75)
     whole = prove(problem, N)

@@ -144,7 +144,7 @@ def points_of(generator: np.random.Generator, count: int) -> list[np.ndarray]:
 
 
 @pytest.mark.parametrize("practical", slow_after(1, [False, True]))
-@pytest.mark.parametrize(("sample", "order"), slow_after(3, SAMPLES))
+@pytest.mark.parametrize(("sample", "order"), slow_after(2, SAMPLES))
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_a_ball_encloses_the_mean_of_every_period(
     name: str, sample: tuple[str, str], order: int, practical: bool
@@ -233,7 +233,7 @@ def value_at(model: Taylor, d: Sequence[arb]) -> arb:
     return value + model.r.union(-model.r)
 
 
-@pytest.mark.parametrize(("sample", "order"), slow_after(2, SAMPLES))
+@pytest.mark.parametrize(("sample", "order"), slow_after(1, SAMPLES))
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_a_leaf_encloses_the_mean_of_every_period(name: str, sample: tuple[str, str], order: int) -> None:
     data = document(name, sample, order, True)

@@ -740,7 +740,7 @@ EDGES: list[tuple[str, Callable[[Document, float], Document]]] = [  # how an edi
 
 
 @pytest.mark.parametrize("name", slow_after(1, ["bent", "swing"]))
-@pytest.mark.parametrize(("what", "edit"), slow_after(4, EDGES))
+@pytest.mark.parametrize(("what", "edit"), slow_after(2, EDGES))
 def test_the_checker_draws_the_same_line(what: str, edit: Callable[[Document, float], Document], name: str) -> None:
     """How far a number can be moved before a file is refused: the same for two programs."""
     ends = []

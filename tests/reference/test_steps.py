@@ -278,7 +278,7 @@ def test_a_period_that_visits_several_cells(monkeypatch: pytest.MonkeyPatch) -> 
 # --------------------------------------------------------------------------------------------- what is accepted is true
 
 
-@pytest.mark.parametrize("kind", ["discrete", "held", "held 0"])
+@pytest.mark.parametrize("kind", slow_after(2, ["held", "discrete", "held 0"]))
 @pytest.mark.parametrize("practical", slow_after(1, [False, True]))
 @pytest.mark.parametrize("seed", slow_after(1, range(3)))
 def test_what_is_accepted_of_a_random_loop_is_true(seed: int, practical: bool, kind: str) -> None:

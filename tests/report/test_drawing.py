@@ -23,6 +23,11 @@ from tests.support.marks import slow_after
 Asked = tuple[bytes, Path, dict[str, Any], dict[str, Any]]
 
 
+@pytest.fixture(autouse=True)
+def drawn_here() -> None:
+    """Here reports are drawn as they are for users."""
+
+
 @pytest.fixture(scope="module")
 def result(tmp_path_factory: pytest.TempPathFactory) -> RoaResult:
     return certify_roa(get_system("pendulum"), pendulum_network((8, 8)), tmp_path_factory.mktemp("run"))

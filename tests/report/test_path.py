@@ -37,6 +37,7 @@ from certify.verdict import Stop, Verdict
 from tests.report.test_report import Page, exactly
 from tests.report.test_tube import QUIET, plane, slab, soft_spring
 from tests.support.loops import chain, scalar_tanh
+from tests.support.marks import slow_after
 
 FROM = {"p": Fraction(6, 5), "v": Fraction(1, 2)}
 
@@ -199,7 +200,7 @@ def test_values_and_deviations_are_told_apart(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [
+    slow_after(6, [
         {"centre": [math.nan, 0.0]},
         {"centre": [math.inf, 0.0]},
         {"centre": [50.0, 0.0]},
@@ -212,7 +213,7 @@ def test_values_and_deviations_are_told_apart(tmp_path: Path) -> None:
         {"slabs": [moving(np.eye(2), np.zeros((2, 2)), [0.0, 0.0])]},
         {"slabs": [moving(np.eye(2), np.eye(2), [0.0, 0.0], -1.0)]},
         {"slabs": [moving(np.eye(2), np.eye(2), [0.0, 0.0], math.inf)]},
-    ],
+    ]),
     ids=["nan", "endless", "far out", "no start", "no slabs", "no path", "lost", "nan in it", "negative", "singular",
          "backwards", "for ever"],
 )  # fmt: skip

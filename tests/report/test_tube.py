@@ -37,6 +37,7 @@ from certify.systems import System
 from certify.verdict import Verdict
 from tests.report.test_report import Page, exactly
 from tests.support.loops import box, chain, scalar_tanh
+from tests.support.marks import slow_after
 
 QUIET = TanhNetwork((np.zeros((1, 2)),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
 
@@ -180,17 +181,20 @@ def test_the_accepted_page_has_a_picture_of_the_tube_in_each_state(proved: RoaRe
 
 @pytest.mark.parametrize(
     "change",
-    [
-        {"slabs": [slab(np.full((2, 2), math.nan), np.eye(2))]},
-        {"slabs": [slab(-np.eye(2), -np.eye(2))]},
-        {"slabs": [slab(np.eye(2), np.zeros((2, 2)))]},
-        {"slabs": [slab(np.eye(2), np.eye(2), math.inf)]},
-        {"slabs": [slab(np.eye(2), np.eye(2), math.nan)]},
-        {"slabs": [slab(np.eye(2), np.eye(2), 0.0)]},
-        {"slabs": [slab(np.eye(2), np.eye(2), -1.0)]},
-        {"start": -np.eye(2)},
-        {"slabs": []},
-    ],
+    slow_after(
+        5,
+        [
+            {"slabs": [slab(np.full((2, 2), math.nan), np.eye(2))]},
+            {"slabs": [slab(-np.eye(2), -np.eye(2))]},
+            {"slabs": [slab(np.eye(2), np.zeros((2, 2)))]},
+            {"slabs": [slab(np.eye(2), np.eye(2), math.inf)]},
+            {"slabs": [slab(np.eye(2), np.eye(2), math.nan)]},
+            {"slabs": [slab(np.eye(2), np.eye(2), 0.0)]},
+            {"slabs": [slab(np.eye(2), np.eye(2), -1.0)]},
+            {"start": -np.eye(2)},
+            {"slabs": []},
+        ],
+    ),
     ids=["nan", "negative", "singular", "endless", "nan long", "at once", "backwards", "no start", "none"],
 )
 def test_a_refused_tube_still_has_a_page(change: dict[str, Any], tmp_path: Path) -> None:
