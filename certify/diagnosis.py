@@ -140,6 +140,8 @@ def _direction(result: RoaResult, proof: Proof | None, point: Array | None, loop
 def _next(
     result: RoaResult, options: RoaOptions, proof: Proof | None, name: str | None, asked: tuple[System, TanhNetwork]
 ) -> Step:
+    if result.stop is Stop.UNSTABLE:
+        return Step((), "no Lyapunov equation has a solution; the policy has to stabilise the plant first")
     if result.claim in ("practical", "nearby") and (centre := _centring(*asked)) is not None:
         return Step((("--centre", centre),), "with pi(0) = u_eq the stronger claim can be tried")
     if result.stop is Stop.DOMAIN and name is not None and options.level is None:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
+import flint
 import numpy as np
 
 from certify.claims import Asymptotic, Claim
@@ -18,7 +19,7 @@ from certify.engines.falsify import Witness, refutes
 from certify.lyapunov import leaves_domain, slowest_decay
 from certify.race import Contender
 from certify.results import Levels, RoaResult, Tried
-from certify.rigorous import eigenvalues, instability
+from certify.rigorous import eigenvalues, in_digits, instability
 from certify.trials import Trial
 from certify.verdict import Stop, Verdict
 
@@ -41,18 +42,24 @@ def by_spectrum(loop: ClosedLoop) -> tuple[Verdict, Stop, tuple[str, ...]] | Non
     """REFUTED or UNKNOWN with the eigenvalues, or None if the spectrum is rigorously stable."""
     enclosures = eigenvalues(loop)
     if enclosures is None:
-        L, h = loop.mean_rate(), loop.step
-        approximate = np.linalg.eigvals(np.eye(len(L)) + h * L if h else L)
-        if slowest_decay(L, h) > 0:
-            return None  # nearly multiple eigenvalues: the local proof decides
-        return Verdict.UNKNOWN, Stop.SPECTRUM, tuple(f"{v:.6g}" for v in approximate)
-    shown = tuple(f"{complex(v.mid()):.6g}" for v in enclosures)
+        approximate = not_stable(loop)
+        # Without any, nearly multiple eigenvalues: the local proof decides.
+        return (Verdict.UNKNOWN, Stop.SPECTRUM, approximate) if approximate else None
+    shown = tuple(map(in_digits, enclosures))
     signs = [instability(loop, v) for v in enclosures]
     if any(v > 0 for v in signs):
         return Verdict.REFUTED, Stop.UNSTABLE, shown
     if not all(v < 0 for v in signs):
         return Verdict.UNKNOWN, Stop.SPECTRUM, shown
     return None
+
+
+def not_stable(loop: ClosedLoop) -> tuple[str, ...]:
+    """The eigenvalues, in floats, of a loop for which no Lyapunov equation has a solution; none if one has."""
+    L, h = loop.mean_rate(), loop.step
+    if slowest_decay(L, h) > 0:
+        return ()
+    return tuple(in_digits(flint.acb(v.real, v.imag)) for v in np.linalg.eigvals(np.eye(len(L)) + h * L if h else L))
 
 
 def refuted_at_once(result: RoaResult, trial: Trial) -> RoaResult | None:

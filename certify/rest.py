@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from certify.closed_loop import ClosedLoop
 from certify.errors import InputError
-from certify.rigorous import field_on, policy_on, precision
+from certify.rigorous import field_on, in_digits, policy_on, precision
 
 Array = NDArray[np.float64]
 _STEPS, _HALVINGS = 100, 30  # of Newton's method, and of a step that does not reduce ||F||
@@ -188,8 +188,7 @@ def _spectrum(J: flint.arb_mat) -> tuple[tuple[str, ...], bool]:
         found = list(flint.acb_mat(J).eig(multiple=True))
     except (ValueError, ArithmeticError):
         return (), False
-    shown = tuple(f"{complex(v.mid()):.6g}" for v in found)
-    return shown, all(bool(v.real < 0) for v in found)
+    return tuple(map(in_digits, found)), all(bool(v.real < 0) for v in found)
 
 
 def _decimals(values: list[flint.arb]) -> tuple[str, ...]:

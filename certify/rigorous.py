@@ -207,6 +207,12 @@ def eigenvalues(loop: ClosedLoop) -> list[flint.acb] | None:
             return None
 
 
+def in_digits(eigenvalue: flint.acb) -> str:
+    """The middle to six digits, a real number where the enclosure meets the real line."""
+    middle = complex(eigenvalue.mid())
+    return f"{middle.real:.6g}" if eigenvalue.imag.contains(0) else f"{middle:.6g}"
+
+
 def instability(loop: ClosedLoop, eigenvalue: flint.acb) -> flint.arb:
     """What is negative of each of `eigenvalues` where they show stability: the real part, or with steps |v| - 1."""
     with precision():

@@ -54,6 +54,7 @@ from certify.outcome import (
     is_refuted,
     limit_of,
     lowest_witness,
+    not_stable,
     refuted_at_once,
     result_about,
     short_of_target,
@@ -256,6 +257,9 @@ class _Run:
                 detail = f"eigenvalues {', '.join(shown)}" + (" touch the axis" if stop is Stop.SPECTRUM else "")
                 return replace(result, verdict=verdict, stop=stop, detail=detail, eigenvalues=shown)
         result = replace(result, rest=rest)
+        if kind == "practical" and options.P is None and not options.resume and (shown := not_stable(loop)):
+            detail = f"eigenvalues {', '.join(shown)} where V is to be 0"
+            return replace(result, stop=Stop.UNSTABLE, detail=detail, eigenvalues=shown)
         if not options.resume:
             (self.out / _SEARCH_FILE).unlink(missing_ok=True)
         if options.resume:

@@ -30,7 +30,7 @@ from certify.rest import Rest, find_rest, seen_from
 from certify.rigorous import field_on, precision
 from certify.roa import RoaOptions, certify_roa
 from certify.systems import System, get_system
-from certify.verdict import Verdict
+from certify.verdict import Stop, Verdict
 from controllers.evaluate import count_covered, require_same_loop, require_same_question
 from tests.support.loops import box
 
@@ -68,14 +68,28 @@ def test_a_clip_that_acts_at_rest_leaves_the_plant_alone_there() -> None:
     """xdot = -x + u with u = clip(0.5 - x, 1/4, 1): the loop would rest at 1/4 exactly on the bound's edge; at 0.2 with
     a bound of 0.2, where the input is held and the only eigenvalue is the plant's."""
     found = find_rest(scalar(-x + u, -1.0, 0.5, (-1.0, 0.125)))
-    assert found is not None and found.x == ("0.125000000000",) and found.eigenvalues == ("-1+0j",)
+    assert found is not None and found.x == ("0.125000000000",) and found.eigenvalues == ("-1",)
     edge = find_rest(scalar(-x + u, -1.0, 0.5, (-1.0, 0.25)))
     assert edge is None or edge.x == ("0.250000000000",)
 
 
 def test_a_rest_that_is_not_stable_is_not_called_so() -> None:
     found = find_rest(scalar(x + u, 0.5, 0.25))
-    assert found is not None and not found.stable and found.eigenvalues == ("1.5+0j",)
+    assert found is not None and not found.stable and found.eigenvalues == ("1.5",)
+
+
+@pytest.mark.parametrize("candidate", ["auto", "lqr"])
+def test_a_loop_that_is_not_stable_there_is_told_so(tmp_path: Path, candidate: Literal["auto", "lqr"]) -> None:
+    """Nothing is refuted: a floor may hold what leaves the point. A V that somebody gives is tried."""
+    loop = scalar(x - x**3 + u, 0.5, 0.25)
+    result = certify_roa(loop.system, loop.network, tmp_path, RoaOptions(candidate=candidate))
+    assert (result.verdict, result.stop, result.P) == (Verdict.UNKNOWN, Stop.UNSTABLE, None)
+    assert result.reason == "unstable linearisation: eigenvalues 1.5 where V is to be 0"
+    assert result.rest is not None and not result.rest.stable
+    given = RoaOptions(P=np.eye(1), around="origin")
+    proved = certify_roa(loop.system, loop.network, tmp_path, given)
+    assert proved.verdict is Verdict.PROVED and proved.levels.floor is not None
+    assert proved.levels.floor > 1.0  # both stable points lie inside
 
 
 @pytest.mark.parametrize("f", [1 + x**2 + 0 * u, x**2 + u])
