@@ -1,5 +1,5 @@
 """The rule `contraction`: on a ball that holds {V <= c0} any two trajectories come closer, where q is constant, in the
-norm of P. So there is one equilibrium at most, and all trajectories converge to it."""
+norm of P. So there is one equilibrium at most, to which those that stay in {V <= c0} converge."""
 
 from __future__ import annotations
 
