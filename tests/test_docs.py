@@ -2,7 +2,7 @@
 
 Each fenced block of sh or python in docs/ carries a comment on the line above it, which the site does not show:
 
-    <!-- run -->         it is run
+    <!-- run -->         it is run; by the slow tests where the page is not one that is read first
     <!-- run slow -->    it is run by the slow tests
     <!-- shown: why -->  it is not run; commands of `certify` and `controllers` in it must exist with these options
 
