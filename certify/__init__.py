@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from certify.api import certify_roa
     from certify.closed_loop import ClosedLoop
     from certify.errors import CertifyError, InputError
+    from certify.expressions import atan, cos, exp, from_sympy, sin, sqrt, symbols, tan, tanh
     from certify.lyapunov import Neural, Polynomial, load_lyapunov, save_lyapunov
     from certify.options import RoaOptions
     from certify.policies import Policy, TanhNetwork, load_policy, save_policy
@@ -26,6 +27,15 @@ _PUBLIC = {
     "Verdict": "certify.verdict",
     "System": "certify.systems",
     "get_system": "certify.systems",
+    "symbols": "certify.expressions",
+    "sin": "certify.expressions",
+    "cos": "certify.expressions",
+    "tan": "certify.expressions",
+    "tanh": "certify.expressions",
+    "exp": "certify.expressions",
+    "atan": "certify.expressions",
+    "sqrt": "certify.expressions",
+    "from_sympy": "certify.expressions",
     "TanhNetwork": "certify.policies",
     "Policy": "certify.policies",
     "load_policy": "certify.policies",
@@ -56,12 +66,21 @@ __all__ = [
     "TanhNetwork",
     "Verdict",
     "__version__",
+    "atan",
     "certify_roa",
+    "cos",
+    "exp",
+    "from_sympy",
     "get_system",
     "load_lyapunov",
     "load_policy",
     "save_lyapunov",
     "save_policy",
+    "sin",
+    "sqrt",
+    "symbols",
+    "tan",
+    "tanh",
 ]
 
 

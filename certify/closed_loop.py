@@ -11,13 +11,12 @@ from typing import Any
 
 import numpy as np
 import scipy.linalg
-import sympy
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from certify.expressions import evaluate_exactly
+from certify.expressions import Expression, evaluate_exactly
 from certify.policies import TanhNetwork, require_centred
-from certify.systems import System, linearise
+from certify.systems import Matrix, System, in_floats, linearise
 
 Array = NDArray[np.float64]
 
@@ -36,7 +35,7 @@ class ClosedLoop:
     network: TanhNetwork
     u_eq: tuple[Fraction, ...] = field(init=False, repr=False, compare=False)
     folded: TanhNetwork = field(init=False, repr=False, compare=False)
-    dynamics: tuple[sympy.Expr, ...] = field(init=False, repr=False, compare=False)
+    dynamics: tuple[Expression, ...] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         system, network = self.system, self.network
@@ -79,7 +78,7 @@ class ClosedLoop:
 
     def linearise(self) -> tuple[Array, Array, Array]:
         """(A, B, K) in float64: `A = df/dx - B K` the closed loop's Jacobian, K = -J_pi(0)."""
-        A_open, B = (_to_float(M) for M in self.plant_jacobians())
+        A_open, B = (in_floats(M) for M in self.plant_jacobians())
         K = -self.network.jacobian_at_origin(self.u_eq)
         return A_open - B @ K, B, K
 
@@ -110,10 +109,6 @@ class ClosedLoop:
         rate: Array = (mean @ held / h)[:n] @ np.vstack([np.eye(n), -K])
         return rate
 
-    def plant_jacobians(self) -> tuple[sympy.Matrix, sympy.Matrix]:
+    def plant_jacobians(self) -> tuple[Matrix, Matrix]:
         """(df/dx, df/du) at the origin and u_eq, exact."""
         return linearise(self.system)
-
-
-def _to_float(matrix: sympy.Matrix) -> Array:
-    return np.array(matrix.tolist(), dtype=np.float64)

@@ -10,15 +10,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from fractions import Fraction
 from functools import lru_cache
-from typing import Any
 
 import flint
 import numpy as np
-import sympy
 from numpy.typing import NDArray
 
 from certify.closed_loop import ClosedLoop
-from certify.expressions import Algebra, evaluate, solution_series
+from certify.expressions import Algebra, Expression, Symbol, differentiate, evaluate, solution_series
 from certify.lyapunov.neural import Neural
 from certify.lyapunov.symbolic import Symbolic
 from certify.policies import TanhNetwork
@@ -52,7 +50,7 @@ def ball(q: Fraction) -> flint.arb:
     return flint.arb(flint.fmpq(q.numerator, q.denominator))
 
 
-def evaluate_arb(expression: sympy.Expr, values: Mapping[sympy.Symbol, flint.arb]) -> flint.arb:
+def evaluate_arb(expression: Expression, values: Mapping[Symbol, flint.arb]) -> flint.arb:
     """An expression of the plant in Arb balls."""
     return evaluate(expression, values, _Balls())
 
@@ -91,9 +89,9 @@ def evaluate_vdot(loop: ClosedLoop, P: Array, x: Array) -> flint.arb:
     """`Vdot = 2 x'P F(x)` at a binary64 point (n,), as an Arb ball."""
     with precision():
         state = _points(x)
-        values: dict[sympy.Symbol, flint.arb] = dict(zip(loop.system.states, state, strict=True))
+        values: dict[Symbol, flint.arb] = dict(zip(loop.system.states, state, strict=True))
         values |= zip(loop.system.inputs, evaluate_policy(loop, x), strict=True)
-        total, known = flint.arb(0), dict[Any, flint.arb]()
+        total, known = flint.arb(0), dict[Expression, flint.arb]()
         for row, expression in zip(P, loop.dynamics, strict=True):
             Px = sum((flint.arb(float(p)) * v for p, v in zip(row, state, strict=True)), flint.arb(0))
             total += 2 * Px * evaluate(expression, values, _Balls(), known)
@@ -141,7 +139,7 @@ def evaluate_rise(loop: ClosedLoop, N: Neural | Symbolic, x: Array) -> tuple[fli
         F = _field(loop, values)
         if isinstance(N, Neural):
             return _layers(N.weights, N.biases, state)[0], _rise(N, state, F)
-        slopes = [evaluate_arb(sympy.diff(N.expression, s), values) for s in N.states]
+        slopes = [evaluate_arb(differentiate(N.expression, s), values) for s in N.states]
         return evaluate_function(N, state), sum((a * b for a, b in zip(slopes, F, strict=True)), flint.arb(0))
 
 
@@ -157,15 +155,15 @@ def _rise(N: Neural, x: Balls, F: Balls) -> flint.arb:
     return F[0]
 
 
-def _field(loop: ClosedLoop, values: Mapping[sympy.Symbol, flint.arb]) -> Balls:
-    known: dict[Any, flint.arb] = {}
+def _field(loop: ClosedLoop, values: Mapping[Symbol, flint.arb]) -> Balls:
+    known: dict[Expression, flint.arb] = {}
     return [evaluate(expression, values, _Balls(), known) for expression in loop.dynamics]
 
 
 def _mean_rate(
     loop: ClosedLoop,
-    states: Mapping[sympy.Symbol, flint.arb],
-    inputs: Mapping[sympy.Symbol, flint.arb],
+    states: Mapping[Symbol, flint.arb],
+    inputs: Mapping[Symbol, flint.arb],
     now: Balls,
     period: Fraction,
 ) -> Balls:
@@ -244,8 +242,8 @@ def policy_on(loop: ClosedLoop, x: Balls) -> tuple[Balls, flint.arb_mat]:
 def function_on(function: Neural | Symbolic, x: Balls) -> tuple[flint.arb, Balls]:
     """N and its gradient on balls x; whatever is not finite says that N need not be differentiable there."""
     if isinstance(function, Symbolic):
-        values, known = dict(zip(function.states, x, strict=True)), dict[Any, flint.arb]()
-        parts = (function.expression, *(function.expression.diff(s) for s in function.states))
+        values, known = dict(zip(function.states, x, strict=True)), dict[Expression, flint.arb]()
+        parts = (function.expression, *(differentiate(function.expression, s) for s in function.states))
         N, *slopes = (evaluate(part, values, _Balls(), known) for part in parts)
         return N, slopes
     y, units = list(x), []
@@ -275,10 +273,10 @@ def field_on(loop: ClosedLoop, x: Balls) -> tuple[Balls, flint.arb_mat]:
     system = loop.system
     u, gain = policy_on(loop, x)
     values = dict(zip((*system.states, *system.inputs), (*x, *u), strict=True))
-    known: dict[Any, flint.arb] = {}
+    known: dict[Expression, flint.arb] = {}
     F = [evaluate(e, values, _Balls(), known) for e in loop.dynamics]
     A, B = (
-        flint.arb_mat([[evaluate(e.diff(s), values, _Balls(), known) for s in by] for e in loop.dynamics])
+        flint.arb_mat([[evaluate(differentiate(e, s), values, _Balls(), known) for s in by] for e in loop.dynamics])
         for by in (system.states, system.inputs)
     )
     return F, A + B * gain
@@ -291,10 +289,7 @@ def gain_at_origin(loop: ClosedLoop) -> flint.arb_mat:
 
 def plant_at_origin(loop: ClosedLoop) -> tuple[flint.arb_mat, flint.arb_mat]:
     """A (n, n) and B (n, m) of the plant at the origin and u_eq."""
-    A, B = (
-        flint.arb_mat([[evaluate_arb(M[i, j], {}) for j in range(M.shape[1])] for i in range(M.shape[0])])
-        for M in loop.plant_jacobians()
-    )
+    A, B = (flint.arb_mat([[evaluate_arb(e, {}) for e in row] for row in M]) for M in loop.plant_jacobians())
     return A, B
 
 

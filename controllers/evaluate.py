@@ -14,12 +14,12 @@ from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
-import sympy
 import torch
 from numpy.typing import NDArray
 
 from certify.containment import ProvedSet
 from certify.errors import InputError
+from certify.expressions import Expression
 from certify.policies import Policy, TanhNetwork
 from certify.running.threads import threads_for
 from certify.systems import System, shipped_system
@@ -271,7 +271,7 @@ def require_same_question(proved: ProvedSet, network: TanhNetwork, system: Syste
             )
 
 
-def _dynamics(system: System, acting: Iterable[str]) -> tuple[sympy.Expr, ...]:
+def _dynamics(system: System, acting: Iterable[str]) -> tuple[Expression, ...]:
     """The equations with these uncertain quantities free, and all others at their nominal values."""
     still = {name: None for name in system.ranges if name not in set(acting)}
     return system.with_ranges(still).uncertain_dynamics()

@@ -125,16 +125,10 @@ def time_step(system: System, w: Array, U: Array) -> float:
 
 def linearisation(system: System) -> tuple[Array, Array]:
     """A (n, n) and B (n, m) of the plant at its operating point, in floats."""
-    import sympy
-
-    from certify.systems import linearise
+    from certify.systems import in_floats, linearise
 
     A, B = linearise(system)
-
-    def floats(matrix: sympy.Matrix) -> Array:
-        return np.array(matrix.evalf(17).tolist(), dtype=np.float64)
-
-    return floats(A), floats(B)
+    return in_floats(A), in_floats(B)
 
 
 def _rounded(values: Array) -> tuple[float, ...]:

@@ -9,10 +9,9 @@ from collections.abc import Iterator
 from fractions import Fraction
 
 import numpy as np
-import sympy
 
 from certify.errors import InputError
-from certify.expressions import Tree, to_tree
+from certify.expressions import Expression, Number, Operation, Tree, gathered, nodes, to_tree
 from certify.policies import TanhNetwork
 from certify.systems import System
 
@@ -32,22 +31,23 @@ def require_within_limits(system: System, network: TanhNetwork) -> None:
     """
     dynamics = system.uncertain_dynamics()
     trees = [to_tree(e) for e in dynamics]
-    nodes = [node for tree in trees for node in _nodes(tree, 0)]
+    listed = [node for tree in trees for node in _nodes(tree, 0)]
     numbers = [q for pair in (*system.domain, *system.input_bounds) for q in pair] + list(system.exact_u_eq())
-    digits = [len(part) for q in (*numbers, *(Fraction(n) for n, _ in nodes if _is_number(n))) for part in _parts(q)]
-    for q in (*numbers, *(Fraction(n) for n, _ in nodes if _is_number(n))):
+    digits = [len(part) for q in (*numbers, *(Fraction(n) for n, _ in listed if _is_number(n))) for part in _parts(q)]
+    made = [e.value for e in nodes(*map(gathered, dynamics)) if isinstance(e, Number)]
+    for q in (*numbers, *made):
         if not abs(q) < _LARGEST:
             raise InputError(
                 f"numbers of {system.name} must lie within the range of binary64; one has {len(str(q))} digits."
             )
-    exponents = [abs(int(p.exp)) for e in dynamics for p in sympy.preorder_traversal(e) if p.is_Pow]
+    exponents = [abs(p.exponent) for p in nodes(*dynamics) if isinstance(p, Operation) and p.operator == "**"]
     for what, found, most in (
         ("states", system.n, MOST_STATES),
         ("inputs", system.m, MOST_STATES),
         ("layers of the policy", len(network.weights), MOST_LAYERS),
         ("units in a layer", max(len(W) for W in network.weights), MOST_ROWS),
-        ("nodes in the equations", len(nodes), MOST_NODES),
-        ("levels of nesting in an equation", max(depth for _, depth in nodes), MOST_DEPTH),
+        ("nodes in the equations", len(listed), MOST_NODES),
+        ("levels of nesting in an equation", max(depth for _, depth in listed), MOST_DEPTH),
         ("as the largest exponent in an equation", max(exponents, default=1), MOST_EXPONENT),
         ("digits in the parts of a rational", max(digits), MOST_DIGITS),
         ("operations in the equations, times the numbers of a model of each,", _size(system), MOST_NUMBERS),
@@ -82,16 +82,17 @@ def numbers_of_a_jet(k: int) -> int:
 
 def _size(system: System) -> int:
     """Operations, each counted once however often it stands in the equations, times their numbers; an upper bound."""
-    seen = {node for e in system.uncertain_dynamics() for node in sympy.preorder_traversal(e)}
-    return sum(_operations(node) for node in seen) * numbers_of_a_jet(system.n)
+    return sum(_operations(node) for node in nodes(*system.uncertain_dynamics())) * numbers_of_a_jet(system.n)
 
 
-def _operations(node: sympy.Expr) -> int:
-    if node.is_Add or node.is_Mul:
-        return len(node.args) - 1
-    if node.is_Pow:
-        return 2 * abs(int(node.exp)).bit_length()
-    return 4 if isinstance(node, sympy.tan) else 1
+def _operations(node: Expression) -> int:
+    if not isinstance(node, Operation):
+        return 1
+    if node.operator in ("+", "*"):
+        return len(node.operands) - 1
+    if node.operator == "**":
+        return 2 * abs(node.exponent).bit_length()
+    return {"/": 2, "tan": 4}.get(node.operator, 1)
 
 
 def _nodes(tree: Tree, depth: int) -> Iterator[tuple[Tree, int]]:

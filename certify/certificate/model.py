@@ -20,12 +20,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import sympy
 from numpy.typing import NDArray
 
 from certify.claims import CLAIMS, Claim, Enlarged, Outer, Reached
 from certify.errors import CertificateFormatError, InputError
-from certify.expressions import from_tree, to_tree
+from certify.expressions import Number, Symbol, from_tree, to_tree
 from certify.lyapunov.function import Quadratic
 from certify.lyapunov.neural import Neural
 from certify.lyapunov.symbolic import Symbolic
@@ -306,9 +305,9 @@ def parse_certificate(raw: bytes, name: str) -> Certificate:
         if kind not in CLAIMS:
             raise CertificateFormatError(f"{name}: `claim.kind` must be one of {', '.join(CLAIMS)}; found {kind!r}.")
         plant, policy, evidence = data["plant"], data["policy"], data["evidence"]
-        states, inputs = (tuple(sympy.Symbol(s) for s in plant[k]) for k in ("states", "inputs"))
+        states, inputs = (tuple(Symbol(s) for s in plant[k]) for k in ("states", "inputs"))
         ranges = {q["name"]: (Fraction(q["range"][0]), Fraction(q["range"][1])) for q in plant["uncertain"]}
-        names = {s.name: s for s in (*states, *inputs, *map(sympy.Symbol, ranges))}
+        names = {s.name: s for s in (*states, *inputs, *map(Symbol, ranges))}
         n, m = len(states), len(inputs)
         sample = data["claim"]["sample"]
         provenance, units, x_eq, nominal = _read_provenance(data["provenance"], names)
@@ -318,11 +317,11 @@ def parse_certificate(raw: bytes, name: str) -> Certificate:
             inputs=inputs,
             parameters={name: _nominal(interval, nominal.get(name)) for name, interval in ranges.items()},
             dynamics=tuple(from_tree(t, names) for t in plant["dynamics"]),
-            u_eq=tuple(sympy.Rational(q) for q in plant["u_eq"]),
+            u_eq=tuple(Number(Fraction(q)) for q in plant["u_eq"]),
             domain=tuple((Fraction(lo), Fraction(hi)) for lo, hi in plant["domain"]),
             input_bounds=tuple((Fraction(lo), Fraction(hi)) for lo, hi in plant["input_bounds"]),
             units=units,
-            x_eq=tuple(sympy.Rational(x_eq.get(s.name, "0")) for s in states),
+            x_eq=tuple(Number(Fraction(x_eq.get(s.name, "0"))) for s in states),
             ranges=ranges,
             time=plant["time"],
             sample=None if sample is None else (Fraction(sample[0]), Fraction(sample[1])),
@@ -350,7 +349,7 @@ def parse_certificate(raw: bytes, name: str) -> Certificate:
         raise CertificateFormatError(f"{name} is not a certificate: {type(error).__name__}: {error}.") from error
 
 
-def _read_claim(data: Mapping[str, Any], states: tuple[sympy.Symbol, ...]) -> Claim:
+def _read_claim(data: Mapping[str, Any], states: tuple[Symbol, ...]) -> Claim:
     n = len(states)
     levels: dict[str, Any] = {k: float.fromhex(v) for k, v in data["levels"].items()}
     levels["rate"] = float.fromhex(data["claim"]["rate"])
@@ -374,7 +373,7 @@ def _outer(outer: Outer) -> dict[str, Any]:
     return {**stated, "level": float(outer.level).hex()}
 
 
-def _read_outer(data: Mapping[str, Any], states: tuple[sympy.Symbol, ...]) -> Outer:
+def _read_outer(data: Mapping[str, Any], states: tuple[Symbol, ...]) -> Outer:
     level = float.fromhex(data["level"])
     if data["kind"] == "network":
         return Outer(Neural(*_read_layers(data["layers"])), level)

@@ -11,8 +11,8 @@ from flint import fmpq, fmpq_mat, fmpz
 from numpy.typing import NDArray
 
 from .document import Policy
+from .expression import MAX_BITS
 
-MAX_BITS = 2**14  # of a number on the tape
 MAX_INVERSE_BITS = 2**14  # of a number in a matrix all of whose inverse is wanted, times the matrix's size
 MAX_MATRIX_BITS = 2**16  # of a number in a matrix, times the matrix's size: beyond, a decision takes minutes
 

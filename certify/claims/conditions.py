@@ -11,10 +11,8 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Literal
 
-import sympy
-
 from certify.claims.claim import Asymptotic, Claim, Problem
-from certify.expressions import as_power
+from certify.expressions import Expression, Operation, nodes, symbols_of
 from certify.policies import bounded_by_form
 
 
@@ -139,14 +137,13 @@ def root_conditions(problem: Problem, level: float) -> tuple[Condition, ...]:
     return tuple(Condition(f"root-{k}", (Guard("inside", level),), Radicand(k)) for k in range(count))
 
 
-def radicands(problem: Problem) -> tuple[sympy.Expr, ...]:
+def radicands(problem: Problem) -> tuple[Expression, ...]:
     """What the equations take square roots of, inner roots before outer ones."""
-    found: dict[sympy.Expr, None] = {}
+    found: dict[Expression, None] = {}
     for expression in problem.loop.system.uncertain_dynamics():
-        for node in sympy.postorder_traversal(expression):
-            power = as_power(node)
-            if power is not None and power[1] > 0 and node.free_symbols:
-                found[power[0]] = None
+        for node in nodes(expression):
+            if isinstance(node, Operation) and node.operator == "sqrt" and symbols_of(node):
+                found[node.operands[0]] = None
     return tuple(found)
 
 

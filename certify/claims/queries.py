@@ -17,7 +17,7 @@ from certify.claims.claim import Problem
 from certify.claims.conditions import BeforeClip, Condition, OfState, Radicand, Vdot, radicands
 from certify.closed_loop import ClosedLoop
 from certify.errors import InputError
-from certify.expressions import Tree, to_tree
+from certify.expressions import Tree, differentiate, to_tree
 
 Array = NDArray[np.float64]
 BEFORE_CLIP = "b."  # and the input's number
@@ -266,7 +266,7 @@ def _jacobian(loop: ClosedLoop) -> list[tuple[str, Tree]]:
     result: list[tuple[str, Tree]] = []
     for i, e in enumerate(loop.dynamics):
         for j, state in enumerate(system.states):
-            terms = [to_tree(e.diff(state))]
-            terms += [["*", to_tree(e.diff(u)), f"Du.{k}.{j}"] for k, u in enumerate(system.inputs)]
+            terms = [to_tree(differentiate(e, state))]
+            terms += [["*", to_tree(differentiate(e, u)), f"Du.{k}.{j}"] for k, u in enumerate(system.inputs)]
             result.append((f"DF.{i}.{j}", total(terms)))
     return result

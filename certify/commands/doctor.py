@@ -233,18 +233,18 @@ def _certificates(folder: Path) -> tuple[Path, Path]:
     from fractions import Fraction
 
     import numpy as np
-    import sympy
 
     from certify.errors import SoundnessError
+    from certify.expressions import Number, symbols
     from certify.options import RoaOptions
     from certify.policies import TanhNetwork
     from certify.roa import certify_roa
     from certify.systems import System
     from certify.verdict import Verdict
 
-    x, u = sympy.symbols("x u")
+    x, u = symbols(["x", "u"])
     system = System(
-        name="known", states=(x,), inputs=(u,), parameters={}, dynamics=(x / 2 + u,), u_eq=(sympy.Integer(0),),
+        name="known", states=(x,), inputs=(u,), parameters={}, dynamics=(x / 2 + u,), u_eq=(Number(0),),
         domain=((Fraction(-3), Fraction(3)),), input_bounds=((Fraction(-1), Fraction(1)),),
     )  # fmt: skip
     network = TanhNetwork((np.array([[-1.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")

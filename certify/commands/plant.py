@@ -14,11 +14,10 @@ from certify.commands.shared import Json, describe
 from certify.commands.terminal import say, show
 
 if TYPE_CHECKING:
-    import sympy
     from rich.console import RenderableType
     from rich.table import Table
 
-    from certify.systems import Controllability, System
+    from certify.systems import Controllability, Matrix, System
 
 
 def plant(
@@ -38,9 +37,7 @@ def plant(
         show(_page(found, A, B, eigenvalues, reach))
 
 
-def _data(
-    s: System, A: sympy.Matrix, B: sympy.Matrix, eigenvalues: Sequence[complex], reach: Controllability
-) -> dict[str, Any]:
+def _data(s: System, A: Matrix, B: Matrix, eigenvalues: Sequence[complex], reach: Controllability) -> dict[str, Any]:
     return {
         **describe(s),
         "residual": {name: str(r) for name, r in s.residuals().items() if r != 0},
@@ -51,9 +48,7 @@ def _data(
     }
 
 
-def _page(
-    s: System, A: sympy.Matrix, B: sympy.Matrix, eigenvalues: Sequence[complex], reach: Controllability
-) -> RenderableType:
+def _page(s: System, A: Matrix, B: Matrix, eigenvalues: Sequence[complex], reach: Controllability) -> RenderableType:
     from rich.console import Group
     from rich.table import Table
     from rich.text import Text
@@ -144,7 +139,7 @@ def _ends(s: System, name: str) -> tuple[str, str]:
     return ("", "") if name in s.parameters else ("0", "0")
 
 
-def _matrix(title: str, s: System, matrix: sympy.Matrix, columns: Sequence[str]) -> Table:
+def _matrix(title: str, s: System, matrix: Matrix, columns: Sequence[str]) -> Table:
     table = _table(title, *columns)
     for name, row in zip(s.states, _floats(matrix), strict=True):
         _row(table, f"{name}'", *(f"{v:.6g}" for v in row))
@@ -184,11 +179,14 @@ def _complex(value: complex) -> str:
     return f"{value.real:.6g}" if value.imag == 0 else f"{value.real:.6g}{value.imag:+.6g}j"
 
 
-def _floats(matrix: sympy.Matrix) -> list[list[float]]:
-    return [[float(v) for v in row] for row in matrix.evalf(17).tolist()]
+def _floats(matrix: Matrix) -> list[list[float]]:
+    from certify.systems import in_floats
+
+    found: list[list[float]] = in_floats(matrix).tolist()
+    return found
 
 
-def _eigenvalues(A: sympy.Matrix) -> list[complex]:
+def _eigenvalues(A: Matrix) -> list[complex]:
     import numpy as np
 
     return sorted((complex(e) for e in np.linalg.eigvals(np.array(_floats(A)))), key=lambda e: (-e.real, e.imag))

@@ -14,16 +14,15 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-import sympy
 import torch
 from torch import Tensor
 
 from certify.enclosures.taylor import EPS, TINY, Models, Taylor
-from certify.expressions import evaluate, solution_series
+from certify.expressions import Expression, Symbol, evaluate, solution_series
 from certify.systems.system import Interval
 
 _ATTEMPTS, _WIDER = 4, 1.25  # at the enclosure of the solution
-Values = Mapping[sympy.Symbol, Taylor]
+Values = Mapping[Symbol, Taylor]
 
 
 class Mean(NamedTuple):
@@ -46,7 +45,7 @@ class Flow:
     order : of the series in time, at least 1.
     """
 
-    def __init__(self, dynamics: Sequence[sympy.Expr], sample: Interval, order: int) -> None:
+    def __init__(self, dynamics: Sequence[Expression], sample: Interval, order: int) -> None:
         self.dynamics, self.order = dynamics, order
         self.shortest, self.longest = sample
         self.symbols = int(self.shortest < self.longest)  # the period's own, the last of all
@@ -78,12 +77,10 @@ class Flow:
         )
 
     def _rate(self, values: Values, models: Models) -> list[Taylor]:
-        known: dict[sympy.Expr, Taylor] = {}
+        known: dict[Expression, Taylor] = {}
         return [evaluate(expression, values, models, known) for expression in self.dynamics]
 
-    def _enclose(
-        self, states: Values, held: Values, now: Sequence[Taylor]
-    ) -> tuple[dict[sympy.Symbol, Taylor], Tensor]:
+    def _enclose(self, states: Values, held: Values, now: Sequence[Taylor]) -> tuple[dict[Symbol, Taylor], Tensor]:
         """Models of all states up to the end of the period, and where (B,) they are that."""
         size = _sizes(now)
         kappa = _WIDER * self.most * size

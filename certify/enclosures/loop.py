@@ -7,21 +7,21 @@ from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
-import sympy
 import torch
 from torch import Tensor
 
 from certify.enclosures.tape import Tape
 from certify.enclosures.taylor import EPS, TINY, Taylor
+from certify.expressions import Symbol
 from certify.systems import System
 
 
 class LoopModels(NamedTuple):
     """Models by symbol, each kind in the plant's order."""
 
-    states: Mapping[sympy.Symbol, Taylor]
-    inputs: Mapping[sympy.Symbol, Taylor]
-    quantities: Mapping[sympy.Symbol, Taylor]
+    states: Mapping[Symbol, Taylor]
+    inputs: Mapping[Symbol, Taylor]
+    quantities: Mapping[Symbol, Taylor]
 
 
 def loop_models(
@@ -38,9 +38,9 @@ def loop_models(
     k = len(system.uncertain) + more
     zeros = torch.zeros(n + m + k, n + m + k, batch, dtype=x.dtype, device=x.device)
     none = zeros[0, : m + k]
-    states: dict[sympy.Symbol, Taylor] = {}
-    inputs: dict[sympy.Symbol, Taylor] = {}
-    quantities: dict[sympy.Symbol, Taylor] = {}
+    states: dict[Symbol, Taylor] = {}
+    inputs: dict[Symbol, Taylor] = {}
+    quantities: dict[Symbol, Taylor] = {}
     for i, symbol in enumerate(system.states):
         states[symbol] = Taylor(x[i, 0], torch.cat([x[i, 1:], none]), zeros, error[i])
     for j, symbol in enumerate(system.inputs):

@@ -10,12 +10,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
-import sympy
 import torch
 from torch import Tensor
 
 from certify.enclosures.taylor import Models, Taylor
-from certify.expressions import PowerSeries, Series, evaluate
+from certify.expressions import PowerSeries, Series, Symbol, evaluate
 from certify.lyapunov.symbolic import Symbolic
 
 
@@ -24,7 +23,7 @@ class SymbolicModels:
     """N on a batch of boxes, `value` in the n symbols of the box."""
 
     function: Symbolic
-    states: Mapping[sympy.Symbol, Taylor]
+    states: Mapping[Symbol, Taylor]
     value: Taylor
 
     @property

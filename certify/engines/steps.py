@@ -13,13 +13,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import sympy
 from numpy.typing import NDArray
 
 from certify.closed_loop import ClosedLoop
 from certify.engines.models import Driven, Models, Paths, Spread, of_all
 from certify.engines.ranged import RangedJet, RangedJets
-from certify.expressions import evaluate, solution_series
+from certify.expressions import Expression, Symbol, evaluate, solution_series
 from certify.systems.system import Interval
 
 Array = NDArray[np.float64]
@@ -42,7 +41,7 @@ class Steps:
     known: Paths
     at_rest: bool
     order: int
-    dynamics: tuple[sympy.Expr, ...]
+    dynamics: tuple[Expression, ...]
 
     @property
     def longest(self) -> float:
@@ -118,7 +117,7 @@ class _Walk:
 
     def rates(self, near: tuple[Array, Array] | None = None, fixed: bool = True) -> list[RangedJet]:
         """f at these states; the quantities are one point of the cell, or anywhere at every place if not `fixed`."""
-        shared: dict[sympy.Expr, RangedJet] = {}
+        shared: dict[Expression, RangedJet] = {}
         values = self._states_by_name(near) | self._held_by_name(fixed)
         return [evaluate(e, values, self.algebra, shared) for e in self.steps.dynamics]
 
@@ -133,10 +132,10 @@ class _Walk:
             return v
         return replace(v, c=0.0, moves=np.zeros_like(v.moves), error=np.zeros_like(v.error))
 
-    def _states_by_name(self, near: tuple[Array, Array] | None) -> dict[sympy.Symbol, RangedJet]:
+    def _states_by_name(self, near: tuple[Array, Array] | None) -> dict[Symbol, RangedJet]:
         return dict(zip(self.loop.system.states, self.states(near), strict=True))
 
-    def _held_by_name(self, fixed: bool) -> dict[sympy.Symbol, RangedJet]:
+    def _held_by_name(self, fixed: bool) -> dict[Symbol, RangedJet]:
         system = self.loop.system
         held = dict(zip(system.inputs, self._inputs, strict=True))
         for j, ((symbol, whole), part) in enumerate(zip(system.uncertain, self.cell, strict=True)):

@@ -1,24 +1,76 @@
-"""Expressions of plants: as nested lists, and evaluated in any arithmetic. The one list of functions is here."""
+"""Expressions: trees as they were written, evaluated in any arithmetic. The one list of functions is here."""
 
 from __future__ import annotations
 
+from certify.expressions.derivative import differentiate
 from certify.expressions.evaluate import Algebra, evaluate
-from certify.expressions.rational import evaluate_exactly
+from certify.expressions.from_sympy import from_sympy
+from certify.expressions.gathering import constant_of, gathered
+from certify.expressions.numerical import numerical
+from certify.expressions.rational import evaluate_exactly, value_if_rational
 from certify.expressions.series import PowerSeries, Series, solution_series
-from certify.expressions.tree import FUNCTIONS, GRAMMAR, Tree, as_power, from_tree, has_tree, to_tree
+from certify.expressions.tree import (
+    FUNCTIONS,
+    GRAMMAR,
+    MOST_EXPONENT,
+    Expression,
+    Number,
+    Operation,
+    Symbol,
+    Tree,
+    as_expression,
+    atan,
+    cos,
+    exp,
+    from_tree,
+    function,
+    nodes,
+    sin,
+    sqrt,
+    substitute,
+    symbols,
+    symbols_of,
+    tan,
+    tanh,
+    to_tree,
+    total,
+)
 
 __all__ = [
     "FUNCTIONS",
     "GRAMMAR",
+    "MOST_EXPONENT",
     "Algebra",
+    "Expression",
+    "Number",
+    "Operation",
     "PowerSeries",
     "Series",
+    "Symbol",
     "Tree",
-    "as_power",
+    "as_expression",
+    "atan",
+    "constant_of",
+    "cos",
+    "differentiate",
     "evaluate",
     "evaluate_exactly",
+    "exp",
+    "from_sympy",
     "from_tree",
-    "has_tree",
+    "function",
+    "gathered",
+    "nodes",
+    "numerical",
+    "sin",
     "solution_series",
+    "sqrt",
+    "substitute",
+    "symbols",
+    "symbols_of",
+    "tan",
+    "tanh",
     "to_tree",
+    "total",
+    "value_if_rational",
 ]

@@ -11,12 +11,11 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from fractions import Fraction
 from functools import reduce
-from typing import Any, Generic, TypeVar
-
-import sympy
+from typing import Generic, TypeVar
 
 from certify.errors import InputError
-from certify.expressions.tree import CONSTANTS, GRAMMAR, as_function, as_power
+from certify.expressions.gathering import gathered
+from certify.expressions.tree import FUNCTIONS, GRAMMAR, Expression, Number, Operation, Symbol
 
 V = TypeVar("V")
 
@@ -63,12 +62,12 @@ class Algebra(ABC, Generic[V]):
 
 
 def evaluate(
-    expression: sympy.Expr,
-    variables: Mapping[sympy.Symbol, V],
+    expression: Expression,
+    variables: Mapping[Symbol, V],
     algebra: Algebra[V],
-    known: dict[Any, V] | None = None,
+    known: dict[Expression, V] | None = None,
 ) -> V:
-    """The value of an expression of a plant.
+    """The value of an expression of a plant; every operand is evaluated, also one that is multiplied by 0.
 
     Parameters
     ----------
@@ -77,44 +76,47 @@ def evaluate(
 
     Raises
     ------
-    InputError : a symbol without a value, or a node outside the grammar.
+    InputError : a symbol without a value, a node outside the grammar, a division by a number that is 0.
     """
     known = {} if known is None else known
-    if expression not in known:
-        known[expression] = _evaluate(expression, variables, algebra, known)
-    return known[expression]
+    plain = gathered(expression)
+    waiting = [plain]
+    while waiting:
+        node = waiting[-1]
+        missing = [e for e in _operands(node) if e not in known] if node not in known else []
+        if missing:
+            waiting += reversed(missing)
+            continue
+        waiting.pop()
+        if node not in known:
+            known[node] = _value(node, variables, algebra, known)
+    return known[plain]
 
 
-def _evaluate(
-    expression: sympy.Expr, variables: Mapping[sympy.Symbol, V], algebra: Algebra[V], known: dict[Any, V]
-) -> V:
-    if expression.is_Symbol:
-        if expression not in variables:
-            raise InputError(f"the expression uses {expression}, which has no value here.")
-        return variables[expression]
-    if expression.is_Rational:
-        return algebra.constant(_fraction(expression))
-    if expression in CONSTANTS:
-        multiple, name = CONSTANTS[expression]
-        return algebra.product(Fraction(multiple), [algebra.function(name, algebra.constant(Fraction(1)))])
-    if (power := as_power(expression)) is not None:
-        base, roots, exponent = power
-        result = evaluate(base, variables, algebra, known)
-        for _ in range(roots):
-            result = algebra.function("sqrt", result)
-        result = algebra.power(result, abs(exponent))
-        return result if exponent > 0 else algebra.inverse(result)
-    if expression.is_Add or expression.is_Mul:
-        numbers = [_fraction(a) for a in expression.args if a.is_Rational]
-        others = [evaluate(a, variables, algebra, known) for a in expression.args if not a.is_Rational]
-        if expression.is_Add:
-            return algebra.total(sum(numbers, Fraction(0)) if numbers else None, others)
-        return algebra.product(reduce(lambda a, b: a * b, numbers) if numbers else None, others)
-    if (function := as_function(expression)) is not None:
-        name, argument = function
-        return algebra.function(name, evaluate(argument, variables, algebra, known))
-    raise InputError(f"{expression} is outside the grammar; allowed are {GRAMMAR}.")
+def _operands(node: Expression) -> Sequence[Expression]:
+    """The operands that have values in an arithmetic: all but exponents and the number of a sum or product."""
+    return [e for e in node.operands if not isinstance(e, Number) or _is_function(node)]
 
 
-def _fraction(q: sympy.Rational) -> Fraction:
-    return Fraction(int(q.p), int(q.q))
+def _is_function(node: Expression) -> bool:
+    return isinstance(node, Operation) and node.operator in FUNCTIONS
+
+
+def _value(node: Expression, variables: Mapping[Symbol, V], algebra: Algebra[V], known: Mapping[Expression, V]) -> V:
+    if isinstance(node, Symbol):
+        if node not in variables:
+            raise InputError(f"the expression uses {node}, which has no value here.")
+        return variables[node]
+    if isinstance(node, Number):
+        return algebra.constant(node.value)
+    values = [known[e] for e in _operands(node)]
+    if isinstance(node, Operation):
+        if node.operator in ("+", "*"):
+            constant = next((e.value for e in node.operands if isinstance(e, Number)), None)
+            return (algebra.total if node.operator == "+" else algebra.product)(constant, values)
+        if node.operator == "**":
+            result = algebra.power(values[0], abs(node.exponent))
+            return result if node.exponent > 0 else algebra.inverse(result)
+        if node.operator in FUNCTIONS:
+            return algebra.function(node.operator, values[0])
+    raise InputError(f"{node!r} is outside the grammar; allowed are {GRAMMAR}.")

@@ -7,13 +7,12 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
-import sympy
-
 from certify.errors import InputError
 from certify.expressions.evaluate import Algebra, evaluate
-from certify.expressions.tree import AT_ZERO
+from certify.expressions.gathering import MOST_BITS
+from certify.expressions.tree import Expression, Symbol
 
-_MOST_BITS = 2**14  # of a number on the way: powers of powers grow without end
+_AT_ZERO: Mapping[str, int] = {"sin": 0, "cos": 1, "tan": 0, "tanh": 0, "exp": 1, "atan": 0}
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,13 +68,27 @@ class _Rational(Algebra[_Number]):
                 )
             root = Fraction(math.isqrt(value.numerator), math.isqrt(value.denominator))
             return root if root * root == value else _Unnamed(f"sqrt of {value}, which is not the square of a rational")
-        return _Unnamed(f"{name} of {value}") if value != 0 else Fraction(AT_ZERO[name])
+        return _Unnamed(f"{name} of {value}") if value != 0 else Fraction(_AT_ZERO[name])
+
+
+def value_if_rational(
+    expression: Expression, values: Mapping[Symbol, Fraction], unknown: Iterable[Symbol] = ()
+) -> Fraction | str:
+    """The rational value of an expression, whatever the unknown symbols stand for; else, in words, what has none.
+
+    Raises
+    ------
+    InputError : it divides by 0, takes the root of a number that is not positive, or a number grows too long.
+    """
+    numbers: dict[Symbol, _Number] = {**values, **{s: _Unnamed(f"{s}, which is uncertain,") for s in unknown}}
+    value = evaluate(expression, numbers, _Rational())
+    return value.words if isinstance(value, _Unnamed) else value
 
 
 def evaluate_exactly(
-    expression: sympy.Expr, values: Mapping[sympy.Symbol, Fraction], unknown: Iterable[sympy.Symbol] = ()
+    expression: Expression, values: Mapping[Symbol, Fraction], unknown: Iterable[Symbol] = ()
 ) -> Fraction:
-    """The rational value of an expression, whatever the unknown symbols stand for.
+    """`value_if_rational`, where that is a number.
 
     Raises
     ------
@@ -83,14 +96,13 @@ def evaluate_exactly(
         value is that of a function at another point than 0 (of a square root at a number that is no square), or
         depends on what is unknown.
     """
-    numbers: dict[sympy.Symbol, _Number] = {**values, **{s: _Unnamed(f"{s}, which is uncertain,") for s in unknown}}
-    value = evaluate(expression, numbers, _Rational())
-    if isinstance(value, _Unnamed):
-        raise InputError(f"{value.words} has no exact value")
+    value = value_if_rational(expression, values, unknown)
+    if isinstance(value, str):
+        raise InputError(f"{value} has no exact value")
     return value
 
 
 def _small(q: Fraction) -> Fraction:
-    if max(q.numerator.bit_length(), q.denominator.bit_length()) > _MOST_BITS:
-        raise InputError(f"a number on the way has more than {_MOST_BITS} bits")
+    if max(q.numerator.bit_length(), q.denominator.bit_length()) > MOST_BITS:
+        raise InputError(f"a number on the way has more than {MOST_BITS} bits")
     return q

@@ -12,9 +12,8 @@ from collections.abc import Callable, Mapping, Sequence
 from fractions import Fraction
 from typing import Generic, TypeVar
 
-import sympy
-
 from certify.expressions.evaluate import Algebra, evaluate
+from certify.expressions.tree import Expression, Symbol
 
 V = TypeVar("V")
 
@@ -168,9 +167,9 @@ class PowerSeries(Algebra[Series[V]]):
 
 
 def solution_series(
-    dynamics: Sequence[sympy.Expr],
-    states: Mapping[sympy.Symbol, V],
-    held: Mapping[sympy.Symbol, V],
+    dynamics: Sequence[Expression],
+    states: Mapping[Symbol, V],
+    held: Mapping[Symbol, V],
     algebra: Algebra[V],
     order: int,
 ) -> list[list[V]]:
@@ -188,9 +187,9 @@ def solution_series(
     list : for each state x_1, ..., x_order: with f_k the k-th coefficient of f, `x_(k+1) = f_k / (k + 1)`.
     """
     series = PowerSeries(algebra)
-    x: dict[sympy.Symbol, Series[V]] = {symbol: Series(value) for symbol, value in states.items()}
+    x: dict[Symbol, Series[V]] = {symbol: Series(value) for symbol, value in states.items()}
     values = {**x, **{symbol: series.held(value) for symbol, value in held.items()}}
-    known: dict[sympy.Expr, Series[V]] = {}
+    known: dict[Expression, Series[V]] = {}
     f = [evaluate(expression, values, series, known) for expression in dynamics]
     for k in range(order):
         if k:

@@ -1,109 +1,326 @@
-"""Expressions as trees of nested lists, which is how certificates and solvers get them (checker/FORMAT.md)."""
+"""Expressions of plants and Lyapunov functions: trees that stay as they were written.
+
+Nothing here simplifies. `x*(x - 1)/(x - 1)` has no value at x = 1 and keeps its quotient, `sqrt(x)**2` keeps its root
+and `0/(x - 1)` its pole, because what is proved must be proved of the equations that somebody wrote. Equal trees are
+one object, so that a subexpression that stands in many places is evaluated once and compared by identity.
+
+In a certificate a tree is nested lists (checker/FORMAT.md): `to_tree` and `from_tree`.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
-
-import sympy
+import numbers
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from fractions import Fraction
+from typing import Any, TypeVar
+from weakref import WeakValueDictionary
 
 from certify.errors import CertificateFormatError, InputError
 
-FUNCTIONS: Mapping[str, Any] = {
-    "sin": sympy.sin,
-    "cos": sympy.cos,
-    "tan": sympy.tan,
-    "tanh": sympy.tanh,
-    "exp": sympy.exp,
-    "atan": sympy.atan,
-    "sqrt": sympy.sqrt,
-}
-# The only values that are used exactly, beside square roots of squares of rationals.
-AT_ZERO: Mapping[str, int] = {"sin": 0, "cos": 1, "tan": 0, "tanh": 0, "exp": 1, "atan": 0}
-CONSTANTS: Mapping[Any, tuple[int, str]] = {sympy.E: (1, "exp"), sympy.pi: (4, "atan")}
-"""What sympy makes of exp(1) and 4 atan(1): a multiple of a function at 1."""
+FUNCTIONS = ("sin", "cos", "tan", "tanh", "exp", "atan", "sqrt")
 GRAMMAR = f"+ - * /, integer powers, {', '.join(FUNCTIONS)}"
+MOST_EXPONENT = 64
+MOST_DEPTH = 800  # of a tree; a certificate holds less
 Tree = Any  # nested lists: a name, an exact fraction as text, or an operator with its operands
+E = TypeVar("E", bound="Expression")
+_KNOWN: WeakValueDictionary[tuple[Any, ...], Any] = WeakValueDictionary()
+_LOCK = threading.RLock()  # two threads that make the same tree must get the same object
 
 
-def as_power(expression: sympy.Expr) -> tuple[sympy.Expr, int, int] | None:
-    """(base, roots, exponent): so many square roots of the base, one after another, to an integer power.
+class Expression:
+    """A node: a `Symbol`, a `Number`, or an `Operation` on other nodes.
 
-    sympy writes a square root as the power 1/2 and merges powers; None if the expression is no such power.
+    Python's operators build expressions, numbers among them being `int` and `Fraction`: a float is refused, because
+    0.1 is no tenth.
+
+    >>> x = Symbol("x")
+    >>> -x * (x - 1) / (x - 1)
+    -x*(x - 1)/(x - 1)
     """
-    if not expression.is_Pow or not expression.exp.is_Rational:
-        return None
-    denominator = int(expression.exp.q)
-    if denominator & (denominator - 1):
-        return None
-    return expression.base, denominator.bit_length() - 1, int(expression.exp.p)
+
+    __slots__ = ("__weakref__", "depth", "gathered", "operands")
+    operands: tuple[Expression, ...]
+    depth: int
+    gathered: Expression | None
+
+    def __add__(self, other: object) -> Expression:
+        return _joined("+", self, as_expression(other))
+
+    def __radd__(self, other: object) -> Expression:
+        return _joined("+", as_expression(other), self)
+
+    def __sub__(self, other: object) -> Expression:
+        return _joined("+", self, -as_expression(other))
+
+    def __rsub__(self, other: object) -> Expression:
+        return _joined("+", as_expression(other), -self)
+
+    def __mul__(self, other: object) -> Expression:
+        return _joined("*", self, as_expression(other))
+
+    def __rmul__(self, other: object) -> Expression:
+        return _joined("*", as_expression(other), self)
+
+    def __truediv__(self, other: object) -> Expression:
+        return Operation("/", self, as_expression(other))
+
+    def __rtruediv__(self, other: object) -> Expression:
+        return Operation("/", as_expression(other), self)
+
+    def __neg__(self) -> Expression:
+        return Number(-self.value) if isinstance(self, Number) else Operation("-", self)
+
+    def __pos__(self) -> Expression:
+        return self
+
+    def __pow__(self, exponent: object) -> Expression:
+        return Operation("**", self, as_expression(exponent))
+
+    def __repr__(self) -> str:
+        from certify.expressions.printing import text
+
+        return text(self)
 
 
-def as_function(expression: sympy.Expr) -> tuple[str, sympy.Expr] | None:
-    """A function's name and argument; None if the expression is none. Square roots are powers."""
-    for name, function in FUNCTIONS.items():
-        if name != "sqrt" and isinstance(expression, function):
-            return name, expression.args[0]
-    return None
+class Symbol(Expression):
+    """A name: a state, an input, a parameter, or something uncertain."""
+
+    __slots__ = ("name",)
+    name: str
+
+    def __new__(cls, name: str) -> Symbol:
+        def make() -> Symbol:
+            made = object.__new__(cls)
+            made.name, made.operands, made.depth, made.gathered = name, (), 0, None
+            return made
+
+        return _only(("symbol", name), make)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Symbol, (self.name,)
 
 
-def has_tree(node: sympy.Expr) -> bool:
-    """Whether a node, apart from its operands, is one that trees have."""
-    simple = node.is_Symbol or node.is_Rational or node.is_Add or node.is_Mul or node in CONSTANTS
-    return bool(simple or as_power(node) or as_function(node))
+class Number(Expression):
+    """An exact rational."""
+
+    __slots__ = ("value",)
+    value: Fraction
+
+    def __new__(cls, value: Fraction | int) -> Number:
+        def make() -> Number:
+            made = object.__new__(cls)
+            made.value, made.operands, made.depth, made.gathered = Fraction(value), (), 0, None
+            return made
+
+        return _only(("number", value), make)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Number, (self.value,)
 
 
-def to_tree(expression: sympy.Expr) -> Tree:
-    """Nested lists: a name, an exact fraction, or an operator with its operands (FORMAT.md).
+class Operation(Expression):
+    """An operator on its operands: `+` and `*` of two or more, `-` of one, `/` of two, `**` of an expression and an
+    integer, or a function of one.
 
     Raises
     ------
-    InputError : the expression is outside the grammar.
+    InputError : an exponent is not an integer from 1 to 64 in magnitude, or the tree is too deep.
     """
-    if expression.is_Symbol:
+
+    __slots__ = ("operator",)
+    operator: str
+
+    def __new__(cls, operator: str, *operands: Expression) -> Operation:
+        def make() -> Operation:
+            if operator == "**":
+                _require_exponent(*operands)
+            made = object.__new__(cls)
+            made.operator, made.operands, made.gathered = operator, operands, None
+            made.depth = 1 + max(e.depth for e in operands)
+            if made.depth > MOST_DEPTH:
+                raise InputError(f"an equation must nest at most {MOST_DEPTH} deep; it nests deeper.")
+            return made
+
+        return _only((operator, *operands), make)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Operation, (self.operator, *self.operands)
+
+    @property
+    def exponent(self) -> int:
+        """The integer k of a power `a**k`."""
+        k = self.operands[1]
+        return int(k.value) if isinstance(k, Number) else 0
+
+
+def _only(key: tuple[Any, ...], make: Callable[[], E]) -> E:
+    """The one object with this key; equal trees are the same object."""
+    with _LOCK:
+        found: E | None = _KNOWN.get(key)
+        if found is None:
+            found = _KNOWN[key] = make()
+        return found
+
+
+def as_expression(value: object) -> Expression:
+    """An expression as it is, an exact number as a `Number`.
+
+    Raises
+    ------
+    InputError : it is neither; a float is rounded, and sympy simplifies what it is given.
+    """
+    if isinstance(value, Expression):
+        return value
+    if isinstance(value, numbers.Rational) and not isinstance(value, bool):
+        return Number(Fraction(int(value.numerator), int(value.denominator)))
+    if isinstance(value, float):
+        raise InputError(f"an equation holds the rounded number {value}; write exact('{value}') for this decimal.")
+    if type(value).__module__.partition(".")[0] == "sympy":
+        raise InputError(
+            f"an equation holds {value}, which is sympy's and was simplified when it was made; write it with "
+            "certify.symbols and certify.sin, or take what sympy made of it with certify.from_sympy."
+        )
+    raise InputError(f"an equation must be made of symbols, exact numbers and {GRAMMAR}; found {value!r}.")
+
+
+def symbols(names: Iterable[str]) -> tuple[Symbol, ...]:
+    """One symbol per name.
+
+    >>> theta, u = symbols(["theta", "u"])
+    """
+    return tuple(Symbol(name) for name in names)
+
+
+def function(name: str, argument: object) -> Expression:
+    """One of `FUNCTIONS`, by its name."""
+    return Operation(name, as_expression(argument))
+
+
+def sin(x: object) -> Expression:
+    """The sine of an angle in radians."""
+    return function("sin", x)
+
+
+def cos(x: object) -> Expression:
+    """The cosine of an angle in radians."""
+    return function("cos", x)
+
+
+def tan(x: object) -> Expression:
+    """The tangent of an angle in radians: `sin(x)/cos(x)`."""
+    return function("tan", x)
+
+
+def tanh(x: object) -> Expression:
+    """The hyperbolic tangent."""
+    return function("tanh", x)
+
+
+def exp(x: object) -> Expression:
+    """The exponential."""
+    return function("exp", x)
+
+
+def atan(x: object) -> Expression:
+    """The arc tangent, in radians."""
+    return function("atan", x)
+
+
+def sqrt(x: object) -> Expression:
+    """The square root, which an equation can be proved with where its argument is positive."""
+    return function("sqrt", x)
+
+
+def total(terms: Iterable[Expression]) -> Expression:
+    """The sum of these; 0 if there are none."""
+    found = tuple(terms)
+    return Operation("+", *found) if len(found) > 1 else found[0] if found else Number(0)
+
+
+def nodes(*expressions: Expression) -> Iterator[Expression]:
+    """Every different node once, operands before what is made of them."""
+    seen: set[Expression] = set()
+    waiting = [(e, False) for e in reversed(expressions)]
+    while waiting:
+        node, ready = waiting.pop()
+        if ready:
+            yield node
+        elif node not in seen:
+            seen.add(node)
+            waiting.append((node, True))
+            waiting += [(e, False) for e in reversed(node.operands)]
+
+
+def symbols_of(*expressions: Expression) -> set[Symbol]:
+    """The symbols that stand in them."""
+    return {node for node in nodes(*expressions) if isinstance(node, Symbol)}
+
+
+def substitute(expression: Expression, values: Mapping[Any, Expression]) -> Expression:
+    """The tree with some of its nodes replaced, all at once, and nothing simplified: a replacement stays whole."""
+    found: dict[Expression, Expression] = {}
+    for node in nodes(expression):
+        operands = tuple(found[e] for e in node.operands)
+        changed = isinstance(node, Operation) and operands != node.operands
+        found[node] = Operation(node.operator, *operands) if changed and isinstance(node, Operation) else node
+        found[node] = values.get(node, found[node])
+    return found[expression]
+
+
+def to_tree(expression: Expression) -> Tree:
+    """Nested lists: a name, an exact fraction, or an operator with its operands (FORMAT.md)."""
+    if isinstance(expression, Symbol):
         return expression.name
-    if expression.is_Rational:
-        return str(expression)
-    if expression in CONSTANTS:
-        multiple, name = CONSTANTS[expression]
-        return ["*", str(multiple), [name, "1"]]
-    arguments = [to_tree(a) for a in expression.args]
-    if expression.is_Add:
-        return ["+", *arguments]
-    if expression.is_Mul:
-        return ["*", *arguments]
-    if (power := as_power(expression)) is not None:
-        _, roots, exponent = power
-        tree = arguments[0]
-        for _ in range(roots):
-            tree = ["sqrt", tree]
-        return tree if exponent == 1 else ["**", tree, exponent]
-    if (function := as_function(expression)) is not None:
-        return [function[0], arguments[0]]
-    raise InputError(f"{expression} is outside the grammar; allowed are {GRAMMAR}.")
+    if isinstance(expression, Number):
+        return str(expression.value)
+    if not isinstance(expression, Operation):
+        raise InputError(f"{expression!r} is no expression.")
+    if expression.operator == "**":
+        return ["**", to_tree(expression.operands[0]), expression.exponent]
+    return [expression.operator, *map(to_tree, expression.operands)]
 
 
-def from_tree(tree: Tree, names: Mapping[str, sympy.Symbol]) -> sympy.Expr:
-    """The sympy expression of a tree; for pictures and summaries, not for proofs.
+_OPERANDS = {"+": (1, None), "*": (1, None), "-": (1, 2), "/": (2, 2), "**": (2, 2), **dict.fromkeys(FUNCTIONS, (1, 1))}
+
+
+def from_tree(tree: Tree, names: Mapping[str, Symbol]) -> Expression:
+    """The expression of nested lists.
 
     Raises
     ------
-    CertificateFormatError : an operator that no certificate has.
+    CertificateFormatError : it is no tree of a certificate over these names.
     """
     if isinstance(tree, str):
-        return names[tree] if tree in names else sympy.Rational(tree)
+        try:
+            return names[tree] if tree in names else Number(Fraction(tree))
+        except (ValueError, ZeroDivisionError) as error:
+            raise CertificateFormatError(f"{tree[:40]!r} is no name of the plant and no exact number.") from error
+    if not isinstance(tree, list) or not tree or not isinstance(tree[0], str) or tree[0] not in _OPERANDS:
+        raise CertificateFormatError(f"{str(tree)[:40]!r} is no expression of a certificate.")
     operator, arguments = tree[0], tree[1:]
+    least, most = _OPERANDS[operator]
+    if len(arguments) < least or (most is not None and len(arguments) > most):
+        raise CertificateFormatError(f"{operator!r} with {len(arguments)} operands is no operator of a certificate.")
     if operator == "**":
-        return from_tree(arguments[0], names) ** int(arguments[1])
-    values = [from_tree(a, names) for a in arguments]
-    if operator == "+":
-        return sympy.Add(*values)
-    if operator == "*":
-        return sympy.Mul(*values)
-    if operator == "-":
-        return -values[0] if len(values) == 1 else values[0] - values[1]
-    if operator == "/":
-        return values[0] / values[1]
-    if operator in FUNCTIONS:
-        return FUNCTIONS[operator](*values)
-    raise CertificateFormatError(f"{operator!r} is no operator of a certificate.")
+        if type(arguments[1]) is not int:
+            raise CertificateFormatError(f"an exponent must be an integer; found {str(arguments[1])[:40]!r}.")
+        return Operation("**", from_tree(arguments[0], names), Number(arguments[1]))
+    operands = [from_tree(a, names) for a in arguments]
+    if operator == "-" and len(operands) == 2:
+        return Operation("+", operands[0], Operation("-", operands[1]))
+    return operands[0] if operator in "+*" and len(operands) == 1 else Operation(operator, *operands)
+
+
+def _joined(operator: str, left: Expression, right: Expression) -> Expression:
+    """A sum or product from left to right: `a + b + c` is one sum of three, which is what FORMAT.md says of it."""
+    chain = isinstance(left, Operation) and left.operator == operator
+    return Operation(operator, *(left.operands if chain else (left,)), right)
+
+
+def _require_exponent(base: Expression, exponent: Expression) -> None:
+    k = exponent.value if isinstance(exponent, Number) else None
+    if k == 0:
+        raise InputError(f"{base} to the power 0 is 1 wherever it has a value; write 1.")
+    if k is None or k.denominator != 1 or abs(k) > MOST_EXPONENT:
+        raise InputError(f"an exponent must be an integer of at most {MOST_EXPONENT} in magnitude; found {exponent}.")

@@ -6,6 +6,7 @@ times, and nested powers would take time that is exponential in their depth.
 
 from __future__ import annotations
 
+import operator
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -29,6 +30,13 @@ OPERANDS = {
     "exp": (1, 1),
     "atan": (1, 1),
     "sqrt": (1, 1),
+}
+MAX_BITS = 2**14  # of a numerator or a denominator
+RATIONALLY: Mapping[str, Callable[..., fmpq]] = {
+    "+": operator.add,
+    "*": operator.mul,
+    "-": operator.neg,
+    "1/": lambda q: 1 / q,
 }
 PLAIN = ("sin", "cos", "tanh", "exp", "atan", "sqrt")  # functions that are one operation
 
@@ -83,11 +91,26 @@ def evaluated(step: Step, values: Mapping[int, Any], names: Mapping[str, Any], c
 class _Compiler:
     """Checks the grammar and writes the steps down, each once."""
 
-    def __init__(self, names: set[str]) -> None:
-        self.names, self.nodes, self.steps = names, 0, dict[Step, int]()
+    def __init__(self, names: set[str], at: str) -> None:
+        self.names, self.at, self.nodes = names, at, 0
+        self.steps, self.rationals = dict[Step, int](), dict[int, fmpq]()
 
     def step(self, *step: Any) -> int:
-        return self.steps.setdefault(step, len(self.steps))
+        """The number of a step; what is made of rationals by + * - 1/ is a rational."""
+        if step[0] in RATIONALLY:
+            known = [self.rationals[operand] for operand in step[1:] if operand in self.rationals]
+            if len(known) == len(step) - 1:
+                step = ("rational", self.computed(step[0], known))
+        number = self.steps.setdefault(step, len(self.steps))
+        if step[0] == "rational":
+            self.rationals[number] = step[1]
+        return number
+
+    def computed(self, kind: str, operands: Sequence[fmpq]) -> fmpq:
+        require(kind != "1/" or bool(operands[0] != 0), "format", self.at, "a division by the number 0")
+        value = RATIONALLY[kind](*operands)
+        require(value.height_bits() <= MAX_BITS, "format", self.at, f"a number of more than {MAX_BITS} bits")
+        return value
 
     def compile(self, node: Any, at: str, depth: int = 0) -> int:
         self.nodes += 1
@@ -128,6 +151,11 @@ class _Compiler:
 
 def equations(nodes: Sequence[Any], names: set[str], at: str) -> Equations:
     """Rule `format` for the expressions of a plant."""
-    compiler = _Compiler(names)
-    results = tuple(compiler.compile(node, f"{at}.{i}") for i, node in enumerate(nodes))
-    return Equations(tuple(compiler.steps), results)
+    compiler = _Compiler(names, at)
+    results = [compiler.compile(node, f"{at}.{i}") for i, node in enumerate(nodes)]
+    steps, wanted = list(compiler.steps), set(results)
+    for k in reversed(range(len(steps))):
+        wanted |= set(operands_of(steps[k])) if k in wanted else set()
+    place = {k: number for number, k in enumerate(sorted(wanted))}
+    kept = [(s[0], *(place[k] for k in s[1:])) if operands_of(s) else s for s in (steps[k] for k in place)]
+    return Equations(tuple(kept), tuple(place[k] for k in results))

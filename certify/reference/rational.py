@@ -11,10 +11,10 @@ from flint import fmpq, fmpq_mat
 
 from .document import Certificate, Policy
 from .evidence import Tree
+from .expressions import MAX_BITS
 from .fields import exact
 from .refusal import require
 
-MAX_BITS = 2**14  # of a numerator or denominator on the way to f(0, u_eq)
 ZERO = fmpq(0)
 
 

@@ -27,7 +27,7 @@ from certify.report.drawing import draw_one
 draw_one()
 """
 _NEEDED = (
-    "matplotlib.figure", "matplotlib.backends.backend_svg", "scipy.ndimage", "sympy.printing.mathml",
+    "matplotlib.figure", "matplotlib.backends.backend_svg", "scipy.ndimage",
     "certify.report.drawn", "certify.report.page",
 )  # fmt: skip
 _FITS = 2**15  # bytes of a certificate; a pipe holds twice as many

@@ -1,36 +1,46 @@
 """Equations as MathML, which browsers typeset without help: a plant's, and a function that is an expression.
 
-It stands apart from the sections because two of them write equations. What comes out is marked as safe to stand in a
-page as it is, so every name passes through escaping here.
+A page shows the tree that was proved. Only what is a number is multiplied out; nothing else is merged or cancelled.
+What comes out is marked as safe to stand in a page as it is, so every name passes through escaping here.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from fractions import Fraction
 from typing import Any
 
-import sympy
-
-from certify.report.words import MINUS, symbol
+from certify.errors import InputError
+from certify.expressions import Expression, Number, Operation, Symbol, constant_of, nodes
+from certify.expressions.printing import ATOM, MINUS, POWER, PRODUCT, SUM, binding, decimal_text
+from certify.report.words import MINUS as SIGN
+from certify.report.words import symbol
 
 _LONG = 10**6  # numerators and denominators beyond it are shown rounded
+_SPACE, _DOT = '<mspace width="0.15em"/>', "<mo>·</mo>"
 
 
-def typeset(left: str, expression: sympy.Expr, names: Sequence[sympy.Symbol]) -> Any:
+def typeset(left: str, expression: Expression) -> Any:
     """`left = expression` as MathML, which browsers typeset without help."""
     from markupsafe import Markup
-    from sympy.printing.mathml import MathMLPresentationPrinter
 
-    # Markers first: a pretty name may be the plain name of another symbol.
-    markers = {s: sympy.Symbol(f"NAME{k}NAME") for k, s in enumerate(names)}
-    long = {v: sympy.Float(v, 8) for v in expression.atoms(sympy.Rational) if is_long(v)}
-    text = MathMLPresentationPrinter().doprint(expression.xreplace(long).xreplace(markers))
-    for k, s in enumerate(names):
-        text = text.replace(f"<mi>NAME{k}NAME</mi>", identifier(s.name))
-    text = text.replace("<mo>-</mo>", f"<mo>{MINUS}</mo>")
-    text = text.replace("<mo>&InvisibleTimes;</mo>", '<mspace width="0.15em"/>')
-    inner = text.removeprefix("<math>").removesuffix("</math>")
-    return Markup(f'<math display="block">{left}<mo>=</mo>{inner}</math>')
+    return Markup(f'<math display="block">{left}<mo>=</mo>{_row(multiplied_out(expression), SUM)}</math>')
+
+
+def multiplied_out(expression: Expression) -> Expression:
+    """The expression with each part that is a number replaced by that number."""
+    found: dict[Expression, Expression] = {}
+    for node in nodes(expression):
+        try:
+            value = constant_of(node) if isinstance(node, Operation) else None
+        except InputError:  # it has no value: shown as it is
+            value = None
+        if value is not None:
+            found[node] = Number(value)
+        elif isinstance(node, Operation):
+            found[node] = Operation(node.operator, *(found[e] for e in node.operands))
+        else:
+            found[node] = node
+    return found[expression]
 
 
 def identifier(name: str) -> str:
@@ -41,11 +51,83 @@ def identifier(name: str) -> str:
     return f"<mi>{_escape(symbol(name))}</mi>"
 
 
+def is_long(value: Fraction) -> bool:
+    """Whether a number is shown rounded."""
+    return max(abs(value.numerator), value.denominator) > _LONG
+
+
+def _row(node: Expression, at_least: int) -> str:
+    """A node where what binds less than `at_least` is put into brackets."""
+    inner = _written(node)
+    if _binding(node) < at_least:
+        inner = f"<mo>(</mo>{inner}<mo>)</mo>"
+    return f"<mrow>{inner}</mrow>"
+
+
+def _binding(node: Expression) -> int:
+    """As in text, but that a fraction has a bar and so needs no brackets as a factor."""
+    if isinstance(node, Number):
+        return MINUS if node.value < 0 else ATOM if _is_decimal(node.value) else POWER
+    return POWER if isinstance(node, Operation) and node.operator == "/" else binding(node)
+
+
+def _written(node: Expression) -> str:
+    if isinstance(node, Symbol):
+        return identifier(node.name)
+    if isinstance(node, Number):
+        return f"<mo>{SIGN}</mo>{_number(-node.value)}" if node.value < 0 else _number(node.value)
+    if not isinstance(node, Operation):
+        return ""
+    first, *rest = node.operands
+    match node.operator:
+        case "+":
+            return _row(first, SUM) + "".join(map(_term, rest))
+        case "*":
+            return _row(first, PRODUCT) + "".join(map(_factor, rest))
+        case "/":
+            return f"<mfrac>{_row(first, SUM)}{_row(rest[0], SUM)}</mfrac>"
+        case "-":
+            return f"<mo>{SIGN}</mo>{_row(first, POWER)}"
+        case "**":
+            return f"<msup>{_row(first, ATOM)}<mrow>{_written(Number(node.exponent))}</mrow></msup>"
+        case "sqrt":
+            return f"<msqrt>{_row(first, SUM)}</msqrt>"
+    return f"<mi>{node.operator}</mi><mo>(</mo>{_row(first, SUM)}<mo>)</mo>"
+
+
+def _term(node: Expression) -> str:
+    """The node with the sign that joins it to a sum."""
+    if isinstance(node, Operation) and node.operator == "-":
+        return f"<mo>{SIGN}</mo>{_row(node.operands[0], PRODUCT)}"
+    if isinstance(node, Number) and node.value < 0:
+        return f"<mo>{SIGN}</mo>{_number(-node.value)}"
+    leading = node.operands[0] if isinstance(node, Operation) and node.operator == "*" else None
+    if isinstance(leading, Number) and leading.value < 0:
+        return f"<mo>{SIGN}</mo>{_row(Operation('*', Number(-leading.value), *node.operands[1:]), PRODUCT)}"
+    return f"<mo>+</mo>{_row(node, PRODUCT)}"
+
+
+def _factor(node: Expression) -> str:
+    return (_DOT if isinstance(node, Number) else _SPACE) + _row(node, POWER)
+
+
+def _is_decimal(q: Fraction) -> bool:
+    return is_long(q) or decimal_text(q) is not None
+
+
+def _number(q: Fraction) -> str:
+    """A number that is not negative: in digits where these are few, else as a fraction, else rounded."""
+    short = decimal_text(q)
+    if not is_long(q) and short is None:
+        return f"<mfrac><mn>{q.numerator}</mn><mn>{q.denominator}</mn></mfrac>"
+    if short is not None and len(short) <= 10:
+        return f"<mn>{short}</mn>"
+    digits, _, exponent = f"{float(q):.8g}".partition("e")
+    power = f"<mo>·</mo><msup><mn>10</mn><mrow>{_written(Number(int(exponent)))}</mrow></msup>" if exponent else ""
+    return f"<mn>{digits}</mn>{power}"
+
+
 def _escape(text: str) -> str:
     from markupsafe import escape
 
     return str(escape(text))
-
-
-def is_long(value: sympy.Rational) -> bool:
-    return max(abs(int(value.p)), int(value.q)) > _LONG

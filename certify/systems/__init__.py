@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from certify.systems.linear import Controllability, controllability, linearise
+from certify.systems.linear import Controllability, Matrix, controllability, in_floats, linearise
 from certify.systems.registry import available_systems, chosen_system, get_system, shipped_system
 from certify.systems.system import System, exact, in_deviations
 from certify.systems.toml import load_system
 
 __all__ = [
     "Controllability",
+    "Matrix",
     "System",
     "available_systems",
     "chosen_system",
@@ -16,6 +17,7 @@ __all__ = [
     "exact",
     "get_system",
     "in_deviations",
+    "in_floats",
     "linearise",
     "load_system",
     "shipped_system",

@@ -1,7 +1,8 @@
 """Equations as people write them, read by a small parser on Python's `ast`.
 
-Nothing in the text is executed, and `0.15` is 3/20, because numbers are read as text. What cannot be read is answered
-with the symbol that is at fault and what to write in its place: equations are typed by hand, and most faults are slips.
+Nothing in the text is executed, and `0.15` is 3/20, because numbers are read as text. The tree is that of the
+text: nothing is cancelled, merged or left out. What cannot be read is answered
+with the symbol that is at fault and what to write instead: equations are typed by hand, and most faults are slips.
 """
 
 from __future__ import annotations
@@ -11,21 +12,18 @@ import difflib
 from collections.abc import Iterable, Mapping
 from fractions import Fraction
 
-import sympy
-
 from certify.errors import InputError
-from certify.expressions import FUNCTIONS
+from certify.expressions import FUNCTIONS, MOST_EXPONENT, Expression, Number, constant_of, function
 from certify.systems.system import exact
 
-_MAX_EXPONENT = 64
 _MOST_NODES = 20_000  # a certificate holds no more (FORMAT.md)
 _OPERATORS = "+ - * /, integer powers with **"
 
 
 def parse_expression(
-    text: str | int | Fraction, names: Mapping[str, sympy.Expr], known: str = "state, input or parameter"
-) -> sympy.Expr:
-    """A sympy expression from text such as `(g/l)*sin(theta) - b/(m*l**2)*theta_dot`.
+    text: str | int | Fraction, names: Mapping[str, Expression], known: str = "state, input or parameter"
+) -> Expression:
+    """An expression from text such as `(g/l)*sin(theta) - b/(m*l**2)*theta_dot`.
 
     Parameters
     ----------
@@ -55,10 +53,10 @@ def parse_expression(
     return found
 
 
-def _size(expression: sympy.Expr, known: dict[sympy.Expr, int]) -> int:
+def _size(expression: Expression, known: dict[Expression, int]) -> int:
     """Nodes of the tree, which may be many more than those of the names that it is written with."""
     if expression not in known:
-        known[expression] = 1 + sum(_size(a, known) for a in expression.args)
+        known[expression] = 1 + sum(_size(e, known) for e in expression.operands)
     return known[expression]
 
 
@@ -94,13 +92,12 @@ def decimal(text: str) -> Fraction:
 
 
 class _Reader:
-    def __init__(self, source: str, names: Mapping[str, sympy.Expr], known: str) -> None:
+    def __init__(self, source: str, names: Mapping[str, Expression], known: str) -> None:
         self.source, self.names, self.known = source, names, known
 
-    def read(self, node: ast.expr) -> sympy.Expr:
+    def read(self, node: ast.expr) -> Expression:
         if isinstance(node, ast.Constant) and isinstance(node.value, int | float) and not isinstance(node.value, bool):
-            literal = decimal(self._text(node))
-            return sympy.Rational(literal.numerator, literal.denominator)
+            return Number(decimal(self._text(node)))
         if isinstance(node, ast.Name):
             return self._name(node.id)
         if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.UAdd):
@@ -115,7 +112,7 @@ class _Reader:
             f"and the functions {', '.join(FUNCTIONS)}"
         )
 
-    def _name(self, name: str) -> sympy.Expr:
+    def _name(self, name: str) -> Expression:
         if name in self.names:
             return self.names[name]
         if name in FUNCTIONS:
@@ -123,7 +120,7 @@ class _Reader:
         close = nearest(name, self.names) or f"; known are {', '.join(self.names) or 'none'}"
         raise self._refuse(f"{name!r} is no {self.known}{close}")
 
-    def _call(self, node: ast.Call) -> sympy.Expr:
+    def _call(self, node: ast.Call) -> Expression:
         name = self._text(node.func)
         if not isinstance(node.func, ast.Name) or name not in FUNCTIONS:
             product = name in self.names or not isinstance(node.func, ast.Name)
@@ -131,9 +128,9 @@ class _Reader:
             raise self._refuse(what or f"the function {name} is not supported; supported are {', '.join(FUNCTIONS)}")
         if node.keywords or len(node.args) != 1:
             raise self._refuse(f"{name} takes one argument; found {self._text(node)!r}")
-        return FUNCTIONS[name](self.read(node.args[0]))
+        return function(name, self.read(node.args[0]))
 
-    def _operation(self, node: ast.BinOp) -> sympy.Expr:
+    def _operation(self, node: ast.BinOp) -> Expression:
         left, right = self.read(node.left), self.read(node.right)
         if isinstance(node.op, ast.Add):
             return left + right
@@ -142,18 +139,30 @@ class _Reader:
         if isinstance(node.op, ast.Mult):
             return left * right
         if isinstance(node.op, ast.Div):
-            if right == 0:
+            if self._number(right) == 0:
                 raise self._refuse(f"{self._text(node)!r} divides by 0")
             return left / right
         if isinstance(node.op, ast.Pow):
-            if not (right.is_Integer and abs(right) <= _MAX_EXPONENT):
-                raise self._refuse(
-                    f"the exponent of {self._text(node)!r} must be an integer of at most {_MAX_EXPONENT}; found {right}"
-                )
-            if left == 0 and right < 0:
-                raise self._refuse(f"{self._text(node)!r} divides by 0")
-            return left**right
+            return self._power(left, self._number(right), node)
         raise self._refuse(f"the operator of {self._text(node)!r} is not allowed; allowed are {_OPERATORS}")
+
+    def _power(self, base: Expression, exponent: Fraction | None, node: ast.BinOp) -> Expression:
+        if exponent is None or exponent.denominator != 1 or not abs(exponent) <= MOST_EXPONENT:
+            raise self._refuse(
+                f"the exponent of {self._text(node)!r} must be an integer of at most {MOST_EXPONENT}; "
+                f"found {self._text(node.right)}"
+            )
+        if exponent == 0:
+            raise self._refuse(f"{self._text(node)!r} is 1 wherever it has a value; write 1")
+        if exponent < 0 and self._number(base) == 0:
+            raise self._refuse(f"{self._text(node)!r} divides by 0")
+        return base ** int(exponent)
+
+    def _number(self, expression: Expression) -> Fraction | None:
+        try:
+            return constant_of(expression)
+        except InputError as error:
+            raise self._refuse(str(error)) from error
 
     def _text(self, node: ast.AST) -> str:
         return ast.get_source_segment(self.source, node) or self.source

@@ -1,4 +1,4 @@
-"""The plant near its operating point: A, B, and whether its inputs reach every direction.
+"""The plant near its operating point: A, B, and how many directions its inputs reach.
 
 Exact where rationals allow it: a rank computed in floats is an opinion about a tolerance.
 """
@@ -6,29 +6,54 @@ Exact where rationals allow it: a rank computed in floats is an opinion about a 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from fractions import Fraction
 
+import flint
 import numpy as np
-import sympy
+from numpy.typing import NDArray
 
 from certify.errors import InputError
+from certify.expressions import (
+    Expression,
+    Number,
+    Symbol,
+    differentiate,
+    numerical,
+    substitute,
+    value_if_rational,
+)
 from certify.systems.system import System
 
+Matrix = tuple[tuple[Expression, ...], ...]
+"""Rows of constants: a `Number` where the entry is rational, else an expression without symbols."""
 
-def linearise(system: System) -> tuple[sympy.Matrix, sympy.Matrix]:
-    """(df/dx, df/du) of the plant at x = 0 and u_eq, exact; shapes (n, n) and (n, m).
+
+def linearise(system: System) -> tuple[Matrix, Matrix]:
+    """(df/dx, df/du) of the nominal plant at x = 0 and u_eq, exact; shapes (n, n) and (n, m).
 
     Raises
     ------
-    InputError : a derivative divides by 0 there.
+    InputError : a derivative divides by 0 there, or takes the root of a number that is not positive.
     """
-    f = sympy.Matrix(system.exact_dynamics())
-    at: dict[sympy.Symbol, sympy.Expr] = dict.fromkeys(system.states, sympy.Integer(0))
-    u_eq = system.exact_u_eq()
-    at |= {s: sympy.Rational(u.numerator, u.denominator) for s, u in zip(system.inputs, u_eq, strict=True)}
-    found = f.jacobian(list(system.states)).subs(at), f.jacobian(list(system.inputs)).subs(at)
-    if any(M.has(sympy.zoo, sympy.nan, sympy.oo) for M in found):
-        raise InputError(f"the equations of {system.name} have no derivative at the origin: they divide by 0 there.")
-    return found
+    at = dict.fromkeys(system.states, Fraction(0)) | dict(zip(system.inputs, system.exact_u_eq(), strict=True))
+    try:
+        A, B = (
+            tuple(tuple(_constant(differentiate(e, s), at) for s in by) for e in system.exact_dynamics())
+            for by in (system.states, system.inputs)
+        )
+    except InputError as error:
+        raise InputError(f"the equations of {system.name} have no derivative at the origin: {error}.") from error
+    return A, B
+
+
+def in_floats(matrix: Matrix) -> NDArray[np.float64]:
+    """The matrix rounded to binary64."""
+    return np.array([numerical(row, [])() for row in matrix], dtype=np.float64)
+
+
+def _constant(slope: Expression, at: dict[Symbol, Fraction]) -> Expression:
+    value = value_if_rational(slope, at)
+    return substitute(slope, {s: Number(q) for s, q in at.items()}) if isinstance(value, str) else Number(value)
 
 
 _NOISE = 1e-11  # of singular values over the largest: below it they are rounding
@@ -54,23 +79,31 @@ class Controllability:
             raise InputError("a rank is either exact or comes with the smallest singular value that it rests on.")
 
 
-def controllability(A: sympy.Matrix, B: sympy.Matrix) -> Controllability:
+def _rationals(rows: list[list[Fraction]]) -> flint.fmpq_mat:
+    return flint.fmpq_mat([[flint.fmpq(q.numerator, q.denominator) for q in row] for row in rows])
+
+
+def controllability(A: Matrix, B: Matrix) -> Controllability:
     """How many directions of the state space the inputs reach (Kalman's rank condition).
 
-    >>> controllability(sympy.Matrix([[0, 1], [0, 0]]), sympy.Matrix([0, 1]))
+    >>> zero, one = Number(0), Number(1)
+    >>> controllability(((zero, one), (zero, zero)), ((zero,), (one,)))
     Controllability(rank=2, exact=True, smallest=None)
     """
-    n = A.shape[0]
-    if all(entry.is_Rational for entry in (*A, *B)):
-        blocks = [B]
+    n, m = len(A), len(B[0])
+    entries = [[[e.value for e in row if isinstance(e, Number)] for row in M] for M in (A, B)]
+    if all(len(row) == width for M, width in zip(entries, (n, m), strict=True) for row in M):
+        step, columns = map(_rationals, entries)
+        blocks = [columns]
         for _ in range(n - 1):
-            blocks.append(A * blocks[-1])
-        return Controllability(int(sympy.Matrix.hstack(*blocks).rank()), True, None)
-    a, b = (np.array(M.evalf(17).tolist(), dtype=np.float64) for M in (A, B))
+            blocks.append(step * blocks[-1])
+        whole = flint.fmpq_mat([[v for M in blocks for v in M.tolist()[i]] for i in range(n)])
+        return Controllability(int(whole.rank()), True, None)
+    a, b = in_floats(A), in_floats(B)
     size = float(np.linalg.norm(a, 2)) or 1.0
-    columns = [b]
+    terms = [b]
     for _ in range(n - 1):
-        columns.append(a @ columns[-1] / size)  # columns are not scaled: one that is rounding alone must stay small
-    values = np.linalg.svd(np.hstack(columns), compute_uv=False)
+        terms.append(a @ terms[-1] / size)  # columns are not scaled: one that is rounding alone must stay small
+    values = np.linalg.svd(np.hstack(terms), compute_uv=False)
     values = values / (values[0] or 1.0)
     return Controllability(int((values > _NOISE).sum()), False, float(values[-1]))

@@ -1,8 +1,8 @@
-"""The plant `xdot = f(x, u)`, or `x+ = f(x, u)`: sympy expressions over exact rational parameters.
+"""The plant `xdot = f(x, u)`, or `x+ = f(x, u)`: expressions as they were written, over exact rational parameters.
 
 Numbers are exact because the proof is about *this* plant: `m = 0.15` written as text is 3/20, while a
-Python float stands for its binary value. sympy never folds floats here; an expression that contains
-one is refused.
+Python float stands for its binary value; an expression that contains one is refused. Nothing simplifies an equation
+either: parameters are replaced by their values and deviations by `x_eq + x`, and the tree stays what it was.
 
 Everything works in deviations from the operating point x_eq: the claims, the certificate and the policy are about
 `x - x_eq`, whose equilibrium is the origin. So no rule of the checkers knows of x_eq; it is a name for people, and
@@ -22,10 +22,23 @@ from fractions import Fraction
 from types import MappingProxyType
 from typing import Any, Literal, get_args
 
-import sympy
-
 from certify.errors import InputError
-from certify.expressions import GRAMMAR, evaluate_exactly, has_tree
+from certify.expressions import (
+    Expression,
+    Number,
+    Operation,
+    Symbol,
+    as_expression,
+    constant_of,
+    evaluate_exactly,
+    nodes,
+    numerical,
+    substitute,
+    symbols,
+    symbols_of,
+    value_if_rational,
+)
+from certify.expressions.numerical import Module
 from certify.systems.ode import rk4_step
 
 Interval = tuple[Fraction, Fraction]
@@ -92,18 +105,18 @@ class System:
     """
 
     name: str
-    states: tuple[sympy.Symbol, ...]
-    inputs: tuple[sympy.Symbol, ...]
+    states: tuple[Symbol, ...]
+    inputs: tuple[Symbol, ...]
     parameters: Mapping[str, Fraction]
-    dynamics: tuple[sympy.Expr, ...]
-    u_eq: tuple[sympy.Expr, ...]
+    dynamics: tuple[Expression, ...]
+    u_eq: tuple[Expression, ...]
     domain: tuple[Interval, ...]
     input_bounds: tuple[Interval, ...]
     positive: frozenset[str] = frozenset()
     units: Mapping[str, str] = field(default_factory=dict)
     description: str = ""
-    x_eq: tuple[sympy.Expr, ...] = ()
-    disturbances: tuple[sympy.Symbol, ...] = ()
+    x_eq: tuple[Expression, ...] = ()
+    disturbances: tuple[Symbol, ...] = ()
     ranges: Mapping[str, Interval] = field(default_factory=dict)
     time: Time = "continuous"
     sample: Interval | None = None
@@ -113,7 +126,15 @@ class System:
         object.__setattr__(self, "ranges", MappingProxyType(dict(self.ranges)))
         object.__setattr__(self, "units", MappingProxyType(dict(self.units)))
         n, m = len(self.states), len(self.inputs)
-        object.__setattr__(self, "x_eq", tuple(self.x_eq) or (sympy.Integer(0),) * n)
+        for symbol in (*self.states, *self.inputs, *self.disturbances):
+            if not isinstance(symbol, Symbol):
+                raise InputError(f"a name in {self.name} must be one of certify.symbols; found {symbol!r}.")
+        object.__setattr__(self, "x_eq", tuple(self.x_eq) or (Number(0),) * n)
+        for key in ("dynamics", "u_eq", "x_eq"):
+            try:
+                object.__setattr__(self, key, tuple(map(as_expression, getattr(self, key))))
+            except InputError as error:
+                raise InputError(f"`{key}` of {self.name}: {error}") from error
         for label, found, wanted in (
             ("dynamics", len(self.dynamics), n),
             ("domain", len(self.domain), n),
@@ -148,11 +169,14 @@ class System:
                 raise InputError(f"`positive` of {self.name} must name parameters, {known}; found {name!r}.")
             if not self.parameters[name] > 0:
                 raise InputError(f"parameter {name} of {self.name} must be positive; found {self.parameters[name]}.")
-        parameters = {sympy.Symbol(p) for p in self.parameters}
-        for expression in self.dynamics:
-            _check_grammar(expression, {*self.states, *self.inputs, *parameters, *self.disturbances}, self.name)
-        for expression in (*self.u_eq, *self.x_eq):
-            _check_grammar(expression, parameters, self.name)
+        parameters = {Symbol(p) for p in self.parameters}
+        everything = {*self.states, *self.inputs, *parameters, *self.disturbances}
+        for allowed, equations in ((everything, self.dynamics), (parameters, (*self.u_eq, *self.x_eq))):
+            for node in nodes(*equations):
+                if isinstance(node, Symbol) and node not in allowed:
+                    raise InputError(
+                        f"an equation of {self.name} uses {node}, which is no state, input, parameter or disturbance."
+                    )
         self.exact_x_eq()
         self._check_ranges()
         self._check_time()
@@ -163,7 +187,7 @@ class System:
         return System, tuple(dict(v) if isinstance(v, MappingProxyType) else v for v in values)
 
     def _check_ranges(self) -> None:
-        acting, fixed = {s.name for s in self.disturbances}, {s.name for e in self.x_eq for s in e.free_symbols}
+        acting, fixed = {s.name for s in self.disturbances}, {s.name for s in symbols_of(*self.x_eq)}
         for name, (lo, hi) in self.ranges.items():
             if name not in self.parameters and name not in acting:
                 known = ", ".join([*self.parameters, *sorted(acting)]) or "none"
@@ -230,15 +254,13 @@ class System:
         ------
         InputError : the point does not lie in the interior of the domain.
         """
-        by = [sympy.Rational(q.numerator, q.denominator) for q in origin]
-        dynamics = in_deviations(self.dynamics, self.states, by)
-        if self.time == "discrete":
-            dynamics = tuple(e - q for e, q in zip(dynamics, by, strict=True))
+        by = map(Number, origin)
+        x_eq = tuple(q if e == Number(0) else e + q if q.value else e for e, q in zip(self.x_eq, by, strict=True))
         return replace(
             self,
-            dynamics=dynamics,
-            u_eq=tuple(sympy.Rational(q.numerator, q.denominator) for q in u),
-            x_eq=tuple(e + q for e, q in zip(self.x_eq, by, strict=True)),
+            dynamics=in_deviations(self.dynamics_of_values(), self.states, x_eq, self.time),
+            u_eq=tuple(map(Number, u)),
+            x_eq=x_eq,
             domain=tuple((lo - q, hi - q) for (lo, hi), q in zip(self.domain, origin, strict=True)),
         )
 
@@ -270,20 +292,21 @@ class System:
         return replace(self, sample=sample)
 
     def with_input_errors(self, bounds: Mapping[str, Fraction]) -> System:
-        """The same plant with u + e in the place of u, |e| at most the bound, for the inputs that are named."""
-        by_name, moved, names = {s.name: s for s in self.inputs}, {}, []
+        """The same plant with u + e instead of u, |e| at most the bound, for the inputs that are named."""
+        by_name, names = {s.name: s for s in self.inputs}, list[str]()
+        moved: dict[Expression, Expression] = {}
         for name, bound in bounds.items():
             if name not in by_name or not bound > 0:
                 raise InputError(
                     f"an input error must be a positive bound for one of {', '.join(by_name)}; found {name} = {bound}."
                 )
             names.append(f"error_{name}")
-            moved[by_name[name]] = by_name[name] + sympy.Symbol(names[-1])
+            moved[by_name[name]] = Operation("+", by_name[name], Symbol(names[-1]))
         ranges = {error: (-bound, bound) for error, bound in zip(names, bounds.values(), strict=True)}
         units = {error: self.units[name] for error, name in zip(names, bounds, strict=True) if name in self.units}
         return replace(
             self,
-            dynamics=tuple(e.subs(moved, simultaneous=True) for e in self.dynamics),
+            dynamics=tuple(substitute(e, moved) for e in self.dynamics),
             disturbances=(*self.disturbances, *symbols(names)),
             ranges={**self.ranges, **ranges},
             units={**self.units, **units},
@@ -300,23 +323,24 @@ class System:
         return "0" if self.time == "continuous" else "x_eq"
 
     @property
-    def uncertain(self) -> tuple[tuple[sympy.Symbol, Interval], ...]:
+    def uncertain(self) -> tuple[tuple[Symbol, Interval], ...]:
         """What has a range, in the order of the ranges."""
-        return tuple((sympy.Symbol(name), interval) for name, interval in self.ranges.items())
+        return tuple((Symbol(name), interval) for name, interval in self.ranges.items())
 
     @property
     def input_errors(self) -> Mapping[str, str]:
         """Of what has a range, that which the equations know only as the error of an input: its name, by the input's.
 
-        That is so if u stands in them as u + error_u alone: with u - error_u in its place the error is gone. A name by
-        itself says nothing, because a file may give it to anything.
+        That is so if both stand in them as u + error_u alone. A name by itself says nothing, because a file may give it
+        to anything.
         """
         found = {}
         for u in self.inputs:
-            error = sympy.Symbol(f"error_{u}")
-            moved = [e.subs(u, u - error) for e in self.dynamics]
-            acts = any(error in e.free_symbols for e in self.dynamics)
-            if error.name in self.ranges and acts and not any(error in e.free_symbols for e in moved):
+            error = Symbol(f"error_{u.name}")
+            acting = Operation("+", u, error)
+            free = symbols_of(*(substitute(e, {acting: Number(0)}) for e in self.dynamics))
+            acts = any(node is acting for node in nodes(*self.dynamics))
+            if error.name in self.ranges and acts and not free & {u, error}:
                 found[u.name] = error.name
         return found
 
@@ -332,9 +356,9 @@ class System:
         u_eq stays that of the nominal parameters: it belongs to the policy, which does not know these values.
         """
         known = {name: q for name, q in values.items() if name in self.parameters}
-        held = {s: sympy.Rational(*values.get(s.name, Fraction(0)).as_integer_ratio()) for s in self.disturbances}
-        dynamics = tuple(e.subs(held) for e in self.dynamics)
-        u_eq = tuple(sympy.Rational(q.numerator, q.denominator) for q in self.exact_u_eq())
+        held = {s: Number(values.get(s.name, Fraction(0))) for s in self.disturbances}
+        dynamics = tuple(substitute(e, held) for e in self.dynamics)
+        u_eq = tuple(map(Number, self.exact_u_eq()))
         return replace(self.with_parameters(known), dynamics=dynamics, u_eq=u_eq, disturbances=(), ranges={})
 
     def corners(self, most: int = 64) -> tuple[dict[str, Fraction], ...]:
@@ -348,17 +372,22 @@ class System:
             for vertex in vertices
         )
 
-    def exact_dynamics(self) -> tuple[sympy.Expr, ...]:
+    def exact_dynamics(self) -> tuple[Expression, ...]:
         """The nominal f: parameters replaced by exact rationals, disturbances by 0; free are states and inputs."""
-        return tuple(self._substitute(self._undisturbed(e)) for e in self.dynamics)
+        return self._with_numbers(())
 
-    def uncertain_dynamics(self) -> tuple[sympy.Expr, ...]:
-        """f for all that the ranges allow: what has one is free, as states and inputs are."""
-        known = {name: q for name, q in self.parameters.items() if name not in self.ranges}
-        return tuple(self._substitute(self._undisturbed(e, self.ranges), known) for e in self.dynamics)
+    def uncertain_dynamics(self) -> tuple[Expression, ...]:
+        """f for all that the ranges allow: what has one is free, as states and inputs are.
 
-    def _undisturbed(self, expression: sympy.Expr, acting: Collection[str] = ()) -> sympy.Expr:
-        return expression.subs({s: sympy.Integer(0) for s in self.disturbances if s.name not in acting})
+        These are the trees of a certificate: the equations as they were written, with numbers instead of the names that
+        have one value.
+        """
+        return self._with_numbers(self.ranges)
+
+    def _with_numbers(self, acting: Collection[str]) -> tuple[Expression, ...]:
+        numbers = {Symbol(name): Number(q) for name, q in self.parameters.items() if name not in acting}
+        numbers |= {s: Number(0) for s in self.disturbances if s.name not in acting}
+        return tuple(self._substituted(e, numbers) for e in self.dynamics)
 
     def exact_u_eq(self) -> tuple[Fraction, ...]:
         """The equilibrium input as exact rationals, shape (m,)."""
@@ -373,10 +402,16 @@ class System:
         values = self.exact_x_eq()
         return {s.name: q for s, q in zip(self.states, values, strict=True)} if any(values) else {}
 
-    def dynamics_of_values(self) -> tuple[sympy.Expr, ...]:
+    def dynamics_of_values(self) -> tuple[Expression, ...]:
         """f over the states' values x_eq + x, as people write it, with the parameters by name."""
-        moved = in_deviations(self.dynamics, self.states, [-e for e in self.x_eq])
-        return moved if self.time == "continuous" else tuple(e + at for e, at in zip(moved, self.x_eq, strict=True))
+        found, none = self.dynamics, Number(0)
+        shifts = [(s, at) for s, at in zip(self.states, self.x_eq, strict=True) if at != none]
+        if self.time == "discrete":
+            found = tuple(_without(e, at) for e, at in zip(found, self.x_eq, strict=True))
+        whole = {Operation("+", at, s): Symbol(f" {s.name}") for s, at in shifts}
+        rest = {s: Operation("+", s, -at) for s, at in shifts}
+        plain = {Symbol(f" {s.name}"): s for s, _ in shifts}
+        return tuple(substitute(substitute(substitute(e, whole), rest), plain) for e in found)
 
     def domain_of_values(self) -> tuple[Interval, ...]:
         """The domain's intervals of the states' values x_eq + x."""
@@ -384,19 +419,18 @@ class System:
 
     def residuals(self) -> dict[str, Fraction | float]:
         """Each state's f(0, u_eq): exact, or rounded where a function stands at another point than 0."""
-        at_rest: dict[sympy.Symbol, Fraction] = dict.fromkeys(self.states, Fraction(0))
+        at_rest: dict[Symbol, Fraction] = dict.fromkeys(self.states, Fraction(0))
         at_rest |= dict(zip(self.inputs, self.exact_u_eq(), strict=True))
         found: dict[str, Fraction | float] = {}
         for symbol, expression in zip(self.states, self.exact_dynamics(), strict=True):
             try:
                 found[symbol.name] = evaluate_exactly(expression, at_rest)
             except InputError:
-                values = {s: sympy.Rational(q.numerator, q.denominator) for s, q in at_rest.items()}
-                value = expression.subs(values).evalf(30, chop=True)
-                found[symbol.name] = float(value) if value.is_real else math.nan
+                rounded = numerical([expression], list(at_rest))(*map(float, at_rest.values()))
+                found[symbol.name] = float(rounded[0])
         return found
 
-    def function(self, module: str = "numpy") -> Callable[[Any, Any], Any]:
+    def function(self, module: Module = "numpy") -> Callable[[Any, Any], Any]:
         """Floating-point nominal f: arrays x (..., n) and u (..., m) to xdot (..., n); `module` numpy or torch.
 
         For simulation and search only: nothing is proved with it.
@@ -404,7 +438,7 @@ class System:
         f = self._function(self.exact_dynamics(), (), module)
         return lambda x, u: f(x, u, ())
 
-    def uncertain_function(self, module: str = "numpy") -> Callable[[Any, Any, Sequence[Any]], Any]:
+    def uncertain_function(self, module: Module = "numpy") -> Callable[[Any, Any, Sequence[Any]], Any]:
         """The same for values of what is uncertain, in the order of the ranges: a third argument, k numbers."""
         return self._function(self.uncertain_dynamics(), [s for s, _ in self.uncertain], module)
 
@@ -424,7 +458,7 @@ class System:
         return (after - x) / step
 
     def _function(
-        self, expressions: Sequence[sympy.Expr], more: Sequence[sympy.Symbol], module: str
+        self, expressions: Sequence[Expression], more: Sequence[Symbol], module: Module
     ) -> Callable[[Any, Any, Sequence[Any]], Any]:
         stack: Any
         broadcast: Any
@@ -439,9 +473,7 @@ class System:
             stack, broadcast, number = torch.stack, torch.broadcast_tensors, _as_tensor
         else:
             raise InputError(f"`module` must be 'numpy' or 'torch'; found {module!r}.")
-        # torch has no sine of a plain number
-        rounded = [e.replace(_is_constant_function, lambda c: c.evalf(17)) for e in expressions]
-        raw = sympy.lambdify([*self.states, *self.inputs, *more], rounded, modules=module, cse=True)
+        raw = numerical(expressions, [*self.states, *self.inputs, *more], module)
         n, m = self.n, self.m
 
         def f(x: Any, u: Any, values: Sequence[Any]) -> Any:
@@ -452,28 +484,30 @@ class System:
 
         return f
 
-    def _substitute(self, expression: sympy.Expr, parameters: Mapping[str, Fraction] | None = None) -> sympy.Expr:
-        parameters = self.parameters if parameters is None else parameters
-        result = expression.subs({s: sympy.Rational(q.numerator, q.denominator) for s, q in _by_symbol(parameters)})
-        if result.has(sympy.zoo, sympy.nan, sympy.oo):
-            shown = ", ".join(f"{name} = {q}" for name, q in parameters.items()) or "none"
-            raise InputError(f"an equation of {self.name} divides by zero with the parameters {shown}.")
+    def _substituted(self, expression: Expression, numbers: Mapping[Symbol, Number]) -> Expression:
+        """The expression with these numbers; refused if it then divides by a number that is 0, or the like."""
+        result = substitute(expression, numbers)
+        try:
+            constant_of(result)
+        except InputError as error:
+            shown = ", ".join(f"{name} = {q}" for name, q in self.parameters.items()) or "none"
+            raise InputError(
+                f"an equation of {self.name} has no value with the parameters {shown}: {error}."
+            ) from error
         return result
 
     def _rational(
-        self, expression: sympy.Expr, what: str, parameters: Mapping[str, Fraction] | None = None
+        self, expression: Expression, what: str, parameters: Mapping[str, Fraction] | None = None
     ) -> Fraction:
-        value = self._substitute(expression, parameters)
-        if not value.is_Rational:
+        parameters = self.parameters if parameters is None else parameters
+        result = self._substituted(expression, {Symbol(name): Number(q) for name, q in parameters.items()})
+        value = value_if_rational(result, {})
+        if isinstance(value, str):
             raise InputError(
                 f"{what} in {self.name} must be rational, because the equilibrium is decided in rationals; "
                 f"found {value}. Choose parameters for which it is, or make it a parameter itself."
             )
-        return Fraction(int(value.p), int(value.q))
-
-
-def _by_symbol(parameters: Mapping[str, Fraction]) -> list[tuple[sympy.Symbol, Fraction]]:
-    return [(sympy.Symbol(name), q) for name, q in parameters.items()]
+        return value
 
 
 def _as_it_is(value: Any, _: Any) -> Any:
@@ -487,36 +521,29 @@ def _as_tensor(value: Any, like: Any) -> Any:
     return torch.as_tensor(value, dtype=like.dtype, device=like.device)
 
 
-def _is_constant_function(node: sympy.Expr) -> bool:
-    return bool(node.is_number and not node.is_Rational and (node.is_Function or node.is_Pow or not node.args))
-
-
 def in_deviations(
-    expressions: Sequence[sympy.Expr], states: Sequence[sympy.Symbol], x_eq: Sequence[sympy.Expr]
-) -> tuple[sympy.Expr, ...]:
+    equations: Sequence[Expression], states: Sequence[Symbol], x_eq: Sequence[Expression], time: Time = "continuous"
+) -> tuple[Expression, ...]:
     """Equations in the states' values as equations in deviations from x_eq: each state s becomes `x_eq_s + s`.
+
+    A rate is the same there; the state one step later is a deviation as well. Where x_eq is 0 nothing changes.
 
     >>> h, h0 = symbols(["h", "h0"])
     >>> in_deviations([1 - h0 / h], [h], [h0])
-    (-h0/(h + h0) + 1,)
+    (1 - h0/(h0 + h),)
     """
-    values = {state: point + state for state, point in zip(states, x_eq, strict=True)}
-    return tuple(sympy.sympify(e).subs(values, simultaneous=True) for e in expressions)
+    shifts = [None if at == Number(0) else at for at in x_eq]
+    values = {s: Operation("+", at, s) for s, at in zip(states, shifts, strict=True) if at is not None}
+    moved = [substitute(e, values) for e in equations]
+    if time == "continuous":
+        return tuple(moved)
+    return tuple(e if at is None else Operation("+", e, -at) for e, at in zip(moved, shifts, strict=True))
 
 
-def symbols(names: Sequence[str]) -> tuple[sympy.Symbol, ...]:
-    """Plain sympy symbols, one a name."""
-    return tuple(sympy.Symbol(name) for name in names)
-
-
-def _check_grammar(expression: sympy.Expr, allowed: set[sympy.Symbol], system: str) -> None:
-    for node in sympy.preorder_traversal(expression):
-        if node in allowed or (has_tree(node) and not node.is_Symbol):
-            continue
-        if node.is_Float:
-            raise InputError(f"an equation of {system} holds the rounded number {node}; write it as a fraction.")
-        if node.is_Symbol:
-            raise InputError(
-                f"an equation of {system} uses {node}, which is no state, input, parameter or disturbance."
-            )
-        raise InputError(f"an equation of {system} uses {node}; allowed are {GRAMMAR} and exact numbers.")
+def _without(equation: Expression, at: Expression) -> Expression:
+    """The equation of a state's value one step later, from that of its deviation from `at`."""
+    if at == Number(0):
+        return equation
+    if isinstance(equation, Operation) and equation.operator == "+" and equation.operands[1:] == (-at,):
+        return equation.operands[0]
+    return Operation("+", equation, at)

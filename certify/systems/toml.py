@@ -6,18 +6,16 @@ is here that they become deviations from x_eq. Every error says the line, the en
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, cast, get_args
 
-import sympy
-
 from certify.errors import InputError
-from certify.expressions import FUNCTIONS
+from certify.expressions import FUNCTIONS, Expression, Number, Symbol, substitute, symbols, value_if_rational
 from certify.systems.equations import nearest, parse_expression
 from certify.systems.source import PlantFile, read_plant_file
-from certify.systems.system import Interval, System, Time, exact, in_deviations, symbols
+from certify.systems.system import Interval, System, Time, exact, in_deviations
 
 _REQUIRED = ("name", "states", "inputs", "dynamics", "u_eq", "domain", "input_bounds")
 _KEYS = (
@@ -97,7 +95,7 @@ def build_system(file: PlantFile) -> System:
             inputs=tuple(symbol[s] for s in inputs),
             parameters=parameters,
             positive=frozenset(_list(file, "positive")),
-            dynamics=_in_deviations(dynamics, [symbol[s] for s in states], x_eq, time),
+            dynamics=in_deviations(dynamics, [symbol[s] for s in states], x_eq, time),
             time=time,
             u_eq=tuple(u_eq),
             domain=tuple(_domain(file, s, e, parameters) for s, e in zip(states, x_eq, strict=True)),
@@ -144,9 +142,9 @@ def _residual(system: System, name: str, residual: Fraction | float) -> str:
     return f"{name}' = {float(residual):.6g}{exactly}" + (f" in {unit} per second" if unit else "")
 
 
-def _shorthand(file: PlantFile, symbol: Mapping[str, sympy.Symbol]) -> dict[str, sympy.Expr]:
+def _shorthand(file: PlantFile, symbol: Mapping[str, Symbol]) -> dict[str, Expression]:
     """The table `where`: names for expressions that equations share, each over the plant's names and those above."""
-    found: dict[str, sympy.Expr] = {}
+    found: dict[str, Expression] = {}
     for name in file.table("where"):
         if name in symbol or name in FUNCTIONS or not name.isidentifier():
             raise file.refuse("must be a new name, and no state, input, parameter or function.", "where", name)
@@ -163,21 +161,13 @@ def _time(file: PlantFile) -> Time:
     raise file.refuse(f"must be one of {', '.join(get_args(Time))}; found {found!r}.", "time")
 
 
-def _in_deviations(
-    equations: Sequence[sympy.Expr], states: Sequence[sympy.Symbol], x_eq: Sequence[sympy.Expr], time: Time
-) -> tuple[sympy.Expr, ...]:
-    """The equations in deviations: a rate is the same there, the state one step later is a deviation as well."""
-    moved = in_deviations(equations, states, x_eq)
-    return moved if time == "continuous" else tuple(e - at for e, at in zip(moved, x_eq, strict=True))
-
-
 def _equation(
-    file: PlantFile, table: str, name: str, symbol: Mapping[str, sympy.Expr], known: str, default: int | None = None
-) -> sympy.Expr:
+    file: PlantFile, table: str, name: str, symbol: Mapping[str, Expression], known: str, default: int | None = None
+) -> Expression:
     entries = file.table(table)
     if name not in entries:
         if default is not None:
-            return sympy.Integer(default)
+            return Number(default)
         raise file.refuse(f'there must be an equation for {name}; none was found. Write {name} = "...".', table)
     value = entries[name]
     if isinstance(value, bool) or not isinstance(value, str | int | Fraction):
@@ -188,7 +178,7 @@ def _equation(
         raise file.refuse(str(error), table, name) from error
 
 
-def _domain(file: PlantFile, name: str, x_eq: sympy.Expr, parameters: Mapping[str, Fraction]) -> Interval:
+def _domain(file: PlantFile, name: str, x_eq: Expression, parameters: Mapping[str, Fraction]) -> Interval:
     """The interval of a state's values as one of deviations."""
     lo, hi = _interval(file, "domain", name)
     at = _at_rest(file, "x_eq", name, x_eq, parameters)
@@ -203,19 +193,22 @@ def _domain(file: PlantFile, name: str, x_eq: sympy.Expr, parameters: Mapping[st
 
 
 def _at_rest(
-    file: PlantFile, table: str, name: str, expression: sympy.Expr, parameters: Mapping[str, Fraction]
+    file: PlantFile, table: str, name: str, expression: Expression, parameters: Mapping[str, Fraction]
 ) -> Fraction:
     """The value of an entry of x_eq or u_eq."""
-    values = {sympy.Symbol(p): sympy.Rational(q.numerator, q.denominator) for p, q in parameters.items()}
-    point = expression.subs(values)
-    if not point.is_Rational:
+    point = substitute(expression, {Symbol(p): Number(q) for p, q in parameters.items()})
+    try:
+        value = value_if_rational(point, {})
+    except InputError as error:
+        raise file.refuse(f"the operating point has no value: {error}.", table, name) from error
+    if isinstance(value, str):
         raise file.refuse(
-            f"the operating point must be rational, because the equilibrium is decided in rationals; found {point}. "
+            f"the operating point must be rational, because the equilibrium is decided in rationals; found {value}. "
             "Choose parameters for which it is, or make it a parameter itself.",
             table,
             name,
         )
-    return Fraction(int(point.p), int(point.q))
+    return value
 
 
 def _disturbance(file: PlantFile, name: str) -> Interval | None:

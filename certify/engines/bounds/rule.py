@@ -19,7 +19,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import sympy
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
@@ -31,7 +30,7 @@ from certify.enclosures.loop import played
 from certify.enclosures.tape import Tape, recorded
 from certify.enclosures.taylor import EPS, TINY, ConstantsLast, V
 from certify.engines.bounds.form import FormBound
-from certify.expressions import evaluate
+from certify.expressions import Expression, evaluate
 from certify.policies import bounded_by_form
 from certify.systems import System
 
@@ -70,7 +69,7 @@ class VdotBound:
         self.P = problem.V.P
         self.V = FormBound(self.P, T, device)
         self.policy = PolicyEnclosure(loop, device)
-        self.dynamics: tuple[sympy.Expr, ...] = loop.system.uncertain_dynamics()
+        self.dynamics: tuple[Expression, ...] = loop.system.uncertain_dynamics()
         self.check_inputs = not bounded_by_form(loop.network, loop.system.input_bounds)
         sample = loop.system.sample
         self.flow = None if sample is None else Flow(self.dynamics, sample, order)
@@ -177,7 +176,7 @@ class VdotBound:
     def _at_rates(self, values: Sequence[V], algebra: ConstantsLast[V]) -> V:
         """D where the input is not held over time, from states, inputs and uncertain quantities."""
         system = self.system
-        known: dict[sympy.Expr, V] = {}
+        known: dict[Expression, V] = {}
         symbols = [*system.states, *system.inputs, *(symbol for symbol, _ in system.uncertain)]
         named, here = dict(zip(symbols, values, strict=True)), values[: system.n]
         G: list[V] = [evaluate(expression, named, algebra, known) for expression in self.dynamics]

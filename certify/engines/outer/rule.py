@@ -30,7 +30,7 @@ from certify.enclosures import (
 from certify.enclosures.taylor import EPS, TINY
 from certify.engines.bounds.form import FormBound
 from certify.engines.bounds.rule import input_bounds_kept, lessened
-from certify.expressions import evaluate
+from certify.expressions import Expression, evaluate
 from certify.lyapunov.neural import Neural
 from certify.lyapunov.symbolic import Symbolic
 from certify.policies import bounded_by_form
@@ -140,7 +140,7 @@ class FallBound:
         models = loop_models(self.system, x, error, mid, slopes, wide)
         values = {**models.states, **models.inputs, **models.quantities}
         algebra = Models(next(iter(models.states.values())))
-        terms: dict[object, Taylor] = {}
+        terms: dict[Expression, Taylor] = {}
         F = [evaluate(expression, values, algebra, terms) for expression in self.dynamics]
         first, pieces = 0, []
         for piece, left in zip(known, lefts, strict=True):

@@ -8,13 +8,14 @@ pair comes first.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from fractions import Fraction
 from itertools import combinations
 
 import numpy as np
-import sympy
 from numpy.typing import NDArray
 
 from certify.errors import InputError
+from certify.expressions import differentiate, symbols_of, value_if_rational
 from certify.systems import System
 
 Array = NDArray[np.float64]
@@ -28,14 +29,17 @@ def rates(system: System) -> list[Pair]:
 
     Each state is in one pair at most: in a chain of integrators the second is a rate, and no coordinate as well.
     """
-    origin = dict.fromkeys(system.states, sympy.Integer(0))
+    origin = dict.fromkeys(system.states, Fraction(0))
     inputs = set(system.inputs)
     taken: set[int] = set()
     found: list[Pair] = []
-    for i, equation in enumerate(map(sympy.sympify, system.exact_dynamics())):
-        if i in taken or equation.free_symbols & inputs:
+    for i, equation in enumerate(system.exact_dynamics()):
+        if i in taken or symbols_of(equation) & inputs:
             continue
-        slopes = [equation.diff(symbol).xreplace(origin) for symbol in system.states]
+        try:
+            slopes = [value_if_rational(differentiate(equation, symbol), origin) for symbol in system.states]
+        except InputError:
+            continue
         felt = [j for j, slope in enumerate(slopes) if slope != 0]
         if len(felt) == 1 and felt[0] not in (i, *taken):
             found.append((i, felt[0]))

@@ -11,11 +11,11 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
-import sympy
 from numpy.typing import NDArray
 
 from certify.certificate import Certificate, PartitionTree, TrustedSolver
 from certify.claims import Enlarged, Outer, Reached
+from certify.expressions import nodes
 from certify.lyapunov import Neural, extents
 from certify.report.claims import CHECKED_ALWAYS, INPUTS
 from certify.report.figures.scene import centre_of, inner_of, is_ellipsoid, is_local_enough, slabs_of, start_of
@@ -117,11 +117,11 @@ def _beyond(certificate: Certificate, outer: Outer | None) -> dict[str, Any] | N
     N, level = outer.function, below(outer.level)
     if isinstance(N, Neural):
         return {"level": level, "name": network_name(N.widths), "sha256": N.sha256(), "formula": ""}
-    operations = int(sympy.count_ops(N.expression))
+    operations = sum(1 for node in nodes(N.expression) if node.operands)
     shown = operations <= _MOST_OPERATIONS
     name = "this expression" if shown else f"an expression of {operations:,} operations, which stands in the file"
     left = "<mi>N</mi><mo>(</mo><mi>x</mi><mo>)</mo>"
-    formula = typeset(left, N.expression, certificate.system.states) if shown else ""
+    formula = typeset(left, N.expression) if shown else ""
     return {"level": level, "name": name, "sha256": "", "formula": formula}
 
 

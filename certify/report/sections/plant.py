@@ -7,10 +7,9 @@ from collections.abc import Sequence
 from fractions import Fraction
 from typing import Any
 
-import sympy
-
 from certify.certificate import Certificate
-from certify.report.mathml import identifier, is_long, typeset
+from certify.expressions import Expression, Number, Symbol, nodes
+from certify.report.mathml import identifier, is_long, multiplied_out, typeset
 from certify.report.sections.shared import centre_in_words, read_in_words
 from certify.report.words import above, at_rest, below, held_at, number, pretty_unit, symbol, varying_in
 
@@ -24,12 +23,11 @@ def plant_of(certificate: Certificate) -> dict[str, Any]:
         lo, hi = bounds
         return f"{symbol(name)} ∈ [{below(lo)}, {above(hi)}] {pretty_unit(units.get(name, ''))}".rstrip()
 
-    names = (*system.states, *system.inputs, *(s for s, _ in system.uncertain))
     equilibrium = zip(system.inputs, system.exact_u_eq(), strict=True)
     return {
         "name": system.name,
-        "equations": [_equation(s, e, names, steps=steps) for s, e in zip(system.states, expressions, strict=True)],
-        "rounded": any(is_long(v) for e in (*expressions, *system.u_eq) for v in e.atoms(sympy.Rational)),
+        "equations": [_equation(s, e, steps=steps) for s, e in zip(system.states, expressions, strict=True)],
+        "rounded": any(map(is_long, _numbers(expressions, system.exact_u_eq()))),
         "domain": [interval(s.name, b) for s, b in zip(system.states, system.domain, strict=True)],
         "inputs": [interval(s.name, b) for s, b in zip(system.inputs, system.input_bounds, strict=True)],
         "at": at_rest(
@@ -45,13 +43,18 @@ def plant_of(certificate: Certificate) -> dict[str, Any]:
     }
 
 
-def _equation(state: sympy.Symbol, expression: sympy.Expr, names: Sequence[sympy.Symbol], *, steps: bool) -> Any:
+def _numbers(expressions: Sequence[Expression], more: Sequence[Fraction]) -> list[Fraction]:
+    shown = nodes(*map(multiplied_out, expressions))
+    return [*(e.value for e in shown if isinstance(e, Number)), *more]
+
+
+def _equation(state: Symbol, expression: Expression, *, steps: bool) -> Any:
     """`state' = expression`, or by steps `state+ = expression`."""
     left = f"<mfrac><mrow><mi>d</mi>{identifier(state.name)}</mrow><mrow><mi>d</mi><mi>t</mi></mrow></mfrac>"
     if steps:
         left = f"<msup>{identifier(state.name)}<mo>+</mo></msup>"
-    return typeset(left, expression, names)
+    return typeset(left, expression)
 
 
 def _short(value: Fraction) -> str:
-    return number(float(value)) if is_long(sympy.Rational(value.numerator, value.denominator)) else str(value)
+    return number(float(value)) if is_long(value) else str(value)

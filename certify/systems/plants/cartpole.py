@@ -14,16 +14,15 @@ Length and domain are chosen here. `docs/plants.md` says what differs elsewhere.
 
 from __future__ import annotations
 
-import sympy
-
-from certify.systems.system import System, exact, symbols
+from certify.expressions import Number, cos, sin, symbols
+from certify.systems.system import System, exact
 
 
 def cartpole() -> System:
     """The cart with a pole: masses as in Li et al., a length chosen here."""
     p, theta, p_dot, theta_dot, u = symbols(["p", "theta", "p_dot", "theta_dot", "u"])
     mc, mp, length, g, force = symbols(["mc", "mp", "l", "g", "force"])
-    s, c = sympy.sin(theta), sympy.cos(theta)
+    s, c = sin(theta), cos(theta)
     mass = mc + mp * s**2
     pushed = u + force
     p_ddot = (pushed + mp * s * (length * theta_dot**2 - g * c)) / mass
@@ -35,7 +34,7 @@ def cartpole() -> System:
         inputs=(u,),
         parameters={"mc": exact(1), "mp": exact("0.1"), "l": exact("0.5"), "g": exact("9.81")},
         dynamics=(p_dot, theta_dot, p_ddot, theta_ddot),
-        u_eq=(sympy.Integer(0),),
+        u_eq=(Number(0),),
         domain=(
             (exact(-3), exact(3)),
             (exact("-1.2"), exact("1.2")),

@@ -13,9 +13,8 @@ the same. 6 N m is in Yang et al., ICML 2024. The domain is chosen here. `docs/p
 
 from __future__ import annotations
 
-import sympy
-
-from certify.systems.system import System, exact, symbols
+from certify.expressions import Number, sin, symbols
+from certify.systems.system import System, exact
 
 
 def pendulum() -> System:
@@ -23,7 +22,7 @@ def pendulum() -> System:
     theta, theta_dot, u, m, length, b, g = symbols(["theta", "theta_dot", "u", "m", "l", "b", "g"])
     (torque,) = symbols(["torque"])
     inertia = m * length**2
-    acceleration = g / length * sympy.sin(theta) - b / inertia * theta_dot + u / inertia + torque / inertia
+    acceleration = g / length * sin(theta) - b / inertia * theta_dot + u / inertia + torque / inertia
     return System(
         name="pendulum",
         description="inverted pendulum with a torque at the pivot",
@@ -31,7 +30,7 @@ def pendulum() -> System:
         inputs=(u,),
         parameters={"m": exact("0.15"), "l": exact("0.5"), "b": exact("0.1"), "g": exact("9.81")},
         dynamics=(theta_dot, acceleration),
-        u_eq=(sympy.Integer(0),),
+        u_eq=(Number(0),),
         domain=((exact("-3.14"), exact("3.14")), (exact(-20), exact(20))),
         input_bounds=((exact(-6), exact(6)),),
         positive=frozenset({"m", "l", "g"}),

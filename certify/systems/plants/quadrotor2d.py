@@ -13,9 +13,8 @@ the same. 6 N is in Li et al., NeurIPS 2025. The domain is chosen here. `docs/pl
 
 from __future__ import annotations
 
-import sympy
-
-from certify.systems.system import System, exact, symbols
+from certify.expressions import cos, sin, symbols
+from certify.systems.system import System, exact
 
 
 def quadrotor2d() -> System:
@@ -36,8 +35,8 @@ def quadrotor2d() -> System:
             x_dot,
             y_dot,
             theta_dot,
-            -sympy.sin(theta) * thrust + wind_x / m,
-            sympy.cos(theta) * thrust - g + wind_y / m,
+            -sin(theta) * thrust + wind_x / m,
+            cos(theta) * thrust - g + wind_y / m,
             length / inertia * (u1 - u2) + torque / inertia,
         ),
         u_eq=(m * g / 2, m * g / 2),

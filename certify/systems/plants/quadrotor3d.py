@@ -20,9 +20,10 @@ what differs elsewhere.
 
 from __future__ import annotations
 
-import sympy
+from fractions import Fraction
 
-from certify.systems.system import System, exact, symbols
+from certify.expressions import cos, sin, symbols, tan
+from certify.systems.system import System, exact
 
 
 def quadrotor3d() -> System:
@@ -32,7 +33,6 @@ def quadrotor3d() -> System:
     inputs = symbols(["u1", "u2", "u3", "u4"])
     u1, u2, u3, u4 = inputs
     m, a, k, Ix, Iy, Iz, g = symbols(["m", "a", "k", "Ix", "Iy", "Iz", "g"])
-    sin, cos = sympy.sin, sympy.cos
     wind_x, wind_y, wind_z, torque_x, torque_y, torque_z = disturbances = symbols(
         ["wind_x", "wind_y", "wind_z", "torque_x", "torque_y", "torque_z"]
     )
@@ -50,7 +50,7 @@ def quadrotor3d() -> System:
         "g": "m/s^2",
     }
 
-    def within(half: str) -> tuple[sympy.Expr, sympy.Expr]:
+    def within(half: str) -> tuple[Fraction, Fraction]:
         return exact("-" + half), exact(half)
 
     return System(
@@ -71,7 +71,7 @@ def quadrotor3d() -> System:
             vx,
             vy,
             vz,
-            p + sympy.tan(theta) * turn,
+            p + tan(theta) * turn,
             cos(phi) * q - sin(phi) * r,
             turn / cos(theta),
             (cos(phi) * sin(theta) * cos(psi) + sin(phi) * sin(psi)) * lift + wind_x / m,
