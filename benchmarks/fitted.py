@@ -13,11 +13,11 @@ from pathlib import Path
 
 import numpy as np
 import scipy.linalg
-import sympy
 import torch
 from numpy.typing import NDArray
 
 from certify.closed_loop import ClosedLoop
+from certify.expressions import Number, Symbol, sin, symbols
 from certify.policies import Policy, TanhNetwork, save_policy
 from certify.systems import System, available_systems, exact, get_system
 
@@ -83,16 +83,16 @@ def lqr_gain(system: System) -> Array:
 
 def chain(n: int) -> System:
     """`x_i' = x_(i+1)`, `x_n' = sin(x_1) + u`: one family of plants in any dimension."""
-    x = sympy.symbols(f"x1:{n + 1}")
-    u = sympy.Symbol("u")
+    x = symbols(f"x{i}" for i in range(1, n + 1))
+    u = Symbol("u")
     wide = (exact(-4), exact(4))
     return System(
         name=f"chain{n}",
         states=x,
         inputs=(u,),
         parameters={},
-        dynamics=(*x[1:], sympy.sin(x[0]) + u),
-        u_eq=(sympy.Integer(0),),
+        dynamics=(*x[1:], sin(x[0]) + u),
+        u_eq=(Number(0),),
         domain=(wide,) * n,
         input_bounds=((exact(-20), exact(20)),),
     )

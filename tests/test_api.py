@@ -15,13 +15,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-import sympy
 import torch
 
 import certify
 from certify import ImportOptions, InputError, Policy, RoaOptions, TanhNetwork, Verdict, certify_roa, get_system
 from certify.api import _remove, in_python
 from certify.certificate import parse_certificate
+from certify.expressions import Number, symbols
 from certify.lyapunov import volume
 from certify.policies import load_policy, save_policy
 from certify.results import RoaResult
@@ -43,14 +43,14 @@ def proved() -> RoaResult:
 @pytest.fixture(scope="module")
 def away() -> RoaResult:
     """h' = 1 + (u - 1) - h/h0 around h0 = 1/10, a tenth that binary64 does not hold: {P d^2 <= c}."""
-    h, u, h0 = sympy.symbols("h u h0")
+    h, u, h0 = symbols("h u h0")
     system = certify.System(
         name="away",
         states=(h,),
         inputs=(u,),
         parameters={"h0": Fraction(1, 10)},
         dynamics=(u - h,),
-        u_eq=(sympy.Integer(0),),
+        u_eq=(Number(0),),
         domain=((Fraction(-1), Fraction(1)),),
         input_bounds=((Fraction(-1), Fraction(1)),),
         x_eq=(h0,),

@@ -40,7 +40,7 @@ EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows th
     "parts": "certificate running",
     "policies": "plain_file systems",
     "race": "engines lyapunov trials",
-    "report": "certificate claims closed_loop lyapunov policies systems",
+    "report": "certificate claims closed_loop expressions lyapunov policies systems",
     "rest": "closed_loop rigorous",
     "results": "certificate claims engines lyapunov policies report rest sublevel systems",
     "rigorous": "closed_loop expressions lyapunov policies",
@@ -55,7 +55,8 @@ EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows th
     "systems": "expressions",
     "trials": "certificate claims closed_loop engines lyapunov options",
     "unfinished": "certificate claims closed_loop engines lyapunov policies systems trials",
-    "controllers": "api certificate closed_loop containment lyapunov policies report rigorous running systems",
+    "controllers": "api certificate closed_loop containment expressions lyapunov policies report rigorous running "
+    "systems",
 }
 
 

@@ -12,31 +12,31 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import sympy
 
 from certify import Neural, Polynomial, System, TanhNetwork, certify_roa, save_lyapunov
 from certify.acceptance import Clerk
 from certify.certificate import Certificate, PartitionTree
 from certify.engines.outer import Rise
 from certify.errors import InputError
+from certify.expressions import Expression, Number, Symbol, cos
 from certify.lyapunov import Symbolic
 from certify.results import RoaResult
 from certify.verdict import Stop, Verdict
 
-x, u = sympy.Symbol("x"), sympy.Symbol("u")
+x, u = Symbol("x"), Symbol("u")
 SQUARE = Polynomial(np.array([[2]]), np.array([1.0]))
 REST = TanhNetwork((np.zeros((1, 1)),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
 HALF = 0.125  # of V = x^2/2: the ellipsoid is |x| <= 1/2
 
 
-def plant(rates: sympy.Expr = -x + x**3 + u) -> System:
+def plant(rates: Expression = -x + x**3 + u) -> System:
     return System(
         name="cubic",
         states=(x,),
         inputs=(u,),
         parameters={},
         dynamics=(rates,),
-        u_eq=(sympy.Integer(0),),
+        u_eq=(Number(0),),
         domain=((Fraction(-2), Fraction(3)),),
         input_bounds=((Fraction(-1), Fraction(1)),),
     )
@@ -66,7 +66,7 @@ def test_the_set_is_that_of_the_certificate(tmp_path: Path) -> None:
 def test_a_network_and_a_formula_of_the_same_shape(tmp_path: Path) -> None:
     """tanh(x - 1) - tanh(x + 1) rises with |x|, as 1 - cos(x) does up to pi."""
     network = Neural((np.ones((2, 1)), np.array([[1.0, -1.0]])), (np.array([-1.0, 1.0]), np.zeros(1)))
-    for N, at_1 in ((network, -np.tanh(2.0)), (Symbolic(1 - sympy.cos(x), (x,)), 1 - np.cos(1.0))):
+    for N, at_1 in ((network, -np.tanh(2.0)), (Symbolic(1 - cos(x), (x,)), 1 - np.cos(1.0))):
         result = proved(tmp_path, lyapunov=N)
         assert result.outer is not None and abs(result.outer.level - at_1) < 0.01
         assert result.outer.level < at_1

@@ -6,12 +6,12 @@ import base64
 import copy
 import json
 from collections.abc import Callable
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import sympy
 
 from certify.certificate import limits, read_certificate, run_checker
 from certify.checker import ball as checker_ball
@@ -20,7 +20,7 @@ from certify.checker import exact as checker_exact
 from certify.checker import expression as checker_expression
 from certify.engines import models as producer_models
 from certify.errors import CertificateFormatError
-from certify.expressions import from_tree, to_tree
+from certify.expressions import Number, from_tree, symbols, tan, to_tree
 from certify.roa import RoaOptions, certify_roa
 from certify.systems import available_systems, get_system
 from tests.support.loops import pendulum_network
@@ -124,8 +124,8 @@ TAMPERED: dict[str, tuple[Callable[[Document], None], str]] = {
     "domain without the origin": (replaced("plant", "domain", to=[["1/2", "3"], ["-20", "20"]]), "domain"),
     "input bounds tighter": (replaced("plant", "input_bounds", to=[["-1", "1"]]), "inputs"),
     "equilibrium input": (replaced("plant", "u_eq", to=["1/1000000"]), "equilibrium"),
-    "gravity": (constant("981/50", "9810/50"), "local|ring"),
-    "damping with the wrong sign": (constant("-8/3", "80/3"), "local|ring"),
+    "gravity": (constant("981/100", "981/10"), "local|ring"),
+    "damping with the wrong sign": (constant('["-", ["*", ["/", "1/10",', '["-", ["*", ["/", "-1",'), "local|ring"),
     "weights": (scaled("policy", "layers", 2, "weight", by=-1.0), "hash"),
     "scale": (scaled("policy", "scale", by=1.25), "hash"),
     "centring": (replaced("policy", "centre", to="none"), "hash"),
@@ -175,15 +175,15 @@ def test_unreadable_certificates(tmp_path: Path, text: str) -> None:
 
 
 def test_expressions_survive_the_round_trip() -> None:
-    x, y = sympy.symbols("x y")
-    extra = [sympy.tan(x / 3) ** -2, (x + y) ** 3 / (1 + x**2), -x, sympy.Rational(-7, 3)]
+    x, y = symbols("x y")
+    extra = [tan(x / 3) ** -2, (x + y) ** 3 / (1 + x**2), -x, Number(Fraction(-7, 3))]
     for expression in extra:
         assert from_tree(json.loads(json.dumps(to_tree(expression))), {"x": x, "y": y}) == expression
     for name in available_systems():
         system = get_system(name)
         names = {s.name: s for s in (*system.states, *system.inputs)}
         for expression in system.exact_dynamics():
-            assert sympy.simplify(from_tree(to_tree(expression), names) - expression) == 0
+            assert from_tree(to_tree(expression), names) is expression
 
 
 @pytest.mark.parametrize(

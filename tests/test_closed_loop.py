@@ -7,10 +7,10 @@ from fractions import Fraction
 import flint
 import numpy as np
 import pytest
-import sympy
 
 from certify.closed_loop import ClosedLoop
 from certify.errors import InputError
+from certify.expressions import Number, Symbol, symbols
 from certify.policies import TanhNetwork
 from certify.rigorous import eigenvalues, evaluate_policy, evaluate_vdot
 from certify.systems import System
@@ -65,8 +65,8 @@ def test_counts_must_match(pendulum: System) -> None:
 
 
 def test_the_origin_must_be_an_equilibrium() -> None:
-    x, u = sympy.symbols("x u")
-    system = System("s", (x,), (u,), {}, (x + u + sympy.Rational(1, 10**9),), (sympy.Integer(0),), box(1), box(1))
+    x, u = symbols("x u")
+    system = System("s", (x,), (u,), {}, (x + u + Fraction(1, 10**9),), (Number(0),), box(1), box(1))
     network = TanhNetwork((np.array([[-2.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
     with pytest.raises(InputError, match="must be exactly 0"):
         ClosedLoop(system, network).require_rest()
@@ -78,8 +78,8 @@ def test_uncentred_policy_is_refused(pendulum: System) -> None:
 
 
 def test_nonzero_equilibrium_input() -> None:
-    x, u = sympy.symbols("x u")
-    c = sympy.Symbol("c")
+    x, u = symbols("x u")
+    c = Symbol("c")
     system = System("s", (x,), (u,), {"c": Fraction(3, 10)}, (u - c,), (c,), box(1), box(1))
     network = TanhNetwork((np.array([[-2.0]]),), (np.array([0.7]),), np.ones(1), np.array([0.1]))
     loop = ClosedLoop(system, network)

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import sympy
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -23,6 +22,7 @@ from certify.cli import _run
 from certify.commands.arguments import region
 from certify.containment import Box, Containment, Ellipsoid, Located, ProvedSet, proved_set
 from certify.errors import CertificateFormatError, InputError
+from certify.expressions import Number, Symbol, cos, sin, symbols
 from certify.lyapunov import Neural, Symbolic
 from certify.sublevel import Sublevel
 from certify.systems import System, load_system
@@ -38,18 +38,18 @@ F = Fraction
 
 def still(n: int, x_eq: tuple[int, ...] = ()) -> System:
     """x' = -x, with an input that does nothing."""
-    states = sympy.symbols(f"x:{n}")
-    u = sympy.Symbol("u")
+    states = symbols(f"x{i}" for i in range(n))
+    u = Symbol("u")
     return System(
         name="still",
         states=states,
         inputs=(u,),
         parameters={},
         dynamics=(-states[0] + u, *(-s for s in states[1:])),
-        u_eq=(sympy.Integer(0),),
+        u_eq=(Number(0),),
         domain=box(*[3] * n),
         input_bounds=box(1),
-        x_eq=tuple(map(sympy.Integer, x_eq)),
+        x_eq=tuple(map(Number, x_eq)),
     )
 
 
@@ -425,8 +425,8 @@ def test_a_state_on_the_boundary_is_decided_in_rationals(tmp_path: Path) -> None
 
 def test_sets_contain_a_box_together() -> None:
     """The disc is what {N <= 1} leaves out in its middle: neither contains the box, and both of them do."""
-    x0, x1 = sympy.symbols("x0 x1")
-    ring = Sublevel(Symbolic(1 / (sympy.Rational(1, 4) + x0**2 + x1**2), (x0, x1)), 2.0, ((F(-3), F(3)),) * 2)
+    x0, x1 = symbols("x0 x1")
+    ring = Sublevel(Symbolic(1 / (Fraction(1, 4) + x0**2 + x1**2), (x0, x1)), 2.0, ((F(-3), F(3)),) * 2)
     both = replace(union(np.eye(2)), outer=ring)
     box = ((F(-6, 5), F(6, 5)), (F(-9, 10), F(9, 10)))
     assert both.locate(box) == Located(Containment.CONTAINED, within=f"E0 and {OUTER}")
@@ -441,8 +441,8 @@ def test_sets_contain_a_box_together() -> None:
 def test_boxes_that_touch_the_boundary_are_not_decided_by_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
     """sin^2 + cos^2 is 1 on all of the box, and no ball tells: it takes all the pieces there are, and says nothing."""
     monkeypatch.setattr("certify.containment._PIECES", 100)
-    x0, x1 = sympy.symbols("x0 x1")
-    flat = sympy.sin(x0) ** 2 + sympy.cos(x0) ** 2 + 0 * x1
+    x0, x1 = symbols("x0 x1")
+    flat = sin(x0) ** 2 + cos(x0) ** 2 + 0 * x1
     both = replace(union(np.eye(2)), outer=Sublevel(Symbolic(flat, (x0, x1)), 1.0, ((F(-3), F(3)),) * 2))
     assert both.locate(((F(3, 2), F(2)), (F(0), F(0)))) == Located(Containment.UNDECIDED)
     assert both.locate(at(2, 0)) == Located(Containment.UNDECIDED)

@@ -13,12 +13,12 @@ from typing import Any
 import flint
 import numpy as np
 import pytest
-import sympy
 
 from certify import float_error as module
 from certify.cli import _run
 from certify.closed_loop import ClosedLoop
 from certify.errors import InputError
+from certify.expressions import symbols
 from certify.float_error import FloatError, FloatOptions, float_error
 from certify.policies import Policy, TanhNetwork, load_policy, save_policy
 from certify.rigorous import evaluate_policy, precision
@@ -41,14 +41,14 @@ MACHINES = [
 
 def plant(n: int, m: int, half_width: str = "1", u_eq: str = "0") -> System:
     """A plant whose equations nobody looks at."""
-    states, inputs = sympy.symbols(f"x:{n}"), sympy.symbols(f"u:{m}")
+    states, inputs = symbols(f"x{i}" for i in range(n)), symbols(f"u{i}" for i in range(m))
     return System(
         name="any",
         states=states,
         inputs=inputs,
         parameters={},
         dynamics=tuple(-s for s in states),
-        u_eq=(sympy.Rational(u_eq),) * m,
+        u_eq=(Fraction(u_eq),) * m,
         domain=box(*[half_width] * n),
         input_bounds=box(*[1000] * m),
     )

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import sympy
 from flint import arb, ctx, fmpq
 from hypothesis import given
 from hypothesis import strategies as st
@@ -26,7 +25,18 @@ from certify.claims.queries import query
 from certify.closed_loop import ClosedLoop
 from certify.engines.local import prove_local
 from certify.errors import InputError
-from certify.expressions import evaluate_exactly, from_tree, has_tree, to_tree
+from certify.expressions import (
+    Expression,
+    Number,
+    atan,
+    evaluate_exactly,
+    exp,
+    from_tree,
+    sqrt,
+    symbols,
+    tanh,
+    to_tree,
+)
 from certify.policies import TanhNetwork
 from certify.reference import expressions as reference_expressions
 from certify.reference import model as reference_model
@@ -47,22 +57,24 @@ from tests.support.loops import box, tank, valve
 from tests.support.oracle import value_of
 from tests.support.reference import judge
 
-X, Y, U = sympy.symbols("x y u")
+X, Y, U = symbols("x y u")
 
 # --------------------------------------------------------------------------------------------------------- expressions
 
 WRITTEN: list[tuple[str, Any]] = [
     ("tanh(x)", ["tanh", "x"]),
-    ("exp(-x)", ["exp", ["*", "-1", "x"]]),
-    ("exp(1)", ["*", "1", ["exp", "1"]]),
+    ("exp(-x)", ["exp", ["-", "x"]]),
+    ("exp(1)", ["exp", "1"]),
     ("atan(x)", ["atan", "x"]),
     ("sqrt(x)", ["sqrt", "x"]),
-    ("sqrt(9/4)", "3/2"),
+    ("sqrt(9/4)", ["sqrt", ["/", "9", "4"]]),
     ("sqrt(2)", ["sqrt", "2"]),
-    ("1/sqrt(x)", ["**", ["sqrt", "x"], -1]),
-    ("x*sqrt(x)", ["**", ["sqrt", "x"], 3]),
+    ("1/sqrt(x)", ["/", "1", ["sqrt", "x"]]),
+    ("x*sqrt(x)", ["*", "x", ["sqrt", "x"]]),
+    ("x*x - x/x + 0*x", ["+", ["*", "x", "x"], ["-", ["/", "x", "x"]], ["*", "0", "x"]]),
+    ("sqrt(x)**2", ["**", ["sqrt", "x"], 2]),
     ("sqrt(sqrt(x))", ["sqrt", ["sqrt", "x"]]),
-    ("1/(x*sqrt(sqrt(x)))", ["**", ["sqrt", ["sqrt", "x"]], -5]),
+    ("1/(x*sqrt(sqrt(x)))", ["/", "1", ["*", "x", ["sqrt", ["sqrt", "x"]]]]),
 ]
 
 
@@ -70,7 +82,7 @@ WRITTEN: list[tuple[str, Any]] = [
 def test_equations_become_trees(text: str, tree: Any) -> None:
     expression = parse_expression(text, {"x": X})
     assert to_tree(expression) == tree
-    assert from_tree(tree, {"x": X}) == expression and has_tree(expression)
+    assert from_tree(tree, {"x": X}) == expression
 
 
 @pytest.mark.parametrize(
@@ -79,8 +91,8 @@ def test_equations_become_trees(text: str, tree: Any) -> None:
      "atan(-x)", "tan(atan(x)/2)", "exp(x/2)**3/sqrt(exp(x))", "sqrt(4*x + 2)", "tanh(-x)/sqrt(1/8)", "sqrt(x**2)",
      "0.15*exp(0.3)"],
 )  # fmt: skip
-def test_what_sympy_makes_of_an_equation_has_the_same_value(text: str) -> None:
-    """sympy merges powers, and knows 4 atan(1) as pi: the tree says the same as the text does in balls."""
+def test_what_is_read_of_an_equation_has_its_value(text: str) -> None:
+    """The tree says the same as the text does in balls, and so does its evaluation with constants gathered."""
     expression = parse_expression(text, {"x": X})
     with ctx.workprec(200):
         for x in (Fraction(1, 3), Fraction(7, 4)):
@@ -125,7 +137,7 @@ def test_what_is_not_rational_is_not_decided(text: str) -> None:
         evaluate_exactly(parse_expression(text, {"x": X}), {X: Fraction(0)})
 
 
-@pytest.mark.parametrize("text", ["sqrt(-4)", "log(x)", "sqrt(x, 2)", "x**0.5", "x**(1/2)", "sqrt", "exp()", "asin(x)"])
+@pytest.mark.parametrize("text", ["x**0", "log(x)", "sqrt(x, 2)", "x**0.5", "x**(1/2)", "sqrt", "exp()", "asin(x)"])
 def test_equations_outside_the_grammar(text: str) -> None:
     with pytest.raises(InputError):
         to_tree(parse_expression(text, {"x": X}))
@@ -269,17 +281,17 @@ def test_the_third_derivatives_of_the_format() -> None:
 # ------------------------------------------------------------------------------------------------- through the pipeline
 
 
-def scalar(dynamics: sympy.Expr, width: float | str = 3, gain: float = -1.0) -> tuple[System, TanhNetwork]:
-    system = System("s", (X,), (U,), {}, (dynamics,), (sympy.Integer(0),), box(width), box(9))
+def scalar(dynamics: Expression, width: float | str = 3, gain: float = -1.0) -> tuple[System, TanhNetwork]:
+    system = System("s", (X,), (U,), {}, (dynamics,), (Number(0),), box(width), box(9))
     network = TanhNetwork((np.array([[gain]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
     return system, network
 
 
 # A loop under u = -x, and where its region of attraction ends.
 KNOWN: dict[str, tuple[Callable[[], tuple[System, TanhNetwork]], float]] = {
-    "tanh": (lambda: scalar(X / 2 + sympy.tanh(U)), 1.9150080481545375),
-    "exp": (lambda: scalar(X / 2 + sympy.exp(U) - 1), 1.5936242600400401),
-    "atan": (lambda: scalar(X / 2 + sympy.atan(U)), 2.331122370414423),
+    "tanh": (lambda: scalar(X / 2 + tanh(U)), 1.9150080481545375),
+    "exp": (lambda: scalar(X / 2 + exp(U) - 1), 1.5936242600400401),
+    "atan": (lambda: scalar(X / 2 + atan(U)), 2.331122370414423),
     "sqrt": (tank, 9.0),
 }
 
@@ -439,7 +451,7 @@ def test_the_local_proof_knows_the_functions() -> None:
         case = case_of(*build())
         level = prove_local(case.problem, case.T, 100.0)
         assert level is not None and 0 < level < edge**2 * float(case.P[0, 0])
-    near = case_of(*scalar(U * sympy.sqrt(X + sympy.Rational(1, 100)) * 10))
+    near = case_of(*scalar(U * sqrt(X + Fraction(1, 100)) * 10))
     level = prove_local(near.problem, near.T, 1.0)
     assert level is not None and level < 1e-4 * float(near.P[0, 0])
 
@@ -449,6 +461,6 @@ def test_solvers_are_asked_whether_roots_are_defined() -> None:
     found = conditions(Asymptotic(roa=1.0, local=0.1), case.problem)
     asked = query(next(c for c in found if c.name == "root-0"), case.problem)
     assert asked.constraints[-1] == ("r.", "<=", "0") and ("r.", ["+", "16", "x"]) in asked.definitions
-    nested = case_of(*scalar(U + sympy.sqrt(3 + sympy.sqrt(1 + X)) * X / 100 + sympy.sqrt(2) * X / 100))
+    nested = case_of(*scalar(U + sqrt(3 + sqrt(1 + X)) * X / 100 + sqrt(2) * X / 100))
     names = [c.name for c in conditions(Asymptotic(roa=1.0, local=0.1), nested.problem)]
     assert [n for n in names if n.startswith("root")] == ["root-0", "root-1"]

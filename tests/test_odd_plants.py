@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import sympy
 from rich.console import Console
 
 from certify.errors import InputError
+from certify.expressions import Number, Symbol
 from certify.policies import TanhNetwork
 from certify.reference.rules import judge
 from certify.report import summary
@@ -24,14 +24,14 @@ from tests.support.certificates import dump, grow, make, verdict
 
 
 def plant(dynamics: dict[str, str], half: float = 2, bound: int = 6) -> System:
-    names = {name: sympy.Symbol(name) for name in (*dynamics, "u")}
+    names = {name: Symbol(name) for name in (*dynamics, "u")}
     return System(
         name="p",
         states=tuple(names[s] for s in dynamics),
         inputs=(names["u"],),
         parameters={},
         dynamics=tuple(parse_expression(e, names) for e in dynamics.values()),
-        u_eq=(sympy.Integer(0),),
+        u_eq=(Number(0),),
         domain=((Fraction(-half), Fraction(half)),) * len(dynamics),
         input_bounds=((Fraction(-bound), Fraction(bound)),),
     )

@@ -13,7 +13,6 @@ import flint
 import mpmath
 import numpy as np
 import pytest
-import sympy
 
 from certify.acceptance import _lowered
 from certify.certificate import Certificate, PartitionTree, read_certificate, run_checker
@@ -22,6 +21,7 @@ from certify.cli import _run
 from certify.closed_loop import ClosedLoop
 from certify.containment import proved_set
 from certify.errors import InputError
+from certify.expressions import Expression, Number, atan, exp, sin, symbols
 from certify.float_error import float_error
 from certify.largest import certify_largest
 from certify.lyapunov.function import Quadratic
@@ -37,10 +37,10 @@ from tests.support.loops import box
 PLAIN = Path(__file__).parent.parent / "examples" / "policies" / "without_gain" / "pendulum.pt"
 
 
-def scalar(f: sympy.Expr, weight: float, bias: float, clip: tuple[float, float] | None = None) -> ClosedLoop:
+def scalar(f: Expression, weight: float, bias: float, clip: tuple[float, float] | None = None) -> ClosedLoop:
     """xdot = f(x, u), u = clip(weight x + bias)."""
-    x, u = sympy.symbols("x u")
-    system = System("s", (x,), (u,), {}, (f,), (sympy.Integer(0),), box(3), box(9))
+    x, u = symbols("x u")
+    system = System("s", (x,), (u,), {}, (f,), (Number(0),), box(3), box(9))
     bounds = None if clip is None else (np.array([clip[0]]), np.array([clip[1]]))
     network = TanhNetwork(
         (np.array([[weight]]),), (np.array([bias]),), np.ones(1), np.zeros(1), "identity", "none", clip=bounds
@@ -48,13 +48,13 @@ def scalar(f: sympy.Expr, weight: float, bias: float, clip: tuple[float, float] 
     return ClosedLoop(system, network)
 
 
-x, u = sympy.symbols("x u")
+x, u = symbols("x u")
 
 
 @pytest.mark.parametrize("bias", [0.25, -0.3, 1e-9])
 def test_the_digits_are_the_roots(bias: float) -> None:
     """sin x - x/2 ... = 0 against fifty digits of another library."""
-    found = find_rest(scalar(sympy.sin(x) / 2 + u, -1.0, bias))
+    found = find_rest(scalar(sin(x) / 2 + u, -1.0, bias))
     assert found is not None and found.stable
     mpmath.mp.dps = 50
     truth = mpmath.findroot(lambda v: mpmath.sin(v) / 2 - v + mpmath.mpf(bias), bias)
@@ -93,7 +93,7 @@ def test_a_loop_that_is_not_stable_there_is_told_so(tmp_path: Path, candidate: L
 
 
 @pytest.mark.parametrize("f", [1 + x**2 + 0 * u, x**2 + u])
-def test_what_is_not_shown_is_not_said(f: sympy.Expr) -> None:
+def test_what_is_not_shown_is_not_said(f: Expression) -> None:
     """No point of rest at all; and a double one, which the test cannot tell from none."""
     assert find_rest(scalar(f, 0.0, 0.0)) is None
 
@@ -147,11 +147,11 @@ def test_a_loop_that_rests_at_the_origin_gets_the_stronger_claim(tmp_path: Path)
 
 def bent(centre: Literal["none", "output"] = "none", **changes: Any) -> ClosedLoop:
     """Two states with an operating point, an uncertain parameter, a disturbance and a product of state and input."""
-    a, b, c, d, v = sympy.symbols("a b c d v")
-    f = (b + c * sympy.sin(a) / 8, -2 * b - sympy.sin(a) + v * (1 + a / 4) + d)
+    a, b, c, d, v = symbols("a b c d v")
+    f = (b + c * sin(a) / 8, -2 * b - sin(a) + v * (1 + a / 4) + d)
     system = System(
-        "bent", (a, b), (v,), {"c": Fraction(1)}, f, (sympy.Integer(0),), box(2, 3), box(9),
-        x_eq=(sympy.Rational(1, 3), sympy.Integer(0)), disturbances=(d,), **changes,
+        "bent", (a, b), (v,), {"c": Fraction(1)}, f, (Number(0),), box(2, 3), box(9),
+        x_eq=(Fraction(1, 3), Number(0)), disturbances=(d,), **changes,
     )  # fmt: skip
     generator = np.random.default_rng(5)
     layers = (generator.standard_normal((5, 2)), np.array([[0.3, -0.2, 0.1, 0.4, -0.5]]))
@@ -186,7 +186,7 @@ def test_seen_from_elsewhere_it_is_the_same_loop(time: Literal["continuous", "di
 
 def test_a_point_of_rest_that_newton_misses_is_found_along_a_trajectory() -> None:
     """On the way from 0 to the point of rest at 1 the rate rises before it falls, and Newton's steps lead away."""
-    flat = sympy.atan(200 * (1 - x)) + sympy.exp(-40 * x**2) * 3 * x + 0 * u
+    flat = atan(200 * (1 - x)) + exp(-40 * x**2) * 3 * x + 0 * u
     found = find_rest(scalar(flat, 0.0, 0.0))
     assert found is not None and abs(float(found.x[0]) - 1) < 1e-12 and found.stable
 

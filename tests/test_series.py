@@ -10,10 +10,13 @@ import pytest
 import scipy.integrate
 import sympy
 
-from certify.expressions import Algebra, PowerSeries, Series, evaluate, solution_series
+from certify.expressions import Algebra, Number, PowerSeries, Series, evaluate, sin, solution_series, symbols
+from certify.systems.equations import parse_expression
+from tests.support.algebra import to_sympy
 from tests.support.marks import slow_after
 
-X, Y, U, T = sympy.symbols("x y u t")
+X, Y, U = symbols("x y u")
+T = sympy.Symbol("t")
 
 
 class Numbers(Algebra[float]):
@@ -47,7 +50,7 @@ class Numbers(Algebra[float]):
     ),
 )
 def test_coefficients_of_a_function_along_a_series(text: str) -> None:
-    expression = sympy.sympify(text, locals={"x": X})
+    expression = parse_expression(text, {"x": X})
     row = [sympy.Rational(1, 3), sympy.Rational(-1, 2), sympy.Integer(0), sympy.Rational(5, 7), sympy.Rational(1, 9)]
     algebra = PowerSeries(Numbers())
     x = Series(float(row[0]))
@@ -55,7 +58,7 @@ def test_coefficients_of_a_function_along_a_series(text: str) -> None:
     for c in row[1:]:
         x.coefficients.append(float(c) if c else None)
         algebra.advance()
-    along = expression.subs(X, sum(c * T**k for k, c in enumerate(row)))
+    along = to_sympy(expression).subs(sympy.Symbol("x"), sum(c * T**k for k, c in enumerate(row)))
     for k, coefficient in enumerate(found.coefficients):
         wanted = float((along.diff(T, k).subs(T, 0) / sympy.factorial(k)).evalf(30))
         assert (coefficient or 0.0) == pytest.approx(wanted, rel=1e-11, abs=1e-12)
@@ -63,7 +66,7 @@ def test_coefficients_of_a_function_along_a_series(text: str) -> None:
 
 def test_a_coefficient_that_is_certainly_0_is_no_value() -> None:
     algebra = PowerSeries(Numbers())
-    found = evaluate(sympy.sin(X) * U + 3, {X: algebra.held(1.0), U: algebra.held(2.0)}, algebra)
+    found = evaluate(sin(X) * U + 3, {X: algebra.held(1.0), U: algebra.held(2.0)}, algebra)
     algebra.advance()
     assert found.coefficients[1] is None
     assert found.coefficients[0] == 3 + 2 * math.sin(1)
@@ -71,7 +74,7 @@ def test_a_coefficient_that_is_certainly_0_is_no_value() -> None:
 
 def test_the_series_of_a_solution_ends_at_the_solution() -> None:
     """x' = y, y' = -sin(x) + u - y/5 from (1, -1/2), u = 3/10: the error of order r over h falls as h^(r + 1)."""
-    f = (Y, -sympy.sin(X) + U - Y / 5)
+    f = (Y, -sin(X) + U - Y / 5)
     rows = solution_series(f, {X: 1.0, Y: -0.5}, {U: 0.3}, Numbers(), 6)
 
     def rate(_: float, z: np.ndarray) -> list[float]:
@@ -90,5 +93,5 @@ def test_the_series_of_a_solution_ends_at_the_solution() -> None:
 
 
 def test_a_solution_that_moves_at_a_constant_rate() -> None:
-    rows = solution_series((sympy.Integer(2), X), {X: 1.0, Y: 0.0}, {}, Numbers(), 4)
+    rows = solution_series((Number(2), X), {X: 1.0, Y: 0.0}, {}, Numbers(), 4)
     assert rows == [[2, 0, 0, 0], [1, 1, 0, 0]]

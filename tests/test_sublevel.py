@@ -11,23 +11,23 @@ from typing import Any
 import mpmath
 import numpy as np
 import pytest
-import sympy
 from hypothesis import given
 from hypothesis import strategies as st
 
 from certify.errors import InputError
+from certify.expressions import as_expression, cos, exp, sin, sqrt, symbols, tan, tanh
 from certify.lyapunov import Neural, Symbolic
 from certify.rigorous import ball, function_on, precision
 from certify.sublevel import Sublevel
 
 F = Fraction
-x, y = sympy.symbols("x y")
+x, y = symbols("x y")
 UNIT = (F(-1), F(1))
 TINY = F(1, 10**200)
 
 
 def of(expression: Any, level: float = 1.0, half: Fraction | int = 2) -> Sublevel:
-    return Sublevel(Symbolic(sympy.sympify(expression), (x, y)), level, ((F(-half), F(half)),) * 2)
+    return Sublevel(Symbolic(as_expression(expression), (x, y)), level, ((F(-half), F(half)),) * 2)
 
 
 def network(seed: int, widths: Sequence[int], size: float = 1.0) -> Neural:
@@ -53,13 +53,13 @@ INSIDE, OUTSIDE, OPEN = (True, False), (False, True), (False, False)
         (x**2 - 10, (F(2), F(0)), INSIDE),  # the domain is closed
         (x**2 - 10, (F(2) + TINY, F(0)), OUTSIDE),
         (x**2 - 10, (F(0), -F(2) - TINY), OUTSIDE),
-        (sympy.exp(x) + y, (0.0, 0.0), INSIDE),  # exp has a rational value at 0, and it is the level
-        (sympy.exp(x) + y, (TINY, F(0)), OUTSIDE),
-        (sympy.tanh(x) ** 2 + 1 - sympy.tanh(x) ** 2, (F(1), F(0)), INSIDE),  # which is 1 to whoever simplifies it
-        (sympy.sin(x) ** 2 + sympy.cos(x) ** 2, (F(1), F(0)), OPEN),  # 1 as well, and no ball tells
+        (exp(x) + y, (0.0, 0.0), INSIDE),  # exp has a rational value at 0, and it is the level
+        (exp(x) + y, (TINY, F(0)), OUTSIDE),
+        (tanh(x) ** 2 + 1 - tanh(x) ** 2, (F(1), F(0)), INSIDE),  # which is 1 to whoever simplifies it
+        (sin(x) ** 2 + cos(x) ** 2, (F(1), F(0)), OPEN),  # 1 as well, and no ball tells
         (1 / x, (F(0), F(1)), OPEN),  # N has no value there
-        (sympy.sqrt(x) - 3, (F(-1), F(1)), OPEN),
-        (sympy.sqrt(x) - 3, (F(1), F(1)), INSIDE),
+        (sqrt(x) - 3, (F(-1), F(1)), OPEN),
+        (sqrt(x) - 3, (F(1), F(1)), INSIDE),
     ],
 )
 def test_known_states(N: Any, point: tuple[Any, ...], expected: tuple[bool, bool]) -> None:
@@ -68,7 +68,7 @@ def test_known_states(N: Any, point: tuple[Any, ...], expected: tuple[bool, bool
 
 def test_bits_are_added_until_it_is_decided() -> None:
     """tanh(x) - x + x^3/3 is 2 x^5/15 or so, which is lost beside x at 1e-60 unless there are five times its digits."""
-    N, at = sympy.tanh(x) - x + x**3 / 3, F(1, 10**60)
+    N, at = tanh(x) - x + x**3 / 3, F(1, 10**60)
     value = 2.0 / 15 * 1e-300
     assert sides(of(N, 1.001 * value), at, F(0)) == INSIDE
     assert sides(of(N, 0.999 * value), at, F(0)) == OUTSIDE
@@ -112,7 +112,7 @@ def test_a_box_that_is_covered_is(seed: int) -> None:
     N = network(seed, (2, 6, 1))
     if seed % 2:
         a, b, c = generator.integers(-3, 4, 3)
-        N = Symbolic(int(a) * x**2 + sympy.sin(int(b) * x * y) + int(c) * y / (x**2 + 1), (x, y))  # type: ignore[assignment]
+        N = Symbolic(int(a) * x**2 + sin(int(b) * x * y) + int(c) * y / (x**2 + 1), (x, y))  # type: ignore[assignment]
     middle, half = generator.uniform(-1, 1, 2), generator.uniform(0, 0.4, 2) * (generator.random(2) < 0.8)
     box = [(F(c) - F(h), F(c) + F(h)) for c, h in zip(middle, half, strict=True)]
     level = float(N(middle) + generator.uniform(-0.2, 1.5))
@@ -141,8 +141,8 @@ def test_small_boxes_are_decided() -> None:
     [
         (x**2, ((F(1), F(5, 2)), UNIT)),  # beyond the domain
         (1 / x - 9, (UNIT, UNIT)),  # it is below the level on most of the box
-        (sympy.sqrt(x) - 9, (UNIT, UNIT)),
-        (sympy.tan(2 * x) - 99, (UNIT, UNIT)),
+        (sqrt(x) - 9, (UNIT, UNIT)),
+        (tan(2 * x) - 99, (UNIT, UNIT)),
     ],
 )
 def test_a_box_that_leaves_the_domain_or_that_n_has_no_value_on_is_not_covered(N: Any, box: Any) -> None:
@@ -151,9 +151,7 @@ def test_a_box_that_leaves_the_domain_or_that_n_has_no_value_on_is_not_covered(N
     assert of(x - 9, 1e9).look((UNIT, UNIT)).covered
 
 
-@pytest.mark.parametrize(
-    "make", [lambda: network(5, (3, 7, 4, 1)), lambda: Symbolic(sympy.exp(x) * y**3 - x / y, (x, y))]
-)
+@pytest.mark.parametrize("make", [lambda: network(5, (3, 7, 4, 1)), lambda: Symbolic(exp(x) * y**3 - x / y, (x, y))])
 def test_gradients_are_those_of_n(make: Callable[[], Any]) -> None:
     N = make()
     point = np.array([0.3, -0.7, 0.2])[: N.n]

@@ -150,7 +150,7 @@ class _Reader:
         if exponent is None or exponent.denominator != 1 or not abs(exponent) <= MOST_EXPONENT:
             raise self._refuse(
                 f"the exponent of {self._text(node)!r} must be an integer of at most {MOST_EXPONENT}; "
-                f"found {self._text(node.right)}"
+                f"found {self._text(node.right) if exponent is None else exponent}"
             )
         if exponent == 0:
             raise self._refuse(f"{self._text(node)!r} is 1 wherever it has a value; write 1")

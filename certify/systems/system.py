@@ -22,6 +22,8 @@ from fractions import Fraction
 from types import MappingProxyType
 from typing import Any, Literal, get_args
 
+import numpy as np
+
 from certify.errors import InputError
 from certify.expressions import (
     Expression,
@@ -133,6 +135,8 @@ class System:
         for key in ("dynamics", "u_eq", "x_eq"):
             try:
                 object.__setattr__(self, key, tuple(map(as_expression, getattr(self, key))))
+                for equation in getattr(self, key):
+                    constant_of(equation)
             except InputError as error:
                 raise InputError(f"`{key}` of {self.name}: {error}") from error
         for label, found, wanted in (
@@ -426,8 +430,9 @@ class System:
             try:
                 found[symbol.name] = evaluate_exactly(expression, at_rest)
             except InputError:
-                rounded = numerical([expression], list(at_rest))(*map(float, at_rest.values()))
-                found[symbol.name] = float(rounded[0])
+                with np.errstate(all="ignore"):
+                    rounded = numerical([expression], list(at_rest))(*(np.float64(q) for q in at_rest.values()))
+                found[symbol.name] = float(rounded[0]) if np.isfinite(rounded[0]) else math.nan
         return found
 
     def function(self, module: Module = "numpy") -> Callable[[Any, Any], Any]:
@@ -464,9 +469,7 @@ class System:
         broadcast: Any
         number: Callable[[Any, Any], Any]
         if module == "numpy":
-            import numpy
-
-            stack, broadcast, number = numpy.stack, numpy.broadcast_arrays, _as_it_is
+            stack, broadcast, number = np.stack, np.broadcast_arrays, _as_it_is
         elif module == "torch":
             import torch
 
@@ -505,7 +508,7 @@ class System:
         if isinstance(value, str):
             raise InputError(
                 f"{what} in {self.name} must be rational, because the equilibrium is decided in rationals; "
-                f"found {value}. Choose parameters for which it is, or make it a parameter itself."
+                f"found {result}. Choose parameters for which it is, or make it a parameter itself."
             )
         return value
 
@@ -522,7 +525,10 @@ def _as_tensor(value: Any, like: Any) -> Any:
 
 
 def in_deviations(
-    equations: Sequence[Expression], states: Sequence[Symbol], x_eq: Sequence[Expression], time: Time = "continuous"
+    equations: Sequence[Expression | Fraction],
+    states: Sequence[Symbol],
+    x_eq: Sequence[Expression | Fraction],
+    time: Time = "continuous",
 ) -> tuple[Expression, ...]:
     """Equations in the states' values as equations in deviations from x_eq: each state s becomes `x_eq_s + s`.
 
@@ -532,9 +538,10 @@ def in_deviations(
     >>> in_deviations([1 - h0 / h], [h], [h0])
     (1 - h0/(h0 + h),)
     """
-    shifts = [None if at == Number(0) else at for at in x_eq]
+    none = Number(0)
+    shifts = [None if at is none else at for at in map(as_expression, x_eq)]
     values = {s: Operation("+", at, s) for s, at in zip(states, shifts, strict=True) if at is not None}
-    moved = [substitute(e, values) for e in equations]
+    moved = [substitute(as_expression(e), values) for e in equations]
     if time == "continuous":
         return tuple(moved)
     return tuple(e if at is None else Operation("+", e, -at) for e, at in zip(moved, shifts, strict=True))

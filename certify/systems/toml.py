@@ -203,7 +203,7 @@ def _at_rest(
         raise file.refuse(f"the operating point has no value: {error}.", table, name) from error
     if isinstance(value, str):
         raise file.refuse(
-            f"the operating point must be rational, because the equilibrium is decided in rationals; found {value}. "
+            f"the operating point must be rational, because the equilibrium is decided in rationals; found {point}. "
             "Choose parameters for which it is, or make it a parameter itself.",
             table,
             name,

@@ -24,7 +24,6 @@ from typing import Any, get_args
 
 import numpy as np
 import pytest
-import sympy
 import torch
 from flint import arb, ctx
 from numpy.typing import NDArray
@@ -38,7 +37,7 @@ from certify.closed_loop import ClosedLoop
 from certify.enclosures import PolicyEnclosure
 from certify.enclosures import policy as producer
 from certify.enclosures import taylor as producer_taylor
-from certify.expressions import to_tree
+from certify.expressions import Number, cos, sin, symbols, tan, to_tree
 from certify.policies import TanhNetwork
 from certify.policies.network import Centre, Squash
 from certify.rigorous import evaluate_policy
@@ -413,14 +412,14 @@ def network_of(policy: Policy, squash: Squash, centre: Centre) -> TanhNetwork:
 
 def still_system(n: int, u_eq: tuple[Fraction, ...]) -> System:
     """A plant with n states that lets the producer read the equilibrium input, and nothing else."""
-    states, inputs = sympy.symbols(f"x1:{n + 1}"), sympy.symbols(f"u1:{len(u_eq) + 1}")
+    states, inputs = symbols(f"x{i}" for i in range(1, n + 1)), symbols(f"u{i}" for i in range(1, len(u_eq) + 1))
     return System(
         name="still",
         states=states,
         inputs=inputs,
         parameters={},
         dynamics=tuple(-x for x in states),
-        u_eq=tuple(sympy.Rational(q.numerator, q.denominator) for q in u_eq),
+        u_eq=tuple(Fraction(q.numerator, q.denominator) for q in u_eq),
         domain=box(*[1] * n),
         input_bounds=box(*[1] * len(u_eq)),
     )
@@ -572,19 +571,19 @@ def test_the_oracle_agrees_with_the_closed_loops_own() -> None:
 
 def crooked() -> System:
     """A plant that uses all of the grammar: quotients, powers, tan."""
-    x, y, z, u, v = sympy.symbols("x y z u v")
-    third = sympy.Rational(1, 3)
+    x, y, z, u, v = symbols("x y z u v")
+    third = Fraction(1, 3)
     return System(
         name="crooked",
         states=(x, y, z),
         inputs=(u, v),
         parameters={},
         dynamics=(
-            (u - third) * sympy.cos(x * y) / (2 + sympy.sin(z) ** 2),
-            sympy.tan(y / 4) * (1 + x**2) ** -2 - v**3 / 7,
-            (x - z) ** 3 + sympy.sin(u - third) * v + sympy.Rational(-5, 11) * z / (3 + x),
+            (u - third) * cos(x * y) / (2 + sin(z) ** 2),
+            tan(y / 4) * (1 + x**2) ** -2 - v**3 / 7,
+            (x - z) ** 3 + sin(u - third) * v + Fraction(-5, 11) * z / (3 + x),
         ),
-        u_eq=(third, sympy.Integer(0)),
+        u_eq=(third, Number(0)),
         domain=box(2, 2, 2),
         input_bounds=box(9, 9),
     )
@@ -592,14 +591,14 @@ def crooked() -> System:
 
 def integrator() -> System:
     """xdot = u: Vdot is 2 P x u, which a model of second order can bound without any slack."""
-    x, u = sympy.symbols("x u")
+    x, u = symbols("x u")
     return System(
         name="integrator",
         states=(x,),
         inputs=(u,),
         parameters={},
         dynamics=(u,),
-        u_eq=(sympy.Integer(0),),
+        u_eq=(Number(0),),
         domain=box(2),
         input_bounds=box(9),
     )

@@ -21,14 +21,13 @@ from controllers.cli import app
 from controllers.options import Plant, available_plants, get_plant
 
 EQUATIONS = """
-import sympy
 from certify.systems import System
 
 def leak() -> System:
-    x, y, u = sympy.symbols("x y u")
-    third = sympy.Rational(1, 3)
+    x, y, u = symbols("x y u")
+    third = Fraction(1, 3)
     box = ((-2, 2), (-2, 2))
-    return System("leak", (x, y), (u,), {}, (y, third * sympy.sin(x) + u), (sympy.Integer(0),), box, ((-3, 3),))
+    return System("leak", (x, y), (u,), {}, (y, third * sin(x) + u), (Number(0),), box, ((-3, 3),))
 """
 TRAINED = """
 from dataclasses import replace

@@ -12,15 +12,15 @@ import flint
 import numpy as np
 import pytest
 import scipy.linalg
-import sympy
 from typer.testing import CliRunner
 
 from certify.closed_loop import ClosedLoop
 from certify.containment import Ellipsoid, ProvedSet
 from certify.errors import InputError
+from certify.expressions import Number, Symbol, substitute, symbols
 from certify.policies import Policy, TanhNetwork, load_policy, save_policy
 from certify.rigorous import is_definite
-from certify.systems import System, get_system
+from certify.systems import System, get_system, in_floats
 from controllers import theory as module
 from controllers.cli import app
 from controllers.evaluate import discrete_linearisation, require_same_loop
@@ -34,9 +34,9 @@ SLACK = 1.01  # a bound that is this much weaker than the truth is still worth p
 
 def _scalar(a=1.0, b=2.0, gain=1.5, K=1.5, weight=3.0):
     """x' = a x + b u under u = -tanh(gain x), whose record says that the gain is K."""
-    x, u = sympy.symbols("x u")
-    rate = sympy.Rational(str(a)) * x + sympy.Rational(str(b)) * u
-    system = System("line", (x,), (u,), {}, (rate,), (sympy.Integer(0),), ((-3, 3),), ((-1, 1),))
+    x, u = symbols("x u")
+    rate = Fraction(str(a)) * x + Fraction(str(b)) * u
+    system = System("line", (x,), (u,), {}, (rate,), (Number(0),), ((-3, 3),), ((-1, 1),))
     layers = (np.array([[0.5]]), np.array([[-2.0 * gain]]))
     network = TanhNetwork(layers, (np.zeros(1), np.zeros(1)), np.ones(1), np.zeros(1), "tanh", "preactivation")
     training = {"dt": DT, "gamma": GAMMA, "reward_weights": [weight], "K": [[K]]}
@@ -115,7 +115,7 @@ def _pendulum():
 def test_within_epsilon_no_gain_breaks_the_loop_and_it_is_nearly_the_largest_that_can_be_said():
     policy, found, system = _pendulum()
     K = np.array(policy.training["K"])
-    A, B = (np.array(M, dtype=float) for M in ClosedLoop(system, policy.network).plant_jacobians())
+    A, B = (in_floats(M) for M in ClosedLoop(system, policy.network).plant_jacobians())
     held = discrete_linearisation(system, policy.training["dt"])
     generator = np.random.default_rng(0)
     for _ in range(200):
@@ -165,7 +165,7 @@ def test_a_set_of_another_loop_is_refused():
         _constants(policy, own, _proved_set(policy, _scalar(a=1.1)[1][0], [[7.0]]))
     with pytest.raises(InputError, match="about the plant that is simulated"):
         _constants(policy, own, _proved_set(policy, replace(own[0], time="discrete"), [[7.0]]))
-    held = own[0].with_sample((0, sympy.Rational(1, 10)))
+    held = own[0].with_sample((0, Fraction(1, 10)))
     said = _constants(policy, (held, own[1]), _proved_set(policy, held, [[7.0]]))["epsilon_P"]
     assert said.value is None and "held action" in said.by
 
@@ -178,7 +178,9 @@ def test_a_set_that_is_proved_for_less_of_what_is_uncertain_is_refused():
             require_same_loop(_proved_set(policy, less, [[7.0]]), policy.network, pushed)
     for plant in (nominal, little, pushed):  # what holds for more holds for these
         require_same_loop(_proved_set(policy, pushed, [[7.0]]), policy.network, plant)
-    backwards = replace(little, dynamics=tuple(e.subs("error_u", "-error_u") for e in little.dynamics))
+    backwards = replace(
+        little, dynamics=tuple(substitute(e, {Symbol("error_u"): -Symbol("error_u")}) for e in little.dynamics)
+    )
     with pytest.raises(InputError, match="about the plant that is simulated"):
         require_same_loop(_proved_set(policy, backwards, [[7.0]]), policy.network, little)
 

@@ -20,7 +20,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import sympy
 
 from certify.certificate import read_certificate, run_checker
 from certify.claims import Practical, Problem
@@ -35,6 +34,7 @@ from certify.engines.dreal.backend import Answer, Backend, decide, find_backend
 from certify.engines.dreal.proof import DrealEngine, DrealOptions, confirm_with_dreal
 from certify.engines.falsify import Witness, confirm
 from certify.errors import BackendError, InputError, SoundnessError
+from certify.expressions import Number, symbols
 from certify.lyapunov.function import Quadratic
 from certify.policies import Policy, TanhNetwork, save_policy
 from certify.report import render_html
@@ -471,16 +471,16 @@ def destabilised() -> tuple[System, TanhNetwork, np.ndarray]:
 
     x'/x = -1 + d s - t s^2 with s = x^4, d = 3/10 - 0.3 and t = d^2/5 is 1/4 at s = 5/(2d).
     """
-    x, u = sympy.symbols("x u")
+    x, u = symbols("x u")
     d = Fraction(3, 10) - Fraction(0.3)
-    t = sympy.Rational(d.numerator, d.denominator) ** 2 / 5
+    t = Fraction(d.numerator, d.denominator) ** 2 / 5
     system = System(
         name="destabilised",
         states=(x,),
         inputs=(u,),
         parameters={},
-        dynamics=(-x + sympy.Rational(3, 10) * x**5 + u * x**4 - t * x**9,),
-        u_eq=(sympy.Integer(0),),
+        dynamics=(-x + Fraction(3, 10) * x**5 + u * x**4 - t * x**9,),
+        u_eq=(Number(0),),
         domain=box(24000),
         input_bounds=box(10**6),
     )
@@ -554,8 +554,8 @@ def test_a_violation_contradicts_only_where_the_guards_hold(
     at: float, contradicts: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """xdot = 2x: Vdot > 0 everywhere, but a practical claim speaks of nothing below its floor."""
-    x, u = sympy.symbols("x u")
-    system = System("away", (x,), (u,), {}, (3 * x + u,), (sympy.Integer(0),), box(3), box(9))
+    x, u = symbols("x u")
+    system = System("away", (x,), (u,), {}, (3 * x + u,), (Number(0),), box(3), box(9))
     network = TanhNetwork((np.array([[-1.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
     problem = Problem(ClosedLoop(system, network), Quadratic(np.eye(1)))
     answer = Answer("delta-sat", 0.1, "fake", {"x": (at, at)})

@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import sympy
 from flint import fmpq_mat
 
 from certify.checker.ball import Ball
@@ -24,6 +23,7 @@ from certify.engines.enlarge import Found, enlarge
 from certify.engines.local import prove_local
 from certify.engines.models import Models, paths
 from certify.engines.tube import Tube, find_tube
+from certify.expressions import cos, sin, symbols
 from certify.lyapunov import domain_limit, leaves_domain
 from certify.policies import TanhNetwork, load_policy
 from certify.roa import RoaOptions, certify_roa
@@ -79,8 +79,8 @@ def loops() -> dict[str, ClosedLoop]:
     curved = Path(__file__).parents[1] / "data" / "quadrotor2d_curved.pt"
     found = {name: loop_of(name) for name in ("scalar", "chain", "pendulum")} | {"tank": tank(), "valve": valve()}
     found["quadrotor2d"] = get_system("quadrotor2d"), load_policy(curved).network
-    x, u = sympy.symbols("x u")
-    others = {"trigonometric": sympy.sin(x + u / 3) + sympy.cos(x * u) - 1, "inverse": u + x / (2 + x + u / 5)}
+    x, u = symbols("x u")
+    others = {"trigonometric": sin(x + u / 3) + cos(x * u) - 1, "inverse": u + x / (2 + x + u / 5)}
     for name, f in others.items():
         system, network = scalar_tanh()
         found[name] = replace(system, states=(x,), inputs=(u,), dynamics=(f,)), network

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import sympy
 import torch
 
 from certify.certificate import Certificate, OuterTree, PartitionTree, run_checker
@@ -25,6 +24,7 @@ from certify.engines.outer import Nothing, OuterProof, prove_outer, split_again,
 from certify.engines.outer.falsify import Falsifier
 from certify.engines.outer.rule import FaceBound, FallBound
 from certify.errors import InputError
+from certify.expressions import Expression, Number, cos, exp, sqrt, symbols
 from certify.lyapunov import Neural, Symbolic
 from certify.lyapunov.function import Quadratic
 from certify.policies import TanhNetwork
@@ -36,7 +36,7 @@ from tests.support.marks import slow_after
 
 CPU = torch.device("cpu")
 RUNNER = ThreadRunner()
-X, Y, U, W = sympy.symbols("x y u w")
+X, Y, U, W = symbols("x y u w")
 LINE, SQUARE = box(3), box(2, 2)
 LIMIT = 1.915008048  # of x' = x/2 - tanh(x)
 
@@ -62,7 +62,7 @@ def plane(domain: Any = SQUARE, dynamics: Any = (-X + Y / 8, U - X / 8), **more:
         inputs=(U,),
         parameters={},
         dynamics=dynamics,
-        u_eq=(sympy.Integer(0),),
+        u_eq=(Number(0),),
         domain=domain,
         input_bounds=box(9),
         **more,
@@ -73,7 +73,7 @@ def minus_y() -> TanhNetwork:
     return TanhNetwork((np.array([[0.0, -1.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
 
 
-def scalar(dynamics: sympy.Expr = X / 2 + U, domain: Any = LINE, **more: Any) -> Problem:
+def scalar(dynamics: Expression = X / 2 + U, domain: Any = LINE, **more: Any) -> Problem:
     system, network = scalar_tanh()
     changed = dataclasses.replace(system, dynamics=(dynamics,), domain=domain, **more)
     return Problem(ClosedLoop(changed, network), Quadratic(np.eye(1)))
@@ -156,9 +156,9 @@ FUNCTIONS = {
         (np.random.default_rng(3).standard_normal((4, 5)), np.random.default_rng(4).standard_normal(4)),
         (np.random.default_rng(5).standard_normal((1, 4)), [0.5]),
     ),
-    "expression": Symbolic(1 - sympy.cos(X) + X * Y**2 / 3 + sympy.exp(Y / 2) / (3 + X), (X, Y)),
+    "expression": Symbolic(1 - cos(X) + X * Y**2 / 3 + exp(Y / 2) / (3 + X), (X, Y)),
     "state": Symbolic(X, (X, Y)),
-    "constant": Symbolic(sympy.Integer(2), (X, Y)),
+    "constant": Symbolic(Number(2), (X, Y)),
 }
 
 
@@ -256,7 +256,7 @@ def is_proved(rule: FallBound, lo: list[float], hi: list[float], level: float) -
 
 
 def test_what_divides_by_a_range_that_holds_zero_is_not_proved() -> None:
-    problem = planar(plane(dynamics=(-X, U + Y**3 / (X - 1) * sympy.Rational(1, 10**9))))
+    problem = planar(plane(dynamics=(-X, U + Y**3 / (X - 1) * Fraction(1, 10**9))))
     rule = FallBound(problem, 0.25, np.eye(2), Symbolic(X**2 + Y**2, (X, Y)), CPU)
     assert is_proved(rule, [0.7, 0.6], [0.8, 0.7], 99.0)
     assert not is_proved(rule, [0.95, 0.6], [1.05, 0.7], 99.0)
@@ -363,7 +363,7 @@ def edges(domain: Any) -> list[np.ndarray]:
 def test_a_planted_rise_is_not_proved(monkeypatch: pytest.MonkeyPatch) -> None:
     """A whirl in a small disc, which no sample of a few hits: V and N fall everywhere else."""
     monkeypatch.setattr(Falsifier, "search", lambda self, cap: None)
-    bump = sympy.exp(-400 * ((X - 1) ** 2 + (Y - sympy.Rational(1, 2)) ** 2))
+    bump = exp(-400 * ((X - 1) ** 2 + (Y - Fraction(1, 2)) ** 2))
     problem = planar(plane(dynamics=(-X + 2 * bump, U)))
     N = Symbolic(X**2 + Y**2, (X, Y))
     found = prove(problem, N)
@@ -438,8 +438,8 @@ def test_nothing_is_proved_of_what_rises_or_lies_inside(N: Symbolic, c2: float) 
 
 def test_an_expression_without_a_value_somewhere_in_the_domain() -> None:
     """sqrt(2 + x) has none for x < -2, and N is not known to be above any level there."""
-    assert prove(scalar(), Symbolic(X**2 + sympy.sqrt(2 + X), (X,))) is None
-    found = prove(scalar(domain=box("3/2")), Symbolic(X**2 + sympy.sqrt(2 + X) / 8, (X,)))
+    assert prove(scalar(), Symbolic(X**2 + sqrt(2 + X), (X,))) is None
+    found = prove(scalar(domain=box("3/2")), Symbolic(X**2 + sqrt(2 + X) / 8, (X,)))
     assert found is not None and found.stop is Stop.DOMAIN
     holds(scalar(domain=box("3/2")), found)
 
@@ -465,7 +465,7 @@ def test_the_checker_accepts_what_is_proved_and_no_higher_level(name: str, tmp_p
     domain = tuple((Fraction(lo), Fraction(hi)) for lo, hi in (("-2", "5/2"), ("-9/4", "7/3")))
     problem, T = planar(plane(domain)), np.array([[0.8, -0.5], [0.5, 0.8]])
     N = {
-        "expression": Symbolic(X**2 + sympy.Rational(5, 4) * Y**2, (X, Y)),
+        "expression": Symbolic(X**2 + Fraction(5, 4) * Y**2, (X, Y)),
         "network": wells([[1.0, 0.0], [-0.5, 0.875], [-0.5, -0.875]], 0.75),
     }[name]
     inner = BoundsEngine(T, RUNNER).prove(Task(problem, "asymptotic", 0.25), Budget())

@@ -11,7 +11,6 @@ from pathlib import Path
 import cvxpy
 import numpy as np
 import pytest
-import sympy
 
 from certify.certificate import run_checker
 from certify.claims import Practical
@@ -23,6 +22,7 @@ from certify.engines.falsify import survey
 from certify.engines.peak import peak_candidate
 from certify.engines.robust import robust_candidate
 from certify.errors import InputError
+from certify.expressions import Number, symbols
 from certify.lyapunov import domain_limit
 from certify.policies import TanhNetwork, load_policy
 from certify.rigorous import evaluate_vdot
@@ -51,9 +51,9 @@ def uncentred(seed: int = 0) -> tuple[System, TanhNetwork]:
 
 def off_the_origin(shift: Fraction) -> tuple[System, TanhNetwork]:
     """xdot = -x + shift: every trajectory converges to `shift`, so c0 cannot lie below shift^2 with V = x^2."""
-    x, u = sympy.symbols("x u")
-    drift = sympy.Rational(shift.numerator, shift.denominator)
-    system = System("off", (x,), (u,), {}, (u + drift,), (sympy.Integer(0),), box(3), box(9))
+    x, u = symbols("x u")
+    drift = Fraction(shift.numerator, shift.denominator)
+    system = System("off", (x,), (u,), {}, (u + drift,), (Number(0),), box(3), box(9))
     return system, TanhNetwork((np.array([[-1.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
 
 
@@ -149,9 +149,9 @@ def test_fifty_planted_violations_are_never_proved() -> None:
 
 def with_pole() -> tuple[System, TanhNetwork]:
     """xdot = -x (1 + 1e-9 / (x - 1/100)): well behaved far out, with a pole inside."""
-    x, u = sympy.symbols("x u")
-    pole = sympy.Rational(1, 10**9) / (x - sympy.Rational(1, 100))
-    system = System("pole", (x,), (u,), {}, (u - x * pole,), (sympy.Integer(0),), box(3), box(9))
+    x, u = symbols("x u")
+    pole = Fraction(1, 10**9) / (x - Fraction(1, 100))
+    system = System("pole", (x,), (u,), {}, (u - x * pole,), (Number(0),), box(3), box(9))
     return system, TanhNetwork((np.array([[-1.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
 
 
@@ -169,8 +169,8 @@ def test_a_pole_inside_the_floor_is_not_forgotten(tmp_path: Path) -> None:
 
 def test_input_bounds_hold_inside_the_floor_too() -> None:
     """The bounds are broken near the origin only: the policy's steep tanhs rise there and cancel further out."""
-    x, u = sympy.symbols("x u")
-    system = System("bump", (x,), (u,), {}, (u - 2 * x,), (sympy.Integer(0),), box(3), box(4))
+    x, u = symbols("x u")
+    system = System("bump", (x,), (u,), {}, (u - 2 * x,), (Number(0),), box(3), box(4))
     first, bias = np.array([[40.0], [40.0], [0.1]]), np.array([12.0, -12.0, 0.0])
     weights, biases = (first, np.array([[3.0, -3.0, -1.0]])), (bias, np.zeros(1))
     network = TanhNetwork(weights, biases, np.ones(1), np.zeros(1), "identity", "none")

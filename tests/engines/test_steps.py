@@ -8,7 +8,6 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-import sympy
 import torch
 
 from certify.claims import Problem
@@ -20,12 +19,14 @@ from certify.engines.bounds.rule import VdotBound
 from certify.engines.bounds.search import prove_inwards, prove_outwards
 from certify.engines.falsify import falsify, refutes
 from certify.errors import InputError
+from certify.expressions import Number, Symbol, numerical, symbols
 from certify.lyapunov import choose_candidate, diagonalising_coordinates, slowest_decay, solve_lyapunov
 from certify.lyapunov.function import Quadratic
 from certify.policies import TanhNetwork
 from certify.rigorous import eigenvalues, evaluate_increment, evaluate_vdot, instability
 from certify.running import ThreadRunner
 from certify.systems import System, get_system
+from certify.systems.equations import parse_expression
 from certify.verdict import Stop
 from tests.engines.test_vdot import boxes, cartpole_case
 from tests.support.loops import box, pendulum_network, scalar_tanh, valve
@@ -78,7 +79,7 @@ def alone(dynamics: str, time: str = "discrete", domain: str = "3") -> tuple[Sys
     """A plant of one state on which no input acts."""
     system, _ = scalar_tanh()
     system = dataclasses.replace(
-        system, dynamics=(sympy.sympify(dynamics, locals={"x": system.states[0]}),), domain=box(domain), time=time
+        system, dynamics=(parse_expression(dynamics, {"x": system.states[0]}),), domain=box(domain), time=time
     )
     return system, TanhNetwork((np.zeros((1, 1)),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
 
@@ -169,15 +170,15 @@ def _highest(case: Stepped, x: np.ndarray) -> float:
     return max(float(evaluate_increment(case.loop, case.problem.V.P, x, h, case.problem.rate)) for h in every)
 
 
-def one_model(centre: float, radius: float) -> dict[sympy.Symbol, Taylor]:
+def one_model(centre: float, radius: float) -> dict[Symbol, Taylor]:
     tensor = torch.tensor([centre], dtype=torch.float64)
     g = torch.tensor([[radius]], dtype=torch.float64)
-    return {sympy.Symbol("x", real=None): Taylor(tensor, g, torch.zeros(1, 1, 1, dtype=torch.float64), 0 * tensor)}
+    return {Symbol("x", real=None): Taylor(tensor, g, torch.zeros(1, 1, 1, dtype=torch.float64), 0 * tensor)}
 
 
 def test_the_flow_of_a_plant_that_escapes() -> None:
     """xdot = x^2 from 1: x/(1 - x t), which exists for t < 1 only; the mean of f over h is x^2/(1 - x h)."""
-    x = sympy.Symbol("x")
+    x = Symbol("x")
     states = {x: next(iter(one_model(1.0, 1e-3).values()))}
     for h in ("1/20", "1/10"):
         mean = Flow((x**2,), held(h), 4)(states, {}, {}, 1)
@@ -197,9 +198,9 @@ def test_the_flow_of_a_plant_that_escapes() -> None:
 @pytest.mark.parametrize("order", slow_after(2, [1, 2, 3, 4]))
 def test_the_mean_over_a_period_holds_for_quantities_that_switch(equations: tuple[str, str], order: int) -> None:
     """A symbol stands for a quantity's mean: of q, -1 for one half and 1 for the other, it is 0, and of q^2 it is 1."""
-    x, y, q, p = sympy.symbols("x y q p")
-    f = tuple(sympy.sympify(text, locals={"x": x, "y": y, "q": q, "p": p}) for text in equations)
-    rate = sympy.lambdify((x, y, q, p), f)
+    x, y, q, p = symbols("x y q p")
+    f = tuple(parse_expression(text, {"x": x, "y": y, "q": q, "p": p}) for text in equations)
+    rate = numerical(f, (x, y, q, p))
     centre, h = {x: 0.3, y: -0.2}, 0.25
 
     def model(value: float, symbol: int, radius: float) -> Taylor:
@@ -283,13 +284,13 @@ def test_a_rate_is_proved_up_to_the_truth() -> None:
 
 def drift(sample: tuple[Fraction, Fraction], speed: int) -> Stepped:
     """x' = speed while y falls fast: on the ring V falls over a period, and x moves by speed h."""
-    x, y = sympy.symbols("x y")
+    x, y = symbols("x y")
     system, _ = scalar_tanh()
     system = dataclasses.replace(
         system,
         states=(x, y),
-        x_eq=(sympy.Integer(0),) * 2,
-        dynamics=(sympy.Integer(speed), -5 * y),
+        x_eq=(Number(0),) * 2,
+        dynamics=(Number(speed), -5 * y),
         domain=box(1, 10),
         sample=sample,
     )
@@ -339,7 +340,7 @@ def test_a_step_may_not_lead_out_of_the_inner_level() -> None:
 def test_the_floor_of_a_disturbed_map() -> None:
     """x+ = x/2 + q, |q| <= 1/10: {|x| <= r} is entered and kept for r > 1/5."""
     system, network = alone("x/2")
-    q = sympy.Symbol("q")
+    q = Symbol("q")
     system = dataclasses.replace(
         system,
         dynamics=(system.dynamics[0] + q,),

@@ -12,7 +12,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import sympy
 
 from certify.certificate import Certificate, PartitionTree
 from certify.claims import Asymptotic, Practical, Problem
@@ -23,6 +22,7 @@ from certify.engines.decrease import corners_of
 from certify.engines.local import Rule, ball_around, local_ball, prove_band, prove_local
 from certify.engines.models import Models, paths
 from certify.engines.steps import Steps, steps_of
+from certify.expressions import Expression, Number, Symbol, atan, cos, exp, sin, sqrt, symbols, symbols_of, tanh
 from certify.lyapunov import choose_candidate, diagonalising_coordinates, domain_limit
 from certify.lyapunov.function import Quadratic
 from certify.policies import TanhNetwork, load_policy
@@ -34,7 +34,7 @@ from tests.support.marks import slow_after
 
 Array = np.ndarray
 POLICIES = Path(__file__).parents[2] / "examples" / "policies"
-X, U, W = sympy.symbols("x u w")
+X, U, W = symbols("x u w")
 
 
 def about(name: str, share: Fraction, names: Sequence[str]) -> dict[str, Interval]:
@@ -55,15 +55,15 @@ def shipped(name: str, ranges: dict[str, Interval] | None = None, sample: Interv
 
 def in_steps(name: str, h: Fraction, ranges: dict[str, Interval] | None = None) -> ClosedLoop:
     """x+ = x + h f(x, u)."""
-    loop, step = shipped(name, ranges), sympy.Rational(h.numerator, h.denominator)
+    loop, step = shipped(name, ranges), Fraction(h.numerator, h.denominator)
     dynamics = tuple(x + step * f for x, f in zip(loop.system.states, loop.system.dynamics, strict=True))
     return ClosedLoop(dataclasses.replace(loop.system, dynamics=dynamics, time="discrete"), loop.network)
 
 
-def linear(f: sympy.Expr, gain: str = "-1", **more: object) -> tuple[Problem, Array]:
+def linear(f: Expression, gain: str = "-1", **more: object) -> tuple[Problem, Array]:
     """One state, u = gain x, V = x^2, w between -1/10 and 1/10 if it is there."""
-    acting = {W} & f.free_symbols
-    system = System("line", (X,), (U,), {}, (f,), (sympy.Integer(0),), box(3), box(9), disturbances=tuple(acting))
+    acting = {W} & symbols_of(f)
+    system = System("line", (X,), (U,), {}, (f,), (Number(0),), box(3), box(9), disturbances=tuple(acting))
     system = dataclasses.replace(system, **more)  # type: ignore[arg-type]
     if acting:
         system = system.with_ranges({"w": (Fraction(-1, 10), Fraction(1, 10))})
@@ -143,14 +143,12 @@ def in_ball(generator: np.random.Generator, points: int, n: int) -> Array:
 
 
 def every_function() -> ClosedLoop:
-    q, r = sympy.symbols("q r")
+    q, r = symbols("q r")
     f = (
-        q * sympy.sin(X + q * W) + sympy.exp(-r * X) / (2 + q * W) - sympy.Rational(1, 3),
-        sympy.sqrt(3 + q + X) * sympy.atan(W - r) + sympy.tanh(q * X + r) * sympy.cos(U - q) + U**3 / (1 + r),
+        q * sin(X + q * W) + exp(-r * X) / (2 + q * W) - Fraction(1, 3),
+        sqrt(3 + q + X) * atan(W - r) + tanh(q * X + r) * cos(U - q) + U**3 / (1 + r),
     )
-    system = System(
-        "all", (X, W), (U,), {"q": Fraction(1), "r": Fraction(1, 2)}, f, (sympy.Integer(0),), box(3, 3), box(9)
-    )
+    system = System("all", (X, W), (U,), {"q": Fraction(1), "r": Fraction(1, 2)}, f, (Number(0),), box(3, 3), box(9))
     weights = np.array([[0.7, -1.1], [0.4, 0.9]]), np.array([[-0.8, 0.5]])
     network = TanhNetwork(weights, (np.array([0.2, -0.1]), np.zeros(1)), np.ones(1), np.zeros(1), "tanh", "none")
     return ClosedLoop(
@@ -353,10 +351,10 @@ HOLD = (Fraction(1, 2), Fraction(1, 2))
         (U, "1/1000", {"sample": HOLD}, 0.0, False),
         (X + U, "-4", {"sample": (Fraction(1, 10), Fraction(1, 10))}, 0.0, True),
         (X + U, "-99/100", {"sample": (Fraction(1, 10), Fraction(1, 10))}, 0.0, False),
-        (sympy.Rational(99, 100) * X, "-1", {"time": "discrete"}, 0.0, True),
-        (sympy.Rational(101, 100) * X, "-1", {"time": "discrete"}, 0.0, False),
-        (-sympy.Rational(99, 100) * X, "-1", {"time": "discrete"}, 0.0, True),
-        (-sympy.Rational(101, 100) * X, "-1", {"time": "discrete"}, 0.0, False),
+        (Fraction(99, 100) * X, "-1", {"time": "discrete"}, 0.0, True),
+        (Fraction(101, 100) * X, "-1", {"time": "discrete"}, 0.0, False),
+        (-Fraction(99, 100) * X, "-1", {"time": "discrete"}, 0.0, True),
+        (-Fraction(101, 100) * X, "-1", {"time": "discrete"}, 0.0, False),
         (U, "-1", {}, 0.99, True),
         (U, "-1", {}, 1.01, False),
         (U, "-1", {"sample": HOLD}, 0.74, True),  # ((1 - h)^2 - 1)/h = h - 2
@@ -366,7 +364,7 @@ HOLD = (Fraction(1, 2), Fraction(1, 2))
     ],
 )
 def test_lines_of_which_all_is_known(
-    f: sympy.Expr, gain: str, more: dict[str, object], rate: float, holds: bool
+    f: Expression, gain: str, more: dict[str, object], rate: float, holds: bool
 ) -> None:
     problem, T = linear(f, gain, **more)
     problem = dataclasses.replace(problem, rate=rate)
@@ -378,10 +376,8 @@ def test_lines_of_which_all_is_known(
 
 @pytest.mark.parametrize(("hi", "holds"), [("99/100", True), ("1001/1000", False)])
 def test_a_plant_in_steps_with_a_range_up_to_one(hi: str, holds: bool) -> None:
-    q = sympy.Symbol("q")
-    system = System(
-        "line", (X,), (U,), {"q": Fraction(3, 4)}, (q * X,), (sympy.Integer(0),), box(3), box(9), time="discrete"
-    )
+    q = Symbol("q")
+    system = System("line", (X,), (U,), {"q": Fraction(3, 4)}, (q * X,), (Number(0),), box(3), box(9), time="discrete")
     problem, T = linear(U)
     system = system.with_ranges({"q": (Fraction(-1, 2), Fraction(hi))})
     problem = Problem(ClosedLoop(system, problem.loop.network), problem.V)
@@ -397,7 +393,7 @@ def test_a_plant_in_steps_with_a_range_up_to_one(hi: str, holds: bool) -> None:
         (2 * U + X + W, {}, 0.01),
     ],
 )
-def test_the_least_floor_of_a_line_is_found_from_above(f: sympy.Expr, more: dict[str, object], least: float) -> None:
+def test_the_least_floor_of_a_line_is_found_from_above(f: Expression, more: dict[str, object], least: float) -> None:
     """|x| ends at w over the rate at which x falls: no floor below that is true, and one not far above it is shown."""
     problem, T = linear(f, **more)
     found = prove_band(problem, T, 0.25)

@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import sympy
 
 from certify.claims import Problem
 from certify.closed_loop import ClosedLoop
 from certify.engines.falsify import confirm, falsify, refutes
 from certify.engines.local import local_ball, prove_local
+from certify.expressions import Number, symbols
 from certify.lyapunov import diagonalising_coordinates
 from certify.lyapunov.function import Quadratic
 from certify.policies import TanhNetwork, load_policy
@@ -34,9 +34,9 @@ def pendulum(ranges: dict[str, tuple[Fraction, Fraction]]) -> System:
 
 def gain(lo: str, hi: str, centre: str = "none") -> tuple[System, TanhNetwork]:
     """xdot = q x - tanh(x): the origin attracts |x| < x* with tanh(x*) = q x*, for q below 1."""
-    x, u, q = sympy.symbols("x u q")
+    x, u, q = symbols("x u q")
     system = System(
-        "gain", (x,), (u,), {"q": (Fraction(lo) + Fraction(hi)) / 2}, (q * x + u,), (sympy.Integer(0),), box(3), box(1)
+        "gain", (x,), (u,), {"q": (Fraction(lo) + Fraction(hi)) / 2}, (q * x + u,), (Number(0),), box(3), box(1)
     )
     network = TanhNetwork((np.array([[-1.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", centre)
     return system.with_ranges({"q": (Fraction(lo), Fraction(hi))}), network
@@ -125,7 +125,7 @@ def test_a_level_is_refuted_with_the_values_at_which_it_fails(tmp_path: Path) ->
 
 def test_a_violation_is_judged_with_the_policy_of_the_nominal_plant() -> None:
     """u_eq = m belongs to the policy: at m = 3/2 the loop is not at rest at 0, though u = m would hold it there."""
-    x, u, m = sympy.symbols("x u m")
+    x, u, m = symbols("x u m")
     system = System("lift", (x,), (u,), {"m": Fraction(1)}, (u - m,), (m,), box(3), box(5))
     system = system.with_ranges({"m": (Fraction(1, 2), Fraction(3, 2))})
     network = TanhNetwork((np.array([[-1.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "output")

@@ -8,10 +8,10 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
-import sympy
 
 from certify.closed_loop import ClosedLoop
 from certify.errors import InputError
+from certify.expressions import Number, Symbol, symbols
 from certify.lyapunov import Neural, Polynomial
 from certify.lyapunov.function import Quadratic
 from certify.lyapunov.learning import Learned, fit_polynomial, learn
@@ -31,8 +31,8 @@ MODELS: list[Model] = [Network(3, (5,)), Network(2, (6, 4)), Network(2, (4, 3, 5
 
 def disc(half: float = 2.0, n: int = 2) -> ClosedLoop:
     """r' = r (r^2 - 1) in n states, turning in the first two: attracted is the open unit ball."""
-    states = sympy.symbols(f"x0:{n}")
-    u = sympy.Symbol("u")
+    states = symbols(f"x{i}" for i in range(0, n))
+    u = Symbol("u")
     grows = sum(s**2 for s in states) - 1
     dynamics = [s * grows for s in states]
     dynamics[0] -= states[1]
@@ -43,7 +43,7 @@ def disc(half: float = 2.0, n: int = 2) -> ClosedLoop:
         inputs=(u,),
         parameters={},
         dynamics=tuple(dynamics),
-        u_eq=(sympy.Integer(0),),
+        u_eq=(Number(0),),
         domain=box(*[half] * n),
         input_bounds=box(1),
     )
@@ -56,7 +56,7 @@ def silent(n: int) -> TanhNetwork:
 
 def pushed(system: System) -> System:
     """The scalar loop under a disturbance on its rate."""
-    w = sympy.Symbol("w")
+    w = Symbol("w")
     dynamics = (system.dynamics[0] + w,)
     return dataclasses.replace(
         system, dynamics=dynamics, disturbances=(w,), ranges={"w": (Fraction(-1, 10), Fraction(1, 10))}

@@ -10,10 +10,10 @@ import clarabel
 import cvxpy
 import numpy as np
 import pytest
-import sympy
 
 from certify.closed_loop import ClosedLoop
 from certify.errors import BackendError
+from certify.expressions import Expression, Number, Symbol, symbols
 from certify.lyapunov import domain_limit, extents, optimise_candidate, solve_lyapunov, volume
 from certify.lyapunov.optimised import _between
 from certify.lyapunov.programs import smallest_trace
@@ -22,16 +22,16 @@ from certify.systems import System, get_system
 from tests.support.loops import box, pendulum_network, scalar_tanh
 
 
-def closed_loop(dynamics: tuple[sympy.Expr, ...], domain: tuple[str, ...], gain: list[float], bound: str) -> ClosedLoop:
+def closed_loop(dynamics: tuple[Expression, ...], domain: tuple[str, ...], gain: list[float], bound: str) -> ClosedLoop:
     """States x1, x2, ... and one input u = gain x, |u| <= bound."""
     n = len(dynamics)
     system = System(
         name="plant",
-        states=sympy.symbols(f"x1:{n + 1}"),
-        inputs=(sympy.Symbol("u"),),
+        states=symbols(f"x{i}" for i in range(1, n + 1)),
+        inputs=(Symbol("u"),),
         parameters={},
         dynamics=dynamics,
-        u_eq=(sympy.Integer(0),),
+        u_eq=(Number(0),),
         domain=box(*domain),
         input_bounds=box(bound),
     )
@@ -40,7 +40,7 @@ def closed_loop(dynamics: tuple[sympy.Expr, ...], domain: tuple[str, ...], gain:
     )
 
 
-x1, x2, x3, u = sympy.symbols("x1 x2 x3 u")
+x1, x2, x3, u = symbols("x1 x2 x3 u")
 
 
 def van_der_pol() -> ClosedLoop:

@@ -10,11 +10,11 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-import sympy
 
 from certify.certificate import Certificate, PartitionTree
 from certify.claims import Asymptotic
 from certify.errors import InputError
+from certify.expressions import Number, symbols
 from certify.lyapunov.function import Quadratic
 from certify.policies import TanhNetwork
 from certify.report import simulated_roa_fraction
@@ -24,6 +24,7 @@ from certify.report.figures.scene import Effort, Scene, starts
 from certify.report.figures.style import LEAVING, UNSETTLED
 from certify.report.sampling import SETTLED, Flow, Runs, SimulatedRoa, edge_of, quadratic, runs_of, simulate
 from certify.systems import System
+from certify.systems.equations import parse_expression
 from tests.support.loops import box
 
 ONE_LEAF = PartitionTree(np.eye(2), np.ones(2), bytes([255]))
@@ -32,9 +33,9 @@ QUIET = TanhNetwork((np.zeros((1, 2)),), (np.zeros(1),), np.ones(1), np.zeros(1)
 
 def plane(first: str, second: str, half: float = 1.0) -> System:
     """x' and y' as texts, in a square domain; the input does nothing."""
-    x, y, u = sympy.symbols("x y u")
-    f = tuple(sympy.sympify(text, {"x": x, "y": y}) for text in (first, second))
-    return System("plane", (x, y), (u,), {}, f, (sympy.Integer(0),), box(half, half), box(1))
+    x, y, u = symbols("x y u")
+    f = tuple(parse_expression(text, {"x": x, "y": y}) for text in (first, second))
+    return System("plane", (x, y), (u,), {}, f, (Number(0),), box(half, half), box(1))
 
 
 def certificate(system: System, level: float, inner: float | None = None) -> Certificate:

@@ -18,13 +18,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-import sympy
 from rich.console import Console
 
 from certify import certify_roa as certify
 from certify.certificate import Certificate, parse_certificate, run_checker
 from certify.claims import Asymptotic, Outer
 from certify.errors import InputError, SoundnessError
+from certify.expressions import Number, exp, sqrt, symbols
 from certify.lyapunov import Neural, Polynomial, Symbolic, sampled_volume
 from certify.lyapunov.function import Quadratic
 from certify.policies import TanhNetwork
@@ -154,7 +154,7 @@ def test_an_expression_is_shown_as_it_is(by_formula: Case) -> None:
     html = _rendered(by_formula.path, json.dumps(by_formula.answer))
     assert "<mi>N</mi><mo>(</mo><mi>x</mi><mo>)</mo><mo>=</mo>" in html and "sha256 of N" not in html
     x, y = by_formula.certificate.system.states
-    long = Symbolic(sum(((x - k) ** 2 * y for k in range(200)), sympy.Integer(0)), (x, y))
+    long = Symbolic(sum(((x - k) ** 2 * y for k in range(200)), Number(0)), (x, y))
     found = _beyond(by_formula.certificate, Outer(long, 1.0))
     assert found is not None and not found["formula"]
     assert re.fullmatch(r"an expression of [\d,]+ operations, which stands in the file", found["name"])
@@ -288,7 +288,7 @@ def test_the_portrait_shows_both_sets(by_network: Case) -> None:
 
 def test_sections_in_more_than_two_states() -> None:
     system, law = chain(4, [-1.0, -2.0, -3.0, -4.0])
-    outer = Outer(Symbolic(sum((s**2 for s in system.states), sympy.Integer(0)), system.states), 0.5)
+    outer = Outer(Symbolic(sum((s**2 for s in system.states), Number(0)), system.states), 0.5)
     certificate = Certificate(
         system,
         law,
@@ -320,7 +320,7 @@ def test_an_interval_of_one_state(tmp_path: Path) -> None:
 def test_a_function_without_a_value_somewhere_can_be_drawn(by_formula: Case) -> None:
     """A rejected file may have any N; nothing warns, and what has no value is not in the set."""
     x, y = by_formula.certificate.system.states
-    odd = Symbolic(1 / x + sympy.sqrt(y) + sympy.exp(800 * x) + x**-3, (x, y))
+    odd = Symbolic(1 / x + sqrt(y) + exp(800 * x) + x**-3, (x, y))
     claim = replace(by_formula.certificate.claim, outer=Outer(odd, 1.0))
     scene = Scene(replace(by_formula.certificate, claim=claim), accepted=False)
     points = np.array([[0.0, 1.0], [-1.0, -1.0], [-1.0, 1.0], [1.0, 1.0]])
@@ -344,14 +344,14 @@ def test_samples_find_the_volume_of_a_ball() -> None:
 @pytest.fixture(scope="module")
 def proved(tmp_path_factory: pytest.TempPathFactory) -> RoaResult:
     """The plane's plant by the whole pipeline, N = x^2 + y^2/4 as a polynomial."""
-    x, y, u = sympy.symbols("x y u")
+    x, y, u = symbols("x y u")
     system = System(
         "plane",
         (x, y),
         (u,),
         {},
         (-x + x**3 + u, -y),
-        (sympy.Integer(0),),
+        (Number(0),),
         box(2, 2),
         box(1),
         units={"x": "m", "y": "m"},

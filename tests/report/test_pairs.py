@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import sympy
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -18,6 +17,7 @@ from certify.certificate import Certificate, PartitionTree
 from certify.claims import Asymptotic
 from certify.cli import _run
 from certify.errors import InputError
+from certify.expressions import Number, cos, symbols
 from certify.lyapunov import extents
 from certify.lyapunov.function import Quadratic
 from certify.policies import TanhNetwork
@@ -38,9 +38,9 @@ FOUR = PartitionTree(np.eye(4), np.ones(4), bytes([255]))
 
 def vehicle() -> System:
     """Names that tell nothing: a's rate is c, b's is 2 d, and d has an input."""
-    a, b, c, d, u = sympy.symbols("a b c d u")
-    f = (c, 2 * d * sympy.cos(b), -a - c, -b - d + u)
-    return System("vehicle", (a, b, c, d), (u,), {}, f, (sympy.Integer(0),), box(1, 1, 1, 1), box(1))
+    a, b, c, d, u = symbols("a b c d u")
+    f = (c, 2 * d * cos(b), -a - c, -b - d + u)
+    return System("vehicle", (a, b, c, d), (u,), {}, f, (Number(0),), box(1, 1, 1, 1), box(1))
 
 
 def drawable(P: np.ndarray, level: float, inner: float) -> Certificate:
@@ -61,8 +61,8 @@ def test_the_pair_of_the_state_that_binds_comes_first() -> None:
 
 
 def test_states_without_a_rate_are_drawn_with_what_p_couples_them_to() -> None:
-    x, y, z, u = sympy.symbols("x y z u")
-    system = System("mixed", (x, y, z), (u,), {}, (-x + u, -y + u, -z + u), (sympy.Integer(0),), box(1, 1, 1), box(1))
+    x, y, z, u = symbols("x y z u")
+    system = System("mixed", (x, y, z), (u,), {}, (-x + u, -y + u, -z + u), (Number(0),), box(1, 1, 1), box(1))
     P = np.array([[4.0, 0.1, 1.9], [0.1, 1.0, -0.2], [1.9, -0.2, 1.0]])
     assert coupling(P)[0, 2] == pytest.approx(0.95) and np.all(np.diag(coupling(P)) == 0)
     pairs = pairs_of(system, P, np.array([0.5, 0.4, 0.3]))

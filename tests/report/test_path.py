@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-import sympy
 from rich.console import Console
 
 from certify.certificate import Certificate, PartitionTree, Slab, Waypoint, read_certificate
 from certify.claims import Asymptotic, Reached
+from certify.expressions import Number
 from certify.lyapunov import extents, semi_axes
 from certify.lyapunov.function import Quadratic
 from certify.policies import TanhNetwork
@@ -45,7 +45,7 @@ FROM = {"p": Fraction(6, 5), "v": Fraction(1, 2)}
 def shifted_spring() -> tuple[System, TanhNetwork]:
     """The soft spring around p = 1/2, by the values of its states."""
     system, network = soft_spring()
-    return replace(system, name="shifted", x_eq=(sympy.Rational(1, 2), sympy.Integer(0))), network
+    return replace(system, name="shifted", x_eq=(Fraction(1, 2), Number(0))), network
 
 
 def claimed(

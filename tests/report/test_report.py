@@ -23,7 +23,6 @@ from xml.etree import ElementTree
 
 import numpy as np
 import pytest
-import sympy
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
@@ -43,6 +42,7 @@ from certify.claims import CLAIMS as KINDS
 from certify.claims import Asymptotic, Practical
 from certify.closed_loop import ClosedLoop
 from certify.errors import CertificateFormatError, InputError, SoundnessError
+from certify.expressions import Number, Symbol, sin, symbols
 from certify.lyapunov import domain_limit, solve_lyapunov, volume
 from certify.lyapunov.function import Quadratic
 from certify.policies import TanhNetwork
@@ -320,8 +320,8 @@ def test_a_set_that_is_too_large_is_contradicted() -> None:
 
 
 def test_stable_linear_plants_lose_only_what_leaves_the_domain() -> None:
-    x, y, u = sympy.symbols("x y u")
-    system = System("decay", (x, y), (u,), {}, (-x, -y + u), (sympy.Integer(0),), box(1, 1), box(1))
+    x, y, u = symbols("x y u")
+    system = System("decay", (x, y), (u,), {}, (-x, -y + u), (Number(0),), box(1, 1), box(1))
     network = TanhNetwork((np.zeros((1, 2)),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
     roa = simulated_roa_fraction(system, network, np.eye(2), 1.0, points=60)
     assert roa.attracted.all()
@@ -365,8 +365,8 @@ def test_paths_end_where_they_leave_the_domain() -> None:
 
 
 def test_the_step_resolves_a_plant_that_is_stiff_away_from_the_origin() -> None:
-    x, u = sympy.symbols("x u")
-    system = System("cubic", (x,), (u,), {}, (-x - x**3 + u,), (sympy.Integer(0),), box(10), box(1))
+    x, u = symbols("x u")
+    system = System("cubic", (x,), (u,), {}, (-x - x**3 + u,), (Number(0),), box(10), box(1))
     network = TanhNetwork((np.zeros((1, 1)),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
     step, _ = time_scales(Flow.of(system, network))
     assert 1 / 301 <= step < 2 / 301  # the Jacobian is -301 at the domain's edge, -1 at the origin
@@ -573,11 +573,11 @@ HOSTILE = "<script>alert('x')</script> $\\frac$ & \"quoted\" {{ 7 * 7 }}"
 
 def hostile_certificate() -> Certificate:
     """Names that a System refuses, put in behind its back; a page must survive them all the same."""
-    x, y = sympy.Symbol("<img src=x onerror=alert(1)>"), sympy.Symbol("$\\frac$")
-    u = sympy.Symbol("</svg><script>u</script>")
-    a, b, v = sympy.symbols("a b v")
-    system = System("plain", (a, b), (v,), {}, (-a + v, -b + sympy.sin(a)), (sympy.Integer(0),), box(1, 1), box(2))
-    hostile = {"name": HOSTILE, "states": (x, y), "inputs": (u,), "dynamics": (-x + u, -y + sympy.sin(x))}
+    x, y = Symbol("<img src=x onerror=alert(1)>"), Symbol("$\\frac$")
+    u = Symbol("</svg><script>u</script>")
+    a, b, v = symbols("a b v")
+    system = System("plain", (a, b), (v,), {}, (-a + v, -b + sin(a)), (Number(0),), box(1, 1), box(2))
+    hostile = {"name": HOSTILE, "states": (x, y), "inputs": (u,), "dynamics": (-x + u, -y + sin(x))}
     for field, value in hostile.items():
         object.__setattr__(system, field, value)
     network = TanhNetwork((np.array([[0.1, 0.2]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
@@ -658,7 +658,7 @@ def test_many_leaves_are_rasterised() -> None:
 def test_long_fractions_are_rounded_and_the_page_says_so(scalar_case: Case) -> None:
     c = scalar_case.certificate
     x, u = c.system.states[0], c.system.inputs[0]
-    tenth = sympy.Rational(*(0.1).as_integer_ratio())
+    tenth = Fraction(*(0.1).as_integer_ratio())
     long = replace(c, system=replace(c.system, dynamics=(tenth * x + u,)))
     text = Page(render_html(long, None, None, scalar_case.path)).text
     assert "Long fractions are rounded here" in text
@@ -666,8 +666,8 @@ def test_long_fractions_are_rounded_and_the_page_says_so(scalar_case: Case) -> N
 
 
 def test_a_pole_in_the_domain_does_no_harm() -> None:
-    x, y, u = sympy.symbols("x y u")
-    system = System("pole", (x, y), (u,), {}, (-x, -y + x**2 / (1 - x) + u), (sympy.Integer(0),), box(2, 2), box(2))
+    x, y, u = symbols("x y u")
+    system = System("pole", (x, y), (u,), {}, (-x, -y + x**2 / (1 - x) + u), (Number(0),), box(2, 2), box(2))
     network = TanhNetwork((np.array([[0.1, 0.2]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
     certificate = Certificate(system, network, *claimed(np.eye(2), 0.01, 0.02), ONE_LEAF)
     pictures, roa = draw(certificate, accepted=False)
@@ -750,9 +750,9 @@ def test_summary_of_a_proof(pendulum_case: Case) -> None:
 
 def test_units_are_the_certificates_own(tmp_path: Path) -> None:
     """A plant that bears the name of another: nothing of the other's appears."""
-    x, v, u = sympy.symbols("range speed u")
+    x, v, u = symbols("range speed u")
     units = {"range": "km", "speed": "<b>kn</b>", "u": "kN"}
-    plant = System("pendulum", (x, v), (u,), {}, (-x + u, -v), (sympy.Integer(0),), box(1, 1), box(2), units=units)
+    plant = System("pendulum", (x, v), (u,), {}, (-x + u, -v), (Number(0),), box(1, 1), box(2), units=units)
     network = TanhNetwork((np.array([[0.1, 0.2]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
     path = tmp_path / "certificate.json"
     write_atomically(
@@ -881,9 +881,9 @@ def test_trusted_is_a_verdict_of_its_own() -> None:
 @pytest.fixture(scope="module")
 def practical_case(tmp_path_factory: pytest.TempPathFactory) -> Case:
     """x' = 1/4 - x + u and y' = -y with u = tanh(x)/10: no equilibrium at 0, but V = x^2 + y^2 falls for V >= 1/3."""
-    x, y, u = sympy.symbols("x y u")
-    f = (sympy.Rational(1, 4) - x + u, -y)
-    system = System("drifting", (x, y), (u,), {}, f, (sympy.Integer(0),), box(2, 2), box(1))
+    x, y, u = symbols("x y u")
+    f = (Fraction(1, 4) - x + u, -y)
+    system = System("drifting", (x, y), (u,), {}, f, (Number(0),), box(2, 2), box(1))
     network = TanhNetwork((np.array([[1.0, 0.0]]),), (np.zeros(1),), np.full(1, 0.1), np.zeros(1), "tanh", "none")
     path = tmp_path_factory.mktemp("practical") / "certificate.json"
     write_atomically(

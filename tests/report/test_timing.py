@@ -15,7 +15,6 @@ from typing import Any
 import flint
 import numpy as np
 import pytest
-import sympy
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
@@ -25,6 +24,7 @@ from certify.checker import document
 from certify.checker import words as checker_words
 from certify.claims import Asymptotic, Claim, Nearby, Practical, Problem
 from certify.closed_loop import ClosedLoop
+from certify.expressions import Number, Symbol, symbols
 from certify.lyapunov.function import Quadratic
 from certify.policies import TanhNetwork
 from certify.report import render_html, summary
@@ -63,11 +63,11 @@ def gain(k: str, n: int = 1) -> TanhNetwork:
 
 def integrator(timing: Timing, *, push: bool = False) -> System:
     """x' = u, or x+ = x + u/50, with a mode that decays by itself; a wind if something is to push."""
-    x, y, u, w = sympy.symbols("x y u w")
-    wind = w if push else sympy.Integer(0)
-    f = (u + wind, -y) if not timing.discrete else (x + (u + wind) / 50, y * sympy.Rational(49, 50))
+    x, y, u, w = symbols("x y u w")
+    wind = w if push else Number(0)
+    f = (u + wind, -y) if not timing.discrete else (x + (u + wind) / 50, y * Fraction(49, 50))
     return System(
-        "integrator", (x, y), (u,), {}, f, (sympy.Integer(0),), box(2, 2), box(3),
+        "integrator", (x, y), (u,), {}, f, (Number(0),), box(2, 2), box(3),
         disturbances=(w,) if push else (), ranges={"w": (F(-1, 10), F(1, 10))} if push else {},
         time="discrete" if timing.discrete else "continuous", sample=timing.sample,
     )  # fmt: skip
@@ -332,10 +332,10 @@ def test_too_long_a_period_leaves_though_the_continuous_loop_settles() -> None:
 
 def test_a_run_may_pass_the_level_between_two_instants() -> None:
     """x' = u, y' = x with a long period: V rises on the way, and only what it is at the instants counts."""
-    x, u = sympy.symbols("x u")
-    t = sympy.symbols("t")
+    x, u = symbols("x u")
+    t = Symbol("t")
     # t turns once in a period and carries x out and back
-    system = System("detour", (x, t), (u,), {}, (-x * t, sympy.Integer(0)), (sympy.Integer(0),), box(9, 9), box(1),
+    system = System("detour", (x, t), (u,), {}, (-x * t, Number(0)), (Number(0),), box(9, 9), box(1),
                     sample=(F(1), F(1)))  # fmt: skip
     flow = Flow.of(system, TanhNetwork((np.zeros((1, 2)),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none"))
     path = simulate(flow, np.array([[1.0, 1.0]]), 0.25, 4)

@@ -14,11 +14,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-import sympy
 from rich.console import Console
 
 from certify.certificate import Certificate, PartitionTree, Slab, read_certificate
 from certify.claims import Asymptotic, Enlarged
+from certify.expressions import Number, symbols
 from certify.lyapunov import extents, semi_axes, volume
 from certify.lyapunov.function import Quadratic
 from certify.policies import TanhNetwork
@@ -34,6 +34,7 @@ from certify.report.words import above, below
 from certify.results import RoaResult
 from certify.roa import RoaOptions, certify_roa
 from certify.systems import System
+from certify.systems.equations import parse_expression
 from certify.verdict import Verdict
 from tests.report.test_report import Page, exactly
 from tests.support.loops import box, chain, scalar_tanh
@@ -44,10 +45,10 @@ QUIET = TanhNetwork((np.zeros((1, 2)),), (np.zeros(1),), np.ones(1), np.zeros(1)
 
 def soft_spring() -> tuple[System, TanhNetwork]:
     """p' = v, v' = -p + p^3/4 - 2 v + u under one tanh."""
-    p, v, u = sympy.symbols("p v u")
+    p, v, u = symbols("p v u")
     f = (v, -p + p**3 / 4 - 2 * v + u)
     units = {"p": "m", "v": "m/s", "u": "N"}
-    system = System("soft_spring", (p, v), (u,), {}, f, (sympy.Integer(0),), box(2, 2), box(1), units=units)
+    system = System("soft_spring", (p, v), (u,), {}, f, (Number(0),), box(2, 2), box(1), units=units)
     weights = (np.array([[-0.3, -0.2]]),)
     return system, TanhNetwork(weights, (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
 
@@ -68,9 +69,9 @@ def slab(middle: np.ndarray, end: np.ndarray, duration: float = 1.0) -> Slab:
 
 
 def plane(first: str, second: str, half: float = 1.0) -> System:
-    x, y, u = sympy.symbols("x y u")
-    f = tuple(sympy.sympify(text, {"x": x, "y": y}) for text in (first, second))
-    return System("plane", (x, y), (u,), {}, f, (sympy.Integer(0),), box(half, half), box(1))
+    x, y, u = symbols("x y u")
+    f = tuple(parse_expression(text, {"x": x, "y": y}) for text in (first, second))
+    return System("plane", (x, y), (u,), {}, f, (Number(0),), box(half, half), box(1))
 
 
 @pytest.fixture(scope="module")

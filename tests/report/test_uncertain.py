@@ -9,7 +9,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import sympy
 from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
@@ -17,6 +16,7 @@ from rich.console import Console
 from certify import certify_roa
 from certify.certificate import Certificate, PartitionTree, parse_certificate
 from certify.claims import Asymptotic, Practical
+from certify.expressions import Number, symbols
 from certify.lyapunov.function import Quadratic
 from certify.policies import TanhNetwork
 from certify.report import render_html, summary
@@ -35,11 +35,11 @@ HALF = ((F(-1), F(1)),)
 def spring() -> tuple[System, TanhNetwork]:
     """The soft spring with a stiffness, and a wind."""
     system, network = soft_spring()
-    p, v, u, k, wind = sympy.symbols("p v u k wind")
+    p, v, u, k, wind = symbols("p v u k wind")
     f = (v, -k * p + p**3 / 4 - 2 * v + u + wind)
     return (
         System(
-            "spring", (p, v), (u,), {"k": F(1)}, f, (sympy.Integer(0),), system.domain, system.input_bounds,
+            "spring", (p, v), (u,), {"k": F(1)}, f, (Number(0),), system.domain, system.input_bounds,
             units={**system.units, "k": "N/m", "wind": "N"}, disturbances=(wind,),
         ),
         network,
@@ -174,9 +174,9 @@ def test_an_error_of_the_input_comes_on_top_of_what_stays_in_bounds() -> None:
 def test_a_name_alone_covers_no_rounding() -> None:
     """A file may call anything error_u: what the equations do not add to u is no error of it."""
     system, network = spring()
-    p, v, u, e = sympy.symbols("p v u error_u")
+    p, v, u, e = symbols("p v u error_u")
     forged = System(
-        "forged", (p, v), (u,), {}, (v, -p - 2 * v + u + p * e), (sympy.Integer(0),), system.domain,
+        "forged", (p, v), (u,), {}, (v, -p - 2 * v + u + p * e), (Number(0),), system.domain,
         system.input_bounds, disturbances=(e,), ranges={"error_u": (F(-1), F(1))},
     )  # fmt: skip
     found = page(claimed(forged, network))
@@ -185,8 +185,8 @@ def test_a_name_alone_covers_no_rounding() -> None:
 
 
 def test_inputs_without_an_error_must_be_exact() -> None:
-    x, a, b = sympy.symbols("x a b")
-    system = System("two", (x,), (a, b), {}, (-x + a - b,), (sympy.Integer(0),) * 2, HALF, HALF * 2)
+    x, a, b = symbols("x a b")
+    system = System("two", (x,), (a, b), {}, (-x + a - b,), (Number(0),) * 2, HALF, HALF * 2)
     network = TanhNetwork((np.zeros((2, 1)),), (np.zeros(2),), np.ones(2), np.zeros(2), "tanh", "none")
     said = outside(page(claimed(system.with_input_errors({"b": F(1, 100)}), network, practical=True)))
     assert "error_b(t) within ±0.01" in said and "a must be exact." in said
@@ -194,8 +194,8 @@ def test_inputs_without_an_error_must_be_exact() -> None:
 
 def test_names_in_equations_are_typeset_as_they_are() -> None:
     """A quantity called I or lambda is no unit and no keyword, and its markup is escaped like every other name."""
-    x, u, i = sympy.symbols("x u I")
-    system = System("s", (x,), (u,), {"I": F(2)}, (-x / i + u,), (sympy.Integer(0),), HALF, HALF)
+    x, u, i = symbols("x u I")
+    system = System("s", (x,), (u,), {"I": F(2)}, (-x / i + u,), (Number(0),), HALF, HALF)
     network = TanhNetwork((np.zeros((1, 1)),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
     html = render_html(claimed(system.with_ranges({"I": (F(1), F(3))}), network), None, None, Path("c.json"))
     assert "<mi>I</mi>" in html and "I(t) in [1, 3]" in html

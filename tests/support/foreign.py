@@ -10,9 +10,9 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-import sympy
 import torch
 
+from certify.expressions import Number, Symbol
 from certify.systems import System
 
 TWO_STAGE = {
@@ -33,18 +33,18 @@ def external(*parts: str) -> Path | None:
 
 def plant(n: int = 2, bound: float = 6, x_eq: tuple[int, ...] = ()) -> System:
     """A chain of n integrators with a stable last one; its states are x0, x1, ..."""
-    states = tuple(sympy.Symbol(f"x{i}") for i in range(n))
-    u = sympy.Symbol("u")
+    states = tuple(Symbol(f"x{i}") for i in range(n))
+    u = Symbol("u")
     return System(
         name="chain",
         states=states,
         inputs=(u,),
         parameters={},
         dynamics=(*states[1:], -sum(states) * 2 - states[-1] + u / 100),
-        u_eq=(sympy.Integer(0),),
+        u_eq=(Number(0),),
         domain=((Fraction(-5), Fraction(5)),) * n,
         input_bounds=((Fraction(-bound), Fraction(bound)),),
-        x_eq=tuple(sympy.Integer(v) for v in x_eq),
+        x_eq=tuple(Number(v) for v in x_eq),
     )
 
 

@@ -7,8 +7,8 @@ from fractions import Fraction
 
 import numpy as np
 import scipy.linalg
-import sympy
 
+from certify.expressions import Number, Symbol, atan, exp, sqrt, symbols, tanh
 from certify.policies import TanhNetwork
 from certify.systems import System
 
@@ -20,14 +20,14 @@ def box(*half_widths: float | str) -> tuple[tuple[Fraction, Fraction], ...]:
 
 def scalar_tanh() -> tuple[System, TanhNetwork]:
     """xdot = x/2 - tanh(x): the origin attracts exactly |x| < 1.915008048..."""
-    x, u = sympy.symbols("x u")
+    x, u = symbols("x u")
     system = System(
         name="scalar",
         states=(x,),
         inputs=(u,),
         parameters={},
         dynamics=(x / 2 + u,),
-        u_eq=(sympy.Integer(0),),
+        u_eq=(Number(0),),
         domain=box(3),
         input_bounds=box(1),
     )
@@ -46,14 +46,14 @@ def scalar_clip() -> tuple[System, TanhNetwork]:
 
 def tank() -> tuple[System, TanhNetwork]:
     """xdot = x/9 + u - sqrt(16 + x), u = 4: the origin attracts, and x > -16 leaves it from x = 9 on."""
-    x, u = sympy.symbols("x u")
+    x, u = symbols("x u")
     system = System(
         name="tank",
         states=(x,),
         inputs=(u,),
         parameters={},
-        dynamics=(x / 9 + u - sympy.sqrt(16 + x),),
-        u_eq=(sympy.Integer(4),),
+        dynamics=(x / 9 + u - sqrt(16 + x),),
+        u_eq=(Number(4),),
         domain=box(15),
         input_bounds=box(5),
     )
@@ -63,17 +63,17 @@ def tank() -> tuple[System, TanhNetwork]:
 
 def valve() -> tuple[System, TanhNetwork]:
     """Two states and every function of equations beside sin, cos and tan, at points where they are known exactly."""
-    x, y, u = sympy.symbols("x y u")
+    x, y, u = symbols("x y u")
     system = System(
         name="valve",
         states=(x, y),
         inputs=(u,),
         parameters={},
         dynamics=(
-            y * sympy.exp(-x / 4) + sympy.tanh(x * y) / 3,
-            u - sympy.sqrt(4 + x + y / 2) - sympy.atan(y) / 2 + x**2 / sympy.sqrt(4 + y) ** 3,
+            y * exp(-x / 4) + tanh(x * y) / 3,
+            u - sqrt(4 + x + y / 2) - atan(y) / 2 + x**2 / sqrt(4 + y) ** 3,
         ),
-        u_eq=(sympy.Integer(2),),
+        u_eq=(Number(2),),
         domain=box("3/2", "3/2"),
         input_bounds=box(9),
     )
@@ -85,15 +85,15 @@ def valve() -> tuple[System, TanhNetwork]:
 def chain(n: int, poles: list[float]) -> tuple[System, TanhNetwork]:
     """An integrator chain of n states under linear feedback that places `poles` exactly (up to integers)."""
     coefficients = np.poly(poles)[:0:-1].real.round(9)  # of s^0 .. s^(n-1)
-    x = sympy.symbols(f"x1:{n + 1}")
-    u = sympy.Symbol("u")
+    x = symbols(f"x{i}" for i in range(1, n + 1))
+    u = Symbol("u")
     system = System(
         name=f"chain{n}",
         states=tuple(x),
         inputs=(u,),
         parameters={},
         dynamics=(*x[1:], u),
-        u_eq=(sympy.Integer(0),),
+        u_eq=(Number(0),),
         domain=box(*[1 + Fraction(i, 2) for i in range(n)]),
         input_bounds=box(10_000),
     )
