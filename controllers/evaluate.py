@@ -29,7 +29,7 @@ from certify.systems import System, shipped_system
 from certify.systems.system import Time
 from controllers.environments import Stepper
 from controllers.lqr import Identified, riccati_gain
-from controllers.options import Plant
+from controllers.options import Plant, held_over
 from controllers.simulation import Loop, continuous_loop, held_loop, initial_states, mean_action
 
 Array = NDArray[np.float64]
@@ -415,7 +415,8 @@ def _settling(loop: Loop, system: System, x0: Array, options: EvaluationOptions)
 
 
 def recorded_step(policy: Policy, system: System) -> float:
-    """The time step of the record; of a plant in discrete time 1, whatever the record says: it has no other step.
+    """The time step of the record, or the nearest of those that the plant has, whatever the record says: 1 in discrete
+    time, else where inputs are held over given times one of these.
 
     Raises
     ------
@@ -426,7 +427,7 @@ def recorded_step(policy: Policy, system: System) -> float:
     dt = float(recorded(policy, "dt", ()))
     if not dt > 0:
         raise InputError(f"`training.dt` of the policy must be positive; found {dt}.")
-    return dt
+    return held_over(system, dt)
 
 
 def recorded(policy: Policy, name: str, shape: Sequence[int]) -> Any:

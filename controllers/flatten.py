@@ -40,7 +40,7 @@ from controllers.departure import departure, departure_of, linearised
 from controllers.evaluate import MONITORING, curvature, discrete_linearisation, settle
 from controllers.gain import regained
 from controllers.lqr import riccati_gain
-from controllers.options import Plant, get_plant
+from controllers.options import Plant, get_plant, held_over
 from controllers.simulation import held_loop, initial_states, mean_action
 
 Array = NDArray[np.float64]
@@ -446,7 +446,7 @@ class _Run:
     def _judge(self) -> tuple[float, Array, Array]:
         """dt, Q and R of the runs that judge: the policy's record, and the plant's preset where it has none.
 
-        In discrete time dt is 1: the plant has no other step.
+        dt is one over which the plant holds its inputs, in discrete time 1.
         """
         preset, record = self.plant.preset, self.policy.training
         wanted = (("dt", ()), ("state_weights", (self.system.n,)), ("input_weights", (self.system.m,)))
@@ -459,10 +459,10 @@ class _Run:
             if value.shape != shape or not np.all(np.isfinite(value)) or np.any(value < 0):
                 raise InputError(f"`training.{name}` must hold finite numbers of shape {shape}, none of them negative.")
             found.append(value)
-        dt = 1.0 if self.system.time == "discrete" else float(found[0])
+        dt = float(found[0])
         if not dt > 0:
             raise InputError(f"`training.dt` of the policy must be positive; found {dt}.")
-        return dt, found[1], found[2]
+        return held_over(self.system, dt), found[1], found[2]
 
     def _require_sizes(self) -> None:
         network, system, box = self.old, self.system, self.options.box

@@ -266,6 +266,14 @@ def require_one_step(system: System, dt: float) -> None:
         )
 
 
+def held_over(system: System, dt: float) -> float:
+    """The time nearest to `dt` over which this plant holds its inputs: 1 in discrete time, where it is a step; `dt`
+    itself for a plant that does not say."""
+    if system.time == "discrete":
+        return 1.0
+    return dt if system.sample is None else min(max(dt, float(system.sample[0])), float(system.sample[1]))
+
+
 def available_plants() -> tuple[str, ...]:
     """Names that `get_plant` knows, in alphabetical order; none of them is imported."""
     names = (module.name for module in pkgutil.iter_modules(plants.__path__))

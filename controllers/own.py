@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from certify.errors import InputError
 from controllers.lqr import riccati_gain
-from controllers.options import Plant, TrainingOptions, available_plants, get_plant
+from controllers.options import Plant, TrainingOptions, available_plants, get_plant, held_over
 
 if TYPE_CHECKING:
     from certify.systems import System
@@ -129,7 +129,7 @@ def time_step(system: System, w: Array, U: Array) -> float:
     step = RESOLUTION / float(rates.max())
     scale = 10.0 ** math.floor(math.log10(step))
     step = float(f"{max(k for k in (1, 2, 5) if k * scale <= step * (1 + 1e-9)) * scale:.1e}")
-    return step if system.sample is None else min(max(step, float(system.sample[0])), float(system.sample[1]))
+    return held_over(system, step)
 
 
 def linearisation(system: System) -> tuple[Array, Array]:
