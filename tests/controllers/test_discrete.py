@@ -330,5 +330,6 @@ def test_a_held_input_is_trained_with_a_period_that_the_plant_has():
         Trainer(held, plant.preset)
     assert isinstance(Trainer(held, replace(plant.preset, dt=0.05)).options, TrainingOptions)
     policy = _linear([9.0, 1.8], "pendulum", dt=0.02)
-    for plants, step in ((held, 0.05), (system, 0.02)):
-        assert evaluate(policy, EvaluationOptions(states=2, duration=1), (plants, default_plant(plants))).held.step == step
+    brief = EvaluationOptions(states=2, duration=1)
+    for judged, step in ((held, 0.05), (system, 0.02)):
+        assert evaluate(policy, brief, (judged, default_plant(judged))).held.step == step
