@@ -1,7 +1,8 @@
 """Our policy beside its baselines or its ablations: trained on one budget, simulated from the same states.
 
-Everything is simulated from the plant's box of initial states, with the action held over the training step and
-clipped to the input's bounds; a run goes on outside the domain. These are figures for a report, never a proof.
+Everything is simulated from the plant's box of initial states, with the action held over the training step, which in
+discrete time is the plant's own, and clipped to the input's bounds; a run goes on outside the domain. These are figures
+for a report, never a proof.
 """
 
 from __future__ import annotations
@@ -63,8 +64,8 @@ def compare(
     BackendError : a run could not be trained at the place; those that were are kept.
     """
     options = options or CompareOptions()
-    x0 = initial_states(system, options.states, options.start_seed)
-    training.check_sizes(system)
+    x0, duration = initial_states(system, options.states, options.start_seed), options.span(system)[0]
+    training.check(system)
     if any(method.run in ("sb3-sac", "sb3-ppo") for method in options.methods):
         require_stable_baselines()
     responses, courses = list[Response](), list[tuple[Run, int, Course]]()
@@ -91,7 +92,7 @@ def compare(
         for method in options.methods:
             if method.run == run:
                 act = _action(trained, method.sampled, options.start_seed)
-                x, cost = simulate(system, training, act, x0, options.duration)
+                x, cost = simulate(system, training, act, x0, duration)
                 responses.append(Response(method, seed, trained.steps, x, cost, spent))
     rows = table(system, training.dt, responses, options)
     drawings = _drawings(system, training.dt, responses, rows, courses)
@@ -99,8 +100,9 @@ def compare(
     stem = system.name + ("-ablations" if ablations else "")
     result: dict[str, Any] = {
         "system": system.name,
+        "time": system.time,
         "dt": training.dt,
-        "duration": options.duration,
+        "duration": duration,
         "states": options.states,
         "seeds": options.seeds,
         "runs": [

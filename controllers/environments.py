@@ -2,7 +2,7 @@
 
 The plant that is trained on is the plant that is proved: nothing here restates an equation, and nothing else
 in this package reads one. An action is held over `dt` and the state moves by one classical Runge-Kutta step
-of order four, in float64; angles are never wrapped.
+of order four, in float64; a plant in discrete time moves by one application of its map. Angles are never wrapped.
 
 Importing this module registers `certify/<plant>-v0` for each file of `controllers.plants`. Gymnasium 1.0 and later
 read no entry points of installed packages; an id that names this module finds the environment without an import:
@@ -26,20 +26,24 @@ from numpy.typing import NDArray
 from certify.errors import InputError
 from certify.systems import System, get_system
 from certify.systems.ode import rk4_step
-from controllers.options import TrainingOptions, available_plants, preset
+from controllers.options import TrainingOptions, available_plants, preset, require_one_step
 
 Array = NDArray[np.float64]
 Module = Literal["numpy", "torch"]
 
 
 class Stepper:
-    """The plant in discrete time, `x+ = F(x, u)`: zero-order hold over `dt`, RK4, batched.
+    """The plant step by step, `x+ = F(x, u)`, batched: its own map, or in continuous time RK4 with u held over `dt`.
 
     Parameters
     ----------
     system : the plant.
-    dt : seconds for which u is held.
+    dt : seconds for which u is held; 1 for a plant in discrete time.
     module : arithmetic of the arguments, numpy arrays or torch tensors.
+
+    Raises
+    ------
+    InputError : `dt` is not positive, or not 1 for a plant in discrete time.
 
     Notes
     -----
@@ -50,11 +54,13 @@ class Stepper:
     def __init__(self, system: System, dt: float, module: Module = "torch") -> None:
         if not dt > 0:
             raise InputError(f"`dt` must be positive; found {dt}.")
-        self.dt = dt
-        self._f = system.function(module)
+        require_one_step(system, dt)
+        self._f, self._dt = system.function(module), None if system.time == "discrete" else dt
 
     def __call__(self, x: Any, u: Any) -> Any:
-        return rk4_step(lambda state: self._f(state, u), x, self.dt)
+        if self._dt is None:
+            return self._f(x, u)
+        return rk4_step(lambda state: self._f(state, u), x, self._dt)
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,13 +86,13 @@ class PlantEnvironment(gymnasium.Env):  # type: ignore[misc]  # gymnasium is unt
 
     Raises
     ------
-    InputError : Q_r does not have one weight a state.
+    InputError : Q_r does not have one weight a state, or `dt` is no time step of this plant.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012  # gymnasium's own signature
 
     def __init__(self, system: System, options: TrainingOptions) -> None:
-        options.check_sizes(system)
+        options.check(system)
         self.system = system
         self.options = options
         self._step = Stepper(system, options.dt, "numpy")
@@ -112,7 +118,7 @@ class PlantEnvironment(gymnasium.Env):  # type: ignore[misc]  # gymnasium is unt
         return self._x.copy(), {}
 
     def step(self, action: Array) -> tuple[Array, float, bool, bool, dict[str, Any]]:
-        """Hold `action` for dt."""
+        """Hold `action` for dt, or for one step of a plant in discrete time."""
         u = np.clip(np.asarray(action, dtype=np.float64), self._u_lo, self._u_hi)
         left = self._x
         x = self._x = self._step(left, u)

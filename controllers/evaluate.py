@@ -4,6 +4,9 @@ A run has *settled* when ||x|| < 1e-6 throughout the last second of 60 s. It is 
 initial states: with the policy evaluated at every Runge-Kutta stage, in steps that resolve the fastest
 eigenvalue of the closed loop, and with the action held over the training step. While a policy is trained,
 `MONITORING` asks for less: ||x|| < 1e-3 throughout the last second of 20 s, action held, 100 initial states.
+
+A plant in discrete time is simulated once, by its own map, and its time is counted in steps: the last 50 of 3,000, and
+of 1,000 while a policy is trained.
 """
 
 from __future__ import annotations
@@ -23,9 +26,10 @@ from certify.expressions import Expression
 from certify.policies import Policy, TanhNetwork
 from certify.running.threads import threads_for
 from certify.systems import System, shipped_system
+from certify.systems.system import Time
 from controllers.environments import Stepper
 from controllers.lqr import Identified, riccati_gain
-from controllers.options import Plant
+from controllers.options import Plant, held_over
 from controllers.simulation import Loop, continuous_loop, held_loop, initial_states, mean_action
 
 Array = NDArray[np.float64]
@@ -40,6 +44,7 @@ class EvaluationOptions:
     states : number of initial states, uniform in the plant's box.
     seed : of the initial states.
     duration, window : seconds simulated, and the last seconds in which the state must stay small.
+    duration_steps, window_steps : the same of a plant in discrete time, in steps.
     tolerance : bound on ||x|| in the window.
     resolution : step of the continuous simulation, as a multiple of 1 / (fastest eigenvalue's modulus).
     """
@@ -48,18 +53,26 @@ class EvaluationOptions:
     seed: int = 0
     duration: float = 60.0
     window: float = 1.0
+    duration_steps: int = 3000
+    window_steps: int = 50
     tolerance: float = 1e-6
     resolution: float = 0.2
 
     def __post_init__(self) -> None:
-        for name in ("states", "duration", "window", "tolerance", "resolution"):
+        for name in ("states", "duration", "window", "duration_steps", "window_steps", "tolerance", "resolution"):
             if not 0 < getattr(self, name) < math.inf:
                 raise InputError(f"`{name}` must be positive and finite; found {getattr(self, name)}.")
-        if self.seed < 0 or self.window > self.duration:
-            raise InputError("`seed` must be at least 0 and `window` at most `duration`.")
+        if self.seed < 0 or self.window > self.duration or self.window_steps > self.duration_steps:
+            raise InputError("`seed` must be at least 0, and `window` at most `duration`, in seconds and in steps.")
+
+    def span(self, system: System) -> tuple[float, float]:
+        """Duration and window in the plant's unit of time: seconds, or steps."""
+        if system.time == "discrete":
+            return self.duration_steps, self.window_steps
+        return self.duration, self.window
 
 
-MONITORING = EvaluationOptions(states=100, duration=20.0, tolerance=1e-3)
+MONITORING = EvaluationOptions(states=100, duration=20.0, duration_steps=1000, tolerance=1e-3)
 """How a policy is judged now and then while it is trained."""
 
 
@@ -68,7 +81,8 @@ class Settling:
     """One simulation of all initial states.
 
     `largest` is the largest ||x|| of any run in the window; `left_domain` counts runs that were outside the
-    domain at some step. `cost` is the integral of `x'Q x + (u - u_eq)'R (u - u_eq)`, median over the runs.
+    domain at some step. `cost` is the integral of `x'Q x + (u - u_eq)'R (u - u_eq)`, in discrete time its sum, median
+    over the runs. `step` is in seconds, and 1 in discrete time.
     """
 
     settled: int
@@ -98,10 +112,12 @@ class Evaluation:
 
     `K_relative_error` is against the gain of the true plant, for the weights that the record says K was made for.
     `curvature` is that of `curvature()` in the ball in which the plant was identified; NaN without `training.eta`.
-    `covered` is None without a certificate.
+    `eigenvalues` are those of the closed loop's Jacobian at the origin: of the rate of change, or, where `time` is
+    discrete, of a step. `continuous` is None in discrete time. `covered` is None without a certificate.
     """
 
     system: str
+    time: Time
     sha256: str
     gain_distance: float
     gain_relative: float
@@ -110,7 +126,7 @@ class Evaluation:
     B_relative_error: float
     K_relative_error: float
     eigenvalues: tuple[complex, ...]
-    continuous: Settling
+    continuous: Settling | None
     held: Settling
     covered: Covered | None = None
 
@@ -129,6 +145,7 @@ class Evaluation:
 
         return {
             "system": self.system,
+            "time": self.time,
             "policy": {"sha256": self.sha256},
             "gain": {"distance": _finite(self.gain_distance), "relative": _finite(self.gain_relative)},
             "curvature": _finite(self.curvature),
@@ -138,7 +155,7 @@ class Evaluation:
                 "K": _finite(self.K_relative_error),
             },
             "eigenvalues": [[e.real, e.imag] for e in self.eigenvalues],
-            "continuous": settling(self.continuous),
+            "continuous": None if self.continuous is None else settling(self.continuous),
             "held": settling(self.held),
             "proved": None if self.covered is None else asdict(self.covered),
         }
@@ -157,7 +174,8 @@ def evaluate(
     Raises
     ------
     InputError : the plant is unknown or has no box of initial states, the sizes of policy and plant differ,
-        the record lacks what the held simulation needs (`dt`, weights), or `proved` is about another loop.
+        the record lacks what the held simulation needs (weights, in continuous time `dt`), or `proved` is about
+        another loop.
     """
     options = options or EvaluationOptions()
     if own is None:
@@ -172,17 +190,17 @@ def evaluate(
         )
     x0 = initial_states(system, options.states, options.seed, plant)
     covered = None if proved is None else count_covered(proved, network, system, x0)
-    dt = recorded(policy, "dt", ())
-    if not dt > 0:
-        raise InputError(f"`training.dt` of the policy must be positive; found {dt}.")
+    dt = recorded_step(policy, system)
     Q = np.asarray(recorded(policy, "state_weights", (system.n,)))
     R = np.asarray(recorded(policy, "input_weights", (system.m,)))
 
     eigenvalues = np.linalg.eigvals(_closed_loop_jacobian(system, policy))
-    fastest = float(np.abs(eigenvalues).max())
-    h = min(dt, options.resolution / fastest) if fastest > 0 else dt
+    continuous = None
     with threads_for(network.weights):
-        continuous = _settling(continuous_loop(system, h, mean_action(network, system), Q, R), system, x0, options)
+        if system.time == "continuous":
+            fastest = float(np.abs(eigenvalues).max())
+            h = min(dt, options.resolution / fastest) if fastest > 0 else dt
+            continuous = _settling(continuous_loop(system, h, mean_action(network, system), Q, R), system, x0, options)
         held = settle(network, system, dt, Q, R, options, plant)
 
     distance = relative = math.nan
@@ -195,6 +213,7 @@ def evaluate(
         learned = errors_of(Identified(A, B, K), system, dt, *_gain_weights(policy, Q, R))
     return Evaluation(
         system=system.name,
+        time=system.time,
         sha256=network.sha256(),
         gain_distance=distance,
         gain_relative=relative,
@@ -286,7 +305,7 @@ def settle(
     options: EvaluationOptions = MONITORING,
     plant: Plant | None = None,
 ) -> Settling:
-    """Simulate `network` with its action held over dt from the plant's initial states, all of them at once.
+    """Simulate `network` with its action held over dt, or in discrete time a step, from the plant's initial states.
 
     Parameters
     ----------
@@ -326,7 +345,7 @@ def curvature(network: TanhNetwork, system: System, radius: float, points: int =
 
 
 def discrete_linearisation(system: System, dt: float) -> tuple[Array, Array]:
-    """A and B of the simulator itself at (0, u_eq): what least squares should have found."""
+    """A and B of the simulator's step at (0, u_eq): what least squares should have found; dt as `Stepper` takes it."""
     stepper = Stepper(system, dt, "torch")
     x = torch.zeros(system.n, dtype=torch.float64)
     u = torch.tensor([float(v) for v in system.exact_u_eq()], dtype=torch.float64)
@@ -376,9 +395,10 @@ def _closed_loop_jacobian(system: System, policy: Policy) -> Array:
 
 def _settling(loop: Loop, system: System, x0: Array, options: EvaluationOptions) -> Settling:
     domain = np.array(system.domain, dtype=np.float64)
-    window_begins = loop.count(options.duration) - loop.count(options.window)
+    duration, window = options.span(system)
+    window_begins = loop.count(duration) - loop.count(window)
     largest, outside, cost = np.zeros(len(x0)), np.zeros(len(x0), dtype=bool), np.zeros(len(x0))
-    for k, (x, total) in enumerate(loop.run(x0, options.duration)):
+    for k, (x, total) in enumerate(loop.run(x0, duration)):
         if k >= window_begins:
             norm = np.linalg.norm(x, axis=1)
             largest = np.maximum(largest, np.where(np.isnan(norm), math.inf, norm))
@@ -392,6 +412,22 @@ def _settling(loop: Loop, system: System, x0: Array, options: EvaluationOptions)
         cost=float(np.median(cost)),
         step=loop.h,
     )
+
+
+def recorded_step(policy: Policy, system: System) -> float:
+    """The time step of the record, or the nearest of those that the plant has, whatever the record says: 1 in discrete
+    time, else where inputs are held over given times one of these.
+
+    Raises
+    ------
+    InputError : the record has no time step that is positive, and needs one.
+    """
+    if system.time == "discrete":
+        return 1.0
+    dt = float(recorded(policy, "dt", ()))
+    if not dt > 0:
+        raise InputError(f"`training.dt` of the policy must be positive; found {dt}.")
+    return held_over(system, dt)
 
 
 def recorded(policy: Policy, name: str, shape: Sequence[int]) -> Any:

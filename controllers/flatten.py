@@ -37,10 +37,10 @@ from certify.policies import Policy, TanhNetwork, require_centred
 from certify.systems import System, shipped_system
 from controllers.contraction import contracted, with_value_at_origin
 from controllers.departure import departure, departure_of, linearised
-from controllers.evaluate import EvaluationOptions, curvature, discrete_linearisation, settle
+from controllers.evaluate import MONITORING, curvature, discrete_linearisation, settle
 from controllers.gain import regained
 from controllers.lqr import riccati_gain
-from controllers.options import Plant, get_plant
+from controllers.options import Plant, get_plant, held_over
 from controllers.simulation import held_loop, initial_states, mean_action
 
 Array = NDArray[np.float64]
@@ -56,7 +56,7 @@ GAIN = 100.0
 CHECKS = 8
 """How often the iterate is judged by simulation while Adam runs; as often the states that it visits are added."""
 
-_RUNS, _EVERY = 64, 10  # runs that give states to fit on, of which every tenth state is taken
+_RUNS, _EVERY = 64, 10  # runs that give states to fit on, of which every tenth state is taken, in discrete time each
 _NEAR = 1e-12  # relative: below it a mean square counts as zero
 
 
@@ -74,7 +74,7 @@ class FlattenOptions:
     max_cost_change : bound on the relative rise of the median cost; a fall is no harm.
     states : initial states of the runs that judge a policy.
     gain : the Jacobian at 0 that is aimed at: `kept` is the policy's own, `lqr` that of the LQR at the time step of the
-        runs that judge.
+        runs that judge, in discrete time the plant's own.
     Q, R : diagonals (n,) and (m,) of the LQR's weights, for `gain` "lqr"; None means those of the runs that judge.
     seed, threads : of everything random; of torch.
 
@@ -361,7 +361,7 @@ class _Run:
         return Q, R
 
     def _figures(self, network: TanhNetwork) -> Figures:
-        judged = EvaluationOptions(states=self.options.states, seed=self.options.seed, duration=20.0, tolerance=1e-3)
+        judged = replace(MONITORING, states=self.options.states, seed=self.options.seed)
         found = settle(network, self.system, self.dt, self.Q, self.R, judged, self.plant)
         return Figures(
             departure=departure_of(network, self.box.tolist()),
@@ -374,8 +374,9 @@ class _Run:
     def _visited(self, network: TanhNetwork) -> Array:
         """States (N, n) on the way from the box of initial states, over an episode's horizon, inside the domain."""
         loop = held_loop(self.system, self.dt, mean_action(network, self.system), self.Q, self.R)
-        duration = self.plant.preset.horizon * self.plant.preset.dt
-        found = [x for k, (x, _) in enumerate(loop.run(self.x0, duration)) if k % _EVERY == 0]
+        preset, every = self.plant.preset, 1 if self.system.time == "discrete" else _EVERY
+        runs = loop.run(self.x0, preset.horizon * preset.dt)
+        found = [x for k, (x, _) in enumerate(runs) if k % every == 0]
         states = np.concatenate(found)
         lo, hi = np.array(self.system.domain, dtype=np.float64).T
         return np.asarray(states[((states >= lo) & (states <= hi)).all(axis=1)])  # NaN, a run that diverged, is not
@@ -443,7 +444,10 @@ class _Run:
         return record
 
     def _judge(self) -> tuple[float, Array, Array]:
-        """dt, Q and R of the runs that judge: the policy's record, and the plant's preset where it has none."""
+        """dt, Q and R of the runs that judge: the policy's record, and the plant's preset where it has none.
+
+        dt is one over which the plant holds its inputs, in discrete time 1.
+        """
         preset, record = self.plant.preset, self.policy.training
         wanted = (("dt", ()), ("state_weights", (self.system.n,)), ("input_weights", (self.system.m,)))
         found = []
@@ -458,7 +462,7 @@ class _Run:
         dt = float(found[0])
         if not dt > 0:
             raise InputError(f"`training.dt` of the policy must be positive; found {dt}.")
-        return dt, found[1], found[2]
+        return held_over(self.system, dt), found[1], found[2]
 
     def _require_sizes(self) -> None:
         network, system, box = self.old, self.system, self.options.box

@@ -23,7 +23,7 @@ from certify.errors import CertificateFormatError, InputError
 from certify.lyapunov import Candidate, volume
 from certify.systems import System
 from certify.verdict import Verdict
-from controllers.evaluate import discrete_linearisation, recorded, require_same_question
+from controllers.evaluate import discrete_linearisation, recorded, recorded_step, require_same_question
 from controllers.files import read
 from controllers.kept import Kept
 from controllers.lqr import riccati_gain
@@ -110,7 +110,7 @@ def distances(history: Sequence[Kept], system: System) -> list[Distances]:
                 f"the policies must map {n} states to {m} inputs for {system.name}; found {policy.network.n} and "
                 f"{policy.network.m}."
             )
-        dt = float(recorded(policy, "dt", ()))
+        dt = recorded_step(policy, system)
         Q, R = (np.diag(recorded(policy, f"{of}_weights", (k,))) for of, k in (("state", n), ("input", m)))
         A, B = discrete_linearisation(system, dt)
         K = riccati_gain(A, B, Q, R)

@@ -3,7 +3,8 @@
 Near the equilibrium `x+ = A x + B (u - u_eq)`. Transitions with zero action, u = u_eq, show A alone; B is
 then fitted to what A leaves unexplained. In a ball of radius eta the linear fit of A is wrong by what the plant's
 second-order terms look like on the states that were seen, of the order of eta; fitted along, they take that error
-with them, and what is left is of the order of eta^2. K solves the *discrete* Riccati equation at the training step, and
+with them, and what is left is of the order of eta^2. A step is that of the training, for a plant in discrete time its
+own. K solves the *discrete* Riccati equation, and
 the control law is `u = u_eq - K x`: the Jacobian of a matching policy is -K (the paper writes +K, with the
 other sign in K).
 """

@@ -48,7 +48,9 @@ class TrainingOptions:
     seed: Annotated[int, "Seed of everything random."] = 0
     threads: Annotated[int, "Threads of torch; networks this small are fastest with one."] = 1
     # The task
-    dt: Annotated[float, "Seconds for which an action is held, integrated by one RK4 step."]
+    dt: Annotated[
+        float, "Seconds for which an action is held, integrated by one RK4 step; 1 for a plant in discrete time."
+    ]
     horizon: Annotated[int, "Steps after which an episode is truncated."]
     start: Annotated[float, "Episodes start uniformly in this share of the domain."] = 1.0
     reward_offset: Annotated[float, "r0 of the reward r0 - x'Q_r x."]
@@ -154,13 +156,19 @@ class TrainingOptions:
         if not holds:
             raise InputError(f"`{name}` must be {requirement}; found {getattr(self, name)!r}.")
 
-    def check_sizes(self, system: System) -> None:
-        """Raise InputError unless there is one weight a state and one an input, and one half-width of a box a state."""
+    def check(self, system: System) -> None:
+        """Raise InputError unless there is one weight a state and one an input, one half-width of a box a state, and
+        `dt` is a time over which this plant's inputs are held."""
         sizes = {"reward_weights": system.n, "state_weights": system.n, "input_weights": system.m}
         if self.proof_box:
             sizes["proof_box"] = system.n
         for name, size in sizes.items():
             self._require(name, len(getattr(self, name)) == size, f"{size} numbers for {system.name}")
+        require_one_step(system, self.dt)
+        if system.sample is not None:
+            lo, hi = map(float, system.sample)
+            held = f"the time {hi:g}" if lo == hi else f"between {lo:g} and {hi:g}"
+            self._require("dt", lo <= self.dt <= hi, f"{held}, over which {system.name} holds its inputs")
 
     def record(self) -> dict[str, Any]:
         """All options as plain values, for the policy file and for checkpoints."""
@@ -218,7 +226,7 @@ class Plant:
     def check(self, system: System) -> None:
         """Raise InputError unless weights, box and positions are those of a plant with the states of `system`."""
         for options in filter(None, (self.preset, self.paper)):
-            options.check_sizes(system)
+            options.check(system)
         if len(self.initial_states) != system.n:
             raise InputError(
                 f"`initial_states` of {system.name} must have {system.n} half-widths; found {len(self.initial_states)}."
@@ -242,6 +250,28 @@ class Plant:
         if self.paper is None:
             raise InputError("this plant has no preset `paper`, since the paper does not have the plant; use `ours`.")
         return self.paper
+
+
+def require_one_step(system: System, dt: float) -> None:
+    """Refuse a time step of a plant in discrete time that is not the plant's own.
+
+    Raises
+    ------
+    InputError : the plant is in discrete time, and `dt` is not 1.
+    """
+    if system.time == "discrete" and dt != 1:
+        raise InputError(
+            f"`dt` must be 1 for {system.name}, a plant in discrete time, whose equations give the state one step "
+            f"later; found {dt}. Leave `dt` out."
+        )
+
+
+def held_over(system: System, dt: float) -> float:
+    """The time nearest to `dt` over which this plant holds its inputs: 1 in discrete time, where it is a step; `dt`
+    itself for a plant that does not say."""
+    if system.time == "discrete":
+        return 1.0
+    return dt if system.sample is None else min(max(dt, float(system.sample[0])), float(system.sample[1]))
 
 
 def available_plants() -> tuple[str, ...]:

@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from controllers.options import Plant, TrainingOptions, available_plants, get_plant
+from controllers.lqr import riccati_gain
+from controllers.options import Plant, TrainingOptions, available_plants, get_plant, held_over
 
 if TYPE_CHECKING:
     from certify.systems import System
@@ -64,7 +65,7 @@ def default_plant(system: System) -> Plant:
     """How a plant is trained of which nothing is known but its equations, domain and input bounds.
 
     With w the half-width of a state's domain and U that of an input's bounds around u_eq, weights are 1/w^2 and 1/U^2.
-    The time step resolves the fastest rate of the LQR loop with these weights.
+    The time step is that of `time_step`.
 
     Raises
     ------
@@ -101,7 +102,10 @@ def default_plant(system: System) -> Plant:
 
 
 def time_step(system: System, w: Array, U: Array) -> float:
-    """Seconds for which an action is held: `RESOLUTION` over the fastest rate, rounded down to 1, 2 or 5 times ten^k.
+    """Time for which an action is held: 1 in discrete time, where it is a step; else seconds.
+
+    It is `RESOLUTION` over the fastest rate of the LQR loop with the weights 1/w^2 and 1/U^2, rounded down to 1, 2 or 5
+    times ten^k; and where the plant says over which times its inputs are held, the nearest of these.
 
     Raises
     ------
@@ -110,21 +114,26 @@ def time_step(system: System, w: Array, U: Array) -> float:
     import scipy.linalg
 
     A, B = linearisation(system)
+    Q, R = np.diag(1 / w**2), np.diag(1 / U**2)
     try:
-        P = scipy.linalg.solve_continuous_are(A, B, np.diag(1 / w**2), np.diag(1 / U**2))
-    except (np.linalg.LinAlgError, ValueError) as error:
+        if system.time == "discrete":
+            riccati_gain(A, B, Q, R)
+            return 1.0
+        P = scipy.linalg.solve_continuous_are(A, B, Q, R)
+    except (np.linalg.LinAlgError, ValueError, InputError) as error:
         raise InputError(
             f"the linearisation of {system.name} must be stabilisable, or no policy near the operating point can hold "
-            f"it: {error}. `certify plant` shows A, B and what cannot be controlled."
+            f"it: {str(error).rstrip('.')}. `certify plant` shows A, B and what cannot be controlled."
         ) from error
     rates = np.abs(np.linalg.eigvals(A - B @ (U[:, None] ** 2 * B.T) @ P))
     step = RESOLUTION / float(rates.max())
     scale = 10.0 ** math.floor(math.log10(step))
-    return float(f"{max(k for k in (1, 2, 5) if k * scale <= step * (1 + 1e-9)) * scale:.1e}")
+    step = float(f"{max(k for k in (1, 2, 5) if k * scale <= step * (1 + 1e-9)) * scale:.1e}")
+    return held_over(system, step)
 
 
 def linearisation(system: System) -> tuple[Array, Array]:
-    """A (n, n) and B (n, m) of the plant at its operating point, in floats."""
+    """A (n, n) and B (n, m) of the plant's equations at its operating point, in floats."""
     from certify.systems import in_floats, linearise
 
     A, B = linearise(system)

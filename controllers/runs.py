@@ -394,7 +394,7 @@ def _options_of(run: Run, training: TrainingOptions, plan: Plan) -> TrainingOpti
 def judged(system: System, training: TrainingOptions, mean: Action) -> Judged:
     """What is found of a policy while its run goes on, from other states than those of the table."""
     x0 = initial_states(system, _JUDGED.states, _JUDGED.start_seed)
-    x, cost = simulate(system, training, mean, x0, _JUDGED.duration)
+    x, cost = simulate(system, training, mean, x0, _JUDGED.span(system)[0])
     [row, _] = table(system, training.dt, [Response(OURS, 0, 0, x, cost)], _JUDGED)
     return Judged(row.floor, row.cost_median, row.left_domain, row.trajectories)
 

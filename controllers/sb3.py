@@ -67,7 +67,7 @@ class Reference:
     def __init__(self, algorithm: Algorithm, system: System, options: TrainingOptions, rollout: int = ROLLOUT) -> None:
         if algorithm not in get_args(Algorithm):
             raise InputError(f"the baseline must be one of {', '.join(get_args(Algorithm))}; found {algorithm!r}.")
-        options.check_sizes(system)
+        options.check(system)
         self.algorithm, self.system, self.options = algorithm, system, options
         self._closing: tuple[int, int] | None = None
         self._generators = _globals()

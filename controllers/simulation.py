@@ -1,4 +1,4 @@
-"""Closed loops in discrete time, run from many initial states at once: what `evaluate` and `compare` measure on.
+"""Closed loops step by step, run from many initial states at once: what `evaluate` and `compare` measure on.
 
 A trajectory whose state is no longer finite, or beyond `DIVERGED`, has *diverged*: from there on its state is NaN
 and its cost infinite. These are figures for a report, never a proof.
@@ -14,6 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from certify.errors import InputError
 from certify.policies import TanhNetwork
 from certify.systems import System
 from certify.systems.ode import rk4_step
@@ -29,13 +30,13 @@ DIVERGED = 1e9
 
 @dataclass(frozen=True, slots=True)
 class Loop:
-    """A closed loop in steps of h seconds.
+    """A closed loop in steps of h, in the plant's unit of time: seconds, or steps, of which h is 1.
 
     Parameters
     ----------
     step : states (N, n) and inputs (N, m) to the next states.
     act : states (N, n) to inputs (N, m); never asked about a state that has diverged.
-    cost : states and inputs to the running cost (N,), per second.
+    cost : states and inputs to the running cost (N,), per unit of time.
 
     Notes
     -----
@@ -50,7 +51,7 @@ class Loop:
     h: float
 
     def count(self, duration: float) -> int:
-        """Steps that cover `duration` seconds."""
+        """Steps that cover `duration`."""
         return math.ceil(duration / self.h - 1e-9)
 
     def run(self, x: Array, duration: float) -> Iterator[tuple[Array, Array]]:
@@ -68,12 +69,22 @@ class Loop:
 
 
 def held_loop(system: System, dt: float, act: Action, Q: Array, R: Array) -> Loop:
-    """The loop in which an action is held for dt seconds; Q (n,) and R (m,) are the diagonals of the cost's weights."""
+    """The loop in which an action is held for dt seconds, or in discrete time for one step, dt = 1.
+
+    Q (n,) and R (m,) are the diagonals of the cost's weights.
+    """
     return Loop(Stepper(system, dt, "numpy"), act, _cost(system, Q, R), dt)
 
 
 def continuous_loop(system: System, h: float, act: Action, Q: Array, R: Array) -> Loop:
-    """The loop in which the policy is evaluated at every Runge-Kutta stage of a step of h seconds."""
+    """The loop in which the policy is evaluated at every Runge-Kutta stage of a step of h seconds.
+
+    Raises
+    ------
+    InputError : the plant is in discrete time, where nothing happens between two steps.
+    """
+    if system.time == "discrete":
+        raise InputError(f"{system.name} must be in continuous time to be followed between two steps; it is not.")
     f = system.function("numpy")
 
     def step(x: Array, u: Array) -> Array:
@@ -110,7 +121,7 @@ def simulate(system: System, training: TrainingOptions, act: Action, x0: Array, 
     ----------
     training : dt, and the weights of `x'Qx + (u - u_eq)'R(u - u_eq)`, which is summed times dt.
     act : states (N, n) to inputs (N, m), which are clipped to their bounds.
-    duration : seconds; T is the number of steps that cover it.
+    duration : seconds, or steps of a plant in discrete time; T is the number of steps that cover it.
     """
     Q, R = np.array(training.state_weights), np.array(training.input_weights)
     u_lo, u_hi = np.array(system.input_bounds, dtype=np.float64).T

@@ -116,7 +116,10 @@ def theory(
     else:
         system, plant = own
     if system.time != "continuous":
-        raise InputError(f"{system.name} must be in continuous time, where an action is held over `dt`.")
+        raise InputError(
+            f"{system.name} must be in continuous time, because the constants are about an action that is held over "
+            "`dt`; it is in discrete time. Use `controllers evaluate` and `certify roa`, which take such a plant."
+        )
     loop = ClosedLoop(system, policy.network)
     loop.require_rest()
     dt, gamma = recorded(policy, "dt", ()), recorded(policy, "gamma", ())

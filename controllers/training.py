@@ -56,13 +56,13 @@ class Trainer:
 
     Raises
     ------
-    InputError : weights do not fit the plant.
+    InputError : weights or the time step do not fit the plant.
     """
 
     def __init__(
         self, system: System, options: TrainingOptions, device: torch.device = CPU, plant: Plant | None = None
     ) -> None:
-        options.check_sizes(system)
+        options.check(system)
         self.system, self.options, self.plant = system, options, plant
         self.environment = PlantEnvironment(system, options)
         self.interface = Interface(system)

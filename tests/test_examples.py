@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 
 def states(name: str, count: int = 200) -> tuple[Array, Array, Array]:
-    """States' values x (count, n), inputs u and the plant's derivative there, from its file."""
+    """States' values x (count, n), inputs u and what the plant's equations give there, from its file."""
     system = load_system(EXAMPLES / "plants" / f"{name}.toml")
     generator = np.random.default_rng(0)
     lo, hi = np.array(system.domain, dtype=float).T
@@ -44,7 +44,8 @@ def test_a_policy_belongs_to_its_plant(path: Path) -> None:
     assert all(isinstance(r, Fraction) for r in system.residuals().values())
     loop = ClosedLoop(system, policy.network)
     loop.require_rest()
-    assert np.linalg.eigvals(loop.linearise()[0]).real.max() < 0
+    eigenvalues = np.linalg.eigvals(loop.linearise()[0])
+    assert np.abs(eigenvalues).max() < 1 if system.time == "discrete" else eigenvalues.real.max() < 0
     found = controllability(*linearise(system))
     assert found.exact and found.rank == system.n
     mine, own = chosen_plant(str(path))
@@ -54,10 +55,11 @@ def test_a_policy_belongs_to_its_plant(path: Path) -> None:
     assert {name: record[name] for name in wanted} == wanted
 
 
-def test_there_are_seven() -> None:
+def test_there_are_eight() -> None:
     assert [p.stem for p in PLANTS] == [
         "bicycle",
         "furuta",
+        "henon",
         "maglev",
         "satellite",
         "two_machines",
@@ -139,6 +141,12 @@ def test_two_machines_swing_about_a_rational_angle() -> None:
     np.testing.assert_allclose(change, np.stack([x[:, 1], wanted], -1), atol=1e-12)
 
 
+def test_the_map_of_henon_takes_a_step() -> None:
+    x, u, after = states("henon")
+    np.testing.assert_allclose(after[:, 0] + 0.63, 1 - 1.4 * x[:, 0] ** 2 + x[:, 1] + u[:, 0], atol=1e-12)
+    np.testing.assert_allclose(after[:, 1] + 0.3 * 0.63, 0.3 * x[:, 0], atol=1e-12)
+
+
 def test_the_magnet_s_force_falls_with_the_square_of_the_gap() -> None:
     x, u, change = states("maglev")
     assert x[:, 0].min() > 0.004 and x[:, 0].max() < 0.016
@@ -165,6 +173,7 @@ def test_the_tanks_empty_as_torricelli_says() -> None:
         ("maglev", 5.03e-3),
         ("bicycle", 5.19),
         ("furuta", 16.8),
+        ("henon", 0.89),
         ("satellite", 0.259),
     ],
 )

@@ -21,7 +21,10 @@ def compare(
     runs: Annotated[Path, typer.Option("--runs", help="Folder of trained runs; missing ones are trained into it.")],
     out: Annotated[Path, typer.Option("--out", help="Folder for the figures and the table.")],
     seeds: Annotated[int, typer.Option("--seeds", help="Runs of each method, with the seeds 0, 1, ...")] = 5,
-    duration: Annotated[float, typer.Option("--duration", help="Seconds simulated.")] = 20.0,
+    duration: Annotated[
+        float | None,
+        typer.Option("--duration", help="Seconds simulated, or steps in discrete time; default: 20 s or 1000 steps."),
+    ] = None,
     states: Annotated[int, typer.Option("--states", help="Number of initial states.")] = 50,
     ablations: Annotated[
         bool, typer.Option("--ablations", help="Compare with ablations of our own training, not with baselines.")
@@ -66,10 +69,14 @@ def compare(
         methods = remaining(ABLATIONS if ablations else BASELINES, without or [])
         if steps is not None and (budget is not None or patience is not None):
             raise InputError("`--steps` is for runs of one length; `--budget` and `--patience` are for the others.")
+        system = get_system(plant)
+        span: dict[str, Any] = {}
+        if duration is not None:
+            span = {"duration": duration} if system.time == "continuous" else {"duration_steps": int(duration)}
         options = CompareOptions(
             methods=methods,
             seeds=seeds,
-            duration=duration,
+            **span,
             states=states,
             to_floor=steps is None and not ablations,
             budget=budget,
@@ -77,7 +84,7 @@ def compare(
         )
         place = None if jobs is None and cluster is None else place_for(jobs, cluster)
         with _progress() as (say, watch):
-            result = run(get_system(plant), training, runs, out, options, say, watch, place)
+            result = run(system, training, runs, out, options, say, watch, place)
         if as_json:
             emit(result, as_json)
             return

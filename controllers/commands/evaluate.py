@@ -11,7 +11,7 @@ import typer
 from controllers.commands.shared import Json, emit, errors
 
 if TYPE_CHECKING:
-    from controllers.evaluate import Covered, Evaluation, Settling
+    from controllers.evaluate import Covered, Evaluation, EvaluationOptions, Settling
 
 
 def evaluate(
@@ -38,13 +38,14 @@ def evaluate(
         stored, own = load_policy(policy), None if system is None else chosen_plant(system)
         proved = None if certificate is None else proved_set(certificate)
         result = judge(stored, options, own, proved)
-        emit(result.as_json() if as_json else _table(result), as_json)
+        emit(result.as_json() if as_json else _table(result, options), as_json)
 
 
-def _table(result: Evaluation) -> dict[str, Any]:
+def _table(result: Evaluation, options: EvaluationOptions) -> dict[str, Any]:
     def settling(s: Settling) -> str:
+        span = f"{options.duration_steps} steps" if result.time == "discrete" else f"step {s.step:.4g} s"
         return (
-            f"{s.settled} of {s.states} settled (step {s.step:.4g} s), {s.left_domain} left the domain, "
+            f"{s.settled} of {s.states} settled ({span}), {s.left_domain} left the domain, "
             f"largest final norm {s.largest:.1e}, median cost {s.cost:.4g}"
         )
 
@@ -52,15 +53,27 @@ def _table(result: Evaluation) -> dict[str, Any]:
     A_error, B_error, K_error = ("?" if math.isnan(error) else f"{100 * error:.2g} %" for error in errors)
     covered = result.covered
     learned = not math.isnan(result.gain_relative)
+    eigenvalues = ", ".join(f"{e:.4g}" for e in result.eigenvalues)
+    if result.continuous is None:
+        largest = max(map(abs, result.eigenvalues))
+        stable = "below 1: stable" if largest < 1 else "not below 1: not stable"
+        runs = {
+            "eigenvalues": f"{eigenvalues} of a step; largest modulus {largest:.4g}, {stable}",
+            "step by step": settling(result.held),
+        }
+    else:
+        runs = {
+            "eigenvalues": eigenvalues,
+            "continuous": settling(result.continuous),
+            "held": settling(result.held),
+        }
     return {
         "system": result.system,
         "sha256": result.sha256,
         "||J+K||/||K||": f"{100 * result.gain_relative:.3g} %" if learned else None,
         "learned A, B, K": f"off by {A_error}, {B_error} and {K_error}" if learned else None,
         "curvature": None if math.isnan(result.curvature) else f"{result.curvature:.4g}",
-        "eigenvalues": ", ".join(f"{e:.4g}" for e in result.eigenvalues),
-        "continuous": settling(result.continuous),
-        "held": settling(result.held),
+        **runs,
     } | ({} if covered is None else {"in the proved set": _share(covered)})
 
 

@@ -8,13 +8,15 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from certify.report.timing import Timing
 from certify.systems import System
 from controllers.figures.style import COLOURS, DEEP, WIDTH, count, drawn, log_scale, name_lines, seeds_of
 from controllers.responses import NAMES, OURS, Response, Row, quartiles
 
 Array = NDArray[np.float64]
 
-_AXES = {"cost": "∫ x'Qx + ũ'Rũ dt,  ũ = u − u_eq", "norm": "‖x‖ (units of the states)"}
+_NORM = "‖x‖ (units of the states)"
+_COST = {"continuous": "∫ x'Qx + ũ'Rũ dt,  ũ = u − u_eq", "discrete": "Σ x'Qx + ũ'Rũ,  ũ = u − u_eq"}
 _SMALLEST = 1e-16  # norms are drawn from here on: a logarithmic axis has no 0
 
 
@@ -40,10 +42,10 @@ def draw_over_time(
                 named.append(_draw_band(panel, what, dt, own, row))
             ends.append(named)
             panel.set_title("stochastic actions (ours: its mean)" if sampled else "mean actions")
-            panel.set_ylabel(_AXES[what])
+            panel.set_ylabel(_NORM if what == "norm" else _COST[system.time])
             panel.grid(axis="y")
         panels[-1].set_xlim(0, dt * (len(responses[0].x) - 1))
-        panels[-1].set_xlabel("time (s)")
+        panels[-1].set_xlabel(Timing.of(system).axis)
         for panel in panels:
             log_scale(panel)
         for panel, named in zip(panels, ends, strict=True):
@@ -51,11 +53,11 @@ def draw_over_time(
         seeds = sorted({response.seed for response in responses})
         title = "accumulated cost" if what == "cost" else "distance from the equilibrium"
         told = f"{system.name}, {seeds_of(seeds)}: {title}\nmedian and quartiles of "
-        told += (
-            f"{count(len(seeds), 'seed')} × {count(responses[0].x.shape[1], 'initial state')}, actions held {dt:g} s"
-        )
+        discrete = system.time == "discrete"
+        held = "step by step" if discrete else f"actions held {dt:g} s"
+        told += f"{count(len(seeds), 'seed')} × {count(responses[0].x.shape[1], 'initial state')}, {held}"
         if what == "norm":
-            told += "\ndotted: floor, the median of the largest in the last second"
+            told += f"\ndotted: floor, the median of the largest in the last {'steps' if discrete else 'second'}"
         figure.suptitle(told, x=0.01, ha="left")
         return figure
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from certify.report.timing import Timing
 from certify.systems import System
 from controllers.figures.states import MOST, draw_state, reach_of, short
 from controllers.figures.style import MUTED, WIDTH, count, drawn
@@ -54,7 +55,7 @@ def draw_positions(system: System, dt: float, responses: Sequence[Response]) -> 
         for panel, run in zip(panels[0], runs, strict=True):
             panel.set_title(short(Method(run, False)))
         for panel in panels[-1]:
-            panel.set_xlabel("time (s)")
+            panel.set_xlabel(Timing.of(system).axis)
         panels[0, 0].set_xlim(0, time[-1])
         number = next(iter(chosen.values())).shape[1]
         figure.suptitle(

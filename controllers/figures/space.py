@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from certify.report.timing import Timing
 from certify.systems import System
 from controllers.figures.states import named, reach_of, short
 from controllers.figures.style import COLOURS, DEEP, INK, MUTED, PALE, WIDTH, count, drawn
@@ -68,8 +69,8 @@ def draw_space(system: System, dt: float, responses: Sequence[Response]) -> byte
             title = short(method).replace("\n", " ") + (f": {leaving} leave the frame" if leaving else "")
             panel.set_title(title, color=DEEP[method.run])
         number = next(iter(chosen.values())).shape[1]
-        seconds = dt * (len(responses[0].x) - 1)
-        what = f"{count(number, 'trajectory', 'trajectories')} of {seconds:g} s in space"
+        duration = f"{dt * (len(responses[0].x) - 1):g} {Timing.of(system).unit}"
+        what = f"{count(number, 'trajectory', 'trajectories')} of {duration} in space"
         figure.suptitle(
             f"{system.name}, seed {seed}: {what}, mean actions, held\n"
             "small dots: where they begin; large ones: where they end; cross: the equilibrium",

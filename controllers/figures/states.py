@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from certify.report.timing import Timing
 from certify.systems import System
 from controllers.figures.style import COLOURS, MUTED, count, drawn
 from controllers.options import get_plant
@@ -37,7 +38,7 @@ def draw_states(system: System, dt: float, responses: Sequence[Response]) -> byt
         for panel, method in zip(panels[0], chosen, strict=True):
             panel.set_title(method.label.replace(", ", ",\n"))  # a panel is narrower than some names
         for panel in panels[-1]:
-            panel.set_xlabel("time (s)")
+            panel.set_xlabel(Timing.of(system).axis)
             panel.set_xlim(0, time[-1])
         number = next(iter(chosen.values())).shape[1]
         figure.suptitle(f"{system.name}, seed {seed}: {count(number, 'trajectory', 'trajectories')}, held actions")
