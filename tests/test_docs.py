@@ -189,7 +189,6 @@ def test_the_sites_packages_are_pinned() -> None:
         "mkdocstrings",
         "mkdocstrings-python",
         "griffelib",
-        "l2m4m",
         "latex2mathml",
     } <= pinned
 
