@@ -26,7 +26,9 @@ def typeset(left: str, expression: sympy.Expr, names: Sequence[sympy.Symbol]) ->
     long = {v: sympy.Float(v, 8) for v in expression.atoms(sympy.Rational) if is_long(v)}
     text = MathMLPresentationPrinter().doprint(expression.xreplace(long).xreplace(markers))
     for k, s in enumerate(names):
-        text = text.replace(f"<mi>NAME{k}NAME</mi>", identifier(s.name))
+        marker, name = f"<mi>NAME{k}NAME</mi>", identifier(s.name)
+        close = f'<mo stretchy="false">(</mo>{name}<mo stretchy="false">)</mo>'  # or brackets grow beyond a letter
+        text = text.replace(f"<mo>(</mo>{marker}<mo>)</mo>", close).replace(marker, name)
     text = text.replace("<mo>-</mo>", f"<mo>{MINUS}</mo>")
     text = text.replace("<mo>&InvisibleTimes;</mo>", '<mspace width="0.15em"/>')
     inner = text.removeprefix("<math>").removesuffix("</math>")
@@ -34,10 +36,10 @@ def typeset(left: str, expression: sympy.Expr, names: Sequence[sympy.Symbol]) ->
 
 
 def identifier(name: str) -> str:
-    """A name in MathML; the dot of a derivative is set above."""
+    """A name in MathML; the dot of a derivative is set above, as large as the letter."""
     base = name.removesuffix("_dot")
     if base and base != name:
-        return f"<mover>{identifier(base)}<mo>˙</mo></mover>"
+        return f'<mover>{identifier(base)}<mo scriptlevel="0">˙</mo></mover>'
     return f"<mi>{_escape(symbol(name))}</mi>"
 
 
