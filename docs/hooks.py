@@ -7,7 +7,6 @@ says of itself when the site is built is what the page shows, so that a command 
 from __future__ import annotations
 
 import inspect
-import re
 from typing import Any
 
 import typer
@@ -15,8 +14,6 @@ import typer
 import certify
 from certify.cli import app
 
-# A bar of an absolute value is an infix operator to a browser unless it is told otherwise, and gets room on both sides.
-_BAR = re.compile(r'<mo(?: stretchy="false")?>(&#x0007C;|&#x02016;)</mo>')
 COMMANDS, NAMES = "<!-- every command -->", "<!-- every public name -->"
 
 
@@ -27,11 +24,6 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
     if NAMES in markdown:
         markdown = markdown.replace(NAMES, public_names())
     return markdown
-
-
-def on_page_content(html: str, **_: Any) -> str:
-    """The page with bars that stand close to what they enclose."""
-    return _BAR.sub(r'<mo stretchy="false" lspace="0" rspace="0">\1</mo>', html)
 
 
 def commands() -> str:

@@ -31,6 +31,7 @@ from certify.enclosures import policy as producer
 from certify.engines.falsify import falsify
 from certify.engines.local import prove_local
 from certify.errors import InputError
+from certify.expressions import Number
 from certify.policies import Policy, TanhNetwork, bounded_by_form, load_policy, require_centred, save_policy
 from certify.reference import leaves as reference
 from certify.reference import rules as reference_rules
@@ -236,7 +237,7 @@ def test_without_centring_the_origin_is_decided_after_the_clip() -> None:
     with pytest.raises(InputError, match="clip must not act"):
         network.jacobian_at_origin((Fraction(1),))
     x, u = get_system("pendulum").states[0], get_system("pendulum").inputs[0]
-    plant = System("p", (x,), (u,), {}, (x + u - 1,), (x * 0 + 1,), box(3), ((Fraction(-2), Fraction(2)),))
+    plant = System("p", (x,), (u,), {}, (x + u - 1,), (Number(1),), box(3), ((Fraction(-2), Fraction(2)),))
     loop = ClosedLoop(plant, network)
     assert eigenvalues(loop) is None
     with pytest.raises(InputError, match="clip must not act"):
@@ -348,7 +349,7 @@ def test_a_saturated_loop_is_proved_up_to_the_edge_of_its_region(tmp_path: Path)
 def test_a_rectified_tanh_is_a_clip(tmp_path: Path) -> None:
     """u = 2 relu(tanh(net(x) - net(0) + beta)), u_eq = 1: it reaches 0 on part of the set, and never 2."""
     x, u = get_system("pendulum").states[0], get_system("pendulum").inputs[0]
-    system = System("lift", (x,), (u,), {}, (u - 1,), (x * 0 + 1,), box(4), ((Fraction(0), Fraction(2)),))
+    system = System("lift", (x,), (u,), {}, (u - 1,), (Number(1),), box(4), ((Fraction(0), Fraction(2)),))
     network = TanhNetwork(
         (np.array([[-0.5]]),), (np.array([0.7]),), np.array([2.0]), np.zeros(1), "tanh", "preactivation",
         (np.zeros(1), np.array([2.0])),

@@ -69,10 +69,10 @@ class Symbolic:
 
 def of_polynomial(function: Polynomial, states: Sequence[Symbol]) -> Symbolic:
     """A polynomial as an expression, its coefficients as the rationals that they are."""
-    terms = [
-        reduce(operator.mul, (s**a for s, a in zip(states, row, strict=True) if a), Number(Fraction(c)))
-        for row, c in zip(function.exponents.tolist(), function.coefficients.tolist(), strict=True)
-    ]
+    terms = []
+    for row, c in zip(function.exponents.tolist(), function.coefficients.tolist(), strict=True):
+        powers: list[Expression] = [s**a for s, a in zip(states, row, strict=True) if a]
+        terms.append(reduce(operator.mul, powers if c == 1 and powers else [Number(Fraction(c)), *powers]))
     return Symbolic(total(terms), tuple(states))
 
 

@@ -44,10 +44,10 @@ def multiplied_out(expression: Expression) -> Expression:
 
 
 def identifier(name: str) -> str:
-    """A name in MathML; the dot of a derivative is set above."""
+    """A name in MathML; the dot of a derivative is set above, as large as the letter."""
     base = name.removesuffix("_dot")
     if base and base != name:
-        return f"<mover>{identifier(base)}<mo>˙</mo></mover>"
+        return f'<mover>{identifier(base)}<mo scriptlevel="0">˙</mo></mover>'
     return f"<mi>{_escape(symbol(name))}</mi>"
 
 
@@ -92,7 +92,8 @@ def _written(node: Expression) -> str:
             return f"<msup>{_row(first, ATOM)}<mrow>{_written(Number(node.exponent))}</mrow></msup>"
         case "sqrt":
             return f"<msqrt>{_row(first, SUM)}</msqrt>"
-    return f"<mi>{node.operator}</mi><mo>(</mo>{_row(first, SUM)}<mo>)</mo>"
+    still = ' stretchy="false"' if isinstance(first, Symbol) else ""  # or brackets grow beyond a letter
+    return f"<mi>{node.operator}</mi><mo{still}>(</mo>{_row(first, SUM)}<mo{still}>)</mo>"
 
 
 def _term(node: Expression) -> str:

@@ -363,9 +363,15 @@ def expressions() -> st.SearchStrategy[Any]:
 @example(["/", "1", ["/", "x", "u"]])
 @example(["-", "x", ["-", "x", "u"]])
 @example(["**", "-3/7", 2])
+@example(["/", "x", ["-", "1", "1"]])
+@example(["+", ["/", "1", "3"], ["*", "0", ["/", "u", ["-", "2"]]]])
 def test_the_printed_equations_are_the_parsed_ones(tree: Any) -> None:
     """The text, read as Python over the rationals, and the tape have the same values."""
-    tape = parse([tree], ["x", "u"], "plant.dynamics")
+    try:
+        tape = parse([tree], ["x", "u"], "plant.dynamics")
+    except Rejected as no:
+        assert no.rule == "format" and no.detail == "a division by the number 0"
+        return
     exact_text = re.sub(r"(?<![\w*])\d+", lambda m: f"Fraction({m[0]})", words.expression(tape.trees[0]))
     x, u = Fraction(7, 5), Fraction(-2, 3)
     try:

@@ -468,7 +468,12 @@ def test_runs_of_the_pendulum_stay_in_its_tube() -> None:
     data = pendulum()
     c = parse(data)
     assert json.dumps(data["plant"]["dynamics"][1][1:]) == json.dumps(
-        [["*", "-8/3", "theta_dot"], ["*", "80/3", "u"], ["*", "981/50", ["sin", "theta"]]]
+        [
+            ["*", ["/", "981/100", "1/2"], ["sin", "theta"]],
+            ["-", ["*", ["/", "1/10", ["*", "3/20", ["**", "1/2", 2]]], "theta_dot"]],
+            ["/", "u", ["*", "3/20", ["**", "1/2", 2]]],
+            ["/", "0", ["*", "3/20", ["**", "1/2", 2]]],
+        ]
     )
     policy, (lo, hi) = c.policy, map(float, c.input_bounds[0])
     assert (policy.squash, policy.centre, policy.clip) == ("tanh", "preactivation", None)

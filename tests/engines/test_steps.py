@@ -79,7 +79,10 @@ def alone(dynamics: str, time: str = "discrete", domain: str = "3") -> tuple[Sys
     """A plant of one state on which no input acts."""
     system, _ = scalar_tanh()
     system = dataclasses.replace(
-        system, dynamics=(parse_expression(dynamics, {"x": system.states[0]}),), domain=box(domain), time=time
+        system,
+        dynamics=(parse_expression(dynamics, {s.name: s for s in (*system.states, *system.inputs)}),),
+        domain=box(domain),
+        time=time,
     )
     return system, TanhNetwork((np.zeros((1, 1)),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
 
@@ -173,7 +176,7 @@ def _highest(case: Stepped, x: np.ndarray) -> float:
 def one_model(centre: float, radius: float) -> dict[Symbol, Taylor]:
     tensor = torch.tensor([centre], dtype=torch.float64)
     g = torch.tensor([[radius]], dtype=torch.float64)
-    return {Symbol("x", real=None): Taylor(tensor, g, torch.zeros(1, 1, 1, dtype=torch.float64), 0 * tensor)}
+    return {Symbol("x"): Taylor(tensor, g, torch.zeros(1, 1, 1, dtype=torch.float64), 0 * tensor)}
 
 
 def test_the_flow_of_a_plant_that_escapes() -> None:

@@ -386,7 +386,7 @@ def test_the_terminal_says_what_it_is(proved: RoaResult) -> None:
     data = proved.to_dict()
     text = rendered(data)
     assert "from every state of the domain with N(x) <= 0.9, {V <= 0.25} is entered in finite time" in text
-    assert "outer set {N(x) <= 0.9} in the domain, and nothing outside of it, N being x**2 + y**2/4" in text
+    assert "outer set {N(x) <= 0.9} in the domain, and nothing outside of it, N being x**2 + 0.25*y**2" in text
     assert "of {V <= c2} alone" in text and "estimated (standard deviation" in text
     assert f"its limit {outer_limited_by(data['outer'])}" in text
     as_network = copy.deepcopy(data)

@@ -449,7 +449,7 @@ def printed_by_checker(timing: Timing, claim: Claim, *, push: bool = False) -> l
 def test_the_checker_prints_the_claim_of_a_sampled_loop() -> None:
     lines = printed_by_checker(TIMINGS["range"], practical(0.25))
     text = "\n".join(lines)
-    assert "plant integrator: xdot = f(x, u)" in text and "x' = u" in text
+    assert "plant integrator: xdot = f(x, u)" in text and "x' = (u + 0)" in text
     assert "that starts in V <= 2.0 at a sampling instant is there at every later sampling instant" in text
     assert (
         "in the domain at all times, enters V <= 0.125 at some sampling instant and is there at every sampling" in text

@@ -16,11 +16,12 @@ from rich.console import Console
 from certify import certify_roa
 from certify.certificate import Certificate, PartitionTree, parse_certificate
 from certify.claims import Asymptotic, Practical
-from certify.expressions import Number, symbols
+from certify.expressions import Number, cos, sin, symbols
 from certify.lyapunov.function import Quadratic
 from certify.policies import TanhNetwork
 from certify.report import render_html, summary
 from certify.report.figures.paper import PaperOptions, paper_figure
+from certify.report.mathml import typeset
 from certify.report.words import Varying, held_at, inside, stated_for, varying_in
 from certify.results import RoaResult
 from certify.systems import System
@@ -199,6 +200,15 @@ def test_names_in_equations_are_typeset_as_they_are() -> None:
     network = TanhNetwork((np.zeros((1, 1)),), (np.zeros(1),), np.ones(1), np.zeros(1), "tanh", "none")
     html = render_html(claimed(system.with_ranges({"I": (F(1), F(3))}), network), None, None, Path("c.json"))
     assert "<mi>I</mi>" in html and "I(t) in [1, 3]" in html
+
+
+def test_brackets_around_a_letter_do_not_grow_and_its_dot_is_not_small() -> None:
+    """Around a fraction they grow."""
+    angle, p = symbols("theta_dot p")
+    dot = '<mover><mi>θ</mi><mo scriptlevel="0">˙</mo></mover>'
+    said = str(typeset("<mi>y</mi>", sin(angle) + cos(p / 2 + 1)))
+    assert f'<mi>sin</mi><mo stretchy="false">(</mo><mrow>{dot}</mrow><mo stretchy="false">)</mo>' in said
+    assert "<mi>cos</mi><mo>(</mo><mrow>" in said
 
 
 def test_the_summary_begins_with_the_ranges(proved: RoaResult) -> None:
