@@ -55,7 +55,7 @@ INSIDE, OUTSIDE, OPEN = (True, False), (False, True), (False, False)
         (x**2 - 10, (F(0), -F(2) - TINY), OUTSIDE),
         (exp(x) + y, (0.0, 0.0), INSIDE),  # exp has a rational value at 0, and it is the level
         (exp(x) + y, (TINY, F(0)), OUTSIDE),
-        (tanh(x) ** 2 + 1 - tanh(x) ** 2, (F(1), F(0)), INSIDE),  # which is 1 to whoever simplifies it
+        (tanh(x) ** 2 + 1 - tanh(x) ** 2, (F(1), F(0)), OPEN),  # 1 to whoever simplifies it, as nobody does
         (sin(x) ** 2 + cos(x) ** 2, (F(1), F(0)), OPEN),  # 1 as well, and no ball tells
         (1 / x, (F(0), F(1)), OPEN),  # N has no value there
         (sqrt(x) - 3, (F(-1), F(1)), OPEN),
