@@ -191,7 +191,7 @@ class _Run:
     start: float = field(default_factory=time.perf_counter)
     proof: Proof | None = None
     cut_short: bool = False
-    aside: str | None = None
+    notices: list[str] = field(default_factory=list)  # what a person should know; nothing takes one away
     centre: tuple[Fraction, ...] | None = None  # of a tube around a path, in deviations
     missed: str = ""  # why there is no such tube
     converging: bool = False  # of a practical claim: to ask for one equilibrium as well
@@ -205,8 +205,8 @@ class _Run:
     def result(self) -> RoaResult:
         result = self._decide()
         result = replace(result, seconds={"load": self.load, **self.seconds, "total": self.spent})
-        said = self.aside, result.notice, self.runner.remark, self.checked
-        notices = [text for text in said if text is not None]
+        said = *self.notices, result.notice, self.runner.remark, self.checked
+        notices = dict.fromkeys(text for text in said if text is not None)
         result = replace(result, notice="; ".join(notices) or None)
         search = self.out / _SEARCH_FILE
         result = replace(result, search=search if search.exists() else None)
@@ -232,9 +232,10 @@ class _Run:
         with self._stage("candidate"):
             claim = self._claim(loop)
             if claim == "practical" and options.enlarges:
-                self.aside = f"{self.aside}; a tube needs a set from which trajectories converge, and is not looked for"
                 if options.reach_from is not None:
-                    raise InputError(f"a tube from a state needs a loop that rests at the origin; {self.aside}.")
+                    why = "; ".join(self.notices)
+                    raise InputError(f"a tube from a state needs a loop that rests at the origin; {why}.")
+                self.notices.append("a tube needs a set from which trajectories converge, and is not looked for")
                 options = replace(options, enlarge=False, box=None)
             self.options = options = replace(options, claim=claim)
             rest, loop = self._rest(loop)
@@ -278,7 +279,7 @@ class _Run:
         return self._conclude(result, race)
 
     def _claim(self, loop: ClosedLoop) -> Kind:
-        """What is claimed: as asked, or by whether the loop rests at the origin; `aside` says why it is the weaker one.
+        """What is claimed: as asked, or by whether the loop rests at the origin; a notice says why it is the weaker one.
 
         Raises
         ------
@@ -292,7 +293,7 @@ class _Run:
         except InputError as error:
             if self.options.claim == "asymptotic":
                 raise
-            self.aside = f"practical stability is claimed, because {_first_sentence(error)}"
+            self.notices.append(f"practical stability is claimed, because {_first_sentence(error)}")
             return "practical"
         return "asymptotic"
 
@@ -584,14 +585,15 @@ class _Run:
         certificate = Certificate(self.system, self.network, task.problem.V, claim, evidence, self.provenance)  # type: ignore[arg-type]
         accepted = self._clerk().accepted(certificate, task.problem)
         certificate = accepted.certificate
-        result = replace(result, notice=accepted.mended or result.notice)
+        if accepted.mended is not None:
+            self.notices.append(accepted.mended)
         if isinstance(certificate.claim, Nearby):
             result = replace(result, claim=certificate.claim.kind)
         if certificate.claim.outer is not None and beyond is not None:
             facts_beyond = outer_facts(task.problem, certificate.claim, certificate.claim.outer, beyond)
             result = replace(result, outer=facts_beyond)
         elif beyond is not None:
-            self.aside = "the checker refused the set beyond the ellipsoid, which is left out"
+            self.notices.append("the checker refused the set beyond the ellipsoid, which is left out")
         if self.options.lyapunov_level is not None and (
             certificate.claim.outer is None or certificate.claim.outer.level < self.options.lyapunov_level
         ):
@@ -602,13 +604,14 @@ class _Run:
             result = replace(result, claim=certificate.claim.kind, tube=facts)
         elif self.centre is not None and not _holds(task.problem, certificate.roa, self.centre):
             why = self.missed if facts is None else accepted.mended or "the checker refused the tube"
-            self.aside = None
             without = _with_certificate(result, accepted, witness, proof.leaves)  # the state
             return replace(without, stop=Stop.PATH, detail=why)
         if task.exactly and certificate.roa < task.target:
             return short_of_target(
                 replace(result, stop=Stop.REFUSED, detail=accepted.mended or ""), task, certificate.claim
             )
+        if self.centre is not None and facts is None:
+            self.notices.append("the state lies in the proved set, and no tube is needed")
         trusted = isinstance(proof.evidence, TrustedSolver)
         if not trusted and self.options.engine == "both":
             result = replace(result, solver=self._confirm(task.problem, certificate.claim))
@@ -639,7 +642,7 @@ class _Run:
             worth = volume(P, claim.roa) if self.options.box is None else 0.0
             found = enlarge(known, P / claim.roa, shapes, lambda: end - self.spent, worth)
         if found is None:
-            self.aside = "no tube leads into the proved set from a larger one, as far as there was time to look"
+            self.notices.append("no tube leads into the proved set from a larger one, as far as there was time to look")
             return None, claim, evidence
         tube = found.tube
         facts = TubeFacts(tube.start, found.shape, len(tube.slabs), tube.duration)
@@ -654,7 +657,6 @@ class _Run:
 
         trial, centre = race.best.trial, self.centre or ()
         if _holds(trial.task.problem, claim.roa, centre):
-            self.aside = "the state lies in the proved set, and no tube is needed"
             self.missed = "the checker accepted only a lower level, and the state lies above it"
             return None, claim, evidence
         self.share = 1.0
@@ -691,7 +693,7 @@ class _Run:
 
     def _beyond(self, trial: Trial, claim: Claim) -> OuterProof | None:
         """The largest set of another function that is proved to lead into {V <= c2} in the time that is left; None, and
-        `aside` says why, if there is none."""
+        a notice says why, if there is none."""
         from certify.engines.outer import Nothing, prove_outer
 
         self.share = 1.0
@@ -706,7 +708,8 @@ class _Run:
             budget = Budget(max(1e-3, _FOR_SEARCH * self.left()), self.options.max_boxes)
             found = prove_outer(trial.task.problem, claim.roa, trial.T, N, level, budget, self.runner, report)
         if isinstance(found, Nothing):
-            self.aside = f"no set of the function `lyapunov` is proved to lead into the ellipsoid: {found.why}"
+            why = f"no set of the function `lyapunov` is proved to lead into the ellipsoid: {found.why}"
+            self.notices.append(why)
             return None
         return found
 
