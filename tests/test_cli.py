@@ -18,6 +18,8 @@ import pytest
 import torch
 
 from certify.cli import _run
+from certify.commands.terminal import ring_line
+from certify.engines.base import Progress
 from certify.policies import Policy, TanhNetwork, load_policy, save_policy
 from tests.support.loops import chain, pendulum_network
 
@@ -696,3 +698,38 @@ def test_a_command_that_ends_at_once_has_said_everything(
     assert done.returncode == status and said in done.stdout + done.stderr
     assert done.stderr.endswith("ended\nleft\n" if watch else "left\n")
     assert watch or "ended" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("command", "both"),
+    [
+        ("certify roa --policy {policy} --out {out}", True),
+        ("certify roa --policy {policy} --out {out}", False),
+        ("certify roa --policy nosuch.pt", False),
+        ("certify prove", True),
+        ("certify roa --help", True),
+        ("controllers evaluate nosuch.pt --json", True),
+        ("controllers train pendulum --no-such", False),
+        ("controllers train --help", True),
+    ],
+)
+def test_a_closed_pipe_is_no_verdict_whatever_was_to_be_said(command: str, both: bool, tmp_path: Path) -> None:
+    """Standard error goes into a pipe that nobody reads, with standard output or without it."""
+    name, *arguments = command.format(policy=SHIPPED, out=tmp_path / "o").split()
+    reading, writing = os.pipe()
+    os.close(reading)
+    code = f"from {name}.cli import main; main()"
+    out = writing if both else subprocess.DEVNULL
+    done = subprocess.run([sys.executable, "-c", code, *arguments], stdout=out, stderr=writing, check=False)
+    os.close(writing)
+    assert done.returncode == 141
+
+
+def test_the_line_of_progress_is_true_of_a_pass_inwards_and_of_nearly_all() -> None:
+    """A floor is looked for from above; and a share is not rounded up to all."""
+    down = Progress(8.463e-11, 6.612e-14, 900, 3, 1 - 1e-9, None, "lyapunov", down=True)
+    said = ring_line("ring", down)
+    assert "down to V = 8.463e-11, the aim is 6.612e-14 (99.9 % of the volume)" in said
+    assert "to V = 0.5 of 1 (50.0 % of the volume)" in ring_line("ring", Progress(0.5, 1.0, 9, 3, 0.5, None, "x"))
+    assert "100.0 %" in ring_line("ring", Progress(1.0, 1.0, 9, 0, 1.0, None, "x"))
+    assert "beyond the ellipsoid: proved to N = 0.5 of 1" in ring_line("outer", Progress(0.5, 1.0, 9, 3, 0.5, None))

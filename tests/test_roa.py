@@ -18,6 +18,7 @@ from torch import Tensor
 from certify.certificate import Certificate, checking, run_checker, sole_writer
 from certify.claims import Problem
 from certify.closed_loop import ClosedLoop
+from certify.engines.base import Progress
 from certify.engines.bounds.rule import BoxBounds, VdotBound
 from certify.engines.falsify import Witness, refutes
 from certify.errors import BackendError, InputError, SoundnessError
@@ -382,3 +383,14 @@ def nested(x: sympy.Symbol, depth: int) -> sympy.Expr:
     for _ in range(depth):
         result = sympy.sin(x * result)
     return result
+
+
+def test_a_pass_says_in_which_direction_it_goes(tmp_path: Path) -> None:
+    """An aim lies above what is proved, or below it where a floor is looked for."""
+    seen: list[Progress] = []
+    system, network = scalar_tanh()
+    pushed = dataclasses.replace(system, dynamics=(system.dynamics[0] + sympy.Rational(1, 100),))
+    certify_roa(pushed, network, tmp_path, RoaOptions(claim="practical"), progress=lambda _, state: seen.append(state))
+    found = [state for state in seen if state is not None]
+    assert {state.down for state in found} >= {True}
+    assert all(state.target <= state.level if state.down else state.target >= state.level for state in found)

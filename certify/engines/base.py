@@ -51,7 +51,7 @@ class Task:
 class Progress:
     """Where a proof stands: `level` is proved, `target` aimed at, `boxes` were bounded and `open` wait.
 
-    `proved` is the share of the ring's volume that is done; `seconds_left` is extrapolated, None at first; `name` is
+    A pass outwards has a target above its level, one inwards, `down`, a target below. `proved` is the share of the ring's volume that is done; `seconds_left` is extrapolated, None at first; `name` is
     the candidate's.
     """
 
@@ -62,6 +62,7 @@ class Progress:
     proved: float
     seconds_left: float | None
     name: str = ""
+    down: bool = False
 
 
 @dataclass(frozen=True, slots=True)
