@@ -16,6 +16,7 @@ from certify.ending import closed_pipe
 if TYPE_CHECKING:
     from certify.engines.base import Progress
 
+
 def say(text: str) -> None:
     """Print the result, and be sure that it has left: a reader that has gone must not look like a verdict."""
     _put(sys.stdout, text + "\n")
