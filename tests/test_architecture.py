@@ -50,7 +50,8 @@ EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows th
     ),
     "sublevel": "expressions lyapunov rigorous systems",
     "sweep": (
-        "arguments certificate claims inputs installation lyapunov options policies report results roa running systems"
+        "arguments certificate claims closed_loop engines inputs installation lyapunov options outcome policies report "
+        "results roa running systems"
     ),
     "systems": "expressions",
     "trials": "certificate claims closed_loop engines lyapunov options",

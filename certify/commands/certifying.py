@@ -19,7 +19,6 @@ from certify.commands.contains import stated, text
 from certify.commands.shared import write
 from certify.commands.terminal import ProgressLine, load_tables, say, show, tell
 from certify.ending import Interrupted
-from certify.lyapunov import BEYOND
 
 if TYPE_CHECKING:
     from certify.largest import Quantity
@@ -145,6 +144,8 @@ def _without(context: typer.Context) -> str:
 
 def _known(context: typer.Context) -> list[str]:
     """The options that were given and that a resumed search has of its own; what is learned is no part of it."""
+    from certify.lyapunov import BEYOND
+
     found = {f"--{key if len(key) > 1 else key.upper()}": context.params.get(key) for key in _OF_SEARCH}
     return [name for name, value in found.items() if value not in (None, "auto", *BEYOND)]
 
