@@ -514,11 +514,18 @@ class _Run:
             winner.advance(Budget(self._within(_PATIENCE * self.options.time_limit), boxes), self._keeping())
         if not self.interruptible or winner.attempt.done or lost() or not winner.attempt.gained:
             return
-        if self.left() > 0:
-            self.check_takes = whole, each = self._check_takes(winner)
+        while self.left() > 0 and not winner.attempt.done and winner.attempt.boxes < boxes and not lost():
+            whole, each, known = self._check_takes(winner)
+            self.check_takes, before = (whole, each), winner.attempt.boxes
             searching = self._within(self.left() - _CAUTION * whole)
-            winner.advance(Budget(searching, boxes, check=_CAUTION * each), self._keeping())
+            if known:
+                budget = Budget(searching, boxes, check=_CAUTION * each)
+            else:  # few leaves say little: some more, and then again
+                budget = Budget(min(searching, _PATIENCE * self.options.time_limit), boxes)
+            winner.advance(budget, self._keeping())
             self._keep()
+            if known or winner.attempt.boxes == before:
+                return
 
     def _keeping(self) -> Callable[[Progress], None]:
         """Who reports, and keeps the search now and then."""
@@ -580,16 +587,16 @@ class _Run:
     def _within(self, seconds: float) -> float:
         return max(1e-3, min(seconds, self.left()))
 
-    def _check_takes(self, contender: Contender) -> tuple[float, float]:
+    def _check_takes(self, contender: Contender) -> tuple[float, float, bool]:
         """Seconds that the check takes here and now without a leaf, and for each, from certificates with some of what
-        is proved already.
+        is proved already; and whether there were enough leaves to tell.
 
         The certificates are good ones, and the last stays if the run is interrupted.
         """
         proof, problem = contender.attempt.proof(), contender.trial.task.problem
         claim, tree = proof.claim, proof.evidence
         if claim is None or not isinstance(tree, PartitionTree) or contender.trial.task.exactly:
-            return _START, 0.0
+            return _START, 0.0, True
         from certify.engines.bounds.mend import level_with_leaves
 
         def check(level: float) -> float:
@@ -599,11 +606,11 @@ class _Run:
             return self.seconds["check"] - before
 
         level, count = level_with_leaves(problem, tree, claim, _SAMPLE)
-        taken = check(level)
-        if count >= _SAMPLE / 2 or taken < 2 * _START:
-            return min(_START, taken), max(0.0, taken - _START) / max(1, count)
+        taken, known = check(level), count >= _SAMPLE / 2
+        if known or taken < 2 * _START:
+            return min(_START, taken), max(0.0, taken - _START) / max(1, count), known
         whole = min(taken, check(claim.inner))  # what few leaves took may be what any file takes
-        return whole, (taken - whole) / max(1, count)
+        return whole, (taken - whole) / max(1, count), False
 
     def _conclude(self, result: RoaResult, race: Race) -> RoaResult:
         """The verdict on what the engine says, the only place that gives one after the search."""
