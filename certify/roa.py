@@ -223,7 +223,8 @@ class _Run:
         except BaseException:  # Ctrl-C, a reader that has gone, a checker that cannot run: --resume goes on from here
             self._keep()
             raise
-        if result.stop in (Stop.TIME, Stop.BOXES, Stop.CLUSTER) and self._can_go_on:
+        gained = self._first is not None and self._first.attempt.gained
+        if self._can_go_on and (result.stop in (Stop.TIME, Stop.CLUSTER) or (result.stop is Stop.BOXES and gained)):
             self._keep()
         else:
             remove(self.out / SEARCH)  # it has come to its end
@@ -610,7 +611,7 @@ class _Run:
         if known or taken < 2 * _START:
             return min(_START, taken), max(0.0, taken - _START) / max(1, count), known
         whole = min(taken, check(claim.inner))  # what few leaves took may be what any file takes
-        return whole, (taken - whole) / max(1, count), False
+        return whole, (taken - whole) / max(1, count), taken > 2 * whole  # then the leaves have taken most of it
 
     def _conclude(self, result: RoaResult, race: Race) -> RoaResult:
         """The verdict on what the engine says, the only place that gives one after the search."""
