@@ -2,7 +2,8 @@
 
 Standard output carries the result, or with `--json` exactly one JSON object; progress and diagnostics go to
 standard error. Exit status: 0 proved or accepted, 1 refuted or rejected, 2 usage or unusable input, 3 unknown
-or trusted, 4 one part of a certificate checked, 70 internal error; 130 and 141 after Ctrl-C and a closed pipe.
+or trusted, 4 one part of a certificate checked, 70 internal error; 130 after Ctrl-C or SIGTERM, 141 after a
+closed pipe.
 """
 
 from __future__ import annotations
@@ -32,8 +33,9 @@ from certify.commands.report import report
 from certify.commands.roa import roa
 from certify.commands.sweep import sweep
 from certify.commands.systems import systems
-from certify.commands.terminal import closed_pipe, say, tell
+from certify.commands.terminal import say, tell
 from certify.commands.version import certify
+from certify.ending import INTERRUPTED, Interrupted, closed_pipe, end_by_sigterm, is_of_closed_pipe
 from certify.errors import BackendError, CertifyError, SoundnessError
 
 app = typer.Typer(
@@ -58,7 +60,6 @@ app.command("prove-in-coq")(prove_in_coq)
 app.command("float-error")(float_error)
 app.command("doctor")(doctor)
 
-_INTERRUPTED = 130  # as a shell reports SIGINT
 _STOPPED = "interrupted; nothing was left half-written."
 
 
@@ -69,6 +70,7 @@ def main(arguments: list[str] | None = None) -> None:
     # numpy's matrices are small here, also the checker's; the engine's threads are torch's.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    end_by_sigterm()
     given = sys.argv[1:] if arguments is None else arguments
     status = _run(given, "--json" in given)
     if arguments is None and sys.getprofile() is None and sys.gettrace() is None:
@@ -89,18 +91,34 @@ def _leave(status: int) -> NoReturn:
 
 
 def _run(arguments: list[str], as_json: bool) -> int:
+    try:
+        return _ended(arguments, as_json)
+    except typer.Exit as stop:  # of a message that nobody reads
+        return stop.exit_code
+    except BrokenPipeError:
+        return closed_pipe()
+    except SystemExit as stop:
+        if not is_of_closed_pipe(stop):
+            raise
+        return closed_pipe()
+
+
+def _ended(arguments: list[str], as_json: bool) -> int:
+    """The exit status of a command that has run to its end, whatever that is."""
     command = typer.main.get_command(app)
     try:
         status = command.main(arguments, prog_name="certify", standalone_mode=False)
-        if status == _INTERRUPTED:  # what typer makes of Ctrl-C
-            return _fail(as_json, _STOPPED, _INTERRUPTED)
+        if status == INTERRUPTED:  # what typer makes of Ctrl-C
+            return _fail(as_json, _STOPPED, INTERRUPTED)
         return status if isinstance(status, int) else 0
     except typer.Exit as stop:
         return stop.exit_code
     except typer.TyperException as error:  # usage
         return _fail(as_json, error.format_message() if hasattr(error, "format_message") else str(error), 2)
+    except Interrupted as stop:
+        return _fail(as_json, str(stop), INTERRUPTED)
     except (typer.Abort, KeyboardInterrupt):
-        return _fail(as_json, _STOPPED, _INTERRUPTED)
+        return _fail(as_json, _STOPPED, INTERRUPTED)
     except SoundnessError as error:
         return _fail(as_json, f"internal error: {error}", 70)
     except BackendError as error:  # another program's: a checker, a solver, a scheduler
@@ -115,10 +133,7 @@ def _run(arguments: list[str], as_json: bool) -> int:
 
 def _fail(as_json: bool, message: str, status: int) -> int:
     if as_json:
-        try:
-            say(json.dumps({"error": message}))
-        except typer.Exit as closed:
-            return closed.exit_code
+        say(json.dumps({"error": message}))
     else:
         tell(f"certify: {message}")
     return status

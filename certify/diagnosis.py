@@ -9,6 +9,7 @@ from what sampling finds beyond it, another candidate only if others were left u
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import replace
 from fractions import Fraction
 
@@ -41,9 +42,10 @@ def diagnose(
     options: RoaOptions,
     proof: Proof | None,
     asked: tuple[System, TanhNetwork] | None = None,
+    seconds: float = math.inf,
 ) -> Diagnosis:
     """What limits `result`, `proof` being what its engine found, and `asked` the plant and the policy as they were
-    given, if the result is about them as seen from where they rest."""
+    given, if the result is about them as seen from where they rest. The next step is looked for so many seconds."""
     system = result.system
     loop = ClosedLoop(system, result.network)
     fastest, slowest = _modes(loop)
@@ -68,7 +70,7 @@ def diagnose(
         fastest,
         slowest,
         tuple(pair for pair in hurts if pair[1] >= 0.1),
-        _next(result, options, proof, name, asked or (system, result.network)),
+        _next(result, options, proof, name, asked or (system, result.network), seconds),
     )
 
 
@@ -138,14 +140,19 @@ def _direction(result: RoaResult, proof: Proof | None, point: Array | None, loop
 
 
 def _next(
-    result: RoaResult, options: RoaOptions, proof: Proof | None, name: str | None, asked: tuple[System, TanhNetwork]
+    result: RoaResult,
+    options: RoaOptions,
+    proof: Proof | None,
+    name: str | None,
+    asked: tuple[System, TanhNetwork],
+    seconds: float,
 ) -> Step:
     if result.stop is Stop.UNSTABLE:
         return Step((), "no Lyapunov equation has a solution; the policy has to stabilise the plant first")
     if result.claim in ("practical", "nearby") and (centre := _centring(*asked)) is not None:
         return Step((("--centre", centre),), "with pi(0) = u_eq the stronger claim can be tried")
     if result.stop is Stop.DOMAIN and name is not None and options.level is None:
-        return _wider_domain(result, name)
+        return _wider_domain(result, name, seconds)
     if result.stop is Stop.PATH:
         why = "the set that the tube has to reach grows with the time, and so do the widths that are tried"
         return Step((("--time-limit", _round(4 * options.time_limit)),), why)
@@ -159,7 +166,7 @@ def _next(
     if options.claim == "asymptotic" and options.only is not None and options.P is None and options.level is None:
         return Step((("--candidate", "auto"),), f"only the candidate {options.only} was tried")
     knows = not (result.system.ranges or result.system.in_steps)  # a tube says nothing of such things
-    if result.stop is Stop.STALLED and knows and not options.enlarges and _has_tube(result):
+    if result.stop is Stop.STALLED and knows and not options.enlarges and _has_tube(result, seconds):
         return Step((("--enlarge", ""),), f"a tube leads into this set from one {_LONGER:g} times as long, at least")
     if result.stop is Stop.STALLED:
         worst = ", ".join(one for one, _ in _hurting(result, proof)[:3])
@@ -174,12 +181,15 @@ def _next(
     return Step((), result.reason)
 
 
-def _has_tube(result: RoaResult) -> bool:
-    """Whether a tube leads from a larger multiple of the proved set into it."""
-    if result.P is None or result.levels.roa is None:
+def _has_tube(result: RoaResult, seconds: float) -> bool:
+    """Whether a tube is found in the time that leads from a larger multiple of the proved set into it."""
+    if result.P is None or result.levels.roa is None or not seconds > 0:
         return False
     goal = result.P / result.levels.roa
-    return find_tube(paths(ClosedLoop(result.system, result.network)), goal / _LONGER**2, goal, _SECONDS) is not None
+    return (
+        find_tube(paths(ClosedLoop(result.system, result.network)), goal / _LONGER**2, goal, min(seconds, _SECONDS))
+        is not None
+    )
 
 
 def _centring(system: System, network: TanhNetwork) -> str | None:
@@ -216,7 +226,7 @@ def _longer(result: RoaResult, options: RoaOptions, proof: Proof | None) -> Step
     return Step((("--time-limit", _round(10 * options.time_limit)),), "the set still grew when the time ended")
 
 
-def _wider_domain(result: RoaResult, name: str) -> Step:
+def _wider_domain(result: RoaResult, name: str, seconds: float) -> Step:
     """Whether the same V reaches further in a domain that is wider in the state that binds."""
     system, problem, level = result.system, result.problem, result.levels.roa
     i = [s.name for s in system.states].index(name)
@@ -228,7 +238,7 @@ def _wider_domain(result: RoaResult, name: str) -> Step:
     loop = ClosedLoop(wider, result.network)
     limit = domain_limit(P, wider.domain)
     T = diagonalising_coordinates(P, loop.mean_rate(), loop.step)
-    witness = falsify(replace(problem, loop=loop), T, limit, samples=4000)
+    witness = falsify(replace(problem, loop=loop), T, limit, samples=4000, until=time.perf_counter() + seconds)
     reach = volume(P, limit if witness is None else min(limit, witness.level))
     grown = reach / volume(P, level)
     if grown < _WORTH:

@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from certify.certificate import sole_writer, write_atomically
+from certify.certificate import set_aside, sole_writer, write_atomically
 from certify.claims import Problem
 from certify.closed_loop import ClosedLoop
 from certify.engines.falsify import is_violated
@@ -75,6 +75,7 @@ def certify_largest(
         return options.time_limit - (time.perf_counter() - start)
 
     with sole_writer(out), TemporaryDirectory(dir=out, prefix="attempt-") as folder:
+        set_aside(out)
         first = certify_roa(
             plain,
             network,

@@ -64,6 +64,11 @@ class Race:
         return max(self.contenders, key=lambda c: c.proved)
 
     @property
+    def proved(self) -> bool:
+        """Whether anything is proved, by a contender or by one that has begun."""
+        return any(c.proved for c in (*self.contenders, *([] if self.early is None else [self.early])))
+
+    @property
     def open(self) -> list[Contender]:
         """Those that more time could make the best, the largest proved volume first."""
         most = self.best.proved
@@ -79,7 +84,10 @@ class Race:
         """
         if most > _WORTH * trial.volume:
             return False
+        before = len(self.contenders)
         self.enter([trial], seconds)
+        if len(self.contenders) == before:  # a search of an earlier run has proved more
+            return False
         claim = self.best.attempt.proof().claim
         if most <= _WORTH * self.best.proved and claim is not None and claim.local <= _RING * claim.roa:
             return True
@@ -87,11 +95,14 @@ class Race:
         return False
 
     def enter(self, trials: Iterable[Trial], seconds: float) -> None:
-        """A heat of so many seconds for each trial within whose reach lies more than is proved already."""
+        """A heat of so many seconds for each trial within whose reach lies more than is proved already, as long as
+        there is time; without time too, until one proves something."""
         for trial in by_reach(list(trials)):
+            known = self.early if self.early is not None and self.early.trial is trial else None
             if self.contenders and trial.volume <= _WORTH * self.best.proved:
                 continue
-            known = self.early if self.early is not None and self.early.trial is trial else None
+            if known is None and self.proved and self.left() <= 0:
+                continue
             self.contenders.append(known or Contender(trial, self.begin(trial)))
             self._heat(self.contenders[-1], seconds)
 
@@ -106,7 +117,7 @@ class Race:
         Those whose search has added nothing yet cannot be told apart by more of the same: they are out.
         """
         contenders = [c for c in self.open if c.attempt.gained]
-        while len(contenders) > 1:
+        while len(contenders) > 1 and self.left() > 0:
             contenders, seconds = contenders[: (len(contenders) + 1) // 2], 2 * seconds
             if len(contenders) == 1:
                 break

@@ -7,7 +7,6 @@ Whatever the checker refuses, the run ends with what it accepts: a refused leaf 
 from __future__ import annotations
 
 import json
-import math
 import os
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -25,11 +24,14 @@ from certify.acceptance import Accepted, Clerk
 from certify.asked import ellipsoid_in, require_one_that_knows, state_in, values_of
 from certify.beyond import outer_facts, short_of
 from certify.certificate import (
+    SEARCH,
     Certificate,
     PartitionTree,
     TrustedSolver,
+    remove,
     require_within_limits,
     run_checker,
+    set_aside,
     sole_writer,
 )
 from certify.claims import Asymptotic, Claim, Enlarged, Nearby, Practical, Problem, Reached
@@ -68,7 +70,9 @@ from certify.rest import Rest, find_rest, seen_from
 from certify.results import RoaResult, TubeFacts
 from certify.systems import System
 from certify.trials import (
+    FOR_PEAK,
     OPTIMISING,
+    SAMPLING,
     Trial,
     blends,
     by_reach,
@@ -77,10 +81,11 @@ from certify.trials import (
     optimised,
     peak,
     robust,
+    share_of_robust,
     solutions,
     solved,
 )
-from certify.unfinished import Unfinished, load, save
+from certify.unfinished import NothingYetError, Unfinished, load, save, save_nothing_yet
 from certify.verdict import Stop, Verdict
 
 if TYPE_CHECKING:
@@ -100,6 +105,7 @@ _KEPT = 0.03  # for what comes after the search: writing, the checker's start
 _BEFORE_TUBE = 0.5  # for candidates and ring, where a tube is to be looked for
 _BEFORE_OUTER = 0.25  # the same, where a set beyond theirs is
 _FOR_LEARNING = 0.4  # of what is left then, the rest being the proof's and its check's
+_GRACE, _LEAST = 1.0, 0.05  # seconds, or of the time limit, for a local level where nothing is proved, whatever is left
 _FOR_SEARCH = 0.5  # of what is left then, the rest being the tube's check
 _FOR_PROOF = 0.4  # of the time limit, that no further candidate is optimised in
 _WORTH = 1.05  # growth of a volume that another candidate must promise
@@ -109,10 +115,10 @@ _MISLED = 0.9  # of its reach: a violation below it is one that the samples miss
 _SAMPLE = 2000  # leaves whose check is timed
 _START = 0.2  # seconds that a checker takes to start
 _CAUTION = 1.2  # on the time that a check is expected to take
+_MUCH = 0.1  # of the time limit: where more was kept for the check it is said
 _LONG = 1_000_000  # bytes of a certificate, from which on several processes check it
 _MOST_JOBS = 64
 _YEAR = 3.156e7  # seconds
-_SEARCH_FILE = "search.json"
 _SAVING = 60.0  # seconds between two savings of a search
 
 
@@ -154,8 +160,10 @@ def certify_roa(
     from certify.running.threads import threads_for
 
     options = options or RoaOptions()
-    with threads_for(network.weights), sole_writer(out), _runner_for(options) as runner:
-        return _Run(system, network, out, options, runner, load_seconds, provenance or {}, progress, show).result()
+    with threads_for(network.weights), sole_writer(out):
+        set_aside(out, keep=options.resume)
+        with _runner_for(options) as runner:
+            return _Run(system, network, out, options, runner, load_seconds, provenance or {}, progress, show).result()
 
 
 @contextmanager
@@ -187,11 +195,16 @@ class _Run:
     provenance: Mapping[str, Any]
     progress: Report | None
     show: Callable[[bytes], None] | None = None
+    clock: Callable[[], float] = time.perf_counter
     seconds: dict[str, float] = field(default_factory=dict)
-    start: float = field(default_factory=time.perf_counter)
+    start: float = field(init=False)
     proof: Proof | None = None
     cut_short: bool = False
-    aside: str | None = None
+    notices: list[str] = field(default_factory=list)  # what a person should know; nothing takes one away
+    race: Race | None = None
+    winner: Contender | None = None  # of the race, once that is decided
+    underway: bool = False  # whether there is a loop to search about
+    check_takes: tuple[float, float] = (0.0, 0.0)  # seconds without a leaf, and for each
     centre: tuple[Fraction, ...] | None = None  # of a tube around a path, in deviations
     missed: str = ""  # why there is no such tube
     converging: bool = False  # of a practical claim: to ask for one equilibrium as well
@@ -200,22 +213,34 @@ class _Run:
     asked: tuple[System, TanhNetwork] = field(init=False)  # the loop as it was given
 
     def __post_init__(self) -> None:
-        self.asked = self.system, self.network
+        self.asked, self.start = (self.system, self.network), self.clock()
 
     def result(self) -> RoaResult:
-        result = self._decide()
+        try:
+            result = self._decide()
+        except (InputError, SoundnessError):
+            raise
+        except BaseException:  # Ctrl-C, a reader that has gone, a checker that cannot run: --resume goes on from here
+            self._keep()
+            raise
+        gained = self._first is not None and self._first.attempt.gained
+        if self._can_go_on and (result.stop in (Stop.TIME, Stop.CLUSTER) or (result.stop is Stop.BOXES and gained)):
+            self._keep()
+        else:
+            remove(self.out / SEARCH)  # it has come to its end
         result = replace(result, seconds={"load": self.load, **self.seconds, "total": self.spent})
-        said = self.aside, result.notice, self.runner.remark, self.checked
-        notices = [text for text in said if text is not None]
+        said = *self.notices, result.notice, self.runner.remark, self.checked
+        notices = dict.fromkeys(text for text in said if text is not None)
         result = replace(result, notice="; ".join(notices) or None)
-        search = self.out / _SEARCH_FILE
+        search = self.out / SEARCH
         result = replace(result, search=search if search.exists() else None)
-        return replace(result, diagnosis=diagnose(result, self.options, self.proof, self.asked))
+        left = max(0.0, self.options.time_limit - self.spent)
+        return replace(result, diagnosis=diagnose(result, self.options, self.proof, self.asked, left))
 
     @property
     def spent(self) -> float:
         """Seconds since the run began, reading included."""
-        return self.load + time.perf_counter() - self.start
+        return self.load + self.clock() - self.start
 
     def left(self) -> float:
         """Seconds that the search may still take."""
@@ -232,9 +257,10 @@ class _Run:
         with self._stage("candidate"):
             claim = self._claim(loop)
             if claim == "practical" and options.enlarges:
-                self.aside = f"{self.aside}; a tube needs a set from which trajectories converge, and is not looked for"
                 if options.reach_from is not None:
-                    raise InputError(f"a tube from a state needs a loop that rests at the origin; {self.aside}.")
+                    why = "; ".join(self.notices)
+                    raise InputError(f"a tube from a state needs a loop that rests at the origin; {why}.")
+                self.notices.append("a tube needs a set from which trajectories converge, and is not looked for")
                 options = replace(options, enlarge=False, box=None)
             self.options = options = replace(options, claim=claim)
             rest, loop = self._rest(loop)
@@ -260,25 +286,27 @@ class _Run:
         if kind == "practical" and options.P is None and not options.resume and (shown := not_stable(loop)):
             detail = f"eigenvalues {', '.join(shown)} where V is to be 0"
             return replace(result, stop=Stop.UNSTABLE, detail=detail, eigenvalues=shown)
-        if not options.resume:
-            (self.out / _SEARCH_FILE).unlink(missing_ok=True)
+        self.underway = True
         if options.resume:
-            race = self._resumed(loop, kind)
+            self._resume(loop, kind)
+        if self.winner is not None:
+            race = self._contest()
         elif options.P is None and options.only is None:
             race = self._race(loop)
         else:
             with self._stage("candidate"):
-                one = named(loop, options)
+                one = named(loop, self._granted(share_of_robust(loop) if options.only == "robust" else OPTIMISING))
             refuted = refuted_at_once(result, one)
             if refuted is not None:
                 return refuted
             race = self._contest()
             race.enter([one], self._heat())
+            self.winner = race.contenders[0]
         self._finish(race)
         return self._conclude(result, race)
 
     def _claim(self, loop: ClosedLoop) -> Kind:
-        """What is claimed: as asked, or by whether the loop rests at the origin; `aside` says why it is the weaker one.
+        """The claim: as asked, or by whether the loop rests at the origin; a notice says why it is the weaker one.
 
         Raises
         ------
@@ -292,7 +320,7 @@ class _Run:
         except InputError as error:
             if self.options.claim == "asymptotic":
                 raise
-            self.aside = f"practical stability is claimed, because {_first_sentence(error)}"
+            self.notices.append(f"practical stability is claimed, because {_first_sentence(error)}")
             return "practical"
         return "asymptotic"
 
@@ -326,63 +354,65 @@ class _Run:
 
     def _race(self, loop: ClosedLoop) -> Race:
         """Every candidate for a little time, and more for the better ones."""
-        heat, options = self._heat(), replace(self.options, time_limit=self.share * self.options.time_limit)
+        heat, options = self._heat(), self.options
         self._tell("candidate")
         with self._stage("candidate"):
             found = solutions(loop, options)
         if self.options.claim == "practical" and options.engine != "dreal" and loop.system.n > FEW:
             with self._stage("candidate"):
-                trials = solved(loop, found, options)
+                trials = solved(loop, found, self._granted())
             rests = self.network.is_moved and not loop.system.ranges
-            return (self._around_its_rest if rests else self._around_a_level)(loop, trials, options)
-        large = self._optimised(partial(optimised, loop, options)) if options.engine != "dreal" else None
+            return (self._around_its_rest if rests else self._around_a_level)(loop, trials)
+        large = self._optimised(partial(optimised, loop)) if options.engine != "dreal" else None
         race, most = self._contest(), volume(ellipsoid_in(self.system), 1.0)
         if self.interruptible and large is not None and race.is_settled_by(large, heat, most):
             return race  # before the others are made, of which `robust` takes longest
-        with self._stage("candidate"):
-            trials = [*solved(loop, found, options), *([] if large is None else [large])]
+        trials = [] if large is None else [large]
+        if self.left() > 0 or not race.proved:
+            with self._stage("candidate"):
+                trials = [*solved(loop, found, self._granted()), *trials]
         if not self.interruptible:
             race.enter(by_reach(trials)[:1], heat)
             if self.network.is_moved:
                 self._improve(race, loop, heat)
             return race
-        certain = self._optimised(partial(robust, loop, options))
+        certain = self._optimised(partial(robust, loop), share_of_robust(loop))
         trials += [] if certain is None else [certain]
         race.enter(trials, heat)
         self._improve(race, loop, heat)
         unproved = [c for c in race.open if c.trial.name == "optimised"]
         others = [c for c in race.contenders if c.trial.name != "optimised" and c.proved]
-        if unproved and others:
+        if unproved and others and self.left() > 0:
             with self._stage("candidate"):
                 best = max(others, key=lambda c: c.proved).trial
-                between = list(blends(loop, unproved[0].trial, best, options))
+                between = list(blends(loop, unproved[0].trial, best, self._granted()))
             race.enter(between, heat if race.gained else 0.0)  # without a gain their local levels tell
         race.knock_out(heat)
         return race
 
-    def _around_a_level(self, loop: ClosedLoop, trials: list[Trial], options: RoaOptions) -> Race:
+    def _around_a_level(self, loop: ClosedLoop, trials: list[Trial]) -> Race:
         """A practical claim in many states, where no tree of boxes can carry what a ball does not: the candidate made
         for that, then others until one proves something; then the largest sampled one, if there is time."""
-        race, first = self._contest(), self._optimised(partial(peak, loop, options))
+        race, first = self._contest(), self._optimised(partial(peak, loop), FOR_PEAK)
         for one in ([] if first is None else [first]) + by_reach(trials):
             race.enter([one], self._heat())
             if race.best.proved:
                 break
         if race.best.proved and self.left() > _FOR_PROOF * self.options.time_limit:
-            large = self._optimised(partial(optimised, loop, options))
+            large = self._optimised(partial(optimised, loop))
             race.enter([] if large is None else [large], self._heat())
         return race
 
-    def _around_its_rest(self, loop: ClosedLoop, trials: list[Trial], options: RoaOptions) -> Race:
+    def _around_its_rest(self, loop: ClosedLoop, trials: list[Trial]) -> Race:
         """A practical claim in many states of a loop that rests where V is 0: a ball carries there as much as it does
         of a loop that rests exactly, and the largest candidates come first as they do there."""
-        race, large = self._contest(), self._optimised(partial(optimised, loop, options))
+        race, large = self._contest(), self._optimised(partial(optimised, loop))
         race.enter([] if large is None else [large], self._heat())
         if large is not None and race.best.proved > _NEAR * large.volume:
             self._improve(race, loop, self._heat())
         little = large is None or race.best.proved < _SMALL * large.volume
         if little and self.left() > _FOR_PROOF * self.options.time_limit:
-            certain = self._optimised(partial(robust, loop, options))
+            certain = self._optimised(partial(robust, loop), share_of_robust(loop))
             race.enter([] if certain is None else [certain], self._heat())
         for one in by_reach(trials):
             if race.contenders and race.best.proved:
@@ -396,7 +426,6 @@ class _Run:
         A proof that comes upon a violation far below its candidate's reach tells the next round of it.
         """
         witnesses: list[Witness] = []
-        options = replace(self.options, time_limit=self.share * self.options.time_limit)
         while self.left() > _FOR_PROOF * self.options.time_limit:
             last = [c for c in race.contenders if c.trial.name == "optimised"][-1:]
             if not last or not last[0].attempt.done:
@@ -407,18 +436,27 @@ class _Run:
                 witnesses.append(found)
             elif not self.cut_short:
                 return
-            again = self._optimised(partial(corrected, loop, last[0].trial, witnesses, options))
+            again = self._optimised(partial(corrected, loop, last[0].trial, witnesses))
             if again is None or (not misled and again.volume <= _WORTH * race.best.proved):
                 return
             race.enter([again], heat)
 
-    def _optimised(self, make: Callable[[], Trial | None]) -> Trial | None:
-        """A trial that has its share of the time to be made in; `cut_short` says whether that ended it."""
-        begin = time.perf_counter()
+    def _optimised(self, make: Callable[[RoaOptions], Trial | None], share: float = OPTIMISING) -> Trial | None:
+        """A trial that has its share of the time to be made in, or None where there is no time left; `cut_short` says
+        whether that ended it."""
+        if self.left() <= 0:
+            self.cut_short = True
+            return None
+        begin, granted = self.clock(), self._granted(share)
         with self._stage("candidate"):
-            made = make()
-        self.cut_short = time.perf_counter() - begin >= OPTIMISING * self.share * self.options.time_limit
+            made = make(granted)
+        self.cut_short = self.clock() - begin >= OPTIMISING * granted.time_limit
         return made
+
+    def _granted(self, share: float = OPTIMISING) -> RoaOptions:
+        """The options with a limit of which this share, and what sampling adds, is no more than there is left."""
+        most = self.left() / (share * (1 + SAMPLING))
+        return replace(self.options, time_limit=max(1e-3, min(self.share * self.options.time_limit, most)))
 
     @property
     def interruptible(self) -> bool:
@@ -432,8 +470,11 @@ class _Run:
         return (1.0 if self.options.engine == "dreal" else _SEARCH) * self.left()
 
     def _contest(self) -> Race:
-        report = None if self.progress is None else self._report
-        return Race(self._begin, self.left, self.options.max_boxes, report)
+        """The race of this run."""
+        if self.race is None:
+            report = None if self.progress is None else self._report
+            self.race = Race(self._begin, self.left, self.options.max_boxes, report)
+        return self.race
 
     def _report(self, state: Progress, stage: Stage = "ring") -> None:
         if self.progress is not None:
@@ -451,14 +492,15 @@ class _Run:
             return DrealEngine(trial.T, self.options.dreal_precision, self.options.jobs or 1).begin(trial.task)
         from certify.engines.bounds.engine import BoundsEngine
 
-        return BoundsEngine(trial.T, self.runner).begin(trial.task)
+        proved = self.race is not None and self.race.proved
+        least = 0.0 if proved else max(_GRACE, _LEAST * self.options.time_limit)
+        return BoundsEngine(trial.T, self.runner, self.clock() + max(least, self.left())).begin(trial.task)
 
     def _finish(self, race: Race) -> None:
         """What is left of the time for the best contender, less what the check of its proof will take."""
         if not race.open:
-            (self.out / _SEARCH_FILE).unlink(missing_ok=True)  # of a search that is at its end now
             return
-        winner, report = race.open[0], race.report
+        self.winner = winner = race.open[0]
         boxes = self.options.max_boxes
 
         def lost() -> bool:
@@ -470,74 +512,106 @@ class _Run:
             and winner.attempt.boxes < boxes
             and not lost()
         ):
-            winner.advance(Budget(self._within(_PATIENCE * self.options.time_limit), boxes), report)
-        if not self.interruptible:
+            winner.advance(Budget(self._within(_PATIENCE * self.options.time_limit), boxes), self._keeping())
+        if not self.interruptible or winner.attempt.done or lost() or not winner.attempt.gained:
             return
-        if winner.attempt.done or lost():
-            with self._kept(winner):
+        while self.left() > 0 and not winner.attempt.done and winner.attempt.boxes < boxes and not lost():
+            whole, each, known = self._check_takes(winner)
+            self.check_takes, before = (whole, each), winner.attempt.boxes
+            searching = self._within(self.left() - _CAUTION * whole)
+            if known:
+                budget = Budget(searching, boxes, check=_CAUTION * each)
+            else:  # few leaves say little: some more, and then again
+                budget = Budget(min(searching, _PATIENCE * self.options.time_limit), boxes)
+            winner.advance(budget, self._keeping())
+            self._keep()
+            if known or winner.attempt.boxes == before:
                 return
-        if not winner.attempt.gained:
-            return
-        each = self._seconds_of_a_leaf(winner)
-        with self._kept(winner) as keep:
-            winner.advance(Budget(self._within(math.inf), boxes, check=_CAUTION * each), keep)
 
-    @contextmanager
-    def _kept(self, contender: Contender) -> Iterator[Callable[[Progress], None]]:
-        """Keep the search in a file now and then, and at the end if it is not done; gives who reports on the way."""
-        path, last = self.out / _SEARCH_FILE, time.monotonic()
-
-        def keep() -> None:
-            state = contender.attempt.state()
-            if state is not None:
-                save(path, Unfinished(contender.trial, state))
+    def _keeping(self) -> Callable[[Progress], None]:
+        """Who reports, and keeps the search now and then."""
+        last = time.monotonic()
 
         def report(progress: Progress) -> None:
             nonlocal last
             if time.monotonic() - last > _SAVING:
-                keep()
+                self._keep()
                 last = time.monotonic()
             self._report(progress)
 
-        try:
-            yield report
-        finally:
-            if contender.attempt.done:
-                path.unlink(missing_ok=True)
-            else:
-                keep()
+        return report
 
-    def _resumed(self, loop: ClosedLoop, kind: Kind) -> Race:
-        """A race of the one contender whose search an earlier run has left."""
-        if kind != "asymptotic":
+    @property
+    def _first(self) -> Contender | None:
+        """The contender whose search is worth most; None if there is none."""
+        race = self.race
+        if self.winner is not None or race is None:
+            return self.winner
+        begun = [*race.contenders, *([] if race.early is None else [race.early])]
+        return max(begun, key=lambda c: c.proved, default=None)
+
+    @property
+    def _can_go_on(self) -> bool:
+        """Whether more time may gain something that a kept search saves."""
+        one = self._first
+        return self.interruptible and one is not None and not (one.attempt.done or one.hopeless)
+
+    def _keep(self) -> None:
+        """Leave a search with which `--resume` goes on."""
+        options, path, one = self.options, self.out / SEARCH, self._first
+        if not self.underway or options.engine != "bounds":
+            return
+        if one is not None and self.interruptible:
+            save(path, Unfinished.of(one.trial, one.attempt.state(), one is self.winner))
+        elif options.P is None and options.only is None:  # else it could not say which candidate was asked for
+            save_nothing_yet(path, self.system, self.network, options.rate)
+
+    def _resume(self, loop: ClosedLoop, kind: Kind) -> None:
+        """Enter the contender whose search an earlier run has left, as the winner if that was decided."""
+        path = self.out / SEARCH
+        try:
+            found = load(path, loop, self.options.rate) if kind == "asymptotic" or path.exists() else None
+        except NothingYetError:
+            self.notices.append("the run before this one was stopped before it had a candidate: it is begun anew")
+            return
+        if found is None or kind != "asymptotic":
             raise InputError("a search for a practical claim cannot be gone on with; run without --resume.")
-        found = load(self.out / _SEARCH_FILE, loop, self.options.rate)
         with self._stage("candidate"):
             race = self._contest()
             attempt = self._begin(found.trial)
-            attempt.restore(found.state)
+            if found.state.tree:
+                attempt.restore(found.state)
             race.contenders.append(Contender(found.trial, attempt))
             race.contenders[0].advance(Budget(1e-3, self.options.max_boxes), race.report)
-        return race
+        self.winner = race.contenders[0] if found.decided else None
 
     def _within(self, seconds: float) -> float:
         return max(1e-3, min(seconds, self.left()))
 
-    def _seconds_of_a_leaf(self, contender: Contender) -> float:
-        """What the check of a leaf takes here and now, from a certificate with some of what is proved already.
+    def _check_takes(self, contender: Contender) -> tuple[float, float, bool]:
+        """Seconds that the check takes here and now without a leaf, and for each, from certificates with some of what
+        is proved already; and whether there were enough leaves to tell.
 
-        The certificate is a good one, and stays if the run is interrupted.
+        The certificates are good ones, and the last stays if the run is interrupted.
         """
         proof, problem = contender.attempt.proof(), contender.trial.task.problem
-        if proof.claim is None or not isinstance(proof.evidence, PartitionTree) or contender.trial.task.exactly:
-            return 0.0
+        claim, tree = proof.claim, proof.evidence
+        if claim is None or not isinstance(tree, PartitionTree) or contender.trial.task.exactly:
+            return _START, 0.0, True
         from certify.engines.bounds.mend import level_with_leaves
 
-        level, count = level_with_leaves(problem, proof.evidence, proof.claim, _SAMPLE)
-        claim = replace(proof.claim, roa=level)
-        before = self.seconds.get("check", 0.0)
-        self._clerk().ask(Certificate(self.system, self.network, problem.V, claim, proof.evidence, self.provenance))
-        return max(0.0, self.seconds["check"] - before - _START) / max(1, count)
+        def check(level: float) -> float:
+            before = self.seconds.get("check", 0.0)
+            some = Certificate(self.system, self.network, problem.V, replace(claim, roa=level), tree, self.provenance)
+            self._clerk().ask(some)
+            return self.seconds["check"] - before
+
+        level, count = level_with_leaves(problem, tree, claim, _SAMPLE)
+        taken, known = check(level), count >= _SAMPLE / 2
+        if known or taken < 2 * _START:
+            return min(_START, taken), max(0.0, taken - _START) / max(1, count), known
+        whole = min(taken, check(claim.inner))  # what few leaves took may be what any file takes
+        return whole, (taken - whole) / max(1, count), taken > 2 * whole  # then the leaves have taken most of it
 
     def _conclude(self, result: RoaResult, race: Race) -> RoaResult:
         """The verdict on what the engine says, the only place that gives one after the search."""
@@ -545,7 +619,7 @@ class _Run:
         task, proof = best.trial.task, best.attempt.proof()
         self.proof = proof
         for stage in ("local", "ring"):
-            self.seconds[stage] = sum(c.attempt.proof().seconds.get(stage, 0.0) for c in race.contenders)
+            self.seconds[stage] = sum(c.attempt.seconds.get(stage, 0.0) for c in race.contenders)
         witness = lowest_witness(task.witness, proof.witness)
         result = replace(result_about(result, best.trial), tried=tuple(tried_row(c, best) for c in race.contenders))
         result = replace(
@@ -553,9 +627,12 @@ class _Run:
             stop=proof.stop,
             detail=proof.detail,
             witness=witness,
-            boxes=sum(c.attempt.proof().boxes for c in race.contenders),
+            boxes=sum(c.attempt.boxes for c in race.contenders),
             solver=proof.solver,
         )
+        reserved = _CAUTION * (self.check_takes[0] + self.check_takes[1] * proof.leaves)
+        if proof.stop is Stop.TIME and best is self.winner and reserved > _MUCH * self.options.time_limit:
+            result = replace(result, detail=f"about {reserved:.0f} s of it were kept for the check")
         if proof.stop is Stop.TIME and proof.claim is not None and best.hopeless:
             pace = proof.boxes / max(1e-3, proof.seconds.get("ring", 0.0))
             years = best.attempt.expected / pace / _YEAR
@@ -584,14 +661,15 @@ class _Run:
         certificate = Certificate(self.system, self.network, task.problem.V, claim, evidence, self.provenance)  # type: ignore[arg-type]
         accepted = self._clerk().accepted(certificate, task.problem)
         certificate = accepted.certificate
-        result = replace(result, notice=accepted.mended or result.notice)
+        if accepted.mended is not None:
+            self.notices.append(accepted.mended)
         if isinstance(certificate.claim, Nearby):
             result = replace(result, claim=certificate.claim.kind)
         if certificate.claim.outer is not None and beyond is not None:
             facts_beyond = outer_facts(task.problem, certificate.claim, certificate.claim.outer, beyond)
             result = replace(result, outer=facts_beyond)
         elif beyond is not None:
-            self.aside = "the checker refused the set beyond the ellipsoid, which is left out"
+            self.notices.append("the checker refused the set beyond the ellipsoid, which is left out")
         if self.options.lyapunov_level is not None and (
             certificate.claim.outer is None or certificate.claim.outer.level < self.options.lyapunov_level
         ):
@@ -602,13 +680,14 @@ class _Run:
             result = replace(result, claim=certificate.claim.kind, tube=facts)
         elif self.centre is not None and not _holds(task.problem, certificate.roa, self.centre):
             why = self.missed if facts is None else accepted.mended or "the checker refused the tube"
-            self.aside = None
             without = _with_certificate(result, accepted, witness, proof.leaves)  # the state
             return replace(without, stop=Stop.PATH, detail=why)
         if task.exactly and certificate.roa < task.target:
             return short_of_target(
                 replace(result, stop=Stop.REFUSED, detail=accepted.mended or ""), task, certificate.claim
             )
+        if self.centre is not None and facts is None:
+            self.notices.append("the state lies in the proved set, and no tube is needed")
         trusted = isinstance(proof.evidence, TrustedSolver)
         if not trusted and self.options.engine == "both":
             result = replace(result, solver=self._confirm(task.problem, certificate.claim))
@@ -639,7 +718,7 @@ class _Run:
             worth = volume(P, claim.roa) if self.options.box is None else 0.0
             found = enlarge(known, P / claim.roa, shapes, lambda: end - self.spent, worth)
         if found is None:
-            self.aside = "no tube leads into the proved set from a larger one, as far as there was time to look"
+            self.notices.append("no tube leads into the proved set from a larger one, as far as there was time to look")
             return None, claim, evidence
         tube = found.tube
         facts = TubeFacts(tube.start, found.shape, len(tube.slabs), tube.duration)
@@ -654,7 +733,6 @@ class _Run:
 
         trial, centre = race.best.trial, self.centre or ()
         if _holds(trial.task.problem, claim.roa, centre):
-            self.aside = "the state lies in the proved set, and no tube is needed"
             self.missed = "the checker accepted only a lower level, and the state lies above it"
             return None, claim, evidence
         self.share = 1.0
@@ -691,7 +769,7 @@ class _Run:
 
     def _beyond(self, trial: Trial, claim: Claim) -> OuterProof | None:
         """The largest set of another function that is proved to lead into {V <= c2} in the time that is left; None, and
-        `aside` says why, if there is none."""
+        a notice says why, if there is none."""
         from certify.engines.outer import Nothing, prove_outer
 
         self.share = 1.0
@@ -706,7 +784,8 @@ class _Run:
             budget = Budget(max(1e-3, _FOR_SEARCH * self.left()), self.options.max_boxes)
             found = prove_outer(trial.task.problem, claim.roa, trial.T, N, level, budget, self.runner, report)
         if isinstance(found, Nothing):
-            self.aside = f"no set of the function `lyapunov` is proved to lead into the ellipsoid: {found.why}"
+            why = f"no set of the function `lyapunov` is proved to lead into the ellipsoid: {found.why}"
+            self.notices.append(why)
             return None
         return found
 
@@ -762,11 +841,11 @@ class _Run:
 
     @contextmanager
     def _stage(self, name: str) -> Iterator[None]:
-        begin = time.perf_counter()
+        begin = self.clock()
         try:
             yield
         finally:
-            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begin
+            self.seconds[name] = self.seconds.get(name, 0.0) + self.clock() - begin
 
 
 def _by_proved(race: Race) -> list[Contender]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -38,8 +40,9 @@ _SMALLEST = 1e-120  # of levels: squares of states and products of bounds must n
 _BLENDS = (0.05, 0.15, 0.3)
 _MANY = 6  # states, beyond which there is next to nothing but the local set
 OPTIMISING = 0.2  # share of the time that the optimised candidate may take
-_FOR_PEAK = 0.4  # share of the time for a candidate that may be the only one
-_SAMPLES = 4000  # of a search for violations; the proof itself finds others
+SAMPLING = 0.25  # of that time, how much more it may take to sample what a candidate could give
+FOR_PEAK = 0.4  # share of the time for a candidate that may be the only one
+_SAMPLES, _MANY_SAMPLES = 4000, 20_000  # of a search for violations, one of many and the only one; a proof finds others
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,8 +79,15 @@ class Trial:
         return self.P / self.task.target
 
 
-def trial(loop: ClosedLoop, P: Array, name: str, options: RoaOptions, notice: str | None = None) -> Trial:
-    """Sample what V = x'Px could give.
+def trial(
+    loop: ClosedLoop,
+    P: Array,
+    name: str,
+    options: RoaOptions,
+    notice: str | None = None,
+    until: float = math.inf,
+) -> Trial:
+    """Sample what V = x'Px could give, more coarsely after `until`, a reading of `time.perf_counter`.
 
     Raises
     ------
@@ -102,10 +112,10 @@ def trial(loop: ClosedLoop, P: Array, name: str, options: RoaOptions, notice: st
     if kind == "practical" and n > FEW:  # a ball decides, and no survey could
         return Trial(name, task, T, limit, "domain", volume(P, level), notice)
     if kind == "practical":
-        bands = survey(problem, T, level)
+        bands = survey(problem, T, level, until=until)
         reach = bands[0].above if bands else 0.0
         return Trial(name, task, T, limit, "sampled" if reach < level else "domain", volume(P, reach), notice)
-    witness = falsify(problem, T, level, *([] if options.only or options.P is not None else [_SAMPLES]))
+    witness = falsify(problem, T, level, _MANY_SAMPLES if _only_one(options) else _SAMPLES, 0, until)
     below = level if witness is None or task.exactly else witness.level * (1 - _BELOW_WITNESS)
     task = Task(problem, kind, below, task.exactly, witness)
     return Trial(name, task, T, limit, "domain" if witness is None else "sampled", volume(P, below), notice)
@@ -113,15 +123,26 @@ def trial(loop: ClosedLoop, P: Array, name: str, options: RoaOptions, notice: st
 
 def named(loop: ClosedLoop, options: RoaOptions) -> Trial:
     """The one candidate that the options ask for."""
-    if options.P is not None:
-        return trial(loop, options.P, "given", options)
     name = options.only or "lyapunov"
+    seconds = (share_of_robust(loop) if name == "robust" else OPTIMISING) * options.time_limit
+    until = _until(seconds)
+    if options.P is not None:
+        return trial(loop, options.P, "given", options, until=until)
     if name == "peak":
-        return trial(loop, peak_candidate(loop, OPTIMISING * options.time_limit), name, options)
+        return trial(loop, peak_candidate(loop, seconds), name, options, until=until)
     if name == "robust":
-        return trial(loop, robust_candidate(loop, _for_robust(loop, options)), name, options)
-    chosen = choose_candidate(loop, name, options.Q, options.R, OPTIMISING * options.time_limit)
-    return trial(loop, chosen.P, chosen.name, options, chosen.notice)
+        return trial(loop, robust_candidate(loop, seconds), name, options, until=until)
+    chosen = choose_candidate(loop, name, options.Q, options.R, seconds)
+    return trial(loop, chosen.P, chosen.name, options, chosen.notice, until)
+
+
+def _only_one(options: RoaOptions) -> bool:
+    return options.only is not None or options.P is not None
+
+
+def _until(seconds: float) -> float:
+    """When the sampling of a candidate ends that may take so many seconds to be made, by `time.perf_counter`."""
+    return time.perf_counter() + (1 + SAMPLING) * seconds
 
 
 def solutions(loop: ClosedLoop, options: RoaOptions) -> dict[str, Array]:
@@ -135,8 +156,12 @@ def solutions(loop: ClosedLoop, options: RoaOptions) -> dict[str, Array]:
 
 
 def solved(loop: ClosedLoop, found: Mapping[str, Array], options: RoaOptions) -> list[Trial]:
-    """What these `solutions` could give."""
-    return [trial(loop, P, name, options) for name, P in found.items()]
+    """What these `solutions` could give, one at least and as many as there is time for."""
+    until, trials = _until(OPTIMISING * options.time_limit), list[Trial]()
+    for name, P in found.items():
+        if not trials or time.perf_counter() < until:
+            trials.append(trial(loop, P, name, options, until=until))
+    return trials
 
 
 def optimised(loop: ClosedLoop, options: RoaOptions) -> Trial | None:
@@ -146,34 +171,41 @@ def optimised(loop: ClosedLoop, options: RoaOptions) -> Trial | None:
     away from it the two differ little. Of an input that is held it is that of the loop whose input follows at once: a
     period is short, and Vdot cheap.
     """
+    until = _until(OPTIMISING * options.time_limit)
     try:
         about = _at_rest(loop, options)
         about = about if loop.system.sample is None else replace(about, system=about.system.with_sample(None))
         chosen = choose_candidate(about, "optimised", options.Q, options.R, OPTIMISING * options.time_limit)
     except (BackendError, InputError):
         return None
-    return trial(loop, chosen.P, chosen.name, options) if chosen.notice is None else None
+    return trial(loop, chosen.P, chosen.name, options, until=until) if chosen.notice is None else None
 
 
 def robust(loop: ClosedLoop, options: RoaOptions) -> Trial | None:
     """The candidate that the local rule likes best, or None if it is not to be had."""
     try:
-        about = _at_rest(loop, options)
-        return trial(loop, robust_candidate(about, _for_robust(loop, options)), "robust", options)
+        seconds = share_of_robust(loop) * options.time_limit
+        until = _until(seconds)
+        return trial(loop, robust_candidate(_at_rest(loop, options), seconds), "robust", options, until=until)
     except (BackendError, InputError):
         return None
 
 
-def _for_robust(loop: ClosedLoop, options: RoaOptions) -> float:
-    """Seconds; where an input is held, in many states, as many again as for the loop without a period, which comes
-    first: there no ring can make up for what is left out."""
-    return OPTIMISING * options.time_limit * (2 if loop.system.sample is not None and loop.system.n > _MANY else 1)
+def share_of_robust(loop: ClosedLoop) -> float:
+    """Share of the time that it may take to be made.
+
+    Where an input is held, in many states, it is twice as much as for the loop without a period, which comes first:
+    there no ring can make up for what is left out.
+    """
+    return OPTIMISING * (2 if loop.system.sample is not None and loop.system.n > _MANY else 1)
 
 
 def peak(loop: ClosedLoop, options: RoaOptions) -> Trial | None:
     """The candidate of a practical claim whose floor is small beside the set, or None if it is not to be had."""
     try:
-        return trial(loop, peak_candidate(loop, _FOR_PEAK * options.time_limit), "peak", options)
+        seconds = FOR_PEAK * options.time_limit
+        until = _until(seconds)
+        return trial(loop, peak_candidate(loop, seconds), "peak", options, until=until)
     except (BackendError, InputError):
         return None
 
@@ -188,18 +220,23 @@ def _at_rest(loop: ClosedLoop, options: RoaOptions) -> ClosedLoop:
 def corrected(loop: ClosedLoop, last: Trial, witnesses: Sequence[Witness], options: RoaOptions) -> Trial | None:
     """An optimised candidate once more, with violations that its samples had missed; None if there is none larger."""
     known = np.array([w.x for w in witnesses]) if witnesses else None
+    until = _until(OPTIMISING * options.time_limit)
     try:
         P = optimise_repeatedly(_at_rest(loop, options), last.P, OPTIMISING * options.time_limit, known)
     except BackendError:
         return None
-    return trial(loop, P, last.name, options)
+    return trial(loop, P, last.name, options, until=until)
 
 
 def blends(loop: ClosedLoop, large: Trial, provable: Trial, options: RoaOptions) -> Iterator[Trial]:
     """Between a candidate whose set is large and one that is easier to prove, where what can be proved is largest."""
+    until = _until(OPTIMISING * options.time_limit)
     for share in _BLENDS:
+        if time.perf_counter() > until:
+            return
         P = (1 - share) * large.unit + share * provable.unit
-        yield trial(loop, (P + P.T) / 2, f"{large.name} with {share:.0%} of {provable.name}", options)
+        name = f"{large.name} with {share:.0%} of {provable.name}"
+        yield trial(loop, (P + P.T) / 2, name, options, until=until)
 
 
 def by_reach(trials: Sequence[Trial]) -> list[Trial]:

@@ -1,9 +1,9 @@
-"""Searches that can be gone on with: a file beside the certificate, with the candidate and the tree as far as it is.
+"""Searches that can be resumed: a file beside the certificate, with the candidate and the tree as far as it is.
 
-Nothing here is trusted. What a search that was gone on with proves, the checker sees leaf by leaf like any other. A
-hash tells a damaged file. Numbers and violations are looked at all the same: whoever wrote the file may have been
-somebody else.
-"""
+A run that is stopped early has no candidate yet, or no tree, or has not decided among candidates. The file says so, and
+the run that resumes it does the rest. Nothing here is trusted. What a search that was resumed proves, the checker sees
+leaf by leaf like any other. A hash tells a damaged file. Numbers and violations are looked at all the same: whoever
+wrote the file may have been somebody else."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from certify.policies import TanhNetwork
 from certify.systems import System
 from certify.trials import Trial
 
-_FORMAT = "certify-search/1"
+FORMAT = "certify-search/2"
 _LARGEST = 2**30  # bytes of a file
 _MOST = 2 * MOST_SPLITS + 1  # bytes of a tree
 _RATIONAL = re.compile(r"-?\d{1,1000}(/[1-9]\d{0,999})?")
@@ -45,10 +45,28 @@ _LIMITS = ("domain", "sampled")
 
 @dataclass(frozen=True, slots=True)
 class Unfinished:
-    """A candidate, with a search for the largest level that has not come to its end."""
+    """A candidate, with a search for the largest level that has not come to its end.
+
+    Parameters
+    ----------
+    trial : the candidate.
+    state : of its search; one without a tree has not bounded any box yet.
+    decided : whether this candidate was chosen for the rest of the time; if not, others may be better.
+    """
 
     trial: Trial
     state: SearchState
+    decided: bool = True
+
+    @classmethod
+    def of(cls, trial: Trial, state: SearchState | None, decided: bool) -> Unfinished:
+        """With the state of an attempt, which may have none."""
+        target = trial.task.target
+        return cls(trial, state or SearchState(target, target, 0, 0, None, b"", np.zeros(0)), decided)
+
+
+class NothingYetError(InputError):
+    """The run that left this file was stopped before it had a candidate."""
 
 
 def identity(system: System, network: TanhNetwork, rate: float) -> str:
@@ -66,8 +84,9 @@ def save(path: Path, unfinished: Unfinished) -> None:
     """
     trial, state, problem = unfinished.trial, unfinished.state, unfinished.trial.task.problem
     data = {
-        "format": _FORMAT,
+        "format": FORMAT,
         "about": identity(problem.loop.system, problem.loop.network, problem.rate),
+        "decided": unfinished.decided,
         "candidate": trial.name,
         "P": encode(trial.P),
         "T": encode(trial.T),
@@ -85,7 +104,21 @@ def save(path: Path, unfinished: Unfinished) -> None:
         "tree": _packed(state.tree),
         "keys": _packed(state.keys.astype("<f8").tobytes()),
     }
-    write_atomically(path, (json.dumps(data | {"sha256": _digest(data)}) + "\n").encode())
+    _write(path, data)
+
+
+def save_nothing_yet(path: Path, system: System, network: TanhNetwork, rate: float) -> None:
+    """Write down that a run about this loop and rate was stopped before it had a candidate.
+
+    Raises
+    ------
+    InputError : the file cannot be written.
+    """
+    _write(path, {"format": FORMAT, "about": identity(system, network, rate), "candidate": None})
+
+
+def _write(path: Path, data: Mapping[str, Any]) -> None:
+    write_atomically(path, (json.dumps({**data, "sha256": _digest(data)}) + "\n").encode())
 
 
 def load(path: Path, loop: ClosedLoop, rate: float) -> Unfinished:
@@ -93,6 +126,7 @@ def load(path: Path, loop: ClosedLoop, rate: float) -> Unfinished:
 
     Raises
     ------
+    NothingYetError : the run that left it had no candidate yet.
     InputError : it is not there, is about another loop or rate, or is damaged.
     """
     try:
@@ -104,8 +138,8 @@ def load(path: Path, loop: ClosedLoop, rate: float) -> Unfinished:
     except (OSError, ValueError, RecursionError) as error:
         raise InputError(f"the search in {path} cannot be read: {error}. Run without --resume.") from error
     try:
-        if data["format"] != _FORMAT:
-            raise _Unfit(f"{path} must be of the format {_FORMAT}; found {data['format']!r:.40}.")
+        if data["format"] != FORMAT:
+            raise _Unfit(f"{path} must be of the format {FORMAT}; found {data['format']!r:.40}. Run without --resume.")
         if data.pop("sha256") != _digest(data):
             raise ValueError("it has another hash than when it was written")
         if data["about"] != identity(loop.system, loop.network, rate):
@@ -113,9 +147,13 @@ def load(path: Path, loop: ClosedLoop, rate: float) -> Unfinished:
                 f"the search in {path} is about another policy, plant, domain or rate; run without --resume, or into "
                 "another folder."
             )
+        if data["candidate"] is None:
+            raise NothingYetError(f"the run that left {path} was stopped before it had a candidate.")
         return _read(data, loop, rate)
     except _Unfit as error:
         raise InputError(str(error)) from error
+    except NothingYetError:
+        raise
     except (KeyError, TypeError, AttributeError, ValueError, ArithmeticError, RecursionError, zlib.error) as error:
         raise InputError(f"the search in {path} is damaged ({error!r:.200}); run without --resume.") from error
 
@@ -137,7 +175,7 @@ def _read(data: Mapping[str, Any], loop: ClosedLoop, rate: float) -> Unfinished:
         and type(name) is str
         and name.isprintable()
         and len(name) <= _NAME
-        and type(data["exactly"]) is bool
+        and type(data["exactly"]) is type(data["decided"]) is bool
         and type(boxes) is type(proved) is int
         and 0 <= proved <= boxes < 2**62
         and is_positive_definite(P)
@@ -149,7 +187,8 @@ def _read(data: Mapping[str, Any], loop: ClosedLoop, rate: float) -> Unfinished:
     trial = Trial(name, task, T, limit, data["limited_by"], volume)
     tree = _unpacked(data["tree"], _MOST)
     keys = np.frombuffer(_unpacked(data["keys"], 8 * len(tree)), dtype="<f8").astype(np.float64)
-    return Unfinished(trial, SearchState(inner, outer, boxes, proved, _read_witness(data["met"], problem), tree, keys))
+    state = SearchState(inner, outer, boxes, proved, _read_witness(data["met"], problem), tree, keys)
+    return Unfinished(trial, state, data["decided"])
 
 
 def _digest(data: Mapping[str, Any]) -> str:

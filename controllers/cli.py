@@ -1,7 +1,8 @@
 """The `controllers` command: which commands there are; their bodies are the files of `controllers.commands`.
 
 Standard output carries the result, or exactly one JSON object with `--json`; progress goes to standard
-error. Exit status: 0 done, 2 bad usage or input, 70 internal error.
+error. Exit status: 0 done, 2 bad usage or input, 70 internal error; 130 after Ctrl-C or SIGTERM, 141 after a closed
+pipe.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import traceback
 
 import typer
 
+from certify.ending import closed_pipe, end_by_sigterm, is_of_closed_pipe
 from controllers.commands.compare import compare
 from controllers.commands.evaluate import evaluate
 from controllers.commands.flatten import flatten
@@ -35,8 +37,15 @@ app.command("history")(history)
 
 def main() -> None:
     """Entry point of the `controllers` command; a fault of the program itself exits 70."""
+    end_by_sigterm()
     try:
         app()
+    except SystemExit as stop:
+        if not is_of_closed_pipe(stop):
+            raise
+        raise SystemExit(closed_pipe()) from None
+    except BrokenPipeError:
+        raise SystemExit(closed_pipe()) from None
     except Exception:
         traceback.print_exc()
         raise SystemExit(70) from None

@@ -50,12 +50,13 @@ EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows th
     ),
     "sublevel": "expressions lyapunov rigorous systems",
     "sweep": (
-        "arguments certificate claims inputs installation lyapunov options policies report results roa running systems"
+        "arguments certificate claims closed_loop engines inputs installation lyapunov options outcome policies report "
+        "results roa running systems"
     ),
     "systems": "expressions",
     "trials": "certificate claims closed_loop engines lyapunov options",
     "unfinished": "certificate claims closed_loop engines lyapunov policies systems trials",
-    "controllers": "api certificate closed_loop containment expressions lyapunov policies report rigorous running "
+    "controllers": "api certificate closed_loop containment ending expressions lyapunov policies report rigorous running "
     "systems",
 }
 

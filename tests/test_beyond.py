@@ -152,3 +152,14 @@ def test_what_cannot_be_asked_for(options: dict[str, object], said: str, tmp_pat
 
 def test_a_witness_in_words() -> None:
     assert Rise(np.array([1.0]), 1.0, "rise").describe(plant()) == "N does not fall at x = 1 with N = 1"
+
+
+def test_a_later_notice_takes_none_away(tmp_path: Path) -> None:
+    """The loop rests beside the origin, and N falls nowhere: both are said."""
+    pushed = plant(-x + x**3 + u + Fraction(1, 1000))
+    falls = Polynomial(np.array([[2]]), np.array([-1.0]))
+    result = certify_roa(pushed, REST, tmp_path, P=[[0.5]], lyapunov=falls, time_limit=20.0)
+    assert result.verdict is Verdict.PROVED and result.notice is not None
+    said = result.notice.split("; ")
+    assert [text.split(",")[0] for text in said[:1]] == ["practical stability is claimed"]
+    assert any(text.startswith("no set of the function `lyapunov` is proved") for text in said[1:])

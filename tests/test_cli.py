@@ -18,6 +18,8 @@ import pytest
 import torch
 
 from certify.cli import _run
+from certify.commands.terminal import ring_line
+from certify.engines.base import Progress
 from certify.policies import Policy, TanhNetwork, load_policy, save_policy
 from tests.support.loops import chain, pendulum_network
 
@@ -274,7 +276,7 @@ def test_the_installed_command(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("where", ["ring", "check"])
-def test_an_interrupt_leaves_nothing_half_written(
+def test_an_interrupt_leaves_a_search_and_nothing_half_written(
     where: str, tmp_path: Path, policy_file: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from certify.engines.bounds.rule import VdotBound
@@ -287,11 +289,16 @@ def test_an_interrupt_leaves_nothing_half_written(
     else:
         monkeypatch.setattr("certify.roa.run_checker", interrupt)
     status, out, err = run(capsys, "roa", "--policy", policy_file, "--out", tmp_path / "o")
-    assert status == 130 and out == "" and "interrupted" in err
-    assert list((tmp_path / "o").iterdir()) == []
+    assert status == 130 and out == "" and "interrupted" in err and "--resume" in err
+    assert [path.name for path in (tmp_path / "o").iterdir()] == ["search.json"]
+    monkeypatch.undo()
+    assert run(capsys, "roa", "--policy", policy_file, "--out", tmp_path / "o", "--resume")[0] == 0
+    assert sorted(path.name for path in (tmp_path / "o").iterdir()) == ["certificate.json", "report.html"]
+    assert run(capsys, "check", tmp_path / "o" / "certificate.json")[0] == 0
 
 
-def test_control_c_ends_a_running_command(tmp_path: Path) -> None:
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_control_c_ends_a_running_command(tmp_path: Path, number: signal.Signals) -> None:
     """A suite in the background of a script ignores SIGINT, and its children inherit that: this one listens again."""
     listening = (
         "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
@@ -306,11 +313,11 @@ def test_control_c_ends_a_running_command(tmp_path: Path) -> None:
     )
     assert running.stderr is not None
     assert "cartpole" in running.stderr.readline()  # the plant is known, the proof begins
-    running.send_signal(signal.SIGINT)
+    running.send_signal(number)
     out, err = running.communicate(timeout=60)
-    assert running.returncode in (130, -signal.SIGINT) and out == ""
+    assert running.returncode == 130 and out == ""
     assert "interrupted" in err and "Traceback" not in err
-    assert not [p for p in tmp_path.rglob("*") if p.is_file()]
+    assert [p.name for p in tmp_path.rglob("*") if p.is_file()] in ([], ["search.json"])
 
 
 def test_a_wrong_policy_is_named_however_deep_the_provenance_nests(
@@ -696,3 +703,38 @@ def test_a_command_that_ends_at_once_has_said_everything(
     assert done.returncode == status and said in done.stdout + done.stderr
     assert done.stderr.endswith("ended\nleft\n" if watch else "left\n")
     assert watch or "ended" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("command", "both"),
+    [
+        ("certify roa --policy {policy} --out {out}", True),
+        ("certify roa --policy {policy} --out {out}", False),
+        ("certify roa --policy nosuch.pt", False),
+        ("certify prove", True),
+        ("certify roa --help", True),
+        ("controllers evaluate nosuch.pt --json", True),
+        ("controllers train pendulum --no-such", False),
+        ("controllers train --help", True),
+    ],
+)
+def test_a_closed_pipe_is_no_verdict_whatever_was_to_be_said(command: str, both: bool, tmp_path: Path) -> None:
+    """Standard error goes into a pipe that nobody reads, with standard output or without it."""
+    name, *arguments = command.format(policy=SHIPPED, out=tmp_path / "o").split()
+    reading, writing = os.pipe()
+    os.close(reading)
+    code = f"from {name}.cli import main; main()"
+    out = writing if both else subprocess.DEVNULL
+    done = subprocess.run([sys.executable, "-c", code, *arguments], stdout=out, stderr=writing, check=False)
+    os.close(writing)
+    assert done.returncode == 141
+
+
+def test_the_line_of_progress_is_true_of_a_pass_inwards_and_of_nearly_all() -> None:
+    """A floor is looked for from above; and a share is not rounded up to all."""
+    down = Progress(8.463e-11, 6.612e-14, 900, 3, 1 - 1e-9, None, "lyapunov", down=True)
+    said = ring_line("ring", down)
+    assert "down to V = 8.463e-11, the aim is 6.612e-14 (99.9 % of the volume)" in said
+    assert "to V = 0.5 of 1 (50.0 % of the volume)" in ring_line("ring", Progress(0.5, 1.0, 9, 3, 0.5, None, "x"))
+    assert "100.0 %" in ring_line("ring", Progress(1.0, 1.0, 9, 0, 1.0, None, "x"))
+    assert "beyond the ellipsoid: proved to N = 0.5 of 1" in ring_line("outer", Progress(0.5, 1.0, 9, 3, 0.5, None))

@@ -7,6 +7,7 @@ import json
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
+from typing import Any
 
 import flint
 import numpy as np
@@ -18,6 +19,7 @@ from torch import Tensor
 from certify.certificate import Certificate, checking, run_checker, sole_writer
 from certify.claims import Problem
 from certify.closed_loop import ClosedLoop
+from certify.engines.base import Progress
 from certify.engines.bounds.rule import BoxBounds, VdotBound
 from certify.engines.falsify import Witness, refutes
 from certify.errors import BackendError, InputError, SoundnessError
@@ -27,6 +29,7 @@ from certify.lyapunov.function import Quadratic
 from certify.policies import TanhNetwork, bounded_by_form, load_policy
 from certify.roa import RoaOptions, certify_roa
 from certify.systems import System, get_system
+from certify.trials import OPTIMISING, Trial, trial
 from certify.verdict import Verdict
 from tests.support.loops import box, chain, pendulum_network, scalar_tanh
 from tests.support.marks import slow_after
@@ -378,3 +381,86 @@ def nested(x: Symbol, depth: int) -> Expression:
     for _ in range(depth):
         result = sin(x * result)
     return result
+
+
+def test_a_pass_says_in_which_direction_it_goes(tmp_path: Path) -> None:
+    """An aim lies above what is proved, or below it where a floor is looked for."""
+    seen: list[Progress] = []
+    system, network = scalar_tanh()
+    pushed = dataclasses.replace(system, dynamics=(system.dynamics[0] + sympy.Rational(1, 100),))
+    certify_roa(pushed, network, tmp_path, RoaOptions(claim="practical"), progress=lambda _, state: seen.append(state))
+    found = [state for state in seen if state is not None]
+    assert {state.down for state in found} >= {True}
+    assert all(state.target <= state.level if state.down else state.target >= state.level for state in found)
+
+
+@pytest.mark.parametrize("ends", ["refuted", "unknown", "with an error", "interrupted"])
+def test_an_earlier_run_s_files_do_not_lie_where_the_result_is_looked_for(
+    ends: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """They are set aside under a name that says so; what is somebody's own stays."""
+    system, network = scalar_tanh()
+    proved = certify_roa(system, network, tmp_path, RoaOptions(level=0.5))
+    assert proved.verdict is Verdict.PROVED and proved.raw is not None
+    (tmp_path / "report.html").write_text("<pre>python -I -m certify.checker certificate.json</pre>")
+    (tmp_path / "search.json").write_text("my own notes")
+    options = {"refuted": RoaOptions(level=3.9), "unknown": RoaOptions(level=0.5, max_boxes=1)}
+    if ends == "interrupted":
+        monkeypatch.setattr("certify.roa.named", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+    if ends == "with an error":
+        monkeypatch.setattr("certify.roa.named", lambda *_: (_ for _ in ()).throw(InputError("no such candidate")))
+    if ends == "unknown":
+        monkeypatch.setattr("certify.engines.bounds.engine.prove_local", lambda *_: None)
+    given = options.get(ends, RoaOptions(level=0.5))
+    if ends in options:
+        assert certify_roa(system, network, tmp_path, given).verdict.value == ends.upper()
+    else:
+        with pytest.raises((InputError, KeyboardInterrupt)):
+            certify_roa(system, network, tmp_path, given)
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"certificate.earlier.json", "report.earlier.html", "search.json"}
+    assert (tmp_path / "certificate.earlier.json").read_bytes() == proved.raw
+    assert (tmp_path / "search.json").read_text() == "my own notes"
+
+
+def test_a_run_that_finds_the_folder_taken_leaves_what_lies_there(tmp_path: Path) -> None:
+    system, network = scalar_tanh()
+    certify_roa(system, network, tmp_path, RoaOptions(level=0.5))
+    with sole_writer(tmp_path), pytest.raises(InputError, match="another run"):
+        certify_roa(system, network, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["certificate.json"]
+
+
+def test_a_file_that_is_in_the_way_is_named_and_stays(tmp_path: Path) -> None:
+    system, network = scalar_tanh()
+    certify_roa(system, network, tmp_path, RoaOptions(level=0.5))
+    (tmp_path / "certificate.earlier.json").write_text("my own notes")
+    with pytest.raises(InputError, match=r"certificate\.earlier\.json, which is another file"):
+        certify_roa(system, network, tmp_path, RoaOptions(level=0.5))
+    assert (tmp_path / "certificate.earlier.json").read_text() == "my own notes"
+
+
+class Made:
+    """Candidates that take all of the seconds that they are granted, by a clock that nothing else moves."""
+
+    def __init__(self, P: float) -> None:
+        self.now, self.P = 0.0, P
+
+    def __call__(self, loop: ClosedLoop, *given: Any) -> Trial:
+        seconds = OPTIMISING * given[-1].time_limit
+        self.now += seconds
+        self.P *= 0.9  # each is a new one
+        return trial(loop, np.array([[self.P]]), "optimised", RoaOptions())
+
+
+def test_candidates_take_no_more_time_than_there_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reading has taken most of the limit, and each candidate takes all that it is granted."""
+    system, network = scalar_tanh()
+    made = Made(1.0)
+    for name in ("optimised", "robust", "corrected"):
+        monkeypatch.setattr(f"certify.roa.{name}", made)
+    monkeypatch.setattr("certify.roa._Run.clock", staticmethod(lambda: made.now))
+    monkeypatch.setattr("certify.roa.time.perf_counter", lambda: made.now)
+    found = certify_roa(system, network, tmp_path, RoaOptions(time_limit=50.0), load_seconds=46.0)
+    assert found.verdict is Verdict.PROVED
+    assert 46.0 + made.now <= 50.0

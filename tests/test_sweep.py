@@ -421,7 +421,7 @@ def test_what_is_done_is_not_done_again_and_what_changed_is(
         ("row.json", lambda raw: raw.replace(b'"inputs": "', b'"inputs": "0')),
         ("row.json", lambda raw: raw[: len(raw) // 2]),
         ("row.json", lambda raw: raw.replace(b'"ACCEPTED"', b'"REJECTED"')),
-        ("row.json", lambda raw: raw.replace(b"certify-sweep-row/1", b"certify-sweep-row/0")),
+        ("row.json", lambda raw: raw.replace(b"certify-sweep-row/2", b"certify-sweep-row/1")),
         ("row.json", lambda raw: raw.replace(b'"boxes"', b'"bxes"')),
         ("row.json", lambda raw: b"[" * 10**5),
         ("row.json", lambda raw: b"\xff"),
@@ -445,6 +445,71 @@ def test_what_is_done_is_not_done_again_and_what_changed_is(
     run_sweep(changed, out, place := Here(lambda piece: "lost"))
     assert place.done == [one, two]
     assert not (out / "cases" / one / "certificate.json").exists()  # of other inputs
+
+
+def test_a_kept_row_is_believed_only_as_far_as_it_is_found_out_again(
+    study: Study, sent: dict[str, bytes], tmp_path: Path
+) -> None:
+    """Whoever edits what a sweep left, with hashes that fit, gets no line of the table: the case is done again."""
+    out = tmp_path / "out"
+    first = run_sweep(study, out, canned(sent))
+    one, two = study.cases()
+    row, certificate = (out / "cases" / one.name / name for name in ("row.json", "certificate.json"))
+    right, raw = row.read_bytes(), certificate.read_bytes()
+    other = (out / "cases" / two.name / "certificate.json").read_bytes()
+
+    def edited(data: bytes, **change: Any) -> None:
+        """Bytes as the certificate, and a row about them."""
+        certificate.write_bytes(data)
+        said = json.loads(right) | {"certificate_sha256": hashlib.sha256(data).hexdigest()}
+        row.write_text(json.dumps(said | change))
+
+    levels = json.loads(right)["levels"]
+    edited(raw)
+    assert kept(out, one) == first.rows[0]
+    larger = raw.replace((0.3).hex().encode(), (0.9).hex().encode())
+    assert larger != raw
+    lies: list[tuple[bytes, dict[str, Any]]] = [
+        (larger, {"levels": levels | {"roa": 0.9}}),
+        (other, {}),
+        (b"{}", {}),
+        *((raw, {"levels": levels | {name: 7.0}}) for name in levels if name != "ultimate"),
+        (raw, {"volume": 7.0}),
+        (raw, {"extents": [7.0, 7.0]}),
+        (raw, {"semi_axes": [7.0, 7.0]}),
+        (raw, {"states": ["a", "b"]}),
+        (raw, {"units": {}}),
+        (raw, {"volume_unit": "m"}),
+        (raw, {"claim": "nearby"}),
+        (raw, {"verdict": "TRUSTED", "checked": "TRUSTED"}),
+        (raw, {"leaves": 7}),
+        (raw, {"seconds": "7"}),
+        (raw, {"certificate": "cases/elsewhere/certificate.json"}),
+        (raw, {"certificate": None, "verdict": "UNKNOWN"}),
+        (raw, {"certificate": None, "verdict": "REFUTED", "stop": "witness"}),
+    ]
+    for data, change in lies:
+        edited(data, **change)
+        assert kept(out, one) is None, change
+    edited(larger, levels=levels | {"roa": 0.9})
+    again = run_sweep(study, out, place := canned(sent))
+    assert place.done == [one.name] and again.rows == first.rows and certificate.read_bytes() == raw
+
+
+def test_what_is_not_kept_does_not_lie_where_its_result_is_looked_for(
+    study: Study, sent: dict[str, bytes], tmp_path: Path
+) -> None:
+    """Also where the sweep ends before the case is done; a file that is somebody's own stays."""
+    out = tmp_path / "out"
+    run_sweep(study, out, canned(sent))
+    one, two = (out / "cases" / case.name for case in study.cases())
+    (two / "certificate.json").write_text("my own notes")
+    (one / "notes.partial").write_text("my own notes")
+    changed = read_study(written(tmp_path, QUICK.replace("time_limit = 30", "time_limit = 31")))
+    with pytest.raises(BackendError):
+        run_sweep(changed, out, Here(lambda piece: BackendError("gone")))
+    assert sorted(path.name for path in one.iterdir()) == ["certificate.earlier.json", "notes.partial"]
+    assert (two / "certificate.json").read_text() == "my own notes"
 
 
 def test_a_case_that_could_not_be_run_ends_nothing_and_is_tried_again(

@@ -6,6 +6,7 @@ import base64
 import dataclasses
 import json
 import math
+import pkgutil
 import time
 import zlib
 from collections.abc import Callable
@@ -33,7 +34,7 @@ from certify.trials import Trial
 from certify.unfinished import Unfinished, load, save
 from certify.verdict import Stop, Verdict
 from tests.support.cases import case_of
-from tests.support.loops import box, pendulum_network
+from tests.support.loops import box, pendulum_network, scalar_tanh
 
 WIDE = dataclasses.replace(get_system("pendulum"), domain=box(7, 30))
 LOOP = ClosedLoop(WIDE, pendulum_network())
@@ -372,3 +373,54 @@ def test_another_problem_is_another_search() -> None:
         loop, rate = make()
         seen.add(unfinished.identity(loop.system, loop.network, rate))
     assert len(seen) == 1 + len(OTHERS)
+
+
+# -------------------------------------------------------------------------------------------------------- interrupted
+
+PLACES = {  # where Ctrl-C comes, and on which call: from the first candidate to the last check
+    "candidates": ("certify.roa.solutions", 1),
+    "the first one": ("certify.roa.optimised", 1),
+    "a local proof": ("certify.engines.bounds.engine.prove_local", 1),
+    "a heat": ("certify.engines.bounds.rule.VdotBound.__call__", 1),
+    "the search": ("certify.engines.bounds.rule.VdotBound.__call__", 3),
+    "the first check": ("certify.roa.run_checker", 1),
+    "the end": ("certify.roa.limit_of", 1),
+}
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_a_run_that_is_interrupted_anywhere_is_resumed_to_its_end(
+    place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name, call = PLACES[place]
+    calls = 0
+
+    def counted(*args: Any, **more: Any) -> Any:
+        nonlocal calls
+        calls += 1
+        if calls == call:
+            raise KeyboardInterrupt
+        return original(*args, **more)
+
+    owner, _, attribute = name.rpartition(".")
+    original = pkgutil.resolve_name(name)
+    monkeypatch.setattr(pkgutil.resolve_name(owner), attribute, counted)
+    monkeypatch.setattr("certify.roa._HEAT", 1e-9)
+    system, network = scalar_tanh()
+    with pytest.raises(KeyboardInterrupt):
+        certify_roa(system, network, tmp_path)
+    left = {path.name for path in tmp_path.iterdir()}
+    assert "search.json" in left and left <= {"search.json", "certificate.json"}
+    end = certify_roa(system, network, tmp_path, RoaOptions(resume=True))
+    assert end.verdict is Verdict.PROVED and run_checker(tmp_path / "certificate.json")["result"] == "ACCEPTED"
+    assert not (tmp_path / "search.json").exists()
+    assert end.volume is not None and end.volume > 3.8  # of the 3.83 that the origin attracts
+
+
+def test_a_run_that_is_out_of_time_at_once_leaves_a_search(tmp_path: Path) -> None:
+    """Whatever it proves is accepted, it says that it was the time, and what is left is resumed."""
+    system, network = scalar_tanh()
+    first = certify_roa(system, network, tmp_path, RoaOptions(time_limit=1e-3))
+    assert first.verdict in (Verdict.PROVED, Verdict.UNKNOWN) and first.stop is Stop.TIME
+    assert first.search == tmp_path / "search.json"
+    assert certify_roa(system, network, tmp_path, RoaOptions(resume=True)).verdict is Verdict.PROVED

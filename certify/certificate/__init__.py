@@ -29,7 +29,7 @@ if TYPE_CHECKING:
         read_raw,
     )
     from certify.certificate.tree import leaves
-    from certify.certificate.writing import sole_writer, write_atomically, write_beside
+    from certify.certificate.writing import SEARCH, remove, set_aside, sole_writer, write_atomically, write_beside
 
 _OTHERS = {
     "join_parts": "joining",
@@ -38,12 +38,16 @@ _OTHERS = {
     "require_short": "limits",
     "require_within_limits": "limits",
     "leaves": "tree",
+    "SEARCH": "writing",
+    "remove": "writing",
+    "set_aside": "writing",
     "sole_writer": "writing",
     "write_atomically": "writing",
     "write_beside": "writing",
 }
 
 __all__ = [
+    "SEARCH",
     "Certificate",
     "Contraction",
     "LocalBall",
@@ -60,10 +64,12 @@ __all__ = [
     "parse_certificate",
     "read_certificate",
     "read_raw",
+    "remove",
     "require_short",
     "require_within_limits",
     "run_checker",
     "run_part",
+    "set_aside",
     "sole_writer",
     "write_atomically",
     "write_beside",

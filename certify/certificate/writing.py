@@ -47,6 +47,52 @@ def write_beside(path: Path, data: bytes, suffix: str) -> Path:
     return file
 
 
+SEARCH = "search.json"
+_OURS = {"certificate.json": b"certify-certificate/", "report.html": b"-m certify.checker", SEARCH: b"certify-search/"}
+"""What a run writes, by names, each with what its text holds."""
+
+
+def set_aside(folder: Path, *, keep: bool = False) -> None:
+    """Rename what an earlier run has left in a folder, `certificate.json` into `certificate.earlier.json` and so on.
+
+    What a run did not make must not lie where its result is looked for, and what took hours must not be lost to a slip.
+
+    A file that is no run's own, by its name and its text, stays as it is.
+
+    Parameters
+    ----------
+    keep : leave the search where it is: it is to be resumed.
+
+    Raises
+    ------
+    InputError : a file cannot be renamed, or somebody's own file has the other name.
+    """
+    for name, text in _OURS.items():
+        path = folder / name
+        if (keep and name == SEARCH) or not _holds(path, text):
+            continue
+        other = path.with_suffix(f".earlier{path.suffix}")
+        if other.exists() and not _holds(other, text):
+            raise InputError(f"{path} is to be kept as {other.name}, which is another file; rename one of them.")
+        try:
+            path.replace(other)
+        except OSError as error:
+            raise InputError(f"{path} cannot be renamed: {error.strerror}.") from error
+
+
+def remove(path: Path) -> None:
+    """Remove a file of a run, if it is one by its name and its text."""
+    if _holds(path, _OURS[path.name]):
+        path.unlink(missing_ok=True)
+
+
+def _holds(path: Path, text: bytes) -> bool:
+    try:
+        return path.is_file() and text in path.read_bytes()
+    except OSError:
+        return False
+
+
 @contextmanager
 def sole_writer(folder: Path) -> Iterator[None]:
     """Make `folder` and lock it until the end; the system lets go of a run that dies.

@@ -13,10 +13,12 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from certify.certificate import SEARCH
 from certify.commands.arguments import region
 from certify.commands.contains import stated, text
 from certify.commands.shared import write
 from certify.commands.terminal import ProgressLine, load_tables, say, show, tell
+from certify.ending import Interrupted
 
 if TYPE_CHECKING:
     from certify.largest import Quantity
@@ -27,6 +29,7 @@ if TYPE_CHECKING:
     from certify.systems import System
 
 CONTAINS = "--contains"
+_OF_SEARCH = ("candidate", "q", "r", "level")
 
 
 def certified(
@@ -85,6 +88,14 @@ def certified(
             provenance=_provenance(policy),
             progress=progress,
         )
+    except KeyboardInterrupt:
+        search = folder / SEARCH
+        if largest is not None or not search.exists():
+            raise
+        raise Interrupted(
+            f"interrupted; what was done is kept in {search}, and the same command with --resume{_without(context)} "
+            "goes on from there."
+        ) from None
     finally:
         if progress is not None:
             progress.close()
@@ -125,13 +136,30 @@ def _where(result: RoaResult, asked: str) -> tuple[dict[str, Any], str]:
     return stated(found, box, result.system), text(found, box, result.system)
 
 
+def _without(context: typer.Context) -> str:
+    """What a resumed search knows already, of the options that were given."""
+    given = _known(context)
+    return f" and without {', '.join(given)}" if given else ""
+
+
+def _known(context: typer.Context) -> list[str]:
+    """The options that were given and that a resumed search has of its own; what is learned is no part of it."""
+    from certify.lyapunov import BEYOND
+
+    found = {f"--{key if len(key) > 1 else key.upper()}": context.params.get(key) for key in _OF_SEARCH}
+    return [name for name, value in found.items() if value not in (None, "auto", *BEYOND)]
+
+
 def _command(context: typer.Context, changed: Mapping[str, str]) -> str:
-    """The command that was given, with these options in the place of what it had."""
+    """The command that was given, with these options instead of those it had; a search that is resumed has its own."""
+    known = _known(context) if "--resume" in changed else []
     parts = ["certify", str(context.info_name)]
     for option in context.command.params:
         source = context.get_parameter_source(option.name or "")
         name, value = max(option.opts, key=len), context.params[option.name or ""]
-        if source is None or source.name != "COMMANDLINE" or (name in changed and not option.multiple):
+        if source is None or source.name != "COMMANDLINE" or name in known:
+            continue
+        if name in changed and not option.multiple:
             continue
         values = list(value) if isinstance(value, list | tuple) else [value]
         if name in changed:  # NAME=VALUE options replace those of the same name

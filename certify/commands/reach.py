@@ -10,7 +10,7 @@ import typer
 from certify.commands.arguments import plant_of, state, widths
 from certify.commands.certifying import certified
 from certify.commands.importing import policy_of
-from certify.commands.shared import Domain, Json, PlantName, PolicyFile, Quiet, Results, TimeLimit
+from certify.commands.shared import Domain, Json, PlantName, PolicyFile, Quiet, Results, Resume, TimeLimit
 from certify.report.drawing import Drawing
 
 if TYPE_CHECKING:
@@ -32,6 +32,7 @@ def reach(
         str | None,
         typer.Option(help="Half-axes of the ellipsoid around the state that is to be widest, as in x=0.4,phi=0.2."),
     ] = None,
+    resume: Resume = False,
     time_limit: TimeLimit = 50.0,
     out: Results = None,
     quiet: Quiet = False,
@@ -43,5 +44,7 @@ def reach(
 
     stored = policy_of(policy, importing, system, param or [])
     plant = plant_of(stored, system, param or [], domain or [])
-    options = RoaOptions(reach_from=state(from_, "--from"), box=widths(box, "--box"), time_limit=time_limit)
+    options = RoaOptions(
+        reach_from=state(from_, "--from"), box=widths(box, "--box"), resume=resume, time_limit=time_limit
+    )
     certified(context, policy, stored, plant, options, out, start, drawing, quiet, as_json)

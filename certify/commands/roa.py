@@ -11,7 +11,7 @@ import typer
 from certify.commands.arguments import layers, numbers, plant_of, region, widths
 from certify.commands.certifying import CONTAINS, certified
 from certify.commands.importing import policy_of
-from certify.commands.shared import Domain, Json, PlantName, PolicyFile, Quiet, Results, TimeLimit
+from certify.commands.shared import Domain, Json, PlantName, PolicyFile, Quiet, Results, Resume, TimeLimit
 from certify.commands.terminal import tell
 from certify.errors import BackendError, InputError
 from certify.report.drawing import Drawing
@@ -104,9 +104,7 @@ def roa(
         bool,
         typer.Option("--cluster-checks", help="Its workers check the certificate as well, in parts, and are believed."),
     ] = False,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on with the search that an earlier run left in the folder.")
-    ] = False,
+    resume: Resume = False,
     enlarge: Annotated[
         bool, typer.Option("--enlarge", help="Look for a tube that leads from a larger set into the proved one.")
     ] = False,

@@ -2,32 +2,30 @@
 
 from __future__ import annotations
 
-import os
+import math
 import shutil
 import sys
 import time
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 import typer
+
+from certify.ending import closed_pipe
 
 if TYPE_CHECKING:
     from certify.engines.base import Progress
 
-CLOSED_PIPE = 141  # as a shell reports SIGPIPE
-
-
-def closed_pipe() -> int:
-    """What is left to say goes nowhere: whoever read it has gone, which is no verdict."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-    return CLOSED_PIPE
-
 
 def say(text: str) -> None:
     """Print the result, and be sure that it has left: a reader that has gone must not look like a verdict."""
+    _put(sys.stdout, text + "\n")
+
+
+def _put(stream: TextIO, text: str) -> None:
     try:
-        sys.stdout.write(text + "\n")
-        sys.stdout.flush()
+        stream.write(text)
+        stream.flush()
     except BrokenPipeError:
         raise typer.Exit(closed_pipe()) from None
 
@@ -50,13 +48,18 @@ def load_tables() -> None:
 
 def tell(line: str) -> None:
     """A diagnostic, on standard error."""
-    sys.stderr.write(line + "\n")
+    _put(sys.stderr, line + "\n")
 
 
-def _ring_line(state: Progress) -> str:
+def ring_line(stage: str, state: Progress) -> str:
+    """Where a proof stands, in a line: of V, or beyond the ellipsoid of N."""
     left = "" if state.seconds_left is None else f", at most {max(state.seconds_left, 0):.0f} s left"
+    letter, name = ("N", "beyond the ellipsoid") if stage == "outer" else ("V", state.name)
+    proved = f"{letter} = {state.level:.4g}"
+    aim = f"down to {proved}, the aim is" if state.down else f"to {proved} of"
+    share = math.floor(1000 * state.proved) / 10  # all is said of all alone
     return (
-        f"{state.name}: proved to V = {state.level:.4g} of {state.target:.4g} ({state.proved:.1%} of the volume), "
+        f"{name}: proved {aim} {state.target:.4g} ({share:.1f} % of the volume), "
         f"{state.boxes} boxes, {state.open} open{left}"
     )
 
@@ -86,16 +89,15 @@ class ProgressLine:
         if now - self.last < self.every:
             return
         self.last = now
-        line = _ring_line(state) if state is not None else _STAGES[stage]
+        line = ring_line(stage, state) if state is not None else _STAGES[stage]
         if self.terminal:
             line = line[: shutil.get_terminal_size().columns - 1]
             self.shown = len(line)
-            sys.stderr.write(f"\r{line}\x1b[K")
+            _put(sys.stderr, f"\r{line}\x1b[K")
         else:
-            sys.stderr.write(line + "\n")
-        sys.stderr.flush()
+            tell(line)
 
     def close(self) -> None:
         """Wipe the line."""
         if self.shown:
-            sys.stderr.write("\r\x1b[K")
+            _put(sys.stderr, "\r\x1b[K")

@@ -51,9 +51,8 @@ class Task:
 class Progress:
     """Where a proof stands: `level` is proved, `target` aimed at, `boxes` were bounded and `open` wait.
 
-    `proved` is the share of the ring's volume that is done; `seconds_left` is extrapolated, None at first; `name` is
-    the candidate's.
-    """
+    A pass outwards has a target above its level, one inwards, `down`, a target below. `proved` is the share of the
+    ring's volume that is done; `seconds_left` is extrapolated, None at first; `name` is the candidate's."""
 
     level: float
     target: float
@@ -62,6 +61,7 @@ class Progress:
     proved: float
     seconds_left: float | None
     name: str = ""
+    down: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,6 +117,10 @@ class Attempt(Protocol):
         """Boxes bounded so far."""
 
     @property
+    def seconds(self) -> Mapping[str, float]:
+        """That its stages took so far."""
+
+    @property
     def level(self) -> float | None:
         """The c2 that is proved so far; None if there is none."""
 
@@ -135,7 +139,7 @@ class Attempt(Protocol):
         """The best claim of the task's kind so far."""
 
     def state(self) -> SearchState | None:
-        """The search, to go on with another time; None if there is nothing to go on with."""
+        """The search, to go on with another time, also one that is done; None if there is none."""
 
     def restore(self, state: SearchState) -> None:
         """Go on with a search for the same task in the same coordinates.
@@ -176,6 +180,11 @@ class Once:
     def boxes(self) -> int:
         """Boxes bounded."""
         return 0 if self.found is None else self.found.boxes
+
+    @property
+    def seconds(self) -> Mapping[str, float]:
+        """Of its stages."""
+        return {} if self.found is None else self.found.seconds
 
     @property
     def level(self) -> float | None:

@@ -9,6 +9,8 @@ reported witness is shown in Arb; the search itself proves nothing.
 from __future__ import annotations
 
 import itertools
+import math
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
@@ -64,9 +66,14 @@ class Band:
     above: float
 
 
-def falsify(problem: Problem, T: Array, limit: float, samples: int = 20_000, seed: int = 0) -> Witness | None:
-    """Search {V <= limit} for the lowest violation; None if none was found. `x = T z`, (n, n): T'PT is about I."""
-    search = _Search(problem, T)
+def falsify(
+    problem: Problem, T: Array, limit: float, samples: int = 20_000, seed: int = 0, until: float = math.inf
+) -> Witness | None:
+    """Search {V <= limit} for the lowest violation; None if none was found. `x = T z`, (n, n): T'PT is about I.
+
+    From `until` on, a reading of `time.perf_counter`, the search ends with what it has.
+    """
+    search = _Search(problem, T, until)
     generator = np.random.default_rng(seed)
     n = problem.loop.system.n
     direction = generator.standard_normal((samples, n))
@@ -75,7 +82,7 @@ def falsify(problem: Problem, T: Array, limit: float, samples: int = 20_000, see
     radius = np.where(np.arange(samples) % 2 == 0, 1.0, generator.random(samples))
     z = direction * (radius * np.sqrt(limit) * (1 - 1e-9))[:, None]
     best = search.lowest(z)
-    if best is None:  # climb D' on the boundary before giving up
+    if best is None and time.perf_counter() < until:  # climb D' on the boundary before giving up
         z = search.climb(z[:: max(1, samples // 512)], limit)
         best = search.lowest(z)
     return best
@@ -92,9 +99,12 @@ def is_violated(problem: Problem, T: Array, limit: float, samples: int = 4000, s
         return bool(search.bad(torch.tensor(z, dtype=torch.float64)).any())
 
 
-def survey(problem: Problem, T: Array, limit: float, samples: int = 512, seed: int = 0) -> list[Band]:
-    """The bands of levels up to `limit` on which no violation was found, the highest first."""
-    search = _Search(problem, T)
+def survey(
+    problem: Problem, T: Array, limit: float, samples: int = 512, seed: int = 0, until: float = math.inf
+) -> list[Band]:
+    """The bands of levels up to `limit` on which no violation was found, the highest first; from `until` on, a reading
+    of `time.perf_counter`, samples are not climbed from."""
+    search = _Search(problem, T, until)
     steps = 20 if problem.loop.system.sample is None else 8  # each of many times the work
     generator = np.random.default_rng(seed)
     direction = generator.standard_normal((samples, problem.loop.system.n))
@@ -157,8 +167,8 @@ def refutes(problem: Problem, witness: Witness, level: float) -> bool:
 
 
 class _Search:
-    def __init__(self, problem: Problem, T: Array) -> None:
-        self.problem = problem
+    def __init__(self, problem: Problem, T: Array, until: float = math.inf) -> None:
+        self.problem, self.until = problem, until
         self.loop = problem.loop
         self.f = self.loop.system.uncertain_function("torch")
         self.corners = self.loop.system.corners()
@@ -239,7 +249,7 @@ class _Search:
                 better = moved.norm(dim=-1, keepdim=True) < norm
                 z = torch.where(better, moved, z)
                 step = torch.where(better, 1.5 * step, 0.4 * step).clamp(max=0.5)
-            if float(step.max()) < 1e-7:
+            if float(step.max()) < 1e-7 or time.perf_counter() > self.until:
                 break
         with torch.no_grad():
             z = self._lowest_few(self._shrink(z, torch.ones(()), halvings=50), 32)
@@ -271,6 +281,8 @@ class _Search:
                 moved = z + step * radius * direction
                 z = radius * moved / moved.norm(dim=-1, keepdim=True)
             step *= 0.95
+            if time.perf_counter() > self.until:
+                break
         result: Array = z.detach().numpy()
         return result
 

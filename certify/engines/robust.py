@@ -63,8 +63,8 @@ def robust_candidate(loop: ClosedLoop, seconds: float = math.inf) -> Array:
     end, known, proved = time.perf_counter() + seconds, paths(loop), list[Array]()
     if loop.system.sample is not None:  # a period is short, and the rule without one is cheap
         at_once = replace(loop, system=loop.system.with_sample(None))
-        proved = _all_scaled(known, [robust_candidate(at_once, _AT_ONCE * (end - time.perf_counter()))])
-    proved = proved or _all_scaled(known, [choose_candidate(loop, name).P for name in SOLVED])
+        proved = _all_scaled(known, [robust_candidate(at_once, _AT_ONCE * (end - time.perf_counter()))], end)
+    proved = proved or _all_scaled(known, [choose_candidate(loop, name).P for name in SOLVED], end)
     if not proved:
         raise BackendError("the local rule proves nothing with the candidates that solve a Lyapunov equation")
     start = max(proved, key=_log_volume)
@@ -111,9 +111,9 @@ def _log_volume(P: Array) -> float:
     return math.log(volume(P, 1.0))
 
 
-def _all_scaled(known: Paths, candidates: Sequence[Array]) -> list[Array]:
-    """Those with which the local rule proves a level, over it."""
-    return [P for P in (_scaled(known, P) for P in candidates) if P is not None]
+def _all_scaled(known: Paths, candidates: Sequence[Array], end: float) -> list[Array]:
+    """Those with which the local rule proves a level in the time, over it."""
+    return [P for P in (_scaled(known, P, end) for P in candidates) if P is not None]
 
 
 def _scaled(known: Paths, P: Array, until: float = math.inf, best: Array | None = None) -> Array | None:

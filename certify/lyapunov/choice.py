@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import time
 from dataclasses import dataclass
 from typing import Literal
 
@@ -72,12 +73,13 @@ def choose_candidate(
                 f"{', '.join(f'{d:g}' for d in nearer)}. Scale the states."
             )
         return Chosen(solve_lyapunov(A, np.diag(weights), h), "scaled")
-    P = solve_lyapunov(A, weight, h)
+    P, end = solve_lyapunov(A, weight, h), time.monotonic() + seconds
     if name == "lyapunov":
         return Chosen(P, "lyapunov")
     try:
-        start = P if Q is not None else largest_sampled(loop, [choose_candidate(loop, one).P for one in SOLVED])
-        return Chosen(optimise_repeatedly(loop, start, seconds), "optimised")
+        starts = [P] if Q is not None else [choose_candidate(loop, one).P for one in SOLVED]
+        start = largest_sampled(loop, starts, seconds=seconds) if len(starts) > 1 else P
+        return Chosen(optimise_repeatedly(loop, start, end - time.monotonic()), "optimised")
     except BackendError as error:
         return Chosen(P, "lyapunov", f"candidate lyapunov in the place of optimised: {error}")
 

@@ -86,7 +86,7 @@ def _optimise(
     found = given = 0.0
     end = time.monotonic() + seconds
     for decay in decays:
-        samples = _Samples(loop, 1e-3 * decay * slowest, np.random.default_rng(seed))
+        samples = _Samples(loop, 1e-3 * decay * slowest, np.random.default_rng(seed), end)
         if known is not None:
             samples.remember(known)
         P = _enlarge(samples, A, start, decay * slowest, end)
@@ -127,10 +127,11 @@ def optimise_repeatedly(loop: ClosedLoop, start: Array, seconds: float = math.in
     return P
 
 
-def largest_sampled(loop: ClosedLoop, candidates: Sequence[Array], seed: int = 0) -> Array:
-    """The P, (n, n), of those given whose set inside the domain without a sampled violation has the largest volume."""
+def largest_sampled(loop: ClosedLoop, candidates: Sequence[Array], seed: int = 0, seconds: float = math.inf) -> Array:
+    """The P, (n, n), of those given whose set inside the domain without a sampled violation has the largest volume;
+    after so many seconds fewer samples tell."""
     slowest = slowest_decay(loop.mean_rate(), loop.step)
-    samples = _Samples(loop, 1e-3 * slowest, np.random.default_rng(seed))
+    samples = _Samples(loop, 1e-3 * slowest, np.random.default_rng(seed), time.monotonic() + seconds)
     return max(candidates, key=lambda P: volume(samples.fit(P, 0.0), 1.0))
 
 
@@ -171,11 +172,11 @@ class _Samples:
     """States that limit sublevel sets of the closed loop, remembered from search to search.
 
     x, G(x), (dG/dx) x : (N, n), G being the mean rate of a step, F in continuous time. outside : (N,), the input leaves
-    its bounds at x or G has a pole there.
+    its bounds at x or G has a pole there. After `end`, a reading of `time.monotonic`, one search does for several.
     """
 
-    def __init__(self, loop: ClosedLoop, least: float, generator: np.random.Generator) -> None:
-        self.loop, self.least, self.generator = loop, least, generator
+    def __init__(self, loop: ClosedLoop, least: float, generator: np.random.Generator, end: float = math.inf) -> None:
+        self.loop, self.least, self.generator, self.end = loop, least, generator, end
         self.f, self.step = loop.system.function(), loop.step
         self.bounds = np.array([[float(v) for v in b] for b in loop.system.input_bounds]).T
         self.x, self.F, self.dF = (np.zeros((0, loop.system.n)) for _ in range(3))
@@ -216,6 +217,8 @@ class _Samples:
             level = self.known(P, alpha)
             P = P / min(level, domain_limit(P, self.loop.system.domain), float(_RADII[-1]) ** 2)
             if k + 1 >= searches and level > 0.5:  # a lower level leaves the set too coarsely sampled
+                break
+            if time.monotonic() > self.end:
                 break
         return P
 

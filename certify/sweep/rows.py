@@ -2,7 +2,10 @@
 
 Whoever did the work is not believed. A row says PROVED only if the checker of this machine, asked about the file that
 lies in the case's folder, accepted it, and if what that file claims is about the very plant and policy of the case; its
-levels and sizes are taken from the file's bytes. What a worker says of the reason, of boxes and of seconds is its word.
+levels and sizes are taken from the file's bytes, and a sampled limit is one at which the violation that was met is
+shown again. Neither is a row believed that an earlier sweep has left, because anybody may have edited it: it is kept if
+all that can be found out again is what it says. What a worker, or the earlier sweep, says of the reason, of boxes and
+of seconds is its word.
 """
 
 from __future__ import annotations
@@ -19,10 +22,22 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.certificate import Certificate, parse_certificate, run_checker, write_atomically, write_beside
-from certify.claims import Enlarged
+from certify.certificate import (
+    Certificate,
+    PartitionTree,
+    parse_certificate,
+    run_checker,
+    set_aside,
+    write_atomically,
+    write_beside,
+)
+from certify.claims import Enlarged, Problem
+from certify.closed_loop import ClosedLoop
+from certify.engines.falsify import Witness, confirm
 from certify.errors import BackendError, CertificateFormatError, CertifyError, InputError, SoundnessError
-from certify.lyapunov import extents, semi_axes, volume
+from certify.lyapunov import domain_limit, extents, semi_axes, volume
+from certify.lyapunov.function import Quadratic
+from certify.outcome import by_spectrum
 from certify.report.words import volume_unit
 from certify.results import Levels
 from certify.sweep.case import Case
@@ -35,9 +50,10 @@ if TYPE_CHECKING:
     from certify.systems import System
 
 Array = NDArray[np.float64]
-SCHEMA = "certify-sweep-row/1"
+SCHEMA = "certify-sweep-row/2"
 ERROR = "error"  # in the place of a stop, where a case could not be run
 _ANSWERS = {Verdict.PROVED: "ACCEPTED", Verdict.TRUSTED: "TRUSTED"}
+_LEAF = bytes([255])  # of a tree in preorder
 _ROW, _CERTIFICATE = "row.json", "certificate.json"
 
 
@@ -55,6 +71,7 @@ class Row:
         volume, in the product of the states' units, and lengths are certain lower bounds.
     states : their names; none where the case could not be run.
     units : of states, parameters and disturbances, by name.
+    witness : the violation at which the sampled limit lies: its state, kind and values; None without one.
     boxes, leaves, seconds : of the work.
     certificate, certificate_sha256, checked : the file, relative to the sweep's folder, its hash, and what the checker
         of this machine said of it.
@@ -75,6 +92,7 @@ class Row:
     extents: tuple[float, ...] = ()
     states: tuple[str, ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
+    witness: Mapping[str, Any] | None = None
     boxes: int = 0
     leaves: int = 0
     seconds: float | None = None
@@ -107,10 +125,13 @@ class Row:
     def write(self, out: Path) -> None:
         """Put it into the case's folder, in one step: from then on the case is done."""
         folder = _folder(out, self.case)
-        for left in (*folder.glob("*.unchecked.json"), *folder.glob("*.partial")):  # by a sweep that was killed
+        for left in (
+            *folder.glob("certificate.*.unchecked.json"),
+            *folder.glob("row.*.partial"),
+        ):  # of one that was killed
             left.unlink(missing_ok=True)
         if self.certificate is None:
-            (folder / _CERTIFICATE).unlink(missing_ok=True)  # of other inputs, or of an attempt that was refused
+            set_aside(folder)  # of an attempt that was refused
         write_atomically(folder / _ROW, (json.dumps(self.to_dict(), indent=1) + "\n").encode())
 
 
@@ -120,26 +141,77 @@ def failed(case: Case, error: str) -> Row:
 
 
 def kept(out: Path, case: Case) -> Row | None:
-    """The row of a case that is done: with the same inputs, without an error, and with the certificate's very bytes.
+    """The row of a case that is done: with the same inputs, without an error, and saying what is found out again here.
 
-    Anything else, whatever is wrong with it, is a case that is to be done.
+    A certificate is asked about anew, which takes as long as its check; that no Lyapunov function exists is shown again
+    by the spectrum, and any other refutation is not kept. Anything else, whatever is wrong with it, is a case that is
+    to be done.
     """
+    folder = out / "cases" / case.name
     try:
-        data = json.loads((out / "cases" / case.name / _ROW).read_bytes())
+        data = json.loads((folder / _ROW).read_bytes())
         if data.pop("schema") != SCHEMA:
             return None
         data |= {"verdict": Verdict(data["verdict"]), "levels": Levels(**data["levels"])}
         data |= {name: tuple(data[name]) for name in ("semi_axes", "extents", "states")}
-        row = Row(**data)
+        row = replace(Row(**data), coordinates=case.coordinates)  # files may be called otherwise by now
         if (row.inputs, row.case, row.failed) != (case.inputs, case.name, False):
             return None
-        if row.certificate is not None:
-            raw = (out / "cases" / case.name / _CERTIFICATE).read_bytes()
-            if hashlib.sha256(raw).hexdigest() != row.certificate_sha256:
-                return None
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
+        raw = None if row.certificate is None else (folder / _CERTIFICATE).read_bytes()
+        return row if row == _found_again(row, case, raw, out) else None
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError, RecursionError, CertifyError):
         return None
-    return replace(row, coordinates=case.coordinates)  # files may be called otherwise by now
+
+
+def forget(out: Path, case: Case) -> None:
+    """Set aside what lies in the folder of a case that is to be done: it is of other inputs, or is not to be believed.
+
+    Raises
+    ------
+    InputError : it cannot be.
+    """
+    folder = out / "cases" / case.name
+    set_aside(folder)
+    (folder / _ROW).unlink(missing_ok=True)
+
+
+def _found_again(row: Row, case: Case, raw: bytes | None, out: Path) -> Row | None:
+    """What can be said of a case whose row an earlier sweep has left, but for what was its word.
+
+    Raises
+    ------
+    CertifyError : the certificate is refused, is about something else, or the checker failed.
+    """
+    with tempfile.TemporaryDirectory(prefix="certify-case-") as temporary:
+        loop = case.loop(Path(temporary), lambda _: None)
+    if raw is None and row.verdict is Verdict.REFUTED and not _is_refuted_again(loop):
+        return None
+    levels = row.levels.to_dict()
+    said = {
+        "verdict": row.verdict.value,
+        "stop": row.stop,
+        "reason": row.reason,
+        "claim": {"kind": row.claim},
+        "levels": {name: levels[name] for name in ("sampled_limit", "domain_limit")},
+        "lyapunov": {"candidate": row.candidate, "notice": row.notice or None},
+        "witness": row.witness,
+        "boxes": row.boxes,
+        "leaves": row.leaves,
+        "seconds": {"total": row.seconds},
+    }
+    answer = Answer("result", data=said, raw=raw)
+    found = _stated(case, answer, loop[1])
+    return found if raw is None else _checked(found, answer, loop, out)
+
+
+def _is_refuted_again(loop: tuple[Policy, System, RoaOptions]) -> bool:
+    """Whether the loop's enclosed eigenvalues show that it is not stable where it rests."""
+    closed, claim = ClosedLoop(loop[1], loop[0].network), loop[2].claim
+    if claim not in ("auto", "asymptotic"):
+        return False
+    closed.require_rest()
+    found = by_spectrum(closed)
+    return found is not None and found[0] is Verdict.REFUTED
 
 
 def judged(case: Case, answer: Answer, out: Path, *, own: bool) -> Row:
@@ -190,7 +262,7 @@ def _stated(case: Case, answer: Answer, plant: System) -> Row:
     """
     data, names = answer.data, [s.name for s in (*plant.states, *plant.disturbances)]
     try:
-        said, used, verdict = data["levels"], data["lyapunov"]["candidate"], Verdict(data["verdict"])
+        used, verdict, witness = data["lyapunov"]["candidate"], Verdict(data["verdict"]), data["witness"]
         notices = [*answer.notices, data["lyapunov"]["notice"]]
         row = Row(
             case.name,
@@ -201,12 +273,12 @@ def _stated(case: Case, answer: Answer, plant: System) -> Row:
             _text(data["reason"]),
             claim=_text(data["claim"]["kind"]),
             candidate=None if used is None else _text(used),
-            levels=Levels(sampled_limit=_optional(said["sampled_limit"]), domain_limit=_optional(said["domain_limit"])),
             volume_unit=volume_unit([plant.units.get(s.name, "") for s in plant.states]),
             states=tuple(s.name for s in plant.states),
             units={name: plant.units.get(name, "") for name in (*names, *plant.parameters)},
+            witness=None if witness is None else {name: witness[name] for name in ("x", "kind", "values")},
             boxes=int(data["boxes"]),
-            leaves=int(data["leaves"]),
+            leaves=0 if answer.raw is None else int(data["leaves"]),
             seconds=_optional(data["seconds"]["total"]),
             notice="; ".join(_text(notice) for notice in notices if notice is not None),
         )
@@ -249,13 +321,17 @@ def _checked(row: Row, answer: Answer, loop: tuple[Policy, System, RoaOptions], 
         if said["result"] != _ANSWERS[verdict]:
             raise _Refused(f"{verdict.value} was said, and the checker says {said['result']}")
         _require_asked(certificate, options)
-    claim = certificate.claim
+    claim, tree = certificate.claim, certificate.evidence
     P, level = _ellipsoid(certificate)
+    limit = domain_limit(certificate.P, certificate.system.domain)
+    sampled = _sampled_limit(certificate, row.witness)
     return replace(
         row,
         verdict=verdict,
         claim=claim.kind,
-        levels=replace(row.levels, **claim.levels),
+        levels=replace(Levels(sampled_limit=sampled, domain_limit=limit), **claim.levels),
+        leaves=tree.tree.count(_LEAF) if isinstance(tree, PartitionTree) else 0,
+        witness=None if sampled is None else row.witness,
         volume=volume(P, level),
         semi_axes=tuple(semi_axes(P, level).tolist()),
         extents=tuple(extents(P, level).tolist()),
@@ -263,6 +339,29 @@ def _checked(row: Row, answer: Answer, loop: tuple[Policy, System, RoaOptions], 
         certificate_sha256=sha256,
         checked=said["result"],
     )
+
+
+def _sampled_limit(certificate: Certificate, said: Mapping[str, Any] | None) -> float | None:
+    """V at a violation that is shown again in balls; None if none is."""
+    if said is None:
+        return None
+    system, x = certificate.system, np.array(said["x"], dtype=np.float64)
+    problem = Problem(ClosedLoop(system, certificate.network), Quadratic(certificate.P), certificate.claim.rate)
+    values = {str(name): Fraction(text) for name, text in said["values"].items()}
+    if x.shape != (system.n,) or not np.all(np.isfinite(x)) or said["kind"] not in ("vdot", "input"):
+        return None
+    if not all(name in system.ranges and _is_in(q, system.ranges[name]) for name, q in values.items()):
+        return None
+    if said["kind"] == "vdot" and set(values) != set(system.ranges):
+        return None
+    periods = [None] if system.sample is None or said["kind"] == "input" else list(system.sample)
+    level = float(problem.V(x))
+    shown = (confirm(problem, Witness(x, level, said["kind"], values, period)) for period in periods)
+    return level if any(shown) else None
+
+
+def _is_in(q: Fraction, ends: tuple[Fraction, Fraction]) -> bool:
+    return ends[0] <= q <= ends[1]
 
 
 def _require_about(certificate: Certificate, raw: bytes, expected: Certificate) -> None:

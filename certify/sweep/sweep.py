@@ -1,7 +1,8 @@
 """The sweep: what is done is kept, what is missing is done, and the table is written however it ends.
 
-A case is done once its row lies in its folder. Rows are written one by one, so that a sweep that is interrupted, is
-killed, or loses its cluster goes on where it was; a case whose run could not even be tried is tried again.
+A case is done once its row lies in its folder and what it says is found out again. Rows are written one by one, so that
+a sweep that is interrupted, is killed, or loses its cluster goes on where it was; a case whose run could not even be
+tried is tried again.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ from certify.certificate import sole_writer
 from certify.errors import BackendError, InputError, SoundnessError
 from certify.running.tasks import Outcome, Piece, Place, Processes
 from certify.sweep.case import Case
-from certify.sweep.rows import Row, failed, judged, kept
+from certify.sweep.rows import Row, failed, forget, judged, kept
 from certify.sweep.study import Study
 from certify.sweep.tables import write_tables
 from certify.sweep.work import answer_in, work
@@ -101,9 +102,14 @@ def run_sweep(study: Study, out: Path, place: Place, watch: Watch = lambda row, 
     """
     start, cases = time.perf_counter(), study.cases()
     with sole_writer(out):
-        rows = {case.name: row for case in cases if (row := kept(out, case)) is not None}
-        before, files = len(rows), dict[str, Path]()
+        rows, before, files = dict[str, Row](), 0, dict[str, Path]()
         try:
+            for row in _kept(cases, out):
+                rows[row.case] = row
+            before = len(rows)
+            for case in cases:
+                if case.name not in rows:
+                    forget(out, case)
             for row in _done([case for case in cases if case.name not in rows], out, place):
                 rows[row.case] = row
                 watch(row, len(rows), len(cases))
@@ -111,6 +117,17 @@ def run_sweep(study: Study, out: Path, place: Place, watch: Watch = lambda row, 
             found = tuple(rows[case.name] for case in cases if case.name in rows)
             files = write_tables(study, found, len(cases), out)
         return Sweep(study, found, len(cases), before, files, time.perf_counter() - start)
+
+
+def _kept(cases: Sequence[Case], out: Path) -> Iterator[Row]:
+    """The rows of cases that are done, each as soon as it is found out again; several checkers run at a time."""
+    with ThreadPoolExecutor(os.cpu_count() or 1) as checks:
+        waiting = [checks.submit(kept, out, case) for case in cases]
+        try:
+            yield from (row for future in waiting if (row := future.result()) is not None)
+        except BaseException:
+            checks.shutdown(cancel_futures=True)
+            raise
 
 
 def _done(cases: Sequence[Case], out: Path, place: Place) -> Iterator[Row]:

@@ -40,6 +40,8 @@ def errors(as_json: bool) -> Iterator[None]:
             raise
         said = f"{error.name} is not installed, and training needs it; `pip install 'certify[controllers]'` brings it."
         raise _refused(said, as_json) from error
+    except BrokenPipeError:  # nobody reads any more what is said
+        raise
     except (CertifyError, OSError) as error:
         raise _refused(str(error), as_json) from error
 

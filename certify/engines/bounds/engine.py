@@ -29,10 +29,13 @@ _TRIES = 4  # inner levels from which c2 is looked for, each with half of the ti
 
 
 class BoundsEngine(Engine):
-    """Branch and bound in the coordinates `x = T z`, T (n, n), on a runner."""
+    """Branch and bound in the coordinates `x = T z`, T (n, n), on a runner.
 
-    def __init__(self, T: Array, runner: Runner) -> None:
-        self.T, self.runner = T, runner
+    An attempt begins with the largest local level that is found until `until`, a reading of `time.perf_counter`.
+    """
+
+    def __init__(self, T: Array, runner: Runner, until: float = math.inf) -> None:
+        self.T, self.runner, self.until = T, runner, until
 
     def begin(self, task: Task) -> Attempt:
         """An attempt at the largest c2 up to the task's target; with claim `practical`, at the smallest c0 for it."""
@@ -171,8 +174,9 @@ class _Outwards:
     def __init__(self, engine: BoundsEngine, task: Task) -> None:
         start = time.perf_counter()
         self.engine, self.task = engine, task
-        self.inner = prove_local(task.problem, engine.T, task.target)
-        self.seconds = {"local": time.perf_counter() - start, "ring": 0.0}
+        self.inner = prove_local(task.problem, engine.T, task.target, None, engine.until)
+        self.hurried = self.inner is None and time.perf_counter() > engine.until
+        self.seconds: dict[str, float] = {"local": time.perf_counter() - start, "ring": 0.0}
         self.ring: Pass | None = None
         self.stop: Stop | None = None
         if self.inner is not None and self.inner < task.target:
@@ -205,7 +209,7 @@ class _Outwards:
         self.seconds["ring"] += time.perf_counter() - start
 
     def state(self) -> SearchState | None:
-        return None if self.ring is None or self.ring.done else self.ring.state()
+        return None if self.ring is None else self.ring.state()
 
     def restore(self, state: SearchState) -> None:
         if self.inner is None or self.inner < state.inner:
@@ -215,6 +219,8 @@ class _Outwards:
         self.ring.restore(state)
 
     def proof(self) -> Proof:
+        if self.hurried:
+            return Proof(None, None, Stop.TIME, "it ended before a local level was found", seconds=self.seconds)
         if self.inner is None:
             why = "the linearisation does not dominate on any ball; try another --Q"
             return Proof(None, None, Stop.LOCAL, why, seconds=self.seconds)

@@ -156,6 +156,8 @@ class _Sweep(ABC):
     Boxes proved before it moved stay proved: the ring only shrinks, and the rule's multipliers do not depend on it.
     """
 
+    down = False  # whether the level that gives way is the inner one
+
     def __init__(self, problem: Problem, T: Array, inner: float, outer: float) -> None:
         self.problem, self.T = problem, T
         self.inner, self.outer = inner, outer
@@ -236,10 +238,12 @@ class _Outwards(_Sweep):
 
     def stand(self, least: float) -> tuple[float, float, float]:
         level = max(self.inner, min(least, self.outer))
-        return level, self.outer, self.share(self.inner, level)
+        return level, max(self.inner, self.outer), self.share(self.inner, level)
 
 
 class _Inwards(_Sweep):
+    down = True
+
     def key(self, lowest: Tensor, highest: Tensor) -> Tensor:
         return -highest
 
@@ -363,7 +367,7 @@ class Pass:
                     return Stop.CLUSTER
                 if report is not None:
                     stand = self.sweep.stand(self._least())
-                    report(self._clock.read(*stand, self.boxes, self._open()))
+                    report(replace(self._clock.read(*stand, self.boxes, self._open()), down=self.sweep.down))
         return None
 
     @contextmanager
