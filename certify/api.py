@@ -440,6 +440,8 @@ def _importing(given: ImportOptions | Mapping[str, Any] | None) -> ImportOptions
             read[name] = tuple(
                 _text(v, where) for v in (value.split(",") if isinstance(value, str) else _list(value, where))
             )
+        elif name == "ignore":
+            read[name] = tuple(_text(v, where) for v in ([value] if isinstance(value, str) else _list(value, where)))
         elif name in ("action_scale", "action_offset"):
             read[name] = _rationals(value, where)
         elif name == "epsilon":

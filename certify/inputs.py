@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from certify.lyapunov import StoredLyapunov
     from certify.policies import Centre, Policy
     from certify.policies.importers import Imported, ImportOptions
+    from certify.policies.importers.comparing import Difference
     from certify.systems import System
     from certify.systems.system import Interval
 
@@ -249,15 +250,12 @@ def is_own(path: Path, importing: ImportOptions) -> bool:
 
 def lines(imported: Imported) -> list[str]:
     """What an import found, for people."""
-    found, difference = imported, imported.difference
-    policy = found.policy
+    found, policy = imported, imported.policy
     origin, target = _row(found.at_origin), _row(found.u_eq)
     said = [
         f"read     {found.words}; sha256 {policy.training['imported']['sha256']}",
         f"policy   {found.formula}; o = ({policy.training['imported']['states']})",
-        f"compared with the framework's own evaluation at {difference.states:,} states: largest difference "
-        f"{difference.largest:.3g} (its rounding explains up to {difference.explained:.3g} there), "
-        f"{difference.in_double:.3g} where it works in double precision",
+        *checked(found.difference, found.compared_with, found.assumed, found.not_read),
         f"pi(0)    {origin}; u_eq {target}",
         f"centring {_centring(found)}",
     ]
@@ -268,6 +266,27 @@ def lines(imported: Imported) -> list[str]:
         "numbers, half a unit in the last place of each at most"
     )
     return said
+
+
+def checked(difference: Difference, compared_with: str | None, assumed: str, not_read: Mapping[str, str]) -> list[str]:
+    """What an import was compared with, and which tensors of its file it left out, for people."""
+    from certify.policies.importers.unread import braced
+
+    numbers = (
+        f"at {difference.states:,} states: largest difference {difference.largest:.3g} (rounding explains up to "
+        f"{difference.explained:.3g} there), {difference.in_double:.3g} in double precision"
+    )
+    if compared_with is not None:
+        said = [f"compared with {compared_with}, {numbers}"]
+    else:
+        said = [
+            f"numbers  only, no program: nothing was compared with the file. {assumed}; check that against your code",
+            f"folding  checked with the same numbers in torch's layers, {numbers}",
+        ]
+    reasons: dict[str, list[str]] = {}
+    for name, why in not_read.items():
+        reasons.setdefault(why, []).append(name)
+    return [*said, *(f"not read {braced(names)}: {why}" for why, names in reasons.items())]
 
 
 def _centring(found: Imported) -> str:

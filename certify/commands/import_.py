@@ -12,7 +12,7 @@ from certify.commands.importing import imported_lyapunov, imported_policy
 from certify.commands.shared import Json
 from certify.commands.terminal import say
 from certify.errors import InputError
-from certify.inputs import lines
+from certify.inputs import checked, lines
 
 if TYPE_CHECKING:
     from certify.lyapunov import ImportedLyapunov
@@ -42,10 +42,10 @@ def import_(
         raise InputError("--lyapunov-prefix must go with --lyapunov-out, the file to write the Lyapunov network to.")
     if lyapunov_out is not None and lyapunov_out.resolve() == out.resolve():
         raise InputError(f"--out and --lyapunov-out must be two files; both are {out}.")
-    imported = imported_policy(file, importing, system, param or [])
     beside = None
     if lyapunov_out is not None:
         beside = imported_lyapunov(file, importing, system, param or [], lyapunov_prefix)
+    imported = imported_policy(file, importing, system, param or [], lyapunov_prefix)
     save_policy(out, imported.policy)
     said = [*lines(imported), f"written  {out}"]
     if beside is not None and lyapunov_out is not None:
@@ -59,12 +59,9 @@ def _lyapunov_lines(found: ImportedLyapunov) -> list[str]:
     """What the import of a Lyapunov network found, for people."""
     from certify.lyapunov.file import FORMAT
 
-    difference = found.difference
     return [
         f"lyapunov {found.words}, as {FORMAT}: N(x) = net(x), {found.meaning}",
-        f"compared with the framework's own evaluation at {difference.states:,} states: largest difference "
-        f"{difference.largest:.3g} (its rounding explains up to {difference.explained:.3g} there), "
-        f"{difference.in_double:.3g} where it works in double precision",
+        *checked(found.difference, None, found.assumed, found.not_read),
         f"N(0)     {found.at_origin:.9g}",
         "level    none: what the file's makers say of a level is not imported, and nothing is proved of N here",
     ]
@@ -77,7 +74,11 @@ def _summary(imported: Imported, out: Path, beside: ImportedLyapunov | None, bes
         "system": policy.system,
         "imported": dict(policy.training["imported"]),
         "formula": imported.formula,
-        "compared": _compared(imported.difference),
+        "compared": None if imported.compared_with is None else _compared(imported.difference),
+        "compared_with": imported.compared_with,
+        "folding": _compared(imported.difference),
+        "assumed": imported.assumed or None,
+        "not_read": dict(imported.not_read),
         "pi_0": imported.at_origin.tolist(),
         "u_eq": imported.u_eq.tolist(),
         "centre": policy.network.centre,
@@ -96,7 +97,10 @@ def _lyapunov_summary(found: ImportedLyapunov, out: Path | None) -> dict[str, An
         "widths": list(found.function.widths),
         "imported": dict(found.stored.training["imported"]),
         "meaning": found.meaning,
-        "compared": _compared(found.difference),
+        "compared": None,
+        "folding": _compared(found.difference),
+        "assumed": found.assumed,
+        "not_read": dict(found.not_read),
         "N_0": found.at_origin,
         "level": None,
     }

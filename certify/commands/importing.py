@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 _PANEL = "Policies of other programs"
 
 
-def _option(help_: str, *names: str) -> Any:
-    return Annotated[str | None, typer.Option(*names, help=help_, rich_help_panel=_PANEL)]
+def _option(help_: str, *names: str, of: Any = str) -> Any:
+    return Annotated[of | None, typer.Option(*names, help=help_, rich_help_panel=_PANEL)]
 
 
 _KINDS = "state-dict, torchscript, onnx, sb3, safetensors or two-stage; auto looks at the file."
@@ -43,6 +43,8 @@ _OPTIONS: dict[str, Any] = {
     "clip": _option("Bounds LO:HI of the action before scale and offset, one pair or one for each input."),
     "centre": _option("Make pi(0) = u_eq: output or preactivation; nothing is centred unless this asks for it."),
     "observes": _option("Whether the network reads absolute states or their deviation from the operating point."),
+    "ignore": _option("Tensor that is no part of the policy, * and ? as in names of files; repeatable.", of=list[str]),
+    "output": _option("Output of an ONNX graph that is the action, where there are several."),
 }
 
 
@@ -85,11 +87,16 @@ def policy_of(path: Path, importing: ImportOptions, system: str | None, params: 
     )
 
 
-def imported_policy(path: Path, importing: ImportOptions, system: str | None, params: list[str]) -> Imported:
-    """The policy in a file of another program, for the plant that `system` names."""
+def imported_policy(
+    path: Path, importing: ImportOptions, system: str | None, params: list[str], beside: str | None
+) -> Imported:
+    """The policy in a file of another program, for the plant that `system` names.
+
+    `beside` is where the Lyapunov network lies that is imported with it.
+    """
     from certify.policies.importers import import_policy
 
-    return import_policy(path, _plant_for(path, system, params), importing)
+    return import_policy(path, _plant_for(path, system, params), importing, beside)
 
 
 def imported_lyapunov(
@@ -112,7 +119,7 @@ def _plant_for(path: Path, system: str | None, params: list[str]) -> System:
     return with_params(chosen_system(system), params)
 
 
-def _parsed(texts: dict[str, str | None]) -> ImportOptions:
+def _parsed(texts: dict[str, Any]) -> ImportOptions:
     from certify.policies.importers import ImportOptions
     from certify.systems import exact
 
@@ -124,18 +131,20 @@ def _parsed(texts: dict[str, str | None]) -> ImportOptions:
     if epsilon is not None and len(epsilon) != 1:
         raise InputError(f"--epsilon takes one number; found {texts['epsilon']!r}.")
     return ImportOptions(
-        kind=texts["kind"] or "auto",  # type: ignore[arg-type]
+        kind=texts["kind"] or "auto",
         prefix=texts["prefix"],
         activation=texts["activation"],
-        squash=texts["squash"],  # type: ignore[arg-type]
+        squash=texts["squash"],
         states=None if states is None else tuple(name.strip() for name in states.split(",")),
         normaliser=None if normaliser is None else "none" if normaliser == "none" else Path(normaliser),
         epsilon=None if epsilon is None else epsilon[0],
         action_scale=rationals("action_scale", "--action-scale"),
         action_offset=rationals("action_offset", "--action-offset"),
         clip=_clip(texts["clip"]),
-        centre=texts["centre"],  # type: ignore[arg-type]
-        observes=texts["observes"],  # type: ignore[arg-type]
+        centre=texts["centre"],
+        observes=texts["observes"],
+        ignore=tuple(texts["ignore"] or ()) or None,
+        output=texts["output"],
     )
 
 

@@ -8,6 +8,7 @@ sets as they are, and only their levels are called otherwise.
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -44,7 +45,10 @@ class ImportedLyapunov:
     stored : the same with its plant, and the record of its origin in `training`.
     words : where it lies in the file, and its widths.
     meaning : what N is beside the file's own function, for people.
-    difference : how far it is from the framework's own evaluation, in units of N.
+    difference : how far it is from what torch's layers give with the same numbers, in units of N: this checks the
+        folding. The file holds no program, and nothing is compared with one.
+    assumed : who says what stands between the numbers.
+    not_read : why each tensor of the file that was not read is left out, by its name.
     at_origin : N(0).
     """
 
@@ -53,6 +57,8 @@ class ImportedLyapunov:
     words: str
     meaning: str
     difference: Difference
+    assumed: str
+    not_read: Mapping[str, str]
     at_origin: float
 
 
@@ -71,7 +77,7 @@ def import_lyapunov(
     Raises
     ------
     InputError : the file is of another kind, does not say enough and the options do not either, holds no such network
-        or more than its layers, or what is folded differs from the framework's own evaluation by more than rounding.
+        or what could belong to it and is not read, or the folding is wrong by more than rounding.
 
     Notes
     -----
@@ -95,7 +101,7 @@ def _imported(raw: bytes, name: str, plant: System, options: ImportOptions, pref
         )
     tensors = tensors_in(kind, raw, name)
     _require_answers(kind, options, prefix, plant, tensors)
-    reading = read_lyapunov(tensors, prefix)
+    reading = read_lyapunov(tensors, prefix, options)
     states = options.states if options.states is not None else tuple(s.name for s in plant.states)
     index = index_of(states, plant)
     if (reading.n, reading.m) != (len(states), 1):
@@ -117,7 +123,9 @@ def _imported(raw: bytes, name: str, plant: System, options: ImportOptions, pref
         "network": reading.words,
         "states": ", ".join(states),
         "options": options.given | ({} if prefix is None else {"--lyapunov-prefix": prefix}),
-        "largest_difference": difference.largest,
+        "compared_with": None,
+        "folding_difference": difference.largest,
+        "not_read": dict(reading.unread),
     }
     parameters = {parameter: str(value) for parameter, value in plant.parameters.items()}
     return ImportedLyapunov(
@@ -126,6 +134,8 @@ def _imported(raw: bytes, name: str, plant: System, options: ImportOptions, pref
         words=reading.words,
         meaning=_SIGMOID if kind == "two-stage" else _UNKNOWN,
         difference=difference,
+        assumed=reading.assumed,
+        not_read=reading.unread,
         at_origin=float(function(np.zeros(plant.n))),
     )
 

@@ -5,6 +5,8 @@ Nothing in a file is executed, and equal policies give equal bytes (see `certify
 
 from __future__ import annotations
 
+import shlex
+import zipfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -24,6 +26,11 @@ SECOND = "certify-policy/2"
 _KEYS = {"format", "activation", "weights", "biases", "output", "centre", "system"}
 _OPTIONAL = {"training", "beta", "valid"}
 _WHAT = "policy file"
+_START = 4096
+_COMES_FROM = (
+    "A policy file comes from controllers train, or from another program's file through certify import FILE "
+    "--system PLANT --out policy.pt."
+)
 _BETA_ROUNDING = 2.0**-20  # of tanh(beta): a few operations in single precision
 
 
@@ -130,14 +137,65 @@ def load_policy(path: str | Path) -> Policy:
 
     Raises
     ------
-    InputError : the file is missing, is not an archive of plain tensors, or does not follow
-        `certify-policy/1` or `certify-policy/2`.
+    InputError : the file is missing, is not an archive of plain tensors, does not follow `certify-policy/1` or
+        `certify-policy/2`, or is another program's; then the message says how to import it.
     """
-    data = read_plain(path, _WHAT)
+    try:
+        data = read_plain(path, _WHAT)
+    except InputError as error:
+        raise InputError(_other(Path(path)) or str(error)) from error
+    if not isinstance(data, dict) or "format" not in data:
+        found = f"a file of torch.save without `format`, a {type(data).__name__}"
+        raise InputError(_to_import(Path(path), found))
     try:
         return _policy(data)
     except InputError as error:
         raise InputError(f"policy file {path}: {error}") from error
+
+
+def is_text(raw: bytes) -> bool:
+    """Whether bytes are text that a person could read, by how they begin."""
+    start = raw[:_START]
+    try:
+        words = start.decode("utf-8")
+    except UnicodeDecodeError as error:
+        if error.start < len(start) - 3:  # a letter may be cut off at the end
+            return False
+        words = start[: error.start].decode("utf-8")
+    return bool(words) and all(c.isprintable() or c in "\t\r\n\f" for c in words)
+
+
+def _other(path: Path) -> str | None:
+    """The message for a file that is no policy file of this program, if its bytes say what it is."""
+    try:
+        with path.open("rb") as file:
+            raw = file.read(_START)
+            names = set(zipfile.ZipFile(file).namelist()) if raw.startswith(b"PK") else set()
+    except (OSError, ValueError, zipfile.BadZipFile, NotImplementedError):
+        return None
+    if {"data", "policy.pth"} <= names:
+        return _to_import(path, "a zip file of stable-baselines3")
+    if any("/code/" in name for name in names):
+        return _to_import(path, "a file of TorchScript")
+    if any(name.endswith("/data.pkl") for name in names):
+        return _to_import(path, "a file of torch.save with more than plain tensors in it")
+    if path.suffix == ".onnx":
+        return _to_import(path, "an ONNX model")
+    if path.suffix == ".safetensors" or raw[8:9] == b"{":
+        return _to_import(path, "a file of safetensors")
+    if is_text(raw):
+        return f"{_WHAT} {path} must hold a policy; it is text. {_COMES_FROM}"
+    return None
+
+
+def _to_import(path: Path, found: str) -> str:
+    """The message for a file that another program wrote, with the command to type."""
+    file, out = (shlex.quote(str(p)) for p in (path, f"{path.stem}-policy.pt"))
+    return (
+        f"{_WHAT} {path} must be one of this program; it is {found}. If it holds a policy, import it first, for the "
+        f"plant that it controls: certify import {file} --system PLANT --out {out}. The import asks for what the file "
+        "does not say."
+    )
 
 
 def _policy(data: Any) -> Policy:

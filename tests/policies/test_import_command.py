@@ -92,7 +92,10 @@ def test_import_as_json(run: Run) -> None:
     policy = load_policy("p.pt")
     assert data["policy"]["sha256"] == policy.network.sha256() and policy.parameters == {"k": "3"}
     assert policy.network.clip is not None and policy.network.clip[0][0] == float(-2 / 3)
-    assert data["compared"]["states"] == 10_000 and data["compared"]["in_double_precision"] < 1e-12
+    assert data["compared"] is None and data["compared_with"] is None and "--activation" in data["assumed"]
+    assert data["folding"]["states"] == 10_000 and data["folding"]["in_double_precision"] < 1e-12
+    assert data["imported"]["compared_with"] is None and "largest_difference" not in data["imported"]
+    assert data["not_read"] == {} == data["imported"]["not_read"]
     assert data["centre"] == "output" and data["centring_changes_u_by"]["output"] == pytest.approx(abs(data["pi_0"][0]))
     assert data["imported"]["options"]["--action-offset"] == "1/3"
 
@@ -176,16 +179,21 @@ def test_the_lyapunov_network_beside_the_policy(run: Run) -> None:
     assert isinstance(stored.function, Neural) and stored.parameters == {"k": "3"} and stored.system == "chain"
     x = np.random.default_rng(0).uniform(-1, 1, (20, 2))
     np.testing.assert_allclose(stored.function(x), values(module, x)[:, 0], rtol=1e-12)
-    # the policy is the one without --lyapunov-out, and so are its words
-    status, plain, _ = run(*given, "--out", "q.pt")
-    assert Path("p.pt").read_bytes() == Path("q.pt").read_bytes()
-    assert plain.replace("q.pt", "p.pt").splitlines() == out.splitlines()[: plain.count("\n")]
+    # without --lyapunov-out the network could belong to the policy; with --ignore the policy is the same
+    status, _, err = run(*given, "--out", "q.pt")
+    assert status == 2 and "--ignore V.0.bias" in err and not Path("q.pt").exists()
+    status, plain, _ = run(*given, "--ignore", "V.*", "--out", "q.pt")
+    assert load_policy("p.pt").network.sha256() == load_policy("q.pt").network.sha256()
+    same = plain.replace("q.pt", "p.pt").replace("--ignore names it", "the Lyapunov network that is imported beside it")
+    assert same.splitlines() == out.splitlines()[: plain.count("\n")]
     data = json.loads(run(*given, "--out", "p.pt", *wanted, "--json")[1])
     found = data["lyapunov"]
     assert (found["path"], found["format"], found["widths"]) == ("V.pt", "certify-lyapunov/1", [2, 6, 1])
     assert found["level"] is None and found["N_0"] == stored.function(np.zeros(2))
-    assert found["compared"]["states"] == 10_000 and found["compared"]["in_double_precision"] < 1e-12
-    assert json.loads(run(*given, "--out", "p.pt", "--json")[1])["lyapunov"] is None
+    assert found["compared"] is None and "--activation" in found["assumed"]
+    assert found["folding"]["states"] == 10_000 and found["folding"]["in_double_precision"] < 1e-12
+    assert set(found["not_read"].values()) == {"the policy beside it"} and len(found["not_read"]) == 6
+    assert json.loads(run(*given, "--ignore", "V.*", "--out", "p.pt", "--json")[1])["lyapunov"] is None
 
 
 @pytest.mark.parametrize(

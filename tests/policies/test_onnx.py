@@ -163,7 +163,7 @@ REFUSED = {
     "a function that redefines tanh": (function(model(chain(*MLP))), "standard operators"),
     "no set of operators": (no_operator_set(model(chain(*MLP))), "evaluator of the onnx package"),
     "a tensor twice": (twice(model(chain(*MLP))), "once"),
-    "a branch": (model([*chain(*TWO), node("Add", "h0", "u", out="v")]), "must join one value|one value"),
+    "a branch": (model([*chain(*TWO)[:1], node("Tanh", "h0", out="v"), node("Add", "h0", "v", out="u")]), "join one"),
     "integers": (model(chain(*MLP), {**CONSTANTS, "W1": np.ones((2, 6), np.int64)}), "floating-point"),
     "nan": (model(chain(*MLP), {**CONSTANTS, "B1": B1 * np.nan}), "finite"),
     "a zero": (model(chain(("Div", "*", "zero"), *MLP)), "divides by 0"),
@@ -198,3 +198,223 @@ def test_damaged_files_and_missing_packages(tmp_path: Path, monkeypatch: pytest.
     path.write_bytes(b"\x0a\xff\xff noise")
     with pytest.raises(InputError, match="no ONNX file"):
         import_policy(path, plant(), SAID)
+
+
+# --------------------------------------------------------------------------------- what exporters write around layers
+
+SHAPE = numpy_helper.from_array(np.array([-1, 1], np.int64), "shape")
+
+
+def like_stable_baselines() -> Any:
+    """The graph that PPO of stable-baselines3 exports: a Flatten, an action, a value and the log of a probability."""
+    nodes = [
+        node("Cast", "x", out="cast", to=TensorProto.FLOAT),
+        node("Flatten", "cast", out="flat", axis=1),
+        node("Gemm", "flat", "W1", "B1", out="h"),
+        node("Tanh", "h", out="latent"),
+        node("Gemm", "latent", "W2", "same", out="value"),
+        node("Identity", "B2", out="same"),
+        node("Gemm", "latent", "W2", "same", out="mu"),
+        node("Exp", "log_std", out="spread"),
+        node("Shape", "mu", out="size"),
+        node("ConstantOfShape", "size", out="zeros", value=numpy_helper.from_array(np.float32([0]), "z")),
+        node("Add", "zeros", "mu", out="sum"),
+        node("Add", "sum", "spread", out="both"),
+        node("Shape", "both", out="size2"),
+        node("Expand", "mu", "size2", out="expanded"),
+        node("Reshape", "expanded", "shape", out="action"),
+        node("Pow", "expanded", "spread", out="log_prob"),
+    ]
+    nodes[4], nodes[5] = nodes[5], nodes[4]
+    made = model(nodes, CONSTANTS | {"log_std": np.float32([0])})
+    made.graph.initializer.append(SHAPE)
+    del made.graph.output[:]
+    for name in ("action", "value", "log_prob"):
+        made.graph.output.append(helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", 1]))
+    return made
+
+
+def test_the_graph_of_stable_baselines_is_read_and_its_outputs_are_named(tmp_path: Path) -> None:
+    path = written(tmp_path, like_stable_baselines())
+    with pytest.raises(InputError, match=r"it has action, value, log_prob\. Say .* --output action"):
+        import_policy(path, plant(), SAID)
+    with pytest.raises(InputError, match=r"must name an output of policy\.onnx, action, value, log_prob; found 'mu'"):
+        import_policy(path, plant(), replace(SAID, output="mu"))
+    imported = import_policy(path, plant(), replace(SAID, output="action"))
+    assert np.max(np.abs(imported.policy.network(X, (Fraction(0),)) - net(X))) < 1e-12
+    assert imported.difference.in_double < 1e-12
+    assert imported.not_read == {"log_std": "action does not depend on it"}
+    assert imported.compared_with is not None and "run by the reference evaluator of onnx" in imported.compared_with
+    assert imported.policy.training["imported"]["options"]["--output"] == "action"
+
+
+def test_an_exported_policy_of_stable_baselines(tmp_path: Path) -> None:
+    """By torch's own exporter, as the documentation of stable-baselines3 has it."""
+    import warnings
+
+    import torch
+
+    from tests.support.foreign import sb3
+
+    class Exported(torch.nn.Module):
+        def __init__(self, policy: Any) -> None:
+            super().__init__()
+            self.policy = policy
+
+        def forward(self, x: torch.Tensor) -> Any:
+            return self.policy(x, deterministic=True)
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        model_, _, _, _ = sb3("PPO", tmp_path)
+        with torch.no_grad():
+            for parameter in model_.policy.parameters():
+                parameter.add_(0.1 * torch.randn_like(parameter))
+        names = {"input_names": ["x"], "output_names": ["action", "value", "log_prob"]}
+        torch.onnx.export(
+            Exported(model_.policy), (torch.zeros(1, 2),), str(tmp_path / "p.onnx"), dynamo=False, **names
+        )
+    imported = import_policy(tmp_path / "p.onnx", plant(), replace(SAID, output="action"))
+    with torch.no_grad():
+        theirs = model_.policy(torch.tensor(X, dtype=torch.float32), deterministic=True)[0].numpy()
+    assert np.max(np.abs(imported.policy.network(X, (Fraction(0),)) - theirs)) < 1e-5
+    assert "policy.log_std" in imported.not_read
+
+
+def shaped(kind: str, *inputs: str, shape: list[int] | None = None, **attributes: Any) -> Any:
+    made = model([*chain(*MLP[:2]), node(kind, "u", *inputs, out="v", **attributes), node("Gemm", "v", "W2", out="w")])
+    made.graph.output[0].name = "w"
+    if shape is not None:
+        made.graph.initializer.append(numpy_helper.from_array(np.array(shape, np.int64), "s"))
+    return made
+
+
+SHAPED = {
+    "a column": (shaped("Flatten", axis=0), "Flatten .* is not read"),
+    "another width": (shaped("Reshape", "s", shape=[-1, 3]), "Reshape .* is not read"),
+    "another rank": (shaped("Reshape", "s", shape=[-1, 2, 3]), "Reshape .* is not read"),
+    "allowzero": (shaped("Reshape", "s", shape=[0, -1], allowzero=1), "Reshape .* is not read"),
+    "integers": (shaped("Cast", to=TensorProto.INT64), "must be a cast to float32 or float64"),
+    "half precision": (shaped("Cast", to=TensorProto.FLOAT16), "must be a cast to float32 or float64"),
+    "an unknown shape": (shaped("Expand", "s", shape=[1, 6]), "as wide as it is"),
+    "a normalisation": (shaped("LayerNormalization", "B1"), "LayerNorm, and every other .* train the policy again"),
+    "a mean": (shaped("ReduceMean"), "a part of LayerNorm"),
+    "a sigmoid": (shaped("Sigmoid"), r"only tanh networks are proved.*activation_fn=torch\.nn\.Tanh"),
+}
+
+
+@pytest.mark.parametrize("name", SHAPED)
+def test_what_changes_a_value_is_refused(name: str, tmp_path: Path) -> None:
+    made, message = SHAPED[name]
+    with pytest.raises(InputError, match=message):
+        import_policy(written(tmp_path, made), plant(), SAID)
+
+
+def test_shapes_that_change_nothing_are_read(tmp_path: Path) -> None:
+    first = ("Gemm", "*", "W1", "B1"), ("Tanh", "*")
+    for more in (("Flatten", "*", {"axis": 1}), ("Flatten", "*"), ("Reshape", "*", "s"), ("Reshape", "*", "t")):
+        made = model(chain(*first, more, MLP[2]))
+        for name, shape in (("s", [-1, 6]), ("t", [0, -1])):
+            made.graph.initializer.append(numpy_helper.from_array(np.array(shape, np.int64), name))
+        imported = import_policy(written(tmp_path, made), plant(), SAID)
+        assert np.max(np.abs(imported.policy.network(X, (Fraction(0),)) - net(X))) < 1e-12
+
+
+# ------------------------------------------------------------------------------------------ weights in a second file
+
+
+def beside(folder: Path, **entries: str) -> Path:
+    """The model with its weights in a second file, and entries of the first tensor changed."""
+    made = model(chain(*MLP))
+    onnx.save_model(
+        made, folder / "policy.onnx", save_as_external_data=True, location="policy.onnx.data", size_threshold=0
+    )
+    made = onnx.load(folder / "policy.onnx", load_external_data=False)
+    tensor = made.graph.initializer[0]
+    said = {e.key: e.value for e in tensor.external_data} | entries
+    del tensor.external_data[:]
+    for key, value in said.items():
+        entry = tensor.external_data.add()
+        entry.key, entry.value = key, value
+    return written(folder, made)
+
+
+def test_weights_in_a_file_beside_the_model_are_read(tmp_path: Path) -> None:
+    import hashlib
+
+    imported = import_policy(beside(tmp_path), plant(), SAID)
+    assert np.max(np.abs(imported.policy.network(X, (Fraction(0),)) - net(X))) < 1e-12
+    digest = hashlib.sha256((tmp_path / "policy.onnx.data").read_bytes()).hexdigest()
+    assert imported.policy.training["imported"]["beside_sha256"] == {"policy.onnx.data": digest}
+
+
+PLACES = ["../policy.onnx.data", "/etc/passwd", "sub/policy.onnx.data", "..", "", "a\\b", "c:x", "a\0b"]
+
+
+@pytest.mark.parametrize("place", PLACES)
+def test_weights_elsewhere_are_not_read(place: str, tmp_path: Path) -> None:
+    (tmp_path / "inner").mkdir()
+    path = beside(tmp_path / "inner", location=place)
+    for folder in (tmp_path, tmp_path / "inner" / "sub"):
+        folder.mkdir(exist_ok=True)
+        (folder / "policy.onnx.data").write_bytes((tmp_path / "inner" / "policy.onnx.data").read_bytes())
+    with pytest.raises(InputError, match=r"one beside it under a plain name.*external_data=False"):
+        import_policy(path, plant(), SAID)
+
+
+def test_weights_that_are_no_plain_file_are_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import os
+
+    path, data = beside(tmp_path), tmp_path / "policy.onnx.data"
+    content = data.read_bytes()
+    (tmp_path / "elsewhere").write_bytes(content)
+    for make, message in (
+        (lambda: None, "Put it there. .*external_data=False"),
+        (lambda: data.symlink_to(tmp_path / "elsewhere"), "no link"),
+        (lambda: os.mkfifo(data), "plain file"),
+        (data.mkdir, "plain file"),
+    ):
+        if data.is_dir():
+            data.rmdir()
+        data.unlink(missing_ok=True)
+        make()
+        with pytest.raises(InputError, match=message):
+            import_policy(path, plant(), SAID)
+    data.rmdir()
+    data.write_bytes(content)
+    assert import_policy(path, plant(), SAID).difference.in_double < 1e-12
+    monkeypatch.setattr("certify.policies.importers.onnx_graph.MAX_BYTES", len(content) - 1)
+    with pytest.raises(InputError, match="at most 0 MiB"):
+        import_policy(path, plant(), SAID)
+
+
+@pytest.mark.parametrize(
+    ("entries", "message"),
+    [
+        ({"offset": "100000"}, "must lie inside of policy.onnx.data"),
+        ({"length": "100000"}, "must lie inside of policy.onnx.data"),
+        ({"offset": "-4"}, "whole numbers of bytes"),
+        ({"length": "1e3"}, "whole numbers of bytes"),
+        ({"offset": "9" * 400}, "whole numbers of bytes"),
+        ({"length": "4"}, "damaged"),
+    ],
+)
+def test_weights_that_reach_out_of_their_file_are_refused(
+    entries: dict[str, str], message: str, tmp_path: Path
+) -> None:
+    with pytest.raises(InputError, match=message):
+        import_policy(beside(tmp_path, **entries), plant(), SAID)
+
+
+def test_many_tensors_of_one_region_count_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = beside(tmp_path, offset="0", length=str((tmp_path / "x").write_bytes(b"") or 48))
+    size = (tmp_path / "policy.onnx.data").stat().st_size
+    monkeypatch.setattr("certify.policies.importers.onnx_graph.MAX_BYTES", size)
+    made = onnx.load(path, load_external_data=False)
+    for tensor in made.graph.initializer:
+        del tensor.external_data[:]
+        for key, value in (("location", "policy.onnx.data"), ("offset", "0"), ("length", str(size))):
+            entry = tensor.external_data.add()
+            entry.key, entry.value = key, value
+    with pytest.raises(InputError, match=r"the tensors of policy\.onnx must have at most"):
+        import_policy(written(tmp_path, made), plant(), SAID)

@@ -1,4 +1,4 @@
-"""Policies of other programs: read without executing anything, folded exactly, compared with the framework."""
+"""Policies of other programs: read without executing anything, folded exactly, compared with the file's own program."""
 
 from __future__ import annotations
 

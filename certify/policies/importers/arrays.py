@@ -46,6 +46,15 @@ def array_of(node: Any, what: str) -> Numbers:
     raise InputError(f"{what} must be a number or an array of numbers; found {brief(node)}.")
 
 
+def is_array(node: Any) -> bool:
+    """Whether a node of a pickle describes an array of numpy; a single number is none."""
+    if not isinstance(node, Call) or not isinstance(node.function, Name):
+        return False
+    module, name = node.function.module, node.function.name
+    rebuilt = module in [f"{part}.multiarray" for part in _NUMPY_PARTS] and name == "_reconstruct"
+    return rebuilt or (module in [f"{part}.numeric" for part in _NUMPY_PARTS] and name == "_frombuffer")
+
+
 def product(shape: Any, what: str) -> int:
     """How many numbers a shape holds.
 

@@ -21,6 +21,7 @@ import flint
 import numpy as np
 
 from certify.errors import InputError
+from certify.policies.importers.options import WITH_TANH
 from certify.policies.importers.steps import Affine, Clip, Diagonal, Normalise, Step, Tanh, spread
 from certify.policies.network import Array, Squash
 
@@ -192,7 +193,8 @@ def _layer(head: _Head | None, segment: Sequence[Step], width: int) -> tuple[Arr
         if isinstance(step, Clip):
             relu = all(v == 0 for v in step.lo) and all(v is None for v in step.hi)
             found = "ReLU" if relu else "a clip"
-            raise InputError(f"the activation must be tanh; the file has {found} between its layers.")
+            after = f" {WITH_TANH}" if relu else ""
+            raise InputError(f"the activation must be tanh; the file has {found} between its layers.{after}")
         if isinstance(step, Normalise):
             raise InputError("a normaliser must read the observation itself.")
     if len(segment) == 1 and isinstance(segment[0], Affine) and (head is None or head.is_nothing):

@@ -19,7 +19,7 @@ import numpy as np
 
 from certify.errors import InputError
 from certify.policies.exact import require_centred
-from certify.policies.file import Policy
+from certify.policies.file import Policy, is_text
 from certify.policies.importers.archives import MAX_BYTES, Archive
 from certify.policies.importers.arrays import Numbers
 from certify.policies.importers.comparing import Difference, compare_reading
@@ -54,7 +54,11 @@ class Imported:
     policy : the policy, with the record of its origin in `training`.
     words : the kind of file and of policy.
     formula : what the file's policy is, for people.
-    difference : how far it is from the framework's own evaluation.
+    difference : how far it is from what the file's own program gives, or, where the file holds no program, from what
+        torch's layers give with the same numbers, which checks the folding alone.
+    compared_with : the file's own program with which it was compared, for people; None where nothing was compared.
+    assumed : where nothing was compared, who says what stands between the numbers.
+    not_read : why each tensor of the file that was not read is left out, by its name.
     at_origin : pi(0), shape (m,).
     u_eq : the plant's equilibrium input, shape (m,).
     centring : for each centring that is possible the largest change of u over the states compared.
@@ -64,6 +68,9 @@ class Imported:
     words: str
     formula: str
     difference: Difference
+    compared_with: str | None
+    assumed: str
+    not_read: Mapping[str, str]
     at_origin: Array
     u_eq: Array
     centring: Mapping[Centre, float]
@@ -92,7 +99,9 @@ def content_of(raw: bytes, name: str) -> Content | None:
     return None
 
 
-def import_policy(path: Path, plant: System, options: ImportOptions | None = None) -> Imported:
+def import_policy(
+    path: Path, plant: System, options: ImportOptions | None = None, beside: str | None = None
+) -> Imported:
     """Read a policy of another program for a plant.
 
     Parameters
@@ -100,16 +109,17 @@ def import_policy(path: Path, plant: System, options: ImportOptions | None = Non
     path : the file.
     plant : the plant that it controls: its states, inputs, domain and u_eq.
     options : what the file cannot say.
+    beside : keys of the layers of the Lyapunov network that is imported from the same file, if one is.
 
     Raises
     ------
     InputError : the file is of no kind that is read, does not say enough and the options do not either, holds what is
-        not proved, or differs from the framework's own evaluation by more than rounding.
+        not proved or could belong to the policy and is not read, or differs from its own program by more than rounding.
     """
     options = options if options is not None else ImportOptions()
     raw = read_bytes(path)
     try:
-        return import_bytes(raw, path.name, plant, options)
+        return import_bytes(raw, path.name, plant, options, folder=path.parent, beside=beside)
     except InputError as error:
         raise InputError(f"policy file {path}: {error}") from error
 
@@ -130,14 +140,22 @@ def read_bytes(path: Path) -> bytes:
 
 
 def import_bytes(
-    raw: bytes, name: str, plant: System, options: ImportOptions, evaluate: Evaluate | None = None
+    raw: bytes,
+    name: str,
+    plant: System,
+    options: ImportOptions,
+    *,
+    evaluate: Evaluate | None = None,
+    folder: Path | None = None,
+    beside: str | None = None,
 ) -> Imported:
     """The same for the bytes of such a file, called `name`.
 
     Parameters
     ----------
-    evaluate : what the policy is compared with, in the place of its framework's operations; where the policy itself is
-        at hand.
+    evaluate : the policy itself, where it is at hand; it is compared with that.
+    folder : where the file lies, if it lies anywhere; an ONNX model may have its weights in a second file there.
+    beside : as in `import_policy`.
 
     Raises
     ------
@@ -145,9 +163,9 @@ def import_bytes(
     """
     kind = kind_of(raw, name, options)
     n = plant.n if options.states is None else len(options.states)
-    reading = _read(kind, raw, name, options, n, plant.m)
+    reading = _read(kind, raw, name, options, n, plant.m, folder, beside)
     if evaluate is not None:
-        reading = replace(reading, evaluate=evaluate)
+        reading = replace(reading, evaluate=evaluate, program="the module itself, run")
     _require_answers(kind, reading, options, plant)
     states = options.states if options.states is not None else tuple(s.name for s in plant.states)
     index = index_of(states, plant)
@@ -185,12 +203,19 @@ def import_bytes(
     bare = network if reading.beta is not None else replace(network, centre="none")
     values = bare(x, u_eq)
     difference = compare_reading(reading, before, after, x[:, index], values)
-    record["largest_difference"] = difference.largest
+    record["compared_with"] = reading.program
+    record["largest_difference" if reading.program is not None else "folding_difference"] = difference.largest
+    record["not_read"] = dict(reading.unread)
+    if reading.beside:
+        record["beside_sha256"] = dict(reading.beside)
     return Imported(
         policy=Policy(network, plant.name, _parameters(plant), {"imported": record}, reading.beta, valid),
         words=reading.words,
         formula=_formula(normaliser, network, folded, reading),
         difference=difference,
+        compared_with=reading.program,
+        assumed=reading.assumed,
+        not_read=reading.unread,
         at_origin=np.asarray(bare(np.zeros(plant.n), u_eq)),
         u_eq=np.array([float(u) for u in u_eq]),
         centring={} if reading.beta is not None else _centrings(bare, u_eq, x, values),
@@ -206,12 +231,13 @@ def kind_of(raw: bytes, name: str, options: ImportOptions) -> Content:
     """
     kind = options.kind if options.kind in ("onnx", "safetensors") else content_of(raw, name)
     if kind is None:
-        pickled = raw[:1] in (b"\x80", b"(")
-        found = "a bare pickle, or torch's format of before version 1.6" if pickled else "none of these"
-        raise InputError(
-            "it must be a file of torch.save, TorchScript, stable-baselines3, ONNX or safetensors; "
-            f"it is {found}. If you trust it, load it and write it again with torch.save."
-        )
+        wanted = "it must be a file of torch.save, TorchScript, stable-baselines3, ONNX or safetensors"
+        if raw[:1] in (b"\x80", b"("):
+            raise InputError(
+                f"{wanted}; it is a bare pickle, or torch's format of before version 1.6. If you trust it, load it and "
+                "write it again with torch.save."
+            )
+        raise InputError(f"{wanted}; it is none of these{', but text' if is_text(raw) else ''}.")
     if kind == "policy":
         raise InputError("it is a policy file of this program already: use it with certify roa --policy.")
     if options.kind not in ("auto", kind) and (options.kind, kind) != ("state-dict", "two-stage"):
@@ -219,14 +245,23 @@ def kind_of(raw: bytes, name: str, options: ImportOptions) -> Content:
     return kind if options.kind == "auto" else options.kind
 
 
-def _read(kind: Content, raw: bytes, name: str, options: ImportOptions, n: int, m: int) -> Reading:
+def _read(
+    kind: Content,
+    raw: bytes,
+    name: str,
+    options: ImportOptions,
+    n: int,
+    m: int,
+    folder: Path | None,
+    beside: str | None,
+) -> Reading:
     readers: dict[Content, Callable[[], Reading]] = {
-        "sb3": lambda: read_sb3(Archive(raw, name), name),
+        "sb3": lambda: read_sb3(Archive(raw, name), name, options.ignore),
         "torchscript": lambda: read_torchscript(TorchFile(raw, name)),
-        "onnx": lambda: read_onnx(raw, name),
-        "safetensors": lambda: read_state_dict(tensors_in(kind, raw, name), options, n, m),
+        "onnx": lambda: read_onnx(raw, name, options.output, folder),
+        "safetensors": lambda: read_state_dict(tensors_in(kind, raw, name), options, n, m, beside),
         "two-stage": lambda: read_two_stage(tensors_in(kind, raw, name), options),
-        "state-dict": lambda: read_state_dict(tensors_in(kind, raw, name), options, n, m),
+        "state-dict": lambda: read_state_dict(tensors_in(kind, raw, name), options, n, m, beside),
     }
     return readers[kind]()
 
@@ -261,6 +296,8 @@ def _require_answers(kind: Content, reading: Reading, options: ImportOptions, pl
         ("--prefix", options.prefix, layers_only),
         ("--normaliser", options.normaliser, kind != "two-stage"),
         ("--centre", options.centre, kind != "two-stage" or options.centre == "preactivation"),
+        ("--ignore", options.ignore, kind not in ("torchscript", "onnx")),
+        ("--output", options.output, kind == "onnx"),
     ):
         if value is not None and not belongs:
             raise InputError(f"{option} must be left out: a file of {kind} says it itself.")

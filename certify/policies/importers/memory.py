@@ -59,7 +59,7 @@ def import_module(module: torch.nn.Module, plant: System, options: ImportOptions
     except Exception as error:  # code of whoever wrote the module
         raise InputError(f"{name} cannot be copied and traced: {_brief(error)} {_INSTEAD}") from error
     try:
-        return import_bytes(raw, name, plant, options, evaluate)
+        return import_bytes(raw, name, plant, options, evaluate=evaluate)
     except InputError as error:
         raise InputError(f"{name}: {error}") from error
 

@@ -70,15 +70,26 @@ def _vec_normalize(root: Any, what: str) -> Normaliser:
     return Normalise(exactly(mean), tuple(v + epsilon for v in exactly(var)), limit)
 
 
-def rsl_normaliser(tensors: Mapping[str, Numbers], epsilon: Fraction | None) -> Diagonal | None:
-    """The empirical normaliser of the policy's observations in a checkpoint of rsl_rl, or None if it has none."""
+def normaliser_root(tensors: Mapping[str, Numbers]) -> str | None:
+    """What stands before the names of that normaliser's tensors, or None if the file has none.
+
+    Raises
+    ------
+    InputError : there are several.
+    """
     roots = [name.removesuffix("_mean") for name in tensors if name.rpartition(".")[2] == "_mean"]
     roots = [r for r in roots if f"{r}_std" in tensors and not any(word in r for word in _CRITIC)]
-    if not roots:
-        return None
     if len(roots) > 1:
         raise InputError(f"a checkpoint must hold one normaliser of observations; found {', '.join(roots)}.")
-    mean, std = exactly(tensors[f"{roots[0]}_mean"]), exactly(tensors[f"{roots[0]}_std"])
+    return roots[0] if roots else None
+
+
+def rsl_normaliser(tensors: Mapping[str, Numbers], epsilon: Fraction | None) -> Diagonal | None:
+    """The empirical normaliser of the policy's observations in a checkpoint of rsl_rl, or None if it has none."""
+    root = normaliser_root(tensors)
+    if root is None:
+        return None
+    mean, std = exactly(tensors[f"{root}_mean"]), exactly(tensors[f"{root}_std"])
     divisors = [s + (_RSL_EPSILON if epsilon is None else epsilon) for s in std]
     if len(mean) != len(std) or any(d <= 0 for d in divisors):
         raise InputError("a normaliser must have as many means as standard deviations, and these must be positive.")

@@ -34,7 +34,10 @@ def index_of(states: tuple[str, ...], plant: System) -> list[int]:
         if name not in known:
             raise InputError(
                 f"the network must read states of {plant.name}, {', '.join(known)}; --states names {name!r}. "
-                "An observation that is a function of states, such as the cosine of an angle, is not proved."
+                "An observation that is a function of states, such as the cosine of an angle, is not proved: only "
+                "networks that read the states themselves are. Train the policy again on the states, through a wrapper "
+                "of the environment that returns them: for the observations (cos_theta, sin_theta, theta_dot) "
+                "gymnasium.wrappers.TransformObservation with (arctan2(sin_theta, cos_theta), theta_dot)."
             )
     return [known.index(name) for name in states]
 

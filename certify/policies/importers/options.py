@@ -18,6 +18,16 @@ Kind = Literal["auto", "state-dict", "torchscript", "onnx", "sb3", "safetensors"
 Output = Literal["identity", "tanh", "relu-tanh"]
 Observes = Literal["absolute", "deviation"]
 REFUSED_ACTIVATIONS = ("relu", "elu", "selu", "gelu", "silu", "leaky_relu", "sigmoid", "softplus", "mish")
+WITH_TANH = (
+    "Train the policy again with torch.nn.Tanh() between its layers: policy_kwargs=dict(activation_fn=torch.nn.Tanh) "
+    "for stable-baselines3, activation = 'tanh' for rsl_rl, fcnet_activation = 'tanh' for RLlib."
+)
+"""The next step where a policy has another activation."""
+WITHOUT_NORMALISATION = (
+    "LayerNorm, and every other normalisation between layers, is not supported: train the policy again without it. "
+    "BatchNorm alone is affine in evaluation and can be folded into the layer before it."
+)
+"""The next step where a policy has a normalisation between its layers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,6 +47,8 @@ class ImportOptions:
     clip : bounds of the action, before scale and offset.
     centre : how pi(0) = u_eq is brought about; None leaves the policy as it is.
     observes : whether the network reads the plant's states or their deviations from its operating point.
+    ignore : names of tensors that are no part of the policy, with `*` and `?` as in names of files.
+    output : which output of an ONNX graph is the action, where it has several.
 
     Raises
     ------
@@ -55,6 +67,8 @@ class ImportOptions:
     clip: Clip | None = None
     centre: Centre | None = None
     observes: Observes | None = None
+    ignore: tuple[str, ...] | None = None
+    output: str | None = None
 
     def __post_init__(self) -> None:
         for option, value, known in (
@@ -68,7 +82,7 @@ class ImportOptions:
         if self.activation is not None and self.activation != "tanh":
             named = self.activation.lower() in REFUSED_ACTIVATIONS
             found = f"{self.activation} is not proved" if named else f"found {self.activation!r}"
-            raise InputError(f"--activation must be tanh: only tanh networks are proved; {found}.")
+            raise InputError(f"--activation must be tanh: only tanh networks are proved; {found}. {WITH_TANH}")
         if self.states is not None and len(set(self.states)) != len(self.states):
             raise InputError(f"--states must name each state once; found {','.join(self.states)}.")
         if self.action_scale is not None and 0 in self.action_scale:
@@ -88,6 +102,7 @@ _OPTIONS = {
     "kind": "--from", "prefix": "--prefix", "activation": "--activation", "squash": "--squash", "states": "--states",
     "normaliser": "--normaliser", "epsilon": "--epsilon", "action_scale": "--action-scale",
     "action_offset": "--action-offset", "clip": "--clip", "centre": "--centre", "observes": "--observes",
+    "ignore": "--ignore", "output": "--output",
 }  # fmt: skip
 
 

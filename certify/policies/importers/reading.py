@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from fractions import Fraction
 from typing import Any
 
@@ -36,6 +36,11 @@ class Reading:
     beta : stored `atanh((u_eq - offset) / scale)` of a policy that is centred inside its squash, shape (m,).
     equilibrium : the state at which a policy of that kind is centred, shape (n,).
     double : whether the file itself asks for double precision.
+    program : the part of the file's own program that `evaluate` runs, for people; None where the file holds numbers and
+        no program, so that `evaluate` can check the folding alone.
+    assumed : where there is no program, who says what stands between the numbers.
+    unread : why each tensor that is not read is left out, by its name.
+    beside : SHA-256 of each other file that was read with it, by its name.
 
     Raises
     ------
@@ -50,6 +55,10 @@ class Reading:
     beta: Array | None = None
     equilibrium: Array | None = None
     double: bool = False
+    program: str | None = None
+    assumed: str = ""
+    unread: Mapping[str, str] = field(default_factory=dict)
+    beside: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if not any(isinstance(step, Affine) for step in self.steps):

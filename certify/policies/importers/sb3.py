@@ -23,10 +23,12 @@ from certify.policies.importers.pickles import Call, Name, brief, read_pickle
 from certify.policies.importers.reading import Observations, Reading, Values, between, perceptron, widths
 from certify.policies.importers.steps import Affine, Clip, Diagonal, Tanh, exactly, linear
 from certify.policies.importers.tensors import load_tensors
+from certify.policies.importers.unread import braced, unread
 
 _ON_POLICY = Name("stable_baselines3.common.policies", "ActorCriticPolicy")
 _SAC = Name("stable_baselines3.sac.policies", "SACPolicy")
 _TD3 = Name("stable_baselines3.td3.policies", "TD3Policy")
+_DEFAULTS = {_ON_POLICY: "PPO and A2C", _SAC: "SAC", _TD3: "TD3 and DDPG"}
 _TANH = Name("torch.nn.modules.activation", "Tanh")
 _FLATTEN = Name("stable_baselines3.common.torch_layers", "FlattenExtractor")
 _HARMLESS = {  # they change how a policy was trained, or are seen in its tensors
@@ -36,12 +38,17 @@ _HARMLESS = {  # they change how a policy was trained, or are seen in its tensor
 _BELOW = ("features_extractor", "pi_features_extractor")
 
 
-def read_sb3(archive: Archive, what: str) -> Reading:
+def read_sb3(archive: Archive, what: str, ignored: tuple[str, ...] | None = None) -> Reading:
     """The deterministic policy of an SB3 file.
+
+    Parameters
+    ----------
+    ignored : names of tensors that are no part of the policy.
 
     Raises
     ------
-    InputError : the file is damaged, its policy is of another class or activation, or a space is no box.
+    InputError : the file is damaged, its policy is of another class or activation, holds a tensor that could belong to
+        it, or a space is no box.
     """
     try:
         data = json.loads(archive.read("data"))
@@ -60,7 +67,7 @@ def read_sb3(archive: Archive, what: str) -> Reading:
     tensors = load_tensors(archive.read("policy.pth"), f"policy.pth in {what}")
     if any(name.startswith(_BELOW) for name in tensors):
         raise InputError(f"{what} must have no features extractor of its own; its tensors have one.")
-    layers = _layers(tensors, policy, what)
+    layers, left = _layers(tensors, policy, what, ignored)
     if layers[0].weight.shape[1] != n or len(layers[-1].bias) != bounds.shape[1]:
         raise InputError(f"the spaces of {what} must match its layers; they have {n} and {bounds.shape[1]} numbers.")
     steps = list(between(layers))
@@ -91,7 +98,21 @@ def read_sb3(archive: Archive, what: str) -> Reading:
 
     finite = bool(np.all(np.isfinite(bounds)))
     action = tuple(zip(exactly(low), exactly(high), strict=True)) if finite else None
-    return Reading(words=words, steps=tuple(steps), evaluate=evaluate, action=action)
+    left |= _elsewhere(archive)
+    who = "what its policy_kwargs say" if given and "activation_fn" in given else "the default of its kind"
+    assumed = f"tanh between the layers is {who}, the rest is how stable-baselines3 documents its policies"
+    return Reading(words=words, steps=tuple(steps), evaluate=evaluate, action=action, assumed=assumed, unread=left)
+
+
+def _elsewhere(archive: Archive) -> dict[str, str]:
+    """Tensors of the file's other members, which no policy has its numbers from."""
+    found: dict[str, str] = {}
+    for member in sorted(set(archive.names) - {"policy.pth"}):
+        if member.endswith(".pth"):
+            why = "the state of an optimiser" if "optimizer" in member else "not in policy.pth"
+            tensors = load_tensors(archive.read(member), member)
+            found |= dict.fromkeys((f"{member.removesuffix('.pth')}/{name}" for name in tensors), why)
+    return found
 
 
 def _value(data: Mapping[str, Any], key: str) -> Any:
@@ -112,7 +133,11 @@ def _require_tanh(policy: Name, given: Any, what: str) -> None:
     activation = given.get("activation_fn", _TANH if policy == _ON_POLICY else Name("torch.nn", "ReLU"))
     if activation != _TANH:
         found = activation.name if isinstance(activation, Name) else brief(activation)
-        raise InputError(f"the activation of {what} must be tanh: only tanh networks are proved; it is {found}.")
+        default = f", the default of {_DEFAULTS[policy]}" if "activation_fn" not in given else ""
+        raise InputError(
+            f"the activation of {what} must be tanh: only tanh networks are proved; it is {found}{default}. Train the "
+            "policy again with policy_kwargs=dict(activation_fn=torch.nn.Tanh)."
+        )
     if given.get("use_sde") not in (None, False) and policy == _SAC:
         raise InputError(
             f"{what} has state-dependent exploration, which bounds its mean by another function (use_sde)."
@@ -147,8 +172,10 @@ def _box(space: Any, what: str) -> dict[str, Numbers]:
     return found
 
 
-def _layers(tensors: Mapping[str, Numbers], policy: Name, what: str) -> list[Affine]:
-    """The policy's layers, with every tensor of the policy accounted for."""
+def _layers(
+    tensors: Mapping[str, Numbers], policy: Name, what: str, ignored: tuple[str, ...] | None
+) -> tuple[list[Affine], dict[str, str]]:
+    """The policy's layers, and why each other tensor of `policy.pth` is left out."""
     if policy == _ON_POLICY:
         if any(name.startswith("mlp_extractor.shared_net") for name in tensors):
             raise InputError(f"{what} has layers that policy and value share; export the policy to ONNX.")
@@ -161,10 +188,11 @@ def _layers(tensors: Mapping[str, Numbers], policy: Name, what: str) -> list[Aff
     count = sum(name.startswith(f"{hidden}.") and name.endswith(".weight") for name in tensors)
     names = [f"{hidden}.{2 * k}" for k in range(count)] + ([last] if last else [])
     wanted = {f"{name}.{part}" for name in names for part in ("weight", "bias")}
-    odd = [name for name in tensors if name not in wanted and not name.startswith(others)]
-    if wanted - set(tensors) or odd or not names:
+    if wanted - set(tensors) or not names:
         raise InputError(
             f"the tensors of {what} must be those of MlpPolicy; missing {sorted(wanted - set(tensors))}, "
-            f"unknown {sorted(odd)[:8]}."
+            f"found {braced(tensors) or 'none'}."
         )
-    return [linear(tensors[f"{name}.weight"], tensors[f"{name}.bias"]) for name in names]
+    layers = [linear(tensors[f"{name}.weight"], tensors[f"{name}.bias"]) for name in names]
+    known = {name: "the value, or the spread of actions, of training" for name in tensors if name.startswith(others)}
+    return layers, unread(tensors, wanted, hidden, len(layers[-1].bias), ignored, known)

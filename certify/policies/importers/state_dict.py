@@ -14,10 +14,11 @@ import numpy as np
 
 from certify.errors import InputError
 from certify.policies.importers.arrays import Numbers
-from certify.policies.importers.normalisers import rsl_normaliser
-from certify.policies.importers.options import ImportOptions, Output
+from certify.policies.importers.normalisers import normaliser_root, rsl_normaliser
+from certify.policies.importers.options import WITHOUT_NORMALISATION, ImportOptions, Output
 from certify.policies.importers.reading import Observations, Reading, Values, between, perceptron, widths
 from certify.policies.importers.steps import Affine, Clip, Step, Tanh, linear
+from certify.policies.importers.unread import unread
 
 _KEY = re.compile(r"(?:(?P<prefix>.*)\.)?(?P<number>[0-9]{1,4})\.(?P<rest>.*)", re.DOTALL)
 _PARTS = ("controller.x_equilibrium", "controller.layers.0.weight", "controller.b")
@@ -27,6 +28,7 @@ _ENDS: dict[Output, tuple[Step, ...]] = {
     "tanh": (Tanh(),),
     "relu-tanh": (Tanh(), Clip((Fraction(0),), (None,))),
 }
+_NORMALISATION = f"A normalisation layer has such a one. {WITHOUT_NORMALISATION}"
 Layers = list[Affine]
 
 
@@ -45,7 +47,8 @@ def read_two_stage(tensors: Mapping[str, Numbers], options: ImportOptions) -> Re
     root = _root(tensors)
     if root is None:
         raise InputError(f"a two-stage file must hold {', '.join(_PARTS)} under one prefix; this one does not.")
-    layers = _layers(tensors, f"{root}controller.layers")
+    prefix = f"{root}controller.layers"
+    layers = _layers(tensors, prefix)
     squash: Output = "tanh" if options.squash is None else options.squash
     if squash == "identity":
         raise InputError("a two-stage policy is squashed: --squash must be tanh or relu-tanh; found identity.")
@@ -57,6 +60,9 @@ def read_two_stage(tensors: Mapping[str, Numbers], options: ImportOptions) -> Re
             f"found {x_eq.shape} and {b.shape}."
         )
 
+    read = {*_own(tensors, prefix), *(root + part for part in _PARTS)}
+    known = {"domain": "the domain of the training"}
+    known |= {f"{root}controller.u_equilibrium": "the input that controller.b is made of"}
     net, relu = perceptron(layers), squash == "relu-tanh"
 
     def evaluate(x: Observations, double: bool) -> Values:
@@ -67,18 +73,26 @@ def read_two_stage(tensors: Mapping[str, Numbers], options: ImportOptions) -> Re
         words=f"two-stage {widths(layers)}, centred inside the squash",
         steps=(*between(layers), *_ENDS[squash]),
         evaluate=evaluate,
+        assumed=f"tanh between the layers is how the two-stage method writes it, {squash} is what --squash says",
+        unread=unread(tensors, read, prefix, len(b), options.ignore, known),
         beta=b.astype(np.float64),
         equilibrium=x_eq.astype(np.float64),
     )
 
 
-def read_state_dict(tensors: Mapping[str, Numbers], options: ImportOptions, n: int, m: int) -> Reading:
+def read_state_dict(
+    tensors: Mapping[str, Numbers], options: ImportOptions, n: int, m: int, beside: str | None = None
+) -> Reading:
     """The perceptron from n observations to m actions among the tensors of a file.
+
+    Parameters
+    ----------
+    beside : keys of the layers of the Lyapunov network that is imported with it, if there is one.
 
     Raises
     ------
-    InputError : there is none, there are several and `--prefix` does not say which, or a layer is of a kind that is
-        not proved.
+    InputError : there is none, there are several and `--prefix` does not say which, a layer is of a kind that is
+        not proved, or another tensor could belong to the policy.
     """
     prefix = options.prefix if options.prefix is not None else _only(tensors, n, m)
     layers = _layers(tensors, prefix)
@@ -88,36 +102,48 @@ def read_state_dict(tensors: Mapping[str, Numbers], options: ImportOptions, n: i
             "Name the states that it reads with --states."
         )
     squash: Output = "identity" if options.squash is None else options.squash
+    read, known = set(_own(tensors, prefix)), dict[str, str]()
+    if (at := normaliser_root(tensors)) is not None:
+        read |= {f"{at}_mean", f"{at}_std"}
+        known |= dict.fromkeys((f"{at}_var", f"{at}count"), "of the normaliser that is read")
+    if beside is not None:
+        known |= dict.fromkeys(_own(tensors, beside), "the Lyapunov network that is imported beside it")
     return Reading(
         words=f"state_dict {prefix} {widths(layers)}",
         steps=(*between(layers), *_ENDS[squash]),
         evaluate=perceptron(layers, squash),
         normaliser=rsl_normaliser(tensors, options.epsilon),
         double=_is_double(tensors, prefix),
+        assumed=f"tanh between the layers is what --activation says, {squash} behind them what --squash says",
+        unread=unread(tensors, read, prefix, m, options.ignore, known),
     )
 
 
-def read_lyapunov(tensors: Mapping[str, Numbers], prefix: str | None) -> Reading:
+def read_lyapunov(tensors: Mapping[str, Numbers], prefix: str | None, options: ImportOptions) -> Reading:
     """The layers of a Lyapunov network, without what may stand behind the last one.
 
     Parameters
     ----------
     prefix : its keys up to their numbers; None for where a two-stage file has them.
+    options : where the policy beside it lies, and which tensors to leave out.
 
     Raises
     ------
     InputError : there are no such layers, one is of a kind that is not proved, or the network has more to it than its
-        layers.
+        layers, or may have.
     """
-    x_eq = None
+    x_eq, known = None, dict[str, str]()
     if prefix is None:
         root = _root(tensors)
         if root is None:
             raise InputError(f"a two-stage file must hold {', '.join(_PARTS)} under one prefix; this one does not.")
         whole, prefix = f"{root}lyapunov.", f"{root}lyapunov.layers"
         x_eq = np.asarray(tensors[f"{root}{_PARTS[0]}"]).reshape(-1).astype(np.float64)
+        known = {"domain": "the domain of the training"}
     else:
         whole = _dot(prefix)
+        if options.prefix is not None:
+            known = dict.fromkeys(_own(tensors, options.prefix), "the policy beside it")
     if prefix not in _groups(tensors):
         raise InputError(
             f"there must be one; no tensor is called {_dot(prefix)}0.weight. "
@@ -141,6 +167,8 @@ def read_lyapunov(tensors: Mapping[str, Numbers], prefix: str | None) -> Reading
         evaluate=perceptron(layers),
         equilibrium=x_eq,
         double=_is_double(tensors, prefix),
+        assumed=f"tanh between the layers is {'what --activation says' if x_eq is None else 'how the method has it'}",
+        unread=unread(tensors, _own(tensors, prefix), prefix, 1, options.ignore, known, of_policy=False),
     )
 
 
@@ -181,7 +209,7 @@ def _layers(tensors: Mapping[str, Numbers], prefix: str) -> Layers:
         if weight.ndim != 2 or weight.dtype.kind != "f":
             raise InputError(
                 f"layer {root}{k} must be affine, with a weight (out, in) of floating-point numbers; its weight has "
-                f"shape {weight.shape} (a normalisation layer has such a one, and is not proved)."
+                f"shape {weight.shape}. {_NORMALISATION if weight.ndim == 1 else ''}".rstrip()
             )
         layers.append(linear(weight, bias))
     return layers
@@ -202,6 +230,16 @@ def _numbers(tensors: Mapping[str, Numbers], prefix: str) -> list[int]:
     if not numbers or any(f"{root}{k}.weight" not in tensors for k in numbers):
         raise InputError(f"there must be layers {root}0.weight and so on; found {', '.join(list(tensors)[:12])}.")
     return sorted(numbers)
+
+
+def _own(tensors: Mapping[str, Numbers], prefix: str) -> list[str]:
+    """The names of the layers' tensors under a prefix."""
+    matches = ((name, _KEY.fullmatch(name)) for name in tensors)
+    return [
+        name
+        for name, match in matches
+        if match is not None and (match["prefix"] or "") == prefix and match["rest"] in ("weight", "bias")
+    ]
 
 
 def _root(tensors: Mapping[str, Numbers]) -> str | None:

@@ -1,32 +1,47 @@
-"""All tensors of a file of weights by their names, whatever dictionaries they lie in."""
+"""All tensors of a file of weights by their names, whatever dictionaries, lists and objects they lie in."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from typing import Any
+
 from certify.errors import InputError
-from certify.policies.importers.arrays import Numbers
+from certify.policies.importers.arrays import Numbers, array_of, is_array
+from certify.policies.importers.pickles import Call
 from certify.policies.importers.torchfile import TorchFile, is_tensor
 
 
 def load_tensors(raw: bytes, what: str, file: TorchFile | None = None) -> dict[str, Numbers]:
-    """The tensors of a file of torch.save: the keys on the way to one are joined by dots.
+    """The tensors and arrays of a file of torch.save: the keys on the way to one are joined by dots.
 
     Raises
     ------
-    InputError : the file is no archive of torch.save, or two tensors have one name.
+    InputError : the file is no archive of torch.save, two tensors have one name, or one cannot be read.
     """
     file = file if file is not None else TorchFile(raw, what)
     found: dict[str, Numbers] = {}
     waiting, seen = [("", file.pickle("data.pkl"))], set[int]()
     while waiting:
         prefix, node = waiting.pop()
-        if is_tensor(node):
+        if is_tensor(node) or is_array(node):
             if prefix in found:
                 raise InputError(f"{what} must name each tensor once; {prefix} stands there twice.")
-            found[prefix] = file.tensor(node, prefix)
-        elif isinstance(node, dict) and id(node) not in seen:
+            found[prefix] = file.tensor(node, prefix) if is_tensor(node) else array_of(node, prefix)
+        elif isinstance(node, dict | list | tuple | Call) and id(node) not in seen:
             seen.add(id(node))
-            waiting += [(f"{prefix}.{k}" if prefix else str(k), v) for k, v in node.items() if isinstance(k, str | int)]
+            waiting += [
+                (f"{prefix}.{k}" if prefix else str(k), v) for k, v in _inside(node) if isinstance(k, str | int)
+            ]
     return found
+
+
+def _inside(node: dict[Any, Any] | list[Any] | tuple[Any, ...] | Call) -> Iterable[tuple[Any, Any]]:
+    """What lies in a container, or in an object that the pickle would have made, by its keys, numbers or attributes."""
+    if isinstance(node, dict):
+        return node.items()
+    if not isinstance(node, Call):
+        return enumerate(node)
+    return [pair for state in node.states if isinstance(state, dict) for pair in state.items()]
 
 
 def load_safetensors(raw: bytes, what: str) -> dict[str, Numbers]:

@@ -19,6 +19,7 @@ from certify.errors import InputError
 from certify.policies.importers import graph
 from certify.policies.importers.arrays import Numbers
 from certify.policies.importers.graph import Chain
+from certify.policies.importers.options import WITH_TANH, WITHOUT_NORMALISATION
 from certify.policies.importers.pickles import Call, Name, brief
 from certify.policies.importers.reading import Observations, Reading, Values
 from certify.policies.importers.torchfile import TorchFile, is_tensor
@@ -27,6 +28,7 @@ _MAX_OPERATIONS = 1000
 _MAX_DEPTH = 40
 _MAX_TEXT = 2**20
 _KNOWN = "linear, addmm, matmul, add, sub, rsub, mul, div, neg, clamp, hardtanh, relu and tanh"
+_NORMALISATIONS = ("layer_norm", "batch_norm", "group_norm", "instance_norm", "rms_norm")
 _RESERVED = ("torch", "CONSTANTS", "getattr")
 _DEFAULTS: dict[str, tuple[Any, ...]] = {"hardtanh": (-1.0, 1.0), "clamp": (None, None)}
 
@@ -81,7 +83,8 @@ def read_torchscript(file: TorchFile) -> Reading:
         return values
 
     words = f"TorchScript of {', '.join(name for name, _ in operations)[:200]}"
-    return Reading(words=words, steps=value.chain, evaluate=evaluate, double=own)
+    ran = "the operations of the file's code, one by one in torch (the code is read as text, and not run)"
+    return Reading(words=words, steps=value.chain, evaluate=evaluate, double=own, program=ran)
 
 
 def _classes(file: TorchFile) -> dict[Name, ast.ClassDef]:
@@ -160,6 +163,8 @@ def _evaluate(program: _Program, node: ast.expr, values: dict[str, Any], depth: 
         case ast.Call(func=ast.Name(id="getattr"), args=[inner, ast.Constant(value=str() as attr)], keywords=[]):
             return _attribute(program, _evaluate(program, inner, values, depth), attr)
         case ast.Call(func=ast.Attribute(value=ast.Name(id="torch"), attr=name)):
+            if name in _NORMALISATIONS:
+                raise InputError(f"torch.{name} in {program.file.what} is not read. {WITHOUT_NORMALISATION}")
             arguments = [_evaluate(program, argument, values, depth) for argument in node.args]
             return _operation(program, name, arguments, node)
         case ast.Call(func=ast.Attribute(value=inner, attr="forward"), args=[argument], keywords=[]):
@@ -251,7 +256,7 @@ def _step(name: str, place: int, count: int, chain: Chain, given: tuple[Any, ...
         case ("clamp", 0, 1 | 2 | 3) | ("hardtanh", 0, 1 | 2 | 3):
             lo, hi = (*given, *_DEFAULTS[name][len(given) :])
             return graph.clipped(chain, lo, hi, at)
-    raise InputError(f"{at} is not read: only tanh networks are proved, and the operations are {_KNOWN}.")
+    raise InputError(f"{at} is not read: only tanh networks are proved, and the operations are {_KNOWN}. {WITH_TANH}")
 
 
 def _run(name: str, y: Any, given: tuple[Any, ...], double: bool) -> Any:
