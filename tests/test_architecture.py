@@ -56,8 +56,8 @@ EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows th
     "systems": "expressions",
     "trials": "certificate claims closed_loop engines lyapunov options",
     "unfinished": "certificate claims closed_loop engines lyapunov policies systems trials",
-    "controllers": "api certificate closed_loop containment ending expressions lyapunov policies report rigorous running "
-    "systems",
+    "controllers": "api certificate closed_loop containment ending expressions lyapunov policies report rigorous "
+    "running systems",
 }
 
 
