@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from . import ball, boxes, contraction, local, outer, ring, tube
+from . import ball, boxes, contraction, limits, local, outer, ring, tube
 from .case import Case, Failures
 from .document import Certificate, Partition
 from .errors import Rejected
@@ -98,8 +98,9 @@ def centring(case: Case) -> Failures:
 Subject = TypeVar("Subject")
 Table = Sequence[tuple[str, Callable[[Subject], Failures]]]
 
-STATED: Table[Case] = tuple(
-    (rule.__name__, rule) for rule in (levels, lyapunov, equilibrium, domain, coordinates, root, centring)
+STATED: Table[Case] = (
+    ("limits", limits.is_bearable),
+    *((rule.__name__, rule) for rule in (levels, lyapunov, equilibrium, domain, coordinates, root, centring)),
 )
 ON_THE_BALL: Table[local.Local] = (
     ("local", local.fits),
