@@ -18,15 +18,15 @@ from .rational import bits
 from .refusal import require
 
 MAX_NUMBERS = 2**25
-MAX_OPERATIONS, MAX_UNASKED = 2**39, 2**36  # the second where nobody has asked for patience
+MAX_OPERATIONS, MAX_IN_PATIENCE = 2**36, 2**43  # the second where somebody has said that it may take days
 LEAF = 255
 
 
 def limits(c: Certificate, patient: bool) -> None:
     count, work = numbers(c), operations(c)
-    most = MAX_OPERATIONS if patient else MAX_UNASKED
+    most = MAX_IN_PATIENCE if patient else MAX_OPERATIONS
     require(count <= MAX_NUMBERS, "limits", "numbers", f"{count} numbers at once; {MAX_NUMBERS} are allowed")
-    more = "" if patient or work > MAX_OPERATIONS else f"; with --patient up to {MAX_OPERATIONS}, which may take hours"
+    more = f"; with --patient {MAX_IN_PATIENCE}" if most < work <= MAX_IN_PATIENCE else ""
     require(work <= most, "limits", "operations", f"{work} operations; {most} are allowed{more}")
 
 

@@ -37,7 +37,7 @@ class Verdict:
 def judge(raw: bytes, patient: bool = False) -> Verdict:
     """The verdict on a file; its hash is taken over the very bytes that are judged.
 
-    A `patient` reader allows it as many operations as the other checker does.
+    A `patient` reader allows it operations that take days.
     """
     sha256, c, leaves = hashlib.sha256(raw).hexdigest(), None, None
     try:
