@@ -13,7 +13,7 @@ from .case import Case, Failures
 from .document import Array, Certificate, Network, Outer, Partition
 
 MOST_NUMBERS = 2**25
-MOST_WORK, MOST_IN_PATIENCE = 2**39, 2**43  # ten minutes; hours, of which somebody has to say that he has them
+MOST_WORK, MOST_IN_PATIENCE = 2**39, 2**46  # ten minutes; many hours, if somebody says that there is time for it
 LEAF = 255
 
 
@@ -59,7 +59,7 @@ class Net:
         return sum(r * (c * (n + m + 2) + 16 * (n + m) + 2**9) for r, c, _ in self.layers)
 
     def on_a_ball(self, d: int, t: int) -> int:
-        return sum(r * (c * (d + before) + before * t) for r, c, before in self.layers) + 64 * self.units * t
+        return sum(r * (c * (d + before) + before * t) + 2**21 for r, c, before in self.layers) + 64 * self.units * t
 
     def models(self, area: int) -> int:
         return sum(r * area * (2 * c + 64) for r, c, _ in self.layers)
@@ -163,7 +163,7 @@ class Sizes:
     def inequality(self) -> int:
         """One matrix inequality on a ball."""
         rows = self.d + 1
-        return 2**12 * rows**4 + 8 * self.d**5 + 4 * self.net.units * self.d**3 + self.decision(rows)
+        return 2**23 + 2**12 * rows**4 + 8 * self.d**5 + 4 * self.net.units * self.d**3 + self.decision(rows)
 
     def of_balls(self) -> int:
         evidence, found = self._partition, 0

@@ -18,7 +18,7 @@ from .rational import bits
 from .refusal import require
 
 MAX_NUMBERS = 2**25
-MAX_OPERATIONS, MAX_IN_PATIENCE = 2**36, 2**43  # the second where somebody has said that it may take days
+MAX_OPERATIONS, MAX_IN_PATIENCE = 2**36, 2**46  # the second where somebody has said that it may take days
 LEAF = 255
 
 
@@ -151,7 +151,7 @@ def as_models(shapes: Sequence[tuple[int, int, int]], symbols: int) -> int:
 
 def policy_on_a_ball(c: Certificate, z: Size) -> int:
     shapes = before_each(c.policy.layers)
-    return sum(p * (q * (z.d + before) + (before + 64) * z.t) for p, q, before in shapes)
+    return sum(p * (q * (z.d + before) + (before + 64) * z.t) + 2**21 for p, q, before in shapes)
 
 
 def equations_on_a_ball(z: Size) -> int:
@@ -162,7 +162,7 @@ def equations_on_a_ball(z: Size) -> int:
 def inequality(c: Certificate, z: Size) -> int:
     units = sum(layer.rows for layer in c.policy.layers)
     rows = z.d + 1
-    return 2**12 * rows**4 + 8 * z.d**5 + 4 * units * z.d**3 + deciding(rows)
+    return 2**23 + 2**12 * rows**4 + 8 * z.d**5 + 4 * units * z.d**3 + deciding(rows)
 
 
 def on_balls(c: Certificate, z: Size, evidence: Tree) -> int:
