@@ -91,7 +91,7 @@ class Sizes:
             found += values * (self.s + 1) ** 2 + 2**14 * (self.n + self.m + len(self.net.layers))
         if self.evidence.local or self.evidence.contraction or self.evidence.tube:
             found += values * (self.t + self.d * self.y + self.m) + self.d**4 // 4
-            found += sum(4 * rows * before for rows, _, before in self.net.layers) + self.net.units * self.t
+            found += sum(4 * rows * before for rows, _, before in self.net.layers) + 3 * self.net.units * self.t
         if self.c.outer:
             area, N, of_tape = (self.s + 1) ** 2, *_function(self.c.outer)
             found += 4 * N.entries + 2 * N.units * area + 8 * of_tape * area
@@ -142,7 +142,8 @@ class Sizes:
         return leaves * (of_each + 2**11 + 2**7 * self.n + self.n**3)
 
     def policies(self, leaves: int) -> int:
-        return leaves * self.net.on_a_leaf(self.n, self.m) + (1 + leaves * self.net.widest // 2**14) * self.net.paths
+        each, batches = self.net.on_a_leaf(self.n, self.m), 1 + leaves * self.net.widest // 2**14
+        return (leaves * each + batches * self.net.paths) // 4
 
     def of_ring(self, leaves: int) -> int:
         order, calls = self._partition.order, self.n * self.s**2 + 160 * len(self.net.layers)
@@ -193,7 +194,7 @@ class Sizes:
         found = N.folded + self.inverse(self.bits(evidence.T))
         found += 2**8 * sum(map(len, (evidence.tree, *evidence.faces)))
         found += self.boxes(faces, of_tape, values, self.n, calls) + faces * N.models((self.n + 4) ** 2)
-        found += (faces + leaves) * N.on_a_leaf(self.n, 1) + (1 + (faces + leaves)) * N.paths
+        found += ((faces + leaves) * N.on_a_leaf(self.n, 1) + (1 + faces + leaves) * N.paths) // 4
         models, calls = self.a + 8 * of_tape + 4 * self.n, calls + self.n * self.s**2 + 160 * len(self.net.layers)
         found += self.boxes(leaves, models, max(values, self.a), self.s, calls)
         return found + leaves * N.models((self.s + 4) ** 2) + self.policies(leaves)

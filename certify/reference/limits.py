@@ -18,7 +18,7 @@ from .rational import bits
 from .refusal import require
 
 MAX_NUMBERS = 2**25
-MAX_OPERATIONS, MAX_IN_PATIENCE = 2**36, 2**46  # the second where somebody has said that it may take days
+MAX_OPERATIONS, MAX_IN_PATIENCE = 2**34, 2**46  # the second where somebody has said that it may take days
 LEAF = 255
 
 
@@ -77,7 +77,7 @@ def numbers(c: Certificate) -> int:
         count += values * (z.s + 1) ** 2 + 2**14 * (z.n + z.m + len(shapes))
     if evidence.ball or evidence.contraction or evidence.tube:
         count += values * (z.t + z.d * z.y + z.m) + z.d**4 // 4
-        count += sum(p * (4 * before + z.t) for p, _, before in shapes)
+        count += sum(p * (4 * before + 3 * z.t) for p, _, before in shapes)
     if c.beyond is not None:
         square = (z.s + 1) ** 2
         count += sum(p * (4 * q + 2 * square) for p, q, _ in before_each(c.beyond.layers))
@@ -134,7 +134,8 @@ def on_leaves(leaves: int, shapes: Sequence[tuple[int, int, int]], n: int, m: in
     """A network between affine forms."""
     each = sum(p * (q * (n + m + 2) + 16 * (n + m) + 2**9) for p, q, _ in shapes)
     widest = max((p for p, _, _ in shapes), default=0)
-    return leaves * each + (1 + leaves * widest // 2**14) * sum(p * q * before for p, q, before in shapes)
+    paths = sum(p * q * before for p, q, before in shapes)
+    return (leaves * each + (1 + leaves * widest // 2**14) * paths) // 4
 
 
 def on_a_box(n: int, models: int, values: int, symbols: int, calls: int) -> int:
@@ -195,7 +196,8 @@ def beyond(c: Certificate, z: Size, covering: Covering | None) -> int:
     work += 2**8 * sum(len(face) for face in covering.faces)
     work += faces * (on_a_box(z.n, steps, held, z.n, calls) + as_models(shapes, z.n))
     each = sum(p * (q * (z.n + 3) + 16 * (z.n + 1) + 2**9) for p, q, _ in shapes)
-    work += (faces + leaves) * each + (1 + faces + leaves) * sum(p * q * before for p, q, before in shapes)
+    paths = sum(p * q * before for p, q, before in shapes)
+    work += ((faces + leaves) * each + (1 + faces + leaves) * paths) // 4
     calls += z.n * z.s**2 + 160 * len(policy)
     work += leaves * on_a_box(z.n, z.a + 8 * steps + 4 * z.n, max(held, z.a), z.s, calls)
     return work + leaves * as_models(shapes, z.s) + on_leaves(leaves, policy, z.n, z.m)

@@ -176,14 +176,14 @@ def test_the_counts_are_those_of_the_page(tmp_path: Path) -> None:
     layers = [(3, 2, 0), (1, 3, 3)]
     H, W = 4, 3
     numbers = 4 * 9 + (a + 2 * n + 8) * (s + 1) ** 2 + 2**14 * (n + m + 2)
-    numbers += (a + 2 * n + 8) * (t + d * y + m) + d**4 // 4 + sum(4 * p * g for p, _, g in layers) + H * t
+    numbers += (a + 2 * n + 8) * (t + d * y + m) + d**4 // 4 + sum(4 * p * g for p, _, g in layers) + 3 * H * t
     X = n**5 * 1 // 2**13 + 2**10 * n**3
     of_S = n**5 * (2 + 1 + 16) ** 2 // 2**13 + 2**10 * n**3
     F = sum(p * q * (2**9 + 8 * min(p, q)) for p, q, _ in layers)
     M, V, C, A = a + n**2 + 4 * n, a, n * s**2 + 320, (s + 4) ** 2
     B = 5 * (8 * A * M + A * (V + 4) * (32 * M + C) // 2**9 + 2**11 + 2**7 * n + n**3)
     R = 5 * sum(p * (q * (n + m + 2) + 16 * (n + m) + 2**9) for p, q, _ in layers)
-    R += (1 + 5 * W // 2**14) * sum(prod(layer) for layer in layers)
+    R = (R + (1 + 5 * W // 2**14) * sum(prod(layer) for layer in layers)) // 4
     K = sum(p * (q * (d + g) + g * t) + 2**21 for p, q, g in layers) + 64 * H * t
     Z = a * (2**16 + 64 * t + 16 * d**2 * (m + y))
     inequality = 2**23 + 2**12 * 3**4 + 8 * d**5 + 4 * H * d**3 + 2**14 * 3**3
