@@ -56,7 +56,7 @@ class Net:
         return sum(r * c * before for r, c, before in self.layers)
 
     def on_a_leaf(self, n: int, m: int) -> int:
-        return sum(r * (c * (n + m + 2) + 16 * (n + m) + 2**9) for r, c, _ in self.layers)
+        return sum(r * (c * (n + m + 2) + 16 * (n + m) + 2**10) for r, c, _ in self.layers)
 
     def on_a_ball(self, d: int, t: int) -> int:
         return sum(r * (c * (d + before) + before * t) + 2**21 for r, c, before in self.layers) + 64 * self.units * t

@@ -132,7 +132,7 @@ def folding(shapes: Sequence[tuple[int, int, int]]) -> int:
 
 def on_leaves(leaves: int, shapes: Sequence[tuple[int, int, int]], n: int, m: int) -> int:
     """A network between affine forms."""
-    each = sum(p * (q * (n + m + 2) + 16 * (n + m) + 2**9) for p, q, _ in shapes)
+    each = sum(p * (q * (n + m + 2) + 16 * (n + m) + 2**10) for p, q, _ in shapes)
     widest = max((p for p, _, _ in shapes), default=0)
     paths = sum(p * q * before for p, q, before in shapes)
     return (leaves * each + (1 + leaves * widest // 2**14) * paths) // 4
@@ -195,7 +195,7 @@ def beyond(c: Certificate, z: Size, covering: Covering | None) -> int:
     work = folding(shapes) + inverting(z.n, bits(covering.T)) + 2**8 * len(covering.tree)
     work += 2**8 * sum(len(face) for face in covering.faces)
     work += faces * (on_a_box(z.n, steps, held, z.n, calls) + as_models(shapes, z.n))
-    each = sum(p * (q * (z.n + 3) + 16 * (z.n + 1) + 2**9) for p, q, _ in shapes)
+    each = sum(p * (q * (z.n + 3) + 16 * (z.n + 1) + 2**10) for p, q, _ in shapes)
     paths = sum(p * q * before for p, q, before in shapes)
     work += ((faces + leaves) * each + (1 + faces + leaves) * paths) // 4
     calls += z.n * z.s**2 + 160 * len(policy)

@@ -182,7 +182,7 @@ def test_the_counts_are_those_of_the_page(tmp_path: Path) -> None:
     F = sum(p * q * (2**9 + 8 * min(p, q)) for p, q, _ in layers)
     M, V, C, A = a + n**2 + 4 * n, a, n * s**2 + 320, (s + 4) ** 2
     B = 5 * (8 * A * M + A * (V + 4) * (32 * M + C) // 2**9 + 2**11 + 2**7 * n + n**3)
-    R = 5 * sum(p * (q * (n + m + 2) + 16 * (n + m) + 2**9) for p, q, _ in layers)
+    R = 5 * sum(p * (q * (n + m + 2) + 16 * (n + m) + 2**10) for p, q, _ in layers)
     R = (R + (1 + 5 * W // 2**14) * sum(prod(layer) for layer in layers)) // 4
     K = sum(p * (q * (d + g) + g * t) + 2**21 for p, q, g in layers) + 64 * H * t
     Z = a * (2**16 + 64 * t + 16 * d**2 * (m + y))
