@@ -203,8 +203,9 @@ class ProvedSet:
         return Located(Containment.UNDECIDED)
 
 
-def proved_set(path: Path) -> ProvedSet:
-    """The set of a certificate, which is checked first, as `certify check` does it: the very bytes that are read.
+def proved_set(path: Path, patient: bool = False) -> ProvedSet:
+    """The set of a certificate, which is checked first, as `certify check` does it: the very bytes that are read;
+    `patient` takes one whose check may need hours.
 
     Raises
     ------
@@ -215,7 +216,7 @@ def proved_set(path: Path) -> ProvedSet:
     with tempfile.TemporaryDirectory() as folder:  # whatever happens to the path meanwhile
         private = Path(folder) / "certificate.json"
         private.write_bytes(raw)
-        answer = run_checker(private)
+        answer = run_checker(private, patient=patient)
     if answer["result"] != "ACCEPTED":
         why = f" rule={answer['rule']} at={answer['at']}: {answer['detail']}" if "rule" in answer else ""
         raise InputError(

@@ -797,12 +797,21 @@ class _Run:
         )
 
     def _checked(self, path: Path) -> Mapping[str, Any]:
-        """The checker's answer about a file; where many leaves make a long file, several processes share them."""
+        """The checker's answer about a file, patiently where it would be refused for what it takes else."""
+        answer = self._answered(path, patient=False)
+        if (answer.get("rule"), answer.get("at")) == ("limits", "operations"):
+            answer = self._answered(path, patient=True)
+            if answer["result"] != "REJECTED":
+                self.checked = "its check takes more than ten minutes: type `certify check --patient` for another"
+        return answer
+
+    def _answered(self, path: Path, patient: bool) -> Mapping[str, Any]:
+        """The checker's answer; where many leaves make a long file, several processes share them."""
         if self.options.cluster_checks:
             from certify.parts import check_in_parts
 
             try:
-                _, answer = check_in_parts(path, self.runner)
+                _, answer = check_in_parts(path, self.runner, patient)
             except BackendError as error:
                 self.checked = f"checked here, and not by the cluster: {str(error).rstrip('.')}"
             else:
@@ -812,7 +821,7 @@ class _Run:
                     )
                 return answer
         cores = len(os.sched_getaffinity(0)) if path.stat().st_size > _LONG else 1
-        return run_checker(path, jobs=self.options.jobs or min(cores, _MOST_JOBS))
+        return run_checker(path, jobs=self.options.jobs or min(cores, _MOST_JOBS), patient=patient)
 
     def _confirm(self, problem: Problem, claim: Claim) -> dict[str, Any]:
         """dReal's answers about what the bounds engine proved.

@@ -8,7 +8,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -17,6 +16,7 @@ import numpy as np
 import pytest
 import torch
 
+from certify.certificate import checking, model
 from certify.cli import _run
 from certify.commands.terminal import ring_line
 from certify.engines.base import Progress
@@ -332,17 +332,26 @@ def test_a_wrong_policy_is_named_however_deep_the_provenance_nests(
     assert run(capsys, "check", certificate, "--policy", policy_file)[0] in (0, 1)  # or too deep to be read at all
 
 
-def test_a_wrong_policy_is_named_when_the_certificate_comes_through_a_pipe(
-    tmp_path: Path, proved: bytes, policy_file: Path, capsys: pytest.CaptureFixture[str]
+def test_a_wrong_policy_is_named_when_the_certificate_is_there_for_one_reader(
+    tmp_path: Path,
+    proved: bytes,
+    policy_file: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    pipe = tmp_path / "pipe"
-    os.mkfifo(pipe)
+    """The file is gone when the checker has read it: its answer alone says whose policy it is."""
+    path, ask = tmp_path / "once.json", checking.ask
+
+    def once(path: Path, *arguments: Any) -> tuple[int, dict[str, Any]]:
+        answer = ask(path, *arguments)
+        path.unlink()
+        return answer
+
+    monkeypatch.setattr(checking, "ask", once)
     for policy, expected in ((SHIPPED, (1, "REJECTED rule=policy")), (policy_file, (0, "ACCEPTED "))):
-        writer = threading.Thread(target=pipe.write_bytes, args=(proved,), daemon=True)
-        writer.start()
-        status, out, _ = run(capsys, "check", pipe, "--policy", policy)
-        writer.join(timeout=10)
-        assert (status, out.splitlines()[-1][: len(expected[1])]) == expected
+        path.write_bytes(proved)
+        status, out, _ = run(capsys, "check", path, "--policy", policy)
+        assert (status, out.splitlines()[-1][: len(expected[1])]) == expected and not path.exists()
 
 
 def test_a_file_whose_name_is_an_option_is_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -408,15 +417,19 @@ def test_both_checkers_refuse_a_level_that_was_not_proved(
 
 
 def test_a_report_is_about_the_bytes_that_were_checked(
-    tmp_path: Path, proved: bytes, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, proved: bytes, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A pipe gives each reader other bytes: there is one reader, and the page names what it read."""
-    pipe, page = tmp_path / "pipe", tmp_path / "page.html"
-    os.mkfifo(pipe)
-    writer = threading.Thread(target=pipe.write_bytes, args=(proved,), daemon=True)
-    writer.start()
-    status, out, _ = run(capsys, "report", pipe, "--out", page)
-    writer.join(timeout=10)
+    """The file gives each reader other bytes: there is one reader, and the page names what it read."""
+    path, page, read_raw = tmp_path / "once.json", tmp_path / "page.html", model.read_raw
+
+    def once(path: Path) -> bytes:
+        raw = read_raw(path)
+        path.write_bytes(b"{}")
+        return raw
+
+    path.write_bytes(proved)
+    monkeypatch.setattr(model, "read_raw", once)
+    status, out, _ = run(capsys, "report", path, "--out", page)
     assert status == 0 and out.startswith("ACCEPTED")
     assert hashlib.sha256(proved).hexdigest() in page.read_text() and "PROVED" in page.read_text()
 

@@ -12,7 +12,9 @@ from __future__ import annotations
 
 import base64
 import json
+import os
 import re
+import stat
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
@@ -263,10 +265,16 @@ def read_raw(path: Path) -> bytes:
 
     Raises
     ------
-    CertificateFormatError : the file cannot be read, or is larger than a certificate may be.
+    CertificateFormatError : the file cannot be read, is no regular file, or is larger than a certificate may be.
     """
     try:
-        with path.open("rb") as stream:
+        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))  # nobody may ever write into a pipe
+        with open(descriptor, "rb") as stream:
+            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+                raise CertificateFormatError(
+                    f"{path} must be a regular file; it is a folder, a pipe, a socket or a device. Name the "
+                    "certificate's own file."
+                )
             raw = stream.read(MAX_BYTES + 1)
     except OSError as error:
         raise CertificateFormatError(f"{path} cannot be read: {error.strerror}.") from error

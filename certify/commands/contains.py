@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from certify.commands.arguments import region
-from certify.commands.shared import Json
+from certify.commands.shared import Json, Patient
 from certify.commands.terminal import say
 
 if TYPE_CHECKING:
@@ -25,12 +25,13 @@ def contains(
     deviations: Annotated[
         bool, typer.Option("--deviations", help="Numbers are deviations from the operating point, not states' values.")
     ] = False,
+    patient: Patient = False,
     as_json: Json = False,
 ) -> None:
     """Check a certificate and decide, exactly, whether a state or every state of a box lies in the proved set."""
     from certify.containment import proved_set
 
-    proved = proved_set(certificate)
+    proved = proved_set(certificate, patient)
     box = region(states, proved.system, "STATES", deviations)
     found = proved.locate(box)
     data = {

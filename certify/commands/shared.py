@@ -11,6 +11,9 @@ if TYPE_CHECKING:
     from certify.systems import System
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
+Patient = Annotated[
+    bool, typer.Option("--patient", help="Take a certificate whose check may need hours, which is refused else.")
+]
 PolicyFile = Annotated[Path, typer.Option(help="Policy file (.pt), or another program's (see certify import).")]
 PlantName = Annotated[
     str | None,
