@@ -233,7 +233,7 @@ def _wider_domain(result: RoaResult, name: str) -> Step:
     grown = reach / volume(P, level)
     if grown < _WORTH:
         return Step((), f"the domain binds in {name}, and a wider one would soon be bound by something else")
-    side = f"{name}={float(hi):g}" if lo == -hi else f"{name}={float(lo):g}:{float(hi):g}"
+    side = f"{name}={float(hi):g}" if lo == -hi else f"{name}={float(lo):g}..{float(hi):g}"
     return Step((("--domain", side),), f"if the equations hold there, this V reaches {grown:.3g} times the volume")
 
 

@@ -17,6 +17,7 @@ from certify.commands.arguments import region
 from certify.commands.contains import stated, text
 from certify.commands.shared import write
 from certify.commands.terminal import ProgressLine, load_tables, say, show, tell
+from certify.commands.typed import as_typed, options_of
 
 if TYPE_CHECKING:
     from certify.largest import Quantity
@@ -92,7 +93,7 @@ def certified(
     if data["diagnosis"] is not None and data["diagnosis"]["next"]["options"]:
         data["diagnosis"]["next"]["command"] = _command(context, data["diagnosis"]["next"]["options"])
     if result.notice is not None:
-        note(result.notice)
+        note(as_typed(result.notice, options_of(context.command)))
     if result.certificate is not None and result.raw is not None:
         answer = None if result.checker is None else dict(result.checker)
         write(folder / "report.html", drawing.page_of(result.raw, result.certificate, answer, data))
@@ -134,6 +135,9 @@ def _command(context: typer.Context, changed: Mapping[str, str]) -> str:
         if source is None or source.name != "COMMANDLINE" or (name in changed and not option.multiple):
             continue
         values = list(value) if isinstance(value, list | tuple) else [value]
+        if option.param_type_name == "argument":
+            parts += map(str, values)
+            continue
         if name in changed:  # NAME=VALUE options replace those of the same name
             values = [v for v in values if v.partition("=")[0] != changed[name].partition("=")[0]]
         for each in values:

@@ -46,7 +46,7 @@ def check(
 
         wanted = load_policy(policy).network.sha256()
     if cluster is not None and (reference or part is not None or jobs != 1):
-        raise InputError("`--cluster` must stand without --reference, --jobs and --part.")
+        raise InputError("--cluster must stand without --reference, --jobs and --part.")
     if cluster is not None:
         status, answer = _by_cluster(certificate, cluster)
     else:
@@ -75,5 +75,5 @@ def _by_cluster(certificate: Path, address: str) -> tuple[int, dict[str, Any]]:
 def _part(text: str) -> tuple[int, int]:
     number, _, of = text.partition("/")
     if not (number.isdecimal() and of.isdecimal() and 1 <= int(number) <= int(of) <= _MOST_PARTS):
-        raise InputError(f"`--part` must be K/N with 1 <= K <= N <= {_MOST_PARTS}, as in 2/8; found {text[:40]!r}.")
+        raise InputError(f"--part must be K/N with 1 <= K <= N <= {_MOST_PARTS}, as in 2/8; found {text[:40]!r}.")
     return int(number), int(of)

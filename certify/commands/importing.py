@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
-from certify.commands.arguments import plant_of, with_params
+from certify.commands.arguments import ends_of, plant_of, with_params
 from certify.commands.terminal import tell
 from certify.errors import InputError
 from certify.inputs import policy_in
@@ -40,7 +40,7 @@ _OPTIONS: dict[str, Any] = {
     "epsilon": _option("What rsl_rl's normaliser adds to the standard deviation; 0.01 if nothing is said."),
     "action_scale": _option("u = scale * action + offset: one number or one for each input."),
     "action_offset": _option("See --action-scale."),
-    "clip": _option("Bounds LO:HI of the action before scale and offset, one pair or one for each input."),
+    "clip": _option("Bounds LO..HI of the action before scale and offset, one pair or one for each input."),
     "centre": _option("Make pi(0) = u_eq: output or preactivation; nothing is centred unless this asks for it."),
     "observes": _option("Whether the network reads absolute states or their deviation from the operating point."),
 }
@@ -145,8 +145,8 @@ def _clip(text: str | None) -> Any:
 
     if text is None:
         return None
-    pairs = [part.split(":") for part in text.split(",")]
+    pairs = [ends_of(part) for part in text.split(",")]
     if any(len(pair) != 2 for pair in pairs):
-        raise InputError(f"--clip takes LO:HI, or LO:HI,LO:HI with a pair for each input; found {text!r}.")
-    lo, hi = ([exact(pair[k].strip(), "--clip") for pair in pairs] for k in (0, 1))
+        raise InputError(f"--clip takes LO..HI, or LO..HI,LO..HI with a pair for each input; found {text!r}.")
+    lo, hi = ([exact(pair[k], "--clip") for pair in pairs] for k in (0, 1))
     return Clip(tuple(lo), tuple(hi))
