@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.certificate import Certificate, parse_certificate, read_raw, run_checker
+from certify.certificate.formats import version_in
 from certify.claims import CLAIMS, Enlarged, Reached
 from certify.errors import InputError
 from certify.lyapunov import are_inside
@@ -213,10 +214,11 @@ def proved_set(path: Path) -> ProvedSet:
         private.write_bytes(raw)
         answer = run_checker(private)
     if answer["result"] != "ACCEPTED":
+        old = version_in(raw)
         why = f" rule={answer['rule']} at={answer['at']}: {answer['detail']}" if "rule" in answer else ""
         raise InputError(
-            f"{path} must be a certificate that the checker accepts; it says {answer['result']}{why:.300}. Without "
-            "that there is no proved set."
+            f"{path} must be a certificate that the checker accepts; it says {answer['result']}{why:.300}. "
+            f"{old or 'Without that there is no proved set.'}"
         )
     return set_of(raw, str(path))
 

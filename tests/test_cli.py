@@ -314,6 +314,30 @@ def test_what_to_try_next_names_a_policy_that_was_the_first_word(
     assert status == 0 and command.startswith(f"certify roa {SHIPPED} ") and "--max-boxes 30" in command
 
 
+def test_a_certificate_of_another_version_is_told_who_reads_it(
+    certificate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = certificate.read_text()
+    certificate.write_text(text.replace("certify-certificate/8", "certify-certificate/7", 1))
+    earlier = "commit eb6ab75 of certify was the last to read it. To have a certificate of today, run certify roa again"
+    for command, status, *more in (
+        ("check", 1),
+        ("check", 1, "--json"),
+        ("check", 1, "--reference"),
+        ("contains", 2, "theta=0"),
+        ("report", 2),
+        ("plot", 2, "--out", tmp_path / "f.svg"),
+        ("prove-in-coq", 2, "--out", tmp_path / "coq"),
+    ):
+        found, out, err = run(capsys, command, certificate, *more)
+        assert found == status and earlier in err and ("REJECTED" in out) == (command == "check")
+    certificate.write_text(text.replace("certify-certificate/8", "certify-certificate/99", 1))
+    assert "A later release of certify wrote it" in run(capsys, "check", certificate)[2]
+    for other in ("certify-policy/1", "certify-certificate/x", "certify-certificate/8"):
+        certificate.write_text(text.replace('"certify-certificate/8"', f'"{other}"', 1).replace('"rational"', '"odd"'))
+        assert "release" not in run(capsys, "check", certificate)[2]
+
+
 @pytest.mark.parametrize("words", [["theta=0.02", "theta_dot=-0.1..0.1"], ["theta=0.02 , theta_dot = -0.1:0.1"]])
 def test_states_come_with_commas_or_without(
     words: list[str], certificate: Path, capsys: pytest.CaptureFixture[str]

@@ -60,6 +60,13 @@ def check(
     if "error" in answer and not as_json:
         tell(f"certify: {answer['error']}")
         raise typer.Exit(status)
+    if answer.get("at") == "schema" and certificate.is_file():  # a pipe is read once
+        from certify.certificate import read_raw
+        from certify.certificate.formats import version_in
+
+        old = version_in(read_raw(certificate))
+        if old is not None:
+            tell(f"certify: {old}")
     say(json.dumps(answer) if as_json else "\n".join(lines))
     raise typer.Exit(status)
 
