@@ -168,12 +168,12 @@ def _next(
         why = "what was done is kept" if kept else "the search was not kept"
         return Step((("--resume", ""),) if kept else (), f"{why}; see to the cluster first, or leave it out")
     if result.stop in _ENDED and _is_bent(result, proof):
-        why = f"bounds see more of the hidden units' bends than of the linear part of the policy: proved is {_share_proved(result):.2g} % of the volume that "
-        return Step(
-            (),
-            why + "sampling allows; a flatter policy that does the same is proved on more, or with less time",
-            flattens=True,
+        why = (
+            f"proved is {_share_proved(result):.2g} % of the volume that sampling allows, and bounds see more of the "
+            "hidden units' bends than of the policy's linear part: a flatter policy that does the same may be proved "
+            "on more"
         )
+        return Step((), why, flattens=True)
     if result.stop in (Stop.TIME, Stop.BOXES):
         step = _longer(result, options, proof)
         return step if result.search is None else replace(step, options=(*step.options, ("--resume", "")))

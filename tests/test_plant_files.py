@@ -140,7 +140,8 @@ def test_a_report_and_the_terminal_say_the_operating_point(tmp_path: Path, capsy
     arguments += ["--candidate", "lyapunov"]
     assert _run([*arguments, "--out", str(tmp_path / "o"), "--time-limit", "20"], False) == 0
     out, err = capsys.readouterr()
-    assert "operating point" in out and "level = 0.333333 m" in out and "level (m)" in out
+    assert "operating point" in out and "level = 0.333333 m" in out and "level − 0.333333 (m)" in out
+    assert "attracted by the operating point" in out and "lengths are deviations from it" in " ".join(out.split())
     assert "trained" not in err
     page = (tmp_path / "o" / "report.html").read_text()
     assert "deviations from the operating point level = 0.333333 m, flow = 0.037037 m/s" in page

@@ -143,7 +143,7 @@ def _flattened(context: typer.Context, policy: Path) -> str:
     from certify.policies.importers import ImportOptions
 
     foreign = {f.name for f in fields(ImportOptions)}
-    others = {option.name or "" for option in context.command.params} - {"file", "policy"}
+    others = {option.name or "" for option in context.command.params} - {"file", "policy", "resume"}
     flat, plant, commands = policy.with_name(f"{policy.stem}_flat.pt"), context.params["system"], list[list[str]]()
     if not is_own(policy, ImportOptions()):
         read = policy.with_name(f"{policy.stem}_imported.pt")

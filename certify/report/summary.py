@@ -316,7 +316,7 @@ def _diagnosis_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
         return []
     timing = Timing.of_result(result)
     if found.get("stiffness") and not timing.discrete:
-        held = ", at the nominal values" if result.get("uncertain") else ""
+        held = " (at the nominal values)" if result.get("uncertain") else ""
         at_once = "" if timing.sample is None else ", if the input followed at once"
         rows.append(("modes", modes(found["fastest"], found["slowest"]) + held + at_once))
     if found["hurts"] and found.get("kind") not in AT_A_POINT:

@@ -70,8 +70,7 @@ def _outer_limit(result: Mapping[str, Any] | None) -> str:
 
 
 def _modes(found: Mapping[str, Any], held: str) -> str:
-    """How fast the closed loop is at the origin, in a sentence, with the values that are not exact `held`."""
+    """How fast the closed loop is at rest, in a sentence, with the values that are not exact `held`."""
     if not found.get("stiffness"):
         return ""
-    where = f"At rest, {held}," if held else "At rest,"
-    return f"Of the loop's modes {where[0].lower()}{where[1:]} {modes(found['fastest'], found['slowest'])}."
+    return f"Modes at rest{f', {held}' if held else ''}: {modes(found['fastest'], found['slowest'])}."
