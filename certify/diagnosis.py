@@ -157,7 +157,10 @@ def _next(
     if result.stop is Stop.UNSTABLE:
         return Step((), "no Lyapunov equation has a solution; the policy has to stabilise the plant first")
     if result.claim in ("practical", "nearby") and (centre := _centring(*asked)) is not None:
-        return Step((("--centre", centre),), "with pi(0) = u_eq the stronger claim can be tried")
+        return Step(
+            (("--centre", centre),),
+            "shifted so that pi(0) = u_eq the loop rests where it should, and convergence to it can be tried",
+        )
     if result.stop is Stop.DOMAIN and name is not None and options.level is None:
         return _wider_domain(result, name)
     if result.stop is Stop.PATH:

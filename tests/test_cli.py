@@ -258,6 +258,8 @@ def test_bad_options_exit_2(
     [
         ("reach", ["--from", "q=1"], "--from must name states of pendulum, theta, theta_dot; found q"),
         ("reach", ["--from", "theta=99"], "--from must lie in the interior of the domain, theta between -3.14 and"),
+        ("reach", ["--from", "theta=1", "--kind", "zip"], "--kind must be one of"),
+        ("reach", ["--from", "theta=1", "--kind", "onnx"], "--kind must be left out: "),
         ("reach", ["--from", "theta=1", "--time-limit", "-1"], "--time-limit must be positive; found -1"),
         ("roa", ["--precision", "2"], "--precision must lie between 0 and 1; found 2"),
         ("roa", ["--cluster-checks"], "--cluster-checks must have a --cluster"),

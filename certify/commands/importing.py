@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
@@ -61,12 +63,24 @@ def takes_import_options(command: Callable[..., None], kind_is: str = "--from") 
     @functools.wraps(command)
     def wrapped(**given: Any) -> None:
         texts = {name: given.pop(name) for name in _OPTIONS}
-        command(**given, importing=_parsed(texts))
+        with kind_called(kind_is):
+            importing = _parsed(texts)
+        command(**given, importing=importing)
 
     parameters = [*(p.replace(kind=kind) for p in kept), *added]
     wrapped.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]
     wrapped.__annotations__ = {p.name: p.annotation for p in parameters}
     return wrapped
+
+
+@contextmanager
+def kind_called(option: str) -> Iterator[None]:
+    """Messages of what is done within, of importing alone, with the option for the kind of file called so."""
+    try:
+        yield
+    except InputError as error:
+        said = re.sub(r"--from\b", option, str(error))
+        raise error if said == str(error) else InputError(said) from error
 
 
 def policy_of(path: Path, importing: ImportOptions, system: str | None, params: list[str]) -> Policy:

@@ -9,7 +9,7 @@ import typer
 
 from certify.commands.arguments import plant_of, state, widths
 from certify.commands.certifying import certified
-from certify.commands.importing import policy_of
+from certify.commands.importing import kind_called, policy_of
 from certify.commands.shared import (
     Domain,
     Json,
@@ -53,7 +53,8 @@ def reach(
     from certify.options import RoaOptions
 
     path = the_policy(context, file, policy)
-    stored = policy_of(path, importing, system, param or [])
+    with kind_called("--kind"):
+        stored = policy_of(path, importing, system, param or [])
     plant = plant_of(stored, system, param or [], domain or [])
     options = RoaOptions(reach_from=state(from_, "--from"), box=widths(box, "--box"), time_limit=time_limit)
     certified(context, path, stored, plant, options, out, start, drawing, quiet, as_json)
