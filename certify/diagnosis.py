@@ -25,7 +25,7 @@ from certify.errors import InputError
 from certify.lyapunov import diagonalising_coordinates, domain_limit, extents, volume
 from certify.options import RoaOptions
 from certify.policies import Centre, TanhNetwork
-from certify.report.words import quantity, symbol
+from certify.report.words import number, quantity, symbol
 from certify.results import Diagnosis, RoaResult, Share, Step
 from certify.systems import System
 from certify.verdict import Stop
@@ -172,7 +172,7 @@ def _next(
         return Step((("--resume", ""),) if kept else (), f"{why}; see to the cluster first, or leave it out")
     if result.stop in _ENDED and _is_bent(result, proof):
         why = (
-            f"proved is {_share_proved(result):.2g} % of the volume that sampling allows, and bounds see more of the "
+            f"proved is {number(_share_proved(result), 2)} % of the volume that sampling allows, and bounds see more of the "
             "hidden units' bends than of the policy's linear part: a flatter policy that does the same may be proved "
             "on more"
         )
