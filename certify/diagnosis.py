@@ -171,10 +171,10 @@ def _next(
         why = "what was done is kept" if kept else "the search was not kept"
         return Step((("--resume", ""),) if kept else (), f"{why}; see to the cluster first, or leave it out")
     if result.stop in _ENDED and _is_bent(result, proof):
+        share = number(_share_proved(result), 2)
         why = (
-            f"proved is {number(_share_proved(result), 2)} % of the volume that sampling allows, and bounds see more of the "
-            "hidden units' bends than of the policy's linear part: a flatter policy that does the same may be proved "
-            "on more"
+            f"proved is {share} % of the volume that sampling allows, and bounds see more of the hidden units' bends than "
+            "of the policy's linear part: a flatter policy that does the same may be proved on more"
         )
         return Step((), why, flattens=True)
     if result.stop in (Stop.TIME, Stop.BOXES):
