@@ -159,7 +159,7 @@ def _next(
     if result.claim in ("practical", "nearby") and (centre := _centring(*asked)) is not None:
         return Step(
             (("--centre", centre),),
-            "shifted so that pi(0) = u_eq the loop rests where it should, and convergence to it can be tried",
+            "shifted so that pi(0) = u_eq the loop rests where it should, and the stronger claim can be tried",
         )
     if result.stop is Stop.DOMAIN and name is not None and options.level is None:
         return _wider_domain(result, name)
@@ -173,8 +173,8 @@ def _next(
     if result.stop in _ENDED and _is_bent(result, proof):
         share = number(_share_proved(result), 2)
         why = (
-            f"proved is {share} % of the volume that sampling allows, and bounds see more of the hidden units' bends than "
-            "of the policy's linear part: a flatter policy that does the same may be proved on more"
+            f"proved is {share} % of the volume that sampling allows, and bounds see more of the hidden units' bends "
+            "than of the policy's linear part: a flatter policy that does the same may be proved on more"
         )
         return Step((), why, flattens=True)
     if result.stop in (Stop.TIME, Stop.BOXES):
