@@ -224,7 +224,7 @@ def field_on(loop: ClosedLoop, x: Balls) -> tuple[Balls, flint.arb_mat]:
     u, gain = policy_on(loop, x)
     values = dict(zip((*system.states, *system.inputs), (*x, *u), strict=True))
     known: dict[Expression, flint.arb] = {}
-    dynamics, F = loop.dynamics, [evaluate(e, values, BallAlgebra(), known) for e in loop.dynamics]
+    F = [evaluate(e, values, BallAlgebra(), known) for e in loop.dynamics]
     A, B = (
         flint.arb_mat(
             [[evaluate(differentiate(e, s), values, BallAlgebra(), known) for s in by] for e in loop.dynamics]

@@ -41,7 +41,7 @@ from certify.diagnosis import diagnose
 from certify.engines.base import FEW, Attempt, Budget, Progress, Proof
 from certify.engines.contraction import contraction
 from certify.engines.falsify import Witness
-from certify.errors import BackendError, InputError, SoundnessError
+from certify.errors import BackendError, InputError, OptionError, SoundnessError
 from certify.lyapunov import (
     Neural,
     Polynomial,
@@ -337,13 +337,13 @@ class _Run:
             return None, loop
         if options.claim != "practical" or loop.system.time == "discrete" or loop.network.centre != "none":
             if options.around == "rest" and options.claim == "practical":
-                raise InputError("`around` the rest needs a policy without centring and a plant in continuous time.")
+                raise OptionError("`around` rest needs a policy without centring and a plant in continuous time.")
             return None, loop
         rest = find_rest(loop)
         given = options.P is not None or options.level is not None or options.lyapunov is not None
         if options.around == "rest" and (rest is None or not rest.stable):
             found = "none was found" if rest is None else f"the one at {', '.join(rest.x)} is not"
-            raise InputError(f"`around` the rest needs a stable point of rest; {found}.")
+            raise OptionError(f"`around` rest needs a stable point of rest; {found}.")
         if rest is None or not rest.stable or options.around == "origin" or (options.around == "auto" and given):
             return rest, loop
         moved = seen_from(loop, rest)
@@ -775,7 +775,7 @@ class _Run:
         self.share = 1.0
         function = self.options.lyapunov or self._learned(trial, claim)
         if function.n != self.system.n:
-            raise InputError(f"`lyapunov` must be a function of {self.system.n} states; found one of {function.n}.")
+            raise OptionError(f"`lyapunov` must be a function of {self.system.n} states; found one of {function.n}.")
         N = of_polynomial(function, self.system.states) if isinstance(function, Polynomial) else function
         level = self.options.lyapunov_level
         report = None if self.progress is None else partial(self._report, stage="outer")

@@ -24,6 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from certify.certificate.formats import SCHEMA, other_version
 from certify.claims import CLAIMS, Claim, Enlarged, Outer, Reached
 from certify.errors import CertificateFormatError, InputError
 from certify.expressions import Number, Symbol, from_tree, to_tree
@@ -35,7 +36,6 @@ from certify.systems import System
 from certify.systems.system import Interval
 
 Array = NDArray[np.float64]
-SCHEMA = "certify-certificate/8"
 MAX_BYTES = 256 * 2**20
 _LONGEST_UNIT = 40
 _OF_A_BALL = ("J", "multipliers", "weight")
@@ -308,7 +308,10 @@ def parse_certificate(raw: bytes, name: str) -> Certificate:
     try:
         data = json.loads(raw.decode("utf-8"))
         if data["schema"] != SCHEMA:
-            raise CertificateFormatError(f"{name}: `schema` must be {SCHEMA!r}; found {data['schema']!r}.")
+            known = other_version(data["schema"])
+            raise CertificateFormatError(
+                f"{name}: `schema` must be {SCHEMA!r}; found {data['schema']!r:.60}.{f' {known}' if known else ''}"
+            )
         kind = data["claim"]["kind"]
         if kind not in CLAIMS:
             raise CertificateFormatError(f"{name}: `claim.kind` must be one of {', '.join(CLAIMS)}; found {kind!r}.")

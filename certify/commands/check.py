@@ -47,7 +47,7 @@ def check(
 
         wanted = load_policy(policy).network.sha256()
     if cluster is not None and (reference or part is not None or jobs != 1):
-        raise InputError("`--cluster` must stand without --reference, --jobs and --part.")
+        raise InputError("--cluster must stand without --reference, --jobs and --part.")
     if cluster is not None:
         status, answer = _by_cluster(certificate, cluster, patient)
     else:
@@ -61,6 +61,13 @@ def check(
     if "error" in answer and not as_json:
         tell(f"certify: {answer['error']}")
         raise typer.Exit(status)
+    if answer.get("at") == "schema" and certificate.is_file():  # a pipe is read once
+        from certify.certificate import read_raw
+        from certify.certificate.formats import version_in
+
+        old = version_in(read_raw(certificate))
+        if old is not None:
+            tell(f"certify: {old}")
     say(json.dumps(answer) if as_json else "\n".join(lines))
     raise typer.Exit(status)
 
@@ -76,5 +83,5 @@ def _by_cluster(certificate: Path, address: str, patient: bool) -> tuple[int, di
 def _part(text: str) -> tuple[int, int]:
     number, _, of = text.partition("/")
     if not (number.isdecimal() and of.isdecimal() and 1 <= int(number) <= int(of) <= _MOST_PARTS):
-        raise InputError(f"`--part` must be K/N with 1 <= K <= N <= {_MOST_PARTS}, as in 2/8; found {text[:40]!r}.")
+        raise InputError(f"--part must be K/N with 1 <= K <= N <= {_MOST_PARTS}, as in 2/8; found {text[:40]!r}.")
     return int(number), int(of)

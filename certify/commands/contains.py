@@ -20,7 +20,10 @@ if TYPE_CHECKING:
 def contains(
     certificate: Annotated[Path, typer.Argument(help="Certificate file.")],
     states: Annotated[
-        str, typer.Argument(help="A state or a box, as in x=1.57,x_dot=-1..1; a state that is not named is at rest.")
+        list[str],
+        typer.Argument(
+            help="A state or a box, as in x=1.57 x_dot=-1..1, or with commas; a state that is not named is at rest."
+        ),
     ],
     deviations: Annotated[
         bool, typer.Option("--deviations", help="Numbers are deviations from the operating point, not states' values.")
@@ -32,7 +35,7 @@ def contains(
     from certify.containment import proved_set
 
     proved = proved_set(certificate, patient)
-    box = region(states, proved.system, "STATES", deviations)
+    box = region(" ".join(states), proved.system, "STATES", deviations)
     found = proved.locate(box)
     data = {
         "certificate": str(certificate),
