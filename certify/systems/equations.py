@@ -16,7 +16,7 @@ from certify.errors import InputError
 from certify.expressions import FUNCTIONS, MOST_EXPONENT, Expression, Number, constant_of, function, nodes
 from certify.systems.system import exact
 
-_MOST_NODES = 20_000  # a certificate holds no more (FORMAT.md)
+_MOST_NODES, _MOST_DEPTH = 20_000, 200  # a certificate holds no more (FORMAT.md)
 _OPERATORS = "+ - * /, integer powers with **"
 
 
@@ -51,6 +51,8 @@ def parse_expression(
         hint = "; for a power write **, not ^" if "^" in source else ""
         reason = error.msg if isinstance(error, SyntaxError) else str(error)
         raise InputError(f"equation {source!r} cannot be read: {reason}{hint}.") from error
+    if found.depth > _MOST_DEPTH:
+        raise InputError(f"equation {source!r}: written out it must nest at most {_MOST_DEPTH} deep; it nests deeper.")
     if _size(found) > _MOST_NODES:
         raise InputError(f"equation {source!r}: written out it must have at most {_MOST_NODES:,} terms; it has more.")
     return found
