@@ -300,7 +300,7 @@ def test_a_number_that_has_no_value_is_refused_where_the_plant_is_read(tmp_path:
 
 
 @pytest.mark.parametrize(
-    "q", ["1000000000000000000001/7", "-123456789012345678901/11", "1000000000000000000001", "1/3"]
+    "q", ["1000000000000000000001/9", "-123456789012345678901/9", "1000000000000000000001", "1/3"]
 )
 @pytest.mark.parametrize("form", ["x/q", "q**2*x", "1/q/x", "x - q", "-q*x", "2*(x + q)"])
 def test_text_gives_long_fractions_back(form: str, q: str) -> None:
