@@ -49,7 +49,7 @@ paper-proved: setup
 
 # The theory behind `certify prove-in-coq`; needs Coq with its library Interval, which nothing else here does.
 coq:
-	rm -rf build/coq && mkdir -p build/coq && cp certify/coq/theory/* build/coq
+	rm -rf build/coq && mkdir -p build/coq && cp certify/certificates/coq/theory/* build/coq
 	cd build/coq && for file in $$(grep '[.]v$$' _CoqProject); do coqc -q $$file || exit 1; done
 
 clean:

@@ -119,15 +119,15 @@ def one_pass(given: Path) -> None:
     import torch
 
     import certify
-    from certify.claims import Problem
-    from certify.closed_loop import ClosedLoop
-    from certify.engines.base import Budget
-    from certify.engines.bounds.search import prove_outwards
+    from certify.certificates.claims import Problem
+    from certify.loop.closed_loop import ClosedLoop
+    from certify.loop.plants import get_system
+    from certify.loop.policies import load_policy
     from certify.lyapunov import diagonalising_coordinates
     from certify.lyapunov.function import Quadratic
-    from certify.policies import load_policy
-    from certify.running import ThreadRunner
-    from certify.systems import get_system
+    from certify.provers.base import Budget
+    from certify.provers.boxes.search import prove_outwards
+    from certify.provers.execution import ThreadRunner
 
     if Path(certify.__file__).parent.parent.resolve() != Path.cwd().resolve():
         raise SystemExit(f"certify was imported from {certify.__file__}, which is not the tree {Path.cwd()}")

@@ -28,10 +28,10 @@ import scipy.linalg
 import torch
 
 from certify import RoaResult, certify_roa, load_policy
-from certify.coq.kernel import find_coqc
-from certify.coq.proving import CoqOptions, prove_in_coq
-from certify.systems import get_system
-from certify.verdict import Verdict
+from certify.certificates.coq.kernel import find_coqc
+from certify.certificates.coq.proving import CoqOptions, prove_in_coq
+from certify.certificates.verdict import Verdict
+from certify.loop.plants import get_system
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 FOLDER = Path(__file__).parents[2] / "shared" / "external" / "two_stage"

@@ -30,11 +30,11 @@ import numpy as np
 import torch
 
 from certify import certify_roa
+from certify.certificates.verdict import Verdict
 from certify.errors import InputError
-from certify.policies import Policy, save_policy
+from certify.loop.plants import System, get_system
+from certify.loop.policies import Policy, save_policy
 from certify.report.words import below
-from certify.systems import System, get_system
-from certify.verdict import Verdict
 from controllers.evaluate import discrete_linearisation
 from controllers.files import make_folder, write_atomically
 from controllers.lqr import riccati_gain

@@ -23,21 +23,21 @@ import torch
 from fitted import fit_policy, spread_of
 from intervals import PlainIntervals
 
-from certify.claims import Problem
-from certify.claims.conditions import ring_condition
-from certify.claims.queries import Query, query
-from certify.closed_loop import ClosedLoop
-from certify.engines.base import Budget
-from certify.engines.bounds.search import prove_outwards
-from certify.engines.dreal import backend as dreal
-from certify.engines.falsify import falsify
-from certify.engines.local import prove_local
+from certify.certificates.claims import Problem
+from certify.certificates.claims.conditions import ring_condition
+from certify.certificates.claims.queries import Query, query
 from certify.errors import BackendError
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.plants import get_system
+from certify.loop.policies import load_policy
 from certify.lyapunov import diagonalising_coordinates, domain_limit, solve_lyapunov
 from certify.lyapunov.function import Quadratic
-from certify.policies import load_policy
-from certify.running import ThreadRunner
-from certify.systems import get_system
+from certify.provers.ball.local import prove_local
+from certify.provers.base import Budget
+from certify.provers.boxes.search import prove_outwards
+from certify.provers.dreal import backend as dreal
+from certify.provers.execution import ThreadRunner
+from certify.provers.falsify import falsify
 
 POLICIES = Path(__file__).parent.parent / "examples" / "policies"
 RUNNER = ThreadRunner()

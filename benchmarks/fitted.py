@@ -16,10 +16,10 @@ import scipy.linalg
 import torch
 from numpy.typing import NDArray
 
-from certify.closed_loop import ClosedLoop
-from certify.expressions import Number, Symbol, sin, symbols
-from certify.policies import Policy, TanhNetwork, save_policy
-from certify.systems import System, available_systems, exact, get_system
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.expressions import Number, Symbol, sin, symbols
+from certify.loop.plants import System, available_systems, exact, get_system
+from certify.loop.policies import Policy, TanhNetwork, save_policy
 
 Array = NDArray[np.float64]
 

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from certify.float_error import FloatOptions, float_error
-from certify.policies import load_policy
-from certify.systems import available_systems, get_system, load_system
+from certify.loop.float32 import FloatOptions, float_error
+from certify.loop.plants import available_systems, get_system, load_system
+from certify.loop.policies import load_policy
 from tests.support.single import Machine, adversarial, by_torch
 
 EXAMPLES = Path(__file__).parent.parent / "examples"

@@ -18,16 +18,16 @@ import numpy as np
 import torch
 from fitted import chain, fit_policy, spread_of
 
-from certify.claims import Problem
-from certify.closed_loop import ClosedLoop
-from certify.engines.base import Budget
-from certify.engines.bounds.search import prove_outwards
-from certify.engines.falsify import falsify
-from certify.engines.local import prove_local
+from certify.certificates.claims import Problem
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.plants import System, get_system
 from certify.lyapunov import diagonalising_coordinates, domain_limit, solve_lyapunov
 from certify.lyapunov.function import Quadratic
-from certify.running import ThreadRunner
-from certify.systems import System, get_system
+from certify.provers.ball.local import prove_local
+from certify.provers.base import Budget
+from certify.provers.boxes.search import prove_outwards
+from certify.provers.execution import ThreadRunner
+from certify.provers.falsify import falsify
 
 WIDTHS = (10, 10, 10, 9, 9, 9)
 

@@ -13,7 +13,7 @@ from typing import get_args
 
 import numpy as np
 
-from certify.systems import get_system
+from certify.loop.plants import get_system
 from controllers.environments import PlantEnvironment
 from controllers.evaluate import errors_of
 from controllers.lqr import GainLearner

@@ -13,8 +13,8 @@ from functools import reduce
 import torch
 from torch import Tensor
 
-from certify.engines.bounds.rule import BoxBounds, VdotBound
-from certify.expressions import Algebra, evaluate
+from certify.loop.expressions import Algebra, evaluate
+from certify.provers.boxes.rule import BoxBounds, VdotBound
 
 Interval = tuple[Tensor, Tensor]
 

@@ -27,11 +27,11 @@ import numpy as np
 import scipy.linalg
 
 from certify import TanhNetwork, certify_roa, load_policy
+from certify.analysis.results import RoaResult
+from certify.loop.plants import System, get_system, load_system
+from certify.loop.policies.importers import ImportOptions, import_policy
 from certify.lyapunov import import_lyapunov
 from certify.lyapunov.learning.flow import LearningFlow
-from certify.policies.importers import ImportOptions, import_policy
-from certify.results import RoaResult
-from certify.systems import System, get_system, load_system
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 SAMPLED = 40_000  # states, of which is simulated what becomes of them

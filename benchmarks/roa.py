@@ -23,16 +23,16 @@ import numpy as np
 import torch
 from against import compare
 
-from certify.claims import Problem
-from certify.closed_loop import ClosedLoop
-from certify.engines.bounds.rule import VdotBound
+from certify.analysis.results import RoaResult
+from certify.analysis.run import RoaOptions, certify_roa
+from certify.certificates.claims import Problem
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.plants import get_system
+from certify.loop.policies import load_policy
 from certify.lyapunov import diagonalising_coordinates, solve_lyapunov, volume
 from certify.lyapunov.function import Quadratic
-from certify.policies import load_policy
-from certify.results import RoaResult
-from certify.roa import RoaOptions, certify_roa
-from certify.running import ThreadRunner
-from certify.systems import get_system
+from certify.provers.boxes.rule import VdotBound
+from certify.provers.execution import ThreadRunner
 
 POLICIES = Path(__file__).parent.parent / "examples" / "policies"
 

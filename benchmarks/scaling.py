@@ -29,13 +29,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from certify.certificate import Certificate, PartitionTree, leaves, read_certificate
-from certify.claims import Problem
-from certify.closed_loop import ClosedLoop
-from certify.engines.bounds import subtrees
-from certify.engines.bounds.partition import Partition
-from certify.engines.bounds.rule import VdotBound
-from certify.running.cluster import ClusterJobs, connect
+from certify.certificates import Certificate, PartitionTree, leaves, read_certificate
+from certify.certificates.claims import Problem
+from certify.loop.closed_loop import ClosedLoop
+from certify.provers.boxes import subtrees
+from certify.provers.boxes.partition import Partition
+from certify.provers.boxes.rule import VdotBound
+from certify.provers.execution.cluster import ClusterJobs, connect
 
 _BATCH = 2048
 _SHELL = 16.0  # of the ring's search

@@ -9,46 +9,46 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from certify.api import certify_roa
-    from certify.closed_loop import ClosedLoop
+    from certify.analysis.api import certify_roa
+    from certify.analysis.options import RoaOptions
+    from certify.analysis.results import RoaResult
+    from certify.certificates.verdict import Verdict
     from certify.errors import CertifyError, InputError
-    from certify.expressions import atan, cos, exp, from_sympy, sin, sqrt, symbols, tan, tanh
+    from certify.loop.closed_loop import ClosedLoop
+    from certify.loop.expressions import atan, cos, exp, from_sympy, sin, sqrt, symbols, tan, tanh
+    from certify.loop.plants import System, get_system
+    from certify.loop.policies import Policy, TanhNetwork, load_policy, save_policy
+    from certify.loop.policies.importers import ImportOptions
     from certify.lyapunov import Neural, Polynomial, load_lyapunov, save_lyapunov
-    from certify.options import RoaOptions
-    from certify.policies import Policy, TanhNetwork, load_policy, save_policy
-    from certify.policies.importers import ImportOptions
-    from certify.results import RoaResult
-    from certify.systems import System, get_system
-    from certify.verdict import Verdict
 
 _PUBLIC = {
     "CertifyError": "certify.errors",
     "InputError": "certify.errors",
-    "Verdict": "certify.verdict",
-    "System": "certify.systems",
-    "get_system": "certify.systems",
-    "symbols": "certify.expressions",
-    "sin": "certify.expressions",
-    "cos": "certify.expressions",
-    "tan": "certify.expressions",
-    "tanh": "certify.expressions",
-    "exp": "certify.expressions",
-    "atan": "certify.expressions",
-    "sqrt": "certify.expressions",
-    "from_sympy": "certify.expressions",
-    "TanhNetwork": "certify.policies",
-    "Policy": "certify.policies",
-    "load_policy": "certify.policies",
-    "save_policy": "certify.policies",
+    "Verdict": "certify.certificates.verdict",
+    "System": "certify.loop.plants",
+    "get_system": "certify.loop.plants",
+    "symbols": "certify.loop.expressions",
+    "sin": "certify.loop.expressions",
+    "cos": "certify.loop.expressions",
+    "tan": "certify.loop.expressions",
+    "tanh": "certify.loop.expressions",
+    "exp": "certify.loop.expressions",
+    "atan": "certify.loop.expressions",
+    "sqrt": "certify.loop.expressions",
+    "from_sympy": "certify.loop.expressions",
+    "TanhNetwork": "certify.loop.policies",
+    "Policy": "certify.loop.policies",
+    "load_policy": "certify.loop.policies",
+    "save_policy": "certify.loop.policies",
     "Neural": "certify.lyapunov",
     "Polynomial": "certify.lyapunov",
     "load_lyapunov": "certify.lyapunov",
     "save_lyapunov": "certify.lyapunov",
-    "ClosedLoop": "certify.closed_loop",
-    "certify_roa": "certify.api",
-    "RoaResult": "certify.results",
-    "RoaOptions": "certify.options",
-    "ImportOptions": "certify.policies.importers",
+    "ClosedLoop": "certify.loop.closed_loop",
+    "certify_roa": "certify.analysis.api",
+    "RoaResult": "certify.analysis.results",
+    "RoaOptions": "certify.analysis.options",
+    "ImportOptions": "certify.loop.policies.importers",
 }
 
 __version__ = "0.1.0"

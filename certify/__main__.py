@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from certify.cli import main
+from certify.cli.main import main
 
 if __name__ == "__main__":
     main()

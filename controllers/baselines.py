@@ -16,8 +16,8 @@ import torch
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from certify.policies import Policy, save_policy
-from certify.systems import System
+from certify.loop.plants import System
+from certify.loop.policies import Policy, save_policy
 from controllers.files import write_atomically
 from controllers.options import TrainingOptions, default_record
 from controllers.sac import Actor, Interface

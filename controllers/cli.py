@@ -11,7 +11,7 @@ import traceback
 
 import typer
 
-from certify.ending import closed_pipe, end_by_sigterm, is_of_closed_pipe
+from certify.cli.ending import closed_pipe, end_by_sigterm, is_of_closed_pipe
 from controllers.commands.compare import compare
 from controllers.commands.evaluate import evaluate
 from controllers.commands.flatten import flatten

@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.running.tasks import Place
-from certify.systems import System
+from certify.loop.plants import System
+from certify.provers.execution.tasks import Place
 from controllers.baselines import Trained
 from controllers.course import Course
 from controllers.figures import draw_curves, draw_over_time, draw_positions, draw_space, draw_states

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from certify.policies import TanhNetwork
+from certify.loop.policies import TanhNetwork
 
 _LEAST = 1e-30  # below any range that counts: a network that ignores the state has no scale of its own
 

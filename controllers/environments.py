@@ -1,4 +1,4 @@
-"""Simulators of `certify.systems`: a batched stepper and gymnasium environments over the same equations.
+"""Simulators of `certify.loop.plants`: a batched stepper and gymnasium environments over the same equations.
 
 The plant that is trained on is the plant that is proved: nothing here restates an equation, and nothing else
 in this package reads one. An action is held over `dt` and the state moves by one classical Runge-Kutta step
@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from certify.systems import System, get_system
-from certify.systems.ode import rk4_step
+from certify.loop.plants import System, get_system
+from certify.loop.plants.ode import rk4_step
 from controllers.options import TrainingOptions, available_plants, preset, require_one_step
 
 Array = NDArray[np.float64]

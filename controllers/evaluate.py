@@ -20,13 +20,13 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from certify.containment import ProvedSet
+from certify.certificates.membership import ProvedSet
 from certify.errors import InputError
-from certify.expressions import Expression, gathered
-from certify.policies import Policy, TanhNetwork
-from certify.running.threads import threads_for
-from certify.systems import System, shipped_system
-from certify.systems.system import Time
+from certify.loop.expressions import Expression, gathered
+from certify.loop.plants import System, shipped_system
+from certify.loop.plants.system import Time
+from certify.loop.policies import Policy, TanhNetwork
+from certify.provers.execution.threads import threads_for
 from controllers.environments import Stepper
 from controllers.lqr import Identified, riccati_gain
 from controllers.options import Plant, held_over

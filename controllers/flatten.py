@@ -33,8 +33,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from certify.errors import InputError
-from certify.policies import Policy, TanhNetwork, require_centred
-from certify.systems import System, shipped_system
+from certify.loop.plants import System, shipped_system
+from certify.loop.policies import Policy, TanhNetwork, require_centred
 from controllers.contraction import contracted, with_value_at_origin
 from controllers.departure import departure, departure_of, linearised
 from controllers.evaluate import MONITORING, curvature, discrete_linearisation, settle

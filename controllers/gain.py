@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from certify.policies import TanhNetwork
+from certify.loop.policies import TanhNetwork
 
 Array = NDArray[np.float64]
 

@@ -18,11 +18,11 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.containment import ProvedSet, proved_set, set_of
+from certify.certificates.membership import ProvedSet, proved_set, set_of
+from certify.certificates.verdict import Verdict
 from certify.errors import CertificateFormatError, InputError
+from certify.loop.plants import System
 from certify.lyapunov import Candidate, volume
-from certify.systems import System
-from certify.verdict import Verdict
 from controllers.evaluate import discrete_linearisation, recorded, recorded_step, require_same_question
 from controllers.files import read
 from controllers.kept import Kept
@@ -147,7 +147,7 @@ def prove(kept: Kept, system: System, folder: Path, options: ProvingOptions) -> 
     ------
     BackendError : the checker is missing or failed.
     """
-    from certify.api import certify_roa
+    from certify.analysis.api import certify_roa
 
     path, network = folder / "certificate.json", kept.policy.network
     if path.is_file():

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from certify.errors import InputError
-from certify.policies import Policy, load_policy, save_policy
+from certify.loop.policies import Policy, load_policy, save_policy
 from controllers.files import make_folder, require_writable
 from controllers.options import TrainingOptions
 

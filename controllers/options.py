@@ -4,7 +4,7 @@ Numbers that the paper fixes are defaults of `TrainingOptions`; numbers that dep
 and come from the plant's preset. All of them are written into the policy's `training` record.
 
 There is no list of plants: the plant `NAME` is the file `plants/NAME.py` with its constant `PLANT`, as its equations
-are the file `NAME.py` among `certify.systems.plants`.
+are the file `NAME.py` among `certify.loop.plants.shipped`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from certify.errors import InputError
 from controllers import plants
 
 if TYPE_CHECKING:
-    from certify.systems import System
+    from certify.loop.plants import System
 
 Centre = Literal["preactivation", "output", "none"]
 Identification = Literal["during", "before", "never"]

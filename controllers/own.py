@@ -21,8 +21,8 @@ from controllers.lqr import riccati_gain
 from controllers.options import Plant, TrainingOptions, available_plants, get_plant, held_over
 
 if TYPE_CHECKING:
-    from certify.systems import System
-    from certify.systems.source import PlantFile
+    from certify.loop.plants import System
+    from certify.loop.plants.source import PlantFile
 
 Array = NDArray[np.float64]
 
@@ -38,7 +38,7 @@ def chosen_plant(name: str) -> tuple[System, Plant]:
     ------
     InputError : no such plant; its own file bears the name of one that ships; or its options cannot be used.
     """
-    from certify.systems import available_systems, chosen_system, get_system
+    from certify.loop.plants import available_systems, chosen_system, get_system
 
     if name in available_plants():
         return get_system(name), get_plant(name)
@@ -54,7 +54,7 @@ def chosen_plant(name: str) -> tuple[System, Plant]:
         )
     plant = default_plant(system)
     if name.endswith(".toml"):
-        from certify.systems.source import read_plant_file
+        from certify.loop.plants.source import read_plant_file
 
         plant = _with_table(plant, read_plant_file(Path(name)))
     plant.check(system)
@@ -134,7 +134,7 @@ def time_step(system: System, w: Array, U: Array) -> float:
 
 def linearisation(system: System) -> tuple[Array, Array]:
     """A (n, n) and B (n, m) of the plant's equations at its operating point, in floats."""
-    from certify.systems import in_floats, linearise
+    from certify.loop.plants import in_floats, linearise
 
     A, B = linearise(system)
     return in_floats(A), in_floats(B)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from certify.systems import System
+from certify.loop.plants import System
 
 Array = NDArray[np.float64]
 Run = Literal["ours", "sac", "before", "uncentred", "sb3-sac", "sb3-ppo"]

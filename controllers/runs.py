@@ -22,11 +22,11 @@ from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from certify.certificate import sole_writer
+from certify.certificates import sole_writer
 from certify.errors import BackendError, InputError
-from certify.policies import load_policy
-from certify.running.tasks import Piece, Place, Processes
-from certify.systems import System
+from certify.loop.plants import System
+from certify.loop.policies import load_policy
+from certify.provers.execution.tasks import Piece, Place, Processes
 from controllers.baselines import ACTOR, OwnRun, Trained, from_checkpoint, from_policy, require_plant, without_gain
 from controllers.course import (
     CHECKPOINT,

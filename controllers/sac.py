@@ -32,8 +32,8 @@ from numpy.typing import NDArray
 from torch import Tensor, nn
 
 from certify.errors import InputError
-from certify.policies import TanhNetwork
-from certify.systems import System
+from certify.loop.plants import System
+from certify.loop.policies import TanhNetwork
 from controllers.departure import departure
 from controllers.options import Centre, GainNorm, TrainingOptions
 

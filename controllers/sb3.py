@@ -32,8 +32,8 @@ from numpy.typing import NDArray
 from torch import nn
 
 from certify.errors import InputError
-from certify.policies import Policy, TanhNetwork, save_policy
-from certify.systems import System
+from certify.loop.plants import System
+from certify.loop.policies import Policy, TanhNetwork, save_policy
 from controllers.baselines import Trained
 from controllers.environments import PlantEnvironment, Snapshot
 from controllers.files import write_atomically

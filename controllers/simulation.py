@@ -15,9 +15,9 @@ import torch
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from certify.policies import TanhNetwork
-from certify.systems import System
-from certify.systems.ode import rk4_step
+from certify.loop.plants import System
+from certify.loop.plants.ode import rk4_step
+from certify.loop.policies import TanhNetwork
 from controllers.environments import Stepper
 from controllers.options import Plant, TrainingOptions, get_plant
 

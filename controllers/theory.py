@@ -28,12 +28,12 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from certify.closed_loop import ClosedLoop
-from certify.containment import ProvedSet
+from certify.certificates.membership import ProvedSet
 from certify.errors import InputError
-from certify.policies import Policy
-from certify.rigorous import gain_at_origin, held_at_origin, is_definite, plant_at_origin, precision, rounded_up
-from certify.systems import System, shipped_system
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.plants import System, shipped_system
+from certify.loop.policies import Policy
+from certify.loop.rigorous import gain_at_origin, held_at_origin, is_definite, plant_at_origin, precision, rounded_up
 from controllers.evaluate import recorded, require_same_loop
 from controllers.options import Plant
 from controllers.simulation import held_loop, initial_states, mean_action

@@ -28,8 +28,8 @@ import torch
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from certify.policies import Policy
-from certify.systems import System
+from certify.loop.plants import System
+from certify.loop.policies import Policy
 from controllers.environments import PlantEnvironment, Snapshot
 from controllers.evaluate import curvature, errors_of, settle
 from controllers.files import write_atomically

@@ -12,7 +12,7 @@ from typing import Any
 import typer
 
 import certify
-from certify.cli import app
+from certify.cli.main import app
 
 COMMANDS, NAMES = "<!-- every command -->", "<!-- every public name -->"
 

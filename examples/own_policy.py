@@ -14,7 +14,7 @@ import scipy.linalg
 import torch
 
 from certify import RoaResult, certify_roa, get_system
-from certify.systems import in_floats, linearise
+from certify.loop.plants import in_floats, linearise
 
 TORQUE = 6.0  # N m, what the pendulum's motor can do
 

@@ -8,8 +8,8 @@ import pytest
 import torch
 from hypothesis import settings
 
+from certify.loop.plants import System, get_system
 from certify.report.drawing import Drawing
-from certify.systems import System, get_system
 
 # The suite runs one process a core: threads that wait for each other's cores take several times as long.
 torch.set_num_threads(1)

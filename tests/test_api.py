@@ -19,12 +19,12 @@ import torch
 
 import certify
 from certify import ImportOptions, InputError, Policy, RoaOptions, TanhNetwork, Verdict, certify_roa, get_system
-from certify.api import _remove, in_python
-from certify.certificate import parse_certificate
-from certify.expressions import Number, symbols
+from certify.analysis.api import _remove, in_python
+from certify.analysis.results import RoaResult
+from certify.certificates import parse_certificate
+from certify.loop.expressions import Number, symbols
+from certify.loop.policies import load_policy, save_policy
 from certify.lyapunov import volume
-from certify.policies import load_policy, save_policy
-from certify.results import RoaResult
 from tests.support.foreign import mlp, plant
 from tests.support.loops import pendulum_network, scalar_tanh
 
@@ -119,7 +119,7 @@ def test_what_the_core_takes_is_taken(tmp_path: Path) -> None:
     )
     assert result.verdict is Verdict.PROVED and result.seconds["load"] >= 2.0 and "check" in seen
     assert json.loads((result.raw or b"").decode())["provenance"] == {"mine": "yes"}
-    core = inspect.signature(__import__("certify.roa", fromlist=["certify_roa"]).certify_roa).parameters
+    core = inspect.signature(__import__("certify.analysis.run", fromlist=["certify_roa"]).certify_roa).parameters
     ours = list(inspect.signature(certify_roa).parameters)
     assert ours[:4] == ["system", "policy", "out", "options"] and set(core) - {"network", "show"} <= set(
         ours

@@ -15,50 +15,17 @@ import pytest
 from tests.support.marks import slow_after
 
 ROOT = Path(__file__).parent.parent
-LEAVES = {"errors", "verdict"}  # anybody may import these, and they import nothing
-ENTRY = {"cli", "commands", "__main__"}  # these may import anything of certify
-EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows that exist
-    "acceptance": "certificate claims engines",
-    "api": "inputs installation lyapunov options policies results roa systems",
-    "arguments": "inputs policies systems",
-    "asked": "options systems",
-    "beyond": "claims engines lyapunov options results",
-    "certificate": "claims expressions lyapunov policies systems",
-    "claims": "closed_loop expressions lyapunov policies",
-    "closed_loop": "expressions policies systems",
-    "containment": "certificate claims lyapunov sublevel systems",
-    "coq": "certificate policies",
-    "diagnosis": "closed_loop engines lyapunov options policies report results systems",
-    "enclosures": "closed_loop expressions lyapunov policies rigorous systems",
-    "engines": "certificate claims closed_loop enclosures expressions lyapunov policies rigorous running systems",
-    "float_error": "closed_loop policies rigorous systems",
-    "inputs": "lyapunov policies systems",
-    "largest": "certificate claims closed_loop engines lyapunov options policies results roa systems",
-    "lyapunov": "closed_loop expressions plain_file policies rigorous systems",
-    "options": "lyapunov",
-    "outcome": "claims closed_loop engines lyapunov race results rigorous trials",
-    "parts": "certificate running",
-    "policies": "plain_file systems",
-    "race": "engines lyapunov trials",
-    "report": "certificate claims closed_loop expressions lyapunov policies systems",
-    "rest": "closed_loop rigorous",
-    "results": "certificate claims engines lyapunov policies report rest sublevel systems",
-    "rigorous": "closed_loop expressions policies",
-    "roa": (
-        "acceptance asked beyond certificate claims closed_loop diagnosis engines lyapunov options outcome parts "
-        "policies race rest results running systems trials unfinished"
-    ),
-    "sublevel": "expressions lyapunov rigorous systems",
-    "sweep": (
-        "arguments certificate claims closed_loop engines inputs installation lyapunov options outcome policies report "
-        "results roa running systems"
-    ),
-    "systems": "expressions",
-    "trials": "certificate claims closed_loop engines lyapunov options",
-    "unfinished": "certificate claims closed_loop engines lyapunov policies systems trials",
-    "controllers": "api certificate closed_loop containment ending expressions lyapunov policies report rigorous "
-    "running systems",
+LEAVES = {"errors"}  # anybody may import these, and they import nothing
+ENTRY = {"cli", "__main__"}  # these may import anything of certify
+EDGES = {  # who imports whom, besides errors: exactly the arrows that exist
+    "analysis": "certificates loop lyapunov provers report",
+    "certificates": "loop lyapunov",
+    "lyapunov": "loop",
+    "provers": "certificates loop lyapunov",
+    "report": "certificates loop lyapunov",
+    "controllers": "analysis certificates cli loop lyapunov provers report",
 }
+ROOMS = {"analysis", "certificates", "checker", "cli", "errors", "loop", "lyapunov", "provers", "reference", "report"}
 
 
 def unit(module: str) -> str:
@@ -108,8 +75,12 @@ def test_the_arrows_are_exactly_these() -> None:
     assert {name: to for name, to in found.items() if to} == EDGES
 
 
+def test_there_are_ten_rooms() -> None:
+    assert {name for name in units() if name not in ("__init__", "__main__", "controllers")} == ROOMS
+
+
 def test_the_picture_shows_these_arrows() -> None:
-    """Of `docs/house.md`: all but those that follow from others, and what `commands` may see anyway."""
+    """Of `docs/house.md`: all but those that follow from others, and what `cli` may see anyway."""
     picture = (ROOT / "docs" / "house.md").read_text("utf-8").split("```mermaid")[1].split("```")[0]
     shown: dict[str, set[str]] = {}
     for line in picture.splitlines():
@@ -186,13 +157,13 @@ def test_certify_never_imports_controllers() -> None:
     ("statement", "absent"),
     [
         ("import certify", ["torch", "sympy", "scipy", "numpy", "matplotlib"]),
-        ("import certify.cli", ["torch", "sympy", "scipy", "matplotlib"]),
+        ("import certify.cli.main", ["torch", "sympy", "scipy", "matplotlib"]),
         ("import certify.checker.rules, certify.checker.__main__", ["torch", "sympy", "scipy", "matplotlib"]),
         ("import certify.reference.__main__", ["torch", "sympy", "scipy", "matplotlib", "numpy", "certify.checker"]),
-        ("import certify.systems", ["torch", "scipy", "matplotlib"]),
-        ("import certify.policies.importers", ["torch", "onnx", "safetensors", "stable_baselines3"]),
+        ("import certify.loop.plants", ["torch", "scipy", "matplotlib"]),
+        ("import certify.loop.policies.importers", ["torch", "onnx", "safetensors", "stable_baselines3"]),
         ("import certify.report", ["matplotlib", "jinja2"]),
-        ("import certify.certificate.checking", ["numpy", "sympy", "scipy", "torch", "flint"]),
+        ("import certify.certificates.checking", ["numpy", "sympy", "scipy", "torch", "flint"]),
     ],
 )
 def test_start_up_is_light(statement: str, absent: list[str]) -> None:
@@ -205,7 +176,13 @@ SHIPPED = ROOT / "examples" / "policies" / "pendulum.pt"
 NOT_FOR_A_VERDICT = [
     *("matplotlib", "jinja2", "cvxpy", "onnx", "safetensors", "distributed", "numba", "pyarrow"),
     *("scipy.optimize", "scipy.stats", "scipy.ndimage", "scipy.interpolate", "scipy.spatial"),
-    *("torch._dynamo", "torch._inductor", "certify.engines.dreal", "certify.lyapunov.learning", "certify.largest"),
+    *(
+        "torch._dynamo",
+        "torch._inductor",
+        "certify.provers.dreal",
+        "certify.lyapunov.learning",
+        "certify.analysis.maximise",
+    ),
     *("certify.report.page", "certify.report.figures", "certify.checker", "certify.reference"),
 ]
 
@@ -214,7 +191,7 @@ NOT_FOR_A_VERDICT = [
 def test_a_proof_loads_no_more_than_it_needs(arguments: list[str], tmp_path: Path) -> None:
     """The whole command as a user has it; what draws its report, and what checks it, are other processes."""
     code = (
-        "import sys\nfrom certify.cli import _run\n"
+        "import sys\nfrom certify.cli.main import _run\n"
         "status = _run(sys.argv[1:], False)\n"
         f"sys.exit(' '.join(set({NOT_FOR_A_VERDICT}) & set(sys.modules)) or status)"
     )
@@ -228,7 +205,7 @@ def test_a_proof_loads_no_more_than_it_needs(arguments: list[str], tmp_path: Pat
 def test_help_and_a_check_load_no_arithmetic(command: list[str]) -> None:
     """A check's is in the checker's own process."""
     code = (
-        "import sys\nfrom certify.cli import _run\nstatus = _run(sys.argv[1:], False)\n"
+        "import sys\nfrom certify.cli.main import _run\nstatus = _run(sys.argv[1:], False)\n"
         "print(' '.join({'numpy', 'sympy', 'scipy', 'torch', 'flint'} & set(sys.modules)) or 'none', status)"
     )
     done = subprocess.run([sys.executable, "-c", code, *command], capture_output=True, text=True, check=False)

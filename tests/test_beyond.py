@@ -14,14 +14,14 @@ import numpy as np
 import pytest
 
 from certify import Neural, Polynomial, System, TanhNetwork, certify_roa, save_lyapunov
-from certify.acceptance import Clerk
-from certify.certificate import Certificate, PartitionTree
-from certify.engines.outer import Rise
+from certify.analysis.acceptance import Clerk
+from certify.analysis.results import RoaResult
+from certify.certificates import Certificate, PartitionTree
+from certify.certificates.verdict import Stop, Verdict
 from certify.errors import InputError
-from certify.expressions import Expression, Number, Symbol, cos
+from certify.loop.expressions import Expression, Number, Symbol, cos
 from certify.lyapunov import Symbolic
-from certify.results import RoaResult
-from certify.verdict import Stop, Verdict
+from certify.provers.outer import Rise
 
 x, u = Symbol("x"), Symbol("u")
 SQUARE = Polynomial(np.array([[2]]), np.array([1.0]))

@@ -13,18 +13,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from certify import roa
-from certify.certificate import limits, read_certificate, run_checker
+from certify.analysis import run as roa
+from certify.analysis.run import RoaOptions, certify_roa
+from certify.certificates import limits, read_certificate, run_checker
+from certify.certificates.verdict import Verdict
 from certify.checker import ball as checker_ball
 from certify.checker import document as checker_document
 from certify.checker import exact as checker_exact
 from certify.checker import expression as checker_expression
-from certify.engines import models as producer_models
 from certify.errors import CertificateFormatError, InputError
-from certify.expressions import Number, from_tree, symbols, tan, to_tree
-from certify.roa import RoaOptions, certify_roa
-from certify.systems import available_systems, get_system
-from certify.verdict import Verdict
+from certify.loop.expressions import Number, from_tree, symbols, tan, to_tree
+from certify.loop.plants import available_systems, get_system
+from certify.provers.ball import models as producer_models
 from tests.support.loops import pendulum_network, scalar_tanh
 
 Document = dict[str, Any]

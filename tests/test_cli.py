@@ -18,15 +18,15 @@ import pytest
 import torch
 import typer
 
-from certify.arguments import with_domains
-from certify.certificate import checking, model
-from certify.cli import _run, app
-from certify.commands.terminal import ring_line
-from certify.commands.typed import options_of
-from certify.engines.base import Progress
-from certify.options import RoaOptions
-from certify.policies import Policy, TanhNetwork, load_policy, save_policy
-from certify.systems import get_system
+from certify.analysis.arguments import with_domains
+from certify.analysis.options import RoaOptions
+from certify.certificates import checking, model
+from certify.cli.main import _run, app
+from certify.cli.terminal import ring_line
+from certify.cli.typed import options_of
+from certify.loop.plants import get_system
+from certify.loop.policies import Policy, TanhNetwork, load_policy, save_policy
+from certify.provers.base import Progress
 from tests.support.loops import chain, pendulum_network
 
 SHIPPED = Path(__file__).parent.parent / "examples" / "policies" / "pendulum.pt"
@@ -388,7 +388,7 @@ def test_the_installed_command(tmp_path: Path) -> None:
 def test_an_interrupt_leaves_a_search_and_nothing_half_written(
     where: str, tmp_path: Path, policy_file: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from certify.engines.bounds.rule import VdotBound
+    from certify.provers.boxes.rule import VdotBound
 
     def interrupt(*_: object, **__: object) -> None:
         raise KeyboardInterrupt
@@ -396,7 +396,7 @@ def test_an_interrupt_leaves_a_search_and_nothing_half_written(
     if where == "ring":
         monkeypatch.setattr(VdotBound, "__call__", interrupt)
     else:
-        monkeypatch.setattr("certify.roa.run_checker", interrupt)
+        monkeypatch.setattr("certify.analysis.run.run_checker", interrupt)
     status, out, err = run(capsys, "roa", "--policy", policy_file, "--out", tmp_path / "o")
     assert status == 130 and out == "" and "interrupted" in err and "--resume" in err
     assert [path.name for path in (tmp_path / "o").iterdir()] == ["search.json"]
@@ -411,7 +411,7 @@ def test_control_c_ends_a_running_command(tmp_path: Path, number: signal.Signals
     """A suite in the background of a script ignores SIGINT, and its children inherit that: this one listens again."""
     listening = (
         "import signal, sys; signal.signal(signal.SIGINT, signal.default_int_handler); "
-        "from certify.cli import main; main(sys.argv[1:])"
+        "from certify.cli.main import main; main(sys.argv[1:])"
     )
     command = [sys.executable, "-c", listening, "roa", "--policy", str(SHIPPED.with_name("cartpole.pt"))]
     running = subprocess.Popen(
@@ -780,11 +780,11 @@ def test_a_sample_time_and_a_rate_are_said_everywhere(
 def test_a_plant_in_discrete_time_is_listed_by_its_steps(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from certify.systems import get_system
+    from certify.loop.plants import get_system
 
     steps = replace(get_system("pendulum"), time="discrete", dynamics=get_system("pendulum").states)
-    monkeypatch.setattr("certify.systems.available_systems", lambda: ("pendulum",))
-    monkeypatch.setattr("certify.systems.get_system", lambda _: steps)
+    monkeypatch.setattr("certify.loop.plants.available_systems", lambda: ("pendulum",))
+    monkeypatch.setattr("certify.loop.plants.get_system", lambda _: steps)
     listed = run(capsys, "systems")[1]
     assert "  theta+ = theta\n" in listed and "theta' =" not in listed
 
@@ -816,7 +816,7 @@ def test_a_command_that_ends_at_once_has_said_everything(
 ) -> None:
     """Into a pipe, which is not flushed line by line; what is left for the end is done, and a profiler sees the end."""
     code = (
-        "import atexit, sys; from certify.cli import main\n"
+        "import atexit, sys; from certify.cli.main import main\n"
         "atexit.register(lambda: sys.stderr.write('left\\n'))\n"
         f"{watch}\n"
         "try:\n    main()\nfinally:\n    sys.stderr.write('ended\\n')"

@@ -21,25 +21,25 @@ from flint import arb, ctx
 from hypothesis import given
 from hypothesis import strategies as st
 
-from certify.certificate import read_certificate, run_checker
+from certify.analysis.run import RoaOptions, certify_roa
+from certify.certificates import read_certificate, run_checker
+from certify.certificates.claims import Asymptotic, conditions
+from certify.certificates.claims.queries import query
+from certify.certificates.verdict import Verdict
 from certify.checker import network as checker
 from certify.checker.document import Policy as CheckerPolicy
-from certify.claims import Asymptotic, conditions
-from certify.claims.queries import query
-from certify.closed_loop import ClosedLoop
-from certify.enclosures import policy as producer
-from certify.engines.falsify import falsify
-from certify.engines.local import prove_local
 from certify.errors import InputError
-from certify.expressions import Number
-from certify.policies import Policy, TanhNetwork, bounded_by_form, load_policy, require_centred, save_policy
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.expressions import Number
+from certify.loop.plants import System, get_system
+from certify.loop.policies import Policy, TanhNetwork, bounded_by_form, load_policy, require_centred, save_policy
+from certify.loop.rigorous import eigenvalues, evaluate_policy
+from certify.provers.ball.local import prove_local
+from certify.provers.bounds import policy as producer
+from certify.provers.falsify import falsify
 from certify.reference import leaves as reference
 from certify.reference import rules as reference_rules
 from certify.report import render_html
-from certify.rigorous import eigenvalues, evaluate_policy
-from certify.roa import RoaOptions, certify_roa
-from certify.systems import System, get_system
-from certify.verdict import Verdict
 from tests.support.cases import case_of
 from tests.support.certificates import edited, encode, grow, make, rehash, verdict
 from tests.support.loops import box, pendulum_network, scalar_clip

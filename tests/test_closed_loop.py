@@ -9,12 +9,12 @@ import flint
 import numpy as np
 import pytest
 
-from certify.closed_loop import ClosedLoop
 from certify.errors import InputError
-from certify.expressions import Number, Symbol, symbols
-from certify.policies import TanhNetwork
-from certify.rigorous import eigenvalues, evaluate_policy, evaluate_vdot
-from certify.systems import System, get_system
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.expressions import Number, Symbol, symbols
+from certify.loop.plants import System, get_system
+from certify.loop.policies import TanhNetwork
+from certify.loop.rigorous import eigenvalues, evaluate_policy, evaluate_vdot
 from tests.support.loops import box, chain, pendulum_network, scalar_tanh
 
 

@@ -19,19 +19,19 @@ import numpy as np
 import pytest
 import torch
 
-from certify.claims import Problem
-from certify.enclosures import compiled, kernels, loop_models, tape
-from certify.enclosures import policy as policies
-from certify.enclosures import taylor as models
-from certify.enclosures.compiled import Compiled
-from certify.enclosures.loop import played
-from certify.engines.base import Budget
-from certify.engines.bounds.rule import BoxBounds, VdotBound
-from certify.engines.bounds.search import prove_outwards
-from certify.expressions.tree import FUNCTIONS
-from certify.policies import load_policy
-from certify.running import ThreadRunner
-from certify.systems import get_system
+from certify.certificates.claims import Problem
+from certify.loop.expressions.tree import FUNCTIONS
+from certify.loop.plants import get_system
+from certify.loop.policies import load_policy
+from certify.provers.base import Budget
+from certify.provers.bounds import compiled, kernels, loop_models, tape
+from certify.provers.bounds import policy as policies
+from certify.provers.bounds import taylor as models
+from certify.provers.bounds.compiled import Compiled
+from certify.provers.bounds.loop import played
+from certify.provers.boxes.rule import BoxBounds, VdotBound
+from certify.provers.boxes.search import prove_outwards
+from certify.provers.execution import ThreadRunner
 from tests.engines.test_steps import alone, stepped, uncertain_pendulum
 from tests.engines.test_vdot import CASES, cartpole_case
 from tests.support.cases import case_of
@@ -183,9 +183,9 @@ def test_the_loops_are_there_once_enough_was_asked_for() -> None:
 
 def test_without_numba_torch_does_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "numba", None)
-    monkeypatch.delitem(sys.modules, "certify.enclosures.kernels")
+    monkeypatch.delitem(sys.modules, "certify.provers.bounds.kernels")
     with pytest.raises(ImportError):
-        importlib.import_module("certify.enclosures.kernels")
+        importlib.import_module("certify.provers.bounds.kernels")
     wanted = Compiled(worth=0.0, least=0.0)
     assert wanted(1.0) is None and wanted(1.0) is None
     monkeypatch.setattr(compiled, "_of_process", wanted)

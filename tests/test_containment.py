@@ -17,15 +17,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from certify import TanhNetwork, certify_roa
-from certify.certificate import parse_certificate
-from certify.cli import _run
-from certify.commands.arguments import region
-from certify.containment import Box, Containment, Ellipsoid, Located, ProvedSet, proved_set
+from certify.certificates import parse_certificate
+from certify.certificates.membership import Box, Containment, Ellipsoid, Located, ProvedSet, proved_set
+from certify.cli.arguments import region
+from certify.cli.main import _run
 from certify.errors import CertificateFormatError, InputError
-from certify.expressions import Number, Symbol, cos, sin, symbols
+from certify.loop.expressions import Number, Symbol, cos, sin, symbols
+from certify.loop.plants import System, load_system
 from certify.lyapunov import Neural, Symbolic
-from certify.sublevel import Sublevel
-from certify.systems import System, load_system
+from certify.lyapunov.sublevel import Sublevel
 from controllers.evaluate import count_covered
 from tests.support.beyond import line, network, plane
 from tests.support.certificates import write
@@ -440,7 +440,7 @@ def test_sets_contain_a_box_together() -> None:
 
 def test_boxes_that_touch_the_boundary_are_not_decided_by_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
     """sin^2 + cos^2 is 1 on all of the box, and no ball tells: it takes all the pieces there are, and says nothing."""
-    monkeypatch.setattr("certify.containment._PIECES", 100)
+    monkeypatch.setattr("certify.certificates.membership._PIECES", 100)
     x0, x1 = symbols("x0 x1")
     flat = sin(x0) ** 2 + cos(x0) ** 2 + 0 * x1
     both = replace(union(np.eye(2)), outer=Sublevel(Symbolic(flat, (x0, x1)), 1.0, ((F(-3), F(3)),) * 2))

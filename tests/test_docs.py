@@ -105,7 +105,7 @@ def test_every_block_says_whether_it_is_run(page: Path) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=named)
 def test_commands_exist_with_their_options(page: Path) -> None:
-    from certify.cli import app as certify
+    from certify.cli.main import app as certify
     from controllers.cli import app as controllers
 
     programs = {"certify": typer.main.get_command(certify), "controllers": typer.main.get_command(controllers)}
@@ -242,7 +242,7 @@ def test_formulas_have_room_beside_functions(formula: str, text: str) -> None:
 
 def test_the_reference_has_every_command_and_public_name(site: Path) -> None:
     import certify
-    from certify.cli import app
+    from certify.cli.main import app
 
     commands = (site / "reference" / "commands.html").read_text("utf-8")
     for name in getattr(typer.main.get_command(app), "commands"):  # noqa: B009

@@ -14,16 +14,16 @@ import torch
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from certify.closed_loop import ClosedLoop
-from certify.enclosures import Models, PolicyEnclosure, Taylor, kernels, upper_bound
-from certify.enclosures.loop import played
-from certify.enclosures.policy import relax_tanh
-from certify.enclosures.tape import recorded
-from certify.enclosures.taylor import ConstantsLast
-from certify.expressions import Expression, Number, atan, cos, evaluate, exp, sin, sqrt, symbols, tan, tanh
-from certify.policies import TanhNetwork
-from certify.rigorous import evaluate_arb, evaluate_policy
-from certify.systems import System, get_system
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.expressions import Expression, Number, atan, cos, evaluate, exp, sin, sqrt, symbols, tan, tanh
+from certify.loop.plants import System, get_system
+from certify.loop.policies import TanhNetwork
+from certify.loop.rigorous import evaluate_arb, evaluate_policy
+from certify.provers.bounds import Models, PolicyEnclosure, Taylor, kernels, upper_bound
+from certify.provers.bounds.loop import played
+from certify.provers.bounds.policy import relax_tanh
+from certify.provers.bounds.tape import recorded
+from certify.provers.bounds.taylor import ConstantsLast
 from tests.support.algebra import to_sympy
 from tests.support.loops import box, pendulum_network
 from tests.support.ways import WAYS, Way, bounded

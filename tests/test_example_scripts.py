@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from certify import RoaResult
-from certify.certificate.checking import ask
-from certify.verdict import Verdict
+from certify.certificates.checking import ask
+from certify.certificates.verdict import Verdict
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 SCRIPTS = sorted(EXAMPLES.glob("*.py"))

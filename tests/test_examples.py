@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from certify.closed_loop import ClosedLoop
-from certify.policies import load_policy
-from certify.roa import RoaOptions, certify_roa
-from certify.systems import available_systems, controllability, linearise, load_system
-from certify.verdict import Verdict
+from certify.analysis.run import RoaOptions, certify_roa
+from certify.certificates.verdict import Verdict
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.plants import available_systems, controllability, linearise, load_system
+from certify.loop.policies import load_policy
 from controllers.options import default_record
 from controllers.own import chosen_plant
 

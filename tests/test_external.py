@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from certify.cli import _run
+from certify.cli.main import _run
 
 FOLDER = Path(__file__).parent.parent.parent / "shared" / "external" / "two_stage"
 SAID = {

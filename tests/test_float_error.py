@@ -14,15 +14,15 @@ import flint
 import numpy as np
 import pytest
 
-from certify import float_error as module
-from certify.cli import _run
-from certify.closed_loop import ClosedLoop
+from certify.cli.main import _run
 from certify.errors import InputError
-from certify.expressions import symbols
-from certify.float_error import FloatError, FloatOptions, float_error
-from certify.policies import Policy, TanhNetwork, load_policy, save_policy
-from certify.rigorous import evaluate_policy, precision
-from certify.systems import System, available_systems, get_system, load_system
+from certify.loop import float32 as module
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.expressions import symbols
+from certify.loop.float32 import FloatError, FloatOptions, float_error
+from certify.loop.plants import System, available_systems, get_system, load_system
+from certify.loop.policies import Policy, TanhNetwork, load_policy, save_policy
+from certify.loop.rigorous import evaluate_policy, precision
 from tests.support.loops import box, pendulum_network
 from tests.support.marks import slow_after
 from tests.support.single import Machine, adversarial, by_torch, f32, off_by, units

@@ -16,16 +16,17 @@ from flint import arb, ctx, fmpq
 from hypothesis import given
 from hypothesis import strategies as st
 
-from certify.certificate import run_checker
+from certify.analysis.run import RoaOptions, certify_roa
+from certify.certificates import run_checker
+from certify.certificates.claims import Asymptotic, conditions
+from certify.certificates.claims.queries import query
+from certify.certificates.verdict import Verdict
 from certify.checker import expression as checker_expression
 from certify.checker import jets as checker_jets
 from certify.checker import taylor as checker_taylor
-from certify.claims import Asymptotic, conditions
-from certify.claims.queries import query
-from certify.closed_loop import ClosedLoop
-from certify.engines.local import prove_local
 from certify.errors import InputError
-from certify.expressions import (
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.expressions import (
     Expression,
     Number,
     atan,
@@ -37,18 +38,17 @@ from certify.expressions import (
     tanh,
     to_tree,
 )
-from certify.policies import TanhNetwork
+from certify.loop.plants import System, load_system
+from certify.loop.plants.toml import parse_expression
+from certify.loop.policies import TanhNetwork
+from certify.loop.rigorous import evaluate_arb
+from certify.provers.ball.local import prove_local
 from certify.reference import expressions as reference_expressions
 from certify.reference import model as reference_model
 from certify.reference import rules as reference_rules
 from certify.reference import taylor as reference_taylor
 from certify.reference.refusal import Refused
 from certify.reference.symmetric import orders, triples
-from certify.rigorous import evaluate_arb
-from certify.roa import RoaOptions, certify_roa
-from certify.systems import System, load_system
-from certify.systems.toml import parse_expression
-from certify.verdict import Verdict
 from tests.support.balls import with_ball
 from tests.support.cases import case_of
 from tests.support.certificates import Document, edited, grow, make, verdict

@@ -11,15 +11,15 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from certify.analysis.run import RoaOptions, certify_roa
+from certify.certificates.verdict import Verdict
 from certify.errors import InputError
-from certify.expressions import Number, Symbol
-from certify.policies import TanhNetwork
+from certify.loop.expressions import Number, Symbol
+from certify.loop.plants import System
+from certify.loop.plants.toml import parse_expression
+from certify.loop.policies import TanhNetwork
 from certify.reference.rules import judge
 from certify.report import summary
-from certify.roa import RoaOptions, certify_roa
-from certify.systems import System
-from certify.systems.toml import parse_expression
-from certify.verdict import Verdict
 from tests.support.certificates import dump, grow, make, verdict
 
 

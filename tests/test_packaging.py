@@ -21,13 +21,13 @@ import pytest
 from packaging.requirements import Requirement
 
 import certify
-from certify.certificate import checking
-from certify.cli import _run
-from certify.commands import doctor as doctor_command
-from certify.engines.dreal import backend
+from certify.analysis.installation import found_by_import, source_sha256, version_of
+from certify.analysis.options import RoaOptions
+from certify.certificates import checking
+from certify.cli import doctor as doctor_command
+from certify.cli.main import _run
 from certify.errors import BackendError
-from certify.installation import found_by_import, source_sha256, version_of
-from certify.options import RoaOptions
+from certify.provers.dreal import backend
 from tests.support.marks import slow_after
 
 ROOT = Path(__file__).parent.parent
@@ -143,7 +143,7 @@ def test_the_hash_of_a_checker_is_that_of_sha256sum(program: Any) -> None:
 
 def test_every_byte_of_a_checker_counts(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.copytree(ROOT / "certify" / "checker", tmp_path / "checker")
-    monkeypatch.setattr("certify.installation._HERE", tmp_path)
+    monkeypatch.setattr("certify.analysis.installation._HERE", tmp_path)
     before = source_sha256("checker")
     assert before == hashlib.sha256(
         b"".join(
@@ -227,7 +227,7 @@ def test_the_doctor_in_words(capsys: pytest.CaptureFixture[str]) -> None:
 def test_a_missing_extra_is_named_with_its_command(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("certify.installation.version_of", lambda name: None if name == "onnx" else "1.0")
+    monkeypatch.setattr("certify.analysis.installation.version_of", lambda name: None if name == "onnx" else "1.0")
     status, found = findings(capsys)
     assert status == 0
     assert found["onnx"]["state"] == "missing" and found["onnx"]["advice"] == "pip install 'certify[onnx]'"
@@ -255,7 +255,7 @@ def test_a_core_package_that_does_not_load_is_a_fault(
             raise OSError("libsomething.so: cannot open shared object file")
         return load(name, package)
 
-    monkeypatch.setattr("certify.commands.doctor.importlib.import_module", broken)
+    monkeypatch.setattr("certify.cli.doctor.importlib.import_module", broken)
     status, found = findings(capsys)
     name = {"flint": "python-flint"}.get(module, module)
     assert status == 1 and found[name]["state"] == "fault" and "libsomething.so" in found[name]["found"]
@@ -278,7 +278,7 @@ def test_a_checker_that_does_not_check_is_a_fault(
             raise BackendError("it ended with status 70 and no verdict")
         return (0, {"result": "ACCEPTED"}) if says == "yes" else (1, {"result": "REJECTED"})
 
-    monkeypatch.setattr("certify.certificate.checking.ask", ask)
+    monkeypatch.setattr("certify.certificates.checking.ask", ask)
     # The run itself asks the checker through this too, and then there is no proof to show to either.
     status, found = findings(capsys)
     assert status == 1
@@ -291,7 +291,7 @@ def test_shells_complete_commands_and_options(shell: str, tmp_path: Path) -> Non
     environment = (
         os.environ | words | {"_CERTIFY_COMPLETE": f"complete_{shell}", "_TYPER_COMPLETE_FISH_ACTION": "get-args"}
     )
-    code = "from certify.cli import main; main([])"
+    code = "from certify.cli.main import main; main([])"
     done = subprocess.run(
         [sys.executable, "-c", code], env=environment, cwd=tmp_path, capture_output=True, text=True, check=False
     )
@@ -308,5 +308,5 @@ def test_help_names_completion_and_version(capsys: pytest.CaptureFixture[str]) -
 def test_nothing_is_imported_that_is_not_needed_to_say_the_version() -> None:
     """Neither the hashes nor the doctor's own module wait for torch."""
     assert importlib.util.find_spec("torch") is not None
-    code = "import certify.commands.doctor, certify.installation, sys; sys.exit('torch' in sys.modules)"
+    code = "import certify.cli.doctor, certify.analysis.installation, sys; sys.exit('torch' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

@@ -11,14 +11,14 @@ from typing import Any
 import pytest
 import torch
 
-from certify.certificate import run_checker
-from certify.certificate.checking import ask
+from certify.analysis.options import RoaOptions
+from certify.analysis.parts import Part, check_in_parts
+from certify.analysis.run import certify_roa
+from certify.certificates import run_checker
+from certify.certificates.checking import ask
+from certify.certificates.verdict import Verdict
 from certify.errors import BackendError
-from certify.options import RoaOptions
-from certify.parts import Part, check_in_parts
-from certify.roa import certify_roa
-from certify.running import Work
-from certify.verdict import Verdict
+from certify.provers.execution import Work
 from tests.support.loops import scalar_tanh
 
 CERTIFICATE = Path(__file__).parent.parent / "docs" / "published" / "two_machines.json"
@@ -67,7 +67,7 @@ def honest(work: Work, job: bytes, number: int) -> bytes:
 
 @pytest.fixture(autouse=True)
 def small_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("certify.parts._LEAVES", 500)
+    monkeypatch.setattr("certify.analysis.parts._LEAVES", 500)
 
 
 def test_the_answer_is_that_of_the_whole() -> None:
@@ -164,7 +164,7 @@ def certified(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, workers: Workers)
     def runner(_: RoaOptions) -> Iterator[Workers]:
         yield workers
 
-    monkeypatch.setattr("certify.roa._runner_for", runner)
+    monkeypatch.setattr("certify.analysis.run._runner_for", runner)
     plant, law = scalar_tanh()
     options = RoaOptions(candidate="lyapunov", level=1.0, cluster="tcp://head:8786", cluster_checks=True)
     return certify_roa(plant, law, tmp_path, options)

@@ -12,14 +12,13 @@ import pytest
 import sympy
 import torch
 
-from certify.certificate import parse_certificate
-from certify.cli import _run
+from certify.analysis.run import RoaOptions, certify_roa
+from certify.certificates import parse_certificate
+from certify.certificates.verdict import Verdict
+from certify.cli.main import _run
 from certify.errors import InputError
-from certify.expressions import Expression, Number, from_sympy, from_tree, sin, sqrt, symbols
-from certify.policies import Policy, TanhNetwork, save_policy
-from certify.report import summary
-from certify.roa import RoaOptions, certify_roa
-from certify.systems import (
+from certify.loop.expressions import Expression, Number, from_sympy, from_tree, sin, sqrt, symbols
+from certify.loop.plants import (
     System,
     chosen_system,
     controllability,
@@ -31,7 +30,8 @@ from certify.systems import (
     load_system,
     shipped_system,
 )
-from certify.verdict import Verdict
+from certify.loop.policies import Policy, TanhNetwork, save_policy
+from certify.report import summary
 from tests.support.algebra import same
 from tests.support.loops import box
 from tests.support.marks import slow_after
@@ -395,8 +395,8 @@ def test_the_table_of_the_training_is_the_trainer_s(tmp_path: Path) -> None:
 PYTHON = """
 from fractions import Fraction
 from pathlib import Path
-from certify.expressions import Number, symbols
-from certify.systems import System, exact, in_deviations
+from certify.loop.expressions import Number, symbols
+from certify.loop.plants import System, exact, in_deviations
 
 Path(__file__).with_name("ran").touch()
 x, u = symbols("x u")

@@ -14,7 +14,7 @@ import torch
 
 from certify.checker.document import Policy as CheckerPolicy
 from certify.errors import InputError
-from certify.policies import Policy, TanhNetwork, load_policy, save_policy
+from certify.loop.policies import Policy, TanhNetwork, load_policy, save_policy
 from tests.support.loops import pendulum_network
 
 U_EQ = (Fraction(1, 3),)

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from certify.certificate import run_checker
+from certify.certificates import run_checker
 from tests.support.marks import slow_after
 
 DOCS = Path(__file__).parent.parent / "docs"

@@ -8,19 +8,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import certify.roa
-from certify.certificate import TrustedSolver
-from certify.claims import Asymptotic
-from certify.closed_loop import ClosedLoop
-from certify.engines.base import Budget, Proof, Report
+import certify.analysis.run
+from certify.analysis.candidates.trials import Trial, trial
+from certify.analysis.options import RoaOptions
+from certify.analysis.run import certify_roa
+from certify.analysis.selection import Race
+from certify.certificates import TrustedSolver
+from certify.certificates.claims import Asymptotic
+from certify.certificates.verdict import Stop
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.plants import System
+from certify.loop.policies import load_policy
 from certify.lyapunov import solve_lyapunov
-from certify.options import RoaOptions
-from certify.policies import load_policy
-from certify.race import Race
-from certify.roa import certify_roa
-from certify.systems import System
-from certify.trials import Trial, trial
-from certify.verdict import Stop
+from certify.provers.base import Budget, Proof, Report
 from tests.support.loops import chain, scalar_tanh
 
 SHIPPED = Path(__file__).parent.parent / "examples" / "policies" / "pendulum.pt"
@@ -113,13 +113,13 @@ def test_no_candidate_is_made_that_could_not_win(
 ) -> None:
     """The pendulum's set fills its domain, and the slow candidate is not made; that changes no byte."""
     made = list[str]()
-    robust = certify.roa.robust
+    robust = certify.analysis.run.robust
 
     def counted(loop: ClosedLoop, options: RoaOptions) -> Trial | None:
         made.append(loop.system.name)
         return robust(loop, options)
 
-    monkeypatch.setattr(certify.roa, "robust", counted)
+    monkeypatch.setattr(certify.analysis.run, "robust", counted)
     network = load_policy(SHIPPED).network
     quick = certify_roa(pendulum, network, tmp_path / "quick")
     assert not made and quick.verdict.value == "PROVED"
@@ -132,7 +132,7 @@ def test_no_candidate_is_made_that_could_not_win(
 def test_a_candidate_that_could_win_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The origin attracts two thirds of this domain: nothing that is proved of it could settle the race."""
     made = list[str]()
-    monkeypatch.setattr(certify.roa, "robust", lambda loop, _: made.append(loop.system.name))
+    monkeypatch.setattr(certify.analysis.run, "robust", lambda loop, _: made.append(loop.system.name))
     system, network = scalar_tanh()
     found = certify_roa(replace(system), network, tmp_path)
     assert found.verdict.value == "PROVED" and made == ["scalar"]

@@ -14,23 +14,23 @@ import mpmath
 import numpy as np
 import pytest
 
-from certify.acceptance import _lowered
-from certify.certificate import Certificate, PartitionTree, read_certificate, run_checker
-from certify.claims import Asymptotic, Nearby
-from certify.cli import _run
-from certify.closed_loop import ClosedLoop
-from certify.containment import proved_set
+from certify.analysis.acceptance import _lowered
+from certify.analysis.maximise import certify_largest
+from certify.analysis.run import RoaOptions, certify_roa
+from certify.certificates import Certificate, PartitionTree, read_certificate, run_checker
+from certify.certificates.claims import Asymptotic, Nearby
+from certify.certificates.membership import proved_set
+from certify.certificates.verdict import Stop, Verdict
+from certify.cli.main import _run
 from certify.errors import InputError
-from certify.expressions import Expression, Number, atan, exp, sin, symbols
-from certify.float_error import float_error
-from certify.largest import certify_largest
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.equilibrium import Rest, find_rest, seen_from
+from certify.loop.expressions import Expression, Number, atan, exp, sin, symbols
+from certify.loop.float32 import float_error
+from certify.loop.plants import System, get_system
+from certify.loop.policies import Policy, TanhNetwork, load_policy, save_policy
+from certify.loop.rigorous import field_on, precision
 from certify.lyapunov.function import Quadratic
-from certify.policies import Policy, TanhNetwork, load_policy, save_policy
-from certify.rest import Rest, find_rest, seen_from
-from certify.rigorous import field_on, precision
-from certify.roa import RoaOptions, certify_roa
-from certify.systems import System, get_system
-from certify.verdict import Stop, Verdict
 from controllers.evaluate import count_covered, require_same_loop, require_same_question
 from tests.support.loops import box
 

@@ -18,22 +18,22 @@ import scipy.linalg
 import sympy
 from torch import Tensor
 
-from certify.certificate import Certificate, checking, run_checker, sole_writer
-from certify.claims import Problem
-from certify.closed_loop import ClosedLoop
-from certify.containment import Containment
-from certify.engines.base import Progress
-from certify.engines.bounds.rule import BoxBounds, VdotBound
-from certify.engines.falsify import Witness, refutes
+from certify.analysis.candidates.trials import OPTIMISING, Trial, trial
+from certify.analysis.run import RoaOptions, certify_roa
+from certify.certificates import Certificate, checking, run_checker, sole_writer
+from certify.certificates.claims import Problem
+from certify.certificates.membership import Containment
+from certify.certificates.verdict import Verdict
 from certify.errors import BackendError, InputError, SoundnessError
-from certify.expressions import Expression, Number, Symbol, sin, symbols
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.expressions import Expression, Number, Symbol, sin, symbols
+from certify.loop.plants import System, get_system
+from certify.loop.policies import TanhNetwork, bounded_by_form, load_policy
 from certify.lyapunov import domain_limit, leaves_domain, solve_lyapunov
 from certify.lyapunov.function import Quadratic
-from certify.policies import TanhNetwork, bounded_by_form, load_policy
-from certify.roa import RoaOptions, certify_roa
-from certify.systems import System, get_system
-from certify.trials import OPTIMISING, Trial, trial
-from certify.verdict import Verdict
+from certify.provers.base import Progress
+from certify.provers.boxes.rule import BoxBounds, VdotBound
+from certify.provers.falsify import Witness, refutes
 from tests.support.loops import box, chain, pendulum_network, scalar_tanh
 from tests.support.marks import slow_after
 
@@ -135,7 +135,7 @@ def test_levels_scale_with_P(tmp_path: Path, pendulum: System) -> None:
 
 
 def test_the_lqr_candidate_solves_its_equation(tmp_path: Path, pendulum: System) -> None:
-    from certify.closed_loop import ClosedLoop
+    from certify.loop.closed_loop import ClosedLoop
 
     network = pendulum_network()
     result = certify_roa(pendulum, network, tmp_path, RoaOptions(candidate="lqr", R=(2.0,)))
@@ -236,7 +236,7 @@ def test_whatever_the_checker_refuses_a_run_ends_with_what_it_accepts(
 
 def test_what_cannot_be_mended_is_a_soundness_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        "certify.roa.run_checker", lambda *_, **__: {"result": "REJECTED", "rule": "hash", "at": "policy"}
+        "certify.analysis.run.run_checker", lambda *_, **__: {"result": "REJECTED", "rule": "hash", "at": "policy"}
     )
     with pytest.raises(SoundnessError, match=r"rejects what the engine proved.*unchecked\.json reproduces"):
         certify_roa(*scalar_tanh(), tmp_path, RoaOptions(candidate="lyapunov"))
@@ -305,7 +305,7 @@ def test_an_answer_about_other_bytes_is_no_proof(tmp_path: Path, monkeypatch: py
     """Another run's certificate is accepted in the place of this one's."""
     other = certify_roa(*scalar_tanh(), tmp_path / "other", RoaOptions(level=1.0)).certificate
     assert other is not None
-    monkeypatch.setattr("certify.roa.run_checker", lambda *_, **__: run_checker(other))
+    monkeypatch.setattr("certify.analysis.run.run_checker", lambda *_, **__: run_checker(other))
     with pytest.raises(SoundnessError, match="other bytes"):
         certify_roa(*scalar_tanh(), tmp_path / "mine", RoaOptions(level=2.0))
     assert not (tmp_path / "mine" / "certificate.json").exists()
@@ -346,7 +346,7 @@ def test_a_witness_above_the_level_refutes_nothing(tmp_path: Path, monkeypatch: 
     while Fraction(below) >= exact:
         below = float(np.nextafter(below, 0))
     assert refutes(problem, witness, above) and not refutes(problem, witness, below)
-    monkeypatch.setattr("certify.trials.falsify", lambda *_: witness)
+    monkeypatch.setattr("certify.analysis.candidates.trials.falsify", lambda *_: witness)
     result = certify_roa(*scalar_tanh(), tmp_path, RoaOptions(level=3.0))
     assert result.verdict is Verdict.PROVED and result.levels.roa == 3.0
 
@@ -424,11 +424,13 @@ def test_an_earlier_run_s_files_do_not_lie_where_the_result_is_looked_for(
     (tmp_path / "search.json").write_text("my own notes")
     options = {"refuted": RoaOptions(level=3.9), "unknown": RoaOptions(level=0.5, max_boxes=1)}
     if ends == "interrupted":
-        monkeypatch.setattr("certify.roa.named", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        monkeypatch.setattr("certify.analysis.run.named", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
     if ends == "with an error":
-        monkeypatch.setattr("certify.roa.named", lambda *_: (_ for _ in ()).throw(InputError("no such candidate")))
+        monkeypatch.setattr(
+            "certify.analysis.run.named", lambda *_: (_ for _ in ()).throw(InputError("no such candidate"))
+        )
     if ends == "unknown":
-        monkeypatch.setattr("certify.engines.bounds.engine.prove_local", lambda *_: None)
+        monkeypatch.setattr("certify.provers.boxes.engine.prove_local", lambda *_: None)
     given = options.get(ends, RoaOptions(level=0.5))
     if ends in options:
         assert certify_roa(system, network, tmp_path, given).verdict.value == ends.upper()
@@ -476,9 +478,9 @@ def test_candidates_take_no_more_time_than_there_is(tmp_path: Path, monkeypatch:
     system, network = scalar_tanh()
     made = Made(1.0)
     for name in ("optimised", "robust", "corrected"):
-        monkeypatch.setattr(f"certify.roa.{name}", made)
-    monkeypatch.setattr("certify.roa._Run.clock", staticmethod(lambda: made.now))
-    monkeypatch.setattr("certify.roa.time.perf_counter", lambda: made.now)
+        monkeypatch.setattr(f"certify.analysis.run.{name}", made)
+    monkeypatch.setattr("certify.analysis.run._Run.clock", staticmethod(lambda: made.now))
+    monkeypatch.setattr("certify.analysis.run.time.perf_counter", lambda: made.now)
     found = certify_roa(system, network, tmp_path, RoaOptions(time_limit=50.0), load_seconds=46.0)
     assert found.verdict is Verdict.PROVED
     assert 46.0 + made.now <= 50.0

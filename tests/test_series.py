@@ -10,8 +10,8 @@ import pytest
 import scipy.integrate
 import sympy
 
-from certify.expressions import Algebra, Number, PowerSeries, Series, evaluate, sin, solution_series, symbols
-from certify.systems.equations import parse_expression
+from certify.loop.expressions import Algebra, Number, PowerSeries, Series, evaluate, sin, solution_series, symbols
+from certify.loop.plants.equations import parse_expression
 from tests.support.algebra import to_sympy
 from tests.support.marks import slow_after
 

@@ -15,11 +15,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from certify.errors import InputError
-from certify.expressions import as_expression, cos, exp, sin, sqrt, symbols, tan, tanh
+from certify.loop.expressions import as_expression, cos, exp, sin, sqrt, symbols, tan, tanh
+from certify.loop.rigorous import ball, precision
 from certify.lyapunov import Neural, Symbolic
 from certify.lyapunov.rigorous import function_on
-from certify.rigorous import ball, precision
-from certify.sublevel import Sublevel
+from certify.lyapunov.sublevel import Sublevel
 
 F = Fraction
 x, y = symbols("x y")

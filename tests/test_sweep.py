@@ -23,22 +23,22 @@ from typing import Any
 import pyarrow.parquet
 import pytest
 
-from certify.certificate import parse_certificate
-from certify.cli import _run
+from certify.analysis.results import Levels
+from certify.analysis.studies import Row, Study, read_study, run_sweep
+from certify.analysis.studies import sweep as flow
+from certify.analysis.studies.page import page_of
+from certify.analysis.studies.rows import judged, kept
+from certify.analysis.studies.study import Axis, plain
+from certify.analysis.studies.tables import names, write_tables
+from certify.analysis.studies.work import Answer, answer_in, work
+from certify.certificates import parse_certificate
+from certify.certificates.verdict import Verdict
+from certify.cli.main import _run
 from certify.errors import BackendError, InputError, SoundnessError
+from certify.loop.plants import exact
 from certify.lyapunov import volume
-from certify.results import Levels
-from certify.running import tasks
-from certify.running.tasks import Cluster, Piece, Processes, place_for
-from certify.sweep import Row, Study, read_study, run_sweep
-from certify.sweep import sweep as flow
-from certify.sweep.page import page_of
-from certify.sweep.rows import judged, kept
-from certify.sweep.study import Axis, plain
-from certify.sweep.tables import names, write_tables
-from certify.sweep.work import Answer, answer_in, work
-from certify.systems import exact
-from certify.verdict import Verdict
+from certify.provers.execution import tasks
+from certify.provers.execution.tasks import Cluster, Piece, Processes, place_for
 from tests.support import pieces
 from tests.support.browser import Browser, find_browser
 from tests.support.pieces import Here
@@ -207,7 +207,7 @@ def test_a_case_is_the_same_if_bytes_texts_and_program_are(study: Study, monkeyp
         replace(case, coordinates={**case.coordinates, "candidates": "lqr"}),
     ]
     assert len({case.inputs, *(other.inputs for other in others)}) == 1 + len(others)
-    from certify.sweep import case as module
+    from certify.analysis.studies import case as module
 
     monkeypatch.setattr(module, "_program", lambda: {"certify": "another"})
     assert study.cases()[0].inputs != others[0].inputs and replace(case).inputs not in {o.inputs for o in others}
@@ -551,7 +551,7 @@ def test_a_contradiction_ends_the_sweep_loudly_with_what_shows_it(
 
 
 def test_a_worker_s_contradiction_comes_with_its_files(study: Study, monkeypatch: pytest.MonkeyPatch) -> None:
-    from certify.sweep import work as module
+    from certify.analysis.studies import work as module
 
     def contradict(_plant: object, _network: object, out: Path, *_: object, **__: object) -> None:
         out.mkdir()
@@ -677,7 +677,7 @@ def test_the_page_draws_what_was_varied(which: tuple[str, ...], figures: int, ti
 
 
 def test_cells_of_a_map_say_their_verdict_in_words() -> None:
-    from certify.sweep.figures import draw
+    from certify.analysis.studies.figures import draw
 
     study, rows = synthetic_study("m", "rate")
     svg = draw(study.varied, rows[:-1]).pictures[0].svg
@@ -686,7 +686,7 @@ def test_cells_of_a_map_say_their_verdict_in_words() -> None:
 
 
 def test_too_many_figures_are_left_out_and_it_says_so() -> None:
-    from certify.sweep.figures import draw
+    from certify.analysis.studies.figures import draw
 
     axes = (AXES["m"], AXES["rate"], Axis("options.seed", tuple(map(str, range(14))), True))
     keys = [axis.key for axis in axes]
@@ -705,7 +705,9 @@ def test_too_many_figures_are_left_out_and_it_says_so() -> None:
 @pytest.fixture(scope="module")
 def server() -> None:
     """The one that forks processes, with what these tests need loaded once."""
-    forkserver.set_forkserver_preload(["certify.sweep.work", "certify.running.tasks", "tests.support.pieces"])
+    forkserver.set_forkserver_preload(
+        ["certify.analysis.studies.work", "certify.provers.execution.tasks", "tests.support.pieces"]
+    )
     forkserver.ensure_running()
 
 

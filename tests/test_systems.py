@@ -20,10 +20,11 @@ import sympy
 import torch
 
 from certify.errors import InputError
-from certify.expressions import Number, Symbol, differentiate, evaluate_exactly, sqrt, symbols
-from certify.systems import System, available_systems, exact, get_system, load_system, plants
-from certify.systems.ode import rk4_step
-from certify.systems.toml import parse_expression
+from certify.loop.expressions import Number, Symbol, differentiate, evaluate_exactly, sqrt, symbols
+from certify.loop.plants import System, available_systems, exact, get_system, load_system
+from certify.loop.plants import shipped as plants
+from certify.loop.plants.ode import rk4_step
+from certify.loop.plants.toml import parse_expression
 from tests.support.algebra import same
 from tests.support.loops import box
 
@@ -168,8 +169,8 @@ def test_unknown_plant_names_the_known_ones() -> None:
 
 
 PLANT = """
-from certify.expressions import Number, symbols
-from certify.systems import System
+from certify.loop.expressions import Number, symbols
+from certify.loop.plants import System
 
 def {function}() -> System:
     x, u = symbols("x u")
@@ -224,7 +225,10 @@ def test_a_file_that_holds_no_plant_is_refused_and_the_others_still_work(
 
 
 def test_listing_plants_imports_none_of_them() -> None:
-    code = "import sys, certify.systems as s; s.available_systems(); print([n for n in sys.modules if '.plants.' in n])"
+    code = (
+        "import sys, certify.loop.plants as s; s.available_systems(); "
+        "print([n for n in sys.modules if '.plants.shipped.' in n])"
+    )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout == "[]\n"
 

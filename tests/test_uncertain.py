@@ -11,19 +11,19 @@ import numpy as np
 import pytest
 
 from certify import certify_roa
-from certify.certificate import Certificate, PartitionTree, parse_certificate, read_certificate
-from certify.claims import Asymptotic, Problem, conditions
-from certify.claims.queries import query
-from certify.closed_loop import ClosedLoop
-from certify.engines.falsify import Witness
+from certify.analysis.inputs import with_acting, with_bounded_errors, with_uncertain_parameters
+from certify.analysis.results import RoaResult
+from certify.certificates import Certificate, PartitionTree, parse_certificate, read_certificate
+from certify.certificates.claims import Asymptotic, Problem, conditions
+from certify.certificates.claims.queries import query
+from certify.certificates.verdict import Stop, Verdict
 from certify.errors import InputError
-from certify.expressions import Number, sin, sqrt, symbols, symbols_of
-from certify.inputs import with_acting, with_bounded_errors, with_uncertain_parameters
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.expressions import Number, sin, sqrt, symbols, symbols_of
+from certify.loop.plants import System, available_systems, get_system, load_system
+from certify.loop.policies import TanhNetwork
 from certify.lyapunov.function import Quadratic
-from certify.policies import TanhNetwork
-from certify.results import RoaResult
-from certify.systems import System, available_systems, get_system, load_system
-from certify.verdict import Stop, Verdict
+from certify.provers.falsify import Witness
 from tests.support.algebra import same
 
 F = Fraction

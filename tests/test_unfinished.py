@@ -19,20 +19,20 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from certify import unfinished
-from certify.certificate import run_checker
-from certify.closed_loop import ClosedLoop
-from certify.engines.base import Budget, SearchState, Task
-from certify.engines.bounds.engine import BoundsEngine
-from certify.engines.falsify import Witness, falsify
+from certify.analysis import saved_search as unfinished
+from certify.analysis.candidates.trials import Trial
+from certify.analysis.run import RoaOptions, RoaResult, certify_roa
+from certify.analysis.saved_search import Unfinished, load, save
+from certify.certificates import run_checker
+from certify.certificates.verdict import Stop, Verdict
 from certify.errors import InputError
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.plants import get_system
 from certify.lyapunov import domain_limit, volume
-from certify.roa import RoaOptions, RoaResult, certify_roa
-from certify.running import ThreadRunner
-from certify.systems import get_system
-from certify.trials import Trial
-from certify.unfinished import Unfinished, load, save
-from certify.verdict import Stop, Verdict
+from certify.provers.base import Budget, SearchState, Task
+from certify.provers.boxes.engine import BoundsEngine
+from certify.provers.execution import ThreadRunner
+from certify.provers.falsify import Witness, falsify
 from tests.support.cases import case_of
 from tests.support.loops import box, pendulum_network, scalar_tanh
 
@@ -313,7 +313,7 @@ def test_a_local_set_of_another_size(factor: float, monkeypatch: pytest.MonkeyPa
     old.restore(before)
     level = old.level
     inner = min(factor * before.inner, task.target)
-    monkeypatch.setattr("certify.engines.bounds.engine.prove_local", lambda *args: inner)
+    monkeypatch.setattr("certify.provers.boxes.engine.prove_local", lambda *args: inner)
     attempt = begun(search)
     if factor < 1:
         with pytest.raises(InputError, match="local set is smaller"):
@@ -333,12 +333,12 @@ def result_of(folder: Path, **more: Any) -> RoaResult:
 
 @pytest.mark.slow
 def test_a_run_out_of_boxes_is_gone_on_with_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for place in ("certify.roa", "certify.race"):
+    for place in ("certify.analysis.run", "certify.analysis.selection"):
         plain = Budget
         monkeypatch.setattr(
             f"{place}.Budget", lambda *args, plain=plain, **more: plain(*args, **({"batch": 16} | more))
         )
-    monkeypatch.setattr("certify.roa._HEAT", 1e-9)
+    monkeypatch.setattr("certify.analysis.run._HEAT", 1e-9)
     found = [result_of(tmp_path, Q=(1.0, 1.0), max_boxes=150)]
     assert found[0].stop is Stop.BOXES and found[0].search == tmp_path / "search.json"
     found.append(result_of(tmp_path, resume=True, max_boxes=250))
@@ -378,13 +378,13 @@ def test_another_problem_is_another_search() -> None:
 # -------------------------------------------------------------------------------------------------------- interrupted
 
 PLACES = {  # where Ctrl-C comes, and on which call: from the first candidate to the last check
-    "candidates": ("certify.roa.solutions", 1),
-    "the first one": ("certify.roa.optimised", 1),
-    "a local proof": ("certify.engines.bounds.engine.prove_local", 1),
-    "a heat": ("certify.engines.bounds.rule.VdotBound.__call__", 1),
-    "the search": ("certify.engines.bounds.rule.VdotBound.__call__", 3),
-    "the first check": ("certify.roa.run_checker", 1),
-    "the end": ("certify.roa.limit_of", 1),
+    "candidates": ("certify.analysis.run.solutions", 1),
+    "the first one": ("certify.analysis.run.optimised", 1),
+    "a local proof": ("certify.provers.boxes.engine.prove_local", 1),
+    "a heat": ("certify.provers.boxes.rule.VdotBound.__call__", 1),
+    "the search": ("certify.provers.boxes.rule.VdotBound.__call__", 3),
+    "the first check": ("certify.analysis.run.run_checker", 1),
+    "the end": ("certify.analysis.run.limit_of", 1),
 }
 
 
@@ -405,7 +405,7 @@ def test_a_run_that_is_interrupted_anywhere_is_resumed_to_its_end(
     owner, _, attribute = name.rpartition(".")
     original = pkgutil.resolve_name(name)
     monkeypatch.setattr(pkgutil.resolve_name(owner), attribute, counted)
-    monkeypatch.setattr("certify.roa._HEAT", 1e-9)
+    monkeypatch.setattr("certify.analysis.run._HEAT", 1e-9)
     system, network = scalar_tanh()
     with pytest.raises(KeyboardInterrupt):
         certify_roa(system, network, tmp_path)

@@ -24,11 +24,13 @@ import numpy as np
 import pytest
 import sympy
 
-from certify.certificate.limits import require_within_limits
+from certify.analysis.run import RoaOptions, certify_roa
+from certify.certificates.limits import require_within_limits
+from certify.certificates.verdict import Verdict
 from certify.checker import __main__ as checker
 from certify.checker import expression as checkers_tape
 from certify.errors import InputError
-from certify.expressions import (
+from certify.loop.expressions import (
     FUNCTIONS,
     Expression,
     Number,
@@ -40,14 +42,12 @@ from certify.expressions import (
     symbols,
     to_tree,
 )
-from certify.policies import TanhNetwork
+from certify.loop.plants import System
+from certify.loop.plants.equations import parse_expression
+from certify.loop.policies import TanhNetwork
+from certify.loop.rigorous import evaluate_arb
 from certify.reference.expressions import equations
 from certify.report.mathml import typeset
-from certify.rigorous import evaluate_arb
-from certify.roa import RoaOptions, certify_roa
-from certify.systems import System
-from certify.systems.equations import parse_expression
-from certify.verdict import Verdict
 from tests.support.algebra import same, to_sympy
 
 X, U, K, W = symbols("x u k w")
@@ -152,7 +152,7 @@ def checked_here(monkeypatch: pytest.MonkeyPatch) -> None:
             checker.main(["--json", "--", str(path)])
         return dict(json.loads(said.getvalue()))
 
-    monkeypatch.setattr("certify.roa.run_checker", run)
+    monkeypatch.setattr("certify.analysis.run.run_checker", run)
 
 
 def proved(text: str, folder: Path, claim: Any = "auto") -> bool:

@@ -10,8 +10,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.closed_loop import ClosedLoop
 from certify.errors import BackendError, InputError, OptionError
+from certify.loop.closed_loop import ClosedLoop
 from certify.lyapunov.candidates import solve_lyapunov
 from certify.lyapunov.optimised import largest_sampled, optimise_repeatedly
 

@@ -1,8 +1,8 @@
 """The Lyapunov function file `certify-lyapunov/1`: a neural or a polynomial function, as plain tensors only.
 
-Nothing in a file is executed, and equal functions give equal bytes (see `certify.plain_file`); a polynomial's terms are
-written in the order of their exponents, because their order is no part of the function. A level is no part of the file:
-which level holds is what a certificate says.
+Nothing in a file is executed, and equal functions give equal bytes (see `certify.loop.plain_file`); a polynomial's
+terms are written in the order of their exponents, because their order is no part of the function. A level is no part
+of the file: which level holds is what a certificate says.
 """
 
 from __future__ import annotations
@@ -16,9 +16,7 @@ from typing import Any
 import numpy as np
 
 from certify.errors import InputError
-from certify.lyapunov.neural import Neural
-from certify.lyapunov.polynomial import Polynomial
-from certify.plain_file import (
+from certify.loop.plain_file import (
     array_in,
     integers_in,
     layers_in,
@@ -28,6 +26,8 @@ from certify.plain_file import (
     tensors,
     write_plain,
 )
+from certify.lyapunov.neural import Neural
+from certify.lyapunov.polynomial import Polynomial
 
 FORMAT = "certify-lyapunov/1"
 _KEYS = {"format", "kind", "system"}

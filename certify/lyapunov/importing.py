@@ -17,19 +17,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from certify.errors import InputError
+from certify.loop.policies.importers.comparing import Difference, compare_reading
+from certify.loop.policies.importers.folding import fold
+from certify.loop.policies.importers.importing import Content, kind_of, read_bytes, tensors_in
+from certify.loop.policies.importers.normalisers import rsl_normaliser
+from certify.loop.policies.importers.observing import index_of, over_states, require_equilibrium, sample, shift
+from certify.loop.policies.importers.options import ImportOptions
+from certify.loop.policies.importers.state_dict import read_lyapunov
 from certify.lyapunov.file import StoredLyapunov
 from certify.lyapunov.neural import Neural
-from certify.policies.importers.comparing import Difference, compare_reading
-from certify.policies.importers.folding import fold
-from certify.policies.importers.importing import Content, kind_of, read_bytes, tensors_in
-from certify.policies.importers.normalisers import rsl_normaliser
-from certify.policies.importers.observing import index_of, over_states, require_equilibrium, sample, shift
-from certify.policies.importers.options import ImportOptions
-from certify.policies.importers.state_dict import read_lyapunov
 
 if TYPE_CHECKING:
-    from certify.policies.importers.arrays import Numbers
-    from certify.systems import System
+    from certify.loop.plants import System
+    from certify.loop.policies.importers.arrays import Numbers
 
 _SIGMOID = "the file's V is sigmoid(N): {V <= v} is {N <= log(v / (1 - v))}"
 _UNKNOWN = "the value of the last layer; what increases strictly behind it leaves the sets {N <= level} as they are"

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from certify.policies.layers import frozen_layers, sha256_of, tanh, through, widths
+from certify.loop.policies.layers import frozen_layers, sha256_of, tanh, through, widths
 
 Array = NDArray[np.float64]
 

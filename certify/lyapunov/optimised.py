@@ -20,8 +20,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.closed_loop import ClosedLoop
 from certify.errors import BackendError
+from certify.loop.closed_loop import ClosedLoop
 from certify.lyapunov.candidates import slowest_decay, solve_lyapunov
 from certify.lyapunov.level_sets import domain_limit, volume
 from certify.lyapunov.programs import Inequality, smallest_trace

@@ -6,11 +6,9 @@ import flint
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.closed_loop import ClosedLoop
-from certify.expressions import Expression, differentiate, evaluate
-from certify.lyapunov.neural import Neural
-from certify.lyapunov.symbolic import Symbolic
-from certify.rigorous import (
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.expressions import Expression, differentiate, evaluate
+from certify.loop.rigorous import (
     BallAlgebra,
     Balls,
     affine,
@@ -22,6 +20,8 @@ from certify.rigorous import (
     points,
     precision,
 )
+from certify.lyapunov.neural import Neural
+from certify.lyapunov.symbolic import Symbolic
 
 Array = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from certify.expressions import Expression, Number, Symbol, differentiate, numerical, symbols_of, total
+from certify.loop.expressions import Expression, Number, Symbol, differentiate, numerical, symbols_of, total
 from certify.lyapunov.polynomial import Polynomial
 
 Array = NDArray[np.float64]
@@ -37,7 +37,7 @@ class Symbolic:
 
     Examples
     --------
-    >>> from certify.expressions import cos, symbols
+    >>> from certify.loop.expressions import cos, symbols
     >>> x, y = symbols(["x", "y"])
     >>> N = Symbolic(1 - cos(x) + y**2 / 2, (x, y))
     >>> float(N(np.array([0.0, 2.0]))), N.gradient(np.array([0.0, 2.0])).tolist()

@@ -6,7 +6,7 @@ import hashlib
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from certify.certificate import Certificate, parse_certificate
+from certify.certificates import Certificate, parse_certificate
 from certify.errors import CertifyError
 
 if TYPE_CHECKING:

@@ -11,8 +11,8 @@ from fractions import Fraction
 from typing import Any
 
 from certify.errors import InputError
-from certify.expressions import Expression, Number, Operation, Symbol, constant_of, nodes
-from certify.expressions.tree import ATOM, MINUS, POWER, PRODUCT, SUM, binding, decimal_text
+from certify.loop.expressions import Expression, Number, Operation, Symbol, constant_of, nodes
+from certify.loop.expressions.tree import ATOM, MINUS, POWER, PRODUCT, SUM, binding, decimal_text
 from certify.report.words import MINUS as SIGN
 from certify.report.words import symbol
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from certify.certificate import Certificate, PartitionTree
+from certify.certificates import Certificate, PartitionTree
 from certify.errors import CertifyError, InputError
 from certify.report.figures import Picture, draw
 from certify.report.sampling import SimulatedRoa
@@ -50,7 +50,7 @@ def render_html(
     """The report as one HTML document.
 
     Read the file once, with `read_raw`; take the certificate from these bytes with `parse_certificate`, their sha256
-    and size, and the answer of `certify.certificate.run_checker` about a private file that holds them.
+    and size, and the answer of `certify.certificates.run_checker` about a private file that holds them.
 
     Parameters
     ----------

@@ -20,9 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from certify.policies import TanhNetwork
-from certify.systems import System
-from certify.systems.ode import eigenvalues_of, rk4_step
+from certify.loop.plants import System
+from certify.loop.plants.ode import eigenvalues_of, rk4_step
+from certify.loop.policies import TanhNetwork
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Any
 from certify.report.words import above, below, exact_number, inside
 
 if TYPE_CHECKING:
-    from certify.systems import System
-    from certify.systems.system import Interval
+    from certify.loop.plants import System
+    from certify.loop.plants.system import Interval
 
 _PERCENT = 100  # of V: the share of it after which a rate is told as a time
 

@@ -61,8 +61,8 @@ def compare(
     """
     with errors(as_json):
         training = options_of(plant, seed=0, steps=steps)
-        from certify.running.tasks import place_for
-        from certify.systems import get_system
+        from certify.loop.plants import get_system
+        from certify.provers.execution.tasks import place_for
         from controllers.compare import compare as run
         from controllers.responses import ABLATIONS, BASELINES, CompareOptions, remaining
 

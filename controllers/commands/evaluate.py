@@ -28,8 +28,8 @@ def evaluate(
 ) -> None:
     """Simulate a policy from random initial states and compare it with its learned gain."""
     with errors(as_json):
-        from certify.containment import proved_set
-        from certify.policies import load_policy
+        from certify.certificates.membership import proved_set
+        from certify.loop.policies import load_policy
         from controllers.evaluate import EvaluationOptions
         from controllers.evaluate import evaluate as judge
         from controllers.own import chosen_plant

@@ -15,8 +15,8 @@ from controllers.commands.shared import Json, emit, errors
 from controllers.files import require_writable
 
 if TYPE_CHECKING:
-    from certify.policies import Policy
-    from certify.systems import System
+    from certify.loop.plants import System
+    from certify.loop.policies import Policy
     from controllers.flatten import Figures, Flattened, FlattenOptions, Gain
     from controllers.options import Plant
 
@@ -64,7 +64,7 @@ def flatten(
     median cost stays within its bound, and what a proof must absorb of the hidden units is less than it was.
     """
     with errors(as_json):
-        from certify.policies import load_policy, save_policy
+        from certify.loop.policies import load_policy, save_policy
         from controllers.flatten import FlattenOptions
         from controllers.flatten import flatten as run
         from controllers.own import chosen_plant
@@ -92,7 +92,7 @@ def flatten(
 
 def _half_widths(text: str, policy: Policy, own: tuple[System, Plant] | None) -> tuple[float, ...]:
     """The box of initial states with the half-widths that `x=0.4,phi=0.2` names."""
-    from certify.systems import shipped_system
+    from certify.loop.plants import shipped_system
     from controllers.options import get_plant
 
     system, plant = own if own is not None else (shipped_system(policy.system), get_plant(policy.system))

@@ -38,7 +38,7 @@ def history(
     what the checker accepts is drawn as proved.
     """
     with errors(as_json):
-        from certify.systems import shipped_system
+        from certify.loop.plants import shipped_system
         from controllers.figures import draw_gain, draw_growth
         from controllers.files import make_folder, write_atomically
         from controllers.history import ProvingOptions, distances, prove_all, read_settled, table

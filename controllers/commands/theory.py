@@ -27,8 +27,8 @@ def theory(
 ) -> None:
     """Show the constants on which the theory of the method rests, each proved or estimated, for one policy."""
     with errors(as_json):
-        from certify.containment import proved_set
-        from certify.policies import load_policy
+        from certify.certificates.membership import proved_set
+        from certify.loop.policies import load_policy
         from controllers.own import chosen_plant
         from controllers.theory import theory as constants_of
 

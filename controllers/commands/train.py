@@ -18,7 +18,7 @@ from controllers.files import make_folder, read, require_writable
 from controllers.options import TrainingOptions, overridden
 
 if TYPE_CHECKING:
-    from certify.policies import Policy
+    from certify.loop.policies import Policy
     from controllers.training import Trainer
 
 
@@ -58,7 +58,7 @@ def train(
 
         system, own = chosen_plant(plant)
         options = overridden(own.named(preset), _given(chosen))
-        from certify.policies import save_policy
+        from certify.loop.policies import save_policy
         from controllers.kept import Keeper
         from controllers.logs import Episode, Log, Monitored
         from controllers.sac import find_device

@@ -22,7 +22,7 @@ def train_baseline(
     """Train PPO or SAC of stable-baselines3 on a plant, for comparison."""
     with errors(as_json):
         options = options_of(plant, seed=seed, steps=steps)
-        from certify.systems import get_system
+        from certify.loop.plants import get_system
         from controllers.sb3 import Algorithm, train_reference
 
         require_writable(out)

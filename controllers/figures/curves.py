@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from certify.systems import System
+from certify.loop.plants import System
 from controllers.course import Evaluated
 from controllers.figures.style import COLOURS, DEEP, WIDTH, count, drawn, log_scale, name_lines, seeds_of
 from controllers.responses import NAMES, Run

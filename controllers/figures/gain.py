@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.systems import System
+from certify.loop.plants import System
 from controllers.figures.style import DEEP, MUTED, WIDTH, drawn, log_scale, name_lines
 from controllers.history import Distances
 

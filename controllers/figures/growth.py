@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.systems import System
-from certify.verdict import Verdict
+from certify.certificates.verdict import Verdict
+from certify.loop.plants import System
 from controllers.figures.states import named
 from controllers.figures.style import DEEP, INK, MUTED, WIDTH, drawn
 from controllers.history import Proof, ProvingOptions

@@ -8,8 +8,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from certify.loop.plants import System
 from certify.report.timing import Timing
-from certify.systems import System
 from controllers.figures.style import COLOURS, DEEP, WIDTH, count, drawn, log_scale, name_lines, seeds_of
 from controllers.responses import NAMES, OURS, Response, Row, quartiles
 

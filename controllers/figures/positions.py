@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from certify.loop.plants import System
 from certify.report.timing import Timing
-from certify.systems import System
 from controllers.figures.states import MOST, draw_state, reach_of, short
 from controllers.figures.style import MUTED, WIDTH, count, drawn
 from controllers.options import get_plant

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from certify.loop.plants import System
 from certify.report.timing import Timing
-from certify.systems import System
 from controllers.figures.states import named, reach_of, short
 from controllers.figures.style import COLOURS, DEEP, INK, MUTED, PALE, WIDTH, count, drawn
 from controllers.options import get_plant

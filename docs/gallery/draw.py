@@ -13,8 +13,8 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from certify.certificate import Certificate, read_certificate, run_checker
-from certify.claims import Enlarged, Practical
+from certify.certificates import Certificate, read_certificate, run_checker
+from certify.certificates.claims import Enlarged, Practical
 from certify.lyapunov import semi_axes, volume
 from certify.report.figures import draw
 from certify.report.words import above, below, pretty_unit, symbol

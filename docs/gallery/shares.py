@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.certificate import read_certificate, run_checker
-from certify.claims import Enlarged
+from certify.certificates import read_certificate, run_checker
+from certify.certificates.claims import Enlarged
 from certify.report.words import below
 from controllers.options import get_plant
 
@@ -61,7 +61,7 @@ ENTRIES = (
 
 
 def _text(name: str) -> str:
-    from certify.systems import shipped_system
+    from certify.loop.plants import shipped_system
 
     states = [state.name for state in shipped_system(name).states]
     return ",".join(f"{s}={width:.4g}" for s, width in zip(states, get_plant(name).initial_states, strict=True))

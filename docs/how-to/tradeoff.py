@@ -13,12 +13,12 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-from certify.certificate import read_certificate, run_checker
+from certify.certificates import read_certificate, run_checker
+from certify.loop.plants import shipped_system
+from certify.loop.policies import load_policy
 from certify.lyapunov import volume
-from certify.policies import load_policy
 from certify.report.figures.style import INK, MUTED, RC, SET, START, to_svg
 from certify.report.words import below
-from certify.systems import shipped_system
 from controllers.options import get_plant
 
 ROOT = Path(__file__).parents[2]

@@ -13,7 +13,7 @@ import sys
 import zipfile
 from pathlib import Path
 
-from certify.certificate import write_atomically
+from certify.certificates import write_atomically
 from controllers.course import CURVE, ENDED
 from controllers.sb3 import MODEL
 

@@ -25,14 +25,14 @@ from typing import Any
 
 import numpy as np
 
-from certify.certificate import loop_sections, read_certificate
-from certify.claims import Practical
-from certify.containment import proved_set
+from certify.certificates import loop_sections, read_certificate
+from certify.certificates.claims import Practical
+from certify.certificates.membership import proved_set
 from certify.errors import CertificateFormatError, InputError
+from certify.loop.plants import System, shipped_system
+from certify.loop.policies import Policy, load_policy
 from certify.lyapunov import volume
-from certify.policies import Policy, load_policy
 from certify.report.words import above, below
-from certify.systems import System, shipped_system
 from controllers.course import ENDED
 from controllers.evaluate import require_same_question
 from controllers.responses import NAMES, Run

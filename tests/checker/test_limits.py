@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from certify.certificate.checking import command
+from certify.certificates.checking import command
 from certify.checker import document, limits, rules
 from certify.checker.case import Case
 from certify.checker.errors import Rejected

@@ -21,7 +21,7 @@ from typing import Any
 
 import pytest
 
-from certify.certificate import checking, join_parts, joining, run_checker, run_part
+from certify.certificates import checking, join_parts, joining, run_checker, run_part
 from certify.checker import outer, rules
 from certify.checker.__main__ import main
 from certify.checker.errors import Rejected

@@ -33,15 +33,15 @@ from certify.checker import network as checker
 from certify.checker.case import Case
 from certify.checker.document import Certificate, Policy
 from certify.checker.ring import Ring
-from certify.closed_loop import ClosedLoop
-from certify.enclosures import PolicyEnclosure
-from certify.enclosures import policy as producer
-from certify.enclosures import taylor as producer_taylor
-from certify.expressions import Number, cos, sin, symbols, tan, to_tree
-from certify.policies import TanhNetwork
-from certify.policies.network import Centre, Squash
-from certify.rigorous import evaluate_policy
-from certify.systems import System, get_system
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.expressions import Number, cos, sin, symbols, tan, to_tree
+from certify.loop.plants import System, get_system
+from certify.loop.policies import TanhNetwork
+from certify.loop.policies.network import Centre, Squash
+from certify.loop.rigorous import evaluate_policy
+from certify.provers.bounds import PolicyEnclosure
+from certify.provers.bounds import policy as producer
+from certify.provers.bounds import taylor as producer_taylor
 from tests.support.certificates import make, parse
 from tests.support.leaves import on_boxes
 from tests.support.loops import box

@@ -79,7 +79,7 @@ def verdict_of(raw: bytes) -> str:
 def pendulum() -> Document:
     """As the command writes it: c1 = c2, and a tube from outside. Shared between tests, which edit copies only."""
     with TemporaryDirectory() as folder:
-        command = [sys.executable, "-c", "from certify.cli import main; main()", "roa"]
+        command = [sys.executable, "-c", "from certify.cli.main import main; main()", "roa"]
         command += ["--policy", str(ROOT / "examples" / "policies" / "pendulum.pt")]
         command += ["--level", "0.3", "--enlarge", "--time-limit", "30", "--out", folder, "--quiet"]
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)

@@ -9,7 +9,7 @@ import flint
 import numpy as np
 import pytest
 
-from certify.claims.conditions import (
+from certify.certificates.claims.conditions import (
     Asymptotic,
     conditions,
     domain_conditions,
@@ -17,12 +17,12 @@ from certify.claims.conditions import (
     local_condition,
     ring_condition,
 )
-from certify.claims.queries import Query, decay, query
-from certify.engines.local import prove_local
+from certify.certificates.claims.queries import Query, decay, query
 from certify.errors import InputError
-from certify.policies import TanhNetwork
-from certify.rigorous import evaluate_policy, evaluate_vdot
-from certify.systems import System, get_system
+from certify.loop.plants import System, get_system
+from certify.loop.policies import TanhNetwork
+from certify.loop.rigorous import evaluate_policy, evaluate_vdot
+from certify.provers.ball.local import prove_local
 from tests.support.cases import Case, case_of
 from tests.support.loops import chain, lqr_gain, pendulum_network, saturated_lqr, scalar_clip, scalar_tanh, tank, valve
 from tests.support.oracle import value_of

@@ -10,8 +10,8 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from certify.policies import load_policy, save_policy
-from certify.systems import get_system
+from certify.loop.plants import get_system
+from certify.loop.policies import load_policy, save_policy
 from controllers.cli import app
 from controllers.evaluate import EvaluationOptions, evaluate
 from controllers.options import TrainingOptions, preset

@@ -15,8 +15,8 @@ import torch
 from typer.testing import CliRunner
 
 from certify.errors import InputError
-from certify.policies import load_policy
-from certify.systems import get_system
+from certify.loop.plants import get_system
+from certify.loop.policies import load_policy
 from controllers import baselines, sb3
 from controllers.cli import app
 from controllers.environments import PlantEnvironment

@@ -16,8 +16,8 @@ import pytest
 from typer.testing import CliRunner
 
 from certify import certify_roa, get_system
-from certify.containment import Containment, proved_set
-from certify.policies import load_policy, save_policy
+from certify.certificates.membership import Containment, proved_set
+from certify.loop.policies import load_policy, save_policy
 from controllers.cli import app
 from controllers.simulation import initial_states
 

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from certify.certificate import sole_writer
+from certify.certificates import sole_writer
 from certify.errors import BackendError, InputError
-from certify.policies import load_policy
-from certify.running.tasks import Cluster, Processes
-from certify.systems import available_systems, get_system
+from certify.loop.plants import available_systems, get_system
+from certify.loop.policies import load_policy
+from certify.provers.execution.tasks import Cluster, Processes
 from controllers import baselines, compare, runs, simulation
 from controllers.cli import app
 from controllers.course import Judged, Stopping

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from certify.errors import InputError
-from certify.policies import TanhNetwork, load_policy, require_centred
+from certify.loop.policies import TanhNetwork, load_policy, require_centred
 from controllers.contraction import contracted, with_value_at_origin
 from controllers.departure import departure_of
 from controllers.flatten import bend
@@ -91,7 +91,7 @@ def test_other_factors_are_refused(factor):
 
 
 def test_a_shipped_policy_keeps_its_jacobian():
-    from certify.systems import get_system
+    from certify.loop.plants import get_system
 
     network, u_eq = load_policy("examples/policies/quadrotor2d.pt").network, get_system("quadrotor2d").exact_u_eq()
     change = contracted(network, 1 / 64).jacobian_at_origin(u_eq) - network.jacobian_at_origin(u_eq)

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from certify.errors import InputError
-from certify.systems import get_system
+from certify.loop.plants import get_system
 from controllers import runs
 from controllers.course import Course, Evaluated, Fixed, Judged, Plan, Stopping, best, follow, read_course, read_curve
 from controllers.options import preset

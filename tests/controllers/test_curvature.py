@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from certify.errors import InputError
-from certify.policies import TanhNetwork
-from certify.systems import get_system
+from certify.loop.plants import get_system
+from certify.loop.policies import TanhNetwork
 from controllers.commands.evaluate import _table
 from controllers.evaluate import EvaluationOptions, curvature, evaluate
 from controllers.options import available_plants, preset

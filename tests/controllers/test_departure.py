@@ -12,8 +12,8 @@ import torch
 from typer.testing import CliRunner
 
 from certify.errors import InputError
-from certify.policies import TanhNetwork, load_policy
-from certify.systems import get_system
+from certify.loop.plants import get_system
+from certify.loop.policies import TanhNetwork, load_policy
 from controllers.cli import app
 from controllers.departure import departure, departure_of, linearised
 from controllers.options import preset

@@ -12,7 +12,7 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from certify.systems import get_system
+from certify.loop.plants import get_system
 from controllers.cli import app
 from controllers.options import preset
 from controllers.sac import CPU, SAC, Interface, Replay

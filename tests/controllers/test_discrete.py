@@ -14,11 +14,11 @@ import scipy.signal
 import torch
 from typer.testing import CliRunner
 
-from certify.api import certify_roa
+from certify.analysis.api import certify_roa
+from certify.certificates.verdict import Verdict
 from certify.errors import InputError
-from certify.policies import Policy, TanhNetwork, save_policy
-from certify.systems import get_system, load_system
-from certify.verdict import Verdict
+from certify.loop.plants import get_system, load_system
+from certify.loop.policies import Policy, TanhNetwork, save_policy
 from controllers.cli import app
 from controllers.environments import PlantEnvironment, Stepper
 from controllers.evaluate import EvaluationOptions, discrete_linearisation, evaluate

@@ -15,7 +15,7 @@ import torch
 from gymnasium.utils.env_checker import check_env
 
 from certify.errors import InputError
-from certify.systems import get_system
+from certify.loop.plants import get_system
 from controllers.environments import PlantEnvironment, Stepper
 from controllers.options import available_plants, preset
 

@@ -14,9 +14,9 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 from PIL import Image
 
+from certify.certificates.verdict import Verdict
 from certify.errors import InputError
-from certify.systems import get_system
-from certify.verdict import Verdict
+from certify.loop.plants import get_system
 from controllers.course import Evaluated
 from controllers.figures import (
     draw_curves,

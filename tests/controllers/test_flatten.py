@@ -11,10 +11,10 @@ import scipy.linalg
 import torch
 from typer.testing import CliRunner
 
-from certify.cli import app as certify_app
+from certify.cli.main import app as certify_app
 from certify.errors import InputError
-from certify.policies import Policy, TanhNetwork, load_policy, require_centred, save_policy
-from certify.systems import get_system
+from certify.loop.plants import get_system
+from certify.loop.policies import Policy, TanhNetwork, load_policy, require_centred, save_policy
 from controllers import flatten as module
 from controllers.cli import app
 from controllers.evaluate import EvaluationOptions, curvature, discrete_linearisation, evaluate

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from certify.errors import InputError
-from certify.policies import TanhNetwork, require_centred
+from certify.loop.policies import TanhNetwork, require_centred
 from controllers.gain import regained
 
 U_EQ = (Fraction(1, 4), Fraction(-1, 8))

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from certify.certificates.verdict import Verdict
 from certify.errors import InputError
-from certify.policies import Policy, TanhNetwork, load_policy, save_policy
-from certify.systems import get_system
-from certify.verdict import Verdict
+from certify.loop.plants import get_system
+from certify.loop.policies import Policy, TanhNetwork, load_policy, save_policy
 from controllers.cli import app
 from controllers.evaluate import MONITORING, discrete_linearisation, settle
 from controllers.history import Distances, ProvingOptions, distances, prove, read_settled, table
@@ -191,7 +191,7 @@ def test_a_certificate_that_is_there_is_believed_only_if_it_is_accepted_and_abou
         raise InputError("it was searched for")
 
     with monkeypatch.context() as patch:
-        patch.setattr("certify.api.certify_roa", search)
+        patch.setattr("certify.analysis.api.certify_roa", search)
         again = prove(kept, PENDULUM, tmp_path, QUICK)
         np.testing.assert_array_equal(again.P, proof.P)
         assert (again.level, again.volume, again.verdict) == (proof.level, proof.volume, Verdict.PROVED)

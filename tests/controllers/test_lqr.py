@@ -9,7 +9,7 @@ import pytest
 import scipy.linalg
 
 from certify.errors import InputError
-from certify.systems import get_system
+from certify.loop.plants import get_system
 from controllers.environments import Stepper
 from controllers.evaluate import discrete_linearisation
 from controllers.lqr import GainLearner, fit_A, fit_B, riccati_gain

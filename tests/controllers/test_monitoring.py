@@ -13,8 +13,8 @@ import pytest
 from typer.testing import CliRunner
 
 from certify.errors import InputError
-from certify.policies import load_policy
-from certify.systems import get_system
+from certify.loop.plants import get_system
+from certify.loop.policies import load_policy
 from controllers.cli import app
 from controllers.evaluate import MONITORING, curvature, discrete_linearisation, errors_of, evaluate, settle
 from controllers.logs import Monitored

@@ -11,8 +11,8 @@ import pytest
 from typer.testing import CliRunner
 
 from certify.errors import InputError
-from certify.policies import load_policy
-from certify.systems import chosen_system, get_system, load_system
+from certify.loop.plants import chosen_system, get_system, load_system
+from certify.loop.policies import load_policy
 from controllers.cli import app
 from controllers.own import RESOLUTION, chosen_plant, default_plant, linearisation, time_step
 
@@ -39,7 +39,7 @@ f = [-4, 4]
 SMALL = "\n[training]\nsteps = 260\nwarm_up = 100\nn_A = 60\nn_B = 60\nbatch = 16\ncritic = [8, 8]\nactor = [4]\n"
 PYTHON = """
 from pathlib import Path
-from certify.systems import load_system
+from certify.loop.plants import load_system
 
 def make():
     return load_system(Path(__file__).with_name("slider.toml"))
@@ -154,7 +154,7 @@ def test_a_plant_of_ones_own_is_trained_evaluated_and_certified(tmp_path, monkey
     assert judged.exit_code == 0, judged.stderr
     assert json.loads(judged.stdout)["held"]["states"] == 3
 
-    from certify.cli import _run
+    from certify.cli.main import _run
 
     monkeypatch.chdir(tmp_path)
     common = ["--out", str(tmp_path / "o"), "--time-limit", "5"]

@@ -13,8 +13,8 @@ import torch
 from typer.testing import CliRunner
 
 from certify.errors import InputError
-from certify.policies import load_policy
-from certify.systems import get_system
+from certify.loop.plants import get_system
+from certify.loop.policies import load_policy
 from controllers.baselines import from_checkpoint
 from controllers.cli import app
 from controllers.environments import PlantEnvironment

@@ -13,17 +13,17 @@ import pytest
 from typer.testing import CliRunner
 
 from certify.errors import InputError
-from certify.policies import load_policy
-from certify.systems import available_systems, get_system
-from certify.systems import plants as system_plants
+from certify.loop.plants import available_systems, get_system
+from certify.loop.plants import shipped as system_plants
+from certify.loop.policies import load_policy
 from controllers import plants
 from controllers.cli import app
 from controllers.options import Plant, available_plants, get_plant
 
 EQUATIONS = """
 from fractions import Fraction
-from certify.expressions import Number, sin, symbols
-from certify.systems import System
+from certify.loop.expressions import Number, sin, symbols
+from certify.loop.plants import System
 
 def leak() -> System:
     x, y, u = symbols("x y u")

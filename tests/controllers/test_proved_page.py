@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from certify.api import certify_roa
-from certify.claims import Practical
-from certify.policies import Policy, TanhNetwork, save_policy
-from certify.systems import get_system
+from certify.analysis.api import certify_roa
+from certify.certificates.claims import Practical
+from certify.loop.plants import get_system
+from certify.loop.policies import Policy, TanhNetwork, save_policy
 
 PENDULUM = get_system("pendulum")
 

@@ -11,7 +11,7 @@ import scipy.integrate
 import scipy.stats
 import torch
 
-from certify.systems import get_system
+from certify.loop.plants import get_system
 from controllers.options import available_plants, preset
 from controllers.sac import SAC, Actor, Critic, Interface, Replay, squashed_log_likelihood
 

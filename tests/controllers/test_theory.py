@@ -14,13 +14,13 @@ import pytest
 import scipy.linalg
 from typer.testing import CliRunner
 
-from certify.closed_loop import ClosedLoop
-from certify.containment import Ellipsoid, ProvedSet
+from certify.certificates.membership import Ellipsoid, ProvedSet
 from certify.errors import InputError
-from certify.expressions import Number, Symbol, substitute, symbols
-from certify.policies import Policy, TanhNetwork, load_policy, save_policy
-from certify.rigorous import is_definite
-from certify.systems import System, get_system, in_floats
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.expressions import Number, Symbol, substitute, symbols
+from certify.loop.plants import System, get_system, in_floats
+from certify.loop.policies import Policy, TanhNetwork, load_policy, save_policy
+from certify.loop.rigorous import is_definite
 from controllers import theory as module
 from controllers.cli import app
 from controllers.evaluate import discrete_linearisation, require_same_loop

@@ -13,8 +13,8 @@ import pytest
 import torch
 
 from certify.errors import InputError
-from certify.policies import load_policy, save_policy
-from certify.systems import get_system
+from certify.loop.plants import get_system
+from certify.loop.policies import load_policy, save_policy
 from controllers.evaluate import EvaluationOptions, discrete_linearisation, evaluate
 from controllers.logs import Episode, Log
 from controllers.options import TrainingOptions, preset

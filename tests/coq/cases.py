@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from certify.certificate import loop_sections
-from certify.policies import load_policy
-from certify.systems import get_system, load_system
+from certify.certificates import loop_sections
+from certify.loop.plants import get_system, load_system
+from certify.loop.policies import load_policy
 from tests.support.certificates import make
 
 Document = dict[str, Any]

@@ -22,12 +22,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from certify.coq.data import read_claim
-from certify.coq.evidence import Leaf, Split, inverse
-from certify.coq.expression import Expression
-from certify.coq.kernel import compile_folder, find_coqc, theory_files, write_folder
-from certify.coq.search import search
-from certify.coq.text import ASSUMPTIONS, PROOF, dyadic, expression, ratio
+from certify.certificates.coq.data import read_claim
+from certify.certificates.coq.evidence import Leaf, Split, inverse
+from certify.certificates.coq.expression import Expression
+from certify.certificates.coq.kernel import compile_folder, find_coqc, theory_files, write_folder
+from certify.certificates.coq.search import search
+from certify.certificates.coq.text import ASSUMPTIONS, PROOF, dyadic, expression, ratio
 from tests.coq.cases import pendulum, raw
 from tests.support.certificates import edited, encode, make
 

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from certify.coq.data import read_claim
-from certify.coq.text import claim_text, dyadic, number
+from certify.certificates.coq.data import read_claim
+from certify.certificates.coq.text import claim_text, dyadic, number
 from certify.errors import CertifyError, InputError
 from tests.coq.cases import Document, everything, pendulum, raw, scalar
 from tests.support.certificates import edited, encode, policy_hash, rehash

@@ -14,11 +14,9 @@ from pathlib import Path
 
 import pytest
 
-from certify.certificate import sole_writer
-from certify.cli import _run
-from certify.commands import doctor
-from certify.coq import kernel
-from certify.coq.kernel import (
+from certify.certificates import sole_writer
+from certify.certificates.coq import kernel
+from certify.certificates.coq.kernel import (
     AXIOMS,
     THEORY,
     axioms_in,
@@ -29,10 +27,12 @@ from certify.coq.kernel import (
     theory_sha256,
     write_folder,
 )
-from certify.coq.proving import CoqOptions, CoqResult, prove_in_coq
-from certify.coq.text import ASSUMPTIONS
+from certify.certificates.coq.proving import CoqOptions, CoqResult, prove_in_coq
+from certify.certificates.coq.text import ASSUMPTIONS
+from certify.certificates.verdict import Verdict
+from certify.cli import doctor
+from certify.cli.main import _run
 from certify.errors import BackendError, InputError
-from certify.verdict import Verdict
 from tests.coq.cases import pendulum, raw, scalar
 from tests.support.certificates import edited
 

@@ -10,12 +10,12 @@ from itertools import product
 import numpy as np
 import pytest
 
-from certify.coq import search as searching
-from certify.coq.data import Claimed, read_claim
-from certify.coq.evidence import Evidence, Leaf, Split, Tree, inverse
-from certify.coq.search import Found, Limits, jacobian, search
-from certify.coq.slopes import Boxes, Interval, Quantity, bounds
-from certify.coq.text import evidence_text
+from certify.certificates.coq import search as searching
+from certify.certificates.coq.data import Claimed, read_claim
+from certify.certificates.coq.evidence import Evidence, Leaf, Split, Tree, inverse
+from certify.certificates.coq.search import Found, Limits, jacobian, search
+from certify.certificates.coq.slopes import Boxes, Interval, Quantity, bounds
+from certify.certificates.coq.text import evidence_text
 from certify.errors import InputError
 from tests.coq.cases import Document, everything, pendulum, raw, scalar, van_der_pol
 from tests.coq.test_data import in_file

@@ -9,21 +9,21 @@ import numpy as np
 import pytest
 import torch
 
-from certify.engines import models
-from certify.engines.base import Budget
-from certify.engines.bounds.partition import LEAF
-from certify.engines.bounds.search import prove_outwards
-from certify.engines.falsify import Witness, confirm, falsify
-from certify.engines.local import local_margin, prove_local
-from certify.engines.models import paths
+from certify.certificates.verdict import Stop
 from certify.errors import InputError
+from certify.loop.plants import System, get_system
+from certify.loop.policies import TanhNetwork, bounded_by_form, load_policy
+from certify.loop.rigorous import evaluate_policy, evaluate_vdot
 from certify.lyapunov import domain_limit
 from certify.lyapunov.function import Quadratic
-from certify.policies import TanhNetwork, bounded_by_form, load_policy
-from certify.rigorous import evaluate_policy, evaluate_vdot
-from certify.running import ThreadRunner
-from certify.systems import System, get_system
-from certify.verdict import Stop
+from certify.provers.ball import models
+from certify.provers.ball.local import local_margin, prove_local
+from certify.provers.ball.models import paths
+from certify.provers.base import Budget
+from certify.provers.boxes.partition import LEAF
+from certify.provers.boxes.search import prove_outwards
+from certify.provers.execution import ThreadRunner
+from certify.provers.falsify import Witness, confirm, falsify
 from tests.support.cases import Case, case_of
 from tests.support.loops import chain, pendulum_network, scalar_tanh
 

@@ -7,16 +7,16 @@ from functools import cache
 import numpy as np
 import pytest
 
-from certify.claims.conditions import ring_condition
-from certify.claims.queries import query
-from certify.engines.base import Budget
-from certify.engines.bounds.search import prove_outwards
-from certify.engines.dreal.backend import Backend, decide, find_backend
-from certify.engines.falsify import Witness, confirm, falsify
+from certify.certificates.claims.conditions import ring_condition
+from certify.certificates.claims.queries import query
 from certify.errors import BackendError
+from certify.loop.plants import get_system
 from certify.lyapunov import domain_limit
-from certify.running import ThreadRunner
-from certify.systems import get_system
+from certify.provers.base import Budget
+from certify.provers.boxes.search import prove_outwards
+from certify.provers.dreal.backend import Backend, decide, find_backend
+from certify.provers.execution import ThreadRunner
+from certify.provers.falsify import Witness, confirm, falsify
 from tests.support import codac_prover
 from tests.support.cases import Case, case_of
 from tests.support.loops import chain, pendulum_network, scalar_clip, scalar_tanh, tank, valve

@@ -21,26 +21,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from certify.certificate import read_certificate, run_checker
-from certify.claims import Practical, Problem
-from certify.claims.conditions import local_condition, ring_condition
-from certify.claims.queries import Query, query
-from certify.cli import _run
-from certify.closed_loop import ClosedLoop
-from certify.engines.base import Budget, Proof, Task
-from certify.engines.dreal import backend as dreal
-from certify.engines.dreal import proof as dreal_proof
-from certify.engines.dreal.backend import Answer, Backend, decide, find_backend
-from certify.engines.dreal.proof import DrealEngine, DrealOptions, confirm_with_dreal
-from certify.engines.falsify import Witness, confirm
+from certify.analysis.run import RoaOptions, certify_roa
+from certify.certificates import read_certificate, run_checker
+from certify.certificates.claims import Practical, Problem
+from certify.certificates.claims.conditions import local_condition, ring_condition
+from certify.certificates.claims.queries import Query, query
+from certify.certificates.verdict import Stop, Verdict
+from certify.cli.main import _run
 from certify.errors import BackendError, InputError, SoundnessError
-from certify.expressions import Number, symbols
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.expressions import Number, symbols
+from certify.loop.plants import System, get_system
+from certify.loop.policies import Policy, TanhNetwork, save_policy
 from certify.lyapunov.function import Quadratic
-from certify.policies import Policy, TanhNetwork, save_policy
+from certify.provers.base import Budget, Proof, Task
+from certify.provers.dreal import backend as dreal
+from certify.provers.dreal import proof as dreal_proof
+from certify.provers.dreal.backend import Answer, Backend, decide, find_backend
+from certify.provers.dreal.proof import DrealEngine, DrealOptions, confirm_with_dreal
+from certify.provers.falsify import Witness, confirm
 from certify.report import render_html
-from certify.roa import RoaOptions, certify_roa
-from certify.systems import System, get_system
-from certify.verdict import Stop, Verdict
 from tests.support.cases import Case, case_of
 from tests.support.certificates import encode
 from tests.support.loops import box, pendulum_network, scalar_tanh
@@ -559,6 +559,6 @@ def test_a_violation_contradicts_only_where_the_guards_hold(
     network = TanhNetwork((np.array([[-1.0]]),), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
     problem = Problem(ClosedLoop(system, network), Quadratic(np.eye(1)))
     answer = Answer("delta-sat", 0.1, "fake", {"x": (at, at)})
-    monkeypatch.setattr("certify.engines.dreal.proof.decide", lambda *_: answer)
+    monkeypatch.setattr("certify.provers.dreal.proof.decide", lambda *_: answer)
     _, witness = confirm_with_dreal(problem, Practical(roa=4.0, local=1.0, floor=1.0), FAKE, DrealOptions())
     assert (witness is not None) is contradicts

@@ -8,15 +8,15 @@ import flint
 import numpy as np
 import pytest
 
-from certify.claims import Asymptotic, conditions
-from certify.claims.conditions import local_condition, ring_condition
-from certify.claims.queries import Query, query
-from certify.engines.dreal import backend
-from certify.engines.dreal.backend import to_smt2
-from certify.engines.dreal.formula import Formula, formula
+from certify.certificates.claims import Asymptotic, conditions
+from certify.certificates.claims.conditions import local_condition, ring_condition
+from certify.certificates.claims.queries import Query, query
 from certify.errors import InputError
-from certify.expressions import Tree
-from certify.systems import get_system
+from certify.loop.expressions import Tree
+from certify.loop.plants import get_system
+from certify.provers.dreal import backend
+from certify.provers.dreal.backend import to_smt2
+from certify.provers.dreal.formula import Formula, formula
 from tests.claims.test_queries import CASES, quadrotor, values
 from tests.support.cases import case_of
 from tests.support.loops import pendulum_network

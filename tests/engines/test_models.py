@@ -11,24 +11,24 @@ import numpy as np
 import pytest
 from flint import fmpq_mat
 
+from certify.analysis.run import RoaOptions, certify_roa
+from certify.certificates.verdict import Verdict
 from certify.checker.ball import Ball
 from certify.checker.case import Case
 from certify.checker.decrease import Models as TheirModels
 from certify.checker.decrease import sides
 from certify.checker.exact import exactly
 from certify.checker.jets import unpacked
-from certify.closed_loop import ClosedLoop
-from certify.engines.decrease import Multipliers, best_multipliers, decay_of, rest_of
-from certify.engines.enlarge import Found, enlarge
-from certify.engines.local import prove_local
-from certify.engines.models import Models, paths
-from certify.engines.tube import Tube, find_tube
-from certify.expressions import cos, sin, symbols
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.expressions import cos, sin, symbols
+from certify.loop.plants import System, get_system
+from certify.loop.policies import TanhNetwork, load_policy
 from certify.lyapunov import domain_limit, leaves_domain
-from certify.policies import TanhNetwork, load_policy
-from certify.roa import RoaOptions, certify_roa
-from certify.systems import System, get_system
-from certify.verdict import Verdict
+from certify.provers.ball.decrease import Multipliers, best_multipliers, decay_of, rest_of
+from certify.provers.ball.local import prove_local
+from certify.provers.ball.models import Models, paths
+from certify.provers.tube.enlarge import Found, enlarge
+from certify.provers.tube.tube import Tube, find_tube
 from tests.support.cases import case_of
 from tests.support.certificates import parse
 from tests.support.loops import chain, pendulum_network, scalar_tanh, tank, valve

@@ -13,24 +13,24 @@ import numpy as np
 import pytest
 import torch
 
-from certify.certificate import Certificate, OuterTree, PartitionTree, run_checker
-from certify.certificate.tree import leaves
-from certify.claims import Asymptotic, Problem
-from certify.closed_loop import ClosedLoop
-from certify.enclosures import NeuralEnclosure, SymbolicEnclosure, Taylor, upper_bound
-from certify.engines.base import Budget, Progress, Task
-from certify.engines.bounds.engine import BoundsEngine
-from certify.engines.outer import Nothing, OuterProof, prove_outer, split_again, split_face_again
-from certify.engines.outer.falsify import Falsifier
-from certify.engines.outer.rule import FaceBound, FallBound
+from certify.certificates import Certificate, OuterTree, PartitionTree, run_checker
+from certify.certificates.claims import Asymptotic, Problem
+from certify.certificates.tree import leaves
+from certify.certificates.verdict import Stop
 from certify.errors import InputError
-from certify.expressions import Expression, Number, cos, exp, sqrt, symbols
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.expressions import Expression, Number, cos, exp, sqrt, symbols
+from certify.loop.plants import System
+from certify.loop.policies import TanhNetwork
 from certify.lyapunov import Neural, Symbolic
 from certify.lyapunov.function import Quadratic
-from certify.policies import TanhNetwork
-from certify.running import ThreadRunner
-from certify.systems import System
-from certify.verdict import Stop
+from certify.provers.base import Budget, Progress, Task
+from certify.provers.bounds import NeuralEnclosure, SymbolicEnclosure, Taylor, upper_bound
+from certify.provers.boxes.engine import BoundsEngine
+from certify.provers.execution import ThreadRunner
+from certify.provers.outer import Nothing, OuterProof, prove_outer, split_again, split_face_again
+from certify.provers.outer.falsify import Falsifier
+from certify.provers.outer.rule import FaceBound, FallBound
 from tests.support.loops import box, scalar_tanh
 from tests.support.marks import slow_after
 

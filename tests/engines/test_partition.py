@@ -14,8 +14,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from certify.engines.bounds.frontier import _HANDFUL, Frontier
-from certify.engines.bounds.partition import LEAF, Partition
+from certify.provers.boxes.frontier import _HANDFUL, Frontier
+from certify.provers.boxes.partition import LEAF, Partition
 from tests.engines.test_bounds import leaves
 
 CPU = torch.device("cpu")
@@ -153,10 +153,10 @@ def test_the_lowest_comes_back_before_many_a_hair_above_it() -> None:
 
 HARD = """
 import resource, torch
-from certify.engines.base import Budget
-from certify.engines.bounds.rule import BoxBounds, VdotBound
-from certify.engines.bounds.search import prove_outwards
-from certify.running import ThreadRunner
+from certify.provers.base import Budget
+from certify.provers.boxes.rule import BoxBounds, VdotBound
+from certify.provers.boxes.search import prove_outwards
+from certify.provers.execution import ThreadRunner
 from tests.support.cases import case_of
 from tests.support.loops import chain
 

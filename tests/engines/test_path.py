@@ -14,25 +14,25 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from certify.certificate import PartitionTree, read_certificate
+from certify.analysis.results import RoaResult
+from certify.analysis.run import RoaOptions, certify_roa
+from certify.certificates import PartitionTree, read_certificate
+from certify.certificates.claims import Reached
+from certify.certificates.verdict import Stop, Verdict
 from certify.checker.document import read
 from certify.checker.rules import check
-from certify.claims import Reached
-from certify.closed_loop import ClosedLoop
-from certify.engines import enlarge as enlarging
-from certify.engines.enlarge import surround
-from certify.engines.local import prove_local
-from certify.engines.models import paths
-from certify.engines.path import after, find_path
-from certify.engines.tube import Tube
 from certify.errors import InputError
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.plants import System, get_system
+from certify.loop.plants.ode import rk4_step
+from certify.loop.policies import TanhNetwork, load_policy
 from certify.lyapunov import domain_limit
-from certify.policies import TanhNetwork, load_policy
-from certify.results import RoaResult
-from certify.roa import RoaOptions, certify_roa
-from certify.systems import System, get_system
-from certify.systems.ode import rk4_step
-from certify.verdict import Stop, Verdict
+from certify.provers.ball.local import prove_local
+from certify.provers.ball.models import paths
+from certify.provers.tube import enlarge as enlarging
+from certify.provers.tube.enlarge import surround
+from certify.provers.tube.path import after, find_path
+from certify.provers.tube.tube import Tube
 from tests.support.cases import case_of
 from tests.support.loops import pendulum_network, scalar_tanh
 

@@ -12,25 +12,25 @@ import cvxpy
 import numpy as np
 import pytest
 
-from certify.certificate import run_checker
-from certify.claims import Practical
-from certify.closed_loop import ClosedLoop
-from certify.engines.base import Budget, Proof, Task
-from certify.engines.bounds.engine import BoundsEngine
-from certify.engines.bounds.search import prove_inwards
-from certify.engines.falsify import survey
-from certify.engines.peak import peak_candidate
-from certify.engines.robust import robust_candidate
+from certify.analysis.candidates.peak import peak_candidate
+from certify.analysis.candidates.robust import robust_candidate
+from certify.analysis.candidates.trials import optimised
+from certify.analysis.run import RoaOptions, certify_roa
+from certify.certificates import run_checker
+from certify.certificates.claims import Practical
+from certify.certificates.verdict import Stop, Verdict
 from certify.errors import InputError
-from certify.expressions import Number, symbols
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.expressions import Number, symbols
+from certify.loop.plants import System, get_system
+from certify.loop.policies import TanhNetwork, load_policy
+from certify.loop.rigorous import evaluate_vdot
 from certify.lyapunov import domain_limit
-from certify.policies import TanhNetwork, load_policy
-from certify.rigorous import evaluate_vdot
-from certify.roa import RoaOptions, certify_roa
-from certify.running import ThreadRunner
-from certify.systems import System, get_system
-from certify.trials import optimised
-from certify.verdict import Stop, Verdict
+from certify.provers.base import Budget, Proof, Task
+from certify.provers.boxes.engine import BoundsEngine
+from certify.provers.boxes.search import prove_inwards
+from certify.provers.execution import ThreadRunner
+from certify.provers.falsify import survey
 from tests.engines.test_bounds import planted, vdot
 from tests.support.cases import Case, case_of
 from tests.support.loops import box, pendulum_network, scalar_tanh

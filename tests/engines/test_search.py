@@ -8,14 +8,14 @@ import numpy as np
 import pytest
 import torch
 
-from certify.engines.base import Budget, Task
-from certify.engines.bounds.engine import BoundsEngine
-from certify.engines.bounds.search import outwards, prove_outwards
-from certify.policies import load_policy
-from certify.roa import RoaOptions, certify_roa
-from certify.running import ThreadRunner
-from certify.systems import get_system
-from certify.verdict import Stop, Verdict
+from certify.analysis.run import RoaOptions, certify_roa
+from certify.certificates.verdict import Stop, Verdict
+from certify.loop.plants import get_system
+from certify.loop.policies import load_policy
+from certify.provers.base import Budget, Task
+from certify.provers.boxes.engine import BoundsEngine
+from certify.provers.boxes.search import outwards, prove_outwards
+from certify.provers.execution import ThreadRunner
 from tests.support.cases import case_of
 from tests.support.loops import pendulum_network
 
@@ -40,7 +40,7 @@ def test_a_pass_in_pieces_is_the_pass_in_one() -> None:
 
 def test_a_snapshot_is_a_proof() -> None:
     """On every leaf that meets the ring of a snapshot the bound is negative with the snapshot's own levels."""
-    from certify.certificate.tree import leaves
+    from certify.certificates.tree import leaves
 
     case = case_of(get_system("pendulum"), pendulum_network())
     ring = outwards(case.problem, case.T, 1e-6, 6.0, RUNNER)

@@ -10,24 +10,24 @@ import numpy as np
 import pytest
 import torch
 
-from certify.claims import Problem
-from certify.closed_loop import ClosedLoop
-from certify.enclosures import Flow, Taylor
-from certify.engines.base import Budget
-from certify.engines.bounds.order import choose_order
-from certify.engines.bounds.rule import VdotBound
-from certify.engines.bounds.search import prove_inwards, prove_outwards
-from certify.engines.falsify import falsify, refutes
+from certify.certificates.claims import Problem
+from certify.certificates.verdict import Stop
 from certify.errors import InputError
-from certify.expressions import Number, Symbol, numerical, symbols
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.expressions import Number, Symbol, numerical, symbols
+from certify.loop.plants import System, get_system
+from certify.loop.plants.equations import parse_expression
+from certify.loop.policies import TanhNetwork
+from certify.loop.rigorous import eigenvalues, evaluate_increment, evaluate_vdot, instability
 from certify.lyapunov import choose_candidate, diagonalising_coordinates, slowest_decay, solve_lyapunov
 from certify.lyapunov.function import Quadratic
-from certify.policies import TanhNetwork
-from certify.rigorous import eigenvalues, evaluate_increment, evaluate_vdot, instability
-from certify.running import ThreadRunner
-from certify.systems import System, get_system
-from certify.systems.equations import parse_expression
-from certify.verdict import Stop
+from certify.provers.base import Budget
+from certify.provers.bounds import Flow, Taylor
+from certify.provers.boxes.order import choose_order
+from certify.provers.boxes.rule import VdotBound
+from certify.provers.boxes.search import prove_inwards, prove_outwards
+from certify.provers.execution import ThreadRunner
+from certify.provers.falsify import falsify, refutes
 from tests.engines.test_vdot import boxes, cartpole_case
 from tests.support.loops import box, pendulum_network, scalar_tanh, valve
 from tests.support.marks import slow_after

@@ -13,21 +13,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from certify.certificate import Certificate, PartitionTree
-from certify.claims import Asymptotic, Practical, Problem
-from certify.closed_loop import ClosedLoop
-from certify.engines.bounds.search import empty_ring
-from certify.engines.cells import cut, cuts_for
-from certify.engines.decrease import corners_of
-from certify.engines.local import Rule, ball_around, local_ball, prove_band, prove_local
-from certify.engines.models import Models, paths
-from certify.engines.steps import Steps, steps_of
-from certify.expressions import Expression, Number, Symbol, atan, cos, exp, sin, sqrt, symbols, symbols_of, tanh
+from certify.certificates import Certificate, PartitionTree
+from certify.certificates.claims import Asymptotic, Practical, Problem
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.expressions import Expression, Number, Symbol, atan, cos, exp, sin, sqrt, symbols, symbols_of, tanh
+from certify.loop.plants import System, get_system
+from certify.loop.plants.system import Interval
+from certify.loop.policies import TanhNetwork, load_policy
 from certify.lyapunov import choose_candidate, diagonalising_coordinates, domain_limit
 from certify.lyapunov.function import Quadratic
-from certify.policies import TanhNetwork, load_policy
-from certify.systems import System, get_system
-from certify.systems.system import Interval
+from certify.provers.ball.cells import cut, cuts_for
+from certify.provers.ball.decrease import corners_of
+from certify.provers.ball.local import Rule, ball_around, local_ball, prove_band, prove_local
+from certify.provers.ball.models import Models, paths
+from certify.provers.ball.steps import Steps, steps_of
+from certify.provers.boxes.search import empty_ring
 from tests.support.certificates import verdict
 from tests.support.loops import box
 from tests.support.marks import slow_after

@@ -17,18 +17,18 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from certify.certificate import run_checker
-from certify.engines.base import Budget
-from certify.engines.bounds import search, subtrees
-from certify.engines.bounds.partition import MAX_DEPTH, Partition
-from certify.engines.bounds.search import Pass, RingProof, outwards, prove_inwards, prove_outwards
-from certify.engines.outer import Nothing, OuterProof, prove_outer
+from certify.analysis.results import RoaResult
+from certify.analysis.run import RoaOptions, certify_roa
+from certify.certificates import run_checker
+from certify.certificates.verdict import Stop, Verdict
 from certify.errors import BackendError, CertificateFormatError
-from certify.results import RoaResult
-from certify.roa import RoaOptions, certify_roa
-from certify.running import ThreadRunner
-from certify.systems import get_system
-from certify.verdict import Stop, Verdict
+from certify.loop.plants import get_system
+from certify.provers.base import Budget
+from certify.provers.boxes import search, subtrees
+from certify.provers.boxes.partition import MAX_DEPTH, Partition
+from certify.provers.boxes.search import Pass, RingProof, outwards, prove_inwards, prove_outwards
+from certify.provers.execution import ThreadRunner
+from certify.provers.outer import Nothing, OuterProof, prove_outer
 from tests.engines.test_outer import planar, wells
 from tests.engines.test_steps import held, stepped, uncertain_pendulum
 from tests.engines.test_vdot import cartpole_case
@@ -298,7 +298,7 @@ def certified(folder: Path, troupe: Troupe, monkeypatch: pytest.MonkeyPatch, **m
     class Told(PlayedRunner):
         remark = "told"
 
-    monkeypatch.setattr("certify.roa._runner_for", lambda options: nullcontext(Told(troupe)))
+    monkeypatch.setattr("certify.analysis.run._runner_for", lambda options: nullcontext(Told(troupe)))
     resume = more.get("resume", False)
     options = RoaOptions(cluster=ADDRESS, **({} if resume else {"Q": (1.0, 1.0)}) | {"time_limit": 12.0} | more)
     return certify_roa(WIDE, pendulum_network(), folder, options)
@@ -339,7 +339,7 @@ def test_a_level_that_was_asked_for_is_not_had_by_lying(
 ) -> None:
     """Above a violation that sampling did not find: the claim is false, and no worker's word makes it PROVED."""
     assert honest.levels.sampled_limit is not None
-    monkeypatch.setattr("certify.trials.falsify", lambda *args, **more: None)
+    monkeypatch.setattr("certify.analysis.candidates.trials.falsify", lambda *args, **more: None)
     troupe = Troupe(play=LIES["all is proved"])
     found = certified(tmp_path, troupe, monkeypatch, level=1.01 * honest.levels.sampled_limit, Q=None)
     assert found.verdict is Verdict.UNKNOWN and found.stop is Stop.REFUSED and troupe.answered
@@ -349,7 +349,7 @@ def test_a_level_that_was_asked_for_is_not_had_by_lying(
 def test_what_cannot_be_mended_is_not_called_a_fault_of_this_program(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("certify.acceptance._lowered", lambda *args: None)
+    monkeypatch.setattr("certify.analysis.acceptance._lowered", lambda *args: None)
     with pytest.raises(BackendError, match=f"workers of {ADDRESS}, who may be at fault") as told:
         certified(tmp_path, Troupe(play=LIES["all is proved"]), monkeypatch)
     assert "run without the cluster" in str(told.value)
@@ -443,9 +443,9 @@ def test_a_run_that_lost_its_cluster_is_gone_on_with(
 ) -> None:
     """What is proved so far is accepted and the search kept; resumed, with a cluster or without, it comes to its
     end."""
-    for place in ("certify.roa", "certify.race"):
+    for place in ("certify.analysis.run", "certify.analysis.selection"):
         monkeypatch.setattr(f"{place}.Budget", partial(Budget, batch=16))
-    monkeypatch.setattr("certify.roa._HEAT", 1e-9)
+    monkeypatch.setattr("certify.analysis.run._HEAT", 1e-9)
     troupe = Troupe(lost_after=answers)
     found = certified(tmp_path, troupe, monkeypatch)
     assert found.verdict is Verdict.PROVED and found.stop is Stop.CLUSTER and accepted(found)

@@ -15,31 +15,31 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from certify.certificate import PartitionTree, read_certificate
+from certify.analysis.candidates.robust import robust_candidate
+from certify.analysis.diagnosis import diagnose
+from certify.analysis.results import RoaResult
+from certify.analysis.run import RoaOptions, certify_roa
+from certify.certificates import PartitionTree, read_certificate
+from certify.certificates.claims import Enlarged, Problem
+from certify.certificates.verdict import Stop, Verdict
 from certify.checker import tube as tube_rule
 from certify.checker.document import read
 from certify.checker.errors import Rejected
 from certify.checker.rules import check
-from certify.claims import Enlarged, Problem
-from certify.closed_loop import ClosedLoop
-from certify.diagnosis import diagnose
-from certify.engines import enlarge as enlarging
-from certify.engines import tube as tubes
-from certify.engines.decrease import Multipliers, best_multipliers, decay_of, multipliers_for, rest_of
-from certify.engines.enlarge import enlarge
-from certify.engines.local import ball_around, local_margin, prove_local
-from certify.engines.models import paths
-from certify.engines.robust import robust_candidate
-from certify.engines.tube import Tube, find_tube
 from certify.errors import InputError
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.plants import get_system
+from certify.loop.plants.ode import rk4_step
+from certify.loop.policies import load_policy
 from certify.lyapunov import SOLVED, choose_candidate, diagonalising_coordinates, domain_limit, volume
 from certify.lyapunov.function import Quadratic
-from certify.policies import load_policy
-from certify.results import RoaResult
-from certify.roa import RoaOptions, certify_roa
-from certify.systems import get_system
-from certify.systems.ode import rk4_step
-from certify.verdict import Stop, Verdict
+from certify.provers.ball.decrease import Multipliers, best_multipliers, decay_of, multipliers_for, rest_of
+from certify.provers.ball.local import ball_around, local_margin, prove_local
+from certify.provers.ball.models import paths
+from certify.provers.tube import enlarge as enlarging
+from certify.provers.tube import tube as tubes
+from certify.provers.tube.enlarge import enlarge
+from certify.provers.tube.tube import Tube, find_tube
 from tests.support.cases import Case, case_of
 from tests.support.loops import pendulum_network, scalar_tanh
 

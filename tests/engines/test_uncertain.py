@@ -9,18 +9,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from certify.claims import Problem
-from certify.closed_loop import ClosedLoop
-from certify.engines.falsify import confirm, falsify, refutes
-from certify.engines.local import local_ball, prove_local
-from certify.expressions import Number, symbols
+from certify.analysis.run import RoaOptions, RoaResult, certify_roa
+from certify.certificates.claims import Problem
+from certify.certificates.verdict import Verdict
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.expressions import Number, symbols
+from certify.loop.plants import System, get_system
+from certify.loop.policies import TanhNetwork, load_policy
+from certify.loop.rigorous import evaluate_vdot
 from certify.lyapunov import diagonalising_coordinates
 from certify.lyapunov.function import Quadratic
-from certify.policies import TanhNetwork, load_policy
-from certify.rigorous import evaluate_vdot
-from certify.roa import RoaOptions, RoaResult, certify_roa
-from certify.systems import System, get_system
-from certify.verdict import Verdict
+from certify.provers.ball.local import local_ball, prove_local
+from certify.provers.falsify import confirm, falsify, refutes
 from tests.support.loops import box
 from tests.support.reference import judge_bytes
 

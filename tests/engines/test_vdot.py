@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from certify.engines.bounds.rule import VdotBound
-from certify.running import ThreadRunner
-from certify.systems import get_system
+from certify.loop.plants import get_system
+from certify.provers.boxes.rule import VdotBound
+from certify.provers.execution import ThreadRunner
 from tests.engines.test_bounds import vdot
 from tests.support.cases import Case, case_of
 from tests.support.loops import lqr_gain, pendulum_network, saturated_lqr, scalar_tanh

@@ -10,15 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from certify.cli import _run
-from certify.closed_loop import ClosedLoop
+from certify.analysis.candidates.trials import blends, trial
+from certify.analysis.run import RoaOptions, certify_roa
+from certify.certificates.verdict import Verdict
+from certify.cli.main import _run
 from certify.errors import BackendError, InputError
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.plants import System, get_system
+from certify.loop.policies import Policy, load_policy, save_policy
 from certify.lyapunov import choice, choose_candidate, domain_limit, solve_lyapunov, volume
-from certify.policies import Policy, load_policy, save_policy
-from certify.roa import RoaOptions, certify_roa
-from certify.systems import System, get_system
-from certify.trials import blends, trial
-from certify.verdict import Verdict
 from tests.support.loops import chain, pendulum_network
 
 SHIPPED = Path(__file__).parent.parent.parent / "examples" / "policies"

@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from certify.errors import InputError
+from certify.loop.policies import load_policy
 from certify.lyapunov import Neural, Polynomial, Quadratic, load_lyapunov, save_lyapunov
-from certify.policies import load_policy
 from tests.lyapunov.test_functions import neural, polynomial
 
 

@@ -12,9 +12,9 @@ import pytest
 import torch
 
 from certify.errors import InputError
+from certify.loop.plants import get_system
+from certify.loop.policies.importers import ImportOptions, import_policy
 from certify.lyapunov import ImportedLyapunov, import_lyapunov, load_lyapunov, save_lyapunov
-from certify.policies.importers import ImportOptions, import_policy
-from certify.systems import get_system
 from tests.support.foreign import TWO_STAGE, external, mlp, plant, saved, sb3, two_stage, values
 
 N = mlp((2, 6, 5, 1), seed=5)

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from certify.cli import _run
-from certify.inputs import ellipsoid_beside
+from certify.analysis.inputs import ellipsoid_beside
+from certify.cli.main import _run
+from certify.loop.plants import System
 from certify.lyapunov import Neural, load_lyapunov, save_lyapunov
-from certify.systems import System
 
 SHIPPED = Path(__file__).parents[2] / "examples" / "policies" / "pendulum.pt"
 FUNCTION = Neural((np.ones((3, 2)), np.ones((1, 3))), (np.zeros(3), np.zeros(1)))

@@ -9,9 +9,11 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from certify.closed_loop import ClosedLoop
 from certify.errors import InputError
-from certify.expressions import Number, Symbol, symbols
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.expressions import Number, Symbol, symbols
+from certify.loop.plants import System
+from certify.loop.policies import TanhNetwork
 from certify.lyapunov import Neural, Polynomial
 from certify.lyapunov.function import Quadratic
 from certify.lyapunov.learning import Learned, fit_polynomial, learn
@@ -20,8 +22,6 @@ from certify.lyapunov.learning.fit import Slopes, Values, along, fit
 from certify.lyapunov.learning.flow import Fate, LearningFlow
 from certify.lyapunov.learning.models import Model, Network, Terms
 from certify.lyapunov.learning.samples import Samples, draw
-from certify.policies import TanhNetwork
-from certify.systems import System
 from tests.support.loops import box, scalar_tanh
 
 EDGE = 1.915008048  # of what x' = x/2 - tanh(x) attracts

@@ -11,14 +11,14 @@ import cvxpy
 import numpy as np
 import pytest
 
-from certify.closed_loop import ClosedLoop
 from certify.errors import BackendError
-from certify.expressions import Expression, Number, Symbol, symbols
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.expressions import Expression, Number, Symbol, symbols
+from certify.loop.plants import System, get_system
+from certify.loop.policies import TanhNetwork
 from certify.lyapunov import domain_limit, extents, optimise_candidate, solve_lyapunov, volume
 from certify.lyapunov.optimised import _between
 from certify.lyapunov.programs import smallest_trace
-from certify.policies import TanhNetwork
-from certify.systems import System, get_system
 from tests.support.loops import box, pendulum_network, scalar_tanh
 
 

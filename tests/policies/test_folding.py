@@ -13,9 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from certify.errors import InputError
-from certify.policies.importers.comparing import apply, rounding
-from certify.policies.importers.folding import Folded, fold
-from certify.policies.importers.steps import Affine, Clip, Diagonal, Normalise, Step, Tanh
+from certify.loop.policies.importers.comparing import apply, rounding
+from certify.loop.policies.importers.folding import Folded, fold
+from certify.loop.policies.importers.steps import Affine, Clip, Diagonal, Normalise, Step, Tanh
 
 NUMBER = st.floats(-4, 4).map(lambda v: round(v, 6))
 POSITIVE = st.floats(1e-3, 4)

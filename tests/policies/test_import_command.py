@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 import torch
 
-from certify.cli import _run
+from certify.cli.main import _run
+from certify.loop.policies import Policy, TanhNetwork, load_policy, save_policy
 from certify.lyapunov import Neural, load_lyapunov
-from certify.policies import Policy, TanhNetwork, load_policy, save_policy
 from tests.support.foreign import TWO_STAGE, external, mlp, sb3, values
 
 PLANT = """

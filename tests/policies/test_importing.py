@@ -14,9 +14,9 @@ import pytest
 import torch
 
 from certify.errors import InputError
-from certify.policies import Policy, TanhNetwork, load_policy, save_policy
-from certify.policies.importers import Clip, Imported, ImportOptions, content_of, import_policy
-from certify.systems import get_system
+from certify.loop.plants import get_system
+from certify.loop.policies import Policy, TanhNetwork, load_policy, save_policy
+from certify.loop.policies.importers import Clip, Imported, ImportOptions, content_of, import_policy
 from tests.support.compiled import Constant, SetsItsState
 from tests.support.foreign import TWO_STAGE, Odd, external, mlp, plant, saved, sb3, two_stage, values
 

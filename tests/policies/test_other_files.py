@@ -13,10 +13,10 @@ from typing import Any
 import pytest
 import torch
 
-from certify.cli import _run
+from certify.cli.main import _run
 from certify.errors import InputError
-from certify.policies import load_policy
-from certify.policies.importers import ImportOptions, import_policy
+from certify.loop.policies import load_policy
+from certify.loop.policies.importers import ImportOptions, import_policy
 from tests.support.foreign import mlp, plant, saved, sb3
 
 SAID = ImportOptions(states=("x0", "x1"), normaliser="none", action_scale=(Fraction(1),))

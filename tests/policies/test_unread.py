@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 import torch
 
-from certify.cli import _run
+from certify.analysis.inputs import lines
+from certify.cli.main import _run
 from certify.errors import InputError
-from certify.inputs import lines
+from certify.loop.policies import load_policy
+from certify.loop.policies.importers import ImportOptions, import_policy, import_state_dict
+from certify.loop.policies.importers.state_dict import read_lyapunov, read_state_dict, read_two_stage
+from certify.loop.policies.importers.tensors import load_tensors
+from certify.loop.policies.importers.unread import braced
 from certify.lyapunov import import_lyapunov
-from certify.policies import load_policy
-from certify.policies.importers import ImportOptions, import_policy, import_state_dict
-from certify.policies.importers.state_dict import read_lyapunov, read_state_dict, read_two_stage
-from certify.policies.importers.tensors import load_tensors
-from certify.policies.importers.unread import braced
 from tests.support.foreign import TWO_STAGE, external, mlp, plant, saved, sb3
 
 SAID = ImportOptions(states=("x0", "x1"), normaliser="none", action_scale=(Fraction(1),))
@@ -278,7 +278,7 @@ def test_every_tensor_of_the_external_files_is_read_or_named() -> None:
 
 
 def test_from_python_the_same_is_asked_and_told(tmp_path: Path) -> None:
-    from certify.api import certify_roa
+    from certify.analysis.api import certify_roa
 
     said = {"states": "theta,theta_dot", "activation": "tanh", "squash": "tanh", "normaliser": "none"}
     said |= {"action_scale": 6}  # type: ignore[dict-item]

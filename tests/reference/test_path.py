@@ -24,8 +24,10 @@ from flint import arb, arb_mat, ctx, fmpq, fmpq_mat
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from certify.analysis.run import RoaOptions, certify_roa
 from certify.checker.errors import Rejected
-from certify.policies import load_policy
+from certify.loop.plants import get_system
+from certify.loop.policies import load_policy
 from certify.reference import __main__ as command
 from certify.reference import decrease, rules, tube
 from certify.reference.balls import PRECISION
@@ -36,8 +38,6 @@ from certify.reference.evidence import Path as Motion
 from certify.reference.loop import Field, Loop
 from certify.reference.model import Model
 from certify.reference.rational import beyond_domain, root_above
-from certify.roa import RoaOptions, certify_roa
-from certify.systems import get_system
 from tests.reference.test_local import row
 from tests.reference.test_tube import array, at, more, of_tube, times, without, yes
 from tests.support.balls import TINY, around, ball, centred, exactly, slab_of, square, with_ball

@@ -24,7 +24,10 @@ from flint import arb, arb_mat, arb_series, ctx, fmpq, fmpq_mat
 from hypothesis import example, given
 from hypothesis import strategies as st
 
-from certify.policies import load_policy
+from certify.analysis.run import RoaOptions, certify_roa
+from certify.certificates.verdict import Verdict
+from certify.loop.plants import get_system
+from certify.loop.policies import load_policy
 from certify.reference import affine, balls, leaves, local, rational
 from certify.reference.document import Certificate
 from certify.reference.document import read as read_certificate
@@ -34,9 +37,6 @@ from certify.reference.loop import Loop
 from certify.reference.model import Model
 from certify.reference.network import Network
 from certify.reference.refusal import Refused
-from certify.roa import RoaOptions, certify_roa
-from certify.systems import get_system
-from certify.verdict import Verdict
 from tests.checker.test_format import NOT_A_HEX_FLOAT, NOT_A_RATIONAL, NOT_BASE64, NOT_IN_THE_GRAMMAR, RAW, SHAPES
 from tests.checker.test_rules import (
     ABLATED,

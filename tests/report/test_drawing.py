@@ -11,12 +11,12 @@ from typing import Any
 
 import pytest
 
+from certify.analysis.results import RoaResult
+from certify.analysis.run import certify_roa
 from certify.errors import SoundnessError
+from certify.loop.plants import get_system
 from certify.report import drawing, drawn
 from certify.report.drawing import Drawing
-from certify.results import RoaResult
-from certify.roa import certify_roa
-from certify.systems import get_system
 from tests.support.loops import pendulum_network
 from tests.support.marks import slow_after
 

@@ -11,20 +11,20 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from certify.certificate import Certificate, PartitionTree
-from certify.claims import Asymptotic
+from certify.certificates import Certificate, PartitionTree
+from certify.certificates.claims import Asymptotic
 from certify.errors import InputError
-from certify.expressions import Number, symbols
+from certify.loop.expressions import Number, symbols
+from certify.loop.plants import System
+from certify.loop.plants.equations import parse_expression
+from certify.loop.policies import TanhNetwork
 from certify.lyapunov.function import Quadratic
-from certify.policies import TanhNetwork
 from certify.report import simulated_roa_fraction
 from certify.report.figures import draw
 from certify.report.figures.portrait import keys
 from certify.report.figures.scene import Effort, Scene, starts
 from certify.report.figures.style import LEAVING, UNSETTLED
 from certify.report.sampling import SETTLED, Flow, Runs, SimulatedRoa, edge_of, quadratic, runs_of, simulate
-from certify.systems import System
-from certify.systems.equations import parse_expression
 from tests.support.loops import box
 
 ONE_LEAF = PartitionTree(np.eye(2), np.ones(2), bytes([255]))

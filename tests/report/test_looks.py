@@ -16,11 +16,11 @@ from pathlib import Path
 import pypdf
 import pytest
 
-from certify.certificate import read_certificate
-from certify.policies import load_policy
+from certify.analysis.run import RoaOptions, certify_roa
+from certify.certificates import read_certificate
+from certify.loop.plants import get_system
+from certify.loop.policies import load_policy
 from certify.report import render_html
-from certify.roa import RoaOptions, certify_roa
-from certify.systems import get_system
 from tests.report.test_tube import soft_spring
 from tests.support.browser import Browser, find_browser
 from tests.support.loops import chain

@@ -21,13 +21,16 @@ import pytest
 from rich.console import Console
 
 from certify import certify_roa as certify
-from certify.certificate import Certificate, parse_certificate, run_checker
-from certify.claims import Asymptotic, Outer
+from certify.analysis.results import RoaResult
+from certify.certificates import Certificate, parse_certificate, run_checker
+from certify.certificates.claims import Asymptotic, Outer
+from certify.certificates.verdict import Stop, Verdict
 from certify.errors import InputError, SoundnessError
-from certify.expressions import Number, exp, sqrt, symbols
+from certify.loop.expressions import Number, exp, sqrt, symbols
+from certify.loop.plants import System
+from certify.loop.policies import TanhNetwork
 from certify.lyapunov import Neural, Polynomial, Symbolic, sampled_volume
 from certify.lyapunov.function import Quadratic
-from certify.policies import TanhNetwork
 from certify.report import render_html, summary
 from certify.report.claims import CLAIMS, words_for
 from certify.report.figures import draw, simulated_roa
@@ -38,9 +41,6 @@ from certify.report.limits import outer_limited_by
 from certify.report.sampling import quadratic
 from certify.report.sections.claim import _beyond, claim_of
 from certify.report.sections.status import Status, missed_of, status_of
-from certify.results import RoaResult
-from certify.systems import System
-from certify.verdict import Stop, Verdict
 from tests.report.test_report import ONE_LEAF, Page, exactly
 from tests.support.beyond import line, network, plane, well
 from tests.support.certificates import Document, write

@@ -13,14 +13,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from certify.certificate import Certificate, PartitionTree
-from certify.claims import Asymptotic
-from certify.cli import _run
+from certify.analysis.run import RoaOptions, certify_roa
+from certify.certificates import Certificate, PartitionTree
+from certify.certificates.claims import Asymptotic
+from certify.cli.main import _run
 from certify.errors import InputError
-from certify.expressions import Number, cos, symbols
+from certify.loop.expressions import Number, cos, symbols
+from certify.loop.plants import System, get_system
+from certify.loop.policies import TanhNetwork
 from certify.lyapunov import extents
 from certify.lyapunov.function import Quadratic
-from certify.policies import TanhNetwork
 from certify.report import render_html, summary
 from certify.report.figures import draw
 from certify.report.figures.geometry import circle, over_level
@@ -28,8 +30,6 @@ from certify.report.figures.pairs import MOST, coupling, named_pairs, pairs_of, 
 from certify.report.figures.paper import PaperOptions, paper_figure
 from certify.report.page import _time_for
 from certify.report.sampling import quadratic
-from certify.roa import RoaOptions, certify_roa
-from certify.systems import System, get_system
 from tests.support.loops import box, chain, pendulum_network, scalar_tanh
 from tests.support.marks import slow_after
 
@@ -116,7 +116,7 @@ def test_a_local_set_that_is_the_whole_set_is_not_zero_of_one_leaves(tmp_path: P
     system, network = chain(4, [-1.0, -2.0, -3.0, -4.0])
     result = certify_roa(system, network, tmp_path, RoaOptions(candidate="lyapunov"))
     assert result.levels.local == result.levels.roa and result.certificate is not None and result.checker is not None
-    from certify.certificate import read_certificate
+    from certify.certificates import read_certificate
 
     html = render_html(read_certificate(result.certificate), dict(result.checker), result.to_dict(), result.certificate)
     assert "none needed: the local part covers the whole set" in html
@@ -136,7 +136,7 @@ def test_a_local_set_that_is_the_whole_set_is_not_zero_of_one_leaves(tmp_path: P
 
 @pytest.fixture(scope="module")
 def proved(tmp_path_factory: pytest.TempPathFactory) -> tuple[Certificate, dict[str, Any], dict[str, Any], Path]:
-    from certify.certificate import read_certificate
+    from certify.certificates import read_certificate
 
     folder = tmp_path_factory.mktemp("proved")
     result = certify_roa(get_system("pendulum"), pendulum_network(), folder, RoaOptions(candidate="lyapunov"))

@@ -16,12 +16,16 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from certify.certificate import Certificate, PartitionTree, Slab, Waypoint, read_certificate
-from certify.claims import Asymptotic, Reached
-from certify.expressions import Number
+from certify.analysis.results import RoaResult
+from certify.analysis.run import RoaOptions, certify_roa
+from certify.certificates import Certificate, PartitionTree, Slab, Waypoint, read_certificate
+from certify.certificates.claims import Asymptotic, Reached
+from certify.certificates.verdict import Stop, Verdict
+from certify.loop.expressions import Number
+from certify.loop.plants import System
+from certify.loop.policies import TanhNetwork
 from certify.lyapunov import extents, semi_axes
 from certify.lyapunov.function import Quadratic
-from certify.policies import TanhNetwork
 from certify.report import render_html, simulated_roa_fraction, summary
 from certify.report.figures import draw
 from certify.report.figures.geometry import shadows
@@ -30,10 +34,6 @@ from certify.report.figures.scene import Band, Scene, band_of, starts
 from certify.report.figures.style import START, START_FILL
 from certify.report.sampling import quadratic
 from certify.report.words import above, below
-from certify.results import RoaResult
-from certify.roa import RoaOptions, certify_roa
-from certify.systems import System
-from certify.verdict import Stop, Verdict
 from tests.report.test_report import Page, exactly
 from tests.report.test_tube import QUIET, plane, slab, soft_spring
 from tests.support.loops import chain, scalar_tanh

@@ -24,7 +24,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from certify.certificate import (
+from certify.analysis.run import RoaOptions, certify_roa
+from certify.certificates import (
     Certificate,
     PartitionTree,
     TrustedSolver,
@@ -35,14 +36,17 @@ from certify.certificate import (
     run_checker,
     write_atomically,
 )
-from certify.claims import CLAIMS as KINDS
-from certify.claims import Asymptotic, Practical
-from certify.closed_loop import ClosedLoop
+from certify.certificates.claims import CLAIMS as KINDS
+from certify.certificates.claims import Asymptotic, Practical
+from certify.certificates.verdict import Verdict
 from certify.errors import CertificateFormatError, InputError, SoundnessError
-from certify.expressions import Number, Symbol, sin, symbols
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.expressions import Number, Symbol, sin, symbols
+from certify.loop.plants import System, get_system
+from certify.loop.plants.ode import rk4_step
+from certify.loop.policies import TanhNetwork
 from certify.lyapunov import domain_limit, solve_lyapunov, volume
 from certify.lyapunov.function import Quadratic
-from certify.policies import TanhNetwork
 from certify.report import render_html, simulated_roa_fraction, summary
 from certify.report.claims import CLAIMS
 from certify.report.figures import draw
@@ -57,10 +61,6 @@ from certify.report.sampling import (
 )
 from certify.report.sections.status import status_of
 from certify.report.words import above, below, kept_apart, label, number, symbol
-from certify.roa import RoaOptions, certify_roa
-from certify.systems import System, get_system
-from certify.systems.ode import rk4_step
-from certify.verdict import Verdict
 from tests.support.loops import box, chain, pendulum_network, scalar_tanh
 from tests.support.marks import slow_after
 

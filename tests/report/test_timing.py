@@ -19,22 +19,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from certify.certificate import Certificate, Contraction, LocalBall, PartitionTree, parse_certificate
+from certify.analysis.results import Levels, RoaResult
+from certify.certificates import Certificate, Contraction, LocalBall, PartitionTree, parse_certificate
+from certify.certificates.claims import Asymptotic, Claim, Nearby, Practical, Problem
+from certify.certificates.verdict import Stop, Verdict
 from certify.checker import document
 from certify.checker import words as checker_words
-from certify.claims import Asymptotic, Claim, Nearby, Practical, Problem
-from certify.closed_loop import ClosedLoop
-from certify.expressions import Number, Symbol, symbols
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.expressions import Number, Symbol, symbols
+from certify.loop.plants import System
+from certify.loop.policies import TanhNetwork
 from certify.lyapunov.function import Quadratic
-from certify.policies import TanhNetwork
 from certify.report import render_html, summary
 from certify.report.claims import CLAIMS, words_for
 from certify.report.limits import limited_by
 from certify.report.sampling import Flow, growth, quadratic, runs_of, simulate, simulated_roa_fraction, time_scales
 from certify.report.timing import Timing, reach_time
-from certify.results import Levels, RoaResult
-from certify.systems import System
-from certify.verdict import Stop, Verdict
 from tests.report.test_report import Page, exactly
 from tests.support.loops import box
 

@@ -16,12 +16,17 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from certify.certificate import Certificate, PartitionTree, Slab, read_certificate
-from certify.claims import Asymptotic, Enlarged
-from certify.expressions import Number, symbols
+from certify.analysis.results import RoaResult
+from certify.analysis.run import RoaOptions, certify_roa
+from certify.certificates import Certificate, PartitionTree, Slab, read_certificate
+from certify.certificates.claims import Asymptotic, Enlarged
+from certify.certificates.verdict import Verdict
+from certify.loop.expressions import Number, symbols
+from certify.loop.plants import System
+from certify.loop.plants.equations import parse_expression
+from certify.loop.policies import TanhNetwork
 from certify.lyapunov import extents, semi_axes, volume
 from certify.lyapunov.function import Quadratic
-from certify.policies import TanhNetwork
 from certify.report import render_html, simulated_roa_fraction, summary
 from certify.report.figures import draw
 from certify.report.figures.paper import PaperOptions, paper_figure
@@ -31,11 +36,6 @@ from certify.report.figures.style import LEAVING, START
 from certify.report.figures.tube import MOST, tube
 from certify.report.sampling import SETTLED, Flow, quadratic, runs_of
 from certify.report.words import above, below
-from certify.results import RoaResult
-from certify.roa import RoaOptions, certify_roa
-from certify.systems import System
-from certify.systems.equations import parse_expression
-from certify.verdict import Verdict
 from tests.report.test_report import Page, exactly
 from tests.support.loops import box, chain, scalar_tanh
 from tests.support.marks import slow_after

@@ -14,18 +14,18 @@ from hypothesis import strategies as st
 from rich.console import Console
 
 from certify import certify_roa
-from certify.certificate import Certificate, PartitionTree, parse_certificate
-from certify.claims import Asymptotic, Practical
-from certify.expressions import Number, cos, sin, symbols
+from certify.analysis.results import RoaResult
+from certify.certificates import Certificate, PartitionTree, parse_certificate
+from certify.certificates.claims import Asymptotic, Practical
+from certify.certificates.verdict import Verdict
+from certify.loop.expressions import Number, cos, sin, symbols
+from certify.loop.plants import System
+from certify.loop.policies import TanhNetwork
 from certify.lyapunov.function import Quadratic
-from certify.policies import TanhNetwork
 from certify.report import render_html, summary
 from certify.report.figures.paper import PaperOptions, paper_figure
 from certify.report.mathml import typeset
 from certify.report.words import Varying, held_at, inside, stated_for, varying_in
-from certify.results import RoaResult
-from certify.systems import System
-from certify.verdict import Verdict
 from tests.report.test_report import Page, exactly
 from tests.report.test_tube import soft_spring
 

@@ -12,18 +12,18 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from certify.certificate import read_certificate
-from certify.cli import _run
-from certify.diagnosis import diagnose
-from certify.options import RoaOptions
-from certify.policies import Policy, TanhNetwork, load_policy, save_policy
+from certify.analysis.diagnosis import diagnose
+from certify.analysis.options import RoaOptions
+from certify.analysis.results import RoaResult, Tried
+from certify.analysis.run import certify_roa
+from certify.certificates import read_certificate
+from certify.certificates.verdict import Stop
+from certify.cli.main import _run
+from certify.loop.plants import load_system
+from certify.loop.policies import Policy, TanhNetwork, load_policy, save_policy
 from certify.report import summary
 from certify.report.figures.portrait import keys
 from certify.report.figures.scene import Scene, starts
-from certify.results import RoaResult, Tried
-from certify.roa import certify_roa
-from certify.systems import load_system
-from certify.verdict import Stop
 from tests.support.loops import pendulum_network
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -181,7 +181,7 @@ def test_a_policy_of_another_program_is_imported_before_it_is_flattened(
 
 
 def test_bends_are_those_that_flattening_lowers() -> None:
-    from certify.diagnosis import _bend
+    from certify.analysis.diagnosis import _bend
     from controllers.departure import departure_of
 
     box = np.array([1.0, 5.0])

@@ -16,17 +16,17 @@ from typing import Any
 
 import pytest
 
-from certify.certificate import run_checker
-from certify.engines.base import Budget
-from certify.engines.bounds import subtrees
-from certify.engines.bounds.search import outwards, prove_outwards
+from certify.analysis.run import RoaOptions, certify_roa
+from certify.certificates import run_checker
+from certify.certificates.verdict import Stop, Verdict
 from certify.errors import BackendError, InputError
-from certify.policies import load_policy
-from certify.roa import RoaOptions, certify_roa
-from certify.running import ThreadRunner
-from certify.running.cluster import ClusterJobs, ClusterRunner, connect
-from certify.systems import get_system
-from certify.verdict import Stop, Verdict
+from certify.loop.plants import get_system
+from certify.loop.policies import load_policy
+from certify.provers.base import Budget
+from certify.provers.boxes import subtrees
+from certify.provers.boxes.search import outwards, prove_outwards
+from certify.provers.execution import ThreadRunner
+from certify.provers.execution.cluster import ClusterJobs, ClusterRunner, connect
 from tests.engines.test_vdot import cartpole_case
 from tests.support.dask import ROOT, Cluster, cluster, echo
 
@@ -277,9 +277,9 @@ def test_a_scheduler_killed_in_the_middle_of_a_run_leaves_a_certificate_and_a_se
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """It is killed once some hundred boxes were bounded; the run says who is gone, and another one ends the search."""
-    for place in ("certify.roa", "certify.race"):
+    for place in ("certify.analysis.run", "certify.analysis.selection"):
         monkeypatch.setattr(f"{place}.Budget", partial(Budget, batch=64))
-    monkeypatch.setattr("certify.roa._HEAT", 1e-9)
+    monkeypatch.setattr("certify.analysis.run._HEAT", 1e-9)
     monkeypatch.setattr(subtrees, "_TURN", (0.05, 0.05))
     policy = load_policy(POLICIES / "cartpole.pt")
     system = get_system("cartpole").with_parameters(policy.parameters)
@@ -330,7 +330,8 @@ def test_a_cluster_over_tls(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     settings = {f"DASK_DISTRIBUTED__COMM__TLS__{name}": value for name, value in names.items()}
     settings["DASK_DISTRIBUTED__COMM__REQUIRE_ENCRYPTION"] = "True"
     program = (
-        "import sys\nfrom certify.running.cluster import ClusterRunner, connect\nfrom tests.support.dask import echo\n"
+        "import sys\nfrom certify.provers.execution.cluster import ClusterRunner, connect\n"
+        "from tests.support.dask import echo\n"
         "import time\n"
         "with connect(sys.argv[1], 20.0) as client, ClusterRunner(client).jobs(echo) as jobs:\n"
         "    while not jobs.places:\n        time.sleep(0.2)\n"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sympy
 
-from certify.expressions import Expression
+from certify.loop.expressions import Expression
 
 
 def to_sympy(expression: object) -> sympy.Expr:

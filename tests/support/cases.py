@@ -6,12 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from certify.claims import Problem
-from certify.closed_loop import ClosedLoop
+from certify.certificates.claims import Problem
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.plants import System
+from certify.loop.policies import TanhNetwork
 from certify.lyapunov import diagonalising_coordinates, solve_lyapunov
 from certify.lyapunov.function import Quadratic
-from certify.policies import TanhNetwork
-from certify.systems import System
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from certify.claims.queries import Query
+    from certify.certificates.claims.queries import Query
 
 
 def decide(query: Query, boxes: int = 20_000, least: float = 1e-6) -> tuple[str, list[float] | None]:

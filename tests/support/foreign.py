@@ -12,8 +12,8 @@ import gymnasium
 import numpy as np
 import torch
 
-from certify.expressions import Number, Symbol
-from certify.systems import System
+from certify.loop.expressions import Number, Symbol
+from certify.loop.plants import System
 
 TWO_STAGE = {
     "pendulum_bigtorque_seed_0.pth": ("pendulum", "theta,theta_dot", "tanh", 6, {}),

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from certify.engines.bounds import subtrees
 from certify.errors import BackendError
-from certify.running import ThreadRunner, Work
+from certify.provers.boxes import subtrees
+from certify.provers.execution import ThreadRunner, Work
 
 Play = Callable[[bytes, bytes], bytes | None]  # a job and its honest answer to what is answered
 OPEN, LOOK, LEAF = b"\xfe", b"\xfd", b"\xff"

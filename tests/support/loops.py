@@ -8,9 +8,9 @@ from fractions import Fraction
 import numpy as np
 import scipy.linalg
 
-from certify.expressions import Number, Symbol, atan, exp, sqrt, symbols, tanh
-from certify.policies import TanhNetwork
-from certify.systems import System
+from certify.loop.expressions import Number, Symbol, atan, exp, sqrt, symbols, tanh
+from certify.loop.plants import System
+from certify.loop.policies import TanhNetwork
 
 
 def box(*half_widths: float | str) -> tuple[tuple[Fraction, Fraction], ...]:

@@ -86,9 +86,9 @@ def base(name: str) -> Document:
 
 def produced(name: str) -> Document:
     """The certificate of a shipped policy, by the bounds engine."""
-    from certify.policies import load_policy
-    from certify.roa import RoaOptions, certify_roa
-    from certify.systems import get_system
+    from certify.analysis.run import RoaOptions, certify_roa
+    from certify.loop.plants import get_system
+    from certify.loop.policies import load_policy
 
     policy = load_policy(POLICIES / f"{name}.pt")
     with tempfile.TemporaryDirectory() as folder:

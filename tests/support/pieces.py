@@ -9,7 +9,7 @@ import time
 from collections.abc import Callable, Generator, Iterable
 from pathlib import Path
 
-from certify.running.tasks import Outcome, Piece
+from certify.provers.execution.tasks import Outcome, Piece
 
 
 def double(text: str) -> bytes:

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from flint import arb
 
-from certify.certificate import parse_certificate
+from certify.certificates import parse_certificate
 from certify.checker.document import Certificate, Slab
-from certify.closed_loop import ClosedLoop
-from certify.engines.path import find_path
+from certify.loop.closed_loop import ClosedLoop
+from certify.provers.tube.path import find_path
 from tests.support.balls import reached_from, with_ball
 from tests.support.certificates import Document, decode, dump, edited, encode, verdict
 from tests.support.oracle import ball, policies_in_arb, value_of

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from certify.policies import TanhNetwork
+from certify.loop.policies import TanhNetwork
 
 Array = np.ndarray[Any, np.dtype[Any]]
 f32 = np.float32

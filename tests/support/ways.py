@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Literal
 
-from certify.enclosures import compiled
+from certify.provers.bounds import compiled
 
 Way = Literal["torch", "compiled"]
 WAYS: tuple[Way, ...] = ("torch", "compiled")

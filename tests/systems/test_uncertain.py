@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from certify.errors import InputError
-from certify.expressions import Number, Symbol, symbols, symbols_of
-from certify.systems import System, get_system
+from certify.loop.expressions import Number, Symbol, symbols, symbols_of
+from certify.loop.plants import System, get_system
 from tests.support.algebra import same
 from tests.support.loops import box
 

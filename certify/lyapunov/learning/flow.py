@@ -14,10 +14,10 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.closed_loop import ClosedLoop
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.plants.ode import eigenvalues_of, rk4_step
+from certify.loop.policies import bounded_by_form
 from certify.lyapunov.function import Quadratic
-from certify.policies import bounded_by_form
-from certify.systems.ode import eigenvalues_of, rk4_step
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -19,8 +19,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.closed_loop import ClosedLoop
 from certify.errors import InputError
+from certify.loop.closed_loop import ClosedLoop
 from certify.lyapunov.function import Quadratic
 from certify.lyapunov.learning.counterexamples import Search
 from certify.lyapunov.learning.fit import Slopes, Values, fit

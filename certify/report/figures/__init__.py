@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from certify.certificate import Certificate
+from certify.certificates import Certificate
 from certify.report.figures.decay import decay
 from certify.report.figures.line import line_figure
 from certify.report.figures.near_origin import near_origin

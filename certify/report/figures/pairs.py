@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from certify.expressions import differentiate, symbols_of, value_if_rational
-from certify.systems import System
+from certify.loop.expressions import differentiate, symbols_of, value_if_rational
+from certify.loop.plants import System
 
 Array = NDArray[np.float64]
 Pair = tuple[int, int]

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
-from certify.certificate import Certificate
+from certify.certificates import Certificate
 from certify.errors import InputError
 from certify.report.figures import region_of, simulated_roa
 from certify.report.figures.line import draw_line

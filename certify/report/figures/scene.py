@@ -15,11 +15,11 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from certify.certificate import Certificate, PartitionTree, Slab, leaves
-from certify.claims import Enlarged, Practical, Reached
+from certify.certificates import Certificate, PartitionTree, Slab, leaves
+from certify.certificates.claims import Enlarged, Practical, Reached
 from certify.errors import CertificateFormatError
+from certify.loop.policies import TanhNetwork
 from certify.lyapunov import extents, is_positive_definite
-from certify.policies import TanhNetwork
 from certify.report.claims import words_for
 from certify.report.figures.geometry import PARTS, Box, circle, over_level, refine
 from certify.report.figures.pairs import Pair, pairs_of

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.certificate import Certificate, PartitionTree, TrustedSolver
-from certify.claims import Enlarged, Outer, Reached
-from certify.expressions import nodes
+from certify.certificates import Certificate, PartitionTree, TrustedSolver
+from certify.certificates.claims import Enlarged, Outer, Reached
+from certify.loop.expressions import nodes
+from certify.loop.plants import System
 from certify.lyapunov import Neural, extents
 from certify.report.claims import CHECKED_ALWAYS, INPUTS
 from certify.report.figures.scene import centre_of, inner_of, is_ellipsoid, is_local_enough, slabs_of, start_of
@@ -35,7 +36,6 @@ from certify.report.words import (
     symbol,
     varying_in,
 )
-from certify.systems import System
 
 _MOST_OPERATIONS = 200  # of an expression N that is shown
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from certify.certificate import Certificate
+from certify.certificates import Certificate
 from certify.lyapunov import extents
 from certify.report.figures.scene import centre_of, is_ellipsoid
 from certify.report.limits import AT_A_POINT, limit_in_words, outer_limited_by

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from certify.certificate import Certificate
+from certify.certificates import Certificate
+from certify.loop.plants import System
 from certify.report.claims import Words
 from certify.report.sections.shared import timing_of
 from certify.report.timing import Timing
 from certify.report.words import Varying, held_at, listed, symbol
-from certify.systems import System
 
 
 def not_proved_of(certificate: Certificate, words: Words) -> list[tuple[str, str]]:

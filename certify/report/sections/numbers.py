@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.certificate import Certificate, TrustedSolver
-from certify.claims import Asymptotic, Enlarged, Outer, Reached
-from certify.closed_loop import ClosedLoop
+from certify.certificates import Certificate, TrustedSolver
+from certify.certificates.claims import Asymptotic, Enlarged, Outer, Reached
 from certify.errors import CertifyError
+from certify.loop.closed_loop import ClosedLoop
 from certify.lyapunov import Neural, domain_limit, extents, sampled_volume, semi_axes, volume
 from certify.report.figures.scene import centre_of, inner_of, is_ellipsoid, is_local_enough, slabs_of
 from certify.report.limits import limited_by, outer_limited_by

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from fractions import Fraction
 from typing import Any
 
-from certify.certificate import Certificate
-from certify.expressions import Expression, Number, Symbol, nodes
+from certify.certificates import Certificate
+from certify.loop.expressions import Expression, Number, Symbol, nodes
 from certify.report.mathml import identifier, is_long, multiplied_out, typeset
 from certify.report.sections.shared import centre_in_words, read_in_words
 from certify.report.words import above, at_rest, below, held_at, number, pretty_unit, symbol, varying_in

@@ -12,7 +12,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.certificate import Certificate, PartitionTree
+from certify.certificates import Certificate, PartitionTree
 from certify.report.claims import Words, words_for
 from certify.report.figures.scene import centre_of, slabs_of, start_of
 from certify.report.timing import Timing

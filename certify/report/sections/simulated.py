@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from certify.certificate import Certificate
+from certify.certificates import Certificate
 from certify.report.claims import words_for
 from certify.report.sampling import SimulatedRoa
 from certify.report.sections.shared import timing_of

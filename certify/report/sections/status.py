@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Any
 
-from certify.certificate import Certificate, PartitionTree, TrustedSolver
+from certify.certificates import Certificate, PartitionTree, TrustedSolver
 from certify.errors import SoundnessError
 from certify.report.claims import CHECKED_ALWAYS, words_for
 from certify.report.words import point

@@ -1,0 +1,1 @@
+"""The pipeline: candidates are chosen, falsified, proved, checked and told of."""

@@ -1,0 +1,101 @@
+"""What is asked of a plant, in its own terms: boxes and states by the states' names, and what is refused.
+
+A run asks here before it begins; nothing here is part of a proof.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.analysis.options import RoaOptions
+from certify.errors import InputError, OptionError
+from certify.loop.plants import System
+
+Array = NDArray[np.float64]
+
+
+def require_one_that_knows(system: System, options: RoaOptions) -> None:
+    """Refuse what is about exact equations and Vdot alone, a solver of formulas and a tube, where something has a range
+    or time goes in steps.
+
+    Raises
+    ------
+    InputError : the option, and what has a range or goes in steps.
+    """
+    if options.lyapunov is None and options.lyapunov_level is not None:
+        raise OptionError("`lyapunov_level` must be the level of a function; give one as `lyapunov`.")
+    if options.goes_beyond and system.in_steps:
+        raise InputError(
+            "a set beyond the ellipsoid must be of a plant in continuous time whose input follows the state at once; "
+            f"the time of {system.name} goes in steps. Ask for the set without it."
+        )
+    if options.engine == "bounds" and not options.enlarges:
+        return
+    if system.in_steps:
+        what = "a tube" if options.enlarges else "dReal's question"
+        found = "its time is discrete" if system.time == "discrete" else "its input is held over a period"
+        raise InputError(
+            f"{what} must be about a plant in continuous time whose input follows the state at once; of {system.name} "
+            f"{found}. Ask for the set with the engine bounds, without a tube."
+        )
+    if not system.ranges:
+        return
+    found = f"found ranges of {', '.join(system.ranges)} in {system.name}"
+    if options.enlarges:
+        raise InputError(
+            f"a tube must be of exact equations: there is no such claim yet for what is uncertain; {found}. Ask for "
+            "the set without a tube, or leave the ranges out (of a disturbance in the plant's file: the half-width 0)."
+        )
+    raise OptionError(
+        f"`engine` must be bounds where something is uncertain: dReal is asked about exact equations; {found}. Use the "
+        "engine bounds, or leave the ranges out."
+    )
+
+
+def ellipsoid_in(system: System, box: Mapping[str, float] | None = None) -> Array:
+    """P (n, n) of the ellipsoid {x'Px <= 1} with these half-axes; default: the nearer sides of the domain.
+
+    Raises
+    ------
+    InputError : the box has no state, or one that the plant has not.
+    """
+    names = [s.name for s in system.states]
+    sides = {n: min(-float(lo), float(hi)) for n, (lo, hi) in zip(names, system.domain, strict=True)}
+    box = sides if box is None else box
+    if not box or not box.keys() <= sides.keys():
+        raise OptionError(
+            f"`box` must name states of {system.name}, {', '.join(names)}; found {', '.join(box) or 'none'}."
+        )
+    least = min(width / sides[name] for name, width in box.items())
+    return np.diag([float(box.get(name, least * sides[name])) ** -2 for name in names])
+
+
+def state_in(system: System, values: Mapping[str, Fraction | float]) -> tuple[Fraction, ...]:
+    """A state by the states' values as a deviation from the operating point, at which those are that are not named.
+
+    Raises
+    ------
+    InputError : it names what is no state, or does not lie in the interior of the domain.
+    """
+    names, at = [s.name for s in system.states], system.exact_x_eq()
+    if not values or not values.keys() <= set(names):
+        raise OptionError(
+            f"`reach_from` must name states of {system.name}, {', '.join(names)}; found {', '.join(values) or 'none'}."
+        )
+    state = tuple(Fraction(values.get(name, q)) - q for name, q in zip(names, at, strict=True))
+    for name, q, v, (lo, hi) in zip(names, at, state, system.domain, strict=True):
+        if not lo < v < hi:
+            raise OptionError(
+                f"`reach_from` must lie in the interior of the domain, {name} between {float(lo + q):g} and "
+                f"{float(hi + q):g}; found {float(v + q):g}."
+            )
+    return state
+
+
+def values_of(system: System, deviations: Sequence[Fraction]) -> tuple[Fraction, ...]:
+    """A state's values from its deviations from the operating point."""
+    return tuple(q + v for q, v in zip(system.exact_x_eq(), deviations, strict=True))

@@ -1,0 +1,49 @@
+"""What a run says of a set beyond the ellipsoid: its size, what limits it, why a level that was asked for is missed."""
+
+from __future__ import annotations
+
+from fractions import Fraction
+
+from certify.analysis.options import RoaOptions
+from certify.analysis.results import OuterFacts
+from certify.certificates.claims import Claim, Outer, Problem
+from certify.lyapunov import sampled_volume
+from certify.lyapunov.rigorous import evaluate_rise
+from certify.provers.outer import OuterProof
+
+
+def outer_facts(problem: Problem, claim: Claim, outer: Outer, found: OuterProof) -> OuterFacts:
+    """What is said of a proved outer set; its volume, with that of the ellipsoid, is estimated from samples."""
+    held = sampled_volume(
+        lambda x: (outer.function(x) <= outer.level) | (problem.V(x) <= claim.roa), problem.loop.system.domain
+    )
+    return OuterFacts(
+        outer.function,
+        outer.level,
+        *held,
+        found.stop.name.lower(),
+        found.boxes,
+        found.leaves,
+        None if found.witness is None else tuple(found.witness.x.tolist()),
+        None if found.witness is None else found.witness.level,
+    )
+
+
+def short_of(problem: Problem, claim: Claim, options: RoaOptions, found: OuterProof | None) -> str:
+    """Why the level of the function that was asked for is not proved."""
+    reached = "nothing beyond V <= " + f"{claim.roa:.6g} is proved"
+    if claim.outer is not None:
+        reached = f"proved only up to N <= {claim.outer.level:.12g}, not {options.lyapunov_level:g}"
+    if found is None or found.witness is None:
+        return reached
+    shown = _rises(problem, claim, found) if options.lyapunov_level is not None else False
+    return f"{reached}; {found.witness.describe(problem.loop.system)}{', shown in Arb' if shown else ''}"
+
+
+def _rises(problem: Problem, claim: Claim, found: OuterProof) -> bool:
+    """Whether N certainly does not fall at the witness, where the certificate has no range to choose a value from."""
+    witness = found.witness
+    if witness is None or witness.kind != "rise" or problem.loop.system.ranges:
+        return False
+    _, rise = evaluate_rise(problem.loop, found.outer.function, witness.x)
+    return bool(rise >= 0) and problem.V.exactly(witness.x) >= Fraction(claim.roa)

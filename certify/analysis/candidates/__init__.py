@@ -1,0 +1,1 @@
+"""Candidates for V: which matrices P are tried, and in which order."""

@@ -1,0 +1,253 @@
+"""The candidate `robust`: P chosen together with the rule that has to prove it, by a sequence of matrix inequalities.
+
+In coordinates in which the present set is the unit ball let P = 1 + X. The rule's matrix inequality, on the ball of
+that set and with the multipliers that are best at X = 0, is nearly linear in X for small X, and so is what the inputs
+take of their room. Its derivatives are difference quotients of the rule itself, so that nothing of what makes it sharp
+is lost: errors that cancel, or that keep their direction. With log det(1 + X) <= tr X the largest set within a trust
+region is a small semidefinite program, and the local rule judges what it gives. (Boyd, El Ghaoui, Feron, Balakrishnan,
+Linear Matrix Inequalities in System and Control Theory, SIAM 1994, section 5.1, have the inequality for errors that do
+not depend on the set.)
+"""
+
+from __future__ import annotations
+
+import math
+import time
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.certificates.claims import Problem
+from certify.errors import BackendError
+from certify.loop.closed_loop import ClosedLoop
+from certify.lyapunov import SOLVED, choose_candidate, diagonalising_coordinates, domain_limit, volume
+from certify.lyapunov.function import Quadratic
+from certify.provers.ball.decrease import Corner, Multipliers, best_at, corners_of, rests_of
+from certify.provers.ball.local import Rule, ball_around, prove_local
+from certify.provers.ball.models import Models, Paths, paths
+
+if TYPE_CHECKING:
+    import cvxpy
+
+Array = NDArray[np.float64]
+_TRUST, _MOST_TRUST, _LEAST_TRUST = 0.4, 0.6, 0.01  # of the eigenvalues of X
+_WIDER, _NARROWER = 1.5, 0.5  # the next trust region, after a gain as foretold and after none
+_FORETOLD = 0.5  # of the gain that the program promises
+_WORTH = 0.005  # of the logarithm of a volume: less is no gain
+_DIFFERENCE = 1e-3
+_AS_ASKED = 1.05  # a level above which there is little hope, where 1 was asked for
+_TOGETHER = 16  # balls that are looked at in one go
+_FAR = -1.0  # of a margin
+_AT_ONCE = 0.5  # of the time, for the loop whose input follows at once, where one is held
+_LEFT = 3e-3  # share of the decay that is to be left
+_INSIDE = 0.995  # of the room of an input or a state
+_BELOW = 1 - 1e-9  # of the domain's limit
+
+
+def robust_candidate(loop: ClosedLoop, seconds: float = math.inf) -> Array:
+    """P (n, n), scaled so that the local rule proves {x'Px <= 1}, for the largest such set found in the time.
+
+    Parameters
+    ----------
+    loop : the closed loop; its linearisation is stable.
+
+    Raises
+    ------
+    BackendError : cvxpy is missing, or the local rule proves nothing with any candidate to begin with.
+    InputError : the network is larger than the checker's local rule allows.
+    """
+    end, known, proved = time.perf_counter() + seconds, paths(loop), list[Array]()
+    if loop.system.sample is not None:  # a period is short, and the rule without one is cheap
+        at_once = replace(loop, system=loop.system.with_sample(None))
+        proved = _all_scaled(known, [robust_candidate(at_once, _AT_ONCE * (end - time.perf_counter()))], end)
+    proved = proved or _all_scaled(known, [choose_candidate(loop, name).P for name in SOLVED], end)
+    if not proved:
+        raise BackendError("the local rule proves nothing with the candidates that solve a Lyapunov equation")
+    start = max(proved, key=_log_volume)
+    return max((_climbed(known, start, end, quick) for quick in (True, False)), key=_log_volume)
+
+
+def solve(problem: cvxpy.Problem) -> bool:
+    """Whether the solver comes to an end with a semidefinite program; what it found may be inaccurate, and is judged by
+    the checker's rules."""
+    import cvxpy
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # that it may be inaccurate
+            problem.solve(solver=cvxpy.CLARABEL)
+    except cvxpy.SolverError:
+        return False
+    return True
+
+
+def _climbed(known: Paths, best: Array, end: float, quick: bool) -> Array:
+    """From {x'Px <= 1}, P = `best`, on, as far as steps gain and time allows; `quick`: with old derivatives as long as
+    what they foretell comes, and levels about those that were asked for. Either way may end far below the other."""
+    trust, about, fresh = _TRUST, None, True
+    while trust > _LEAST_TRUST and time.perf_counter() < end:
+        if about is None:
+            about, fresh = _linearised(known, best, end), True
+        if about is None:
+            break
+        asked = about.largest(trust)
+        found = None if asked is None else _scaled(known, asked, end, best if quick else None)
+        gain = -math.inf if found is None else _log_volume(found) - _log_volume(best)
+        as_foretold = asked is not None and gain > _FORETOLD * (_log_volume(asked) - _log_volume(best))
+        if fresh:  # what older derivatives foretell says little of how far new ones reach
+            trust = min(_WIDER * trust, _MOST_TRUST) if as_foretold else _NARROWER * trust
+        if found is not None and gain > _WORTH:
+            best, about, fresh = found, about.at(found) if quick and as_foretold else None, False
+        elif not fresh:
+            about = None
+    return best
+
+
+def _log_volume(P: Array) -> float:
+    return math.log(volume(P, 1.0))
+
+
+def _all_scaled(known: Paths, candidates: Sequence[Array], end: float) -> list[Array]:
+    """Those with which the local rule proves a level in the time, over it."""
+    return [P for P in (_scaled(known, P, end) for P in candidates) if P is not None]
+
+
+def _scaled(known: Paths, P: Array, until: float = math.inf, best: Array | None = None) -> Array | None:
+    """P over the largest level that the local rule proves with it; None if there is none, or none with a set that is
+    larger than that of `best`, when the level should be about 1."""
+    if not np.linalg.eigvalsh(P)[0] > 0:
+        return None
+    limit, between = domain_limit(P, known.loop.system.domain) * _BELOW, None
+    if best is not None:
+        least = math.exp(2 / len(P) * (_WORTH + _log_volume(best) - _log_volume(P)))
+        between = least, _AS_ASKED
+    level = prove_local(*_problem(known, P), limit, known, until, between)
+    return None if level is None else P / level
+
+
+def _problem(known: Paths, P: Array) -> tuple[Problem, Array]:
+    """With the coordinates of its proof."""
+    return Problem(known.loop, Quadratic(P)), diagonalising_coordinates(P, known.loop.mean_rate(), known.loop.step)
+
+
+@dataclass(frozen=True, slots=True)
+class _Linearised:
+    """The rule around {x'Px <= 1}, x = J d where X = 0.
+
+    A row holds what the decay leaves at each corner of what is uncertain, (n, n) each, between the `roots`, the
+    inverses of those of the decays at X = 0, and how far inputs and states move, who have that `room`, (m + n,): `here`
+    at this X. `slopes` are its derivatives at 0 by the entries of X on and above the diagonal.
+    """
+
+    rule: Rule
+    J: Array
+    roots: tuple[Array, ...]
+    X: Array
+    here: Array
+    slopes: Array
+    room: Array
+
+    def at(self, P: Array) -> _Linearised | None:
+        """From P on, with the same derivatives, which cost much more than a row; None if the rule is far from
+        holding."""
+        X = self.J.T @ P @ self.J - np.eye(len(P))
+        X = (X + X.T) / 2
+        ball = _balls(self.J, X[None])[0]
+        with np.errstate(all="ignore"):
+            models = self.rule.models(ball, 1.0)
+            if not (models and all(one.finite for one in models)):
+                return None
+            corners = _corners(self.rule, models, ball, P)
+            shown = best_at(corners)
+            here = _row(models, corners, ball, shown.multipliers, self.roots) if shown.margin > _FAR else self.here
+        return replace(self, X=X, here=here) if shown.margin > _FAR and np.all(np.isfinite(here)) else None
+
+    def largest(self, trust: float) -> Array | None:
+        """P (n, n) of the largest set with (1 + X) up to `trust` of itself from where it is; None if there is none."""
+        try:
+            import cvxpy
+        except ImportError as error:
+            raise BackendError(f"the candidate 'robust' needs cvxpy: {error}. Install it, or use another.") from error
+
+        n, now = len(self.J), np.eye(len(self.J)) + self.X
+        x = cvxpy.Variable(len(self.slopes))
+        change = cvxpy.reshape(np.reshape(_directions(n), (-1, n * n)).T @ x, (n, n), order="C")
+        asked = self.here + self.slopes.T @ x
+        within = [change << trust * now, change >> -trust * now]
+        after = len(self.here) - len(self.room)
+        for start in range(0, after, n * n):
+            left = cvxpy.reshape(asked[start : start + n * n], (n, n), order="C")
+            least = min(_LEFT, float(np.linalg.eigvalsh(self.here[start : start + n * n].reshape(n, n))[0]))
+            within.append(left + left.T >> 2 * least * np.eye(n))
+        within += [asked[after + j] <= _INSIDE * room for j, room in enumerate(self.room) if math.isfinite(room)]
+        problem = cvxpy.Problem(cvxpy.Minimize(cvxpy.trace(np.linalg.inv(now) @ change)), within)
+        if not solve(problem) or change.value is None or not np.all(np.isfinite(change.value)):
+            return None
+        inverse = np.linalg.inv(self.J)
+        found = inverse.T @ (now + change.value) @ inverse
+        return np.asarray((found + found.T) / 2)
+
+
+def _linearised(known: Paths, P: Array, end: float) -> _Linearised | None:
+    """None if there is no time for it, or the rule is far from holding."""
+    problem, T = _problem(known, P)
+    rule, J = Rule.at_rest(problem, T, known), ball_around(problem, T, 1.0)
+    with np.errstate(all="ignore"):
+        models = rule.models(J, 1.0)
+        if not (models and all(one.finite for one in models)):
+            return None
+        corners = _corners(rule, models, J, P)
+        shown = best_at(corners)
+        if not shown.margin > _FAR:
+            return None
+        roots = tuple(np.linalg.inv(np.linalg.cholesky(corner.decay)) for corner in corners)
+        changes = np.array([np.zeros_like(P), *(_DIFFERENCE * X for X in _directions(len(P)))])
+        rows, inverse = list[Array](), np.linalg.inv(J)
+        for start in range(0, len(changes), _TOGETHER):
+            if time.perf_counter() > end:
+                return None
+            some = changes[start : start + _TOGETHER]
+            balls = _balls(J, some)
+            for X, ball, found in zip(some, balls, rule.models_on(balls, 1.0), strict=True):
+                corners = _corners(rule, found, ball, P + inverse.T @ X @ inverse)
+                rows.append(_row(found, corners, ball, shown.multipliers, roots))
+    here = rows[0]
+    slopes = (np.array(rows[1:]) - here) / _DIFFERENCE
+    half = [float(min(-lo, hi)) for lo, hi in known.loop.system.domain]
+    room = np.append(models[0].inputs.room, half)
+    return _Linearised(rule, J, roots, changes[0], here, slopes, room) if np.all(np.isfinite(slopes)) else None
+
+
+def _corners(rule: Rule, models: Sequence[Models], J: Array, P: Array) -> list[Corner]:
+    return [corner for one in models for corner in corners_of(one, J, P, None, rule.steps.longest)]
+
+
+def _directions(n: int) -> list[Array]:
+    """A basis of the symmetric matrices, (n, n) each."""
+    found = []
+    for i, j in zip(*np.triu_indices(n), strict=True):
+        X = np.zeros((n, n))
+        X[i, j] = X[j, i] = 1.0
+        found.append(X)
+    return found
+
+
+def _balls(J: Array, changes: Array) -> Array:
+    """Those of 1 + X for each X of `changes`, (N, n, n) both."""
+    values, vectors = np.linalg.eigh(np.eye(len(J)) + changes)
+    return np.asarray(J @ (vectors / np.sqrt(values)[:, None]) @ np.swapaxes(vectors, 1, 2))
+
+
+def _row(
+    models: Sequence[Models], corners: Sequence[Corner], ball: Array, multipliers: Multipliers, roots: Sequence[Array]
+) -> Array:
+    """As `_Linearised` has it."""
+    rests = rests_of(corners, multipliers)
+    left = [root @ (c.decay - rest) @ root.T for root, c, rest in zip(roots, corners, rests, strict=True)]
+    inputs = models[0].inputs
+    moved = np.linalg.norm(inputs.A, axis=1) + inputs.curve
+    return np.concatenate([np.ravel(left), moved, np.linalg.norm(ball, axis=1)])

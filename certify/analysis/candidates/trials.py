@@ -1,0 +1,244 @@
+"""Candidates for V, each with what it could give at most: whether it is worth a proof, and which one first."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.analysis.candidates.peak import peak_candidate
+from certify.analysis.candidates.robust import robust_candidate
+from certify.analysis.options import RoaOptions
+from certify.certificates import require_short
+from certify.certificates.claims import Problem
+from certify.certificates.claims.claim import Kind
+from certify.errors import BackendError, InputError
+from certify.loop.closed_loop import ClosedLoop
+from certify.lyapunov import (
+    SOLVED,
+    choose_candidate,
+    diagonalising_coordinates,
+    domain_limit,
+    is_positive_definite,
+    leaves_domain,
+    optimise_repeatedly,
+    volume,
+)
+from certify.lyapunov.function import Quadratic
+from certify.provers.base import FEW, Task
+from certify.provers.falsify import Witness, falsify, survey
+
+Array = NDArray[np.float64]
+_BELOW = 1e-9  # relative distance from a limit that is itself out of reach (the domain's open condition)
+_BELOW_WITNESS = 1e-3
+_SMALLEST = 1e-120  # of levels: squares of states and products of bounds must not underflow
+_BLENDS = (0.05, 0.15, 0.3)
+_MANY = 6  # states, beyond which there is next to nothing but the local set
+OPTIMISING = 0.2  # share of the time that the optimised candidate may take
+SAMPLING = 0.25  # of that time, how much more it may take to sample what a candidate could give
+FOR_PEAK = 0.4  # share of the time for a candidate that may be the only one
+_SAMPLES, _MANY_SAMPLES = 4000, 20_000  # of a search for violations, one of many and the only one; a proof finds others
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """A candidate and what is asked for with it.
+
+    Parameters
+    ----------
+    name : where P comes from.
+    task : the problem, and the largest level within reach: below the domain's limit and the lowest violation found.
+    T : (n, n), the coordinates x = T z of its proof.
+    limit : the domain's limit of V.
+    limited_by : what its reach ends at.
+    volume : of the largest set within reach; sampled, not proved.
+    notice : why it is not the candidate that was asked for.
+    """
+
+    name: str
+    task: Task
+    T: Array
+    limit: float
+    limited_by: Literal["domain", "sampled"]
+    volume: float
+    notice: str | None = None
+
+    @property
+    def P(self) -> Array:
+        """The matrix of V, (n, n)."""
+        return self.task.problem.V.P
+
+    @property
+    def unit(self) -> Array:
+        """P scaled so that the largest set within reach is {V <= 1}."""
+        return self.P / self.task.target
+
+
+def trial(
+    loop: ClosedLoop,
+    P: Array,
+    name: str,
+    options: RoaOptions,
+    notice: str | None = None,
+    until: float = math.inf,
+) -> Trial:
+    """Sample what V = x'Px could give, more coarsely after `until`, a reading of `time.perf_counter`.
+
+    Raises
+    ------
+    InputError : P is not positive definite, too long for a certificate, or its levels are too small or too large.
+    """
+    n = loop.system.n
+    if P.shape != (n, n) or not is_positive_definite(P):
+        raise InputError(f"`P` must be a symmetric positive definite matrix of shape ({n}, {n}).")
+    require_short(P)
+    problem = Problem(loop, Quadratic(P), options.rate)
+    T = diagonalising_coordinates(P, loop.mean_rate(), loop.step)
+    limit = domain_limit(P, loop.system.domain)
+    level = options.level or limit * (1 - _BELOW)
+    if not _SMALLEST < level < 1 / _SMALLEST:
+        raise InputError(
+            f"levels of V must lie between {_SMALLEST:g} and {1 / _SMALLEST:g}; found {level:g}. Scale the states or P."
+        )
+    kind: Kind = "practical" if options.claim == "practical" else "asymptotic"
+    task = Task(problem, kind, level, options.level is not None)
+    if options.level is not None and leaves_domain(P, options.level, loop.system.domain):
+        return Trial(name, task, T, limit, "domain", volume(P, limit), notice)
+    if kind == "practical" and n > FEW:  # a ball decides, and no survey could
+        return Trial(name, task, T, limit, "domain", volume(P, level), notice)
+    if kind == "practical":
+        bands = survey(problem, T, level, until=until)
+        reach = bands[0].above if bands else 0.0
+        return Trial(name, task, T, limit, "sampled" if reach < level else "domain", volume(P, reach), notice)
+    witness = falsify(problem, T, level, _MANY_SAMPLES if _only_one(options) else _SAMPLES, 0, until)
+    below = level if witness is None or task.exactly else witness.level * (1 - _BELOW_WITNESS)
+    task = Task(problem, kind, below, task.exactly, witness)
+    return Trial(name, task, T, limit, "domain" if witness is None else "sampled", volume(P, below), notice)
+
+
+def named(loop: ClosedLoop, options: RoaOptions) -> Trial:
+    """The one candidate that the options ask for."""
+    name = options.only or "lyapunov"
+    seconds = (share_of_robust(loop) if name == "robust" else OPTIMISING) * options.time_limit
+    until = _until(seconds)
+    if options.P is not None:
+        return trial(loop, options.P, "given", options, until=until)
+    if name == "peak":
+        return trial(loop, peak_candidate(loop, seconds), name, options, until=until)
+    if name == "robust":
+        return trial(loop, robust_candidate(loop, seconds), name, options, until=until)
+    chosen = choose_candidate(loop, name, options.Q, options.R, seconds)
+    return trial(loop, chosen.P, chosen.name, options, chosen.notice, until)
+
+
+def _only_one(options: RoaOptions) -> bool:
+    return options.only is not None or options.P is not None
+
+
+def _until(seconds: float) -> float:
+    """When the sampling of a candidate ends that may take so many seconds to be made, by `time.perf_counter`."""
+    return time.perf_counter() + (1 + SAMPLING) * seconds
+
+
+def solutions(loop: ClosedLoop, options: RoaOptions) -> dict[str, Array]:
+    """P of each candidate that solves a Lyapunov equation, (n, n).
+
+    Raises
+    ------
+    InputError : a weight is not positive, or the linearisation is not stable.
+    """
+    return {name: choose_candidate(loop, name, options.Q, options.R).P for name in SOLVED}
+
+
+def solved(loop: ClosedLoop, found: Mapping[str, Array], options: RoaOptions) -> list[Trial]:
+    """What these `solutions` could give, one at least and as many as there is time for."""
+    until, trials = _until(OPTIMISING * options.time_limit), list[Trial]()
+    for name, P in found.items():
+        if not trials or time.perf_counter() < until:
+            trials.append(trial(loop, P, name, options, until=until))
+    return trials
+
+
+def optimised(loop: ClosedLoop, options: RoaOptions) -> Trial | None:
+    """The candidate of the largest sampled set, or None if it is not to be had.
+
+    Under `practical` it is that of the loop whose policy is centred: near the origin no V decreases under this one, and
+    away from it the two differ little. Of an input that is held it is that of the loop whose input follows at once: a
+    period is short, and Vdot cheap.
+    """
+    until = _until(OPTIMISING * options.time_limit)
+    try:
+        about = _at_rest(loop, options)
+        about = about if loop.system.sample is None else replace(about, system=about.system.with_sample(None))
+        chosen = choose_candidate(about, "optimised", options.Q, options.R, OPTIMISING * options.time_limit)
+    except (BackendError, InputError):
+        return None
+    return trial(loop, chosen.P, chosen.name, options, until=until) if chosen.notice is None else None
+
+
+def robust(loop: ClosedLoop, options: RoaOptions) -> Trial | None:
+    """The candidate that the local rule likes best, or None if it is not to be had."""
+    try:
+        seconds = share_of_robust(loop) * options.time_limit
+        until = _until(seconds)
+        return trial(loop, robust_candidate(_at_rest(loop, options), seconds), "robust", options, until=until)
+    except (BackendError, InputError):
+        return None
+
+
+def share_of_robust(loop: ClosedLoop) -> float:
+    """Share of the time that it may take to be made.
+
+    Where an input is held, in many states, it is twice as much as for the loop without a period, which comes first:
+    there no ring can make up for what is left out.
+    """
+    return OPTIMISING * (2 if loop.system.sample is not None and loop.system.n > _MANY else 1)
+
+
+def peak(loop: ClosedLoop, options: RoaOptions) -> Trial | None:
+    """The candidate of a practical claim whose floor is small beside the set, or None if it is not to be had."""
+    try:
+        seconds = FOR_PEAK * options.time_limit
+        until = _until(seconds)
+        return trial(loop, peak_candidate(loop, seconds), "peak", options, until=until)
+    except (BackendError, InputError):
+        return None
+
+
+def _at_rest(loop: ClosedLoop, options: RoaOptions) -> ClosedLoop:
+    """A loop that rests at the origin: itself, or under a practical claim that whose policy is centred, in floats."""
+    if options.claim != "practical" or loop.network.centre != "none":
+        return loop
+    return replace(loop, network=replace(loop.folded, centre="output"))
+
+
+def corrected(loop: ClosedLoop, last: Trial, witnesses: Sequence[Witness], options: RoaOptions) -> Trial | None:
+    """An optimised candidate once more, with violations that its samples had missed; None if there is none larger."""
+    known = np.array([w.x for w in witnesses]) if witnesses else None
+    until = _until(OPTIMISING * options.time_limit)
+    try:
+        P = optimise_repeatedly(_at_rest(loop, options), last.P, OPTIMISING * options.time_limit, known)
+    except BackendError:
+        return None
+    return trial(loop, P, last.name, options, until=until)
+
+
+def blends(loop: ClosedLoop, large: Trial, provable: Trial, options: RoaOptions) -> Iterator[Trial]:
+    """Between a candidate whose set is large and one that is easier to prove, where what can be proved is largest."""
+    until = _until(OPTIMISING * options.time_limit)
+    for share in _BLENDS:
+        if time.perf_counter() > until:
+            return
+        P = (1 - share) * large.unit + share * provable.unit
+        name = f"{large.name} with {share:.0%} of {provable.name}"
+        yield trial(loop, (P + P.T) / 2, name, options, until=until)
+
+
+def by_reach(trials: Sequence[Trial]) -> list[Trial]:
+    """The largest volume within reach first."""
+    return sorted(trials, key=lambda t: -t.volume)

@@ -1,0 +1,334 @@
+"""What limits a result, in the plant's own names, and what to try next: computed from the run, in floats, for people.
+
+Of a plant with ranges the modes and the input that leaves its bounds are those at the nominal values.
+
+Nothing here is part of a proof. The next step is worked out: a longer limit from how the proof grew, a wider domain
+from what sampling finds beyond it, another candidate only if others were left untried.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.analysis.options import RoaOptions
+from certify.analysis.results import Diagnosis, RoaResult, Share, Step
+from certify.certificates.verdict import Stop
+from certify.errors import InputError
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.plants import System
+from certify.loop.policies import Centre, TanhNetwork
+from certify.lyapunov import diagonalising_coordinates, domain_limit, extents, volume
+from certify.provers.ball.models import paths
+from certify.provers.base import Proof
+from certify.provers.falsify import falsify
+from certify.provers.tube.tube import find_tube
+from certify.report.words import number, quantity, symbol
+
+Array = NDArray[np.float64]
+_WIDER = Fraction(3, 2)  # of the side of the domain that binds
+_WORTH = 1.1  # growth of the volume that makes a wider domain worth a word
+_LONGEST = 86_400.0  # seconds that may be suggested
+_LONGER, _SECONDS = 1.1, 5.0  # of a tube's start, relative to the proved set; for looking
+_LITTLE = 25.0  # per cent of the volume that sampling allows, below which the bounds are to blame
+_BENT = 1.0  # bends of the hidden units, as a share of the linear part, that are worth flattening
+_FEW = 3  # states, for which a function beyond the ellipsoid is suggested
+_ENDED = (Stop.TIME, Stop.BOXES, Stop.LOCAL)
+
+
+def diagnose(
+    result: RoaResult,
+    options: RoaOptions,
+    proof: Proof | None,
+    asked: tuple[System, TanhNetwork] | None = None,
+    seconds: float = math.inf,
+) -> Diagnosis:
+    """What limits `result`, `proof` being what its engine found, and `asked` the plant and the policy as they were
+    given, if the result is about them as seen from where they rest. The next step is looked for so many seconds."""
+    system = result.system
+    loop = ClosedLoop(system, result.network)
+    fastest, slowest = _modes(loop)
+    binds, kind, name, side, point = _binding(result)
+    scale = np.array([min(-float(lo), float(hi)) for lo, hi in system.domain])
+    direction = _direction(result, proof, point, loop)
+    weights = np.zeros(system.n) if direction is None else np.abs(direction) / scale
+    weights = weights / (weights.max() or 1.0)
+    hurts = sorted(zip((s.name for s in system.states), weights.tolist(), strict=True), key=lambda pair: -pair[1])
+    shares: tuple[Share, ...] = ()
+    if result.ellipsoid is not None:
+        reach = extents(*result.ellipsoid)
+        each = zip(system.states, reach.tolist(), scale.tolist(), strict=True)
+        shares = tuple(Share(s.name, system.units.get(s.name, ""), e, e / d) for s, e, d in each)
+    return Diagnosis(
+        binds,
+        kind,
+        name,
+        side,
+        None if point is None else tuple(point.tolist()),
+        shares,
+        fastest,
+        slowest,
+        tuple(pair for pair in hurts if pair[1] >= 0.1),
+        _next(result, options, proof, name, asked or (system, result.network), seconds),
+    )
+
+
+def _modes(loop: ClosedLoop) -> tuple[float | None, float | None]:
+    """Real parts of the fastest and the slowest eigenvalue at the origin."""
+    try:
+        real = np.linalg.eigvals(loop.linearise()[0]).real
+    except InputError:
+        return None, None
+    return float(np.min(real)), float(np.max(real))
+
+
+def _binding(result: RoaResult) -> tuple[str, str, str | None, str | None, Array | None]:
+    """Words, kind, name, side and point of what limits the level."""
+    system, P, level, witness = result.system, result.P, result.levels.roa, result.witness
+    limit = result.levels.domain_limit
+    if result.stop in (Stop.DOMAIN, Stop.MARGIN) and P is not None and limit is not None:
+        columns = np.asarray(np.linalg.inv(P), dtype=np.float64)
+        share = [columns[i, i] / min(-float(lo), float(hi)) ** 2 for i, (lo, hi) in enumerate(system.domain)]
+        i = int(np.argmax(share))
+        lo, hi = system.domain[i]
+        side = "lower" if -lo < hi else "upper"
+        sign = -1.0 if side == "lower" else 1.0
+        point = sign * columns[:, i] * math.sqrt((level or limit) / columns[i, i])
+        name = str(system.states[i].name)
+        end, at, unit = lo if side == "lower" else hi, system.exact_x_eq()[i], system.units.get(name, "")
+        where = f"the {side} side of the domain in {symbol(name)}, {quantity(end + at, unit)}"
+        where += f" ({quantity(abs(end), unit)} from the operating point)" if at else ""
+        return where, "domain", name, side, point
+    if witness is not None and result.stop in (Stop.WITNESS, Stop.INPUTS):
+        each = zip(system.states, witness.x.tolist(), system.exact_x_eq(), strict=True)
+        where = _named(system, {s.name: v + float(at) for s, v, at in each})
+        if witness.kind == "vdot" and witness.values:
+            where += f" with {_named(system, {name: float(q) for name, q in witness.values.items()})}"
+        if witness.kind == "input":
+            found = _input_out_of_bounds(result, witness.x)
+            if found is not None:
+                name, side, value = found
+                bound = quantity(value, system.units.get(name, ""))
+                return f"{symbol(name)} leaves its {side} bound, {bound}, at {where}", "input", name, side, witness.x
+        what = (
+            "Vdot = 0"
+            if result.timing.is_plain and not result.timing.rate
+            else f"V does not fall enough{result.timing.over_what}"
+        )
+        return f"{what} near {where}", "vdot", None, None, witness.x
+    return result.reason, result.stop.name.lower(), None, None, None
+
+
+def _named(system: System, values: Mapping[str, float]) -> str:
+    """Quantities of a plant with their names and units."""
+    return ", ".join(f"{symbol(name)} = {quantity(v, system.units.get(name, ''), 4)}" for name, v in values.items())
+
+
+def _input_out_of_bounds(result: RoaResult, x: Array) -> tuple[str, str, float] | None:
+    system = result.system
+    u = ClosedLoop(system, result.network).policy(x[None])[0]
+    for one, value, (lo, hi) in zip(system.inputs, u.tolist(), system.input_bounds, strict=True):
+        if value < lo or value > hi:
+            return (one.name, "lower", float(lo)) if value < lo else (one.name, "upper", float(hi))
+    return None
+
+
+def _direction(result: RoaResult, proof: Proof | None, point: Array | None, loop: ClosedLoop) -> Array | None:
+    """A direction (n,) of states: of the point that binds, else along which boxes had to be halved most, else of the
+    eigenvector that decays least."""
+    if point is not None:
+        return point
+    if proof is not None and proof.direction is not None:
+        return np.array(proof.direction)
+    try:
+        values, vectors = np.linalg.eig(loop.linearise()[0])
+    except InputError:
+        return None
+    return np.asarray(np.abs(vectors[:, np.argmax(values.real)]))
+
+
+def _next(
+    result: RoaResult,
+    options: RoaOptions,
+    proof: Proof | None,
+    name: str | None,
+    asked: tuple[System, TanhNetwork],
+    seconds: float,
+) -> Step:
+    if result.stop is Stop.UNSTABLE:
+        return Step((), "no Lyapunov equation has a solution; the policy has to stabilise the plant first")
+    if result.claim in ("practical", "nearby") and (centre := _centring(*asked)) is not None:
+        return Step(
+            (("--centre", centre),),
+            "shifted so that pi(0) = u_eq the loop rests where it should, and the stronger claim can be tried",
+        )
+    if result.stop is Stop.DOMAIN and name is not None and options.level is None:
+        return _wider_domain(result, name, seconds)
+    if result.stop is Stop.PATH:
+        why = "the set that the tube has to reach grows with the time, and so do the widths that are tried"
+        return Step((("--time-limit", _round(4 * options.time_limit)),), why)
+    if result.stop is Stop.CLUSTER:
+        kept = result.search is not None
+        why = "what was done is kept" if kept else "the search was not kept"
+        return Step((("--resume", ""),) if kept else (), f"{why}; see to the cluster first, or leave it out")
+    if result.stop in _ENDED and _is_bent(result, proof):
+        share = number(_share_proved(result), 2)
+        why = (
+            f"proved is {share} % of the volume that sampling allows, and bounds see more of the hidden units' bends "
+            "than of the policy's linear part: a flatter policy that does the same may be proved on more"
+        )
+        return Step((), why, flattens=True)
+    if result.stop in (Stop.TIME, Stop.BOXES):
+        step = _longer(result, options, proof)
+        return step if result.search is None else replace(step, options=(*step.options, ("--resume", "")))
+    if options.claim == "asymptotic" and options.only is not None and options.P is None and options.level is None:
+        return Step((("--candidate", "auto"),), f"only the candidate {options.only} was tried")
+    knows = not (result.system.ranges or result.system.in_steps)  # a tube says nothing of such things
+    if result.stop is Stop.STALLED and knows and not options.enlarges and _has_tube(result, seconds):
+        return Step((("--enlarge", ""),), f"a tube leads into this set from one {_LONGER:g} times as long, at least")
+    if result.stop is Stop.STALLED:
+        worst = ", ".join(symbol(one) for one, _ in _hurting(result, proof)[:3])
+        why = f"the bounds are too wide beyond the local set, most of all along {worst}; "
+        return Step((), why + "a policy that bends less there helps", flattens=_can_be_flattened(result))
+    if result.stop in (Stop.WITNESS, Stop.INPUTS):
+        tried = max((t.volume for t in result.tried), default=0.0)
+        reached = max((t.proved_volume or 0.0 for t in result.tried), default=0.0)
+        if reached and tried > _WORTH * reached:
+            return Step((("--time-limit", _round(4 * options.time_limit)),), "another candidate reaches further")
+        if _may_go_beyond(result, options):
+            why = "what this V can show is proved; a function of higher degree may show more, beyond the ellipsoid"
+            return Step((("--candidate", "polynomial"),), why)
+        return Step((), "what this V can show is proved; a larger set needs another policy or another kind of V")
+    if result.stop is Stop.REQUESTED and result.levels.roa is not None:
+        return Step((), "the level that was asked for is proved; leave --level out for the largest")
+    return Step((), result.reason)
+
+
+def _may_go_beyond(result: RoaResult, options: RoaOptions) -> bool:
+    """Whether a function beyond the ellipsoid can be learned, and pays: of few states, in continuous time."""
+    plain = result.timing.is_plain and not options.rate and not options.enlarges and options.engine == "bounds"
+    free = options.level is None and options.only is None and options.P is None and not options.resume
+    return plain and free and not options.goes_beyond and result.system.n <= _FEW and not result.system.ranges
+
+
+def _can_be_flattened(result: RoaResult) -> bool:
+    """Whether `controllers flatten` takes the policy and judges it by the loop that is certified."""
+    return len(result.network.weights) > 1 and not result.system.in_steps and not result.system.ranges
+
+
+def _share_proved(result: RoaResult) -> float:
+    """The volume that is proved, in per cent of what sampling allows at most."""
+    allowed = max((one.volume for one in result.tried), default=0.0)
+    return 100 * (result.volume or 0.0) / allowed if allowed else 100.0
+
+
+def _is_bent(result: RoaResult, proof: Proof | None) -> bool:
+    """Whether little of what sampling allows is proved, and the pace of the proof does not say when more will be."""
+    known = proof is not None and proof.seconds_left is not None and result.levels.roa is not None
+    if not _can_be_flattened(result) or known or _share_proved(result) >= _LITTLE:
+        return False
+    half_widths = np.array([min(-float(lo), float(hi)) for lo, hi in result.system.domain])
+    return _bend(result.network.folded(result.system.exact_u_eq()), half_widths) > _BENT
+
+
+def _bend(network: TanhNetwork, half_widths: Array) -> float:
+    """What bounds see of the hidden units' bends on a box, as a share of the linear part there, to first order.
+
+    The sum over all hidden units of their distance from their tangent at 0, at both ends of what the box drives them
+    through, times their gain towards the inputs.
+    """
+    y, J, units = np.zeros(network.n), np.eye(network.n), list[tuple[Array, Array, Array]]()
+    for W, b in zip(network.weights[:-1], network.biases[:-1], strict=True):
+        y, J = W @ y + b, W @ J
+        t, reach = np.tanh(y), np.abs(J) @ half_widths
+        slope = 1 - t**2
+        ends = [np.abs(np.tanh(y + v) - t - slope * v) for v in (reach, -reach)]
+        units.append((W, slope, (ends[0] + ends[1]) / 2))
+        y, J = t, slope[:, None] * J
+    gain, total = network.weights[-1], 0.0
+    linear = float(np.sum(np.abs(gain @ J) @ half_widths))
+    for W, slope, departure in reversed(units):
+        total += float(np.sum(np.abs(gain) @ departure))
+        gain = (gain * slope) @ W
+    return total / linear if linear else 0.0
+
+
+def _has_tube(result: RoaResult, seconds: float) -> bool:
+    """Whether a tube is found in the time that leads from a larger multiple of the proved set into it."""
+    if result.P is None or result.levels.roa is None or not seconds > 0:
+        return False
+    goal = result.P / result.levels.roa
+    return (
+        find_tube(paths(ClosedLoop(result.system, result.network)), goal / _LONGER**2, goal, min(seconds, _SECONDS))
+        is not None
+    )
+
+
+def _centring(system: System, network: TanhNetwork) -> str | None:
+    """A centring with which the loop rests at the origin, exactly; None if it has one, or none can be had."""
+    if network.centre != "none":
+        return None
+    centres: tuple[Centre, ...] = ("preactivation", "output")
+    for centre in centres:
+        try:
+            ClosedLoop(system, replace(network, centre=centre)).require_rest()
+        except InputError:
+            continue
+        return centre
+    return None
+
+
+def _hurting(result: RoaResult, proof: Proof | None) -> list[tuple[str, float]]:
+    direction = _direction(result, proof, None, ClosedLoop(result.system, result.network))
+    names = [s.name for s in result.system.states]
+    if direction is None:
+        return [(name, 0.0) for name in names]
+    scale = np.array([min(-float(lo), float(hi)) for lo, hi in result.system.domain])
+    return sorted(zip(names, (np.abs(direction) / scale).tolist(), strict=True), key=lambda pair: -pair[1])
+
+
+def _longer(result: RoaResult, options: RoaOptions, proof: Proof | None) -> Step:
+    """A time after which the ring is done, as the growth so far says, or ten times as long."""
+    left = None if proof is None else proof.seconds_left
+    if result.stop is Stop.BOXES and options.max_boxes <= result.boxes:
+        return Step((("--max-boxes", f"{10 * options.max_boxes}"),), "the limit on boxes ended the search")
+    if left is not None and 2 * left + options.time_limit < _LONGEST:
+        longer = 2 * left + options.time_limit  # the check grows with the tree
+        return Step((("--time-limit", _round(longer)),), f"at this pace the ring needs about {left:.0f} s more")
+    return Step((("--time-limit", _round(10 * options.time_limit)),), "the set still grew when the time ended")
+
+
+def _wider_domain(result: RoaResult, name: str, seconds: float) -> Step:
+    """Whether the same V reaches further in a domain that is wider in the state that binds."""
+    system, problem, level = result.system, result.problem, result.levels.roa
+    i = [s.name for s in system.states].index(name)
+    lo, hi = (_WIDER * side for side in system.domain[i])
+    wider = system.with_domain({name: (lo, hi)})
+    if problem is None or level is None:
+        return Step((), result.reason)
+    P = problem.V.P
+    loop = ClosedLoop(wider, result.network)
+    limit = domain_limit(P, wider.domain)
+    T = diagonalising_coordinates(P, loop.mean_rate(), loop.step)
+    witness = falsify(replace(problem, loop=loop), T, limit, samples=4000, until=time.perf_counter() + seconds)
+    reach = volume(P, limit if witness is None else min(limit, witness.level))
+    grown = reach / volume(P, level)
+    if grown < _WORTH:
+        return Step(
+            (), f"no option helps: in a domain that is wider in {symbol(name)} something else soon limits this V"
+        )
+    at = system.operating_point().get(name, Fraction(0))  # the command takes an interval as values
+    side = f"{name}={float(hi):g}" if lo == -hi else f"{name}={float(lo + at):g}..{float(hi + at):g}"
+    return Step((("--domain", side),), f"if the equations hold there, this V reaches {grown:.3g} times the volume")
+
+
+def _round(seconds: float) -> str:
+    """Seconds with two digits, rounded up."""
+    unit = 10.0 ** (math.floor(math.log10(seconds)) - 1)
+    return f"{math.ceil(seconds / unit) * unit:.0f}"

@@ -1,0 +1,309 @@
+"""A plant and a policy, from what somebody names them by: the same rules for the command line and for Python.
+
+A policy file says which plant it was trained for, and by which numbers; whoever uses it may say otherwise, and what
+he says counts. What has to be known of that goes to `tell`, a line each: the command prints it on standard error, a
+result of Python keeps it. Where a policy's network is what it was made from only on a part of the states, the domain
+is cut to that part here, and nowhere is it left to the caller to remember. What is uncertain of a plant, and acts on
+it, is put in here too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from certify.errors import InputError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from certify.loop.plants import System
+    from certify.loop.plants.system import Interval
+    from certify.loop.policies import Centre, Policy
+    from certify.loop.policies.importers import Imported, ImportOptions
+    from certify.loop.policies.importers.comparing import Difference
+    from certify.lyapunov import StoredLyapunov
+
+    Array = NDArray[np.float64]
+
+Tell = Callable[[str], None]
+
+
+def policy_in(
+    path: Path, importing: ImportOptions, plant: Callable[[], System], own: Callable[[Policy], System], tell: Tell
+) -> Policy:
+    """The policy in a file of this program, or of another one.
+
+    Parameters
+    ----------
+    plant : gives the plant that a policy of another program is for.
+    own : gives the plant of a policy of this program, where a centring is asked for.
+
+    Raises
+    ------
+    InputError : the file cannot be read or imported, or the centring cannot be had.
+    """
+    from certify.loop.policies import load_policy
+    from certify.loop.policies.importers import import_policy
+
+    if is_own(path, importing):
+        stored = load_policy(path)
+        return stored if importing.centre is None else centred(stored, importing.centre, own(stored), tell)
+    imported = import_policy(path, plant(), importing)
+    for line in lines(imported):
+        tell(line)
+    return imported.policy
+
+
+def centred(stored: Policy, centre: Centre, plant: System, tell: Tell) -> Policy:
+    """A policy of this program with the centring that is asked for; says by how much u changes.
+
+    Raises
+    ------
+    InputError : the policy has another centring already, or this one cannot be had.
+    """
+    from certify.loop.policies.importers import centring_changes
+
+    if stored.network.centre == centre:
+        return stored
+    if stored.network.centre != "none":
+        raise InputError(f"--centre {centre} must be left out: the file's centring is {stored.network.centre}.")
+    changes = centring_changes(stored.network, plant)
+    if centre not in changes:
+        raise InputError(f"--centre {centre} cannot be had: u_eq must lie within the policy's reach.")
+    tell(f"centred: --centre {centre} changes u by up to {changes[centre]:.3g} in the domain")
+    return replace(stored, network=replace(stored.network, centre=centre))
+
+
+def named_plant(stored: Policy, name: str | None) -> tuple[System, bool]:
+    """The plant that `name` says, or else the policy; whether it is the policy's own, with the policy's parameters.
+
+    A policy file names a plant that ships, never a file: a plant of one's own is named each time.
+
+    Raises
+    ------
+    InputError : there is no such plant.
+    """
+    from certify.loop.plants import available_systems, chosen_system, shipped_system
+
+    if name is None and stored.system not in available_systems():
+        raise InputError(
+            f"unknown system {stored.system!r}: the policy was trained for a plant that does not ship here. Name its "
+            f"file, as in --system {stored.system if stored.system.isidentifier() else 'plant'}.toml."
+        )
+    plant = shipped_system(stored.system) if name is None else chosen_system(name)
+    own = name is None or name == stored.system
+    return (plant.with_parameters(stored.parameters) if own else plant), own
+
+
+def tell_of_other(stored: Policy, plant: System, tell: Tell) -> None:
+    """Say so if the policy says that it was trained for another plant than this one."""
+    if stored.system != plant.name:
+        tell(f"the policy was trained for {stored.system!r}; it is used with {plant.name}")
+        return
+    try:
+        off = [f"{p} = {v}" for p, v in stored.parameters.items() if plant.parameters.get(p) != Fraction(v)]
+    except (ValueError, TypeError, ArithmeticError):
+        off = [f"{p} = {v}" for p, v in stored.parameters.items()]
+    if off:
+        tell(f"the policy was trained with {', '.join(off)}; --system says otherwise, and counts")
+
+
+def function_in(path: Path, plant: System, tell: Tell) -> StoredLyapunov:
+    """What is in a Lyapunov file, for this plant; says so if the file names another.
+
+    Raises
+    ------
+    InputError : the file cannot be read, or its function has another number of states.
+    """
+    from certify.lyapunov import load_lyapunov
+
+    stored = load_lyapunov(path)
+    if stored.function.n != plant.n:
+        raise InputError(
+            f"Lyapunov file {path} must be of {plant.n} states, those of {plant.name}; it is of {stored.function.n}."
+        )
+    if stored.system != plant.name:
+        tell(f"Lyapunov file {path} is of {stored.system}; it is proved for {plant.name}")
+    return stored
+
+
+def ellipsoid_beside(stored: StoredLyapunov, plant: System) -> Array | None:
+    """P (n, n) of the ellipsoid beyond which a function in a Lyapunov file was learned; None if it does not say.
+
+    A file that says something else than a symmetric matrix says nothing: P is a hint, and what is proved with it is
+    proved like any other.
+    """
+    from certify.lyapunov.function import Quadratic
+
+    learned = stored.training.get("learned")
+    try:
+        P = Quadratic(learned["P"]).P if isinstance(learned, dict) else None
+    except (InputError, KeyError, ValueError, TypeError):
+        return None
+    return P if P is not None and len(P) == plant.n else None
+
+
+def where_valid(stored: Policy, plant: System, tell: Tell) -> System:
+    """The plant on the part of its domain where the policy's network is what it was made from; says what was cut.
+
+    Raises
+    ------
+    InputError : the policy has bounds for another number of states.
+    """
+    if stored.valid is None:
+        return plant
+    if len(stored.valid) != plant.n:
+        raise InputError(f"the policy is valid for {len(stored.valid)} states; {plant.name} has {plant.n}.")
+    cut: dict[str, tuple[Fraction, Fraction]] = {}
+    for symbol, (lo, hi), (low, high) in zip(plant.states, plant.domain, stored.valid.tolist(), strict=True):
+        ends = (max(lo, Fraction(low)) if low > -math.inf else lo, min(hi, Fraction(high)) if high < math.inf else hi)
+        if ends != (lo, hi):
+            cut[symbol.name] = ends
+    for name, (lo, hi) in cut.items():
+        tell(f"the domain of {name} is cut to [{float(lo):.6g}, {float(hi):.6g}]: there its observation is not clipped")
+    return plant.with_domain(cut)
+
+
+def with_uncertain_parameters(plant: System, ranges: Mapping[str, Interval]) -> System:
+    """The plant where parameters have ranges.
+
+    Raises
+    ------
+    InputError : one is no parameter, or cannot have this range.
+    """
+    for name in ranges:
+        if name not in plant.parameters:
+            known = ", ".join(plant.parameters) or "none"
+            raise InputError(f"{plant.name} has no parameter {name!r}; it has: {known}.")
+    return plant.with_ranges(ranges)
+
+
+def with_acting(plant: System, given: Mapping[str, Interval | Fraction]) -> System:
+    """The plant where disturbances act within a range or a half-width; with 0 one that the plant has acts no more.
+
+    Raises
+    ------
+    InputError : one is no disturbance of the plant, or a half-width is negative.
+    """
+    known, ranges = [s.name for s in plant.disturbances], dict[str, "Interval | None"]()
+    for name, value in given.items():
+        if name not in known:
+            raise InputError(f"{plant.name} has no disturbance {name!r}; it has: {', '.join(known) or 'none'}.")
+        if not isinstance(value, tuple) and value < 0:
+            raise InputError(
+                f"disturbance {name} must have a half-width that is not negative, or a range; found {float(value):g}."
+            )
+        ranges[name] = value if isinstance(value, tuple) else (-value, value) if value else None
+    return plant.with_ranges(ranges)
+
+
+def with_bounded_errors(plant: System, bound: Fraction | Mapping[str, Fraction]) -> System:
+    """The plant with u + e in the place of u, |e| at most the bound: one for all inputs, or each by the input's name.
+
+    Raises
+    ------
+    InputError : a bound is not positive, or is of no input.
+    """
+    bounds = bound if isinstance(bound, Mapping) else {s.name: bound for s in plant.inputs}
+    return plant.with_input_errors(bounds)
+
+
+def with_period(plant: System, period: Fraction | Interval | None) -> System:
+    """The plant whose inputs are held over a period, or over any period between two; None for inputs that follow at
+    once.
+
+    Raises
+    ------
+    InputError : the plant is in discrete time, a period is negative, or all are 0.
+    """
+    return plant.with_sample((period, period) if isinstance(period, Fraction) else period)
+
+
+def is_own(path: Path, importing: ImportOptions) -> bool:
+    """Whether a file is to be read as this program's own: also one that nobody can read, whose reader says why.
+
+    Raises
+    ------
+    InputError : options of other programs' files, other than a centring, are given for one of this program.
+    """
+    from certify.loop.policies.importers import content_of, read_bytes
+
+    raw = read_bytes(path)
+    try:
+        content = content_of(raw, path.name)
+    except InputError:
+        if importing.given:
+            raise
+        return True
+    others = [name for name in importing.given if name != "--centre"]
+    if content == "policy" and others:
+        raise InputError(f"{', '.join(others)} must be left out: {path} is a policy file of this program and says all.")
+    foreign_pickle = content is None and raw[:1] == b"\x80"
+    return content == "policy" or (content is None and not importing.given and not foreign_pickle)
+
+
+def lines(imported: Imported) -> list[str]:
+    """What an import found, for people."""
+    found, policy = imported, imported.policy
+    origin, target = _row(found.at_origin), _row(found.u_eq)
+    said = [
+        f"read     {found.words}; sha256 {policy.training['imported']['sha256']}",
+        f"policy   {found.formula}; o = ({policy.training['imported']['states']})",
+        *checked(found.difference, found.compared_with, found.assumed, found.not_read),
+        f"pi(0)    {origin}; u_eq {target}",
+        f"centring {_centring(found)}",
+    ]
+    if policy.valid is not None:
+        said.append(f"valid    where no observation is clipped: {_box(found)}")
+    said.append(
+        "proved   is the folded policy: it differs from the file's real-number policy by the rounding of folded "
+        "numbers, half a unit in the last place of each at most"
+    )
+    return said
+
+
+def checked(difference: Difference, compared_with: str | None, assumed: str, not_read: Mapping[str, str]) -> list[str]:
+    """What an import was compared with, and which tensors of its file it left out, for people."""
+    from certify.loop.policies.importers.unread import braced
+
+    numbers = (
+        f"at {difference.states:,} states: largest difference {difference.largest:.3g} (rounding explains up to "
+        f"{difference.explained:.3g} there), {difference.in_double:.3g} in double precision"
+    )
+    if compared_with is not None:
+        said = [f"compared with {compared_with}, {numbers}"]
+    else:
+        said = [
+            f"numbers  only, no program: nothing was compared with the file. {assumed}; check that against your code",
+            f"folding  checked with the same numbers in torch's layers, {numbers}",
+        ]
+    reasons: dict[str, list[str]] = {}
+    for name, why in not_read.items():
+        reasons.setdefault(why, []).append(name)
+    return [*said, *(f"not read {braced(names)}: {why}" for why, names in reasons.items())]
+
+
+def _centring(found: Imported) -> str:
+    centre = found.policy.network.centre
+    if found.policy.beta is not None:
+        return "the file's own, inside the squash"
+    changes = [f"{name} changes u by up to {value:.3g}" for name, value in found.centring.items()]
+    if centre != "none":
+        return f"{centre}, as asked for, which changes u by up to {found.centring[centre]:.3g}"
+    return f"none; {', '.join(f'--centre {c}' for c in changes) or 'u_eq is out of reach of any'}"
+
+
+def _box(found: Imported) -> str:
+    states, valid = found.policy.training["imported"]["plant_states"], found.policy.valid
+    pairs = zip(states, valid if valid is not None else (), strict=True)
+    return ", ".join(f"{name} in [{lo:.6g}, {hi:.6g}]" for name, (lo, hi) in pairs)
+
+
+def _row(values: Any) -> str:
+    return ", ".join(f"{v:.9g}" for v in values)

@@ -1,0 +1,178 @@
+"""The longest period, or the largest rate, for which the set that is proved without it can still be proved.
+
+The set is that of a first run: its P stays, and its level but for a few hundredths. What sampling allows for it is
+found by bisection; then shares of that are tried, the largest first, each as a run of its own for exactly this set, and
+middles between the first that is proved and the last that is not. What is returned is the largest that the checker
+accepted, under the usual name.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from fractions import Fraction
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Literal
+
+import numpy as np
+
+from certify.analysis.options import RoaOptions
+from certify.analysis.results import RoaResult
+from certify.analysis.run import Report, certify_roa
+from certify.certificates import set_aside, sole_writer, write_atomically
+from certify.certificates.claims import Problem
+from certify.certificates.verdict import Verdict
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.plants import System, exact
+from certify.loop.policies import TanhNetwork
+from certify.lyapunov import diagonalising_coordinates
+from certify.lyapunov.function import Quadratic
+from certify.provers.falsify import is_violated
+
+Quantity = Literal["period", "rate"]
+_FOR_THE_SET = 0.25  # of the time, for the run without it
+_SHARES = (0.97, 0.87, 0.66, 0.4, 0.2, 0.1, 0.03)  # of what sampling allows
+_EACH = 0.25  # of the time that is left, for one of them
+_BISECTIONS, _HALVINGS = 12, 4  # of what sampling allows, and between what is proved and what is not
+_SET = 0.95  # of the level that is proved without it: at the edge of what can be proved there is room for neither
+_LEAST = 2.0**-16  # of the slowest time constant, or of the fastest rate, that is looked at
+_DIGITS = 3
+
+
+def certify_largest(
+    quantity: Quantity,
+    system: System,
+    network: TanhNetwork,
+    out: Path,
+    options: RoaOptions,
+    *,
+    load_seconds: float = 0.0,
+    provenance: Mapping[str, Any] | None = None,
+    progress: Report | None = None,
+) -> RoaResult:
+    """Certify the set that is proved with an input that follows at once and no rate, but for a few hundredths of its
+    level, with as long a period, or as large a rate, as can be proved for it.
+
+    Parameters
+    ----------
+    quantity : `period`, for exactly which the input is held, or `rate`; with a rate the plant keeps its sample time.
+    system, network, out, options, load_seconds, provenance, progress : those of `certify_roa`.
+
+    Returns
+    -------
+    RoaResult : of the largest; of the first run, with a notice, if no share of what sampling allows is proved.
+
+    Raises
+    ------
+    InputError, BackendError, SoundnessError : those of `certify_roa`.
+    """
+    start = time.perf_counter() - load_seconds
+    plain = system.with_sample(None) if quantity == "period" else system
+
+    def left() -> float:
+        return options.time_limit - (time.perf_counter() - start)
+
+    with sole_writer(out), TemporaryDirectory(dir=out, prefix="attempt-") as folder:
+        set_aside(out)
+        first = certify_roa(
+            plain,
+            network,
+            Path(folder) / "first",
+            replace(options, rate=0.0, time_limit=_FOR_THE_SET * options.time_limit),
+            load_seconds=load_seconds,
+            provenance=provenance,
+            progress=progress,
+        )
+        best, proved = first, None
+        if first.verdict is Verdict.PROVED and first.problem is not None and first.levels.roa is not None:
+            P, level = first.problem.V.P, _SET * first.levels.roa
+            plain, network = first.system, first.network  # as seen from where V is 0
+            refused: Fraction | None = None
+
+            def attempt(value: Fraction) -> RoaResult:
+                found = certify_roa(
+                    plain.with_sample((value, value)) if quantity == "period" else plain,
+                    network,
+                    Path(folder) / "next",
+                    replace(
+                        options,
+                        P=P,
+                        level=level,
+                        rate=float(value) if quantity == "rate" else 0.0,
+                        time_limit=max(1.0, _EACH * left()),
+                    ),
+                    provenance=provenance,
+                    progress=progress,
+                )
+                return replace(found, rest=first.rest)
+
+            for value in _tried(quantity, plain, network, P, level):
+                if not left() > 0:
+                    break
+                found = attempt(value)
+                if found.verdict is Verdict.PROVED:
+                    best, proved = found, value
+                    break
+                refused = value
+            for _ in range(_HALVINGS):
+                if proved is None or refused is None or not left() > 0:
+                    break
+                middle = _short((proved + refused) / 2)
+                found = attempt(middle)
+                if found.verdict is Verdict.PROVED:
+                    best, proved = found, middle
+                else:
+                    refused = middle
+        return _in_place(best, out, _notice(quantity, proved, first), time.perf_counter() - start)
+
+
+def _tried(quantity: Quantity, system: System, network: TanhNetwork, P: Any, level: float) -> Sequence[Fraction]:
+    """Shares of the largest value for which no violation is sampled in the set, rounded to a few digits."""
+    loop = ClosedLoop(system, network)
+    L = loop.mean_rate()
+    T, modes = diagonalising_coordinates(P, L, loop.step), np.abs(np.linalg.eigvals(L).real)
+    most = 8 / float(np.min(modes)) if quantity == "period" else 2 * float(np.max(modes))
+
+    def holds(value: float) -> bool:
+        if quantity == "period":
+            h = exact(value)
+            problem = Problem(ClosedLoop(system.with_sample((h, h)), network), Quadratic(P))
+        else:
+            problem = Problem(loop, Quadratic(P), value)
+        return not is_violated(problem, T, level)
+
+    low, high = most * _LEAST, most
+    if not holds(low):
+        return ()
+    for _ in range(_BISECTIONS):
+        middle = (low * high) ** 0.5
+        low, high = (middle, high) if holds(middle) else (low, middle)
+    return [_short(Fraction(share * low)) for share in _SHARES]
+
+
+def _short(value: Fraction) -> Fraction:
+    """Rounded to a few decimal digits, which is what people give."""
+    return Fraction(f"{float(value):.{_DIGITS}g}")
+
+
+def _notice(quantity: Quantity, proved: Fraction | None, first: RoaResult) -> str | None:
+    if first.verdict is not Verdict.PROVED:
+        return first.notice
+    if proved is None:
+        return f"no {quantity} could be proved for this set; the claim is the one without it"
+    what = f"the input is held over {float(proved):g}" if quantity == "period" else f"the rate is {float(proved):g}"
+    return f"{what}, the largest of those tried that could be proved for {_SET:g} of the level proved without it"
+
+
+def _in_place(result: RoaResult, out: Path, notice: str | None, seconds: float) -> RoaResult:
+    """The result with its certificate in the folder that was asked for."""
+    said = "; ".join(dict.fromkeys(text for text in (notice, result.notice) if text)) or None
+    result = replace(result, notice=said)
+    result = replace(result, seconds={**result.seconds, "total": seconds})
+    if result.certificate is None or result.raw is None:
+        return result
+    path = out / result.certificate.name
+    write_atomically(path, result.raw)
+    return replace(result, certificate=path)

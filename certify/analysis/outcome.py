@@ -1,0 +1,113 @@
+"""What a run may say: a result with a candidate, its levels, a witness; and whether something is refuted, exactly.
+
+Results are put together from what the engines found; PROVED is not said here, but by the run once the checker has
+spoken.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import flint
+import numpy as np
+
+from certify.analysis.candidates.trials import Trial
+from certify.analysis.results import Levels, RoaResult, Tried
+from certify.analysis.selection import Contender
+from certify.certificates.claims import Asymptotic, Claim
+from certify.certificates.verdict import Stop, Verdict
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.rigorous import eigenvalues, in_digits, instability
+from certify.lyapunov import leaves_domain, slowest_decay
+from certify.provers.base import Task
+from certify.provers.falsify import Witness, refutes
+
+
+def result_about(result: RoaResult, trial: Trial) -> RoaResult:
+    """The result with the candidate that it is about."""
+    levels = Levels(domain_limit=trial.limit)
+    return replace(result, problem=trial.task.problem, candidate=trial.name, notice=trial.notice, levels=levels)
+
+
+def tried_row(contender: Contender, best: Contender) -> Tried:
+    """A candidate's row in the result."""
+    trial = contender.trial
+    return Tried(
+        trial.name, trial.task.target, trial.limited_by, trial.volume, contender is best, contender.proved or None
+    )
+
+
+def by_spectrum(loop: ClosedLoop) -> tuple[Verdict, Stop, tuple[str, ...]] | None:
+    """REFUTED or UNKNOWN with the eigenvalues, or None if the spectrum is rigorously stable."""
+    enclosures = eigenvalues(loop)
+    if enclosures is None:
+        approximate = not_stable(loop)
+        # Without any, nearly multiple eigenvalues: the local proof decides.
+        return (Verdict.UNKNOWN, Stop.SPECTRUM, approximate) if approximate else None
+    shown = tuple(map(in_digits, enclosures))
+    signs = [instability(loop, v) for v in enclosures]
+    if any(v > 0 for v in signs):
+        return Verdict.REFUTED, Stop.UNSTABLE, shown
+    if not all(v < 0 for v in signs):
+        return Verdict.UNKNOWN, Stop.SPECTRUM, shown
+    return None
+
+
+def not_stable(loop: ClosedLoop) -> tuple[str, ...]:
+    """The eigenvalues, in floats, of a loop for which no Lyapunov equation has a solution; none if one has."""
+    L, h = loop.mean_rate(), loop.step
+    if slowest_decay(L, h) > 0:
+        return ()
+    return tuple(in_digits(flint.acb(v.real, v.imag)) for v in np.linalg.eigvals(np.eye(len(L)) + h * L if h else L))
+
+
+def refuted_at_once(result: RoaResult, trial: Trial) -> RoaResult | None:
+    """REFUTED where the level that was asked for leaves the domain or holds a witness."""
+    task, result = trial.task, result_about(result, trial)
+    if not task.exactly:
+        return None
+    if leaves_domain(trial.P, task.target, result.system.domain):
+        detail = f"{{V <= {task.target:g}}} leaves the domain, whose limit is {trial.limit:.12g}"
+        return replace(result, verdict=Verdict.REFUTED, stop=Stop.DOMAIN, detail=detail)
+    return with_witness(result, task, task.witness) if is_refuted(task, task.witness) else None
+
+
+def is_refuted(task: Task, witness: Witness | None) -> bool:
+    """Whether a witness refutes the claim for the level that the task asks for, exactly."""
+    return witness is not None and task.kind == "asymptotic" and refutes(task.problem, witness, task.target)
+
+
+def with_witness(result: RoaResult, task: Task, witness: Witness | None) -> RoaResult:
+    """REFUTED by a witness; as it is without one."""
+    if witness is None:
+        return result
+    detail = witness.describe(result.system)
+    levels = replace(result.levels, sampled_limit=witness.level)
+    return replace(result, verdict=Verdict.REFUTED, stop=Stop.WITNESS, detail=detail, witness=witness, levels=levels)
+
+
+def with_levels(result: RoaResult, levels: Mapping[str, float], witness: Witness | None) -> RoaResult:
+    """The result with these levels, and the lowest violation that was met."""
+    sampled = None if witness is None else witness.level
+    return replace(result, levels=replace(result.levels, sampled_limit=sampled, **levels))
+
+
+def short_of_target(result: RoaResult, task: Task, claim: Claim) -> RoaResult:
+    """UNKNOWN, because only a lower level than the one asked for is proved."""
+    if isinstance(claim, Asymptotic):
+        result = replace(result, levels=replace(result.levels, local=claim.local))
+    missed = f"proved only up to V <= {claim.roa:.12g}, not {task.target:g}"
+    return replace(result, detail=f"{result.detail}; {missed}" if result.detail else missed)
+
+
+def lowest_witness(*witnesses: Witness | None) -> Witness | None:
+    """The one with the lowest level; None if there is none."""
+    return min((w for w in witnesses if w is not None), key=lambda w: w.level, default=None)
+
+
+def limit_of(stop: Stop, task: Task, witness: Witness | None) -> Stop:
+    """What limits a level, from what stopped its proof."""
+    if stop is not Stop.REQUESTED or task.exactly:
+        return stop
+    return Stop.DOMAIN if witness is None else (Stop.INPUTS if witness.kind == "input" else Stop.WITNESS)

@@ -1,0 +1,244 @@
+"""Searches that can be resumed: a file beside the certificate, with the candidate and the tree as far as it is.
+
+A run that is stopped early has no candidate yet, or no tree, or has not decided among candidates. The file says so, and
+the run that resumes it does the rest. Nothing here is trusted. What a search that was resumed proves, the checker sees
+leaf by leaf like any other. A hash tells a damaged file. Numbers and violations are looked at all the same: whoever
+wrote the file may have been somebody else."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import math
+import re
+import zlib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from certify.analysis.candidates.trials import Trial
+from certify.certificates import decode, encode, loop_sections, write_atomically
+from certify.certificates.claims import Problem
+from certify.errors import InputError
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.plants import System
+from certify.loop.policies import TanhNetwork
+from certify.lyapunov import is_positive_definite, leaves_domain
+from certify.lyapunov.function import Quadratic
+from certify.provers.base import SearchState, Task
+from certify.provers.boxes.partition import MOST_SPLITS
+from certify.provers.falsify import Witness, confirm
+
+FORMAT = "certify-search/2"
+_LARGEST = 2**30  # bytes of a file
+_MOST = 2 * MOST_SPLITS + 1  # bytes of a tree
+_RATIONAL = re.compile(r"-?\d{1,1000}(/[1-9]\d{0,999})?")
+_NAME = 80  # characters of a candidate's
+_SAME = 1e-9  # relative, of a level
+_LIMITS = ("domain", "sampled")
+
+
+@dataclass(frozen=True, slots=True)
+class Unfinished:
+    """A candidate, with a search for the largest level that has not come to its end.
+
+    Parameters
+    ----------
+    trial : the candidate.
+    state : of its search; one without a tree has not bounded any box yet.
+    decided : whether this candidate was chosen for the rest of the time; if not, others may be better.
+    """
+
+    trial: Trial
+    state: SearchState
+    decided: bool = True
+
+    @classmethod
+    def of(cls, trial: Trial, state: SearchState | None, decided: bool) -> Unfinished:
+        """With the state of an attempt, which may have none."""
+        target = trial.task.target
+        return cls(trial, state or SearchState(target, target, 0, 0, None, b"", np.zeros(0)), decided)
+
+
+class NothingYetError(InputError):
+    """The run that left this file was stopped before it had a candidate."""
+
+
+def identity(system: System, network: TanhNetwork, rate: float) -> str:
+    """A hash of the loop and the rate, which a search is about."""
+    said = json.dumps([loop_sections(system, network), float(rate).hex()], sort_keys=True)
+    return hashlib.sha256(said.encode()).hexdigest()
+
+
+def save(path: Path, unfinished: Unfinished) -> None:
+    """Write the search to a file, in one step.
+
+    Raises
+    ------
+    InputError : the file cannot be written.
+    """
+    trial, state, problem = unfinished.trial, unfinished.state, unfinished.trial.task.problem
+    data = {
+        "format": FORMAT,
+        "about": identity(problem.loop.system, problem.loop.network, problem.rate),
+        "decided": unfinished.decided,
+        "candidate": trial.name,
+        "P": encode(trial.P),
+        "T": encode(trial.T),
+        "target": trial.task.target.hex(),
+        "exactly": trial.task.exactly,
+        "limit": float(trial.limit).hex(),
+        "limited_by": trial.limited_by,
+        "volume": float(trial.volume).hex(),
+        "witness": _stated(trial.task.witness),
+        "inner": state.inner.hex(),
+        "outer": state.outer.hex(),
+        "boxes": state.boxes,
+        "proved": state.proved,
+        "met": _stated(state.witness),
+        "tree": _packed(state.tree),
+        "keys": _packed(state.keys.astype("<f8").tobytes()),
+    }
+    _write(path, data)
+
+
+def save_nothing_yet(path: Path, system: System, network: TanhNetwork, rate: float) -> None:
+    """Write down that a run about this loop and rate was stopped before it had a candidate.
+
+    Raises
+    ------
+    InputError : the file cannot be written.
+    """
+    _write(path, {"format": FORMAT, "about": identity(system, network, rate), "candidate": None})
+
+
+def _write(path: Path, data: Mapping[str, Any]) -> None:
+    write_atomically(path, (json.dumps({**data, "sha256": _digest(data)}) + "\n").encode())
+
+
+def load(path: Path, loop: ClosedLoop, rate: float) -> Unfinished:
+    """The search in a file, which must be one of this loop and rate.
+
+    Raises
+    ------
+    NothingYetError : the run that left it had no candidate yet.
+    InputError : it is not there, is about another loop or rate, or is damaged.
+    """
+    try:
+        if path.stat().st_size > _LARGEST:
+            raise ValueError(f"it is larger than {_LARGEST} bytes")
+        data = json.loads(path.read_bytes())
+    except FileNotFoundError as error:
+        raise InputError(f"there is no search to go on with in {path.parent}; run without --resume.") from error
+    except (OSError, ValueError, RecursionError) as error:
+        raise InputError(f"the search in {path} cannot be read: {error}. Run without --resume.") from error
+    try:
+        if data["format"] != FORMAT:
+            raise _Unfit(f"{path} must be of the format {FORMAT}; found {data['format']!r:.40}. Run without --resume.")
+        if data.pop("sha256") != _digest(data):
+            raise ValueError("it has another hash than when it was written")
+        if data["about"] != identity(loop.system, loop.network, rate):
+            raise _Unfit(
+                f"the search in {path} is about another policy, plant, domain or rate; run without --resume, or into "
+                "another folder."
+            )
+        if data["candidate"] is None:
+            raise NothingYetError(f"the run that left {path} was stopped before it had a candidate.")
+        return _read(data, loop, rate)
+    except _Unfit as error:
+        raise InputError(str(error)) from error
+    except NothingYetError:
+        raise
+    except (KeyError, TypeError, AttributeError, ValueError, ArithmeticError, RecursionError, zlib.error) as error:
+        raise InputError(f"the search in {path} is damaged ({error!r:.200}); run without --resume.") from error
+
+
+class _Unfit(Exception):
+    """A file that is in order, and not what is asked for."""
+
+
+def _read(data: Mapping[str, Any], loop: ClosedLoop, rate: float) -> Unfinished:
+    n = loop.system.n
+    P, T = decode(data["P"], (n, n)), decode(data["T"], (n, n))
+    target, limit, volume = (float.fromhex(data[name]) for name in ("target", "limit", "volume"))
+    inner, outer = (float.fromhex(data[name]) for name in ("inner", "outer"))
+    problem, name, boxes, proved = Problem(loop, Quadratic(P), rate), data["candidate"], data["boxes"], data["proved"]
+    if not (
+        0 < inner <= outer <= target <= limit < math.inf
+        and 0 <= volume < math.inf
+        and data["limited_by"] in _LIMITS
+        and type(name) is str
+        and name.isprintable()
+        and len(name) <= _NAME
+        and type(data["exactly"]) is type(data["decided"]) is bool
+        and type(boxes) is type(proved) is int
+        and 0 <= proved <= boxes < 2**62
+        and is_positive_definite(P)
+        and not leaves_domain(P, target, loop.system.domain)
+        and np.linalg.cond(T) < 1 / np.finfo(np.float64).eps
+    ):
+        raise ValueError("its numbers do not fit together")
+    task = Task(problem, "asymptotic", target, data["exactly"], _read_witness(data["witness"], problem))
+    trial = Trial(name, task, T, limit, data["limited_by"], volume)
+    tree = _unpacked(data["tree"], _MOST)
+    keys = np.frombuffer(_unpacked(data["keys"], 8 * len(tree)), dtype="<f8").astype(np.float64)
+    state = SearchState(inner, outer, boxes, proved, _read_witness(data["met"], problem), tree, keys)
+    return Unfinished(trial, state, data["decided"])
+
+
+def _digest(data: Mapping[str, Any]) -> str:
+    """A hash of all that is said."""
+    return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()
+
+
+def _stated(witness: Witness | None) -> dict[str, Any] | None:
+    if witness is None:
+        return None
+    values = {name: str(q) for name, q in witness.values.items()}
+    period = None if witness.period is None else str(witness.period)
+    level = float(witness.level).hex()
+    return {"x": encode(witness.x), "level": level, "kind": witness.kind, "values": values, "period": period}
+
+
+def _read_witness(data: Mapping[str, Any] | None, problem: Problem) -> Witness | None:
+    """A violation, which is shown again."""
+    if data is None:
+        return None
+    system, x = problem.loop.system, decode(data["x"], (problem.V.n,))
+    values = {name: _rational(q) for name, q in data["values"].items()}
+    period = None if data["period"] is None else _rational(data["period"])
+    witness = Witness(x, float.fromhex(data["level"]), data["kind"], values, period)
+    if not (
+        witness.kind in ("vdot", "input")
+        and np.all(np.isfinite(x))
+        and all(system.ranges[name][0] <= q <= system.ranges[name][1] for name, q in values.items())
+        and (period is None) == (system.sample is None or witness.kind == "input")
+        and (period is None or system.sample is None or system.sample[0] <= period <= system.sample[1])
+        and math.isclose(witness.level, float(problem.V(x)), rel_tol=_SAME)
+        and confirm(problem, witness)
+    ):
+        raise ValueError("a violation that is none")
+    return witness
+
+
+def _rational(text: str) -> Fraction:
+    if not _RATIONAL.fullmatch(text):
+        raise ValueError("a rational number must be P or P/Q")
+    return Fraction(text)
+
+
+def _packed(data: bytes) -> str:
+    return base64.b64encode(zlib.compress(data, 1)).decode()
+
+
+def _unpacked(text: str, most: int) -> bytes:
+    reader = zlib.decompressobj()
+    data = reader.decompress(base64.b64decode(text, validate=True), most + 1)
+    if not reader.eof or len(data) > most or reader.unused_data:
+        raise ValueError("what is packed in it has no end, or is too large")
+    return data

@@ -1,0 +1,289 @@
+"""Whether states lie in the set that a certificate proves, decided in rationals and, where N is asked, in balls.
+
+The set is {V <= c2}, and under a claim with a tube also the tube's start: ellipsoids, each of them
+convex. So a box of states lies in one of them exactly if its corners do, and the corners' values are rational numbers.
+Under a claim with an outer set {N <= n2} within the domain belongs to it too, which need not be convex: then a box is
+cut into pieces, until each of them lies in one of the sets or a state is found that lies in none.
+What is said here is about bytes that the checker has accepted; a file that it does not accept has no proved set.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import tempfile
+from collections import deque
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.certificates import Certificate, parse_certificate, read_raw, run_checker
+from certify.certificates.claims import CLAIMS, Enlarged, Reached
+from certify.certificates.formats import version_in
+from certify.certificates.verdict import Answer
+from certify.errors import InputError
+from certify.loop.plants import System
+from certify.lyapunov import are_inside
+from certify.lyapunov.sublevel import Sublevel
+
+Array = NDArray[np.float64]
+Box = tuple[tuple[Fraction, Fraction], ...]
+_CORNERS = 16  # 2 to the power of this many corners are looked at one by one
+_PIECES = 4096  # of a box, that are looked at
+
+
+class Containment(Answer):
+    """Whether all states of a box lie in a proved set.
+
+    CONTAINED: all do. NOT_CONTAINED: a state of the box does not. UNDECIDED: neither was shown.
+    """
+
+    CONTAINED = "contained"
+    NOT_CONTAINED = "not contained"
+    UNDECIDED = "undecided"
+
+    @property
+    def exit_status(self) -> int:
+        """Exit status of the command line: 0 contained, 1 not contained, 3 undecided."""
+        return {Containment.CONTAINED: 0, Containment.NOT_CONTAINED: 1}.get(self, 3)
+
+
+@dataclass(frozen=True, slots=True)
+class Ellipsoid:
+    """{(x - c)'P(x - c) <= level} with what it is called; P (n, n), c = `centre` (n,), empty for 0."""
+
+    name: str
+    P: Array
+    level: float
+    centre: tuple[float, ...] = ()
+
+    def around(self, box: Box) -> Box:
+        """A box as deviations from the centre."""
+        shift = [Fraction(v) for v in self.centre] or [Fraction(0)] * len(box)
+        return tuple((lo - c, hi - c) for (lo, hi), c in zip(box, shift, strict=True))
+
+    def holds(self, points: Iterable[Sequence[Fraction | float]]) -> list[bool]:
+        """Whether each of the states lies in it."""
+        return are_inside(self.P, self.level, points, self.centre)
+
+    def covers(self, box: Box) -> bool:
+        """Whether a bound of (x - c)'P(x - c) shows that all of a box lies in it."""
+        return _largest(self.P, self.around(box)) <= Fraction(float(self.level))
+
+
+@dataclass(frozen=True, slots=True)
+class Located:
+    """Where a box lies: `within` names the set that contains it, or the sets that do so together, `outside` is a state
+    of it in none of them, (n,)."""
+
+    answer: Containment
+    within: str | None = None
+    outside: tuple[Fraction, ...] | None = None
+
+
+NOTHING_PROVED = Located(Containment.UNDECIDED)
+"""Where any box lies if there is no proved set."""
+
+
+@dataclass(frozen=True, slots=True)
+class ProvedSet:
+    """The union of the sets that an accepted certificate proves something about, in deviations from x_eq.
+
+    Parameters
+    ----------
+    system : the plant of the certificate. Its x_eq is what the file says for people; no rule depends on it.
+    claim : the claim's kind.
+    ellipsoids, outer : which together are the set; `outer` is None where the claim has no outer set.
+    policy_sha256, certificate_sha256 : of the policy that it is about, and of the file.
+    origin : where x = 0 lies among the states that the policy's layers read, (n,); empty for 0. The plant is in
+        deviations from there, and so are the states that are asked about.
+    """
+
+    system: System
+    claim: str
+    ellipsoids: tuple[Ellipsoid, ...]
+    policy_sha256: str
+    certificate_sha256: str
+    outer: Sublevel | None = None
+    origin: tuple[float, ...] = ()
+
+    def seen_from_there(self, system: System) -> System:
+        """A plant whose states the policy's layers read, in deviations from where x = 0 lies for this set.
+
+        Raises
+        ------
+        InputError : that does not lie in the interior of the plant's domain.
+        """
+        if not any(self.origin):
+            return system
+        return system.seen_from([Fraction(v) for v in self.origin], self.system.exact_u_eq())
+
+    def deviations(self, states: Iterable[Sequence[Fraction | float]]) -> list[list[Fraction]]:
+        """States that the policy's layers read, as deviations from where x = 0 lies for this set."""
+        at = [Fraction(v) for v in self.origin] or [Fraction(0)] * self.system.n
+        return [[Fraction(v) - q for v, q in zip(x, at, strict=True)] for x in states]
+
+    def holds(self, states: Iterable[Sequence[Fraction | float]]) -> list[bool]:
+        """Whether each of the states, as deviations from x_eq, lies in the set; a float means its binary value.
+
+        Where N is asked, whether that is shown: no state is let in by rounding, and one at which N is exactly n2 may
+        not be either.
+        """
+        points = list(states)
+        found = [e.holds(points) for e in self.ellipsoids]
+        inside = [any(each) for each in zip(*found, strict=True)]
+        if self.outer is None:
+            return inside
+        beyond = iter(self.outer.holds(x for x, known in zip(points, inside, strict=True) if not known))
+        return [known or next(beyond) for known in inside]
+
+    def excludes(self, states: Iterable[Sequence[Fraction | float]]) -> list[bool]:
+        """Whether each of the states, as deviations from x_eq, is shown to lie outside of the set."""
+        points = list(states)
+        found = [[not inside for inside in e.holds(points)] for e in self.ellipsoids]
+        found += [] if self.outer is None else [self.outer.excludes(points)]
+        return [all(each) for each in zip(*found, strict=True)]
+
+    def locate(self, box: Box) -> Located:
+        """Whether a box of states, as deviations from x_eq, lies in the set.
+
+        With at most 16 states that have a width the corners decide, unless one ellipsoid has some of them and another
+        one the rest; beyond that a bound of x'Px on the box may show that it is contained, and a corner that it is not.
+        With an outer set that is asked of pieces of the box, at most 4,096.
+
+        Raises
+        ------
+        InputError : the box has another number of states, or an interval has lo > hi.
+        """
+        if len(box) != self.system.n or not all(lo <= hi for lo, hi in box):
+            raise InputError(f"a box must have {self.system.n} intervals lo <= hi; found {_shown(box)}.")
+        wide = [i for i, (lo, hi) in enumerate(box) if lo < hi]
+        if len(wide) > _CORNERS:
+            corners = [_steepest(e, box) for e in self.ellipsoids]
+            contained = [e.covers(box) for e in self.ellipsoids]
+        else:
+            ends = (pair if pair[0] < pair[1] else pair[:1] for pair in box)
+            corners = list(itertools.product(*ends))
+            contained = [e.covers(box) or all(e.holds(corners)) for e in self.ellipsoids]  # a bound costs no corner
+        for ellipsoid, whole in zip(self.ellipsoids, contained, strict=True):
+            if whole:
+                return Located(Containment.CONTAINED, within=ellipsoid.name)
+        for corner, outside in zip(corners, self.excludes(corners), strict=True):
+            if outside:
+                return Located(Containment.NOT_CONTAINED, outside=corner)
+        return Located(Containment.UNDECIDED) if self.outer is None else self._by_pieces(box, self.outer)
+
+    def _by_pieces(self, box: Box, outer: Sublevel) -> Located:
+        """The same of a box that is cut into pieces, the large ones first, each at its middle along an axis."""
+        waiting, used = deque([box]), set[str]()
+        for _ in range(_PIECES):
+            piece = waiting.popleft()
+            name = next((e.name for e in self.ellipsoids if e.covers(piece)), None)
+            seen = outer.look(piece) if name is None else None
+            if seen is None or seen.covered:
+                used.add(name or outer.name)
+                if not waiting:
+                    named = (one for one in (*(e.name for e in self.ellipsoids), outer.name) if one in used)
+                    return Located(Containment.CONTAINED, within=" and ".join(named))
+                continue
+            middle = tuple((lo + hi) / 2 for lo, hi in piece)
+            if self.excludes([middle])[0]:
+                return Located(Containment.NOT_CONTAINED, outside=middle)
+            if seen.axis is None:
+                break
+            (lo, hi), at = piece[seen.axis], middle[seen.axis]
+            waiting += [(*piece[: seen.axis], half, *piece[seen.axis + 1 :]) for half in ((lo, at), (at, hi))]
+        return Located(Containment.UNDECIDED)
+
+
+def proved_set(path: Path, patient: bool = False) -> ProvedSet:
+    """The set of a certificate, which is checked first, as `certify check` does it: the very bytes that are read;
+    `patient` takes one whose check may need hours.
+
+    Raises
+    ------
+    InputError : the checker does not accept it; a solver's word, TRUSTED, is no proof.
+    CertificateFormatError : the file cannot be read.
+    """
+    raw = read_raw(path)
+    with tempfile.TemporaryDirectory() as folder:  # whatever happens to the path meanwhile
+        private = Path(folder) / "certificate.json"
+        private.write_bytes(raw)
+        answer = run_checker(private, patient=patient)
+    if answer["result"] != "ACCEPTED":
+        old = version_in(raw)
+        why = f" rule={answer['rule']} at={answer['at']}: {answer['detail']}" if "rule" in answer else ""
+        raise InputError(
+            f"{path} must be a certificate that the checker accepts; it says {answer['result']}{why:.300}. "
+            f"{old or 'Without that there is no proved set.'}"
+        )
+    return set_of(raw, str(path))
+
+
+def set_of(raw: bytes, name: str) -> ProvedSet:
+    """The set of a certificate's bytes, which the checker has accepted; `name` is what messages call them.
+
+    Raises
+    ------
+    InputError : the claim is of a kind whose set is not known here.
+    CertificateFormatError : the bytes are no certificate.
+    """
+    read = parse_certificate(raw, name)
+    return ProvedSet(
+        system=read.system,
+        claim=read.kind,
+        ellipsoids=_ellipsoids(read),
+        policy_sha256=read.network.sha256(),
+        certificate_sha256=hashlib.sha256(raw).hexdigest(),
+        outer=_outer(read),
+        origin=tuple(read.network.origin.tolist()) if read.network.is_moved else (),
+    )
+
+
+def _ellipsoids(read: Certificate) -> tuple[Ellipsoid, ...]:
+    if type(read.claim) not in CLAIMS.values():
+        raise InputError(f"the claim must be one of {', '.join(CLAIMS)}; found {read.kind!r}.")
+    found = (Ellipsoid("{V <= c2}", read.P, read.roa),)
+    if not isinstance(read.claim, Enlarged | Reached):
+        return found
+    centre = read.claim.centre if isinstance(read.claim, Reached) else ()
+    return (*found, Ellipsoid("the tube's start", read.claim.start.P, 1.0, centre))
+
+
+def _outer(read: Certificate) -> Sublevel | None:
+    outer = read.claim.outer
+    return None if outer is None else Sublevel(outer.function, outer.level, tuple(read.system.domain))
+
+
+def _symmetric(P: Array) -> list[list[Fraction]]:
+    rows = [[Fraction(float(v)) for v in row] for row in P]
+    return [[(rows[i][j] + rows[j][i]) / 2 for j in range(len(rows))] for i in range(len(rows))]
+
+
+def _middle(box: Box) -> tuple[list[Fraction], list[Fraction]]:
+    return [(lo + hi) / 2 for lo, hi in box], [(hi - lo) / 2 for lo, hi in box]
+
+
+def _largest(P: Array, box: Box) -> Fraction:
+    """A bound of x'Px on a box: with x = c + d, |d| <= r, `c'Pc + 2 |Pc| r + r'|P|r`."""
+    S, (c, r) = _symmetric(P), _middle(box)
+    Sc = [sum((s * v for s, v in zip(row, c, strict=True)), Fraction(0)) for row in S]
+    curved = sum(
+        (abs(s) * a * b for row, a in zip(S, r, strict=True) for s, b in zip(row, r, strict=True)), Fraction(0)
+    )
+    return sum((v * g + 2 * abs(g) * w for v, g, w in zip(c, Sc, r, strict=True)), Fraction(0)) + curved
+
+
+def _steepest(ellipsoid: Ellipsoid, box: Box) -> tuple[Fraction, ...]:
+    """The corner to which (x - c)'P(x - c) rises at the middle of the box."""
+    S, (c, _) = _symmetric(ellipsoid.P), _middle(ellipsoid.around(box))
+    slopes = [sum((s * v for s, v in zip(row, c, strict=True)), Fraction(0)) for row in S]
+    return tuple(hi if slope >= 0 else lo for (lo, hi), slope in zip(box, slopes, strict=True))
+
+
+def _shown(box: Box) -> str:
+    return ", ".join(f"[{float(lo):.6g}, {float(hi):.6g}]" for lo, hi in box)

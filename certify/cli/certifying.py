@@ -1,0 +1,236 @@
+"""What the commands that certify share: what is said before a run, the run, and what is written and printed of it."""
+
+from __future__ import annotations
+
+import json
+import shlex
+import threading
+import time
+from collections.abc import Collection, Mapping
+from dataclasses import fields
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from certify.certificates import SEARCH
+from certify.cli.arguments import region
+from certify.cli.contains import stated, text
+from certify.cli.ending import Interrupted
+from certify.cli.shared import write
+from certify.cli.terminal import ProgressLine, load_tables, say, show, tell
+from certify.cli.typed import as_typed, options_of
+
+if TYPE_CHECKING:
+    from certify.analysis.maximise import Quantity
+    from certify.analysis.options import RoaOptions
+    from certify.analysis.results import RoaResult
+    from certify.loop.plants import System
+    from certify.loop.policies import Policy
+    from certify.report.drawing import Drawing
+
+CONTAINS = "--contains"
+_OF_SEARCH = ("candidate", "q", "r", "level")
+
+
+def certified(
+    context: typer.Context,
+    policy: Path,
+    stored: Policy,
+    plant: System,
+    options: RoaOptions,
+    out: Path | None,
+    start: float,
+    drawing: Drawing,
+    quiet: bool,
+    as_json: bool,
+    asked: str | None = None,
+    largest: Quantity | None = None,
+) -> None:
+    """Run, write certificate and report, print the result; ends the command with the verdict's exit status.
+
+    Parameters
+    ----------
+    stored, plant : the policy in the file `policy`, and the plant that it is certified on.
+    out : folder for the results.
+    start : when the command began, by `time.perf_counter`.
+    drawing : draws the report.
+    asked : a state or a box, as people write it, of which it is to be said whether the proved set contains it.
+    largest : what is to be as large as can be proved for the set.
+    """
+    from certify.analysis.run import certify_roa
+    from certify.report import summary
+
+    note = (lambda _: None) if quiet else tell
+    note(_plant_line(stored, plant, context.params["system"] is not None))
+    shift = stored.beta_shift(plant.exact_u_eq())
+    if shift:
+        note(f"the file's rounded beta is read as the real number; this shifts u(0) by {shift:.3g}")
+    folder = out if out is not None else Path("out") / policy.stem
+
+    def draw(raw: bytes) -> None:
+        drawing.begin(raw, folder / "certificate.json", time.perf_counter() - start)
+        if not as_json:  # this process waits for the checker's
+            threading.Thread(target=load_tables, daemon=True).start()
+
+    run = partial(certify_roa, show=draw)
+    if largest is not None:
+        from certify.analysis.maximise import certify_largest
+
+        run = partial(certify_largest, largest)
+    progress = None if quiet else ProgressLine()
+    try:
+        result = run(
+            plant,
+            stored.network,
+            folder,
+            options,
+            load_seconds=time.perf_counter() - start,
+            provenance=_provenance(policy),
+            progress=progress,
+        )
+    except KeyboardInterrupt:
+        search = folder / SEARCH
+        if largest is not None or not search.exists():
+            raise
+        raise Interrupted(
+            f"interrupted; what was done is kept in {search}, and the same command with --resume{_without(context)} "
+            "goes on from there."
+        ) from None
+    finally:
+        if progress is not None:
+            progress.close()
+    data = result.to_dict()
+    following = {} if data["diagnosis"] is None else data["diagnosis"]["next"]
+    if following.get("flatten"):
+        following["command"] = _flattened(context, policy)
+    elif following.get("options"):
+        following["command"] = _command(context, following["options"])
+    if result.notice is not None:
+        note(as_typed(result.notice, options_of(context.command)))
+    if result.certificate is not None and result.raw is not None:
+        answer = None if result.checker is None else dict(result.checker)
+        write(folder / "report.html", drawing.page_of(result.raw, result.certificate, answer, data))
+    where = None if asked is None else _where(result, asked)
+    if where is not None:
+        data["contains"] = where[0]
+    if as_json:
+        say(json.dumps(data))
+    else:
+        show(summary(data))
+        if where is not None:
+            say(where[1])
+        if result.certificate is not None:
+            say(f"certificate  {result.certificate}\nreport       {folder / 'report.html'}")
+    raise typer.Exit(result.verdict.exit_status)
+
+
+def _where(result: RoaResult, asked: str) -> tuple[dict[str, Any], str]:
+    """Whether the proved set contains a box, for JSON and in words, from the very bytes that were checked.
+
+    The box is read as of the result's plant, in whose deviations the set is: those of the plant that was asked about
+    may be others.
+    """
+    from certify.certificates.membership import NOTHING_PROVED, set_of
+    from certify.certificates.verdict import Verdict
+
+    found, box = NOTHING_PROVED, region(asked, result.system, CONTAINS)
+    if result.verdict is Verdict.PROVED and result.raw is not None:
+        found = set_of(result.raw, str(result.certificate)).locate(box)
+    return stated(found, box, result.system), text(found, box, result.system)
+
+
+def _without(context: typer.Context) -> str:
+    """What a resumed search knows already, of the options that were given."""
+    given = _known(context)
+    return f" and without {', '.join(given)}" if given else ""
+
+
+def _known(context: typer.Context) -> list[str]:
+    """The options that were given and that a resumed search has of its own; what is learned is no part of it."""
+    from certify.lyapunov import BEYOND
+
+    found = {f"--{key if len(key) > 1 else key.upper()}": context.params.get(key) for key in _OF_SEARCH}
+    return [name for name, value in found.items() if value not in (None, "auto", *BEYOND)]
+
+
+def _command(context: typer.Context, changed: Mapping[str, str]) -> str:
+    """The command that was given, with these options instead of those it had; a search that is resumed has its own."""
+    known = _known(context) if "--resume" in changed else []
+    added = (part for pair in changed.items() for part in pair if part)
+    return shlex.join(["certify", str(context.info_name), *_given(context, changed, without=known), *added])
+
+
+def _flattened(context: typer.Context, policy: Path) -> str:
+    """The commands that fine-tune the policy for proof, after its import if it is another program's, and then the one
+    that was given about what comes of it; each policy lies beside the one that it was made from."""
+    from certify.analysis.inputs import is_own
+    from certify.loop.policies.importers import ImportOptions
+
+    foreign = {f.name for f in fields(ImportOptions)}
+    others = {option.name or "" for option in context.command.params} - {"file", "policy", "resume"}
+    flat, plant, commands = policy.with_name(f"{policy.stem}_flat.pt"), context.params["system"], list[list[str]]()
+    if not is_own(policy, ImportOptions()):
+        read = policy.with_name(f"{policy.stem}_imported.pt")
+        said = _given(context, only=foreign | {"system", "param"})
+        said = ["--from" if part == "--kind" else part for part in said]
+        commands.append(["certify", "import", str(policy), *said, "--out", str(read)])
+        policy, others = read, others - foreign
+    named = [] if plant is None else ["--system", plant]
+    commands.append(["controllers", "flatten", str(policy), *named, "--out", str(flat)])
+    commands.append(["certify", str(context.info_name), str(flat), *_given(context, only=others)])
+    return " && ".join(map(shlex.join, commands))
+
+
+def _given(
+    context: typer.Context,
+    changed: Mapping[str, str] | None = None,
+    only: Collection[str] | None = None,
+    without: Collection[str] = (),
+) -> list[str]:
+    """The words that were given to the command, but for options that are `changed` or named in `without`; of the
+    parameters in `only`, if there are such."""
+    parts, changed = list[str](), changed or {}
+    for option in context.command.params:
+        source = context.get_parameter_source(option.name or "")
+        name, value = max(option.opts, key=len), context.params[option.name or ""]
+        if source is None or source.name != "COMMANDLINE" or name in without:
+            continue
+        if name in changed and not option.multiple:
+            continue
+        if only is not None and option.name not in only:
+            continue
+        values = list(value) if isinstance(value, list | tuple) else [value]
+        if option.param_type_name == "argument":
+            parts += map(str, values)
+            continue
+        if name in changed:  # NAME=VALUE options replace those of the same name
+            values = [v for v in values if v.partition("=")[0] != changed[name].partition("=")[0]]
+        for each in values:
+            parts += [name] if each is True else [name, str(each)]
+    return parts
+
+
+def _plant_line(stored: Policy, plant: System, overridden: bool) -> str:
+    values = ", ".join(f"{name} = {float(q):g}{_within(plant, name)}" for name, q in plant.parameters.items())
+    acting = [name for name in plant.ranges if name not in plant.parameters]
+    moved = "".join(f"; {plant.kind_of(name)} {name}{_within(plant, name)}" for name in acting)
+    source = "from the command line" if overridden else "from the policy file"
+    layers = "-".join(map(str, stored.network.layers))
+    return f"plant {plant.name} ({source}) with {values or 'no parameters'}{moved}; policy {layers}"
+
+
+def _within(plant: System, name: str) -> str:
+    """The range of what is uncertain, as it is proved for."""
+    if name not in plant.ranges:
+        return ""
+    from certify.report.words import inside
+
+    return f" in {inside(*plant.ranges[name])}"
+
+
+def _provenance(policy: Path) -> dict[str, Any]:
+    from certify.analysis.installation import versions
+
+    return {"policy": policy.name, **versions()}

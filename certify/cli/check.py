@@ -1,0 +1,87 @@
+"""`certify check`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from certify.cli.shared import Json, Patient
+from certify.cli.terminal import say, tell
+from certify.errors import InputError
+
+_MOST_PARTS = 2**16
+
+
+def check(
+    certificate: Annotated[Path, typer.Argument(help="Certificate file.")],
+    policy: Annotated[
+        Path | None, typer.Option(help="Policy file that the certificate must be about (compares hashes).")
+    ] = None,
+    reference: Annotated[
+        bool, typer.Option("--reference", help="Ask the second checker (fractions and balls): slower, shares no code.")
+    ] = False,
+    jobs: Annotated[int, typer.Option(min=1, max=256, help="Processes that examine the leaves.")] = 1,
+    part: Annotated[
+        str | None,
+        typer.Option(metavar="K/N", help="Of the leaves, examine part K of N only: status 4 if nothing is refused."),
+    ] = None,
+    cluster: Annotated[
+        str | None,
+        typer.Option(
+            help="Have the parts checked by the workers of a Dask cluster, which are trusted with that: local:N, or a "
+            "scheduler's address."
+        ),
+    ] = None,
+    patient: Patient = False,
+    as_json: Json = False,
+) -> None:
+    """Check a certificate with the independent checker, in a process of its own."""
+    from certify.certificates.checking import ask
+
+    wanted = None
+    if policy is not None:
+        from certify.loop.policies import load_policy
+
+        wanted = load_policy(policy).network.sha256()
+    if cluster is not None and (reference or part is not None or jobs != 1):
+        raise InputError("--cluster must stand without --reference, --jobs and --part.")
+    if cluster is not None:
+        status, answer = _by_cluster(certificate, cluster, patient)
+    else:
+        share = None if part is None else _part(part)
+        status, answer = ask(certificate, "reference" if reference else "checker", jobs, share, patient)
+    lines = answer.pop("text", [])
+    if wanted is not None and "policy_sha256" in answer and answer["policy_sha256"] != wanted:
+        detail = f"the certificate is about policy {answer['policy_sha256']}, not about {policy} ({wanted})"
+        answer = {"result": "REJECTED", "rule": "policy", "at": "policy.sha256", "detail": detail}
+        status, lines = 1, [f"REJECTED rule=policy at=policy.sha256: {detail}"]
+    if "error" in answer and not as_json:
+        tell(f"certify: {answer['error']}")
+        raise typer.Exit(status)
+    if answer.get("at") == "schema" and certificate.is_file():  # a pipe is read once
+        from certify.certificates import read_raw
+        from certify.certificates.formats import version_in
+
+        old = version_in(read_raw(certificate))
+        if old is not None:
+            tell(f"certify: {old}")
+    say(json.dumps(answer) if as_json else "\n".join(lines))
+    raise typer.Exit(status)
+
+
+def _by_cluster(certificate: Path, address: str, patient: bool) -> tuple[int, dict[str, Any]]:
+    from certify.analysis.parts import check_in_parts
+    from certify.provers.execution.cluster import ClusterRunner, connect
+
+    with connect(address) as client:
+        return check_in_parts(certificate, ClusterRunner(client), patient)
+
+
+def _part(text: str) -> tuple[int, int]:
+    number, _, of = text.partition("/")
+    if not (number.isdecimal() and of.isdecimal() and 1 <= int(number) <= int(of) <= _MOST_PARTS):
+        raise InputError(f"--part must be K/N with 1 <= K <= N <= {_MOST_PARTS}, as in 2/8; found {text[:40]!r}.")
+    return int(number), int(of)

@@ -1,0 +1,90 @@
+"""`certify contains`."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from certify.cli.arguments import region
+from certify.cli.shared import Json, Patient
+from certify.cli.terminal import say
+
+if TYPE_CHECKING:
+    from certify.certificates.membership import Box, Located
+    from certify.loop.plants import System
+
+
+def contains(
+    certificate: Annotated[Path, typer.Argument(help="Certificate file.")],
+    states: Annotated[
+        list[str],
+        typer.Argument(
+            help="A state or a box, as in x=1.57 x_dot=-1..1, or with commas; a state that is not named is at rest."
+        ),
+    ],
+    deviations: Annotated[
+        bool, typer.Option("--deviations", help="Numbers are deviations from the operating point, not states' values.")
+    ] = False,
+    patient: Patient = False,
+    as_json: Json = False,
+) -> None:
+    """Check a certificate and decide, exactly, whether a state or every state of a box lies in the proved set."""
+    from certify.certificates.membership import proved_set
+
+    proved = proved_set(certificate, patient)
+    box = region(" ".join(states), proved.system, "STATES", deviations)
+    found = proved.locate(box)
+    data = {
+        "certificate": str(certificate),
+        "certificate_sha256": proved.certificate_sha256,
+        "claim": {"kind": proved.claim},
+        "system": proved.system.name,
+        "operating_point": {name: str(q) for name, q in proved.system.operating_point().items()},
+        **stated(found, box, proved.system),
+    }
+    say(json.dumps(data) if as_json else text(found, box, proved.system))
+    raise typer.Exit(found.answer.exit_status)
+
+
+def stated(found: Located, box: Box, system: System) -> dict[str, Any]:
+    """The answer for JSON: numbers are exact fractions; `box` and `outside` are values of the states."""
+    at, names = system.exact_x_eq(), [s.name for s in system.states]
+    values = {name: [str(lo + q), str(hi + q)] for name, (lo, hi), q in zip(names, box, at, strict=True)}
+    corner = found.outside
+    outside = None if corner is None else {name: str(v + q) for name, v, q in zip(names, corner, at, strict=True)}
+    return {"result": found.answer.value, "within": found.within, "box": values, "outside": outside}
+
+
+def text(found: Located, box: Box, system: System) -> str:
+    """The answer in words, in values of the states."""
+    from certify.certificates.membership import NOTHING_PROVED, Containment
+
+    at = system.exact_x_eq()
+    shown = ", ".join(
+        f"{s.name} = {_number(lo + q)}" + ("" if lo == hi else f"..{_number(hi + q)}")
+        for s, (lo, hi), q in zip(system.states, box, at, strict=True)
+    )
+    if found is NOTHING_PROVED:
+        said = f"UNDECIDED  {shown}: nothing was proved"
+    elif found.answer is Containment.CONTAINED:
+        said = f"CONTAINED  {shown}: in {found.within}"
+    elif found.outside is not None:
+        corner = ", ".join(_number(v + q) for v, q in zip(found.outside, at, strict=True))
+        said = f"NOT CONTAINED  {shown}" + (
+            "" if all(lo == hi for lo, hi in box) else f": not in the set is ({corner})"
+        )
+    else:
+        said = f"UNDECIDED  {shown}: it was not shown to lie in the set, and no state of it to lie outside"
+    rest = ", ".join(f"{name} = {_number(q)}" for name, q in system.operating_point().items())
+    return said + (
+        f"\n(values of the states; their operating point, which no rule of the checker knows, is {rest})"
+        if rest
+        else ""
+    )
+
+
+def _number(q: Any) -> str:
+    return f"{float(q):.6g}"

@@ -1,0 +1,145 @@
+"""The command line `certify`: which commands there are, and exit statuses; their bodies are in `certify.cli`.
+
+Standard output carries the result, or with `--json` exactly one JSON object; progress and diagnostics go to
+standard error. Exit status: 0 proved or accepted, 1 refuted or rejected, 2 usage or unusable input, 3 unknown
+or trusted, 4 one part of a certificate checked, 70 internal error; 130 after Ctrl-C or SIGTERM, 141 after a
+closed pipe.
+"""
+
+from __future__ import annotations
+
+import atexit
+import gc
+import json
+import os
+import sys
+from collections.abc import Mapping
+from typing import Any, NoReturn
+
+import typer
+
+from certify.cli.check import check
+from certify.cli.contains import contains
+from certify.cli.doctor import doctor
+from certify.cli.ending import INTERRUPTED, Interrupted, closed_pipe, end_by_sigterm, is_of_closed_pipe
+from certify.cli.export_smt2 import export_smt2
+from certify.cli.float_error import float_error
+from certify.cli.import_ import import_
+from certify.cli.importing import takes_import_options
+from certify.cli.learn_lyapunov import learn_lyapunov
+from certify.cli.plant import plant
+from certify.cli.plot import plot
+from certify.cli.prove_in_coq import prove_in_coq
+from certify.cli.reach import reach
+from certify.cli.report import report
+from certify.cli.roa import roa
+from certify.cli.sweep import sweep
+from certify.cli.systems import systems
+from certify.cli.terminal import say, tell
+from certify.cli.typed import as_typed, options_of
+from certify.cli.version import certify
+from certify.errors import BackendError, CertifyError, OptionError, SoundnessError
+
+app = typer.Typer(
+    no_args_is_help=True,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+app.callback()(certify)
+app.command("roa")(takes_import_options(roa))
+app.command("reach")(takes_import_options(reach, kind_is="--kind"))
+app.command("sweep")(sweep)
+app.command("check")(check)
+app.command("contains")(contains)
+app.command("report")(report)
+app.command("plot")(plot)
+app.command("import")(takes_import_options(import_))
+app.command("learn-lyapunov")(takes_import_options(learn_lyapunov))
+app.command("plant")(plant)
+app.command("systems")(systems)
+app.command("export-smt2")(export_smt2)
+app.command("prove-in-coq")(prove_in_coq)
+app.command("float-error")(float_error)
+app.command("doctor")(doctor)
+
+_STOPPED = "interrupted; nothing was left half-written."
+
+
+def main(arguments: list[str] | None = None) -> None:
+    """Entry point: turns every error into one sentence and the right exit status."""
+    gc.set_threshold(100_000)  # most objects of a run are modules, which live to its end
+    # Threads that wait must not spin: on a busy machine spinning costs a factor of ten. OpenBLAS cannot be told so, and
+    # numpy's matrices are small here, also the checker's; the engine's threads are torch's.
+    os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    end_by_sigterm()
+    given = sys.argv[1:] if arguments is None else arguments
+    status = _run(given, "--json" in given)
+    if arguments is None and sys.getprofile() is None and sys.gettrace() is None:
+        _leave(status)
+    sys.exit(status)
+
+
+def _leave(status: int) -> NoReturn:
+    """End the process as a command's end does, but do not take its thousands of modules apart one by one first: that
+    takes a tenth of a second, and the memory goes back with the process."""
+    atexit._run_exitfuncs()
+    try:
+        sys.stdout.flush()
+        sys.stderr.flush()
+    except BrokenPipeError:
+        status = closed_pipe()
+    os._exit(status)
+
+
+def _run(arguments: list[str], as_json: bool) -> int:
+    try:
+        return _ended(arguments, as_json)
+    except typer.Exit as stop:  # of a message that nobody reads
+        return stop.exit_code
+    except BrokenPipeError:
+        return closed_pipe()
+    except SystemExit as stop:
+        if not is_of_closed_pipe(stop):
+            raise
+        return closed_pipe()
+
+
+def _ended(arguments: list[str], as_json: bool) -> int:
+    """The exit status of a command that has run to its end, whatever that is."""
+    command = typer.main.get_command(app)
+    try:
+        status = command.main(arguments, prog_name="certify", standalone_mode=False)
+        if status == INTERRUPTED:  # what typer makes of Ctrl-C
+            return _fail(as_json, _STOPPED, INTERRUPTED)
+        return status if isinstance(status, int) else 0
+    except typer.Exit as stop:
+        return stop.exit_code
+    except typer.TyperException as error:  # usage
+        return _fail(as_json, error.format_message() if hasattr(error, "format_message") else str(error), 2)
+    except Interrupted as stop:
+        return _fail(as_json, str(stop), INTERRUPTED)
+    except (typer.Abort, KeyboardInterrupt):
+        return _fail(as_json, _STOPPED, INTERRUPTED)
+    except SoundnessError as error:
+        return _fail(as_json, f"internal error: {error}", 70)
+    except BackendError as error:  # another program's: a checker, a solver, a scheduler
+        return _fail(as_json, str(error), 70)
+    except OptionError as error:
+        commands: Mapping[str, Any] = getattr(command, "commands", {})
+        called = next((commands[name] for name in arguments if name in commands), command)
+        return _fail(as_json, as_typed(str(error), options_of(called)), 2)
+    except CertifyError as error:
+        return _fail(as_json, str(error), 2)
+    except BrokenPipeError:
+        return closed_pipe()
+    except Exception as error:  # the last resort: no traceback reaches a user
+        return _fail(as_json, f"internal error: {type(error).__name__}: {error}", 70)
+
+
+def _fail(as_json: bool, message: str, status: int) -> int:
+    if as_json:
+        say(json.dumps({"error": message}))
+    else:
+        tell(f"certify: {message}")
+    return status

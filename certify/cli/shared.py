@@ -1,0 +1,84 @@
+"""What several commands share: an option, a report on a certificate's bytes, a file written in one step."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from certify.errors import InputError
+
+if TYPE_CHECKING:
+    from certify.loop.plants import System
+
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
+Patient = Annotated[
+    bool, typer.Option("--patient", help="Take a certificate whose check may need hours, which is refused else.")
+]
+PolicyFile = Annotated[
+    Path | None, typer.Option("--policy", help="Policy file (.pt), or another program's (see certify import).")
+]
+PolicyArgument = Annotated[Path | None, typer.Argument(metavar="FILE", help="The policy file, as --policy FILE.")]
+PlantName = Annotated[
+    str | None,
+    typer.Option(
+        help="Plant: a name, FILE.toml, or FILE.py:NAME, whose code is run; default: what the policy file says."
+    ),
+]
+Domain = Annotated[
+    list[str] | None, typer.Option(help="Half-width NAME=D or interval NAME=LO..HI of a state; repeatable.")
+]
+Resume = Annotated[bool, typer.Option("--resume", help="Resume the search that an earlier run left in the folder.")]
+TimeLimit = Annotated[float, typer.Option(help="Seconds for everything up to the verdict, the check included.")]
+Results = Annotated[Path | None, typer.Option(help="Folder for the results; default: out/POLICY.")]
+Quiet = Annotated[bool, typer.Option("--quiet", help="No progress and no notices, errors only.")]
+
+
+def the_policy(context: typer.Context, file: Path | None, policy: Path | None) -> Path:
+    """The policy file, which is named as the argument or with --policy.
+
+    Raises
+    ------
+    InputError : it is named in neither way, or two files are.
+    """
+    if file is not None and policy is not None and file.resolve() != policy.resolve():
+        raise InputError(f"one policy file must be named; found {file} and --policy {policy}. Leave one of them out.")
+    found = policy if policy is not None else file
+    if found is None:
+        raise InputError(f"a policy file must be named, as in certify {context.info_name} policy.pt; found none.")
+    return found
+
+
+def page_of(raw: bytes, path: Path, answer: dict[str, Any] | None, data: dict[str, Any] | None) -> str:
+    """The report on a certificate's bytes, with the checker's answer about them and what the run says, if there are."""
+    from certify.report import drawn
+
+    return drawn.page_of(raw, path, answer, data)
+
+
+def describe(s: System) -> dict[str, Any]:
+    """A plant as plain values; equations, operating point and domain are those of the states' values."""
+    domain, x_eq, u_eq = s.domain_of_values(), s.exact_x_eq(), s.exact_u_eq()
+    return {
+        "name": s.name,
+        "description": s.description,
+        "time": s.time,
+        "states": [x.name for x in s.states],
+        "inputs": [u.name for u in s.inputs],
+        "parameters": {name: str(q) for name, q in s.parameters.items()},
+        "disturbances": [w.name for w in s.disturbances],
+        "ranges": {name: [str(lo), str(hi)] for name, (lo, hi) in s.ranges.items()},
+        "domain": {x.name: [str(lo), str(hi)] for x, (lo, hi) in zip(s.states, domain, strict=True)},
+        "input_bounds": {u.name: [str(lo), str(hi)] for u, (lo, hi) in zip(s.inputs, s.input_bounds, strict=True)},
+        "dynamics": {x.name: str(e) for x, e in zip(s.states, s.dynamics_of_values(), strict=True)},
+        "x_eq": {x.name: str(q) for x, q in zip(s.states, x_eq, strict=True)},
+        "u_eq": {u.name: str(q) for u, q in zip(s.inputs, u_eq, strict=True)},
+        "units": dict(s.units),
+    }
+
+
+def write(path: Path, text: str) -> None:
+    from certify.certificates import write_atomically
+
+    write_atomically(path, text.encode())

@@ -1,9 +1,0 @@
-"""The engine for a claim's outer set: falsifier, rules for boxes, a pass whose level gives way."""
-
-from __future__ import annotations
-
-from certify.engines.outer.falsify import Rise
-from certify.engines.outer.mend import split_again, split_face_again
-from certify.engines.outer.prove import Nothing, OuterProof, prove_outer
-
-__all__ = ["Nothing", "OuterProof", "Rise", "prove_outer", "split_again", "split_face_again"]

@@ -1,0 +1,195 @@
+"""Where a closed loop really rests when that is not the origin: enclosed by Krawczyk's test, with its eigenvalues.
+
+A policy that nobody centred has pi(0) near u_eq at best, and its loop rests beside the origin, if anywhere. Newton's
+method finds the point in floats, from the origin or from where a trajectory from there comes to; the test shows in Arb
+that exactly one point of rest lies in a box around it:
+`K = x0 - Y F(x0) + (I - Y J)(X - x0)` lies inside X, J being mean slopes of F on X and Y about the inverse of one.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from fractions import Fraction
+
+import flint
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.errors import InputError
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.rigorous import field_on, in_digits, policy_on, precision
+
+Array = NDArray[np.float64]
+_STEPS, _HALVINGS = 100, 30  # of Newton's method, and of a step that does not reduce ||F||
+_REFINEMENTS = 8  # in Arb, each by some ten digits
+_RADIUS = 1e-20  # of the box of the test, in the states' units
+_DIGITS = 12
+_BITS = 40  # of a point from which a loop is looked at
+_WHILE = 100.0  # of a trajectory, in the plant's unit of time
+_MOST_STEPS = 10_000  # of one: where F is no number, time stands still
+
+
+@dataclass(frozen=True, slots=True)
+class Rest:
+    """The only point of rest in a small box.
+
+    Parameters
+    ----------
+    x, u : decimals with 12 digits that are certain up to the last, or 0 for less than 1e-18, (n,) and (m,); x is in
+        deviations from the plant's operating point.
+    eigenvalues : of the Jacobian there, enclosed, in digits; empty if Arb cannot isolate them.
+    stable : whether all of them are certain to lie left of the axis.
+    """
+
+    x: tuple[str, ...]
+    u: tuple[str, ...]
+    eigenvalues: tuple[str, ...]
+    stable: bool
+
+
+def find_rest(loop: ClosedLoop) -> Rest | None:
+    """The point of rest that Newton's method reaches from the origin, or else from the end of a trajectory that starts
+    there, enclosed; None if there is none to be shown."""
+    for begin in (_origin, _end):
+        x0 = begin(loop)
+        start = None if x0 is None else _newton(loop, x0)
+        if start is not None:
+            return _enclosed(loop, start)
+    return None
+
+
+def seen_from(loop: ClosedLoop, rest: Rest) -> ClosedLoop:
+    """The same loop in deviations from where it rests, as near as 40 bits of the domain's widths come to it.
+
+    Raises
+    ------
+    InputError : the policy is centred or seen from elsewhere already, or the point does not lie in the interior of the
+        domain.
+    """
+    system, network = loop.system, loop.network
+    if network.centre != "none" or network.is_moved:
+        raise InputError("a loop that is to be seen from where it rests must have a policy without centring, as it is.")
+    by = [_short(Fraction(v), hi - lo) for v, (lo, hi) in zip(rest.x, system.domain, strict=True)]
+    u = [_short(Fraction(v), hi - lo) for v, (lo, hi) in zip(rest.u, system.input_bounds, strict=True)]
+    origin = np.array([float(q) for q in by])
+    if [Fraction(v) for v in origin.tolist()] != by:
+        raise InputError("a point from which a loop is seen must have coordinates in binary64.")
+    return ClosedLoop(system.seen_from(by, u), replace(network, origin=origin))
+
+
+def _short(q: Fraction, width: Fraction) -> Fraction:
+    """q to a multiple of 2^-40 times about a width."""
+    unit = Fraction(2) ** (width.numerator.bit_length() - width.denominator.bit_length() - _BITS)
+    return round(q / unit) * unit
+
+
+def _enclosed(loop: ClosedLoop, start: Array) -> Rest | None:
+    with precision():
+        x = [flint.arb(float(v)) for v in start]
+        for _ in range(_REFINEMENTS):
+            F, J = field_on(loop, x)
+            Y = _inverse(J)
+            if Y is None:
+                return None
+            step = Y * flint.arb_mat([[v] for v in F])
+            x = [(v - step[i, 0]).mid() for i, v in enumerate(x)]
+        box = [v + flint.arb(0, _RADIUS) for v in x]
+        if not _is_inside(loop, x, box):
+            return None
+        u, _ = policy_on(loop, box)
+        _, J = field_on(loop, box)
+        eigenvalues, stable = _spectrum(J)
+    return Rest(_decimals(box), _decimals(u), eigenvalues, stable)
+
+
+def _rates(loop: ClosedLoop) -> Callable[[Array], Array]:
+    """F in floats, (n,) to (n,)."""
+    f = loop.system.function()
+
+    def F(x: Array) -> Array:
+        with np.errstate(all="ignore"):
+            return np.asarray(f(x, loop.policy(x[None])[0]), dtype=np.float64)
+
+    return F
+
+
+def _origin(loop: ClosedLoop) -> Array:
+    return np.zeros(loop.system.n)
+
+
+def _end(loop: ClosedLoop) -> Array | None:
+    """Where the trajectory from the origin is after a while, however stiff the loop; None if it leaves the domain."""
+    import scipy.integrate
+
+    F, (lo, hi) = _rates(loop), np.array([[float(a), float(b)] for a, b in loop.system.domain]).T
+    with warnings.catch_warnings(action="ignore"):  # of steps that fail
+        solver = scipy.integrate.LSODA(lambda _, x: F(x), 0.0, _origin(loop), _WHILE, rtol=1e-6)
+        for _ in range(_MOST_STEPS):
+            solver.step()
+            x = np.asarray(solver.y, dtype=np.float64)
+            if solver.status == "failed" or not np.all((lo < x) & (x < hi)):
+                return None
+            if solver.status == "finished":
+                return x
+    return None
+
+
+def _newton(loop: ClosedLoop, x: Array) -> Array | None:
+    """A root of F in floats inside the domain, by Newton's method with halved steps; None if it finds none."""
+    F = _rates(loop)
+    lo, hi = np.array([[float(a), float(b)] for a, b in loop.system.domain]).T
+    value = F(x)
+    for _ in range(_STEPS):
+        steps = 1e-7 * np.maximum(1e-3, np.abs(x)) + 1e-9
+        J = np.stack([(F(x + d) - F(x - d)) / (2 * s) for s, d in zip(steps, np.diag(steps), strict=True)], axis=1)
+        if not np.all(np.isfinite(J)):
+            return None
+        step = np.linalg.lstsq(J, value, rcond=None)[0]
+        for _ in range(_HALVINGS):
+            new = F(x - step)
+            if np.all((x - step > lo) & (x - step < hi)) and np.linalg.norm(new) < np.linalg.norm(value):
+                break
+            step = step / 2
+        else:
+            break
+        x, value = x - step, new
+    return x if np.linalg.norm(value) < 1e-8 * (1 + np.linalg.norm(x)) else None
+
+
+def _inverse(J: flint.arb_mat) -> flint.arb_mat | None:
+    """About the inverse, entries without radius."""
+    middle = np.array([[float(J[i, j].mid()) for j in range(J.ncols())] for i in range(J.nrows())])
+    if not np.all(np.isfinite(middle)):
+        return None
+    try:
+        return flint.arb_mat(np.linalg.inv(middle).tolist())
+    except np.linalg.LinAlgError:
+        return None
+
+
+def _is_inside(loop: ClosedLoop, x: list[flint.arb], box: list[flint.arb]) -> bool:
+    """Krawczyk's test (Moore, Kearfott, Cloud, Introduction to Interval Analysis, SIAM 2009, chapter 8)."""
+    n = len(x)
+    F, _ = field_on(loop, x)
+    _, J = field_on(loop, box)
+    Y = _inverse(J)
+    if Y is None:
+        return False
+    identity = flint.arb_mat([[int(i == j) for j in range(n)] for i in range(n)])
+    spread = flint.arb_mat([[b - v] for b, v in zip(box, x, strict=True)])
+    K = flint.arb_mat([[v] for v in x]) - Y * flint.arb_mat([[v] for v in F]) + (identity - Y * J) * spread
+    return all(bool(box[i].contains_interior(K[i, 0])) for i in range(n))
+
+
+def _spectrum(J: flint.arb_mat) -> tuple[tuple[str, ...], bool]:
+    try:
+        found = list(flint.acb_mat(J).eig(multiple=True))
+    except (ValueError, ArithmeticError):
+        return (), False
+    return tuple(map(in_digits, found)), all(bool(v.real < 0) for v in found)
+
+
+def _decimals(values: list[flint.arb]) -> tuple[str, ...]:
+    return tuple("0" if v.contains(0) else v.str(_DIGITS, radius=False) for v in values)

@@ -1,0 +1,122 @@
+"""One walk over an expression for every arithmetic: rationals, Arb balls, Taylor models, jets.
+
+An arithmetic says what a constant is and how constants enter sums and products; everything else follows from its
+values' own `+`, `*`, `inverse` and functions. What the walk does not know it refuses: a node that slipped through
+as something else would be a proof about another plant.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from fractions import Fraction
+from functools import reduce
+from typing import Generic, TypeVar
+
+from certify.errors import InputError
+from certify.loop.expressions.gathering import gathered
+from certify.loop.expressions.tree import FUNCTIONS, GRAMMAR, Expression, Number, Operation, Symbol
+
+V = TypeVar("V")
+
+
+class Algebra(ABC, Generic[V]):
+    """What an arithmetic does with the nodes of an expression.
+
+    `total` and `product` get the constant of a sum or product apart from its other operands, which come in the
+    expression's order. A power is the square of the power of half the exponent, times the base if it is odd.
+    """
+
+    @abstractmethod
+    def constant(self, q: Fraction) -> V:
+        """The value of an exact number."""
+
+    def total(self, constant: Fraction | None, terms: Sequence[V]) -> V:
+        """Sum of one or more values."""
+        first = [] if constant is None else [self.constant(constant)]
+        return reduce(lambda a, b: a + b, [*first, *terms])  # type: ignore[operator]
+
+    def product(self, constant: Fraction | None, factors: Sequence[V]) -> V:
+        """Product of one or more values."""
+        first = [] if constant is None else [self.constant(constant)]
+        return reduce(lambda a, b: a * b, [*first, *factors])  # type: ignore[operator]
+
+    def inverse(self, value: V) -> V:
+        """1 / value."""
+        return value.inverse()  # type: ignore[attr-defined, no-any-return]
+
+    def function(self, name: str, value: V) -> V:
+        """One of `FUNCTIONS` by its name."""
+        if name == "tan":
+            return self.product(None, [self.function("sin", value), self.inverse(self.function("cos", value))])
+        return getattr(value, name)()  # type: ignore[no-any-return]
+
+    def power(self, base: V, exponent: int) -> V:
+        """`base ** exponent`, exponent >= 1."""
+        result = base
+        for bit in bin(exponent)[3:]:
+            result = self.product(None, [result, result])
+            if bit == "1":
+                result = self.product(None, [result, base])
+        return result
+
+
+def evaluate(
+    expression: Expression,
+    variables: Mapping[Symbol, V],
+    algebra: Algebra[V],
+    known: dict[Expression, V] | None = None,
+) -> V:
+    """The value of an expression of a plant; every operand is evaluated, also one that is multiplied by 0.
+
+    Parameters
+    ----------
+    variables : the values of its symbols.
+    known : subexpressions that are there already; filled on the way, so that calls can share them.
+
+    Raises
+    ------
+    InputError : a symbol without a value, a node outside the grammar, a division by a number that is 0.
+    """
+    known = {} if known is None else known
+    plain = gathered(expression)
+    waiting = [plain]
+    while waiting:
+        node = waiting[-1]
+        missing = [e for e in _operands(node) if e not in known] if node not in known else []
+        if missing:
+            waiting += reversed(missing)
+            continue
+        waiting.pop()
+        if node not in known:
+            known[node] = _value(node, variables, algebra, known)
+    return known[plain]
+
+
+def _operands(node: Expression) -> Sequence[Expression]:
+    """The operands that have values in an arithmetic: all but exponents and the number of a sum or product."""
+    return [e for e in node.operands if not isinstance(e, Number) or _is_function(node)]
+
+
+def _is_function(node: Expression) -> bool:
+    return isinstance(node, Operation) and node.operator in FUNCTIONS
+
+
+def _value(node: Expression, variables: Mapping[Symbol, V], algebra: Algebra[V], known: Mapping[Expression, V]) -> V:
+    if isinstance(node, Symbol):
+        if node not in variables:
+            raise InputError(f"the expression uses {node}, which has no value here.")
+        return variables[node]
+    if isinstance(node, Number):
+        return algebra.constant(node.value)
+    values = [known[e] for e in _operands(node)]
+    if isinstance(node, Operation):
+        if node.operator in ("+", "*"):
+            constant = next((e.value for e in node.operands if isinstance(e, Number)), None)
+            return (algebra.total if node.operator == "+" else algebra.product)(constant, values)
+        if node.operator == "**":
+            result = algebra.power(values[0], abs(node.exponent))
+            return result if node.exponent > 0 else algebra.inverse(result)
+        if node.operator in FUNCTIONS:
+            return algebra.function(node.operator, values[0])
+    raise InputError(f"{node!r} is outside the grammar; allowed are {GRAMMAR}.")

@@ -1,0 +1,557 @@
+"""How far the policy that a robot computes in binary32 can be from pi, which a certificate is about: a proven bound.
+
+A certificate speaks of the real function pi. A robot computes it with rounded numbers, in an order that its compiler
+or its library chooses. Nothing of that is looked at here but a model of it (Higham, Accuracy and Stability of Numerical
+Algorithms, sections 2.2 and 3.1): each operation has a relative error of 2^-24 at most, and a product in a sum passes
+through no more additions than the sum has, whatever the order. What an operation adds anew is then carried to the
+output by the mean value theorem, through the slopes that tanh has on a box of states and the errors around it.
+
+With ranges and slopes known on a box, let the computed values be y^_k before and h^_k behind the tanh of layer k. Then
+
+    net^(x) - net(x) = sum_k J_k (y^_k - W_k h^_(k-1) - b_k)
+                     + sum_k J_(k+1) W_(k+1) (h^_k - tanh(y^_k)) + J_1 W_1 (x^ - x)
+
+row by row, with J_k the derivative of net by y_k at points between values that are computed and ones that are exact
+from there on. All of these lie within E_k of y_k(x), E_k the error that layers up to k can make. The rows of J_k are
+held as a centre and what may be added to it, in two ways that are both good: entry by entry, and as a 2-norm, which in
+wide networks is far less than what entries add up to. All of it is done in Arb balls: no bound is itself rounded.
+"""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+
+import flint
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.errors import InputError, OptionError, SoundnessError
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.plants import System
+from certify.loop.policies import TanhNetwork
+from certify.loop.rigorous import Balls, ball, centring_with_errors, precision, rounded_up
+
+Array = NDArray[np.float64]
+Box = tuple[tuple[Fraction, Fraction], ...]
+
+_DIGITS = 24  # of binary32
+_UNIT = Fraction(1, 2**_DIGITS)
+_NORMAL = Fraction(1, 2**126)  # below it binary32 numbers lose digits, or are taken for 0
+_TINY = Fraction(1, 2**120)  # more than the few times 2^-126 that results and operands of one operation may lose there
+_LARGEST = Fraction(2**127)  # a factor of 2 below overflow
+_MOST_ULP = 2.0**20
+_MOST_BOXES, _MOST_WEIGHTS = 2**8, 2**20  # parts of the domain, and weights in all of them together
+_SQUARINGS = 4  # of W'W, in the bound of its largest eigenvalue
+
+
+@dataclass(frozen=True, slots=True)
+class FloatOptions:
+    """What is assumed of the arithmetic, and how much is spent on the bound.
+
+    Parameters
+    ----------
+    tanh_ulp : accuracy of tanh, in units in the last place of binary32 of the exact value.
+    chain : the most additions that one product passes through in a sum; None allows any order.
+    boxes : into how many parts the domain is cut; more of them give a smaller bound. None is as many as take seconds,
+        256 for a network of 4000 weights or less and one from a million on.
+
+    Raises
+    ------
+    InputError : a number is out of its range.
+    """
+
+    tanh_ulp: float = 4.0
+    chain: int | None = None
+    boxes: int | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.tanh_ulp <= _MOST_ULP:
+            raise OptionError(f"`tanh_ulp` must be a number from 0 to {_MOST_ULP:.0f}; found {self.tanh_ulp}.")
+        if self.chain is not None and self.chain < 1:
+            raise OptionError(f"`chain` must be at least 1, or be left out for any order; found {self.chain}.")
+        if self.boxes is not None and self.boxes < 1:
+            raise OptionError(f"`boxes` must be at least 1; found {self.boxes}.")
+
+
+@dataclass(frozen=True, slots=True)
+class Part:
+    """What one source adds to the bound of each input, (m,), in the inputs' units."""
+
+    source: str
+    errors: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class FloatError:
+    """Bounds of |binary32 policy - pi| on the domain.
+
+    Parameters
+    ----------
+    bounds : one an input, (m,), in its unit, rounded up.
+    parts : what they are made of, each where the bound of that input is largest; a clip adds none.
+    assumptions : what has to hold of the program that runs, in words.
+    boxes : into how many parts the domain was cut.
+    """
+
+    bounds: tuple[float, ...]
+    parts: tuple[Part, ...]
+    assumptions: tuple[str, ...]
+    boxes: int
+
+
+def float_error(network: TanhNetwork, system: System, options: FloatOptions | None = None) -> FloatError:
+    """Bound what computing the policy in binary32 changes in each input, for every state of the plant's domain.
+
+    Parameters
+    ----------
+    network : the policy; its binary64 numbers are rounded to binary32, which is part of the error.
+    system : the plant, whose domain holds the states, as deviations from x_eq.
+    options : what is assumed of the arithmetic; by default any order of summation and a tanh good to 4 units.
+
+    Raises
+    ------
+    InputError : policy and plant do not fit, a number or a sum may overflow in binary32, or no order of summation
+        has chains as short as `options.chain`.
+
+    Notes
+    -----
+    The bound is of single evaluations of pi. It says nothing of what a robot's sensors, its actuators and the time
+    between two evaluations change.
+
+    Source: Higham, Accuracy and Stability of Numerical Algorithms, 2nd edition, lemma 3.1 and section 3.1.
+
+    Examples
+    --------
+    >>> from certify import TanhNetwork, get_system
+    >>> law = TanhNetwork(([[-8.0, -2.0]],), ([0.0],), [1.0], [0.0], "identity", "none")
+    >>> found = float_error(law, get_system("pendulum"))
+    >>> 1e-6 < found.bounds[0] < 1e-4
+    True
+    """
+    options = options if options is not None else FloatOptions()
+    if network.is_moved:
+        raise InputError("`network` must be the policy as its layers read it; found one that is seen from elsewhere.")
+    loop = ClosedLoop(system, network)
+    with precision():
+        machine = _Machine.of(loop, options)
+        found = _refined(machine, system.domain, options.boxes)
+        worst = [_worst(found, j) for j in range(network.m)]
+        bounds = [rounded_up(errors.total(j)) for j, errors in enumerate(worst)]
+        if machine.clip_errors:  # min(max(v, lo), hi) moves by no more than the one of the three that moves most
+            bounds = [max(bound, *ends) for bound, ends in zip(bounds, machine.clip_errors, strict=True)]
+        parts = tuple(
+            Part(source, tuple(rounded_up(errors.parts[source][j]) for j, errors in enumerate(worst)))
+            for source in found[0].parts
+        )
+    return FloatError(tuple(bounds), parts, _assumptions(network, options), len(found))
+
+
+def _refined(machine: _Machine, domain: Box, boxes: int | None) -> list[_Errors]:
+    """The errors on the parts of the domain, which is cut always where the bound is largest."""
+    whole, ties = machine.errors(domain), itertools.count()
+    if boxes is None:
+        boxes = max(1, min(_MOST_BOXES, _MOST_WEIGHTS // machine.weights))
+
+    def rank(errors: _Errors) -> float:
+        return -max(float(errors.total(j) / whole.total(j)) for j in range(machine.m))
+
+    heap: list[tuple[float, int, Box, _Errors]] = [(rank(whole), next(ties), domain, whole)]
+    while len(heap) < boxes:
+        _, _, box, _ = heapq.heappop(heap)
+        widths = [float(hi - lo) * reach for (lo, hi), reach in zip(box, machine.reach, strict=True)]
+        i = widths.index(max(widths))
+        middle = (box[i][0] + box[i][1]) / 2
+        for half in ((box[i][0], middle), (middle, box[i][1])):
+            part = (*box[:i], half, *box[i + 1 :])
+            errors = machine.errors(part)
+            heapq.heappush(heap, (rank(errors), next(ties), part, errors))
+    return [errors for _, _, _, errors in heap]
+
+
+def _worst(found: Sequence[_Errors], j: int) -> _Errors:
+    """The errors of the part of the domain where the bound of input j, rounded up, is largest."""
+    bounds = [rounded_up(errors.total(j)) for errors in found]
+    if not all(map(math.isfinite, bounds)):  # the largest of numbers and NaN may be a number
+        raise SoundnessError(f"the bounds of input {j} must be finite where nothing overflows; found {bounds!s:.200}.")
+    return found[bounds.index(max(bounds))]
+
+
+@dataclass(frozen=True, slots=True)
+class _Errors:
+    """Bounds of the errors on a box by their source, each (m,), in their order."""
+
+    parts: dict[str, Balls]
+
+    def total(self, j: int) -> flint.arb:
+        """Their sum for an input."""
+        return sum((errors[j] for errors in self.parts.values()), flint.arb(0))
+
+
+@dataclass(frozen=True, slots=True)
+class _Layer:
+    """A layer's numbers, exact, and what they lose in binary32.
+
+    `weight`, `magnitude` (out, in); `bias` (out,) with what centring adds; `bias_size` bounds the magnitudes of the
+    terms that a program may keep it in. `growth` is what sums lose relative to their terms' magnitudes. `norm` bounds
+    ||weight||_2, `columns` (in,) the norms of its columns.
+    """
+
+    weight: flint.arb_mat
+    magnitude: flint.arb_mat
+    weight_error: flint.arb_mat
+    bias: Balls
+    bias_size: Balls
+    bias_error: Balls
+    growth: flint.arb
+    lost: flint.arb
+    norm: flint.arb
+    columns: Balls
+
+
+@dataclass(frozen=True, slots=True)
+class _Step:
+    """What a layer adds on a box: errors of its numbers and sums before the tanh, (out,), and behind it its tanh's,
+    with the slopes through which errors pass; both None without a tanh."""
+
+    numbers: Balls
+    sums: Balls
+    tanh: Balls | None
+    slopes: Balls | None
+
+
+@dataclass(frozen=True, slots=True)
+class _Machine:
+    """The policy with what a program in binary32 makes of its numbers; `reach` (n,) weighs the states for cuts."""
+
+    layers: tuple[_Layer, ...]
+    squash: bool
+    scale: Balls
+    scale_error: Balls
+    offset_size: Balls
+    offset_error: Balls
+    clip_errors: tuple[tuple[float, float], ...]
+    tanh_ulp: flint.arb
+    reach: tuple[float, ...]
+
+    @property
+    def m(self) -> int:
+        """Number of inputs."""
+        return len(self.scale)
+
+    @property
+    def weights(self) -> int:
+        """Number of weights."""
+        return sum(layer.weight.nrows() * layer.weight.ncols() for layer in self.layers)
+
+    @classmethod
+    def of(cls, loop: ClosedLoop, options: FloatOptions) -> _Machine:
+        """The machine of a closed loop's policy.
+
+        Raises
+        ------
+        InputError : a number overflows, or no sum has chains as short as asked for.
+        """
+        network = loop.network
+        shift, shift_error, offset, offset_error = centring_with_errors(loop)
+        layers = []
+        for k, (W, b) in enumerate(zip(network.weights, network.biases, strict=True)):
+            bias, size, error = _points(b), _points(np.abs(b)), _rounding(b, f"bias {k}")
+            terms = W.shape[1] + 1
+            if k == len(network.weights) - 1 and network.centre == "preactivation":
+                # kept as a number of its own or put into the bias: what covers the one covers the other
+                added = [flint.arb(float(s), float(e)) for s, e in zip(shift, shift_error, strict=True)]
+                bias = [v + s for v, s in zip(bias, added, strict=True)]
+                size = [v + s.abs_upper() for v, s in zip(size, added, strict=True)]
+                error = [v + 4 * ball(_UNIT) * s + ball(_TINY) for v, s in zip(error, size, strict=True)]
+                terms += 1
+            layers.append(_layer(W, bias, size, error, _growth(terms, options.chain), terms, k))
+        scale_error = _rounding(network.scale, "scale")
+        if network.centre == "output":
+            reals = [flint.arb(float(o), float(e)) for o, e in zip(offset, offset_error, strict=True)]
+            offset_size = [v.abs_upper() for v in reals]
+            error_of_offset = [2 * ball(_UNIT) * v + ball(_TINY) for v in offset_size]
+        else:
+            offset_size = _points(np.abs(network.offset))
+            error_of_offset = _rounding(network.offset, "offset")
+        clip: list[list[float]] = []
+        if network.clip is not None:
+            clip = [[rounded_up(e) for e in _rounding(end, "clip")] for end in network.clip]
+        return cls(
+            layers=tuple(layers),
+            squash=network.squash == "tanh",
+            scale=_points(network.scale),
+            scale_error=scale_error,
+            offset_size=offset_size,
+            offset_error=error_of_offset,
+            clip_errors=tuple(zip(*clip, strict=True)),
+            tanh_ulp=flint.arb(float(options.tanh_ulp)),
+            reach=tuple(np.abs(network.weights[0]).sum(axis=0).tolist()),
+        )
+
+    def errors(self, box: Box) -> _Errors:
+        """Bounds of the errors for all states of a box.
+
+        Raises
+        ------
+        InputError : a sum may overflow in binary32.
+        """
+        steps, entering, output = self._forward(box)
+        return self._backward(steps, entering, output)
+
+    def _forward(self, box: Box) -> tuple[list[_Step], Balls, Balls]:
+        """The layers' steps, the errors of the state itself, (n,), and those of the output map, (m,)."""
+        x = [ball(lo).union(ball(hi)) for lo, hi in box]
+        middle = [v.mid() for v in x]
+        away = [v - c for v, c in zip(x, middle, strict=True)]
+        n = len(x)
+        J = flint.arb_mat([[int(i == j) for j in range(n)] for i in range(n)])
+        for v in x:
+            _require_finite(v.abs_upper(), "a state")
+        entering = [ball(_UNIT) * v.abs_upper() + ball(_TINY) for v in x]
+        h, error, steps = x, entering, []
+        for k, layer in enumerate(self.layers):
+            size = [v.abs_upper() + e for v, e in zip(h, error, strict=True)]
+            off = _times(layer.weight_error, size)
+            terms = [p + q + b for p, q, b in zip(_times(layer.magnitude, size), off, layer.bias_size, strict=True)]
+            terms = [t + e for t, e in zip(terms, layer.bias_error, strict=True)]
+            numbers = [v + e for v, e in zip(off, layer.bias_error, strict=True)]
+            sums = [layer.growth * t + layer.lost for t in terms]
+            for t, s in zip(terms, sums, strict=True):
+                _require_finite(t + s, f"a sum in layer {k}")
+            error = [e + v + s for e, v, s in zip(_times(layer.magnitude, error), numbers, sums, strict=True)]
+            J = layer.weight * J
+            natural = [v + b for v, b in zip(_times(layer.weight, h), layer.bias, strict=True)]
+            middle = [v + b for v, b in zip(_times(layer.weight, middle), layer.bias, strict=True)]
+            y = [
+                v.intersection(c + d)  # the range by its own terms, and by its derivatives
+                for v, c, d in zip(natural, middle, _times(J, away), strict=True)
+            ]
+            if k == len(self.layers) - 1 and not self.squash:
+                steps.append(_Step(numbers, sums, None, None))
+                h = y
+                break
+            around = [_tanh(v + flint.arb(0, e)) for v, e in zip(y, error, strict=True)]
+            slopes = [_slope(t) for t in around]
+            fresh = [self.tanh_ulp * _ulp(t) + ball(_TINY) for t in around]
+            steps.append(_Step(numbers, sums, fresh, slopes))
+            h, middle = [_tanh(v) for v in y], [v.tanh() for v in middle]
+            J = flint.arb_mat([[s * J[i, j] for j in range(n)] for i, s in enumerate(map(_slope, h))])
+            error = [s.abs_upper() * e + f for s, e, f in zip(slopes, error, fresh, strict=True)]
+        return steps, entering, self._output([v.abs_upper() + e for v, e in zip(h, error, strict=True)])
+
+    def _output(self, size: Balls) -> Balls:
+        """Errors of `scale * . + offset` on values of these magnitudes, (m,)."""
+        twice, once, found = _growth(2, None), ball(_UNIT), []
+        for j, q in enumerate(size):
+            product = (self.scale[j].abs_upper() + self.scale_error[j]) * q
+            constant = self.offset_size[j] + self.offset_error[j]
+            rounding = twice * product + once * constant + 4 * ball(_TINY)
+            _require_finite(product + constant + rounding, "the output")
+            found.append(self.scale_error[j] * q + self.offset_error[j] + rounding)
+        return found
+
+    def _backward(self, steps: Sequence[_Step], entering: Balls, output: Balls) -> _Errors:
+        """What the errors of each step come to at the output."""
+        m, found = self.m, dict[str, Balls]()
+        rows = _Rows(
+            flint.arb_mat([[self.scale[j] if i == j else 0 for j in range(m)] for i in range(m)]),
+            flint.arb_mat(m, m),
+            [flint.arb(0)] * m,
+        )
+        for k in reversed(range(len(steps))):
+            step, layer = steps[k], self.layers[k]
+            if step.tanh is not None and step.slopes is not None:
+                found[f"layer {k}, tanh"] = rows.on(step.tanh)
+                rows = rows.through_tanh(step.slopes)
+            found[f"layer {k}, sums"] = rows.on(step.sums)
+            found[f"layer {k}, rounded numbers"] = rows.on(step.numbers)
+            rows = rows.through(layer)
+        return _Errors({"state": rows.on(entering)} | dict(reversed(found.items())) | {"output": output})
+
+
+@dataclass(frozen=True, slots=True)
+class _Rows:
+    """Derivatives (m, k) of the output: `centre`, a real matrix in its balls, and what may be added to it.
+
+    That is at most `spread` (m, k) entry by entry, and has at most the 2-norms `radius` (m,) row by row.
+    """
+
+    centre: flint.arb_mat
+    spread: flint.arb_mat
+    radius: Balls
+
+    def on(self, errors: Balls) -> Balls:
+        """The most that errors (k,) come to at the output, (m,)."""
+        length = _norm(errors)
+        direct, added = _times(_magnitude(self.centre), errors), _times(self.spread, errors)
+        return [(c + s.min(r * length)).upper() for c, s, r in zip(direct, added, self.radius, strict=True)]
+
+    def through_tanh(self, slopes: Balls) -> _Rows:
+        """The derivatives in front of tanh, whose slopes are in these balls, (k,)."""
+        m, columns = self.centre.nrows(), range(len(slopes))
+        middles, radii = [s.mid() for s in slopes], [flint.arb(s.rad()).upper() for s in slopes]
+        steepest = [s.abs_upper() for s in slopes]
+        largest = max(steepest, key=float)
+        fresh = [[self.centre[j, i].abs_upper() * radii[i] for i in columns] for j in range(m)]
+        spread = [[self.spread[j, i] * steepest[i] + fresh[j][i] for i in columns] for j in range(m)]
+        radius = [(r * largest + _norm(f)).min(_norm(s)) for r, f, s in zip(self.radius, fresh, spread, strict=True)]
+        centre = flint.arb_mat([[self.centre[j, i] * middles[i] for i in columns] for j in range(m)])
+        return _Rows(centre, flint.arb_mat(spread), radius)
+
+    def through(self, layer: _Layer) -> _Rows:
+        """The derivatives in front of an affine layer."""
+        product, m = self.spread * layer.magnitude, self.centre.nrows()
+        spread = [
+            [product[j, i].min(self.radius[j] * column) for i, column in enumerate(layer.columns)] for j in range(m)
+        ]
+        radius = [(r * layer.norm).min(_norm(s)) for r, s in zip(self.radius, spread, strict=True)]
+        return _Rows(self.centre * layer.weight, flint.arb_mat(spread), radius)
+
+
+def _layer(W: Array, bias: Balls, size: Balls, error: Balls, growth: flint.arb, terms: int, k: int) -> _Layer:
+    rows, columns = W.shape
+    lost = 2 * terms * ball(_TINY) * (1 + growth)
+    weight = flint.arb_mat([_points(row) for row in W])
+    return _Layer(
+        weight=weight,
+        magnitude=flint.arb_mat([_points(row) for row in np.abs(W)]),
+        weight_error=flint.arb_mat(rows, columns, _rounding(W.ravel(), f"weight {k}")),
+        bias=bias,
+        bias_size=size,
+        bias_error=error,
+        growth=growth,
+        lost=lost,
+        norm=_spectral_norm(weight),
+        columns=[_norm(_points(column)) for column in W.T],
+    )
+
+
+def _growth(terms: int, chain: int | None) -> flint.arb:
+    """(1 + u)^k - 1 of a sum of products and other terms: k one more than the additions that a product passes through.
+
+    Raises
+    ------
+    InputError : no order of the additions has such short chains.
+    """
+    longest, shortest = terms - 1, (terms - 1).bit_length()
+    if chain is not None and chain < shortest:
+        raise OptionError(
+            f"`chain` must be at least {shortest}: in a sum of {terms} terms some term passes through as many "
+            f"additions, in whatever order; found {chain}."
+        )
+    additions = longest if chain is None else min(chain, longest)
+    return (1 + ball(_UNIT)) ** (additions + 1) - 1
+
+
+def _rounding(numbers: Array, what: str) -> Balls:
+    """|fl(v) - v| of binary64 numbers, fl rounding to the nearest binary32 number, which 0 may stand for if it is tiny.
+
+    Raises
+    ------
+    InputError : one is too large for binary32.
+    """
+    if np.any(np.abs(numbers) >= float(_LARGEST)):
+        raise InputError(
+            f"{what} of the policy must lie below 2^127, or it may overflow in binary32; found "
+            f"{float(np.max(np.abs(numbers))):.3g}."
+        )
+    with np.errstate(under="ignore"):
+        single = numbers.astype(np.float32).astype(np.float64)
+    lost = np.where(np.abs(single) < float(_NORMAL), np.abs(single), 0.0)
+    return [
+        (flint.arb(float(v)) - flint.arb(float(s))).abs_upper() + flint.arb(float(z))
+        for v, s, z in zip(numbers, single, lost, strict=True)
+    ]
+
+
+def _require_finite(size: flint.arb, what: str) -> None:
+    """Refuse values that may overflow."""
+    if not size < ball(_LARGEST):
+        raise InputError(
+            f"{what} must stay below 2^127, or it may overflow in binary32; found up to {float(size.upper()):.3g} on "
+            "the domain. Make the domain smaller, or the policy's numbers."
+        )
+
+
+def _tanh(y: flint.arb) -> flint.arb:
+    """tanh of all of a ball: it rises, so that the ends have it; Arb's own is wide on wide balls."""
+    return y.lower().tanh().union(y.upper().tanh())
+
+
+def _slope(t: flint.arb) -> flint.arb:
+    """1 - t^2, the slope of tanh where its value is t."""
+    most, least = t.abs_upper(), t.abs_lower()
+    return (1 - most * most).union(1 - least * least)
+
+
+def _ulp(t: flint.arb) -> flint.arb:
+    """The unit in the last place of the largest binary32 number within t, |t| < 1 in truth."""
+    size = float(t.abs_upper())  # rounding does not lead below a power of two
+    exponent = math.frexp(size)[1] if size else -149
+    return flint.arb(2) ** max(min(exponent, 0) - _DIGITS, -149)
+
+
+def _spectral_norm(W: flint.arb_mat) -> flint.arb:
+    """A bound of ||W||_2: with G = W'W or WW', its largest eigenvalue is at most ||G^k||_F^(1/k)."""
+    wide = W.nrows() < W.ncols()
+    G, power = (W * W.transpose() if wide else W.transpose() * W), 1
+    for _ in range(_SQUARINGS):
+        G, power = G * G, 2 * power
+    length = _norm(G.entries())
+    return length if length == 0 else length.root(2 * power).upper()
+
+
+def _norm(v: Balls) -> flint.arb:
+    """A bound of the 2-norm."""
+    sizes = [x.abs_upper() for x in v]
+    return sum((s * s for s in sizes), flint.arb(0)).upper().sqrt().upper()
+
+
+def _magnitude(M: flint.arb_mat) -> flint.arb_mat:
+    return flint.arb_mat(M.nrows(), M.ncols(), [v.abs_upper() for v in M.entries()])
+
+
+def _times(M: flint.arb_mat, v: Balls) -> Balls:
+    return list((M * flint.arb_mat([[x] for x in v])).entries())
+
+
+def _points(numbers: Array) -> Balls:
+    return [flint.arb(float(v)) for v in numbers]
+
+
+def _assumptions(network: TanhNetwork, options: FloatOptions) -> tuple[str, ...]:
+    """What has to hold of the program that runs, in words."""
+    centring = {
+        "none": "",
+        "output": "; u_eq - scale * squash(net(0)) takes the place of the offset, right to one unit in its last place",
+        "preactivation": (
+            "; beta - net(0), right to one unit in its last place, is put into the last bias before that is rounded, "
+            "or is a term of its own"
+        ),
+    }[network.centre]
+    order = (
+        "in any order"
+        if options.chain is None
+        else f"in an order in which no product passes through more than {options.chain} additions"
+    )
+    used = len(network.weights) > 1 or network.squash == "tanh"
+    ulp = options.tanh_ulp
+    tanh = (
+        f"tanh of a binary32 number is within {ulp:g} units in the last place of the exact value t: within {ulp:g} * "
+        "2^(e-23) where 2^e <= |t| < 2^(e+1), so that its error is relative near 0, and near 1 at most "
+        f"{ulp:g} * 2^-24; below 2^-126 the unit is 2^-149"
+    )
+    return (
+        "operations are those of IEEE binary32, rounded to nearest, or more precise ones; numbers below 2^-126 may be "
+        "taken for 0",
+        f"weights, biases, scale, offset and clip are the file's, rounded to nearest{centring}",
+        "the state lies in the domain and is rounded to nearest once, as a deviation from x_eq",
+        f"each value of a layer is the sum of its products and its bias, {order}, with or without fused multiply-add",
+        *((tanh,) if used else ()),
+        "the output is scale * squash + offset" + ("" if network.clip is None else ", and the clip comes last"),
+    )

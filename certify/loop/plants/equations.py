@@ -1,0 +1,190 @@
+"""Equations as people write them, read by a small parser on Python's `ast`.
+
+Nothing in the text is executed, and `0.15` is 3/20, because numbers are read as text. The tree is that of the
+text: nothing is cancelled, merged or left out. What cannot be read is answered
+with the symbol that is at fault and what to write instead: equations are typed by hand, and most faults are slips.
+"""
+
+from __future__ import annotations
+
+import ast
+import difflib
+import re
+from collections.abc import Iterable, Mapping
+from fractions import Fraction
+
+from certify.errors import InputError
+from certify.loop.expressions import FUNCTIONS, MOST_EXPONENT, Expression, Number, constant_of, function, nodes
+from certify.loop.plants.spelling import instead_of, instead_of_call, instead_of_name
+from certify.loop.plants.system import exact
+
+_MOST_NODES, _MOST_DEPTH = 20_000, 200  # a certificate holds no more (FORMAT.md)
+_OPERATORS = "+ - * /, integer powers with **"
+
+
+def parse_expression(
+    text: str | int | Fraction, names: Mapping[str, Expression], known: str = "state, input or parameter"
+) -> Expression:
+    """An expression from text such as `(g/l)*sin(theta) - b/(m*l**2)*theta_dot`.
+
+    Parameters
+    ----------
+    names : what it may use: symbols, or expressions that a name stands for.
+    known : what these are, for messages.
+
+    Raises
+    ------
+    InputError : the text is no equation over them; the message names the symbol.
+    """
+    source = " ".join(str(text).split())  # a long equation may go over several lines
+    if not source.isascii():  # Python would read a bold or a wide x as x
+        odd = next(c for c in source if not c.isascii())
+        raise InputError(f"equation {source!r}: letters, digits and signs must be plain ASCII; found {odd!r}.")
+    if "#" in source:  # Python would leave out what follows, and the plant would be another
+        raise InputError(f"equation {source!r}: # begins no comment here; put comments outside the text.")
+    try:
+        tree = ast.parse(source, mode="eval")
+        if any(isinstance(node, ast.BitXor) for node in ast.walk(tree)):
+            raise InputError(f"equation {source!r}: `^` is no power here; write ** as in x**2.")
+        found = _Reader(source, names, known).read(tree.body)
+    except (SyntaxError, RecursionError, ValueError, MemoryError) as error:
+        if isinstance(error, InputError):
+            raise
+        hint = "; for a power write **, not ^" if "^" in source else ""
+        hint = "; there are no cases: write one formula" if re.search(r"\bif\b", source) else hint
+        reason = error.msg if isinstance(error, SyntaxError) else str(error)
+        raise InputError(f"equation {source!r} cannot be read: {reason}{hint}.") from error
+    if found.depth > _MOST_DEPTH:
+        raise InputError(f"equation {source!r}: written out it must nest at most {_MOST_DEPTH} deep; it nests deeper.")
+    if _size(found) > _MOST_NODES:
+        raise InputError(f"equation {source!r}: written out it must have at most {_MOST_NODES:,} terms; it has more.")
+    return found
+
+
+def _size(expression: Expression) -> int:
+    """Nodes of the tree, which may be many more than those of the names that it is written with."""
+    known: dict[Expression, int] = {}
+    for node in nodes(expression):
+        known[node] = 1 + sum(known[e] for e in node.operands)
+    return known[expression]
+
+
+def nearest(name: str, known: Iterable[str]) -> str:
+    """`; did you mean 'theta'?` if one of the known names is close, else nothing.
+
+    >>> nearest("thta", ["theta", "omega"]), nearest("q", ["theta"])
+    ("; did you mean 'theta'?", '')
+    """
+    close = difflib.get_close_matches(name, list(known), n=1, cutoff=0.6)
+    return f"; did you mean {close[0]!r}?" if close else ""
+
+
+def decimal(text: str) -> Fraction:
+    """The exact value of a decimal literal; one like 1e999999 must not become an integer of a million digits.
+
+    Raises
+    ------
+    InputError : it is not a finite decimal number, or far out of range.
+    """
+    plain = text.replace("_", "")
+    exponent = plain.lower().partition("e")[2]
+    try:
+        far = bool(exponent) and abs(int(exponent)) > 400
+    except ValueError as error:
+        raise InputError(f"number {text!r} must be a decimal such as 0.15 or 1e-3.") from error
+    if far:
+        raise InputError(f"number {text} is out of range.")
+    try:
+        return exact(plain)
+    except InputError as error:
+        raise InputError(f"number {text!r} must be a finite decimal such as 0.15 or 1e-3.") from error
+
+
+class _Reader:
+    def __init__(self, source: str, names: Mapping[str, Expression], known: str) -> None:
+        self.source, self.names, self.known = source, names, known
+
+    def read(self, node: ast.expr) -> Expression:
+        if isinstance(node, ast.Constant) and isinstance(node.value, int | float) and not isinstance(node.value, bool):
+            return Number(decimal(self._text(node)))
+        if isinstance(node, ast.Name):
+            return self._name(node.id)
+        if isinstance(node, ast.UnaryOp) and isinstance(node.op, ast.USub | ast.UAdd):
+            operand = self.read(node.operand)
+            return -operand if isinstance(node.op, ast.USub) else operand
+        if isinstance(node, ast.Call):
+            return self._call(node)
+        if isinstance(node, ast.BinOp):
+            return self._operation(node)
+        raise self._refuse(
+            instead_of(node, self._text(node))
+            or f"{self._text(node)!r} is not allowed; allowed are the plant's names, numbers, {_OPERATORS}, "
+            f"and the functions {', '.join(FUNCTIONS)}"
+        )
+
+    def _name(self, name: str) -> Expression:
+        if name in self.names:
+            return self.names[name]
+        if name in FUNCTIONS:
+            raise self._refuse(f"the function {name} must have its argument in brackets, as in {name}(x)")
+        instead = instead_of_name(name)
+        if instead is not None:
+            raise self._refuse(f"{name!r} is no {self.known}; {instead}")
+        close = nearest(name, self.names) or f"; known are {', '.join(self.names) or 'none'}"
+        raise self._refuse(f"{name!r} is no {self.known}{close}")
+
+    def _call(self, node: ast.Call) -> Expression:
+        name = self._text(node.func)
+        if not isinstance(node.func, ast.Name) or name not in FUNCTIONS:
+            instead = instead_of_call(name, [self._text(a) for a in node.args], FUNCTIONS)
+            if instead is not None and name not in self.names:
+                raise self._refuse(instead)
+            product = name in self.names or not isinstance(node.func, ast.Name | ast.Attribute)
+            what = f"{name} is no function; for a product write {name}*(...)" if product else ""
+            raise self._refuse(what or f"the function {name} is not supported; supported are {', '.join(FUNCTIONS)}")
+        if node.keywords or len(node.args) != 1:
+            raise self._refuse(f"{name} takes one argument; found {self._text(node)!r}")
+        return function(name, self.read(node.args[0]))
+
+    def _operation(self, node: ast.BinOp) -> Expression:
+        left, right = self.read(node.left), self.read(node.right)
+        if isinstance(node.op, ast.Add):
+            return left + right
+        if isinstance(node.op, ast.Sub):
+            return left - right
+        if isinstance(node.op, ast.Mult):
+            return left * right
+        if isinstance(node.op, ast.Div):
+            if self._number(right) == 0:
+                raise self._refuse(f"{self._text(node)!r} divides by 0")
+            return left / right
+        if isinstance(node.op, ast.Pow):
+            return self._power(left, self._number(right), node)
+        raise self._refuse(f"the operator of {self._text(node)!r} is not allowed; allowed are {_OPERATORS}")
+
+    def _power(self, base: Expression, exponent: Fraction | None, node: ast.BinOp) -> Expression:
+        if exponent is None or exponent.denominator != 1 or not abs(exponent) <= MOST_EXPONENT:
+            raise self._refuse(
+                f"the exponent of {self._text(node)!r} must be an integer of at most {MOST_EXPONENT}; "
+                f"found {self._text(node.right) if exponent is None else exponent}"
+            )
+        if exponent == 0:
+            raise self._refuse(f"{self._text(node)!r} is 1 wherever it has a value; write 1")
+        if exponent < 0 and self._number(base) == 0:
+            raise self._refuse(f"{self._text(node)!r} divides by 0")
+        return base ** int(exponent)
+
+    def _number(self, expression: Expression) -> Fraction | None:
+        try:
+            return constant_of(expression)
+        except InputError as error:
+            raise self._refuse(str(error)) from error
+
+    def _text(self, node: ast.AST) -> str:
+        if not isinstance(node, ast.expr):
+            return self.source
+        return self.source[node.col_offset : node.end_col_offset]  # of one line, in ASCII
+
+    def _refuse(self, message: str) -> InputError:
+        end = "" if message.endswith("?") else "."
+        return InputError(f"equation {self.source!r}: {message}{end}")

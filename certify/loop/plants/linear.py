@@ -1,0 +1,101 @@
+"""The plant near its operating point: A, B, and how many directions its inputs reach.
+
+Exact where rationals allow it: a rank computed in floats is an opinion about a tolerance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+
+import flint
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.errors import InputError
+from certify.loop.expressions import Expression, Number, Symbol, differentiate, numerical, substitute, value_if_rational
+from certify.loop.plants.system import System
+
+Matrix = tuple[tuple[Expression, ...], ...]
+"""Rows of constants: a `Number` where the entry is rational, else an expression without symbols."""
+
+
+def linearise(system: System) -> tuple[Matrix, Matrix]:
+    """(df/dx, df/du) of the nominal plant at x = 0 and u_eq, exact; shapes (n, n) and (n, m).
+
+    Raises
+    ------
+    InputError : a derivative divides by 0 there, or takes the root of a number that is not positive.
+    """
+    at = dict.fromkeys(system.states, Fraction(0)) | dict(zip(system.inputs, system.exact_u_eq(), strict=True))
+    try:
+        A, B = (
+            tuple(tuple(_constant(differentiate(e, s), at) for s in by) for e in system.exact_dynamics())
+            for by in (system.states, system.inputs)
+        )
+    except InputError as error:
+        raise InputError(f"the equations of {system.name} have no derivative at the origin: {error}.") from error
+    return A, B
+
+
+def in_floats(matrix: Matrix) -> NDArray[np.float64]:
+    """The matrix rounded to binary64."""
+    return np.array([numerical(row, [])() for row in matrix], dtype=np.float64)
+
+
+def _constant(slope: Expression, at: dict[Symbol, Fraction]) -> Expression:
+    value = value_if_rational(slope, at)
+    return substitute(slope, {s: Number(q) for s, q in at.items()}) if isinstance(value, str) else Number(value)
+
+
+_NOISE = 1e-11  # of singular values over the largest: below it they are rounding
+
+
+@dataclass(frozen=True, slots=True)
+class Controllability:
+    """Rank of [B, AB, ..., A^(n-1) B].
+
+    Parameters
+    ----------
+    rank : of n directions of the state space, how many the inputs reach.
+    exact : whether it was computed in rationals.
+    smallest : where it was not, the smallest singular value over the largest, of the matrix with A divided by its norm.
+    """
+
+    rank: int
+    exact: bool
+    smallest: float | None
+
+    def __post_init__(self) -> None:
+        if self.exact != (self.smallest is None):
+            raise InputError("a rank is either exact or comes with the smallest singular value that it rests on.")
+
+
+def _rationals(rows: list[list[Fraction]]) -> flint.fmpq_mat:
+    return flint.fmpq_mat([[flint.fmpq(q.numerator, q.denominator) for q in row] for row in rows])
+
+
+def controllability(A: Matrix, B: Matrix) -> Controllability:
+    """How many directions of the state space the inputs reach (Kalman's rank condition).
+
+    >>> zero, one = Number(0), Number(1)
+    >>> controllability(((zero, one), (zero, zero)), ((zero,), (one,)))
+    Controllability(rank=2, exact=True, smallest=None)
+    """
+    n, m = len(A), len(B[0])
+    entries = [[[e.value for e in row if isinstance(e, Number)] for row in M] for M in (A, B)]
+    if all(len(row) == width for M, width in zip(entries, (n, m), strict=True) for row in M):
+        step, columns = map(_rationals, entries)
+        blocks = [columns]
+        for _ in range(n - 1):
+            blocks.append(step * blocks[-1])
+        whole = flint.fmpq_mat([[v for M in blocks for v in M.tolist()[i]] for i in range(n)])
+        return Controllability(int(whole.rank()), True, None)
+    a, b = in_floats(A), in_floats(B)
+    size = float(np.linalg.norm(a, 2)) or 1.0
+    terms = [b]
+    for _ in range(n - 1):
+        terms.append(a @ terms[-1] / size)  # columns are not scaled: one that is rounding alone must stay small
+    values = np.linalg.svd(np.hstack(terms), compute_uv=False)
+    values = values / (values[0] or 1.0)
+    return Controllability(int((values > _NOISE).sum()), False, float(values[-1]))

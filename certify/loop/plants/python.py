@@ -1,0 +1,73 @@
+"""A plant of one's own in Python: `my_plant.py:plant`.
+
+Reading it runs its code, with all that code may do. So nothing here is called for a name that stands in a file, only
+for what a person typed on the command line (`registry.chosen_system`).
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from contextlib import redirect_stdout
+from pathlib import Path
+
+from certify.errors import CertifyError, InputError
+from certify.loop.plants.equations import nearest
+from certify.loop.plants.system import System
+from certify.loop.plants.toml import require_equilibrium
+
+
+def load_python_system(path: Path, name: str) -> System:
+    """The plant that `name` of the Python file is: a System, or a function without arguments that returns one.
+
+    Raises
+    ------
+    InputError : the file cannot be run, has no such name, or the name is no plant; an x_eq that is no equilibrium.
+    """
+    if not path.is_file():
+        raise InputError(f"system file {path} cannot be read: there is no such file.")
+    spec = importlib.util.spec_from_file_location("certify_plant_of_ones_own", path)
+    if spec is None or spec.loader is None:
+        raise InputError(f"system file {path} must be a Python file, with the ending .py.")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = module  # dataclasses look their module up
+    writes, sys.dont_write_bytecode = sys.dont_write_bytecode, True  # somebody's folder stays as it is
+    try:
+        with redirect_stdout(sys.stderr):  # standard output is for results
+            spec.loader.exec_module(module)
+            found = getattr(module, name, None)
+            made = found() if callable(found) and not isinstance(found, System) else found
+    except CertifyError as error:
+        raise InputError(f"{path}: {error}") from error
+    except (Exception, SystemExit) as error:  # another's code may raise anything, and its exit status is no verdict
+        line = _line(error, path)
+        raise InputError(f"{path}{line}: running it raises {type(error).__name__}: {error}.") from error
+    finally:
+        sys.dont_write_bytecode = writes
+        sys.modules.pop(spec.name, None)
+    if found is None:
+        public = [key for key in vars(module) if not key.startswith("_")]
+        close = nearest(name, public) or "; give a System, or a function without arguments that returns one."
+        raise InputError(f"{path} has no {name!r}{close}")
+    if not isinstance(made, System):
+        raise InputError(
+            f"`{name}` in {path} must be a System or a function without arguments that returns one; "
+            f"it gives {type(made).__name__}."
+        )
+    if any(made.exact_x_eq()):
+        require_equilibrium(made, lambda message: InputError(f"`{name}` in {path}: {message}"))
+    return made
+
+
+def _line(error: BaseException, path: Path) -> str:
+    """`, line N` of the file where the error arose, if it is in the file at all."""
+    if isinstance(error, SyntaxError):
+        return f", line {error.lineno}" if error.lineno else ""
+    traceback, line = error.__traceback__, None
+    while traceback is not None:
+        if Path(traceback.tb_frame.f_code.co_filename) == path.resolve() or (
+            traceback.tb_frame.f_code.co_filename == str(path)
+        ):
+            line = traceback.tb_lineno
+        traceback = traceback.tb_next
+    return "" if line is None else f", line {line}"

@@ -1,0 +1,115 @@
+"""The text of a plant's file beside what was read from it, so that an error can say where in the file it is.
+
+tomllib gives values without their places. They are found again in the text, line by line; where that fails, as it may
+in an inline table, the line of the table is named, and failing that none: a line is help, never a condition.
+"""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from certify.errors import InputError
+from certify.loop.plants.equations import decimal, nearest
+
+_TABLE = re.compile(r"\s*\[([^\[\]]+)\]")
+_ENTRY = re.compile(r"""\s*((?:["']?[A-Za-z0-9_-]+["']?\s*\.\s*)*["']?[A-Za-z0-9_-]+["']?)\s*=""")
+
+
+@dataclass(frozen=True, slots=True)
+class PlantFile:
+    """A TOML file of a plant, or of a study: its values, and where they stand.
+
+    Parameters
+    ----------
+    path : of the file, for messages.
+    data : the document; decimal numbers are exact fractions.
+    lines : line of each key, by its dotted path.
+    """
+
+    path: Path
+    data: Mapping[str, Any]
+    lines: Mapping[str, int] = field(repr=False)
+
+    def refuse(self, message: str, *keys: str) -> InputError:
+        """The error that `message` is at this key: file, line, key, and what is wrong."""
+        line = next((self.lines[k] for k in _upwards(keys) if k in self.lines), None)
+        where = f"{self.path}, line {line}" if line is not None else str(self.path)
+        return InputError(f"{where}{': ' + '.'.join(keys) if keys else ''}: {message}")
+
+    def table(self, name: str) -> Mapping[str, Any]:
+        """The table `name`, empty if there is none.
+
+        Raises
+        ------
+        InputError : it is something else.
+        """
+        found = self.data.get(name, {})
+        if not isinstance(found, dict):
+            raise self.refuse(f"must be a table, [{name}] with an entry a line; found {found!r}.", name)
+        return found
+
+    def require_known(self, name: str, known: Mapping[str, str] | list[str], what: str) -> None:
+        """Refuse entries of the table `name` that are none of `known`, which is called `what`."""
+        for key in self.table(name):
+            if key not in known:
+                close = nearest(key, known) or f"; known are {', '.join(known) or 'none'}."
+                raise self.refuse(f"{key!r} is no {what}{close}", name, key)
+
+
+def read_plant_file(path: Path, what: str = "system file") -> PlantFile:
+    """Read a TOML file; `what` is what messages call it.
+
+    Raises
+    ------
+    InputError : it is missing, not TOML, or holds a number that is no finite decimal.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"{what} {path} cannot be read: {error}.") from error
+    odd: list[str] = []
+
+    def number(literal: str) -> Any:
+        try:
+            return decimal(literal)  # decimal text goes to Fraction unrounded
+        except InputError:
+            odd.append(literal)
+            raise
+
+    try:
+        data = tomllib.loads(text, parse_float=number)
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{what} {path} is not valid TOML: {error}.") from error
+    except InputError as error:
+        line = next(i for i, content in enumerate(text.splitlines(), 1) if odd[0] in content)
+        raise InputError(f"{path}, line {line}: {error}") from error
+    except ValueError as error:  # an integer of thousands of digits
+        raise InputError(f"{what} {path} cannot be read: {error}.") from error
+    return PlantFile(path, data, _lines(text))
+
+
+def _lines(text: str) -> dict[str, int]:
+    found: dict[str, int] = {}
+    table: list[str] = []
+    for number, line in enumerate(text.splitlines(), 1):
+        if header := _TABLE.match(line):
+            table = _parts(header.group(1))
+            found.setdefault(".".join(table), number)
+        elif entry := _ENTRY.match(line):
+            keys = table + _parts(entry.group(1))
+            for k in range(len(table) + 1, len(keys) + 1):
+                found.setdefault(".".join(keys[:k]), number)
+    return found
+
+
+def _parts(dotted: str) -> list[str]:
+    return [part.strip().strip("\"'") for part in dotted.split(".")]
+
+
+def _upwards(keys: tuple[str, ...]) -> list[str]:
+    return [".".join(keys[:k]) for k in range(len(keys), 0, -1)]

@@ -1,0 +1,282 @@
+"""A plant of one's own, described in TOML. See `examples/plants`.
+
+The file speaks of values as people measure them: equations, operating point and domain are in absolute states, and it
+is here that they become deviations from x_eq. Every error says the line, the entry and what is expected there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, cast, get_args
+
+from certify.errors import InputError
+from certify.loop.expressions import FUNCTIONS, Expression, Number, Symbol, substitute, symbols, value_if_rational
+from certify.loop.plants.equations import nearest, parse_expression
+from certify.loop.plants.source import PlantFile, read_plant_file
+from certify.loop.plants.system import Interval, System, Time, exact, in_deviations
+
+_REQUIRED = ("name", "states", "inputs", "dynamics", "u_eq", "domain", "input_bounds")
+_KEYS = (
+    *_REQUIRED,
+    "description",
+    "parameters",
+    "disturbances",
+    "positive",
+    "where",
+    "x_eq",
+    "units",
+    "training",
+    "time",
+)
+_ROUNDED = 1e-12  # of a residual with functions at other points than 0, which rationals do not decide
+
+
+def load_system(path: Path) -> System:
+    """Read a plant from a TOML file. Its table `training` is the trainer's, and not looked at.
+
+    Raises
+    ------
+    InputError : the file is missing or not TOML, a key is unknown or absent, an equation is outside the grammar, or
+        x_eq is no equilibrium. The message names file, line and entry.
+    """
+    return build_system(read_plant_file(path))
+
+
+def build_system(file: PlantFile) -> System:
+    """The plant of a file that was read; raises as `load_system` does."""
+    for key in file.data:
+        if key not in _KEYS:
+            close = nearest(key, _KEYS) or f"; known are {', '.join(_KEYS)}."
+            raise file.refuse(f"unknown keys are refused: {key!r} is none of a plant's{close}", key)
+    missing = [key for key in _REQUIRED if key not in file.data]
+    if missing:
+        raise file.refuse(f"missing keys: a plant must have {', '.join(missing)}.")
+    name, description, time = _text(file, "name"), _text(file, "description"), _time(file)
+    states, inputs = _names(file, "states"), _names(file, "inputs")
+    parameters = {p: number_at(file, value, "parameters", p) for p, value in file.table("parameters").items()}
+    acting = {w: _disturbance(file, w) for w in file.table("disturbances")}
+    everything = [*states, *inputs, *parameters, *acting]
+    for key, names in (
+        ("states", states),
+        ("inputs", inputs),
+        ("parameters", list(parameters)),
+        ("disturbances", list(acting)),
+    ):
+        twice = next((name for name in names if everything.count(name) > 1), None)
+        if twice is not None:
+            raise file.refuse(
+                f"names of states, inputs, parameters and disturbances must differ; found {twice!r} twice.", key
+            )
+    file.require_known("units", everything, "state, input, parameter or disturbance")
+    for table, names, what in (
+        ("dynamics", states, "state"),
+        ("domain", states, "state"),
+        ("x_eq", states, "state"),
+        ("u_eq", inputs, "input"),
+        ("input_bounds", inputs, "input"),
+    ):
+        file.require_known(table, names, what)
+    try:
+        symbol = dict(zip(everything, symbols(everything), strict=True))
+        constants = {p: symbol[p] for p in parameters}
+        x_eq = [_equation(file, "x_eq", s, constants, "parameter", 0) for s in states]
+        shorthand = _shorthand(file, symbol)
+        known = "state, input, parameter or disturbance" + (", and not defined in [where] above" if shorthand else "")
+        dynamics = [_equation(file, "dynamics", s, symbol | shorthand, known) for s in states]
+        u_eq = [_equation(file, "u_eq", s, constants, "parameter") for s in inputs]
+        for s, e in zip(inputs, u_eq, strict=True):
+            _at_rest(file, "u_eq", s, e, parameters)
+        system = System(
+            name=name,
+            description=description,
+            states=tuple(symbol[s] for s in states),
+            inputs=tuple(symbol[s] for s in inputs),
+            parameters=parameters,
+            positive=frozenset(_list(file, "positive")),
+            dynamics=in_deviations(dynamics, [symbol[s] for s in states], x_eq, time),
+            time=time,
+            u_eq=tuple(u_eq),
+            domain=tuple(_domain(file, s, e, parameters) for s, e in zip(states, x_eq, strict=True)),
+            input_bounds=tuple(_interval(file, "input_bounds", s) for s in inputs),
+            units={name: _unit(file, name) for name in file.table("units")},
+            x_eq=tuple(x_eq),
+            disturbances=tuple(symbol[w] for w in acting),
+            ranges={w: interval for w, interval in acting.items() if interval is not None},
+        )
+    except InputError as error:
+        if str(file.path) in str(error):
+            raise
+        raise file.refuse(str(error)) from error
+    if "x_eq" in file.data:
+        require_equilibrium(system, lambda message: file.refuse(message, "x_eq"))
+    return system
+
+
+def require_equilibrium(system: System, refuse: Callable[[str], InputError] = InputError) -> None:
+    """Refuse a plant that does not rest at its operating point; `refuse` makes the error of a message.
+
+    Raises
+    ------
+    InputError : f(x_eq, u_eq) is not 0; the message has the residual of each state by its name.
+    """
+    off = {name: r for name, r in system.residuals().items() if _is_off(r)}
+    if off:
+        shown = ", ".join(_residual(system, name, r) for name, r in off.items())
+        raise refuse(
+            f"x_eq of {system.name} must be an equilibrium, f(x_eq, u_eq) = {system.rests_where}; found {shown}. "
+            "Correct x_eq or u_eq."
+        )
+
+
+def _is_off(residual: Fraction | float) -> bool:
+    return residual != 0 if isinstance(residual, Fraction) else not abs(residual) <= _ROUNDED
+
+
+def _residual(system: System, name: str, residual: Fraction | float) -> str:
+    exactly = f" (exactly {residual})" if isinstance(residual, Fraction) and len(str(residual)) <= 40 else ""
+    unit = system.units.get(name, "")
+    if system.time == "discrete":
+        return f"{name} moves by {float(residual):.6g}{exactly}{unit and f' {unit}'} in a step"
+    return f"{name}' = {float(residual):.6g}{exactly}" + (f" in {unit} per second" if unit else "")
+
+
+def _shorthand(file: PlantFile, symbol: Mapping[str, Symbol]) -> dict[str, Expression]:
+    """The table `where`: names for expressions that equations share, each over the plant's names and those above."""
+    found: dict[str, Expression] = {}
+    for name in file.table("where"):
+        if name in symbol or name in FUNCTIONS or not name.isidentifier():
+            raise file.refuse("must be a new name, and no state, input, parameter or function.", "where", name)
+        found[name] = _equation(file, "where", name, {**symbol, **found}, "name of the plant or of a line above")
+    return found
+
+
+def _time(file: PlantFile) -> Time:
+    """`continuous` unless the file says `discrete`."""
+    found = file.data.get("time", "continuous")
+    for known in get_args(Time):
+        if found == known:
+            return cast("Time", known)
+    raise file.refuse(f"must be one of {', '.join(get_args(Time))}; found {found!r}.", "time")
+
+
+def _equation(
+    file: PlantFile, table: str, name: str, symbol: Mapping[str, Expression], known: str, default: int | None = None
+) -> Expression:
+    entries = file.table(table)
+    if name not in entries:
+        if default is not None:
+            return Number(default)
+        raise file.refuse(f'there must be an equation for {name}; none was found. Write {name} = "...".', table)
+    value = entries[name]
+    if isinstance(value, bool) or not isinstance(value, str | int | Fraction):
+        raise file.refuse(f"must be an equation as text, or a number; found {value!r}.", table, name)
+    try:
+        return parse_expression(value, symbol, known)
+    except InputError as error:
+        raise file.refuse(str(error), table, name) from error
+
+
+def _domain(file: PlantFile, name: str, x_eq: Expression, parameters: Mapping[str, Fraction]) -> Interval:
+    """The interval of a state's values as one of deviations."""
+    lo, hi = _interval(file, "domain", name)
+    at = _at_rest(file, "x_eq", name, x_eq, parameters)
+    if not lo < at < hi:
+        raise file.refuse(
+            f"the domain must have the operating point {name} = {float(at):g} in its interior; "
+            f"found [{float(lo):g}, {float(hi):g}].",
+            "domain",
+            name,
+        )
+    return lo - at, hi - at
+
+
+def _at_rest(
+    file: PlantFile, table: str, name: str, expression: Expression, parameters: Mapping[str, Fraction]
+) -> Fraction:
+    """The value of an entry of x_eq or u_eq."""
+    point = substitute(expression, {Symbol(p): Number(q) for p, q in parameters.items()})
+    try:
+        value = value_if_rational(point, {})
+    except InputError as error:
+        raise file.refuse(f"the operating point has no value: {error}.", table, name) from error
+    if isinstance(value, str):
+        raise file.refuse(
+            f"the operating point must be rational, because the equilibrium is decided in rationals; found {point}. "
+            "Choose parameters for which it is, or make it a parameter itself.",
+            table,
+            name,
+        )
+    return value
+
+
+def _disturbance(file: PlantFile, name: str) -> Interval | None:
+    """The range of a disturbance: a half-width or a pair; None where it is 0, unless somebody asks for it."""
+    value = file.table("disturbances")[name]
+    if isinstance(value, list):
+        return _interval(file, "disturbances", name)
+    half = number_at(file, value, "disturbances", name)
+    if half < 0:
+        raise file.refuse(
+            f"must be a half-width that is not negative, or a pair [lo, hi]; found {value!r}.", "disturbances", name
+        )
+    return (-half, half) if half else None
+
+
+def _interval(file: PlantFile, table: str, name: str) -> Interval:
+    value = file.table(table).get(name)
+    if name not in file.table(table):
+        raise file.refuse(f"there must be bounds of {name}; none were found. Write {name} = [lo, hi].", table)
+    if not isinstance(value, list) or len(value) != 2:
+        raise file.refuse(f"the bounds of {name} must be a pair [lo, hi]; found {value!r}.", table, name)
+    lo, hi = (number_at(file, end, table, name) for end in value)
+    if not lo < hi:
+        where = "interior: the bounds" if table == "domain" else "bounds"
+        raise file.refuse(
+            f"the {where} of {name} must satisfy lo < hi; found [{float(lo):g}, {float(hi):g}].", table, name
+        )
+    return lo, hi
+
+
+def number_at(file: PlantFile, value: Any, *keys: str) -> Fraction:
+    """The exact number that stands in a file at this key.
+
+    Raises
+    ------
+    InputError : it is none.
+    """
+    if isinstance(value, bool) or not isinstance(value, int | str | Fraction):
+        raise file.refuse(f"must be a number such as 0.15 or the text '3/20'; found {value!r}.", *keys)
+    try:
+        return exact(value, keys[-1])
+    except InputError as error:
+        raise file.refuse(str(error), *keys) from error
+
+
+def _text(file: PlantFile, key: str) -> str:
+    value = file.data.get(key, "")
+    if not isinstance(value, str):
+        raise file.refuse(f"must be text; found {value!r}.", key)
+    return value
+
+
+def _unit(file: PlantFile, name: str) -> str:
+    value = file.table("units")[name]
+    if not isinstance(value, str):
+        raise file.refuse(f"must be a unit as text, such as 'rad/s'; found {value!r}.", "units", name)
+    return value
+
+
+def _names(file: PlantFile, key: str) -> list[str]:
+    names = _list(file, key)
+    if not names:
+        raise file.refuse("must name at least one; found none.", key)
+    return names
+
+
+def _list(file: PlantFile, key: str) -> list[str]:
+    value = file.data.get(key, [])
+    if not isinstance(value, list) or not all(isinstance(name, str) for name in value):
+        raise file.refuse(f'must be a list of names, as in ["x1", "x2"]; found {value!r}.', key)
+    return value

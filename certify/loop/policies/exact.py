@@ -1,0 +1,117 @@
+"""What follows exactly from a policy's form: the bounds of its inputs, and pi(0). Decided in rationals."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from fractions import Fraction
+
+import numpy as np
+
+from certify.errors import InputError
+from certify.loop.policies.network import TanhNetwork
+
+_NEAR = 1e-9
+
+
+def bounded_by_form(network: TanhNetwork, bounds: Sequence[tuple[Fraction, Fraction]]) -> bool:
+    """True if squash, centring and clip keep every input in its bounds `(lo, hi)`, whatever the state.
+
+    The clip comes last and is monotone: of a range [a, b] before it, it leaves the range between what it makes of a and
+    of b. That need not lie in [a, b], because the clip may lie elsewhere.
+    """
+    known = network.squash == "tanh" and network.centre != "output"
+    middles, reaches = ([Fraction(float(v)) for v in end] for end in (network.offset, network.scale))
+    ranges = [(o - abs(s), o + abs(s)) for o, s in zip(middles, reaches, strict=True)]
+    if network.clip is not None:
+        low, high = ([Fraction(float(v)) for v in end] for end in network.clip)
+        limits = list(zip(low, high, strict=True))
+        clipped = [tuple(min(max(v, lo), hi) for v in ends) for ends, (lo, hi) in zip(ranges, limits, strict=True)]
+        ranges = [(a, b) for a, b in clipped] if known else limits
+    elif not known:
+        return False
+    return all(lo <= a and b <= hi for (a, b), (lo, hi) in zip(ranges, bounds, strict=True))
+
+
+def raw_at_origin(network: TanhNetwork) -> tuple[Fraction | None, ...]:
+    """raw(0) as rationals, (m,), x = 0 being the network's origin; None where a tanh stands at another point than 0.
+
+    A weight of exact 0 removes a value that is not known.
+    """
+    h: list[Fraction | None] = [Fraction(float(v)) for v in network.origin]
+    last = len(network.weights) - 1
+    for k, (W, b) in enumerate(zip(network.weights, network.biases, strict=True)):
+        y = [_affine(row, h, float(c)) for row, c in zip(W, b, strict=True)]
+        h = [_tanh(v) for v in y] if k < last or network.squash == "tanh" else y
+    return tuple(
+        None if v is None else Fraction(float(s)) * v + Fraction(float(o))
+        for v, s, o in zip(h, network.scale, network.offset, strict=True)
+    )
+
+
+def at_origin(network: TanhNetwork) -> tuple[Fraction | None, ...]:
+    """pi(0) of a policy without centring as rationals, (m,); None where raw(0) is not known."""
+    raw = raw_at_origin(network)
+    if network.clip is None:
+        return raw
+    ends = ([Fraction(float(v)) for v in end] for end in network.clip)
+    return tuple(None if v is None else min(max(v, lo), hi) for v, lo, hi in zip(raw, *ends, strict=True))
+
+
+def require_centred(network: TanhNetwork, u_eq: Sequence[Fraction], names: Sequence[str] = ()) -> None:
+    """Refuse a policy whose `pi(0) = u_eq` does not hold exactly; `names` are what the message calls its inputs.
+
+    Raises
+    ------
+    InputError : u_eq lies outside the squash's range (centre `preactivation`) or not strictly inside the clip, or
+        pi(0) is another number or not a rational (centre `none`).
+    """
+    if network.centre == "preactivation":
+        network.ratios(u_eq)
+    if network.centre != "none":
+        network.require_unclipped(u_eq)
+        return
+    for j, (value, u) in enumerate(zip(at_origin(network), u_eq, strict=True)):
+        if value != u:
+            named = f"input {names[j]}" if names else f"input {j}"
+            found = _found(value, float(network(np.zeros(network.n), u_eq)[j]), float(u))
+            raise InputError(
+                f"the policy is not centred: pi(0), what it commands at the operating point, must be exactly "
+                f"u_eq = {float(u):.12g}; its {named} is {found}. Shift it by the difference with "
+                f"{_centrings(network, u_eq)}, or ask for less with --claim practical, which needs no rest there."
+            )
+
+
+def _found(value: Fraction | None, about: float, wanted: float) -> str:
+    """pi(0) of an input in words, `about` being it in floats."""
+    if value is not None:
+        return f"{float(value)!r}, exactly {_short(value)}"
+    near = math.isclose(about, wanted, rel_tol=_NEAR, abs_tol=_NEAR)
+    tanh = ", and whether exactly that cannot be decided: tanh at the operating point gives no fraction" if near else ""
+    return f"about {about:.9g}{tanh}"
+
+
+def _centrings(network: TanhNetwork, u_eq: Sequence[Fraction]) -> str:
+    """The options that centre it: inside the squash only if it can come to u_eq there."""
+    reaches = zip(u_eq, network.scale.tolist(), network.offset.tolist(), strict=True)
+    inside = network.squash == "tanh" and all(abs(float(u) - o) < abs(s) for u, s, o in reaches)
+    return "--centre output" + " or --centre preactivation" * inside
+
+
+def _affine(row: Sequence[float], h: Sequence[Fraction | None], bias: float) -> Fraction | None:
+    total = Fraction(bias)
+    for w, v in zip(row, h, strict=True):
+        if w != 0 and v != 0:
+            if v is None:
+                return None
+            total += Fraction(float(w)) * v
+    return total
+
+
+def _tanh(v: Fraction | None) -> Fraction | None:
+    return v if v == 0 else None
+
+
+def _short(q: Fraction) -> str:
+    text = str(q)
+    return text if len(text) <= 60 else "a longer fraction"

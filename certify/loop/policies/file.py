@@ -1,0 +1,234 @@
+"""The policy file `certify-policy/1`, or with a clip or bounds of validity `certify-policy/2`: plain tensors only.
+
+Nothing in a file is executed, and equal policies give equal bytes (see `certify.loop.plain_file`).
+"""
+
+from __future__ import annotations
+
+import shlex
+import zipfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any, cast
+
+import numpy as np
+
+from certify.errors import InputError
+from certify.loop.plain_file import array_in, layers_in, origin_in, read_plain, require_keys, tensors, write_plain
+from certify.loop.policies.network import Array, Centre, Squash, TanhNetwork
+
+FORMAT = "certify-policy/1"
+# The same with `output.clip`, a pair of tensors, or `valid`, a tensor (n, 2), or both; others stay version 1.
+SECOND = "certify-policy/2"
+_KEYS = {"format", "activation", "weights", "biases", "output", "centre", "system"}
+_OPTIONAL = {"training", "beta", "valid"}
+_WHAT = "policy file"
+_START = 4096
+_COMES_FROM = (
+    "A policy file comes from controllers train, or from another program's file through certify import FILE "
+    "--system PLANT --out policy.pt."
+)
+_BETA_ROUNDING = 2.0**-20  # of tanh(beta): a few operations in single precision
+
+
+@dataclass(frozen=True, slots=True)
+class Policy:
+    """A network with the plant it was trained for.
+
+    Parameters
+    ----------
+    network : the policy itself.
+    system : name of the plant.
+    parameters : parameters of the plant as text or numbers (text means its decimal value).
+    training : how it was made (seed, steps, versions, A, B, K ...); never trusted, may be empty.
+    beta : rounded `atanh((u_eq - offset) / scale)` stored by another program, shape (m,), or None;
+        the proof uses the real number and reports the shift.
+    valid : bounds of each state, shape (n, 2), infinite where there is none, or None: only between them is the network
+        what it was made from, because there no observation is clipped. A plant's domain must be cut to them before
+        anything is proved; `certify roa` does so.
+
+    Raises
+    ------
+    InputError : the bounds are not n pairs lo < 0 < hi, or bound nothing.
+    """
+
+    network: TanhNetwork
+    system: str
+    parameters: Mapping[str, float | int | str] = field(default_factory=dict)
+    training: Mapping[str, Any] = field(default_factory=dict)
+    beta: Array | None = None
+    valid: Array | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "parameters", MappingProxyType(dict(self.parameters)))
+        object.__setattr__(self, "training", MappingProxyType(dict(self.training)))
+        if self.valid is not None:
+            valid = np.array(self.valid, dtype=np.float64)
+            if valid.shape != (self.network.n, 2) or np.all(np.isinf(valid)):
+                raise InputError(f"`valid` must be bounds of shape ({self.network.n}, 2); found {valid.tolist()}.")
+            if not (np.all(valid[:, 0] < 0) and np.all(valid[:, 1] > 0)):
+                raise InputError(
+                    "the states where no observation is clipped must surround the origin; "
+                    f"found the bounds {valid.tolist()}."
+                )
+            valid.setflags(write=False)
+            object.__setattr__(self, "valid", valid)
+
+    def beta_shift(self, u_eq: Sequence[Fraction]) -> float:
+        """What reading the stored beta as the real number changes in u at the origin, in the input's units.
+
+        Raises
+        ------
+        InputError : the stored beta is another number than the real one rounded.
+        """
+        if self.beta is None:
+            return 0.0
+        network, ratios = self.network, np.array([float(q) for q in self.network.ratios(u_eq)])
+        off = np.abs(np.tanh(self.beta) - ratios)
+        if not np.all(off <= _BETA_ROUNDING):
+            j = int(np.argmax(off))
+            raise InputError(
+                f"`beta` must be atanh((u_eq - offset) / scale) up to rounding, {network.beta(u_eq)[j]:.9g} for input "
+                f"{j}; the file has {self.beta[j]:.9g}, which shifts u(0) by {abs(network.scale[j]) * off[j]:.3g}. "
+                "Was it trained for other parameters?"
+            )
+        return float(np.max(np.abs(network.scale) * off))
+
+
+def save_policy(path: str | Path, policy: Policy) -> None:
+    """Write `policy` to `path` in one step; the same policy gives the same bytes.
+
+    Raises
+    ------
+    InputError : the file cannot be written.
+    """
+    import torch
+
+    network, depth = policy.network, len(policy.network.weights)
+    if network.is_moved:
+        raise InputError("a policy must be written as its layers read it; found one that is looked at from elsewhere.")
+    arrays = (*network.weights, *network.biases, network.scale, network.offset, *(network.clip or ()))
+    numbers = tensors(arrays)
+    scale, offset, *clip = numbers[2 * depth :]
+    data: dict[str, Any] = {
+        "format": FORMAT if network.clip is None and policy.valid is None else SECOND,
+        "activation": "tanh",
+        "weights": numbers[:depth],
+        "biases": numbers[depth : 2 * depth],
+        "output": {"squash": network.squash, "scale": scale, "offset": offset},
+        "centre": network.centre,
+        "system": {"name": policy.system, "parameters": dict(policy.parameters)},
+        "training": dict(policy.training),
+    }
+    if network.clip is not None:
+        data["output"]["clip"] = clip
+    if policy.valid is not None:
+        data["valid"] = torch.tensor(policy.valid, dtype=torch.float64)
+    if policy.beta is not None:
+        data["beta"] = torch.tensor(policy.beta, dtype=torch.float64)
+    write_plain(path, data, _WHAT)
+
+
+def load_policy(path: str | Path) -> Policy:
+    """Read a policy file.
+
+    Raises
+    ------
+    InputError : the file is missing, is not an archive of plain tensors, does not follow `certify-policy/1` or
+        `certify-policy/2`, or is another program's; then the message says how to import it.
+    """
+    try:
+        data = read_plain(path, _WHAT)
+    except InputError as error:
+        raise InputError(_other(Path(path)) or str(error)) from error
+    if not isinstance(data, dict) or "format" not in data:
+        found = f"a file of torch.save without `format`, a {type(data).__name__}"
+        raise InputError(_to_import(Path(path), found))
+    try:
+        return _policy(data)
+    except InputError as error:
+        raise InputError(f"policy file {path}: {error}") from error
+
+
+def is_text(raw: bytes) -> bool:
+    """Whether bytes are text that a person could read, by how they begin."""
+    start = raw[:_START]
+    try:
+        words = start.decode("utf-8")
+    except UnicodeDecodeError as error:
+        if error.start < len(start) - 3:  # a letter may be cut off at the end
+            return False
+        words = start[: error.start].decode("utf-8")
+    return bool(words) and all(c.isprintable() or c in "\t\r\n\f" for c in words)
+
+
+def _other(path: Path) -> str | None:
+    """The message for a file that is no policy file of this program, if its bytes say what it is."""
+    try:
+        with path.open("rb") as file:
+            raw = file.read(_START)
+            names = set(zipfile.ZipFile(file).namelist()) if raw.startswith(b"PK") else set()
+    except (OSError, ValueError, zipfile.BadZipFile, NotImplementedError):
+        return None
+    if {"data", "policy.pth"} <= names:
+        return _to_import(path, "a zip file of stable-baselines3")
+    if any("/code/" in name for name in names):
+        return _to_import(path, "a file of TorchScript")
+    if any(name.endswith("/data.pkl") for name in names):
+        return _to_import(path, "a file of torch.save with more than plain tensors in it")
+    if path.suffix == ".onnx":
+        return _to_import(path, "an ONNX model")
+    if path.suffix == ".safetensors" or raw[8:9] == b"{":
+        return _to_import(path, "a file of safetensors")
+    if is_text(raw):
+        return f"{_WHAT} {path} must hold a policy; it is text. {_COMES_FROM}"
+    return None
+
+
+def _to_import(path: Path, found: str) -> str:
+    """The message for a file that another program wrote, with the command to type."""
+    file, out = (shlex.quote(str(p)) for p in (path, f"{path.stem}-policy.pt"))
+    return (
+        f"{_WHAT} {path} must be one of this program; it is {found} (nothing in it was executed). If it holds a "
+        f"policy, import it first, for the plant that it controls: certify import {file} --system PLANT --out {out}. "
+        "The import asks for what the file does not say."
+    )
+
+
+def _policy(data: Any) -> Policy:
+    found = data.get("format") if isinstance(data, dict) else type(data).__name__
+    if not isinstance(data, dict) or found not in (FORMAT, SECOND):
+        raise InputError(f"`format` must be {FORMAT!r} or {SECOND!r}; found {found!r}.")
+    keys, output = set(data), data.get("output")
+    parts = {"squash", "scale", "offset"}
+    if found == SECOND and isinstance(output, dict) and ("clip" in output or "valid" not in keys):
+        parts |= {"clip"}  # one of the two is what makes a file version 2
+    if found == FORMAT and "valid" in keys:
+        raise InputError(f"`valid` must go with format {SECOND!r}; found {FORMAT!r}.")
+    require_keys(data, _KEYS, _OPTIONAL)
+    if data["activation"] != "tanh":
+        raise InputError(f"`activation` must be 'tanh'; found {data['activation']!r}. Only tanh networks are proved.")
+    if not isinstance(output, dict) or set(output) != parts:
+        raise InputError(f"`output` of {found} must be a dictionary with exactly {', '.join(sorted(parts))}.")
+    clip = output.get("clip", ())
+    if not isinstance(clip, list | tuple) or len(clip) != (2 if "clip" in parts else 0):
+        raise InputError("`output.clip` must be a list of two tensors, lo and hi.")
+    system, parameters, training = origin_in(data)
+    weights, biases = layers_in(data)
+    network = TanhNetwork(
+        weights=weights,
+        biases=biases,
+        scale=array_in(output["scale"], "output.scale"),
+        offset=array_in(output["offset"], "output.offset"),
+        squash=cast(Squash, output["squash"]),
+        centre=cast(Centre, data["centre"]),
+        clip=cast(Any, tuple(array_in(end, "output.clip") for end in clip) or None),
+    )
+    beta = array_in(data["beta"], "beta") if "beta" in data else None
+    if beta is not None and (beta.shape != (network.m,) or network.centre != "preactivation"):
+        raise InputError(f"`beta` must have shape ({network.m},) and goes with centre 'preactivation'.")
+    valid = array_in(data["valid"], "valid") if "valid" in data else None
+    return Policy(network, system, parameters, training, beta, valid)

@@ -1,0 +1,368 @@
+"""Folding: a file's steps as the one form that is proved, layers with tanh between them, then scale, offset and a clip.
+
+What several steps make of one number of the network is computed exactly, in rationals, and rounded once to the nearest
+binary64; where a normaliser divides by the square root of a rational that is no square, the number is enclosed in Arb
+until both ends of the enclosure round to the same binary64. So the policy that is proved is the folded one, and it
+differs from the file's real-number policy by at most half a unit in the last place of each weight, bias, scale and
+offset. A layer that stands alone keeps its numbers as they are.
+
+A clip of the observation does not fold. It is inactive on a box of states, which is given out beside the network:
+inside the box the folded policy is the real one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+
+import flint
+import numpy as np
+
+from certify.errors import InputError
+from certify.loop.policies.importers.options import WITH_TANH
+from certify.loop.policies.importers.steps import Affine, Clip, Diagonal, Normalise, Step, Tanh, spread
+from certify.loop.policies.network import Array, Squash
+
+Bounds = tuple[Fraction | None, Fraction | None]
+_BITS = (128, 512, 2048, 8192)
+_ROOT_BITS = 128
+_NO_BOUNDS: Bounds = (None, None)
+
+
+@dataclass(frozen=True, slots=True)
+class Folded:
+    """The numbers of a policy `clip(scale * squash(net(o)) + offset)` and where the observation is not clipped.
+
+    Parameters
+    ----------
+    weights, biases : the layers, shapes (out, in) and (out,).
+    scale, offset : shape (m,).
+    squash : `tanh` or `identity`.
+    clip : (lo, hi), shapes (m,), or None.
+    inactive : for each observation the exact bounds within which no clip of it acts, rounded inwards where they are no
+        rationals; None for a side without a bound.
+    """
+
+    weights: tuple[Array, ...]
+    biases: tuple[Array, ...]
+    scale: Array
+    offset: Array
+    squash: Squash
+    clip: tuple[Array, Array] | None
+    inactive: tuple[Bounds, ...]
+
+
+def fold(steps: Sequence[Step], n: int) -> Folded:
+    """Fold the steps from n observations to the action.
+
+    Raises
+    ------
+    InputError : the steps are no tanh network with a clip at its ends, or their shapes do not chain.
+    """
+    first = next((k for k, step in enumerate(steps) if isinstance(step, Affine)), None)
+    if first is None:
+        raise InputError("a policy must have a layer; the file has none.")
+    head, inactive = _head(steps[:first], n)
+    *hidden, last = _segments(steps[first:])
+    tail = last
+    layers: list[tuple[Array, Array]] = []
+    width = n
+    for k, segment in enumerate(hidden):
+        if not k:
+            layers.append(_layer(head, segment, width))
+        elif any(isinstance(step, Affine) for step in segment):
+            layers.append(_layer(None, segment, width))
+        else:
+            raise InputError("between two tanh there must be a layer; the file has two tanh in a row.")
+        width = len(layers[-1][1])
+    ends = [k for k, step in enumerate(last) if isinstance(step, Affine)]
+    squash: Squash = "tanh"
+    if ends:
+        layers.append(_layer(head if not hidden else None, last[: ends[-1] + 1], width))
+        width, squash, tail = len(layers[-1][1]), "identity", last[ends[-1] + 1 :]
+    scale, offset, clip = _tail(tail, width, squash)
+    return Folded(
+        tuple(w for w, _ in layers), tuple(b for _, b in layers), scale, offset, squash, clip, tuple(inactive)
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class _Head:
+    """What comes before the first layer: `o -> factor * (o - mean) / sqrt(square) + offset`, componentwise."""
+
+    factor: tuple[Fraction, ...]
+    mean: tuple[Fraction, ...]
+    square: tuple[Fraction, ...]
+    offset: tuple[Fraction, ...]
+
+    @property
+    def is_nothing(self) -> bool:
+        return all(v == 1 for v in (*self.factor, *self.square)) and not any((*self.mean, *self.offset))
+
+
+def _head(steps: Sequence[Step], n: int) -> tuple[_Head, list[Bounds]]:
+    zero, one = (Fraction(0),) * n, (Fraction(1),) * n
+    head, bounds = _Head(one, zero, one, zero), [_NO_BOUNDS] * n
+    for step in steps:
+        match step:
+            case Diagonal():
+                scale, offset = spread(step.scale, n), spread(step.offset, n)
+                head = _Head(
+                    tuple(s * f for s, f in zip(scale, head.factor, strict=True)),
+                    head.mean,
+                    head.square,
+                    tuple(s * o + t for s, o, t in zip(scale, head.offset, offset, strict=True)),
+                )
+            case Normalise():
+                # Before it there may be shifts only, such as that of the operating point.
+                if any(v != 1 for v in (*head.factor, *head.square)) or any(b != _NO_BOUNDS for b in bounds):
+                    raise InputError("a normaliser must read the observation itself.")
+                before = head.offset
+                mean = tuple(m - t for m, t in zip(spread(step.mean, n), before, strict=True))
+                head = _Head(one, mean, spread(step.square, n), zero)
+                if step.limit is not None:
+                    bounds = [_preimage(head, i, (-step.limit, step.limit), _NO_BOUNDS) for i in range(n)]
+            case Clip():
+                limits = zip(spread(step.lo, n), spread(step.hi, n), strict=True)
+                bounds = [_preimage(head, i, limit, bounds[i]) for i, limit in enumerate(limits)]
+            case _:
+                raise InputError("a policy must begin with a layer; the file has a tanh before the first one.")
+    return head, bounds
+
+
+def _preimage(head: _Head, i: int, limit: Bounds, known: Bounds) -> Bounds:
+    """The observations i that `head` takes into `limit`, within `known`; rounded inwards where they are irrational."""
+    factor, ends = head.factor[i], list[Fraction | None]()
+    if factor == 0:
+        raise InputError("an observation that is multiplied by 0 must not be clipped.")
+    for side, value in enumerate(limit if factor > 0 else limit[::-1]):
+        if value is None:
+            ends.append(known[side])
+            continue
+        distance = (value - head.offset[i]) / factor
+        square = distance**2 * head.square[i]
+        root = _root(square)
+        if root is None:
+            # A larger lower end and a smaller upper end are inside.
+            up = (side == 0) == (distance > 0)
+            root = _root_towards(square, up)
+        end = head.mean[i] + (root if distance > 0 else -root)
+        ends.append(_larger(known[0], end) if side == 0 else _smaller(known[1], end))
+    lo, hi = ends
+    if lo is not None and hi is not None and not lo < hi:
+        raise InputError("the clips of the observation leave no states on which none of them acts.")
+    return lo, hi
+
+
+def _larger(a: Fraction | None, b: Fraction | None) -> Fraction | None:
+    return b if a is None else a if b is None else max(a, b)
+
+
+def _smaller(a: Fraction | None, b: Fraction | None) -> Fraction | None:
+    return b if a is None else a if b is None else min(a, b)
+
+
+def _root(square: Fraction) -> Fraction | None:
+    """The square root of a rational if it is one."""
+    up, down = math.isqrt(square.numerator), math.isqrt(square.denominator)
+    return Fraction(up, down) if up * up == square.numerator and down * down == square.denominator else None
+
+
+def _root_towards(square: Fraction, up: bool) -> Fraction:
+    """A rational above (or below) the square root of a rational that is no square, at most 2^-128 from it."""
+    scaled = square.numerator * square.denominator << 2 * _ROOT_BITS
+    return Fraction(math.isqrt(scaled) + up, square.denominator << _ROOT_BITS)
+
+
+def _segments(steps: Sequence[Step]) -> list[list[Step]]:
+    """The steps between one tanh and the next."""
+    segments: list[list[Step]] = [[]]
+    for step in steps:
+        if isinstance(step, Tanh):
+            segments.append([])
+        else:
+            segments[-1].append(step)
+    return segments
+
+
+def _layer(head: _Head | None, segment: Sequence[Step], width: int) -> tuple[Array, Array]:
+    """One layer from all steps of a segment, and from `head` before them."""
+    for step in segment:
+        if isinstance(step, Clip):
+            relu = all(v == 0 for v in step.lo) and all(v is None for v in step.hi)
+            found = "ReLU" if relu else "a clip"
+            after = f" {WITH_TANH}" if relu else ""
+            raise InputError(f"the activation must be tanh; the file has {found} between its layers.{after}")
+        if isinstance(step, Normalise):
+            raise InputError("a normaliser must read the observation itself.")
+    if len(segment) == 1 and isinstance(segment[0], Affine) and (head is None or head.is_nothing):
+        _require_width(segment[0].weight, width)
+        return segment[0].weight, segment[0].bias
+    weight, bias = _product(segment, width)
+    if head is None:
+        head = _Head(*((Fraction(v),) * width for v in (1, 0, 1, 0)))
+    return _behind(head, weight, bias)
+
+
+def _product(segment: Sequence[Step], width: int) -> tuple[flint.fmpq_mat, list[Fraction]]:
+    """The exact weight and bias of affine steps that follow each other."""
+    weight: flint.fmpq_mat | None = None
+    scale, bias = [Fraction(1)] * width, [Fraction(0)] * width  # a diagonal, as long as there is no weight
+    for step in segment:
+        if isinstance(step, Affine):
+            _require_width(step.weight, len(bias))
+            matrix = _matrix(step.weight)
+            shifted = matrix * _column(bias)
+            out = matrix.nrows()
+            bias = [_fraction(shifted[i, 0]) + Fraction(float(step.bias[i])) for i in range(out)]
+            diagonal = flint.fmpq_mat(width, width, [0] * width**2) if weight is None else None
+            if diagonal is not None:
+                for i, s in enumerate(scale):
+                    diagonal[i, i] = _rational(s)
+            weight = matrix * (weight if diagonal is None else diagonal)
+        elif isinstance(step, Diagonal):
+            scales, offsets = spread(step.scale, len(bias)), spread(step.offset, len(bias))
+            bias = [s * b + o for s, b, o in zip(scales, bias, offsets, strict=True)]
+            if weight is None:
+                scale = [s * t for s, t in zip(scales, scale, strict=True)]
+            else:
+                rows = range(weight.nrows())
+                entries = [_rational(scales[i]) * weight[i, j] for i in rows for j in range(weight.ncols())]
+                weight = flint.fmpq_mat(weight.nrows(), weight.ncols(), entries)
+    if weight is None:
+        raise InputError("between two tanh there must be a layer; the file has none there.")
+    return weight, bias
+
+
+def _behind(head: _Head, weight: flint.fmpq_mat, bias: list[Fraction]) -> tuple[Array, Array]:
+    """The layer behind a normaliser, each number of it rounded once."""
+    rows, columns = weight.nrows(), weight.ncols()
+    roots = [_root(q) for q in head.square]
+    out, shift = np.empty((rows, columns)), np.empty(rows)
+    for i in range(rows):
+        entries = [_fraction(weight[i, j]) * head.factor[j] for j in range(columns)]
+        rest = bias[i] + sum(
+            (_fraction(weight[i, j]) * head.offset[j] for j in range(columns)), start=Fraction(0)
+        )  # fmt: skip
+        odd = []
+        for j, (entry, root) in enumerate(zip(entries, roots, strict=True)):
+            if root is not None:
+                out[i, j] = _nearest(entry / root)
+                rest -= entry * head.mean[j] / root
+            else:
+                out[i, j] = _rounded(Fraction(0), [(entry, head.square[j])])
+                odd.append((-entry * head.mean[j], head.square[j]))
+        shift[i] = _rounded(rest, odd)
+    return out, shift
+
+
+def _rounded(rest: Fraction, terms: list[tuple[Fraction, Fraction]]) -> float:
+    """`rest + sum of a / sqrt(q)` over the terms (a, q), rounded once to the nearest binary64."""
+    terms = [(a, q) for a, q in terms if a != 0]
+    if not terms:
+        return _nearest(rest)
+    lo = hi = 0.0
+    for bits in _BITS:
+        with flint.ctx.workprec(bits):
+            total = flint.arb(_rational(rest))
+            for a, q in terms:
+                total += flint.arb(_rational(a)) / flint.arb(_rational(q)).sqrt()
+            lo, hi = _nearest(_end(total.lower())), _nearest(_end(total.upper()))
+        if lo == hi:
+            return lo
+    # Terms that cancel exactly, or to the middle of two numbers: nothing separates the ends, which are neighbours.
+    return lo
+
+
+def _end(value: flint.arb) -> Fraction:
+    mantissa, exponent = value.mid().man_exp()
+    return Fraction(int(mantissa)) * Fraction(2) ** int(exponent)
+
+
+def _tail(steps: Sequence[Step], width: int, squash: Squash) -> tuple[Array, Array, tuple[Array, Array] | None]:
+    scale, offset = [Fraction(1)] * width, [Fraction(0)] * width
+    lows: list[Fraction | None] = [None] * width
+    highs: list[Fraction | None] = [None] * width
+    for step in steps:
+        match step:
+            case Diagonal():
+                for i, (s, o) in enumerate(zip(spread(step.scale, width), spread(step.offset, width), strict=True)):
+                    if s == 0:
+                        raise InputError(f"the scale of an action must not be 0; that of input {i} is.")
+                    scale[i], offset[i] = s * scale[i], s * offset[i] + o
+                    ends = [None if v is None else s * v + o for v in (lows[i], highs[i])]
+                    lows[i], highs[i] = ends if s > 0 else ends[::-1]
+            case Clip():
+                for i, (lo, hi) in enumerate(zip(spread(step.lo, width), spread(step.hi, width), strict=True)):
+                    lows[i] = _larger(lows[i], lo)
+                    highs[i] = _smaller(highs[i], hi)
+            case _:
+                raise InputError("after the last layer there may be a tanh, a scale, an offset and a clip only.")
+    return _numbers(scale), _numbers(offset), _clip(scale, offset, lows, highs, squash)
+
+
+def _clip(
+    scale: list[Fraction],
+    offset: list[Fraction],
+    lows: list[Fraction | None],
+    highs: list[Fraction | None],
+    squash: Squash,
+) -> tuple[Array, Array] | None:
+    """The clip of the action, with the squash's own range where a side has none; None if none of it can act."""
+    if all(v is None for v in (*lows, *highs)):
+        return None
+    acts = False
+    for i in range(len(scale)):
+        if squash == "tanh":
+            least, most = offset[i] - abs(scale[i]), offset[i] + abs(scale[i])
+            lo, hi = lows[i], highs[i]
+            acts = acts or (lo is not None and lo > least) or (hi is not None and hi < most)
+            lows[i], highs[i] = least if lo is None else lo, most if hi is None else hi
+        else:
+            acts = True
+        if lows[i] is None or highs[i] is None:
+            raise InputError(
+                f"a clip of an action without a tanh must have two bounds; that of input {i} has one "
+                "(ReLU at the output is such a clip)."
+            )
+    if not acts:
+        return None
+    lo_hi = _numbers([v for v in lows if v is not None]), _numbers([v for v in highs if v is not None])
+    for i, (a, b) in enumerate(zip(*lo_hi, strict=True)):
+        if not a < b:
+            raise InputError(f"the clips of input {i} leave nothing between them; found [{a}, {b}].")
+    return lo_hi
+
+
+def _require_width(weight: Array, width: int) -> None:
+    if weight.shape[1] != width:
+        raise InputError(f"a layer must take {width} numbers; its weight has shape {weight.shape}.")
+
+
+def _numbers(values: Sequence[Fraction]) -> Array:
+    return np.array([_nearest(v) for v in values])
+
+
+def _nearest(value: Fraction) -> float:
+    try:
+        return float(value)
+    except OverflowError as error:
+        raise InputError("a folded number must lie in the range of binary64; one of them is larger.") from error
+
+
+def _matrix(array: Array) -> flint.fmpq_mat:
+    return flint.fmpq_mat(*array.shape, [flint.fmpq(*float(v).as_integer_ratio()) for v in array.ravel()])
+
+
+def _column(values: Sequence[Fraction]) -> flint.fmpq_mat:
+    return flint.fmpq_mat(len(values), 1, [_rational(v) for v in values])
+
+
+def _rational(q: Fraction) -> flint.fmpq:
+    return flint.fmpq(q.numerator, q.denominator)
+
+
+def _fraction(q: flint.fmpq) -> Fraction:
+    return Fraction(int(q.p), int(q.q))

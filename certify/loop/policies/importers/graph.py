@@ -1,0 +1,99 @@
+"""The operations that a graph of ONNX or TorchScript may hold, as exact steps on one chain of values.
+
+A chain begins with the observation, and each operation makes another one out of a chain and constants; two chains never
+meet. Whatever is not here is refused by its name.
+"""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+
+from certify.errors import InputError
+from certify.loop.policies.importers.arrays import Numbers
+from certify.loop.policies.importers.steps import Affine, Clip, Diagonal, Step, Tanh, exactly
+
+Chain = tuple[Step, ...]
+_EXACT_INTEGERS = 2**53
+
+
+def real(value: Any, what: str) -> Numbers:
+    """A constant as binary64, which must hold it exactly.
+
+    Raises
+    ------
+    InputError : it is no array of real numbers, is not finite, or is an integer that binary64 does not hold.
+    """
+    array = np.asarray(value)
+    if array.dtype.kind not in "fiu" or array.dtype.itemsize > 8:
+        raise InputError(f"the constants of {what} must be real numbers; found {array.dtype}.")
+    if array.dtype.kind in "iu" and array.size and max(abs(int(array.min())), abs(int(array.max()))) > _EXACT_INTEGERS:
+        raise InputError(f"an integer of {what} must be at most 2^53 in magnitude.")
+    result: Numbers = array.astype(np.float64)
+    if not np.all(np.isfinite(result)):
+        raise InputError(f"the constants of {what} must be finite; found NaN or infinity.")
+    return result
+
+
+def row(value: Any, what: str) -> tuple[Fraction, ...]:
+    """A constant that meets every row of a batch alike: one number, or one for each component.
+
+    Raises
+    ------
+    InputError : its shape says something else.
+    """
+    array = real(value, what)
+    if any(size != 1 for size in array.shape[:-1]) or array.size == 0:
+        raise InputError(
+            f"a constant of {what} must be one number or one for each component; its shape is {array.shape}."
+        )
+    return exactly(array)
+
+
+def affine(chain: Chain, weight: Any, bias: Any | None, what: str) -> Chain:
+    """`W h + b`, with W of shape (out, in)."""
+    matrix = real(weight, what)
+    if matrix.ndim != 2:
+        raise InputError(f"the weight of {what} must be a matrix; its shape is {matrix.shape}.")
+    offset = np.zeros(len(matrix)) if bias is None else np.array([float(v) for v in row(bias, what)])
+    if offset.shape == (1,):
+        offset = np.repeat(offset, len(matrix))
+    return (*chain, Affine(matrix, offset))
+
+
+def scaled(chain: Chain, scale: Any, what: str, *, divide: bool = False) -> Chain:
+    """`scale * h`, or `h / scale`."""
+    values = row(scale, what)
+    if divide and 0 in values:
+        raise InputError(f"{what} divides by 0.")
+    return (*chain, Diagonal(tuple(1 / v for v in values) if divide else values, (Fraction(0),)))
+
+
+def shifted(chain: Chain, offset: Any, what: str, *, sign: int = 1) -> Chain:
+    """`h + offset`, or `h - offset` with sign -1."""
+    return moved(chain, tuple(sign * v for v in row(offset, what)))
+
+
+def moved(chain: Chain, offset: tuple[Fraction, ...]) -> Chain:
+    """`h + offset`, with exact numbers."""
+    return (*chain, Diagonal((Fraction(1),), offset))
+
+
+def negated(chain: Chain) -> Chain:
+    """`-h`."""
+    return (*chain, Diagonal((Fraction(-1),), (Fraction(0),)))
+
+
+def tanh(chain: Chain) -> Chain:
+    """`tanh h`."""
+    return (*chain, Tanh())
+
+
+def clipped(chain: Chain, lo: Any | None, hi: Any | None, what: str) -> Chain:
+    """`min(max(h, lo), hi)`, where None is no bound."""
+    if lo is None and hi is None:
+        return chain
+    none: tuple[Fraction | None, ...] = (None,)
+    return (*chain, Clip(none if lo is None else row(lo, what), none if hi is None else row(hi, what)))

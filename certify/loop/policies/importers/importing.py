@@ -1,0 +1,406 @@
+"""A policy file of another program as a policy of this one: read, ask for what is missing, fold, compare, and say so.
+
+The bytes decide what a file is; nothing in it is executed. What is proved afterwards is the folded policy: it differs
+from the file's real-number policy by the rounding of each folded number, half a unit in the last place at most.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from certify.errors import InputError
+from certify.loop.policies.exact import require_centred
+from certify.loop.policies.file import Policy, is_text
+from certify.loop.policies.importers.archives import MAX_BYTES, Archive
+from certify.loop.policies.importers.arrays import Numbers
+from certify.loop.policies.importers.comparing import Difference, compare_reading
+from certify.loop.policies.importers.folding import Bounds, Folded, fold
+from certify.loop.policies.importers.normalisers import load_normaliser
+from certify.loop.policies.importers.observing import index_of, over_states, require_equilibrium, sample, shift
+from certify.loop.policies.importers.onnx_graph import read_onnx
+from certify.loop.policies.importers.options import ImportOptions
+from certify.loop.policies.importers.reading import Evaluate, Reading
+from certify.loop.policies.importers.sb3 import read_sb3
+from certify.loop.policies.importers.state_dict import is_two_stage, read_state_dict, read_two_stage
+from certify.loop.policies.importers.steps import Clip, Diagonal, Normalise, Step, spread
+from certify.loop.policies.importers.tensors import load_safetensors, load_tensors
+from certify.loop.policies.importers.torchfile import TorchFile
+from certify.loop.policies.importers.torchscript import is_torchscript, read_torchscript
+from certify.loop.policies.network import Array, Centre, TanhNetwork
+
+if TYPE_CHECKING:
+    from certify.loop.plants import System
+
+Content = Literal["state-dict", "torchscript", "onnx", "sb3", "safetensors", "two-stage", "policy"]
+_OWN, _LYAPUNOV = "certify-policy/", "certify-lyapunov/"
+_ONE, _ZERO = (Fraction(1),), (Fraction(0),)
+
+
+@dataclass(frozen=True, slots=True)
+class Imported:
+    """A policy with what its import found.
+
+    Parameters
+    ----------
+    policy : the policy, with the record of its origin in `training`.
+    words : the kind of file and of policy.
+    formula : what the file's policy is, for people.
+    difference : how far it is from what the file's own program gives, or, where the file holds no program, from what
+        torch's layers give with the same numbers, which checks the folding alone.
+    compared_with : the file's own program with which it was compared, for people; None where nothing was compared.
+    assumed : where nothing was compared, who says what stands between the numbers.
+    not_read : why each tensor of the file that was not read is left out, by its name.
+    at_origin : pi(0), shape (m,).
+    u_eq : the plant's equilibrium input, shape (m,).
+    centring : for each centring that is possible the largest change of u over the states compared.
+    """
+
+    policy: Policy
+    words: str
+    formula: str
+    difference: Difference
+    compared_with: str | None
+    assumed: str
+    not_read: Mapping[str, str]
+    at_origin: Array
+    u_eq: Array
+    centring: Mapping[Centre, float]
+
+
+def content_of(raw: bytes, name: str) -> Content | None:
+    """What a file is by its bytes and, for ONNX, by its name; None if it is nothing that is read here."""
+    if raw.startswith(b"PK"):
+        archive = Archive(raw, name)
+        if "policy.pth" in archive and "data" in archive:
+            return "sb3"
+        file = TorchFile(raw, name, archive)
+        if is_torchscript(file):
+            return "torchscript"
+        root = file.pickle("data.pkl")
+        said = root.get("format") if isinstance(root, dict) else None
+        if isinstance(said, str) and said.startswith(_OWN):
+            return "policy"
+        if isinstance(said, str) and said.startswith(_LYAPUNOV):
+            raise InputError("it must hold a policy; it is a Lyapunov function of this program.")
+        return "two-stage" if is_two_stage(load_tensors(raw, name, file)) else "state-dict"
+    if name.endswith(".onnx"):
+        return "onnx"
+    if name.endswith(".safetensors") or raw[8:9] == b"{":
+        return "safetensors"
+    return None
+
+
+def import_policy(
+    path: Path, plant: System, options: ImportOptions | None = None, beside: str | None = None
+) -> Imported:
+    """Read a policy of another program for a plant.
+
+    Parameters
+    ----------
+    path : the file.
+    plant : the plant that it controls: its states, inputs, domain and u_eq.
+    options : what the file cannot say.
+    beside : keys of the layers of the Lyapunov network that is imported from the same file, if one is.
+
+    Raises
+    ------
+    InputError : the file is of no kind that is read, does not say enough and the options do not either, holds what is
+        not proved or could belong to the policy and is not read, or differs from its own program by more than rounding.
+    """
+    options = options if options is not None else ImportOptions()
+    raw = read_bytes(path)
+    try:
+        return import_bytes(raw, path.name, plant, options, folder=path.parent, beside=beside)
+    except InputError as error:
+        raise InputError(f"policy file {path}: {error}") from error
+
+
+def read_bytes(path: Path) -> bytes:
+    """The bytes of a policy file.
+
+    Raises
+    ------
+    InputError : it cannot be read, or is larger than any policy.
+    """
+    try:
+        if path.stat().st_size > MAX_BYTES:
+            raise InputError(f"policy file {path} must have at most {MAX_BYTES >> 20} MiB; it has more.")
+        return path.read_bytes()
+    except OSError as error:
+        raise InputError(f"policy file {path} cannot be read: {error.strerror}.") from error
+
+
+def import_bytes(
+    raw: bytes,
+    name: str,
+    plant: System,
+    options: ImportOptions,
+    *,
+    evaluate: Evaluate | None = None,
+    folder: Path | None = None,
+    beside: str | None = None,
+) -> Imported:
+    """The same for the bytes of such a file, called `name`.
+
+    Parameters
+    ----------
+    evaluate : the policy itself, where it is at hand; it is compared with that.
+    folder : where the file lies, if it lies anywhere; an ONNX model may have its weights in a second file there.
+    beside : as in `import_policy`.
+
+    Raises
+    ------
+    InputError : as `import_policy`, without the name.
+    """
+    kind = kind_of(raw, name, options)
+    n = plant.n if options.states is None else len(options.states)
+    reading = _read(kind, raw, name, options, n, plant.m, folder, beside)
+    if evaluate is not None:
+        reading = replace(reading, evaluate=evaluate, program="the module itself, run")
+    _require_answers(kind, reading, options, plant)
+    states = options.states if options.states is not None else tuple(s.name for s in plant.states)
+    index = index_of(states, plant)
+    if (reading.n, reading.m) != (len(states), plant.m):
+        raise InputError(
+            f"the policy must read the {len(states)} states {', '.join(states)} and command the {plant.m} inputs of "
+            f"{plant.name}; it reads {reading.n} and commands {reading.m}. Name what it reads with --states."
+        )
+    record: dict[str, Any] = {
+        "file": name,
+        "sha256": hashlib.sha256(raw).hexdigest(),
+        "kind": kind,
+        "policy": reading.words,
+        "states": ", ".join(states),
+        "plant_states": [s.name for s in plant.states],
+        "options": options.given,
+    }
+    x_eq = [plant.exact_x_eq()[i] for i in index]
+    moved = shift(x_eq, options)
+    normaliser = _normaliser(reading, options, len(states))
+    if isinstance(options.normaliser, Path):
+        record["normaliser_sha256"] = hashlib.sha256(read_bytes(options.normaliser)).hexdigest()
+    before = (*moved, *normaliser)
+    require_equilibrium(reading, x_eq if moved else [Fraction(0)] * len(states))
+    after = _action(options, plant.m)
+    steps = (*before, *reading.steps, *after)
+    folded = fold(steps, len(states))
+    network, valid = _network(folded, index, plant.n, reading, options)
+    u_eq = plant.exact_u_eq()
+    if network.centre != "none":
+        require_centred(network, u_eq)
+    # It refuses another plant's beta, before the comparison does with less to say.
+    Policy(network, plant.name, beta=reading.beta, valid=valid).beta_shift(u_eq)
+    x = sample(plant, valid)
+    bare = network if reading.beta is not None else replace(network, centre="none")
+    values = bare(x, u_eq)
+    difference = compare_reading(reading, before, after, x[:, index], values)
+    record["compared_with"] = reading.program
+    record["largest_difference" if reading.program is not None else "folding_difference"] = difference.largest
+    record["not_read"] = dict(reading.unread)
+    if reading.beside:
+        record["beside_sha256"] = dict(reading.beside)
+    return Imported(
+        policy=Policy(network, plant.name, _parameters(plant), {"imported": record}, reading.beta, valid),
+        words=reading.words,
+        formula=_formula(normaliser, network, folded, reading),
+        difference=difference,
+        compared_with=reading.program,
+        assumed=reading.assumed,
+        not_read=reading.unread,
+        at_origin=np.asarray(bare(np.zeros(plant.n), u_eq)),
+        u_eq=np.array([float(u) for u in u_eq]),
+        centring={} if reading.beta is not None else _centrings(bare, u_eq, x, values),
+    )
+
+
+def kind_of(raw: bytes, name: str, options: ImportOptions) -> Content:
+    """The kind of a file by its bytes, and by `options` where they say it.
+
+    Raises
+    ------
+    InputError : it is of no kind that is read, of this program already, or not what the options say.
+    """
+    kind = options.kind if options.kind in ("onnx", "safetensors") else content_of(raw, name)
+    if kind is None:
+        wanted = "it must be a file of torch.save, TorchScript, stable-baselines3, ONNX or safetensors"
+        if raw[:1] in (b"\x80", b"("):
+            raise InputError(
+                f"{wanted}; it is a bare pickle, or torch's format of before version 1.6. If you trust it, load it and "
+                "write it again with torch.save."
+            )
+        raise InputError(f"{wanted}; it is none of these{', but text' if is_text(raw) else ''}.")
+    if kind == "policy":
+        raise InputError("it is a policy file of this program already: use it with certify roa --policy.")
+    if options.kind not in ("auto", kind) and (options.kind, kind) != ("state-dict", "two-stage"):
+        raise InputError(f"it must be what --from says, {options.kind}; it is {kind}.")
+    return kind if options.kind == "auto" else options.kind
+
+
+def _read(
+    kind: Content,
+    raw: bytes,
+    name: str,
+    options: ImportOptions,
+    n: int,
+    m: int,
+    folder: Path | None,
+    beside: str | None,
+) -> Reading:
+    readers: dict[Content, Callable[[], Reading]] = {
+        "sb3": lambda: read_sb3(Archive(raw, name), name, options.ignore),
+        "torchscript": lambda: read_torchscript(TorchFile(raw, name)),
+        "onnx": lambda: read_onnx(raw, name, options.output, folder),
+        "safetensors": lambda: read_state_dict(tensors_in(kind, raw, name), options, n, m, beside),
+        "two-stage": lambda: read_two_stage(tensors_in(kind, raw, name), options),
+        "state-dict": lambda: read_state_dict(tensors_in(kind, raw, name), options, n, m, beside),
+    }
+    return readers[kind]()
+
+
+def tensors_in(kind: Content, raw: bytes, name: str) -> dict[str, Numbers]:
+    """The tensors of a state_dict or two-stage file, or of safetensors, by their names."""
+    return load_safetensors(raw, name) if kind == "safetensors" else load_tensors(raw, name)
+
+
+def _require_answers(kind: Content, reading: Reading, options: ImportOptions, plant: System) -> None:
+    """Ask for everything that the file cannot say, in one sentence."""
+    wanted = []
+    order = ",".join(s.name for s in plant.states)
+    layers_only = kind in ("state-dict", "safetensors")
+    if options.states is None and plant.n > 1:
+        wanted.append(f"--states {order} (what the network reads, in its order)")
+    if options.activation is None and layers_only:
+        wanted.append("--activation tanh (between the layers)")
+    if options.squash is None and (layers_only or kind == "two-stage"):
+        wanted.append("--squash identity, tanh or relu-tanh (after the last layer)")
+    if options.normaliser is None and reading.normaliser is None and kind != "two-stage":
+        wanted.append("--normaliser FILE or none (what was done to observations)")
+    if options.action_scale is None and reading.action != plant.input_bounds:
+        wanted.append("--action-scale (u = scale * action + offset in the plant's units: 1 if they are the same)")
+    if options.observes is None and any(plant.exact_x_eq()):
+        wanted.append(f"--observes absolute or deviation (the operating point of {plant.name} is not 0)")
+    if wanted:
+        raise InputError(f"the file does not say all that its policy is; nothing is guessed. Give {'; '.join(wanted)}.")
+    for option, value, belongs in (
+        ("--activation", options.activation, layers_only),
+        ("--squash", options.squash, layers_only or kind == "two-stage"),
+        ("--prefix", options.prefix, layers_only),
+        ("--normaliser", options.normaliser, kind != "two-stage"),
+        ("--centre", options.centre, kind != "two-stage" or options.centre == "preactivation"),
+        ("--ignore", options.ignore, kind not in ("torchscript", "onnx")),
+        ("--output", options.output, kind == "onnx"),
+    ):
+        if value is not None and not belongs:
+            raise InputError(f"{option} must be left out: a file of {kind} says it itself.")
+
+
+def _normaliser(reading: Reading, options: ImportOptions, n: int) -> tuple[Step, ...]:
+    if options.normaliser is None:
+        found: Normalise | Diagonal | None = reading.normaliser
+    elif reading.normaliser is not None:
+        raise InputError("--normaliser must be left out: the file holds the normaliser of its policy.")
+    elif options.normaliser == "none":
+        found = None
+    else:
+        found = load_normaliser(options.normaliser, options.epsilon)
+    if found is None:
+        if options.epsilon is not None:
+            raise InputError("--epsilon must go with a normaliser of rsl_rl; there is none.")
+        return ()
+    spread(found.mean if isinstance(found, Normalise) else found.offset, n)
+    return (found,)
+
+
+def _action(options: ImportOptions, m: int) -> tuple[Step, ...]:
+    """What becomes of the network's action on its way to the plant."""
+    scale = spread(options.action_scale or _ONE, m)
+    offset = spread(options.action_offset or _ZERO, m)
+    steps: list[Step] = []
+    if options.clip is not None:
+        steps.append(Clip(spread(options.clip.lo, m), spread(options.clip.hi, m)))
+    if any(v != 1 for v in scale) or any(offset):
+        steps.append(Diagonal(scale, offset))
+    return tuple(steps)
+
+
+def _network(
+    folded: Folded, index: list[int], n: int, reading: Reading, options: ImportOptions
+) -> tuple[TanhNetwork, Array | None]:
+    """The network over the plant's states, and the states where no observation is clipped, (n, 2), rounded inwards."""
+    first = over_states(folded.weights[0], index, n)
+    centre: Centre = "preactivation" if reading.beta is not None else options.centre or "none"
+    network = TanhNetwork(
+        (first, *folded.weights[1:]), folded.biases, folded.scale, folded.offset, folded.squash, centre, folded.clip
+    )
+    valid = np.tile([-math.inf, math.inf], (n, 1))
+    for k, bounds in zip(index, folded.inactive, strict=True):
+        valid[k] = _inwards(bounds)
+    return network, None if np.all(np.isinf(valid)) else valid
+
+
+def _inwards(bounds: Bounds) -> tuple[float, float]:
+    largest = Fraction(sys.float_info.max)
+    lo, hi = (None if v is not None and abs(v) > largest else v for v in bounds)
+    if (lo, hi) != bounds:
+        raise InputError("what a normaliser clips to must lie in the range of binary64.")
+    low, high = -math.inf if lo is None else float(lo), math.inf if hi is None else float(hi)
+    if lo is not None and Fraction(low) < lo:
+        low = math.nextafter(low, math.inf)
+    if hi is not None and Fraction(high) > hi:
+        high = math.nextafter(high, -math.inf)
+    return low, high
+
+
+def _parameters(plant: System) -> dict[str, str]:
+    return {name: str(value) for name, value in plant.parameters.items()}
+
+
+def centring_changes(network: TanhNetwork, plant: System) -> dict[Centre, float]:
+    """How much each centring that can be had would change u at most, over samples of the domain."""
+    x, u_eq = sample(plant, None), plant.exact_u_eq()
+    bare = replace(network, centre="none")
+    return _centrings(bare, u_eq, x, bare(x, u_eq))
+
+
+def _centrings(bare: TanhNetwork, u_eq: tuple[Fraction, ...], x: Array, values: Array) -> dict[Centre, float]:
+    """How much each centring would change u, at most, over the states."""
+    changes: dict[Centre, float] = {}
+    centres: tuple[Centre, ...] = ("output", "preactivation")
+    for centre in centres:
+        try:
+            moved = replace(bare, centre=centre)(x, u_eq)
+        except InputError:
+            continue  # u_eq outside of the squash's range, or no squash to centre in
+        changes[centre] = float(np.max(np.abs(moved - values)))
+    return changes
+
+
+def _formula(normaliser: tuple[Step, ...], network: TanhNetwork, folded: Folded, reading: Reading) -> str:
+    """The file's policy in the plant's units."""
+    observation = "o"
+    if normaliser:
+        divisor = "sqrt(var + epsilon)" if isinstance(normaliser[0], Normalise) else "(std + epsilon)"
+        observation = f"(o - mean) / {divisor}"
+    net = f"net({observation})"
+    if reading.beta is not None:
+        net = "net(x) - net(x_eq) + beta"
+    inner = f"tanh({net})" if network.squash == "tanh" else net
+    scaled = inner if np.all(folded.scale == 1) else f"{_short(folded.scale)} * {inner}"
+    scaled = scaled if not np.any(folded.offset) else f"{scaled} + {_short(folded.offset)}"
+    if folded.clip is None:
+        return f"u = {scaled}"
+    return f"u = clip({scaled}, {_short(folded.clip[0])}, {_short(folded.clip[1])})"
+
+
+def _short(values: Any) -> str:
+    distinct = [f"{v:.6g}" for v in values]
+    return distinct[0] if len(set(distinct)) == 1 else f"[{', '.join(distinct)}]"

@@ -1,0 +1,144 @@
+"""Policies that lie in memory: a torch module, a state_dict. Each goes the way that its file would go.
+
+A module is more than its tensors: what stands between the layers is in its code. So it is traced, and the trace is read
+as a TorchScript archive is: affine layers, tanh and constant scalings, and nothing else. A trace follows one
+observation and is deaf to branches; what torch says about that counts as a refusal, and what is folded is compared with
+the module itself at the states of the plant's domain, not with its trace. A state_dict holds numbers alone, and what
+it does not say is asked for, as of a file.
+"""
+
+from __future__ import annotations
+
+import copy
+import io
+import warnings
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from certify.errors import InputError
+from certify.loop.policies.importers.importing import Imported, import_bytes
+from certify.loop.policies.importers.options import ImportOptions
+from certify.loop.policies.importers.reading import Evaluate, Observations, Values
+
+if TYPE_CHECKING:
+    import torch
+
+    from certify.loop.plants import System
+
+_INSTEAD = (
+    "Give its state_dict with the options of one, or a module of Linear and Tanh layers and constant scalings, whose "
+    "forward takes states (k, n) and returns actions (k, m)."
+)
+
+
+def import_module(module: torch.nn.Module, plant: System, options: ImportOptions | None = None) -> Imported:
+    """A torch module in evaluation mode as a policy of this program; the module is copied and stays as it is.
+
+    Parameters
+    ----------
+    module : `forward` takes observations (k, n) and gives actions (k, m).
+    plant : the plant that it controls.
+    options : what the module cannot say, see `ImportOptions`.
+
+    Raises
+    ------
+    InputError : it cannot be copied or traced, is no chain of layers that are proved, differs from what was folded by
+        more than rounding, or the options do not say enough.
+    """
+    options = options if options is not None else ImportOptions()
+    name = f"the module {type(module).__name__}"
+    n = plant.n if options.states is None else len(options.states)
+    try:
+        still = copy.deepcopy(module).cpu().eval()
+        for parameter in still.parameters():
+            parameter.requires_grad_(False)
+        raw = _traced(still, n)
+        evaluate = _evaluation(still)
+    except Exception as error:  # code of whoever wrote the module
+        raise InputError(f"{name} cannot be copied and traced: {_brief(error)} {_INSTEAD}") from error
+    try:
+        return import_bytes(raw, name, plant, options, evaluate=evaluate)
+    except InputError as error:
+        raise InputError(f"{name}: {error}") from error
+
+
+def import_state_dict(tensors: Mapping[str, Any], plant: System, options: ImportOptions | None = None) -> Imported:
+    """The layers `PREFIX.N.weight` and `PREFIX.N.bias` of a state_dict as a policy of this program.
+
+    Parameters
+    ----------
+    tensors : torch tensors or arrays of floating-point numbers by their names; mappings of such count as well.
+    plant : the plant that it controls.
+    options : what the numbers cannot say, see `ImportOptions`.
+
+    Raises
+    ------
+    InputError : a value is neither, the layers are not those of one policy, or the options do not say enough.
+    """
+    import torch
+
+    buffer = io.BytesIO()
+    torch.save(_plain(tensors, "the state_dict"), buffer)
+    try:
+        return import_bytes(buffer.getvalue(), "state_dict", plant, options if options is not None else ImportOptions())
+    except InputError as error:
+        raise InputError(f"the state_dict: {error}") from error
+
+
+def _traced(module: torch.nn.Module, n: int) -> bytes:
+    """The bytes of the module's trace for one observation, in the precision of its parameters."""
+    import torch
+
+    dtype = next((p.dtype for p in module.parameters()), torch.float32)
+    buffer = io.BytesIO()
+    # As errors the warnings would be raised in the midst of torch's C code, which loses them.
+    with warnings.catch_warnings(record=True) as told, torch.no_grad():
+        warnings.simplefilter("always")
+        traced = torch.jit.trace(module, torch.zeros(1, n, dtype=dtype), check_trace=False)  # type: ignore[no-untyped-call]
+        torch.jit.save(traced, buffer)
+    for warning in told:
+        if issubclass(warning.category, torch.jit.TracerWarning):  # type: ignore[attr-defined]
+            raise InputError(f"it branches, or hides a number from torch. {warning.message}")
+    return buffer.getvalue()
+
+
+def _evaluation(module: torch.nn.Module) -> Evaluate:
+    """The module's own values, in double precision or in single."""
+    import torch
+
+    versions = {True: copy.deepcopy(module).double(), False: copy.deepcopy(module).float()}
+
+    def evaluate(x: Observations, double: bool) -> Values:
+        with torch.no_grad():
+            given = torch.tensor(x, dtype=torch.float64 if double else torch.float32)
+            values: Values = versions[double](given).numpy()
+        return values
+
+    return evaluate
+
+
+def _plain(node: Any, what: str) -> Any:
+    """Dictionaries of dense tensors on the CPU, and nothing else."""
+    import torch
+
+    if isinstance(node, Mapping):
+        for key in node:
+            if not isinstance(key, str):
+                raise InputError(f"the keys of {what} must be text; found {key!r:.60}, a {type(key).__name__}.")
+        return {key: _plain(value, f"{what}[{key!r}]") for key, value in node.items()}
+    numbers = isinstance(node, np.ndarray) and node.dtype.kind == "f"
+    if not numbers and not isinstance(node, torch.Tensor):
+        raise InputError(
+            f"{what} must be a tensor, an array of floats or a mapping of these; it is a {type(node).__name__}."
+        )
+    try:
+        return torch.tensor(node) if numbers else node.detach().cpu().clone()
+    except (TypeError, ValueError, RuntimeError) as error:  # a precision that torch has not, a tensor without numbers
+        raise InputError(f"{what} cannot be read as a tensor: {_brief(error)}") from error
+
+
+def _brief(error: Exception) -> str:
+    first = str(error).strip().splitlines()
+    return f"{type(error).__name__}: {first[0].strip().rstrip('.:') if first else 'no message'}."

@@ -1,0 +1,423 @@
+"""ONNX graphs of Gemm, MatMul, Add, Sub, Mul, Div, Neg, Clip, Relu and Tanh that form one chain.
+
+The file is parsed, and of its graph what the action depends on is read. The comparison runs that part in the reference
+evaluator of the onnx package, which knows the standard operators and nothing else. Exporters write around the layers
+what leaves every number as it is: Identity, Cast between float32 and float64, Flatten, Reshape to the same width, and
+Expand to the width that a value has already, which is left out before the graph is run.
+Weights may lie in one more file, as exporters write them: it is read if it lies in the model's own folder under a plain
+name and is no link, up to the size that any policy may have.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import stat
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from certify.errors import InputError
+from certify.loop.policies.importers import graph
+from certify.loop.policies.importers.archives import MAX_BYTES
+from certify.loop.policies.importers.arrays import Numbers
+from certify.loop.policies.importers.graph import Chain
+from certify.loop.policies.importers.options import WITH_TANH, WITHOUT_NORMALISATION
+from certify.loop.policies.importers.reading import Observations, Reading, Values
+from certify.loop.policies.importers.steps import Affine
+
+_OPERATIONS = {
+    "Gemm", "MatMul", "Add", "Sub", "Mul", "Div", "Neg", "Clip", "Relu", "Tanh",
+    "Identity", "Cast", "Flatten", "Reshape", "Constant",
+}  # fmt: skip
+_KNOWN = "Gemm, MatMul, Add, Sub, Mul, Div, Neg, Clip, Relu, Tanh, Identity, Flatten and Constant"
+_NORMALISATIONS = {
+    "LayerNormalization",
+    "BatchNormalization",
+    "InstanceNormalization",
+    "GroupNormalization",
+    "ReduceMean",
+}
+_STANDARD = ("", "ai.onnx")
+_FLAGS = {
+    "Gemm": {"alpha", "beta", "transA", "transB"},
+    "Constant": {"value", "value_float", "value_floats", "value_int", "value_ints"},
+    "Cast": {"to", "saturate"},
+    "Flatten": {"axis"},
+    "Reshape": {"allowzero"},
+}
+_INSIDE = "Or write the model again as one file, with torch.onnx.export(..., external_data=False)."
+_ELEMENTWISE = {"Add", "Sub", "Mul", "Div", "Neg", "Clip", "Relu", "Tanh", "Exp", "Log", "Identity", "Cast"}
+
+
+def read_onnx(raw: bytes, what: str, wanted: str | None = None, folder: Path | None = None) -> Reading:
+    """The policy of an ONNX file with one input.
+
+    Parameters
+    ----------
+    wanted : the output that is the action; None where there is one.
+    folder : where the file lies, and a file of its weights may lie.
+
+    Raises
+    ------
+    InputError : the onnx package is missing, the file is damaged, has several outputs and `wanted` is none of them, its
+        weights lie where they are not read, or the graph is no chain of known operations.
+    """
+    try:
+        import onnx
+        from google.protobuf.message import DecodeError
+        from onnx.reference import ReferenceEvaluator
+    except ImportError as error:
+        raise InputError(
+            "a file of ONNX needs the package that reads it; install it with pip install 'certify[onnx]'."
+        ) from error
+    try:
+        model = onnx.load_model_from_string(raw)
+    except (DecodeError, ValueError, RuntimeError) as error:
+        raise InputError(f"{what} is no ONNX file or is damaged: {error}.") from error
+    if model.functions or any(opset.domain not in _STANDARD for opset in model.opset_import):
+        raise InputError(f"{what} must hold standard operators only; it defines or imports others.")
+    name, output = _ends(model.graph, wanted, what)
+    unread = _prune(model, output, what)
+    beside = _fetch(model.graph, folder, what)
+    steps = _walk(model.graph, name, output, what)
+    double = any(t.data_type == onnx.TensorProto.DOUBLE for t in model.graph.initializer)
+    try:
+        evaluators = {False: ReferenceEvaluator(model), True: ReferenceEvaluator(_doubled(model))}
+    except (RuntimeError, TypeError, ValueError, KeyError, AttributeError) as error:
+        raise InputError(f"the evaluator of the onnx package cannot read {what}: {error}.") from error
+
+    def evaluate(x: Observations, double: bool) -> Values:
+        given = x.astype(np.float64 if double else np.float32)
+        values: Values = np.asarray(evaluators[double].run([output], {name: given})[0])
+        return values
+
+    kinds = [node.op_type for node in model.graph.node if node.op_type != "Constant"]
+    return Reading(
+        words=f"ONNX graph {', '.join(kinds)[:200]}",
+        steps=steps,
+        evaluate=evaluate,
+        double=double,
+        program=f"the file's graph as far as {output}, run by the reference evaluator of onnx",
+        unread=dict.fromkeys(unread, f"{output} does not depend on it"),
+        beside=beside,
+    )
+
+
+def _prune(model: Any, output: str, what: str) -> list[str]:
+    """Leave in a model what the numbers of the output depend on; the names of the tensors that are left out."""
+    graph_ = model.graph
+    widths = _widths(graph_)
+    wanted, nodes = {output}, []
+    for node in reversed(graph_.node):
+        if not wanted.intersection(node.output):
+            continue
+        kept = type(node)()
+        kept.CopyFrom(node)
+        if node.op_type == "Expand" and len(node.input) == 2:
+            before, after = (widths.get(name) for name in node.input)
+            if before is None or before != after:
+                raise InputError(f"Expand {node.name} in {what} must leave a value as wide as it is.")
+            kept.op_type = "Identity"
+            del kept.input[1:]
+        nodes.append(kept)
+        wanted.update(kept.input)
+    left_out = [t.name for t in graph_.initializer if t.name not in wanted]
+    for field, keep in (("initializer", wanted), ("output", {output})):
+        values = getattr(graph_, field)
+        for k in reversed([k for k, value in enumerate(values) if value.name not in keep]):
+            del values[k]
+    del graph_.node[:]
+    graph_.node.extend(nodes[::-1])
+    return left_out
+
+
+def _widths(graph_: Any) -> dict[str, int]:
+    """How many numbers rows of values have, and those of which a shape is taken, as far as that follows from layers."""
+    found: dict[str, int] = {}
+    sizes = {tensor.name: tuple(tensor.dims) for tensor in graph_.initializer}
+    for name, size in sizes.items():
+        if all(k == 1 for k in size[:-1]):
+            found[name] = size[-1] if size else 1
+    for node in graph_.node:
+        kind, given = node.op_type, list(node.input)
+        size = sizes.get(given[1], ()) if len(given) > 1 else ()
+        if kind == "Constant":
+            dims = next((tuple(a.t.dims) for a in node.attribute if a.name == "value"), None)
+            width = 1 if dims == () else dims[-1] if dims and all(k == 1 for k in dims[:-1]) else None
+        elif kind in ("Gemm", "MatMul"):
+            turned = kind == "Gemm" and any(a.name == "transB" and a.i for a in node.attribute)
+            width = size[0 if turned else 1] if len(size) == 2 else None
+        elif kind in ("Shape", "ConstantOfShape"):
+            width = found.get(given[0]) if given and not node.attribute[1:] else None
+        elif kind == "Expand":
+            width = found.get(given[-1])
+        elif kind in _ELEMENTWISE:
+            several = {found.get(name) for name in given if name} - {1}
+            width = 1 if not several else several.pop() if len(several) == 1 else None
+        else:
+            width = None
+        if width is not None and len(node.output) == 1:
+            found[node.output[0]] = width
+    return found
+
+
+def _fetch(graph_: Any, folder: Path | None, what: str) -> dict[str, str]:
+    """Put the tensors that lie in a file beside the model into it; the SHA-256 of that file, by its name."""
+    import onnx
+
+    contents: dict[str, bytes] = {}
+    left = MAX_BYTES
+    for tensor in graph_.initializer:
+        if tensor.data_location != onnx.TensorProto.EXTERNAL:
+            continue
+        at = f"tensor {tensor.name} of {what}"
+        said = {entry.key: entry.value for entry in tensor.external_data}
+        place = said.get("location", "")
+        if len(said) != len(tensor.external_data) or place in ("", ".", "..") or set(place) & set("/\\:\0"):
+            raise InputError(
+                f"{at} must lie in the file itself or in one beside it under a plain name; it lies in {place[:80]!r}. "
+                f"{_INSIDE}"
+            )
+        if folder is None:
+            raise InputError(f"{at} must lie in the file itself; it lies in {place[:80]!r}. {_INSIDE}")
+        if place not in contents:
+            contents[place] = _plain_bytes(folder / place, f"the weights of {what}")
+        content = contents[place]
+        texts = said.get("offset", "0"), said.get("length", str(len(content)))
+        if not all(text.isascii() and text.isdigit() and len(text) < 16 for text in texts):
+            raise InputError(
+                f"{at} must lie at whole numbers of bytes of {place}; found {texts[0]!r:.40}, {texts[1]!r:.40}."
+            )
+        offset = int(texts[0])
+        length = int(texts[1]) if "length" in said else len(content) - offset
+        if length < 0 or offset + length > len(content):
+            raise InputError(
+                f"{at} must lie inside of {place}, which has {len(content)} bytes; it ends at {offset + length}."
+            )
+        left -= length
+        if left < 0:
+            raise InputError(f"the tensors of {what} must have at most {MAX_BYTES >> 20} MiB; they have more.")
+        tensor.raw_data = content[offset : offset + length]
+        tensor.data_location = onnx.TensorProto.DEFAULT
+        del tensor.external_data[:]
+    return {place: hashlib.sha256(content).hexdigest() for place, content in contents.items()}
+
+
+def _plain_bytes(path: Path, what: str) -> bytes:
+    """The bytes of a regular file that is no link, if they are as few as a policy's may be."""
+    try:
+        # A pipe must not make it wait, nor a link lead elsewhere.
+        handle = os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0))
+    except OSError as error:
+        raise InputError(
+            f"{what} must lie beside it in {path.name}, a plain file and no link; it cannot be read: "
+            f"{os.strerror(error.errno or 0)}. Put it there. {_INSIDE}"
+        ) from error
+    found = os.fstat(handle)
+    if not stat.S_ISREG(found.st_mode) or found.st_size > MAX_BYTES:
+        os.close(handle)
+        raise InputError(
+            f"{what} must lie in a plain file of at most {MAX_BYTES >> 20} MiB; {path.name} is none. {_INSIDE}"
+        )
+    with os.fdopen(handle, "rb") as file:
+        return file.read(MAX_BYTES + 1)[:MAX_BYTES]
+
+
+def _doubled(model: Any) -> Any:
+    """The same model with its constants in double precision."""
+    import onnx
+    from onnx import numpy_helper
+
+    copied = onnx.ModelProto()
+    copied.CopyFrom(model)
+    attributes = [(node.op_type, a) for node in copied.graph.node for a in node.attribute]
+    held = (a.t for kind, a in attributes if kind == "Constant" and a.name == "value")
+    for tensor in (*copied.graph.initializer, *held):
+        if tensor.data_type == onnx.TensorProto.FLOAT:
+            tensor.CopyFrom(numpy_helper.from_array(_constant(tensor, "the graph").astype(np.float64), tensor.name))
+    for kind, a in attributes:
+        if kind == "Cast" and a.i == onnx.TensorProto.FLOAT:
+            a.i = onnx.TensorProto.DOUBLE
+    return copied
+
+
+def _ends(graph_: Any, wanted: str | None, what: str) -> tuple[str, str]:
+    """The names of the one input that is no constant, and of the output that is the action."""
+    constants = {t.name for t in graph_.initializer}
+    inputs = [value.name for value in graph_.input if value.name not in constants]
+    outputs = [value.name for value in graph_.output]
+    if len(inputs) != 1 or not outputs:
+        raise InputError(
+            f"the graph of {what} must have one input, the observation, and an output, the action; "
+            f"found {', '.join(inputs) or 'none'} and {', '.join(outputs) or 'none'}."
+        )
+    if wanted is None and len(outputs) > 1:
+        raise InputError(
+            f"the graph of {what} must have one output, the action; it has {', '.join(outputs)}. Say which is the "
+            f"action with --output, as in --output {outputs[0]}."
+        )
+    if wanted is not None and wanted not in outputs:
+        raise InputError(f"--output must name an output of {what}, {', '.join(outputs)}; found {wanted!r}.")
+    return inputs[0], wanted if wanted is not None else outputs[0]
+
+
+def _walk(graph_: Any, name: str, output: str, what: str) -> Chain:
+    """The steps that lead from the input to the output."""
+    if graph_.sparse_initializer:
+        raise InputError(f"the tensors of {what} must be dense.")
+    constants: dict[str, Numbers] = {}
+    for tensor in graph_.initializer:
+        if tensor.name in constants:
+            raise InputError(f"{what} must name each tensor once; {tensor.name} stands there twice.")
+        constants[tensor.name] = _constant(tensor, what)
+    chains: dict[str, Chain] = {name: ()}
+    for node in graph_.node:
+        at = f"{node.op_type} {node.name}".strip()
+        if node.domain not in _STANDARD or len(node.output) != 1:
+            raise InputError(f"{what} must hold {_KNOWN}; found {node.domain}.{at}.")
+        if node.output[0] in chains or node.output[0] in constants:
+            raise InputError(f"{what} must name each value once; {node.output[0]} stands there twice.")
+        if node.op_type in _NORMALISATIONS:
+            part = " (a part of LayerNorm, as exporters write it)" if node.op_type == "ReduceMean" else ""
+            raise InputError(f"{at} in {what}{part} is not read. {WITHOUT_NORMALISATION}")
+        if node.op_type not in _OPERATIONS:
+            raise InputError(
+                f"{at} in {what} is not read: only tanh networks are proved, and the operations are {_KNOWN}. "
+                f"{WITH_TANH}"
+            )
+        flags = {a.name: a for a in node.attribute}
+        if len(flags) != len(node.attribute):
+            raise InputError(f"{at} in {what} must have each attribute once.")
+        unknown = sorted(set(flags) - _FLAGS.get(node.op_type, set()))
+        if unknown:
+            raise InputError(
+                f"{at} in {what} has {', '.join(unknown)}, which is not read; the operations are {_KNOWN}."
+            )
+        if node.op_type == "Constant":
+            constants[node.output[0]] = _attribute(flags, what)
+            continue
+        given = [None if not i else chains[i] if i in chains else constants.get(i) for i in node.input]
+        if any(i and v is None for i, v in zip(node.input, given, strict=True)):
+            raise InputError(f"{at} in {what} reads a value that nothing before it makes.")
+        if node.op_type != "Reshape" and any(isinstance(v, np.ndarray) and v.dtype.kind != "f" for v in given):
+            raise InputError(f"{at} in {what} must be of floating-point numbers (float32 or float64).")
+        if node.op_type in ("Identity", "Cast") and len(given) == 1 and isinstance(given[0], np.ndarray):
+            if node.op_type == "Cast":
+                _require_real(flags, f"{at} in {what}")
+            constants[node.output[0]] = given[0]
+            continue
+        chains[node.output[0]] = _apply(node.op_type, given, flags, f"{at} in {what}")
+    if output not in chains:
+        raise InputError(f"the output of {what} does not depend on its input.")
+    return chains[output]
+
+
+def _apply(kind: str, given: list[Any], flags: dict[str, Any], at: str) -> Chain:
+    found = [k for k, value in enumerate(given) if isinstance(value, tuple)]
+    if len(found) != 1:
+        raise InputError(
+            f"{at} must join one value that depends on the observation with constants; it has {len(found)}."
+        )
+    chain: Chain
+    place, chain, others = found[0], given[found[0]], [v for v in given if not isinstance(v, tuple)]
+    match kind, place, len(given):
+        case "Gemm", 0, 2 | 3:
+            if "transA" in flags and flags["transA"].i:
+                raise InputError(f"{at} must not transpose the observation (transA).")
+            alpha, beta = (float(flags[k].f) if k in flags else 1.0 for k in ("alpha", "beta"))
+            weight = graph.real(given[1], at)
+            if weight.ndim != 2:
+                raise InputError(f"the weight of {at} must be a matrix; its shape is {weight.shape}.")
+            weight = weight if "transB" in flags and flags["transB"].i else weight.T
+            if alpha == 1 and beta == 1:
+                return graph.affine(chain, weight, given[2] if len(given) == 3 else None, at)
+            chain = graph.affine(chain, weight, None, at)
+            chain = chain if alpha == 1 else graph.scaled(chain, alpha, at)
+            if len(given) == 3 and given[2] is not None:
+                chain = graph.moved(chain, tuple(v * graph.row(beta, at)[0] for v in graph.row(given[2], at)))
+            return chain
+        case "MatMul", 0, 2:
+            weight = graph.real(given[1], at)
+            if weight.ndim != 2:
+                raise InputError(f"the weight of {at} must be a matrix; its shape is {weight.shape}.")
+            return graph.affine(chain, weight.T, None, at)
+        case "Add", _, 2:
+            return graph.shifted(chain, others[0], at)
+        case "Sub", 0, 2:
+            return graph.shifted(chain, others[0], at, sign=-1)
+        case "Sub", 1, 2:
+            return graph.shifted(graph.negated(chain), others[0], at)
+        case "Mul", _, 2:
+            return graph.scaled(chain, others[0], at)
+        case "Div", 0, 2:
+            return graph.scaled(chain, others[0], at, divide=True)
+        case "Neg", 0, 1:
+            return graph.negated(chain)
+        case "Tanh", 0, 1:
+            return graph.tanh(chain)
+        case "Identity", 0, 1:
+            return chain
+        case "Cast", 0, 1:
+            _require_real(flags, at)
+            return chain
+        case "Flatten", 0, 1 if flags["axis"].i in (1, -1) if "axis" in flags else True:
+            return chain
+        case "Reshape", 0, 2 if _keeps_width(chain, given[1]) and not ("allowzero" in flags and flags["allowzero"].i):
+            return chain
+        case "Relu", 0, 1:
+            return graph.clipped(chain, 0.0, None, at)
+        case "Clip", 0, 1 | 2 | 3:
+            bounds = [*given[1:], None, None]
+            return graph.clipped(chain, bounds[0], bounds[1], at)
+    raise InputError(f"{at} is not read: the operations are {_KNOWN}, with the observation in the usual place.")
+
+
+def _require_real(flags: dict[str, Any], at: str) -> None:
+    """Refuse a Cast to integers or to half precision, which changes numbers by more than rounding."""
+    import onnx
+
+    if "to" not in flags or flags["to"].i not in (onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE):
+        raise InputError(f"{at} must be a cast to float32 or float64.")
+
+
+def _keeps_width(chain: Chain, shape: Any) -> bool:
+    """Whether a Reshape to `shape` leaves rows of a batch as they are, because it names their width."""
+    wide = [step for step in chain if isinstance(step, Affine)]
+    said = np.asarray(shape).ravel().tolist()
+    return len(said) == 2 and (
+        said == [0, -1] or (bool(wide) and said in ([-1, len(wide[-1].bias)], [0, len(wide[-1].bias)]))
+    )
+
+
+def _attribute(flags: dict[str, Any], what: str) -> Numbers:
+    if set(flags) == {"value"}:
+        return _constant(flags["value"].t, what)
+    if set(flags) == {"value_int"}:
+        return np.array(flags["value_int"].i)
+    if set(flags) == {"value_ints"}:
+        return np.array(list(flags["value_ints"].ints))
+    if set(flags) == {"value_float"}:
+        return np.array(flags["value_float"].f)
+    if set(flags) == {"value_floats"}:
+        return np.array(list(flags["value_floats"].floats))
+    raise InputError(f"a Constant in {what} must be a tensor or floats; found {sorted(flags)}.")
+
+
+def _constant(tensor: Any, what: str) -> Numbers:
+    """A tensor that lies in the file itself, with as many numbers as its shape says."""
+    import onnx
+    from onnx import numpy_helper
+
+    if tensor.data_location == onnx.TensorProto.EXTERNAL or tensor.external_data:
+        raise InputError(f"tensor {tensor.name} of {what} must lie in the file itself; it lies in another one.")
+    if tensor.data_type not in (onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE, onnx.TensorProto.INT64):
+        raise InputError(f"tensor {tensor.name} of {what} must hold floating-point numbers (float32 or float64).")
+    if any(size < 0 for size in tensor.dims):
+        raise InputError(f"the shape of tensor {tensor.name} of {what} must have no negative size.")
+    try:
+        array: Numbers = numpy_helper.to_array(tensor)
+    except (ValueError, TypeError, RuntimeError) as error:
+        raise InputError(f"tensor {tensor.name} of {what} is damaged: {error}.") from error
+    return array

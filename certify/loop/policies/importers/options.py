@@ -1,0 +1,116 @@
+"""What a file cannot say about its policy, and whoever imports it has to.
+
+Nothing here is guessed: a reader that needs an answer which its file does not hold asks for the option by name.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+from certify.errors import InputError
+from certify.loop.policies.importers.steps import Clip
+from certify.loop.policies.network import Centre
+
+Kind = Literal["auto", "state-dict", "torchscript", "onnx", "sb3", "safetensors", "two-stage"]
+Output = Literal["identity", "tanh", "relu-tanh"]
+Observes = Literal["absolute", "deviation"]
+REFUSED_ACTIVATIONS = ("relu", "elu", "selu", "gelu", "silu", "leaky_relu", "sigmoid", "softplus", "mish")
+WITH_TANH = (
+    "Train the policy again with torch.nn.Tanh() between its layers: policy_kwargs=dict(activation_fn=torch.nn.Tanh) "
+    "for stable-baselines3, activation = 'tanh' for rsl_rl, fcnet_activation = 'tanh' for RLlib."
+)
+"""The next step where a policy has another activation."""
+WITHOUT_NORMALISATION = (
+    "LayerNorm, and every other normalisation between layers, is not supported: train the policy again without it. "
+    "BatchNorm alone is affine in evaluation and can be folded into the layer before it."
+)
+"""The next step where a policy has a normalisation between its layers."""
+
+
+@dataclass(frozen=True, slots=True)
+class ImportOptions:
+    """What is known about a policy file of another program; None where nothing is said.
+
+    Parameters
+    ----------
+    kind : the kind of file, or `auto`.
+    prefix : in a state_dict, the keys of the policy's layers up to their numbers, such as `actor.pi_net.fcs`.
+    activation : between the layers of a state_dict: `tanh`.
+    squash : what follows the last layer of a state_dict: `identity`, `tanh`, or `relu-tanh` for relu(tanh(.)).
+    states : the plant's states in the order in which the network reads them.
+    normaliser : a file with the observations' normaliser, or `none`.
+    epsilon : what a normaliser of rsl_rl adds to the standard deviation; 1/100 if nothing is said.
+    action_scale, action_offset : `u = scale * action + offset` in the plant's units, exact, one number or m.
+    clip : bounds of the action, before scale and offset.
+    centre : how pi(0) = u_eq is brought about; None leaves the policy as it is.
+    observes : whether the network reads the plant's states or their deviations from its operating point.
+    ignore : names of tensors that are no part of the policy, with `*` and `?` as in names of files.
+    output : which output of an ONNX graph is the action, where it has several.
+
+    Raises
+    ------
+    InputError : a value is none of those that an option takes.
+    """
+
+    kind: Kind = "auto"
+    prefix: str | None = None
+    activation: str | None = None
+    squash: Output | None = None
+    states: tuple[str, ...] | None = None
+    normaliser: Path | Literal["none"] | None = None
+    epsilon: Fraction | None = None
+    action_scale: tuple[Fraction, ...] | None = None
+    action_offset: tuple[Fraction, ...] | None = None
+    clip: Clip | None = None
+    centre: Centre | None = None
+    observes: Observes | None = None
+    ignore: tuple[str, ...] | None = None
+    output: str | None = None
+
+    def __post_init__(self) -> None:
+        for option, value, known in (
+            ("--from", self.kind, get_args(Kind)),
+            ("--squash", self.squash, get_args(Output)),
+            ("--centre", self.centre, get_args(Centre)),
+            ("--observes", self.observes, get_args(Observes)),
+        ):
+            if value is not None and value not in known:
+                raise InputError(f"{option} must be one of {', '.join(known)}; found {value!r}.")
+        if self.activation is not None and self.activation != "tanh":
+            named = self.activation.lower() in REFUSED_ACTIVATIONS
+            found = f"{self.activation} is not proved" if named else f"found {self.activation!r}"
+            raise InputError(f"--activation must be tanh: only tanh networks are proved; {found}. {WITH_TANH}")
+        if self.states is not None and len(set(self.states)) != len(self.states):
+            raise InputError(f"--states must name each state once; found {','.join(self.states)}.")
+        if self.action_scale is not None and 0 in self.action_scale:
+            raise InputError("--action-scale must not be 0.")
+        if self.epsilon is not None and self.epsilon < 0:
+            raise InputError(f"--epsilon must not be negative; found {float(self.epsilon)}.")
+
+    @property
+    def given(self) -> dict[str, Any]:
+        """What was said, by option, as text: for messages and for the record in the policy file."""
+        names = (f.name for f in fields(self))
+        values = {name: getattr(self, name) for name in names}
+        return {_OPTIONS[k]: _text(v) for k, v in values.items() if v is not None and v != "auto"}
+
+
+_OPTIONS = {
+    "kind": "--from", "prefix": "--prefix", "activation": "--activation", "squash": "--squash", "states": "--states",
+    "normaliser": "--normaliser", "epsilon": "--epsilon", "action_scale": "--action-scale",
+    "action_offset": "--action-offset", "clip": "--clip", "centre": "--centre", "observes": "--observes",
+    "ignore": "--ignore", "output": "--output",
+}  # fmt: skip
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, Path):
+        return value.name
+    if isinstance(value, Clip):
+        return ",".join(
+            f"{'' if lo is None else lo}:{'' if hi is None else hi}" for lo, hi in zip(value.lo, value.hi, strict=True)
+        )
+    return ",".join(map(str, value)) if isinstance(value, tuple) else str(value)

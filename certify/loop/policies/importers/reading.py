@@ -1,0 +1,114 @@
+"""What a reader of a file hands on: exact steps, and how the framework itself evaluates them."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.errors import InputError
+from certify.loop.policies.importers.options import Output
+from certify.loop.policies.importers.steps import Affine, Diagonal, Normalise, Step, Tanh
+from certify.loop.policies.network import Array
+
+Observations = NDArray[np.floating[Any]]
+Values = NDArray[Any]
+Evaluate = Callable[[Observations, bool], Values]
+
+
+@dataclass(frozen=True, slots=True)
+class Reading:
+    """A policy as its file says it.
+
+    Parameters
+    ----------
+    words : the kind of file and of policy, for people.
+    steps : from the (normalised) observation to the action.
+    evaluate : the framework's own evaluation of the same, observations (k, n) to actions (k, m), in single precision,
+        or, if the second argument says so, with the same operations in double precision.
+    normaliser : the one that the file itself holds, if it does.
+    action : the bounds of the action that the file states, (m,) pairs, if it does.
+    beta : stored `atanh((u_eq - offset) / scale)` of a policy that is centred inside its squash, shape (m,).
+    equilibrium : the state at which a policy of that kind is centred, shape (n,).
+    double : whether the file itself asks for double precision.
+    program : the part of the file's own program that `evaluate` runs, for people; None where the file holds numbers and
+        no program, so that `evaluate` can check the folding alone.
+    assumed : where there is no program, who says what stands between the numbers.
+    unread : why each tensor that is not read is left out, by its name.
+    beside : SHA-256 of each other file that was read with it, by its name.
+
+    Raises
+    ------
+    InputError : there is no layer among the steps.
+    """
+
+    words: str
+    steps: tuple[Step, ...]
+    evaluate: Evaluate
+    normaliser: Normalise | Diagonal | None = None
+    action: tuple[tuple[Fraction, Fraction], ...] | None = None
+    beta: Array | None = None
+    equilibrium: Array | None = None
+    double: bool = False
+    program: str | None = None
+    assumed: str = ""
+    unread: Mapping[str, str] = field(default_factory=dict)
+    beside: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if not any(isinstance(step, Affine) for step in self.steps):
+            raise InputError("a policy must have a layer; the file has none.")
+
+    @property
+    def n(self) -> int:
+        """Number of observations that the first layer reads."""
+        return next(int(step.weight.shape[1]) for step in self.steps if isinstance(step, Affine))
+
+    @property
+    def m(self) -> int:
+        """Number of actions."""
+        return next(int(step.weight.shape[0]) for step in reversed(self.steps) if isinstance(step, Affine))
+
+
+def perceptron(layers: Sequence[Affine], squash: Output = "identity") -> Evaluate:
+    """The layers with tanh between them, and `squash` behind them, as torch's own modules."""
+    import torch
+
+    modules: list[torch.nn.Module] = []
+    for layer in layers:
+        rows, columns = layer.weight.shape
+        module = torch.nn.Linear(columns, rows, dtype=torch.float64)
+        with torch.no_grad():
+            module.weight.copy_(torch.tensor(layer.weight))
+            module.bias.copy_(torch.tensor(layer.bias))
+        modules += [module, torch.nn.Tanh()]
+    ends: dict[Output, list[torch.nn.Module]] = {
+        "identity": [],
+        "tanh": [torch.nn.Tanh()],
+        "relu-tanh": [torch.nn.Tanh(), torch.nn.ReLU()],
+    }
+    whole = torch.nn.Sequential(*modules[:-1], *ends[squash])
+    versions = {True: whole, False: copy.deepcopy(whole).to(torch.float32)}
+
+    def evaluate(x: Observations, double: bool) -> Values:
+        with torch.no_grad():
+            dtype = torch.float64 if double else torch.float32
+            values: Values = versions[double](torch.tensor(x, dtype=dtype)).numpy()
+        return values
+
+    return evaluate
+
+
+def between(layers: Sequence[Affine]) -> tuple[Step, ...]:
+    """The layers as steps, with tanh between them."""
+    return tuple(step for layer in layers for step in (layer, Tanh()))[:-1]
+
+
+def widths(layers: Sequence[Affine]) -> str:
+    """The widths from observation to action, such as 2-16-16-1."""
+    return "-".join(str(w) for w in (layers[0].weight.shape[1], *(len(layer.bias) for layer in layers)))

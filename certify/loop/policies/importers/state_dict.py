@@ -1,0 +1,258 @@
+"""Multilayer perceptrons in a state_dict: `PREFIX.N.weight` and `PREFIX.N.bias`, whatever the prefix.
+
+A state_dict holds numbers and no functions. Which activation stands between the layers, what follows the last one, and
+what was done to observations and actions is not in it: each is asked for by the name of its option.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from fractions import Fraction
+
+import numpy as np
+
+from certify.errors import InputError
+from certify.loop.policies.importers.arrays import Numbers
+from certify.loop.policies.importers.normalisers import normaliser_root, rsl_normaliser
+from certify.loop.policies.importers.options import WITHOUT_NORMALISATION, ImportOptions, Output
+from certify.loop.policies.importers.reading import Observations, Reading, Values, between, perceptron, widths
+from certify.loop.policies.importers.steps import Affine, Clip, Step, Tanh, linear
+from certify.loop.policies.importers.unread import unread
+
+_KEY = re.compile(r"(?:(?P<prefix>.*)\.)?(?P<number>[0-9]{1,4})\.(?P<rest>.*)", re.DOTALL)
+_PARTS = ("controller.x_equilibrium", "controller.layers.0.weight", "controller.b")
+_OTHERS = ("critic", "value", "vf", "v_net", "q_net", "qf", "q1", "q2", "lyapunov", "target")
+_ENDS: dict[Output, tuple[Step, ...]] = {
+    "identity": (),
+    "tanh": (Tanh(),),
+    "relu-tanh": (Tanh(), Clip((Fraction(0),), (None,))),
+}
+_NORMALISATION = f"A normalisation layer has such a one. {WITHOUT_NORMALISATION}"
+Layers = list[Affine]
+
+
+def is_two_stage(tensors: Mapping[str, Numbers]) -> bool:
+    """Whether a file holds the policy of a two-stage checkpoint: its layers, and what it is centred at."""
+    return _root(tensors) is not None
+
+
+def read_two_stage(tensors: Mapping[str, Numbers], options: ImportOptions) -> Reading:
+    """`u = scale * squash(net(x) - net(x_eq) + b)`, centred inside the squash, as the two-stage method writes it.
+
+    Raises
+    ------
+    InputError : a tensor is missing or has another shape.
+    """
+    root = _root(tensors)
+    if root is None:
+        raise InputError(f"a two-stage file must hold {', '.join(_PARTS)} under one prefix; this one does not.")
+    prefix = f"{root}controller.layers"
+    layers = _layers(tensors, prefix)
+    squash: Output = "tanh" if options.squash is None else options.squash
+    if squash == "identity":
+        raise InputError("a two-stage policy is squashed: --squash must be tanh or relu-tanh; found identity.")
+    x_eq = np.asarray(tensors[f"{root}controller.x_equilibrium"]).reshape(-1)
+    b = np.asarray(tensors[f"{root}controller.b"]).reshape(-1)
+    if x_eq.shape != layers[0].weight.shape[1:] or b.shape != layers[-1].bias.shape:
+        raise InputError(
+            "controller.x_equilibrium and controller.b must have a number for each state and input; "
+            f"found {x_eq.shape} and {b.shape}."
+        )
+
+    read = {*_own(tensors, prefix), *(root + part for part in _PARTS)}
+    known = {"domain": "the domain of the training"}
+    known |= {f"{root}controller.u_equilibrium": "the input that controller.b is made of"}
+    net, relu = perceptron(layers), squash == "relu-tanh"
+
+    def evaluate(x: Observations, double: bool) -> Values:
+        squashed: Values = np.tanh(net(x, double) - net(x_eq[None], double) + b)
+        return np.maximum(squashed, 0) if relu else squashed
+
+    return Reading(
+        words=f"two-stage {widths(layers)}, centred inside the squash",
+        steps=(*between(layers), *_ENDS[squash]),
+        evaluate=evaluate,
+        assumed=f"tanh between the layers is how the two-stage method writes it, {squash} is what --squash says",
+        unread=unread(tensors, read, prefix, len(b), options.ignore, known),
+        beta=b.astype(np.float64),
+        equilibrium=x_eq.astype(np.float64),
+    )
+
+
+def read_state_dict(
+    tensors: Mapping[str, Numbers], options: ImportOptions, n: int, m: int, beside: str | None = None
+) -> Reading:
+    """The perceptron from n observations to m actions among the tensors of a file.
+
+    Parameters
+    ----------
+    beside : keys of the layers of the Lyapunov network that is imported with it, if there is one.
+
+    Raises
+    ------
+    InputError : there is none, there are several and `--prefix` does not say which, a layer is of a kind that is
+        not proved, or another tensor could belong to the policy.
+    """
+    prefix = options.prefix if options.prefix is not None else _only(tensors, n, m)
+    layers = _layers(tensors, prefix)
+    if (layers[0].weight.shape[1], layers[-1].weight.shape[0]) != (n, m):
+        raise InputError(
+            f"the policy must read {n} states and command {m} inputs; {prefix} is {widths(layers)}. "
+            "Name the states that it reads with --states."
+        )
+    squash: Output = "identity" if options.squash is None else options.squash
+    read, known = set(_own(tensors, prefix)), dict[str, str]()
+    if (at := normaliser_root(tensors)) is not None:
+        read |= {f"{at}_mean", f"{at}_std"}
+        known |= dict.fromkeys((f"{at}_var", f"{at}count"), "of the normaliser that is read")
+    if beside is not None:
+        known |= dict.fromkeys(_own(tensors, beside), "the Lyapunov network that is imported beside it")
+    return Reading(
+        words=f"state_dict {prefix} {widths(layers)}",
+        steps=(*between(layers), *_ENDS[squash]),
+        evaluate=perceptron(layers, squash),
+        normaliser=rsl_normaliser(tensors, options.epsilon),
+        double=_is_double(tensors, prefix),
+        assumed=f"tanh between the layers is what --activation says, {squash} behind them what --squash says",
+        unread=unread(tensors, read, prefix, m, options.ignore, known),
+    )
+
+
+def read_lyapunov(tensors: Mapping[str, Numbers], prefix: str | None, options: ImportOptions) -> Reading:
+    """The layers of a Lyapunov network, without what may stand behind the last one.
+
+    Parameters
+    ----------
+    prefix : its keys up to their numbers; None for where a two-stage file has them.
+    options : where the policy beside it lies, and which tensors to leave out.
+
+    Raises
+    ------
+    InputError : there are no such layers, one is of a kind that is not proved, or the network has more to it than its
+        layers, or may have.
+    """
+    x_eq, known = None, dict[str, str]()
+    if prefix is None:
+        root = _root(tensors)
+        if root is None:
+            raise InputError(f"a two-stage file must hold {', '.join(_PARTS)} under one prefix; this one does not.")
+        whole, prefix = f"{root}lyapunov.", f"{root}lyapunov.layers"
+        x_eq = np.asarray(tensors[f"{root}{_PARTS[0]}"]).reshape(-1).astype(np.float64)
+        known = {"domain": "the domain of the training"}
+    else:
+        whole = _dot(prefix)
+        if options.prefix is not None:
+            known = dict.fromkeys(_own(tensors, options.prefix), "the policy beside it")
+    if prefix not in _groups(tensors):
+        raise InputError(
+            f"there must be one; no tensor is called {_dot(prefix)}0.weight. "
+            f"The file has layers under {', '.join(g or 'no prefix' for g in _groups(tensors)) or 'no key'}."
+        )
+    inside = [(name, _KEY.fullmatch(name)) for name in tensors if name.startswith(whole)]
+    more = sorted(name for name, match in inside if match is None or (match["prefix"] or "") != prefix)
+    if more:
+        raise InputError(
+            f"it must be its layers {_dot(prefix)}NUMBER alone; the file has {', '.join(more[:3])} as well, and does "
+            "not say what becomes of that."
+        )
+    layers = _layers(tensors, prefix)
+    if x_eq is not None and x_eq.shape != layers[0].weight.shape[1:]:
+        raise InputError(
+            f"it must read a number for each of controller.x_equilibrium's {x_eq.size}; it is {widths(layers)}."
+        )
+    return Reading(
+        words=f"{prefix or 'no prefix'} {widths(layers)}",
+        steps=between(layers),
+        evaluate=perceptron(layers),
+        equilibrium=x_eq,
+        double=_is_double(tensors, prefix),
+        assumed=f"tanh between the layers is {'what --activation says' if x_eq is None else 'how the method has it'}",
+        unread=unread(tensors, _own(tensors, prefix), prefix, 1, options.ignore, known, of_policy=False),
+    )
+
+
+def _groups(tensors: Mapping[str, Numbers]) -> list[str]:
+    """Prefixes under which numbered layers lie, in the file's order."""
+    found = {}
+    for name in tensors:
+        match = _KEY.fullmatch(name)
+        if match is not None and match["rest"] == "weight":
+            found[match["prefix"] or ""] = True
+    return list(found)
+
+
+def _only(tensors: Mapping[str, Numbers], n: int, m: int) -> str:
+    """The one prefix whose layers lead from n to m and that no name calls a critic."""
+    described = []
+    fitting = []
+    for prefix in _groups(tensors):
+        numbers = _numbers(tensors, prefix)
+        first, last = tensors[f"{_dot(prefix)}{numbers[0]}.weight"], tensors[f"{_dot(prefix)}{numbers[-1]}.weight"]
+        described.append(f"{prefix or 'no prefix'}: {first.shape[-1]} to {last.shape[0] if last.ndim else 0}")
+        other = any(part.startswith(_OTHERS) for part in prefix.split("."))
+        if first.shape[-1:] == (n,) and last.shape[:1] == (m,) and not other:
+            fitting.append(prefix)
+    if len(fitting) == 1:
+        return fitting[0]
+    listed = "; ".join(described) or "none (layers must be called PREFIX.NUMBER.weight and PREFIX.NUMBER.bias)"
+    raise InputError(
+        f"a file must hold one policy from {n} states to {m} inputs; it holds {len(fitting)}. "
+        f"Name its keys up to their numbers with --prefix, and its states with --states. Found {listed}."
+    )
+
+
+def _layers(tensors: Mapping[str, Numbers], prefix: str) -> Layers:
+    root, layers = _dot(prefix), []
+    for k in _numbers(tensors, prefix):
+        weight, bias = tensors[f"{root}{k}.weight"], tensors.get(f"{root}{k}.bias")
+        if weight.ndim != 2 or weight.dtype.kind != "f":
+            raise InputError(
+                f"layer {root}{k} must be affine, with a weight (out, in) of floating-point numbers; its weight has "
+                f"shape {weight.shape}. {_NORMALISATION if weight.ndim == 1 else ''}".rstrip()
+            )
+        layers.append(linear(weight, bias))
+    return layers
+
+
+def _numbers(tensors: Mapping[str, Numbers], prefix: str) -> list[int]:
+    """The numbers of the layers under a prefix; whatever else lies under such a number is refused."""
+    root, numbers = _dot(prefix), set()
+    for name in tensors:
+        match = _KEY.fullmatch(name)
+        if match is None or (match["prefix"] or "") != prefix:
+            continue
+        if match["rest"] not in ("weight", "bias"):
+            raise InputError(
+                f"the layers of a policy must be affine, with weight and bias; {name} belongs to one of another kind."
+            )
+        numbers.add(int(match["number"]))
+    if not numbers or any(f"{root}{k}.weight" not in tensors for k in numbers):
+        raise InputError(f"there must be layers {root}0.weight and so on; found {', '.join(list(tensors)[:12])}.")
+    return sorted(numbers)
+
+
+def _own(tensors: Mapping[str, Numbers], prefix: str) -> list[str]:
+    """The names of the layers' tensors under a prefix."""
+    matches = ((name, _KEY.fullmatch(name)) for name in tensors)
+    return [
+        name
+        for name, match in matches
+        if match is not None and (match["prefix"] or "") == prefix and match["rest"] in ("weight", "bias")
+    ]
+
+
+def _root(tensors: Mapping[str, Numbers]) -> str | None:
+    """What stands before the names of a two-stage policy, where that is one thing for all of them."""
+    roots = [key.removesuffix(_PARTS[0]) for key in tensors if key.endswith(_PARTS[0])]
+    if len(roots) != 1 or not all(roots[0] + part in tensors for part in _PARTS):
+        return None
+    return roots[0]
+
+
+def _is_double(tensors: Mapping[str, Numbers], prefix: str) -> bool:
+    return any(tensors[f"{_dot(prefix)}{k}.weight"].dtype == np.float64 for k in _numbers(tensors, prefix))
+
+
+def _dot(prefix: str) -> str:
+    return f"{prefix}." if prefix else ""

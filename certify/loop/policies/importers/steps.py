@@ -1,0 +1,133 @@
+"""What a file says that its policy does, as exact steps from the observation to the action.
+
+Every reader ends here, so that folding, comparing and refusing are written once. A constant of a file is the exact
+number that its bytes are; what a step does is meant in real arithmetic.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from fractions import Fraction
+from typing import TypeVar
+
+import numpy as np
+
+from certify.errors import InputError
+from certify.loop.policies.network import Array
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, slots=True)
+class Affine:
+    """`y = W h + b`.
+
+    Parameters
+    ----------
+    weight : shape (out, in).
+    bias : shape (out,).
+
+    Raises
+    ------
+    InputError : the shapes do not match, or a number is not finite.
+    """
+
+    weight: Array
+    bias: Array
+
+    def __post_init__(self) -> None:
+        for name in ("weight", "bias"):
+            array = np.array(getattr(self, name), dtype=np.float64)
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+        if self.weight.ndim != 2 or self.bias.shape != self.weight.shape[:1] or 0 in self.weight.shape:
+            raise InputError(
+                "a layer must have a weight (out, in) and a bias (out,); "
+                f"found {self.weight.shape} and {self.bias.shape}."
+            )
+        if not (np.all(np.isfinite(self.weight)) and np.all(np.isfinite(self.bias))):
+            raise InputError("the numbers of a layer must be finite; found NaN or infinity.")
+
+
+@dataclass(frozen=True, slots=True)
+class Diagonal:
+    """`y_i = scale_i h_i + offset_i`; one number stands for every component."""
+
+    scale: tuple[Fraction, ...]
+    offset: tuple[Fraction, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Normalise:
+    """`y_j = clip((o_j - mean_j) / sqrt(square_j), -limit, limit)`; without a limit, no clip.
+
+    Raises
+    ------
+    InputError : a square or the limit is not positive.
+    """
+
+    mean: tuple[Fraction, ...]
+    square: tuple[Fraction, ...]
+    limit: Fraction | None = None
+
+    def __post_init__(self) -> None:
+        if len(self.mean) != len(self.square):
+            raise InputError(
+                f"a normaliser must have as many means as variances; found {len(self.mean)} and {len(self.square)}."
+            )
+        if any(q <= 0 for q in self.square) or (self.limit is not None and self.limit <= 0):
+            raise InputError("what a normaliser divides by, and what it clips to, must be positive.")
+
+
+@dataclass(frozen=True, slots=True)
+class Tanh:
+    """`y_i = tanh h_i`."""
+
+
+@dataclass(frozen=True, slots=True)
+class Clip:
+    """`y_i = min(max(h_i, lo_i), hi_i)`; None for a side without a bound, one bound for every component."""
+
+    lo: tuple[Fraction | None, ...]
+    hi: tuple[Fraction | None, ...]
+
+    def __post_init__(self) -> None:
+        width = max(len(self.lo), len(self.hi))
+        for lo, hi in zip(spread(self.lo, width), spread(self.hi, width), strict=True):
+            if lo is not None and hi is not None and not lo < hi:
+                raise InputError(f"a clip must have lo < hi; found {float(lo)} and {float(hi)}.")
+
+
+Step = Affine | Diagonal | Normalise | Tanh | Clip
+
+
+def spread(values: tuple[T, ...], width: int) -> tuple[T, ...]:
+    """One value for each of `width` components, where a single one stands for all of them.
+
+    Raises
+    ------
+    InputError : there are neither one nor `width` values.
+    """
+    if len(values) == 1:
+        return values * width
+    if len(values) != width:
+        raise InputError(f"there must be one number or {width} of them; found {len(values)}.")
+    return values
+
+
+def exactly(array: Array) -> tuple[Fraction, ...]:
+    """The exact rationals of an array's numbers, in row order.
+
+    Raises
+    ------
+    InputError : a number is not finite.
+    """
+    flat = np.asarray(array, dtype=np.float64).ravel()
+    if not np.all(np.isfinite(flat)):
+        raise InputError("the constants of a policy must be finite; found NaN or infinity.")
+    return tuple(Fraction(float(v)) for v in flat)
+
+
+def linear(weight: Array, bias: Array | None) -> Affine:
+    """The layer of a file, whose bias may be missing."""
+    return Affine(weight, np.zeros(np.shape(weight)[0]) if bias is None else bias)

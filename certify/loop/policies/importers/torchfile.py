@@ -1,0 +1,155 @@
+"""A file of torch.save or torch.jit.save: its pickle as data, and the tensors that its storages hold.
+
+torch's own `weights_only` refuses a checkpoint with a numpy random state beside the weights, and without it torch.load
+runs what the pickle says. Here nothing runs in either case: whatever is no tensor stays a name.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from certify.errors import InputError
+from certify.loop.policies.importers.archives import Archive
+from certify.loop.policies.importers.arrays import Numbers, product
+from certify.loop.policies.importers.pickles import Call, Name, Persistent, brief, read_pickle
+
+_MAX_NUMBERS = 2**26
+_TYPES = {
+    "Float": "f4", "Double": "f8", "Half": "f2", "BFloat16": "bf16",
+    "Long": "i8", "Int": "i4", "Short": "i2", "Char": "i1", "Byte": "u1", "Bool": "b1",
+}  # fmt: skip
+_DTYPES = {
+    "float32": "f4", "float64": "f8", "float16": "f2", "bfloat16": "bf16",
+    "int64": "i8", "int32": "i4", "int16": "i2", "int8": "i1", "uint8": "u1", "bool": "b1",
+}  # fmt: skip
+_LEGACY = b"\x80\x02\x8a\x0al\xfc\x9cF\xf9 j\xa8P\x19."  # the pickled magic number with which such a file begins
+
+
+class TorchFile:
+    """A zip file of torch, read without running anything in it.
+
+    Parameters
+    ----------
+    raw : the file.
+    what : how messages call it.
+    archive : the file as an archive, if it has been opened.
+
+    Raises
+    ------
+    InputError : it is a file of before torch 1.6, is damaged, or holds no pickle.
+    """
+
+    def __init__(self, raw: bytes, what: str, archive: Archive | None = None) -> None:
+        if raw.startswith(_LEGACY):
+            raise InputError(
+                f"{what} has torch's format of before version 1.6, which cannot be read without running it; "
+                "load it where you trust it and write it again with torch.save."
+            )
+        self.what = what
+        self.archive = archive if archive is not None else Archive(raw, what)
+        roots = [name.removesuffix("data.pkl") for name in self.archive.names if _depth(name) == 1]
+        roots = [root for root in roots if f"{root}data.pkl" in self.archive]
+        if len(set(roots)) != 1:
+            raise InputError(f"{what} must hold one data.pkl, as torch.save writes it; found {len(set(roots))}.")
+        self.root = roots[0]
+        self.order = "<"
+        if f"{self.root}byteorder" in self.archive:
+            word = self.archive.read(f"{self.root}byteorder")
+            if word not in (b"little", b"big"):
+                raise InputError(f"the byte order of {what} must be little or big; found {word[:20]!r}.")
+            self.order = "<" if word == b"little" else ">"
+        self._storages: dict[str, bytes] = {}
+        self._left = _MAX_NUMBERS
+
+    def pickle(self, name: str) -> Any:
+        """A pickle of the archive, as data."""
+        return read_pickle(self.archive.read(self.root + name), f"{name} in {self.what}")
+
+    def holds(self, name: str) -> bool:
+        """Whether the archive has a member of that name."""
+        return self.root + name in self.archive
+
+    def tensor(self, node: Any, what: str, folder: str = "data") -> Numbers:
+        """The numbers of a tensor, in their own precision; float16 and bfloat16 as float32, which holds them exactly.
+
+        Raises
+        ------
+        InputError : it is no dense tensor of plain numbers, or reaches out of its storage.
+        """
+        if isinstance(node, Call) and node.function == Name("torch._utils", "_rebuild_parameter"):
+            node = node.arguments[0] if isinstance(node.arguments, tuple) and node.arguments else None
+        if not is_tensor(node):
+            raise InputError(f"{what} must be a dense tensor; found {brief(node)}.")
+        given = node.arguments
+        if not isinstance(given, tuple) or len(given) < 6 or not isinstance(given[0], Persistent):
+            raise InputError(f"tensor {what} is damaged.")
+        _, offset, size, stride = given[:4]
+        typed = node.function.name == "_rebuild_tensor_v3"
+        dtype = given[6] if typed and len(given) > 6 else None
+        # What may stand behind says that the numbers are meant negated or conjugated, or what shape lies behind them.
+        if any(given[7 if typed else 6 :]):
+            raise InputError(f"tensor {what} must be plain numbers; something is said of how to read them.")
+        flat = self._storage(given[0].reference, dtype, what, folder)
+        count = product(size, what)
+        if type(offset) is not int or offset < 0:
+            raise InputError(f"tensor {what} must begin inside its storage.")
+        if (
+            not isinstance(stride, tuple | list)
+            or len(stride) != len(size)
+            or not all(type(s) is int and 0 <= s <= flat.size for s in stride)
+        ):
+            raise InputError(f"the strides of tensor {what} must be as many numbers as its sizes, none below zero.")
+        # A view that repeats its storage would make much of little; weights are no such views.
+        if not 0 < count <= flat.size:
+            raise InputError(f"tensor {what} must have 1 to {flat.size} numbers, as its storage has; it has {count}.")
+        self._left -= count
+        if self._left < 0:
+            raise InputError(f"{self.what} must hold at most {_MAX_NUMBERS} numbers in its tensors; it holds more.")
+        last = offset + sum((k - 1) * s for k, s in zip(size, stride, strict=True))
+        if last >= flat.size:
+            raise InputError(f"tensor {what} must lie inside its storage of {flat.size} numbers; it reaches {last}.")
+        index = np.full(tuple(size), offset, dtype=np.int64)
+        for axis, (k, s) in enumerate(zip(size, stride, strict=True)):
+            shape = [1] * len(size)
+            shape[axis] = k
+            index += (np.arange(k, dtype=np.int64) * s).reshape(shape)
+        result: Numbers = flat[index]
+        return result
+
+    def _storage(self, reference: Any, dtype: Any, what: str, folder: str) -> Numbers:
+        if not isinstance(reference, tuple) or len(reference) != 5 or reference[0] != "storage":
+            raise InputError(f"tensor {what} must name a storage of the file; it names something else.")
+        _, kind, key, _, count = reference
+        code = _DTYPES.get(dtype.name) if isinstance(dtype, Name) and dtype.module == "torch" else None
+        if code is None and dtype is None and isinstance(kind, Name) and kind.module in ("torch", "torch.cuda"):
+            code = _TYPES.get(kind.name.removesuffix("Storage"))
+        if code is None:
+            raise InputError(f"tensor {what} must hold plain real numbers; its storage is {brief(kind)}.")
+        if not isinstance(key, str) or not key.isascii() or not key.isdigit():
+            raise InputError(f"tensor {what} must lie in a storage of this file, by its number; found {brief(key)}.")
+        name = f"{self.root}{folder}/{key}"
+        if name not in self._storages:
+            self._storages[name] = self.archive.read(name)
+        raw = self._storages[name]
+        width = 2 if code == "bf16" else int(code[1])
+        # Version 3 of tensors counts its storage in bytes, the others in numbers.
+        if type(count) is not int or len(raw) % width or count not in (len(raw) // width, len(raw)):
+            raise InputError(f"the storage of tensor {what} must hold what is said of it; it has {len(raw)} bytes.")
+        if code == "bf16":
+            high = np.frombuffer(raw, dtype=f"{self.order}u2").astype(np.uint32) << 16
+            return high.view(np.float32)
+        array = np.frombuffer(raw, dtype=f"{self.order}{code}")
+        return array.astype(np.float32 if code == "f2" else array.dtype.newbyteorder("="))
+
+
+def is_tensor(node: Any) -> bool:
+    """Whether a node of the pickle describes a dense tensor, or a parameter that is one."""
+    if not isinstance(node, Call) or not isinstance(node.function, Name) or node.function.module != "torch._utils":
+        return False
+    return node.function.name in ("_rebuild_tensor_v2", "_rebuild_tensor_v3", "_rebuild_parameter")
+
+
+def _depth(name: str) -> int:
+    return name.count("/") if name.endswith("/data.pkl") else -1

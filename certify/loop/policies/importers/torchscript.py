@@ -1,0 +1,295 @@
+"""TorchScript archives, their code read as text: affine layers, tanh and constant scalings that form one chain.
+
+torch.jit.load compiles whatever code an archive holds, and runs the methods by which its modules set their state; among
+the operations of TorchScript are some that read files. So it is not called. The code is parsed as Python's grammar,
+which it follows, and only the statements below are understood; constants and parameters are pickles, read as data.
+What is compared with is torch itself, given the same operations one by one.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from certify.errors import InputError
+from certify.loop.policies.importers import graph
+from certify.loop.policies.importers.arrays import Numbers
+from certify.loop.policies.importers.graph import Chain
+from certify.loop.policies.importers.options import WITH_TANH, WITHOUT_NORMALISATION
+from certify.loop.policies.importers.pickles import Call, Name, brief
+from certify.loop.policies.importers.reading import Observations, Reading, Values
+from certify.loop.policies.importers.torchfile import TorchFile, is_tensor
+
+_MAX_OPERATIONS = 1000
+_MAX_DEPTH = 40
+_MAX_TEXT = 2**20
+_KNOWN = "linear, addmm, matmul, add, sub, rsub, mul, div, neg, clamp, hardtanh, relu and tanh"
+_NORMALISATIONS = ("layer_norm", "batch_norm", "group_norm", "instance_norm", "rms_norm")
+_RESERVED = ("torch", "CONSTANTS", "getattr")
+_DEFAULTS: dict[str, tuple[Any, ...]] = {"hardtanh": (-1.0, 1.0), "clamp": (None, None)}
+
+
+@dataclass(frozen=True, slots=True)
+class _Value:
+    """A value that depends on the observation: the exact steps to it, and torch's operations with their constants."""
+
+    chain: Chain = ()
+    operations: tuple[tuple[str, tuple[Any, ...]], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class _Program:
+    """The archive's classes and constants, and how many operations were met."""
+
+    file: TorchFile
+    classes: dict[Name, ast.ClassDef]
+    constants: tuple[Any, ...]
+    count: list[int] = field(default_factory=lambda: [0])
+
+
+def is_torchscript(file: TorchFile) -> bool:
+    """Whether a file of torch holds code."""
+    return any(name.startswith(f"{file.root}code/") for name in file.archive.names)
+
+
+def read_torchscript(file: TorchFile) -> Reading:
+    """The policy of a TorchScript archive, whose `forward` takes the observation and gives the action.
+
+    Raises
+    ------
+    InputError : the archive is damaged, or its code is no chain of known operations.
+    """
+    constants = file.pickle("constants.pkl") if file.holds("constants.pkl") else ()
+    program = _Program(file, _classes(file), constants if isinstance(constants, tuple) else ())
+    try:
+        value = _forward(program, file.pickle("data.pkl"), _Value(), 0)
+    except RecursionError as error:
+        raise InputError(f"the code of {file.what} nests too deep to be read.") from error
+    operations = value.operations
+    own = any(a.dtype == np.float64 and a.ndim for _, given in operations for a in given if _is_array(a))
+
+    def evaluate(x: Observations, double: bool) -> Values:
+        import torch
+
+        with torch.no_grad():
+            y = torch.tensor(x, dtype=torch.float64 if double else torch.float32)
+            for name, given in operations:
+                y = _run(name, y, given, double)
+            values: Values = y.numpy()
+        return values
+
+    words = f"TorchScript of {', '.join(name for name, _ in operations)[:200]}"
+    ran = "the operations of the file's code, one by one in torch (the code is read as text, and not run)"
+    return Reading(words=words, steps=value.chain, evaluate=evaluate, double=own, program=ran)
+
+
+def _classes(file: TorchFile) -> dict[Name, ast.ClassDef]:
+    """The classes of the archive's code by the names that its pickle has for them."""
+    found = {}
+    start = f"{file.root}code/"
+    for member in file.archive.names:
+        if not member.startswith(start) or not member.endswith(".py"):
+            continue
+        raw = file.archive.read(member)
+        if len(raw) > _MAX_TEXT:
+            raise InputError(f"{member} in {file.what} must be at most 1 MiB of code; it has {len(raw)} bytes.")
+        try:
+            tree = ast.parse(raw.decode("ascii"))
+        except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
+            raise InputError(f"{member} in {file.what} is no code that can be read: {error}.") from error
+        module = member.removeprefix(start).removesuffix(".py").replace("/", ".")
+        for node in tree.body:
+            if isinstance(node, ast.ClassDef):
+                name = Name(module, node.name)
+                if name in found:
+                    raise InputError(f"{file.what} must define each class once; {name} stands there twice.")
+                found[name] = node
+    return found
+
+
+def _forward(program: _Program, module: Any, given: _Value, depth: int) -> _Value:
+    what = program.file.what
+    if depth > _MAX_DEPTH:
+        raise InputError(f"the modules of {what} must nest at most {_MAX_DEPTH} deep.")
+    if not isinstance(module, Call) or not isinstance(module.function, Name) or len(module.states) != 1:
+        raise InputError(f"{what} must hold modules; found {brief(module)}.")
+    definition = program.classes.get(module.function)
+    methods = [] if definition is None else [n for n in definition.body if isinstance(n, ast.FunctionDef)]
+    forward = [node for node in methods if node.name == "forward"]
+    if len(forward) != 1 or len(forward[0].args.args) != 2 or forward[0].decorator_list:
+        raise InputError(f"{module.function} in {what} must have one forward of one observation.")
+    names = [argument.arg for argument in forward[0].args.args]
+    if len(set(names)) != 2 or any(name in _RESERVED for name in names):
+        raise InputError(f"forward of {module.function} in {what} must not rename {', '.join(_RESERVED)}.")
+    values: dict[str, Any] = {names[0]: module, names[1]: given}
+    for statement in forward[0].body:
+        match statement:
+            case ast.Assign(targets=[ast.Name(id=name)]) if name not in _RESERVED:
+                values[name] = _evaluate(program, statement.value, values, depth)
+            case ast.Return(value=ast.expr() as expression):
+                result = _evaluate(program, expression, values, depth)
+                if isinstance(result, _Value):
+                    return result
+                raise InputError(
+                    f"forward of {module.function} in {what} must return what it makes of the observation."
+                )
+            case _:
+                raise InputError(
+                    f"forward of {module.function} in {what} has a statement that is not read: {_text(statement)}."
+                )
+    raise InputError(f"forward of {module.function} in {what} must return its action.")
+
+
+def _evaluate(program: _Program, node: ast.expr, values: dict[str, Any], depth: int) -> Any:
+    """The value of an expression: a module, a constant, or a `_Value`."""
+    match node:
+        case ast.Name(id=name) if name in values:
+            return values[name]
+        case ast.Constant(value=bool() | int() | float() | None as value):
+            return value
+        case ast.UnaryOp(op=ast.USub(), operand=ast.Constant(value=int() | float() as value)):
+            return -value
+        case ast.Attribute(value=ast.Name(id="CONSTANTS"), attr=attr) if attr[:1] == "c" and attr[1:].isdecimal():
+            index = int(attr[1:])
+            if index >= len(program.constants):
+                raise InputError(f"{program.file.what} has no constant {index}.")
+            return _tensor(program, program.constants[index], attr, "constants")
+        case ast.Attribute(value=inner, attr=attr):
+            return _attribute(program, _evaluate(program, inner, values, depth), attr)
+        case ast.Call(func=ast.Name(id="getattr"), args=[inner, ast.Constant(value=str() as attr)], keywords=[]):
+            return _attribute(program, _evaluate(program, inner, values, depth), attr)
+        case ast.Call(func=ast.Attribute(value=ast.Name(id="torch"), attr=name)):
+            if name in _NORMALISATIONS:
+                raise InputError(f"torch.{name} in {program.file.what} is not read. {WITHOUT_NORMALISATION}")
+            arguments = [_evaluate(program, argument, values, depth) for argument in node.args]
+            return _operation(program, name, arguments, node)
+        case ast.Call(func=ast.Attribute(value=inner, attr="forward"), args=[argument], keywords=[]):
+            module = _evaluate(program, inner, values, depth)
+            given = _evaluate(program, argument, values, depth)
+            if not isinstance(given, _Value):
+                raise InputError(f"a module of {program.file.what} must be given what depends on the observation.")
+            return _forward(program, module, given, depth + 1)
+    raise InputError(f"{program.file.what} has an expression that is not read: {_text(node)}. Known are {_KNOWN}.")
+
+
+def _attribute(program: _Program, module: Any, name: str) -> Any:
+    state = module.states[0] if isinstance(module, Call) and len(module.states) == 1 else None
+    fixed = _fixed(program, module, name)
+    if not isinstance(state, dict) or (name in state) == (fixed is not None):
+        found = "has no" if fixed is None else "says twice what is its"
+        raise InputError(f"a module of {program.file.what} {found} {name}.")
+    if fixed is not None:
+        return fixed
+    value = state[name]
+    if is_tensor(value):
+        return _tensor(program, value, name, "data")
+    if isinstance(value, Call | float | int) or value is None:
+        return value
+    raise InputError(f"{name} in {program.file.what} must be a module or a number; found {brief(value)}.")
+
+
+def _fixed(program: _Program, module: Any, name: str) -> int | float | None:
+    """The number that a module's class gives to an attribute, as it does to constants; None if it gives none."""
+    definition = program.classes.get(module.function) if isinstance(module, Call) else None
+    for node in [] if definition is None else definition.body:
+        match node:
+            case ast.AnnAssign(target=ast.Name(id=found), value=ast.expr() as value) if found == name:
+                number = _evaluate(program, value, {}, 0)
+                if isinstance(number, int | float) and not isinstance(number, bool):
+                    return number
+                raise InputError(f"{name} in {program.file.what} must be a number; found {_text(value)}.")
+    return None
+
+
+def _tensor(program: _Program, node: Any, name: str, folder: str) -> Numbers:
+    return program.file.tensor(node, f"{name} in {program.file.what}", folder)
+
+
+def _operation(program: _Program, name: str, given: list[Any], node: ast.Call) -> Any:
+    at = f"torch.{name} in {program.file.what}"
+    program.count[0] += 1
+    if program.count[0] > _MAX_OPERATIONS:
+        raise InputError(f"{program.file.what} must have at most {_MAX_OPERATIONS} operations; it has more.")
+    for word in node.keywords:
+        # alpha is written out even where it is 1, and then changes nothing
+        if word.arg != "alpha" or not isinstance(word.value, ast.Constant) or word.value.value != 1:
+            raise InputError(f"{at} has {word.arg}, which is not read.")
+    if name in ("t", "numpy_T") and len(given) == 1 and _is_array(given[0]) and given[0].ndim == 2:
+        return given[0].T
+    places = [k for k, value in enumerate(given) if isinstance(value, _Value)]
+    if len(places) != 1 or any(isinstance(value, Call | bool) for value in given):
+        raise InputError(f"{at} must join one value that depends on the observation with constants.")
+    value, others = given[places[0]], tuple(v for v in given if not isinstance(v, _Value))
+    chain = _step(name, places[0], len(given), value.chain, others, at)
+    label = "rsub" if name == "sub" and places[0] == 1 else name
+    return _Value(chain, (*value.operations, (label, others)))
+
+
+def _step(name: str, place: int, count: int, chain: Chain, given: tuple[Any, ...], at: str) -> Chain:
+    match name, place, count:
+        case "linear", 0, 2 | 3:
+            return graph.affine(chain, given[0], given[1] if count == 3 else None, at)
+        case "addmm", 1, 3:
+            return graph.affine(chain, graph.real(given[1], at).T, given[0], at)
+        case "matmul" | "mm", 0, 2:
+            return graph.affine(chain, graph.real(given[0], at).T, None, at)
+        case "add", _, 2:
+            return graph.shifted(chain, given[0], at)
+        case "sub", 0, 2:
+            return graph.shifted(chain, given[0], at, sign=-1)
+        case ("sub", 1, 2) | ("rsub", 0, 2):
+            return graph.shifted(graph.negated(chain), given[0], at)
+        case "mul", _, 2:
+            return graph.scaled(chain, given[0], at)
+        case "div", 0, 2:
+            return graph.scaled(chain, given[0], at, divide=True)
+        case "neg", 0, 1:
+            return graph.negated(chain)
+        case "tanh", 0, 1:
+            return graph.tanh(chain)
+        case "relu", 0, 1:
+            return graph.clipped(chain, 0.0, None, at)
+        case ("clamp", 0, 1 | 2 | 3) | ("hardtanh", 0, 1 | 2 | 3):
+            lo, hi = (*given, *_DEFAULTS[name][len(given) :])
+            return graph.clipped(chain, lo, hi, at)
+    raise InputError(f"{at} is not read: only tanh networks are proved, and the operations are {_KNOWN}. {WITH_TANH}")
+
+
+def _run(name: str, y: Any, given: tuple[Any, ...], double: bool) -> Any:
+    """torch's own operation, with its constants as they are or in double precision."""
+    import torch
+
+    kind = np.float64 if double else None
+    constants = [torch.from_numpy(np.array(v, dtype=kind)) if _is_array(v) else v for v in given]
+    functions: dict[str, Callable[..., Any]] = {
+        "linear": torch.nn.functional.linear,
+        "addmm": lambda h, bias, weight: torch.addmm(bias, h, weight),
+        "matmul": torch.matmul,
+        "mm": torch.mm,
+        "add": torch.add,
+        "sub": torch.sub,
+        "rsub": lambda h, constant: constant - h,
+        "mul": torch.mul,
+        "div": torch.div,
+        "neg": torch.neg,
+        "tanh": torch.tanh,
+        "relu": torch.relu,
+        "clamp": torch.clamp,
+        "hardtanh": torch.nn.functional.hardtanh,
+    }
+    return functions[name](y, *constants)
+
+
+def _is_array(value: Any) -> bool:
+    return isinstance(value, np.ndarray)
+
+
+def _text(node: ast.AST) -> str:
+    try:
+        return repr(ast.unparse(node)[:120])
+    except (RecursionError, ValueError):
+        return f"a {type(node).__name__}"

@@ -1,0 +1,175 @@
+"""Tensors of a file that the layers of its network do not account for: each is named, and known to be none of it.
+
+A file of numbers does not say what becomes of them. A tensor that is not read is left out without a question only if
+its name says that no action depends on it, whatever it holds:
+
+- the state of an optimiser, of a schedule of learning rates or of the run (steps, random numbers, last observations);
+- the spread of the actions that training draws, and weights of losses: `log_std`, `log_alpha`, `log_sigma_...`, or
+  `std` with a number for each output and no mean beside it;
+- another network: it lies in a part called critic, value, Q, Lyapunov or target.
+
+Every other one could belong to the network, as the K of `u = -K x + net(x)` does, and a file with such a tensor is
+refused unless `--ignore` names it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Mapping
+from fnmatch import fnmatchcase
+
+from certify.errors import InputError
+from certify.loop.policies.importers.arrays import Numbers
+
+_STATE = re.compile(
+    r"(.*\.)?state\.[0-9]+\.(step|exp_avg|exp_avg_sq|max_exp_avg_sq|exp_inf|momentum_buffer|square_avg|grad_avg|acc_delta|sum)"
+)
+_SPREAD = re.compile(r"(.*_)?log_?(std|sigma|alpha|ent_coef|temperature)s?(_.*)?|sigma_param", re.IGNORECASE)
+_COUNTS = {"step", "steps", "global_step", "total_steps", "num_timesteps", "iteration", "epoch", "count"}
+_SEEN = {"obs", "last_obs", "_last_obs"}
+_RUN_PARTS = {"random_state", "env_random_state", "rng_state", "rng_states", "cuda_rng_state", "torch_rng_state"}
+_OPTIMISER = {"optimizer", "optimizers", "optimiser", "optimisers", "optim", "scheduler", "schedulers"}
+_OTHER = {"critic", "critics", "value", "values", "vf", "vnet", "qf", "qnet", "lyapunov", "privileged"}
+_OF = {"net", "network", "nets", "function", "fn", "head", "mlp", "v", "q"}
+_NETWORKS = _OTHER | _OF | {"actor", "policy", "pi", "controller", "model"}
+_POLICY = {"actor", "policy", "pi", "controller"}
+_OPTIMISER_WORDS = "the state of an optimiser or of a schedule"
+_SPREAD_WORDS = "the spread of actions in training, or a weight of a loss"
+_RUN_WORDS = "the state of the run"
+_OTHER_WORDS = "another network: a critic, a value, a Lyapunov or a target network"
+
+
+def unread(
+    tensors: Mapping[str, Numbers],
+    read: Collection[str],
+    prefix: str,
+    outputs: int,
+    ignored: tuple[str, ...] | None,
+    known: Mapping[str, str],
+    *,
+    of_policy: bool = True,
+) -> dict[str, str]:
+    """Why each tensor that is not read is left out, by its name.
+
+    Parameters
+    ----------
+    tensors : all tensors of the file.
+    read : the names of those that the network is made of.
+    prefix : the keys of its layers up to their numbers.
+    outputs : how many numbers it gives.
+    ignored : names to leave out, `*` and `?` in them as in names of files.
+    known : why others are left out, for whoever knows the format.
+    of_policy : the network is a policy; of a Lyapunov network the policy is another one.
+
+    Raises
+    ------
+    InputError : a tensor could belong to the network, or a name of `ignored` is none of a tensor that is not read.
+    """
+    found: dict[str, str] = {}
+    could = []
+    left = sorted(set(tensors) - set(read))
+    for name in left:
+        if any(fnmatchcase(name, pattern) for pattern in ignored or ()):
+            found[name] = "--ignore names it"
+            continue
+        why = known.get(name) or _known(name, tensors, prefix, outputs, of_policy)
+        if why is None:
+            could.append(name)
+        else:
+            found[name] = why
+    if of_policy:
+        for pattern in ignored or ():
+            if not any(fnmatchcase(name, pattern) for name in left):
+                taken = "; it names what is read" if any(fnmatchcase(name, pattern) for name in read) else ""
+                raise InputError(
+                    f"--ignore must name tensors of the file that are not read{taken}; found {pattern!r}. "
+                    f"Not read are {braced(left) or 'none'}."
+                )
+    if could:
+        whole = "policy" if of_policy else "Lyapunov function"
+        listed = ", ".join(f"{name} {tensors[name].shape}" for name in could[:8])
+        more = f" and {len(could) - 8} more" if len(could) > 8 else ""
+        options = " ".join(f"--ignore {_quoted(name)}" for name in could[:3])
+        raise InputError(
+            f"the layers {_dot(prefix)}NUMBER must be all of the {whole}, and the file holds what could belong to it: "
+            f"{listed}{more}. If the layers are all of it, say so: {options}{' ...' if len(could) > 3 else ''}. "
+            f"If they are not, export the {whole} as TorchScript or ONNX, which say what becomes of each number."
+        )
+    return found
+
+
+def _known(name: str, tensors: Mapping[str, Numbers], prefix: str, outputs: int, of_policy: bool) -> str | None:
+    """Why no output depends on a tensor of this name; None if its name does not say that."""
+    *parts, leaf = name.split(".")
+    if any(_SPREAD.fullmatch(part) for part in (leaf, *parts)):
+        return _SPREAD_WORDS
+    if leaf == "std" and tensors[name].size in (1, outputs) and not _has_mean(tensors, parts):
+        return _SPREAD_WORDS
+    if _STATE.fullmatch(name):
+        return _OPTIMISER_WORDS
+    counts = leaf in _COUNTS and tensors[name].size == 1
+    if counts or leaf in _SEEN or any(part in _RUN_PARTS for part in (leaf, *parts)):
+        return _RUN_WORDS
+    own = prefix.split(".") if prefix else []
+    for k, part in enumerate(parts):
+        if parts[: k + 1] == own[: k + 1]:
+            continue  # a part that holds the network itself
+        words = {word.lower() for word in re.findall(r"[A-Z]?[a-z]+|[A-Z]+", part)}
+        if words & _OPTIMISER:
+            return _OPTIMISER_WORDS
+        if _names_another(part.lower(), words, leaf):
+            return _OTHER_WORDS
+        if not of_policy and words & _POLICY:
+            return "the policy beside it"
+    return None
+
+
+def _names_another(part: str, words: set[str], leaf: str) -> bool:
+    """Whether a part of a name says that it is a critic, a value, a Lyapunov or a target network."""
+    if words & _OTHER:
+        return True
+    if "target" in words:  # which a state to be reached is called too
+        return bool(words & _NETWORKS) or leaf in ("weight", "bias")
+    return part not in ("q", "v") and bool(words & {"q", "v"}) and words <= _OF  # positions and velocities are q and v
+
+
+def _has_mean(tensors: Mapping[str, Numbers], parts: list[str]) -> bool:
+    beside = ".".join([*parts, ""])
+    return any(f"{beside}{mean}" in tensors for mean in ("mean", "running_mean", "mu", "loc"))
+
+
+def braced(names: Collection[str]) -> str:
+    """Names in a few words, what several of them share written once.
+
+    >>> braced(["a.0.weight", "a.0.bias", "a.2.bias", "a.2.weight", "K"])
+    'K, a.{0,2}.{bias,weight}'
+    """
+    return ", ".join(_branches([name.split(".") for name in sorted(names)]))
+
+
+def _branches(paths: list[list[str]]) -> list[str]:
+    """The same for names in parts."""
+    below: dict[str, list[list[str]]] = {}
+    ends = []
+    for first, *rest in paths:
+        if rest:
+            below.setdefault(first, []).append(rest)
+        else:
+            ends.append(first)
+    alike: dict[tuple[str, ...], list[str]] = {}
+    for first, rest_of in below.items():
+        alike.setdefault(tuple(_branches(rest_of)), []).append(first)
+    said = [_one(ends)] if ends else []
+    return [*said, *(f"{_one(firsts)}.{_one(list(rest))}" for rest, firsts in alike.items())]
+
+
+def _one(words: list[str]) -> str:
+    return words[0] if len(words) == 1 else "{" + ",".join(words) + "}"
+
+
+def _quoted(name: str) -> str:
+    return name if re.fullmatch(r"[\w.\-/]+", name) else f"'{name}'"
+
+
+def _dot(prefix: str) -> str:
+    return f"{prefix}." if prefix else ""

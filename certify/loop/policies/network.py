@@ -1,0 +1,278 @@
+"""The policy `u = pi(x)`: a tanh network with exact binary64 numbers and a centring that gives pi(0) = u_eq.
+
+`raw(x) = scale * tanh(net(x)) + offset` with squash `tanh`, or `scale * net(x) + offset` with squash
+`identity`. Centring makes pi(0) = u_eq by its form:
+
+- `output`: `pi(x) = raw(x) - raw(0) + u_eq` (the paper's step 4);
+- `preactivation`: `pi(x) = scale * tanh(net(x) - net(0) + beta) + offset` with the real number
+  `beta = atanh((u_eq - offset) / scale)`; the input never leaves `offset +- scale`;
+- `none`: pi = raw.
+
+So `pi(x) = scale * squash(net(x) + shift) + offset'` with numbers shift and offset', which `centring` gives in any
+arithmetic: floats, Arb balls and the terms of formulas put their own numbers into the same lines. With a `clip` (lo,
+hi) the policy is `min(max(., lo), hi)` of that: the last step, behind the centring, which it must leave as it is at 0.
+
+A policy that nobody centred may be looked at from where its loop rests: with an `origin` the layers read
+`origin + x`, exactly, x being the deviation from there. The network's numbers, and so its hash, stay what they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from typing import Any, Literal, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.errors import InputError
+from certify.loop.policies.arithmetic import Arithmetic
+from certify.loop.policies.layers import frozen, frozen_layers, like, sha256_of, tanh, through, widths
+
+Squash = Literal["tanh", "identity"]
+Centre = Literal["output", "preactivation", "none"]
+Array = NDArray[np.float64]
+_WHOSE = "the policy"  # in messages
+
+
+@dataclass(frozen=True, slots=True)
+class TanhNetwork:
+    """Affine layers with tanh between them; float32 weights are converted, which is exact.
+
+    Parameters
+    ----------
+    weights : arrays of shape (out, in); the first `in` is n, the last `out` is m.
+    biases : arrays of shape (out,).
+    squash, centre : see the module's docstring.
+    scale, offset : arrays of shape (m,), in the input's units; scale is nonzero.
+    clip : (lo, hi), arrays of shape (m,) in the input's units with lo < hi, between which each input is kept; or None.
+    origin : where x = 0 lies among the states that the layers read, shape (n,); empty for 0.
+
+    Raises
+    ------
+    InputError : shapes do not chain, a number is not finite, an option is unknown, or the origin of a policy that is
+        centred is not 0.
+    """
+
+    weights: tuple[Array, ...]
+    biases: tuple[Array, ...]
+    scale: Array
+    offset: Array
+    squash: Squash = "tanh"
+    centre: Centre = "preactivation"
+    clip: tuple[Array, Array] | None = None
+    origin: Array = field(default_factory=lambda: np.zeros(0))
+
+    def __post_init__(self) -> None:
+        weights, biases = frozen_layers(self.weights, self.biases, _WHOSE)
+        object.__setattr__(self, "weights", weights)
+        object.__setattr__(self, "biases", biases)
+        for name in ("scale", "offset"):
+            object.__setattr__(self, name, frozen(getattr(self, name), name, _WHOSE))
+        if self.squash not in get_args(Squash):
+            raise InputError(f"`squash` must be one of {get_args(Squash)}; found {self.squash!r}.")
+        if self.centre not in get_args(Centre):
+            raise InputError(f"`centre` must be one of {get_args(Centre)}; found {self.centre!r}.")
+        if self.centre == "preactivation" and self.squash != "tanh":
+            raise InputError("`centre` 'preactivation' needs `squash` 'tanh'; found 'identity'. Use 'output'.")
+        if self.scale.shape != (self.m,) or self.offset.shape != (self.m,):
+            raise InputError(
+                f"`scale` and `offset` must have shape ({self.m},); found {self.scale.shape} and {self.offset.shape}."
+            )
+        if np.any(self.scale == 0):
+            raise InputError("`scale` must be nonzero.")
+        if self.clip is not None:
+            object.__setattr__(self, "clip", _limits(self.clip, self.m))
+        origin = self.origin if np.any(self.origin) else np.zeros(self.n)  # of whatever n was before `replace`
+        object.__setattr__(self, "origin", frozen(origin, "origin", _WHOSE))
+        if self.origin.shape != (self.n,):
+            raise InputError(f"`origin` must have shape ({self.n},); found {self.origin.shape}.")
+        if self.is_moved and self.centre != "none":
+            raise InputError(f"`origin` must be 0 of a policy that is centred; found {self.origin.tolist()}.")
+
+    @property
+    def is_moved(self) -> bool:
+        """Whether x = 0 is another state than 0 for the layers."""
+        return bool(np.any(self.origin != 0))
+
+    @property
+    def n(self) -> int:
+        """Number of states that the network reads."""
+        return int(self.weights[0].shape[1])
+
+    @property
+    def m(self) -> int:
+        """Number of inputs that the network commands."""
+        return int(self.weights[-1].shape[0])
+
+    @property
+    def layers(self) -> tuple[int, ...]:
+        """Widths from state to input, such as (2, 16, 16, 1)."""
+        return widths(self.weights)
+
+    def ratios(self, u_eq: Sequence[Fraction]) -> tuple[Fraction, ...]:
+        """`(u_eq - offset) / scale`, exactly, (m,): what tanh must be at the origin with preactivation centring.
+
+        Raises
+        ------
+        InputError : u_eq does not lie strictly inside `offset +- scale`.
+        """
+        values = []
+        for u, scale, offset in zip(u_eq, self.scale, self.offset, strict=True):
+            ratio = (u - Fraction(float(offset))) / Fraction(float(scale))
+            if not -1 < ratio < 1:
+                raise InputError(
+                    f"u_eq = {float(u)} must lie strictly inside offset +- scale = {offset} +- {abs(scale)} "
+                    "for preactivation centring."
+                )
+            values.append(ratio)
+        return tuple(values)
+
+    def beta(self, u_eq: Sequence[Fraction]) -> Array:
+        """`atanh((u_eq - offset) / scale)` rounded to binary64, (m,); the proof uses the real number."""
+        return np.array([np.arctanh(float(ratio)) for ratio in self.ratios(u_eq)])
+
+    def net(self, x: Any) -> Any:
+        """`net(x)`, last axis n to m, in the arithmetic of x (numpy array or torch tensor)."""
+        return through(self.weights, self.biases, x + like(self.origin, x) if self.is_moved else x)
+
+    def __call__(self, x: Any, u_eq: Sequence[Fraction]) -> Any:
+        """pi(x) in float64, shape (..., n) to (..., m); for simulation and search, not for proofs."""
+        if self.centre != "none":
+            return self.folded(u_eq)(x, u_eq)
+        return self.clipped(like(self.scale, x) * self.squashed(self.net(x)) + like(self.offset, x))
+
+    def squashed(self, y: Any, arithmetic: Arithmetic[Any] | None = None) -> Any:
+        """What the policy does to the last layer's values before scale and offset; numpy or torch if none is given."""
+        return (arithmetic or _ARRAYS).tanh(y) if self.squash == "tanh" else y
+
+    def squash_slope(self, squashed: Any, arithmetic: Arithmetic[Any] | None = None) -> Any:
+        """The derivative of the squash where its value is `squashed`."""
+        one = (arithmetic or _ARRAYS).number(Fraction(1))
+        return one - squashed * squashed if self.squash == "tanh" else one
+
+    def clipped(self, u: Any, arithmetic: Arithmetic[Any] | None = None) -> Any:
+        """`min(max(u, lo), hi)` of the m inputs: a list in an arithmetic, or if none is given an array (..., m)."""
+        if self.clip is None:
+            return u
+        if arithmetic is None:
+            return _clip(u, *(like(end, u) for end in self.clip))
+        ends = ([Fraction(float(v)) for v in end] for end in self.clip)
+        return [arithmetic.clip(v, lo, hi) for v, lo, hi in zip(u, *ends, strict=True)]
+
+    def require_unclipped(self, at_0: Sequence[Fraction | float]) -> None:
+        """Refuse a clip that may act where the policy without it is `at_0`, its m values at the origin.
+
+        Raises
+        ------
+        InputError : a value does not lie strictly inside the clip.
+        """
+        if self.clip is None:
+            return
+        for j, (value, lo, hi) in enumerate(zip(at_0, *self.clip, strict=True)):
+            if not Fraction(float(lo)) < value < Fraction(float(hi)):
+                raise InputError(
+                    f"the clip must not act at the origin: there input {j} must lie strictly inside [{lo}, {hi}]; it "
+                    f"is {float(value)!r} before the clip. Widen the clip."
+                )
+
+    def centring(
+        self, u_eq: Sequence[Fraction], at_0: Sequence[Any], arithmetic: Arithmetic[Any]
+    ) -> tuple[list[Any], list[Any]]:
+        """(shift, offset'), (m,) each, from net(0): pi = scale * squash(net(x) + shift) + offset'.
+
+        Raises
+        ------
+        InputError : u_eq does not lie strictly inside `offset +- scale` (centre `preactivation`).
+        """
+        number = arithmetic.number
+        shift = [number(Fraction(0)) for _ in at_0]
+        offset = [number(Fraction(float(o))) for o in self.offset]
+        if self.centre == "preactivation":
+            shift = [arithmetic.atanh(q) - v for q, v in zip(self.ratios(u_eq), at_0, strict=True)]
+        if self.centre == "output":
+            each = zip(u_eq, self.scale, at_0, strict=True)
+            offset = [number(u) - number(Fraction(float(s))) * self.squashed(v, arithmetic) for u, s, v in each]
+        return shift, offset
+
+    def folded(self, u_eq: Sequence[Fraction]) -> TanhNetwork:
+        """A network without centring that reads x and is pi up to rounding: for search and simulation."""
+        if self.is_moved:
+            first = self.biases[0] + self.weights[0] @ self.origin
+            return replace(self, biases=(first, *self.biases[1:]), origin=np.zeros(self.n))
+        if self.centre == "none":
+            return self
+        shift, offset = self.centring(u_eq, self.net(np.zeros(self.n)).tolist(), _ARRAYS)
+        biases = (*self.biases[:-1], self.biases[-1] + np.array(shift))
+        return TanhNetwork(self.weights, biases, self.scale, np.array(offset), self.squash, "none", self.clip)
+
+    def squashed_at_origin(self, at_0: Array, u_eq: Sequence[Fraction]) -> Array:
+        """What enters the last tanh at the origin, (m,), given net(0)."""
+        return self.beta(u_eq) if self.centre == "preactivation" else at_0
+
+    def jacobian_at_origin(self, u_eq: Sequence[Fraction]) -> Array:
+        """`d pi / d x` at 0 in float64, shape (m, n).
+
+        Raises
+        ------
+        InputError : the clip may act at the origin.
+        """
+        x = self.origin
+        jacobian = np.eye(self.n)
+        for k, (weight, bias) in enumerate(zip(self.weights, self.biases, strict=True)):
+            if k:
+                x = np.tanh(x)
+                jacobian = (1 - x**2)[:, None] * jacobian
+            x, jacobian = weight @ x + bias, weight @ jacobian
+        squashed = self.squashed(self.squashed_at_origin(x, u_eq))
+        self.require_unclipped(u_eq if self.centre != "none" else (self.scale * squashed + self.offset).tolist())
+        slope = self.squash_slope(squashed)
+        return np.asarray(self.scale[:, None] * ((slope * np.ones(self.m))[:, None] * jacobian))
+
+    def sha256(self) -> str:
+        """Hash of the canonical bytes: squash, centre, then the arrays as `sha256_of` has them.
+
+        They are the layers in order as weight, bias; scale; offset; with a clip lo and hi. From where a policy is
+        looked at, its origin, is no part of it.
+        """
+        pairs = [a for pair in zip(self.weights, self.biases, strict=True) for a in pair]
+        head = f"certify-policy/1\0{self.squash}\0{self.centre}\0".encode()
+        return sha256_of(head, (*pairs, self.scale, self.offset, *(self.clip or ())))
+
+
+class _Arrays:
+    """Numbers, numpy arrays and torch tensors."""
+
+    def number(self, q: Fraction) -> Any:
+        return float(q)
+
+    def atanh(self, q: Fraction) -> Any:
+        return float(np.arctanh(float(q)))
+
+    def tanh(self, v: Any) -> Any:
+        return tanh(v)
+
+    def clip(self, v: Any, lo: Fraction, hi: Fraction) -> Any:
+        return _clip(v, float(lo), float(hi))
+
+
+_ARRAYS = _Arrays()
+
+
+def _limits(clip: Any, m: int) -> tuple[Array, Array]:
+    if not isinstance(clip, tuple | list) or len(clip) != 2:
+        raise InputError(f"`clip` must be a pair (lo, hi) of arrays of shape ({m},), or None; found {clip!r}.")
+    lo, hi = (frozen(end, "clip", _WHOSE) for end in clip)
+    if lo.shape != (m,) or hi.shape != (m,):
+        raise InputError(f"`clip` must be two arrays of shape ({m},); found {lo.shape} and {hi.shape}.")
+    if not np.all(lo < hi):
+        j = int(np.argmin(lo < hi))
+        raise InputError(f"`clip` must satisfy lo < hi; found [{lo[j]}, {hi[j]}] for input {j}.")
+    return lo, hi
+
+
+def _clip(x: Any, lo: Any, hi: Any) -> Any:
+    if isinstance(x, np.ndarray | float):
+        return np.minimum(np.maximum(x, lo), hi)
+    return x.clamp(lo, hi)

@@ -1,0 +1,361 @@
+"""The closed loop at single points in Arb balls: what REFUTED rests on, and the eigenvalues at the origin.
+
+A comparison of balls is True only if it is certain, so `not (a < b)` proves nothing; whatever is not certain here
+counts as not shown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from fractions import Fraction
+from functools import lru_cache
+
+import flint
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.expressions import Algebra, Expression, Symbol, differentiate, evaluate, solution_series
+from certify.loop.policies import TanhNetwork
+
+Array = NDArray[np.float64]
+_PRECISION = 200  # bits
+_ATTEMPTS, _WIDER, _ORDER = 6, 1.25, 30  # at the balls around a solution over a period; of its series in time
+Balls = list[flint.arb]
+
+
+class BallAlgebra(Algebra[flint.arb]):
+    """Expressions in Arb balls."""
+
+    def constant(self, q: Fraction) -> flint.arb:
+        return ball(q)
+
+    def inverse(self, value: flint.arb) -> flint.arb:
+        return 1 / value
+
+
+@contextmanager
+def precision(bits: int = _PRECISION) -> Iterator[None]:
+    """Arb at the precision of this module, or at another one."""
+    before, flint.ctx.prec = flint.ctx.prec, bits
+    try:
+        yield
+    finally:
+        flint.ctx.prec = before
+
+
+def ball(q: Fraction) -> flint.arb:
+    """The ball around a rational."""
+    return flint.arb(flint.fmpq(q.numerator, q.denominator))
+
+
+def evaluate_arb(expression: Expression, values: Mapping[Symbol, flint.arb]) -> flint.arb:
+    """An expression of the plant in Arb balls."""
+    return evaluate(expression, values, BallAlgebra())
+
+
+def evaluate_policy(loop: ClosedLoop, x: Array) -> Balls:
+    """pi(x) at a binary64 point (n,), as Arb balls."""
+    with precision():
+        network = loop.network
+        y = _net(network, points(x))
+        shift, offset = _centring(loop)
+        u = [
+            flint.arb(float(s)) * network.squashed(v + d, _NUMBERS) + o
+            for v, d, s, o in zip(y, shift, network.scale, offset, strict=True)
+        ]
+        return list(network.clipped(u, _NUMBERS))
+
+
+def centring_with_errors(loop: ClosedLoop) -> tuple[Array, Array, Array, Array]:
+    """`shift` and `offset` of the centring rounded to binary64, each followed by an upper bound of its error, (m,)."""
+    with precision():
+        columns = []
+        for balls in _centring(loop):
+            middle = [float(b.mid()) for b in balls]
+            columns += [middle, [rounded_up((b - m).abs_upper()) for b, m in zip(balls, middle, strict=True)]]
+    shift, shift_error, offset, offset_error = map(np.array, columns)
+    return shift, shift_error, offset, offset_error
+
+
+def rounded_up(x: flint.arb) -> float:
+    """A binary64 number that is not below x >= 0."""
+    value = float(x)
+    return value if value >= x else float(np.nextafter(value * (1 + 2.0**-50), np.inf))
+
+
+def evaluate_vdot(loop: ClosedLoop, P: Array, x: Array) -> flint.arb:
+    """`Vdot = 2 x'P F(x)` at a binary64 point (n,), as an Arb ball."""
+    with precision():
+        state = points(x)
+        values: dict[Symbol, flint.arb] = dict(zip(loop.system.states, state, strict=True))
+        values |= zip(loop.system.inputs, evaluate_policy(loop, x), strict=True)
+        total, known = flint.arb(0), dict[Expression, flint.arb]()
+        for row, expression in zip(P, loop.dynamics, strict=True):
+            Px = sum((flint.arb(float(p)) * v for p, v in zip(row, state, strict=True)), flint.arb(0))
+            total += 2 * Px * evaluate(expression, values, BallAlgebra(), known)
+        return total
+
+
+def evaluate_increment(
+    loop: ClosedLoop, P: Array, x: Array, period: Fraction | None = None, rate: float = 0.0
+) -> flint.arb:
+    """`D + 2 lambda V` at a binary64 point (n,), as an Arb ball, D being V's increment over a step, by time.
+
+    That is `Vdot = 2 x'P F(x)`; in discrete time V(F(x)) - V(x); with a `period` h over which the input is held
+    (V(phi(h)) - V(x))/h, or Vdot where h = 0. No number where no solution is enclosed.
+    """
+    with precision():
+        state = points(x)
+        states = dict(zip(loop.system.states, state, strict=True))
+        inputs = dict(zip(loop.system.inputs, evaluate_policy(loop, x), strict=True))
+        step, G = flint.arb(0), field_at(loop, {**states, **inputs})
+        if loop.system.time == "discrete":
+            step, G = flint.arb(1), [after - before for after, before in zip(G, state, strict=True)]
+        elif period:
+            step, G = ball(period), _mean_rate(loop, states, inputs, G, period)
+        lam, total = flint.arb(float(rate)), flint.arb(0)
+        for row, v, own in zip(P, state, G, strict=True):
+            p = [flint.arb(float(entry)) for entry in row]
+            Px, PG = (sum((a * b for a, b in zip(p, by, strict=True)), flint.arb(0)) for by in (state, G))
+            total += own * (2 * Px + step * PG) + 2 * lam * v * Px
+        return total
+
+
+def field_at(loop: ClosedLoop, values: Mapping[Symbol, flint.arb]) -> Balls:
+    """f at balls around states and inputs, by their symbols."""
+    known: dict[Expression, flint.arb] = {}
+    return [evaluate(expression, values, BallAlgebra(), known) for expression in loop.dynamics]
+
+
+def _mean_rate(
+    loop: ClosedLoop,
+    states: Mapping[Symbol, flint.arb],
+    inputs: Mapping[Symbol, flint.arb],
+    now: Balls,
+    period: Fraction,
+) -> Balls:
+    """(phi(h) - x)/h with the input held, by a series whose last coefficient is taken on balls around all of phi.
+
+    A solution cannot be the first to leave the balls of radius kappa if h |f| < kappa on them.
+    """
+    h, size = ball(period), [v.abs_upper() for v in now]
+    for _ in range(_ATTEMPTS):
+        kappa = [(_WIDER * h * v).abs_upper() for v in size]
+        around = {s: v + flint.arb(0, k) for (s, v), k in zip(states.items(), kappa, strict=True)}
+        size = [v.abs_upper() for v in field_at(loop, {**around, **inputs})]
+        if all(bool(h * v < k) for v, k in zip(size, kappa, strict=True)):
+            break
+    else:
+        return [flint.arb.nan()] * len(size)
+    rows = solution_series(loop.dynamics, states, inputs, BallAlgebra(), _ORDER - 1)
+    last = [row[-1] for row in solution_series(loop.dynamics, around, inputs, BallAlgebra(), _ORDER)]
+    result = last
+    for k in reversed(range(_ORDER - 1)):
+        result = [row[k] + h * v for row, v in zip(rows, result, strict=True)]
+    return result
+
+
+def eigenvalues(loop: ClosedLoop) -> list[flint.acb] | None:
+    """Rigorous enclosures of the eigenvalues of the closed loop's Jacobian at 0.
+
+    Where the input is held, those of the linear maps over the shortest (if it is not 0) and the longest period.
+    None if Arb cannot isolate them, or the clip is not certain to be inactive at the origin.
+    """
+    with precision():
+        if not _unclipped(loop):
+            return None
+        sample = loop.system.sample
+        try:
+            found = [_jacobian(loop)] if sample is None else [_held_map(loop, h) for h in dict.fromkeys(sample) if h]
+            return [value for matrix in found for value in flint.acb_mat(matrix).eig(multiple=True)]
+        except (ValueError, ArithmeticError):
+            return None
+
+
+def in_digits(eigenvalue: flint.acb) -> str:
+    """The middle to six digits, a real number where the enclosure meets the real line."""
+    middle = complex(eigenvalue.mid())
+    return f"{middle.real:.6g}" if eigenvalue.imag.contains(0) else f"{middle:.6g}"
+
+
+def instability(loop: ClosedLoop, eigenvalue: flint.acb) -> flint.arb:
+    """What is negative of each of `eigenvalues` where they show stability: the real part, or with steps |v| - 1."""
+    with precision():
+        return eigenvalue.real if loop.step == 0 else abs(eigenvalue) - 1
+
+
+def policy_on(loop: ClosedLoop, x: Balls) -> tuple[Balls, flint.arb_mat]:
+    """pi and its Jacobian (m, n) on balls x.
+
+    Where it is not certain on which side of a bound of the clip its argument lies, the slope is the ball of all slopes
+    between 0 and 1: good for mean values, and for nothing else.
+    """
+    network, y = loop.network, _read(loop.network, x)
+    J = flint.arb_mat([[int(i == j) for j in range(network.n)] for i in range(network.n)])
+    for k, (W, b) in enumerate(zip(network.weights, network.biases, strict=True)):
+        if k:
+            y, J = _through_tanh(y, J)
+        y, J = affine(W, b, y), matrix(W) * J
+    shift, offset = _centring(loop)
+    squashed = [network.squashed(v + d, _NUMBERS) for v, d in zip(y, shift, strict=True)]
+    slopes = [network.squash_slope(v, _NUMBERS) for v in squashed]
+    scale = [flint.arb(float(s)) for s in network.scale]
+    u = [s * v + o for s, v, o in zip(scale, squashed, offset, strict=True)]
+    slopes = [s * slope * clip for s, slope, clip in zip(scale, slopes, _clip_slopes(network, u), strict=True)]
+    gain = flint.arb_mat([[slopes[i] * J[i, j] for j in range(network.n)] for i in range(network.m)])
+    return list(network.clipped(u, _NUMBERS)), gain
+
+
+def _clip_slopes(network: TanhNetwork, u: Balls) -> Balls:
+    if network.clip is None:
+        return [flint.arb(1)] * len(u)
+    slopes = []
+    for v, lo, hi in zip(u, *network.clip, strict=True):
+        inside, outside = v > float(lo) and v < float(hi), v < float(lo) or v > float(hi)
+        slopes.append(flint.arb(1) if inside else flint.arb(0) if outside else flint.arb(0.5, 0.5))
+    return slopes
+
+
+def field_on(loop: ClosedLoop, x: Balls) -> tuple[Balls, flint.arb_mat]:
+    """F and its Jacobian (n, n) on balls x, the Jacobian as `policy_on` says."""
+    system = loop.system
+    u, gain = policy_on(loop, x)
+    values = dict(zip((*system.states, *system.inputs), (*x, *u), strict=True))
+    known: dict[Expression, flint.arb] = {}
+    F = [evaluate(e, values, BallAlgebra(), known) for e in loop.dynamics]
+    A, B = (
+        flint.arb_mat(
+            [[evaluate(differentiate(e, s), values, BallAlgebra(), known) for s in by] for e in loop.dynamics]
+        )
+        for by in (system.states, system.inputs)
+    )
+    return F, A + B * gain
+
+
+def gain_at_origin(loop: ClosedLoop) -> flint.arb_mat:
+    """The policy's Jacobian J (m, n) at the origin."""
+    return policy_on(loop, [flint.arb(0)] * loop.network.n)[1]
+
+
+def plant_at_origin(loop: ClosedLoop) -> tuple[flint.arb_mat, flint.arb_mat]:
+    """A (n, n) and B (n, m) of the plant at the origin and u_eq."""
+    A, B = (flint.arb_mat([[evaluate_arb(e, {}) for e in row] for row in M]) for M in loop.plant_jacobians())
+    return A, B
+
+
+def held_at_origin(loop: ClosedLoop, period: Fraction) -> tuple[flint.arb_mat, flint.arb_mat]:
+    """A (n, n) and B (n, m) of the map over a period of the linearised plant whose input is held."""
+    n, m = loop.system.n, loop.system.m
+    A, B = plant_at_origin(loop)
+    block = flint.arb_mat(n + m, n + m)
+    for i in range(n):
+        for j in range(n + m):
+            block[i, j] = ball(period) * (A[i, j] if j < n else B[i, j - n])
+    motion = block.exp()
+    free = flint.arb_mat([[motion[i, j] for j in range(n)] for i in range(n)])
+    forced = flint.arb_mat([[motion[i, n + j] for j in range(m)] for i in range(n)])
+    return free, forced
+
+
+def is_definite(M: flint.arb_mat) -> bool:
+    """Whether a symmetric matrix, of which the lower triangle is read, is certainly positive definite.
+
+    Its pivots are: they lie in those of the balls, and a pivot that is not certainly positive shows nothing.
+    """
+    rows = [[M[i, j] for j in range(i + 1)] for i in range(M.nrows())]
+    for k, top in enumerate(rows):
+        if not top[k] > 0:
+            return False
+        for row in rows[k + 1 :]:
+            factor = row[k] / top[k]
+            for j in range(k + 1, len(row)):
+                row[j] -= factor * rows[j][k]
+    return True
+
+
+def _jacobian(loop: ClosedLoop) -> flint.arb_mat:
+    """The closed loop's Jacobian at the origin and u_eq."""
+    A, B = plant_at_origin(loop)
+    return A + B * gain_at_origin(loop)
+
+
+def _held_map(loop: ClosedLoop, period: Fraction) -> flint.arb_mat:
+    """The map over a period of the linearised plant whose input `-K x` is held."""
+    free, forced = held_at_origin(loop, period)
+    return free + forced * gain_at_origin(loop)
+
+
+def _unclipped(loop: ClosedLoop) -> bool:
+    """Whether every input at the origin, before the clip, lies certainly and strictly inside it."""
+    network = loop.network
+    if network.clip is None:
+        return True
+    u, _ = policy_on(loop, [flint.arb(0)] * network.n)
+    return all(bool(v > float(lo)) and bool(v < float(hi)) for v, lo, hi in zip(u, *network.clip, strict=True))
+
+
+class _Numbers:
+    def number(self, q: Fraction) -> flint.arb:
+        return ball(q)
+
+    def atanh(self, q: Fraction) -> flint.arb:
+        return ball(q).atanh()
+
+    def tanh(self, v: flint.arb) -> flint.arb:
+        return v.tanh()
+
+    def clip(self, v: flint.arb, lo: Fraction, hi: Fraction) -> flint.arb:
+        return v.max(ball(lo)).min(ball(hi))
+
+
+_NUMBERS = _Numbers()
+
+
+def _centring(loop: ClosedLoop) -> tuple[Balls, Balls]:
+    at_0 = _net(loop.network, [flint.arb(0)] * loop.network.n)
+    return loop.network.centring(loop.u_eq, at_0, _NUMBERS)
+
+
+def _net(network: TanhNetwork, x: Balls) -> Balls:
+    return layers_on(network.weights, network.biases, _read(network, x))
+
+
+def _read(network: TanhNetwork, x: Balls) -> Balls:
+    """What the layers read at a state."""
+    return [v + at for v, at in zip(x, points(network.origin), strict=True)] if network.is_moved else list(x)
+
+
+def layers_on(weights: Sequence[Array], biases: Sequence[Array], h: Balls) -> Balls:
+    """Affine layers with tanh between them, on balls."""
+    for k, (W, b) in enumerate(zip(weights, biases, strict=True)):
+        h = affine(W, b, [v.tanh() for v in h] if k else h)
+    return h
+
+
+def affine(W: Array, b: Array, h: Balls) -> Balls:
+    """W h + b on balls."""
+    product = matrix(W) * flint.arb_mat([[v] for v in h])
+    return [product[i, 0] + flint.arb(float(c)) for i, c in enumerate(b)]
+
+
+def _through_tanh(y: Balls, J: flint.arb_mat) -> tuple[Balls, flint.arb_mat]:
+    t = [v.tanh() for v in y]
+    slope = [1 - v * v for v in t]  # Arb's own power is NaN for a ball around 0
+    return t, flint.arb_mat([[slope[i] * J[i, j] for j in range(J.ncols())] for i in range(J.nrows())])
+
+
+def matrix(W: Array) -> flint.arb_mat:
+    """A binary64 matrix as it is."""
+    return _balls_of(np.asarray(W, dtype=np.float64).tobytes(), W.shape)
+
+
+@lru_cache(maxsize=32)  # a network's numbers, which are exact at any precision, for all the states that it is asked at
+def _balls_of(raw: bytes, shape: tuple[int, ...]) -> flint.arb_mat:
+    return flint.arb_mat([points(row) for row in np.frombuffer(raw).reshape(shape)])
+
+
+def points(x: Array) -> Balls:
+    """Binary64 numbers as they are."""
+    return [flint.arb(float(v)) for v in x]

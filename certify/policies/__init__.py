@@ -1,9 +1,0 @@
-"""Tanh policies: exact layers, centring, and the policy file."""
-
-from __future__ import annotations
-
-from certify.policies.exact import bounded_by_form, require_centred
-from certify.policies.file import Policy, load_policy, save_policy
-from certify.policies.network import Centre, TanhNetwork
-
-__all__ = ["Centre", "Policy", "TanhNetwork", "bounded_by_form", "load_policy", "require_centred", "save_policy"]

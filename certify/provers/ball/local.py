@@ -1,0 +1,277 @@
+"""The local step: the largest level below which the linearisation alone proves V's decrease, and the evidence for it.
+
+Around a level c0 of a practical claim the models do not start from 0, and what drives V up near the origin is paid with
+`edge (V - c0)`: so c0 has a least value for each ball, and each ball its best edge.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.linalg
+from numpy.typing import NDArray
+
+from certify.certificates import LocalBall
+from certify.certificates.claims import Problem
+from certify.lyapunov import extents
+from certify.provers.ball.cells import cut, cuts_for
+from certify.provers.ball.decrease import NOT_SHOWN, Corner, Multipliers, Shown, best_at, corners_of, rests_of
+from certify.provers.ball.models import Models, Paths, paths
+from certify.provers.ball.steps import Cell, Steps, steps_of
+
+Array = NDArray[np.float64]
+_LEAST = 1e-280  # a level, below which binary64 holds nothing more
+_MARGIN = 1e-3  # share of the decay that is left to the checker's rounding
+_ENOUGH = 1.01 * _MARGIN
+_WIDER = 1 + 1e-9  # of the ball, which has to contain {V <= c1} beyond all rounding
+_ORDER = 4  # of the series in time, where an input is held
+_FAR, _NEAR = 1e-2, 0.3  # from one level to the next lower one, where all below one is good, and where not
+_LOWER = 0.5  # from one level to the next, while floors fall with them
+_NOTHING = 1e-10  # of the limit: no floor is asked to be lower
+_EDGES = 400  # that are tried
+_AMPLE = 0.3  # a margin that is good enough for the multipliers of a floor
+_ROUNDS = 3  # of multipliers and edge, each best for the other
+_WORTH = 0.01  # of a floor: less is no gain
+_ROUNDING = 1e-12  # of the decay, of which the checker's numbers are in doubt at d = 0 as well
+_ABOVE = 1 + 1e-3  # of the least floor that is shown
+
+
+def prove_local(
+    problem: Problem,
+    T: Array,
+    limit: float,
+    known: Paths | None = None,
+    until: float = math.inf,
+    between: tuple[float, float] | None = None,
+) -> float | None:
+    """The largest level up to `limit` that the local proof of a claim at rest reaches, within 2 %; None if there is
+    none, or none is found in the time.
+
+    Parameters
+    ----------
+    T : (n, n), with T'PT about the unit matrix: the ball of the proof is x = T z.
+    known : the `paths` of the loop, if they are there already.
+    until : the reading of `time.perf_counter` at which the search ends with what it has.
+    between : a level below which nothing is of interest, and a higher one, above which little is expected.
+
+    Raises
+    ------
+    InputError : the network is larger than the checker's local rule allows.
+    """
+    rule = Rule.at_rest(problem, T, known)
+    if rule.cuts is None:
+        return None
+
+    def good(level: float) -> bool:
+        return rule.shown(level, _ENOUGH).margin > _MARGIN
+
+    if between is None:
+        return _largest(good, limit, until)
+    low, high = between[0], min(between[1], limit)
+    if not (low < high and good(low)):
+        return None
+    while high < limit and time.perf_counter() < until and good(high):
+        low, high = high, min(high * high / low, limit)
+    return _closer(good, low, high, until)
+
+
+def prove_band(
+    problem: Problem,
+    T: Array,
+    limit: float,
+    known: Paths | None = None,
+    until: float = math.inf,
+    above: float = 1.5,
+) -> tuple[float, float] | None:
+    """(c0, c1) with c0 < c1: V falls where c0 <= V <= c1; None if there are none, or none are found in the time.
+
+    Parameters
+    ----------
+    known : the `paths` of the loop, which need not be at rest.
+    until : the reading of `time.perf_counter` at which the search ends with what it has.
+    above : a large ball has a large floor: c1, up to `limit`, is about the largest level whose ball shows a floor of at
+        most so many times the least that any ball shows, and c0 is that floor.
+
+    Raises
+    ------
+    InputError : the network is larger than the checker's local rule allows.
+    """
+    rule = Rule.anywhere(problem, T, known)
+    if rule.cuts is None:
+        return None
+    floors: dict[float, float] = {}
+
+    def floor(level: float) -> float:
+        if level not in floors:
+            floors[level] = max(rule.around(level).floor, _NOTHING * limit)
+        return floors[level]
+
+    top = _largest(lambda level: floor(level) < level, limit, until, _NEAR)
+    if top is None:
+        return None
+    level, least = top * _LOWER, floor(top)
+    while time.perf_counter() < until and floor(level) < min(level, (1 - _WORTH) * least):
+        level, least = level * _LOWER, floor(level)
+    c1 = _largest(lambda level: floor(level) <= above * least, top, until, _LOWER)
+    return (floor(top), top) if c1 is None else (floor(c1), c1)
+
+
+def local_margin(problem: Problem, T: Array, level: float, known: Paths) -> float:
+    """Share of the decay that the remainder leaves on {V <= level}; positive means that V falls there."""
+    return Rule.at_rest(problem, T, known).shown(level).margin
+
+
+def local_ball(
+    problem: Problem, T: Array, level: float, floor: float | None = None
+) -> tuple[LocalBall, tuple[int, ...]]:
+    """The evidence for a level that `prove_local` has found, or a lower one, and into how many parts the range of each
+    uncertain quantity is cut for it; with a floor, for both that `prove_band` has found, or a higher floor."""
+    if floor is None:
+        rule = Rule.at_rest(problem, T)
+        by, edge = rule.shown(level).multipliers, 0.0
+    else:
+        rule = Rule.anywhere(problem, T)
+        found = rule.around(level)
+        by, edge = found.multipliers, found.edge
+    ball = LocalBall(ball_around(problem, T, level), by.rows, by.weight, edge, rule.steps.order)
+    return ball, rule.cuts or (1,) * len(problem.loop.system.ranges)
+
+
+def ball_around(problem: Problem, T: Array, level: float) -> Array:
+    """J (n, n), a multiple of T, with {V <= level} inside {J d : ||d|| <= 1}."""
+    least = float(np.linalg.eigvalsh(T.T @ problem.V.P @ T)[0])
+    return T * (math.sqrt(level / least) * _WIDER) if least > 0 else np.full_like(T, math.inf)
+
+
+@dataclass(frozen=True, slots=True)
+class _Around:
+    """The least level around which a ball's inequality holds, infinite if there is none, and by what."""
+
+    floor: float
+    edge: float
+    multipliers: Multipliers
+
+
+_NOWHERE = _Around(math.inf, 0.0, NOT_SHOWN.multipliers)
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """The rule `local` on balls of one shape; `cuts` is None where it can show nothing on any."""
+
+    problem: Problem
+    T: Array
+    steps: Steps
+    cuts: tuple[int, ...] | None
+    cells: Sequence[Cell]
+    R: Array | None
+
+    @classmethod
+    def at_rest(cls, problem: Problem, T: Array, known: Paths | None = None) -> Rule:
+        """For a loop that rests at the origin; `known` are its paths, if they are there already."""
+        return cls._of(problem, T, steps_of(known or paths(problem.loop), True, _order(problem)))
+
+    @classmethod
+    def anywhere(cls, problem: Problem, T: Array, known: Paths | None = None) -> Rule:
+        """For one that need not."""
+        return cls._of(problem, T, steps_of(known or paths(problem.loop, resting=False), False, _order(problem)))
+
+    @classmethod
+    def _of(cls, problem: Problem, T: Array, steps: Steps) -> Rule:
+        """With as many cells as it takes."""
+        R = 2 * problem.rate * problem.V.P if problem.rate else None
+        with np.errstate(all="ignore"):
+            cuts = cuts_for(steps, T, problem.V.P, R)
+        cells = [] if cuts is None else cut(list(problem.loop.system.ranges.values()), cuts)
+        return cls(problem, T, steps, cuts, cells, R)
+
+    def shown(self, level: float, enough: float = math.inf) -> Shown:
+        """At rest, on the ball of a level."""
+        with np.errstate(all="ignore"):  # what overflows is not shown
+            corners = self._corners(level)
+            return NOT_SHOWN if corners is None else best_at(corners, enough)
+
+    def around(self, level: float) -> _Around:
+        """The least floor on the ball of a level, with its edge."""
+        with np.errstate(all="ignore"):
+            J = ball_around(self.problem, self.T, level)
+            corners, best, edge = self._corners(level), _NOWHERE, 0.0
+            if corners is None:
+                return best
+            V = J.T @ self.problem.V.P @ J
+            for _ in range(_ROUNDS):
+                found = best_at([replace(c, decay=c.decay - edge * V) for c in corners], _AMPLE)
+                if not found.margin > _MARGIN:
+                    return best
+                around = self._least(corners, V, found.multipliers)
+                if not around.floor < best.floor * (1 - _WORTH):
+                    return min(best, around, key=lambda one: one.floor)
+                best, edge = around, around.edge
+            return best
+
+    def _least(self, corners: Sequence[Corner], V: Array, by: Multipliers) -> _Around:
+        """Where `edge floor - start > linear' (D - edge V)^-1 linear` and D > edge V, D being what of the decay is
+        left, at all corners."""
+        parts = []
+        for c, rest in zip(corners, rests_of(corners, by), strict=True):
+            left = (1 - _MARGIN) * c.decay - rest
+            values, vectors = scipy.linalg.eigh((left + left.T) / 2, V)
+            parts.append((values, (vectors.T @ c.linear) ** 2, c.start + _ROUNDING * float(np.trace(c.decay))))
+        most, h = min(float(values[0]) for values, _, _ in parts), self.steps.longest
+        if not most > 0:
+            return _NOWHERE
+        edges = most * np.append(np.geomspace(1e-4, 0.5, _EDGES), 1 - np.geomspace(0.5, 1e-4, _EDGES))
+        edges = np.minimum(edges, (1 - _MARGIN) / h) if h else edges
+        floors = [(s + np.sum(w / (v - edges[:, None]), axis=1)) / edges for v, w, s in parts]
+        worst = np.max(floors, axis=0) * _ABOVE
+        at = int(np.argmin(worst))
+        return _Around(float(worst[at]), float(edges[at]), by) if worst[at] < math.inf else _NOWHERE
+
+    def models(self, J: Array, level: float) -> list[Models]:
+        """Of a step on a ball that holds {V <= level}, in each cell."""
+        return self.models_on(J[None], level)[0]
+
+    def models_on(self, balls: Array, level: float) -> list[list[Models]]:
+        """The same on each of several balls, (N, n, n); if one has no finite models, none has."""
+        reach = np.minimum(np.linalg.norm(balls, axis=2), extents(self.problem.V.P, level) * _WIDER)
+        return self.steps.models_on(balls, self.cells, reach)
+
+    def _corners(self, level: float) -> list[Corner] | None:
+        """The inequality at the corners of all cells; None where something has no finite model, or may leave its
+        bounds."""
+        if self.cuts is None:
+            return None
+        J, found = ball_around(self.problem, self.T, level), list[Corner]()
+        for models in self.models(J, level):
+            if not (models.finite and models.admitted):
+                return None
+            found += corners_of(models, J, self.problem.V.P, self.R, self.steps.longest)
+        return found
+
+
+def _order(problem: Problem) -> int:
+    return 1 if problem.loop.system.sample is None else _ORDER
+
+
+def _largest(good: Callable[[float], bool], limit: float, until: float, fall: float = _FAR) -> float | None:
+    """The largest level up to `limit` that is good, within 2 %, if those somewhat below it are."""
+    if good(limit):
+        return limit
+    high, low = limit, limit
+    while not good(low):
+        high, low = low, low * fall
+        if low <= 1e-30 * limit or low < _LEAST or time.perf_counter() > until:
+            return None
+    return _closer(good, low, high, until)
+
+
+def _closer(good: Callable[[float], bool], low: float, high: float, until: float) -> float:
+    """A good level, within 2 % of one that is not, from a good one and one that is not."""
+    while high > 1.02 * low and time.perf_counter() < until:
+        middle = math.sqrt(low * high)
+        low, high = (middle, high) if good(middle) else (low, middle)
+    return low

@@ -1,0 +1,305 @@
+"""Jets on a ball where something is uncertain: value and gradient are affine in it, all else is as at its worst.
+
+In a cell of the box of ranges each quantity is its middle plus half its width times y_j in [-1, 1]; the length of a
+period may be one more of them. What decides a stiff loop is how the gradients of F move with y: they move in directions
+that the decay can afford, which a norm of them does not know.
+So `v(0) = c + moves.y` within `error`, the gradient is `a + turns.y` within `slack`, and what moves in the
+second and third order, where the ball is what makes it small, is part of E (checker/FORMAT.md, cells).
+
+An error without a y_j is also what a quantity is that may differ from place to place, and what a state is that is only
+known to be near another.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from functools import reduce
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.loop.expressions import Algebra
+from certify.provers.ball.jets import (
+    ATAN4,
+    TANH4,
+    TANH5,
+    Sizes,
+    basis,
+    beyond_tangent,
+    is_extreme,
+    of_inputs,
+    remainder,
+    sizes,
+)
+from certify.provers.bounds.taylor import EXP_END
+
+Array = NDArray[np.float64]
+Four = tuple[float, float, float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class RangedJet:
+    """A value on M balls around the same middle: c, `moves` (N,) and `error` (M,) of v(0); a (M, k), `turns` (N, M, k)
+    and `slack` (M,) of the gradient; the rest as a Jet has it."""
+
+    c: float
+    moves: Array
+    error: Array
+    a: Array
+    turns: Array
+    slack: Array
+    Q: Array
+    K: Array
+    B: Array
+    E: Array
+    errors: Array
+
+    @property
+    def away(self) -> Array:
+        """How far v(0) may be from c, (M,)."""
+        return np.asarray(np.sum(np.abs(self.moves)) + self.error)
+
+    @property
+    def tilt(self) -> Array:
+        """How far y may turn the gradient, (M,)."""
+        if not len(self.turns):
+            return np.zeros_like(self.slack)
+        return np.asarray(np.sum(np.linalg.norm(self.turns, axis=2), axis=0))
+
+    @property
+    def turned(self) -> Array:
+        """How far the gradient may be from a, (M,)."""
+        return self.tilt + self.slack
+
+    @property
+    def rest(self) -> Array:
+        return self.E + of_inputs(self.B, self.errors, self.E)
+
+    @property
+    def sizes(self) -> Sizes:
+        """For every value of what is uncertain."""
+        found = sizes(self.a, self.Q, self.K, self.rest)
+        return replace(found, slope=found.slope + self.turned)
+
+    @property
+    def radius(self) -> Array:
+        return self.sizes.radius
+
+    @property
+    def value(self) -> Array:
+        """No |v(0)| is larger, (M,)."""
+        return abs(self.c) + self.away
+
+    def _spread(self, size: Sizes) -> Array:
+        """What Q, K and the errors e_j come to together."""
+        e = np.linalg.norm(of_inputs(self.B, self.errors, self.E), axis=1)
+        return np.asarray(size.bend + size.twist + e)
+
+    def __add__(self, other: RangedJet) -> RangedJet:
+        x, y = self, other
+        return RangedJet(
+            x.c + y.c,
+            x.moves + y.moves,
+            x.error + y.error,
+            x.a + y.a,
+            x.turns + y.turns,
+            x.slack + y.slack,
+            x.Q + y.Q,
+            x.K + y.K,
+            x.B + y.B,
+            x.E + y.E,
+            x.errors,
+        )
+
+    def shifted(self, by: float) -> RangedJet:
+        """The value plus a number."""
+        return replace(self, c=self.c + by)
+
+    def scaled(self, s: float) -> RangedJet:
+        """The value times a number."""
+        m = abs(s)
+        return RangedJet(
+            s * self.c,
+            s * self.moves,
+            m * self.error,
+            s * self.a,
+            s * self.turns,
+            m * self.slack,
+            s * self.Q,
+            s * self.K,
+            s * self.B,
+            m * self.E,
+            self.errors,
+        )
+
+    def __mul__(self, other: RangedJet) -> RangedJet:
+        x, y, b, rows = self, other, basis(self.a.shape[1]), np.newaxis
+        p, q, xv, yv = x.sizes, y.sizes, x.value, y.value
+        xm, ym = (float(np.sum(np.abs(v.moves))) for v in (x, y))
+        xt, yt = x.tilt, y.tilt
+        error = xv * y.error + yv * x.error + xm * ym  # the last is of second order in y
+        slack = xv * y.slack + x.error * q.slope + yv * x.slack + y.error * p.slope + xm * yt + ym * xt
+        Q = x.c * y.Q + y.c * x.Q + b.between(x.a, y.a)
+        K = x.c * y.K + y.c * x.K + b.times(x.a, y.Q) + b.times(y.a, x.Q)
+        left = p.slope * q.twist + p.twist * q.slope + (p.bend + p.twist) * (q.bend + q.twist)
+        moved = x.away * y._spread(q) + y.away * x._spread(p)
+        moved += (xt + x.slack) * (q.slope + q.bend) + (yt + y.slack) * (p.slope + p.bend)
+        E = xv[:, rows] * y.E + yv[:, rows] * x.E
+        E += p.radius[:, rows] * y.rest + (q.slope + q.bend + q.twist)[:, rows] * x.rest
+        return RangedJet(
+            x.c * y.c,
+            x.c * y.moves + y.c * x.moves,
+            error,
+            x.c * y.a + y.c * x.a,
+            x.c * y.turns + y.c * x.turns + x.moves[:, rows, rows] * y.a + y.moves[:, rows, rows] * x.a,
+            slack,
+            Q,
+            K,
+            x.c * y.B + y.c * x.B,
+            E + (left + moved)[:, rows] * b.eye,
+            x.errors,
+        )
+
+    def compose(self, f: Four, e: Sequence[Array], fourth: Array) -> RangedJet:
+        """A function's phi, phi', phi''/2 and phi'''/6 at c, how far they are from those at v(0), and at least
+        |phi''''|/24 on the ranges, one for each ball or for all."""
+        (f0, f1, half, sixth), (e0, e1, e2, e3) = f, e
+        size, far, rows = self.sizes, self.away, np.newaxis
+        slope, bend = size.slope, size.bend
+        h, g = abs(half) + e2, abs(sixth) + e3
+        second, third = np.array([half]), np.array([sixth])
+        squares = basis(self.a.shape[1]).square(self.a)
+        H, cubic = beyond_tangent(self.a, squares, self.Q, self.K, second, third)
+        R = remainder(squares, size, self.rest, h, g, fourth)
+        moved = e1 * self._spread(size) + e2 * (slope**2 + 2 * slope * bend) + e3 * slope**3
+        bent = 2 * (h + fourth * size.radius**2) * slope + 2 * h * bend + 3 * g * slope**2
+        if len(self.moves):
+            by_y = 2 * abs(half) * float(np.sum(np.abs(self.moves)))
+            error = abs(f1) * self.error + h * far**2
+            slack = (2 * h * self.error + 3 * g * far**2) * slope + (abs(f1) + by_y) * self.slack + by_y * self.tilt
+        else:
+            error, slack = e0, e1 * slope + (abs(f1) + e1) * self.slack
+        return RangedJet(
+            f0,
+            f1 * self.moves,
+            error,
+            f1 * self.a,
+            f1 * self.turns + 2 * half * self.moves[:, rows, rows] * self.a,
+            slack,
+            f1 * self.Q + H,
+            f1 * self.K + cubic,
+            f1 * self.B,
+            (abs(f1) + e1)[:, rows] * self.E + R + (moved + bent * self.turned)[:, rows] * basis(self.a.shape[1]).eye,
+            self.errors,
+        )
+
+    def _nowhere(self) -> RangedJet:
+        """Of all balls, where one of them has no finite model."""
+        return replace(self, c=math.nan, E=self.E + math.inf)
+
+    def inverse(self) -> RangedJet:
+        c, far = self.c, self.away
+        close = abs(c) - far
+        least = close - self.radius
+        if not np.all(least > 0) or is_extreme(c):
+            return self._nowhere()
+        f = 1 / c, -1 / c**2, 1 / c**3, -1 / c**4
+        e = far / close**2, 2 * far / close**3, 3 * far / close**4, 4 * far / close**5
+        return self.compose(f, e, 1 / (close**4 * least))
+
+    def sqrt(self) -> RangedJet:
+        far = self.away
+        close = self.c - far
+        if not np.all(close - self.radius > 0) or is_extreme(self.c):
+            return self._nowhere()
+        r, s, w = math.sqrt(self.c), np.sqrt(close), np.sqrt(close - self.radius)
+        f = r, 1 / (2 * r), -1 / (8 * r**3), 1 / (16 * r**5)
+        e = far / (2 * s), far / (4 * s**3), 0.1875 * far / s**5, 0.15625 * far / s**7
+        return self.compose(f, e, (5 * s**2 + 4 * s * w + w**2) / (16 * s**5 * (s + w) ** 4))
+
+    def exp(self) -> RangedJet:
+        end = self.c + self.away + self.radius
+        if not np.all(end < EXP_END):
+            return self._nowhere()
+        here, most = math.exp(self.c), np.exp(end)
+        e = self.away * most
+        return self.compose((here, here, here / 2, here / 6), (e, e, e, e), most / 24)
+
+    def tanh(self) -> RangedJet:
+        t, far = math.tanh(self.c), self.away
+        slope = 1 - t * t
+        e1 = 2 * far * (1 + far)
+        e = far, e1, far * (slope + e1) + abs(t) * e1, 1.4 * far
+        there = abs(8 * t * (2 - 3 * t**2) * slope)
+        fourth = np.minimum(TANH4, there + TANH5 * (far + self.radius)) / 24
+        return self.compose((t, slope, -t * slope, (t * t - 1 / 3) * slope), e, fourth)
+
+    def atan(self) -> RangedJet:
+        slope, far = 1 / (1 + self.c**2), self.away
+        f = math.atan(self.c), slope, -self.c * slope**2, (self.c**2 - 1 / 3) * slope**3
+        return self.compose(f, (far, far, far, far), np.array([ATAN4 / 24]))
+
+    def sin(self) -> RangedJet:
+        return self._nowhere() if math.isinf(self.c) else self._wave(math.sin(self.c), math.cos(self.c))
+
+    def cos(self) -> RangedJet:
+        return self._nowhere() if math.isinf(self.c) else self._wave(math.cos(self.c), -math.sin(self.c))
+
+    def _wave(self, value: float, slope: float) -> RangedJet:
+        far = self.away
+        fourth = np.minimum(1.0, abs(value) + far + self.radius) / 24
+        return self.compose((value, slope, -value / 2, -slope / 6), (far, far, far, far), fourth)
+
+
+class RangedJets(Algebra[RangedJet]):
+    """Such jets on M balls, in k variables and N uncertain quantities, with the errors that they share."""
+
+    def __init__(self, M: int, k: int, N: int, errors: Array) -> None:
+        b = basis(k)
+        self._nothing = RangedJet(
+            0.0,
+            np.zeros(N),
+            np.zeros(M),
+            np.zeros((M, k)),
+            np.zeros((N, M, k)),
+            np.zeros(M),
+            np.zeros((M, len(b.eye))),
+            np.zeros((M, len(b.scale3))),
+            np.zeros((1, len(errors))),
+            np.zeros((M, len(b.eye))),
+            errors,
+        )
+
+    def constant(self, q: Fraction) -> RangedJet:
+        return replace(self._nothing, c=float(q))
+
+    def total(self, constant: Fraction | None, terms: Sequence[RangedJet]) -> RangedJet:
+        result = reduce(lambda x, y: x + y, terms)
+        return result if constant is None else result.shifted(float(constant))
+
+    def product(self, constant: Fraction | None, factors: Sequence[RangedJet]) -> RangedJet:
+        result = reduce(lambda x, y: x * y, factors)
+        return result if constant is None else result.scaled(float(constant))
+
+    def quantity(self, lo: Fraction, hi: Fraction, number: int | None) -> RangedJet:
+        """One of [lo, hi], at the same place as y of its number; None: at any place."""
+        middle, half = float((lo + hi) / 2), float((hi - lo) / 2)
+        if number is None:
+            return replace(self._nothing, c=middle, error=np.full_like(self._nothing.error, half))
+        moves = np.zeros_like(self._nothing.moves)
+        moves[number] = half
+        return replace(self._nothing, c=middle, moves=moves)
+
+    def state(self, value: float, rows: Array, error: Array | None = None, slack: Array | None = None) -> RangedJet:
+        """A value at the middle and its gradients (M, k), or one that is near, (M,) each."""
+        error, slack = (self._nothing.error if v is None else v for v in (error, slack))
+        return replace(self._nothing, c=value, a=rows, error=error, slack=slack)
+
+    def input(self, number: int, value: float, a: Array, Q: Array, K: Array) -> RangedJet:
+        """An input's model, without its error, which is e of its number."""
+        B = np.zeros_like(self._nothing.B)
+        B[0, number] = 1.0
+        return replace(self._nothing, c=value, a=a, Q=Q, K=K, B=B)

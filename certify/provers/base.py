@@ -1,0 +1,216 @@
+"""What every engine takes and gives. No engine is trusted: the checker decides."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.certificates import PartitionTree, TrustedSolver
+from certify.certificates.claims import Claim, Problem
+from certify.certificates.claims.claim import Kind
+from certify.certificates.verdict import Stop
+from certify.errors import InputError
+from certify.provers.falsify import Witness
+
+FEW = 3
+"""States, up to which a tree of boxes may carry a practical claim without a ball."""
+
+
+@dataclass(frozen=True, slots=True)
+class Budget:
+    """What a proof may use: seconds on the wall, of which `check` are left for the check of each proved box; boxes,
+    boxes at once, and the width of the smallest box relative to the root box."""
+
+    seconds: float = 600.0
+    boxes: int = 4_000_000
+    batch: int = 2048
+    least_width: float = 2.0**-24
+    check: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """What an engine is asked for: a claim of this kind about the largest set {V <= c2}, c2 up to `target`.
+
+    `exactly` says that less than `target` is of no use; `witness` is the violation that made `target` what it is.
+    """
+
+    problem: Problem
+    kind: Kind
+    target: float
+    exactly: bool = False
+    witness: Witness | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """Where a proof stands: `level` is proved, `target` aimed at, `boxes` were bounded and `open` wait.
+
+    A pass outwards has a target above its level, one inwards, `down`, a target below. `proved` is the share of the
+    ring's volume that is done; `seconds_left` is extrapolated, None at first; `name` is the candidate's."""
+
+    level: float
+    target: float
+    boxes: int
+    open: int
+    proved: float
+    seconds_left: float | None
+    name: str = ""
+    down: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Proof:
+    """What an engine found: a claim with evidence for it, or None and why there is none.
+
+    `stop` and `detail` say what limits the level; `witness` is the lowest violation met on the way; `partial` are
+    levels that were reached without making a claim; `solver` is the record of a solver's answers; `seconds` the
+    stages `local` and `ring`; `direction`, (n,), is that in which boxes had to be halved most, and `seconds_left` how
+    long the search would still take, both None where unknown.
+    """
+
+    claim: Claim | None
+    evidence: PartitionTree | TrustedSolver | None
+    stop: Stop
+    detail: str = ""
+    witness: Witness | None = None
+    boxes: int = 0
+    leaves: int = 0
+    partial: Mapping[str, float] = field(default_factory=dict)
+    solver: Mapping[str, Any] | None = None
+    seconds: Mapping[str, float] = field(default_factory=dict)
+    direction: tuple[float, ...] | None = None
+    seconds_left: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class SearchState:
+    """A search that can be gone on with: the levels, boxes bounded and proved so far, the lowest violation met, and the
+    tree in preorder, in which 254 is an open leaf, with the keys (B,) of these, by which they are taken."""
+
+    inner: float
+    outer: float
+    boxes: int
+    proved: int
+    witness: Witness | None
+    tree: bytes
+    keys: NDArray[np.float64]
+
+
+Report = Callable[[Progress], None]
+
+
+class Attempt(Protocol):
+    """A proof in the making: it can be asked at any time for what it has, and go on."""
+
+    @property
+    def done(self) -> bool:
+        """Whether more time would gain nothing."""
+
+    @property
+    def boxes(self) -> int:
+        """Boxes bounded so far."""
+
+    @property
+    def seconds(self) -> Mapping[str, float]:
+        """That its stages took so far."""
+
+    @property
+    def level(self) -> float | None:
+        """The c2 that is proved so far; None if there is none."""
+
+    @property
+    def gained(self) -> bool:
+        """Whether the search has added anything to what was there at its beginning."""
+
+    @property
+    def expected(self) -> float:
+        """Boxes that the search may need before it gains anything, a guess of its order of magnitude."""
+
+    def advance(self, budget: Budget, report: Report | None = None) -> None:
+        """Work for as long as the budget allows."""
+
+    def proof(self) -> Proof:
+        """The best claim of the task's kind so far."""
+
+    def state(self) -> SearchState | None:
+        """The search, to go on with another time, also one that is done; None if there is none."""
+
+    def restore(self, state: SearchState) -> None:
+        """Go on with a search for the same task in the same coordinates.
+
+        Raises
+        ------
+        InputError : it does not fit.
+        """
+
+
+class Engine(ABC):
+    """A way to prove claims."""
+
+    @abstractmethod
+    def begin(self, task: Task) -> Attempt:
+        """An attempt at the task that has not been worked on."""
+
+    def prove(self, task: Task, budget: Budget, report: Report | None = None) -> Proof:
+        """The best claim of the task's kind that the budget allows."""
+        attempt = self.begin(task)
+        attempt.advance(budget, report)
+        return attempt.proof()
+
+
+@dataclass
+class Once:
+    """An attempt that cannot be interrupted: all its work is done the first time that it is given any."""
+
+    prove: Callable[[Budget, Report | None], Proof]
+    found: Proof | None = None
+
+    @property
+    def done(self) -> bool:
+        """Whether it has been worked on."""
+        return self.found is not None
+
+    @property
+    def boxes(self) -> int:
+        """Boxes bounded."""
+        return 0 if self.found is None else self.found.boxes
+
+    @property
+    def seconds(self) -> Mapping[str, float]:
+        """Of its stages."""
+        return {} if self.found is None else self.found.seconds
+
+    @property
+    def level(self) -> float | None:
+        """The c2 that was proved."""
+        return None if self.found is None or self.found.claim is None else self.found.claim.roa
+
+    @property
+    def gained(self) -> bool:
+        """Whether anything was proved."""
+        return self.level is not None
+
+    @property
+    def expected(self) -> float:
+        """None: there is no going on."""
+        return 0.0
+
+    def advance(self, budget: Budget, report: Report | None = None) -> None:
+        """Work once."""
+        self.found = self.found or self.prove(budget, report)
+
+    def proof(self) -> Proof:
+        """What was found."""
+        return self.found or Proof(None, None, Stop.TIME)
+
+    def state(self) -> None:
+        """None: there is no going on."""
+
+    def restore(self, state: SearchState) -> None:
+        raise InputError("a search for this claim, or of this engine, cannot be gone on with; begin it anew.")

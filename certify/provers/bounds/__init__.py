@@ -1,0 +1,28 @@
+"""Bounds on boxes in batched torch float64: Taylor models of the plant, affine forms of the policy.
+
+Untrusted: the checker repeats the proof with its own code. Rounding is still accounted for, so that what is proved
+here is accepted there.
+"""
+
+from __future__ import annotations
+
+from certify.provers.bounds.flow import Flow
+from certify.provers.bounds.loop import LoopModels, loop_models
+from certify.provers.bounds.neural import NeuralEnclosure, NeuralModels
+from certify.provers.bounds.policy import PolicyEnclosure
+from certify.provers.bounds.symbolic import SymbolicEnclosure, SymbolicModels
+from certify.provers.bounds.taylor import Models, Taylor, upper_bound
+
+__all__ = [
+    "Flow",
+    "LoopModels",
+    "Models",
+    "NeuralEnclosure",
+    "NeuralModels",
+    "PolicyEnclosure",
+    "SymbolicEnclosure",
+    "SymbolicModels",
+    "Taylor",
+    "loop_models",
+    "upper_bound",
+]

@@ -1,0 +1,151 @@
+"""What the plant does in a sampling period, while its input is held, in Taylor models on boxes.
+
+Wanted is G = (phi(h) - x)/h, the mean of f over the period, for every period in a range and whatever the uncertain
+quantities do in it. The series in time is taken along x, but for its last coefficient, which is the remainder of
+Taylor's formula and has to hold all along the solution: it is taken along an enclosure of that, found beforehand by the
+argument that a solution cannot be the first to leave what it would need longer than a period to leave (Moore 1966;
+Nedialkov, Jackson, Corliss 1999). A quantity that changes in the period is another number at each place where it
+stands, so that only the first coefficient, in which it stands for its mean, may know it by a symbol.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from certify.loop.expressions import Expression, Symbol, evaluate, solution_series
+from certify.loop.plants.system import Interval
+from certify.provers.bounds.taylor import EPS, TINY, Models, Taylor
+
+_ATTEMPTS, _WIDER = 4, 1.25  # at the enclosure of the solution
+Values = Mapping[Symbol, Taylor]
+
+
+class Mean(NamedTuple):
+    """`G`: models of the mean of f over the period, a component each; `least` and `most` (n, B): bounds of f from its
+    beginning to the end of the longest; `exists` (B,): the solution does, and these hold for it."""
+
+    G: list[Taylor]
+    least: Tensor
+    most: Tensor
+    exists: Tensor
+
+
+class Flow:
+    """The mean of f over a period with the input held.
+
+    Parameters
+    ----------
+    dynamics : f, in the order of the states.
+    sample : the shortest and the longest period, in units of time.
+    order : of the series in time, at least 1.
+    """
+
+    def __init__(self, dynamics: Sequence[Expression], sample: Interval, order: int) -> None:
+        self.dynamics, self.order = dynamics, order
+        self.shortest, self.longest = sample
+        self.symbols = int(self.shortest < self.longest)  # the period's own, the last of all
+        self.most = math.nextafter(float(self.longest), math.inf)
+
+    def __call__(self, states: Values, inputs: Values, quantities: Values, first: int) -> Mean:
+        """G from states, held inputs and uncertain quantities; those have symbols of their own from `first` on."""
+        like = next(iter(states.values()))
+        models = Models(like)
+        alike = slice(first, first + len(quantities))
+        held = {**inputs, **{symbol: _without_symbols(model) for symbol, model in quantities.items()}}
+        now = self._rate({**states, **inputs, **quantities}, models)
+        around, exists = self._enclose(states, held, now)
+        along = solution_series(self.dynamics, around, held, models, self.order)
+        if self.order == 1:  # the first coefficient is the remainder
+            rows = [[model] for model in self._rate({**around, **inputs, **quantities}, models)]
+        elif self.order == 2:
+            rows = [[model, row[1]] for model, row in zip(now, along, strict=True)]
+        else:
+            inner = solution_series(self.dynamics, states, held, models, self.order - 1)
+            rows = [[model, *row[1:], last[-1]] for model, row, last in zip(now, inner, along, strict=True)]
+        f = [row[0] for row in along]
+        reach = [model.radius() for model in f]
+        return Mean(
+            [self._sum([_mean(row[0], alike), *row[1:]]) for row in rows],
+            torch.stack([model.c - r for model, r in zip(f, reach, strict=True)]),
+            torch.stack([model.c + r for model, r in zip(f, reach, strict=True)]),
+            exists,
+        )
+
+    def _rate(self, values: Values, models: Models) -> list[Taylor]:
+        known: dict[Expression, Taylor] = {}
+        return [evaluate(expression, values, models, known) for expression in self.dynamics]
+
+    def _enclose(self, states: Values, held: Values, now: Sequence[Taylor]) -> tuple[dict[Symbol, Taylor], Tensor]:
+        """Models of all states up to the end of the period, and where (B,) they are that."""
+        size = _sizes(now)
+        kappa = _WIDER * self.most * size
+        left = torch.arange(size.shape[1], device=size.device)
+        for attempt in range(_ATTEMPTS):
+            if attempt:
+                kappa[:, left] = _WIDER * self.most * size[:, left]
+            around = {s: _widened(_part(v, left), kappa[i, left]) for i, (s, v) in enumerate(states.items())}
+            values = {**around, **{symbol: _part(model, left) for symbol, model in held.items()}}
+            size[:, left] = _sizes(self._rate(values, Models(next(iter(around.values())))))
+            fits = (self.most * size[:, left] * (1 + EPS) < kappa[:, left]).all(0)
+            left = left[~fits]
+            if not len(left):
+                break
+        exists = torch.ones(size.shape[1], dtype=torch.bool, device=size.device)
+        exists[left] = False
+        return {s: _widened(v, kappa[i]) for i, (s, v) in enumerate(states.items())}, exists
+
+    def _sum(self, row: Sequence[Taylor]) -> Taylor:
+        """`x_1 + h x_2 + ... + h^(r-1) x_r`."""
+        result = row[-1]
+        for model in reversed(row[:-1]):
+            result = model + self.times_period(result)
+        return result
+
+    def times_period(self, model: Taylor) -> Taylor:
+        """h v."""
+        if not self.symbols:
+            return model.scaled(float(self.longest))
+        middle = float((self.shortest + self.longest) / 2)
+        reach = float((self.longest - self.shortest) / 2)
+        g = torch.zeros_like(model.g)
+        g[-1] = reach
+        rounding = torch.full_like(model.c, EPS * (middle + reach) + TINY)
+        return model * Taylor(torch.full_like(model.c, middle), g, torch.zeros_like(model.Q), rounding)
+
+
+def _sizes(models: Sequence[Taylor]) -> Tensor:
+    """Bounds of |v| (n, B)."""
+    return torch.stack([model.c.abs() + model.radius() for model in models]) * (1 + EPS)
+
+
+def _part(model: Taylor, index: Tensor) -> Taylor:
+    if len(index) == len(model.c):
+        return model
+    return model.at(index)
+
+
+def _widened(model: Taylor, by: Tensor) -> Taylor:
+    return Taylor(model.c, model.g, model.Q, (model.r + by) * (1 + EPS))
+
+
+def _without_symbols(model: Taylor) -> Taylor:
+    """The range as a remainder, in which nothing is known of one place by another."""
+    return Taylor(model.c, torch.zeros_like(model.g), torch.zeros_like(model.Q), model.radius())
+
+
+def _mean(model: Taylor, alike: slice) -> Taylor:
+    """The mean over the period, in which the symbols `alike` change and stand for their means from here on.
+
+    What is linear in them has the mean of the same form; a product of two is any number of its range.
+    """
+    if alike.start == alike.stop:
+        return model
+    Q = model.Q.clone()
+    products = Q[alike, alike].abs().sum((0, 1))
+    Q[alike, alike] = 0.0
+    return Taylor(model.c, model.g, Q, (model.r + products) * (1 + EPS))

@@ -1,0 +1,75 @@
+"""What to do about a leaf that the checker refuses: split it again, or keep the level below it.
+
+Producer and checker round in their own ways, and a bound that is barely negative for the one may be barely positive for
+the other. Neither remedy starts anew: the tree stays, with one leaf more finely cut, or with a lower level.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from certify.certificates import PartitionTree
+from certify.certificates.claims import Claim, Problem
+from certify.certificates.tree import leaves
+from certify.provers.boxes.partition import LEAF
+from certify.provers.boxes.rule import VdotBound
+
+Array = NDArray[np.float64]
+_DEPTH = 3  # halvings of a leaf that was refused
+_SLACK = 2e-9  # relative distance of a level from the leaves that it leaves out
+
+
+def split_again(problem: Problem, evidence: PartitionTree, claim: Claim, leaf: int) -> PartitionTree:
+    """The tree with the leaf of this number, counted in preorder, cut into eight along the axes that matter most."""
+    lo, hi = leaves(evidence.tree, evidence.root)
+    rule = VdotBound(problem, evidence.T, torch.device("cpu"), order=evidence.order)
+    tree = cut_leaf(evidence.tree, leaf, lo[leaf], hi[leaf], lambda a, b: rule(a, b, claim.inner, claim.roa).score)
+    return replace(evidence, tree=tree)
+
+
+def cut_leaf(tree: bytes, leaf: int, lo: Array, hi: Array, score: Callable[[Tensor, Tensor], Tensor]) -> bytes:
+    """The tree with this leaf, of corners (n,), cut into eight, along the axes of the highest score (n, 1)."""
+    at = int(np.flatnonzero(np.frombuffer(tree, dtype=np.uint8) == LEAF)[leaf])
+    lower, upper = (torch.tensor(corner[:, None]) for corner in (lo, hi))
+    return tree[:at] + _cut(score, lower, upper, _DEPTH) + tree[at + 1 :]
+
+
+def _cut(score: Callable[[Tensor, Tensor], Tensor], lo: Tensor, hi: Tensor, depth: int) -> bytes:
+    """A box (n, 1) as a subtree of this depth."""
+    axis = int(score(lo, hi)[:, 0].argmax())
+    middle = 0.5 * lo[axis] + 0.5 * hi[axis]
+    if depth == 0 or not bool(lo[axis] < middle) or not bool(middle < hi[axis]):
+        return bytes([LEAF])
+    lower_hi, upper_lo = hi.clone(), lo.clone()
+    lower_hi[axis] = upper_lo[axis] = middle
+    halves = ((lo, lower_hi), (upper_lo, hi))
+    return bytes([axis]) + b"".join(_cut(score, low, high, depth - 1) for low, high in halves)
+
+
+def below_leaf(problem: Problem, evidence: PartitionTree, leaf: int) -> float:
+    """A level that leaves the leaf outside; it may be negative, if the leaf holds the origin."""
+    lowest, _ = leaf_levels(problem, evidence)
+    return float(lowest[leaf]) * (1 - _SLACK)
+
+
+def level_with_leaves(problem: Problem, evidence: PartitionTree, claim: Claim, count: int) -> tuple[float, int]:
+    """A level of the ring below which about so many leaves meet it, the whole ring's if there are no more, and how
+    many the checker has to bound for it."""
+    lowest, highest = leaf_levels(problem, evidence)
+    met = np.sort(lowest[(highest >= claim.inner) & (lowest <= claim.roa)])
+    level = claim.roa if len(met) <= count else max(claim.inner, float(met[count]) * (1 - _SLACK))
+    return level, int(np.sum(met <= level))
+
+
+def leaf_levels(problem: Problem, evidence: PartitionTree) -> tuple[Array, Array]:
+    """Bounds of V from below and above on the leaves, (N,) each, in the order of the tree."""
+    lo, hi = leaves(evidence.tree, evidence.root)
+    rule = VdotBound(problem, evidence.T, torch.device("cpu"))
+    lowest, highest = rule.levels(torch.tensor(lo.T.copy()), torch.tensor(hi.T.copy()))
+    return lowest.numpy(), highest.numpy()

@@ -1,0 +1,282 @@
+"""The rule for a box: an upper bound of D' = D + 2 lambda V on the part of the ring that lies in it.
+
+D is V's increment over a step, by time: Vdot; V(F(x)) - V(x) in discrete time; (V(phi(h)) - V(x))/h where the input is
+held over h. With the mean rate of the step, G = F; F(x) - x; (phi(h) - x)/h, it is `2 x'P G + h G'P G`.
+
+Where a box sticks out of the ring, D' need not be negative on all of it. For any multiplier >= 0,
+`D' < 0` on {V <= c2} follows from `D' + multiplier (c2 - V) < 0`, and on {V >= c1} from
+`D' + multiplier (V - c1) < 0` (the S-procedure: Boyd, El Ghaoui, Feron, Balakrishnan 1994, section 2.6.3). Near the
+point where {V <= c2} touches {D' >= 0} the two gradients are parallel, and the right multiplier cancels the first
+order: close to the largest level this saves tenfold in boxes.
+
+A bound over a step keeps something that no splitting takes away, because a solution leaves each box, however small.
+Whether a box's centre can be proved at all is therefore asked of the centre alone, before the box is split for ever.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from certify.certificates.claims import Problem
+from certify.loop.expressions import Expression, evaluate
+from certify.loop.plants import System
+from certify.loop.policies import bounded_by_form
+from certify.provers.bounds import Flow, Models, PolicyEnclosure, Taylor, loop_models, upper_bound
+from certify.provers.bounds.compiled import kernels
+from certify.provers.bounds.loop import played
+from certify.provers.bounds.tape import Tape, recorded
+from certify.provers.bounds.taylor import EPS, TINY, ConstantsLast, V
+from certify.provers.boxes.form import FormBound
+
+Array = NDArray[np.float64]
+_SLACK = 1e-9  # relative distance from the inner level at which a box counts as inside
+_ENDS = 1e-11  # relative distance kept from the ends of the domain
+_POINT = 2.0**-20  # of a box: what is left of it around its centre
+
+
+class BoxBounds(NamedTuple):
+    """What is known of each box: `proved` (B,), `bound` of D' (B,), `score` (n, B): what each axis adds to the bound,
+    `violated` (B,): a condition fails at the centre, or cannot be proved there; `smooth` (B,): what is asked inside
+    the inner level holds."""
+
+    proved: Tensor
+    bound: Tensor
+    score: Tensor
+    violated: Tensor
+    smooth: Tensor
+
+
+class VdotBound:
+    """Upper bounds of D', which is Vdot in continuous time, and bounds of V, over boxes in the coordinates z.
+
+    With `inside`, a box on which V is below the inner level is proved if F is enclosed there and the inputs keep their
+    bounds, and where time has steps if none leads from it to V of at least that level; otherwise such a box is
+    nobody's concern here. `order` is that of the series in time where the input is held.
+    """
+
+    def __init__(self, problem: Problem, T: Array, device: torch.device, inside: bool = False, order: int = 2) -> None:
+        self.inside = inside
+        loop = problem.loop
+        self.system = loop.system
+        self.rate = problem.rate
+        self.T = torch.tensor(T, dtype=torch.float64, device=device)
+        self.P = problem.V.P
+        self.V = FormBound(self.P, T, device)
+        self.policy = PolicyEnclosure(loop, device)
+        self.dynamics: tuple[Expression, ...] = loop.system.uncertain_dynamics()
+        self.check_inputs = not bounded_by_form(loop.network, loop.system.input_bounds)
+        sample = loop.system.sample
+        self.flow = None if sample is None else Flow(self.dynamics, sample, order)
+        self.order = 1 if self.flow is None else order
+        self.step = loop.step
+        self.tape: Tape | None = None  # of D, recorded when it is first played
+        ends = [[float(end) for end in pair] for pair in loop.system.domain]
+        self.ends = torch.tensor(ends, dtype=torch.float64, device=device).T[:, :, None]
+        extent = np.sqrt(np.diag(np.linalg.inv(self.P))) * (1 + 1e-9)
+        self.extent = torch.tensor(extent, dtype=torch.float64, device=device)[:, None]  # of {V <= 1}
+
+    def levels(self, lo: Tensor, hi: Tensor) -> tuple[Tensor, Tensor]:
+        """Bounds of V from below and above on boxes (n, B)."""
+        return self.V.levels(lo, hi)
+
+    def levels_at(self, z: Tensor) -> Tensor:
+        """V at points (n, B)."""
+        return self.V.at(z)
+
+    def at_points(self, z: Tensor, outer: float) -> Tensor:
+        """The bound of D' at points (n, B) in {V <= outer}; infinite where nothing is known of it."""
+        return self._judge(z, torch.zeros_like(z), z, z, 0.0, outer).bound.nan_to_num(torch.inf, torch.inf)
+
+    def levels_after(self, z: Tensor, outer: float) -> Tensor:
+        """V after a step from points (n, B) in {V <= outer}, from above; infinite where nothing is known of it."""
+        return self.levels_at(z) + self.step * self.at_points(z, outer)
+
+    def __call__(self, lo: Tensor, hi: Tensor, inner: float, outer: float) -> BoxBounds:
+        """Bounds on inner <= V <= outer within boxes lo, hi (n, B)."""
+        centre = 0.5 * lo + 0.5 * hi
+        radius = torch.maximum(hi - centre, centre - lo) * (1 + EPS)
+        found = self._judge(centre, radius, lo, hi, inner, outer)
+        if self.step == 0:
+            return found
+        asked = ~found.proved & ~found.violated
+        if not self.inside:
+            asked = asked & (self.levels_at(centre) >= inner)
+        index = torch.nonzero(asked)[:, 0]
+        if not len(index):
+            return found
+        z, small = centre[:, index], _POINT * radius[:, index]
+        provable = self._judge(z, small, z - small, z + small, inner, outer).proved
+        return found._replace(violated=found.violated.index_put((index,), ~provable))
+
+    def _judge(self, centre: Tensor, radius: Tensor, lo: Tensor, hi: Tensor, inner: float, outer: float) -> BoxBounds:
+        n = self.system.n
+        slopes_x = self.T[:, :, None] * radius
+        x = torch.cat([(self.T @ centre)[:, None], slopes_x], 1)
+        error = 2 * (n + 4) * EPS * (self.T.abs() @ (centre.abs() + radius)) + TINY
+        mid, slopes, wide, share = self.policy(x, error)
+        decrease, kept = self._decrease(x, error, mid, slopes, wide, outer)
+        if self.rate:
+            decrease = decrease + self.V.model(centre, radius, decrease).scaled(2 * self.rate)
+        bound, excess = upper_bound(decrease)
+        smooth = torch.isfinite(bound)  # a component of F that is not enclosed leaves a NaN in the sum over all
+        # At the box's centre, and for the worst values of what is uncertain, only the inputs' errors, what is of second
+        # order in all these, and the remainder are left.
+        known = n + self.system.m
+        doubt = decrease.g[n:known].abs().sum(0) + decrease.Q[n:, n:].abs().sum((0, 1)) + decrease.r
+        violated = decrease.c + decrease.g[known:].abs().sum(0) - doubt >= 0
+        bound = self._within_ring(bound, decrease, lo, hi, centre, radius, inner, outer)
+        proved = bound < 0
+        if self.inside and self.step == 0:
+            proved = smooth & (proved | (self.levels(lo, hi)[1] < inner * (1 - _SLACK)))
+        # What the inputs' errors and the remainder add is charged to the axes that spread the network.
+        extra = excess[n:].sum(0) + decrease.r
+        score = excess[:n] + share * extra
+        score = torch.where(torch.isfinite(score), score, slopes_x.abs().sum(0))
+        if kept is not None:
+            score = torch.where(kept, score, slopes_x.abs().sum(0))
+            proved, bound = proved & kept, torch.where(kept, bound, torch.inf)
+        if self.check_inputs:
+            for j, (inside, outside) in enumerate(input_bounds_kept(self.system, mid, slopes, wide)):
+                proved, violated, smooth = proved & inside, violated | outside, smooth & inside
+                score = torch.where(inside, score, slopes[j].abs() + share * wide[j])
+        if self.inside and self.step:
+            smooth = proved
+        return BoxBounds(proved, bound, score, violated, smooth)
+
+    def _decrease(
+        self, x: Tensor, error: Tensor, mid: Tensor, slopes: Tensor, wide: Tensor, outer: float
+    ) -> tuple[Taylor, Tensor | None]:
+        """D, and where (B,) the solution stays in the domain over a period in which the input is held, if it is.
+
+        Symbols: n box coordinates, m input errors, k uncertain quantities, and the period if that is in a range.
+        """
+        compiled = kernels(self.policy.units * x.shape[2]) if self.flow is None and x.device.type == "cpu" else None
+        if compiled is not None:
+            if self.tape is None:
+                count = self.system.n + self.system.m + len(self.system.uncertain)
+                self.tape = recorded(count, self._at_rates)
+            return played(compiled, self.tape, self.system, x, error, mid, slopes, wide), None
+        more = 0 if self.flow is None else self.flow.symbols
+        states, inputs, quantities = loop_models(self.system, x, error, mid, slopes, wide, more)
+        here = list(states.values())
+        models = Models(here[0])
+        if self.flow is None:
+            return self._at_rates([*here, *inputs.values(), *quantities.values()], models), None
+        mean = self.flow(states, inputs, quantities, self.system.n + self.system.m)
+        moved = [self.flow.times_period(rate) for rate in mean.G]
+        kept = mean.exists & self._in_domain(here, mean.least, mean.most, outer)
+        return self._increment(here, mean.G, moved, models), kept
+
+    def _at_rates(self, values: Sequence[V], algebra: ConstantsLast[V]) -> V:
+        """D where the input is not held over time, from states, inputs and uncertain quantities."""
+        system = self.system
+        known: dict[Expression, V] = {}
+        symbols = [*system.states, *system.inputs, *(symbol for symbol, _ in system.uncertain)]
+        named, here = dict(zip(symbols, values, strict=True)), values[: system.n]
+        G: list[V] = [evaluate(expression, named, algebra, known) for expression in self.dynamics]
+        if system.time == "discrete":
+            G = [after + before.scaled(-1.0) for after, before in zip(G, here, strict=True)]
+        return self._increment(here, G, G, algebra)
+
+    def _increment(self, here: Sequence[V], G: Sequence[V], moved: Sequence[V], algebra: ConstantsLast[V]) -> V:
+        """`2 x'P G + h G'P G`, `moved` being h G."""
+        along, factor = here, 2.0
+        if self.step:
+            along, factor = [v.scaled(2.0) + by for v, by in zip(here, moved, strict=True)], 1.0
+        terms = [row * rate for row, rate in zip(algebra.combined(factor * self.P, along), G, strict=True)]
+        return algebra.total(None, terms)
+
+    def _in_domain(self, states: list[Taylor], least: Tensor, most: Tensor, outer: float) -> Tensor:
+        """Where (B,) the solution from V <= outer stays inside the domain over the longest period."""
+        centre = torch.stack([model.c for model in states])
+        reach = torch.stack([model.radius() for model in states])
+        wide = outer**0.5 * self.extent
+        longest = self.step * (1 + EPS)
+        down = torch.maximum(centre - reach, -wide) + longest * least.clamp(max=0.0)
+        up = torch.minimum(centre + reach, wide) + longest * most.clamp(min=0.0)
+        low, high = self.ends
+        slack = _ENDS * (low.abs() + high.abs() + centre.abs() + reach)
+        inside: Tensor = ((down > low + slack) & (up < high - slack)).all(0)
+        return inside
+
+    def _within_ring(
+        self,
+        bound: Tensor,
+        decrease: Taylor,
+        lo: Tensor,
+        hi: Tensor,
+        centre: Tensor,
+        radius: Tensor,
+        inner: float,
+        outer: float,
+    ) -> Tensor:
+        """The bound, made tighter by the S-procedure where it is not negative and the box sticks out of the ring.
+
+        Where nothing but a step's end shows that it does not lead out of {V < inner}, on boxes that meet that set, the
+        multiplier of V - inner is at most 1/h, and there is no other.
+        """
+        n = len(centre)
+        lowest, highest = self.levels(lo, hi)
+        below, beyond = lowest < inner, highest > outer
+        most = torch.inf
+        if self.inside and self.step:
+            below = lowest < inner * (1 + _SLACK)
+            beyond = beyond & ~below
+            most = (1 - 1e-12) / self.step
+        for level, sign, outside in ((outer, 1.0, beyond), (inner, -1.0, below)):
+            index = torch.nonzero(outside & ~(bound < 0))[:, 0]
+            if not len(index):
+                continue
+            # it is >= 0 in the ring
+            part = decrease.at(index)
+            gap = self.V.gap(centre[:, index], radius[:, index], part, level, sign)
+            bound = bound.index_put((index,), lessened(bound[index], part, gap, n, most))
+        return bound
+
+
+def input_bounds_kept(system: System, mid: Tensor, slopes: Tensor, wide: Tensor) -> list[tuple[Tensor, Tensor]]:
+    """For each input, enclosed by `mid + slopes.d` within `wide`, on which boxes (B,) it lies in its bounds, and on
+    which it certainly leaves them at the centre."""
+    reach, kept = slopes.abs().sum(1) + wide + 1e-11 * mid.abs(), []
+    for j, (low, high) in enumerate(system.input_bounds):
+        slack = 1e-11 * (abs(float(low)) + abs(float(high)))
+        inside = (mid[j] - reach[j] > float(low) + slack) & (mid[j] + reach[j] < float(high) - slack)
+        outside = (mid[j] - wide[j] > float(high) + slack) | (mid[j] + wide[j] < float(low) - slack)
+        kept.append((inside, outside))
+    return kept
+
+
+def lessened(bound: Tensor, decrease: Taylor, gap: Taylor, n: int, most: float = torch.inf) -> Tensor:
+    """The bound (B,) of a model, made tighter where it is not negative by multiples of what is >= 0 where it counts.
+
+    Parameters
+    ----------
+    gap : the model of that, whose first n symbols are the box coordinates.
+    most : the largest multiplier, which is tried too if it is finite.
+    """
+    scale = gap.r + EPS * sum(gap.norms())
+    tried = _multipliers(decrease.g[:n], gap.g[:n], gap.c).clamp(max=most)
+    if most < torch.inf:
+        tried = torch.cat([tried, torch.full_like(tried[:1], most)])
+    for each in tried:
+        still = torch.nonzero(~(bound < 0) & (each > 0))[:, 0]
+        k = each[still]
+        c = k * gap.c[still]
+        rest = k * scale[still] + EPS * c.abs() + TINY
+        added = Taylor(c, k * gap.g[:, still], k * gap.Q[:, :, still], rest)
+        tighter, _ = upper_bound(decrease.at(still) + added)
+        bound = bound.index_put((still,), torch.fmin(bound[still], tighter))
+    return bound
+
+
+def _multipliers(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
+    """The k at which a term of `c k + sum_i |a_i + k b_i|` vanishes, or 0 where it is negative: (n, B), best first."""
+    k = torch.nan_to_num(torch.where(b != 0, -a / b, 0.0), 0.0, 0.0, 0.0).clamp(min=0.0)
+    value = c * k + (a[:, None] + k * b[:, None]).abs().sum(0)
+    return k.gather(0, value.argsort(dim=0, stable=True))

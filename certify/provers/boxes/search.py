@@ -1,0 +1,526 @@
+"""The ring: one best-first pass of branch and bound that finds the best provable level as it goes.
+
+A pass outwards keeps the inner level and looks for the largest outer one: boxes are taken in the order of the lowest V
+on them, and everything below the lowest undecided box is proved. A pass inwards keeps the outer level and looks for the
+smallest inner one, in the order of the highest V. Either way the answer is ready whenever the pass stops: for a
+violation, a budget, or because nothing is left. No trial level is ever proved again from scratch.
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from certify.certificates.claims import Problem
+from certify.certificates.verdict import Stop
+from certify.errors import BackendError, CertificateFormatError, InputError
+from certify.provers.base import Budget, Report, SearchState
+from certify.provers.boxes.clock import Clock
+from certify.provers.boxes.frontier import Frontier
+from certify.provers.boxes.halving import Halves, split
+from certify.provers.boxes.order import choose_order
+from certify.provers.boxes.partition import LEAF, MOST_SPLITS, OPEN, Partition
+from certify.provers.boxes.rule import BoxBounds, VdotBound
+from certify.provers.boxes.subtrees import Abroad, Growth, Subtrees
+from certify.provers.execution import Bound, Runner
+from certify.provers.falsify import Witness, descend
+
+Array = NDArray[np.float64]
+_SLACK = 1e-9  # relative distance kept from every level, so that the checker's own rounding agrees
+_BESIDE_WITNESS = 1e-3  # relative distance kept from a violation
+_SHELL = 16.0  # a batch reaches up to this multiple of the nearest open level
+_HIGHER = 8.0  # an inner level over one from below which a step may lead out
+
+
+@dataclass(frozen=True, slots=True)
+class RingProof:
+    """D' < 0 is proved for `inner <= V <= outer` (equal if the ring is empty); `stop` says what ended the pass.
+
+    `tree` is the partition in preorder: an axis for a split, 255 for a leaf; `root` its half-widths (n,) in z.
+    `direction` and `seconds_left` are those of `Proof`.
+    `witness` is the lowest violation found along the way. `covered` is False if a pass inwards left boxes inside
+    the inner level on which F could not be enclosed, or a step might lead to the inner level. `order` is that of the
+    series in time of the leaves.
+    """
+
+    inner: float
+    outer: float
+    stop: Stop
+    tree: bytes
+    root: Array
+    boxes: int
+    leaves: int
+    witness: Witness | None
+    covered: bool = True
+    direction: tuple[float, ...] | None = None
+    seconds_left: float | None = None
+    order: int = 1
+
+
+def prove_outwards(
+    problem: Problem,
+    T: Array,
+    inner: float,
+    target: float,
+    budget: Budget,
+    runner: Runner,
+    report: Report | None = None,
+    rule: VdotBound | None = None,
+) -> RingProof:
+    """Prove D' < 0 (and the input bounds) on `inner <= V <= level` for the largest level up to `target`.
+
+    Parameters
+    ----------
+    T : (n, n), invertible; boxes are drawn in z, x = T z.
+    inner, target : levels, 0 < inner <= target.
+    report : called after every batch.
+    rule : another bound for boxes, to compare with; None for `VdotBound`.
+
+    Notes
+    -----
+    Deterministic for a machine and a number of threads, unless `budget.seconds` stops the pass.
+    """
+    if inner >= target:
+        return empty_ring(problem, T, target)
+    ring = outwards(problem, T, inner, target, runner, rule)
+    return ring.proof(ring.advance(budget, report))
+
+
+def outwards(
+    problem: Problem, T: Array, inner: float, target: float, runner: Runner, rule: VdotBound | None = None
+) -> Pass:
+    """The pass of `prove_outwards` before its first box."""
+    sweep = _Outwards(problem, T, inner, target)
+    if rule is None:
+        order = choose_order(problem, T, inner, target)
+        rule = VdotBound(problem, T, runner.device, order=order)
+    return Pass(sweep, _root(problem, T, target), runner, rule)
+
+
+def empty_ring(problem: Problem, T: Array, level: float) -> RingProof:
+    """The ring from a level to itself, of which nothing has to be proved."""
+    return RingProof(level, level, Stop.REQUESTED, bytes([LEAF]), _root(problem, T, level), 0, 1, None)
+
+
+def prove_inwards(
+    problem: Problem,
+    T: Array,
+    floor: float,
+    outer: float,
+    budget: Budget,
+    runner: Runner,
+    report: Report | None = None,
+) -> RingProof:
+    """Prove D' < 0 on `level <= V <= outer` for the smallest level from `floor` on, and F and its inputs inside it.
+
+    Parameters are those of `prove_outwards`. On {V < level} every leaf of the tree has a finite enclosure of F
+    and inputs in their bounds, and where time has steps none leads from it to V >= level; if the budget ends before,
+    the proof is not `covered`.
+    """
+    order = choose_order(problem, T, max(floor, 1e-3 * outer), outer)
+    rule = VdotBound(problem, T, runner.device, inside=True, order=order)
+    end = time.monotonic() + budget.seconds
+    while True:
+        ring = Pass(_Inwards(problem, T, floor, outer), _root(problem, T, outer), runner, rule)
+        left = replace(budget, seconds=max(0.0, end - time.monotonic()))
+        stop = ring.advance(left, report)
+        if stop is not None:
+            ring.settle()
+            ring.advance(budget, report)
+        found = ring.proof(stop)
+        # A step from below may end above a level to which the ring reaches: then there is none from which it does not.
+        floor = _HIGHER * max(floor, found.inner)
+        if found.covered or not rule.step or floor >= outer or time.monotonic() > end:
+            return found
+
+
+def _root(problem: Problem, T: Array, level: float) -> Array:
+    """Half-widths (n,) of a box in z around {V <= level}, a hair larger for the checker's rounding."""
+    S = T.T @ problem.V.P @ T
+    return np.asarray(np.sqrt(level * np.diag(np.linalg.inv(S))) * (1 + 1e-9))
+
+
+class _Sweep(ABC):
+    """The moving level of a pass: `inner` or `outer` gives way to what cannot be proved.
+
+    Boxes proved before it moved stay proved: the ring only shrinks, and the rule's multipliers do not depend on it.
+    """
+
+    down = False  # whether the level that gives way is the inner one
+
+    def __init__(self, problem: Problem, T: Array, inner: float, outer: float) -> None:
+        self.problem, self.T = problem, T
+        self.inner, self.outer = inner, outer
+        self.witness: Witness | None = None
+
+    @abstractmethod
+    def key(self, lowest: Tensor, highest: Tensor) -> Tensor:
+        """Ascending in the order in which boxes are taken, from the bounds of V on them (B,)."""
+
+    @abstractmethod
+    def wanted(self, lowest: Tensor, highest: Tensor) -> Tensor:
+        """True for boxes (B,) that still have to be decided."""
+
+    @abstractmethod
+    def reach(self, least: float) -> float:
+        """The key up to which a batch may go, where `least` is the smallest."""
+
+    @abstractmethod
+    def last(self) -> float:
+        """The key beyond which open boxes no longer count."""
+
+    @abstractmethod
+    def violated(self, centres: Tensor, level: Tensor) -> bool:
+        """Move the level off violations at `centres` (n, B), V being `level` (infinite elsewhere); True if it moved."""
+
+    @abstractmethod
+    def stuck(self, lowest: Tensor, highest: Tensor) -> bool:
+        """Move the level off boxes that are too small to halve; True if it moved."""
+
+    @abstractmethod
+    def reached(self, least: float) -> tuple[float, float]:
+        """(inner, outer) between which all is proved, `least` being the smallest open key; maybe nothing is."""
+
+    @abstractmethod
+    def stand(self, least: float) -> tuple[float, float, float]:
+        """(level reached, level aimed at, share of the ring's volume that lies between)."""
+
+    def share(self, a: float, b: float) -> float:
+        """The volume of `a <= V <= b` as a share of the ring's."""
+        power = len(self.T) / 2
+        a, b, inner, outer = (max(0.0, v) ** power for v in (a, b, self.inner, self.outer))
+        return min(1.0, max(0.0, (b - a) / (outer - inner))) if outer > inner else 1.0
+
+
+class _Outwards(_Sweep):
+    def key(self, lowest: Tensor, highest: Tensor) -> Tensor:
+        return lowest
+
+    def wanted(self, lowest: Tensor, highest: Tensor) -> Tensor:
+        return (lowest <= self.outer * (1 + _SLACK)) & (highest >= self.inner * (1 - _SLACK))
+
+    def reach(self, least: float) -> float:
+        return _SHELL * max(least, self.inner)
+
+    def last(self) -> float:
+        return self.outer * (1 + _SLACK)
+
+    def violated(self, centres: Tensor, level: Tensor) -> bool:
+        lowest = float(level.min())
+        if lowest > self.outer:
+            return False
+        found = descend(self.problem, self.T, centres[:, level.argmin()].cpu().numpy())
+        if found is not None and (self.witness is None or found.level < self.witness.level):
+            self.witness = found
+        known = math.inf if self.witness is None else self.witness.level
+        self.outer = min(lowest, known) * (1 - _BESIDE_WITNESS)
+        return True
+
+    def stuck(self, lowest: Tensor, highest: Tensor) -> bool:
+        bottom = float(lowest.min()) if len(lowest) else math.inf
+        if not bottom < self.outer:
+            return False
+        self.outer = bottom * (1 - _SLACK)
+        return True
+
+    def reached(self, least: float) -> tuple[float, float]:
+        return self.inner, min(self.outer, least * (1 - 2 * _SLACK))
+
+    def stand(self, least: float) -> tuple[float, float, float]:
+        level = max(self.inner, min(least, self.outer))
+        return level, max(self.inner, self.outer), self.share(self.inner, level)
+
+
+class _Inwards(_Sweep):
+    down = True
+
+    def key(self, lowest: Tensor, highest: Tensor) -> Tensor:
+        return -highest
+
+    def wanted(self, lowest: Tensor, highest: Tensor) -> Tensor:
+        return lowest <= self.outer * (1 + _SLACK)
+
+    def reach(self, least: float) -> float:
+        return least / _SHELL
+
+    def last(self) -> float:
+        return math.inf
+
+    def violated(self, centres: Tensor, level: Tensor) -> bool:
+        highest = float(torch.where(level <= self.outer, level, -math.inf).max())
+        if not highest >= self.inner:
+            return False
+        self.inner = highest * (1 + _BESIDE_WITNESS)
+        return True
+
+    def stuck(self, lowest: Tensor, highest: Tensor) -> bool:
+        top = float(highest.max()) if len(highest) else -math.inf
+        if not top >= self.inner:
+            return False
+        self.inner = top * (1 + 2 * _SLACK)
+        return True
+
+    def reached(self, least: float) -> tuple[float, float]:
+        return max(self.inner, -least * (1 + 2 * _SLACK)), self.outer
+
+    def stand(self, least: float) -> tuple[float, float, float]:
+        level = max(self.inner, min(-least, self.outer))
+        return level, self.inner, self.share(level, self.outer)
+
+
+class _RingGrowth(Growth):
+    """The ring's rule at a sweep's levels."""
+
+    def __init__(self, sweep: _Sweep, rule: VdotBound, half: Tensor) -> None:
+        super().__init__(rule, half)
+        self.sweep, self.rule = sweep, rule
+
+    @property
+    def levels(self) -> tuple[float, float]:
+        return self.sweep.inner, self.sweep.outer
+
+    def at(self, inner: float, outer: float) -> _RingGrowth:
+        sweep = copy.copy(self.sweep)
+        sweep.inner, sweep.outer = inner, outer
+        return _RingGrowth(sweep, self.rule, self.half)
+
+    def gives_way(self, lo: Tensor, hi: Tensor, found: BoxBounds) -> Tensor:
+        levels = self.levels_of(0.5 * lo + 0.5 * hi, found)
+        return (levels <= self.sweep.outer) & (levels >= self.sweep.inner)
+
+    def opened(self, halves: Halves, found: BoxBounds, key: Tensor) -> tuple[Tensor, Tensor]:
+        lowest, highest = self.rule.levels(halves.lo, halves.hi)
+        return self.sweep.wanted(lowest, highest), self.sweep.key(lowest, highest)
+
+    def levels_of(self, centres: Tensor, found: BoxBounds) -> Tensor:
+        """V at violations, infinite elsewhere; where a step leads from within the outer level to a higher V, that, but
+        no more than just above the outer level."""
+        levels = torch.where(found.violated, self.rule.levels_at(centres), math.inf)
+        index = torch.nonzero(levels <= self.sweep.outer)[:, 0]
+        if not (self.rule.inside and self.rule.step) or not len(index):
+            return levels
+        after = self.rule.levels_after(centres[:, index], self.sweep.outer).clamp(max=self.sweep.outer)
+        return levels.index_put((index,), torch.maximum(levels[index], after))
+
+
+class Pass:
+    """A pass that can be asked at any time for what it has proved, and go on."""
+
+    def __init__(self, sweep: _Sweep, root: Array, runner: Runner, rule: VdotBound) -> None:
+        self.sweep, self.root, self.runner, self.rule = sweep, root, runner, rule
+        self.partition = Partition(root)
+        self.frontier = Frontier(self.partition, runner.device)
+        self.half = torch.tensor(root, device=runner.device)[:, None]
+        self.growth = _RingGrowth(sweep, rule, self.half)
+        self.abroad: Abroad | None = None
+        self.boxes = self.proved = 0
+        self.covered = True
+        self.halvings = 0.0
+        self.lost = ""  # what is said of a cluster that went away
+        self._stop = Stop.REQUESTED
+        self._clock = Clock()
+        first = torch.zeros(1, dtype=torch.int64, device=runner.device)
+        self.frontier.add(-self.half, self.half, sweep.key(*rule.levels(-self.half, self.half)), first)
+
+    @property
+    def done(self) -> bool:
+        """Whether no box is open: the pass has nothing left to gain."""
+        return not self._open()
+
+    @property
+    def levels(self) -> tuple[float, float]:
+        """(inner, outer) between which all is proved; equal if nothing is."""
+        inner, outer = self.sweep.reached(self._least())
+        return inner, max(inner, outer)
+
+    def _open(self) -> int:
+        return len(self.frontier) + (0 if self.abroad is None else len(self.abroad))
+
+    def _least(self) -> float:
+        return min(self.frontier.least(), math.inf if self.abroad is None else self.abroad.least())
+
+    def advance(self, budget: Budget, report: Report | None = None) -> Stop | None:
+        """Take boxes, bound them, give way to violations, halve what is undecided; what ran out, or None if done."""
+        most = self.boxes + budget.boxes
+        with self._clock, self.runner.start(self.rule) as bound, self._elsewhere(budget):
+            while not self.done:
+                if self.boxes >= most or self.partition.splits + 3 * budget.batch > MOST_SPLITS:
+                    return Stop.BOXES
+                left = budget.seconds - self._clock.spent - self.proved * budget.check
+                if left < 0:
+                    return Stop.TIME
+                with self._whole():
+                    exchanged = self._exchanged(bound, left, budget)
+                    if not exchanged:
+                        self._step(bound, min(budget.batch, most - self.boxes), budget.least_width)
+                if exchanged and self.lost:
+                    return Stop.CLUSTER
+                if report is not None:
+                    stand = self.sweep.stand(self._least())
+                    report(replace(self._clock.read(*stand, self.boxes, self._open()), down=self.sweep.down))
+        return None
+
+    @contextmanager
+    def _elsewhere(self, budget: Budget) -> Iterator[None]:
+        """Have boxes grown elsewhere, where that can be; what is out at the end comes back."""
+        with self.runner.jobs(Subtrees(self.growth)) as jobs:
+            if jobs is not None and not self.lost:
+                self.abroad = Abroad(jobs, self.growth, self.partition, budget.batch, budget.least_width)
+            try:
+                yield
+            finally:
+                self._recall()
+
+    @contextmanager
+    def _whole(self) -> Iterator[None]:
+        """Do all of a step or nothing: what Ctrl-C cuts short leaves every box where it was, so that the search can be
+        kept."""
+        frontier, mark, abroad = self.frontier.copy(), self.partition.mark(), self.abroad
+        held = None if abroad is None else dict(abroad.held)
+        done = False
+        try:
+            yield
+            done = True
+        finally:
+            if not done:
+                self.frontier, self.abroad = frontier, abroad
+                self.partition.back_to(mark)
+                if abroad is not None and held is not None:
+                    abroad.held = held
+
+    def _recall(self) -> None:
+        if self.abroad is not None:
+            self.abroad.recall(self.frontier)
+        self.abroad = None
+
+    def _exchanged(self, bound: Bound, left: float, budget: Budget) -> bool:
+        """Send boxes out, and take in what has been grown; False if that is not worth it."""
+        if self.abroad is None:
+            return False
+        sweep = self.sweep
+        try:
+            if not self.abroad.is_worth(self.frontier):
+                return False
+            self.abroad.send((sweep.inner, sweep.outer), self.frontier, sweep.reach(self._least()), left)
+            back = self.abroad.collect(left)
+        except BackendError as error:
+            self.lost = str(error)
+            self._recall()
+            return True
+        for _, answer, opened, looked in back:
+            self.boxes += answer.boxes
+            self.proved += answer.proved
+            lo, hi, number = opened.tensors()
+            self.frontier.add(lo, hi, torch.tensor(answer.keys), number)
+            if len(looked.number):
+                self._examine(bound, *looked.tensors(), budget.least_width)
+        self.abroad.forget_above(sweep.last())
+        self.frontier.drop_above(sweep.last())
+        return True
+
+    def _step(self, bound: Bound, count: int, least_width: float) -> None:
+        lo, hi, number, _ = self.frontier.take(count, self.sweep.reach(self._least()))
+        self._examine(bound, lo, hi, number, least_width)
+
+    def _examine(self, bound: Bound, lo: Tensor, hi: Tensor, number: Tensor, least_width: float) -> None:
+        sweep, rule = self.sweep, self.rule
+        self.boxes += lo.shape[1]
+        found = bound(lo, hi, sweep.inner, sweep.outer)
+        self.proved += int(found.proved.sum())
+        self._expect(found)
+        centres = 0.5 * lo + 0.5 * hi
+        if sweep.violated(centres, self.growth.levels_of(centres, found)):
+            self._stop = Stop.WITNESS
+        halves = split(self.partition, lo, hi, number, found, least_width * self.half)
+        small = halves.small
+        if bool(small.any()):
+            self.covered = self.covered and bool(found.smooth[small].all())
+            if sweep.stuck(*rule.levels(lo[:, small], hi[:, small])):
+                self._stop = Stop.BOXES
+        keep, key = self.growth.opened(halves, found, number)
+        self.frontier.add(halves.lo[:, keep], halves.hi[:, keep], key[keep], halves.number[keep])
+        self.frontier.drop_above(sweep.last())
+
+    def _expect(self, found: BoxBounds) -> None:
+        """How often a box of this batch that is not proved has to be halved, so that what its axes add to the bound is
+        less than the decay at its centre: a bound of second order falls fourfold when all n axes are halved once."""
+        excess = found.score.clamp(min=0.0).sum(0)
+        decay = excess - found.bound
+        share = (excess / decay)[~found.proved & (decay > 0) & torch.isfinite(decay)]
+        if len(share):
+            self.halvings = len(self.root) / 2 * math.log2(max(1.0, float(share.median())))
+
+    @property
+    def expected(self) -> float:
+        """Boxes that the search may need before it gains anything, by the last batch."""
+        return len(self.frontier) * math.exp2(min(1000.0, self.halvings))
+
+    def settle(self) -> None:
+        """Take the levels that are proved for good: what is open lies outside of them, and needs at most one look."""
+        self.sweep.inner, self.sweep.outer = self.sweep.reached(self._least())
+
+    def state(self) -> SearchState:
+        """The search as it stands; boxes that are out are open."""
+        waiting, keys = self.frontier.waiting()
+        if self.abroad is not None:
+            numbers, their_keys = self.abroad.waiting()
+            waiting, keys = np.concatenate([waiting, numbers]), np.concatenate([keys, their_keys])
+        tree = self.partition.preorder([(OPEN, waiting)])
+        sweep = self.sweep
+        keys = keys[self.partition.order(waiting)]
+        return SearchState(sweep.inner, sweep.outer, self.boxes, self.proved, sweep.witness, tree, keys)
+
+    def restore(self, state: SearchState) -> None:
+        """Go on from a state, before the first box of this pass, whose inner level may have grown since.
+
+        Raises
+        ------
+        InputError : it is not of a ring between these levels.
+        """
+        sweep = self.sweep
+        try:
+            opened, looked = self.partition.graft(
+                np.zeros(1, np.int64), *self.partition.corners(np.zeros(1, np.int64)), state.tree
+            )
+        except CertificateFormatError as error:
+            raise InputError(f"the search cannot be gone on with: {error}") from error
+        fits = sweep.inner >= state.inner and state.outer <= sweep.outer and not len(looked.number)
+        if not fits or len(opened.number) != len(state.keys) or np.isnan(state.keys).any():
+            raise InputError("the search cannot be gone on with: it is of another ring.")
+        self.frontier = Frontier(self.partition, self.runner.device)
+        lo, hi, number = (a.to(self.runner.device) for a in opened.tensors())
+        self.frontier.add(lo, hi, torch.tensor(state.keys, device=self.runner.device), number)
+        sweep.outer, sweep.witness = state.outer, state.witness
+        self.boxes, self.proved = state.boxes, state.proved
+        self._stop = Stop.REQUESTED if state.witness is None else Stop.WITNESS
+
+    def proof(self, stop: Stop | None = None) -> RingProof:
+        """What is proved, `stop` being what ran out."""
+        stop = stop or self._stop
+        (inner, outer), witness, covered = self.levels, self.sweep.witness, self.covered and self.done
+        if outer <= inner:  # nothing beyond the inner level
+            empty = empty_ring(self.sweep.problem, self.sweep.T, inner)
+            found = replace(empty, stop=stop, boxes=self.boxes, witness=witness, covered=covered)
+            return replace(found, direction=self._direction())
+        tree = self.partition.preorder()
+        leaves = tree.count(bytes([LEAF]))
+        found = RingProof(inner, outer, stop, tree, self.root, self.boxes, leaves, witness, covered)
+        left = None if self.done else self._clock.left
+        return replace(found, direction=self._direction(), seconds_left=left, order=self.rule.order)
+
+    def _direction(self) -> tuple[float, ...] | None:
+        """The coordinate that was halved most often, in the states, as long as the root box in it; None at first."""
+        if not self.partition.splits:
+            return None
+        axis = int(np.argmax(self.partition.halvings()))
+        return tuple((self.sweep.T[:, axis] * self.root[axis]).tolist())

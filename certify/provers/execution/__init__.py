@@ -1,0 +1,8 @@
+"""Where work is done: on threads of this machine, or by a cluster. Another place is another `Runner`."""
+
+from __future__ import annotations
+
+from certify.provers.execution.base import Bound, Jobs, Runner, Work
+from certify.provers.execution.threads import ThreadRunner
+
+__all__ = ["Bound", "Jobs", "Runner", "ThreadRunner", "Work"]

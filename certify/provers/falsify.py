@@ -1,0 +1,314 @@
+"""The falsifier: the lowest V at which D' >= 0, or at which the input leaves its bounds.
+
+D' = D + 2 lambda V, where D is Vdot, or V's increment over a step by time. Violating samples of the ellipsoid are
+improved by descending V along D' = 0, each on its own so that they end in different valleys: a gradient step on D'
+along the sphere V = const makes room, and the point is scaled towards the origin as far as it stays violating. A
+reported witness is shown in Arb; the search itself proves nothing.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from typing import Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from certify.certificates.claims import Problem
+from certify.loop.plants import System
+from certify.loop.policies import bounded_by_form
+from certify.loop.rigorous import evaluate_increment, evaluate_policy
+
+Array = NDArray[np.float64]
+_RATIO, _LEVELS, _LOWER = 1.4, 60, 13  # of a survey: between levels, how many, and how many steps of 8 further it goes
+_TOGETHER = 15  # levels that are looked at in one batch
+
+
+@dataclass(frozen=True, slots=True)
+class Witness:
+    """A state `x` (n,) with D' >= 0 (kind `vdot`) or an input out of bounds (`input`); `level` is V(x), rounded.
+
+    `values` are those of what is uncertain, at which it is so, and `period` the sampling period; None without one.
+    """
+
+    x: Array
+    level: float
+    kind: Literal["vdot", "input"]
+    values: Mapping[str, Fraction] = field(default_factory=dict)
+    period: Fraction | None = None
+
+    def describe(self, system: System) -> str:
+        """The violation in words."""
+        names = ", ".join(f"{s} = {v:.6g}" for s, v in zip(system.states, self.x, strict=True))
+        names += "".join(f", {name} = {float(q):.6g}" for name, q in self.values.items())
+        names += ", in deviations from x_eq," if system.operating_point() else ""
+        what = "the input leaves its bounds" if self.kind == "input" else "Vdot >= 0"
+        if self.kind == "vdot" and (system.time == "discrete" or self.period):
+            over = "a step" if self.period is None else f"a period of {float(self.period):.6g}"
+            what = f"V does not fall over {over}"
+        return f"{what} at {names} with V = {self.level:.12g} (shown in Arb)"
+
+
+@dataclass(frozen=True, slots=True)
+class Band:
+    """Levels between which sampling found no violation; `below` and `above` are their neighbours, at which it did,
+    or the ends of what was sampled."""
+
+    below: float
+    floor: float
+    top: float
+    above: float
+
+
+def falsify(
+    problem: Problem, T: Array, limit: float, samples: int = 20_000, seed: int = 0, until: float = math.inf
+) -> Witness | None:
+    """Search {V <= limit} for the lowest violation; None if none was found. `x = T z`, (n, n): T'PT is about I.
+
+    From `until` on, a reading of `time.perf_counter`, the search ends with what it has.
+    """
+    search = _Search(problem, T, until)
+    generator = np.random.default_rng(seed)
+    n = problem.loop.system.n
+    direction = generator.standard_normal((samples, n))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    # Half of the samples on the boundary, where violations usually begin, half spread over the levels.
+    radius = np.where(np.arange(samples) % 2 == 0, 1.0, generator.random(samples))
+    z = direction * (radius * np.sqrt(limit) * (1 - 1e-9))[:, None]
+    best = search.lowest(z)
+    if best is None and time.perf_counter() < until:  # climb D' on the boundary before giving up
+        z = search.climb(z[:: max(1, samples // 512)], limit)
+        best = search.lowest(z)
+    return best
+
+
+def is_violated(problem: Problem, T: Array, limit: float, samples: int = 4000, seed: int = 0) -> bool:
+    """Whether a violation is sampled in {V <= limit}, at any level, in floats: nothing is shown of it."""
+    search = _Search(problem, T)
+    direction = np.random.default_rng(seed).standard_normal((samples, problem.loop.system.n))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+    radius = np.sqrt(limit) * (1 - 1e-9) * np.linspace(0.01, 1.0, samples)
+    z = np.concatenate([direction * radius[:, None], search.climb(direction[::8] * radius[-1], limit)])
+    with torch.no_grad():
+        return bool(search.bad(torch.tensor(z, dtype=torch.float64)).any())
+
+
+def survey(
+    problem: Problem, T: Array, limit: float, samples: int = 512, seed: int = 0, until: float = math.inf
+) -> list[Band]:
+    """The bands of levels up to `limit` on which no violation was found, the highest first; from `until` on, a reading
+    of `time.perf_counter`, samples are not climbed from."""
+    search = _Search(problem, T, until)
+    steps = 20 if problem.loop.system.sample is None else 8  # each of many times the work
+    generator = np.random.default_rng(seed)
+    direction = generator.standard_normal((samples, problem.loop.system.n))
+    direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+
+    def clear(level: Array, steps: int) -> list[bool]:
+        """Of each level (k,), whether its samples show no violation after so many steps of ascent."""
+        found: list[bool] = []
+        for k in range(0, len(level), _TOGETHER):
+            each = np.repeat(level[k : k + _TOGETHER], samples)[:, None]
+            z = search.climb(np.sqrt(each) * np.resize(direction, (len(each), direction.shape[1])), each, steps)
+            with torch.no_grad():
+                bad = search.bad(torch.tensor(z, dtype=torch.float64))
+            found += (~bad.reshape(-1, samples).any(1)).tolist()
+        return found
+
+    def good(levels: list[float]) -> list[bool]:
+        level = np.array(levels)
+        found = np.array(clear(level, 0))
+        found[found] = clear(level[found], steps)
+        return [bool(ok) for ok in found]
+
+    levels = [limit * _RATIO**-k for k in range(_LEVELS)]  # from the highest
+    found = good(levels)
+    if found[-1]:  # on to the first at which one is found
+        lower = [levels[-1] * _RATIO ** (-8 * k) for k in range(1, _LOWER + 1)]
+        further = good(lower)
+        count = next((k + 1 for k, ok in enumerate(further) if not ok), _LOWER)
+        levels, found = levels + lower[:count], found + further[:count]
+    runs = [list(run) for ok, run in itertools.groupby(range(len(levels)), key=found.__getitem__) if ok]
+    last = len(levels) - 1
+    return [Band(levels[min(k[-1] + 1, last)], levels[k[-1]], levels[k[0]], levels[max(k[0] - 1, 0)]) for k in runs]
+
+
+def descend(problem: Problem, T: Array, z: Array) -> Witness | None:
+    """The lowest violation reached from a violating point `x = T z`, shape (n,)."""
+    return _Search(problem, T).lowest(z[None])
+
+
+def confirm(problem: Problem, witness: Witness) -> bool:
+    """True if the violation at the witness's binary64 point is shown in Arb."""
+    loop = problem.loop
+    if witness.kind == "vdot":
+        held = replace(loop, system=loop.system.at(witness.values)) if witness.values else loop
+        found = evaluate_increment(held, problem.V.P, witness.x, witness.period, problem.rate)
+        return bool(np.any(witness.x != 0)) and found >= 0
+    for u, (lo, hi) in zip(evaluate_policy(loop, witness.x), loop.system.input_bounds, strict=True):
+        if u * lo.denominator < lo.numerator or u * hi.denominator > hi.numerator:
+            return True
+    return False
+
+
+def refutes(problem: Problem, witness: Witness, level: float) -> bool:
+    """True if the witness shows that a condition of the asymptotic claim fails on {V <= level}.
+
+    The violation is shown in Arb, and `V(x) <= level` is decided in rationals: a point that lies above the level by
+    less than a rounding says nothing about it.
+    """
+    return problem.V.exactly(witness.x) <= Fraction(level) and confirm(problem, witness)
+
+
+class _Search:
+    def __init__(self, problem: Problem, T: Array, until: float = math.inf) -> None:
+        self.problem, self.until = problem, until
+        self.loop = problem.loop
+        self.f = self.loop.system.uncertain_function("torch")
+        self.corners = self.loop.system.corners()
+        system = self.loop.system
+        self.periods: list[Fraction | None] = [None] if system.sample is None else [*dict.fromkeys(system.sample)]
+        self.worst = self._worst()
+        network = self.loop.folded
+        self.layers = [
+            (torch.tensor(W.T.copy()), torch.tensor(b)) for W, b in zip(network.weights, network.biases, strict=True)
+        ]
+        self.squashed, self.clipped = network.squashed, network.clipped
+        self.scale, self.offset = torch.tensor(network.scale), torch.tensor(network.offset)
+        self.P, self.T = (torch.tensor(a, dtype=torch.float64) for a in (problem.V.P, T))
+        bounds = self.loop.system.input_bounds
+        self.lo = torch.tensor([float(b[0]) for b in bounds], dtype=torch.float64)
+        self.hi = torch.tensor([float(b[1]) for b in bounds], dtype=torch.float64)
+        self.check_inputs = not bounded_by_form(network, bounds)
+
+    def violation(self, z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """(D', how far the worst input lies outside its bounds) at x = T z, shapes (B,)."""
+        x = z @ self.T.T
+        h = x
+        for k, (W, b) in enumerate(self.layers):
+            h = torch.addmm(b, h.tanh() if k else h, W)
+        u = self.clipped(self.scale * self.squashed(h) + self.offset)
+        decrease = [self._decrease(x, u, values, step) for values, step in self.worst]
+        return torch.cat(decrease).amax(0), torch.maximum(self.lo - u, u - self.hi).amax(-1)
+
+    def _worst(self) -> list[tuple[list[torch.Tensor], float | torch.Tensor]]:
+        """Values (C, 1) of what is uncertain and steps, one for all or (C, 1, 1), at which D' is looked at together."""
+        rows = [[float(q) for q in corner.values()] for corner in self.corners]
+
+        def columns(times: int) -> list[torch.Tensor]:
+            return [torch.tensor(column * times, dtype=torch.float64)[:, None] for column in zip(*rows, strict=True)]
+
+        if self.periods == [None]:
+            return [(columns(1), self.loop.step)]
+        positive = [float(period) for period in self.periods if period]
+        steps = torch.tensor([h for h in positive for _ in rows], dtype=torch.float64)[:, None, None]
+        found: list[tuple[list[torch.Tensor], float | torch.Tensor]] = [(columns(len(positive)), steps)]
+        return found if len(positive) == len(self.periods) else [*found, (columns(1), 0.0)]
+
+    def _decrease(
+        self, x: torch.Tensor, u: torch.Tensor, values: list[torch.Tensor], step: float | torch.Tensor
+    ) -> torch.Tensor:
+        """D' (C, B) for constant values of what is uncertain, or (1, B) without any."""
+        G = self.loop.system.mean_rate(lambda y, v: self.f(y, v, values), x[None], u, step)
+        gradient = 2 * (x @ self.P)
+        result: torch.Tensor = (gradient * G).sum(-1)
+        if self.loop.step:
+            result = result + (step * (G @ self.P) * G).sum(-1)
+        if self.problem.rate:
+            result = result + self.problem.rate * (gradient * x).sum(-1)
+        return result
+
+    def bad(self, z: torch.Tensor) -> torch.Tensor:
+        vdot, excess = self.violation(z)
+        return (vdot >= 0) | (excess > 0) if self.check_inputs else vdot >= 0
+
+    def lowest(self, start: Array) -> Witness | None:
+        """The lowest violation reached from the points `start` (B, n)."""
+        with torch.no_grad():
+            z = torch.tensor(start, dtype=torch.float64)
+            z = z[self.bad(z)]
+        if len(z) == 0:
+            return None
+        with torch.no_grad():
+            z = self._lowest_few(self._shrink(self._lowest_few(z, 2048), torch.ones(()), halvings=8), 32)
+        step = torch.full((len(z), 1), 0.3, dtype=torch.float64)
+        for _ in range(60):
+            uphill = self._uphill(z)
+            with torch.no_grad():
+                norm = z.norm(dim=-1, keepdim=True)
+                moved = z + step * norm * uphill
+                moved = moved * (norm / moved.norm(dim=-1, keepdim=True))
+                bad = self.bad(moved)[:, None]
+                moved = torch.where(bad, self._shrink(moved, (4 * step).clamp(max=1.0), halvings=10), z)
+                better = moved.norm(dim=-1, keepdim=True) < norm
+                z = torch.where(better, moved, z)
+                step = torch.where(better, 1.5 * step, 0.4 * step).clamp(max=0.5)
+            if float(step.max()) < 1e-7 or time.perf_counter() > self.until:
+                break
+        with torch.no_grad():
+            z = self._lowest_few(self._shrink(z, torch.ones(()), halvings=50), 32)
+        # The binary64 state is what counts: pull outwards until the violation is certain there.
+        for point in z:
+            for factor in (1.0, 1 + 1e-12, 1 + 1e-9, 1 + 1e-6):
+                x = (self.T @ (factor * point)).numpy()
+                kinds: tuple[Literal["vdot", "input"], ...] = ("vdot", "input") if self.check_inputs else ("vdot",)
+                for kind in kinds:
+                    every = itertools.product(self.periods, self.corners)
+                    for period, values in every if kind == "vdot" else [(None, self.corners[0])]:
+                        witness = Witness(x, float(self.problem.V(x)), kind, values, period)
+                        if confirm(self.problem, witness):
+                            return witness
+        return None
+
+    def climb(self, start: Array, limit: float | Array, steps: int = 60) -> Array:
+        """Gradient ascent of D' from `start` (B, n) on the sphere V = limit, or each point's own, (B, 1)."""
+        z = torch.tensor(start, dtype=torch.float64)
+        radius = torch.as_tensor(np.sqrt(limit) * (1 - 1e-9), dtype=torch.float64)
+        step = 0.1
+        for _ in range(steps):
+            z = z.detach().requires_grad_(True)
+            vdot, excess = self.violation(z)
+            value = (vdot / (z * z).sum(-1)).sum() + (excess.sum() if self.check_inputs else 0.0)
+            (gradient,) = torch.autograd.grad(value, z)
+            with torch.no_grad():
+                direction = gradient / (gradient.norm(dim=-1, keepdim=True) + 1e-300)
+                moved = z + step * radius * direction
+                z = radius * moved / moved.norm(dim=-1, keepdim=True)
+            step *= 0.95
+            if time.perf_counter() > self.until:
+                break
+        result: Array = z.detach().numpy()
+        return result
+
+    def _lowest_few(self, z: torch.Tensor, count: int) -> torch.Tensor:
+        return z[torch.argsort((z * z).sum(-1), stable=True)][:count]
+
+    def _shrink(self, z: torch.Tensor, share: torch.Tensor, halvings: int) -> torch.Tensor:
+        """Scale violating points down to where they just violate, by bisection, but by `share` (B, 1) at most."""
+        high = torch.ones(len(z), 1, dtype=z.dtype)
+        low = high - share
+        whole = self.bad(low * z)[:, None] & (low > 0)
+        least = low
+        for _ in range(halvings):
+            middle = (low + high) / 2
+            bad = self.bad(middle * z)[:, None]
+            low, high = torch.where(bad, low, middle), torch.where(bad, middle, high)
+        return torch.where(whole, least, high) * z
+
+    def _uphill(self, z: torch.Tensor) -> torch.Tensor:
+        """Unit directions (B, n), tangent to the sphere, in which the violation grows fastest."""
+        z = z.detach().requires_grad_(True)
+        vdot, excess = self.violation(z)
+        value = torch.where(vdot >= 0, vdot, excess) if self.check_inputs else vdot
+        (gradient,) = torch.autograd.grad(value.sum(), z)
+        with torch.no_grad():
+            z = z / z.norm(dim=-1, keepdim=True)
+            tangent = gradient - (gradient * z).sum(-1, keepdim=True) * z
+            unit: torch.Tensor = tangent / (tangent.norm(dim=-1, keepdim=True) + 1e-300)
+            return unit

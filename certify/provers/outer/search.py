@@ -1,0 +1,224 @@
+"""One best-first pass over a box, at whose end a rule holds on each leaf for a level that only falls.
+
+Boxes are taken in the order of the lowest N known of them, so that there is an answer whenever the pass stops: what is
+still open has N above the level that is left. What cannot be proved, a violation or a box too small to halve, takes the
+level below it. No leaf is proved twice, because what holds for a level holds for each lower one; and none is left
+unproved, because an open box that a lower level settles is looked at once more for itself: a bound of the box from
+which it was cut is none of its own.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from certify.certificates.verdict import Stop
+from certify.errors import BackendError
+from certify.provers.base import Budget, Report
+from certify.provers.boxes.clock import Clock
+from certify.provers.boxes.frontier import Frontier
+from certify.provers.boxes.halving import Halves, split
+from certify.provers.boxes.partition import LEAF, MOST_SPLITS, Partition
+from certify.provers.boxes.subtrees import Abroad, Growth, Subtrees
+from certify.provers.execution import Bound, Runner
+from certify.provers.outer.rule import OuterBounds
+
+Array = NDArray[np.float64]
+_SLACK = 1e-9  # of the level's span: how far below a bound the level stays
+_LAST_LOOK = 0.5  # seconds of a box that a lower level settles, in those of one of all that were looked at
+
+
+class _CoverGrowth(Growth):
+    """A rule for a level, the second of its two."""
+
+    def __init__(self, rule: Bound, half: Tensor, level: float) -> None:
+        super().__init__(rule, half)
+        self.level = level
+
+    @property
+    def levels(self) -> tuple[float, float]:
+        return -math.inf, self.level
+
+    def at(self, inner: float, outer: float) -> _CoverGrowth:
+        return _CoverGrowth(self.bound, self.half, outer)
+
+    def gives_way(self, lo: Tensor, hi: Tensor, found: OuterBounds) -> Tensor:
+        return found.violated <= self.level
+
+    def opened(self, halves: Halves, found: OuterBounds, key: Tensor) -> tuple[Tensor, Tensor]:
+        # what a box's bound leaves unknown, its place in the order still says
+        keys = torch.maximum(found.lowest, key)[halves.origin]
+        return torch.ones_like(keys, dtype=torch.bool), keys
+
+
+class Cover:
+    """A pass over `lower <= z <= upper`.
+
+    Parameters
+    ----------
+    rule : bounds of boxes; the second of its two levels is n2.
+    level, floor : where n2 starts, and that below which it is of no use.
+    beside : how far n2 goes below a violation.
+    deepen : from a violating centre (n,) in z to the lowest N of a violation found from there.
+    """
+
+    def __init__(
+        self,
+        rule: Bound,
+        lower: Array,
+        upper: Array,
+        runner: Runner,
+        level: float,
+        floor: float,
+        beside: float,
+        deepen: Callable[[Array], float] | None = None,
+    ) -> None:
+        self.rule, self.runner, self.deepen = rule, runner, deepen
+        self.level, self.target, self.floor, self.beside = level, level, floor, beside
+        self.slack = _SLACK * max(abs(level), level - floor)
+        self.partition = Partition(upper, lower)
+        self.frontier = Frontier(self.partition, runner.device)
+        lo, hi = (torch.tensor(side[:, None], dtype=torch.float64, device=runner.device) for side in (lower, upper))
+        self.width = torch.where(hi > lo, (hi - lo) / 2, 1.0)
+        self.boxes = self.leaves = 0
+        self.done_share = 0.0
+        self.stop = Stop.REQUESTED
+        self.lost = ""  # what is said of a cluster that went away
+        self.abroad: Abroad | None = None
+        self._clock = Clock()
+        first = torch.zeros(1, dtype=torch.int64, device=runner.device)
+        self.frontier.add(lo, hi, torch.full((1,), -math.inf, dtype=torch.float64, device=runner.device), first)
+
+    @property
+    def proved(self) -> float:
+        """The level for which all is proved but what is open; -inf at first."""
+        abroad = math.inf if self.abroad is None else self.abroad.least()
+        return min(self.level, min(self.frontier.least(), abroad) - self.slack)
+
+    @property
+    def growth(self) -> _CoverGrowth:
+        """The rule at the level of now."""
+        return _CoverGrowth(self.rule, self.width, self.level)
+
+    def _open(self) -> int:
+        return len(self.frontier) + (0 if self.abroad is None else len(self.abroad))
+
+    def advance(self, budget: Budget, report: Report | None = None) -> Stop:
+        """Prove what there is for the level, or what the budget allows for a lower one; what limits it."""
+        most, ended = self.boxes + budget.boxes, None
+        with self._clock, self.runner.start(self.rule) as bound, self._elsewhere(budget):
+            while self._open() and self.level > self.floor:
+                if ended is None:
+                    ended = self._ended(budget, most)
+                    if ended is not None:  # what is left has N above this
+                        self.stop, self.level = ended, self.proved
+                        continue
+                left = math.inf if ended is not None else budget.seconds - self._clock.spent
+                if not self._exchanged(bound, left, budget):
+                    self._step(bound, budget)
+                elif self.lost and ended is None:
+                    self.stop = ended = Stop.CLUSTER
+                    self.level = self.proved
+                    continue
+                if report is not None:
+                    level = min(max(self.proved, self.floor), self.target)
+                    report(self._clock.read(level, self.target, self.done_share, self.boxes, self._open()))
+        return self.stop
+
+    @contextmanager
+    def _elsewhere(self, budget: Budget) -> Iterator[None]:
+        """Have boxes grown elsewhere, where that can be; what is out at the end comes back."""
+        with self.runner.jobs(Subtrees(self.growth)) as jobs:
+            if jobs is not None:
+                self.abroad = Abroad(jobs, self.growth, self.partition, budget.batch, budget.least_width)
+            try:
+                yield
+            finally:
+                self._recall()
+
+    def _recall(self) -> None:
+        if self.abroad is not None:
+            self.abroad.recall(self.frontier)
+        self.abroad = None
+
+    def _ended(self, budget: Budget, most: int) -> Stop | None:
+        if self.boxes >= most or self.partition.splits + 3 * budget.batch + self._open() > MOST_SPLITS:
+            return Stop.BOXES
+        each = _LAST_LOOK * self._clock.spent / max(1, self.boxes)
+        spent = self._clock.spent + each * self._open() + budget.check * self.leaves
+        return Stop.TIME if spent > budget.seconds else None
+
+    def _exchanged(self, bound: Bound, left: float, budget: Budget) -> bool:
+        """Send boxes out, and take in what has been grown; False if that is not worth it."""
+        if self.abroad is None:
+            return False
+        try:
+            if not self.abroad.is_worth(self.frontier):
+                return False
+            self.abroad.send(self.growth.levels, self.frontier, math.inf, left)
+            back = self.abroad.collect(left)
+        except BackendError as error:
+            self.lost = str(error)
+            self._recall()
+            return True
+        for sent, answer, opened, looked in back:
+            self.boxes += answer.boxes
+            self.leaves += answer.proved
+            parts = ((sent.lo, sent.hi), opened.tensors()[:2], looked.tensors()[:2])
+            whole, *rest = (self._share(*corners) for corners in parts)
+            self.done_share += whole - sum(rest)
+            lo, hi, number = opened.tensors()
+            self.frontier.add(lo, hi, torch.tensor(answer.keys), number)
+            if len(looked.number):
+                lo, hi, number = looked.tensors()
+                self._examine(bound, lo, hi, number, torch.full_like(lo[0], -math.inf), budget)
+        return True
+
+    def _share(self, lo: Tensor, hi: Tensor) -> float:
+        """The volume of boxes (n, B), of that of the whole."""
+        return float(torch.where(hi > lo, (hi - lo) / (2 * self.width), 1.0).prod(0).sum())
+
+    def _step(self, bound: Bound, budget: Budget) -> None:
+        lo, hi, number, key = self.frontier.take(budget.batch, math.inf)
+        self._examine(bound, lo, hi, number, key, budget)
+
+    def _examine(self, bound: Bound, lo: Tensor, hi: Tensor, number: Tensor, key: Tensor, budget: Budget) -> None:
+        self.boxes += lo.shape[1]
+        found: OuterBounds = bound(lo, hi, -math.inf, self.level)
+        lowest = float(found.violated.min())
+        if lowest <= self.level:
+            if self.deepen is not None:
+                centre = (0.5 * lo + 0.5 * hi)[:, int(found.violated.argmin())]
+                lowest = min(lowest, self.deepen(centre.cpu().numpy()))
+            self.level, self.stop = lowest - self.beside, Stop.WITNESS
+            found = found._replace(proved=found.proved | (found.lowest > self.level))
+        halves = split(self.partition, lo, hi, number, found, budget.least_width * self.width)
+        if bool(halves.small.any()):
+            bottom = float(found.lowest[halves.small].min())
+            if bottom <= self.level:
+                self.level, self.stop = bottom - self.slack, Stop.BOXES
+        self.done_share += self._share(lo[:, found.proved], hi[:, found.proved])
+        self.leaves += int(found.proved.sum())
+        _, keys = self.growth.opened(halves, found, key)
+        self.frontier.add(halves.lo, halves.hi, keys, halves.number)
+
+    def tree(self) -> bytes:
+        """The partition in preorder."""
+        return self.partition.preorder()
+
+
+def without_time(budget: Budget) -> Budget:
+    """The same budget without an end in time."""
+    return replace(budget, seconds=math.inf)
+
+
+def count(tree: bytes) -> int:
+    """Leaves of a tree."""
+    return tree.count(bytes([LEAF]))

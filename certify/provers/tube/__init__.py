@@ -1,0 +1,1 @@
+"""Tubes: ellipsoids that move, from a larger set into a proved one."""

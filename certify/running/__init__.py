@@ -1,8 +1,0 @@
-"""Where work is done: on threads of this machine, or by a cluster. Another place is another `Runner`."""
-
-from __future__ import annotations
-
-from certify.running.base import Bound, Jobs, Runner, Work
-from certify.running.threads import ThreadRunner
-
-__all__ = ["Bound", "Jobs", "Runner", "ThreadRunner", "Work"]

@@ -1,9 +1,0 @@
-"""Sweeps: every combination of policies, plants, values and candidates certified, into a table with certificates."""
-
-from __future__ import annotations
-
-from certify.sweep.rows import Row
-from certify.sweep.study import Study, read_study
-from certify.sweep.sweep import Sweep, run_sweep
-
-__all__ = ["Row", "Study", "Sweep", "read_study", "run_sweep"]
