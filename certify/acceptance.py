@@ -19,7 +19,7 @@ from certify.certificate import Certificate, PartitionTree, TrustedSolver, write
 from certify.claims import Asymptotic, Enlarged, Nearby, Practical, Problem, Reached
 from certify.engines.bounds.mend import below_leaf, split_again
 from certify.engines.contraction import contraction
-from certify.errors import BackendError, SoundnessError
+from certify.errors import BackendError, InputError, SoundnessError
 
 _SPLITS, _LOWERINGS = 3, 9  # of what the checker refuses
 _HIGHER = 1.5  # the next floor, after one that is refused
@@ -63,6 +63,7 @@ class Clerk:
 
         Raises
         ------
+        InputError : the checker takes none of this size.
         SoundnessError : the checker refuses what cannot be mended so.
         BackendError : the same, where a cluster had a part in it.
         """
@@ -81,6 +82,11 @@ class Clerk:
             elif (lower := _lowered(certificate, answer, problem, lowerings)) is not None and lowerings < _LOWERINGS:
                 lowerings += 1
                 certificate = lower
+            elif answer.get("rule") == "limits":
+                raise InputError(
+                    f"the checkers take no certificate of this size: {answer['detail']} (rule limits, {answer['at']}). "
+                    "Try a lower --level, a smaller policy, or fewer ranges and cells."
+                )
             else:
                 reproduces = write_beside(self.path, first.to_json().encode(), ".unchecked.json")
                 if self.cluster is not None:

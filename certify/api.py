@@ -168,7 +168,7 @@ def certify_roa(
 
     Returns
     -------
-    RoaResult : `result.verdict` is PROVED only if the checker accepted the file; compare it with `is`. Then
+    RoaResult : `result.verdict` is PROVED only if the checker accepted the file (`result.verdict == "PROVED"`). Then
         `result.contains(x)`, `.volume`, `.levels`, `.plot()`, `.report()`, `.certificate` (a path), `.to_dict()`.
 
     Raises

@@ -5,7 +5,8 @@ The command line and a study's file speak the same language, and mean the same b
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Iterator, Sequence
 from fractions import Fraction
 from typing import TYPE_CHECKING
 
@@ -89,8 +90,17 @@ def with_samples(plant: System, period: str | None) -> System:
 def _range(text: str, name: str) -> tuple[Fraction, Fraction]:
     from certify.systems import exact
 
-    lo, _, hi = text.partition("..")
+    lo, hi = ends_of(text)
     return exact(lo, name), exact(hi, name)
+
+
+def ends_of(text: str) -> list[str]:
+    """The ends of a range LO..HI, as text, or of LO:HI, as ranges once were written; one text where it is no range.
+
+    >>> ends_of("-1..3"), ends_of("-1:3"), ends_of("2")
+    (['-1', '3'], ['-1', '3'], ['2'])
+    """
+    return [end.strip() for end in text.split(".." if ".." in text else ":", 1)]
 
 
 def with_domains(plant: System, bounds: list[str]) -> System:
@@ -101,17 +111,19 @@ def with_domains(plant: System, bounds: list[str]) -> System:
     at = plant.operating_point()
     for text in bounds:
         state, value = _assignment(text, "--domain")
-        lo, _, hi = value.rpartition(":")
-        shift = at.get(state, Fraction(0)) if lo else Fraction(0)
-        ends = (exact(lo, state), exact(hi, state)) if lo else (-exact(hi, state), exact(hi, state))
-        domain[state] = (ends[0] - shift, ends[1] - shift)
+        if len(ends_of(value)) == 2:
+            (lo, hi), shift = _range(value, state), at.get(state, Fraction(0))
+            domain[state] = (lo - shift, hi - shift)
+        else:
+            domain[state] = (-exact(value, state), exact(value, state))
     return plant.with_domain(domain)
 
 
 def region(text: str, plant: System, option: str, deviations: bool = False) -> tuple[tuple[Fraction, Fraction], ...]:
-    """A state or a box, NAME=VALUE or NAME=LO..HI separated by commas, as intervals of deviations from x_eq, (n,).
+    """A state or a box, NAME=VALUE or NAME=LO..HI separated by commas or spaces, as intervals of deviations from x_eq,
+    (n,).
 
-    Numbers are the states' values, as for `--domain NAME=LO:HI`, unless they are `deviations`; text means its decimal
+    Numbers are the states' values, as for `--domain NAME=LO..HI`, unless they are `deviations`; text means its decimal
     value. A state that is not named is at rest.
 
     Raises
@@ -122,17 +134,15 @@ def region(text: str, plant: System, option: str, deviations: bool = False) -> t
 
     names, at = [s.name for s in plant.states], plant.operating_point()
     found: dict[str, tuple[Fraction, Fraction]] = {}
-    for part in text.split(","):
-        name, value = _assignment(part, option)
+    for name, value in _assignments(text, option):
         if name not in names:
             raise InputError(f"{plant.name} has no state {name!r}; it has: {', '.join(names)}.")
         if name in found:
             raise InputError(f"{option} must name each state once; found {name} twice.")
-        lo, dots, hi = value.partition("..")
-        shift = Fraction(0) if deviations else at.get(name, Fraction(0))
-        ends = exact(lo.strip(), name) - shift, exact(hi.strip() if dots else lo.strip(), name) - shift
+        given, shift = ends_of(value), Fraction(0) if deviations else at.get(name, Fraction(0))
+        ends = exact(given[0], name) - shift, exact(given[-1], name) - shift
         if ends[0] > ends[1]:
-            raise InputError(f"{option} takes intervals LO..HI with LO <= HI; found {part.strip()!r}.")
+            raise InputError(f"{option} takes intervals LO..HI with LO <= HI; found {f'{name}={value}'!r}.")
         found[name] = ends
     return tuple(found.get(name, (Fraction(0), Fraction(0))) for name in names)
 
@@ -156,10 +166,10 @@ def layers(text: str, option: str) -> tuple[int, ...]:
 
 
 def widths(text: str | None, option: str) -> dict[str, float] | None:
-    """Numbers by name, separated by commas."""
+    """Numbers by name, separated by commas or spaces."""
     if text is None:
         return None
-    pairs = dict(_assignment(part, option) for part in text.split(","))
+    pairs = dict(_assignments(text, option))
     try:
         return {name: float(value) for name, value in pairs.items()}
     except ValueError as error:
@@ -169,11 +179,16 @@ def widths(text: str | None, option: str) -> dict[str, float] | None:
 
 
 def state(text: str, option: str) -> dict[str, Fraction]:
-    """Exact numbers by name, separated by commas."""
+    """Exact numbers by name, separated by commas or spaces."""
     from certify.systems import exact
 
-    pairs = dict(_assignment(part, option) for part in text.split(","))
-    return {name: exact(value, name) for name, value in pairs.items()}
+    return {name: exact(value, name) for name, value in _assignments(text, option)}
+
+
+def _assignments(text: str, option: str) -> Iterator[tuple[str, str]]:
+    """The names and values of NAME=VALUE,NAME=VALUE or NAME=VALUE NAME=VALUE."""
+    joined = re.sub(r"\s*(=|\.\.|,)\s*", r"\1", text.strip())
+    return (_assignment(part, option) for part in re.split(r"[,\s]", re.sub(r"\s+", " ", joined)))
 
 
 def _assignment(text: str, option: str) -> tuple[str, str]:

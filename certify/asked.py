@@ -11,7 +11,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.errors import InputError
+from certify.errors import InputError, OptionError
 from certify.options import RoaOptions
 from certify.systems import System
 
@@ -27,7 +27,7 @@ def require_one_that_knows(system: System, options: RoaOptions) -> None:
     InputError : the option, and what has a range or goes in steps.
     """
     if options.lyapunov is None and options.lyapunov_level is not None:
-        raise InputError("`lyapunov_level` must be the level of a function; give one as `lyapunov`.")
+        raise OptionError("`lyapunov_level` must be the level of a function; give one as `lyapunov`.")
     if options.goes_beyond and system.in_steps:
         raise InputError(
             "a set beyond the ellipsoid must be of a plant in continuous time whose input follows the state at once; "
@@ -50,7 +50,7 @@ def require_one_that_knows(system: System, options: RoaOptions) -> None:
             f"a tube must be of exact equations: there is no such claim yet for what is uncertain; {found}. Ask for "
             "the set without a tube, or leave the ranges out (of a disturbance in the plant's file: the half-width 0)."
         )
-    raise InputError(
+    raise OptionError(
         f"`engine` must be bounds where something is uncertain: dReal is asked about exact equations; {found}. Use the "
         "engine bounds, or leave the ranges out."
     )
@@ -67,7 +67,7 @@ def ellipsoid_in(system: System, box: Mapping[str, float] | None = None) -> Arra
     sides = {n: min(-float(lo), float(hi)) for n, (lo, hi) in zip(names, system.domain, strict=True)}
     box = sides if box is None else box
     if not box or not box.keys() <= sides.keys():
-        raise InputError(
+        raise OptionError(
             f"`box` must name states of {system.name}, {', '.join(names)}; found {', '.join(box) or 'none'}."
         )
     least = min(width / sides[name] for name, width in box.items())
@@ -83,13 +83,13 @@ def state_in(system: System, values: Mapping[str, Fraction | float]) -> tuple[Fr
     """
     names, at = [s.name for s in system.states], system.exact_x_eq()
     if not values or not values.keys() <= set(names):
-        raise InputError(
+        raise OptionError(
             f"`reach_from` must name states of {system.name}, {', '.join(names)}; found {', '.join(values) or 'none'}."
         )
     state = tuple(Fraction(values.get(name, q)) - q for name, q in zip(names, at, strict=True))
     for name, q, v, (lo, hi) in zip(names, at, state, system.domain, strict=True):
         if not lo < v < hi:
-            raise InputError(
+            raise OptionError(
                 f"`reach_from` must lie in the interior of the domain, {name} between {float(lo + q):g} and "
                 f"{float(hi + q):g}; found {float(v + q):g}."
             )

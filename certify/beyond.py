@@ -7,9 +7,9 @@ from fractions import Fraction
 from certify.claims import Claim, Outer, Problem
 from certify.engines.outer import OuterProof
 from certify.lyapunov import sampled_volume
+from certify.lyapunov.rigorous import evaluate_rise
 from certify.options import RoaOptions
 from certify.results import OuterFacts
-from certify.rigorous import evaluate_rise
 
 
 def outer_facts(problem: Problem, claim: Claim, outer: Outer, found: OuterProof) -> OuterFacts:

@@ -13,7 +13,8 @@ import gc
 import json
 import os
 import sys
-from typing import NoReturn
+from collections.abc import Mapping
+from typing import Any, NoReturn
 
 import typer
 
@@ -34,9 +35,10 @@ from certify.commands.roa import roa
 from certify.commands.sweep import sweep
 from certify.commands.systems import systems
 from certify.commands.terminal import say, tell
+from certify.commands.typed import as_typed, options_of
 from certify.commands.version import certify
 from certify.ending import INTERRUPTED, Interrupted, closed_pipe, end_by_sigterm, is_of_closed_pipe
-from certify.errors import BackendError, CertifyError, SoundnessError
+from certify.errors import BackendError, CertifyError, OptionError, SoundnessError
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -123,6 +125,10 @@ def _ended(arguments: list[str], as_json: bool) -> int:
         return _fail(as_json, f"internal error: {error}", 70)
     except BackendError as error:  # another program's: a checker, a solver, a scheduler
         return _fail(as_json, str(error), 70)
+    except OptionError as error:
+        commands: Mapping[str, Any] = getattr(command, "commands", {})
+        called = next((commands[name] for name in arguments if name in commands), command)
+        return _fail(as_json, as_typed(str(error), options_of(called)), 2)
     except CertifyError as error:
         return _fail(as_json, str(error), 2)
     except BrokenPipeError:

@@ -14,7 +14,7 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from certify.expressions import Expression, evaluate_exactly
+from certify.expressions import Expression, evaluate_exactly, symbols_of
 from certify.policies import TanhNetwork, require_centred
 from certify.systems import Matrix, System, in_floats, linearise
 
@@ -64,11 +64,18 @@ class ClosedLoop:
             try:
                 value = evaluate_exactly(expression, at_zero, unknown)
             except InputError as error:
+                acting = [s.name for s in unknown if s in symbols_of(expression)]
+                if acting:
+                    raise InputError(
+                        f"the loop must rest at the operating point of {system.name} whatever {' and '.join(acting)} "
+                        f"may be; {symbol}' depends on that there. Ask for --claim practical or nearby, which do not "
+                        "need it."
+                    ) from error
                 raise InputError(f"{wanted}; {symbol}' is not decided in rationals: {error}.") from error
             if value != 0:
                 raise InputError(
                     f"{wanted}; {symbol}' = {float(value):.6g} at the origin. Shift the states or correct u_eq, "
-                    "or claim practical stability, which does not need it."
+                    "or ask for --claim practical, which does not need it."
                 )
         require_centred(self.network, self.u_eq, [s.name for s in system.inputs])
 

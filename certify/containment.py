@@ -15,20 +15,20 @@ import tempfile
 from collections import deque
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from enum import Enum
 from fractions import Fraction
 from pathlib import Path
-from typing import NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
 
 from certify.certificate import Certificate, parse_certificate, read_raw, run_checker
+from certify.certificate.formats import version_in
 from certify.claims import CLAIMS, Enlarged, Reached
 from certify.errors import InputError
 from certify.lyapunov import are_inside
 from certify.sublevel import Sublevel
 from certify.systems import System
+from certify.verdict import Answer
 
 Array = NDArray[np.float64]
 Box = tuple[tuple[Fraction, Fraction], ...]
@@ -36,7 +36,7 @@ _CORNERS = 16  # 2 to the power of this many corners are looked at one by one
 _PIECES = 4096  # of a box, that are looked at
 
 
-class Containment(Enum):
+class Containment(Answer):
     """Whether all states of a box lie in a proved set.
 
     CONTAINED: all do. NOT_CONTAINED: a state of the box does not. UNDECIDED: neither was shown.
@@ -45,9 +45,6 @@ class Containment(Enum):
     CONTAINED = "contained"
     NOT_CONTAINED = "not contained"
     UNDECIDED = "undecided"
-
-    def __bool__(self) -> NoReturn:
-        raise TypeError("a Containment has three values; compare it with `is`, do not use it as a bool.")
 
     @property
     def exit_status(self) -> int:
@@ -203,8 +200,9 @@ class ProvedSet:
         return Located(Containment.UNDECIDED)
 
 
-def proved_set(path: Path) -> ProvedSet:
-    """The set of a certificate, which is checked first, as `certify check` does it: the very bytes that are read.
+def proved_set(path: Path, patient: bool = False) -> ProvedSet:
+    """The set of a certificate, which is checked first, as `certify check` does it: the very bytes that are read;
+    `patient` takes one whose check may need hours.
 
     Raises
     ------
@@ -215,12 +213,13 @@ def proved_set(path: Path) -> ProvedSet:
     with tempfile.TemporaryDirectory() as folder:  # whatever happens to the path meanwhile
         private = Path(folder) / "certificate.json"
         private.write_bytes(raw)
-        answer = run_checker(private)
+        answer = run_checker(private, patient=patient)
     if answer["result"] != "ACCEPTED":
+        old = version_in(raw)
         why = f" rule={answer['rule']} at={answer['at']}: {answer['detail']}" if "rule" in answer else ""
         raise InputError(
-            f"{path} must be a certificate that the checker accepts; it says {answer['result']}{why:.300}. Without "
-            "that there is no proved set."
+            f"{path} must be a certificate that the checker accepts; it says {answer['result']}{why:.300}. "
+            f"{old or 'Without that there is no proved set.'}"
         )
     return set_of(raw, str(path))
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 import time
+from collections.abc import Mapping
 from dataclasses import replace
 from fractions import Fraction
 
@@ -25,6 +26,7 @@ from certify.errors import InputError
 from certify.lyapunov import diagonalising_coordinates, domain_limit, extents, volume
 from certify.options import RoaOptions
 from certify.policies import Centre, TanhNetwork
+from certify.report.words import number, quantity, symbol
 from certify.results import Diagnosis, RoaResult, Share, Step
 from certify.systems import System
 from certify.verdict import Stop
@@ -34,7 +36,10 @@ _WIDER = Fraction(3, 2)  # of the side of the domain that binds
 _WORTH = 1.1  # growth of the volume that makes a wider domain worth a word
 _LONGEST = 86_400.0  # seconds that may be suggested
 _LONGER, _SECONDS = 1.1, 5.0  # of a tube's start, relative to the proved set; for looking
-_TOUCHES = 1e-6  # relative distance from the domain's limit
+_LITTLE = 25.0  # per cent of the volume that sampling allows, below which the bounds are to blame
+_BENT = 1.0  # bends of the hidden units, as a share of the linear part, that are worth flattening
+_FEW = 3  # states, for which a function beyond the ellipsoid is suggested
+_ENDED = (Stop.TIME, Stop.BOXES, Stop.LOCAL)
 
 
 def diagnose(
@@ -96,17 +101,21 @@ def _binding(result: RoaResult) -> tuple[str, str, str | None, str | None, Array
         sign = -1.0 if side == "lower" else 1.0
         point = sign * columns[:, i] * math.sqrt((level or limit) / columns[i, i])
         name = str(system.states[i].name)
-        value, unit = float(lo if side == "lower" else hi), system.units.get(name, "")
-        return f"the {side} side of the domain in {name}, {value:g} {unit}".rstrip(), "domain", name, side, point
+        end, at, unit = lo if side == "lower" else hi, system.exact_x_eq()[i], system.units.get(name, "")
+        where = f"the {side} side of the domain in {symbol(name)}, {quantity(end + at, unit)}"
+        where += f" ({quantity(abs(end), unit)} from the operating point)" if at else ""
+        return where, "domain", name, side, point
     if witness is not None and result.stop in (Stop.WITNESS, Stop.INPUTS):
-        where = ", ".join(f"{s.name} = {v:.4g}" for s, v in zip(system.states, witness.x, strict=True))
+        each = zip(system.states, witness.x.tolist(), system.exact_x_eq(), strict=True)
+        where = _named(system, {s.name: v + float(at) for s, v, at in each})
         if witness.kind == "vdot" and witness.values:
-            where += " with " + ", ".join(f"{name} = {float(q):.4g}" for name, q in witness.values.items())
+            where += f" with {_named(system, {name: float(q) for name, q in witness.values.items()})}"
         if witness.kind == "input":
             found = _input_out_of_bounds(result, witness.x)
             if found is not None:
                 name, side, value = found
-                return f"{name} leaves its {side} bound {value:g} at {where}", "input", name, side, witness.x
+                bound = quantity(value, system.units.get(name, ""))
+                return f"{symbol(name)} leaves its {side} bound, {bound}, at {where}", "input", name, side, witness.x
         what = (
             "Vdot = 0"
             if result.timing.is_plain and not result.timing.rate
@@ -116,12 +125,17 @@ def _binding(result: RoaResult) -> tuple[str, str, str | None, str | None, Array
     return result.reason, result.stop.name.lower(), None, None, None
 
 
+def _named(system: System, values: Mapping[str, float]) -> str:
+    """Quantities of a plant with their names and units."""
+    return ", ".join(f"{symbol(name)} = {quantity(v, system.units.get(name, ''), 4)}" for name, v in values.items())
+
+
 def _input_out_of_bounds(result: RoaResult, x: Array) -> tuple[str, str, float] | None:
     system = result.system
     u = ClosedLoop(system, result.network).policy(x[None])[0]
-    for symbol, value, (lo, hi) in zip(system.inputs, u.tolist(), system.input_bounds, strict=True):
+    for one, value, (lo, hi) in zip(system.inputs, u.tolist(), system.input_bounds, strict=True):
         if value < lo or value > hi:
-            return (symbol.name, "lower", float(lo)) if value < lo else (symbol.name, "upper", float(hi))
+            return (one.name, "lower", float(lo)) if value < lo else (one.name, "upper", float(hi))
     return None
 
 
@@ -150,7 +164,10 @@ def _next(
     if result.stop is Stop.UNSTABLE:
         return Step((), "no Lyapunov equation has a solution; the policy has to stabilise the plant first")
     if result.claim in ("practical", "nearby") and (centre := _centring(*asked)) is not None:
-        return Step((("--centre", centre),), "with pi(0) = u_eq the stronger claim can be tried")
+        return Step(
+            (("--centre", centre),),
+            "shifted so that pi(0) = u_eq the loop rests where it should, and the stronger claim can be tried",
+        )
     if result.stop is Stop.DOMAIN and name is not None and options.level is None:
         return _wider_domain(result, name, seconds)
     if result.stop is Stop.PATH:
@@ -160,6 +177,13 @@ def _next(
         kept = result.search is not None
         why = "what was done is kept" if kept else "the search was not kept"
         return Step((("--resume", ""),) if kept else (), f"{why}; see to the cluster first, or leave it out")
+    if result.stop in _ENDED and _is_bent(result, proof):
+        share = number(_share_proved(result), 2)
+        why = (
+            f"proved is {share} % of the volume that sampling allows, and bounds see more of the hidden units' bends "
+            "than of the policy's linear part: a flatter policy that does the same may be proved on more"
+        )
+        return Step((), why, flattens=True)
     if result.stop in (Stop.TIME, Stop.BOXES):
         step = _longer(result, options, proof)
         return step if result.search is None else replace(step, options=(*step.options, ("--resume", "")))
@@ -169,16 +193,70 @@ def _next(
     if result.stop is Stop.STALLED and knows and not options.enlarges and _has_tube(result, seconds):
         return Step((("--enlarge", ""),), f"a tube leads into this set from one {_LONGER:g} times as long, at least")
     if result.stop is Stop.STALLED:
-        worst = ", ".join(one for one, _ in _hurting(result, proof)[:3])
-        why = f"the bounds are too wide between the local set and beyond, most of all along {worst}; "
-        return Step((), why + "a policy with less curvature there helps (controllers train --curvature-weight)")
+        worst = ", ".join(symbol(one) for one, _ in _hurting(result, proof)[:3])
+        why = f"the bounds are too wide beyond the local set, most of all along {worst}; "
+        return Step((), why + "a policy that bends less there helps", flattens=_can_be_flattened(result))
     if result.stop in (Stop.WITNESS, Stop.INPUTS):
         tried = max((t.volume for t in result.tried), default=0.0)
         reached = max((t.proved_volume or 0.0 for t in result.tried), default=0.0)
         if reached and tried > _WORTH * reached:
             return Step((("--time-limit", _round(4 * options.time_limit)),), "another candidate reaches further")
+        if _may_go_beyond(result, options):
+            why = "what this V can show is proved; a function of higher degree may show more, beyond the ellipsoid"
+            return Step((("--candidate", "polynomial"),), why)
         return Step((), "what this V can show is proved; a larger set needs another policy or another kind of V")
+    if result.stop is Stop.REQUESTED and result.levels.roa is not None:
+        return Step((), "the level that was asked for is proved; leave --level out for the largest")
     return Step((), result.reason)
+
+
+def _may_go_beyond(result: RoaResult, options: RoaOptions) -> bool:
+    """Whether a function beyond the ellipsoid can be learned, and pays: of few states, in continuous time."""
+    plain = result.timing.is_plain and not options.rate and not options.enlarges and options.engine == "bounds"
+    free = options.level is None and options.only is None and options.P is None and not options.resume
+    return plain and free and not options.goes_beyond and result.system.n <= _FEW and not result.system.ranges
+
+
+def _can_be_flattened(result: RoaResult) -> bool:
+    """Whether `controllers flatten` takes the policy and judges it by the loop that is certified."""
+    return len(result.network.weights) > 1 and not result.system.in_steps and not result.system.ranges
+
+
+def _share_proved(result: RoaResult) -> float:
+    """The volume that is proved, in per cent of what sampling allows at most."""
+    allowed = max((one.volume for one in result.tried), default=0.0)
+    return 100 * (result.volume or 0.0) / allowed if allowed else 100.0
+
+
+def _is_bent(result: RoaResult, proof: Proof | None) -> bool:
+    """Whether little of what sampling allows is proved, and the pace of the proof does not say when more will be."""
+    known = proof is not None and proof.seconds_left is not None and result.levels.roa is not None
+    if not _can_be_flattened(result) or known or _share_proved(result) >= _LITTLE:
+        return False
+    half_widths = np.array([min(-float(lo), float(hi)) for lo, hi in result.system.domain])
+    return _bend(result.network.folded(result.system.exact_u_eq()), half_widths) > _BENT
+
+
+def _bend(network: TanhNetwork, half_widths: Array) -> float:
+    """What bounds see of the hidden units' bends on a box, as a share of the linear part there, to first order.
+
+    The sum over all hidden units of their distance from their tangent at 0, at both ends of what the box drives them
+    through, times their gain towards the inputs.
+    """
+    y, J, units = np.zeros(network.n), np.eye(network.n), list[tuple[Array, Array, Array]]()
+    for W, b in zip(network.weights[:-1], network.biases[:-1], strict=True):
+        y, J = W @ y + b, W @ J
+        t, reach = np.tanh(y), np.abs(J) @ half_widths
+        slope = 1 - t**2
+        ends = [np.abs(np.tanh(y + v) - t - slope * v) for v in (reach, -reach)]
+        units.append((W, slope, (ends[0] + ends[1]) / 2))
+        y, J = t, slope[:, None] * J
+    gain, total = network.weights[-1], 0.0
+    linear = float(np.sum(np.abs(gain @ J) @ half_widths))
+    for W, slope, departure in reversed(units):
+        total += float(np.sum(np.abs(gain) @ departure))
+        gain = (gain * slope) @ W
+    return total / linear if linear else 0.0
 
 
 def _has_tube(result: RoaResult, seconds: float) -> bool:
@@ -242,8 +320,11 @@ def _wider_domain(result: RoaResult, name: str, seconds: float) -> Step:
     reach = volume(P, limit if witness is None else min(limit, witness.level))
     grown = reach / volume(P, level)
     if grown < _WORTH:
-        return Step((), f"the domain binds in {name}, and a wider one would soon be bound by something else")
-    side = f"{name}={float(hi):g}" if lo == -hi else f"{name}={float(lo):g}:{float(hi):g}"
+        return Step(
+            (), f"no option helps: in a domain that is wider in {symbol(name)} something else soon limits this V"
+        )
+    at = system.operating_point().get(name, Fraction(0))  # the command takes an interval as values
+    side = f"{name}={float(hi):g}" if lo == -hi else f"{name}={float(lo + at):g}..{float(hi + at):g}"
     return Step((("--domain", side),), f"if the equations hold there, this V reaches {grown:.3g} times the volume")
 
 

@@ -14,6 +14,11 @@ class InputError(CertifyError, ValueError):
     """The user's plant, policy or option cannot be used (exit status 2)."""
 
 
+class OptionError(InputError):
+    """An option cannot be used; the message names options as Python does, in backquotes, and the command line shows
+    them as they are typed there."""
+
+
 class UnstableError(CertifyError):
     """An eigenvalue enclosure of the closed loop has positive real part (verdict REFUTED)."""
 

@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.closed_loop import ClosedLoop
-from certify.errors import InputError, SoundnessError
+from certify.errors import InputError, OptionError, SoundnessError
 from certify.policies import TanhNetwork
 from certify.rigorous import Balls, ball, centring_with_errors, precision, rounded_up
 from certify.systems import System
@@ -71,11 +71,11 @@ class FloatOptions:
 
     def __post_init__(self) -> None:
         if not 0 <= self.tanh_ulp <= _MOST_ULP:
-            raise InputError(f"`tanh_ulp` must be a number from 0 to {_MOST_ULP:.0f}; found {self.tanh_ulp}.")
+            raise OptionError(f"`tanh_ulp` must be a number from 0 to {_MOST_ULP:.0f}; found {self.tanh_ulp}.")
         if self.chain is not None and self.chain < 1:
-            raise InputError(f"`chain` must be at least 1, or be left out for any order; found {self.chain}.")
+            raise OptionError(f"`chain` must be at least 1, or be left out for any order; found {self.chain}.")
         if self.boxes is not None and self.boxes < 1:
-            raise InputError(f"`boxes` must be at least 1; found {self.boxes}.")
+            raise OptionError(f"`boxes` must be at least 1; found {self.boxes}.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -440,7 +440,7 @@ def _growth(terms: int, chain: int | None) -> flint.arb:
     """
     longest, shortest = terms - 1, (terms - 1).bit_length()
     if chain is not None and chain < shortest:
-        raise InputError(
+        raise OptionError(
             f"`chain` must be at least {shortest}: in a sum of {terms} terms some term passes through as many "
             f"additions, in whatever order; found {chain}."
         )

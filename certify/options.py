@@ -11,7 +11,7 @@ from typing import Literal, cast, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.errors import InputError
+from certify.errors import OptionError
 from certify.lyapunov import BEYOND, Beyond, Candidate, Named, Neural, Polynomial, Symbolic
 
 Array = NDArray[np.float64]
@@ -98,6 +98,11 @@ class RoaOptions:
         return self.enlarge or self.box is not None or self.reach_from is not None
 
     @property
+    def _tube(self) -> str:
+        """The option that asks for a tube."""
+        return "reach_from" if self.reach_from is not None else "enlarge" if self.enlarge else "box"
+
+    @property
     def learned(self) -> Beyond | None:
         """What is learned for a set beyond the ellipsoid, if anything is."""
         return next((name for name in BEYOND if name == self.candidate), None)
@@ -117,46 +122,62 @@ class RoaOptions:
     def __post_init__(self) -> None:
         for name, known in (("claim", Asked), ("around", Around), ("candidate", Candidate), ("engine", EngineName)):
             if getattr(self, name) not in get_args(known):
-                raise InputError(f"`{name}` must be one of {get_args(known)}; found {getattr(self, name)!r}.")
-        if not 0 < self.dreal_precision < 1 or (self.jobs is not None and not 1 <= self.jobs <= _MOST_JOBS):
-            raise InputError("`dreal_precision` must lie between 0 and 1, and `jobs` be 1 to 256.")
+                raise OptionError(
+                    f"`{name}` must be one of {', '.join(get_args(known))}; found {getattr(self, name)!r}."
+                )
+        if not 0 < self.dreal_precision < 1:
+            raise OptionError(f"`dreal_precision` must lie between 0 and 1; found {self.dreal_precision}.")
+        if self.jobs is not None and not 1 <= self.jobs <= _MOST_JOBS:
+            raise OptionError(f"`jobs` must be 1 to {_MOST_JOBS}; found {self.jobs}.")
         if self.cluster_checks and self.cluster is None:
-            raise InputError("`cluster_checks` must have a `cluster`; found none.")
+            raise OptionError("`cluster_checks` must have a `cluster`; found none.")
         if self.cluster is not None and (self.engine != "bounds" or self.device != "cpu"):
-            raise InputError("`cluster` needs the engine bounds, and the device cpu.")
+            raise OptionError("`cluster` needs the engine bounds, and the device cpu.")
         if self.resume and (self.engine != "bounds" or self.P is not None or self.only is not None):
-            raise InputError(
-                "`resume` goes on with the candidate of the search; leave `P`, `Q`, `R`, `level` and `candidate` out, "
-                "and use the engine bounds."
+            raise OptionError(
+                "`resume` takes the candidate of the search; leave out `candidate`, `Q`, `R`, `level` and a P of your "
+                "own, and use the engine bounds."
             )
         if self.around == "rest" and self.claim == "asymptotic":
-            raise InputError("`around` the rest needs another claim than `asymptotic`, under which that is the origin.")
+            raise OptionError(
+                "`around` rest needs another `claim` than asymptotic, under which the loop rests at the origin."
+            )
         if self.level is not None and not (math.isfinite(self.level) and self.level > 0):
-            raise InputError(f"`level` must be a positive number; found {self.level}.")
+            raise OptionError(f"`level` must be a positive number; found {self.level}.")
         if self.box is not None and not all(math.isfinite(v) and v > 0 for v in self.box.values()):
-            raise InputError(f"`box` must have positive half-widths; found {dict(self.box)}.")
+            raise OptionError(f"`box` must have positive half-widths; found {_listed(self.box)}.")
         if self.reach_from is not None and not all(math.isfinite(v) for v in self.reach_from.values()):
-            raise InputError(f"`reach_from` must be a state of finite numbers; found {dict(self.reach_from)}.")
+            raise OptionError(f"`reach_from` must be a state of finite numbers; found {_listed(self.reach_from)}.")
         if self.enlarges and (self.engine == "dreal" or self.claim in ("practical", "nearby")):
-            raise InputError(
-                "`enlarge` needs the engine bounds and a claim that is not practical: a tube ends in a set "
-                "that the checker can replay, and from which trajectories converge."
+            raise OptionError(
+                f"`{self._tube}` looks for a tube, which needs the engine bounds and the claim asymptotic: it ends in "
+                "a set that the checker can replay, and from which trajectories converge."
             )
         if not (math.isfinite(self.rate) and self.rate >= 0):
-            raise InputError(f"`rate` must be a number of at least 0; found {self.rate}.")
+            raise OptionError(f"`rate` must be a number of at least 0; found {self.rate}.")
         if self.rate and (self.enlarges or self.engine != "bounds"):
-            raise InputError("`rate` needs the engine bounds, and a claim without a tube.")
+            raise OptionError(
+                "`rate` needs the engine bounds, and a claim without a tube: leave `enlarge` and `box` out."
+            )
         if self.goes_beyond and (self.enlarges or self.rate or self.engine != "bounds"):
-            what = "lyapunov" if self.learned is None else f"candidate` `{self.learned}"
-            raise InputError(f"`{what}` needs the engine bounds, and a claim without a tube and without a rate.")
+            what = "`lyapunov`" if self.learned is None else f"`candidate` {self.learned}"
+            raise OptionError(f"{what} needs the engine bounds, and a claim without a tube and without a rate.")
         if self.lyapunov is not None and self.learned is not None:
-            raise InputError(f"the candidate `{self.learned}` is learned; leave `lyapunov` out, or ask for another.")
+            raise OptionError(
+                f"`candidate` {self.learned} learns a function; leave `lyapunov` out, or name another candidate."
+            )
         if any(width < 1 for width in self.hidden) or self.degree not in range(2, 13, 2):
-            raise InputError(
+            raise OptionError(
                 "`hidden` must be widths of at least 1, and `degree` even, 2 to 12; "
                 f"found {self.hidden}, {self.degree}."
             )
         if self.lyapunov_level is not None and not math.isfinite(self.lyapunov_level):
-            raise InputError(f"`lyapunov_level` must be a finite number; found {self.lyapunov_level}.")
-        if not self.time_limit > 0 or not self.max_boxes > 0:
-            raise InputError("`time_limit` and `max_boxes` must be positive.")
+            raise OptionError(f"`lyapunov_level` must be a finite number; found {self.lyapunov_level}.")
+        if not self.time_limit > 0:
+            raise OptionError(f"`time_limit` must be positive; found {self.time_limit:g}.")
+        if not self.max_boxes > 0:
+            raise OptionError(f"`max_boxes` must be positive; found {self.max_boxes}.")
+
+
+def _listed(values: Mapping[str, Fraction | float]) -> str:
+    return ", ".join(f"{name}={float(value):g}" for name, value in values.items())

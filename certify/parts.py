@@ -28,8 +28,8 @@ _STATUS = {"PART": 4, "REJECTED": 1}
 class Part:
     """The work: the checker's answer about part K of N of a certificate's bytes, with its exit status."""
 
-    def __init__(self, raw: bytes) -> None:
-        self.raw = raw
+    def __init__(self, raw: bytes, patient: bool = False) -> None:
+        self.raw, self.patient = raw, patient
 
     def __call__(self, job: bytes) -> bytes:
         """Status and answer as JSON."""
@@ -37,10 +37,10 @@ class Part:
         with tempfile.TemporaryDirectory(prefix="certify-") as folder:
             path = Path(folder) / "certificate.json"
             path.write_bytes(self.raw)
-            return json.dumps(ask(path, part=(number, of))).encode()
+            return json.dumps(ask(path, part=(number, of), patient=self.patient)).encode()
 
 
-def check_in_parts(path: Path, runner: Runner) -> tuple[int, dict[str, Any]]:
+def check_in_parts(path: Path, runner: Runner, patient: bool = False) -> tuple[int, dict[str, Any]]:
     """Exit status and answer of the checker about a file, as its parts were checked by a cluster's workers: a refusal
     by one of them, or what all of them together have accepted.
 
@@ -51,11 +51,11 @@ def check_in_parts(path: Path, runner: Runner) -> tuple[int, dict[str, Any]]:
     raw = read_raw(path)
     evidence = parse_certificate(raw, str(path)).evidence
     if not isinstance(evidence, PartitionTree):
-        return ask(path)
-    work = Part(raw)
+        return ask(path, patient=patient)
+    work = Part(raw, patient)
     with runner.jobs(work) as jobs:
         if jobs is None or not jobs.places:
-            return ask(path)
+            return ask(path, patient=patient)
         trees = (evidence.tree, *(() if evidence.outer is None else (evidence.outer.tree, *evidence.outer.faces)))
         leaves = sum(tree.count(b"\xff") for tree in trees)
         of = max(1, min(_EACH * jobs.places, leaves // _LEAVES))

@@ -87,10 +87,12 @@ class Tried:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """What to try next: options to add to the command (none if no option helps), and why."""
+    """What to try next: options to add to the command (none if no option helps), and why; `flattens` says that the
+    policy is to be fine-tuned first, by `controllers flatten`."""
 
     options: tuple[tuple[str, str], ...]
     why: str
+    flattens: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,7 +197,7 @@ class Diagnosis:
         """For JSON: the fields, and `stiffness`; `hurts` by state."""
         stated = asdict(self)
         stated |= {"stiffness": self.stiffness, "hurts": dict(self.hurts)}
-        stated["next"] = {"options": dict(self.next.options), "why": self.next.why}
+        stated["next"] = {"options": dict(self.next.options), "why": self.next.why, "flatten": self.next.flattens}
         return stated
 
 
@@ -429,6 +431,13 @@ class RoaResult:
         sample = self.system.sample
         return {"kind": self.claim, **rate, **({} if sample is None else {"sample": [str(h) for h in sample]})}
 
+    def _rest(self, rest: Rest) -> dict[str, Any]:
+        """Where the loop rests, also by the states' values; `origin` says that V is 0 there."""
+        moved = map(Fraction, self.network.origin.tolist())  # x is in deviations from where the plant was to rest
+        each = zip(self.system.exact_x_eq(), moved, rest.x, strict=True)
+        values = [float(at - by + Fraction(x)) for at, by, x in each]
+        return asdict(rest) | {"values": values, "origin": self.network.is_moved}
+
     def to_dict(self) -> dict[str, Any]:
         """The JSON object of `certify roa --json`; lengths along the states are in their units."""
         system, network, witness = self.system, self.network, self.witness
@@ -474,7 +483,7 @@ class RoaResult:
             "outer": None if self.outer is None else self.outer.to_dict(),
             "witness": None,
             "eigenvalues": list(self.eigenvalues),
-            "rest": None if self.rest is None else asdict(self.rest),
+            "rest": None if self.rest is None else self._rest(self.rest),
         }
         if witness is not None:
             held = witness.values if witness.kind == "vdot" else {}  # an input does not depend on them

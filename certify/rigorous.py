@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 
 from certify.closed_loop import ClosedLoop
 from certify.expressions import Algebra, Expression, Symbol, differentiate, evaluate, solution_series
-from certify.lyapunov.neural import Neural
-from certify.lyapunov.symbolic import Symbolic
 from certify.policies import TanhNetwork
 
 Array = NDArray[np.float64]
@@ -27,7 +25,9 @@ _ATTEMPTS, _WIDER, _ORDER = 6, 1.25, 30  # at the balls around a solution over a
 Balls = list[flint.arb]
 
 
-class _Balls(Algebra[flint.arb]):
+class BallAlgebra(Algebra[flint.arb]):
+    """Expressions in Arb balls."""
+
     def constant(self, q: Fraction) -> flint.arb:
         return ball(q)
 
@@ -52,14 +52,14 @@ def ball(q: Fraction) -> flint.arb:
 
 def evaluate_arb(expression: Expression, values: Mapping[Symbol, flint.arb]) -> flint.arb:
     """An expression of the plant in Arb balls."""
-    return evaluate(expression, values, _Balls())
+    return evaluate(expression, values, BallAlgebra())
 
 
 def evaluate_policy(loop: ClosedLoop, x: Array) -> Balls:
     """pi(x) at a binary64 point (n,), as Arb balls."""
     with precision():
         network = loop.network
-        y = _net(network, _points(x))
+        y = _net(network, points(x))
         shift, offset = _centring(loop)
         u = [
             flint.arb(float(s)) * network.squashed(v + d, _NUMBERS) + o
@@ -88,13 +88,13 @@ def rounded_up(x: flint.arb) -> float:
 def evaluate_vdot(loop: ClosedLoop, P: Array, x: Array) -> flint.arb:
     """`Vdot = 2 x'P F(x)` at a binary64 point (n,), as an Arb ball."""
     with precision():
-        state = _points(x)
+        state = points(x)
         values: dict[Symbol, flint.arb] = dict(zip(loop.system.states, state, strict=True))
         values |= zip(loop.system.inputs, evaluate_policy(loop, x), strict=True)
         total, known = flint.arb(0), dict[Expression, flint.arb]()
         for row, expression in zip(P, loop.dynamics, strict=True):
             Px = sum((flint.arb(float(p)) * v for p, v in zip(row, state, strict=True)), flint.arb(0))
-            total += 2 * Px * evaluate(expression, values, _Balls(), known)
+            total += 2 * Px * evaluate(expression, values, BallAlgebra(), known)
         return total
 
 
@@ -107,10 +107,10 @@ def evaluate_increment(
     (V(phi(h)) - V(x))/h, or Vdot where h = 0. No number where no solution is enclosed.
     """
     with precision():
-        state = _points(x)
+        state = points(x)
         states = dict(zip(loop.system.states, state, strict=True))
         inputs = dict(zip(loop.system.inputs, evaluate_policy(loop, x), strict=True))
-        step, G = flint.arb(0), _field(loop, {**states, **inputs})
+        step, G = flint.arb(0), field_at(loop, {**states, **inputs})
         if loop.system.time == "discrete":
             step, G = flint.arb(1), [after - before for after, before in zip(G, state, strict=True)]
         elif period:
@@ -123,41 +123,10 @@ def evaluate_increment(
         return total
 
 
-def evaluate_function(N: Neural | Symbolic, x: Balls) -> flint.arb:
-    """N at balls around a state, n of them, at the precision that is set."""
-    if isinstance(N, Neural):
-        return _layers(N.weights, N.biases, x)[0]
-    return evaluate_arb(N.expression, dict(zip(N.states, x, strict=True)))
-
-
-def evaluate_rise(loop: ClosedLoop, N: Neural | Symbolic, x: Array) -> tuple[flint.arb, flint.arb]:
-    """`N(x)` and `N'(x) F(x)` at a binary64 point (n,), as Arb balls."""
-    with precision():
-        state = _points(x)
-        values = dict(zip(loop.system.states, state, strict=True))
-        values |= zip(loop.system.inputs, evaluate_policy(loop, x), strict=True)
-        F = _field(loop, values)
-        if isinstance(N, Neural):
-            return _layers(N.weights, N.biases, state)[0], _rise(N, state, F)
-        slopes = [evaluate_arb(differentiate(N.expression, s), values) for s in N.states]
-        return evaluate_function(N, state), sum((a * b for a, b in zip(slopes, F, strict=True)), flint.arb(0))
-
-
-def _rise(N: Neural, x: Balls, F: Balls) -> flint.arb:
-    """N'F of a network: the layers of the value and of the derivative along F, side by side."""
-    zeros = [np.zeros(len(W)) for W in N.weights]
-    for k, (W, b) in enumerate(zip(N.weights, N.biases, strict=True)):
-        if k:
-            h = [v.tanh() for v in x]
-            F = [(1 - t * t) * y for t, y in zip(h, F, strict=True)]
-            x = h
-        x, F = _affine(W, b, x), _affine(W, zeros[k], F)
-    return F[0]
-
-
-def _field(loop: ClosedLoop, values: Mapping[Symbol, flint.arb]) -> Balls:
+def field_at(loop: ClosedLoop, values: Mapping[Symbol, flint.arb]) -> Balls:
+    """f at balls around states and inputs, by their symbols."""
     known: dict[Expression, flint.arb] = {}
-    return [evaluate(expression, values, _Balls(), known) for expression in loop.dynamics]
+    return [evaluate(expression, values, BallAlgebra(), known) for expression in loop.dynamics]
 
 
 def _mean_rate(
@@ -175,13 +144,13 @@ def _mean_rate(
     for _ in range(_ATTEMPTS):
         kappa = [(_WIDER * h * v).abs_upper() for v in size]
         around = {s: v + flint.arb(0, k) for (s, v), k in zip(states.items(), kappa, strict=True)}
-        size = [v.abs_upper() for v in _field(loop, {**around, **inputs})]
+        size = [v.abs_upper() for v in field_at(loop, {**around, **inputs})]
         if all(bool(h * v < k) for v, k in zip(size, kappa, strict=True)):
             break
     else:
         return [flint.arb.nan()] * len(size)
-    rows = solution_series(loop.dynamics, states, inputs, _Balls(), _ORDER - 1)
-    last = [row[-1] for row in solution_series(loop.dynamics, around, inputs, _Balls(), _ORDER)]
+    rows = solution_series(loop.dynamics, states, inputs, BallAlgebra(), _ORDER - 1)
+    last = [row[-1] for row in solution_series(loop.dynamics, around, inputs, BallAlgebra(), _ORDER)]
     result = last
     for k in reversed(range(_ORDER - 1)):
         result = [row[k] + h * v for row, v in zip(rows, result, strict=True)]
@@ -228,7 +197,7 @@ def policy_on(loop: ClosedLoop, x: Balls) -> tuple[Balls, flint.arb_mat]:
     for k, (W, b) in enumerate(zip(network.weights, network.biases, strict=True)):
         if k:
             y, J = _through_tanh(y, J)
-        y, J = _affine(W, b, y), _matrix(W) * J
+        y, J = affine(W, b, y), matrix(W) * J
     shift, offset = _centring(loop)
     squashed = [network.squashed(v + d, _NUMBERS) for v, d in zip(y, shift, strict=True)]
     slopes = [network.squash_slope(v, _NUMBERS) for v in squashed]
@@ -237,25 +206,6 @@ def policy_on(loop: ClosedLoop, x: Balls) -> tuple[Balls, flint.arb_mat]:
     slopes = [s * slope * clip for s, slope, clip in zip(scale, slopes, _clip_slopes(network, u), strict=True)]
     gain = flint.arb_mat([[slopes[i] * J[i, j] for j in range(network.n)] for i in range(network.m)])
     return list(network.clipped(u, _NUMBERS)), gain
-
-
-def function_on(function: Neural | Symbolic, x: Balls) -> tuple[flint.arb, Balls]:
-    """N and its gradient on balls x; whatever is not finite says that N need not be differentiable there."""
-    if isinstance(function, Symbolic):
-        values, known = dict(zip(function.states, x, strict=True)), dict[Expression, flint.arb]()
-        parts = (function.expression, *(differentiate(function.expression, s) for s in function.states))
-        N, *slopes = (evaluate(part, values, _Balls(), known) for part in parts)
-        return N, slopes
-    y, units = list(x), []
-    for k, (W, b) in enumerate(zip(function.weights, function.biases, strict=True)):
-        if k:
-            y = [v.tanh() for v in y]
-            units.append([1 - v * v for v in y])
-        y = _affine(W, b, y)
-    row = _matrix(function.weights[-1])
-    for W, slopes in zip(function.weights[-2::-1], reversed(units), strict=True):
-        row = flint.arb_mat([[row[0, j] * slope for j, slope in enumerate(slopes)]]) * _matrix(W)
-    return y[0], [row[0, j] for j in range(function.n)]
 
 
 def _clip_slopes(network: TanhNetwork, u: Balls) -> Balls:
@@ -274,9 +224,11 @@ def field_on(loop: ClosedLoop, x: Balls) -> tuple[Balls, flint.arb_mat]:
     u, gain = policy_on(loop, x)
     values = dict(zip((*system.states, *system.inputs), (*x, *u), strict=True))
     known: dict[Expression, flint.arb] = {}
-    F = [evaluate(e, values, _Balls(), known) for e in loop.dynamics]
+    F = [evaluate(e, values, BallAlgebra(), known) for e in loop.dynamics]
     A, B = (
-        flint.arb_mat([[evaluate(differentiate(e, s), values, _Balls(), known) for s in by] for e in loop.dynamics])
+        flint.arb_mat(
+            [[evaluate(differentiate(e, s), values, BallAlgebra(), known) for s in by] for e in loop.dynamics]
+        )
         for by in (system.states, system.inputs)
     )
     return F, A + B * gain
@@ -367,22 +319,24 @@ def _centring(loop: ClosedLoop) -> tuple[Balls, Balls]:
 
 
 def _net(network: TanhNetwork, x: Balls) -> Balls:
-    return _layers(network.weights, network.biases, _read(network, x))
+    return layers_on(network.weights, network.biases, _read(network, x))
 
 
 def _read(network: TanhNetwork, x: Balls) -> Balls:
     """What the layers read at a state."""
-    return [v + at for v, at in zip(x, _points(network.origin), strict=True)] if network.is_moved else list(x)
+    return [v + at for v, at in zip(x, points(network.origin), strict=True)] if network.is_moved else list(x)
 
 
-def _layers(weights: Sequence[Array], biases: Sequence[Array], h: Balls) -> Balls:
+def layers_on(weights: Sequence[Array], biases: Sequence[Array], h: Balls) -> Balls:
+    """Affine layers with tanh between them, on balls."""
     for k, (W, b) in enumerate(zip(weights, biases, strict=True)):
-        h = _affine(W, b, [v.tanh() for v in h] if k else h)
+        h = affine(W, b, [v.tanh() for v in h] if k else h)
     return h
 
 
-def _affine(W: Array, b: Array, h: Balls) -> Balls:
-    product = _matrix(W) * flint.arb_mat([[v] for v in h])
+def affine(W: Array, b: Array, h: Balls) -> Balls:
+    """W h + b on balls."""
+    product = matrix(W) * flint.arb_mat([[v] for v in h])
     return [product[i, 0] + flint.arb(float(c)) for i, c in enumerate(b)]
 
 
@@ -392,14 +346,16 @@ def _through_tanh(y: Balls, J: flint.arb_mat) -> tuple[Balls, flint.arb_mat]:
     return t, flint.arb_mat([[slope[i] * J[i, j] for j in range(J.ncols())] for i in range(J.nrows())])
 
 
-def _matrix(W: Array) -> flint.arb_mat:
+def matrix(W: Array) -> flint.arb_mat:
+    """A binary64 matrix as it is."""
     return _balls_of(np.asarray(W, dtype=np.float64).tobytes(), W.shape)
 
 
 @lru_cache(maxsize=32)  # a network's numbers, which are exact at any precision, for all the states that it is asked at
 def _balls_of(raw: bytes, shape: tuple[int, ...]) -> flint.arb_mat:
-    return flint.arb_mat([_points(row) for row in np.frombuffer(raw).reshape(shape)])
+    return flint.arb_mat([points(row) for row in np.frombuffer(raw).reshape(shape)])
 
 
-def _points(x: Array) -> Balls:
+def points(x: Array) -> Balls:
+    """Binary64 numbers as they are."""
     return [flint.arb(float(v)) for v in x]

@@ -41,7 +41,7 @@ from certify.diagnosis import diagnose
 from certify.engines.base import FEW, Attempt, Budget, Progress, Proof
 from certify.engines.contraction import contraction
 from certify.engines.falsify import Witness
-from certify.errors import BackendError, InputError, SoundnessError
+from certify.errors import BackendError, InputError, OptionError, SoundnessError
 from certify.lyapunov import (
     Neural,
     Polynomial,
@@ -337,13 +337,13 @@ class _Run:
             return None, loop
         if options.claim != "practical" or loop.system.time == "discrete" or loop.network.centre != "none":
             if options.around == "rest" and options.claim == "practical":
-                raise InputError("`around` the rest needs a policy without centring and a plant in continuous time.")
+                raise OptionError("`around` rest needs a policy without centring and a plant in continuous time.")
             return None, loop
         rest = find_rest(loop)
         given = options.P is not None or options.level is not None or options.lyapunov is not None
         if options.around == "rest" and (rest is None or not rest.stable):
             found = "none was found" if rest is None else f"the one at {', '.join(rest.x)} is not"
-            raise InputError(f"`around` the rest needs a stable point of rest; {found}.")
+            raise OptionError(f"`around` rest needs a stable point of rest; {found}.")
         if rest is None or not rest.stable or options.around == "origin" or (options.around == "auto" and given):
             return rest, loop
         moved = seen_from(loop, rest)
@@ -775,7 +775,7 @@ class _Run:
         self.share = 1.0
         function = self.options.lyapunov or self._learned(trial, claim)
         if function.n != self.system.n:
-            raise InputError(f"`lyapunov` must be a function of {self.system.n} states; found one of {function.n}.")
+            raise OptionError(f"`lyapunov` must be a function of {self.system.n} states; found one of {function.n}.")
         N = of_polynomial(function, self.system.states) if isinstance(function, Polynomial) else function
         level = self.options.lyapunov_level
         report = None if self.progress is None else partial(self._report, stage="outer")
@@ -797,12 +797,21 @@ class _Run:
         )
 
     def _checked(self, path: Path) -> Mapping[str, Any]:
-        """The checker's answer about a file; where many leaves make a long file, several processes share them."""
+        """The checker's answer about a file, patiently where it would be refused for what it takes else."""
+        answer = self._answered(path, patient=False)
+        if (answer.get("rule"), answer.get("at")) == ("limits", "operations"):
+            answer = self._answered(path, patient=True)
+            if answer["result"] != "REJECTED":
+                self.checked = "its check takes more than ten minutes: type `certify check --patient` for another"
+        return answer
+
+    def _answered(self, path: Path, patient: bool) -> Mapping[str, Any]:
+        """The checker's answer; where many leaves make a long file, several processes share them."""
         if self.options.cluster_checks:
             from certify.parts import check_in_parts
 
             try:
-                _, answer = check_in_parts(path, self.runner)
+                _, answer = check_in_parts(path, self.runner, patient)
             except BackendError as error:
                 self.checked = f"checked here, and not by the cluster: {str(error).rstrip('.')}"
             else:
@@ -812,7 +821,7 @@ class _Run:
                     )
                 return answer
         cores = len(os.sched_getaffinity(0)) if path.stat().st_size > _LONG else 1
-        return run_checker(path, jobs=self.options.jobs or min(cores, _MOST_JOBS))
+        return run_checker(path, jobs=self.options.jobs or min(cores, _MOST_JOBS), patient=patient)
 
     def _confirm(self, problem: Problem, claim: Claim) -> dict[str, Any]:
         """dReal's answers about what the bounds engine proved.

@@ -16,8 +16,9 @@ import flint
 from certify.errors import InputError
 from certify.expressions import evaluate_exactly
 from certify.lyapunov.neural import Neural
+from certify.lyapunov.rigorous import evaluate_function, function_on
 from certify.lyapunov.symbolic import Symbolic
-from certify.rigorous import ball, evaluate_function, function_on, precision
+from certify.rigorous import ball, precision
 from certify.systems.system import Interval
 
 _BITS = (80, 160, 320, 640, 1280, 2560, 5120)  # of the balls at a state, one after the other

@@ -1,7 +1,8 @@
 """How an attempt to prove a claim ends: the verdict, and what stopped the level from being higher.
 
-A verdict is never a bool: a program that writes `if verdict:` has merged REFUTED with UNKNOWN, or worse, so
-`bool(verdict)` raises.
+An answer is never a bool: a program that writes `if verdict:` has merged REFUTED with UNKNOWN, or worse, so
+`bool(verdict)` raises. It is equal to its name, and comparing it with text that names no answer of its kind raises too:
+a slip such as `verdict == "proved"` must not pass for "not proved", nor `verdict != "refuted"` for a proof.
 """
 
 from __future__ import annotations
@@ -10,7 +11,32 @@ from enum import Enum
 from typing import NoReturn
 
 
-class Verdict(Enum):
+class Answer(Enum):
+    """An answer of several values to a question of proof: no bool, equal to itself and to its value as text.
+
+    It hashes as that text does, so that the two are the same key.
+    """
+
+    def __bool__(self) -> NoReturn:
+        known = ", ".join(repr(one.value) for one in type(self))
+        raise TypeError(f"a {type(self).__name__} is no bool; compare it with one of its values: {known}.")
+
+    def __eq__(self, other: object) -> bool:
+        if not isinstance(other, str):
+            return self is other
+        known = [one.value for one in type(self)]
+        if other not in known:
+            raise ValueError(
+                f"a {type(self).__name__} must be compared with one of {', '.join(map(repr, known))}; "
+                f"found {other!r:.60}."
+            )
+        return bool(self.value == other)
+
+    def __hash__(self) -> int:
+        return hash(self.value)
+
+
+class Verdict(Answer):
     """Outcome of an attempt to prove a claim.
 
     PROVED: an independent checker accepted the written certificate.
@@ -18,15 +44,21 @@ class Verdict(Enum):
     REFUTED: a condition of the claim fails for this V and level, shown in rigorous arithmetic; trajectories may behave
         all the same, and another V may show it.
     UNKNOWN: none of these; the accompanying reason says what ran out.
+
+    Examples
+    --------
+    >>> Verdict.PROVED == "PROVED", Verdict.UNKNOWN == "PROVED"
+    (True, False)
+    >>> Verdict.PROVED == "proved"
+    Traceback (most recent call last):
+        ...
+    ValueError: a Verdict must be compared with one of 'PROVED', 'TRUSTED', 'REFUTED', 'UNKNOWN'; found 'proved'.
     """
 
     PROVED = "PROVED"
     TRUSTED = "TRUSTED"
     REFUTED = "REFUTED"
     UNKNOWN = "UNKNOWN"
-
-    def __bool__(self) -> NoReturn:
-        raise TypeError("a Verdict has four values; compare it with `is`, do not use it as a bool.")
 
     @property
     def exit_status(self) -> int:

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from certify.containment import ProvedSet
 from certify.errors import InputError
-from certify.expressions import Expression
+from certify.expressions import Expression, gathered
 from certify.policies import Policy, TanhNetwork
 from certify.running.threads import threads_for
 from certify.systems import System, shipped_system
@@ -291,9 +291,10 @@ def require_same_question(proved: ProvedSet, network: TanhNetwork, system: Syste
 
 
 def _dynamics(system: System, acting: Iterable[str]) -> tuple[Expression, ...]:
-    """The equations with these uncertain quantities free, and all others at their nominal values."""
+    """The equations with these uncertain quantities free, all others at their nominal values, and constants gathered:
+    an input with an error of 0 is the input."""
     still = {name: None for name in system.ranges if name not in set(acting)}
-    return system.with_ranges(still).uncertain_dynamics()
+    return tuple(map(gathered, system.with_ranges(still).uncertain_dynamics()))
 
 
 def settle(

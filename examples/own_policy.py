@@ -14,14 +14,14 @@ import scipy.linalg
 import torch
 
 from certify import RoaResult, certify_roa, get_system
-from certify.systems import linearise
+from certify.systems import in_floats, linearise
 
 TORQUE = 6.0  # N m, what the pendulum's motor can do
 
 
 def trained(seed: int = 0) -> torch.nn.Sequential:
     """A 2-16-1 network in [-1, 1] that has learned to answer as the LQR, saturated by tanh, does."""
-    A, B = (np.array(M, dtype=float) for M in linearise(get_system("pendulum")))
+    A, B = map(in_floats, linearise(get_system("pendulum")))
     K = B.T @ scipy.linalg.solve_continuous_are(A, B, np.eye(2), np.eye(1))
     torch.manual_seed(seed)
     net = torch.nn.Sequential(torch.nn.Linear(2, 16), torch.nn.Tanh(), torch.nn.Linear(16, 1), torch.nn.Tanh())

@@ -28,7 +28,7 @@ EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows th
     "closed_loop": "expressions policies systems",
     "containment": "certificate claims lyapunov sublevel systems",
     "coq": "certificate policies",
-    "diagnosis": "closed_loop engines lyapunov options policies results systems",
+    "diagnosis": "closed_loop engines lyapunov options policies report results systems",
     "enclosures": "closed_loop expressions lyapunov policies rigorous systems",
     "engines": "certificate claims closed_loop enclosures expressions lyapunov policies rigorous running systems",
     "float_error": "closed_loop policies rigorous systems",

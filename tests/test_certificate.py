@@ -13,17 +13,19 @@ from typing import Any
 import numpy as np
 import pytest
 
+from certify import roa
 from certify.certificate import limits, read_certificate, run_checker
 from certify.checker import ball as checker_ball
 from certify.checker import document as checker_document
 from certify.checker import exact as checker_exact
 from certify.checker import expression as checker_expression
 from certify.engines import models as producer_models
-from certify.errors import CertificateFormatError
+from certify.errors import CertificateFormatError, InputError
 from certify.expressions import Number, from_tree, symbols, tan, to_tree
 from certify.roa import RoaOptions, certify_roa
 from certify.systems import available_systems, get_system
-from tests.support.loops import pendulum_network
+from certify.verdict import Verdict
+from tests.support.loops import pendulum_network, scalar_tanh
 
 Document = dict[str, Any]
 
@@ -209,6 +211,32 @@ def test_bytes_that_are_no_certificate(
     got = run_checker(tmp_path / "c.json")
     assert (got["result"], got["rule"]) == ("REJECTED", "format")
     assert any(word in got["detail"] for word in detail.split("|")), got
+
+
+@pytest.mark.parametrize("at", ["numbers", "operations"])
+def test_what_no_checker_takes_ends_in_words(at: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A run asks again with patience where that may help, lowers the level, and leaves no certificate behind."""
+    asked = []
+
+    def too_large(path: Path, jobs: int = 1, patient: bool = False) -> dict[str, Any]:
+        asked.append(patient)
+        return {"result": "REJECTED", "rule": "limits", "at": at, "detail": "the file asks for 1e20"}
+
+    monkeypatch.setattr(roa, "run_checker", too_large)
+    with pytest.raises(InputError, match=f"take no certificate of this size: the file asks for 1e20.*{at}"):
+        certify_roa(*scalar_tanh(), tmp_path)
+    assert (True in asked) is (at == "operations") and not list(tmp_path.glob("certificate.json"))
+
+
+def test_a_check_that_needs_patience_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def slow(path: Path, jobs: int = 1, patient: bool = False) -> dict[str, Any]:
+        if patient:
+            return run_checker(path)
+        return {"result": "REJECTED", "rule": "limits", "at": "operations", "detail": "the file asks for 1e20"}
+
+    monkeypatch.setattr(roa, "run_checker", slow)
+    result = certify_roa(*scalar_tanh(), tmp_path)
+    assert result.verdict is Verdict.PROVED and "certify check --patient" in str(result.notice)
 
 
 def test_the_limits_are_the_checker_s() -> None:

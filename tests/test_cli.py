@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import json
 import os
 import signal
 import subprocess
 import sys
-import threading
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,11 +16,17 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import typer
 
-from certify.cli import _run
+from certify.arguments import with_domains
+from certify.certificate import checking, model
+from certify.cli import _run, app
 from certify.commands.terminal import ring_line
+from certify.commands.typed import options_of
 from certify.engines.base import Progress
+from certify.options import RoaOptions
 from certify.policies import Policy, TanhNetwork, load_policy, save_policy
+from certify.systems import get_system
 from tests.support.loops import chain, pendulum_network
 
 SHIPPED = Path(__file__).parent.parent / "examples" / "policies" / "pendulum.pt"
@@ -234,7 +240,7 @@ def test_bad_policies_exit_2_and_overwrite_nothing(
         (["--level", "x"], "--level"),
         (["--candidate", "sos"], "candidate"),
         (["--device", "tpu"], "device"),
-        (["--time-limit", "0"], "time_limit"),
+        (["--time-limit", "0"], "--time-limit must be positive; found 0"),
         (["--bogus"], "--bogus"),
     ],
 )
@@ -247,6 +253,109 @@ def test_bad_options_exit_2(
     assert not list(out_folder.glob("*"))
     status, out, _ = run(capsys, "roa", "--policy", policy_file, "--out", out_folder, *arguments, "--json")
     assert status == 2 and message in json.loads(out)["error"]
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments", "message"),
+    [
+        ("reach", ["--from", "q=1"], "--from must name states of pendulum, theta, theta_dot; found q"),
+        ("reach", ["--from", "theta=99"], "--from must lie in the interior of the domain, theta between -3.14 and"),
+        ("reach", ["--from", "theta=1", "--kind", "zip"], "--kind must be one of"),
+        ("reach", ["--from", "theta=1", "--kind", "onnx"], "--kind must be left out: "),
+        ("reach", ["--from", "theta=1", "--time-limit", "-1"], "--time-limit must be positive; found -1"),
+        ("roa", ["--precision", "2"], "--precision must lie between 0 and 1; found 2"),
+        ("roa", ["--cluster-checks"], "--cluster-checks must have a --cluster"),
+        ("roa", ["--lyapunov-level", "1"], "--lyapunov-level must be the level of a function; give one as --lyapunov."),
+        ("roa", ["--box", "q=1"], "--box must name states of pendulum"),
+        ("roa", ["--enlarge", "--claim", "practical"], "--enlarge looks for a tube"),
+        ("roa", ["--Q", "1"], "--Q must have 2 positive numbers"),
+        ("roa", ["--claim", "global"], "--claim must be one of auto, asymptotic, practical, nearby; found 'global'"),
+        ("roa", ["--around", "rest", "--claim", "asymptotic"], "--around rest needs another --claim than asymptotic"),
+        ("roa", ["--candidate", "neural", "--rate", "1"], "--candidate neural needs the engine bounds"),
+        ("float-error", ["--tanh-ulp", "-1"], "--tanh-ulp must be a number from 0"),
+        ("float-error", ["--chain", "0"], "--chain must be at least 1"),
+    ],
+)
+def test_an_option_is_named_as_it_is_typed(
+    command: str, arguments: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = [] if command == "float-error" else ["--out", str(tmp_path / "o")]
+    for last in ([], ["--json"]):
+        status, said, err = run(capsys, command, SHIPPED, *arguments, *out, *last)
+        found = json.loads(said)["error"] if last else err
+        assert status == 2 and message in found and "`" not in found
+
+
+def test_each_option_that_python_refuses_by_name_is_an_option_of_the_command_line() -> None:
+    """Whoever adds a field to the options and a message about it need not think of how it is typed."""
+    command = typer.main.get_command(app)
+    options = {name: options_of(command.commands[name]) for name in ("roa", "reach")}  # type: ignore[attr-defined]
+    only_in_python = {"P"}
+    for one in dataclasses.fields(RoaOptions):
+        known = options["reach"] if one.name == "reach_from" else options["roa"]
+        assert one.name in known or one.name in only_in_python, one.name
+    assert options["reach"]["reach_from"] == "--from" and options["roa"]["dreal_precision"] == "--precision"
+
+
+def test_the_policy_may_be_the_first_word(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    plain = ["--level", "0.3", "--quiet", "--json"]
+    status, out, _ = run(capsys, "roa", SHIPPED, "--out", tmp_path, *plain)
+    assert status == 0 and json.loads(out)["policy"]["sha256"] == load_policy(SHIPPED).network.sha256()
+    twice = str(SHIPPED.parent / ".." / "policies" / SHIPPED.name)
+    assert run(capsys, "roa", SHIPPED, "--policy", twice, "--out", tmp_path, *plain)[0] == 0
+    for command, more in (("roa", []), ("reach", ["--from", "theta=1"])):
+        status, _, err = run(capsys, command, SHIPPED, "--policy", tmp_path / "other.pt", *more)
+        assert status == 2 and f"found {SHIPPED} and --policy {tmp_path / 'other.pt'}" in err
+        status, _, err = run(capsys, command, *more)
+        assert status == 2 and f"a policy file must be named, as in certify {command} policy.pt" in err
+
+
+def test_what_to_try_next_names_a_policy_that_was_the_first_word(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, out, _ = run(capsys, "roa", SHIPPED, "--max-boxes", "3", "--out", tmp_path, "--json", "--quiet")
+    command = json.loads(out)["diagnosis"]["next"]["command"]
+    assert status == 0 and command.startswith(f"certify roa {SHIPPED} ") and "--max-boxes 30" in command
+
+
+def test_a_certificate_of_another_version_is_told_who_reads_it(
+    certificate: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = certificate.read_text()
+    certificate.write_text(text.replace("certify-certificate/8", "certify-certificate/7", 1))
+    earlier = "commit eb6ab75 of certify was the last to read it. To have a certificate of today, run certify roa again"
+    for command, status, *more in (
+        ("check", 1),
+        ("check", 1, "--json"),
+        ("check", 1, "--reference"),
+        ("contains", 2, "theta=0"),
+        ("report", 2),
+        ("plot", 2, "--out", tmp_path / "f.svg"),
+        ("prove-in-coq", 2, "--out", tmp_path / "coq"),
+    ):
+        found, out, err = run(capsys, command, certificate, *more)
+        assert found == status and earlier in err and ("REJECTED" in out) == (command == "check")
+    certificate.write_text(text.replace("certify-certificate/8", "certify-certificate/99", 1))
+    assert "A later release of certify wrote it" in run(capsys, "check", certificate)[2]
+    for other in ("certify-policy/1", "certify-certificate/x", "certify-certificate/8"):
+        certificate.write_text(text.replace('"certify-certificate/8"', f'"{other}"', 1).replace('"rational"', '"odd"'))
+        assert "release" not in run(capsys, "check", certificate)[2]
+
+
+@pytest.mark.parametrize("words", [["theta=0.02", "theta_dot=-0.1..0.1"], ["theta=0.02 , theta_dot = -0.1:0.1"]])
+def test_states_come_with_commas_or_without(
+    words: list[str], certificate: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    status, out, _ = run(capsys, "contains", certificate, *words, "--json")
+    found = json.loads(out)
+    assert status == 0 and found["box"] == {"theta": ["1/50", "1/50"], "theta_dot": ["-1/10", "1/10"]}
+    status, _, err = run(capsys, "contains", certificate, *words, "theta=1")
+    assert status == 2 and "found theta twice" in err
+
+
+@pytest.mark.parametrize("interval", ["theta=-1..2", "theta=-1:2"])
+def test_a_domain_is_written_as_all_ranges_are(interval: str) -> None:
+    assert with_domains(get_system("pendulum"), [interval]).domain[0] == (-1, 2)
 
 
 def test_an_output_folder_that_cannot_be_written(
@@ -332,17 +441,26 @@ def test_a_wrong_policy_is_named_however_deep_the_provenance_nests(
     assert run(capsys, "check", certificate, "--policy", policy_file)[0] in (0, 1)  # or too deep to be read at all
 
 
-def test_a_wrong_policy_is_named_when_the_certificate_comes_through_a_pipe(
-    tmp_path: Path, proved: bytes, policy_file: Path, capsys: pytest.CaptureFixture[str]
+def test_a_wrong_policy_is_named_when_the_certificate_is_there_for_one_reader(
+    tmp_path: Path,
+    proved: bytes,
+    policy_file: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    pipe = tmp_path / "pipe"
-    os.mkfifo(pipe)
+    """The file is gone when the checker has read it: its answer alone says whose policy it is."""
+    path, ask = tmp_path / "once.json", checking.ask
+
+    def once(path: Path, *arguments: Any) -> tuple[int, dict[str, Any]]:
+        answer = ask(path, *arguments)
+        path.unlink()
+        return answer
+
+    monkeypatch.setattr(checking, "ask", once)
     for policy, expected in ((SHIPPED, (1, "REJECTED rule=policy")), (policy_file, (0, "ACCEPTED "))):
-        writer = threading.Thread(target=pipe.write_bytes, args=(proved,), daemon=True)
-        writer.start()
-        status, out, _ = run(capsys, "check", pipe, "--policy", policy)
-        writer.join(timeout=10)
-        assert (status, out.splitlines()[-1][: len(expected[1])]) == expected
+        path.write_bytes(proved)
+        status, out, _ = run(capsys, "check", path, "--policy", policy)
+        assert (status, out.splitlines()[-1][: len(expected[1])]) == expected and not path.exists()
 
 
 def test_a_file_whose_name_is_an_option_is_a_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -378,7 +496,7 @@ def test_a_beta_that_is_not_the_rounded_one_is_refused(
 def test_practical_stability_from_the_command_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     plain = SHIPPED.parent / "without_gain" / "pendulum.pt"
     status, out, err = run(capsys, "roa", "--policy", plain, "--out", tmp_path, "--claim", "asymptotic")
-    assert (status, out) == (2, "") and "claim practical stability" in err
+    assert (status, out) == (2, "") and "--claim practical" in err
     arguments = ("roa", "--policy", plain, "--claim", "practical", "--candidate", "lqr", "--out", tmp_path)
     status, out, _ = run(capsys, *arguments)
     assert status == 0 and "enters" in out and "converge" not in out and "floor c0" in out
@@ -408,15 +526,19 @@ def test_both_checkers_refuse_a_level_that_was_not_proved(
 
 
 def test_a_report_is_about_the_bytes_that_were_checked(
-    tmp_path: Path, proved: bytes, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, proved: bytes, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A pipe gives each reader other bytes: there is one reader, and the page names what it read."""
-    pipe, page = tmp_path / "pipe", tmp_path / "page.html"
-    os.mkfifo(pipe)
-    writer = threading.Thread(target=pipe.write_bytes, args=(proved,), daemon=True)
-    writer.start()
-    status, out, _ = run(capsys, "report", pipe, "--out", page)
-    writer.join(timeout=10)
+    """The file gives each reader other bytes: there is one reader, and the page names what it read."""
+    path, page, read_raw = tmp_path / "once.json", tmp_path / "page.html", model.read_raw
+
+    def once(path: Path) -> bytes:
+        raw = read_raw(path)
+        path.write_bytes(b"{}")
+        return raw
+
+    path.write_bytes(proved)
+    monkeypatch.setattr(model, "read_raw", once)
+    status, out, _ = run(capsys, "report", path, "--out", page)
     assert status == 0 and out.startswith("ACCEPTED")
     assert hashlib.sha256(proved).hexdigest() in page.read_text() and "PROVED" in page.read_text()
 
@@ -501,7 +623,7 @@ def test_a_state_in_the_proved_set_needs_no_tube(
         (("--from", "q=1"), "must name states of soft_spring, p, v; found q"),
         (("--from", "p"), "--from takes NAME=VALUE"),
         (("--from", "p=one"), "one"),
-        (("--from", "p=1", "--box", "q=1"), "`box` must name states"),
+        (("--from", "p=1", "--box", "q=1"), "--box must name states"),
         (("--from", "p=1", "--box", "p=-1"), "positive half-widths"),
     ],
 )
@@ -581,7 +703,7 @@ def test_three_ways_in_make_one_plant(
         (("--input-error", "some"), "`--input-error` must be a finite number"),
         (("--param", "k=0.9..1.1", "--enlarge"), "a tube must be of exact equations"),
         (("--param", "k=0.9..1.1", "--box", "p=0.1"), "a tube must be of exact equations"),
-        (("--param", "k=0.9..1.1", "--engine", "dreal"), "`engine` must be bounds where something is uncertain"),
+        (("--param", "k=0.9..1.1", "--engine", "dreal"), "--engine must be bounds where something is uncertain"),
         (("--disturbance", "wind=0.1", "--engine", "both"), "found ranges of wind in soft_spring"),
     ],
 )

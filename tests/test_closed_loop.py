@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from fractions import Fraction
 
 import flint
@@ -13,7 +14,7 @@ from certify.errors import InputError
 from certify.expressions import Number, Symbol, symbols
 from certify.policies import TanhNetwork
 from certify.rigorous import eigenvalues, evaluate_policy, evaluate_vdot
-from certify.systems import System
+from certify.systems import System, get_system
 from tests.support.loops import box, chain, pendulum_network, scalar_tanh
 
 
@@ -87,3 +88,27 @@ def test_nonzero_equilibrium_input() -> None:
     with flint.ctx.workprec(200):
         assert (10 * value).contains(3) and float(value.rad()) < 1e-40
     assert evaluate_vdot(loop, np.eye(1), np.array([0.5])) < 0
+
+
+def test_a_policy_that_is_not_centred_is_told_by_how_much_and_what_to_type() -> None:
+    """Of pi(0), where it is no fraction, the message says what it is about, and options as they are typed."""
+    system = get_system("pendulum")
+    base = pendulum_network((8, 8))
+    off = replace(base, biases=tuple(b + 0.1 for b in base.biases), centre="none")
+    with pytest.raises(InputError, match=r"exactly u_eq = 0; its input u is about -?\d\.\d+\. .*--centre output or"):
+        ClosedLoop(system, off).require_rest()
+    value = float(off(np.zeros(2), (Fraction(0),))[0])
+    with pytest.raises(InputError, match=f"about {value:.9g}"):
+        ClosedLoop(system, off).require_rest()
+    near = replace(off, biases=(*off.biases[:-1], off.biases[-1] - np.arctanh(value / off.scale[0])))
+    with pytest.raises(InputError, match="whether exactly that cannot be decided: tanh at the operating point"):
+        ClosedLoop(system, near).require_rest()
+    plain = replace(off, squash="identity")
+    with pytest.raises(InputError, match=r"with --centre output, or ask for less with --claim practical"):
+        ClosedLoop(system, plain).require_rest()
+
+
+def test_a_loop_that_rests_nowhere_for_all_values_is_told_so() -> None:
+    system = get_system("pendulum").with_input_errors({"u": Fraction(1, 10)})
+    with pytest.raises(InputError, match=r"whatever error_u may be; theta_dot' depends on that there. Ask for --claim"):
+        ClosedLoop(system, pendulum_network((8, 8))).require_rest()

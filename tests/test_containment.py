@@ -203,7 +203,7 @@ def test_what_is_no_box_is_refused(wrong: Box) -> None:
 
 
 def test_a_containment_is_no_bool() -> None:
-    with pytest.raises(TypeError, match="compare it with `is`"):
+    with pytest.raises(TypeError, match="is no bool"):
         bool(Containment.NOT_CONTAINED)
 
 

@@ -472,9 +472,9 @@ def test_the_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
 @pytest.mark.parametrize(
     ("given", "message"),
     [
-        (["--chain", "2"], "`chain` must be at least 4"),
-        (["--tanh-ulp", "-1"], "`tanh_ulp` must be a number"),
-        (["--boxes", "0"], "`boxes` must be at least 1"),
+        (["--chain", "2"], "--chain must be at least 4"),
+        (["--tanh-ulp", "-1"], "--tanh-ulp must be a number"),
+        (["--boxes", "0"], "--boxes must be at least 1"),
         (["--domain", "nothing=1"], "no state 'nothing'"),
         (["--system", "cartpole"], "must read 4 states"),
     ],

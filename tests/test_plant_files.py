@@ -146,7 +146,8 @@ def test_a_report_and_the_terminal_say_the_operating_point(tmp_path: Path, capsy
     arguments += ["--candidate", "lyapunov"]
     assert _run([*arguments, "--out", str(tmp_path / "o"), "--time-limit", "20"], False) == 0
     out, err = capsys.readouterr()
-    assert "operating point" in out and "level = 0.333333 m" in out and "level (m)" in out
+    assert "operating point" in out and "level = 0.333333 m" in out and "level − 0.333333 (m)" in out
+    assert "attracted by the operating point" in out and "lengths are deviations from it" in " ".join(out.split())
     assert "trained" not in err
     page = (tmp_path / "o" / "report.html").read_text()
     assert "deviations from the operating point level = 0.333333 m, flow = 0.037037 m/s" in page
@@ -229,6 +230,22 @@ LINES = {line: k for k, line in enumerate(TANK.splitlines(), 1)}
         ("level**3", "level**0.5", 'level = "flow - level**3"', ["exponent", "integer", "1/2"]),
         ("level**3", "level # **3", 'level = "flow - level**3"', ["# begins no comment"]),
         ("level**3", "2(level)", 'level = "flow - level**3"', ["2 is no function", "2*(...)"]),
+        ("level**3", "np.sin(level)", 'level = "flow - level**3"', ["for np.sin(level) write sin(level)."]),
+        ("level**3", "math.sin(2*level)", 'level = "flow - level**3"', ["for math.sin(2*level) write sin(2*level)."]),
+        ("level**3", "sympy.tanh(level)", 'level = "flow - level**3"', ["write tanh(level)."]),
+        ("level**3", "torch.cos(level)", 'level = "flow - level**3"', ["write cos(level)."]),
+        ("level**3", "numpy.arctan(level)", 'level = "flow - level**3"', ["write atan(level)."]),
+        ("level**3", "arctan(level)", 'level = "flow - level**3"', ["for arctan(level) write atan(level)."]),
+        ("level**3", "np.power(level, 3)", 'level = "flow - level**3"', ["write level**3."]),
+        ("level**3", "power(level + u, 3)", 'level = "flow - level**3"', ["write (level + u)**3."]),
+        ("level**3", "abs(level)", 'level = "flow - level**3"', ["write sqrt(level**2 + 1e-6)", "must be smooth"]),
+        ("level**3", "np.sign(level)", 'level = "flow - level**3"', ["write tanh(50*level)", "must be smooth"]),
+        ("level**3", "pi*level", 'level = "flow - level**3"', ["'pi' is no state", "a number, 3.141592653589793,"]),
+        ("level**3", "np.pi*level", 'level = "flow - level**3"', ["for np.pi write", "3.141592653589793,"]),
+        ("level**3", "level if level > 0 else 0", 'level = "flow - level**3"', ["there are no cases", "1 + tanh("]),
+        ("level**3", "(level > 0)*u", 'level = "flow - level**3"', ["'level > 0' is not allowed", "no cases"]),
+        ("level**3", "max(level, 0)", 'level = "flow - level**3"', ["max(level, 0) is not allowed", "[input_bounds]"]),
+        ("level**3", "np.gamma(level)", 'level = "flow - level**3"', ["np.gamma is not supported; supported are sin"]),
         ("level**3", "level % 3", 'level = "flow - level**3"', ["'level % 3'"]),
         ("level**3", "level/0", 'level = "flow - level**3"', ["divides by 0"]),
         ("level**3", "0x10*level", 'level = "flow - level**3"', ["'0x10'"]),

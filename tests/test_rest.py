@@ -233,7 +233,7 @@ def test_without_a_stable_point_of_rest_it_is_not_asked_for(tmp_path: Path) -> N
     for options in (RoaOptions(around="rest"), RoaOptions(around="rest", claim="practical")):
         with pytest.raises(InputError, match="stable point of rest"):
             certify_roa(loop.system, loop.network, tmp_path, options)
-    with pytest.raises(InputError, match="`around` the rest needs another claim"):
+    with pytest.raises(InputError, match="`around` rest needs another `claim`"):
         RoaOptions(around="rest", claim="asymptotic")
     loop = bent("output")
     with pytest.raises(InputError, match="without centring"):

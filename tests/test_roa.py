@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import json
+import pickle
 from collections.abc import Callable
 from fractions import Fraction
 from pathlib import Path
@@ -19,6 +21,7 @@ from torch import Tensor
 from certify.certificate import Certificate, checking, run_checker, sole_writer
 from certify.claims import Problem
 from certify.closed_loop import ClosedLoop
+from certify.containment import Containment
 from certify.engines.base import Progress
 from certify.engines.bounds.rule import BoxBounds, VdotBound
 from certify.engines.falsify import Witness, refutes
@@ -268,9 +271,24 @@ def test_bad_weights(tmp_path: Path) -> None:
 
 
 def test_a_verdict_is_not_a_bool() -> None:
-    with pytest.raises(TypeError, match="four values"):
+    with pytest.raises(TypeError, match="is no bool"):
         bool(Verdict.PROVED)
     assert {v.name: v.exit_status for v in Verdict} == {"PROVED": 0, "TRUSTED": 3, "REFUTED": 1, "UNKNOWN": 3}
+
+
+def test_a_verdict_is_equal_to_its_name_and_to_no_other_text() -> None:
+    for verdict in Verdict:
+        assert [one for one in Verdict if one == verdict.value] == [verdict]
+        assert verdict != Verdict("UNKNOWN" if verdict is Verdict.PROVED else "PROVED").value
+        assert hash(verdict) == hash(verdict.value) and {verdict: 1}[verdict.value] == 1  # type: ignore[index]
+        assert pickle.loads(pickle.dumps(verdict)) is verdict and copy.deepcopy(verdict) is verdict
+    for slip in ("proved", "PROOVED", "", "accepted"):
+        with pytest.raises(ValueError, match=r"a Verdict must be compared with one of 'PROVED', .*; found"):
+            bool(slip == Verdict.PROVED)
+        with pytest.raises(ValueError, match="must be compared"):
+            bool(slip != Verdict.UNKNOWN)
+    assert Verdict.PROVED != 1 and Verdict.PROVED is not None and Containment.CONTAINED != Verdict.PROVED
+    assert Containment.CONTAINED == "contained" and Containment.UNDECIDED != "contained"
 
 
 def test_every_registered_plant_can_be_named() -> None:

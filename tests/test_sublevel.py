@@ -17,7 +17,8 @@ from hypothesis import strategies as st
 from certify.errors import InputError
 from certify.expressions import as_expression, cos, exp, sin, sqrt, symbols, tan, tanh
 from certify.lyapunov import Neural, Symbolic
-from certify.rigorous import ball, function_on, precision
+from certify.lyapunov.rigorous import function_on
+from certify.rigorous import ball, precision
 from certify.sublevel import Sublevel
 
 F = Fraction

@@ -33,7 +33,11 @@ def command(program: Program, arguments: list[str]) -> list[str]:
 
 
 def ask(
-    path: Path, program: Program = "checker", jobs: int = 1, part: tuple[int, int] | None = None
+    path: Path,
+    program: Program = "checker",
+    jobs: int = 1,
+    part: tuple[int, int] | None = None,
+    patient: bool = False,
 ) -> tuple[int, dict[str, Any]]:
     """Run a checker on a file in a process of its own: its exit status and its JSON answer.
 
@@ -43,6 +47,7 @@ def ask(
     program : which of the two.
     jobs : in how many processes it examines the leaves; the reference knows of one only.
     part : K and N, for the answer of part K of N in the place of an acceptance; of the checker only.
+    patient : whether it may take a file that needs hours, which its rule `limits` refuses else.
 
     Raises
     ------
@@ -53,6 +58,7 @@ def ask(
         raise InputError("the reference must be asked for the whole in one process; leave out `jobs` and parts.")
     shares = [] if jobs == 1 else ["--jobs", str(jobs)]
     shares += [] if part is None else ["--part", "/".join(map(str, part))]
+    shares += ["--patient"] if patient else []
     line = command(program, ["--json", *shares, "--", str(path)])
     done = subprocess.run(line, capture_output=True, text=True, check=False, stdin=subprocess.DEVNULL)
     try:
@@ -66,14 +72,15 @@ def ask(
     return done.returncode, answer
 
 
-def run_checker(path: Path, program: Program = "checker", jobs: int = 1) -> dict[str, Any]:
-    """The JSON answer of a checker that came to a verdict, having examined the leaves in so many processes.
+def run_checker(path: Path, program: Program = "checker", jobs: int = 1, patient: bool = False) -> dict[str, Any]:
+    """The JSON answer of a checker that came to a verdict, having examined the leaves in so many processes;
+    `patient` lets it take a file that needs hours.
 
     Raises
     ------
     BackendError : it ended with neither ACCEPTED, nor TRUSTED, nor REJECTED.
     """
-    return _verdict(program, *ask(path, program, jobs))
+    return _verdict(program, *ask(path, program, jobs, patient=patient))
 
 
 def run_part(path: Path, number: int, of: int, jobs: int = 1) -> dict[str, Any]:

@@ -12,7 +12,9 @@ from __future__ import annotations
 
 import base64
 import json
+import os
 import re
+import stat
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
@@ -22,6 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from certify.certificate.formats import SCHEMA, other_version
 from certify.claims import CLAIMS, Claim, Enlarged, Outer, Reached
 from certify.errors import CertificateFormatError, InputError
 from certify.expressions import Number, Symbol, from_tree, to_tree
@@ -33,7 +36,6 @@ from certify.systems import System
 from certify.systems.system import Interval
 
 Array = NDArray[np.float64]
-SCHEMA = "certify-certificate/8"
 MAX_BYTES = 256 * 2**20
 _LONGEST_UNIT = 40
 _OF_A_BALL = ("J", "multipliers", "weight")
@@ -263,10 +265,16 @@ def read_raw(path: Path) -> bytes:
 
     Raises
     ------
-    CertificateFormatError : the file cannot be read, or is larger than a certificate may be.
+    CertificateFormatError : the file cannot be read, is no regular file, or is larger than a certificate may be.
     """
     try:
-        with path.open("rb") as stream:
+        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))  # nobody may ever write into a pipe
+        with open(descriptor, "rb") as stream:
+            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+                raise CertificateFormatError(
+                    f"{path} must be a regular file; it is a folder, a pipe, a socket or a device. Name the "
+                    "certificate's own file."
+                )
             raw = stream.read(MAX_BYTES + 1)
     except OSError as error:
         raise CertificateFormatError(f"{path} cannot be read: {error.strerror}.") from error
@@ -300,7 +308,10 @@ def parse_certificate(raw: bytes, name: str) -> Certificate:
     try:
         data = json.loads(raw.decode("utf-8"))
         if data["schema"] != SCHEMA:
-            raise CertificateFormatError(f"{name}: `schema` must be {SCHEMA!r}; found {data['schema']!r}.")
+            known = other_version(data["schema"])
+            raise CertificateFormatError(
+                f"{name}: `schema` must be {SCHEMA!r}; found {data['schema']!r:.60}.{f' {known}' if known else ''}"
+            )
         kind = data["claim"]["kind"]
         if kind not in CLAIMS:
             raise CertificateFormatError(f"{name}: `claim.kind` must be one of {', '.join(CLAIMS)}; found {kind!r}.")

@@ -1,4 +1,4 @@
-"""`python -I -m certify.checker FILE [--json] [--jobs N] [--part K/N]`: check one certificate.
+"""`python -I -m certify.checker FILE [--json] [--jobs N] [--part K/N] [--patient]`: check one certificate.
 
 Exit status: 0 accepted, 1 rejected, 2 usage or unreadable file, 3 trusted (the evidence is a solver's word, which
 cannot be checked; what can be was), 4 nothing was refused in one part, which is no acceptance, 70 internal error.
@@ -26,6 +26,7 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--jobs", metavar="N", type=_jobs, default=1, help="examine the leaves in N processes")
     parser.add_argument("--part", metavar="K/N", type=_part, help="of the leaves, only those of part K of N")
+    parser.add_argument("--patient", action="store_true", help="take a file that may need hours")
     try:
         options = parser.parse_args(arguments)
     except SystemExit as stop:
@@ -33,7 +34,7 @@ def main(arguments: list[str]) -> int:
     # Threads of several processes would wait for each other. numpy reads this when it is first imported: below.
     os.environ |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     try:
-        status, answer = _examine(options.file, options.part, options.jobs)
+        status, answer = _examine(options.file, options.part, options.jobs, options.patient)
     except Rejected as no:
         status, answer = 1, {"result": "REJECTED", "rule": no.rule, "at": no.at, "detail": no.detail, "text": [str(no)]}
     except Unreadable as error:
@@ -64,7 +65,7 @@ def _part(text: str) -> tuple[int, int]:
     return number, of
 
 
-def _examine(path: str, share: tuple[int, int] | None, jobs: int) -> tuple[int, dict[str, Any]]:
+def _examine(path: str, share: tuple[int, int] | None, jobs: int, patient: bool) -> tuple[int, dict[str, Any]]:
     """Status and answer of a certificate that no rule refuses."""
     from . import document, words
 
@@ -75,7 +76,7 @@ def _examine(path: str, share: tuple[int, int] | None, jobs: int) -> tuple[int, 
     from .parts import Part
 
     ready, part = time.perf_counter(), Part(*share or (1, 1))
-    tally = rules.check(c, part, jobs)
+    tally = rules.check(c, part, jobs, patient)
     seconds = {"start": ready - start, "check": time.perf_counter() - ready}
     answer: dict[str, Any] = {"certificate_sha256": c.sha256, "policy_sha256": c.policy.sha256(), "claim": c.claim}
     sample = None if c.sample is None else [str(h) for h in c.sample]

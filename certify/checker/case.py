@@ -25,6 +25,7 @@ class Case:
 
     c: Certificate
     part: Part = field(default_factory=Part)
+    patient: bool = False  # whether somebody has said that it may take hours
 
     @property
     def partition(self) -> Partition:

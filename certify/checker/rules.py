@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from . import ball, boxes, contraction, local, outer, ring, tube
+from . import ball, boxes, contraction, limits, local, outer, ring, tube
 from .case import Case, Failures
 from .document import Certificate, Partition
 from .errors import Rejected
@@ -98,8 +98,9 @@ def centring(case: Case) -> Failures:
 Subject = TypeVar("Subject")
 Table = Sequence[tuple[str, Callable[[Subject], Failures]]]
 
-STATED: Table[Case] = tuple(
-    (rule.__name__, rule) for rule in (levels, lyapunov, equilibrium, domain, coordinates, root, centring)
+STATED: Table[Case] = (
+    ("limits", limits.is_bearable),
+    *((rule.__name__, rule) for rule in (levels, lyapunov, equilibrium, domain, coordinates, root, centring)),
 )
 ON_THE_BALL: Table[local.Local] = (
     ("local", local.fits),
@@ -165,19 +166,20 @@ class Tally:
         return {name: count - self.by_leaf.get(name, 0) for name, count in self.rules.items()}
 
 
-def check(c: Certificate, part: Part | None = None, jobs: int = 1) -> Tally:
+def check(c: Certificate, part: Part | None = None, jobs: int = 1, patient: bool = False) -> Tally:
     """Check every rule; returns the tally, raises `Rejected` at the first rule that fails.
 
     Of a part, the rules for leaves look at its leaves only: the caller must not say ACCEPTED. Nor where evidence cannot
     be replayed, of which only the rules about what is stated are checked; the tally then has no leaves. From the first
-    leaf on, each of `jobs` processes does with a part of its own what one would do.
+    leaf on, each of `jobs` processes does with a part of its own what one would do. Rule `limits` takes files that need
+    hours if the caller is `patient`.
     """
     self_test()
     np.empty(_KEPT)  # given back at once: an allocator that adapts then keeps arrays, and need not ask for each anew
     replayed = isinstance(c.evidence, Partition)
     spared = {"equilibrium": c.practical, "coordinates": not replayed, "root": not replayed}
     with np.errstate(all="ignore"):  # overflow becomes infinity or NaN, and every test then fails
-        tally, case = Tally(), Case(c, part or Part())
+        tally, case = Tally(), Case(c, part or Part(), patient)
         tally.hold([(name, rule) for name, rule in STATED if not spared.get(name)], case)
         if not replayed:
             return tally

@@ -7,7 +7,9 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
+import stat
 from typing import Any, NoReturn
 
 from .errors import Rejected, Unreadable
@@ -26,7 +28,10 @@ def fail(at: str, detail: str) -> NoReturn:
 def load(path: str) -> tuple[Any, str]:
     """The JSON value in the file at `path`, and the sha256 of its bytes; raises `Unreadable` or `Rejected`."""
     try:
-        with open(path, "rb") as stream:
+        descriptor = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))  # nobody may ever write into a pipe
+        with open(descriptor, "rb") as stream:
+            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+                raise Unreadable(f"{path} cannot be read: it is not a regular file")
             raw = stream.read(MAX_BYTES + 1)
     except OSError as error:
         raise Unreadable(f"{path} cannot be read: {error.strerror}") from error

@@ -6,14 +6,14 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from certify import arguments
-from certify.arguments import layers, numbers, region, state, widths, with_params
+from certify.arguments import ends_of, layers, numbers, region, state, widths, with_params
 from certify.commands.terminal import tell
 
 if TYPE_CHECKING:
     from certify.policies import Policy
     from certify.systems import System
 
-__all__ = ["layers", "numbers", "plant_of", "region", "state", "widths", "with_params"]
+__all__ = ["ends_of", "layers", "numbers", "plant_of", "region", "state", "widths", "with_params"]
 
 
 def plant_of(

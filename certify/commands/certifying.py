@@ -6,7 +6,8 @@ import json
 import shlex
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
+from dataclasses import fields
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +19,7 @@ from certify.commands.arguments import region
 from certify.commands.contains import stated, text
 from certify.commands.shared import write
 from certify.commands.terminal import ProgressLine, load_tables, say, show, tell
+from certify.commands.typed import as_typed, options_of
 from certify.ending import Interrupted
 
 if TYPE_CHECKING:
@@ -100,10 +102,13 @@ def certified(
         if progress is not None:
             progress.close()
     data = result.to_dict()
-    if data["diagnosis"] is not None and data["diagnosis"]["next"]["options"]:
-        data["diagnosis"]["next"]["command"] = _command(context, data["diagnosis"]["next"]["options"])
+    following = {} if data["diagnosis"] is None else data["diagnosis"]["next"]
+    if following.get("flatten"):
+        following["command"] = _flattened(context, policy)
+    elif following.get("options"):
+        following["command"] = _command(context, following["options"])
     if result.notice is not None:
-        note(result.notice)
+        note(as_typed(result.notice, options_of(context.command)))
     if result.certificate is not None and result.raw is not None:
         answer = None if result.checker is None else dict(result.checker)
         write(folder / "report.html", drawing.page_of(result.raw, result.certificate, answer, data))
@@ -153,20 +158,58 @@ def _known(context: typer.Context) -> list[str]:
 def _command(context: typer.Context, changed: Mapping[str, str]) -> str:
     """The command that was given, with these options instead of those it had; a search that is resumed has its own."""
     known = _known(context) if "--resume" in changed else []
-    parts = ["certify", str(context.info_name)]
+    added = (part for pair in changed.items() for part in pair if part)
+    return shlex.join(["certify", str(context.info_name), *_given(context, changed, without=known), *added])
+
+
+def _flattened(context: typer.Context, policy: Path) -> str:
+    """The commands that fine-tune the policy for proof, after its import if it is another program's, and then the one
+    that was given about what comes of it; each policy lies beside the one that it was made from."""
+    from certify.inputs import is_own
+    from certify.policies.importers import ImportOptions
+
+    foreign = {f.name for f in fields(ImportOptions)}
+    others = {option.name or "" for option in context.command.params} - {"file", "policy", "resume"}
+    flat, plant, commands = policy.with_name(f"{policy.stem}_flat.pt"), context.params["system"], list[list[str]]()
+    if not is_own(policy, ImportOptions()):
+        read = policy.with_name(f"{policy.stem}_imported.pt")
+        said = _given(context, only=foreign | {"system", "param"})
+        said = ["--from" if part == "--kind" else part for part in said]
+        commands.append(["certify", "import", str(policy), *said, "--out", str(read)])
+        policy, others = read, others - foreign
+    named = [] if plant is None else ["--system", plant]
+    commands.append(["controllers", "flatten", str(policy), *named, "--out", str(flat)])
+    commands.append(["certify", str(context.info_name), str(flat), *_given(context, only=others)])
+    return " && ".join(map(shlex.join, commands))
+
+
+def _given(
+    context: typer.Context,
+    changed: Mapping[str, str] | None = None,
+    only: Collection[str] | None = None,
+    without: Collection[str] = (),
+) -> list[str]:
+    """The words that were given to the command, but for options that are `changed` or named in `without`; of the
+    parameters in `only`, if there are such."""
+    parts, changed = list[str](), changed or {}
     for option in context.command.params:
         source = context.get_parameter_source(option.name or "")
         name, value = max(option.opts, key=len), context.params[option.name or ""]
-        if source is None or source.name != "COMMANDLINE" or name in known:
+        if source is None or source.name != "COMMANDLINE" or name in without:
             continue
         if name in changed and not option.multiple:
             continue
+        if only is not None and option.name not in only:
+            continue
         values = list(value) if isinstance(value, list | tuple) else [value]
+        if option.param_type_name == "argument":
+            parts += map(str, values)
+            continue
         if name in changed:  # NAME=VALUE options replace those of the same name
             values = [v for v in values if v.partition("=")[0] != changed[name].partition("=")[0]]
         for each in values:
             parts += [name] if each is True else [name, str(each)]
-    return shlex.join([*parts, *(part for pair in changed.items() for part in pair if part)])
+    return parts
 
 
 def _plant_line(stored: Policy, plant: System, overridden: bool) -> str:

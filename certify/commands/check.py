@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from certify.commands.shared import Json
+from certify.commands.shared import Json, Patient
 from certify.commands.terminal import say, tell
 from certify.errors import InputError
 
@@ -35,6 +35,7 @@ def check(
             "scheduler's address."
         ),
     ] = None,
+    patient: Patient = False,
     as_json: Json = False,
 ) -> None:
     """Check a certificate with the independent checker, in a process of its own."""
@@ -46,12 +47,12 @@ def check(
 
         wanted = load_policy(policy).network.sha256()
     if cluster is not None and (reference or part is not None or jobs != 1):
-        raise InputError("`--cluster` must stand without --reference, --jobs and --part.")
+        raise InputError("--cluster must stand without --reference, --jobs and --part.")
     if cluster is not None:
-        status, answer = _by_cluster(certificate, cluster)
+        status, answer = _by_cluster(certificate, cluster, patient)
     else:
         share = None if part is None else _part(part)
-        status, answer = ask(certificate, "reference" if reference else "checker", jobs, share)
+        status, answer = ask(certificate, "reference" if reference else "checker", jobs, share, patient)
     lines = answer.pop("text", [])
     if wanted is not None and "policy_sha256" in answer and answer["policy_sha256"] != wanted:
         detail = f"the certificate is about policy {answer['policy_sha256']}, not about {policy} ({wanted})"
@@ -60,20 +61,27 @@ def check(
     if "error" in answer and not as_json:
         tell(f"certify: {answer['error']}")
         raise typer.Exit(status)
+    if answer.get("at") == "schema" and certificate.is_file():  # a pipe is read once
+        from certify.certificate import read_raw
+        from certify.certificate.formats import version_in
+
+        old = version_in(read_raw(certificate))
+        if old is not None:
+            tell(f"certify: {old}")
     say(json.dumps(answer) if as_json else "\n".join(lines))
     raise typer.Exit(status)
 
 
-def _by_cluster(certificate: Path, address: str) -> tuple[int, dict[str, Any]]:
+def _by_cluster(certificate: Path, address: str, patient: bool) -> tuple[int, dict[str, Any]]:
     from certify.parts import check_in_parts
     from certify.running.cluster import ClusterRunner, connect
 
     with connect(address) as client:
-        return check_in_parts(certificate, ClusterRunner(client))
+        return check_in_parts(certificate, ClusterRunner(client), patient)
 
 
 def _part(text: str) -> tuple[int, int]:
     number, _, of = text.partition("/")
     if not (number.isdecimal() and of.isdecimal() and 1 <= int(number) <= int(of) <= _MOST_PARTS):
-        raise InputError(f"`--part` must be K/N with 1 <= K <= N <= {_MOST_PARTS}, as in 2/8; found {text[:40]!r}.")
+        raise InputError(f"--part must be K/N with 1 <= K <= N <= {_MOST_PARTS}, as in 2/8; found {text[:40]!r}.")
     return int(number), int(of)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from certify.commands.arguments import region
-from certify.commands.shared import Json
+from certify.commands.shared import Json, Patient
 from certify.commands.terminal import say
 
 if TYPE_CHECKING:
@@ -20,18 +20,22 @@ if TYPE_CHECKING:
 def contains(
     certificate: Annotated[Path, typer.Argument(help="Certificate file.")],
     states: Annotated[
-        str, typer.Argument(help="A state or a box, as in x=1.57,x_dot=-1..1; a state that is not named is at rest.")
+        list[str],
+        typer.Argument(
+            help="A state or a box, as in x=1.57 x_dot=-1..1, or with commas; a state that is not named is at rest."
+        ),
     ],
     deviations: Annotated[
         bool, typer.Option("--deviations", help="Numbers are deviations from the operating point, not states' values.")
     ] = False,
+    patient: Patient = False,
     as_json: Json = False,
 ) -> None:
     """Check a certificate and decide, exactly, whether a state or every state of a box lies in the proved set."""
     from certify.containment import proved_set
 
-    proved = proved_set(certificate)
-    box = region(states, proved.system, "STATES", deviations)
+    proved = proved_set(certificate, patient)
+    box = region(" ".join(states), proved.system, "STATES", deviations)
     found = proved.locate(box)
     data = {
         "certificate": str(certificate),

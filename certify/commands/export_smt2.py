@@ -19,7 +19,7 @@ def export_smt2(
     out: Annotated[Path, typer.Option(help="Folder for the files, one a condition.")],
     system: Annotated[str | None, typer.Option(help="Plant, as for roa; default: what the policy file says.")] = None,
     param: Annotated[list[str] | None, typer.Option(help="Parameter of the plant, NAME=VALUE; repeatable.")] = None,
-    domain: Annotated[list[str] | None, typer.Option(help="Half-width NAME=D or interval NAME=LO:HI.")] = None,
+    domain: Annotated[list[str] | None, typer.Option(help="Half-width NAME=D or interval NAME=LO..HI.")] = None,
     candidate: Annotated[str, typer.Option(help="Lyapunov candidate, as for roa.")] = "lyapunov",
     level: Annotated[float | None, typer.Option(help="c2; default: 0.99 of the largest that is proved.")] = None,
     time_limit: Annotated[float, typer.Option(help="Seconds for everything up to the verdict.")] = 50.0,

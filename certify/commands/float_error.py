@@ -26,7 +26,7 @@ def float_error(
     system: Annotated[str | None, typer.Option(help="Plant, as for roa; default: what the policy file says.")] = None,
     param: Annotated[list[str] | None, typer.Option(help="Parameter of the plant, NAME=VALUE; repeatable.")] = None,
     domain: Annotated[
-        list[str] | None, typer.Option(help="Half-width NAME=D or interval NAME=LO:HI of a state; repeatable.")
+        list[str] | None, typer.Option(help="Half-width NAME=D or interval NAME=LO..HI of a state; repeatable.")
     ] = None,
     tanh_ulp: Annotated[
         float, typer.Option("--tanh-ulp", help="Accuracy of tanh, in units in the last place of its exact value.")

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 
 import typer
 
-from certify.commands.arguments import plant_of, with_params
+from certify.commands.arguments import ends_of, plant_of, with_params
 from certify.commands.terminal import tell
 from certify.errors import InputError
 from certify.inputs import policy_in
@@ -40,7 +42,7 @@ _OPTIONS: dict[str, Any] = {
     "epsilon": _option("What rsl_rl's normaliser adds to the standard deviation; 0.01 if nothing is said."),
     "action_scale": _option("u = scale * action + offset: one number or one for each input."),
     "action_offset": _option("See --action-scale."),
-    "clip": _option("Bounds LO:HI of the action before scale and offset, one pair or one for each input."),
+    "clip": _option("Bounds LO..HI of the action before scale and offset, one pair or one for each input."),
     "centre": _option("Make pi(0) = u_eq: output or preactivation; nothing is centred unless this asks for it."),
     "observes": _option("Whether the network reads absolute states or their deviation from the operating point."),
     "ignore": _option("Tensor that is no part of the policy, * and ? as in names of files; repeatable.", of=list[str]),
@@ -63,12 +65,24 @@ def takes_import_options(command: Callable[..., None], kind_is: str = "--from") 
     @functools.wraps(command)
     def wrapped(**given: Any) -> None:
         texts = {name: given.pop(name) for name in _OPTIONS}
-        command(**given, importing=_parsed(texts))
+        with kind_called(kind_is):
+            importing = _parsed(texts)
+        command(**given, importing=importing)
 
     parameters = [*(p.replace(kind=kind) for p in kept), *added]
     wrapped.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]
     wrapped.__annotations__ = {p.name: p.annotation for p in parameters}
     return wrapped
+
+
+@contextmanager
+def kind_called(option: str) -> Iterator[None]:
+    """Messages of what is done within, of importing alone, with the option for the kind of file called so."""
+    try:
+        yield
+    except InputError as error:
+        said = re.sub(r"--from\b", option, str(error))
+        raise error if said == str(error) else InputError(said) from error
 
 
 def policy_of(path: Path, importing: ImportOptions, system: str | None, params: list[str]) -> Policy:
@@ -154,8 +168,8 @@ def _clip(text: str | None) -> Any:
 
     if text is None:
         return None
-    pairs = [part.split(":") for part in text.split(",")]
+    pairs = [ends_of(part) for part in text.split(",")]
     if any(len(pair) != 2 for pair in pairs):
-        raise InputError(f"--clip takes LO:HI, or LO:HI,LO:HI with a pair for each input; found {text!r}.")
-    lo, hi = ([exact(pair[k].strip(), "--clip") for pair in pairs] for k in (0, 1))
+        raise InputError(f"--clip takes LO..HI, or LO..HI,LO..HI with a pair for each input; found {text!r}.")
+    lo, hi = ([exact(pair[k], "--clip") for pair in pairs] for k in (0, 1))
     return Clip(tuple(lo), tuple(hi))

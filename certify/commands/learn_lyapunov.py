@@ -13,7 +13,7 @@ import typer
 
 from certify.commands.arguments import layers, plant_of
 from certify.commands.importing import policy_of
-from certify.commands.shared import Domain, Json, PlantName, PolicyFile, Quiet
+from certify.commands.shared import Domain, Json, PlantName, PolicyArgument, PolicyFile, Quiet, the_policy
 from certify.commands.terminal import ProgressLine, say
 from certify.errors import InputError
 
@@ -35,9 +35,10 @@ _HIDDEN = "16,16"
 
 def learn_lyapunov(
     context: typer.Context,
-    policy: PolicyFile,
     importing: ImportOptions,
     out: Annotated[Path, typer.Option(help="Lyapunov file to write (.pt).")],
+    file: PolicyArgument = None,
+    policy: PolicyFile = None,
     system: PlantName = None,
     param: Annotated[list[str] | None, typer.Option(help="Parameter of the plant, NAME=VALUE; repeatable.")] = None,
     domain: Domain = None,
@@ -64,7 +65,8 @@ def learn_lyapunov(
     widths = layers(hidden or _HIDDEN, "--hidden")
     if not time_limit > 0:
         raise InputError(f"--time-limit must be positive; found {time_limit}.")
-    stored = policy_of(policy, importing, system, param or [])
+    path = the_policy(context, file, policy)
+    stored = policy_of(path, importing, system, param or [])
     plant = plant_of(stored, system, param or [], domain or [])
     progress = None if quiet else ProgressLine()
     try:
@@ -91,7 +93,7 @@ def learn_lyapunov(
     save_lyapunov(out, learned.function, plant.name, parameters, {"learned": record})
     data = {"lyapunov": str(out), "function": _described(learned.function), **record}
     data["seconds"] = time.monotonic() - start
-    say(json.dumps(data) if as_json else _text(learned, volume(P, c2), out, _next(policy, system, param, domain, out)))
+    say(json.dumps(data) if as_json else _text(learned, volume(P, c2), out, _next(path, system, param, domain, out)))
 
 
 def _ellipsoid(plant: System, stored: Policy, seconds: float, progress: ProgressLine | None) -> tuple[Array, float]:

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from certify.commands.shared import Json
+from certify.commands.shared import Json, Patient
 from certify.commands.terminal import say
 
 
@@ -22,6 +22,7 @@ def plot(
             help="Two states to draw against each other, as in x,x_dot; repeatable; default: what belongs together."
         ),
     ] = None,
+    patient: Patient = False,
     as_json: Json = False,
 ) -> None:
     """Check a certificate and draw its set for a paper."""
@@ -35,7 +36,7 @@ def plot(
     with tempfile.TemporaryDirectory() as folder:  # what is checked is what is drawn, whatever happens to the path
         private = Path(folder) / "certificate.json"
         private.write_bytes(raw)
-        answer = run_checker(private)
+        answer = run_checker(private, patient=patient)
     accepted = answer["result"] == "ACCEPTED"
     write_atomically(out, paper_figure(parse_certificate(raw, str(certificate)), accepted, options))
     stated = {"figure": str(out), "result": answer["result"]}

@@ -9,8 +9,19 @@ import typer
 
 from certify.commands.arguments import plant_of, state, widths
 from certify.commands.certifying import certified
-from certify.commands.importing import policy_of
-from certify.commands.shared import Domain, Json, PlantName, PolicyFile, Quiet, Results, Resume, TimeLimit
+from certify.commands.importing import kind_called, policy_of
+from certify.commands.shared import (
+    Domain,
+    Json,
+    PlantName,
+    PolicyArgument,
+    PolicyFile,
+    Quiet,
+    Results,
+    Resume,
+    TimeLimit,
+    the_policy,
+)
 from certify.report.drawing import Drawing
 
 if TYPE_CHECKING:
@@ -19,12 +30,13 @@ if TYPE_CHECKING:
 
 def reach(
     context: typer.Context,
-    policy: PolicyFile,
     importing: ImportOptions,
     from_: Annotated[
         str,
         typer.Option("--from", help="The state, as in x=0.5,y=-0.2; what is not named is at the operating point."),
     ],
+    file: PolicyArgument = None,
+    policy: PolicyFile = None,
     system: PlantName = None,
     param: Annotated[list[str] | None, typer.Option(help="Parameter of the plant, NAME=VALUE; repeatable.")] = None,
     domain: Domain = None,
@@ -42,9 +54,11 @@ def reach(
     start, drawing = time.perf_counter(), context.with_resource(Drawing())
     from certify.options import RoaOptions
 
-    stored = policy_of(policy, importing, system, param or [])
+    path = the_policy(context, file, policy)
+    with kind_called("--kind"):
+        stored = policy_of(path, importing, system, param or [])
     plant = plant_of(stored, system, param or [], domain or [])
     options = RoaOptions(
         reach_from=state(from_, "--from"), box=widths(box, "--box"), resume=resume, time_limit=time_limit
     )
-    certified(context, policy, stored, plant, options, out, start, drawing, quiet, as_json)
+    certified(context, path, stored, plant, options, out, start, drawing, quiet, as_json)

@@ -11,7 +11,18 @@ import typer
 from certify.commands.arguments import layers, numbers, plant_of, region, widths
 from certify.commands.certifying import CONTAINS, certified
 from certify.commands.importing import policy_of
-from certify.commands.shared import Domain, Json, PlantName, PolicyFile, Quiet, Results, Resume, TimeLimit
+from certify.commands.shared import (
+    Domain,
+    Json,
+    PlantName,
+    PolicyArgument,
+    PolicyFile,
+    Quiet,
+    Results,
+    Resume,
+    TimeLimit,
+    the_policy,
+)
 from certify.commands.terminal import tell
 from certify.errors import BackendError, InputError
 from certify.report.drawing import Drawing
@@ -25,8 +36,9 @@ _MOST = "max"
 
 def roa(
     context: typer.Context,
-    policy: PolicyFile,
     importing: ImportOptions,
+    file: PolicyArgument = None,
+    policy: PolicyFile = None,
     system: PlantName = None,
     param: Annotated[
         list[str] | None,
@@ -142,7 +154,8 @@ def roa(
     from certify.options import RoaOptions
 
     largest = _largest(sample_time, rate, resume)
-    stored = policy_of(policy, importing, system, param or [])
+    path = the_policy(context, file, policy)
+    stored = policy_of(path, importing, system, param or [])
     plant = plant_of(
         stored,
         system,
@@ -183,7 +196,7 @@ def roa(
     )
     if contains is not None:
         region(contains, plant, CONTAINS)  # what cannot be read is said before the run
-    certified(context, policy, stored, plant, options, out, start, drawing, quiet, as_json, contains, largest)
+    certified(context, path, stored, plant, options, out, start, drawing, quiet, as_json, contains, largest)
 
 
 def _largest(sample_time: str | None, rate: str, resume: bool) -> Quantity | None:

@@ -7,11 +7,19 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from certify.errors import InputError
+
 if TYPE_CHECKING:
     from certify.systems import System
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
-PolicyFile = Annotated[Path, typer.Option(help="Policy file (.pt), or another program's (see certify import).")]
+Patient = Annotated[
+    bool, typer.Option("--patient", help="Take a certificate whose check may need hours, which is refused else.")
+]
+PolicyFile = Annotated[
+    Path | None, typer.Option("--policy", help="Policy file (.pt), or another program's (see certify import).")
+]
+PolicyArgument = Annotated[Path | None, typer.Argument(metavar="FILE", help="The policy file, as --policy FILE.")]
 PlantName = Annotated[
     str | None,
     typer.Option(
@@ -19,12 +27,27 @@ PlantName = Annotated[
     ),
 ]
 Domain = Annotated[
-    list[str] | None, typer.Option(help="Half-width NAME=D or interval NAME=LO:HI of a state; repeatable.")
+    list[str] | None, typer.Option(help="Half-width NAME=D or interval NAME=LO..HI of a state; repeatable.")
 ]
 Resume = Annotated[bool, typer.Option("--resume", help="Resume the search that an earlier run left in the folder.")]
 TimeLimit = Annotated[float, typer.Option(help="Seconds for everything up to the verdict, the check included.")]
 Results = Annotated[Path | None, typer.Option(help="Folder for the results; default: out/POLICY.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="No progress and no notices, errors only.")]
+
+
+def the_policy(context: typer.Context, file: Path | None, policy: Path | None) -> Path:
+    """The policy file, which is named as the argument or with --policy.
+
+    Raises
+    ------
+    InputError : it is named in neither way, or two files are.
+    """
+    if file is not None and policy is not None and file.resolve() != policy.resolve():
+        raise InputError(f"one policy file must be named; found {file} and --policy {policy}. Leave one of them out.")
+    found = policy if policy is not None else file
+    if found is None:
+        raise InputError(f"a policy file must be named, as in certify {context.info_name} policy.pt; found none.")
+    return found
 
 
 def page_of(raw: bytes, path: Path, answer: dict[str, Any] | None, data: dict[str, Any] | None) -> str:

@@ -14,7 +14,7 @@ def _version(asked: bool) -> None:
     if not asked:
         return
     from certify import __version__
-    from certify.certificate.model import SCHEMA
+    from certify.certificate.formats import SCHEMA
     from certify.installation import source_sha256, version_of
     from certify.policies.file import FORMAT, SECOND
 

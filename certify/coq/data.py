@@ -21,13 +21,13 @@ from typing import Any, NoReturn
 import numpy as np
 from numpy.typing import NDArray
 
+from certify.certificate.formats import SCHEMA, other_version
 from certify.coq.expression import Expression, from_tree, rational
 from certify.errors import CertificateFormatError, InputError
 from certify.policies import TanhNetwork
 
 Array = NDArray[np.float64]
 Interval = tuple[Fraction, Fraction]
-SCHEMA = "certify-certificate/8"
 _MOST = 64  # states, inputs, layers
 _MOST_ROWS = 2**14  # of a layer
 _LONGEST = 10  # characters of an integer
@@ -108,7 +108,10 @@ def read_claim(raw: bytes) -> Claimed:
 
 def _claimed(data: Any, sha256: str) -> Claimed:
     if not isinstance(data, dict) or data.get("schema") != SCHEMA:
-        raise CertificateFormatError(f"a certificate must have the schema {SCHEMA!r}; found another.")
+        known = other_version(data.get("schema")) if isinstance(data, dict) else None
+        raise CertificateFormatError(
+            f"a certificate must have the schema {SCHEMA!r}; found another.{f' {known}' if known else ''}"
+        )
     claim, plant, policy, lyapunov, levels = (data[k] for k in ("claim", "plant", "policy", "lyapunov", "levels"))
     _require_supported(claim, plant, policy, lyapunov)
     for name, section in {"certificate": data, **{k: data[k] for k in _KEYS if k != "certificate"}}.items():

@@ -16,7 +16,7 @@ from certify.coq.data import read_claim
 from certify.coq.kernel import WRITTEN, compile_apart, find_coqc, theory_files, theory_sha256, write_folder
 from certify.coq.search import Limits, search
 from certify.coq.text import ASSUMPTIONS, PROOF, claim_text, evidence_text
-from certify.errors import BackendError, InputError
+from certify.errors import BackendError, OptionError
 from certify.verdict import Verdict
 
 
@@ -39,9 +39,9 @@ class CoqOptions:
 
     def __post_init__(self) -> None:
         if self.rate is not None and self.rate <= 0:
-            raise InputError(f"`rate` must be positive; found {self.rate}.")
+            raise OptionError(f"`rate` must be positive; found {self.rate}.")
         if not (self.time_limit > 0 and self.boxes >= 1):
-            raise InputError(
+            raise OptionError(
                 f"`time_limit` must be positive and `boxes` at least 1; found {self.time_limit} and {self.boxes}."
             )
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.closed_loop import ClosedLoop
-from certify.errors import BackendError, InputError
+from certify.errors import BackendError, InputError, OptionError
 from certify.lyapunov.candidates import solve_lyapunov
 from certify.lyapunov.optimised import largest_sampled, optimise_repeatedly
 
@@ -87,5 +87,5 @@ def choose_candidate(
 def _weight(diagonal: tuple[float, ...] | None, count: int, name: str) -> Array:
     values = np.ones(count) if diagonal is None else np.array(diagonal, dtype=np.float64)
     if values.shape != (count,) or not np.all(np.isfinite(values)) or not np.all(values > 0):
-        raise InputError(f"`{name}` must have {count} positive numbers; found {diagonal}.")
+        raise OptionError(f"`{name}` must have {count} positive numbers; found {diagonal}.")
     return np.diag(values)

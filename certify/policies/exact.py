@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from fractions import Fraction
 
+import numpy as np
+
 from certify.errors import InputError
 from certify.policies.network import TanhNetwork
+
+_NEAR = 1e-9
 
 
 def bounded_by_form(network: TanhNetwork, bounds: Sequence[tuple[Fraction, Fraction]]) -> bool:
@@ -69,11 +74,28 @@ def require_centred(network: TanhNetwork, u_eq: Sequence[Fraction], names: Seque
     for j, (value, u) in enumerate(zip(at_origin(network), u_eq, strict=True)):
         if value != u:
             named = f"input {names[j]}" if names else f"input {j}"
-            found = "not a rational number" if value is None else f"{float(value)!r}, exactly {_short(value)}"
+            found = _found(value, float(network(np.zeros(network.n), u_eq)[j]), float(u))
             raise InputError(
-                f"the policy is not centred: pi(0) must be exactly u_eq = {float(u)!r}; its {named} is {found}. "
-                "Use centre 'output' or 'preactivation', or claim practical stability, which does not need it."
+                f"the policy is not centred: pi(0), what it commands at the operating point, must be exactly "
+                f"u_eq = {float(u):.12g}; its {named} is {found}. Shift it by the difference with "
+                f"{_centrings(network, u_eq)}, or ask for less with --claim practical, which needs no rest there."
             )
+
+
+def _found(value: Fraction | None, about: float, wanted: float) -> str:
+    """pi(0) of an input in words, `about` being it in floats."""
+    if value is not None:
+        return f"{float(value)!r}, exactly {_short(value)}"
+    near = math.isclose(about, wanted, rel_tol=_NEAR, abs_tol=_NEAR)
+    tanh = ", and whether exactly that cannot be decided: tanh at the operating point gives no fraction" if near else ""
+    return f"about {about:.9g}{tanh}"
+
+
+def _centrings(network: TanhNetwork, u_eq: Sequence[Fraction]) -> str:
+    """The options that centre it: inside the squash only if it can come to u_eq there."""
+    reaches = zip(u_eq, network.scale.tolist(), network.offset.tolist(), strict=True)
+    inside = network.squash == "tanh" and all(abs(float(u) - o) < abs(s) for u, s, o in reaches)
+    return "--centre output" + " or --centre preactivation" * inside
 
 
 def _affine(row: Sequence[float], h: Sequence[Fraction | None], bias: float) -> Fraction | None:

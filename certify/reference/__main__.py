@@ -1,4 +1,4 @@
-"""The command line: `python -I -m certify.reference FILE [--json]`.
+"""The command line: `python -I -m certify.reference FILE [--json] [--patient]`.
 
 The claim in words and the verdict. Exit status 0 accepted, 1 rejected, 2 usage or an unreadable file, 3 trusted,
 70 an error of this program.
@@ -202,6 +202,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.json = "--json" in given
     parser.add_argument("file", metavar="FILE")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--patient", action="store_true", help="take files that may keep this program for hours")
     options = parser.parse_args(given)
 
     def failed(message: str, status: int) -> int:
@@ -217,7 +218,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (OSError, ValueError) as error:
         return failed(f"{options.file} cannot be read: {getattr(error, 'strerror', None) or error}", UNUSABLE)
     try:
-        verdict = judge(raw)
+        verdict = judge(raw, options.patient)
     except Exception as error:  # whatever it is, it must not look like a verdict
         return failed(f"internal error: {type(error).__name__}: {error}", INTERNAL)
     seconds = time.perf_counter() - start

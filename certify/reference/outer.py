@@ -14,7 +14,7 @@ from itertools import islice
 from flint import arb, arb_mat, fmpq, fmpq_mat
 
 from .balls import ZERO, bounded_by_form, total, within_bounds
-from .document import Certificate, Function
+from .document import Certificate
 from .evidence import Covering, Tree
 from .fields import exact
 from .function import Models
@@ -23,8 +23,6 @@ from .refusal import Refused, require
 from .taylor import Taylor
 
 RULE, FACES = "outer", "faces"
-MAX_NETWORK = 2**22  # rows times columns and the square of symbols, over all layers
-MAX_EXPRESSION = 2**26  # operations times the square of symbols
 
 
 def outer(c: Certificate, evidence: Tree) -> None:
@@ -32,22 +30,12 @@ def outer(c: Certificate, evidence: Tree) -> None:
     N, covering = c.beyond, evidence.covering
     if N is None or covering is None:
         raise Refused("format", "evidence.outer", "the claim needs a tree over the domain")
-    bearable(c, N)
     models = Models(N, c.plant.states)
     for k, tree in enumerate(covering.faces):
         face(c, models, k, tree)
     covers_domain(c, covering)
     structure(covering.tree, range(c.n), RULE)
     check_leaves(c, models, covering)
-
-
-def bearable(c: Certificate, N: Function) -> None:
-    """Refuses what would fill the memory: every unit, or operation, is a model of the second order in all symbols."""
-    square = (c.n + c.m + c.k) ** 2
-    units = sum(layer.rows * (layer.columns + square) for layer in N.layers)
-    require(units <= MAX_NETWORK, RULE, "claim.outer", "the network is too large for this checker")
-    steps = 0 if N.expression is None else len(N.expression.steps)
-    require(steps * square <= MAX_EXPRESSION, RULE, "claim.outer", "the expression is too large for this checker")
 
 
 # ------------------------------------------------------------------------------------------------------------ the faces

@@ -15,6 +15,7 @@ from .expressions import MAX_BITS
 from .fields import exact
 from .refusal import require
 
+MAX_MATRIX_BITS = 2**16  # of a numerator over a common denominator, times rows: beyond it a decision takes minutes
 ZERO = fmpq(0)
 
 
@@ -32,6 +33,7 @@ def inverse_diagonal(A: fmpq_mat, rule: str, at: str | None = None) -> list[fmpq
     n = A.nrows()
     symmetric = A.transpose() == A
     require(symmetric, rule, at or "symmetry", "the matrix differs from its transpose")
+    require(is_short(A), rule, at or "bits", f"rows times bits exceed {MAX_MATRIX_BITS}")
     for k in range(1, n + 1):
         require(bool(minor(A, range(k)) > 0), rule, at or f"minor {k}", "a leading principal minor is not positive")
     whole = A.det()
@@ -39,8 +41,18 @@ def inverse_diagonal(A: fmpq_mat, rule: str, at: str | None = None) -> list[fmpq
 
 
 def positive_definite(A: fmpq_mat) -> bool:
-    """Whether A = A' and every leading principal minor is positive (Sylvester)."""
-    return bool(A.transpose() == A) and all(bool(minor(A, range(k)) > 0) for k in range(1, A.nrows() + 1))
+    """Whether A = A' and every leading principal minor is positive (Sylvester); False where that takes too long."""
+    sound = is_short(A) and bool(A.transpose() == A)
+    return sound and all(bool(minor(A, range(k)) > 0) for k in range(1, A.nrows() + 1))
+
+
+def bits(A: fmpq_mat) -> int:
+    """Of the longest numerator over a common denominator."""
+    return int(max(v.height_bits() for v in A.numer_denom()[0].entries()))
+
+
+def is_short(A: fmpq_mat) -> bool:
+    return bool(A.nrows() * bits(A) <= MAX_MATRIX_BITS)
 
 
 def identity(n: int) -> fmpq_mat:

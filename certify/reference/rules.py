@@ -11,16 +11,14 @@ from . import rational
 from .balls import PRECISION
 from .contraction import contraction
 from .document import Certificate, read
-from .evidence import WITH_TUBE, Tree, Trusted
+from .evidence import WITH_TUBE, Trusted
 from .leaves import Leaves, check_leaves, structure
+from .limits import limits
 from .local import local
 from .loop import Loop
 from .outer import outer
-from .refusal import Refused, require
+from .refusal import Refused
 from .tube import tube
-
-MAX_PLANT = 2**26  # numbers of a model times operations of the plant
-MAX_NETWORK = 2**22  # entries of the matrices of a network
 
 
 @dataclass(frozen=True)
@@ -36,12 +34,16 @@ class Verdict:
     leaves: int | None = None
 
 
-def judge(raw: bytes) -> Verdict:
-    """The verdict on a file; its hash is taken over the very bytes that are judged."""
+def judge(raw: bytes, patient: bool = False) -> Verdict:
+    """The verdict on a file; its hash is taken over the very bytes that are judged.
+
+    A `patient` reader allows it operations that take days.
+    """
     sha256, c, leaves = hashlib.sha256(raw).hexdigest(), None, None
     try:
         with ctx.workprec(PRECISION):
             c = read(raw)
+            limits(c, patient)
             leaves = check(c)
     except Refused as no:
         return Verdict("REJECTED", sha256, no.rule, no.at, no.detail, c)
@@ -65,7 +67,6 @@ def check(c: Certificate) -> int | None:
     S, inverse = rational.coordinates(c, evidence)
     rational.root(c, evidence, inverse)
     rational.centring(c)
-    bearable(c, evidence)
     loop = None
     if evidence.ball is not None:
         loop = Loop(c)
@@ -82,23 +83,3 @@ def check(c: Certificate) -> int | None:
     if c.beyond is not None:
         outer(c, evidence)
     return leaves
-
-
-def bearable(c: Certificate, evidence: Tree) -> None:
-    """Refuses what would fill the memory, or take days, before it is decided.
-
-    Models on a ball are of the third order, on a leaf not. The symbols are states and the motion, on a leaf states,
-    inputs, what is uncertain and a period. A series of order r has r products for each of r^2 / 2 coefficients.
-    """
-    ball, size = evidence.ball, c.n + (c.claim == "reached")
-    balls = ball is not None or evidence.contraction is not None
-    thirds = size * (size + 1) * (size + 2) // 6 if balls else 0
-    order = max(evidence.order, ball.order if ball else 1)
-    plant = len(c.plant.dynamics.steps) * max((c.n + c.m + c.k + c.varies) ** 2, size**2 + thirds) * order**2
-    rule = "local" if ball else "contraction" if balls else "ring"
-    require(plant <= MAX_PLANT, rule, "plant", "the equations are too large for this checker")
-    before, network = 0, 0
-    for layer in c.policy.layers:
-        network += layer.rows * (layer.columns + before + size**2 + thirds)
-        before += layer.rows
-    require(network <= MAX_NETWORK, rule, "policy", "the network is too large for this checker")

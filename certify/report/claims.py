@@ -107,7 +107,7 @@ CLAIMS: Mapping[str, Words] = {
         "all: of what happens inside the smaller set nothing is said.",
         headline="from {{V <= {outer}}} every trajectory enters {{V <= {inner}}} and $there; nothing is said of "
         "the origin$over{speed}",
-        meaning="from which every trajectory enters the green set and $there",
+        meaning="from which every trajectory enters the inner set {V ≤ c₀} and $there",
         decay="That V falls below c₀ $within and stays there$always is {word}; $later is not.$kept",
         simulated="stay in the domain and come near {V ≤ c₀}",
         settles="come near {V ≤ c₀}",

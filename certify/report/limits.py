@@ -7,7 +7,7 @@ from fractions import Fraction
 from typing import Any
 
 from certify.report.timing import PLAIN, Timing
-from certify.report.words import below, number
+from certify.report.words import below, number, symbol
 
 _LIMITS = {
     "domain": "the domain",
@@ -25,6 +25,8 @@ _OF_OUTER = {
     "boxes": "the limit on boxes: more may be provable",
     "requested": "the level that was asked for",
 }
+AT_A_POINT = frozenset({"domain", "vdot", "input"})
+"""Kinds of limits that are met at a state, which is named; of others a run knows along which states it was hard."""
 _TOUCHING = Fraction(1, 10**6)  # relative distance from the domain's limit below which a set is said to touch it
 
 
@@ -47,6 +49,19 @@ def limited_by(result: Mapping[str, Any]) -> str:
                 return f"a margin that the engine keeps: {apart}"
             return f"the precision of {solver['solver']} (delta {number(precision)}), which stops {apart}"
     return limit_in_words(reason, Timing.of_result(result))
+
+
+def hardest(weights: Mapping[str, float]) -> str:
+    """Along which states a proof had most to do, the first most of all.
+
+    >>> hardest({"theta": 1.0, "x": 0.392})
+    'θ; then x, 39 % as much, each measured by its domain'
+    >>> hardest({"theta": 1.0})
+    'θ'
+    """
+    first, *others = weights.items()
+    then = ", ".join(f"{symbol(name)}, {100 * weight:.0f} % as much" for name, weight in others)
+    return symbol(first[0]) + (f"; then {then}, each measured by its domain" if then else "")
 
 
 def outer_limited_by(outer: Mapping[str, Any]) -> str:

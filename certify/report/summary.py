@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 from unicodedata import normalize
 
 from certify.report.claims import Words, words_for
-from certify.report.limits import limited_by, outer_limited_by
+from certify.report.limits import AT_A_POINT, hardest, limited_by, outer_limited_by
 from certify.report.timing import Timing, reach_time
 from certify.report.words import (
     ABSENT,
@@ -20,13 +20,16 @@ from certify.report.words import (
     above,
     at_rest,
     below,
+    deviation,
+    distinguished,
     estimated,
     inner_level,
-    label,
+    modes,
     network_name,
     number,
     point,
     pretty_unit,
+    quantity,
     seconds,
     symbol,
     varying,
@@ -109,6 +112,8 @@ def _headline(result: Mapping[str, Any], verdict: str) -> str:
             constant="where what is uncertain is constant in time, " if result.get("uncertain") else "",
         )
         word = ", if the solver is right: nothing checked its answers" if verdict == "TRUSTED" else ""
+        if any(map(Fraction, (result.get("operating_point") or {}).values())):
+            stated = stated.replace("the origin", "the operating point")
         return f"{name}: {_whatever(result)}{stated}{word}"
     if verdict == "REFUTED":
         return f"{name}: a condition of the claim fails for this V and level; another V may show what this one cannot"
@@ -158,8 +163,8 @@ def _rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
         rows.append(("input held over" if shown else "asked to hold", timing.periods))
     if shown:
         rows.append(("limited by", limited_by(result)))
-        if result.get("diagnosis"):
-            rows.append(("binds", str(result["diagnosis"]["binds"])))
+        if (result.get("diagnosis") or {}).get("kind") in AT_A_POINT:
+            rows.append(("namely", str(result["diagnosis"]["binds"])))
     else:
         rows.append(("reason", str(result["reason"])))
     if timing.rate:
@@ -171,8 +176,8 @@ def _rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
         (f"{words.inner_word} {normalize('NFKC', words.inner)}", "" if inner is None else inner_level(kind, inner)),
         ("local c1", _level(local) if local != inner else ""),
         ("enlarged c2", _level(levels.get("roa"))),
-        ("domain limit", _level(levels.get("domain_limit"))),
-        ("sampled limit", _level(levels.get("sampled_limit"))),
+        ("the domain's edge at", _level(levels.get("domain_limit"))),
+        ("the lowest violation found at", _level(levels.get("sampled_limit"))),
     ]
     stated = [f"{name} {text}" for name, text in known if text]
     if stated:
@@ -194,28 +199,30 @@ def _rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
             rows.append(("with outer set", union))
     if len(result.get("candidates", [])) > 1:
         unit = volume_unit(units)
+        named = distinguished([c["candidate"] for c in result["candidates"]])
         tried = [
-            f"{c['candidate']} {below(c.get('proved_volume') or 0.0, 3)} of {number(c['volume'], 3)}"
-            for c in result["candidates"]
+            f"{name}: {below(c.get('proved_volume') or 0.0, 3)} of {number(c['volume'], 3)}"
+            for name, c in zip(named, result["candidates"], strict=True)
         ]
         rows.append(
-            ("candidates", f"{', '.join(tried)} {unit}".rstrip() + " (proved in the time, of what sampling allows)")
+            (
+                "candidates",
+                f"{'; '.join(tried)} {unit}".rstrip() + " (volume proved in the time, of what sampling allows)",
+            )
         )
     at = result.get("operating_point") or {}
     if at:
         names = _state_names(result)
         point = at_rest(names, [Fraction(at.get(name, 0)) for name in names], units)
-        rows.append(("operating point", f"{point}; the set lies around it, in deviations from it"))
+        rests = ", where the loop rests" if (result.get("rest") or {}).get("origin") else ""
+        rows.append(
+            ("operating point", f"{point}{rests}; the set lies around it, and its lengths are deviations from it")
+        )
+    if result.get("rest"):
+        rows.append(_rest(result))
     rows += _diagnosis_rows(result)
     rows.append(("policy", "-".join(map(str, result["policy"]["layers"]))))
     rows.append(("its sha256", str(result["policy"]["sha256"])))
-    if result.get("rest"):
-        rest = result["rest"]
-        point = ", ".join(f"{name} = {value}" for name, value in zip(_state_names(result), rest["x"], strict=True))
-        held = " at the nominal values" if result.get("uncertain") else ""
-        rows.append(
-            ("rests at", f"{point}{held}; eigenvalues there {', '.join(rest['eigenvalues']) or 'not enclosed'}")
-        )
     if result.get("eigenvalues"):
         held = " (at the nominal values)" if result.get("uncertain") else ""
         rows.append(("eigenvalues", ", ".join(map(str, result["eigenvalues"])) + held))
@@ -239,10 +246,19 @@ def _rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
     return rows
 
 
+def _rest(result: Mapping[str, Any]) -> tuple[str, str]:
+    """Where the loop rests, by the states' values, and its eigenvalues there."""
+    rest: Mapping[str, Any] = result["rest"]
+    held = " at the nominal values" if result.get("uncertain") else ""
+    each = zip(_state_names(result), rest["values"], _state_units(result), strict=True)
+    where = ", ".join(f"{symbol(name)} = {quantity(value, unit, 9)}" for name, value, unit in each)
+    return "rests at", f"{where}{held}; eigenvalues there {', '.join(rest['eigenvalues']) or 'not enclosed'}"
+
+
 def _functions(timing: Timing) -> str:
     if timing.discrete:
-        return "any sequences of values, constant ones too"
-    return "any measurable functions of time, constant ones too"
+        return "any sequences of values: constant, drifting or jumping"
+    return "any measurable functions of time: constant, drifting or jumping"
 
 
 def _rate(result: Mapping[str, Any], timing: Timing) -> str:
@@ -266,7 +282,7 @@ def _tube(result: Mapping[str, Any]) -> str:
     Around a state that is how far each state may be from its own alone, the others being as they are, rounded down.
     """
     tube = result["tube"]
-    size = f"{tube['slabs']} slabs, {above(tube['duration'], 3)} units of time"
+    size = f"{tube['slabs']} slabs, {above(tube['duration'], 3)} s"
     start = f"from an ellipsoid of the shape {tube['shape']}"
     if not tube.get("centre"):
         return f"{start}, {size}"
@@ -294,19 +310,17 @@ def _outer(outer: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def _diagnosis_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """How stiff the loop is, where the proof had most to do, and what to try next."""
+    """How fast the loop is, along which states the proof had most to do, and what to try next."""
     found, rows = result.get("diagnosis"), []
     if not found:
         return []
-    if found.get("stiffness") and not Timing.of_result(result).discrete:
-        fast, slow = number(found["fastest"], 3), number(found["slowest"], 3)
+    timing = Timing.of_result(result)
+    if found.get("stiffness") and not timing.discrete:
         held = " (at the nominal values)" if result.get("uncertain") else ""
-        rows.append(
-            ("modes", f"from {fast} to {slow} per second, a stiffness of {number(found['stiffness'], 2)}{held}")
-        )
-    if found["hurts"]:
-        weights = ", ".join(f"{name} {number(weight, 2)}" for name, weight in found["hurts"].items())
-        rows.append(("hurts most", f"{weights} (shares of the domain, the largest 1)"))
+        at_once = "" if timing.sample is None else ", if the input followed at once"
+        rows.append(("modes", modes(found["fastest"], found["slowest"]) + held + at_once))
+    if found["hurts"] and found.get("kind") not in AT_A_POINT:
+        rows.append(("hardest along", hardest(found["hurts"])))
     step = found["next"]
     command = f"{step['command']}  ({step['why']})" if step.get("command") else step["why"]
     return [*rows, ("try next", command)]
@@ -340,14 +354,15 @@ def _reach(result: Mapping[str, Any]) -> RenderableType:
 
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, show_edge=False, header_style="dim")
     table.add_column("state")
-    table.add_column("on its axis, +-", justify="right")
-    table.add_column("largest in the set, +-", justify="right")
+    table.add_column("others at rest, ±", justify="right")
+    table.add_column("at most, ±", justify="right")
     shares = [one["share"] for one in (result.get("diagnosis") or {}).get("shares", [])]
     if shares:
         table.add_column("of its domain", justify="right")
     columns = zip(_state_names(result), _state_units(result), result["semi_axes"], result["extents"], strict=True)
+    at = [Fraction((result.get("operating_point") or {}).get(name, 0)) for name in _state_names(result)]
     for k, (name, unit, semi_axis, extent) in enumerate(columns):
-        title = label(name, unit) if name.isascii() else f"{name} {pretty_unit(unit)}"
+        title = deviation(name, at[k], unit) if name.isascii() else f"{name} {pretty_unit(unit)}"
         cells = [title, below(semi_axis), above(extent)] + ([f"{100 * shares[k]:.3g} %"] if shares else [])
         table.add_row(*map(Text, cells))
     return table

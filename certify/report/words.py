@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import re
 import unicodedata
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -46,7 +47,17 @@ def symbol(name: str) -> str:
 
 def label(name: str, unit: str) -> str:
     """Symbol and unit of an axis."""
-    return f"{symbol(name)} ({pretty_unit(unit)})" if unit else symbol(name)
+    shown = pretty_unit(unit)
+    return f"{symbol(name)} ({shown})" if shown else symbol(name)
+
+
+def quantity(value: float | Fraction, unit: str, digits: int = 6) -> str:
+    """A number with its unit.
+
+    >>> quantity(0.016, "m"), quantity(-2, "1")
+    ('0.016 m', '−2')
+    """
+    return f"{number(float(value), digits)} {pretty_unit(unit)}".rstrip()
 
 
 def deviation(name: str, x_eq: Fraction, unit: str) -> str:
@@ -58,8 +69,8 @@ def deviation(name: str, x_eq: Fraction, unit: str) -> str:
     if not x_eq:
         return label(name, unit)
     value = number(float(abs(x_eq)))
-    shifted = f"{symbol(name)} {MINUS if x_eq > 0 else '+'} {value}"
-    return f"{shifted} ({pretty_unit(unit)})" if unit else shifted
+    shifted, shown = f"{symbol(name)} {MINUS if x_eq > 0 else '+'} {value}", pretty_unit(unit)
+    return f"{shifted} ({shown})" if shown else shifted
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,8 +176,8 @@ def point(names: Sequence[str], values: Sequence[float | Fraction], units: Seque
 
 
 def pretty_unit(unit: str) -> str:
-    """`m/s^2` as `m/s²`."""
-    return re.sub(r"\^(-?\d+)", lambda match: match.group(1).translate(_SUPERSCRIPTS), unit)
+    """`m/s^2` as `m/s²`; nothing for 1, the unit of what has none."""
+    return "" if unit == "1" else re.sub(r"\^(-?\d+)", lambda match: match.group(1).translate(_SUPERSCRIPTS), unit)
 
 
 def volume_name(n: int) -> str:
@@ -194,7 +205,37 @@ def estimated(volume: float, deviation: float, unit: str) -> str:
 
 def volume_unit(units: Sequence[str]) -> str:
     """Unit of the product of the states, or nothing if a state has none."""
-    return " · ".join(pretty_unit(u) for u in units) if all(units) and len(units) <= 3 else ""
+    return " · ".join(filter(None, map(pretty_unit, units))) if all(units) and len(units) <= 3 else ""
+
+
+def distinguished(names: Sequence[str]) -> list[str]:
+    """Names of candidates, those that come again with their round.
+
+    >>> distinguished(["optimised", "lqr", "optimised"])
+    ['optimised, round 1', 'lqr', 'optimised, round 2']
+    """
+    counts, seen = Counter(names), Counter[str]()
+    shown = []
+    for name in names:
+        seen[name] += 1
+        shown.append(name if counts[name] == 1 else f"{name}, round {seen[name]}")
+    return shown
+
+
+def modes(fastest: float, slowest: float) -> str:
+    """How fast a loop's modes decay at rest, from the real parts of its slowest and fastest eigenvalue, both negative.
+
+    >>> modes(-16.8, -1.63), modes(-0.5, -0.5)
+    ('the slowest decays at 1.63 per second (time constant 0.61 s), the fastest at 16.8 per second (0.06 s)', \
+'all decay at 0.5 per second (time constant 2 s)')
+    """
+    slow, fast = ((number(-v, 3), number(-1 / v, 2)) for v in (slowest, fastest))
+    if slow == fast:
+        return f"all decay at {slow[0]} per second (time constant {slow[1]} s)"
+    return (
+        f"the slowest decays at {slow[0]} per second (time constant {slow[1]} s), the fastest at {fast[0]} per second "
+        f"({fast[1]} s)"
+    )
 
 
 def number(value: float | None, digits: int = 6) -> str:

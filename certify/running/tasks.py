@@ -23,7 +23,7 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import TYPE_CHECKING, Any, Protocol
 
-from certify.errors import BackendError, InputError
+from certify.errors import BackendError, InputError, OptionError
 from certify.running.cluster import connect
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ class Processes:
 
     def __init__(self, jobs: int) -> None:
         if jobs < 1:
-            raise InputError(f"`jobs` must be at least 1; found {jobs}.")
+            raise OptionError(f"`jobs` must be at least 1; found {jobs}.")
         self.jobs = jobs
 
     def run(self, pieces: Iterable[Piece]) -> Generator[Outcome | None, None, None]:

@@ -262,7 +262,7 @@ def _require_readable(file: PlantFile, text: str, table: str, name: str) -> None
         if table == "options" and name in OPTIONS:
             _options_with(file, f"options.{name}", **OPTIONS[name].read(text))
         elif table != "options" or name in ("sample_time", "input_error"):
-            separator = ":" if table == "domain" else ".."
+            separator = ":" if table == "domain" and ".." not in text else ".."
             parts = [text.rpartition("=")[2]] if name == "input_error" else text.split(separator)
             if len(parts) > 2:
                 raise InputError(f"must be a number, or an interval LO{separator}HI; found {text!r}.")

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 import ast
 import difflib
+import re
 from collections.abc import Iterable, Mapping
 from fractions import Fraction
 
 from certify.errors import InputError
 from certify.expressions import FUNCTIONS, MOST_EXPONENT, Expression, Number, constant_of, function
+from certify.systems.spelling import instead_of, instead_of_call, instead_of_name
 from certify.systems.system import exact
 
 _MOST_NODES = 20_000  # a certificate holds no more (FORMAT.md)
@@ -46,6 +48,7 @@ def parse_expression(
         if isinstance(error, InputError):
             raise
         hint = "; for a power write **, not ^" if "^" in source else ""
+        hint = "; there are no cases: write one formula" if re.search(r"\bif\b", source) else hint
         reason = error.msg if isinstance(error, SyntaxError) else str(error)
         raise InputError(f"equation {source!r} cannot be read: {reason}{hint}.") from error
     if _size(found, {}) > _MOST_NODES:
@@ -108,7 +111,8 @@ class _Reader:
         if isinstance(node, ast.BinOp):
             return self._operation(node)
         raise self._refuse(
-            f"{self._text(node)!r} is not allowed; allowed are the plant's names, numbers, {_OPERATORS}, "
+            instead_of(node, self._text(node))
+            or f"{self._text(node)!r} is not allowed; allowed are the plant's names, numbers, {_OPERATORS}, "
             f"and the functions {', '.join(FUNCTIONS)}"
         )
 
@@ -117,13 +121,19 @@ class _Reader:
             return self.names[name]
         if name in FUNCTIONS:
             raise self._refuse(f"the function {name} must have its argument in brackets, as in {name}(x)")
+        instead = instead_of_name(name)
+        if instead is not None:
+            raise self._refuse(f"{name!r} is no {self.known}; {instead}")
         close = nearest(name, self.names) or f"; known are {', '.join(self.names) or 'none'}"
         raise self._refuse(f"{name!r} is no {self.known}{close}")
 
     def _call(self, node: ast.Call) -> Expression:
         name = self._text(node.func)
         if not isinstance(node.func, ast.Name) or name not in FUNCTIONS:
-            product = name in self.names or not isinstance(node.func, ast.Name)
+            instead = instead_of_call(name, [self._text(a) for a in node.args], FUNCTIONS)
+            if instead is not None and name not in self.names:
+                raise self._refuse(instead)
+            product = name in self.names or not isinstance(node.func, ast.Name | ast.Attribute)
             what = f"{name} is no function; for a product write {name}*(...)" if product else ""
             raise self._refuse(what or f"the function {name} is not supported; supported are {', '.join(FUNCTIONS)}")
         if node.keywords or len(node.args) != 1:

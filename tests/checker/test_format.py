@@ -10,6 +10,7 @@ import hashlib
 import json
 import os
 import re
+import socket
 import subprocess
 import sys
 from collections.abc import Callable
@@ -129,10 +130,43 @@ def test_a_file_beyond_the_limit_is_rejected(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not os.path.exists("/dev/zero"), reason="needs an endless file")
-def test_an_endless_file_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_endless_file_is_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(strict, "MAX_BYTES", 2**16)
-    with pytest.raises(Rejected, match="larger than"):
+    with pytest.raises(Unreadable, match="not a regular file"):
         document.read("/dev/zero")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes")
+@pytest.mark.parametrize(
+    ("kind", "arguments"),
+    [
+        *(
+            ("pipe", line.split())
+            for line in ("check", "check --reference", "contains x=0", "report", "plot --out f.pdf")
+        ),
+        *((kind, ["check"]) for kind in ("link to a pipe", "socket", "folder", "device")),
+    ],
+)
+def test_what_is_no_regular_file_is_refused_at_once(
+    kind: str, arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nobody writes into the pipe: whoever opened it as a file would wait for ever."""
+    path = Path(os.devnull) if kind == "device" else tmp_path / "certificate.json"
+    if kind == "folder":
+        path.mkdir()
+    elif kind == "socket":
+        with socket.socket(socket.AF_UNIX) as server:
+            monkeypatch.chdir(tmp_path)  # a socket's name is short
+            server.bind(path.name)
+    elif kind != "device":
+        os.mkfifo(tmp_path / "pipe")
+        path.symlink_to(tmp_path / "pipe")
+        path = path if kind == "link to a pipe" else tmp_path / "pipe"
+    name, *rest = arguments
+    line = [sys.executable, "-m", "certify", name, str(path), *rest]
+    done = subprocess.run(line, capture_output=True, text=True, check=False, timeout=60, cwd=tmp_path)
+    assert done.returncode == 2 and done.stdout == "" and "Traceback" not in done.stderr
+    assert str(path) in done.stderr and ("regular file" in done.stderr or "cannot be read" in done.stderr)
 
 
 # ---------------------------------------------------------------------------------------------------------- the values

@@ -53,7 +53,7 @@ CHECKER = Path(certify.checker.__file__).parent
 SHIPPED = Path(__file__).parents[2] / "examples" / "policies" / "pendulum.pt"
 RULES = {
     "format", "hash", "levels", "lyapunov", "equilibrium", "centring", "domain", "coordinates", "root", "local", "tree",
-    "ring", "inputs", "tube", "flow",
+    "ring", "inputs", "tube", "flow", "limits",
 }  # fmt: skip
 RESULTS = {0: "ACCEPTED", 1: "REJECTED", 3: "TRUSTED"}
 SECONDS = 5  # for one small file; a thousand times what it takes

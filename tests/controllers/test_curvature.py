@@ -136,12 +136,13 @@ def test_a_run_records_it_and_the_evaluation_reports_the_same():
     changes = {"steps": 200, "warm_up": 100, "n_A": 40, "n_B": 40, "batch": 16, "critic": (8,)}
     policy = train(Trainer(PENDULUM, replace(preset("pendulum"), **changes)))
     assert policy.training["curvature"] == curvature(policy.network, PENDULUM, 0.1) > 0
-    result = evaluate(policy, EvaluationOptions(states=2, duration=1.0))
+    shown = EvaluationOptions(states=2, duration=1.0)
+    result = evaluate(policy, shown)
     assert result.curvature == result.as_json()["curvature"] == policy.training["curvature"]
-    assert _table(result)["curvature"] == f"{result.curvature:.4g}"
+    assert _table(result, shown)["curvature"] == f"{result.curvature:.4g}"
     training = {name: value for name, value in policy.training.items() if name != "eta"}
-    foreign = evaluate(replace(policy, training=training), EvaluationOptions(states=2, duration=1.0))
-    assert np.isnan(foreign.curvature) and _table(foreign)["curvature"] is None
+    foreign = evaluate(replace(policy, training=training), shown)
+    assert np.isnan(foreign.curvature) and _table(foreign, shown)["curvature"] is None
 
 
 @pytest.mark.parametrize("name", ["curvature_weight", "rest_weight"])

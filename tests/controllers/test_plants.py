@@ -21,6 +21,8 @@ from controllers.cli import app
 from controllers.options import Plant, available_plants, get_plant
 
 EQUATIONS = """
+from fractions import Fraction
+from certify.expressions import Number, sin, symbols
 from certify.systems import System
 
 def leak() -> System:

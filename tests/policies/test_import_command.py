@@ -105,7 +105,7 @@ def test_import_as_json(run: Run) -> None:
     [
         (["--system", "plant.toml"], "Give --states x0,x1"),
         ([*SAID], "name the plant with --system"),
-        (["--system", "plant.toml", *SAID, "--clip", "1"], "--clip takes LO:HI"),
+        (["--system", "plant.toml", *SAID, "--clip", "1"], "--clip takes LO..HI"),
         (["--system", "plant.toml", *SAID, "--clip", "2:1"], "lo < hi"),
         (["--system", "plant.toml", *SAID, "--action-offset", "one"], "--action-offset"),
         (["--system", "plant.toml", *SAID, "--epsilon", "1,2"], "--epsilon takes one number"),

@@ -152,14 +152,20 @@ def test_the_page_says_what_limits_the_set_and_what_to_try(proved: Any) -> None:
         "command": "certify roa --policy p.pt --time-limit 90",
     }
     diagnosis = {
-        **result["diagnosis"], "binds": "time", "stiffness": 12.5, "fastest": -25.0, "slowest": -2.0,
+        **result["diagnosis"], "kind": "time", "binds": "time", "stiffness": 12.5, "fastest": -25.0, "slowest": -2.0,
         "hurts": {"theta": 1.0, "theta_dot": 0.25}, "next": step,
     }  # fmt: skip
     html = render_html(certificate, answer, {**result, "diagnosis": diagnosis}, path)
     assert "What limits the set, and what to try next" in html and "the time limit: more may be provable" in html
-    assert "decays at 2 per second, its fastest at 25 per second: a stiffness of 12." in html
+    assert "slowest decays at 2 per second (time constant 0.5 s), the fastest at 25 per second (0.04 s)." in html
+    assert "stiffness" not in html
     assert "<b>What to try next:</b> it still grew.</p>" in html and f"<pre>{step['command']}</pre>" in html
     assert '<span class="bar hurts"><i style="width: 25.0%">' in html
+    assert "Along which states the proof had most to do" in html and ">25 %</td>" in html
+    # A limit that is met at a state is named with it, and has no direction besides.
+    at_a_point = {**diagnosis, "kind": "domain", "binds": "the upper side of the domain in θ, 3 rad"}
+    met = render_html(certificate, answer, {**result, "diagnosis": at_a_point}, path)
+    assert "<b>the upper side of the domain in θ, 3 rad</b>" in met and "had most to do" not in met
     # The words of a run are text.
     hostile = {**diagnosis, "binds": "<script>", "next": {"options": {}, "why": "<b>&", "command": "<i>"}}
     html = render_html(certificate, answer, {**result, "diagnosis": hostile}, path)

@@ -16,7 +16,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.errors import InputError
+from certify.errors import OptionError
 from certify.lyapunov.neural import Neural
 from certify.lyapunov.polynomial import MAX_DEGREE, Polynomial, monomials
 
@@ -59,7 +59,7 @@ class Network:
 
     def __post_init__(self) -> None:
         if not self.hidden or min(self.hidden) < 1:
-            raise InputError(f"`hidden` must be positive widths, at least one; found {self.hidden}.")
+            raise OptionError(f"`hidden` must be positive widths, at least one; found {self.hidden}.")
 
     def initial(self, generator: np.random.Generator) -> Array:
         """Random layers."""
@@ -135,7 +135,7 @@ class Terms:
 
     def __post_init__(self) -> None:
         if self.degree % 2 or not 2 <= self.degree <= MAX_DEGREE:
-            raise InputError(f"`degree` must be even, from 2 to {MAX_DEGREE}; found {self.degree}.")
+            raise OptionError(f"`degree` must be even, from 2 to {MAX_DEGREE}; found {self.degree}.")
 
     @property
     def exponents(self) -> NDArray[np.int64]:

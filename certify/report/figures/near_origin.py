@@ -40,7 +40,7 @@ def near_origin(scene: Scene) -> Picture:
         "practical": f"Green: the inner set {inner}, {keeps}; the dot marks the origin, of which nothing is said.",
     }[scene.kind]
     return Picture(
-        "Near the origin",
+        "Near the operating point" if any(scene.system.exact_x_eq()) else "Near the origin",
         f"{green}{around} Grey trajectories are simulated{scene.held}, not proved.",
         to_svg(figure),
         simulated=True,

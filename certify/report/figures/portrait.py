@@ -85,6 +85,8 @@ def portraits(scene: Scene, runs: Runs, region: Region | None) -> list[Picture]:
         )
     about = _ABOUT if scene.centre is None else _ABOUT_A_PATH
     about = (about if scene.beyond is None else _ABOUT_AN_OUTER_SET) if len(scene.pairs) > 1 else ""
+    meaning += _unseen(scene)
+    about = f"{about} {_unseen(scene)}".rstrip() if about else ""
     pictures = []
     for pair, growing, svg in drawn:
         if scene.n > 2:
@@ -107,6 +109,15 @@ def portraits(scene: Scene, runs: Runs, region: Region | None) -> list[Picture]:
         caption = f"{meaning}{sign}*\N{NO-BREAK SPACE}Simulated or evaluated on a grid{scene.held}, not proved."
         pictures.append(Picture(title, caption, svg, simulated=True, wide=scene.n == 2, legend=legend, about=about))
     return pictures
+
+
+def _unseen(scene: Scene) -> str:
+    """That the inner set cannot be seen, where it is too small for all of the pictures."""
+    if not scene.shows_inner or any(map(scene.sees_inner, scene.pairs)):
+        return ""
+    below_it = "; a picture below shows it" if scene.n == 2 else ""
+    level = inner_level(scene.kind, scene.inner, 3)
+    return f"The {scene.words.inner_set}, V ≤ {level}, is too small to be seen here{below_it}. "
 
 
 def _but_inside(scene: Scene) -> str:
@@ -151,7 +162,7 @@ def keys(scene: Scene, runs: Runs, region: Region | None, growing: bool) -> tupl
         shown = ": section through the origin" if scene.n > 2 else ""
         level = below(scene.beyond.level, 4)
         found.insert(0, Key(f"{scene.word} outer set, N = {level}{shown}", START, 1.8, fill=START_FILL))
-    if scene.shows_inner:
+    if any(map(scene.sees_inner, scene.pairs)):
         found.append(Key(inner + (": section" if scene.n > 2 else ""), INNER, 1.4, fill=INNER_FILL))
     if growing:
         found.append(Key(f"{scene.falling} ≥ 0 on a grid*", GROWTH, 1.0, fill=GROWTH_FILL))
@@ -226,7 +237,7 @@ def draw_plane(axes: Any, scene: Scene, pair: Pair, runs: Runs, region: Region |
         axes.plot(*ellipse(scene.start, pair, 1.0), color=START, lw=1.8 if scene.n == 2 else 1.5, zorder=4)
         if scene.n > 2:
             axes.plot(*shadow(scene.start, pair, 1.0), color=START, lw=1.2, ls="--", zorder=4)
-    if scene.shows_inner:
+    if scene.sees_inner(pair):
         inner = ellipse(scene.P, pair, scene.inner)
         axes.fill(*inner, color=INNER_FILL, lw=0, zorder=1.5)
         axes.plot(*inner, color=INNER, lw=1.4, zorder=3.5)

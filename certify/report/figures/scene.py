@@ -46,6 +46,7 @@ _FINE, _SEVERAL = (
     121,
 )  # points along a grid on which the outline of an outer set is drawn, in one plane and in each
 _ALONG = 400  # points of a ray, of which the last one in the sets is where a trajectory starts
+_SEEN = 1 / 200  # of a picture's width: less is no more than a dot
 _VIEW = 1.3  # of the set's reach, in pictures of more than two states
 
 
@@ -273,6 +274,13 @@ class Scene:
     def shows_inner(self) -> bool:
         """Whether there is an inner set besides the outer one."""
         return self.kind == "practical" or not self.local_is_enough
+
+    def sees_inner(self, pair: Pair) -> bool:
+        """Whether the inner set is large enough to be seen in a picture of two states."""
+        if not self.shows_inner:
+            return False
+        box = self.view(pair)
+        return bool(np.any(2 * self.inner_reach[list(pair)] > _SEEN * (box.hi - box.lo)))
 
     @property
     def there(self) -> str:

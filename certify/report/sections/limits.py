@@ -11,10 +11,10 @@ from typing import Any
 from certify.certificate import Certificate
 from certify.lyapunov import extents
 from certify.report.figures.scene import centre_of, is_ellipsoid
-from certify.report.limits import limit_in_words, outer_limited_by
+from certify.report.limits import AT_A_POINT, limit_in_words, outer_limited_by
 from certify.report.sections.shared import ellipsoids_of, shares_of, timing_of
 from certify.report.sections.status import is_missed
-from certify.report.words import above, held_at, number, pretty_unit, symbol
+from certify.report.words import above, held_at, modes, pretty_unit, symbol
 
 
 def limits_of(certificate: Certificate, result: Mapping[str, Any] | None) -> dict[str, Any] | None:
@@ -55,8 +55,8 @@ def limits_of(certificate: Certificate, result: Mapping[str, Any] | None) -> dic
             for each, e, share in zip(sets, reach, shares, strict=True)
         ],
         "hurts": [
-            (names.get(name, name), f"{100 * weight:.1f}", number(weight, 2))
-            for name, weight in (found.get("hurts") or {}).items()
+            (names.get(name, name), f"{100 * weight:.1f}", f"{100 * weight:.0f} %")
+            for name, weight in ({} if found.get("kind") in AT_A_POINT else found.get("hurts") or {}).items()
         ],
         "why": str(step.get("why", "")).rstrip("."),
         "command": step.get("command") or options,
@@ -70,12 +70,7 @@ def _outer_limit(result: Mapping[str, Any] | None) -> str:
 
 
 def _modes(found: Mapping[str, Any], held: str) -> str:
-    """How fast the closed loop is at the origin, in a sentence, with the values that are not exact `held`."""
+    """How fast the closed loop is at rest, in a sentence, with the values that are not exact `held`."""
     if not found.get("stiffness"):
         return ""
-    fast, slow = number(abs(found["fastest"]), 3), number(abs(found["slowest"]), 3)
-    where = f"At the origin, {held}," if held else "At the origin"
-    return (
-        f"{where} its slowest mode decays at {slow} per second, its fastest at {fast} per second: a stiffness of "
-        f"{number(found['stiffness'], 2)}."
-    )
+    return f"Modes at rest{f', {held}' if held else ''}: {modes(found['fastest'], found['slowest'])}."

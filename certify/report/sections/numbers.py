@@ -32,6 +32,7 @@ from certify.report.words import (
     above,
     below,
     deviation,
+    distinguished,
     estimated,
     held_at,
     network_name,
@@ -187,17 +188,17 @@ def _run(result: Mapping[str, Any] | None) -> Rows:
 
 def _candidates(certificate: Certificate, result: Mapping[str, Any] | None) -> list[tuple[str, ...]]:
     """A row for each V that the run tried."""
-    unit = _unit_of(certificate)
+    unit, found = _unit_of(certificate), list((result or {}).get("candidates", []))
     return [
         (
-            row["candidate"],
+            name,
             below(row["level"]),
             f"{below(row['volume'])} {unit}".rstrip(),
             "the domain" if row["limited_by"] == "domain" else "a violation found",
             f"{below(row['proved_volume'])} {unit}".rstrip() if row.get("proved_volume") else ABSENT,
             "this one" if row["proved"] else "",
         )
-        for row in (result or {}).get("candidates", [])
+        for name, row in zip(distinguished([one["candidate"] for one in found]), found, strict=True)
     ]
 
 
@@ -241,11 +242,11 @@ def _lengths(certificate: Certificate, sets: Sequence[Ellipsoid]) -> tuple[list[
     axes = [[below(float(v)) for v in semi_axes(each.P, each.level)] for each in sets]
     most = [[above(float(v)) for v in extents(each.P, each.level)] for each in sets]
     if len(sets) == 1:
-        return ["on its axis, ±", "largest in the set, ±"], [*axes, *most]
+        return ["others at rest, ±", "at most, ±"], [*axes, *most]
     for column, each in zip(axes, sets, strict=True) if centre_of(certificate) is None else ():
         shares = shares_of(certificate, semi_axes(each.P, each.level))
         column[:] = [f"{v} ({below(100 * q, 3)} %)" for v, q in zip(column, shares, strict=True)]
-    heads = [f"{what} {each.name}, ±" for what in ("axis of", "largest in") for each in sets]
+    heads = [f"{each.name}, {what}, ±" for what in ("others at rest", "at most") for each in sets]
     return heads, [*axes, *most]
 
 

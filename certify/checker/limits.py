@@ -1,0 +1,213 @@
+"""The rule `limits`: what a file asks for, counted from the sizes that it states, before anything is computed.
+
+Each rule alone is cheap, and so is each size; what is dear is their product. FORMAT.md has these sums, which count
+generously what this checker and the reference do: a unit is about what a nanosecond does here. They read sizes only.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import prod
+
+from .case import Case, Failures
+from .document import Array, Certificate, Network, Outer, Partition
+
+MOST_NUMBERS = 2**25
+MOST_WORK, MOST_IN_PATIENCE = 2**39, 2**46  # ten minutes; many hours, if somebody says that there is time for it
+LEAF = 255
+
+
+def is_bearable(case: Case) -> Failures:
+    """`limits`: neither too many numbers at once, nor too many operations in all."""
+    sizes = Sizes(case.c)
+    count, work, most = sizes.numbers(), sizes.work(), MOST_IN_PATIENCE if case.patient else MOST_WORK
+    if count > MOST_NUMBERS:
+        yield "numbers", f"the file asks for {in_short(count)} at once; {in_short(MOST_NUMBERS)} are allowed"
+    if work > most:
+        more = f"; with --patient {in_short(MOST_IN_PATIENCE)}" if most < work <= MOST_IN_PATIENCE else ""
+        yield "operations", f"the file asks for {in_short(work)}; {in_short(most)} are allowed{more}"
+    return 1
+
+
+def in_short(count: int) -> str:
+    """Two digits and a power of ten; a count may be beyond binary64."""
+    power = max(len(str(count)) - 1, 0)
+    return f"{count}" if power < 4 else f"{count // 10 ** (power - 1) / 10}e{power}"
+
+
+class Net:
+    """The sums over a network's layers, (rows, columns) of each."""
+
+    def __init__(self, weights: Sequence[Array]) -> None:
+        before, self.layers = 0, list[tuple[int, int, int]]()
+        for W in weights:
+            rows, columns = W.shape
+            self.layers.append((rows, columns, before))
+            before += rows
+        self.units, self.widest = before, max((rows for rows, _, _ in self.layers), default=0)
+        self.entries = sum(rows * columns for rows, columns, _ in self.layers)
+
+    @property
+    def folded(self) -> int:
+        return sum(r * c * (2**9 + 8 * min(r, c)) for r, c, _ in self.layers)
+
+    @property
+    def paths(self) -> int:
+        return sum(r * c * before for r, c, before in self.layers)
+
+    def on_a_leaf(self, n: int, m: int) -> int:
+        return sum(r * (c * (n + m + 2) + 16 * (n + m) + 2**10) for r, c, _ in self.layers)
+
+    def on_a_ball(self, d: int, t: int) -> int:
+        return sum(r * (c * (d + before) + before * t) + 2**21 for r, c, before in self.layers) + 64 * self.units * t
+
+    def models(self, area: int) -> int:
+        return sum(r * area * (2 * c + 64) for r, c, _ in self.layers)
+
+
+class Sizes:
+    """Of a certificate, in the letters of FORMAT.md."""
+
+    def __init__(self, c: Certificate) -> None:
+        self.c, self.evidence = c, c.evidence
+        self.n, self.m, quantities = len(c.states), len(c.inputs), len(c.uncertain)
+        self.varies = int(c.sample is not None and c.sample[0] < c.sample[1])
+        self.y = quantities + self.varies
+        self.s = self.n + self.m + self.y
+        self.d = self.n + (c.claim == "reached")
+        self.t = 2 * self.d**2 + self.d * (self.d + 1) * (self.d + 2) // 6
+        self.a, self.net = len(c.dynamics.operations), Net(c.policy.weights)
+
+    # ------------------------------------------------------------------------------------------------------ numbers
+
+    def numbers(self) -> int:
+        """Held at once."""
+        found = 4 * self.net.entries
+        if not isinstance(self.evidence, Partition):
+            return found
+        order = max(self.evidence.order, self.evidence.local.order if self.evidence.local else 1)
+        values = (4 * order if self.c.sample else 1) * self.a + 2 * self.n + 8
+        if self.asked or self.c.outer:
+            found += values * (self.s + 1) ** 2 + 2**14 * (self.n + self.m + len(self.net.layers))
+        if self.evidence.local or self.evidence.contraction or self.evidence.tube:
+            found += values * (self.t + self.d * self.y + self.m) + self.d**4 // 4
+            found += sum(4 * rows * before for rows, _, before in self.net.layers) + 3 * self.net.units * self.t
+        if self.c.outer:
+            area, N, of_tape = (self.s + 1) ** 2, *_function(self.c.outer)
+            found += 4 * N.entries + 2 * N.units * area + 8 * of_tape * area
+        return found
+
+    # --------------------------------------------------------------------------------------------------------- work
+
+    def work(self) -> int:
+        """Elementary operations."""
+        found = 2**15 * self.a + self.net.folded + self.inverse(self.bits(self.c.P))
+        if self.c.policy.centre == "none" and not self.c.practical:
+            found += 2**12 * self.net.entries
+        if not isinstance(self.evidence, Partition):
+            return found
+        seen = min(2 * self.bits(self.evidence.T) + self.bits(self.c.P) + 16, 2**16 // self.n)
+        found += self.inverse(seen) + 2**8 * len(self.evidence.tree)
+        if self.asked:
+            found += self.of_ring(self.evidence.tree.count(LEAF))
+        return found + self.of_balls() + self.of_tube() + self.of_outer()
+
+    @property
+    def asked(self) -> bool:
+        """Whether the leaves of the ring are looked at."""
+        return isinstance(self.evidence, Partition) and (self.evidence.local is None or self.c.c1 != self.c.c2)
+
+    def bits(self, A: Array) -> int:
+        """Of the longest numerator over a common denominator."""
+        parts = [v.as_integer_ratio() for v in A.ravel().tolist()]
+        common = max(below for _, below in parts)  # of powers of 2
+        return max((abs(above) * (common // below)).bit_length() for above, below in parts)
+
+    def inverse(self, bits: int) -> int:
+        """Of an exact matrix of n rows."""
+        return self.n**5 * bits**2 // 2**13 + 2**10 * self.n**3
+
+    def decision(self, rows: int) -> int:
+        """Whether an exact matrix is positive definite."""
+        return 2**14 * rows**3
+
+    def evaluations(self, order: int) -> int:
+        """Of the equations, for a series of that order in time."""
+        return 2 * order**3 + 8 if self.c.sample else 1
+
+    def boxes(self, leaves: int, models: int, values: int, symbols: int, calls: int) -> int:
+        """So many models on each leaf, `values` of which are held; `calls` are those beside the models'."""
+        area = (symbols + 4) ** 2
+        of_each = 8 * area * models + area * (values + 4) * (32 * models + calls) // 2**9
+        return leaves * (of_each + 2**11 + 2**7 * self.n + self.n**3)
+
+    def policies(self, leaves: int) -> int:
+        each, batches = self.net.on_a_leaf(self.n, self.m), 1 + leaves * self.net.widest // 2**14
+        return (leaves * each + batches * self.net.paths) // 4
+
+    def of_ring(self, leaves: int) -> int:
+        order, calls = self._partition.order, self.n * self.s**2 + 160 * len(self.net.layers)
+        models = self.a * self.evaluations(order) + self.n**2 + 4 * self.n
+        return self.boxes(leaves, models, self.a * order, self.s, calls) + self.policies(leaves)
+
+    @property
+    def ball(self) -> int:
+        """The policy on a ball, once."""
+        return self.net.on_a_ball(self.d, self.t)
+
+    @property
+    def model(self) -> int:
+        """An operation of the equations in models on a ball."""
+        return 2**16 + 64 * self.t + 16 * self.d**2 * (self.m + self.y)
+
+    @property
+    def inequality(self) -> int:
+        """One matrix inequality on a ball."""
+        rows = self.d + 1
+        return 2**23 + 2**12 * rows**4 + 8 * self.d**5 + 4 * self.net.units * self.d**3 + self.decision(rows)
+
+    def of_balls(self) -> int:
+        evidence, found = self._partition, 0
+        cells = prod(evidence.cells)
+        if evidence.local:
+            times = cells + (self.evaluations(evidence.local.order) + 8 if self.c.sample else 0)
+            corners = cells * 2**self.y
+            found += self.ball + self.a * times * self.model + corners * self.inequality + self.decision(self.n)
+        if evidence.contraction:
+            corners = cells * 2**self.y
+            found += self.ball + self.a * cells * self.model + corners * self.inequality + self.decision(self.n)
+        return found
+
+    def of_tube(self) -> int:
+        of_each = self.ball + self.a * self.model + 3 * (self.inequality + self.decision(self.n))
+        tube = self._partition.tube
+        nodes = [P for slab in tube for P in (slab.middle, slab.end)] + ([] if self.c.start is None else [self.c.start])
+        return len(tube) * of_each + sum(self.inverse(self.bits(P)) for P in nodes)
+
+    def of_outer(self) -> int:
+        evidence = self._partition.outer
+        if self.c.outer is None or evidence is None:
+            return 0
+        N, of_tape = _function(self.c.outer)
+        calls, values = 200 * len(N.layers), max(N.widest, 2 * of_tape)
+        faces, leaves = sum(tree.count(LEAF) for tree in evidence.faces), evidence.tree.count(LEAF)
+        found = N.folded + self.inverse(self.bits(evidence.T))
+        found += 2**8 * sum(map(len, (evidence.tree, *evidence.faces)))
+        found += self.boxes(faces, of_tape, values, self.n, calls) + faces * N.models((self.n + 4) ** 2)
+        found += ((faces + leaves) * N.on_a_leaf(self.n, 1) + (1 + faces + leaves) * N.paths) // 4
+        models, calls = self.a + 8 * of_tape + 4 * self.n, calls + self.n * self.s**2 + 160 * len(self.net.layers)
+        found += self.boxes(leaves, models, max(values, self.a), self.s, calls)
+        return found + leaves * N.models((self.s + 4) ** 2) + self.policies(leaves)
+
+    @property
+    def _partition(self) -> Partition:
+        if not isinstance(self.evidence, Partition):
+            raise TypeError("a solver's word takes no work")
+        return self.evidence
+
+
+def _function(outer: Outer) -> tuple[Net, int]:
+    """Its layers, or the operations of its expression."""
+    if isinstance(outer.function, Network):
+        return Net(outer.function.weights), 0
+    return Net(()), len(outer.function.operations)

@@ -1,0 +1,91 @@
+"""Slips of whoever writes equations as Python or as mathematics has them: what to write here instead.
+
+Only messages come from here; what an equation may hold is decided where it is read.
+"""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Collection, Sequence
+
+_MODULES = ("np", "numpy", "math", "cmath", "sympy", "sp", "torch", "jnp", "jax", "scipy", "casadi", "ca", "tf")
+_SMOOTH = "equations must be smooth"
+_STEP = f"{_SMOOTH}; a step from 0 to 1 where y changes its sign is (1 + tanh(50*y))/2, as steep as its factor says"
+_BOUNDS = f"{_SMOOTH}; what limits an input belongs in [input_bounds]"
+# {x} and {y} are the arguments, {X} and {Y} the same in brackets where they need some.
+_FORMULAS = {
+    "arctan": "atan({x})",
+    "power": "{X}**{Y}",
+    "pow": "{X}**{Y}",
+    "square": "{X}**2",
+    "arctan2": "atan({X}/{Y}), which is the same where {y} > 0",
+    "atan2": "atan({X}/{Y}), which is the same where {y} > 0",
+    "arcsin": "atan({X}/sqrt(1 - {X}**2))",
+    "asin": "atan({X}/sqrt(1 - {X}**2))",
+    "arccos": "2*atan(sqrt((1 - {X})/(1 + {X})))",
+    "acos": "2*atan(sqrt((1 - {X})/(1 + {X})))",
+    "sinh": "(exp({x}) - exp(-{X}))/2",
+    "cosh": "(exp({x}) + exp(-{X}))/2",
+    "sigmoid": "(1 + tanh({X}/2))/2",
+    "expit": "(1 + tanh({X}/2))/2",
+    "cot": "1/tan({x})",
+    "sec": "1/cos({x})",
+    "radians": "{X}*3.141592653589793/180",
+    "deg2rad": "{X}*3.141592653589793/180",
+    "abs": f"sqrt({{X}}**2 + 1e-6): {_SMOOTH}, and the absolute value is not at 0",
+    "sign": f"tanh(50*{{X}}), as steep as its factor says: {_SMOOTH}, and the sign is not at 0",
+}
+_SAME = {"fabs": "abs", "absolute": "abs", "Abs": "abs", "sgn": "sign"}
+_KINKS = ("min", "max", "minimum", "maximum", "clip", "clamp", "Min", "Max", "sat", "saturate", "relu")
+_STEPS = ("heaviside", "Heaviside", "step", "where", "Piecewise", "piecewise")
+_CONSTANTS = {"pi": "3.141592653589793", "e": "exp(1)", "E": "exp(1)", "tau": "6.283185307179586"}
+
+
+def instead_of_call(name: str, arguments: Sequence[str], functions: Collection[str]) -> str | None:
+    """What to write in the place of a function that is called so, `np.sin` for one; None if nothing is known of it.
+
+    >>> instead_of_call("np.sin", ["p"], ["sin"])
+    'for np.sin(p) write sin(p)'
+    >>> instead_of_call("arctan", ["p"], ["atan"]), instead_of_call("gamma", ["p"], ["atan"])
+    ('for arctan(p) write atan(p)', None)
+    """
+    module, _, bare = name.rpartition(".")
+    if module and module.partition(".")[0] not in _MODULES:
+        return None
+    bare, call = _SAME.get(bare, bare), f"{name}({', '.join(arguments)})"
+    if module and bare in functions:
+        return f"for {call} write {bare}({', '.join(arguments)})"
+    formula = _FORMULAS.get(bare)
+    if formula is not None and len(arguments) == 1 + ("{Y}" in formula):
+        each = dict(zip("xy", arguments, strict=False))
+        each |= {
+            name.upper(): text if text.isidentifier() or text.isalnum() else f"({text})" for name, text in each.items()
+        }
+        return f"for {call} write {formula.format(**each)}"
+    if bare in _KINKS:
+        return f"{call} is not allowed: {_BOUNDS}"
+    return f"{call} is not allowed: {_STEP}" if bare in _STEPS else None
+
+
+def instead_of_name(name: str) -> str | None:
+    """What to write in the place of a constant, `pi` or `np.pi`; None if it is none.
+
+    >>> instead_of_name("np.pi")
+    'for np.pi write its value as a number, 3.141592653589793, or as a parameter: what is written is meant exactly'
+    """
+    module, _, bare = name.rpartition(".")
+    value = _CONSTANTS.get(bare) if not module or module in _MODULES else None
+    if value is None:
+        return None
+    if value.startswith("exp"):
+        return f"for {name} write {value}"
+    return f"for {name} write its value as a number, {value}, or as a parameter: what is written is meant exactly"
+
+
+def instead_of(node: ast.expr, text: str) -> str | None:
+    """What to write in the place of something else that equations may not hold; None if nothing is known of it."""
+    if isinstance(node, ast.Attribute):
+        return instead_of_name(text)
+    if isinstance(node, ast.IfExp | ast.Compare | ast.BoolOp):
+        return f"{text!r} is not allowed, because there are no cases: {_STEP}"
+    return None
