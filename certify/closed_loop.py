@@ -84,8 +84,18 @@ class ClosedLoop:
         return self.folded(x, self.u_eq)
 
     def linearise(self) -> tuple[Array, Array, Array]:
-        """(A, B, K) in float64: `A = df/dx - B K` the closed loop's Jacobian, K = -J_pi(0)."""
+        """(A, B, K) in float64: `A = df/dx - B K` the closed loop's Jacobian, K = -J_pi(0).
+
+        Raises
+        ------
+        InputError : the plant has none at the origin, or it leaves binary64.
+        """
         A_open, B = (in_floats(M) for M in self.plant_jacobians())
+        if not (np.all(np.isfinite(A_open)) and np.all(np.isfinite(B))):
+            raise InputError(
+                f"derivatives of {self.system.name} at the origin must be within the range of binary64; found others. "
+                "Scale the states."
+            )
         K = -self.network.jacobian_at_origin(self.u_eq)
         return A_open - B @ K, B, K
 

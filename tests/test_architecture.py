@@ -22,7 +22,7 @@ EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows th
     "api": "inputs installation lyapunov options policies results roa systems",
     "arguments": "inputs policies systems",
     "asked": "options systems",
-    "beyond": "claims engines lyapunov options results rigorous",
+    "beyond": "claims engines lyapunov options results",
     "certificate": "claims expressions lyapunov policies systems",
     "claims": "closed_loop expressions lyapunov policies",
     "closed_loop": "expressions policies systems",
@@ -34,7 +34,7 @@ EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows th
     "float_error": "closed_loop policies rigorous systems",
     "inputs": "lyapunov policies systems",
     "largest": "certificate claims closed_loop engines lyapunov options policies results roa systems",
-    "lyapunov": "closed_loop expressions plain_file policies systems",
+    "lyapunov": "closed_loop expressions plain_file policies rigorous systems",
     "options": "lyapunov",
     "outcome": "claims closed_loop engines lyapunov race results rigorous trials",
     "parts": "certificate running",
@@ -43,7 +43,7 @@ EDGES = {  # who imports whom, besides errors and verdict: exactly the arrows th
     "report": "certificate claims closed_loop expressions lyapunov policies systems",
     "rest": "closed_loop rigorous",
     "results": "certificate claims engines lyapunov policies report rest sublevel systems",
-    "rigorous": "closed_loop expressions lyapunov policies",
+    "rigorous": "closed_loop expressions policies",
     "roa": (
         "acceptance asked beyond certificate claims closed_loop diagnosis engines lyapunov options outcome parts "
         "policies race rest results running systems trials unfinished"

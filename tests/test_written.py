@@ -11,8 +11,10 @@ import io
 import json
 import pickle
 import random
+import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import redirect_stdout
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -22,10 +24,25 @@ import numpy as np
 import pytest
 import sympy
 
+from certify.certificate.limits import require_within_limits
 from certify.checker import __main__ as checker
+from certify.checker import expression as checkers_tape
 from certify.errors import InputError
-from certify.expressions import FUNCTIONS, Number, differentiate, from_sympy, from_tree, symbols, to_tree
+from certify.expressions import (
+    FUNCTIONS,
+    Expression,
+    Number,
+    Operation,
+    differentiate,
+    evaluate_exactly,
+    from_sympy,
+    from_tree,
+    symbols,
+    to_tree,
+)
 from certify.policies import TanhNetwork
+from certify.reference.expressions import equations
+from certify.report.mathml import typeset
 from certify.rigorous import evaluate_arb
 from certify.roa import RoaOptions, certify_roa
 from certify.systems import System
@@ -277,3 +294,104 @@ def test_a_number_that_has_no_value_is_refused_where_the_plant_is_read(tmp_path:
             plant(text)
     with pytest.raises(InputError, match=r"has no value with the parameters k = 0: it divides by 0"):
         plant("u - x/k").exact_dynamics()
+
+
+# -------------------------------------------------------------------------------------------- odd names, numbers, sizes
+
+
+@pytest.mark.parametrize("q", ["1000000000000000000001/9", "-123456789012345678901/9", "1000000000000000000001", "1/3"])
+@pytest.mark.parametrize("form", ["x/q", "q**2*x", "1/q/x", "x - q", "-q*x", "2*(x + q)"])
+def test_text_gives_long_fractions_back(form: str, q: str) -> None:
+    expression, point = parse_expression(form, {"x": X, "q": Number(Fraction(q))}), {X: Fraction(3, 5)}
+    assert evaluate_exactly(parse_expression(str(expression), {"x": X}), point) == evaluate_exactly(expression, point)
+
+
+def test_a_letter_that_python_takes_for_another_is_refused(tmp_path: Path) -> None:
+    """To Python a bold x is x, so that an equation would not be about the name that a line of [where] gives it."""
+    with pytest.raises(InputError, match="plain ASCII; found '\U0001d431'"):
+        parse_expression("u - \U0001d431", NAMES)
+
+
+def test_a_long_equation_is_read_in_the_time_of_its_length() -> None:
+    row = "(" + "+".join(["x*3"] * 40) + ")"
+    start = time.perf_counter()
+    parse_expression("+".join([row] * 118), NAMES)  # 20 kB
+    assert time.perf_counter() - start < 5  # it took half a minute
+
+
+def test_a_long_sum_that_stands_in_many_places_takes_little_time() -> None:
+    long: Expression = X
+    for _ in range(13):
+        long = parse_expression("s + s", {"s": long})
+    start = time.perf_counter()
+    for k in range(600):  # of the 1,400 such lines that 20 kB hold
+        parse_expression(f"1/(s + {k})", {"s": long})
+    assert time.perf_counter() - start < 3
+
+
+def test_both_checkers_hold_a_number_of_more_digits_than_python_writes() -> None:
+    number = "7" * 1200
+    equation = ["+", ["*", number, number, number, number, "x"], "u"]
+    assert len(checkers_tape.parse([equation], ["x", "u"], "plant.dynamics").operations) == 5
+    assert len(equations([equation], {"x", "u"}, "plant.dynamics").steps) == 5
+
+
+def test_an_equation_that_nests_too_deep_is_refused_with_words() -> None:
+    deep: Expression = X
+    for _ in range(200):
+        deep = parse_expression("sin(s)", {"s": deep})
+    for _ in range(2):
+        with pytest.raises(InputError, match="nest at most 200 deep"):
+            parse_expression("sin(s)", {"s": deep})
+    deep = Operation("sin", deep)
+    for _ in range(590):
+        deep = Operation("sin", deep)
+    system = replace(plant("u - x"), dynamics=(U - X + deep,))
+    with pytest.raises(InputError, match="at most 200 levels of nesting in an equation; found 79"):
+        require_within_limits(system, POLICY)
+
+
+def test_numbers_that_python_does_not_write_are_refused_with_words() -> None:
+    """Python writes at most 4,300 digits."""
+    with pytest.raises(InputError, match="more than 14000 bits"):
+        replace(plant("u - x*sqrt(0 - k*k)"), parameters={"k": Fraction(10**2200 + 1)}).exact_dynamics()
+    with pytest.raises(InputError, match="parameter k of odd must have at most 14000 bits"):
+        replace(plant("u - k*x"), parameters={"k": Fraction(10) ** 4500})
+
+
+@pytest.mark.parametrize("text", ["u - x*1e400/1e400", "u - x*1e400*1e-400", "u - x*(1e200*1e200)*1e-400"])
+def test_numbers_that_cancel_must_lie_within_the_range_of_the_checkers_too(tmp_path: Path, text: str) -> None:
+    with pytest.raises(InputError, match="range of binary64; one is about 10"):
+        certify_roa(plant(text), POLICY, tmp_path, RoaOptions(P=np.eye(1), level=LEVEL))
+
+
+@pytest.mark.usefixtures("checked_here")
+@pytest.mark.parametrize(
+    "text",
+    [
+        "u - x + 1/(1e80 + x) - 1/1e80", "u - x/(1e-90 + 1e-90*x*x)*1e-90", "u - x - x*sqrt(1e130 + x)/1e65",
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("ranged", [False, True])
+def test_middles_whose_powers_leave_binary64_raise_nothing(tmp_path: Path, text: str, ranged: bool) -> None:
+    system = plant(text + " + w*x")
+    system = system.with_ranges({"w": (Fraction(-1, 9), Fraction(1, 9))}) if ranged else system
+    for each in (system, replace(system, time="discrete")):
+        result = certify_roa(each, POLICY, tmp_path, RoaOptions(P=np.eye(1), level=LEVEL, max_boxes=100))
+        assert result.verdict in (Verdict.UNKNOWN, Verdict.REFUTED)
+
+
+@pytest.mark.parametrize("wave", ["sin", "cos"])
+def test_a_derivative_beyond_binary64_is_named(tmp_path: Path, wave: str) -> None:
+    system = plant(f"u - x - x*{wave}((1e150 + x)*(1e150 + x)*(1e150 + x))")
+    with pytest.raises(InputError, match="derivatives of odd at the origin must be within the range of binary64"):
+        certify_roa(system, POLICY, tmp_path, RoaOptions(P=np.eye(1), level=LEVEL, max_boxes=100))
+
+
+def test_the_page_shows_numbers_of_every_size() -> None:
+    for text, shown in (
+        ("1e-400*x", "<mn>1</mn><mo>·</mo><msup><mn>10</mn><mrow><mo>−</mo><mn>400</mn></mrow></msup>"),
+        ("x*(1e200*1e200)", "<mn>1</mn><mo>·</mo><msup><mn>10</mn><mrow><mn>400</mn></mrow></msup>"),
+        ("1234567.8912*x", "<mn>1234567.9</mn>"),
+    ):
+        assert shown in typeset("", parse_expression(text, NAMES))

@@ -5,13 +5,14 @@ The checkers have these limits so that no file can take their time or memory; a 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from fractions import Fraction
 
 import numpy as np
 
 from certify.errors import InputError
-from certify.expressions import Expression, Number, Operation, Tree, gathered, nodes, to_tree
+from certify.expressions import Expression, Operation, Tree, constant_of, gathered, nodes, to_tree
 from certify.policies import TanhNetwork
 from certify.systems import System
 
@@ -30,15 +31,19 @@ def require_within_limits(system: System, network: TanhNetwork) -> None:
     InputError : a limit of the format is exceeded; the message names it.
     """
     dynamics = system.uncertain_dynamics()
+    deepest = max(e.depth for e in dynamics)
+    if deepest > MOST_DEPTH:
+        raise InputError(_too_large(system, "levels of nesting in an equation", deepest, MOST_DEPTH))
     trees = [to_tree(e) for e in dynamics]
     listed = [node for tree in trees for node in _nodes(tree, 0)]
     numbers = [q for pair in (*system.domain, *system.input_bounds) for q in pair] + list(system.exact_u_eq())
     digits = [len(part) for q in (*numbers, *(Fraction(n) for n, _ in listed if _is_number(n))) for part in _parts(q)]
-    made = [e.value for e in nodes(*map(gathered, dynamics)) if isinstance(e, Number)]
+    parts = (*nodes(*dynamics), *nodes(*map(gathered, dynamics)))
+    made = [q for q in map(constant_of, parts) if q is not None]
     for q in (*numbers, *made):
         if not abs(q) < _LARGEST:
             raise InputError(
-                f"numbers of {system.name} must lie within the range of binary64; one has {len(str(q))} digits."
+                f"numbers of {system.name} must lie within the range of binary64; one is about 10^{_magnitude(q)}."
             )
     exponents = [abs(p.exponent) for p in nodes(*dynamics) if isinstance(p, Operation) and p.operator == "**"]
     for what, found, most in (
@@ -47,15 +52,21 @@ def require_within_limits(system: System, network: TanhNetwork) -> None:
         ("layers of the policy", len(network.weights), MOST_LAYERS),
         ("units in a layer", max(len(W) for W in network.weights), MOST_ROWS),
         ("nodes in the equations", len(listed), MOST_NODES),
-        ("levels of nesting in an equation", max(depth for _, depth in listed), MOST_DEPTH),
         ("as the largest exponent in an equation", max(exponents, default=1), MOST_EXPONENT),
         ("digits in the parts of a rational", max(digits), MOST_DIGITS),
         ("operations in the equations, times the numbers of a model of each,", _size(system), MOST_NUMBERS),
     ):
         if found > most:
-            raise InputError(
-                f"{system.name} with this policy is too large for a certificate: at most {most} {what}; found {found}."
-            )
+            raise InputError(_too_large(system, what, found, most))
+
+
+def _too_large(system: System, what: str, found: int, most: int) -> str:
+    return f"{system.name} with this policy is too large for a certificate: at most {most} {what}; found {found}."
+
+
+def _magnitude(q: Fraction) -> int:
+    """The decimal exponent of a number that may be too long to be written."""
+    return round((q.numerator.bit_length() - q.denominator.bit_length()) * math.log10(2))
 
 
 def require_short(P: np.ndarray) -> None:

@@ -84,7 +84,7 @@ class _Builder:
         return self.push("const", part) if isinstance(part, Fraction) else part
 
     def push(self, *operation: Any) -> int:
-        index, _ = self.tape.setdefault(" ".join(map(str, operation)), (len(self.tape), operation))
+        index, _ = self.tape.setdefault(" ".join(map(_word, operation)), (len(self.tape), operation))
         if index >= MAX_OPERATIONS:
             strict.fail(self.at, f"more than {MAX_OPERATIONS} operations")
         return index
@@ -127,3 +127,8 @@ class _Builder:
             if bit == "1":
                 result = self.apply("*", result, base)
         return result if exponent > 0 else self.apply("inv", result)
+
+
+def _word(part: Any) -> str:
+    """A part of an operation, for the tape's keys; Python writes no integer of more than 4,300 decimal digits."""
+    return f"{part.numerator:x}/{part.denominator:x}" if isinstance(part, Fraction) else str(part)

@@ -150,6 +150,11 @@ def fourth_of_tanh(y: Array, radius: Array) -> Array:
     return np.asarray(np.minimum(TANH4, there + TANH5 * radius) / 24)
 
 
+def is_extreme(c: float) -> bool:
+    """Whether the powers of a middle c, that inverses and roots have derivatives of, may leave binary64."""
+    return not 2.0**-200 < abs(c) < 2.0**200
+
+
 def of_inputs(B: Array, errors: Array, like: Array) -> Array:
     """The bound of B (1, m) times the e_j, a row for each ball as `like` has them."""
     return np.asarray((np.abs(B) @ errors).reshape(like.shape))
@@ -210,13 +215,13 @@ class Jet:
 
     def inverse(self) -> Jet:
         c, least = self.c, abs(self.c) - self.radius
-        if not np.all(least > 0):
+        if not np.all(least > 0) or is_extreme(c):
             return self._nowhere()
         return self.compose(1 / c, -1 / c**2, 2 / c**3, -6 / c**4, 1 / (c**4 * least))  # D^4 / (c^4 v) is what is left
 
     def sqrt(self) -> Jet:
         least = self.c - self.radius
-        if not np.all(least > 0):
+        if not np.all(least > 0) or is_extreme(self.c):
             return self._nowhere()
         s, w = math.sqrt(self.c), np.sqrt(least)
         fourth = (5 * s**2 + 4 * s * w + w**2) / (16 * s**5 * (s + w) ** 4)  # what is left of a root w, over D^4
@@ -241,10 +246,14 @@ class Jet:
         return self.compose(math.atan(self.c), slope, -2 * self.c * slope**2, f3, np.array([ATAN4 / 24]))
 
     def sin(self) -> Jet:
+        if math.isinf(self.c):
+            return self._nowhere()
         s, c = math.sin(self.c), math.cos(self.c)
         return self.compose(s, c, -s, -c, np.minimum(1.0, abs(s) + self.radius) / 24)
 
     def cos(self) -> Jet:
+        if math.isinf(self.c):
+            return self._nowhere()
         s, c = math.sin(self.c), math.cos(self.c)
         return self.compose(c, -s, -c, s, np.minimum(1.0, abs(c) + self.radius) / 24)
 

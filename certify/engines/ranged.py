@@ -22,7 +22,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.enclosures.taylor import EXP_END
-from certify.engines.jets import ATAN4, TANH4, TANH5, Sizes, basis, beyond_tangent, of_inputs, remainder, sizes
+from certify.engines.jets import (
+    ATAN4,
+    TANH4,
+    TANH5,
+    Sizes,
+    basis,
+    beyond_tangent,
+    is_extreme,
+    of_inputs,
+    remainder,
+    sizes,
+)
 from certify.expressions import Algebra
 
 Array = NDArray[np.float64]
@@ -193,7 +204,7 @@ class RangedJet:
         c, far = self.c, self.away
         close = abs(c) - far
         least = close - self.radius
-        if not np.all(least > 0):
+        if not np.all(least > 0) or is_extreme(c):
             return self._nowhere()
         f = 1 / c, -1 / c**2, 1 / c**3, -1 / c**4
         e = far / close**2, 2 * far / close**3, 3 * far / close**4, 4 * far / close**5
@@ -202,7 +213,7 @@ class RangedJet:
     def sqrt(self) -> RangedJet:
         far = self.away
         close = self.c - far
-        if not np.all(close - self.radius > 0):
+        if not np.all(close - self.radius > 0) or is_extreme(self.c):
             return self._nowhere()
         r, s, w = math.sqrt(self.c), np.sqrt(close), np.sqrt(close - self.radius)
         f = r, 1 / (2 * r), -1 / (8 * r**3), 1 / (16 * r**5)
@@ -232,10 +243,10 @@ class RangedJet:
         return self.compose(f, (far, far, far, far), np.array([ATAN4 / 24]))
 
     def sin(self) -> RangedJet:
-        return self._wave(math.sin(self.c), math.cos(self.c))
+        return self._nowhere() if math.isinf(self.c) else self._wave(math.sin(self.c), math.cos(self.c))
 
     def cos(self) -> RangedJet:
-        return self._wave(math.cos(self.c), -math.sin(self.c))
+        return self._nowhere() if math.isinf(self.c) else self._wave(math.cos(self.c), -math.sin(self.c))
 
     def _wave(self, value: float, slope: float) -> RangedJet:
         far = self.away

@@ -14,7 +14,8 @@ from math import prod
 from certify.errors import InputError
 from certify.expressions.tree import Expression, Number, Operation, nodes, total
 
-MOST_BITS = 2**14  # of a number on the way: powers of powers grow without end
+MOST_BITS = 14_000  # of a number on the way: the checkers allow 2^14, and Python writes 4,300 digits
+_MOST_JOINED = 64  # terms
 
 
 def gathered(expression: Expression) -> Expression:
@@ -77,7 +78,7 @@ def _sum(operands: tuple[Expression, ...]) -> tuple[Fraction, Expression | None]
         factor, core = _parts(operand)
         if core is None:
             constant = _short(constant + factor)
-        elif abs(factor) == 1 and isinstance(core, Operation) and core.operator == "+":
+        elif abs(factor) == 1 and _is_short_sum(core):
             for term in core.operands:
                 inner, of = _parts(term)
                 if of is None:
@@ -91,6 +92,11 @@ def _sum(operands: tuple[Expression, ...]) -> tuple[Fraction, Expression | None]
     if constant == 0 and len(terms) == 1:
         return _parts(terms[0])
     return Fraction(1), total([Number(constant), *terms] if constant else terms)
+
+
+def _is_short_sum(core: Expression) -> bool:
+    """Whether its terms may join those of a sum around it; a long sum that stands in many others stays one."""
+    return isinstance(core, Operation) and core.operator == "+" and len(core.operands) <= _MOST_JOINED
 
 
 def _product(parts: list[tuple[Fraction, Expression | None]]) -> tuple[Fraction, Expression | None]:

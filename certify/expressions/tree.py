@@ -395,5 +395,7 @@ def decimal_text(q: Fraction) -> str | None:
     >>> decimal_text(Fraction(981, 100)), decimal_text(Fraction(1, 3))
     ('9.81', None)
     """
-    short = f"{Decimal(q.numerator) / Decimal(q.denominator):.{_DIGITS}g}" if abs(q) < 10**_DIGITS else str(q)
+    if abs(q) >= 10**_DIGITS:
+        return str(q) if q.denominator == 1 else None
+    short = f"{Decimal(q.numerator) / Decimal(q.denominator):.{_DIGITS}g}"
     return short if "e" not in short and Fraction(short) == q else None

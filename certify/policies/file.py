@@ -192,9 +192,9 @@ def _to_import(path: Path, found: str) -> str:
     """The message for a file that another program wrote, with the command to type."""
     file, out = (shlex.quote(str(p)) for p in (path, f"{path.stem}-policy.pt"))
     return (
-        f"{_WHAT} {path} must be one of this program; it is {found} (nothing in it was executed). If it holds a policy, "
-        f"import it first, for the plant that it controls: certify import {file} --system PLANT --out {out}. The import asks for what the file "
-        "does not say."
+        f"{_WHAT} {path} must be one of this program; it is {found} (nothing in it was executed). If it holds a "
+        f"policy, import it first, for the plant that it controls: certify import {file} --system PLANT --out {out}. "
+        "The import asks for what the file does not say."
     )
 
 

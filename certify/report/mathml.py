@@ -6,6 +6,7 @@ What comes out is marked as safe to stand in a page as it is, so every name pass
 
 from __future__ import annotations
 
+from decimal import Context, Decimal
 from fractions import Fraction
 from typing import Any
 
@@ -16,6 +17,7 @@ from certify.report.words import MINUS as SIGN
 from certify.report.words import symbol
 
 _LONG = 10**6  # numerators and denominators beyond it are shown rounded
+_DIGITS = 8  # of what is rounded
 _SPACE, _DOT = '<mspace width="0.15em"/>', "<mo>·</mo>"
 
 
@@ -123,9 +125,12 @@ def _number(q: Fraction) -> str:
         return f"<mfrac><mn>{q.numerator}</mn><mn>{q.denominator}</mn></mfrac>"
     if short is not None and len(short) <= 10:
         return f"<mn>{short}</mn>"
-    digits, _, exponent = f"{float(q):.8g}".partition("e")
-    power = f"<mo>·</mo><msup><mn>10</mn><mrow>{_written(Number(int(exponent)))}</mrow></msup>" if exponent else ""
-    return f"<mn>{digits}</mn>{power}"
+    rounded = Context(prec=_DIGITS).divide(Decimal(q.numerator), Decimal(q.denominator)).normalize()
+    exponent = rounded.adjusted()
+    if -5 < exponent < _DIGITS:
+        return f"<mn>{rounded:f}</mn>"
+    power = f"<msup><mn>10</mn><mrow>{_written(Number(exponent))}</mrow></msup>"
+    return f"<mn>{rounded.scaleb(-exponent):f}</mn><mo>·</mo>{power}"
 
 
 def _escape(text: str) -> str:

@@ -14,11 +14,11 @@ from collections.abc import Iterable, Mapping
 from fractions import Fraction
 
 from certify.errors import InputError
-from certify.expressions import FUNCTIONS, MOST_EXPONENT, Expression, Number, constant_of, function
+from certify.expressions import FUNCTIONS, MOST_EXPONENT, Expression, Number, constant_of, function, nodes
 from certify.systems.spelling import instead_of, instead_of_call, instead_of_name
 from certify.systems.system import exact
 
-_MOST_NODES = 20_000  # a certificate holds no more (FORMAT.md)
+_MOST_NODES, _MOST_DEPTH = 20_000, 200  # a certificate holds no more (FORMAT.md)
 _OPERATORS = "+ - * /, integer powers with **"
 
 
@@ -37,6 +37,9 @@ def parse_expression(
     InputError : the text is no equation over them; the message names the symbol.
     """
     source = " ".join(str(text).split())  # a long equation may go over several lines
+    if not source.isascii():  # Python would read a bold or a wide x as x
+        odd = next(c for c in source if not c.isascii())
+        raise InputError(f"equation {source!r}: letters, digits and signs must be plain ASCII; found {odd!r}.")
     if "#" in source:  # Python would leave out what follows, and the plant would be another
         raise InputError(f"equation {source!r}: # begins no comment here; put comments outside the text.")
     try:
@@ -51,15 +54,18 @@ def parse_expression(
         hint = "; there are no cases: write one formula" if re.search(r"\bif\b", source) else hint
         reason = error.msg if isinstance(error, SyntaxError) else str(error)
         raise InputError(f"equation {source!r} cannot be read: {reason}{hint}.") from error
-    if _size(found, {}) > _MOST_NODES:
+    if found.depth > _MOST_DEPTH:
+        raise InputError(f"equation {source!r}: written out it must nest at most {_MOST_DEPTH} deep; it nests deeper.")
+    if _size(found) > _MOST_NODES:
         raise InputError(f"equation {source!r}: written out it must have at most {_MOST_NODES:,} terms; it has more.")
     return found
 
 
-def _size(expression: Expression, known: dict[Expression, int]) -> int:
+def _size(expression: Expression) -> int:
     """Nodes of the tree, which may be many more than those of the names that it is written with."""
-    if expression not in known:
-        known[expression] = 1 + sum(_size(e, known) for e in expression.operands)
+    known: dict[Expression, int] = {}
+    for node in nodes(expression):
+        known[node] = 1 + sum(known[e] for e in node.operands)
     return known[expression]
 
 
@@ -175,7 +181,9 @@ class _Reader:
             raise self._refuse(str(error)) from error
 
     def _text(self, node: ast.AST) -> str:
-        return ast.get_source_segment(self.source, node) or self.source
+        if not isinstance(node, ast.expr):
+            return self.source
+        return self.source[node.col_offset : node.end_col_offset]  # of one line, in ASCII
 
     def _refuse(self, message: str) -> InputError:
         end = "" if message.endswith("?") else "."

@@ -40,6 +40,7 @@ from certify.expressions import (
     symbols_of,
     value_if_rational,
 )
+from certify.expressions.gathering import MOST_BITS
 from certify.expressions.numerical import Module
 from certify.systems.ode import rk4_step
 
@@ -173,6 +174,9 @@ class System:
                 raise InputError(f"`positive` of {self.name} must name parameters, {known}; found {name!r}.")
             if not self.parameters[name] > 0:
                 raise InputError(f"parameter {name} of {self.name} must be positive; found {self.parameters[name]}.")
+        for name, q in self.parameters.items():
+            if max(q.numerator.bit_length(), q.denominator.bit_length()) > MOST_BITS:
+                raise InputError(f"parameter {name} of {self.name} must have at most {MOST_BITS} bits; it has more.")
         parameters = {Symbol(p) for p in self.parameters}
         everything = {*self.states, *self.inputs, *parameters, *self.disturbances}
         for allowed, equations in ((everything, self.dynamics), (parameters, (*self.u_eq, *self.x_eq))):

@@ -31,6 +31,8 @@ from certify.checker.exact import Exact, Undecided
 from certify.checker.expression import evaluate, parse
 from certify.checker.schema import Value
 from certify.checker.strict import MAX_BYTES
+from certify.reference.expressions import equations
+from certify.reference.refusal import Refused
 from tests.support.certificates import Document, dump, edited, encode, grow, make, rehash, write
 
 
@@ -405,6 +407,8 @@ def test_the_printed_equations_are_the_parsed_ones(tree: Any) -> None:
         tape = parse([tree], ["x", "u"], "plant.dynamics")
     except Rejected as no:
         assert no.rule == "format" and no.detail == "a division by the number 0"
+        with pytest.raises(Refused, match="a division by the number 0"):
+            equations([tree], {"x", "u"}, "plant.dynamics")
         return
     exact_text = re.sub(r"(?<![\w*])\d+", lambda m: f"Fraction({m[0]})", words.expression(tape.trees[0]))
     x, u = Fraction(7, 5), Fraction(-2, 3)
