@@ -558,12 +558,13 @@ def test_loading_a_policy_by_hand_changes_nothing() -> None:
     assert by_hand.raw == certify_roa(None, SHIPPED, None, QUICK, provenance={}).raw
 
 
-def test_what_the_readme_shows_runs(
+def test_what_the_readme_and_the_reference_show_runs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "examples").symlink_to(ROOT / "examples")
     monkeypatch.chdir(tmp_path)
-    first, second = re.findall(r"```python\n(.*?)```", (ROOT / "README.md").read_text(), re.DOTALL)
+    pages = (ROOT / "README.md", ROOT / "docs" / "reference" / "python.md")
+    first, second = (code for page in pages for code in re.findall(r"```python\n(.*?)```", page.read_text(), re.DOTALL))
     exec(first, {})
     shown = capsys.readouterr().out.splitlines()
     assert shown[0].startswith("RoaResult(PROVED; pendulum; V <= ") and shown[0].startswith(first.split("# ")[1][:30])

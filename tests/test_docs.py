@@ -1,6 +1,7 @@
 """The site builds without a warning and loads nothing from elsewhere, and what its pages tell a reader to run works.
 
-Each fenced block of sh or python in docs/ carries a comment on the line above it, which the site does not show:
+Each fenced block of sh or python in docs/ and in the README carries a comment on the line above it, which readers do
+not see:
 
     <!-- run -->         it is run; by the slow tests where the page is not one that is read first
     <!-- run slow -->    it is run by the slow tests
@@ -30,8 +31,11 @@ import typer
 from tests.support.marks import slow_after
 
 ROOT = Path(__file__).parent.parent
+README = ROOT / "README.md"
 PAGES = sorted((ROOT / "docs").rglob("*.md"))
-FIRST = ("index.md", "tutorial.md", "how-to/own-policy.md", "how-to/own-plant.md")  # what a newcomer reads
+READ = [README, *PAGES]
+WRITTEN_APART = {"CITATION.cff", "CONTRIBUTING.md", "CHANGELOG.md"}
+FIRST = ("README.md", "index.md", "tutorial.md", "how-to/own-policy.md", "how-to/own-plant.md")  # what a newcomer reads
 _BLOCK = re.compile(r"(?:<!-- (?P<mark>[^\n]*?) -->\n)?^```(?P<language>[^\n]*)\n(?P<code>.*?)^```$", re.M | re.S)
 _OUTSIDE = re.compile(r"""<(?:script|link|img|iframe|source|object)\b[^>]*?(?:src|href|data)=["']?(?:https?:)?//""")
 
@@ -54,7 +58,7 @@ def blocks(page: Path) -> list[Block]:
 
 
 def named(page: Path) -> str:
-    return str(page.relative_to(ROOT / "docs"))
+    return page.name if page == README else str(page.relative_to(ROOT / "docs"))
 
 
 def run_page(page: Path, folder: Path, slow: bool) -> None:
@@ -91,7 +95,7 @@ def test_the_pages_have_blocks_that_are_run() -> None:
     assert run["tutorial.md"] >= 5 and sum(run.values()) >= 20
 
 
-@pytest.mark.parametrize("page", PAGES, ids=named)
+@pytest.mark.parametrize("page", READ, ids=named)
 def test_every_block_says_whether_it_is_run(page: Path) -> None:
     for block in blocks(page):
         known = ("run", "run slow", "prints")
@@ -103,7 +107,7 @@ def test_every_block_says_whether_it_is_run(page: Path) -> None:
             assert block.language == "text"
 
 
-@pytest.mark.parametrize("page", PAGES, ids=named)
+@pytest.mark.parametrize("page", READ, ids=named)
 def test_commands_exist_with_their_options(page: Path) -> None:
     from certify.cli.main import app as certify
     from controllers.cli import app as controllers
@@ -126,7 +130,7 @@ def test_commands_exist_with_their_options(page: Path) -> None:
 
 def running() -> list[Path]:
     """The pages with a command that is run, those that are read first before the others."""
-    return sorted((p for p in PAGES if any(b.mark == "run" for b in blocks(p))), key=lambda p: named(p) not in FIRST)
+    return sorted((p for p in READ if any(b.mark == "run" for b in blocks(p))), key=lambda p: named(p) not in FIRST)
 
 
 @pytest.mark.parametrize("page", slow_after(len(FIRST), running()), ids=map(named, running()))
@@ -264,10 +268,32 @@ def test_the_sites_packages_are_pinned() -> None:
     } <= pinned
 
 
-def test_the_tables_of_the_comparison_are_of_the_figures_beside_them() -> None:
-    """In the README too: what `make paper` would write is what stands there."""
+def test_the_table_of_the_comparison_is_of_the_figures_beside_it() -> None:
+    """The page shows exactly the table that `make paper` would write."""
     script = runpy.run_path(str(ROOT / "docs" / "paper" / "table.py"))
-    long, short = script["tables"]()
-    assert (ROOT / "docs" / "paper" / "baselines.txt").read_text("utf-8") == long
-    readme = (ROOT / "README.md").read_text("utf-8")
-    assert script["between"](readme, short) == readme != script["between"](readme, "another table")
+    written = (ROOT / "docs" / "paper" / "baselines.txt").read_text("utf-8")
+    assert written == script["table"]() and written.count("| ours |") == len(script["PLANTS"])
+
+
+def test_the_readme_is_short_and_its_links_lead_somewhere() -> None:
+    text = README.read_text("utf-8")
+    assert len(text.splitlines()) <= 150
+    links = re.findall(r"\]\((?!https?:)([^)#]+)", text)
+    missing = [link for link in links if not (ROOT / link).exists()]
+    assert len(links) > 20 and not set(missing) - WRITTEN_APART, missing
+
+
+def test_the_home_page_is_a_picture_three_commands_and_five_places() -> None:
+    page = ROOT / "docs" / "index.md"
+    text = page.read_text("utf-8")
+    commands = [line for block in blocks(page) if block.language == "sh" for line in block.code.splitlines()]
+    assert len(re.findall(r"!\[", text)) == 1 and len(commands) == 3
+    assert len(re.findall(r"^- ", text, re.M)) == 5
+
+
+def test_the_glossary_has_each_term_once_with_an_anchor(site: Path) -> None:
+    html = (site / "glossary.html").read_text("utf-8")
+    terms = re.findall(r"<dt\b([^>]*)>(.*?)</dt>", html, re.S)
+    names = [text_of(name).strip().lower() for _, name in terms]
+    assert len(names) == len(set(names)) >= 90 and all("id=" in attributes for attributes, _ in terms)
+    assert html.count("<dd>") == len(terms)  # an indentation that is wrong makes two terms one
