@@ -2,7 +2,7 @@
 PYTHON ?= python3.11
 BIN := .venv/bin
 
-.PHONY: setup roa test lint docs gallery shares tradeoff paper paper-keep paper-proved coq clean
+.PHONY: setup roa test lint docs gallery shares tradeoff paper paper-proved coq clean
 
 setup: .venv/.installed
 
@@ -35,14 +35,12 @@ shares: setup
 tradeoff: setup
 	$(BIN)/python docs/how-to/tradeoff.py
 
+# The runs themselves are not in the tree; docs/paper.md says how to get them.
 RUNS ?= runs
 
 paper: setup
 	$(BIN)/python docs/paper/draw.py $(RUNS)
 	$(BIN)/python docs/paper/table.py
-
-paper-keep: setup
-	$(BIN)/python docs/paper/keep.py $(RUNS)
 
 paper-proved: setup
 	$(BIN)/python docs/paper/proved.py $(RUNS)
