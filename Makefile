@@ -2,7 +2,7 @@
 PYTHON ?= python3.11
 BIN := .venv/bin
 
-.PHONY: setup roa test lint docs gallery shares tradeoff paper paper-keep paper-proved coq clean
+.PHONY: setup roa test fast lint docs dist gallery shares tradeoff paper paper-proved coq clean
 
 setup: .venv/.installed
 
@@ -18,6 +18,9 @@ roa: setup
 test: setup
 	$(BIN)/pytest -n 2 --dist worksteal
 
+fast: setup
+	.ci/fast
+
 lint: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -25,6 +28,9 @@ lint: setup
 
 docs: setup
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+
+dist: setup
+	.ci/dist
 
 gallery: setup
 	$(BIN)/python docs/gallery/draw.py
@@ -35,14 +41,12 @@ shares: setup
 tradeoff: setup
 	$(BIN)/python docs/how-to/tradeoff.py
 
+# The runs themselves are not in the tree; docs/paper.md says how to get them.
 RUNS ?= runs
 
 paper: setup
 	$(BIN)/python docs/paper/draw.py $(RUNS)
 	$(BIN)/python docs/paper/table.py
-
-paper-keep: setup
-	$(BIN)/python docs/paper/keep.py $(RUNS)
 
 paper-proved: setup
 	$(BIN)/python docs/paper/proved.py $(RUNS)

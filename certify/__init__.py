@@ -51,7 +51,7 @@ _PUBLIC = {
     "ImportOptions": "certify.loop.policies.importers",
 }
 
-__version__ = "0.1.0"
+__version__ = "0.2.0.dev0"  # the only place; CHANGELOG.md has the same heading
 __all__ = [
     "CertifyError",
     "ClosedLoop",

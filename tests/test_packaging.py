@@ -10,6 +10,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tarfile
 import tomllib
 import venv
 import zipfile
@@ -35,20 +36,38 @@ POLICY = ROOT / "examples" / "policies" / "pendulum.pt"
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 
 
+def build(kind: str, tree: Path, folder: Path) -> None:
+    code = f"import sys, setuptools.build_meta as b; b.build_{kind}(sys.argv[1])"
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(folder)], cwd=tree, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+
+
 @pytest.fixture(scope="module")
-def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The wheel of the tree, built in a copy."""
-    folder = tmp_path_factory.mktemp("wheel")
+def sdist(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The source distribution of the tree, built in a copy."""
+    folder = tmp_path_factory.mktemp("sdist")
     tree = folder / "tree"
     for name in ("certify", "controllers"):
         shutil.copytree(ROOT / name, tree / name, ignore=shutil.ignore_patterns("__pycache__"))
-    for name in ("pyproject.toml", "README.md", "LICENSE"):
-        shutil.copy(ROOT / name, tree)
-    build = "import sys, setuptools.build_meta as b; b.build_wheel(sys.argv[1])"
-    done = subprocess.run(
-        [sys.executable, "-c", build, str(folder)], cwd=tree, capture_output=True, text=True, check=False
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
+    (tree / "tests").mkdir()
+    for name in (*(path.name for path in ROOT.iterdir() if path.is_file()), "tests/test_habits.py"):
+        if name != ".git":  # of a worktree
+            shutil.copy(ROOT / name, tree / name)
+    build("sdist", tree, folder)
+    (built,) = folder.glob("*.tar.gz")
+    return built
+
+
+@pytest.fixture(scope="module")
+def wheel(sdist: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The wheel, built of nothing but the source distribution."""
+    folder = tmp_path_factory.mktemp("wheel")
+    with tarfile.open(sdist) as archive:
+        archive.extractall(folder, filter="data")
+    (tree,) = folder.iterdir()
+    build("wheel", tree, folder)
     (built,) = folder.glob("*.whl")
     return built
 
@@ -80,14 +99,23 @@ def test_the_wheel_holds_everything(wheel: Path) -> None:
             if path.is_file() and "__pycache__" not in path.parts:
                 assert path.relative_to(ROOT).as_posix() in files, path
     assert {"certify/checker/FORMAT.md", "certify/report/template.html", "certify/py.typed"} <= files
-    assert not any(name.startswith(("tests/", "examples/", "docs/", "benchmarks/")) for name in files)
+    assert {name.split("/")[0] for name in files if ".dist-info/" not in name} == {"certify", "controllers"}
+
+
+def test_the_source_distribution_holds_what_a_wheel_needs_and_what_a_reader_wants(sdist: Path) -> None:
+    with tarfile.open(sdist) as archive:
+        files = {name.partition("/")[2] for name in archive.getnames()}
+    wanted = {"README.md", "LICENSE", "CHANGELOG.md", "CITATION.cff", "pyproject.toml", "constraints.txt"}
+    assert wanted | {"certify/checker/FORMAT.md", "certify/certificates/coq/theory/_CoqProject"} <= files
+    assert not any(name.startswith(("tests/", "docs/", "examples/")) for name in files)
 
 
 def test_an_installed_certify_works_from_any_folder(installed: Path, tmp_path: Path) -> None:
     place = say(installed / "python", "-c", "import certify; print(certify.__file__)", cwd=tmp_path).stdout.strip()
     assert Path(place).is_relative_to(installed.parent)
     options = ("--candidate", "lyapunov", "--level", "0.05", "--json")
-    done = say(installed / "certify", "roa", "--policy", POLICY, "--out", "o", *options, cwd=tmp_path)
+    shutil.copy(POLICY, tmp_path / "mine.pt")  # of the tree only this is used
+    done = say(installed / "certify", "roa", "--policy", "mine.pt", "--out", "o", *options, cwd=tmp_path)
     assert done.returncode == 0 and json.loads(done.stdout)["checked"] == "ACCEPTED", done.stderr
     assert (tmp_path / "o" / "report.html").read_text().startswith("<!DOCTYPE html>")
     for more in ((), ("--reference",)):
@@ -156,8 +184,13 @@ def test_every_byte_of_a_checker_counts(tmp_path: Path, monkeypatch: pytest.Monk
     assert source_sha256("checker") != before
 
 
-def test_the_numbers_of_the_version_agree() -> None:
-    assert PROJECT["project"]["version"] == certify.__version__
+def test_the_numbers_of_the_version_agree(wheel: Path, sdist: Path) -> None:
+    """One place says it: `certify.__version__`."""
+    assert "version" not in PROJECT["project"] and PROJECT["project"]["dynamic"] == ["version"]
+    assert sdist.name == f"certify-{certify.__version__}.tar.gz"
+    with zipfile.ZipFile(wheel) as archive:
+        metadata = archive.read(f"certify-{certify.__version__}.dist-info/METADATA").decode()
+    assert f"\nVersion: {certify.__version__}\n" in metadata and "The certify authors" in metadata
     assert PROJECT["project"]["requires-python"] == ">=3.11"
     assert PROJECT["tool"]["ruff"]["target-version"] == "py311"  # nothing newer than the oldest Python is written
 

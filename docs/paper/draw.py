@@ -2,7 +2,8 @@
 
 Nothing is trained here. Of each plant the methods are compared whose runs are over, with as many seeds as all of them
 have, and the history of a run is drawn whose policies were kept; `figures.txt` lists every picture that lies beside it.
-So the page is whole whatever is missing, and a run that is added adds its pictures.
+So the page is whole whatever is missing, and a run that is added adds its pictures. Files that are not those of
+`manifest.txt` are named, and the manifest is written for what was drawn.
 """
 
 from __future__ import annotations
@@ -13,6 +14,8 @@ import subprocess
 import sys
 from dataclasses import dataclass
 from pathlib import Path
+
+from manifest import MANIFEST, differences, digests, of_parts, read, replaced, run_files, write
 
 from controllers.course import ENDED
 from controllers.responses import NAMES, Run
@@ -62,33 +65,56 @@ def seeds(runs: Path, run: Run) -> int:
     return found
 
 
-def compare(plant: str, runs: Path) -> bool:
+def compare(plant: str, folder: Path) -> bool:
     """Compare what is over of a plant and keep the pictures of a page and the table; whether there was anything."""
+    runs = folder / plant
     there = {run: count for run in ("ours", *BASELINES) if (count := seeds(runs, run))}
     if "ours" not in there or len(there) < 2:
         return False
+    count = min(there.values())
+    used = [runs / run / f"seed-{seed}" for run in there for seed in range(count)]
+    parts = [f"{plant}/{run}" for run in ("ours", *BASELINES)]
+    say_differences(folder, parts, run_files(used))
     without = [word for run in BASELINES if run not in there for word in ("--without", run)]
     out = OUT / "compared"
-    words = ("controllers", "compare", plant, "--runs", str(runs), "--seeds", str(min(there.values())))
+    words = ("controllers", "compare", plant, "--runs", str(runs), "--seeds", str(count))
     Command((*words, *without, *SECONDS.get(plant, ()), "--out", str(out))).run()
     for name in COMPARED:
         keep(out / f"{plant}-{name}.png", PAGE / f"{plant}-{name}.png")
-    shutil.copyfile(out / f"{plant}-table.json", PAGE / f"{plant}-table.json")
+    table = json.loads((out / f"{plant}-table.json").read_text("utf-8"))
+    table.pop("files", None)  # paths of this machine
+    (PAGE / f"{plant}-table.json").write_text(json.dumps(table, indent=1) + "\n", "utf-8")
+    note_drawn(folder, parts, run_files(used))
     print(plant, ", ".join(f"{NAMES[run]}: {count}" for run, count in there.items()))
     return True
 
 
-def look_back(plant: str, kept: Path, adds: str) -> bool:
+def look_back(plant: str, folder: Path, name: str, adds: str) -> bool:
     """Draw the history of a run whose policies were kept; whether there is one."""
+    kept = folder / plant / name
     if not kept.is_dir():
         return False
-    out, evaluations = OUT / f"{plant}-{kept.name}", kept.with_suffix(".csv")
+    out, evaluations = OUT / f"{plant}-{name}", kept.with_suffix(".csv")
+    used = [*kept.glob("*.pt"), *([evaluations] if evaluations.is_file() else [])]
+    say_differences(folder, [f"{plant}/{name}"], used)
     words = ["controllers", "history", str(kept), "--out", str(out), "--time-limit", str(TIME_LIMITS[plant])]
     Command((*words, *(("--evaluations", str(evaluations)) if evaluations.is_file() else ()))).run()
-    for name in LOOKED_BACK:
-        keep(out / f"{plant}-{name}.png", PAGE / f"{plant}{adds}-{name}.png")
-    print(plant, kept.name)
+    for figure in LOOKED_BACK:
+        keep(out / f"{plant}-{figure}.png", PAGE / f"{plant}{adds}-{figure}.png")
+    note_drawn(folder, [f"{plant}/{name}"], used)
+    print(plant, name)
     return True
+
+
+def say_differences(folder: Path, parts: list[str], used: list[Path]) -> None:
+    """Name the files that are not those of the manifest, before hours are spent on them."""
+    for line in differences(of_parts(read(MANIFEST), parts), digests(folder, used)):
+        print(line)
+
+
+def note_drawn(folder: Path, parts: list[str], used: list[Path]) -> None:
+    """Write the manifest for what was drawn of these parts."""
+    write(MANIFEST, replaced(read(MANIFEST), parts, digests(folder, used)))
 
 
 def keep(made: Path, path: Path) -> None:
@@ -118,11 +144,13 @@ def section(plant: str) -> str:
 def main() -> None:
     """Every plant that has runs, then the list of all pictures."""
     folder = Path(sys.argv[1] if len(sys.argv) > 1 else "runs").resolve()
+    if not folder.is_dir():
+        raise SystemExit(f"RUNS must be a folder of runs; {folder} is none. docs/paper.md says how to get one.")
     OUT.mkdir(parents=True, exist_ok=True)
     drawn = {}
     for plant in TIME_LIMITS:
-        runs = folder / plant
-        drawn[plant] = compare(plant, runs), *(look_back(plant, runs / name, adds) for name, adds in HISTORIES.items())
+        looked_back = (look_back(plant, folder, name, adds) for name, adds in HISTORIES.items())
+        drawn[plant] = compare(plant, folder), *looked_back
     sections = [text for plant in TIME_LIMITS if (text := section(plant))]
     (PAGE / "figures.txt").write_text("\n".join(sections), "utf-8")
     print(json.dumps(drawn))

@@ -1,11 +1,12 @@
 """What is proved of the mean action of every method: the table of certificates of the page on the paper's figures.
 
-`make paper-proved RUNS=runs`, minutes a plant. A simulation that ends near the origin may still leave it later; a
-certificate says what never happens. Each run's `policy.pt`, which `controllers compare` leaves in the folder of runs,
-is given to `certify roa`: ours is centred and is proved to converge; what is not centred rests, if at all, beside the
-origin, and what can be proved of it is that from a set it enters a small one and stays there. A certificate that
-`out/paper` already has is checked again, and used if it is about this policy on the plant as it is now; what was
-searched for in vain is searched for again only with another policy, plant or time.
+`make paper-proved RUNS=runs` takes minutes per plant, and is about the runs of `manifest.txt` alone. A simulation that
+ends near the origin may still leave it later; a certificate says what never happens. Each run's `policy.pt`, which
+`controllers compare` leaves in the folder of runs, is given to `certify roa`: ours is centred and is proved to
+converge; what is not centred rests, if at all, beside the origin, and what can be proved of it is that from a set it
+enters a small one and stays there. A certificate that `out/paper` already has is checked again, and used if it is about
+this policy on the plant as it is now; what was searched for in vain is searched for again only with another policy,
+plant or time.
 
 A line is of several runs, and what it says is true of each of them that is proved: the smallest volume, and the largest
 radius.
@@ -24,6 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from manifest import MANIFEST, differences, digests, read
 
 from certify.certificates import loop_sections, read_certificate
 from certify.certificates.claims import Practical
@@ -33,7 +35,6 @@ from certify.loop.plants import System, shipped_system
 from certify.loop.policies import Policy, load_policy
 from certify.lyapunov import volume
 from certify.report.words import above, below
-from controllers.course import ENDED
 from controllers.evaluate import require_same_question
 from controllers.responses import NAMES, Run
 
@@ -145,10 +146,16 @@ def row(plant: str, kind: Run, folders: Sequence[Path]) -> str:
 def main() -> None:
     """The table, and the command behind each number."""
     runs = Path(sys.argv[1]) if len(sys.argv) > 1 else ROOT / "runs"
+    policies = {name: digest for name, digest in read(MANIFEST).items() if name.endswith("/policy.pt")}
+    found = digests(runs, (runs / name for name in policies if (runs / name).is_file()))
+    if lines := differences(policies, found):
+        raise SystemExit(
+            "\n".join((*lines, f"{runs} must hold the runs that the page shows: first `make paper RUNS={runs}`."))
+        )
     rows = []
     for plant in PLANTS:
         for kind in KINDS:
-            folders = sorted(path.parent for path in (runs / plant / kind).glob(f"seed-*/{ENDED}"))
+            folders = sorted((runs / name).parent for name in policies if name.startswith(f"{plant}/{kind}/"))
             if folders:
                 rows.append(row(plant, kind, folders))
     head = ["plant", "method", "runs proved", "what", "from a volume of at least", "into ‖x‖ of at most"]

@@ -23,9 +23,10 @@ PENDULUM = get_system("pendulum")
 
 
 @pytest.fixture
-def page(tmp_path: Path) -> ModuleType:
+def page(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     """The script, with a folder of results of its own."""
     path = Path(__file__).parents[2] / "docs" / "paper" / "proved.py"
+    monkeypatch.syspath_prepend(str(path.parent))  # where Python looks when it runs a script
     spec = importlib.util.spec_from_file_location("proved_page", path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
