@@ -38,6 +38,7 @@ _LONGEST = 86_400.0  # seconds that may be suggested
 _LONGER, _SECONDS = 1.1, 5.0  # of a tube's start, relative to the proved set; for looking
 _LITTLE = 25.0  # per cent of the volume that sampling allows, below which the bounds are to blame
 _BENT = 1.0  # bends of the hidden units, as a share of the linear part, that are worth flattening
+_TELLING = 1000  # boxes: a limit below it is what ended the search, and says nothing of the policy
 _FEW = 3  # states, for which a function beyond the ellipsoid is suggested
 _ENDED = (Stop.TIME, Stop.BOXES, Stop.LOCAL)
 
@@ -177,7 +178,8 @@ def _next(
         kept = result.search is not None
         why = "what was done is kept" if kept else "the search was not kept"
         return Step((("--resume", ""),) if kept else (), f"{why}; see to the cluster first, or leave it out")
-    if result.stop in _ENDED and _is_bent(result, proof):
+    few = result.stop is Stop.BOXES and options.max_boxes < _TELLING
+    if result.stop in _ENDED and not few and _is_bent(result, proof):
         share = number(_share_proved(result), 2)
         why = (
             f"proved is {share} % of the volume that sampling allows, and bounds see more of the hidden units' bends "

@@ -890,7 +890,7 @@ def held_too_long() -> Document:
 
 def sprawling() -> Document:
     """xdot = -x + 0 + 0 + ..., under 64 ranges: each operation is a model in 66 symbols, were all of them kept."""
-    plant = ["+", ["-", "x"], *(["*", "0", f"1/{i}"] for i in range(1, 2600))]
+    plant = ["+", ["-", "x"], *(["*", "0", "x", f"1/{i}"] for i in range(2, 2600))]
     return make(
         [plant], [([[0.0]], [0.0])], 1.0, (1.0, 1.0), claim="practical", centre="none",
         tree=bytes([0, LEAF, 0, LEAF, LEAF]),

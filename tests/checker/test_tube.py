@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from fractions import Fraction
 from functools import cache
 from pathlib import Path
-from tempfile import TemporaryDirectory
+from tempfile import NamedTemporaryFile, TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -67,7 +67,10 @@ def verdict_of(raw: bytes) -> str:
     """The checker's word as a child process."""
     command = [sys.executable, "-I", "-c", "import sys; sys.path.insert(0, sys.argv.pop(1)); "]
     command[-1] += "from certify.checker.__main__ import main; sys.exit(main(sys.argv[1:]))"
-    done = subprocess.run([*command, str(ROOT), "/dev/stdin", "--json"], input=raw, capture_output=True, check=False)
+    with NamedTemporaryFile(suffix=".json") as file:
+        file.write(raw)
+        file.flush()
+        done = subprocess.run([*command, str(ROOT), file.name, "--json"], capture_output=True, check=False)
     answer = json.loads(done.stdout)
     return str(answer.get("rule") or answer["result"])
 

@@ -299,8 +299,8 @@ def test_a_level_is_shown_rounded_down(proving: Prove, tmp_path: Path, capsys: p
         (["--rate", "fast"], "`--rate` must be a finite number"),
         (["--rate", "1/0"], "`--rate` must be a finite number"),
         (["--rate", "1e400000000"], "`--rate` must be a finite number"),
-        (["--rate", "-1"], "`rate` must be positive"),
-        (["--time-limit", "0"], "`time_limit` must be positive"),
+        (["--rate", "-1"], "--rate must be positive"),
+        (["--time-limit", "0"], "--time-limit must be positive"),
         (["--boxes", "0"], "boxes"),
     ],
 )

@@ -123,8 +123,9 @@ def test_a_set_that_cannot_be_seen_is_in_no_legend(beside: RoaResult) -> None:
 
 
 def test_flattening_is_suggested_where_bounds_see_bends_and_little_is_proved(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr("certify.analysis.diagnosis._TELLING", 0)
     path, out = tmp_path / "bent.pt", tmp_path / "o"
     save_policy(path, bent())
     status = _run(["roa", str(path), "--max-boxes", "3", "--time-limit", "8", "--out", str(out), "--json"], True)
@@ -156,10 +157,11 @@ def test_flattening_is_not_suggested_to_whom_it_cannot_help(tmp_path: Path) -> N
 
 
 def test_a_policy_of_another_program_is_imported_before_it_is_flattened(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import torch
 
+    monkeypatch.setattr("certify.analysis.diagnosis._TELLING", 0)
     network, path, out = bent().network, tmp_path / "actor.pt", tmp_path / "o"
     state = {}
     for k, (W, b) in enumerate(zip(network.weights, network.biases, strict=True)):
