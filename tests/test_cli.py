@@ -845,7 +845,7 @@ def test_a_closed_pipe_is_no_verdict_whatever_was_to_be_said(command: str, both:
     name, *arguments = command.format(policy=SHIPPED, out=tmp_path / "o").split()
     reading, writing = os.pipe()
     os.close(reading)
-    code = f"from {name}.cli import main; main()"
+    code = f"from {'certify.cli.main' if name == 'certify' else 'controllers.cli'} import main; main()"
     out = writing if both else subprocess.DEVNULL
     done = subprocess.run([sys.executable, "-c", code, *arguments], stdout=out, stderr=writing, check=False)
     os.close(writing)
