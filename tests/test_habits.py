@@ -42,7 +42,7 @@ def test_every_citation_says_the_same() -> None:
     (paper,) = found["references"]
     assert f"{{{paper['title']}}}" in page and paper["identifiers"][0]["value"].removeprefix("arXiv:") in page
     names = [who["family-names"] for who in paper["authors"]]
-    authors = " and ".join(f"{{{name}}}" if " " in name else name for name in names)  # one name for BibTeX, of two words
+    authors = " and ".join(f"{{{name}}}" if " " in name else name for name in names)
     assert f"{{{authors}}}" in page
     assert "version" not in found  # certify/__init__.py is its only place
 
