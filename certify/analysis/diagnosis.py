@@ -213,14 +213,14 @@ def _next(
 
 
 def _may_go_beyond(result: RoaResult, options: RoaOptions) -> bool:
-    """Whether a function beyond the ellipsoid can be learned, and pays: of few states, in continuous time."""
+    """True if a function beyond the ellipsoid can be learned, and pays: of few states, in continuous time."""
     plain = result.timing.is_plain and not options.rate and not options.enlarges and options.engine == "bounds"
     free = options.level is None and options.only is None and options.P is None and not options.resume
     return plain and free and not options.goes_beyond and result.system.n <= _FEW and not result.system.ranges
 
 
 def _can_be_flattened(result: RoaResult) -> bool:
-    """Whether `controllers flatten` takes the policy and judges it by the loop that is certified."""
+    """True if `controllers flatten` takes the policy and judges it by the loop that is certified."""
     return len(result.network.weights) > 1 and not result.system.in_steps and not result.system.ranges
 
 
@@ -231,7 +231,7 @@ def _share_proved(result: RoaResult) -> float:
 
 
 def _is_bent(result: RoaResult, proof: Proof | None) -> bool:
-    """Whether little of what sampling allows is proved, and the pace of the proof does not say when more will be."""
+    """True if little of what sampling allows is proved, and the pace of the proof does not say when more will be."""
     known = proof is not None and proof.seconds_left is not None and result.levels.roa is not None
     if not _can_be_flattened(result) or known or _share_proved(result) >= _LITTLE:
         return False
@@ -240,7 +240,7 @@ def _is_bent(result: RoaResult, proof: Proof | None) -> bool:
 
 
 def _bend(network: TanhNetwork, half_widths: Array) -> float:
-    """What bounds see of the hidden units' bends on a box, as a share of the linear part there, to first order.
+    """Bends of the hidden units on a box as bounds see them, over the policy's linear part there, to first order.
 
     The sum over all hidden units of their distance from their tangent at 0, at both ends of what the box drives them
     through, times their gain towards the inputs.
@@ -262,7 +262,7 @@ def _bend(network: TanhNetwork, half_widths: Array) -> float:
 
 
 def _has_tube(result: RoaResult, seconds: float) -> bool:
-    """Whether a tube is found in the time that leads from a larger multiple of the proved set into it."""
+    """True if a tube is found in the time that leads from a larger multiple of the proved set into it."""
     if result.P is None or result.levels.roa is None or not seconds > 0:
         return False
     goal = result.P / result.levels.roa

@@ -269,7 +269,7 @@ def lines(imported: Imported) -> list[str]:
 
 
 def checked(difference: Difference, compared_with: str | None, assumed: str, not_read: Mapping[str, str]) -> list[str]:
-    """What an import was compared with, and which tensors of its file it left out, for people."""
+    """Say what an import was compared with, and which tensors of its file it left out."""
     from certify.loop.policies.importers.unread import braced
 
     numbers = (

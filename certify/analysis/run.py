@@ -552,7 +552,7 @@ class _Run:
 
     @property
     def _can_go_on(self) -> bool:
-        """Whether more time may gain something that a kept search saves."""
+        """True if more time may gain something that a kept search saves."""
         one = self._first
         return self.interruptible and one is not None and not (one.attempt.done or one.hopeless)
 

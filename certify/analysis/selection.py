@@ -65,7 +65,7 @@ class Race:
 
     @property
     def proved(self) -> bool:
-        """Whether anything is proved, by a contender or by one that has begun."""
+        """True if anything is proved, by a contender or by one that has begun."""
         return any(c.proved for c in (*self.contenders, *([] if self.early is None else [self.early])))
 
     @property

@@ -66,7 +66,7 @@ class Net:
 
 
 class Sizes:
-    """Of a certificate, in the letters of FORMAT.md."""
+    """Sizes of a certificate, in the letters of FORMAT.md."""
 
     def __init__(self, c: Certificate) -> None:
         self.c, self.evidence = c, c.evidence
@@ -114,25 +114,25 @@ class Sizes:
 
     @property
     def asked(self) -> bool:
-        """Whether the leaves of the ring are looked at."""
+        """True if the leaves of the ring are looked at."""
         return isinstance(self.evidence, Partition) and (self.evidence.local is None or self.c.c1 != self.c.c2)
 
     def bits(self, A: Array) -> int:
-        """Of the longest numerator over a common denominator."""
+        """Bits of the longest numerator over a common denominator."""
         parts = [v.as_integer_ratio() for v in A.ravel().tolist()]
         common = max(below for _, below in parts)  # of powers of 2
         return max((abs(above) * (common // below)).bit_length() for above, below in parts)
 
     def inverse(self, bits: int) -> int:
-        """Of an exact matrix of n rows."""
+        """Operations for the inverse of an exact matrix of n rows."""
         return self.n**5 * bits**2 // 2**13 + 2**10 * self.n**3
 
     def decision(self, rows: int) -> int:
-        """Whether an exact matrix is positive definite."""
+        """Operations to decide that an exact matrix is positive definite."""
         return 2**14 * rows**3
 
     def evaluations(self, order: int) -> int:
-        """Of the equations, for a series of that order in time."""
+        """Evaluations of the equations for a series of that order in time."""
         return 2 * order**3 + 8 if self.c.sample else 1
 
     def boxes(self, leaves: int, models: int, values: int, symbols: int, calls: int) -> int:

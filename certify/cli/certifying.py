@@ -142,7 +142,7 @@ def _where(result: RoaResult, asked: str) -> tuple[dict[str, Any], str]:
 
 
 def _without(context: typer.Context) -> str:
-    """What a resumed search knows already, of the options that were given."""
+    """Name the options that were given and that a resumed search has of its own."""
     given = _known(context)
     return f" and without {', '.join(given)}" if given else ""
 

@@ -32,7 +32,7 @@ def _terminate(number: int, frame: FrameType | None) -> None:
 
 
 def is_of_closed_pipe(stop: SystemExit) -> bool:
-    """Whether click or rich has raised this exit because a reader has gone."""
+    """True if click or rich has raised this exit because a reader has gone."""
     return isinstance(stop.__context__, BrokenPipeError)
 
 

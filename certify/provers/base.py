@@ -183,7 +183,7 @@ class Once:
 
     @property
     def seconds(self) -> Mapping[str, float]:
-        """Of its stages."""
+        """Seconds of its stages."""
         return {} if self.found is None else self.found.seconds
 
     @property

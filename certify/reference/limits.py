@@ -32,7 +32,7 @@ def limits(c: Certificate, patient: bool) -> None:
 
 @dataclass(frozen=True)
 class Size:
-    """Of a certificate: `s` symbols on a leaf, `d` entries on a ball, `y` of what is uncertain, `a` operations."""
+    """Sizes of a certificate: `s` symbols on a leaf, `d` entries on a ball, `y` of what is uncertain, `a` operations."""
 
     n: int
     m: int
@@ -109,12 +109,12 @@ def inverting(n: int, length: int) -> int:
 
 
 def deciding(n: int) -> int:
-    """Whether one is positive definite."""
+    """Operations to decide that a matrix is positive definite."""
     return 2**14 * n**3
 
 
 def evaluations(c: Certificate, order: int) -> int:
-    """Of the equations, for a series in time."""
+    """Evaluations of the equations for a series in time."""
     return 1 if c.sample is None else 2 * order**3 + 8
 
 
@@ -126,7 +126,7 @@ def steps_of(N: Function) -> int:
 
 
 def folding(shapes: Sequence[tuple[int, int, int]]) -> int:
-    """What is done once with a network's weights."""
+    """Operations that are done once with a network's weights."""
     return sum(p * q * (2**9 + 8 * min(p, q)) for p, q, _ in shapes)
 
 
@@ -185,7 +185,7 @@ def in_tube(c: Certificate, z: Size, evidence: Tree) -> int:
 
 
 def beyond(c: Certificate, z: Size, covering: Covering | None) -> int:
-    """What another function N takes, on the faces of the domain and on its own leaves."""
+    """Operations for another function N, on the faces of the domain and on its own leaves."""
     N = c.beyond
     if N is None or covering is None:
         return 0

@@ -41,13 +41,13 @@ def inverse_diagonal(A: fmpq_mat, rule: str, at: str | None = None) -> list[fmpq
 
 
 def positive_definite(A: fmpq_mat) -> bool:
-    """Whether A = A' and every leading principal minor is positive (Sylvester); False where that takes too long."""
+    """True if A = A' and every leading principal minor is positive (Sylvester); False where that takes too long."""
     sound = is_short(A) and bool(A.transpose() == A)
     return sound and all(bool(minor(A, range(k)) > 0) for k in range(1, A.nrows() + 1))
 
 
 def bits(A: fmpq_mat) -> int:
-    """Of the longest numerator over a common denominator."""
+    """Bits of the longest numerator over a common denominator."""
     return int(max(v.height_bits() for v in A.numer_denom()[0].entries()))
 
 

@@ -54,7 +54,7 @@ def identifier(name: str) -> str:
 
 
 def is_long(value: Fraction) -> bool:
-    """Whether a number is shown rounded."""
+    """True if a number is shown rounded."""
     return max(abs(value.numerator), value.denominator) > _LONG
 
 

@@ -112,7 +112,7 @@ def _log_volume(P: Array) -> float:
 
 
 def _all_scaled(known: Paths, candidates: Sequence[Array], end: float) -> list[Array]:
-    """Those with which the local rule proves a level in the time, over it."""
+    """Scale each P by the level that the local rule proves with it in the time; leave out those without one."""
     return [P for P in (_scaled(known, P, end) for P in candidates) if P is not None]
 
 

@@ -156,7 +156,7 @@ def solutions(loop: ClosedLoop, options: RoaOptions) -> dict[str, Array]:
 
 
 def solved(loop: ClosedLoop, found: Mapping[str, Array], options: RoaOptions) -> list[Trial]:
-    """What these `solutions` could give, one at least and as many as there is time for."""
+    """Sample these `solutions`: one at least, and as many as there is time for."""
     until, trials = _until(OPTIMISING * options.time_limit), list[Trial]()
     for name, P in found.items():
         if not trials or time.perf_counter() < until:

@@ -176,7 +176,7 @@ def forget(out: Path, case: Case) -> None:
 
 
 def _found_again(row: Row, case: Case, raw: bytes | None, out: Path) -> Row | None:
-    """What can be said of a case whose row an earlier sweep has left, but for what was its word.
+    """Find out again what a row of an earlier sweep says, but for what rests on that sweep's word.
 
     Raises
     ------
@@ -205,7 +205,7 @@ def _found_again(row: Row, case: Case, raw: bytes | None, out: Path) -> Row | No
 
 
 def _is_refuted_again(loop: tuple[Policy, System, RoaOptions]) -> bool:
-    """Whether the loop's enclosed eigenvalues show that it is not stable where it rests."""
+    """True if the loop's enclosed eigenvalues show that it is not stable where it rests."""
     closed, claim = ClosedLoop(loop[1], loop[0].network), loop[2].claim
     if claim not in ("auto", "asymptotic"):
         return False

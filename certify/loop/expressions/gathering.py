@@ -95,7 +95,7 @@ def _sum(operands: tuple[Expression, ...]) -> tuple[Fraction, Expression | None]
 
 
 def _is_short_sum(core: Expression) -> bool:
-    """Whether its terms may join those of a sum around it; a long sum that stands in many others stays one."""
+    """True if its terms may join those of a sum around it; a long sum that stands in many others stays one."""
     return isinstance(core, Operation) and core.operator == "+" and len(core.operands) <= _MOST_JOINED
 
 

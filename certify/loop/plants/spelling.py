@@ -42,7 +42,7 @@ _CONSTANTS = {"pi": "3.141592653589793", "e": "exp(1)", "E": "exp(1)", "tau": "6
 
 
 def instead_of_call(name: str, arguments: Sequence[str], functions: Collection[str]) -> str | None:
-    """What to write in the place of a function that is called so, `np.sin` for one; None if nothing is known of it.
+    """Say what to write instead of a function of that name, such as `np.sin`; None if the name is not known.
 
     >>> instead_of_call("np.sin", ["p"], ["sin"])
     'for np.sin(p) write sin(p)'
@@ -68,7 +68,7 @@ def instead_of_call(name: str, arguments: Sequence[str], functions: Collection[s
 
 
 def instead_of_name(name: str) -> str | None:
-    """What to write in the place of a constant, `pi` or `np.pi`; None if it is none.
+    """Say what to write instead of a constant, such as `pi` or `np.pi`; None if it is none.
 
     >>> instead_of_name("np.pi")
     'for np.pi write its value as a number, 3.141592653589793, or as a parameter: what is written is meant exactly'
@@ -83,7 +83,7 @@ def instead_of_name(name: str) -> str | None:
 
 
 def instead_of(node: ast.expr, text: str) -> str | None:
-    """What to write in the place of something else that equations may not hold; None if nothing is known of it."""
+    """Say what to write instead of anything else that equations may not hold; None if it is not known."""
     if isinstance(node, ast.Attribute):
         return instead_of_name(text)
     if isinstance(node, ast.IfExp | ast.Compare | ast.BoolOp):

@@ -154,7 +154,7 @@ def load_policy(path: str | Path) -> Policy:
 
 
 def is_text(raw: bytes) -> bool:
-    """Whether bytes are text that a person could read, by how they begin."""
+    """True if bytes are text that a person could read, by how they begin."""
     start = raw[:_START]
     try:
         words = start.decode("utf-8")

@@ -151,7 +151,7 @@ def fourth_of_tanh(y: Array, radius: Array) -> Array:
 
 
 def is_extreme(c: float) -> bool:
-    """Whether the powers of a middle c, that inverses and roots have derivatives of, may leave binary64."""
+    """True if the powers of a middle c, that inverses and roots have derivatives of, may leave binary64."""
     return not 2.0**-200 < abs(c) < 2.0**200
 
 

@@ -276,7 +276,7 @@ class Scene:
         return self.kind == "practical" or not self.local_is_enough
 
     def sees_inner(self, pair: Pair) -> bool:
-        """Whether the inner set is large enough to be seen in a picture of two states."""
+        """True if the inner set is large enough to be seen in a picture of two states."""
         if not self.shows_inner:
             return False
         box = self.view(pair)

@@ -47,7 +47,7 @@ def array_of(node: Any, what: str) -> Numbers:
 
 
 def is_array(node: Any) -> bool:
-    """Whether a node of a pickle describes an array of numpy; a single number is none."""
+    """True if a node of a pickle describes an array of numpy; a single number is none."""
     if not isinstance(node, Call) or not isinstance(node.function, Name):
         return False
     module, name = node.function.module, node.function.name

@@ -71,7 +71,7 @@ def _vec_normalize(root: Any, what: str) -> Normaliser:
 
 
 def normaliser_root(tensors: Mapping[str, Numbers]) -> str | None:
-    """What stands before the names of that normaliser's tensors, or None if the file has none.
+    """Prefix of the names of that normaliser's tensors, or None if the file has none.
 
     Raises
     ------

@@ -383,7 +383,7 @@ def _require_real(flags: dict[str, Any], at: str) -> None:
 
 
 def _keeps_width(chain: Chain, shape: Any) -> bool:
-    """Whether a Reshape to `shape` leaves rows of a batch as they are, because it names their width."""
+    """True if a Reshape to `shape` leaves rows of a batch as they are, because it names their width."""
     wide = [step for step in chain if isinstance(step, Affine)]
     said = np.asarray(shape).ravel().tolist()
     return len(said) == 2 and (

@@ -36,7 +36,7 @@ def load_tensors(raw: bytes, what: str, file: TorchFile | None = None) -> dict[s
 
 
 def _inside(node: dict[Any, Any] | list[Any] | tuple[Any, ...] | Call) -> Iterable[tuple[Any, Any]]:
-    """What lies in a container, or in an object that the pickle would have made, by its keys, numbers or attributes."""
+    """Items of a container, or of an object that the pickle would have made, by key, number or attribute."""
     if isinstance(node, dict):
         return node.items()
     if not isinstance(node, Call):

@@ -125,7 +125,7 @@ def _known(name: str, tensors: Mapping[str, Numbers], prefix: str, outputs: int,
 
 
 def _names_another(part: str, words: set[str], leaf: str) -> bool:
-    """Whether a part of a name says that it is a critic, a value, a Lyapunov or a target network."""
+    """True if a part of a name says that it is a critic, a value, a Lyapunov or a target network."""
     if words & _OTHER:
         return True
     if "target" in words:  # which a state to be reached is called too
