@@ -32,7 +32,7 @@ def limits(c: Certificate, patient: bool) -> None:
 
 @dataclass(frozen=True)
 class Size:
-    """Sizes of a certificate: `s` symbols on a leaf, `d` entries on a ball, `y` of what is uncertain, `a` operations."""
+    """Sizes in a file: `s` symbols on a leaf, `d` entries on a ball, `y` of what is uncertain, `a` operations."""
 
     n: int
     m: int

@@ -15,7 +15,7 @@ from typing import Generic, TypeVar
 
 from certify.errors import InputError
 from certify.loop.expressions.gathering import gathered
-from certify.loop.expressions.tree import FUNCTIONS, GRAMMAR, Expression, Number, Operation, Symbol
+from certify.loop.expressions.tree import FUNCTIONS, GRAMMAR, Expression, Number, Operation, Symbol, nodes
 
 V = TypeVar("V")
 
@@ -80,26 +80,10 @@ def evaluate(
     """
     known = {} if known is None else known
     plain = gathered(expression)
-    waiting = [plain]
-    while waiting:
-        node = waiting[-1]
-        missing = [e for e in _operands(node) if e not in known] if node not in known else []
-        if missing:
-            waiting += reversed(missing)
-            continue
-        waiting.pop()
-        if node not in known:
+    for node in nodes(plain):
+        if node not in known and (node is plain or not isinstance(node, Number)):
             known[node] = _value(node, variables, algebra, known)
     return known[plain]
-
-
-def _operands(node: Expression) -> Sequence[Expression]:
-    """The operands that have values in an arithmetic: all but exponents and the number of a sum or product."""
-    return [e for e in node.operands if not isinstance(e, Number) or _is_function(node)]
-
-
-def _is_function(node: Expression) -> bool:
-    return isinstance(node, Operation) and node.operator in FUNCTIONS
 
 
 def _value(node: Expression, variables: Mapping[Symbol, V], algebra: Algebra[V], known: Mapping[Expression, V]) -> V:
@@ -109,8 +93,8 @@ def _value(node: Expression, variables: Mapping[Symbol, V], algebra: Algebra[V],
         return variables[node]
     if isinstance(node, Number):
         return algebra.constant(node.value)
-    values = [known[e] for e in _operands(node)]
     if isinstance(node, Operation):
+        values = [known[e] for e in node.operands if not isinstance(e, Number)]
         if node.operator in ("+", "*"):
             constant = next((e.value for e in node.operands if isinstance(e, Number)), None)
             return (algebra.total if node.operator == "+" else algebra.product)(constant, values)
@@ -118,5 +102,6 @@ def _value(node: Expression, variables: Mapping[Symbol, V], algebra: Algebra[V],
             result = algebra.power(values[0], abs(node.exponent))
             return result if node.exponent > 0 else algebra.inverse(result)
         if node.operator in FUNCTIONS:
-            return algebra.function(node.operator, values[0])
+            (at,) = node.operands
+            return algebra.function(node.operator, algebra.constant(at.value) if isinstance(at, Number) else values[0])
     raise InputError(f"{node!r} is outside the grammar; allowed are {GRAMMAR}.")

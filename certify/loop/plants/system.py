@@ -347,7 +347,7 @@ class System:
             error = Symbol(f"error_{u.name}")
             acting = Operation("+", u, error)
             free = symbols_of(*(substitute(e, {acting: Number(0)}) for e in self.dynamics))
-            acts = any(node is acting for node in nodes(*self.dynamics))
+            acts = acting in nodes(*self.dynamics)
             if error.name in self.ranges and acts and not free & {u, error}:
                 found[u.name] = error.name
         return found
