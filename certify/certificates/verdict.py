@@ -74,6 +74,7 @@ class Stop(Enum):
     MARGIN = "margin to the domain"
     WITNESS = "witness"
     INPUTS = "inputs"
+    EFFORT = "effort"
     TIME = "time"
     STALLED = "nothing gained"
     REFUSED = "refused by the checker"

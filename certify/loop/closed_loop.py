@@ -14,7 +14,7 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from certify.errors import InputError
-from certify.loop.expressions import Expression, evaluate_exactly, symbols_of
+from certify.loop.expressions import Expression, evaluate_exactly, nodes, symbols_of
 from certify.loop.plants import Matrix, System, in_floats, linearise
 from certify.loop.policies import TanhNetwork, require_centred
 
@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 @dataclass(frozen=True, slots=True)
 class ClosedLoop:
     """A plant under a tanh policy; `u_eq` is the exact equilibrium input, `folded` the policy without its centring,
-    `dynamics` the nominal equations.
+    `dynamics` the nominal equations. `operations` are about those of F at one state, as an `Effort` counts them.
 
     Raises
     ------
@@ -36,6 +36,7 @@ class ClosedLoop:
     u_eq: tuple[Fraction, ...] = field(init=False, repr=False, compare=False)
     folded: TanhNetwork = field(init=False, repr=False, compare=False)
     dynamics: tuple[Expression, ...] = field(init=False, repr=False, compare=False)
+    operations: float = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         system, network = self.system, self.network
@@ -48,6 +49,9 @@ class ClosedLoop:
         object.__setattr__(self, "u_eq", u_eq)
         object.__setattr__(self, "folded", network.folded(u_eq))
         object.__setattr__(self, "dynamics", system.exact_dynamics())
+        weights, neurons = sum(W.size for W in network.weights), sum(len(b) for b in network.biases)
+        equations = sum(1 for _ in nodes(*self.dynamics))
+        object.__setattr__(self, "operations", 2.0 * weights + 20.0 * neurons + 8.0 * equations)
 
     def require_rest(self) -> None:
         """Refuse a loop whose origin is not an equilibrium, exactly: `f(0, u_eq) = 0` and `pi(0) = u_eq`.

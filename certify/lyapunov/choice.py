@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
-import time
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from certify.effort import UNLIMITED, Effort
 from certify.errors import BackendError, InputError, OptionError
 from certify.loop.closed_loop import ClosedLoop
 from certify.lyapunov.candidates import solve_lyapunov
@@ -40,7 +39,7 @@ def choose_candidate(
     name: Literal["lyapunov", "scaled", "lqr", "optimised"],
     Q: tuple[float, ...] | None = None,
     R: tuple[float, ...] | None = None,
-    seconds: float = math.inf,
+    effort: Effort = UNLIMITED,
 ) -> Chosen:
     """The candidate `name` for the closed loop.
 
@@ -51,7 +50,7 @@ def choose_candidate(
         whose sampled set is largest, or at `lyapunov` if Q is given, and enlarges it; it falls back to `lyapunov` with
         a notice.
     Q, R : diagonals, (n,) and (m,); None means ones.
-    seconds : after which `optimised` takes what it has.
+    effort : where it ends, `optimised` takes what it has.
 
     Raises
     ------
@@ -73,13 +72,13 @@ def choose_candidate(
                 f"{', '.join(f'{d:g}' for d in nearer)}. Scale the states."
             )
         return Chosen(solve_lyapunov(A, np.diag(weights), h), "scaled")
-    P, end = solve_lyapunov(A, weight, h), time.monotonic() + seconds
+    P = solve_lyapunov(A, weight, h)
     if name == "lyapunov":
         return Chosen(P, "lyapunov")
     try:
         starts = [P] if Q is not None else [choose_candidate(loop, one).P for one in SOLVED]
-        start = largest_sampled(loop, starts, seconds=seconds) if len(starts) > 1 else P
-        return Chosen(optimise_repeatedly(loop, start, end - time.monotonic()), "optimised")
+        start = largest_sampled(loop, starts, effort=effort) if len(starts) > 1 else P
+        return Chosen(optimise_repeatedly(loop, start, effort), "optimised")
     except BackendError as error:
         return Chosen(P, "lyapunov", f"candidate lyapunov in the place of optimised: {error}")
 

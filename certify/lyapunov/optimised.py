@@ -14,12 +14,12 @@ The margin alpha is asked for, not only the sign, because a proof needs many box
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
+from certify.effort import UNLIMITED, Effort
 from certify.errors import BackendError
 from certify.loop.closed_loop import ClosedLoop
 from certify.lyapunov.candidates import slowest_decay, solve_lyapunov
@@ -38,6 +38,7 @@ _SMALL = 0.01  # growth of the log of the volume, or trust radius, at which to s
 _STEP = 1e-4  # relative, of the difference quotient along a ray
 _TOLERANCE = 1e-6  # of the solver
 _SLACK = 1e-4  # by which a state may violate its row: the next search rescales P
+_CALL, _CONE = 2e5, 20.0  # operations of evaluating few states at once; of a solver, for each product of its sizes
 _LINEAR, _SCORED = 1.3, 0.5  # shares of alpha: what the linearisation must keep, and what a sample must
 
 
@@ -46,7 +47,7 @@ def optimise_candidate(
     start: Array,
     decays: tuple[float, ...] = DECAYS,
     seed: int = 0,
-    seconds: float = math.inf,
+    effort: Effort = UNLIMITED,
     known: Array | None = None,
 ) -> Array:
     """Choose P for a large sampled set `{x'Px <= 1}` inside the domain with `Vdot <= -alpha V` (and inputs in bounds).
@@ -57,8 +58,8 @@ def optimise_candidate(
     start : (n, n), symmetric positive definite with `A'P + PA < 0`, or its like over a step, such as a solution of
         the Lyapunov equation.
     decays : alpha over the slowest decay rate of A, each between 0 and 0.7; the first that beats `start` is taken.
-    seed : of the samples; equal seeds give equal results, unless the time ends the search.
-    seconds : after which the present P is taken.
+    seed : of the samples; equal seeds give equal results.
+    effort : where it ends, the present P is taken.
     known : (N, n), states that sampling may miss, such as violations that a proof came upon.
 
     Returns
@@ -74,22 +75,21 @@ def optimise_candidate(
     A local optimum. Boyd, El Ghaoui, Feron, Balakrishnan, Linear Matrix Inequalities in System and Control Theory, SIAM
     1994: section 2.6.3 (S-procedure), chapter 5 (invariant ellipsoids of extreme volume).
     """
-    return _optimise(loop, start, decays, seed, seconds, known)[0]
+    return _optimise(loop, start, decays, seed, effort, known)[0]
 
 
 def _optimise(
-    loop: ClosedLoop, start: Array, decays: tuple[float, ...], seed: int, seconds: float, known: Array | None
+    loop: ClosedLoop, start: Array, decays: tuple[float, ...], seed: int, effort: Effort, known: Array | None
 ) -> tuple[Array, float]:
     """P, and the ratio of its sampled volume and the start's."""
     A, h = loop.mean_rate(), loop.step
     slowest = slowest_decay(A, h)
     found = given = 0.0
-    end = time.monotonic() + seconds
     for decay in decays:
-        samples = _Samples(loop, 1e-3 * decay * slowest, np.random.default_rng(seed), end)
+        samples = _Samples(loop, 1e-3 * decay * slowest, np.random.default_rng(seed), effort)
         if known is not None:
             samples.remember(known)
-        P = _enlarge(samples, A, start, decay * slowest, end)
+        P = _enlarge(samples, A, start, decay * slowest)
         if not (np.all(np.linalg.eigvalsh(P) > 0) and np.all(np.linalg.eigvalsh(_linear(P, A, h)) < 0)):
             raise BackendError(
                 "the optimised P must satisfy P > 0 and A'P + PA + h A'PA < 0; it does not. Use 'lyapunov'."
@@ -103,8 +103,10 @@ def _optimise(
     )
 
 
-def optimise_repeatedly(loop: ClosedLoop, start: Array, seconds: float = math.inf, known: Array | None = None) -> Array:
-    """`optimise_candidate` from its own result again, with other samples, while that gains volume in the time.
+def optimise_repeatedly(
+    loop: ClosedLoop, start: Array, effort: Effort = UNLIMITED, known: Array | None = None
+) -> Array:
+    """`optimise_candidate` from its own result again, with other samples, while that gains volume and effort is left.
 
     A trust region that has shrunk around one optimum opens again: on a planar quadrotor three rounds enlarge the
     sampled set of the first 30-fold.
@@ -113,13 +115,12 @@ def optimise_repeatedly(loop: ClosedLoop, start: Array, seconds: float = math.in
     ------
     BackendError : of the first round.
     """
-    end = time.monotonic() + seconds
-    P, _ = _optimise(loop, start, DECAYS, 0, seconds, known)
+    P, _ = _optimise(loop, start, DECAYS, 0, effort, known)
     for seed in range(1, _REPEATS):
-        if time.monotonic() > end:
+        if effort.over:
             break
         try:
-            P, growth = _optimise(loop, P, DECAYS, seed, end - time.monotonic(), known)
+            P, growth = _optimise(loop, P, DECAYS, seed, effort, known)
         except BackendError:  # no larger one
             break
         if growth < _WORTH:
@@ -127,15 +128,15 @@ def optimise_repeatedly(loop: ClosedLoop, start: Array, seconds: float = math.in
     return P
 
 
-def largest_sampled(loop: ClosedLoop, candidates: Sequence[Array], seed: int = 0, seconds: float = math.inf) -> Array:
+def largest_sampled(loop: ClosedLoop, candidates: Sequence[Array], seed: int = 0, effort: Effort = UNLIMITED) -> Array:
     """The P, (n, n), of those given whose set inside the domain without a sampled violation has the largest volume;
-    after so many seconds fewer samples tell."""
+    where the effort ends, fewer samples tell."""
     slowest = slowest_decay(loop.mean_rate(), loop.step)
-    samples = _Samples(loop, 1e-3 * slowest, np.random.default_rng(seed), time.monotonic() + seconds)
+    samples = _Samples(loop, 1e-3 * slowest, np.random.default_rng(seed), effort)
     return max(candidates, key=lambda P: volume(samples.fit(P, 0.0), 1.0))
 
 
-def _enlarge(samples: _Samples, A: Array, start: Array, alpha: float, end: float) -> Array:
+def _enlarge(samples: _Samples, A: Array, start: Array, alpha: float) -> Array:
     """Rounds of sampling and solving, from `start` to P with its margin."""
     h = samples.loop.step
     Q = -_linear(start, A, h)
@@ -144,7 +145,7 @@ def _enlarge(samples: _Samples, A: Array, start: Array, alpha: float, end: float
     P = samples.fit(P, _SCORED * alpha)
     radius, answers = 0.4, 0
     for _ in range(_ROUNDS):
-        if answers and time.monotonic() > end:
+        if answers and samples.effort.over:
             break
         new = _solve(samples, P, A, alpha, radius)
         if new is None:
@@ -172,11 +173,11 @@ class _Samples:
     """States that limit sublevel sets of the closed loop, remembered from search to search.
 
     x, G(x), (dG/dx) x : (N, n), G being the mean rate of a step, F in continuous time. outside : (N,), the input leaves
-    its bounds at x or G has a pole there. After `end`, a reading of `time.monotonic`, one search does for several.
+    its bounds at x or G has a pole there. Where the effort has ended, one search does for several.
     """
 
-    def __init__(self, loop: ClosedLoop, least: float, generator: np.random.Generator, end: float = math.inf) -> None:
-        self.loop, self.least, self.generator, self.end = loop, least, generator, end
+    def __init__(self, loop: ClosedLoop, least: float, generator: np.random.Generator, effort: Effort) -> None:
+        self.loop, self.least, self.generator, self.effort = loop, least, generator, effort
         self.f, self.step = loop.system.function(), loop.step
         self.bounds = np.array([[float(v) for v in b] for b in loop.system.input_bounds]).T
         self.x, self.F, self.dF = (np.zeros((0, loop.system.n)) for _ in range(3))
@@ -184,6 +185,7 @@ class _Samples:
 
     def field(self, x: Array) -> tuple[Array, NDArray[np.bool_]]:
         """G and `outside` at x, shapes (..., n) and (...)."""
+        self.effort.charge(_CALL + x.size / self.loop.system.n * self.loop.operations)
         # One matrix product for all states: numpy would make one for each leading index.
         u = self.loop.policy(x.reshape(-1, x.shape[-1])).reshape(*x.shape[:-1], self.loop.system.m)
         with np.errstate(all="ignore"):
@@ -218,7 +220,7 @@ class _Samples:
             P = P / min(level, domain_limit(P, self.loop.system.domain), float(_RADII[-1]) ** 2)
             if k + 1 >= searches and level > 0.5:  # a lower level leaves the set too coarsely sampled
                 break
-            if time.monotonic() > self.end:
+            if self.effort.over:
                 break
         return P
 
@@ -227,6 +229,7 @@ class _Samples:
         L = np.linalg.cholesky(P)
         n = len(P)
         z = self.generator.standard_normal((_FRESH, n))
+        self.effort.charge(4 * n * n * len(self.x))
         if len(self.x):
             lowest = np.argsort(self.crossings(P, alpha)[0], kind="stable")[:100]
             limiting = _unit(self.x[lowest] @ L)
@@ -297,6 +300,8 @@ def _solve(samples: _Samples, P: Array, A: Array, alpha: float, radius: float) -
         size = np.linalg.norm(G.reshape(len(rows), n * n), axis=1)
         held.append(G / size[:, None, None])
         least.append((np.minimum(1.0, level[rows]) - _SLACK) / size)
+    entries = n * (n + 1) / 2
+    samples.effort.charge(_CALL + _CONE * entries**2 * (sum(map(len, held)) + len(matrices) * entries))
     M = smallest_trace(matrices, np.concatenate(held), np.concatenate(least), _TOLERANCE)
     if M is None:
         return None

@@ -14,6 +14,7 @@ from certify.certificates import PartitionTree, TrustedSolver
 from certify.certificates.claims import Claim, Problem
 from certify.certificates.claims.claim import Kind
 from certify.certificates.verdict import Stop
+from certify.effort import UNLIMITED, Effort
 from certify.errors import InputError
 from certify.provers.falsify import Witness
 
@@ -23,14 +24,19 @@ FEW = 3
 
 @dataclass(frozen=True, slots=True)
 class Budget:
-    """What a proof may use: seconds on the wall, of which `check` are left for the check of each proved box; boxes,
+    """Limits of a proof: its effort, of which `check` operations are left for the check of each proved box; boxes,
     boxes at once, and the width of the smallest box relative to the root box."""
 
-    seconds: float = 600.0
+    effort: Effort = UNLIMITED
     boxes: int = 4_000_000
     batch: int = 2048
     least_width: float = 2.0**-24
     check: float = 0.0
+
+    @property
+    def ended_by(self) -> Stop:
+        """The end of its effort, or the clock if that came first."""
+        return Stop.TIME if self.effort.is_short_of_time else Stop.EFFORT
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,14 +58,15 @@ class Progress:
     """Where a proof stands: `level` is proved, `target` aimed at, `boxes` were bounded and `open` wait.
 
     A pass outwards has a target above its level, one inwards, `down`, a target below. `proved` is the share of the
-    ring's volume that is done; `seconds_left` is extrapolated, None at first; `name` is the candidate's."""
+    ring's volume that is done; `left` is how many operations are
+    needed to do the rest, extrapolated, None at first; `name` is the candidate's."""
 
     level: float
     target: float
     boxes: int
     open: int
     proved: float
-    seconds_left: float | None
+    left: float | None
     name: str = ""
     down: bool = False
 
@@ -70,8 +77,8 @@ class Proof:
 
     `stop` and `detail` say what limits the level; `witness` is the lowest violation met on the way; `partial` are
     levels that were reached without making a claim; `solver` is the record of a solver's answers; `seconds` the
-    stages `local` and `ring`; `direction`, (n,), is that in which boxes had to be halved most, and `seconds_left` how
-    long the search would still take, both None where unknown.
+    stages `local` and `ring`; `direction`, (n,), is that in which boxes had to be halved most, and `left` how many
+    operations the search would still take, both None where unknown.
     """
 
     claim: Claim | None
@@ -85,7 +92,7 @@ class Proof:
     solver: Mapping[str, Any] | None = None
     seconds: Mapping[str, float] = field(default_factory=dict)
     direction: tuple[float, ...] | None = None
-    seconds_left: float | None = None
+    left: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -207,7 +214,7 @@ class Once:
 
     def proof(self) -> Proof:
         """What was found."""
-        return self.found or Proof(None, None, Stop.TIME)
+        return self.found or Proof(None, None, Stop.EFFORT)
 
     def state(self) -> None:
         """None: there is no going on."""

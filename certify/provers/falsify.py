@@ -9,8 +9,6 @@ reported witness is shown in Arb; the search itself proves nothing.
 from __future__ import annotations
 
 import itertools
-import math
-import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from fractions import Fraction
@@ -21,12 +19,14 @@ import torch
 from numpy.typing import NDArray
 
 from certify.certificates.claims import Problem
+from certify.effort import UNLIMITED, Effort
 from certify.loop.plants import System
 from certify.loop.policies import bounded_by_form
 from certify.loop.rigorous import evaluate_increment, evaluate_policy
 
 Array = NDArray[np.float64]
 _RATIO, _LEVELS, _LOWER = 1.4, 60, 13  # of a survey: between levels, how many, and how many steps of 8 further it goes
+_CALL, _EACH = 3e5, 2.0  # operations of evaluating few states at once; of an operation at one, with its derivative
 _TOGETHER = 15  # levels that are looked at in one batch
 
 
@@ -67,13 +67,13 @@ class Band:
 
 
 def falsify(
-    problem: Problem, T: Array, limit: float, samples: int = 20_000, seed: int = 0, until: float = math.inf
+    problem: Problem, T: Array, limit: float, samples: int = 20_000, seed: int = 0, effort: Effort = UNLIMITED
 ) -> Witness | None:
     """Search {V <= limit} for the lowest violation; None if none was found. `x = T z`, (n, n): T'PT is about I.
 
-    From `until` on, a reading of `time.perf_counter`, the search ends with what it has.
+    Where the effort ends, the search ends with what it has.
     """
-    search = _Search(problem, T, until)
+    search = _Search(problem, T, effort)
     generator = np.random.default_rng(seed)
     n = problem.loop.system.n
     direction = generator.standard_normal((samples, n))
@@ -82,7 +82,7 @@ def falsify(
     radius = np.where(np.arange(samples) % 2 == 0, 1.0, generator.random(samples))
     z = direction * (radius * np.sqrt(limit) * (1 - 1e-9))[:, None]
     best = search.lowest(z)
-    if best is None and time.perf_counter() < until:  # climb D' on the boundary before giving up
+    if best is None and not effort.over:  # climb D' on the boundary before giving up
         z = search.climb(z[:: max(1, samples // 512)], limit)
         best = search.lowest(z)
     return best
@@ -100,11 +100,11 @@ def is_violated(problem: Problem, T: Array, limit: float, samples: int = 4000, s
 
 
 def survey(
-    problem: Problem, T: Array, limit: float, samples: int = 512, seed: int = 0, until: float = math.inf
+    problem: Problem, T: Array, limit: float, samples: int = 512, seed: int = 0, effort: Effort = UNLIMITED
 ) -> list[Band]:
-    """The bands of levels up to `limit` on which no violation was found, the highest first; from `until` on, a reading
-    of `time.perf_counter`, samples are not climbed from."""
-    search = _Search(problem, T, until)
+    """The bands of levels up to `limit` on which no violation was found, the highest first; once the effort
+    is over, samples are not climbed from."""
+    search = _Search(problem, T, effort)
     steps = 20 if problem.loop.system.sample is None else 8  # each of many times the work
     generator = np.random.default_rng(seed)
     direction = generator.standard_normal((samples, problem.loop.system.n))
@@ -167,8 +167,8 @@ def refutes(problem: Problem, witness: Witness, level: float) -> bool:
 
 
 class _Search:
-    def __init__(self, problem: Problem, T: Array, until: float = math.inf) -> None:
-        self.problem, self.until = problem, until
+    def __init__(self, problem: Problem, T: Array, effort: Effort = UNLIMITED) -> None:
+        self.problem, self.effort = problem, effort
         self.loop = problem.loop
         self.f = self.loop.system.uncertain_function("torch")
         self.corners = self.loop.system.corners()
@@ -189,6 +189,8 @@ class _Search:
 
     def violation(self, z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """(D', how far the worst input lies outside its bounds) at x = T z, shapes (B,)."""
+        times = len(self.corners) * len(self.periods) * (4 if self.loop.system.sample else 1)
+        self.effort.charge(_CALL + _EACH * len(z) * times * self.loop.operations)
         x = z @ self.T.T
         h = x
         for k, (W, b) in enumerate(self.layers):
@@ -249,7 +251,7 @@ class _Search:
                 better = moved.norm(dim=-1, keepdim=True) < norm
                 z = torch.where(better, moved, z)
                 step = torch.where(better, 1.5 * step, 0.4 * step).clamp(max=0.5)
-            if float(step.max()) < 1e-7 or time.perf_counter() > self.until:
+            if float(step.max()) < 1e-7 or self.effort.over:
                 break
         with torch.no_grad():
             z = self._lowest_few(self._shrink(z, torch.ones(()), halvings=50), 32)
@@ -281,7 +283,7 @@ class _Search:
                 moved = z + step * radius * direction
                 z = radius * moved / moved.norm(dim=-1, keepdim=True)
             step *= 0.95
-            if time.perf_counter() > self.until:
+            if self.effort.over:
                 break
         result: Array = z.detach().numpy()
         return result

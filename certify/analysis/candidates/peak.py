@@ -9,24 +9,24 @@ Balakrishnan 1994, section 6.1), and P >= W keeps the set inside one that the lo
 from __future__ import annotations
 
 import math
-import time
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from certify.analysis.candidates.robust import robust_candidate, solve
+from certify.analysis.candidates.robust import CONE, PROGRAM, robust_candidate, solve
+from certify.effort import UNLIMITED, Effort
 from certify.errors import BackendError
 from certify.loop.closed_loop import ClosedLoop
 
 Array = NDArray[np.float64]
 _EDGES = (0.3, 0.5, 0.65, 0.8)  # of the slowest rate at which V can fall
 _ROUND = 1e-3  # of the floor, for a set that is not small where it need not be
-_FOR_W = 0.6  # of the time
+_FOR_W = 0.6  # of the effort
 _MOST = 16  # corners
 
 
-def peak_candidate(loop: ClosedLoop, seconds: float = math.inf) -> Array:
+def peak_candidate(loop: ClosedLoop, effort: Effort = UNLIMITED) -> Array:
     """P (n, n), scaled so that about {x'Px <= 1} can be proved where nothing pushes.
 
     Parameters
@@ -42,8 +42,7 @@ def peak_candidate(loop: ClosedLoop, seconds: float = math.inf) -> Array:
         import cvxpy
     except ImportError as error:
         raise BackendError(f"the candidate 'peak' needs cvxpy: {error}. Install it, or use another.") from error
-    end = time.perf_counter() + seconds
-    W, h, n = robust_candidate(_alone(loop), _FOR_W * seconds), loop.step, loop.system.n
+    W, h, n = robust_candidate(_alone(loop), effort.share(_FOR_W)), loop.step, loop.system.n
     corners = _corners(loop)
     slowest = min(-float(np.max(np.linalg.eigvals(L).real)) for L, _ in corners)
     best, least = None, math.inf
@@ -55,12 +54,13 @@ def peak_candidate(loop: ClosedLoop, seconds: float = math.inf) -> Array:
             corner = cvxpy.reshape(k * c0 - h * (f.T @ P @ f), (1, 1), order="C")
             within.append(cvxpy.bmat([[-side, -b], [-b.T, corner]]) >> 0)
         size = cvxpy.trace(np.linalg.inv(W) @ P) / n
+        effort.charge(PROGRAM + CONE * n**4 * (len(corners) * (n + 1) ** 2 + n**2))
         problem = cvxpy.Problem(cvxpy.Minimize(c0 + _ROUND * size), within)
         if not solve(problem):
             continue
         if P.value is not None and np.all(np.isfinite(P.value)) and float(c0.value) < least:
             best, least = np.asarray((P.value + P.value.T) / 2), float(c0.value)
-        if time.perf_counter() > end:
+        if effort.over:
             break
     if best is None or not slowest > 0:
         raise BackendError("no ellipsoid is found that keeps what pushes the loop small beside the set")

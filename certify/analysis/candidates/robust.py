@@ -12,7 +12,6 @@ not depend on the set.)
 from __future__ import annotations
 
 import math
-import time
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -22,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.certificates.claims import Problem
+from certify.effort import UNLIMITED, Effort
 from certify.errors import BackendError
 from certify.loop.closed_loop import ClosedLoop
 from certify.lyapunov import SOLVED, choose_candidate, diagonalising_coordinates, domain_limit, volume
@@ -42,14 +42,15 @@ _DIFFERENCE = 1e-3
 _AS_ASKED = 1.05  # a level above which there is little hope, where 1 was asked for
 _TOGETHER = 16  # balls that are looked at in one go
 _FAR = -1.0  # of a margin
-_AT_ONCE = 0.5  # of the time, for the loop whose input follows at once, where one is held
+PROGRAM, CONE = 5e7, 30.0  # operations of a program, however small, and for each product of its sizes
+_AT_ONCE = 0.5  # of the effort, for the loop whose input follows at once, where one is held
 _LEFT = 3e-3  # share of the decay that is to be left
 _INSIDE = 0.995  # of the room of an input or a state
 _BELOW = 1 - 1e-9  # of the domain's limit
 
 
-def robust_candidate(loop: ClosedLoop, seconds: float = math.inf) -> Array:
-    """P (n, n), scaled so that the local rule proves {x'Px <= 1}, for the largest such set found in the time.
+def robust_candidate(loop: ClosedLoop, effort: Effort = UNLIMITED) -> Array:
+    """P (n, n), scaled so that the local rule proves {x'Px <= 1}, for the largest such set that the effort finds.
 
     Parameters
     ----------
@@ -60,15 +61,15 @@ def robust_candidate(loop: ClosedLoop, seconds: float = math.inf) -> Array:
     BackendError : cvxpy is missing, or the local rule proves nothing with any candidate to begin with.
     InputError : the network is larger than the checker's local rule allows.
     """
-    end, known, proved = time.perf_counter() + seconds, paths(loop), list[Array]()
+    known, proved = paths(loop), list[Array]()
     if loop.system.sample is not None:  # a period is short, and the rule without one is cheap
         at_once = replace(loop, system=loop.system.with_sample(None))
-        proved = _all_scaled(known, [robust_candidate(at_once, _AT_ONCE * (end - time.perf_counter()))], end)
-    proved = proved or _all_scaled(known, [choose_candidate(loop, name).P for name in SOLVED], end)
+        proved = _all_scaled(known, [robust_candidate(at_once, effort.share(_AT_ONCE))], effort)
+    proved = proved or _all_scaled(known, [choose_candidate(loop, name).P for name in SOLVED], effort)
     if not proved:
         raise BackendError("the local rule proves nothing with the candidates that solve a Lyapunov equation")
     start = max(proved, key=_log_volume)
-    return max((_climbed(known, start, end, quick) for quick in (True, False)), key=_log_volume)
+    return max((_climbed(known, start, effort, quick) for quick in (True, False)), key=_log_volume)
 
 
 def solve(problem: cvxpy.Problem) -> bool:
@@ -85,17 +86,18 @@ def solve(problem: cvxpy.Problem) -> bool:
     return True
 
 
-def _climbed(known: Paths, best: Array, end: float, quick: bool) -> Array:
-    """From {x'Px <= 1}, P = `best`, on, as far as steps gain and time allows; `quick`: with old derivatives as long as
+def _climbed(known: Paths, best: Array, effort: Effort, quick: bool) -> Array:
+    """From {x'Px <= 1}, P = `best`, on, as far as steps gain and the effort allows; `quick`: with old derivatives as long as
     what they foretell comes, and levels about those that were asked for. Either way may end far below the other."""
     trust, about, fresh = _TRUST, None, True
-    while trust > _LEAST_TRUST and time.perf_counter() < end:
+    while trust > _LEAST_TRUST and not effort.over:
         if about is None:
-            about, fresh = _linearised(known, best, end), True
+            about, fresh = _linearised(known, best, effort), True
         if about is None:
             break
+        effort.charge(PROGRAM + CONE * len(about.slopes) ** 2 * about.slopes.shape[1])
         asked = about.largest(trust)
-        found = None if asked is None else _scaled(known, asked, end, best if quick else None)
+        found = None if asked is None else _scaled(known, asked, effort, best if quick else None)
         gain = -math.inf if found is None else _log_volume(found) - _log_volume(best)
         as_foretold = asked is not None and gain > _FORETOLD * (_log_volume(asked) - _log_volume(best))
         if fresh:  # what older derivatives foretell says little of how far new ones reach
@@ -111,12 +113,12 @@ def _log_volume(P: Array) -> float:
     return math.log(volume(P, 1.0))
 
 
-def _all_scaled(known: Paths, candidates: Sequence[Array], end: float) -> list[Array]:
-    """Scale each P by the level that the local rule proves with it in the time; leave out those without one."""
-    return [P for P in (_scaled(known, P, end) for P in candidates) if P is not None]
+def _all_scaled(known: Paths, candidates: Sequence[Array], effort: Effort) -> list[Array]:
+    """Scale each P by the level that the local rule proves with it; leave out those without one."""
+    return [P for P in (_scaled(known, P, effort) for P in candidates) if P is not None]
 
 
-def _scaled(known: Paths, P: Array, until: float = math.inf, best: Array | None = None) -> Array | None:
+def _scaled(known: Paths, P: Array, effort: Effort, best: Array | None = None) -> Array | None:
     """P over the largest level that the local rule proves with it; None if there is none, or none with a set that is
     larger than that of `best`, when the level should be about 1."""
     if not np.linalg.eigvalsh(P)[0] > 0:
@@ -125,7 +127,7 @@ def _scaled(known: Paths, P: Array, until: float = math.inf, best: Array | None 
     if best is not None:
         least = math.exp(2 / len(P) * (_WORTH + _log_volume(best) - _log_volume(P)))
         between = least, _AS_ASKED
-    level = prove_local(*_problem(known, P), limit, known, until, between)
+    level = prove_local(*_problem(known, P), limit, known, effort, between)
     return None if level is None else P / level
 
 
@@ -192,8 +194,8 @@ class _Linearised:
         return np.asarray((found + found.T) / 2)
 
 
-def _linearised(known: Paths, P: Array, end: float) -> _Linearised | None:
-    """None if there is no time for it, or the rule is far from holding."""
+def _linearised(known: Paths, P: Array, effort: Effort) -> _Linearised | None:
+    """None if the effort ends before, or the rule is far from holding."""
     problem, T = _problem(known, P)
     rule, J = Rule.at_rest(problem, T, known), ball_around(problem, T, 1.0)
     with np.errstate(all="ignore"):
@@ -208,9 +210,10 @@ def _linearised(known: Paths, P: Array, end: float) -> _Linearised | None:
         changes = np.array([np.zeros_like(P), *(_DIFFERENCE * X for X in _directions(len(P)))])
         rows, inverse = list[Array](), np.linalg.inv(J)
         for start in range(0, len(changes), _TOGETHER):
-            if time.perf_counter() > end:
+            if effort.over:
                 return None
             some = changes[start : start + _TOGETHER]
+            effort.charge(len(some) * rule.operations)
             balls = _balls(J, some)
             for X, ball, found in zip(some, balls, rule.models_on(balls, 1.0), strict=True):
                 corners = _corners(rule, found, ball, P + inverse.T @ X @ inverse)

@@ -7,13 +7,13 @@ found violated later can be added as it stands. Steps are those of Levenberg and
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
+from certify.effort import UNLIMITED, Effort
 from certify.errors import InputError
 from certify.lyapunov.function import LyapunovFunction
 from certify.lyapunov.learning.models import Model
@@ -22,6 +22,7 @@ Array = NDArray[np.float64]
 _TRIES = 8  # of a step, with more damping each time
 _MORE, _LESS, _LEAST = 3.0, 0.4, 1e-8  # damping
 _ENOUGH = 1e-5  # relative gain of a step, below which the fit ends
+_CALL, _EACH = 1e6, 40.0  # operations of a step, however small, and for each entry of its rows
 _DECAY = 1e-6  # of the parameters: small weights make smooth functions
 
 
@@ -71,9 +72,9 @@ class Fit:
 
 
 def fit(
-    model: Model, p: Array, values: Values, slopes: Slopes, steps: int, damping: float = 1.0, deadline: float = np.inf
+    model: Model, p: Array, values: Values, slopes: Slopes, steps: int, damping: float = 1.0, effort: Effort = UNLIMITED
 ) -> Fit:
-    """Least squares from the parameters p, in at most so many steps, or until `deadline` by `time.monotonic`."""
+    """Least squares from the parameters p, in at most so many steps, or until the effort is over."""
 
     def cost(q: Array) -> float:
         function = model.function(q)
@@ -82,7 +83,9 @@ def fit(
         return float(r @ r + s @ s + _DECAY * (q @ q))
 
     least = cost(p)
+    rows, size = len(values.z) + len(slopes.z), len(p)
     for _ in range(steps):
+        effort.charge(_CALL + rows * size * (size + _EACH) + size**3)
         normal, downhill = _normal_equations(model, p, values, slopes)
         diagonal = np.diag(normal)
         floor = 1e-6 * diagonal.max()
@@ -103,7 +106,7 @@ def fit(
             break
         gain, p, least = (least - found) / least, p + step, found
         damping = max(damping * _LESS, _LEAST)
-        if gain < _ENOUGH or time.monotonic() > deadline:
+        if gain < _ENOUGH or effort.over:
             break
     return Fit(p, least, damping)
 

@@ -14,6 +14,7 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 
+from certify.effort import UNLIMITED, Effort
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants.ode import eigenvalues_of, rk4_step
 from certify.loop.policies import bounded_by_form
@@ -66,9 +67,9 @@ class LearningFlow:
     inner, c : of the ellipsoid.
     """
 
-    def __init__(self, loop: ClosedLoop, inner: Quadratic, c: float) -> None:
+    def __init__(self, loop: ClosedLoop, inner: Quadratic, c: float, effort: Effort = UNLIMITED) -> None:
         system = loop.system
-        self.loop, self.V, self.c, self.n = loop, inner, c, system.n
+        self.loop, self.V, self.c, self.n, self.effort = loop, inner, c, system.n, effort
         self.low, self.high = np.array([[float(end) for end in pair] for pair in system.domain]).T
         nominal, general = system.function(), system.uncertain_function()
         folded, u_eq = loop.folded, loop.u_eq  # once, not in every step
@@ -107,6 +108,7 @@ class LearningFlow:
 
     def directions(self, x: Array, scale: Array) -> Array:
         """Unit vectors of the rates in z = x / scale at each corner of what is uncertain, (C, B, n)."""
+        self.effort.charge(_CALL + len(self._corners) * len(x) * self.loop.operations)
         u = self.policy(x)
         rates = np.stack([np.asarray(self._general(x, u, values)) for values in self._corners]) / scale
         return np.asarray(rates / (np.linalg.norm(rates, axis=-1, keepdims=True) + 1e-12))
@@ -128,6 +130,7 @@ class LearningFlow:
                 relative = np.max(np.abs((x - middle) / half), axis=-1)
                 close = np.clip((relative - _NEAR) / (1 - _NEAR), 0.0, 1.0) ** 2
                 nearness[alive] = np.maximum(nearness[alive], close)
+                self.effort.charge(_CALL + 5 * len(x) * self.loop.operations)
                 after = rk4_step(self.rate, x, self.step)
                 length[alive] += np.linalg.norm((after - x) / scale, axis=-1)
                 x = after

@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from certify.effort import UNLIMITED, Effort
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.lyapunov.function import Quadratic
@@ -44,6 +45,7 @@ _FACES = 300  # for each state
 _KEPT = 3000  # counterexamples
 _NEW = 600  # of them at most in a round
 _SLOPE_WEIGHT, _EDGE_WEIGHT = 3.0, 2.0
+_SEARCHED, _EACH = 3e5, 4.0  # states at which a search evaluates the function; operations for a parameter
 _BESIDE = 0.003  # the lowest violation
 
 
@@ -86,7 +88,7 @@ def learn(
     c2: float,
     hidden: Sequence[int] = (16, 16),
     seed: int = 0,
-    seconds: float = 120.0,
+    effort: Effort = UNLIMITED,
     progress: Report | None = None,
 ) -> Learned:
     """Learn a tanh network for a loop on its domain.
@@ -97,14 +99,14 @@ def learn(
     inner, c2 : a region of attraction {V <= c2}.
     hidden : widths of the layers between the states and the output.
     seed : of everything random.
-    seconds : after which no further round begins.
+    effort : where it ends, no further round begins.
     progress : called after each round.
 
     Raises
     ------
     InputError : the loop goes in steps, the ellipsoid is none of its states, or too little converges to learn from.
     """
-    return _learned(loop, inner, c2, Network(loop.system.n, tuple(hidden)), seed, seconds, progress)
+    return _learned(loop, inner, c2, Network(loop.system.n, tuple(hidden)), seed, effort, progress)
 
 
 def fit_polynomial(
@@ -113,7 +115,7 @@ def fit_polynomial(
     c2: float,
     degree: int = 4,
     seed: int = 0,
-    seconds: float = 120.0,
+    effort: Effort = UNLIMITED,
     progress: Report | None = None,
 ) -> Learned:
     """Fit a polynomial of an even degree for a loop on its domain; the arguments are those of `learn`.
@@ -122,11 +124,11 @@ def fit_polynomial(
     ------
     InputError : as `learn`, or the degree is odd or out of range.
     """
-    return _learned(loop, inner, c2, Terms(loop.system.n, degree), seed, seconds, progress)
+    return _learned(loop, inner, c2, Terms(loop.system.n, degree), seed, effort, progress)
 
 
 def _learned(
-    loop: ClosedLoop, inner: Quadratic, c2: float, model: Model, seed: int, seconds: float, progress: Report | None
+    loop: ClosedLoop, inner: Quadratic, c2: float, model: Model, seed: int, effort: Effort, progress: Report | None
 ) -> Learned:
     start = time.monotonic()
     system = loop.system
@@ -141,18 +143,19 @@ def _learned(
             f"found {inner.n} states and the level {c2}."
         )
     generator = np.random.default_rng(seed)
-    flow = LearningFlow(loop, inner, _WITHIN * c2)
+    flow = LearningFlow(loop, inner, _WITHIN * c2, effort)
     samples = draw(flow, generator)
     lesson = _Lesson(flow, samples, generator)
     search = Search(flow, samples)
     p, damping = model.initial(generator), 1.0
     best, history = p, list[Round]()
-    while len(history) < _ROUNDS and (not history or time.monotonic() < start + seconds):
+    while len(history) < _ROUNDS and (not history or not effort.over):
         done = len(history)
         steps = _STEPS if done else _FIRST
-        fitted = fit(model, p, lesson.values(), lesson.slopes(model.function(p)), steps, damping, start + seconds)
+        fitted = fit(model, p, lesson.values(), lesson.slopes(model.function(p)), steps, damping, effort)
         p, damping = fitted.p, max(fitted.damping, 1e-4) if done else 1.0
         function = model.function(p)
+        effort.charge(_SEARCHED * _EACH * len(p))
         z, v, slope = search.rising(function, lesson.sought, -_NATURAL * _MARGIN, lesson.risen, generator)
         low = search.low(function, lesson.sought, generator)
         level = min(

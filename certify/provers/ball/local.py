@@ -7,7 +7,6 @@ Around a level c0 of a practical claim the models do not start from 0, and what 
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 
 from certify.certificates import LocalBall
 from certify.certificates.claims import Problem
+from certify.effort import UNLIMITED, Effort
 from certify.lyapunov import extents
 from certify.provers.ball.cells import cut, cuts_for
 from certify.provers.ball.decrease import NOT_SHOWN, Corner, Multipliers, Shown, best_at, corners_of, rests_of
@@ -28,6 +28,7 @@ _LEAST = 1e-280  # a level, below which binary64 holds nothing more
 _MARGIN = 1e-3  # share of the decay that is left to the checker's rounding
 _ENOUGH = 1.01 * _MARGIN
 _WIDER = 1 + 1e-9  # of the ball, which has to contain {V <= c1} beyond all rounding
+_WEIGHINGS, _WEIGHING = 8, 3e5  # rounds of multipliers on a ball, and operations of one, however small
 _ORDER = 4  # of the series in time, where an input is held
 _FAR, _NEAR = 1e-2, 0.3  # from one level to the next lower one, where all below one is good, and where not
 _LOWER = 0.5  # from one level to the next, while floors fall with them
@@ -45,17 +46,17 @@ def prove_local(
     T: Array,
     limit: float,
     known: Paths | None = None,
-    until: float = math.inf,
+    effort: Effort = UNLIMITED,
     between: tuple[float, float] | None = None,
 ) -> float | None:
     """The largest level up to `limit` that the local proof of a claim at rest reaches, within 2 %; None if there is
-    none, or none is found in the time.
+    none, or the effort ends before one is found.
 
     Parameters
     ----------
     T : (n, n), with T'PT about the unit matrix: the ball of the proof is x = T z.
     known : the `paths` of the loop, if they are there already.
-    until : the reading of `time.perf_counter` at which the search ends with what it has.
+    effort : where it ends, the search ends with what it has.
     between : a level below which nothing is of interest, and a higher one, above which little is expected.
 
     Raises
@@ -67,16 +68,17 @@ def prove_local(
         return None
 
     def good(level: float) -> bool:
+        effort.charge(rule.operations)
         return rule.shown(level, _ENOUGH).margin > _MARGIN
 
     if between is None:
-        return _largest(good, limit, until)
+        return _largest(good, limit, effort)
     low, high = between[0], min(between[1], limit)
     if not (low < high and good(low)):
         return None
-    while high < limit and time.perf_counter() < until and good(high):
+    while high < limit and not effort.over and good(high):
         low, high = high, min(high * high / low, limit)
-    return _closer(good, low, high, until)
+    return _closer(good, low, high, effort)
 
 
 def prove_band(
@@ -84,15 +86,16 @@ def prove_band(
     T: Array,
     limit: float,
     known: Paths | None = None,
-    until: float = math.inf,
+    effort: Effort = UNLIMITED,
     above: float = 1.5,
 ) -> tuple[float, float] | None:
-    """(c0, c1) with c0 < c1: V falls where c0 <= V <= c1; None if there are none, or none are found in the time.
+    """(c0, c1) with c0 < c1: V falls where c0 <= V <= c1; None if there are none, or the effort
+    ends before.
 
     Parameters
     ----------
     known : the `paths` of the loop, which need not be at rest.
-    until : the reading of `time.perf_counter` at which the search ends with what it has.
+    effort : where it ends, the search ends with what it has.
     above : a large ball has a large floor: c1, up to `limit`, is about the largest level whose ball shows a floor of at
         most so many times the least that any ball shows, and c0 is that floor.
 
@@ -107,16 +110,17 @@ def prove_band(
 
     def floor(level: float) -> float:
         if level not in floors:
+            effort.charge(_ROUNDS * rule.operations)
             floors[level] = max(rule.around(level).floor, _NOTHING * limit)
         return floors[level]
 
-    top = _largest(lambda level: floor(level) < level, limit, until, _NEAR)
+    top = _largest(lambda level: floor(level) < level, limit, effort, _NEAR)
     if top is None:
         return None
     level, least = top * _LOWER, floor(top)
-    while time.perf_counter() < until and floor(level) < min(level, (1 - _WORTH) * least):
+    while not effort.over and floor(level) < min(level, (1 - _WORTH) * least):
         level, least = level * _LOWER, floor(level)
-    c1 = _largest(lambda level: floor(level) <= above * least, top, until, _LOWER)
+    c1 = _largest(lambda level: floor(level) <= above * least, top, effort, _LOWER)
     return (floor(top), top) if c1 is None else (floor(c1), c1)
 
 
@@ -189,6 +193,16 @@ class Rule:
         cells = [] if cuts is None else cut(list(problem.loop.system.ranges.values()), cuts)
         return cls(problem, T, steps, cuts, cells, R)
 
+    @property
+    def operations(self) -> float:
+        """Operations of a look at one ball, about, as an `Effort` counts them."""
+        n, units, sample = len(self.T), sum(len(b) for b in self.problem.loop.network.biases), self.problem.loop.step
+        times = max(1, len(self.cells)) * (1 if self.steps.is_plain else 3) + (20 if sample else 0)
+        corners = max(1, len(self.cells)) * 2 ** len(self.problem.loop.system.ranges)
+        return times * self.steps.known.operations + corners * _WEIGHINGS * (
+            _WEIGHING + 4.0 * units * n**2 + 8.0 * n**5
+        )
+
     def shown(self, level: float, enough: float = math.inf) -> Shown:
         """At rest, on the ball of a level."""
         with np.errstate(all="ignore"):  # what overflows is not shown
@@ -257,21 +271,21 @@ def _order(problem: Problem) -> int:
     return 1 if problem.loop.system.sample is None else _ORDER
 
 
-def _largest(good: Callable[[float], bool], limit: float, until: float, fall: float = _FAR) -> float | None:
+def _largest(good: Callable[[float], bool], limit: float, effort: Effort, fall: float = _FAR) -> float | None:
     """The largest level up to `limit` that is good, within 2 %, if those somewhat below it are."""
     if good(limit):
         return limit
     high, low = limit, limit
     while not good(low):
         high, low = low, low * fall
-        if low <= 1e-30 * limit or low < _LEAST or time.perf_counter() > until:
+        if low <= 1e-30 * limit or low < _LEAST or effort.over:
             return None
-    return _closer(good, low, high, until)
+    return _closer(good, low, high, effort)
 
 
-def _closer(good: Callable[[float], bool], low: float, high: float, until: float) -> float:
+def _closer(good: Callable[[float], bool], low: float, high: float, effort: Effort) -> float:
     """A good level, within 2 % of one that is not, from a good one and one that is not."""
-    while high > 1.02 * low and time.perf_counter() < until:
+    while high > 1.02 * low and not effort.over:
         middle = math.sqrt(low * high)
         low, high = (middle, high) if good(middle) else (low, middle)
     return low

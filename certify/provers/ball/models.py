@@ -21,12 +21,13 @@ from numpy.typing import NDArray
 from certify.certificates.limits import numbers_of_a_jet
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
-from certify.loop.expressions import evaluate
+from certify.loop.expressions import evaluate, nodes
 from certify.loop.policies import bounded_by_form
 from certify.provers.ball.jets import Jet, Jets, basis, beyond_tangent, fourth_of_tanh, remainder, sizes
 from certify.provers.ball.ranged import RangedJet
 
 Array = NDArray[np.float64]
+_CALL, _EACH = 3e5, 1e5  # operations of a layer, and of an operation of the equations, however small
 _MOST_NUMBERS, _MOST_PRODUCTS = 2**25, 2**33  # of the sums over paths: the checker refuses more
 _MARGIN = 1e-3  # of an input's range, left to the checker's rounding where a clip begins
 _UNIT = 2.0**-51  # twice what a checker counts for each term of a sum, relative to the sum's size
@@ -182,6 +183,17 @@ class Paths:
     rounding: Array
     layers: tuple[_Layer, ...]
     squashed: bool
+
+    @property
+    def operations(self) -> float:
+        """Operations of models on a ball, about, as an `Effort` counts them."""
+        n, found, before = self.loop.system.n, _CALL * len(self.layers), 0
+        second, numbers = n * (n + 1) / 2, float(numbers_of_a_jet(n))
+        for layer in self.layers:
+            rows, columns = layer.W.shape
+            found += rows * (2 * columns * numbers + 2 * before * second + 16 * numbers)
+            before += rows
+        return found + sum(1 for _ in nodes(*self.loop.dynamics)) * (_EACH + 32 * numbers)
 
     def models(self, J: Array) -> Models:
         """F on the ball x = middle + J d, ||d|| <= 1; J is (n, k)."""

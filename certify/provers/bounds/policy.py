@@ -25,6 +25,7 @@ from certify.provers.bounds.fused import FusedLayers, Layer
 from certify.provers.bounds.taylor import EPS, TINY
 
 Array = NDArray[np.float64]
+_NEURON = 100.0  # operations of a relaxation
 _NUMBERS = 2**15  # units of a layer times boxes at a time, which stay in a core's cache
 _LIBM = 2.0**-47  # error allowed to torch.tanh, relative to 1
 
@@ -63,6 +64,8 @@ class LayersEnclosure:
         rows = (self.weights, self.magnitudes, self.biases, self.bias_errors, self.rows, self.norms)
         self.layers = [Layer(*row) for row in zip(*rows, strict=True)]
         self.units, self.widest = sum(network.layers[1:]), max(network.layers)
+        entries = sum(W.size for W in network.weights)
+        self.operations = 2.0 * entries * (network.n + network.m + 3) + _NEURON * self.units  # of a box, about
         self.clip = None if network.clip is None else tuple(tensor(end)[:, None] for end in network.clip)
 
     def __call__(self, x: Tensor, x_error: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

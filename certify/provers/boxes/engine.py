@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from certify.certificates import PartitionTree
 from certify.certificates.claims import Asymptotic, Practical, Problem
 from certify.certificates.verdict import Stop
+from certify.effort import UNLIMITED, Effort
 from certify.errors import InputError
 from certify.provers.ball.local import local_ball, prove_band, prove_local
 from certify.provers.base import FEW, Attempt, Budget, Engine, Once, Proof, Report, SearchState, Task
@@ -20,22 +21,22 @@ from certify.provers.execution import Runner
 from certify.provers.falsify import Band, Witness, survey
 
 Array = NDArray[np.float64]
-_SHARE = 0.6  # of the time, for finding c2 before c0
-_FOR_BALL = 0.5  # of the time, for a ring from a ball, and of that for the ball
+_SHARE = 0.6  # of the effort, for finding c2 before c0
+_FOR_BALL = 0.5  # of the effort, for a ring from a ball, and of that for the ball
 _EQUAL = 0.01  # of a level
 _NOTHING = 1e-9  # of a level: no smaller floor is looked for
 _ABOVE = (1.5, 1.1)  # of the least floor, in few and in many states, where leaves do not lower it any more
-_TRIES = 4  # inner levels from which c2 is looked for, each with half of the time that is left for it
+_TRIES = 4  # inner levels from which c2 is looked for, each with half of what is left of the effort
 
 
 class BoundsEngine(Engine):
     """Branch and bound in the coordinates `x = T z`, T (n, n), on a runner.
 
-    An attempt begins with the largest local level that is found until `until`, a reading of `time.perf_counter`.
+    An attempt begins with the largest local level that `first`, an effort, finds.
     """
 
-    def __init__(self, T: Array, runner: Runner, until: float = math.inf) -> None:
-        self.T, self.runner, self.until = T, runner, until
+    def __init__(self, T: Array, runner: Runner, first: Effort = UNLIMITED) -> None:
+        self.T, self.runner, self.first = T, runner, first
 
     def begin(self, task: Task) -> Attempt:
         """An attempt at the largest c2 up to the task's target; with claim `practical`, at the smallest c0 for it."""
@@ -46,17 +47,17 @@ class BoundsEngine(Engine):
     def _practical(self, task: Task, budget: Budget, report: Report | None) -> Proof:
         """The better of two: a ring from a ball around a level, and one that leaves alone have to carry."""
         start = time.perf_counter()
-        first = self._from_ball(task, replace(budget, seconds=_FOR_BALL * budget.seconds), report)
+        whole = budget.effort.left
+        first = self._from_ball(task, replace(budget, effort=budget.effort.share(_FOR_BALL)), report)
         if task.exactly and first is not None and first.claim is not None and first.claim.roa < task.target:
             first = None
         if first is not None and _is_ample(first, task.target):
             return first
-        left = replace(budget, seconds=budget.seconds - (time.perf_counter() - start))
         if self.T.shape[0] > FEW:
             return first or Proof(None, None, Stop.LOCAL, "no ball shows V to fall around any level; try another P")
-        if first is not None and left.seconds < _FOR_BALL * budget.seconds:
+        if first is not None and budget.effort.left < _FOR_BALL * whole:
             return first
-        second = self._by_leaves(task, left, report)
+        second = self._by_leaves(task, budget, report)
         found = second if first is None or _is_better(second, first) else first
         return replace(found, seconds={"ring": time.perf_counter() - start})
 
@@ -64,14 +65,13 @@ class BoundsEngine(Engine):
         """A ring that grows from the ball whose floor is about the least; None without such a ball."""
         start = time.perf_counter()
         above = _ABOVE[len(self.T) > FEW]
-        until = start + _FOR_BALL * budget.seconds
-        found = prove_band(task.problem, self.T, task.target, until=until, above=above)
+        found = prove_band(task.problem, self.T, task.target, effort=budget.effort.share(_FOR_BALL), above=above)
         if found is None:
             return None
         (floor, inner), stop = found, None
         if inner < task.target:
             grown = outwards(task.problem, self.T, inner, task.target, self.runner)
-            stop = grown.advance(replace(budget, seconds=budget.seconds - (time.perf_counter() - start)), report)
+            stop = grown.advance(budget, report)
             ring = grown.proof(stop)
         else:
             ring = empty_ring(task.problem, self.T, inner)
@@ -81,16 +81,15 @@ class BoundsEngine(Engine):
     def _by_leaves(self, task: Task, budget: Budget, report: Report | None) -> Proof:
         """The bands of a survey in turn, the highest first, until one holds a proof."""
         start = time.perf_counter()
-        bands = survey(task.problem, self.T, task.target)
+        bands = survey(task.problem, self.T, task.target, effort=budget.effort)
         if task.exactly:
             bands = [band for band in bands if band.top >= task.target]
         where = "near" if task.exactly else "around"
         why = f"Vdot >= 0 or an input out of bounds was sampled {where} every level"
         found = Proof(None, None, Stop.FLOOR, why)
         for k, band in enumerate(bands):
-            left = budget.seconds - (time.perf_counter() - start)
-            share = left if k == len(bands) - 1 else left / 2
-            proof = self._in_band(task, band, replace(budget, seconds=share), report)
+            share = budget.effort.share(1.0 if k == len(bands) - 1 else 0.5)
+            proof = self._in_band(task, band, replace(budget, effort=share), report)
             found = proof if k == 0 or proof.claim is not None else found
             if proof.claim is not None:
                 break
@@ -98,14 +97,12 @@ class BoundsEngine(Engine):
 
     def _in_band(self, task: Task, band: Band, budget: Budget, report: Report | None) -> Proof:
         """The largest c2, then the smallest c0 for it, from levels between which no violation was sampled."""
-        start = time.perf_counter()
         outer, stop, witness = task.target, Stop.REQUESTED, None
         if not task.exactly:
             outer, stop, witness = self._outer_level(
-                task, band, replace(budget, seconds=_SHARE * budget.seconds), report
+                task, band, replace(budget, effort=budget.effort.share(_SHARE)), report
             )
-        left = replace(budget, seconds=budget.seconds - (time.perf_counter() - start))
-        ring = prove_inwards(task.problem, self.T, band.below, outer, left, self.runner, report)
+        ring = prove_inwards(task.problem, self.T, band.below, outer, budget, self.runner, report)
         if not ring.inner < ring.outer:
             stop = Stop.CLUSTER if ring.stop is Stop.CLUSTER else Stop.FLOOR
             return Proof(None, None, stop, f"no ring below V = {outer:.6g} is proved", boxes=ring.boxes)
@@ -121,9 +118,8 @@ class BoundsEngine(Engine):
     ) -> tuple[float, Stop, Witness | None]:
         """The largest c2 that a ring from somewhat above the floor reaches, and what stopped it."""
         inner = min(4 * band.floor, math.sqrt(band.floor * band.top))
-        end = time.perf_counter() + budget.seconds
         for _ in range(_TRIES):
-            part = replace(budget, seconds=max(1e-3, (end - time.perf_counter()) / 2))
+            part = replace(budget, effort=budget.effort.share(0.5))
             ring = prove_outwards(task.problem, self.T, inner, band.above, part, self.runner, report)
             if ring.outer > inner:
                 break
@@ -148,7 +144,7 @@ class BoundsEngine(Engine):
             leaves=ring.leaves,
             seconds=seconds,
             direction=ring.direction,
-            seconds_left=ring.seconds_left,
+            left=ring.left,
         )
 
 
@@ -174,8 +170,8 @@ class _Outwards:
     def __init__(self, engine: BoundsEngine, task: Task) -> None:
         start = time.perf_counter()
         self.engine, self.task = engine, task
-        self.inner = prove_local(task.problem, engine.T, task.target, None, engine.until)
-        self.hurried = self.inner is None and time.perf_counter() > engine.until
+        self.inner = prove_local(task.problem, engine.T, task.target, None, engine.first)
+        self.hurried = self.inner is None and engine.first.over
         self.seconds: dict[str, float] = {"local": time.perf_counter() - start, "ring": 0.0}
         self.ring: Pass | None = None
         self.stop: Stop | None = None
@@ -220,7 +216,7 @@ class _Outwards:
 
     def proof(self) -> Proof:
         if self.hurried:
-            return Proof(None, None, Stop.TIME, "it ended before a local level was found", seconds=self.seconds)
+            return Proof(None, None, Stop.EFFORT, "it ended before a local level was found", seconds=self.seconds)
         if self.inner is None:
             why = "the linearisation does not dominate on any ball; try another --Q"
             return Proof(None, None, Stop.LOCAL, why, seconds=self.seconds)

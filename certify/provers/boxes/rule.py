@@ -16,6 +16,7 @@ Whether a box's centre can be proved at all is therefore asked of the centre alo
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -24,7 +25,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from certify.certificates.claims import Problem
-from certify.loop.expressions import Expression, evaluate
+from certify.loop.expressions import Expression, evaluate, nodes
 from certify.loop.plants import System
 from certify.loop.policies import bounded_by_form
 from certify.provers.bounds import Flow, Models, PolicyEnclosure, Taylor, loop_models, upper_bound
@@ -37,6 +38,7 @@ from certify.provers.boxes.form import FormBound
 Array = NDArray[np.float64]
 _SLACK = 1e-9  # relative distance from the inner level at which a box counts as inside
 _ENDS = 1e-11  # relative distance kept from the ends of the domain
+_EACH = 4.0  # operations of an entry of a model
 _POINT = 2.0**-20  # of a box: what is left of it around its centre
 
 
@@ -80,6 +82,14 @@ class VdotBound:
         self.ends = torch.tensor(ends, dtype=torch.float64, device=device).T[:, :, None]
         extent = np.sqrt(np.diag(np.linalg.inv(self.P))) * (1 + 1e-9)
         self.extent = torch.tensor(extent, dtype=torch.float64, device=device)[:, None]  # of {V <= 1}
+
+    @cached_property
+    def operations(self) -> float:
+        """Operations to bound a box, about, as an `Effort` counts them."""
+        symbols = self.system.n + self.system.m + len(self.system.uncertain) + (self.flow is not None)
+        times = 1 if self.flow is None else 2 + 2 * self.order**2
+        equations = sum(1 for _ in nodes(*self.dynamics)) * times + self.system.n * (self.system.n + 3)
+        return self.policy.operations + _EACH * equations * (symbols + 1) ** 2
 
     def levels(self, lo: Tensor, hi: Tensor) -> tuple[Tensor, Tensor]:
         """Bounds of V from below and above on boxes (n, B)."""

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import copy
 import math
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -23,9 +22,10 @@ from torch import Tensor
 
 from certify.certificates.claims import Problem
 from certify.certificates.verdict import Stop
+from certify.effort import UNLIMITED
 from certify.errors import BackendError, CertificateFormatError, InputError
 from certify.provers.base import Budget, Report, SearchState
-from certify.provers.boxes.clock import Clock
+from certify.provers.boxes.account import Account
 from certify.provers.boxes.frontier import Frontier
 from certify.provers.boxes.halving import Halves, split
 from certify.provers.boxes.order import choose_order
@@ -39,6 +39,7 @@ Array = NDArray[np.float64]
 _SLACK = 1e-9  # relative distance kept from every level, so that the checker's own rounding agrees
 _BESIDE_WITNESS = 1e-3  # relative distance kept from a violation
 _SHELL = 16.0  # a batch reaches up to this multiple of the nearest open level
+_BATCH = 1e6  # operations of a batch, however small
 _HIGHER = 8.0  # an inner level over one from below which a step may lead out
 
 
@@ -47,7 +48,7 @@ class RingProof:
     """D' < 0 is proved for `inner <= V <= outer` (equal if the ring is empty); `stop` says what ended the pass.
 
     `tree` is the partition in preorder: an axis for a split, 255 for a leaf; `root` its half-widths (n,) in z.
-    `direction` and `seconds_left` are those of `Proof`.
+    `direction` and `left` are those of `Proof`.
     `witness` is the lowest violation found along the way. `covered` is False if a pass inwards left boxes inside
     the inner level on which F could not be enclosed, or a step might lead to the inner level. `order` is that of the
     series in time of the leaves.
@@ -63,7 +64,7 @@ class RingProof:
     witness: Witness | None
     covered: bool = True
     direction: tuple[float, ...] | None = None
-    seconds_left: float | None = None
+    left: float | None = None
     order: int = 1
 
 
@@ -88,7 +89,7 @@ def prove_outwards(
 
     Notes
     -----
-    Deterministic for a machine and a number of threads, unless `budget.seconds` stops the pass.
+    Deterministic: the budget is counted, and a box's bounds do not depend on those that are bounded with it.
     """
     if inner >= target:
         return empty_ring(problem, T, target)
@@ -129,18 +130,16 @@ def prove_inwards(
     """
     order = choose_order(problem, T, max(floor, 1e-3 * outer), outer)
     rule = VdotBound(problem, T, runner.device, inside=True, order=order)
-    end = time.monotonic() + budget.seconds
     while True:
         ring = Pass(_Inwards(problem, T, floor, outer), _root(problem, T, outer), runner, rule)
-        left = replace(budget, seconds=max(0.0, end - time.monotonic()))
-        stop = ring.advance(left, report)
+        stop = ring.advance(budget, report)
         if stop is not None:
             ring.settle()
-            ring.advance(budget, report)
+            ring.advance(replace(budget, effort=UNLIMITED), report)
         found = ring.proof(stop)
         # A step from below may end above a level to which the ring reaches: then there is none from which it does not.
         floor = _HIGHER * max(floor, found.inner)
-        if found.covered or not rule.step or floor >= outer or time.monotonic() > end:
+        if found.covered or not rule.step or floor >= outer or budget.effort.over:
             return found
 
 
@@ -328,7 +327,7 @@ class Pass:
         self.halvings = 0.0
         self.lost = ""  # what is said of a cluster that went away
         self._stop = Stop.REQUESTED
-        self._clock = Clock()
+        self._account = Account()
         first = torch.zeros(1, dtype=torch.int64, device=runner.device)
         self.frontier.add(-self.half, self.half, sweep.key(*rule.levels(-self.half, self.half)), first)
 
@@ -352,22 +351,25 @@ class Pass:
     def advance(self, budget: Budget, report: Report | None = None) -> Stop | None:
         """Take boxes, bound them, give way to violations, halve what is undecided; what ran out, or None if done."""
         most = self.boxes + budget.boxes
-        with self._clock, self.runner.start(self.rule) as bound, self._elsewhere(budget):
+        with self.runner.start(self.rule) as bound, self._elsewhere(budget):
             while not self.done:
                 if self.boxes >= most or self.partition.splits + 3 * budget.batch > MOST_SPLITS:
                     return Stop.BOXES
-                left = budget.seconds - self._clock.spent - self.proved * budget.check
-                if left < 0:
-                    return Stop.TIME
+                if budget.effort.left < self.proved * budget.check:
+                    return budget.ended_by
+                before = self.boxes
                 with self._whole():
-                    exchanged = self._exchanged(bound, left, budget)
+                    exchanged = self._exchanged(bound, budget)
                     if not exchanged:
                         self._step(bound, min(budget.batch, most - self.boxes), budget.least_width)
+                work = _BATCH + (self.boxes - before) * self.rule.operations
+                budget.effort.charge(work)
+                self._account.spent += work
                 if exchanged and self.lost:
                     return Stop.CLUSTER
                 if report is not None:
                     stand = self.sweep.stand(self._least())
-                    report(replace(self._clock.read(*stand, self.boxes, self._open()), down=self.sweep.down))
+                    report(replace(self._account.read(*stand, self.boxes, self._open()), down=self.sweep.down))
         return None
 
     @contextmanager
@@ -403,7 +405,7 @@ class Pass:
             self.abroad.recall(self.frontier)
         self.abroad = None
 
-    def _exchanged(self, bound: Bound, left: float, budget: Budget) -> bool:
+    def _exchanged(self, bound: Bound, budget: Budget) -> bool:
         """Send boxes out, and take in what has been grown; False if that is not worth it."""
         if self.abroad is None:
             return False
@@ -411,8 +413,8 @@ class Pass:
         try:
             if not self.abroad.is_worth(self.frontier):
                 return False
-            self.abroad.send((sweep.inner, sweep.outer), self.frontier, sweep.reach(self._least()), left)
-            back = self.abroad.collect(left)
+            self.abroad.send((sweep.inner, sweep.outer), self.frontier, sweep.reach(self._least()), budget.effort.left)
+            back = self.abroad.collect()
         except BackendError as error:
             self.lost = str(error)
             self._recall()
@@ -515,8 +517,8 @@ class Pass:
         tree = self.partition.preorder()
         leaves = tree.count(bytes([LEAF]))
         found = RingProof(inner, outer, stop, tree, self.root, self.boxes, leaves, witness, covered)
-        left = None if self.done else self._clock.left
-        return replace(found, direction=self._direction(), seconds_left=left, order=self.rule.order)
+        left = None if self.done else self._account.left
+        return replace(found, direction=self._direction(), left=left, order=self.rule.order)
 
     def _direction(self) -> tuple[float, ...] | None:
         """The coordinate that was halved most often, in the states, as long as the root box in it; None at first."""

@@ -3,7 +3,7 @@
 A job is some open boxes with the levels of the moment; its answer are the bytes of their trees, whose leaves are
 proved, still open, or to be looked at by whoever asked: there a condition fails, or halving has come to its end, and a
 level has to give way, which is not decided elsewhere. Boxes do not know of each other: as long as no level moves, the
-tree is the same whoever grows which, how far, and in which order. A job ends after its seconds: what it leaves open
+tree is the same whoever grows which, how far, and in which order. A job ends after so many boxes: what it leaves open
 comes back, and is shared out anew. That is all there is of balancing loads.
 
 An answer is bytes, and is believed nothing: it must be sealed for its job, lengths, counts and trees must fit, and a
@@ -26,6 +26,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from certify.effort import UNIT
 from certify.errors import BackendError, CertificateFormatError
 from certify.provers.boxes.frontier import Boxes, Frontier
 from certify.provers.boxes.halving import Halves, split
@@ -34,21 +35,20 @@ from certify.provers.execution import Bound, Jobs
 
 Array = NDArray[np.float64]
 _MAGIC = b"subtree1"
-_JOB = struct.Struct("<8sQQQdddd")  # n, boxes, batch; inner and outer level, seconds, relative least width
+_JOB = struct.Struct("<8sQQQQddd")  # n, boxes, batch, boxes to bound; inner and outer level, relative least width
 _ANSWER = struct.Struct("<8sQQQQ16s")  # boxes bounded, boxes proved, bytes of the trees, open leaves, seal
 _QUEUE = 2  # jobs a place, so that none waits for the next
 _LEAST = 256  # boxes of a job, if there are as many
 _FEW, _ENOUGH = 32, 2048  # boxes a place, or in all, from which on growing them elsewhere is worth a message
-_TURN, _EACH = (0.25, 4.0), 8e-3  # seconds of a job, the shortest and the longest, and between them for each place
+_TURN, _EACH = (0.25, 4.0), 8e-3  # units of effort of a job, the least and the most, and between them for each place
 _POLL = 0.25  # seconds
 _LATE = 300.0  # seconds after which a job is worked out here
 
 
 def turn(places: int) -> float:
-    """Seconds of a job: those of many places are longer, so that whoever gives them keeps up, at some milliseconds
-    each."""
+    """Operations of a job: those of many places have more, so that whoever gives them keeps up."""
     shortest, longest = _TURN
-    return min(longest, max(shortest, _EACH * places))
+    return UNIT * min(longest, max(shortest, _EACH * places))
 
 
 def enough(places: int) -> int:
@@ -67,6 +67,7 @@ class Growth(ABC):
 
     def __init__(self, bound: Bound, half: Tensor) -> None:
         self.bound, self.half = bound, half
+        self.operations: float = bound.operations  # of a box
 
     @property
     @abstractmethod
@@ -95,16 +96,16 @@ class Subtrees:
     def __call__(self, job: bytes) -> bytes:
         """The answer to a job."""
         torch.set_num_threads(1)  # places are many
-        _, n, count, batch, *levels, seconds, least_width = _JOB.unpack_from(job)
+        _, n, count, batch, most, *levels, least_width = _JOB.unpack_from(job)
         lo, hi, key = np.split(np.frombuffer(job, offset=_JOB.size), [n * count, 2 * n * count])
         lo, hi = lo.reshape(n, count), hi.reshape(n, count)
-        growth, end = self.growth.at(*levels), time.monotonic() + seconds
+        growth = self.growth.at(*levels)
         partition = Partition(hi, lo)
         frontier = Frontier(partition, torch.device("cpu"))
         frontier.add(*(torch.tensor(a) for a in (lo, hi, key, np.arange(count))))
         looks: list[NDArray[np.int64]] = []
         boxes = proved = 0
-        while len(frontier) and (not boxes or time.monotonic() < end):
+        while len(frontier) and (not boxes or boxes < most):
             now = frontier.take(batch, math.inf)
             found = growth.bound(now.lo, now.hi, *growth.levels)
             boxes, proved = boxes + len(now.key), proved + int(found.proved.sum())
@@ -223,18 +224,17 @@ class Abroad:
             self.recall(frontier)
         return places > 0 and (bool(self.held) or len(frontier) >= enough(places))
 
-    def send(self, levels: tuple[float, float], frontier: Frontier, limit: float, seconds: float) -> None:
-        """Share out boxes with keys up to about `limit`, until all places are busy, in jobs that end well within so
-        many seconds."""
+    def send(self, levels: tuple[float, float], frontier: Frontier, limit: float, left: float) -> None:
+        """Share out boxes with keys up to about `limit`, until all places are busy, in jobs of well below the
+        operations that are left."""
         places = self.jobs.places
         most = _QUEUE * places
         while len(self.held) < most and len(frontier):
             count = min(self.batch, max(_LEAST, len(frontier) // most))
             boxes = frontier.take(count, limit)
             n, count = boxes.lo.shape
-            head = _JOB.pack(
-                _MAGIC, n, count, self.batch, *levels, min(turn(places), seconds / _QUEUE), self.least_width
-            )
+            worth = int(min(turn(places), left / most) / self.growth.operations)
+            head = _JOB.pack(_MAGIC, n, count, self.batch, worth, *levels, self.least_width)
             job = head + b"".join(a.cpu().numpy().tobytes() for a in (boxes.lo, boxes.hi, boxes.key))
             try:
                 self.held[self.jobs.give(job)] = Held(boxes, job, time.monotonic())
@@ -242,10 +242,10 @@ class Abroad:
                 frontier.add(boxes.lo, boxes.hi, boxes.key, boxes.number)
                 raise
 
-    def collect(self, seconds: float) -> list[Return]:
-        """What has ended, after waiting so long for something."""
+    def collect(self) -> list[Return]:
+        """Jobs that have ended, after waiting a moment for one."""
         found = []
-        ended = self.jobs.ended(min(_POLL, seconds))
+        ended = self.jobs.ended(_POLL)
         oldest = min(self.held, key=lambda number: self.held[number].since, default=None)
         if not ended and oldest is not None and time.monotonic() - self.held[oldest].since > _LATE:
             self.jobs.forget([oldest])

@@ -29,6 +29,7 @@ from certify.certificates.claims.conditions import (
 )
 from certify.certificates.claims.queries import query
 from certify.certificates.verdict import Stop
+from certify.effort import UNIT
 from certify.errors import BackendError, InputError
 from certify.provers.ball.local import prove_local
 from certify.provers.base import Attempt, Budget, Engine, Once, Proof, Task
@@ -40,6 +41,7 @@ _LOCAL_RATIO, _RING_RATIO = 1.05, 1.002  # at which bisection stops
 _BELOW_WITNESS = 1e-3
 _LEAST = 1e-12  # of the guess, below which no local level is looked for
 _MARGIN = 4  # dReal's deltas that a set keeps from the domain
+_SECONDS = 600.0
 _LOCAL_SHARE = 0.3  # of the time, after which a local level that is there will do
 
 
@@ -86,7 +88,9 @@ class DrealEngine(Engine):
             return Proof(None, None, Stop.SOLVER, str(error))
         guess = prove_local(task.problem, self.T, task.target)
         local = time.perf_counter() - start
-        options = DrealOptions(self.precision, self.jobs, budget.seconds - local)
+        options = DrealOptions(
+            self.precision, self.jobs, _SECONDS if budget.effort.left == math.inf else budget.effort.left / UNIT
+        )
         session = _Session(task.problem, backend, options)
         first = 16 * guess if guess is not None else 1e-4 * task.target
         inner, level, stop, detail = session.levels(first, task.target)

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.certificates.claims import Problem
+from certify.effort import UNLIMITED, Effort
 from certify.loop.plants import System
 from certify.loop.policies import bounded_by_form
 from certify.lyapunov.neural import Neural
@@ -24,6 +25,7 @@ from certify.lyapunov.symbolic import Symbolic
 Array = NDArray[np.float64]
 _SAMPLES, _CLIMBERS, _FEW = 65_536, 512, 128
 _ON_A_FACE, _FEW_THERE = 4096, 32
+_CALL = 2e5  # operations of evaluating few states at once
 _CLIMB, _DESCENT = 40, 80  # steps
 _APART = 1e-6  # of the domain, between the points of a difference
 _PUSH = 0.05  # away from the edge of what violates, beside a step along it
@@ -50,8 +52,10 @@ class Rise:
 class Falsifier:
     """A search of the domain outside of {V < c2}."""
 
-    def __init__(self, problem: Problem, c2: float, T: Array, function: Neural | Symbolic) -> None:
-        self.problem, self.c2, self.T, self.N = problem, c2, T, function
+    def __init__(
+        self, problem: Problem, c2: float, T: Array, function: Neural | Symbolic, effort: Effort = UNLIMITED
+    ) -> None:
+        self.problem, self.c2, self.T, self.N, self.effort = problem, c2, T, function, effort
         self.system = problem.loop.system
         self.f = self.system.uncertain_function()
         self.corners = self.system.corners()
@@ -63,6 +67,7 @@ class Falsifier:
 
     def rates(self, x: Array) -> tuple[Array, Array]:
         """(N'F at each corner of what is uncertain (C, B), how far the worst input lies outside its bounds (B,))."""
+        self.effort.charge(_CALL + 2 * len(x) * len(self.corners) * self.problem.loop.operations)
         u, gradient = self.problem.loop.policy(x), self.N.gradient(x)
         rows = [(gradient * self.f(x, u, [float(q) for q in values.values()])).sum(-1) for values in self.corners]
         return np.stack(rows), np.maximum(self.least - u, u - self.most).max(-1)

@@ -30,7 +30,7 @@ from certify.provers.outer.search import Cover, count
 Array = NDArray[np.float64]
 _BESIDE_FACE = 1e-4  # of N's span, kept from the least N on the faces
 _BESIDE_RISE = 1e-3  # of N's span, kept from a violation
-_FOR_FACES = 0.25  # of the seconds, at most
+_FOR_FACES = 0.25  # of the effort, at most
 _AGAIN = 0.05  # of N's span: how far the level must have fallen for smaller trees of the faces
 
 
@@ -87,7 +87,7 @@ def prove_outer(
     """
     _require(problem, function)
     start = time.monotonic()
-    search = Falsifier(problem, c2, T, function)
+    search = Falsifier(problem, c2, T, function, budget.effort)
     floor = search.least_value()
     if not math.isfinite(floor):
         return Nothing("every sampled state of the domain lies in the ellipsoid")
@@ -103,7 +103,7 @@ def prove_outer(
         top, stop = witness.level - _BESIDE_RISE * span, Stop.WITNESS
     seconds = {"falsify": time.monotonic() - start}
 
-    share = replace(budget, seconds=_FOR_FACES * budget.seconds)
+    share = replace(budget, effort=budget.effort.share(_FOR_FACES))
     found = _faces(problem, function, top, floor, share, runner)
     if isinstance(found, Nothing):
         return found
@@ -119,11 +119,10 @@ def prove_outer(
             witness = deeper
         return math.inf if deeper is None else deeper.level
 
-    left = replace(budget, seconds=budget.seconds - (time.monotonic() - start))
     root = root_around(problem, T)
     rule = FallBound(problem, c2, T, function, runner.device)
     cover = Cover(rule, -root, root, runner, top, floor, _BESIDE_RISE * span, deepen)
-    stopped = cover.advance(left, report)
+    stopped = cover.advance(budget, report)
     if not cover.level > floor:
         return Nothing(f"{cover.boxes:,} boxes did not show that N falls at any level; {_ended_by(stopped)}")
     if cover.level < top:
@@ -165,7 +164,7 @@ def _faces(
     problem: Problem, function: Neural | Symbolic, level: float, floor: float, budget: Budget, runner: Runner
 ) -> tuple[int, tuple[bytes, ...], float, Stop] | Nothing:
     """Boxes, trees of all faces, the level below which N is on none of them, and what limits it."""
-    system, start = problem.loop.system, time.monotonic()
+    system = problem.loop.system
     trees: list[bytes] = []
     boxes, stop = 0, Stop.DOMAIN
     for axis in range(system.n):
@@ -173,8 +172,8 @@ def _faces(
             rule = FaceBound(system, axis, side, function, runner.device)
             lo, hi = face_box(system, axis, side)
             cover = Cover(rule, lo, hi, runner, level, floor, _BESIDE_FACE * (level - floor))
-            left = (budget.seconds - (time.monotonic() - start)) / (2 * system.n - len(trees))
-            ended = cover.advance(replace(budget, seconds=left, check=0.0))
+            share = budget.effort.share(1 / (2 * system.n - len(trees)))
+            ended = cover.advance(replace(budget, effort=share, check=0.0))
             boxes += cover.boxes
             if not cover.level > floor:
                 where = f"{system.states[axis]} = {float(system.domain[axis][side]):g}"
@@ -189,8 +188,8 @@ def _faces(
 
 def _ended_by(stop: Stop) -> str:
     """What ended a pass that proved nothing, and what may help."""
-    if stop is Stop.TIME:
-        return "the time for that ended: more of it, or a cluster, may do"
+    if stop in (Stop.EFFORT, Stop.TIME):
+        return f"the {stop.value} for that ended: more of it, or a cluster, may do"
     return "a smaller level, or another function, is needed" if stop is Stop.WITNESS else f"it ended by {stop.value}"
 
 

@@ -8,6 +8,7 @@ N's model, then the policy, the plant and N'F. What is proved for a level n2 is 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from certify.certificates.claims import Problem
-from certify.loop.expressions import Expression, evaluate
+from certify.loop.expressions import Expression, evaluate, nodes
 from certify.loop.plants import System
 from certify.loop.policies import bounded_by_form
 from certify.lyapunov.neural import Neural
@@ -39,6 +40,7 @@ from certify.provers.boxes.rule import input_bounds_kept, lessened
 Array = NDArray[np.float64]
 _SLACK = 1e-9  # relative distance from c2 at which a box counts as inside
 _ENDS = 1e-11  # relative distance kept from the ends of the domain
+_EACH = 4.0  # operations of an entry of a model
 _NUMBERS = 2**19  # in the largest tensor of a piece of a batch, so that it stays in a core's cache
 
 
@@ -76,6 +78,13 @@ class FallBound:
         self.ends = torch.tensor(ends, dtype=torch.float64, device=device).T[:, :, None]
         symbols = self.system.n + self.system.m + len(self.system.uncertain)
         self.piece = max(16, _NUMBERS // (self.N.units * (1 + symbols) * (2 + symbols) // 2))
+
+    @cached_property
+    def operations(self) -> float:
+        """Operations to bound a box, about, as an `Effort` counts them."""
+        area = (1 + self.system.n + self.system.m + len(self.system.uncertain)) ** 2
+        equations = sum(1 for _ in nodes(*self.dynamics)) + 3 * self.system.n
+        return self.policy.operations + _EACH * area * (equations + 4 * self.N.units)
 
     def __call__(self, lo: Tensor, hi: Tensor, inner: float, outer: float) -> OuterBounds:
         """Bounds for the level `outer` on boxes lo, hi (n, B)."""
@@ -199,6 +208,7 @@ class FaceBound:
         self.axis, self.N = axis, enclosure_of(function, device)
         self.end = float(system.domain[axis][side])
         self.piece = max(16, _NUMBERS // (self.N.units * (1 + system.n) * (2 + system.n) // 2))
+        self.operations = 4 * _EACH * self.N.units * (1 + system.n) ** 2  # of a box, about
 
     def __call__(self, lo: Tensor, hi: Tensor, inner: float, outer: float) -> OuterBounds:
         """Bounds for the level `outer` on boxes lo, hi (n, B), which have no extent along the face's own axis."""

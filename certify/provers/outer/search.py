@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from certify.certificates.verdict import Stop
+from certify.effort import UNLIMITED
 from certify.errors import BackendError
 from certify.provers.base import Budget, Report
-from certify.provers.boxes.clock import Clock
+from certify.provers.boxes.account import Account
 from certify.provers.boxes.frontier import Frontier
 from certify.provers.boxes.halving import Halves, split
 from certify.provers.boxes.partition import LEAF, MOST_SPLITS, Partition
@@ -32,7 +33,8 @@ from certify.provers.outer.rule import OuterBounds
 
 Array = NDArray[np.float64]
 _SLACK = 1e-9  # of the level's span: how far below a bound the level stays
-_LAST_LOOK = 0.5  # seconds of a box that a lower level settles, in those of one of all that were looked at
+_LAST_LOOK = 0.5  # operations of a box that a lower level settles, in those of one of all that were looked at
+_BATCH = 1e6  # operations of a batch, however small
 
 
 class _CoverGrowth(Growth):
@@ -92,7 +94,7 @@ class Cover:
         self.stop = Stop.REQUESTED
         self.lost = ""  # what is said of a cluster that went away
         self.abroad: Abroad | None = None
-        self._clock = Clock()
+        self._account = Account()
         first = torch.zeros(1, dtype=torch.int64, device=runner.device)
         self.frontier.add(lo, hi, torch.full((1,), -math.inf, dtype=torch.float64, device=runner.device), first)
 
@@ -113,23 +115,27 @@ class Cover:
     def advance(self, budget: Budget, report: Report | None = None) -> Stop:
         """Prove what there is for the level, or what the budget allows for a lower one; what limits it."""
         most, ended = self.boxes + budget.boxes, None
-        with self._clock, self.runner.start(self.rule) as bound, self._elsewhere(budget):
+        with self.runner.start(self.rule) as bound, self._elsewhere(budget):
             while self._open() and self.level > self.floor:
                 if ended is None:
                     ended = self._ended(budget, most)
                     if ended is not None:  # what is left has N above this
                         self.stop, self.level = ended, self.proved
                         continue
-                left = math.inf if ended is not None else budget.seconds - self._clock.spent
-                if not self._exchanged(bound, left, budget):
+                left, before = math.inf if ended is not None else budget.effort.left, self.boxes
+                exchanged = self._exchanged(bound, left, budget)
+                if not exchanged:
                     self._step(bound, budget)
-                elif self.lost and ended is None:
+                work = _BATCH + (self.boxes - before) * self.rule.operations
+                budget.effort.charge(work)
+                self._account.spent += work
+                if exchanged and self.lost and ended is None:
                     self.stop = ended = Stop.CLUSTER
                     self.level = self.proved
                     continue
                 if report is not None:
                     level = min(max(self.proved, self.floor), self.target)
-                    report(self._clock.read(level, self.target, self.done_share, self.boxes, self._open()))
+                    report(self._account.read(level, self.target, self.done_share, self.boxes, self._open()))
         return self.stop
 
     @contextmanager
@@ -151,9 +157,8 @@ class Cover:
     def _ended(self, budget: Budget, most: int) -> Stop | None:
         if self.boxes >= most or self.partition.splits + 3 * budget.batch + self._open() > MOST_SPLITS:
             return Stop.BOXES
-        each = _LAST_LOOK * self._clock.spent / max(1, self.boxes)
-        spent = self._clock.spent + each * self._open() + budget.check * self.leaves
-        return Stop.TIME if spent > budget.seconds else None
+        kept = _LAST_LOOK * self.rule.operations * self._open() + budget.check * self.leaves
+        return budget.ended_by if kept > budget.effort.left else None
 
     def _exchanged(self, bound: Bound, left: float, budget: Budget) -> bool:
         """Send boxes out, and take in what has been grown; False if that is not worth it."""
@@ -163,7 +168,7 @@ class Cover:
             if not self.abroad.is_worth(self.frontier):
                 return False
             self.abroad.send(self.growth.levels, self.frontier, math.inf, left)
-            back = self.abroad.collect(left)
+            back = self.abroad.collect()
         except BackendError as error:
             self.lost = str(error)
             self._recall()
@@ -214,9 +219,9 @@ class Cover:
         return self.partition.preorder()
 
 
-def without_time(budget: Budget) -> Budget:
-    """The same budget without an end in time."""
-    return replace(budget, seconds=math.inf)
+def without_end(budget: Budget) -> Budget:
+    """The same budget without an end of its effort."""
+    return replace(budget, effort=UNLIMITED)
 
 
 def count(tree: bytes) -> int:

@@ -4,7 +4,6 @@ origin, or around a state."""
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
@@ -12,6 +11,7 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
+from certify.effort import Effort
 from certify.loop.closed_loop import ClosedLoop
 from certify.lyapunov import domain_limit, volume
 from certify.provers.ball.models import Paths
@@ -44,32 +44,31 @@ def enlarge(
     known: Paths,
     goal: Array,
     shapes: Mapping[str, Array],
-    left: Callable[[], float],
+    effort: Effort,
     worth: float = 0.0,
     report: Callable[[Found], None] | None = None,
 ) -> Found | None:
-    """The tube with the largest start that the time allows; None if none starts outside the goal.
+    """The tube with the largest start that the effort allows; None if none starts outside the goal.
 
     Parameters
     ----------
     goal : (n, n), of {x'Px <= 1}, where tubes end.
     shapes : by name, each (n, n) up to a factor: of the ellipsoids that are tried.
-    left : seconds that the search may still take; half of them go to each shape but the last.
+    effort : of what is left of it half goes to each shape but the last.
     worth : the volume that a start must exceed.
     report : called with each that is better than those before.
     """
     best: Found | None = None
     for number, (name, shape) in enumerate(shapes.items(), start=1):
-        share = left() if number == len(shapes) else left() / 2
-        end = time.perf_counter() + share
-        for tube in _growing(known, goal, shape, worth if best is None else best.volume, end):
+        share = effort.share(1.0 if number == len(shapes) else 0.5)
+        for tube in _growing(known, goal, shape, worth if best is None else best.volume, share):
             best = Found(tube, name)
             if report is not None:
                 report(best)
     return best
 
 
-def _growing(known: Paths, goal: Array, shape: Array, worth: float, end: float) -> Iterator[Tube]:
+def _growing(known: Paths, goal: Array, shape: Array, worth: float, effort: Effort) -> Iterator[Tube]:
     """Tubes from larger and larger multiples of a shape, each of more volume than `worth`."""
     unit = shape * float(
         np.max(np.linalg.eigvals(np.linalg.solve(shape, goal)).real)
@@ -78,8 +77,8 @@ def _growing(known: Paths, goal: Array, shape: Array, worth: float, end: float) 
     least = max(1.0, (_WORTH * worth / volume(unit, 1.0)) ** (1 / len(shape)))
     proved, refused = 1.0, most * _FINE
     size = least if worth > 0 else min(_FIRST, most)
-    while time.perf_counter() < end and proved < size <= most:
-        tube = find_tube(known, unit / size**2, goal, end - time.perf_counter())
+    while not effort.over and proved < size <= most:
+        tube = find_tube(known, unit / size**2, goal, effort)
         if tube is not None:
             proved = size
             yield tube
@@ -93,27 +92,27 @@ def _growing(known: Paths, goal: Array, shape: Array, worth: float, end: float) 
 
 
 def surround(
-    loop: ClosedLoop, centre: Array, goal: Array, shapes: Mapping[str, Array], left: Callable[[], float]
+    loop: ClosedLoop, centre: Array, goal: Array, shapes: Mapping[str, Array], effort: Effort
 ) -> tuple[Found | None, str]:
-    """The tube with the largest start around a state that the time allows; None, and why, if there is none.
+    """The tube with the largest start around a state that the effort allows; None, and why, if there is none.
 
     Parameters
     ----------
     centre : (n,), in the interior of the domain.
-    goal, shapes, left : see `enlarge`.
+    goal, shapes, effort : see `enlarge`.
     """
     best: Found | None = None
     why = ""
     each = zip(centre, loop.system.domain, strict=True)
     around = [(lo - Fraction(float(c)), hi - Fraction(float(c))) for c, (lo, hi) in each]
     for number, (name, shape) in enumerate(shapes.items(), start=1):
-        end = time.perf_counter() + (left() if number == len(shapes) else left() / 2)
+        share = effort.share(1.0 if number == len(shapes) else 0.5)
         unit = shape / (domain_limit(shape, around) * _BELOW)  # the largest in the domain
         proved, refused, size = 0.0, 1.0, _TRIED
         if best is not None:
             size = (_WORTH * best.volume / volume(unit, 1.0)) ** (1 / len(shape))
-        while time.perf_counter() < end and _NARROW < size < 1 and refused > _FINE * proved:
-            tube, said = find_path(loop, centre, unit / size**2, goal, end - time.perf_counter())
+        while not share.over and _NARROW < size < 1 and refused > _FINE * proved:
+            tube, said = find_path(loop, centre, unit / size**2, goal, share)
             if tube is not None:
                 best, proved = Found(tube, name), size
             elif proved or best is None:

@@ -9,7 +9,6 @@ they hold for the whole slab at once.
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -17,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.certificates import Slab, Waypoint
+from certify.effort import UNLIMITED, Effort
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants.ode import rk4_step
 from certify.provers.ball.decrease import Multipliers, decay_of, multipliers_for, rest_of, short
@@ -30,6 +30,7 @@ from certify.provers.tube.tube import (
     Tube,
     first_duration,
     is_definite,
+    look,
     nodes_of,
     root,
 )
@@ -45,7 +46,7 @@ _GROWN = 12.0  # logarithm of a volume, relative to the start, at which a tube i
 
 
 def find_path(
-    loop: ClosedLoop, centre: Array, start: Array, goal: Array, seconds: float = math.inf
+    loop: ClosedLoop, centre: Array, start: Array, goal: Array, effort: Effort = UNLIMITED
 ) -> tuple[Tube | None, str]:
     """A tube from {(x - c)'P(x - c) <= 1}, P = start, c = centre, into {x'Px <= 1}, P = goal; None and why there is
     none.
@@ -55,7 +56,7 @@ def find_path(
     centre : (n,), the state from which the path goes.
     start, goal : (n, n), positive definite.
     """
-    until, f = time.perf_counter() + seconds, loop.system.function()
+    f = loop.system.function()
 
     def flow(x: Array) -> Array:
         return np.asarray(f(x, loop.policy(x)))
@@ -66,14 +67,14 @@ def find_path(
     spent = 0.0
     with np.errstate(all="ignore"):  # what overflows is not shown
         while not slabs or not _has_arrived(P, c, goal):
-            if time.perf_counter() > until:
-                return None, f"there was no time for more than {len(slabs)} slabs, which take {spent:.3g} units of time"
+            if effort.over:
+                return None, f"the effort ended after {len(slabs)} slabs, which take {spent:.3g} units of time"
             if len(slabs) == most or spent > _MOST_TIME:
                 return None, f"the path has not arrived after {spent:.3g} units of time and {len(slabs)} slabs"
             if not _is_in_domain(loop, P, c):
                 return None, f"the tube leaves the domain after {spent:.3g} units of time"
             try:
-                slab = _slab(loop, flow, P, c, rate, goal, duration)
+                slab = _slab(loop, flow, P, c, rate, goal, duration, effort)
             except np.linalg.LinAlgError:  # numbers that have no finite model, or an ellipsoid without extent
                 slab = None
             if slab is None or slab.path is None or begin - np.linalg.slogdet(slab.end)[1] > 2 * _GROWN:
@@ -138,7 +139,7 @@ class _Along:
 
 
 def _slab(
-    loop: ClosedLoop, flow: Flow, P: Array, c: Array, rate: Array | None, goal: Array, duration: float
+    loop: ClosedLoop, flow: Flow, P: Array, c: Array, rate: Array | None, goal: Array, duration: float, effort: Effort
 ) -> Slab | None:
     """One slab from {e'Pe <= 1} around c on, of at most that duration; `rate` is a guess of that of P."""
     if rate is not None:
@@ -148,7 +149,9 @@ def _slab(
         end = after(flow, c, duration)
         if is_definite(middle) and np.all(np.isfinite(end)):
             J = WIDER * math.sqrt(_ROOM) * root(middle)
-            models = paths(loop, (c + end) / 2).models(np.append(J, ((end - c) / (2 * _SHARE))[:, None], axis=1))
+            known = paths(loop, (c + end) / 2)
+            effort.charge(2 * look(known))
+            models = known.models(np.append(J, ((end - c) / (2 * _SHARE))[:, None], axis=1))
             if models.finite and models.admitted:
                 along = _multipliers(models, J, models.f - (end - c) / duration, middle, J.T @ goal @ J)
                 nodes = nodes_of(along.growth, J, P, duration, _ROOM)

@@ -9,7 +9,6 @@ the nonlinearity can widen it. The idea is set propagation with ellipsoids; no s
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -19,6 +18,7 @@ import scipy.linalg
 from numpy.typing import NDArray
 
 from certify.certificates import Slab
+from certify.effort import UNLIMITED, Effort
 from certify.lyapunov import leaves_domain
 from certify.provers.ball.decrease import Multipliers, decay_of, multipliers_for, rest_of
 from certify.provers.ball.models import Models, Paths
@@ -31,6 +31,7 @@ _LONGEST = 0.5  # units of time of a slab
 _SURPLUS = 1e-3  # decrease of V per unit of time that is left to the checker's rounding
 _CORRECTIONS, SHORTENINGS = 5, 12  # of a slab's rate, of its duration
 MOST_SLABS, MOST_WORK = 4000, 2**26  # the second over n^4: the checker refuses more
+_GROWTHS = 6  # of V that a slab asks for
 _GROWN = 8.0  # logarithm of a volume, relative to the start, at which a tube is given up
 INSIDE = 1 - 1e-6  # of the goal, beyond all rounding
 
@@ -49,25 +50,24 @@ class Tube:
         return math.fsum(slab.duration for slab in self.slabs)
 
 
-def find_tube(known: Paths, start: Array, goal: Array, seconds: float = math.inf) -> Tube | None:
-    """A tube from {x'Px <= 1}, P = start, into that of `goal`; None if there is none to be had in the time.
+def find_tube(known: Paths, start: Array, goal: Array, effort: Effort = UNLIMITED) -> Tube | None:
+    """A tube from {x'Px <= 1}, P = start, into that of `goal`; None if there is none to be had with the effort.
 
     Parameters
     ----------
     known : the closed loop at the origin.
     start, goal : (n, n), positive definite.
     """
-    end = time.perf_counter() + seconds
     slabs: list[Slab] = []
     P, rate = start, None
     begin, domain = np.linalg.slogdet(start)[1], known.loop.system.domain
     most = min(MOST_SLABS, MOST_WORK // len(start) ** 4)
     with np.errstate(all="ignore"):  # what overflows is not shown
         while not np.linalg.eigvalsh(P * INSIDE - goal)[0] > 0 or not slabs:
-            if time.perf_counter() > end or len(slabs) == most or leaves_domain(P, 1.0, domain):
+            if effort.over or len(slabs) == most or leaves_domain(P, 1.0, domain):
                 return None
             try:
-                made = _slab(known, P, rate, goal)
+                made = _slab(known, P, rate, goal, effort)
             except np.linalg.LinAlgError:  # numbers that have no finite model, or an ellipsoid without extent
                 return None
             if made is None or begin - np.linalg.slogdet(made.end)[1] > 2 * _GROWN:
@@ -77,13 +77,14 @@ def find_tube(known: Paths, start: Array, goal: Array, seconds: float = math.inf
     return Tube(start, tuple(slabs))
 
 
-def _slab(known: Paths, P: Array, rate: Array | None, weight: Array) -> Slab | None:
+def _slab(known: Paths, P: Array, rate: Array | None, weight: Array, effort: Effort) -> Slab | None:
     """One slab from {x'Px <= 1} on; `rate` is a guess of that of P.
 
     The multipliers are best where it counts, in the directions in which `weight` (n, n) is large.
     """
     if rate is None:
         J = WIDER * root(P)
+        effort.charge(look(known))
         models = known.models(J)
         if not (models.finite and models.admitted):
             return None
@@ -93,6 +94,7 @@ def _slab(known: Paths, P: Array, rate: Array | None, weight: Array) -> Slab | N
         middle = P + duration / 2 * rate
         if is_definite(middle):
             J = WIDER * root(middle)
+            effort.charge(look(known))
             models = known.models(J)
             if models.finite and models.admitted:
                 multipliers = _multipliers(models, J, P, weight)
@@ -163,6 +165,12 @@ def _symmetric(X: Array) -> Array:
 def _contains(J: Array, P: Array, room: float) -> bool:
     """Whether {x'Px <= room} lies in {J d : ||d|| <= 1}."""
     return bool(np.linalg.eigvalsh(J.T @ P @ J)[0] > room / INSIDE)
+
+
+def look(known: Paths) -> float:
+    """Operations to try one slab, about, as an `Effort` counts them."""
+    n, units = known.loop.system.n, sum(len(b) for b in known.loop.network.biases)
+    return known.operations + _GROWTHS * (3e5 + 4.0 * units * n**2 + 8.0 * n**5)
 
 
 def root(P: Array) -> Array:
