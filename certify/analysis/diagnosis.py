@@ -9,7 +9,6 @@ from what sampling finds beyond it, another candidate only if others were left u
 from __future__ import annotations
 
 import math
-import time
 from collections.abc import Mapping
 from dataclasses import replace
 from fractions import Fraction
@@ -20,6 +19,7 @@ from numpy.typing import NDArray
 from certify.analysis.options import RoaOptions
 from certify.analysis.results import Diagnosis, RoaResult, Share, Step
 from certify.certificates.verdict import Stop
+from certify.effort import UNIT, UNLIMITED, WHOLE, Effort
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import System
@@ -34,13 +34,13 @@ from certify.report.words import number, quantity, symbol
 Array = NDArray[np.float64]
 _WIDER = Fraction(3, 2)  # of the side of the domain that binds
 _WORTH = 1.1  # growth of the volume that makes a wider domain worth a word
-_LONGEST = 86_400.0  # seconds that may be suggested
-_LONGER, _SECONDS = 1.1, 5.0  # of a tube's start, relative to the proved set; for looking
+_MOST = 1000.0  # an effort that may be suggested
+_LONGER, _LOOK = 1.1, 2 * UNIT  # of a tube's start, relative to the proved set; operations for looking
 _LITTLE = 25.0  # per cent of the volume that sampling allows, below which the bounds are to blame
 _BENT = 1.0  # bends of the hidden units, as a share of the linear part, that are worth flattening
 _TELLING = 1000  # boxes: a limit below it is what ended the search, and says nothing of the policy
 _FEW = 3  # states, for which a function beyond the ellipsoid is suggested
-_ENDED = (Stop.TIME, Stop.BOXES, Stop.LOCAL)
+_ENDED = (Stop.EFFORT, Stop.TIME, Stop.BOXES, Stop.LOCAL)
 
 
 def diagnose(
@@ -48,10 +48,10 @@ def diagnose(
     options: RoaOptions,
     proof: Proof | None,
     asked: tuple[System, TanhNetwork] | None = None,
-    seconds: float = math.inf,
+    effort: Effort = UNLIMITED,
 ) -> Diagnosis:
     """What limits `result`, `proof` being what its engine found, and `asked` the plant and the policy as they were
-    given, if the result is about them as seen from where they rest. The next step is looked for so many seconds."""
+    given, if the result is about them as seen from where they rest. The next step is looked for with this effort."""
     system = result.system
     loop = ClosedLoop(system, result.network)
     fastest, slowest = _modes(loop)
@@ -76,7 +76,7 @@ def diagnose(
         fastest,
         slowest,
         tuple(pair for pair in hurts if pair[1] >= 0.1),
-        _next(result, options, proof, name, asked or (system, result.network), seconds),
+        _next(result, options, proof, name, asked or (system, result.network), effort),
     )
 
 
@@ -160,7 +160,7 @@ def _next(
     proof: Proof | None,
     name: str | None,
     asked: tuple[System, TanhNetwork],
-    seconds: float,
+    effort: Effort,
 ) -> Step:
     if result.stop is Stop.UNSTABLE:
         return Step((), "no Lyapunov equation has a solution; the policy has to stabilise the plant first")
@@ -170,10 +170,10 @@ def _next(
             "shifted so that pi(0) = u_eq the loop rests where it should, and the stronger claim can be tried",
         )
     if result.stop is Stop.DOMAIN and name is not None and options.level is None:
-        return _wider_domain(result, name, seconds)
+        return _wider_domain(result, name, effort)
     if result.stop is Stop.PATH:
-        why = "the set that the tube has to reach grows with the time, and so do the widths that are tried"
-        return Step((("--time-limit", _round(4 * options.time_limit)),), why)
+        why = "the set that the tube has to reach grows with the effort, and so do the widths that are tried"
+        return Step((("--effort", _round(4 * options.effort)),), why)
     if result.stop is Stop.CLUSTER:
         kept = result.search is not None
         why = "what was done is kept" if kept else "the search was not kept"
@@ -186,13 +186,13 @@ def _next(
             "than of the policy's linear part: a flatter policy that does the same may be proved on more"
         )
         return Step((), why, flattens=True)
-    if result.stop in (Stop.TIME, Stop.BOXES):
-        step = _longer(result, options, proof)
+    if result.stop in (Stop.EFFORT, Stop.TIME, Stop.BOXES):
+        step = _longer(result, options, proof, effort)
         return step if result.search is None else replace(step, options=(*step.options, ("--resume", "")))
     if options.claim == "asymptotic" and options.only is not None and options.P is None and options.level is None:
         return Step((("--candidate", "auto"),), f"only the candidate {options.only} was tried")
     knows = not (result.system.ranges or result.system.in_steps)  # a tube says nothing of such things
-    if result.stop is Stop.STALLED and knows and not options.enlarges and _has_tube(result, seconds):
+    if result.stop is Stop.STALLED and knows and not options.enlarges and _has_tube(result, effort):
         return Step((("--enlarge", ""),), f"a tube leads into this set from one {_LONGER:g} times as long, at least")
     if result.stop is Stop.STALLED:
         worst = ", ".join(symbol(one) for one, _ in _hurting(result, proof)[:3])
@@ -202,7 +202,7 @@ def _next(
         tried = max((t.volume for t in result.tried), default=0.0)
         reached = max((t.proved_volume or 0.0 for t in result.tried), default=0.0)
         if reached and tried > _WORTH * reached:
-            return Step((("--time-limit", _round(4 * options.time_limit)),), "another candidate reaches further")
+            return Step((("--effort", _round(4 * options.effort)),), "another candidate reaches further")
         if _may_go_beyond(result, options):
             why = "what this V can show is proved; a function of higher degree may show more, beyond the ellipsoid"
             return Step((("--candidate", "polynomial"),), why)
@@ -232,7 +232,7 @@ def _share_proved(result: RoaResult) -> float:
 
 def _is_bent(result: RoaResult, proof: Proof | None) -> bool:
     """True if little of what sampling allows is proved, and the pace of the proof does not say when more will be."""
-    known = proof is not None and proof.seconds_left is not None and result.levels.roa is not None
+    known = proof is not None and proof.left is not None and result.levels.roa is not None
     if not _can_be_flattened(result) or known or _share_proved(result) >= _LITTLE:
         return False
     half_widths = np.array([min(-float(lo), float(hi)) for lo, hi in result.system.domain])
@@ -261,13 +261,18 @@ def _bend(network: TanhNetwork, half_widths: Array) -> float:
     return total / linear if linear else 0.0
 
 
-def _has_tube(result: RoaResult, seconds: float) -> bool:
-    """True if a tube is found in the time that leads from a larger multiple of the proved set into it."""
-    if result.P is None or result.levels.roa is None or not seconds > 0:
+def _has_tube(result: RoaResult, effort: Effort) -> bool:
+    """True if a tube is found with little effort that leads from a larger multiple of the proved set into it."""
+    if result.P is None or result.levels.roa is None:
         return False
     goal = result.P / result.levels.roa
     return (
-        find_tube(paths(ClosedLoop(result.system, result.network)), goal / _LONGER**2, goal, min(seconds, _SECONDS))
+        find_tube(
+            paths(ClosedLoop(result.system, result.network)),
+            goal / _LONGER**2,
+            goal,
+            effort.part(_LOOK, even_if_over=True),
+        )
         is not None
     )
 
@@ -295,19 +300,23 @@ def _hurting(result: RoaResult, proof: Proof | None) -> list[tuple[str, float]]:
     return sorted(zip(names, (np.abs(direction) / scale).tolist(), strict=True), key=lambda pair: -pair[1])
 
 
-def _longer(result: RoaResult, options: RoaOptions, proof: Proof | None) -> Step:
-    """A time after which the ring is done, as the growth so far says, or ten times as long."""
-    left = None if proof is None else proof.seconds_left
+def _longer(result: RoaResult, options: RoaOptions, proof: Proof | None, effort: Effort) -> Step:
+    """An effort with which the ring is done, as the growth so far says, or ten times as much."""
+    left = None if proof is None else proof.left
     if result.stop is Stop.BOXES and options.max_boxes <= result.boxes:
         return Step((("--max-boxes", f"{10 * options.max_boxes}"),), "the limit on boxes ended the search")
-    if left is not None and 2 * left + options.time_limit < _LONGEST:
-        longer = 2 * left + options.time_limit  # the check grows with the tree
-        return Step((("--time-limit", _round(longer)),), f"at this pace the ring needs about {left:.0f} s more")
-    return Step((("--time-limit", _round(10 * options.time_limit)),), "the set still grew when the time ended")
+    if result.stop is Stop.TIME and options.time_limit is not None:
+        needed = "" if left is None else f": the ring needs about {_round(effort.seconds_for(left))} s more"
+        return Step((("--time-limit", _round(10 * options.time_limit)),), f"the time ended the search{needed}")
+    if left is not None and options.effort + 2 * left / WHOLE < _MOST:
+        more = options.effort + 2 * left / WHOLE  # the check grows with the tree
+        seconds = _round(effort.seconds_for(left))
+        return Step((("--effort", _round(more)),), f"the ring needs about {seconds} s more at this pace")
+    return Step((("--effort", _round(10 * options.effort)),), "the set still grew when the effort ended")
 
 
-def _wider_domain(result: RoaResult, name: str, seconds: float) -> Step:
-    """Whether the same V reaches further in a domain that is wider in the state that binds."""
+def _wider_domain(result: RoaResult, name: str, effort: Effort) -> Step:
+    """A wider domain, where the same V reaches further in a domain that is wider in the state that binds."""
     system, problem, level = result.system, result.problem, result.levels.roa
     i = [s.name for s in system.states].index(name)
     lo, hi = (_WIDER * side for side in system.domain[i])
@@ -318,7 +327,7 @@ def _wider_domain(result: RoaResult, name: str, seconds: float) -> Step:
     loop = ClosedLoop(wider, result.network)
     limit = domain_limit(P, wider.domain)
     T = diagonalising_coordinates(P, loop.mean_rate(), loop.step)
-    witness = falsify(replace(problem, loop=loop), T, limit, samples=4000, until=time.perf_counter() + seconds)
+    witness = falsify(replace(problem, loop=loop), T, limit, samples=4000, effort=effort.part(_LOOK, even_if_over=True))
     reach = volume(P, limit if witness is None else min(limit, witness.level))
     grown = reach / volume(P, level)
     if grown < _WORTH:
@@ -330,7 +339,7 @@ def _wider_domain(result: RoaResult, name: str, seconds: float) -> Step:
     return Step((("--domain", side),), f"if the equations hold there, this V reaches {grown:.3g} times the volume")
 
 
-def _round(seconds: float) -> str:
-    """Seconds with two digits, rounded up."""
-    unit = 10.0 ** (math.floor(math.log10(seconds)) - 1)
-    return f"{math.ceil(seconds / unit) * unit:.0f}"
+def _round(value: float) -> str:
+    """Two digits, rounded up."""
+    unit = Fraction(10) ** (math.floor(math.log10(max(value, 0.01))) - 1)
+    return f"{float(math.ceil(value / unit) * unit):g}"

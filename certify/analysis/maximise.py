@@ -20,10 +20,11 @@ import numpy as np
 
 from certify.analysis.options import RoaOptions
 from certify.analysis.results import RoaResult
-from certify.analysis.run import Report, certify_roa
+from certify.analysis.run import Report, certify_roa, effort_of
 from certify.certificates import set_aside, sole_writer, write_atomically
 from certify.certificates.claims import Problem
 from certify.certificates.verdict import Verdict
+from certify.effort import UNIT
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import System, exact
 from certify.loop.policies import TanhNetwork
@@ -32,9 +33,9 @@ from certify.lyapunov.function import Quadratic
 from certify.provers.falsify import is_violated
 
 Quantity = Literal["period", "rate"]
-_FOR_THE_SET = 0.25  # of the time, for the run without it
+_FOR_THE_SET = 0.25  # of the effort, for the run without it
 _SHARES = (0.97, 0.87, 0.66, 0.4, 0.2, 0.1, 0.03)  # of what sampling allows
-_EACH = 0.25  # of the time that is left, for one of them
+_EACH = 0.25  # of the effort that is left, for one of them
 _BISECTIONS, _HALVINGS = 12, 4  # of what sampling allows, and between what is proved and what is not
 _SET = 0.95  # of the level that is proved without it: at the edge of what can be proved there is room for neither
 _LEAST = 2.0**-16  # of the slowest time constant, or of the fastest rate, that is looked at
@@ -70,20 +71,18 @@ def certify_largest(
     """
     start = time.perf_counter() - load_seconds
     plain = system.with_sample(None) if quantity == "period" else system
-
-    def left() -> float:
-        return options.time_limit - (time.perf_counter() - start)
-
+    effort = effort_of(options)
     with sole_writer(out), TemporaryDirectory(dir=out, prefix="attempt-") as folder:
         set_aside(out)
         first = certify_roa(
             plain,
             network,
             Path(folder) / "first",
-            replace(options, rate=0.0, time_limit=_FOR_THE_SET * options.time_limit),
+            replace(options, rate=0.0),
             load_seconds=load_seconds,
             provenance=provenance,
             progress=progress,
+            effort=effort.share(_FOR_THE_SET),
         )
         best, proved = first, None
         if first.verdict is Verdict.PROVED and first.problem is not None and first.levels.roa is not None:
@@ -101,15 +100,15 @@ def certify_largest(
                         P=P,
                         level=level,
                         rate=float(value) if quantity == "rate" else 0.0,
-                        time_limit=max(1.0, _EACH * left()),
                     ),
                     provenance=provenance,
                     progress=progress,
+                    effort=effort.part(max(UNIT, _EACH * effort.left)),
                 )
                 return replace(found, rest=first.rest)
 
             for value in _tried(quantity, plain, network, P, level):
-                if not left() > 0:
+                if effort.over:
                     break
                 found = attempt(value)
                 if found.verdict is Verdict.PROVED:
@@ -117,7 +116,7 @@ def certify_largest(
                     break
                 refused = value
             for _ in range(_HALVINGS):
-                if proved is None or refused is None or not left() > 0:
+                if proved is None or refused is None or effort.over:
                     break
                 middle = _short((proved + refused) / 2)
                 found = attempt(middle)

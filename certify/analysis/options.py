@@ -60,7 +60,8 @@ class RoaOptions:
     hidden, degree : of what the candidates `neural` and `polynomial` learn: the widths of the layers between states and
         output, and the degree.
     seed : of that learning.
-    time_limit : seconds for everything up to the verdict, the check included.
+    effort : counted work of every stage; 1 is what two quiet cores do in about 50 s.
+    time_limit : seconds for everything up to the verdict, the check included; None is no limit.
     max_boxes : boxes for the ring.
     rate : lambda in `D + 2 lambda V < 0`: V is to fall at least as exp(-2 lambda t), in units of time of the plant, or
         in discrete time at each step by the share 2 lambda.
@@ -88,7 +89,8 @@ class RoaOptions:
     hidden: tuple[int, ...] = (16, 16)
     degree: int = 4
     seed: int = 0
-    time_limit: float = 50.0
+    effort: float = 1.0
+    time_limit: float | None = None
     max_boxes: int = 4_000_000
     rate: float = 0.0
 
@@ -173,7 +175,9 @@ class RoaOptions:
             )
         if self.lyapunov_level is not None and not math.isfinite(self.lyapunov_level):
             raise OptionError(f"`lyapunov_level` must be a finite number; found {self.lyapunov_level}.")
-        if not self.time_limit > 0:
+        if not (math.isfinite(self.effort) and self.effort > 0):
+            raise OptionError(f"`effort` must be a positive number; found {self.effort}.")
+        if self.time_limit is not None and not self.time_limit > 0:
             raise OptionError(f"`time_limit` must be positive; found {self.time_limit:g}.")
         if not self.max_boxes > 0:
             raise OptionError(f"`max_boxes` must be positive; found {self.max_boxes}.")

@@ -22,7 +22,8 @@ from typing import Any
 import numpy as np
 
 from certify.analysis.candidates.trials import Trial
-from certify.certificates import decode, encode, loop_sections, write_atomically
+from certify.analysis.selection import Contender, Race
+from certify.certificates import SEARCH, decode, encode, loop_sections, remove, write_atomically
 from certify.certificates.claims import Problem
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
@@ -63,6 +64,56 @@ class Unfinished:
         """With the state of an attempt, which may have none."""
         target = trial.task.target
         return cls(trial, state or SearchState(target, target, 0, 0, None, b"", np.zeros(0)), decided)
+
+
+class Keeper:
+    """Keeps the search of a run that is stopped before its end.
+
+    Parameters
+    ----------
+    out : folder of the run.
+    can_keep : False where the options leave nothing to resume.
+    names_candidate : the run was told its candidate, so that a file without one could not say which.
+    """
+
+    def __init__(self, out: Path, can_keep: bool, names_candidate: bool) -> None:
+        self.path, self.can_keep, self.names_candidate = out / SEARCH, can_keep, names_candidate
+        self.about: tuple[ClosedLoop, float] | None = None
+        self.race: Race | None = None
+        self.winner: Contender | None = None
+        self.interruptible = False
+
+    def begin(self, loop: ClosedLoop, rate: float, race: Race, interruptible: bool) -> None:
+        """Keep from now on the searches of this race."""
+        self.about, self.race, self.interruptible = (loop, rate), race, interruptible
+
+    @property
+    def first(self) -> Contender | None:
+        """The contender whose search is worth most; None if there is none."""
+        if self.winner is not None or self.race is None:
+            return self.winner
+        begun = [*self.race.contenders, *([] if self.race.early is None else [self.race.early])]
+        return max(begun, key=lambda c: c.proved, default=None)
+
+    @property
+    def gains(self) -> bool:
+        """True if more effort may gain something that a kept search saves."""
+        one = self.first
+        return self.interruptible and one is not None and not (one.attempt.done or one.hopeless)
+
+    def keep(self) -> None:
+        """Write the search that `--resume` continues."""
+        if self.about is None or not self.can_keep:
+            return
+        (loop, rate), one = self.about, self.first
+        if one is not None and self.interruptible:
+            save(self.path, Unfinished.of(one.trial, one.attempt.state(), one is self.winner))
+        elif not self.names_candidate:
+            save_nothing_yet(self.path, loop.system, loop.network, rate)
+
+    def drop(self) -> None:
+        """Remove the search, which has come to its end."""
+        remove(self.path)
 
 
 class NothingYetError(InputError):

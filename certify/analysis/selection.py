@@ -1,7 +1,7 @@
-"""Which candidate is proved: each gets a little time, the better half of them more, and the best what is left.
+"""The race of candidates: each gets a little effort, the better half more, and the best the rest.
 
-A candidate is judged by the volume that is proved with it in the time, not by the volume within its reach: the largest
-sampled set is of no use if its proof takes a week.
+A candidate is judged by the volume that is proved with it, not by the volume within its reach: the largest sampled set
+is of no use if its proof takes a week.
 """
 
 from __future__ import annotations
@@ -10,13 +10,15 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 
 from certify.analysis.candidates.trials import Trial, by_reach
+from certify.effort import Effort
 from certify.lyapunov import volume
 from certify.provers.base import Attempt, Budget, Once, Progress
 
 _FIRST_LOOK = 0.25  # of a heat, after which it may end
 _HOPELESS = 1e9  # boxes that a first gain may need, at a hundred thousand a second some hours
 _RING = 0.5  # share of a set's level, up to which the local rule proves little of it
-_WORTH = 1.02  # of the best proved volume: what a candidate's reach must exceed to be given time
+_WORTH = 1.02  # of the best proved volume: what a candidate's reach must exceed to be given effort
+_LEAST = 1.0  # operation of an advance, so that an attempt that has begun is always asked once
 
 
 @dataclass
@@ -29,7 +31,7 @@ class Contender:
 
     @property
     def hopeless(self) -> bool:
-        """Whether no time that anybody has would gain anything."""
+        """True if no effort that anybody has would gain anything."""
         return not self.attempt.gained and self.attempt.expected > _HOPELESS
 
     def advance(self, budget: Budget, report: Callable[[Progress], None] | None) -> None:
@@ -46,13 +48,15 @@ class Race:
 
     Parameters
     ----------
-    begin : makes the attempt of a trial.
-    left : seconds that the search may still take.
+    begin : makes the attempt of a trial; it is told whether anything is proved already.
+    effort : of all contenders.
+    heat : operations of a candidate's first heat, which for some is the only one.
     boxes : that an attempt may bound.
     """
 
-    begin: Callable[[Trial], Attempt]
-    left: Callable[[], float]
+    begin: Callable[[Trial, bool], Attempt]
+    effort: Effort
+    heat: float
     boxes: int
     report: Callable[[Progress], None] | None = None
     contenders: list[Contender] = field(default_factory=list)
@@ -70,22 +74,27 @@ class Race:
 
     @property
     def open(self) -> list[Contender]:
-        """Those that more time could make the best, the largest proved volume first."""
+        """Those that more effort could make the best, the largest proved volume first."""
         most = self.best.proved
         can = [c for c in self.contenders if c is self.best or c.trial.volume > _WORTH * most]
         return sorted((c for c in can if not c.attempt.done), key=lambda c: -c.proved)
 
-    def is_settled_by(self, trial: Trial, seconds: float, most: float) -> bool:
-        """Whether after a heat of so many seconds this trial leaves no other one worth its time, because no set has a
-        larger volume than `most`; it is entered only where its reach lets that be hoped for.
+    @property
+    def gained(self) -> bool:
+        """True if any contender's search has added to what it began with."""
+        return any(c.attempt.gained for c in self.contenders)
+
+    def is_settled_by(self, trial: Trial, most: float) -> bool:
+        """Run one candidate for one heat. True if its proved volume leaves no other one worth its effort, because no
+        set has a larger volume than `most`; it is entered only where its reach lets that be hoped for.
 
         Where the local rule proves most of the set, the candidate that is made for this rule could still be ahead by a
-        little. If the race goes on, it does so as if this trial had not been entered, which keeps what it has proved.
+        little. If the race continues, it does so as if this trial had not been entered, which keeps what it has proved.
         """
         if most > _WORTH * trial.volume:
             return False
         before = len(self.contenders)
-        self.enter([trial], seconds)
+        self.enter([trial])
         if len(self.contenders) == before:  # a search of an earlier run has proved more
             return False
         claim = self.best.attempt.proof().claim
@@ -94,39 +103,36 @@ class Race:
         self.early = self.contenders.pop()
         return False
 
-    def enter(self, trials: Iterable[Trial], seconds: float) -> None:
-        """A heat of so many seconds for each trial within whose reach lies more than is proved already, as long as
-        there is time; without time too, until one proves something."""
+    def enter(self, trials: Iterable[Trial], heat: float | None = None) -> None:
+        """A heat for each trial within whose reach lies more than is proved already, as long as there is effort left;
+        without any too, until one proves something."""
         for trial in by_reach(list(trials)):
             known = self.early if self.early is not None and self.early.trial is trial else None
             if self.contenders and trial.volume <= _WORTH * self.best.proved:
                 continue
-            if known is None and self.proved and self.left() <= 0:
+            if known is None and self.proved and self.effort.over:
                 continue
-            self.contenders.append(known or Contender(trial, self.begin(trial)))
-            self._heat(self.contenders[-1], seconds)
+            self.contenders.append(known or Contender(trial, self.begin(trial, self.proved)))
+            self._heat(self.contenders[-1], self.heat if heat is None else heat)
 
-    @property
-    def gained(self) -> bool:
-        """Whether any contender's search has added to what it began with."""
-        return any(c.attempt.gained for c in self.contenders)
-
-    def knock_out(self, seconds: float) -> None:
+    def knock_out(self) -> None:
         """Heats among the better half, each round twice as long as the one before, until one is left.
 
         Those whose search has added nothing yet cannot be told apart by more of the same: they are out.
         """
-        contenders = [c for c in self.open if c.attempt.gained]
-        while len(contenders) > 1 and self.left() > 0:
-            contenders, seconds = contenders[: (len(contenders) + 1) // 2], 2 * seconds
+        contenders, heat = [c for c in self.open if c.attempt.gained], self.heat
+        while len(contenders) > 1 and not self.effort.over:
+            contenders, heat = contenders[: (len(contenders) + 1) // 2], 2 * heat
             if len(contenders) == 1:
                 break
             for contender in contenders:
-                self._heat(contender, seconds)
+                self._heat(contender, heat)
             contenders = [c for c in self.open if c in contenders]
 
-    def _heat(self, contender: Contender, seconds: float) -> None:
+    def _heat(self, contender: Contender, operations: float) -> None:
         for share in (1.0,) if isinstance(contender.attempt, Once) else (_FIRST_LOOK, 1 - _FIRST_LOOK):
-            contender.advance(Budget(max(1e-3, min(share * seconds, self.left())), self.boxes), self.report)
+            over = self.effort.over
+            part = self.effort.part(_LEAST if over else share * operations, even_if_over=over)
+            contender.advance(Budget(part, self.boxes), self.report)
             if contender.hopeless:
                 return

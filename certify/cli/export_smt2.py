@@ -22,7 +22,7 @@ def export_smt2(
     domain: Annotated[list[str] | None, typer.Option(help="Half-width NAME=D or interval NAME=LO..HI.")] = None,
     candidate: Annotated[str, typer.Option(help="Lyapunov candidate, as for roa.")] = "lyapunov",
     level: Annotated[float | None, typer.Option(help="c2; default: 0.99 of the largest that is proved.")] = None,
-    time_limit: Annotated[float, typer.Option(help="Seconds for everything up to the verdict.")] = 50.0,
+    time_limit: Annotated[float | None, typer.Option(help="Seconds for everything up to the verdict.")] = None,
     as_json: Json = False,
 ) -> None:
     """Prove an asymptotic claim with the bounds engine and write its conditions as SMT-LIB 2 for another solver."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shlex
 import tempfile
 import time
@@ -15,6 +16,7 @@ from certify.cli.arguments import layers, plant_of
 from certify.cli.importing import policy_of
 from certify.cli.shared import Domain, Json, PlantName, PolicyArgument, PolicyFile, Quiet, the_policy
 from certify.cli.terminal import ProgressLine, say
+from certify.effort import UNIT, Effort
 from certify.errors import InputError
 
 if TYPE_CHECKING:
@@ -29,7 +31,8 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-_FOR_ELLIPSOID = 0.4  # of the time limit, at most
+_FOR_ELLIPSOID = 0.4  # of the effort, at most
+_WHOLE = 120 * UNIT
 _HIDDEN = "16,16"
 
 
@@ -49,7 +52,9 @@ def learn_lyapunov(
         int | None, typer.Option(help="Fit a polynomial of this even degree in the place of a network.")
     ] = None,
     seed: Annotated[int, typer.Option(help="Of everything random: the same seed learns the same function.")] = 0,
-    time_limit: Annotated[float, typer.Option(help="Seconds for the ellipsoid and for learning.")] = 120.0,
+    effort: Annotated[
+        float, typer.Option(help="Scale the counted work; 1 is what two quiet cores do in about 2 min.")
+    ] = 1.0,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
@@ -63,20 +68,21 @@ def learn_lyapunov(
     if hidden is not None and degree is not None:
         raise InputError("--hidden must stand without --degree; found both. A polynomial has no layers.")
     widths = layers(hidden or _HIDDEN, "--hidden")
-    if not time_limit > 0:
-        raise InputError(f"--time-limit must be positive; found {time_limit}.")
+    if not (math.isfinite(effort) and effort > 0):
+        raise InputError(f"--effort must be a positive number; found {effort}.")
     path = the_policy(context, file, policy)
     stored = policy_of(path, importing, system, param or [])
     plant = plant_of(stored, system, param or [], domain or [])
     progress = None if quiet else ProgressLine()
     try:
-        P, c2 = _ellipsoid(plant, stored, _FOR_ELLIPSOID * time_limit, progress)
+        granted = Effort(_WHOLE * effort)
+        P, c2 = _ellipsoid(plant, stored, granted.share(_FOR_ELLIPSOID), progress)
         loop, V = ClosedLoop(plant, stored.network), Quadratic(P)
-        left, tell_round = time_limit - (time.monotonic() - start), None if progress is None else _shown(progress)
+        tell_round = None if progress is None else _shown(progress)
         learned = (
-            learn(loop, V, c2, widths, seed, left, tell_round)
+            learn(loop, V, c2, widths, seed, granted, tell_round)
             if degree is None
-            else fit_polynomial(loop, V, c2, degree, seed, left, tell_round)
+            else fit_polynomial(loop, V, c2, degree, seed, granted, tell_round)
         )
     finally:
         if progress is not None:
@@ -96,23 +102,22 @@ def learn_lyapunov(
     say(json.dumps(data) if as_json else _text(learned, volume(P, c2), out, _next(path, system, param, domain, out)))
 
 
-def _ellipsoid(plant: System, stored: Policy, seconds: float, progress: ProgressLine | None) -> tuple[Array, float]:
+def _ellipsoid(plant: System, stored: Policy, effort: Effort, progress: ProgressLine | None) -> tuple[Array, float]:
     """A proved region of attraction, into which trajectories are to fall.
 
     Raises
     ------
-    InputError : none is proved in the time.
+    InputError : none is proved with that effort.
     """
-    from certify.analysis.options import RoaOptions
     from certify.analysis.run import certify_roa
     from certify.certificates.verdict import Verdict
 
     with tempfile.TemporaryDirectory() as folder:
-        found = certify_roa(plant, stored.network, Path(folder), RoaOptions(time_limit=seconds), progress=progress)
+        found = certify_roa(plant, stored.network, Path(folder), progress=progress, effort=effort)
     if found.verdict is not Verdict.PROVED or found.P is None or found.levels.roa is None:
         raise InputError(
             "an ellipsoid must be proved before a function beyond it is learned; the verdict on one is "
-            f"{found.verdict.value}. See certify roa, or give --time-limit more seconds."
+            f"{found.verdict.value}. See certify roa, or give more --effort."
         )
     return found.P, found.levels.roa
 

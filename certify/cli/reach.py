@@ -45,7 +45,7 @@ def reach(
         typer.Option(help="Half-axes of the ellipsoid around the state that is to be widest, as in x=0.4,phi=0.2."),
     ] = None,
     resume: Resume = False,
-    time_limit: TimeLimit = 50.0,
+    time_limit: TimeLimit = None,
     out: Results = None,
     quiet: Quiet = False,
     as_json: Json = False,

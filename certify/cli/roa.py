@@ -142,7 +142,7 @@ def roa(
         str | None,
         typer.Option(help="Say whether the proved set contains a state or a box, as in x=1.57,x_dot=-1..1."),
     ] = None,
-    time_limit: TimeLimit = 50.0,
+    time_limit: TimeLimit = None,
     max_boxes: Annotated[int, typer.Option(help="Boxes for the ring.")] = 4_000_000,
     out: Results = None,
     quiet: Quiet = False,

@@ -30,7 +30,7 @@ Domain = Annotated[
     list[str] | None, typer.Option(help="Half-width NAME=D or interval NAME=LO..HI of a state; repeatable.")
 ]
 Resume = Annotated[bool, typer.Option("--resume", help="Resume the search that an earlier run left in the folder.")]
-TimeLimit = Annotated[float, typer.Option(help="Seconds for everything up to the verdict, the check included.")]
+TimeLimit = Annotated[float | None, typer.Option(help="Seconds for everything up to the verdict, the check included.")]
 Results = Annotated[Path | None, typer.Option(help="Folder for the results; default: out/POLICY.")]
 Quiet = Annotated[bool, typer.Option("--quiet", help="No progress and no notices, errors only.")]
 

@@ -58,8 +58,8 @@ class Progress:
     """Where a proof stands: `level` is proved, `target` aimed at, `boxes` were bounded and `open` wait.
 
     A pass outwards has a target above its level, one inwards, `down`, a target below. `proved` is the share of the
-    ring's volume that is done; `left` is how many operations are
-    needed to do the rest, extrapolated, None at first; `name` is the candidate's."""
+    ring's volume that is done; `left` is how many operations the rest probably takes, None at first; `seconds_left` is
+    that in seconds, where somebody knows the pace; `name` is the candidate's."""
 
     level: float
     target: float
@@ -69,6 +69,7 @@ class Progress:
     left: float | None
     name: str = ""
     down: bool = False
+    seconds_left: float | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -87,8 +87,9 @@ def solve(problem: cvxpy.Problem) -> bool:
 
 
 def _climbed(known: Paths, best: Array, effort: Effort, quick: bool) -> Array:
-    """From {x'Px <= 1}, P = `best`, on, as far as steps gain and the effort allows; `quick`: with old derivatives as long as
-    what they foretell comes, and levels about those that were asked for. Either way may end far below the other."""
+    """From {x'Px <= 1}, P = `best`, on, as far as steps gain and the effort allows; `quick`: with old derivatives as
+    long as what they foretell comes, and levels about those that were asked for. Either way may end far below the
+    other."""
     trust, about, fresh = _TRUST, None, True
     while trust > _LEAST_TRUST and not effort.over:
         if about is None:

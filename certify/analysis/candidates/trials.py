@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import math
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
@@ -17,6 +15,7 @@ from certify.analysis.options import RoaOptions
 from certify.certificates import require_short
 from certify.certificates.claims import Problem
 from certify.certificates.claims.claim import Kind
+from certify.effort import UNLIMITED, Effort
 from certify.errors import BackendError, InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.lyapunov import (
@@ -39,9 +38,9 @@ _BELOW_WITNESS = 1e-3
 _SMALLEST = 1e-120  # of levels: squares of states and products of bounds must not underflow
 _BLENDS = (0.05, 0.15, 0.3)
 _MANY = 6  # states, beyond which there is next to nothing but the local set
-OPTIMISING = 0.2  # share of the time that the optimised candidate may take
-SAMPLING = 0.25  # of that time, how much more it may take to sample what a candidate could give
-FOR_PEAK = 0.4  # share of the time for a candidate that may be the only one
+OPTIMISING = 0.2  # share of the effort that the optimised candidate may take
+SAMPLING = 0.25  # of that, how much more it may take to sample what a candidate could give
+FOR_PEAK = 0.4  # share of the effort for a candidate that may be the only one
 _SAMPLES, _MANY_SAMPLES = 4000, 20_000  # of a search for violations, one of many and the only one; a proof finds others
 
 
@@ -84,10 +83,10 @@ def trial(
     P: Array,
     name: str,
     options: RoaOptions,
+    effort: Effort = UNLIMITED,
     notice: str | None = None,
-    until: float = math.inf,
 ) -> Trial:
-    """Sample what V = x'Px could give, more coarsely after `until`, a reading of `time.perf_counter`.
+    """Sample what V = x'Px could give, more coarsely once the effort is over.
 
     Raises
     ------
@@ -112,37 +111,35 @@ def trial(
     if kind == "practical" and n > FEW:  # a ball decides, and no survey could
         return Trial(name, task, T, limit, "domain", volume(P, level), notice)
     if kind == "practical":
-        bands = survey(problem, T, level, until=until)
+        bands = survey(problem, T, level, effort=effort)
         reach = bands[0].above if bands else 0.0
         return Trial(name, task, T, limit, "sampled" if reach < level else "domain", volume(P, reach), notice)
-    witness = falsify(problem, T, level, _MANY_SAMPLES if _only_one(options) else _SAMPLES, 0, until)
+    witness = falsify(problem, T, level, _MANY_SAMPLES if _only_one(options) else _SAMPLES, 0, effort)
     below = level if witness is None or task.exactly else witness.level * (1 - _BELOW_WITNESS)
     task = Task(problem, kind, below, task.exactly, witness)
     return Trial(name, task, T, limit, "domain" if witness is None else "sampled", volume(P, below), notice)
 
 
-def named(loop: ClosedLoop, options: RoaOptions) -> Trial:
+def named(loop: ClosedLoop, options: RoaOptions, effort: Effort) -> Trial:
     """The one candidate that the options ask for."""
     name = options.only or "lyapunov"
-    seconds = (share_of_robust(loop) if name == "robust" else OPTIMISING) * options.time_limit
-    until = _until(seconds)
     if options.P is not None:
-        return trial(loop, options.P, "given", options, until=until)
+        return trial(loop, options.P, "given", options, effort)
     if name == "peak":
-        return trial(loop, peak_candidate(loop, seconds), name, options, until=until)
+        return trial(loop, peak_candidate(loop, _for_making(effort)), name, options, effort)
     if name == "robust":
-        return trial(loop, robust_candidate(loop, seconds), name, options, until=until)
-    chosen = choose_candidate(loop, name, options.Q, options.R, seconds)
-    return trial(loop, chosen.P, chosen.name, options, chosen.notice, until)
+        return trial(loop, robust_candidate(loop, _for_making(effort)), name, options, effort)
+    chosen = choose_candidate(loop, name, options.Q, options.R, _for_making(effort))
+    return trial(loop, chosen.P, chosen.name, options, effort, chosen.notice)
 
 
 def _only_one(options: RoaOptions) -> bool:
     return options.only is not None or options.P is not None
 
 
-def _until(seconds: float) -> float:
-    """When the sampling of a candidate ends that may take so many seconds to be made, by `time.perf_counter`."""
-    return time.perf_counter() + (1 + SAMPLING) * seconds
+def _for_making(effort: Effort) -> Effort:
+    """The part of the effort for a candidate that its making may take; the rest is for sampling."""
+    return effort.share(1 / (1 + SAMPLING))
 
 
 def solutions(loop: ClosedLoop, options: RoaOptions) -> dict[str, Array]:
@@ -155,44 +152,42 @@ def solutions(loop: ClosedLoop, options: RoaOptions) -> dict[str, Array]:
     return {name: choose_candidate(loop, name, options.Q, options.R).P for name in SOLVED}
 
 
-def solved(loop: ClosedLoop, found: Mapping[str, Array], options: RoaOptions) -> list[Trial]:
-    """Sample these `solutions`: one at least, and as many as there is time for."""
-    until, trials = _until(OPTIMISING * options.time_limit), list[Trial]()
+def solved(loop: ClosedLoop, found: Mapping[str, Array], options: RoaOptions, effort: Effort) -> list[Trial]:
+    """Sample these `solutions`: one at least, and as many as the effort allows."""
+    trials = list[Trial]()
     for name, P in found.items():
-        if not trials or time.perf_counter() < until:
-            trials.append(trial(loop, P, name, options, until=until))
+        if not trials or not effort.over:
+            trials.append(trial(loop, P, name, options, effort))
     return trials
 
 
-def optimised(loop: ClosedLoop, options: RoaOptions) -> Trial | None:
+def optimised(loop: ClosedLoop, options: RoaOptions, effort: Effort) -> Trial | None:
     """The candidate of the largest sampled set, or None if it is not to be had.
 
     Under `practical` it is that of the loop whose policy is centred: near the origin no V decreases under this one, and
     away from it the two differ little. Of an input that is held it is that of the loop whose input follows at once: a
     period is short, and Vdot cheap.
     """
-    until = _until(OPTIMISING * options.time_limit)
     try:
         about = _at_rest(loop, options)
         about = about if loop.system.sample is None else replace(about, system=about.system.with_sample(None))
-        chosen = choose_candidate(about, "optimised", options.Q, options.R, OPTIMISING * options.time_limit)
+        chosen = choose_candidate(about, "optimised", options.Q, options.R, _for_making(effort))
     except (BackendError, InputError):
         return None
-    return trial(loop, chosen.P, chosen.name, options, until=until) if chosen.notice is None else None
+    return trial(loop, chosen.P, chosen.name, options, effort) if chosen.notice is None else None
 
 
-def robust(loop: ClosedLoop, options: RoaOptions) -> Trial | None:
+def robust(loop: ClosedLoop, options: RoaOptions, effort: Effort) -> Trial | None:
     """The candidate that the local rule likes best, or None if it is not to be had."""
     try:
-        seconds = share_of_robust(loop) * options.time_limit
-        until = _until(seconds)
-        return trial(loop, robust_candidate(_at_rest(loop, options), seconds), "robust", options, until=until)
+        P = robust_candidate(_at_rest(loop, options), _for_making(effort))
+        return trial(loop, P, "robust", options, effort)
     except (BackendError, InputError):
         return None
 
 
 def share_of_robust(loop: ClosedLoop) -> float:
-    """Share of the time that it may take to be made.
+    """Share of the effort that it may take to be made.
 
     Where an input is held, in many states, it is twice as much as for the loop without a period, which comes first:
     there no ring can make up for what is left out.
@@ -200,12 +195,10 @@ def share_of_robust(loop: ClosedLoop) -> float:
     return OPTIMISING * (2 if loop.system.sample is not None and loop.system.n > _MANY else 1)
 
 
-def peak(loop: ClosedLoop, options: RoaOptions) -> Trial | None:
+def peak(loop: ClosedLoop, options: RoaOptions, effort: Effort) -> Trial | None:
     """The candidate of a practical claim whose floor is small beside the set, or None if it is not to be had."""
     try:
-        seconds = FOR_PEAK * options.time_limit
-        until = _until(seconds)
-        return trial(loop, peak_candidate(loop, seconds), "peak", options, until=until)
+        return trial(loop, peak_candidate(loop, _for_making(effort)), "peak", options, effort)
     except (BackendError, InputError):
         return None
 
@@ -217,26 +210,26 @@ def _at_rest(loop: ClosedLoop, options: RoaOptions) -> ClosedLoop:
     return replace(loop, network=replace(loop.folded, centre="output"))
 
 
-def corrected(loop: ClosedLoop, last: Trial, witnesses: Sequence[Witness], options: RoaOptions) -> Trial | None:
+def corrected(
+    loop: ClosedLoop, last: Trial, witnesses: Sequence[Witness], options: RoaOptions, effort: Effort
+) -> Trial | None:
     """An optimised candidate once more, with violations that its samples had missed; None if there is none larger."""
     known = np.array([w.x for w in witnesses]) if witnesses else None
-    until = _until(OPTIMISING * options.time_limit)
     try:
-        P = optimise_repeatedly(_at_rest(loop, options), last.P, OPTIMISING * options.time_limit, known)
+        P = optimise_repeatedly(_at_rest(loop, options), last.P, _for_making(effort), known)
     except BackendError:
         return None
-    return trial(loop, P, last.name, options, until=until)
+    return trial(loop, P, last.name, options, effort)
 
 
-def blends(loop: ClosedLoop, large: Trial, provable: Trial, options: RoaOptions) -> Iterator[Trial]:
+def blends(loop: ClosedLoop, large: Trial, provable: Trial, options: RoaOptions, effort: Effort) -> Iterator[Trial]:
     """Between a candidate whose set is large and one that is easier to prove, where what can be proved is largest."""
-    until = _until(OPTIMISING * options.time_limit)
     for share in _BLENDS:
-        if time.perf_counter() > until:
+        if effort.over:
             return
         P = (1 - share) * large.unit + share * provable.unit
         name = f"{large.name} with {share:.0%} of {provable.name}"
-        yield trial(loop, (P + P.T) / 2, name, options, until=until)
+        yield trial(loop, (P + P.T) / 2, name, options, effort)
 
 
 def by_reach(trials: Sequence[Trial]) -> list[Trial]:

@@ -28,6 +28,8 @@ _MAX_STEPS = 3000
 _RATE_SAMPLES = 300
 _NEAR = 0.93  # of a domain's half-width: from here on its faces are near
 
+_CALL = 2e5  # operations of evaluating few states at once
+
 
 class Fate(IntEnum):
     """What becomes of a run until the horizon."""

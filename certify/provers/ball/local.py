@@ -199,9 +199,8 @@ class Rule:
         n, units, sample = len(self.T), sum(len(b) for b in self.problem.loop.network.biases), self.problem.loop.step
         times = max(1, len(self.cells)) * (1 if self.steps.is_plain else 3) + (20 if sample else 0)
         corners = max(1, len(self.cells)) * 2 ** len(self.problem.loop.system.ranges)
-        return times * self.steps.known.operations + corners * _WEIGHINGS * (
-            _WEIGHING + 4.0 * units * n**2 + 8.0 * n**5
-        )
+        weighing = _WEIGHINGS * (_WEIGHING + 4.0 * units * n**2 + 8.0 * n**5)
+        return float(times * self.steps.known.operations + corners * weighing)
 
     def shown(self, level: float, enough: float = math.inf) -> Shown:
         """At rest, on the ball of a level."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 from certify.provers.bounds.flow import Flow
 from certify.provers.bounds.loop import LoopModels, loop_models
 from certify.provers.bounds.neural import NeuralEnclosure, NeuralModels
-from certify.provers.bounds.policy import PolicyEnclosure
+from certify.provers.bounds.policy import PolicyEnclosure, operations_of_policy
 from certify.provers.bounds.symbolic import SymbolicEnclosure, SymbolicModels
 from certify.provers.bounds.taylor import Models, Taylor, upper_bound
 
@@ -24,5 +24,6 @@ __all__ = [
     "SymbolicModels",
     "Taylor",
     "loop_models",
+    "operations_of_policy",
     "upper_bound",
 ]

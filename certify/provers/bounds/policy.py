@@ -64,8 +64,6 @@ class LayersEnclosure:
         rows = (self.weights, self.magnitudes, self.biases, self.bias_errors, self.rows, self.norms)
         self.layers = [Layer(*row) for row in zip(*rows, strict=True)]
         self.units, self.widest = sum(network.layers[1:]), max(network.layers)
-        entries = sum(W.size for W in network.weights)
-        self.operations = 2.0 * entries * (network.n + network.m + 3) + _NEURON * self.units  # of a box, about
         self.clip = None if network.clip is None else tuple(tensor(end)[:, None] for end in network.clip)
 
     def __call__(self, x: Tensor, x_error: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -152,6 +150,12 @@ class LayersEnclosure:
             through = weight if slope is None else slope[:, None] * weight
             weight = (W.T @ through.reshape(len(W), -1)).reshape(-1, m, batch)
         return result + (weight.abs() * x_error[:, None]).sum(0)
+
+
+def operations_of_policy(network: TanhNetwork) -> float:
+    """Operations to enclose a network on a box, about, as an `Effort` counts them."""
+    entries, neurons = sum(W.size for W in network.weights), sum(len(b) for b in network.biases)
+    return 2.0 * entries * (network.n + network.m + 3) + _NEURON * neurons
 
 
 class PolicyEnclosure(LayersEnclosure):

@@ -16,7 +16,6 @@ Whether a box's centre can be proved at all is therefore asked of the centre alo
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -25,10 +24,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from certify.certificates.claims import Problem
+from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Expression, evaluate, nodes
 from certify.loop.plants import System
 from certify.loop.policies import bounded_by_form
-from certify.provers.bounds import Flow, Models, PolicyEnclosure, Taylor, loop_models, upper_bound
+from certify.provers.bounds import Flow, Models, PolicyEnclosure, Taylor, loop_models, operations_of_policy, upper_bound
 from certify.provers.bounds.compiled import kernels
 from certify.provers.bounds.loop import played
 from certify.provers.bounds.tape import Tape, recorded
@@ -54,6 +54,15 @@ class BoxBounds(NamedTuple):
     smooth: Tensor
 
 
+def operations_of_box(loop: ClosedLoop, order: int = 2) -> float:
+    """Operations to bound a box, about, as an `Effort` counts them."""
+    system = loop.system
+    symbols = system.n + system.m + len(system.uncertain) + (system.sample is not None)
+    times = 1 if system.sample is None else 2 + 2 * order**2
+    equations = sum(1 for _ in nodes(*system.uncertain_dynamics())) * times + system.n * (system.n + 3)
+    return operations_of_policy(loop.network) + _EACH * equations * (symbols + 1) ** 2
+
+
 class VdotBound:
     """Upper bounds of D', which is Vdot in continuous time, and bounds of V, over boxes in the coordinates z.
 
@@ -70,6 +79,7 @@ class VdotBound:
         self.T = torch.tensor(T, dtype=torch.float64, device=device)
         self.P = problem.V.P
         self.V = FormBound(self.P, T, device)
+        self.operations = operations_of_box(loop, order)
         self.policy = PolicyEnclosure(loop, device)
         self.dynamics: tuple[Expression, ...] = loop.system.uncertain_dynamics()
         self.check_inputs = not bounded_by_form(loop.network, loop.system.input_bounds)
@@ -82,14 +92,6 @@ class VdotBound:
         self.ends = torch.tensor(ends, dtype=torch.float64, device=device).T[:, :, None]
         extent = np.sqrt(np.diag(np.linalg.inv(self.P))) * (1 + 1e-9)
         self.extent = torch.tensor(extent, dtype=torch.float64, device=device)[:, None]  # of {V <= 1}
-
-    @cached_property
-    def operations(self) -> float:
-        """Operations to bound a box, about, as an `Effort` counts them."""
-        symbols = self.system.n + self.system.m + len(self.system.uncertain) + (self.flow is not None)
-        times = 1 if self.flow is None else 2 + 2 * self.order**2
-        equations = sum(1 for _ in nodes(*self.dynamics)) * times + self.system.n * (self.system.n + 3)
-        return self.policy.operations + _EACH * equations * (symbols + 1) ** 2
 
     def levels(self, lo: Tensor, hi: Tensor) -> tuple[Tensor, Tensor]:
         """Bounds of V from below and above on boxes (n, B)."""

@@ -31,7 +31,7 @@ from certify.errors import BackendError, CertificateFormatError
 from certify.provers.boxes.frontier import Boxes, Frontier
 from certify.provers.boxes.halving import Halves, split
 from certify.provers.boxes.partition import LEAF, LOOK, MOST_SPLITS, OPEN, Grafted, Partition
-from certify.provers.execution import Bound, Jobs
+from certify.provers.execution import Counted, Jobs
 
 Array = NDArray[np.float64]
 _MAGIC = b"subtree1"
@@ -65,9 +65,8 @@ class Growth(ABC):
     half : (n, 1) half-widths, in which the least width of a box is given.
     """
 
-    def __init__(self, bound: Bound, half: Tensor) -> None:
+    def __init__(self, bound: Counted, half: Tensor) -> None:
         self.bound, self.half = bound, half
-        self.operations: float = bound.operations  # of a box
 
     @property
     @abstractmethod
@@ -233,7 +232,7 @@ class Abroad:
             count = min(self.batch, max(_LEAST, len(frontier) // most))
             boxes = frontier.take(count, limit)
             n, count = boxes.lo.shape
-            worth = int(min(turn(places), left / most) / self.growth.operations)
+            worth = int(min(turn(places), left / most) / self.growth.bound.operations)
             head = _JOB.pack(_MAGIC, n, count, self.batch, worth, *levels, self.least_width)
             job = head + b"".join(a.cpu().numpy().tobytes() for a in (boxes.lo, boxes.hi, boxes.key))
             try:

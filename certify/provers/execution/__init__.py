@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from certify.provers.execution.base import Bound, Jobs, Runner, Work
+from certify.provers.execution.base import Bound, Counted, Jobs, Runner, Work
 from certify.provers.execution.threads import ThreadRunner
 
-__all__ = ["Bound", "Jobs", "Runner", "ThreadRunner", "Work"]
+__all__ = ["Bound", "Counted", "Jobs", "Runner", "ThreadRunner", "Work"]

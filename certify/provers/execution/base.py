@@ -13,6 +13,16 @@ Bound = Callable[[Tensor, Tensor, float, float], Any]
 Work = Callable[[bytes], bytes]
 
 
+class Counted(Protocol):
+    """A bound of boxes that says about how many operations one takes."""
+
+    @property
+    def operations(self) -> float:
+        """Operations to bound a box, as an `Effort` counts them."""
+
+    def __call__(self, lo: Tensor, hi: Tensor, inner: float, outer: float, /) -> Any: ...
+
+
 class Jobs(Protocol):
     """Work that is done elsewhere, a job at a time at each of several places."""
 

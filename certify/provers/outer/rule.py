@@ -8,7 +8,6 @@ N's model, then the policy, the plant and N'F. What is proved for a level n2 is 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -31,6 +30,7 @@ from certify.provers.bounds import (
     SymbolicModels,
     Taylor,
     loop_models,
+    operations_of_policy,
     upper_bound,
 )
 from certify.provers.bounds.taylor import EPS, TINY
@@ -77,14 +77,10 @@ class FallBound:
         ends = [[float(end) for end in pair] for pair in self.system.domain]
         self.ends = torch.tensor(ends, dtype=torch.float64, device=device).T[:, :, None]
         symbols = self.system.n + self.system.m + len(self.system.uncertain)
-        self.piece = max(16, _NUMBERS // (self.N.units * (1 + symbols) * (2 + symbols) // 2))
-
-    @cached_property
-    def operations(self) -> float:
-        """Operations to bound a box, about, as an `Effort` counts them."""
-        area = (1 + self.system.n + self.system.m + len(self.system.uncertain)) ** 2
         equations = sum(1 for _ in nodes(*self.dynamics)) + 3 * self.system.n
-        return self.policy.operations + _EACH * area * (equations + 4 * self.N.units)
+        own = _EACH * (1 + symbols) ** 2 * (equations + 4 * self.N.units)
+        self.operations = operations_of_policy(problem.loop.network) + own  # of a box, about
+        self.piece = max(16, _NUMBERS // (self.N.units * (1 + symbols) * (2 + symbols) // 2))
 
     def __call__(self, lo: Tensor, hi: Tensor, inner: float, outer: float) -> OuterBounds:
         """Bounds for the level `outer` on boxes lo, hi (n, B)."""

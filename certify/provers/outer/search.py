@@ -28,7 +28,7 @@ from certify.provers.boxes.frontier import Frontier
 from certify.provers.boxes.halving import Halves, split
 from certify.provers.boxes.partition import LEAF, MOST_SPLITS, Partition
 from certify.provers.boxes.subtrees import Abroad, Growth, Subtrees
-from certify.provers.execution import Bound, Runner
+from certify.provers.execution import Bound, Counted, Runner
 from certify.provers.outer.rule import OuterBounds
 
 Array = NDArray[np.float64]
@@ -40,7 +40,7 @@ _BATCH = 1e6  # operations of a batch, however small
 class _CoverGrowth(Growth):
     """A rule for a level, the second of its two."""
 
-    def __init__(self, rule: Bound, half: Tensor, level: float) -> None:
+    def __init__(self, rule: Counted, half: Tensor, level: float) -> None:
         super().__init__(rule, half)
         self.level = level
 
@@ -73,7 +73,7 @@ class Cover:
 
     def __init__(
         self,
-        rule: Bound,
+        rule: Counted,
         lower: Array,
         upper: Array,
         runner: Runner,

@@ -1,0 +1,198 @@
+"""The last stages: have the certificate accepted by the checker, state the verdict, and ask a solver as well."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from certify.analysis.acceptance import Accepted, Clerk
+from certify.analysis.beyond import outer_facts, short_of
+from certify.analysis.outcome import limit_of, short_of_target, with_levels
+from certify.analysis.results import RoaResult
+from certify.analysis.stages.state import State, Tools
+from certify.certificates import Certificate, TrustedSolver, run_checker
+from certify.certificates.claims import Claim, Problem
+from certify.certificates.verdict import Stop, Verdict
+from certify.effort import UNIT, Effort
+from certify.errors import BackendError, SoundnessError
+from certify.loop.closed_loop import ClosedLoop
+
+_LONG = 1_000_000  # bytes of a certificate, from which on several processes check it
+_MOST_JOBS = 64
+_CHECK = 2.0  # of the operations that bound a box: what the checker takes for a leaf
+
+
+def operations_of_check(loop: ClosedLoop) -> float:
+    """Operations of the check of a leaf, about, as an `Effort` counts them."""
+    from certify.provers.boxes.rule import operations_of_box
+
+    return _CHECK * operations_of_box(loop)
+
+
+@dataclass(frozen=True)
+class Acceptance:
+    """The stage that gives the verdict: PROVED only for bytes that the checker has accepted."""
+
+    tools: Tools
+
+    def extend(self, state: State, effort: Effort) -> State:
+        """At its end, unless a solver is to be asked as well.
+
+        Raises
+        ------
+        SoundnessError : the checker rejects what was proved, and no smaller set mends it.
+        """
+        problem = state.contest.best.trial.task.problem
+        system, network = state.loop.system, state.loop.network
+        certificate = Certificate(system, network, problem.V, state.claim, state.evidence, self.tools.provenance)  # type: ignore[arg-type]
+        clerk = _Desk(state, self.tools, effort).clerk()
+        accepted = clerk.accepted(certificate, problem)
+        state = replace(state, accepted=accepted).noting(accepted.mended)
+        return _concluded(_with_facts(state, accepted), accepted)
+
+
+@dataclass(frozen=True)
+class _Desk:
+    """Where certificates are checked."""
+
+    state: State
+    tools: Tools
+    effort: Effort
+
+    def clerk(self) -> Clerk:
+        tools = self.tools
+        return Clerk(
+            tools.out / "certificate.json",
+            lambda: self.effort.left,
+            tools.timing,
+            partial(tools.tell, "check"),
+            tools.show,
+            self._checked,
+            self.state.options.cluster,
+        )
+
+    def _checked(self, path: Path) -> Mapping[str, Any]:
+        """The checker's answer about a file, patiently where it would be refused for what it takes else."""
+        answer = self._answered(path, patient=False)
+        if (answer.get("rule"), answer.get("at")) == ("limits", "operations"):
+            answer = self._answered(path, patient=True)
+            if answer["result"] != "REJECTED":
+                self.tools.remarks.append(
+                    "its check takes more than ten minutes: type `certify check --patient` for another"
+                )
+        return answer
+
+    def _answered(self, path: Path, patient: bool) -> Mapping[str, Any]:
+        """The checker's answer; where many leaves make a long file, several processes share them."""
+        options = self.state.options
+        if options.cluster_checks:
+            from certify.analysis.parts import check_in_parts
+
+            try:
+                _, answer = check_in_parts(path, self.tools.runner, patient)
+            except BackendError as error:
+                self.tools.remarks.append(f"checked here, and not by the cluster: {str(error).rstrip('.')}")
+            else:
+                if "parts" in answer:
+                    self.tools.remarks.append(
+                        f"checked in {answer['parts']} parts by the workers of {options.cluster}, whose word it is"
+                    )
+                return answer
+        cores = len(os.sched_getaffinity(0)) if path.stat().st_size > _LONG else 1
+        return run_checker(path, jobs=options.jobs or min(cores, _MOST_JOBS), patient=patient)
+
+
+def _with_facts(state: State, accepted: Accepted) -> State:
+    """With what the result says of the accepted claim beside its levels."""
+    claim, problem, result = accepted.certificate.claim, state.contest.best.trial.task.problem, state.result
+    if claim.kind != state.kind:
+        result = replace(result, claim=claim.kind)
+    if claim.start is None:
+        result = replace(result, tube=None)
+    if state.beyond is not None:
+        if claim.outer is not None:
+            result = replace(result, outer=outer_facts(problem, claim, claim.outer, state.beyond))
+        else:
+            state = state.noting("the checker refused the set beyond the ellipsoid, which is left out")
+    return replace(state, result=result)
+
+
+def _concluded(state: State, accepted: Accepted) -> State:
+    """With the verdict: UNKNOWN where the accepted claim is less than was asked for."""
+    from certify.analysis.stages.further import holds
+
+    trial, options, result = state.contest.best.trial, state.options, state.result
+    task, claim, proof, witness = trial.task, accepted.certificate.claim, state.proof, result.witness
+    leaves = 0 if proof is None else proof.leaves
+    found = _with_certificate(result, accepted, leaves)
+    if options.lyapunov_level is not None and (claim.outer is None or claim.outer.level < options.lyapunov_level):
+        why = short_of(task.problem, claim, options, state.beyond)
+        return state.finished(replace(found, stop=Stop.BEYOND, detail=why))
+    if state.centre is not None and claim.start is None:
+        if not holds(task.problem, claim.roa, state.centre):
+            tube = state.claim is not None and state.claim.start is not None
+            why = (accepted.mended or "the checker refused the tube") if tube else state.missed
+            return state.finished(replace(found, stop=Stop.PATH, detail=why))
+        if state.claim is None or state.claim.start is None:
+            state = state.noting("the state lies in the proved set, and no tube is needed")
+    if task.exactly and claim.roa < task.target:
+        refused = replace(result, stop=Stop.REFUSED, detail=accepted.mended or "")
+        return state.finished(short_of_target(refused, task, claim))
+    lowered = state.claim is not None and claim.roa < state.claim.roa
+    trusted = isinstance(accepted.certificate.evidence, TrustedSolver)
+    return replace(
+        state,
+        result=replace(
+            found,
+            verdict=Verdict.TRUSTED if trusted else Verdict.PROVED,
+            stop=Stop.REFUSED if lowered else limit_of(result.stop, task, witness),
+        ),
+    )
+
+
+def _with_certificate(result: RoaResult, accepted: Accepted, leaves: int) -> RoaResult:
+    """The result with what the checker accepted, and its answer about these very bytes."""
+    stated = with_levels(result, accepted.certificate.claim.levels, result.witness)
+    return replace(stated, leaves=leaves, certificate=accepted.path, raw=accepted.data, checker=accepted.answer)
+
+
+@dataclass(frozen=True)
+class Confirmation:
+    """The stage that asks dReal about every condition that the bounds engine has proved."""
+
+    tools: Tools
+
+    def extend(self, state: State, effort: Effort) -> State:
+        """With dReal's answers.
+
+        Raises
+        ------
+        SoundnessError : dReal points at a genuine violation of what was proved and checked.
+        """
+        if state.accepted is None or isinstance(state.accepted.certificate.evidence, TrustedSolver):
+            return state
+        problem, claim = state.contest.best.trial.task.problem, state.accepted.certificate.claim
+        return state.with_result(solver=self._asked(state, problem, claim, effort))
+
+    def _asked(self, state: State, problem: Problem, claim: Claim, effort: Effort) -> dict[str, Any]:
+        from certify.provers.dreal.backend import find_backend
+        from certify.provers.dreal.proof import DrealOptions, confirm_with_dreal, record_of
+
+        try:
+            backend = find_backend()
+        except BackendError as error:
+            return {"solver": "dreal", "missing": str(error)}
+        options = state.options
+        allowed = DrealOptions(options.dreal_precision, options.jobs or 1, self.tools.whole / UNIT)
+        asked, witness = confirm_with_dreal(problem, claim, backend, allowed)
+        if witness is not None:
+            path = self.tools.out / "contradiction.json"
+            stated = {"x": [v.hex() for v in witness.x.tolist()], "kind": witness.kind, "V": witness.level}
+            path.write_text(json.dumps({"witness": stated, "certificate": "certificate.json"}) + "\n", encoding="utf-8")
+            raise SoundnessError(f"dReal and Arb contradict a checked certificate; {path} has the witness.")
+        return record_of(backend.version, allowed, asked)

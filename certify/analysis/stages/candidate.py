@@ -1,0 +1,252 @@
+"""The candidates for V: those that are asked for, or several in a race."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+from certify.analysis.asked import ellipsoid_in
+from certify.analysis.candidates.trials import (
+    FOR_PEAK,
+    OPTIMISING,
+    SAMPLING,
+    Trial,
+    blends,
+    by_reach,
+    corrected,
+    named,
+    optimised,
+    peak,
+    robust,
+    share_of_robust,
+    solutions,
+    solved,
+)
+from certify.analysis.options import RoaOptions
+from certify.analysis.outcome import refuted_at_once
+from certify.analysis.saved_search import NothingYetError, load
+from certify.analysis.selection import Contender, Race
+from certify.analysis.stages.state import State, Tools
+from certify.effort import UNIT, Effort
+from certify.errors import InputError
+from certify.loop.closed_loop import ClosedLoop
+from certify.lyapunov import volume
+from certify.provers.base import FEW, Attempt, Budget
+from certify.provers.falsify import Witness
+
+_HEAT = 0.04  # of the effort, for a candidate's first heat
+_SEARCH = 0.6  # of the effort that is left, for a search that cannot be interrupted
+_GRACE, _LEAST = 1.0 * UNIT, 0.05  # operations, or of the whole, for a local level where nothing is proved yet
+_FOR_PROOF = 0.4  # of the whole, that no further candidate is optimised in
+_WORTH = 1.05  # growth of a volume that another candidate must promise
+_SMALL = 0.1  # of the volume within a candidate's reach: where less is proved, another one is worth its effort
+_NEAR = 1e-3  # the same: where less is proved, its own correction is not
+_MISLED = 0.9  # of its reach: a violation below it is one that the samples missed
+
+Make = Callable[[RoaOptions, Effort], Trial | None]
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """The stage that chooses P, by what a first heat proves with each candidate."""
+
+    tools: Tools
+
+    def extend(self, state: State, effort: Effort) -> State:
+        """With a race in which at least one candidate has been worked on, or refuted at once."""
+        tools, options = self.tools, state.options
+        race = Race(partial(self._begun, state, effort), effort, 0.0, options.max_boxes, None)
+        race.heat = _HEAT * effort.left if state.interruptible else self._only_heat(state, effort)
+        race.report = None if tools.progress is None else tools.report
+        state = replace(state, race=race)
+        tools.keeper.begin(state.loop, options.rate, race, state.interruptible)
+        if options.resume:
+            state = _resumed(state, tools)
+        if tools.keeper.winner is not None:
+            return state
+        if options.P is None and options.only is None:
+            _Choice(state, tools, effort, race).run()
+            return state
+        share = share_of_robust(state.loop) if options.only == "robust" else OPTIMISING
+        with tools.timing("candidate"):
+            one = named(state.loop, options, _granted(effort, tools.whole, share))
+        refuted = refuted_at_once(state.result, one)
+        if refuted is not None:
+            return state.finished(refuted)
+        race.enter([one])
+        tools.keeper.winner = race.contenders[0]
+        return state
+
+    def _only_heat(self, state: State, effort: Effort) -> float:
+        """Operations of the only heat of a search that cannot be interrupted."""
+        return (1.0 if state.options.engine == "dreal" else _SEARCH) * effort.left
+
+    def _begun(self, state: State, effort: Effort, trial: Trial, proved: bool) -> Attempt:
+        """The attempt of a trial, which begins with its local level."""
+        options, tools = state.options, self.tools
+        if options.engine == "dreal":
+            from certify.provers.dreal.proof import DrealEngine
+
+            return DrealEngine(trial.T, options.dreal_precision, options.jobs or 1).begin(trial.task)
+        from certify.provers.boxes.engine import BoundsEngine
+
+        least = 0.0 if proved else max(_GRACE, _LEAST * tools.whole)
+        first = effort if effort.left >= least else effort.part(least, even_if_over=True)
+        return BoundsEngine(trial.T, tools.runner, first).begin(trial.task)
+
+
+def _granted(effort: Effort, whole: float, share: float = OPTIMISING) -> Effort:
+    """A share of the whole for a candidate, and what sampling adds, as far as there is effort left."""
+    return effort.part((1 + SAMPLING) * min(share * whole, effort.left / (1 + SAMPLING)))
+
+
+def _resumed(state: State, tools: Tools) -> State:
+    """With the contender whose search an earlier run has left, as the winner if that was decided.
+
+    Raises
+    ------
+    InputError : there is no search, or it is of another claim.
+    """
+    path, race = tools.keeper.path, state.contest
+    try:
+        found = load(path, state.loop, state.options.rate) if state.kind == "asymptotic" or path.exists() else None
+    except NothingYetError:
+        return state.noting("the run before this one was stopped before it had a candidate: it is begun anew")
+    if found is None or state.kind != "asymptotic":
+        raise InputError("a search for a practical claim cannot be resumed; run without --resume.")
+    with tools.timing("candidate"):
+        attempt = race.begin(found.trial, race.proved)
+        if found.state.tree:
+            attempt.restore(found.state)
+        race.contenders.append(Contender(found.trial, attempt))
+        race.contenders[0].advance(Budget(tools.effort.part(1.0), state.options.max_boxes), race.report)
+    tools.keeper.winner = race.contenders[0] if found.decided else None
+    return state
+
+
+@dataclass
+class _Choice:
+    """The choice among several candidates."""
+
+    state: State
+    tools: Tools
+    effort: Effort
+    race: Race
+    cut_short: bool = False  # the effort ended the making of the last candidate
+
+    @property
+    def loop(self) -> ClosedLoop:
+        return self.state.loop
+
+    def run(self) -> None:
+        """Every candidate for a little effort, and more for the better ones."""
+        state, race, loop = self.state, self.race, self.loop
+        self.tools.tell("candidate")
+        with self.tools.timing("candidate"):
+            found = solutions(loop, state.options)
+        if state.kind == "practical" and state.options.engine != "dreal" and loop.system.n > FEW:
+            with self.tools.timing("candidate"):
+                trials = solved(loop, found, state.options, self._granted())
+            rests = loop.network.is_moved and not loop.system.ranges
+            return (self._around_its_rest if rests else self._around_a_level)(trials)
+        large = self._made(partial(optimised, loop)) if state.options.engine != "dreal" else None
+        most = volume(ellipsoid_in(loop.system), 1.0)
+        if state.interruptible and large is not None and race.is_settled_by(large, most):
+            return None  # before the others are made, of which `robust` takes longest
+        trials = [] if large is None else [large]
+        if not self.effort.over or not race.proved:
+            with self.tools.timing("candidate"):
+                trials = [*solved(loop, found, state.options, self._granted()), *trials]
+        if state.interruptible:
+            return self._among(trials)
+        race.enter(by_reach(trials)[:1])
+        return self._improve() if loop.network.is_moved else None
+
+    def _among(self, trials: list[Trial]) -> None:
+        """The best of these, of `robust`, and of what lies between the two that are largest and best proved."""
+        loop, race = self.loop, self.race
+        certain = self._made(partial(robust, loop), share_of_robust(loop))
+        race.enter([*trials, *([] if certain is None else [certain])])
+        self._improve()
+        unproved = [c for c in race.open if c.trial.name == "optimised"]
+        others = [c for c in race.contenders if c.trial.name != "optimised" and c.proved]
+        if unproved and others and not self.effort.over:
+            with self.tools.timing("candidate"):
+                best = max(others, key=lambda c: c.proved).trial
+                between = list(blends(loop, unproved[0].trial, best, self.state.options, self._granted()))
+            race.enter(between, None if race.gained else 0.0)  # without a gain their local levels tell
+        race.knock_out()
+
+    def _around_a_level(self, trials: list[Trial]) -> None:
+        """A practical claim in many states, where no tree of boxes can carry what a ball does not: the candidate made
+        for that, then others until one proves something; then the largest sampled one, if there is effort left."""
+        race, first = self.race, self._made(partial(peak, self.loop), FOR_PEAK)
+        for one in ([] if first is None else [first]) + by_reach(trials):
+            self._enter_alone(one)
+            if race.best.proved:
+                break
+        if race.best.proved and self._is_left_for_more():
+            large = self._made(partial(optimised, self.loop))
+            if large is not None:
+                self._enter_alone(large)
+
+    def _around_its_rest(self, trials: list[Trial]) -> None:
+        """A practical claim in many states of a loop that rests where V is 0: a ball carries there as much as it does
+        of a loop that rests exactly, and the largest candidates come first as they do there."""
+        race, large = self.race, self._made(partial(optimised, self.loop))
+        if large is not None:
+            self._enter_alone(large)
+        if large is not None and race.best.proved > _NEAR * large.volume:
+            self._improve()
+        little = large is None or race.best.proved < _SMALL * large.volume
+        if little and self._is_left_for_more():
+            certain = self._made(partial(robust, self.loop), share_of_robust(self.loop))
+            if certain is not None:
+                self._enter_alone(certain)
+        for one in by_reach(trials):
+            if race.contenders and race.best.proved:
+                break
+            self._enter_alone(one)
+
+    def _improve(self) -> None:
+        """The optimised candidate again, from where it is, as long as its proofs reach as far as its samples do.
+
+        A proof that comes upon a violation far below its candidate's reach tells the next round of it.
+        """
+        race, witnesses = self.race, list[Witness]()
+        while self._is_left_for_more():
+            last = [c for c in race.contenders if c.trial.name == "optimised"][-1:]
+            if not last or not last[0].attempt.done:
+                return
+            found = last[0].attempt.proof().witness
+            misled = found is not None and found.level < _MISLED * last[0].trial.task.target
+            if found is not None and misled:
+                witnesses.append(found)
+            elif not self.cut_short:
+                return
+            again = self._made(partial(corrected, self.loop, last[0].trial, witnesses))
+            if again is None or (not misled and again.volume <= _WORTH * race.best.proved):
+                return
+            race.enter([again])
+
+    def _made(self, make: Make, share: float = OPTIMISING) -> Trial | None:
+        """A trial that has its share of the effort to be made with, or None where none is left."""
+        if self.effort.over:
+            self.cut_short = True
+            return None
+        granted = self._granted(share)
+        with self.tools.timing("candidate"):
+            made = make(self.state.options, granted)
+        self.cut_short = granted.spent >= granted.granted / (1 + SAMPLING)
+        return made
+
+    def _granted(self, share: float = OPTIMISING) -> Effort:
+        return _granted(self.effort, self.tools.whole, share)
+
+    def _enter_alone(self, trial: Trial) -> None:
+        """With a heat of what is left, where a search cannot be interrupted."""
+        self.race.enter([trial], self.race.heat if self.state.interruptible else _SEARCH * self.effort.left)
+
+    def _is_left_for_more(self) -> bool:
+        return self.effort.left > _FOR_PROOF * self.tools.whole

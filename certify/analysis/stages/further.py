@@ -1,0 +1,169 @@
+"""The stages that add to a proved set: one equilibrium inside, a tube from a larger set, a set of another function."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.analysis.asked import ellipsoid_in
+from certify.analysis.results import TubeFacts
+from certify.analysis.stages.state import State, Tools
+from certify.certificates import PartitionTree
+from certify.certificates.claims import Claim, Problem
+from certify.effort import Effort
+from certify.errors import OptionError
+from certify.lyapunov import Neural, Polynomial, are_inside, of_polynomial, volume
+from certify.lyapunov.function import Quadratic
+from certify.provers.base import Budget
+
+Array = NDArray[np.float64]
+_FOR_SEARCH = 0.5  # of what is left, the rest being for the check
+_FOR_LEARNING = 0.4  # of what is left, the rest being for the proof and its check
+
+
+@dataclass(frozen=True)
+class Equilibrium:
+    """The stage that shows convergence to one equilibrium near the origin."""
+
+    tools: Tools
+
+    def extend(self, state: State, effort: Effort) -> State:
+        """With the stronger claim, where the loop contracts around the floor."""
+        from certify.provers.ball.contraction import contraction
+
+        claim, evidence, best = state.claim, state.evidence, state.contest.best.trial
+        if claim is None or claim.floor is None or not isinstance(evidence, PartitionTree):
+            return state
+        closer = contraction(best.task.problem, best.T, claim.floor)
+        if closer is None:
+            return state
+        return replace(state, claim=claim.converging(), evidence=replace(evidence, contraction=closer))
+
+
+@dataclass(frozen=True)
+class Tube:
+    """The stage that looks for a tube from a larger ellipsoid into the proved set."""
+
+    tools: Tools
+
+    def extend(self, state: State, effort: Effort) -> State:
+        """With the largest tube that the effort finds; a note says if there is none."""
+        from certify.provers.ball.models import paths
+        from certify.provers.tube.enlarge import enlarge
+
+        claim, evidence, race = state.claim, state.evidence, state.contest
+        if claim is None or not isinstance(evidence, PartitionTree):
+            return state
+        trial, box = race.best.trial, state.options.box
+        by_proved = sorted(race.contenders, key=lambda c: -c.proved)
+        shapes = {c.trial.name: c.trial.P for c in (race.best, *by_proved)}
+        shapes |= {"domain": ellipsoid_in(state.loop.system)}
+        with self.tools.timing("tube"):
+            self.tools.tell("tube")
+            worth = volume(trial.P, claim.roa) if box is None else 0.0
+            known, goal = paths(trial.task.problem.loop), trial.P / claim.roa
+            found = enlarge(known, goal, _shapes(state, shapes), effort.share(_FOR_SEARCH), worth)
+        if found is None:
+            return state.noting("no tube leads into the proved set from a larger one that the effort could reach")
+        facts = TubeFacts(found.tube.start, found.shape, len(found.tube.slabs), found.tube.duration)
+        state = state.with_result(tube=facts)
+        return replace(state, claim=claim.with_tube(Quadratic(facts.start)), evidence=replace(evidence, tube=found.tube.slabs))
+
+
+@dataclass(frozen=True)
+class Route:
+    """The stage that looks for a tube around the trajectory from a state into the proved set."""
+
+    tools: Tools
+
+    def extend(self, state: State, effort: Effort) -> State:
+        """With the widest tube that the effort finds; `missed` says why there is none."""
+        from certify.provers.tube.enlarge import surround
+
+        claim, evidence, centre = state.claim, state.evidence, state.centre or ()
+        trial = state.contest.best.trial
+        if claim is None or not isinstance(evidence, PartitionTree):
+            return state
+        if holds(trial.task.problem, claim.roa, centre):
+            return replace(state, missed="the checker accepted only a lower level, and the state lies above it")
+        with self.tools.timing("tube"):
+            self.tools.tell("tube")
+            middle, goal = np.array([float(q) for q in centre]), trial.P / claim.roa
+            shapes = _shapes(state, {trial.name: trial.P, "domain": ellipsoid_in(state.loop.system)})
+            found, missed = surround(trial.task.problem.loop, middle, goal, shapes, effort.share(_FOR_SEARCH))
+        if found is None:
+            return replace(state, missed=missed)
+        tube, at = found.tube, tuple(middle.tolist())
+        facts = TubeFacts(tube.start, found.shape, len(tube.slabs), tube.duration, at)
+        if not facts.contains([centre]):
+            return replace(state, missed="the tube is narrower than the rounding of that state")
+        state = state.with_result(tube=facts)
+        return replace(state, claim=claim.with_tube(Quadratic(tube.start), at), evidence=replace(evidence, tube=tube.slabs))
+
+
+def _shapes(state: State, shapes: Mapping[str, Array]) -> Mapping[str, Array]:
+    """These shapes, or the one box that was asked for."""
+    box = state.options.box
+    return shapes if box is None else {"box": ellipsoid_in(state.loop.system, box)}
+
+
+def holds(problem: Problem, level: float, state: Sequence[Fraction]) -> bool:
+    """True if {V <= level} holds a state, decided in rationals."""
+    return are_inside(problem.V.P, level, [state])[0]
+
+
+@dataclass(frozen=True)
+class Beyond:
+    """The stage that proves the largest set of another function that leads into the ellipsoid."""
+
+    tools: Tools
+
+    def extend(self, state: State, effort: Effort) -> State:
+        """With the outer set; a note says why there is none.
+
+        Raises
+        ------
+        OptionError : the function is one of another number of states.
+        """
+        from certify.provers.outer import Nothing, prove_outer
+
+        tools, claim, evidence, trial = self.tools, state.claim, state.evidence, state.contest.best.trial
+        if claim is None or not isinstance(evidence, PartitionTree):
+            return state
+        system, options = state.loop.system, state.options
+        function = options.lyapunov or self._learned(state, claim, effort)
+        if function.n != system.n:
+            raise OptionError(f"`lyapunov` must be a function of {system.n} states; found one of {function.n}.")
+        N = of_polynomial(function, system.states) if isinstance(function, Polynomial) else function
+        report = None if tools.progress is None else partial(tools.report, stage="outer")
+        with tools.timing("outer"):
+            tools.tell("outer")
+            budget = Budget(effort.share(_FOR_SEARCH), options.max_boxes)
+            found = prove_outer(
+                trial.task.problem, claim.roa, trial.T, N, options.lyapunov_level, budget, tools.runner, report
+            )
+        if isinstance(found, Nothing):
+            return state.noting(f"no set of the function `lyapunov` is proved to lead into the ellipsoid: {found.why}")
+        return replace(
+            state,
+            beyond=found,
+            claim=replace(claim, outer=found.outer),
+            evidence=replace(evidence, outer=found.evidence),
+        )
+
+    def _learned(self, state: State, claim: Claim, effort: Effort) -> Neural | Polynomial:
+        """A function whose set may reach beyond the ellipsoid, learned with a share of what is left."""
+        from certify.lyapunov.learning import fit_polynomial, learn
+
+        options, problem = state.options, state.contest.best.trial.task.problem
+        with self.tools.timing("learn"):
+            self.tools.tell("learn")
+            share = effort.share(_FOR_LEARNING)
+            if options.learned == "neural":
+                return learn(problem.loop, problem.V, claim.roa, options.hidden, options.seed, share).function
+            return fit_polynomial(problem.loop, problem.V, claim.roa, options.degree, options.seed, share).function

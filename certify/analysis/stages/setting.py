@@ -1,0 +1,131 @@
+"""The setting: which claim is aimed at, where V is to be 0, and whether the linearisation allows any."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+from certify.analysis.asked import ellipsoid_in, require_one_that_knows, state_in, values_of
+from certify.analysis.options import RoaOptions
+from certify.analysis.outcome import by_spectrum, not_stable
+from certify.analysis.results import RoaResult
+from certify.analysis.stages.state import State, Tools
+from certify.certificates import require_within_limits
+from certify.certificates.claims.claim import Kind
+from certify.certificates.verdict import Stop, Verdict
+from certify.effort import Effort
+from certify.errors import InputError, OptionError
+from certify.loop.closed_loop import ClosedLoop
+from certify.loop.equilibrium import Rest, find_rest, seen_from
+
+
+@dataclass(frozen=True)
+class Setting:
+    """The first stage."""
+
+    tools: Tools
+
+    def extend(self, state: State, effort: Effort) -> State:
+        """Choose the claim and the origin; end the run where the spectrum decides.
+
+        Raises
+        ------
+        InputError : the loop or an option cannot be used.
+        """
+        options, system, network = state.options, state.loop.system, state.loop.network
+        require_within_limits(system, network)
+        require_one_that_knows(system, options)
+        if options.box is not None:
+            ellipsoid_in(system, options.box)
+        centre = None if options.reach_from is None else state_in(system, options.reach_from)
+        state = replace(state, centre=centre)
+        with self.tools.timing("candidate"):
+            state = _with_claim(state)
+            rest, loop = _rest(state.loop, state.options)
+            state = replace(state, loop=loop)
+            state = state.with_result(
+                system=loop.system,
+                network=loop.network,
+                claim=state.kind,
+                reach_from=None if centre is None else values_of(loop.system, centre),
+            )
+            return _by_spectrum(state, rest)
+
+
+def setting_of(loop: ClosedLoop, options: RoaOptions) -> State:
+    """The state before the first stage."""
+    unknown = RoaResult(Verdict.UNKNOWN, Stop.REQUESTED, loop.system, loop.network, engine=options.engine)
+    return State(loop, options, unknown)
+
+
+def _with_claim(state: State) -> State:
+    """The claim: as asked, or by whether the loop rests at the origin; a note says why it is the weaker one.
+
+    Raises
+    ------
+    InputError : the claim `asymptotic` is asked for, and the loop does not rest at the origin.
+    """
+    options = state.options
+    converging = options.claim in ("auto", "nearby") and not state.loop.system.in_steps
+    kind, why = _kind_of(state.loop, options)
+    state = replace(state, converging=converging)
+    if why is not None:
+        state = state.noting(f"practical stability is claimed, because {why}")
+    if kind == "practical" and options.enlarges:
+        if options.reach_from is not None:
+            raise InputError(f"a tube from a state needs a loop that rests at the origin; {'; '.join(state.notes)}.")
+        state = state.noting("a tube needs a set from which trajectories converge, and is not looked for")
+        options = replace(options, enlarge=False, box=None)
+    return replace(state, options=replace(options, claim=kind))
+
+
+def _kind_of(loop: ClosedLoop, options: RoaOptions) -> tuple[Kind, str | None]:
+    """The claim, and why it is the weaker one."""
+    if options.claim in ("practical", "nearby"):
+        return "practical", None
+    try:
+        loop.require_rest()
+    except InputError as error:
+        if options.claim == "asymptotic":
+            raise
+        return "practical", str(error).split(". ")[0].rstrip(".")
+    return "asymptotic", None
+
+
+def _rest(loop: ClosedLoop, options: RoaOptions) -> tuple[Rest | None, ClosedLoop]:
+    """Where the loop rests, if that is worth saying, and the loop as seen from where V is to be 0.
+
+    Raises
+    ------
+    OptionError : V is to be 0 where the loop rests, and no stable point of rest is found.
+    """
+    if loop.network.is_moved:
+        return None, loop
+    if options.claim != "practical" or loop.system.time == "discrete" or loop.network.centre != "none":
+        if options.around == "rest" and options.claim == "practical":
+            raise OptionError("`around` rest needs a policy without centring and a plant in continuous time.")
+        return None, loop
+    rest = find_rest(loop)
+    given = options.P is not None or options.level is not None or options.lyapunov is not None
+    if options.around == "rest" and (rest is None or not rest.stable):
+        found = "none was found" if rest is None else f"the one at {', '.join(rest.x)} is not"
+        raise OptionError(f"`around` rest needs a stable point of rest; {found}.")
+    if rest is None or not rest.stable or options.around == "origin" or (options.around == "auto" and given):
+        return rest, loop
+    moved = seen_from(loop, rest)
+    return rest, moved if moved.network.is_moved else loop
+
+
+def _by_spectrum(state: State, rest: Rest | None) -> State:
+    """At its end, where an eigenvalue decides; with `rest` otherwise."""
+    options = state.options
+    if state.kind == "asymptotic":
+        unstable = by_spectrum(state.loop)
+        if unstable is not None:
+            verdict, stop, shown = unstable
+            detail = f"eigenvalues {', '.join(shown)}" + (" touch the axis" if stop is Stop.SPECTRUM else "")
+            return state.finished(replace(state.result, verdict=verdict, stop=stop, detail=detail, eigenvalues=shown))
+    state = state.with_result(rest=rest)
+    if state.kind == "practical" and options.P is None and not options.resume and (shown := not_stable(state.loop)):
+        detail = f"eigenvalues {', '.join(shown)} where V is to be 0"
+        return state.finished(replace(state.result, stop=Stop.UNSTABLE, detail=detail, eigenvalues=shown))
+    return state

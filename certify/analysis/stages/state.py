@@ -1,0 +1,152 @@
+"""The state of a run, which each stage extends, and the tools that all stages share."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, Literal, Protocol
+
+from certify.analysis.acceptance import Accepted
+from certify.analysis.options import RoaOptions
+from certify.analysis.results import RoaResult
+from certify.analysis.saved_search import Keeper
+from certify.analysis.selection import Race
+from certify.certificates import PartitionTree, TrustedSolver
+from certify.certificates.claims import Claim
+from certify.certificates.claims.claim import Kind
+from certify.effort import Effort
+from certify.loop.closed_loop import ClosedLoop
+from certify.provers.base import Progress, Proof
+from certify.provers.execution import Runner
+from certify.provers.outer import OuterProof
+
+StageName = Literal["candidate", "ring", "tube", "learn", "outer", "check"]
+Report = Callable[[StageName, Progress | None], None]
+
+
+@dataclass(frozen=True)
+class State:
+    """All that a run has found so far.
+
+    Parameters
+    ----------
+    loop : the closed loop, as seen from where V is 0.
+    options : of the run, with the claim that is aimed at.
+    result : as far as it is known.
+    converging : convergence to one nearby equilibrium is to be shown as well.
+    centre : the state that a tube has to start around, in deviations; None if none was named.
+    notes : remarks for a person, in order; none is ever taken away.
+    race, proof : the candidates, and what the prover says of the best.
+    claim, evidence : what is to be certified.
+    beyond : the set of another function around the ellipsoid.
+    missed : why no tube holds `centre`.
+    accepted : the certificate that the checker accepts.
+    done : the result is final.
+    """
+
+    loop: ClosedLoop
+    options: RoaOptions
+    result: RoaResult
+    converging: bool = False
+    centre: tuple[Fraction, ...] | None = None
+    notes: tuple[str, ...] = ()
+    race: Race | None = None
+    proof: Proof | None = None
+    claim: Claim | None = None
+    evidence: PartitionTree | TrustedSolver | None = None
+    beyond: OuterProof | None = None
+    missed: str = ""
+    accepted: Accepted | None = None
+    done: bool = False
+
+    @property
+    def kind(self) -> Kind:
+        """The claim that the provers aim at."""
+        return "practical" if self.options.claim == "practical" else "asymptotic"
+
+    @property
+    def interruptible(self) -> bool:
+        """True if attempts can be worked on a little at a time."""
+        return self.kind == "asymptotic" and self.options.engine != "dreal"
+
+    @property
+    def contest(self) -> Race:
+        """The race, once the candidates have entered it."""
+        if self.race is None:
+            raise ValueError("no candidate has entered the race")
+        return self.race
+
+    def noting(self, *notes: str | None) -> State:
+        """With further remarks."""
+        return replace(self, notes=(*self.notes, *(note for note in notes if note is not None)))
+
+    def with_result(self, **changes: Any) -> State:
+        """With changes of the result."""
+        return replace(self, result=replace(self.result, **changes))
+
+    def finished(self, result: RoaResult) -> State:
+        """At its end, with this result."""
+        return replace(self, result=result, done=True)
+
+
+@dataclass
+class Tools:
+    """The hands of a run: where it writes and computes, what it reports, and its stopwatch.
+
+    Parameters
+    ----------
+    whole : operations of the run, of which stages take shares.
+    show : called with the bytes of a certificate that the run ends with if they are accepted, before they are checked.
+    load : seconds spent on reading before.
+    """
+
+    out: Path
+    runner: Runner
+    effort: Effort
+    keeper: Keeper
+    provenance: Mapping[str, Any]
+    progress: Report | None = None
+    show: Callable[[bytes], None] = lambda _: None
+    load: float = 0.0
+    seconds: dict[str, float] = field(default_factory=dict)
+    remarks: list[str] = field(default_factory=list)  # on where and how it was checked
+    whole: float = field(init=False)
+    start: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.whole, self.start = self.effort.left, time.perf_counter()
+
+    @contextmanager
+    def timing(self, stage: str) -> Iterator[None]:
+        """Add the seconds of the block to those of a stage."""
+        begin = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - begin
+
+    def timings(self) -> dict[str, float]:
+        """Seconds of all stages, and in all."""
+        return {"load": self.load, **self.seconds, "total": self.load + time.perf_counter() - self.start}
+
+    def tell(self, stage: StageName) -> None:
+        """Report that a stage begins."""
+        if self.progress is not None:
+            self.progress(stage, None)
+
+    def report(self, state: Progress, stage: StageName = "ring") -> None:
+        """Report where a stage stands, and in how many seconds the run ends at the latest, at the pace so far."""
+        if self.progress is not None:
+            left = self.effort.left if state.left is None else min(state.left, self.effort.left)
+            self.progress(stage, replace(state, left=left, seconds_left=self.effort.seconds_for(left)))
+
+
+class Stage(Protocol):
+    """A step of the pipeline."""
+
+    def extend(self, state: State, effort: Effort) -> State:
+        """The state with what this stage finds, within the effort."""
