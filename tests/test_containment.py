@@ -55,7 +55,8 @@ def still(n: int, x_eq: tuple[int, ...] = ()) -> System:
 
 def union(*matrices: Any, level: float = 1.0) -> ProvedSet:
     ellipsoids = tuple(Ellipsoid(f"E{k}", np.array(P, dtype=float), level) for k, P in enumerate(matrices))
-    return ProvedSet(still(len(ellipsoids[0].P)), "asymptotic", ellipsoids, "0" * 64, "0" * 64)
+    system, unknown = still(len(ellipsoids[0].P)), "0" * 64
+    return ProvedSet(ellipsoids, system=system, claim="asymptotic", policy_sha256=unknown, certificate_sha256=unknown)
 
 
 def at(*values: Fraction | int) -> Box:
@@ -117,7 +118,7 @@ def test_an_ellipsoid_may_lie_around_another_point(n: int) -> None:
     """The unit ball around (2, 0, ...): what is contained of a box is what is left of it as seen from there."""
     centre = (2.0, *[0.0] * (n - 1))
     plain = union(np.eye(n))
-    moved = ProvedSet(plain.system, "reached", (Ellipsoid("E0", np.eye(n), 1.0, centre),), "0" * 64, "0" * 64)
+    moved = replace(plain, claim="reached", ellipsoids=(Ellipsoid("E0", np.eye(n), 1.0, centre),))
     side = F(1, 5)
     around = ((F(2) - side, F(2) + side), *[(-side, side)] * (n - 1))
     assert moved.locate(around).answer is Containment.CONTAINED

@@ -16,12 +16,13 @@ from pathlib import Path
 from typing import Any
 
 from certify.certificates import Certificate, PartitionTree, TrustedSolver, write_beside
-from certify.certificates.claims import Asymptotic, Enlarged, Nearby, Practical, Problem, Reached
+from certify.certificates.claims import Claim, Problem
 from certify.errors import BackendError, InputError, SoundnessError
 from certify.provers.ball.contraction import contraction
 from certify.provers.boxes.mend import below_leaf, split_again
 
 _SPLITS, _LOWERINGS = 3, 9  # of what the checker refuses
+_BELOW_LEAVES, _LEVELS = 2, 5  # weaker certificates: below a refused leaf so long, and with a lower level at all
 _HIGHER = 1.5  # the next floor, after one that is refused
 
 
@@ -138,12 +139,13 @@ def _what_is_lower(first: Certificate, certificate: Certificate) -> str:
     said = []
     if first.claim.outer is not None and certificate.claim.outer is None:
         said.append("the set beyond the ellipsoid is left out")
-    if first.kind != certificate.kind:
-        what = "that trajectories converge to one equilibrium" if isinstance(first.claim, Nearby) else "it"
-        said.append(f"{what} is left out" + ("" if isinstance(first.claim, Nearby) else " with its tube"))
-    floors = [c.claim.floor for c in (certificate, first) if isinstance(c.claim, Practical)]
-    if len(floors) == 2 and floors[0] > floors[1]:
-        said.append(f"the floor is {floors[0]:.6g} in the place of {floors[1]:.6g}")
+    if first.claim.one_equilibrium and not certificate.claim.one_equilibrium:
+        said.append("that trajectories converge to one equilibrium is left out")
+    if first.claim.start is not None and certificate.claim.start is None:
+        said.append("it is left out with its tube")
+    floor, lower = certificate.claim.floor, first.claim.floor
+    if floor is not None and lower is not None and floor > lower:
+        said.append(f"the floor is {floor:.6g} in the place of {lower:.6g}")
     if certificate.roa < first.roa:
         said.append(f"the level is {certificate.roa:.6g} in the place of {first.roa:.6g}")
     return ", ".join(said)
@@ -177,45 +179,86 @@ def _finer(certificate: Certificate, problem: Problem, answer: Mapping[str, Any]
     return replace(evidence, outer=outer.split_face_again(problem, evidence.outer, claim, int(found[1]), int(found[2])))
 
 
+@dataclass(frozen=True, slots=True)
+class _Refused:
+    """A certificate that the checker refuses under a `rule`, at a `leaf` of the ring (None: elsewhere), after `tries`
+    weaker ones."""
+
+    certificate: Certificate
+    evidence: PartitionTree
+    problem: Problem
+    rule: str
+    leaf: int | None
+    tries: int
+
+    @property
+    def claim(self) -> Claim:
+        return self.certificate.claim
+
+    def with_claim(self, claim: Claim | None, **evidence: Any) -> Certificate | None:
+        """The certificate with a weaker claim and less evidence; None without such a claim."""
+        if claim is None:
+            return None
+        return replace(self.certificate, claim=claim, evidence=replace(self.evidence, **evidence))
+
+
+def _without_outer(refused: _Refused) -> Certificate | None:
+    return refused.with_claim(refused.claim.without_outer(), outer=None)
+
+
+def _with_higher_floor(refused: _Refused) -> Certificate | None:
+    """Not for a leaf of the ring, and to one equilibrium only where trajectories still come closer."""
+    claim = refused.claim
+    higher = None if claim.floor is None or refused.leaf is not None else claim.with_floor(_HIGHER * claim.floor)
+    if higher is None or higher.floor is None or not claim.one_equilibrium:
+        return refused.with_claim(higher)
+    if refused.rule != "local":
+        return None
+    closer = contraction(refused.problem, refused.evidence.T, higher.floor)
+    return None if closer is None else refused.with_claim(higher, contraction=closer)
+
+
+def _without_tube(refused: _Refused) -> Certificate | None:
+    """Without its tube, what is refused may not be asked any more."""
+    return refused.with_claim(refused.claim.without_tube(), tube=())
+
+
+def _with_lower_level(refused: _Refused) -> Certificate | None:
+    """Below the refused leaf at first, then halfway to the inner level."""
+    claim = refused.claim
+    if refused.leaf is None or refused.tries >= _LEVELS:
+        return None
+    if refused.tries < _BELOW_LEAVES:
+        return refused.with_claim(claim.lowered(below_leaf(refused.problem, refused.evidence, refused.leaf)))
+    return refused.with_claim(claim.lowered(math.sqrt(claim.inner * claim.roa)))
+
+
+def _without_equilibrium(refused: _Refused) -> Certificate | None:
+    return refused.with_claim(refused.claim.without_equilibrium(), contraction=None)
+
+
+def _local_only(refused: _Refused) -> Certificate | None:
+    """At the inner level, and then at one that is lower itself."""
+    claim = refused.claim
+    return refused.with_claim(claim.local_only(claim.local / (2 if claim.inner == claim.roa else 1)))
+
+
+_CONCESSIONS = (
+    _without_outer,
+    _with_higher_floor,
+    _without_tube,
+    _with_lower_level,
+    _without_equilibrium,
+    _local_only,
+)
+"""What can be given up for the rest to be accepted, in this order."""
+
+
 def _lowered(certificate: Certificate, answer: Mapping[str, Any], problem: Problem, tries: int) -> Certificate | None:
-    """The certificate with a lower level: below the refused leaf at first, then halfway to the inner level, then at it,
-    and then an inner level that is lower itself; None if there is nothing to lower."""
-    claim, evidence, leaf = certificate.claim, certificate.evidence, _leaf_of(answer)
+    """The certificate with the first concession that can be made to the checker's answer; None if there is none."""
+    evidence, claim = certificate.evidence, certificate.claim
     if not isinstance(evidence, PartitionTree):
         return None
-    if claim.outer is not None:
-        return replace(certificate, claim=replace(claim, outer=None), evidence=replace(evidence, outer=None))
-    if isinstance(claim, Nearby) and leaf is None:
-        floor = _HIGHER * claim.floor
-        closer = (
-            contraction(problem, evidence.T, floor) if answer.get("rule") == "local" and floor < claim.local else None
-        )
-        if closer is None:
-            return _without_equilibrium(certificate, claim, evidence)
-        return replace(certificate, claim=replace(claim, floor=floor), evidence=replace(evidence, contraction=closer))
-    if isinstance(claim, Enlarged | Reached):  # without its tube, what is refused may not be asked any more
-        return replace(certificate, claim=Asymptotic(claim.roa, claim.local), evidence=replace(evidence, tube=()))
-    if leaf is None or claim.inner == claim.roa:
-        if isinstance(claim, Practical):
-            floor = _HIGHER * claim.floor
-            return replace(certificate, claim=replace(claim, floor=floor)) if floor < claim.local else None
-        if not isinstance(claim, Asymptotic):
-            return None
-        return _local_only(certificate, claim.local / (2 if claim.inner == claim.roa else 1))
-
-    level = below_leaf(problem, evidence, leaf) if tries < 2 else math.sqrt(claim.inner * claim.roa)
-    if claim.inner < level < claim.roa and tries < 5:
-        return replace(certificate, claim=replace(claim, roa=level))
-    if isinstance(claim, Nearby):
-        return _without_equilibrium(certificate, claim, evidence)
-    return _local_only(certificate, claim.local) if isinstance(claim, Asymptotic) else None
-
-
-def _without_equilibrium(certificate: Certificate, claim: Nearby, evidence: PartitionTree) -> Certificate:
-    weaker = Practical(claim.roa, claim.local, claim.floor, rate=claim.rate)
-    return replace(certificate, claim=weaker, evidence=replace(evidence, contraction=None))
-
-
-def _local_only(certificate: Certificate, level: float) -> Certificate:
-    """A claim of the local set alone, of which no leaf is asked."""
-    return replace(certificate, claim=Asymptotic(roa=level, local=level, rate=certificate.claim.rate))
+    leaf = _leaf_of(answer) if claim.inner < claim.roa else None
+    refused = _Refused(certificate, evidence, problem, str(answer.get("rule")), leaf, tries)
+    return next((weaker for concede in _CONCESSIONS if (weaker := concede(refused)) is not None), None)

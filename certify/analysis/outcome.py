@@ -15,7 +15,7 @@ import numpy as np
 from certify.analysis.candidates.trials import Trial
 from certify.analysis.results import Levels, RoaResult, Tried
 from certify.analysis.selection import Contender
-from certify.certificates.claims import Asymptotic, Claim
+from certify.certificates.claims import Claim
 from certify.certificates.verdict import Stop, Verdict
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.rigorous import eigenvalues, in_digits, instability
@@ -95,7 +95,7 @@ def with_levels(result: RoaResult, levels: Mapping[str, float], witness: Witness
 
 def short_of_target(result: RoaResult, task: Task, claim: Claim) -> RoaResult:
     """UNKNOWN, because only a lower level than the one asked for is proved."""
-    if isinstance(claim, Asymptotic):
+    if claim.at_rest:
         result = replace(result, levels=replace(result.levels, local=claim.local))
     missed = f"proved only up to V <= {claim.roa:.12g}, not {task.target:g}"
     return replace(result, detail=f"{result.detail}; {missed}" if result.detail else missed)

@@ -20,12 +20,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from certify.certificates import parse_certificate, write_atomically
 from certify.certificates.claims import Problem
+from certify.certificates.membership import Region, sublevel_set, tube_start
 from certify.certificates.verdict import Stop, Verdict
 from certify.errors import InputError
 from certify.loop.equilibrium import Rest
 from certify.loop.plants import System
 from certify.loop.policies import TanhNetwork
-from certify.lyapunov import are_inside, extents, semi_axes, volume
+from certify.lyapunov import extents, semi_axes, volume
 from certify.lyapunov.neural import Neural
 from certify.lyapunov.sublevel import Sublevel
 from certify.lyapunov.symbolic import Symbolic
@@ -108,7 +109,7 @@ class TubeFacts:
 
     def contains(self, states: Sequence[Sequence[Fraction | float]]) -> list[bool]:
         """Whether states, as deviations from the operating point, lie in the start, decided in rationals."""
-        return are_inside(self.start, 1.0, states, self.centre or ())
+        return tube_start(self.start, self.centre).holds(states)
 
     def to_dict(self) -> dict[str, Any]:
         """For JSON, with the size of the start along the states."""
@@ -289,12 +290,20 @@ class RoaResult:
     def ellipsoid(self) -> tuple[Array, float] | None:
         """(P, level) of the larger ellipsoid {x'Px <= level} of those that are proved around the operating point:
         {V <= c2}, a tube's start."""
+        if self._region is None:
+            return None
+        largest = self._region.largest
+        return largest.P, largest.level
+
+    @property
+    def _region(self) -> Region | None:
+        """What the levels, the tube and the outer set say together; None if there is no level c2."""
         if self.P is None or self.levels.roa is None:
             return None
-        inner = self.P, self.levels.roa
-        if self.tube is None or self.tube.centre is not None or volume(self.tube.start, 1.0) < volume(*inner):
-            return inner
-        return self.tube.start, 1.0
+        tube, outer = self.tube, self.outer
+        starts = () if tube is None else (tube_start(tube.start, tube.centre),)
+        beyond = None if outer is None else Sublevel(outer.function, outer.level, tuple(self.system.domain))
+        return Region((sublevel_set(self.P, self.levels.roa), *starts), beyond)
 
     def contains(self, x: ArrayLike, *, deviations: bool = False) -> bool | NDArray[np.bool_]:
         """Whether states lie in the proved set, decided in rationals: no state is let in by rounding.
@@ -319,7 +328,8 @@ class RoaResult:
         InputError : nothing was proved (a solver's word, TRUSTED, is no proof), x has another shape, or an entry is no
             finite number.
         """
-        if self.verdict is not Verdict.PROVED or self.problem is None or self.levels.roa is None:
+        region = self._region
+        if self.verdict is not Verdict.PROVED or region is None:
             raise InputError(
                 f"there must be a proved set to ask for; the verdict is {self.verdict.value} ({self.reason})."
             )
@@ -331,13 +341,7 @@ class RoaResult:
         rows = states.reshape(-1, n).tolist()
         if any(shifts):
             rows = [[Fraction(v) - q for v, q in zip(row, shifts, strict=True)] for row in rows]
-        found = are_inside(self.problem.V.P, self.levels.roa, rows)
-        if self.tube is not None:
-            found = [a or b for a, b in zip(found, self.tube.contains(rows), strict=True)]
-        if self.outer is not None:
-            beyond = Sublevel(self.outer.function, self.outer.level, tuple(self.system.domain))
-            others = iter(beyond.holds(row for row, known in zip(rows, found, strict=True) if not known))
-            found = [known or next(others) for known in found]
+        found = region.holds(rows)
         return found[0] if states.ndim == 1 else np.array(found, dtype=np.bool_)
 
     def report(self, path: str | PathLike[str] | None = None) -> Path:

@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from certify.certificates.claims import Claim, Enlarged, Reached
+from certify.certificates.claims import Claim
 from certify.certificates.model import Certificate, PartitionTree, parse_certificate
 from certify.certificates.tree import LEAF
 from certify.errors import BackendError
@@ -78,10 +78,8 @@ def _stated(certificate: Certificate, raw: bytes) -> dict[str, Any]:
 
 def _started(claim: Claim) -> dict[str, Any]:
     """The set from which a tube leads, as an answer has it."""
-    if not isinstance(claim, Enlarged | Reached):
-        return {"start": None, "centre": None}
-    centre = list(claim.centre) if isinstance(claim, Reached) else None
-    return {"start": claim.start.P.tolist(), "centre": centre}
+    centre = None if claim.centre is None else list(claim.centre)
+    return {"start": None if claim.start is None else claim.start.P.tolist(), "centre": centre}
 
 
 def _joined(stated: dict[str, Any], parts: list[dict[str, Any]]) -> dict[str, Any]:

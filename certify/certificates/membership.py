@@ -22,12 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.certificates import Certificate, parse_certificate, read_raw, run_checker
-from certify.certificates.claims import CLAIMS, Enlarged, Reached
 from certify.certificates.formats import version_in
 from certify.certificates.verdict import Answer
 from certify.errors import InputError
 from certify.loop.plants import System
-from certify.lyapunov import are_inside
+from certify.lyapunov import are_inside, volume
 from certify.lyapunov.sublevel import Sublevel
 
 Array = NDArray[np.float64]
@@ -90,42 +89,16 @@ NOTHING_PROVED = Located(Containment.UNDECIDED)
 
 
 @dataclass(frozen=True, slots=True)
-class ProvedSet:
-    """The union of the sets that an accepted certificate proves something about, in deviations from x_eq.
+class Region:
+    """The union of `ellipsoids` and, where a claim has one, of an `outer` set, in deviations from x_eq."""
 
-    Parameters
-    ----------
-    system : the plant of the certificate. Its x_eq is what the file says for people; no rule depends on it.
-    claim : the claim's kind.
-    ellipsoids, outer : which together are the set; `outer` is None where the claim has no outer set.
-    policy_sha256, certificate_sha256 : of the policy that it is about, and of the file.
-    origin : where x = 0 lies among the states that the policy's layers read, (n,); empty for 0. The plant is in
-        deviations from there, and so are the states that are asked about.
-    """
-
-    system: System
-    claim: str
     ellipsoids: tuple[Ellipsoid, ...]
-    policy_sha256: str
-    certificate_sha256: str
     outer: Sublevel | None = None
-    origin: tuple[float, ...] = ()
 
-    def seen_from_there(self, system: System) -> System:
-        """A plant whose states the policy's layers read, in deviations from where x = 0 lies for this set.
-
-        Raises
-        ------
-        InputError : that does not lie in the interior of the plant's domain.
-        """
-        if not any(self.origin):
-            return system
-        return system.seen_from([Fraction(v) for v in self.origin], self.system.exact_u_eq())
-
-    def deviations(self, states: Iterable[Sequence[Fraction | float]]) -> list[list[Fraction]]:
-        """States that the policy's layers read, as deviations from where x = 0 lies for this set."""
-        at = [Fraction(v) for v in self.origin] or [Fraction(0)] * self.system.n
-        return [[Fraction(v) - q for v, q in zip(x, at, strict=True)] for x in states]
+    @property
+    def largest(self) -> Ellipsoid:
+        """The largest one of the ellipsoids around x_eq."""
+        return max((e for e in self.ellipsoids if not e.centre), key=lambda e: volume(e.P, e.level))
 
     def holds(self, states: Iterable[Sequence[Fraction | float]]) -> list[bool]:
         """Whether each of the states, as deviations from x_eq, lies in the set; a float means its binary value.
@@ -159,8 +132,9 @@ class ProvedSet:
         ------
         InputError : the box has another number of states, or an interval has lo > hi.
         """
-        if len(box) != self.system.n or not all(lo <= hi for lo, hi in box):
-            raise InputError(f"a box must have {self.system.n} intervals lo <= hi; found {_shown(box)}.")
+        n = len(self.ellipsoids[0].P)
+        if len(box) != n or not all(lo <= hi for lo, hi in box):
+            raise InputError(f"a box must have {n} intervals lo <= hi; found {_shown(box)}.")
         wide = [i for i, (lo, hi) in enumerate(box) if lo < hi]
         if len(wide) > _CORNERS:
             corners = [_steepest(e, box) for e in self.ellipsoids]
@@ -200,6 +174,42 @@ class ProvedSet:
         return Located(Containment.UNDECIDED)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ProvedSet(Region):
+    """The union of the sets that an accepted certificate proves something about, in deviations from x_eq.
+
+    Parameters
+    ----------
+    system : the plant of the certificate. Its x_eq is what the file says for people; no rule depends on it.
+    claim : the claim's kind.
+    policy_sha256, certificate_sha256 : of the policy that it is about, and of the file.
+    origin : where x = 0 lies among the states that the policy's layers read, (n,); empty for 0. The plant is in
+        deviations from there, and so are the states that are asked about.
+    """
+
+    system: System
+    claim: str
+    policy_sha256: str
+    certificate_sha256: str
+    origin: tuple[float, ...] = ()
+
+    def seen_from_there(self, system: System) -> System:
+        """A plant whose states the policy's layers read, in deviations from where x = 0 lies for this set.
+
+        Raises
+        ------
+        InputError : that does not lie in the interior of the plant's domain.
+        """
+        if not any(self.origin):
+            return system
+        return system.seen_from([Fraction(v) for v in self.origin], self.system.exact_u_eq())
+
+    def deviations(self, states: Iterable[Sequence[Fraction | float]]) -> list[list[Fraction]]:
+        """States that the policy's layers read, as deviations from where x = 0 lies for this set."""
+        at = [Fraction(v) for v in self.origin] or [Fraction(0)] * self.system.n
+        return [[Fraction(v) - q for v, q in zip(x, at, strict=True)] for x in states]
+
+
 def proved_set(path: Path, patient: bool = False) -> ProvedSet:
     """The set of a certificate, which is checked first, as `certify check` does it: the very bytes that are read;
     `patient` takes one whose check may need hours.
@@ -229,34 +239,39 @@ def set_of(raw: bytes, name: str) -> ProvedSet:
 
     Raises
     ------
-    InputError : the claim is of a kind whose set is not known here.
     CertificateFormatError : the bytes are no certificate.
     """
     read = parse_certificate(raw, name)
+    region = region_of(read)
     return ProvedSet(
+        region.ellipsoids,
+        region.outer,
         system=read.system,
         claim=read.kind,
-        ellipsoids=_ellipsoids(read),
         policy_sha256=read.network.sha256(),
         certificate_sha256=hashlib.sha256(raw).hexdigest(),
-        outer=_outer(read),
         origin=tuple(read.network.origin.tolist()) if read.network.is_moved else (),
     )
 
 
-def _ellipsoids(read: Certificate) -> tuple[Ellipsoid, ...]:
-    if type(read.claim) not in CLAIMS.values():
-        raise InputError(f"the claim must be one of {', '.join(CLAIMS)}; found {read.kind!r}.")
-    found = (Ellipsoid("{V <= c2}", read.P, read.roa),)
-    if not isinstance(read.claim, Enlarged | Reached):
-        return found
-    centre = read.claim.centre if isinstance(read.claim, Reached) else ()
-    return (*found, Ellipsoid("the tube's start", read.claim.start.P, 1.0, centre))
+def sublevel_set(P: Array, roa: float) -> Ellipsoid:
+    """{V <= c2}, V = x'Px."""
+    return Ellipsoid("{V <= c2}", P, roa)
 
 
-def _outer(read: Certificate) -> Sublevel | None:
-    outer = read.claim.outer
-    return None if outer is None else Sublevel(outer.function, outer.level, tuple(read.system.domain))
+def tube_start(P: Array, centre: tuple[float, ...] | None = None) -> Ellipsoid:
+    """The set from which a tube leads to {V <= c2}."""
+    return Ellipsoid("the tube's start", P, 1.0, centre or ())
+
+
+def region_of(read: Certificate) -> Region:
+    """The region that a certificate is about; whether it is proved is for the checker to say."""
+    claim = read.claim
+    starts = () if claim.start is None else (tube_start(claim.start.P, claim.centre),)
+    outer = (
+        None if claim.outer is None else Sublevel(claim.outer.function, claim.outer.level, tuple(read.system.domain))
+    )
+    return Region((sublevel_set(read.P, claim.roa), *starts), outer)
 
 
 def _symmetric(P: Array) -> list[list[Fraction]]:

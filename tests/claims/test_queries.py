@@ -9,8 +9,8 @@ import flint
 import numpy as np
 import pytest
 
+from certify.certificates.claims import Asymptotic
 from certify.certificates.claims.conditions import (
-    Asymptotic,
     conditions,
     domain_conditions,
     input_conditions,

@@ -52,8 +52,13 @@ def _constants(policy, own, proved=None):
 
 
 def _proved_set(policy, system, P):
+    ellipsoids = (Ellipsoid("{V <= c2}", np.array(P), 1.0),)
     return ProvedSet(
-        system, "asymptotic", (Ellipsoid("{V <= c2}", np.array(P), 1.0),), policy.network.sha256(), "0" * 64
+        ellipsoids,
+        system=system,
+        claim="asymptotic",
+        policy_sha256=policy.network.sha256(),
+        certificate_sha256="0" * 64,
     )
 
 

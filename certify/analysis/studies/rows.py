@@ -35,7 +35,8 @@ from certify.certificates import (
     write_atomically,
     write_beside,
 )
-from certify.certificates.claims import Enlarged, Problem
+from certify.certificates.claims import Problem
+from certify.certificates.membership import region_of
 from certify.certificates.verdict import Verdict
 from certify.errors import BackendError, CertificateFormatError, CertifyError, InputError, SoundnessError
 from certify.loop.closed_loop import ClosedLoop
@@ -400,10 +401,8 @@ def _require_asked(certificate: Certificate, options: RoaOptions) -> None:
 
 def _ellipsoid(certificate: Certificate) -> tuple[Array, float]:
     """The larger one of those around the operating point, as `RoaResult.ellipsoid` has it."""
-    inner, claim = (certificate.P, certificate.roa), certificate.claim
-    if not isinstance(claim, Enlarged) or volume(claim.start.P, 1.0) < volume(*inner):
-        return inner
-    return claim.start.P, 1.0
+    largest = region_of(certificate).largest
+    return largest.P, largest.level
 
 
 def _optional(value: Any) -> float | None:

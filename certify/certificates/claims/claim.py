@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import ClassVar, Literal
 
 from certify.errors import InputError
@@ -69,14 +69,32 @@ class Claim:
     `local` is c1, the level from which the ring reaches outwards to c2: below it what is shown is shown on a ball.
     `rate` is lambda: V falls at least as exp(-2 lambda t) where it is claimed to fall. `outer` is a set from which
     trajectories enter {V <= c2}.
+
+    A method that gives another claim gives None where this one has no such form.
     """
 
-    kind: ClassVar[Kind | Literal["nearby", "enlarged", "reached"]]
+    kind: ClassVar[str]
     at_rest: ClassVar[bool]  # the origin must be an equilibrium, exactly
+    one_equilibrium: ClassVar[bool] = False  # trajectories converge to an equilibrium that is near the origin
     roa: float
     local: float
     rate: float = field(default=0.0, kw_only=True)
     outer: Outer | None = field(default=None, kw_only=True)
+
+    @property
+    def floor(self) -> float | None:
+        """The level c0 of the ultimate bound; None where trajectories converge to the origin."""
+        return None
+
+    @property
+    def start(self) -> Quadratic | None:
+        """W of the set {W(x - c) <= 1} from which a tube leads into {V <= c2}; None without a tube."""
+        return None
+
+    @property
+    def centre(self) -> tuple[float, ...] | None:
+        """The state c around which a tube starts; None without a tube, and where that is the origin."""
+        return None
 
     @property
     def inner(self) -> float:
@@ -86,15 +104,58 @@ class Claim:
     @property
     def levels(self) -> Mapping[str, float]:
         """The section `levels` of the certificate, in its order."""
-        return {"local": self.local, "roa": self.roa}
+        floor = {} if self.floor is None else {"floor": self.floor}
+        return {**floor, "local": self.local, "roa": self.roa}
+
+    def lowered(self, level: float) -> Claim | None:
+        """The same about {V <= level}, a smaller set that the ring still reaches."""
+        return replace(self, roa=level) if self.inner < level < self.roa else None
+
+    def without_outer(self) -> Claim | None:
+        """The same without the set beyond the ellipsoid."""
+        return None if self.outer is None else replace(self, outer=None)
+
+    def local_only(self, level: float) -> Claim | None:
+        """Asymptotic stability on {V <= level} alone, of which the ring is not asked."""
+        return None
+
+    def with_tube(self, start: Quadratic, centre: tuple[float, ...] | None = None) -> Claim | None:
+        """The same, and every trajectory from {W(x - c) <= 1}, W = `start`, c = `centre`, reaches {V <= c2}."""
+        return None
+
+    def without_tube(self) -> Claim | None:
+        """The same without the set from which a tube leads."""
+        return None
+
+    def with_floor(self, floor: float) -> Claim | None:
+        """The same with a higher ultimate bound, which is still below c1."""
+        return None
+
+    def converging(self) -> Claim | None:
+        """The same, and trajectories converge to one equilibrium."""
+        return None
+
+    def without_equilibrium(self) -> Claim | None:
+        """The same without the equilibrium to which trajectories converge."""
+        return None
 
 
 @dataclass(frozen=True, slots=True)
 class Asymptotic(Claim):
     """Every trajectory from {V <= c2} stays in it and converges to the origin, which is asymptotically stable."""
 
-    kind: ClassVar[Kind | Literal["nearby", "enlarged", "reached"]] = "asymptotic"
+    kind = "asymptotic"
     at_rest = True
+
+    def local_only(self, level: float) -> Claim | None:
+        """Asymptotic stability on {V <= level} alone, of which the ring is not asked."""
+        return Asymptotic(level, level, rate=self.rate)
+
+    def with_tube(self, start: Quadratic, centre: tuple[float, ...] | None = None) -> Claim | None:
+        """The same, and every trajectory from {W(x - c) <= 1}, W = `start`, c = `centre`, reaches {V <= c2}."""
+        if centre is None:
+            return Enlarged(self.roa, self.local, start, rate=self.rate, outer=self.outer)
+        return Reached(self.roa, self.local, start, centre, rate=self.rate, outer=self.outer)
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,18 +163,21 @@ class Enlarged(Asymptotic):
     """The same, and every trajectory from {W <= 1}, W = `start`, reaches {V <= c2} and converges to the origin."""
 
     kind = "enlarged"
-    start: Quadratic
+    start: Quadratic = field()
+
+    def without_tube(self) -> Claim | None:
+        """The same without the set from which a tube leads."""
+        return Asymptotic(self.roa, self.local, rate=self.rate, outer=self.outer)
 
 
 @dataclass(frozen=True, slots=True)
-class Reached(Asymptotic):
+class Reached(Enlarged):
     """The same, and every trajectory from {W(x - c) <= 1}, W = `start`, c = `centre`, reaches {V <= c2} and converges
     to the origin.
     """
 
     kind = "reached"
-    start: Quadratic
-    centre: tuple[float, ...]
+    centre: tuple[float, ...] = field()
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,14 +188,17 @@ class Practical(Claim):
     {V <= c0}; the origin need not be an equilibrium.
     """
 
-    kind: ClassVar[Kind | Literal["nearby", "enlarged", "reached"]] = "practical"
+    kind = "practical"
     at_rest = False
-    floor: float
+    floor: float = field()
 
-    @property
-    def levels(self) -> Mapping[str, float]:
-        """The section `levels` of the certificate, in its order."""
-        return {"floor": self.floor, "local": self.local, "roa": self.roa}
+    def with_floor(self, floor: float) -> Claim | None:
+        """The same with a higher ultimate bound, which is still below c1."""
+        return replace(self, floor=floor) if self.floor < floor < self.local else None
+
+    def converging(self) -> Claim | None:
+        """The same, and trajectories converge to one equilibrium."""
+        return Nearby(self.roa, self.local, self.floor, rate=self.rate, outer=self.outer)
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,8 +206,11 @@ class Nearby(Practical):
     """The same, and where what is uncertain is constant, one equilibrium in {V <= c0}, to which all converge."""
 
     kind = "nearby"
+    one_equilibrium = True
+
+    def without_equilibrium(self) -> Claim | None:
+        """The same without the equilibrium to which trajectories converge."""
+        return Practical(self.roa, self.local, self.floor, rate=self.rate, outer=self.outer)
 
 
-CLAIMS: Mapping[str, type[Asymptotic] | type[Practical]] = {
-    c.kind: c for c in (Asymptotic, Practical, Nearby, Enlarged, Reached)
-}
+CLAIMS: Mapping[str, type[Claim]] = {c.kind: c for c in (Asymptotic, Practical, Nearby, Enlarged, Reached)}

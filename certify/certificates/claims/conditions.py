@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from fractions import Fraction
 from typing import Literal
 
-from certify.certificates.claims.claim import Asymptotic, Claim, Problem
+from certify.certificates.claims.claim import Claim, Problem
 from certify.loop.expressions import Expression, Operation, nodes, symbols_of
 from certify.loop.policies import bounded_by_form
 
@@ -88,9 +88,9 @@ def conditions(claim: Claim, problem: Problem) -> tuple[Condition, ...]:
     interior of the box only through a side.
     """
     found = domain_conditions(problem, claim.roa)
-    if isinstance(claim, Asymptotic):
+    if claim.at_rest:
         found += (*clip_conditions(problem, claim.local), local_condition(claim.local))
-    if claim.inner < claim.roa or not isinstance(claim, Asymptotic):
+    if claim.inner < claim.roa or not claim.at_rest:
         found += (ring_condition(claim.inner, claim.roa),)
     return found + root_conditions(problem, claim.roa) + input_conditions(problem, claim.roa)
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.certificates import PartitionTree
-from certify.certificates.claims import Asymptotic, Practical, Problem
+from certify.certificates.claims import Asymptotic, Claim, Practical, Problem
 from certify.certificates.verdict import Stop
 from certify.effort import UNLIMITED, Effort
 from certify.errors import InputError
@@ -126,14 +126,10 @@ class BoundsEngine(Engine):
             inner = math.sqrt(inner * band.top)
         return ring.outer, ring.stop, ring.witness
 
-    def stated(
-        self, problem: Problem, ring: RingProof, claim: Asymptotic | Practical, seconds: dict[str, float]
-    ) -> Proof:
+    def stated(self, problem: Problem, ring: RingProof, claim: Claim, seconds: dict[str, float]) -> Proof:
         """The proof of a claim from a ring's."""
         local, cells = None, (1,) * len(problem.loop.system.ranges)
-        if isinstance(claim, Asymptotic):
-            local, cells = local_ball(problem, self.T, claim.local)
-        elif claim.floor < claim.local:
+        if claim.floor is None or claim.floor < claim.local:
             local, cells = local_ball(problem, self.T, claim.local, claim.floor)
         return Proof(
             claim,
@@ -151,7 +147,7 @@ class BoundsEngine(Engine):
 def _is_better(one: Proof, other: Proof) -> bool:
     """Whether a practical claim is about a larger set, or about nearly the same with a lower floor."""
     a, b = one.claim, other.claim
-    if not (isinstance(a, Practical) and isinstance(b, Practical)):
+    if a is None or a.floor is None or b is None or b.floor is None:
         return a is not None
     if abs(a.roa - b.roa) <= _EQUAL * b.roa:
         return a.floor < b.floor
@@ -161,7 +157,9 @@ def _is_better(one: Proof, other: Proof) -> bool:
 def _is_ample(proof: Proof, target: float) -> bool:
     """Whether a practical claim is about all that is within reach, with a floor that is next to nothing."""
     claim = proof.claim
-    return isinstance(claim, Practical) and claim.roa >= (1 - _EQUAL) * target and claim.floor <= _NOTHING * claim.roa
+    if claim is None or claim.floor is None:
+        return False
+    return claim.roa >= (1 - _EQUAL) * target and claim.floor <= _NOTHING * claim.roa
 
 
 class _Outwards:

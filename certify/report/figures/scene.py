@@ -16,7 +16,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from certify.certificates import Certificate, PartitionTree, Slab, leaves
-from certify.certificates.claims import Enlarged, Practical, Reached
 from certify.errors import CertificateFormatError
 from certify.loop.policies import TanhNetwork
 from certify.lyapunov import extents, is_positive_definite
@@ -60,7 +59,7 @@ def is_ellipsoid(certificate: Certificate) -> bool:
 def inner_of(certificate: Certificate) -> float:
     """The level of the inner set that the claim speaks of: c0 of a practical claim, else c1."""
     claim = certificate.claim
-    return claim.floor if isinstance(claim, Practical) else claim.local
+    return claim.local if claim.floor is None else claim.floor
 
 
 def is_local_enough(certificate: Certificate) -> bool:
@@ -76,7 +75,7 @@ def start_of(certificate: Certificate) -> Array | None:
     None where the claim has none, and where a rejected file has something else in its place.
     """
     claim = certificate.claim
-    if not isinstance(claim, Enlarged | Reached):
+    if claim.start is None:
         return None
     P, c = claim.start.P, centre_of(certificate)
     return P if is_positive_definite(P) and (c is None or bool(np.all(np.isfinite(c)))) else None
@@ -84,7 +83,8 @@ def start_of(certificate: Certificate) -> Array | None:
 
 def centre_of(certificate: Certificate) -> Array | None:
     """The state (n,) that a tube around a path begins around; None where the claim has none."""
-    return np.array(certificate.claim.centre) if isinstance(certificate.claim, Reached) else None
+    centre = certificate.claim.centre
+    return None if centre is None else np.array(centre)
 
 
 def slabs_of(certificate: Certificate) -> tuple[Slab, ...]:
@@ -191,7 +191,7 @@ class Scene:
         self.timing = Timing.of(certificate.system, certificate.claim.rate)
         self.certificate, self.beyond = certificate, certificate.claim.outer
         self.words = words_for(certificate.kind, self.timing, beyond=self.beyond is not None)
-        self.kind = "practical" if isinstance(certificate.claim, Practical) else "asymptotic"
+        self.kind = "asymptotic" if certificate.claim.floor is None else "practical"
         self.word, self.proved = ("certified", "proved") if accepted else ("claimed", "claimed")
         self.system, self.P = certificate.system, certificate.P
         self.inner, self.outer = inner_of(certificate), certificate.roa

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.certificates import Certificate, PartitionTree, TrustedSolver
-from certify.certificates.claims import Enlarged, Outer, Reached
+from certify.certificates.claims import Outer
 from certify.loop.expressions import nodes
 from certify.loop.plants import System
 from certify.lyapunov import Neural, extents
@@ -100,8 +100,8 @@ def claim_of(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict
         "statement": stated_for(varying_in(system), statement, by_steps=timing.discrete),
         "definition": timing.definitions,
         "middle": below(certificate.inner) if practical and certificate.inner != inner_of(certificate) else "",
-        "enlarged": isinstance(certificate.claim, Enlarged | Reached),
-        "centre": isinstance(certificate.claim, Reached),
+        "enlarged": certificate.claim.start is not None,
+        "centre": certificate.claim.centre is not None,
         "beyond": beyond,
         "level": outer,
         "inner": inner,

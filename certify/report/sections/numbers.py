@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.certificates import Certificate, TrustedSolver
-from certify.certificates.claims import Asymptotic, Enlarged, Outer, Reached
+from certify.certificates.claims import Outer
 from certify.errors import CertifyError
 from certify.loop.closed_loop import ClosedLoop
 from certify.lyapunov import Neural, domain_limit, extents, sampled_volume, semi_axes, volume
@@ -76,7 +76,7 @@ def tables_of(
 def matrices_of(certificate: Certificate) -> list[tuple[str, list[list[str]]]]:
     """Names and entries of what the quadratic forms are, as the file has them."""
     named = [("P", certificate.P)]
-    if isinstance(certificate.claim, Enlarged | Reached):
+    if certificate.claim.start is not None:
         named.append(("P₀ of the tube's start", certificate.claim.start.P))
     centre = centre_of(certificate)
     if centre is not None:
@@ -136,7 +136,7 @@ def _geometry(certificate: Certificate) -> Rows:
     system, timing, rows = certificate.system, timing_of(certificate), list[tuple[str, str]]()
     if np.all(np.isfinite(certificate.P)):
         rows.append(("eigenvalues of P", ", ".join(number(float(v)) for v in np.linalg.eigvalsh(certificate.P))))
-    if isinstance(certificate.claim, Asymptotic):  # elsewhere the origin need not be an equilibrium
+    if certificate.claim.at_rest:  # elsewhere the origin need not be an equilibrium
         held = f" with {held_at(system)}" if system.ranges else ""
         rows.append((f"eigenvalues of the closed loop{timing.linearised}{held}", _eigenvalues(certificate)))
     if timing.sample is not None:
