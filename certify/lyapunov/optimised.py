@@ -38,7 +38,7 @@ _SMALL = 0.01  # growth of the log of the volume, or trust radius, at which to s
 _STEP = 1e-4  # relative, of the difference quotient along a ray
 _TOLERANCE = 1e-6  # of the solver
 _SLACK = 1e-4  # by which a state may violate its row: the next search rescales P
-_CALL, _CONE = 2e5, 20.0  # operations of evaluating few states at once; of a solver, for each product of its sizes
+_CALL, _SOLVER, _CONE = 2e5, 8e6, 60.0  # operations of few states at once, of a program, and for each of its products
 _LINEAR, _SCORED = 1.3, 0.5  # shares of alpha: what the linearisation must keep, and what a sample must
 
 
@@ -229,7 +229,7 @@ class _Samples:
         L = np.linalg.cholesky(P)
         n = len(P)
         z = self.generator.standard_normal((_FRESH, n))
-        self.effort.charge(4 * n * n * len(self.x))
+        self.effort.charge(2 * _CALL + 4 * n * n * len(self.x))
         if len(self.x):
             lowest = np.argsort(self.crossings(P, alpha)[0], kind="stable")[:100]
             limiting = _unit(self.x[lowest] @ L)
@@ -301,7 +301,7 @@ def _solve(samples: _Samples, P: Array, A: Array, alpha: float, radius: float) -
         held.append(G / size[:, None, None])
         least.append((np.minimum(1.0, level[rows]) - _SLACK) / size)
     entries = n * (n + 1) / 2
-    samples.effort.charge(_CALL + _CONE * entries**2 * (sum(map(len, held)) + len(matrices) * entries))
+    samples.effort.charge(_SOLVER + _CONE * entries**2 * (sum(map(len, held)) + len(matrices) * entries))
     M = smallest_trace(matrices, np.concatenate(held), np.concatenate(least), _TOLERANCE)
     if M is None:
         return None

@@ -42,7 +42,7 @@ _DIFFERENCE = 1e-3
 _AS_ASKED = 1.05  # a level above which there is little hope, where 1 was asked for
 _TOGETHER = 16  # balls that are looked at in one go
 _FAR = -1.0  # of a margin
-PROGRAM, CONE = 5e7, 30.0  # operations of a program, however small, and for each product of its sizes
+PROGRAM, CONE = 2e7, 30.0  # operations of a program, however small, and for each product of its sizes
 _AT_ONCE = 0.5  # of the effort, for the loop whose input follows at once, where one is held
 _LEFT = 3e-3  # share of the decay that is to be left
 _INSIDE = 0.995  # of the room of an input or a state
@@ -214,7 +214,7 @@ def _linearised(known: Paths, P: Array, effort: Effort) -> _Linearised | None:
             if effort.over:
                 return None
             some = changes[start : start + _TOGETHER]
-            effort.charge(len(some) * rule.operations)
+            effort.charge(len(some) * rule.operations_of_models)
             balls = _balls(J, some)
             for X, ball, found in zip(some, balls, rule.models_on(balls, 1.0), strict=True):
                 corners = _corners(rule, found, ball, P + inverse.T @ X @ inverse)

@@ -72,7 +72,9 @@ class Tube:
             return state.noting("no tube leads into the proved set from a larger one that the effort could reach")
         facts = TubeFacts(found.tube.start, found.shape, len(found.tube.slabs), found.tube.duration)
         state = state.with_result(tube=facts)
-        return replace(state, claim=claim.with_tube(Quadratic(facts.start)), evidence=replace(evidence, tube=found.tube.slabs))
+        return replace(
+            state, claim=claim.with_tube(Quadratic(facts.start)), evidence=replace(evidence, tube=found.tube.slabs)
+        )
 
 
 @dataclass(frozen=True)
@@ -103,7 +105,9 @@ class Route:
         if not facts.contains([centre]):
             return replace(state, missed="the tube is narrower than the rounding of that state")
         state = state.with_result(tube=facts)
-        return replace(state, claim=claim.with_tube(Quadratic(tube.start), at), evidence=replace(evidence, tube=tube.slabs))
+        return replace(
+            state, claim=claim.with_tube(Quadratic(tube.start), at), evidence=replace(evidence, tube=tube.slabs)
+        )
 
 
 def _shapes(state: State, shapes: Mapping[str, Array]) -> Mapping[str, Array]:

@@ -22,7 +22,7 @@ Array = NDArray[np.float64]
 _TRIES = 8  # of a step, with more damping each time
 _MORE, _LESS, _LEAST = 3.0, 0.4, 1e-8  # damping
 _ENOUGH = 1e-5  # relative gain of a step, below which the fit ends
-_CALL, _EACH = 1e6, 40.0  # operations of a step, however small, and for each entry of its rows
+_CALL, _ENTRY, _EACH = 1e6, 0.05, 100.0  # operations of a step, and of a product and an entry of its rows
 _DECAY = 1e-6  # of the parameters: small weights make smooth functions
 
 
@@ -85,7 +85,7 @@ def fit(
     least = cost(p)
     rows, size = len(values.z) + len(slopes.z), len(p)
     for _ in range(steps):
-        effort.charge(_CALL + rows * size * (size + _EACH) + size**3)
+        effort.charge(_CALL + _ENTRY * rows * size * (size + _EACH) + size**3)
         normal, downhill = _normal_equations(model, p, values, slopes)
         diagonal = np.diag(normal)
         floor = 1e-6 * diagonal.max()

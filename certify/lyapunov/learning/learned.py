@@ -45,7 +45,7 @@ _FACES = 300  # for each state
 _KEPT = 3000  # counterexamples
 _NEW = 600  # of them at most in a round
 _SLOPE_WEIGHT, _EDGE_WEIGHT = 3.0, 2.0
-_SEARCHED, _EACH = 3e5, 4.0  # states at which a search evaluates the function; operations for a parameter
+_SEARCHED, _EACH = 3e5, 0.3  # states at which a search evaluates the function; operations for a parameter
 _BESIDE = 0.003  # the lowest violation
 
 

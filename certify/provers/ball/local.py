@@ -28,7 +28,7 @@ _LEAST = 1e-280  # a level, below which binary64 holds nothing more
 _MARGIN = 1e-3  # share of the decay that is left to the checker's rounding
 _ENOUGH = 1.01 * _MARGIN
 _WIDER = 1 + 1e-9  # of the ball, which has to contain {V <= c1} beyond all rounding
-_WEIGHINGS, _WEIGHING = 8, 3e5  # rounds of multipliers on a ball, and operations of one, however small
+_WEIGHINGS, _WEIGHING = 8, 7e5  # rounds of multipliers on a ball, and operations of one, however small
 _ORDER = 4  # of the series in time, where an input is held
 _FAR, _NEAR = 1e-2, 0.3  # from one level to the next lower one, where all below one is good, and where not
 _LOWER = 0.5  # from one level to the next, while floors fall with them
@@ -196,11 +196,15 @@ class Rule:
     @property
     def operations(self) -> float:
         """Operations of a look at one ball, about, as an `Effort` counts them."""
-        n, units, sample = len(self.T), sum(len(b) for b in self.problem.loop.network.biases), self.problem.loop.step
-        times = max(1, len(self.cells)) * (1 if self.steps.is_plain else 3) + (20 if sample else 0)
+        n, units = len(self.T), sum(len(b) for b in self.problem.loop.network.biases)
         corners = max(1, len(self.cells)) * 2 ** len(self.problem.loop.system.ranges)
-        weighing = _WEIGHINGS * (_WEIGHING + 4.0 * units * n**2 + 8.0 * n**5)
-        return float(times * self.steps.known.operations + corners * weighing)
+        return float(self.operations_of_models + corners * _WEIGHINGS * (_WEIGHING + 30.0 * units * n**2 + 15.0 * n**5))
+
+    @property
+    def operations_of_models(self) -> float:
+        """Those of the models alone."""
+        cells = max(1, len(self.cells)) * (1 if self.steps.is_plain else 3) + (20 if self.problem.loop.step else 0)
+        return cells * self.steps.known.operations
 
     def shown(self, level: float, enough: float = math.inf) -> Shown:
         """At rest, on the ball of a level."""

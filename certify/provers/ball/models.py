@@ -27,7 +27,7 @@ from certify.provers.ball.jets import Jet, Jets, basis, beyond_tangent, fourth_o
 from certify.provers.ball.ranged import RangedJet
 
 Array = NDArray[np.float64]
-_CALL, _EACH = 3e5, 1e5  # operations of a layer, and of an operation of the equations, however small
+_CALL, _EACH, _ENTRY = 3e5, 1e5, 0.12  # operations of a layer, of one of the equations, of an entry of a product
 _MOST_NUMBERS, _MOST_PRODUCTS = 2**25, 2**33  # of the sums over paths: the checker refuses more
 _MARGIN = 1e-3  # of an input's range, left to the checker's rounding where a clip begins
 _UNIT = 2.0**-51  # twice what a checker counts for each term of a sum, relative to the sum's size
@@ -191,7 +191,7 @@ class Paths:
         second, numbers = n * (n + 1) / 2, float(numbers_of_a_jet(n))
         for layer in self.layers:
             rows, columns = layer.W.shape
-            found += rows * (2 * columns * numbers + 2 * before * second + 16 * numbers)
+            found += _ENTRY * rows * (columns * numbers + before * second + 8 * numbers)
             before += rows
         return found + sum(1 for _ in nodes(*self.loop.dynamics)) * (_EACH + 32 * numbers)
 

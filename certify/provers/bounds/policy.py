@@ -25,7 +25,7 @@ from certify.provers.bounds.fused import FusedLayers, Layer
 from certify.provers.bounds.taylor import EPS, TINY
 
 Array = NDArray[np.float64]
-_NEURON = 100.0  # operations of a relaxation
+_ENTRY, _NEURON = 0.05, 25.0  # operations of an entry of a product, of a relaxation
 _NUMBERS = 2**15  # units of a layer times boxes at a time, which stay in a core's cache
 _LIBM = 2.0**-47  # error allowed to torch.tanh, relative to 1
 
@@ -155,7 +155,7 @@ class LayersEnclosure:
 def operations_of_policy(network: TanhNetwork) -> float:
     """Operations to enclose a network on a box, about, as an `Effort` counts them."""
     entries, neurons = sum(W.size for W in network.weights), sum(len(b) for b in network.biases)
-    return 2.0 * entries * (network.n + network.m + 3) + _NEURON * neurons
+    return _ENTRY * entries * (network.n + network.m + 3) + _NEURON * neurons
 
 
 class PolicyEnclosure(LayersEnclosure):

@@ -38,7 +38,7 @@ from certify.provers.boxes.form import FormBound
 Array = NDArray[np.float64]
 _SLACK = 1e-9  # relative distance from the inner level at which a box counts as inside
 _ENDS = 1e-11  # relative distance kept from the ends of the domain
-_EACH = 4.0  # operations of an entry of a model
+_EACH = 2.0  # operations of an entry of a model
 _POINT = 2.0**-20  # of a box: what is left of it around its centre
 
 

@@ -39,7 +39,7 @@ Array = NDArray[np.float64]
 _SLACK = 1e-9  # relative distance kept from every level, so that the checker's own rounding agrees
 _BESIDE_WITNESS = 1e-3  # relative distance kept from a violation
 _SHELL = 16.0  # a batch reaches up to this multiple of the nearest open level
-_BATCH = 1e6  # operations of a batch, however small
+_BATCH = 4e6  # operations of a batch, however small
 _HIGHER = 8.0  # an inner level over one from below which a step may lead out
 
 
@@ -355,7 +355,7 @@ class Pass:
             while not self.done:
                 if self.boxes >= most or self.partition.splits + 3 * budget.batch > MOST_SPLITS:
                     return Stop.BOXES
-                if budget.effort.left < self.proved * budget.check:
+                if budget.effort.left <= self.proved * budget.check:
                     return budget.ended_by
                 before = self.boxes
                 with self._whole():

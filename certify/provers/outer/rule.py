@@ -40,7 +40,7 @@ from certify.provers.boxes.rule import input_bounds_kept, lessened
 Array = NDArray[np.float64]
 _SLACK = 1e-9  # relative distance from c2 at which a box counts as inside
 _ENDS = 1e-11  # relative distance kept from the ends of the domain
-_EACH = 4.0  # operations of an entry of a model
+_EACH = 2.0  # operations of an entry of a model
 _NUMBERS = 2**19  # in the largest tensor of a piece of a batch, so that it stays in a core's cache
 
 

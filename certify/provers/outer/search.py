@@ -34,7 +34,7 @@ from certify.provers.outer.rule import OuterBounds
 Array = NDArray[np.float64]
 _SLACK = 1e-9  # of the level's span: how far below a bound the level stays
 _LAST_LOOK = 0.5  # operations of a box that a lower level settles, in those of one of all that were looked at
-_BATCH = 1e6  # operations of a batch, however small
+_BATCH = 4e6  # operations of a batch, however small
 
 
 class _CoverGrowth(Growth):
@@ -158,7 +158,7 @@ class Cover:
         if self.boxes >= most or self.partition.splits + 3 * budget.batch + self._open() > MOST_SPLITS:
             return Stop.BOXES
         kept = _LAST_LOOK * self.rule.operations * self._open() + budget.check * self.leaves
-        return budget.ended_by if kept > budget.effort.left else None
+        return budget.ended_by if kept >= budget.effort.left else None
 
     def _exchanged(self, bound: Bound, left: float, budget: Budget) -> bool:
         """Send boxes out, and take in what has been grown; False if that is not worth it."""

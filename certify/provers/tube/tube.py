@@ -170,7 +170,7 @@ def _contains(J: Array, P: Array, room: float) -> bool:
 def look(known: Paths) -> float:
     """Operations to try one slab, about, as an `Effort` counts them."""
     n, units = known.loop.system.n, sum(len(b) for b in known.loop.network.biases)
-    return known.operations + _GROWTHS * (3e5 + 4.0 * units * n**2 + 8.0 * n**5)
+    return known.operations + _GROWTHS * (3e5 + 30.0 * units * n**2 + 15.0 * n**5)
 
 
 def root(P: Array) -> Array:
