@@ -33,8 +33,9 @@ from certify.loop.policies import TanhNetwork
 from certify.lyapunov.function import Quadratic
 from certify.report import render_html, summary
 from certify.report.claims import CLAIMS, words_for
+from certify.report.flow import Flow, simulate, time_scales
 from certify.report.limits import limited_by
-from certify.report.sampling import Flow, growth, quadratic, runs_of, simulate, simulated_roa_fraction, time_scales
+from certify.report.sampling import growth, quadratic, runs_of, simulated_roa_fraction
 from certify.report.timing import TimingInWords
 from tests.report.test_report import Page, exactly
 from tests.support.loops import box

@@ -22,7 +22,8 @@ from certify.lyapunov import extents, is_positive_definite
 from certify.report.claims import words_for
 from certify.report.figures.geometry import PARTS, Box, circle, over_level, refine
 from certify.report.figures.pairs import Pair, pairs_of
-from certify.report.sampling import SETTLED, Flow, Runs, growth, quadratic, runs_of, time_scales
+from certify.report.flow import Flow, time_scales
+from certify.report.sampling import SETTLED, Runs, growth, quadratic, runs_of
 from certify.report.timing import TimingInWords
 from certify.report.words import deviation, exact_number, held_at, label
 
