@@ -1,7 +1,9 @@
 """Simulation for pictures. Nothing here is proved, and whatever is shown of it is labelled as simulated.
 
 Runs leave the batch as soon as they are decided, which is what keeps a grid of a few thousand states well below a
-second. A run has one of three fates: it settles, it leaves, or it has done neither by the end. The third is a fate of its own:
+second.
+
+A run has one of three fates: it settles, it leaves, or it has done neither by the end. The third is a fate of its own:
 a slow run is no sign that anything leaves.
 """
 
