@@ -20,7 +20,7 @@ import typer
 
 from certify.analysis.arguments import with_domains
 from certify.analysis.options import RoaOptions
-from certify.certificates import checking, model
+from certify.certificates import checking, reading
 from certify.cli.main import _run, app
 from certify.cli.terminal import ring_line
 from certify.cli.typed import options_of
@@ -529,7 +529,7 @@ def test_a_report_is_about_the_bytes_that_were_checked(
     tmp_path: Path, proved: bytes, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The file gives each reader other bytes: there is one reader, and the page names what it read."""
-    path, page, read_raw = tmp_path / "once.json", tmp_path / "page.html", model.read_raw
+    path, page, read_raw = tmp_path / "once.json", tmp_path / "page.html", reading.read_raw
 
     def once(path: Path) -> bytes:
         raw = read_raw(path)
@@ -537,7 +537,7 @@ def test_a_report_is_about_the_bytes_that_were_checked(
         return raw
 
     path.write_bytes(proved)
-    monkeypatch.setattr(model, "read_raw", once)
+    monkeypatch.setattr(reading, "read_raw", once)
     status, out, _ = run(capsys, "report", path, "--out", page)
     assert status == 0 and out.startswith("ACCEPTED")
     assert hashlib.sha256(proved).hexdigest() in page.read_text() and "PROVED" in page.read_text()

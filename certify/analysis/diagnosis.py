@@ -29,6 +29,7 @@ from certify.provers.ball.models import paths
 from certify.provers.base import Proof
 from certify.provers.falsify import falsify
 from certify.provers.tube.tube import find_tube
+from certify.report.timing import TimingInWords
 from certify.report.words import number, quantity, symbol
 
 Array = NDArray[np.float64]
@@ -120,7 +121,7 @@ def _binding(result: RoaResult) -> tuple[str, str, str | None, str | None, Array
         what = (
             "Vdot = 0"
             if result.timing.is_plain and not result.timing.rate
-            else f"V does not fall enough{result.timing.over_what}"
+            else f"V does not fall enough{TimingInWords.of(result.system).over_what}"
         )
         return f"{what} near {where}", "vdot", None, None, witness.x
     return result.reason, result.stop.name.lower(), None, None, None

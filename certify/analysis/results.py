@@ -21,6 +21,7 @@ from numpy.typing import ArrayLike, NDArray
 from certify.certificates import parse_certificate, write_atomically
 from certify.certificates.claims import Problem
 from certify.certificates.membership import Region, sublevel_set, tube_start
+from certify.certificates.timing import Timing, reach_time
 from certify.certificates.verdict import Stop, Verdict
 from certify.errors import InputError
 from certify.loop.equilibrium import Rest
@@ -31,7 +32,7 @@ from certify.lyapunov.neural import Neural
 from certify.lyapunov.sublevel import Sublevel
 from certify.lyapunov.symbolic import Symbolic
 from certify.provers.falsify import Witness
-from certify.report.timing import Timing, reach_time
+from certify.report.timing import TimingInWords
 from certify.report.words import below, estimated, varying, varying_in, volume_name, volume_unit
 
 if TYPE_CHECKING:
@@ -407,10 +408,11 @@ class RoaResult:
         rows = [("verdict", self.verdict.value), ("plant", self.system.name), ("claim", self.claim)]
         if self.system.ranges:
             rows.append(("for every", varying(varying_in(self.system))))
-        if not self.timing.is_plain:
-            rows.append(("in time", "by steps" if self.timing.discrete else f"input held over {self.timing.periods}"))
-        if self.timing.rate:
-            rows.append(("rate", self.timing.shown_rate))
+        timing = TimingInWords.of(self.system, self.timing.rate)
+        if not timing.is_plain:
+            rows.append(("in time", "by steps" if timing.discrete else f"input held over {timing.periods}"))
+        if timing.rate:
+            rows.append(("rate", timing.shown_rate))
         shown = self.verdict in (Verdict.PROVED, Verdict.TRUSTED)
         level, size = (self.levels.roa, self.volume) if shown else (None, None)
         if level is not None and size is not None:

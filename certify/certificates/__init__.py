@@ -10,10 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from certify.certificates.checking import run_checker, run_part
-    from certify.certificates.joining import join_parts
-    from certify.certificates.limits import require_short, require_within_limits
-    from certify.certificates.model import (
-        Certificate,
+    from certify.certificates.encoding import decode, encode
+    from certify.certificates.evidence import (
         Contraction,
         LocalBall,
         OuterTree,
@@ -21,30 +19,26 @@ if TYPE_CHECKING:
         Slab,
         TrustedSolver,
         Waypoint,
-        decode,
-        encode,
-        loop_sections,
-        parse_certificate,
-        read_certificate,
-        read_raw,
     )
+    from certify.certificates.joining import join_parts
+    from certify.certificates.limits import require_short, require_within_limits
+    from certify.certificates.model import Certificate, loop_sections
+    from certify.certificates.reading import parse_certificate, read_certificate, read_raw
     from certify.certificates.tree import leaves
     from certify.certificates.writing import SEARCH, remove, set_aside, sole_writer, write_atomically, write_beside
 
-_OTHERS = {
-    "join_parts": "joining",
-    "run_checker": "checking",
-    "run_part": "checking",
-    "require_short": "limits",
-    "require_within_limits": "limits",
-    "leaves": "tree",
-    "SEARCH": "writing",
-    "remove": "writing",
-    "set_aside": "writing",
-    "sole_writer": "writing",
-    "write_atomically": "writing",
-    "write_beside": "writing",
+_NAMES = {
+    "checking": ("run_checker", "run_part"),
+    "encoding": ("decode", "encode"),
+    "evidence": ("Contraction", "LocalBall", "OuterTree", "PartitionTree", "Slab", "TrustedSolver", "Waypoint"),
+    "joining": ("join_parts",),
+    "limits": ("require_short", "require_within_limits"),
+    "model": ("Certificate", "loop_sections"),
+    "reading": ("parse_certificate", "read_certificate", "read_raw"),
+    "tree": ("leaves",),
+    "writing": ("SEARCH", "remove", "set_aside", "sole_writer", "write_atomically", "write_beside"),
 }
+_PLACES = {name: module for module, names in _NAMES.items() for name in names}
 
 __all__ = [
     "SEARCH",
@@ -77,6 +71,6 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    if name in __all__:
-        return getattr(import_module(f"certify.certificates.{_OTHERS.get(name, 'model')}"), name)
+    if name in _PLACES:
+        return getattr(import_module(f"certify.certificates.{_PLACES[name]}"), name)
     raise AttributeError(f"module 'certify.certificates' has no attribute {name!r}")

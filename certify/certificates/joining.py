@@ -12,7 +12,9 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from certify.certificates.claims import Claim
-from certify.certificates.model import Certificate, PartitionTree, parse_certificate
+from certify.certificates.evidence import PartitionTree
+from certify.certificates.model import Certificate
+from certify.certificates.reading import parse_certificate
 from certify.certificates.tree import LEAF
 from certify.errors import BackendError
 

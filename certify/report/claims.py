@@ -13,7 +13,7 @@ from string import Template
 from typing import Any
 
 from certify.errors import CertificateFormatError
-from certify.report.timing import PLAIN, Timing
+from certify.report.timing import PLAIN, TimingInWords
 from certify.report.words import PRACTICAL, exact_number
 
 Part = tuple[str, str, str]
@@ -22,7 +22,7 @@ Part = tuple[str, str, str]
 @dataclass(frozen=True, slots=True)
 class Words:
     """One kind of claim in words. In texts, {inner} and {outer} stand for its levels in digits, {duration} for how long
-    its tube is, {centre} for the state that it begins around, {speed} for what a rate says (Timing.speed),
+    its tube is, {centre} for the state that it begins around, {speed} for what a rate says (TimingInWords.speed),
     {constant} for the words that ask what is uncertain to be constant, {beyond} for the level of N.
 
     Parameters
@@ -307,7 +307,7 @@ def _with_outer(words: Words) -> Words:
     )
 
 
-def words_for(kind: str, timing: Timing = PLAIN, *, ball: bool = False, beyond: bool = False) -> Words:
+def words_for(kind: str, timing: TimingInWords = PLAIN, *, ball: bool = False, beyond: bool = False) -> Words:
     """The words of a claim about a loop in which time passes so.
 
     `ball` says that its evidence has one, `beyond` that the claim has an outer set.
@@ -331,7 +331,7 @@ def _with_ball(kind: str, parts: tuple[Part, ...], ball: bool) -> tuple[Part, ..
     return tuple(one for part in parts for one in ((_AROUND_A_LEVEL, RING) if part[0] == "Ring" else (part,)))
 
 
-def _in_steps(kind: str, parts: tuple[Part, ...], timing: Timing) -> Iterator[Part]:
+def _in_steps(kind: str, parts: tuple[Part, ...], timing: TimingInWords) -> Iterator[Part]:
     """The parts, with those that a loop needs that is spoken of at its samples or steps."""
     after = "F(x)" if timing.discrete else "φ(h)"
     for part in parts:

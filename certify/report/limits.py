@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from fractions import Fraction
 from typing import Any
 
-from certify.report.timing import PLAIN, Timing
+from certify.report.timing import PLAIN, TimingInWords
 from certify.report.words import below, number, symbol
 
 _LIMITS = {
@@ -48,7 +48,7 @@ def limited_by(result: Mapping[str, Any]) -> str:
             if precision is None:
                 return f"a margin that the engine keeps: {apart}"
             return f"the precision of {solver['solver']} (delta {number(precision)}), which stops {apart}"
-    return limit_in_words(reason, Timing.of_result(result))
+    return limit_in_words(reason, TimingInWords.of_result(result))
 
 
 def hardest(weights: Mapping[str, float]) -> str:
@@ -76,7 +76,7 @@ def outer_limited_by(outer: Mapping[str, Any]) -> str:
     return said + (f", where N = {number(met)}" if reason == "witness" and met is not None else "")
 
 
-def limit_in_words(reason: str, timing: Timing = PLAIN) -> str:
+def limit_in_words(reason: str, timing: TimingInWords = PLAIN) -> str:
     """A reason that is a single word as a reader understands it; sentences stay as they are.
 
     >>> limit_in_words("time")

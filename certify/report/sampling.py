@@ -1,9 +1,7 @@
 """Simulation for pictures. Nothing here is proved, and whatever is shown of it is labelled as simulated.
 
-The continuous closed loop is integrated by the classical Runge-Kutta method of order four with the policy evaluated at
-every stage, many initial states at a time; where the input is held over a period, with the policy evaluated at its
-beginning, in steps that divide it. A loop in discrete time takes its own steps. Runs leave the batch as soon as they
-are decided, which is what keeps a grid of a few thousand states well below a second.
+Runs leave the batch as soon as they are decided, which is what keeps a grid of a few thousand states well below a
+second.
 
 A run has one of three fates: it settles, it leaves, or it has done neither by the end. The third is a fate of its own:
 a slow run is no sign that anything leaves.
@@ -21,19 +19,14 @@ from numpy.typing import NDArray
 
 from certify.errors import InputError
 from certify.loop.plants import System
-from certify.loop.plants.ode import eigenvalues_of, rk4_step
 from certify.loop.policies import TanhNetwork
+from certify.report.flow import Flow, simulate, time_scales
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
-Field = Callable[[Array], Array]
 Holds = Callable[[Array], Mask]
 SETTLED = 1e-3
 """A run has settled when V is at most this share of the certified level: a thirtieth of the set's radius."""
-_STEP = 1.0  # of the time constant of the fastest eigenvalue
-_HORIZON = 15.0  # time constants of the slowest eigenvalue
-_MAX_STEPS = 3000
-_RATE_SAMPLES = 200
 _GRID = {1: 401, 2: 35}
 _FINER = 8  # of the step, in runs that are asked again because they contradict what is claimed
 _HALVINGS = 2  # of the grid's cells along the edge of the region
@@ -88,127 +81,6 @@ class SimulatedRoa:
     def slow(self) -> int:
         """Certified grid points whose simulation had not settled within the horizon, which contradicts nothing."""
         return int((self.certified & ~self.attracted & ~self.left).sum())
-
-
-@dataclass(frozen=True, slots=True)
-class Flow:
-    """The closed loop for simulation, in float64. It need not have an equilibrium at the origin.
-
-    Parameters
-    ----------
-    field : `F(x) = f(x, pi(x))`, shapes (..., n) to (..., n). Compiling it takes a while for large plants, hence this
-        class.
-    policy : pi, shapes (..., n) to (..., m).
-    lo, hi : corners of the domain box, shape (n,).
-    plant : f, shapes (..., n) and (..., m) to (..., n).
-    period : over which the input is held, the longest that is allowed, in seconds; 0 if it follows the state at once.
-    discrete : whether F(x) is the state one step later, and not the rate of change.
-    """
-
-    field: Field
-    policy: Field
-    lo: Array
-    hi: Array
-    plant: Callable[[Array, Array], Array]
-    period: float = 0.0
-    discrete: bool = False
-
-    @classmethod
-    def of(cls, system: System, network: TanhNetwork) -> Flow:
-        """Compile the equations.
-
-        Raises
-        ------
-        InputError : the policy is not one for this plant.
-        """
-        if (network.n, network.m) != (system.n, system.m):
-            raise InputError(
-                f"the policy must read {system.n} states and command {system.m} inputs of {system.name}; "
-                f"it reads {network.n} and commands {network.m}."
-            )
-        f, u_eq = system.function(), system.exact_u_eq()
-        folded = network.folded(u_eq)  # once, not in every step
-
-        def policy(x: Array) -> Array:
-            return np.asarray(folded(x, u_eq))
-
-        def field(x: Array) -> Array:
-            return np.asarray(f(x, policy(x)))
-
-        def plant(x: Array, u: Array) -> Array:
-            return np.asarray(f(x, u))
-
-        period = 0.0 if system.sample is None else float(system.sample[1])
-        return cls(field, policy, *domain_bounds(system), plant, period, system.time == "discrete")
-
-    def fitting(self, step: float) -> float:
-        """The largest step of a simulation up to `step`, in seconds, that divides the period; in discrete time 1."""
-        if self.discrete:
-            return 1.0
-        return self.period / math.ceil(self.period / step) if self.period else step
-
-    def steps_between(self, step: float) -> int:
-        """How many of these steps lie between two instants of which the claim speaks."""
-        return max(round(self.period / step), 1)
-
-    def input(self, x: Array, held: Array | None, k: int, step: float) -> Array | None:
-        """The input that acts from step k on, (..., m): the one that is held, or a new one; None if none is held."""
-        if not self.period:
-            return None
-        return self.policy(x) if held is None or k % self.steps_between(step) == 0 else held
-
-    def advance(self, x: Array, u: Array | None, step: float) -> Array:
-        """States one step later, (..., n), with the input held at u if there is one."""
-        if self.discrete:
-            return self.field(x)
-        return rk4_step(self.field if u is None else lambda y: self.plant(y, u), x, step)
-
-
-def time_scales(flow: Flow, samples: int = _RATE_SAMPLES, reach: Array | None = None) -> tuple[float, float]:
-    """(step, horizon) in seconds: the fastest time constant, and 15 times the slowest at the origin.
-
-    Of `samples` states in the domain, or in the part of it where `|x_i| <= reach_i`.
-
-    The fastest is taken over Jacobians at the origin and at sampled states of the domain, because a plant can be
-    stiffer away from the origin; Runge-Kutta of order four is stable up to 2.8 of it. The horizon is cut at 3,000
-    steps. In discrete time the two are numbers of steps, the first 1.
-    """
-    lo, hi = (flow.lo, flow.hi) if reach is None else (np.maximum(flow.lo, -reach), np.minimum(flow.hi, reach))
-    x = np.random.default_rng(0).uniform(lo, hi, (samples, len(lo)))
-    rates = eigenvalues_of(flow.field, np.concatenate([np.zeros((1, len(flow.lo))), x]), flow.hi - flow.lo)
-    if flow.discrete:
-        with np.errstate(divide="ignore"):
-            slowest = -float(np.max(np.log(np.abs(rates[:1])), initial=-math.inf))
-        return 1.0, min(math.ceil(_HORIZON / slowest) if slowest > _HORIZON / _MAX_STEPS else _MAX_STEPS, _MAX_STEPS)
-    fastest = float(np.max(np.abs(rates), initial=0.0))
-    slowest = float(np.min(np.abs(rates[:1].real), initial=math.inf))
-    step = _STEP / fastest if fastest > 0 else 1.0
-    return step, min(_HORIZON / slowest if slowest > 0 else math.inf, _MAX_STEPS * flow.fitting(step))
-
-
-def simulate(flow: Flow, starts: Array, step: float, steps: int, deadline: float = math.inf) -> Array:
-    """Trajectories from `starts` (N, n), shape (steps + 1, N, n); NaN from the first step outside the domain on.
-
-    At `deadline`, a reading of `time.monotonic`, the trajectories end where they are, in fewer steps. Where the input
-    is held `step` must divide the period (Flow.fitting); the first period begins at the start.
-    """
-    u: Array | None = None
-    x = np.array(starts, dtype=np.float64)
-    path = np.full((steps + 1, *x.shape), math.nan)
-    path[0] = x
-    alive = np.arange(len(x))
-    with np.errstate(all="ignore"):
-        for k in range(1, steps + 1):
-            if not alive.size:
-                break
-            if k > 1 and time.monotonic() > deadline:
-                return path[:k]
-            u = flow.input(x, u, k - 1, step)
-            x = flow.advance(x, u, step)
-            inside = np.all((x >= flow.lo) & (x <= flow.hi), axis=-1)
-            x, alive, u = x[inside], alive[inside], None if u is None else u[inside]
-            path[k, alive] = x
-    return path
 
 
 @dataclass(frozen=True, slots=True)
@@ -430,9 +302,3 @@ def growth(flow: Flow, P: Array, x: Array, step: float) -> Array:
 def quadratic(P: Array, x: Array) -> Array:
     """`x'Px` along the last axis."""
     return np.asarray(np.einsum("...i,...i->...", x @ P, x))
-
-
-def domain_bounds(system: System) -> tuple[Array, Array]:
-    """Lower and upper corner of the domain box in float64."""
-    bounds = np.array([[float(a), float(b)] for a, b in system.domain])
-    return bounds[:, 0], bounds[:, 1]

@@ -10,9 +10,10 @@ from fractions import Fraction
 from typing import TYPE_CHECKING, Any
 from unicodedata import normalize
 
+from certify.certificates.timing import reach_time
 from certify.report.claims import Words, words_for
 from certify.report.limits import AT_A_POINT, hardest, limited_by, outer_limited_by
-from certify.report.timing import Timing, reach_time
+from certify.report.timing import TimingInWords
 from certify.report.words import (
     ABSENT,
     PRACTICAL,
@@ -97,7 +98,7 @@ def _inner(result: Mapping[str, Any]) -> float | None:
 
 
 def _words(result: Mapping[str, Any]) -> Words:
-    return words_for(_kind(result), Timing.of_result(result), beyond=bool(result.get("outer")))
+    return words_for(_kind(result), TimingInWords.of_result(result), beyond=bool(result.get("outer")))
 
 
 def _headline(result: Mapping[str, Any], verdict: str) -> str:
@@ -107,7 +108,7 @@ def _headline(result: Mapping[str, Any], verdict: str) -> str:
         stated = _words(result).headline.format(
             outer=below(level),
             inner="?" if inner is None else inner_level(kind, inner),
-            speed=Timing.of_result(result).headline_rate(),
+            speed=TimingInWords.of_result(result).headline_rate(),
             beyond=below(result["outer"]["level"]) if result.get("outer") else "",
             constant="where what is uncertain is constant in time, " if result.get("uncertain") else "",
         )
@@ -154,7 +155,7 @@ def _is_missed(result: Mapping[str, Any]) -> bool:
 
 def _rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
     levels, rows = result["levels"], []
-    found, timing = _uncertain(result), Timing.of_result(result)
+    found, timing = _uncertain(result), TimingInWords.of_result(result)
     if found:
         each = "; ".join(q.words for q in found)
         what = "for every" if shown else "asked for every"
@@ -255,13 +256,13 @@ def _rest(result: Mapping[str, Any]) -> tuple[str, str]:
     return "rests at", f"{where}{held}; eigenvalues there {', '.join(rest['eigenvalues']) or 'not enclosed'}"
 
 
-def _functions(timing: Timing) -> str:
+def _functions(timing: TimingInWords) -> str:
     if timing.discrete:
         return "any sequences of values: constant, drifting or jumping"
     return "any measurable functions of time: constant, drifting or jumping"
 
 
-def _rate(result: Mapping[str, Any], timing: Timing) -> str:
+def _rate(result: Mapping[str, Any], timing: TimingInWords) -> str:
     """What the rate says of the time, rounded up."""
     floor = result["levels"].get("floor") if _kind(result) in PRACTICAL else None
     latest = reach_time(timing, floor, result["levels"].get("roa"))
@@ -314,7 +315,7 @@ def _diagnosis_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
     found, rows = result.get("diagnosis"), []
     if not found:
         return []
-    timing = Timing.of_result(result)
+    timing = TimingInWords.of_result(result)
     if found.get("stiffness") and not timing.discrete:
         held = " (at the nominal values)" if result.get("uncertain") else ""
         at_once = "" if timing.sample is None else ", if the input followed at once"

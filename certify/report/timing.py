@@ -1,58 +1,32 @@
 """How time passes in a closed loop, in words: what of a claim's sentences depends on it, and on the claimed rate.
 
-A claim says the same of every loop; *when* it holds is another matter. A loop in continuous time is spoken of at all
-times, one whose input is held over a period at its sampling instants, one in discrete time at its steps. Each text of a
-report that depends on this takes its words from here, so that no text has to be written once for every kind of claim.
+Each text of a report that depends on this takes its words from here, so that no text has to be written once for every
+kind of claim.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
 from fractions import Fraction
-from typing import TYPE_CHECKING, Any
+from typing import Any, Self
 
+from certify.certificates.timing import PERCENT, Timing
 from certify.report.words import above, below, exact_number, inside
 
-if TYPE_CHECKING:
-    from certify.loop.plants import System
-    from certify.loop.plants.system import Interval
 
-_PERCENT = 100  # of V: the share of it after which a rate is told as a time
+class TimingInWords(Timing):
+    """A timing that says itself."""
 
-
-@dataclass(frozen=True, slots=True)
-class Timing:
-    """Whether a plant is in `discrete` time, the least and the largest period over which its input is held (`sample`;
-    None if it follows the state at once), and the `rate` lambda at which V is claimed to fall (0: no rate)."""
-
-    discrete: bool = False
-    sample: Interval | None = None
-    rate: float = 0.0
+    __slots__ = ()
 
     @classmethod
-    def of(cls, system: System, rate: float = 0.0) -> Timing:
-        """Of a plant, with what is claimed of it."""
-        return cls(system.time == "discrete", system.sample, rate)
-
-    @classmethod
-    def of_result(cls, result: Mapping[str, Any]) -> Timing:
+    def of_result(cls, result: Mapping[str, Any]) -> Self:
         """Of the object that `certify roa --json` prints; what it does not say is as it always was."""
         claim = result.get("claim") or {}
         sample = claim.get("sample")
         ends = None if sample is None else (Fraction(sample[0]), Fraction(sample[1]))
         return cls(result.get("time") == "discrete", ends, float(claim.get("rate") or 0.0))
-
-    @property
-    def is_plain(self) -> bool:
-        """Whether the input follows at once in continuous time."""
-        return not self.discrete and self.sample is None
-
-    @property
-    def from_zero(self) -> bool:
-        """Whether the claim holds within each period as well, because each part of a period is one that is allowed."""
-        return self.sample is not None and self.sample[0] == 0
 
     @property
     def unit(self) -> str:
@@ -68,9 +42,9 @@ class Timing:
     def periods(self) -> str:
         """Over what the input is held, such as `exactly 0.02 s`; nothing where it is not held.
 
-        >>> Timing(sample=(Fraction(1, 50), Fraction(1, 50))).periods
+        >>> TimingInWords(sample=(Fraction(1, 50), Fraction(1, 50))).periods
         'exactly 0.02 s'
-        >>> Timing(sample=(Fraction(0), Fraction(1, 50))).periods
+        >>> TimingInWords(sample=(Fraction(0), Fraction(1, 50))).periods
         'any sequence of periods up to 0.02 s'
         """
         if self.sample is None:
@@ -126,11 +100,6 @@ class Timing:
             "D(x) = (V(φ(h)) − V(x))/h: by how much V changes over a period, by time, where φ(h) is the state that x "
             f"has become when the input has been held at π(x) for h = {which}{'' if lo else '; V̇ at h = 0'}."
         )
-
-    @property
-    def simulated(self) -> Timing:
-        """What pictures show of several periods: the longest."""
-        return self if self.sample is None else Timing(sample=(self.sample[1], self.sample[1]), rate=self.rate)
 
     @property
     def definitions(self) -> str:
@@ -259,7 +228,7 @@ class Timing:
         if not self.rate:
             return ""
         bound, when = self._bound(all_times=inner is None)
-        time = self.time_to_fall(_PERCENT if inner is None else Fraction(outer) / Fraction(inner))
+        time = self.time_to_fall(PERCENT if inner is None else Fraction(outer) / Fraction(inner))
         value = f" = {above(time)} {self.unit}" if math.isfinite(time) else ""
         until = "" if inner is None else " until it is in the smaller set"
         said = f" Moreover {bound}{until}, with λ = {self.shown_rate}: "
@@ -290,45 +259,5 @@ class Timing:
             return ""
         return f", V falling at least as exp(-2*{below(self.rate)} {'k) in k steps' if self.discrete else 't)'}"
 
-    def time_to_fall(self, factor: Fraction | int) -> float:
-        """How long it takes V at most to be divided by a factor of at least 1, rounded up; infinite without a rate.
 
-        With a sample it is by when a sampling instant has come at which that is so, less the longest period.
-        """
-        if not self.rate:
-            return math.inf
-        if factor <= 1:
-            return 0.0
-        time = math.nextafter(_log(Fraction(factor)) / self.rate / 2, math.inf)
-        return float(math.ceil(time)) if self.discrete and math.isfinite(time) else time
-
-    def reach_time(self, factor: Fraction | int) -> float | None:
-        """By when V is certainly divided by the factor: in units of time, at a step, or at a sampling instant that has
-        come by then. None without a rate, or where no number is as large."""
-        time = self.time_to_fall(factor)
-        if self.sample is not None:  # the next instant comes within a period
-            time = math.nextafter(time + math.nextafter(float(self.sample[1]), math.inf), math.inf)
-        return time if math.isfinite(time) else None
-
-
-PLAIN = Timing()
-
-
-def reach_time(timing: Timing, floor: float | None, roa: float | None) -> float | None:
-    """By when a trajectory from {V <= c2} is in {V <= c0}, `floor`; without a floor, by when V is a hundredth of what
-    it was. None where nothing is claimed."""
-    if roa is None:
-        return None
-    return timing.reach_time(_PERCENT if floor is None else Fraction(roa) / Fraction(floor))
-
-
-def _log(factor: Fraction) -> float:
-    """The natural logarithm of a number above 1, rounded up."""
-    try:
-        # of the next number above the factor; the logarithm itself is off by less than two units in the last place
-        value = math.log(math.nextafter(float(factor), math.inf))
-    except OverflowError:
-        value = (math.log(factor.numerator) - math.log(factor.denominator)) * (1 + 1e-12)
-    for _ in range(3):
-        value = math.nextafter(value, math.inf)
-    return value
+PLAIN = TimingInWords()

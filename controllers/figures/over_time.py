@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.loop.plants import System
-from certify.report.timing import Timing
+from certify.report.timing import TimingInWords
 from controllers.figures.style import COLOURS, DEEP, WIDTH, count, drawn, log_scale, name_lines, seeds_of
 from controllers.responses import NAMES, OURS, Response, Row, quartiles
 
@@ -45,7 +45,7 @@ def draw_over_time(
             panel.set_ylabel(_NORM if what == "norm" else _COST[system.time])
             panel.grid(axis="y")
         panels[-1].set_xlim(0, dt * (len(responses[0].x) - 1))
-        panels[-1].set_xlabel(Timing.of(system).axis)
+        panels[-1].set_xlabel(TimingInWords.of(system).axis)
         for panel in panels:
             log_scale(panel)
         for panel, named in zip(panels, ends, strict=True):

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.loop.plants import System
-from certify.report.timing import Timing
+from certify.report.timing import TimingInWords
 from controllers.figures.states import MOST, draw_state, reach_of, short
 from controllers.figures.style import MUTED, WIDTH, count, drawn
 from controllers.options import get_plant
@@ -55,7 +55,7 @@ def draw_positions(system: System, dt: float, responses: Sequence[Response]) -> 
         for panel, run in zip(panels[0], runs, strict=True):
             panel.set_title(short(Method(run, False)))
         for panel in panels[-1]:
-            panel.set_xlabel(Timing.of(system).axis)
+            panel.set_xlabel(TimingInWords.of(system).axis)
         panels[0, 0].set_xlim(0, time[-1])
         number = next(iter(chosen.values())).shape[1]
         figure.suptitle(

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.loop.plants import System
-from certify.report.timing import Timing
+from certify.report.timing import TimingInWords
 from controllers.figures.states import named, reach_of, short
 from controllers.figures.style import COLOURS, DEEP, INK, MUTED, PALE, WIDTH, count, drawn
 from controllers.options import get_plant
@@ -69,7 +69,7 @@ def draw_space(system: System, dt: float, responses: Sequence[Response]) -> byte
             title = short(method).replace("\n", " ") + (f": {leaving} leave the frame" if leaving else "")
             panel.set_title(title, color=DEEP[method.run])
         number = next(iter(chosen.values())).shape[1]
-        duration = f"{dt * (len(responses[0].x) - 1):g} {Timing.of(system).unit}"
+        duration = f"{dt * (len(responses[0].x) - 1):g} {TimingInWords.of(system).unit}"
         what = f"{count(number, 'trajectory', 'trajectories')} of {duration} in space"
         figure.suptitle(
             f"{system.name}, seed {seed}: {what}, mean actions, held\n"

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.loop.plants import System
-from certify.report.timing import Timing
+from certify.report.timing import TimingInWords
 from controllers.figures.style import COLOURS, MUTED, count, drawn
 from controllers.options import get_plant
 from controllers.responses import NAMES, Method, Response
@@ -38,7 +38,7 @@ def draw_states(system: System, dt: float, responses: Sequence[Response]) -> byt
         for panel, method in zip(panels[0], chosen, strict=True):
             panel.set_title(method.label.replace(", ", ",\n"))  # a panel is narrower than some names
         for panel in panels[-1]:
-            panel.set_xlabel(Timing.of(system).axis)
+            panel.set_xlabel(TimingInWords.of(system).axis)
             panel.set_xlim(0, time[-1])
         number = next(iter(chosen.values())).shape[1]
         figure.suptitle(f"{system.name}, seed {seed}: {count(number, 'trajectory', 'trajectories')}, held actions")

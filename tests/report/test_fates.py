@@ -24,7 +24,8 @@ from certify.report.figures import draw
 from certify.report.figures.portrait import keys
 from certify.report.figures.scene import Effort, Scene, starts
 from certify.report.figures.style import LEAVING, UNSETTLED
-from certify.report.sampling import SETTLED, Flow, Runs, SimulatedRoa, edge_of, quadratic, runs_of, simulate
+from certify.report.flow import Flow, simulate
+from certify.report.sampling import SETTLED, Runs, SimulatedRoa, edge_of, quadratic, runs_of
 from tests.support.loops import box
 
 ONE_LEAF = PartitionTree(np.eye(2), np.ones(2), bytes([255]))

@@ -51,14 +51,9 @@ from certify.report import render_html, simulated_roa_fraction, summary
 from certify.report.claims import CLAIMS
 from certify.report.figures import draw
 from certify.report.figures.geometry import PARTS, ellipse, refine, shadow
+from certify.report.flow import Flow, domain_bounds, simulate, time_scales
 from certify.report.limits import limited_by
-from certify.report.sampling import (
-    Flow,
-    domain_bounds,
-    quadratic,
-    simulate,
-    time_scales,
-)
+from certify.report.sampling import quadratic
 from certify.report.sections.status import status_of
 from certify.report.words import above, below, kept_apart, label, number, symbol
 from tests.support.loops import box, chain, pendulum_network, scalar_tanh

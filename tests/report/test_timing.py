@@ -22,6 +22,7 @@ from rich.console import Console
 from certify.analysis.results import Levels, RoaResult
 from certify.certificates import Certificate, Contraction, LocalBall, PartitionTree, parse_certificate
 from certify.certificates.claims import Asymptotic, Claim, Nearby, Practical, Problem
+from certify.certificates.timing import reach_time
 from certify.certificates.verdict import Stop, Verdict
 from certify.checker import document
 from certify.checker import words as checker_words
@@ -32,20 +33,21 @@ from certify.loop.policies import TanhNetwork
 from certify.lyapunov.function import Quadratic
 from certify.report import render_html, summary
 from certify.report.claims import CLAIMS, words_for
+from certify.report.flow import Flow, simulate, time_scales
 from certify.report.limits import limited_by
-from certify.report.sampling import Flow, growth, quadratic, runs_of, simulate, simulated_roa_fraction, time_scales
-from certify.report.timing import Timing, reach_time
+from certify.report.sampling import growth, quadratic, runs_of, simulated_roa_fraction
+from certify.report.timing import TimingInWords
 from tests.report.test_report import Page, exactly
 from tests.support.loops import box
 
 F = Fraction
 EXACT, RANGE, FROM_0 = (F(1, 50), F(1, 50)), (F(1, 100), F(1, 50)), (F(0), F(1, 50))
 TIMINGS = {
-    "plain": Timing(),
-    "exact": Timing(sample=EXACT),
-    "range": Timing(sample=RANGE),
-    "from 0": Timing(sample=FROM_0),
-    "discrete": Timing(discrete=True),
+    "plain": TimingInWords(),
+    "exact": TimingInWords(sample=EXACT),
+    "range": TimingInWords(sample=RANGE),
+    "from 0": TimingInWords(sample=FROM_0),
+    "discrete": TimingInWords(discrete=True),
 }
 STEPPED = [name for name in TIMINGS if name != "plain"]
 CONTINUOUS_ONLY = re.compile(
@@ -61,7 +63,7 @@ def gain(k: str, n: int = 1) -> TanhNetwork:
     return TanhNetwork((weight,), (np.zeros(1),), np.ones(1), np.zeros(1), "identity", "none")
 
 
-def integrator(timing: Timing, *, push: bool = False) -> System:
+def integrator(timing: TimingInWords, *, push: bool = False) -> System:
     """x' = u, or x+ = x + u/50, with a mode that decays by itself; a wind if something is to push."""
     x, y, u, w = symbols("x y u w")
     wind = w if push else Number(0)
@@ -73,7 +75,7 @@ def integrator(timing: Timing, *, push: bool = False) -> System:
     )  # fmt: skip
 
 
-def claimed(timing: Timing, claim: Claim, *, push: bool = False, ball: bool = True) -> Certificate:
+def claimed(timing: TimingInWords, claim: Claim, *, push: bool = False, ball: bool = True) -> Certificate:
     """A certificate that nobody has checked."""
     local = LocalBall(np.eye(2), np.ones((3, 2)), np.eye(2)) if ball else None
     evidence = PartitionTree(np.eye(2), np.ones(2), bytes([255]), local, cells=(1,) * push)
@@ -144,7 +146,13 @@ def test_without_anything_new_the_words_are_those_of_continuous_time() -> None:
     assert of.decay == (
         "That V falls below c₀ in finite time and stays there is {word}; how soon, and what V does below c₀, is not."
     )
-    assert Timing().speed(None, 1.0) == Timing().headline_rate() == Timing().definitions == Timing().periods == ""
+    assert (
+        TimingInWords().speed(None, 1.0)
+        == TimingInWords().headline_rate()
+        == TimingInWords().definitions
+        == TimingInWords().periods
+        == ""
+    )
 
 
 @pytest.mark.parametrize("rate", [0.0, 0.3])
@@ -152,7 +160,7 @@ def test_without_anything_new_the_words_are_those_of_continuous_time() -> None:
 @pytest.mark.parametrize("kind", ["asymptotic", "practical"])
 def test_every_place_is_filled(kind: str, timing: str, rate: float) -> None:
     how = TIMINGS[timing]
-    how = Timing(how.discrete, how.sample, rate)
+    how = TimingInWords(how.discrete, how.sample, rate)
     words = words_for(kind, how, ball=True)
     for text in every_text(words):
         assert "$" not in text and "  " not in text
@@ -255,7 +263,7 @@ def nearby(*, push: bool, rate: float = 0.0) -> Certificate:
         contraction=Contraction(np.eye(2), np.ones(2), np.eye(2)),
     )
     claim = Nearby(roa=2.0, local=0.5, floor=0.125, rate=rate)
-    return Certificate(integrator(Timing(), push=push), gain("1", 2), Quadratic(np.eye(2)), claim, evidence)
+    return Certificate(integrator(TimingInWords(), push=push), gain("1", 2), Quadratic(np.eye(2)), claim, evidence)
 
 
 def test_one_equilibrium_is_said_of_constants_alone() -> None:
@@ -273,7 +281,7 @@ def test_one_equilibrium_is_said_of_constants_alone() -> None:
     alone = page(nearby(push=False))
     assert "And there is exactly one equilibrium in the smaller set" in alone.text
     assert "c₀ = 0.125 (floor), c₁ = 0.5 (local)" in alone.text
-    headline = printed(result_of(Timing(), nearby(push=True).claim, push=True).to_dict())
+    headline = printed(result_of(TimingInWords(), nearby(push=True).claim, push=True).to_dict())
     assert (
         "enters {V <= 0.125} and stays there; where what is uncertain is constant in time, it converges to the one "
         "equilibrium in that set"
@@ -288,20 +296,20 @@ def test_one_equilibrium_is_said_of_constants_alone() -> None:
     st.floats(min_value=1e-9, max_value=1e9),
 )
 def test_a_time_is_never_too_short(factor: Fraction, rate: float) -> None:
-    time = Timing(rate=rate).time_to_fall(factor)
+    time = TimingInWords(rate=rate).time_to_fall(factor)
     exact = flint.arb(flint.fmpq(factor.numerator, factor.denominator)).log() / (2 * flint.arb(rate))
     assert exact <= flint.arb(time) and flint.arb(time) <= exact * (1 + 1e-12) + 1e-15 / rate
-    steps = Timing(discrete=True, rate=rate).time_to_fall(factor)
+    steps = TimingInWords(discrete=True, rate=rate).time_to_fall(factor)
     assert steps == math.ceil(time)
-    sampled = Timing(sample=RANGE, rate=rate).reach_time(factor)
+    sampled = TimingInWords(sample=RANGE, rate=rate).reach_time(factor)
     assert sampled is not None and F(sampled) >= F(time) + RANGE[1]
 
 
 def test_times_that_no_number_holds() -> None:
-    assert Timing().reach_time(100) is None and Timing(rate=5e-324).reach_time(100) is None
-    assert reach_time(Timing(rate=1e308), None, 1.0) > 0  # type: ignore[operator]
-    assert reach_time(Timing(rate=1.0), 5e-324, 1e308) == pytest.approx((math.log(1e308) - math.log(5e-324)) / 2)
-    assert "= " not in Timing(rate=5e-324).speed(1.0, 2.0).split("/(2λ)")[1]
+    assert TimingInWords().reach_time(100) is None and TimingInWords(rate=5e-324).reach_time(100) is None
+    assert reach_time(TimingInWords(rate=1e308), None, 1.0) > 0  # type: ignore[operator]
+    assert reach_time(TimingInWords(rate=1.0), 5e-324, 1e308) == pytest.approx((math.log(1e308) - math.log(5e-324)) / 2)
+    assert "= " not in TimingInWords(rate=5e-324).speed(1.0, 2.0).split("/(2λ)")[1]
 
 
 # Simulation
@@ -310,7 +318,7 @@ def test_times_that_no_number_holds() -> None:
 @pytest.mark.parametrize("h", [F(1, 50), F(1, 2), F(3, 2)])
 def test_a_held_input_is_held(h: Fraction) -> None:
     """x' = u, u = -x held: x(t_k) = (1 - h)^k x(0), which Runge-Kutta gets exactly."""
-    system = integrator(Timing(sample=(h, h)))
+    system = integrator(TimingInWords(sample=(h, h)))
     flow = Flow.of(system, gain("1", 2))
     step = flow.fitting(0.3)
     apart = flow.steps_between(step)
@@ -322,9 +330,9 @@ def test_a_held_input_is_held(h: Fraction) -> None:
 
 
 def test_too_long_a_period_leaves_though_the_continuous_loop_settles() -> None:
-    held = integrator(Timing(sample=(F(5, 2), F(5, 2))))  # 1 - h = -3/2
+    held = integrator(TimingInWords(sample=(F(5, 2), F(5, 2))))  # 1 - h = -3/2
     P, network = np.eye(2), gain("1", 2)
-    for system, attracted in ((held, False), (integrator(Timing()), True)):
+    for system, attracted in ((held, False), (integrator(TimingInWords()), True)):
         roa = simulated_roa_fraction(system, network, P, 1.0, points=9, horizon=30.0)
         off = np.abs(roa.axes[0]) > 0.1
         assert np.all(roa.attracted[off] == attracted)
@@ -362,18 +370,18 @@ def test_a_discrete_plant_takes_its_own_steps() -> None:
 def test_the_change_of_V() -> None:
     x, P = np.array([[1.0, 0.0], [0.5, 0.0]]), np.eye(2)
     for h in (F(1, 50), F(1, 2)):
-        flow = Flow.of(integrator(Timing(sample=(h, h))), gain("1", 2))
+        flow = Flow.of(integrator(TimingInWords(sample=(h, h))), gain("1", 2))
         assert growth(flow, P, x, 0.1) == pytest.approx(((1 - float(h)) ** 2 - 1) / float(h) * x[:, 0] ** 2)
     flow = Flow.of(integrator(TIMINGS["discrete"]), gain("5", 2))
     assert growth(flow, P, x, 1.0) == pytest.approx((0.81 - 1) * x[:, 0] ** 2)
-    flow = Flow.of(integrator(Timing()), gain("1", 2))
+    flow = Flow.of(integrator(TimingInWords()), gain("1", 2))
     assert growth(flow, P, x, 1.0) == pytest.approx(-2 * x[:, 0] ** 2)
 
 
 # Results
 
 
-def result_of(timing: Timing, claim: Claim, *, push: bool = False) -> RoaResult:
+def result_of(timing: TimingInWords, claim: Claim, *, push: bool = False) -> RoaResult:
     system, network = integrator(timing, push=push), gain("1", 2)
     problem = Problem(ClosedLoop(system, network), Quadratic(np.eye(2)), claim.rate)
     return RoaResult(
@@ -389,7 +397,7 @@ def printed(data: dict[str, Any]) -> str:
 
 
 def test_the_json_of_a_plain_claim_is_what_it_was() -> None:
-    data = result_of(Timing(), asymptotic()).to_dict()
+    data = result_of(TimingInWords(), asymptotic()).to_dict()
     assert data["claim"] == {"kind": "asymptotic"} and data["time"] == "continuous" and data["reach_time"] is None
     assert data["levels"]["ultimate"] is None
     json.dumps(data)
@@ -426,20 +434,23 @@ def test_the_summary_says_when(timing: str, kind: str) -> None:
 
 
 def test_a_plain_summary_says_nothing_of_times() -> None:
-    said = printed(result_of(Timing(), asymptotic()).to_dict())
+    said = printed(result_of(TimingInWords(), asymptotic()).to_dict())
     assert not re.search(r"sampl(ing|e )|held|rate|step", said), said
 
 
 def test_what_limits_names_the_step() -> None:
     data = result_of(TIMINGS["exact"], asymptotic(0.1)).to_dict() | {"reason": "witness"}
     assert limited_by(data) == "a point where V does not fall at the rate asked for over a period"
-    assert limited_by(result_of(Timing(), asymptotic()).to_dict() | {"reason": "witness"}) == "a point where Vdot >= 0"
+    assert (
+        limited_by(result_of(TimingInWords(), asymptotic()).to_dict() | {"reason": "witness"})
+        == "a point where Vdot >= 0"
+    )
 
 
 # The checker's words
 
 
-def printed_by_checker(timing: Timing, claim: Claim, *, push: bool = False) -> list[str]:
+def printed_by_checker(timing: TimingInWords, claim: Claim, *, push: bool = False) -> list[str]:
     raw = claimed(timing, claim, push=push).to_json().encode()
     read = document.certificate(json.loads(raw), hashlib.sha256(raw).hexdigest())
     answer = {"result": "ACCEPTED", "rules": {"tree": 1}, "margins": {"local": 0.5, "ring": 0.25}}
@@ -481,5 +492,5 @@ def test_the_checker_prints_a_plain_claim_as_ever() -> None:
 
 
 def test_rates_are_rounded_down() -> None:
-    shown = Timing(rate=1 / 3).shown_rate.removesuffix(" per s")
+    shown = TimingInWords(rate=1 / 3).shown_rate.removesuffix(" per s")
     assert exactly(shown) <= F(1 / 3) and shown == "0.333333"

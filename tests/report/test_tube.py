@@ -34,7 +34,8 @@ from certify.report.figures.portrait import keys
 from certify.report.figures.scene import Band, Scene, band_of, starts
 from certify.report.figures.style import LEAVING, START
 from certify.report.figures.tube import MOST, tube
-from certify.report.sampling import SETTLED, Flow, quadratic, runs_of
+from certify.report.flow import Flow
+from certify.report.sampling import SETTLED, quadratic, runs_of
 from certify.report.words import above, below
 from tests.report.test_report import Page, exactly
 from tests.support.loops import box, chain, scalar_tanh

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.lyapunov import inverse
-from certify.report.sampling import Field
+from certify.report.flow import Field
 
 Array = NDArray[np.float64]
 PARTS = 3

@@ -22,8 +22,9 @@ from certify.lyapunov import extents, is_positive_definite
 from certify.report.claims import words_for
 from certify.report.figures.geometry import PARTS, Box, circle, over_level, refine
 from certify.report.figures.pairs import Pair, pairs_of
-from certify.report.sampling import SETTLED, Flow, Runs, growth, quadratic, runs_of, time_scales
-from certify.report.timing import Timing
+from certify.report.flow import Flow, time_scales
+from certify.report.sampling import SETTLED, Runs, growth, quadratic, runs_of
+from certify.report.timing import TimingInWords
 from certify.report.words import deviation, exact_number, held_at, label
 
 Array = NDArray[np.float64]
@@ -188,7 +189,7 @@ class Scene:
         self.deadline = time.monotonic() + _SHARE * seconds
         if not is_ellipsoid(certificate):
             raise CertificateFormatError("P must be positive definite and the levels positive and in order.")
-        self.timing = Timing.of(certificate.system, certificate.claim.rate)
+        self.timing = TimingInWords.of(certificate.system, certificate.claim.rate)
         self.certificate, self.beyond = certificate, certificate.claim.outer
         self.words = words_for(certificate.kind, self.timing, beyond=self.beyond is not None)
         self.kind = "asymptotic" if certificate.claim.floor is None else "practical"

@@ -22,7 +22,7 @@ from certify.report.claims import CHECKED_ALWAYS, INPUTS
 from certify.report.figures.scene import centre_of, inner_of, is_ellipsoid, is_local_enough, slabs_of, start_of
 from certify.report.mathml import typeset
 from certify.report.sections.shared import centre_in_words, duration_in_words, timing_of, words_of
-from certify.report.timing import Timing
+from certify.report.timing import TimingInWords
 from certify.report.words import (
     MINUS,
     above,
@@ -125,7 +125,7 @@ def _beyond(certificate: Certificate, outer: Outer | None) -> dict[str, Any] | N
     return {"level": level, "name": name, "sha256": "", "formula": formula}
 
 
-def _smallest(timing: Timing) -> str:
+def _smallest(timing: TimingInWords) -> str:
     """Of what the margin of the ring is the least."""
     return f"the smallest bound on {MINUS}{f'({timing.decrease})' if timing.rate else timing.decrease}"
 

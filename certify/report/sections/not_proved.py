@@ -11,7 +11,7 @@ from certify.certificates import Certificate
 from certify.loop.plants import System
 from certify.report.claims import Words
 from certify.report.sections.shared import timing_of
-from certify.report.timing import Timing
+from certify.report.timing import TimingInWords
 from certify.report.words import Varying, held_at, listed, symbol
 
 
@@ -53,7 +53,7 @@ def not_proved_of(certificate: Certificate, words: Words) -> list[tuple[str, str
     return items
 
 
-def _other_times(timing: Timing) -> Iterator[tuple[str, str]]:
+def _other_times(timing: TimingInWords) -> Iterator[tuple[str, str]]:
     """In which other ways than the claim's time may pass in a loop."""
     if timing.discrete:
         yield (

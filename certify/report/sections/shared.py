@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 from certify.certificates import Certificate, PartitionTree
 from certify.report.claims import Words, words_for
 from certify.report.figures.scene import centre_of, slabs_of, start_of
-from certify.report.timing import Timing
+from certify.report.timing import TimingInWords
 from certify.report.words import ABSENT, above, number, point, symbol
 
 
-def timing_of(certificate: Certificate) -> Timing:
+def timing_of(certificate: Certificate) -> TimingInWords:
     """How time passes in its loop, and the rate at which V is claimed to fall."""
-    return Timing.of(certificate.system, certificate.claim.rate)
+    return TimingInWords.of(certificate.system, certificate.claim.rate)
 
 
 def words_of(certificate: Certificate) -> Words:

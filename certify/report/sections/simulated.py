@@ -11,7 +11,7 @@ from certify.certificates import Certificate
 from certify.report.claims import words_for
 from certify.report.sampling import SimulatedRoa
 from certify.report.sections.shared import timing_of
-from certify.report.timing import Timing
+from certify.report.timing import TimingInWords
 from certify.report.words import ABSENT, TIMES, number, volume_name
 
 
@@ -33,7 +33,7 @@ def simulated_of(roa: SimulatedRoa, certificate: Certificate) -> dict[str, str]:
     }
 
 
-def _integrated(roa: SimulatedRoa, timing: Timing) -> str:
+def _integrated(roa: SimulatedRoa, timing: TimingInWords) -> str:
     """How the runs of a grid come about; {} stands for the values that are held."""
     step = f"step {number(roa.step, 3)} s"
     if timing.discrete:

@@ -1,0 +1,236 @@
+"""Evidence of a claim, which the checker replays, or a solver's word: as data and as a section of the file."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.certificates.encoding import decode, encode
+
+Array = NDArray[np.float64]
+_OF_A_BALL = ("J", "multipliers", "weight")
+_OF_A_PATH = ("share", "edge", "motion", "joint")
+
+
+@dataclass(frozen=True, slots=True)
+class LocalBall:
+    """Evidence of the local proof: a ball x = J d, ||d|| <= 1, J (n, n), that contains {V <= c1}, and `multipliers`
+    (3, n) of the matrix inequality on it with the `weight` (n, n) from which all others follow.
+
+    `edge` is the multiplier of V - c0 of a practical claim, `order` that of the series in time of a sampled one.
+    """
+
+    J: Array
+    multipliers: Array
+    weight: Array
+    edge: float = 0.0
+    order: int = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Contraction:
+    """Evidence that trajectories come closer: a ball x = J d, ||d|| <= 1, J (n, n), that contains {V <= c0}, and the
+    `weights` (n,) of one bound on it and the `weight` (n, n) of another."""
+
+    J: Array
+    weights: Array
+    weight: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Waypoint:
+    """Where a slab of a tube around a path ends, and what its inequality takes beyond the multipliers.
+
+    Parameters
+    ----------
+    centre : of the slab's ellipsoids at its end, (n,); between its ends it moves on a line.
+    share : of the slab's ball, that its middle's motion takes; between 0 and 1.
+    edge, motion, joint : multipliers of the tube's edge and of the motion, and the motion's entry of the third row.
+    """
+
+    centre: Array
+    share: float
+    edge: float
+    motion: float
+    joint: float
+
+
+@dataclass(frozen=True, slots=True)
+class Slab:
+    """A piece of a tube, on which P(t) is a polynomial of degree 2 in Bernstein's form.
+
+    Parameters
+    ----------
+    middle, end : its coefficients after that of the slab before, (n, n); the piece ends at {x'Px <= 1}, P = `end`.
+    duration : units of time.
+    J, multipliers, weight : a ball that contains it, (n, n), and what the matrix inequalities on it take, (3, n) and
+        (k, k), k = n at rest and n + 1 along a path.
+    path : None where the ellipsoids stay around the origin.
+    """
+
+    middle: Array
+    end: Array
+    duration: float
+    J: Array
+    multipliers: Array
+    weight: Array
+    path: Waypoint | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class OuterTree:
+    """Evidence of a claim's outer set: a partition of a box around the domain, and one of each of the domain's faces.
+
+    Parameters
+    ----------
+    T, root : (n, n) and (n,), half-widths of the root box in z, x = T z.
+    tree : the partition in preorder, one byte a node.
+    faces : the same for the lower and the upper end of each state, in the order of the states, 2 n in all.
+    """
+
+    T: Array
+    root: Array
+    tree: bytes
+    faces: tuple[bytes, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class PartitionTree:
+    """Evidence that the checker replays.
+
+    Parameters
+    ----------
+    T, root : (n, n) and (n,), half-widths of the root box in z, x = T z.
+    tree : the partition in preorder, one byte a node.
+    local : of the local proof; None where the claim has none.
+    cells : into how many parts the range of each uncertain quantity is cut for it, in their order.
+    tube : the slabs, in their order, of a claim that is enlarged by a tube.
+    order : of the series in time on its leaves, where the input is held over a period.
+    contraction : of a claim of a nearby equilibrium.
+    outer : of a claim with an outer set.
+    """
+
+    T: Array
+    root: Array
+    tree: bytes
+    local: LocalBall | None = None
+    tube: tuple[Slab, ...] = ()
+    cells: tuple[int, ...] = ()
+    order: int = 1
+    contraction: Contraction | None = None
+    outer: OuterTree | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class TrustedSolver:
+    """Evidence that cannot be replayed: what a solver answered. `queries` are pairs (name, answer)."""
+
+    solver: str
+    version: str
+    precision: float
+    queries: tuple[tuple[str, str], ...]
+
+
+def evidence_section(evidence: PartitionTree | TrustedSolver) -> dict[str, Any]:
+    if isinstance(evidence, PartitionTree):
+        return {
+            "kind": "partition-tree",
+            "T": encode(evidence.T),
+            "root": encode(evidence.root),
+            "tree": base64.b64encode(evidence.tree).decode("ascii"),
+            "cells": list(evidence.cells),
+            "order": evidence.order,
+            "local": None if evidence.local is None else _local(evidence.local),
+            "contraction": None if evidence.contraction is None else _contraction(evidence.contraction),
+            "tube": [
+                {"middle": encode(slab.middle), "end": encode(slab.end), "duration": float(slab.duration).hex()}
+                | _ball(slab)
+                | {"path": None if slab.path is None else _path(slab.path)}
+                for slab in evidence.tube
+            ],
+            "outer": None if evidence.outer is None else _outer_tree(evidence.outer),
+        }
+    return {
+        "kind": "trusted-solver",
+        "solver": evidence.solver,
+        "version": evidence.version,
+        "precision": float(evidence.precision).hex(),
+        "queries": [list(pair) for pair in evidence.queries],
+    }
+
+
+def read_evidence(data: Mapping[str, Any], n: int) -> PartitionTree | TrustedSolver:
+    if data["kind"] == "partition-tree":
+        root, local = decode(data["root"], (n,)), data["local"]
+        return PartitionTree(
+            decode(data["T"], (n, n)),
+            root,
+            base64.b64decode(data["tree"]),
+            None if local is None else _read_local(local, n),
+            tuple(
+                Slab(
+                    decode(slab["middle"], (n, n)),
+                    decode(slab["end"], (n, n)),
+                    float.fromhex(slab["duration"]),
+                    *_read_ball(slab, n, n + (slab["path"] is not None)),
+                    None if slab["path"] is None else _read_path(slab["path"], n),
+                )
+                for slab in data["tube"]
+            ),
+            tuple(map(int, data["cells"])),
+            int(data["order"]),
+            None if data["contraction"] is None else _read_contraction(data["contraction"], n),
+            None if data["outer"] is None else _read_outer_tree(data["outer"], n),
+        )
+    queries = tuple((str(name), str(answer)) for name, answer in data["queries"])
+    return TrustedSolver(str(data["solver"]), str(data["version"]), float.fromhex(data["precision"]), queries)
+
+
+def _outer_tree(evidence: OuterTree) -> dict[str, Any]:
+    tree, *faces = (base64.b64encode(nodes).decode("ascii") for nodes in (evidence.tree, *evidence.faces))
+    return {"T": encode(evidence.T), "root": encode(evidence.root), "tree": tree, "faces": faces}
+
+
+def _read_outer_tree(data: Mapping[str, Any], n: int) -> OuterTree:
+    tree, *faces = (base64.b64decode(nodes) for nodes in (data["tree"], *data["faces"]))
+    return OuterTree(decode(data["T"], (n, n)), decode(data["root"], (n,)), tree, tuple(faces))
+
+
+def _ball(evidence: LocalBall | Slab) -> dict[str, str]:
+    return {name: encode(getattr(evidence, name)) for name in _OF_A_BALL}
+
+
+def _contraction(ball: Contraction) -> dict[str, str]:
+    return {name: encode(getattr(ball, name)) for name in ("J", "weights", "weight")}
+
+
+def _read_contraction(data: Mapping[str, str], n: int) -> Contraction:
+    return Contraction(decode(data["J"], (n, n)), decode(data["weights"], (n,)), decode(data["weight"], (n, n)))
+
+
+def _local(ball: LocalBall) -> dict[str, Any]:
+    return {**_ball(ball), "edge": float(ball.edge).hex(), "order": ball.order}
+
+
+def _read_local(data: Mapping[str, Any], n: int) -> LocalBall:
+    return LocalBall(*_read_ball(data, n, n), float.fromhex(data["edge"]), int(data["order"]))
+
+
+def _read_ball(data: Mapping[str, str], n: int, k: int) -> tuple[Array, Array, Array]:
+    """k is how many entries d has."""
+    J, multipliers, weight = (data[name] for name in _OF_A_BALL)
+    return decode(J, (n, n)), decode(multipliers, (3, n)), decode(weight, (k, k))
+
+
+def _path(path: Waypoint) -> dict[str, str]:
+    numbers = {name: float(getattr(path, name)).hex() for name in _OF_A_PATH}
+    return {"centre": encode(path.centre), **numbers}
+
+
+def _read_path(data: Mapping[str, str], n: int) -> Waypoint:
+    return Waypoint(decode(data["centre"], (n,)), *(float.fromhex(data[name]) for name in _OF_A_PATH))

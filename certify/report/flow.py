@@ -1,0 +1,155 @@
+"""The closed loop as pictures simulate it, in floats.
+
+The continuous closed loop is integrated by the classical Runge-Kutta method of order four with the policy evaluated at
+every stage, many initial states at a time; where the input is held over a period, with the policy evaluated at its
+beginning, in steps that divide it. A loop in discrete time takes its own steps.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.errors import InputError
+from certify.loop.plants import System
+from certify.loop.plants.ode import eigenvalues_of, rk4_step
+from certify.loop.policies import TanhNetwork
+
+Array = NDArray[np.float64]
+Field = Callable[[Array], Array]
+_STEP = 1.0  # of the time constant of the fastest eigenvalue
+_HORIZON = 15.0  # time constants of the slowest eigenvalue
+_MAX_STEPS = 3000
+_RATE_SAMPLES = 200
+
+
+@dataclass(frozen=True, slots=True)
+class Flow:
+    """The closed loop for simulation, in float64. It need not have an equilibrium at the origin.
+
+    Parameters
+    ----------
+    field : `F(x) = f(x, pi(x))`, shapes (..., n) to (..., n). Compiling it takes a while for large plants, hence this
+        class.
+    policy : pi, shapes (..., n) to (..., m).
+    lo, hi : corners of the domain box, shape (n,).
+    plant : f, shapes (..., n) and (..., m) to (..., n).
+    period : over which the input is held, the longest that is allowed, in seconds; 0 if it follows the state at once.
+    discrete : whether F(x) is the state one step later, and not the rate of change.
+    """
+
+    field: Field
+    policy: Field
+    lo: Array
+    hi: Array
+    plant: Callable[[Array, Array], Array]
+    period: float = 0.0
+    discrete: bool = False
+
+    @classmethod
+    def of(cls, system: System, network: TanhNetwork) -> Flow:
+        """Compile the equations.
+
+        Raises
+        ------
+        InputError : the policy is not one for this plant.
+        """
+        if (network.n, network.m) != (system.n, system.m):
+            raise InputError(
+                f"the policy must read {system.n} states and command {system.m} inputs of {system.name}; "
+                f"it reads {network.n} and commands {network.m}."
+            )
+        f, u_eq = system.function(), system.exact_u_eq()
+        folded = network.folded(u_eq)  # once, not in every step
+
+        def policy(x: Array) -> Array:
+            return np.asarray(folded(x, u_eq))
+
+        def field(x: Array) -> Array:
+            return np.asarray(f(x, policy(x)))
+
+        def plant(x: Array, u: Array) -> Array:
+            return np.asarray(f(x, u))
+
+        period = 0.0 if system.sample is None else float(system.sample[1])
+        return cls(field, policy, *domain_bounds(system), plant, period, system.time == "discrete")
+
+    def fitting(self, step: float) -> float:
+        """The largest step of a simulation up to `step`, in seconds, that divides the period; in discrete time 1."""
+        if self.discrete:
+            return 1.0
+        return self.period / math.ceil(self.period / step) if self.period else step
+
+    def steps_between(self, step: float) -> int:
+        """How many of these steps lie between two instants of which the claim speaks."""
+        return max(round(self.period / step), 1)
+
+    def input(self, x: Array, held: Array | None, k: int, step: float) -> Array | None:
+        """The input that acts from step k on, (..., m): the one that is held, or a new one; None if none is held."""
+        if not self.period:
+            return None
+        return self.policy(x) if held is None or k % self.steps_between(step) == 0 else held
+
+    def advance(self, x: Array, u: Array | None, step: float) -> Array:
+        """States one step later, (..., n), with the input held at u if there is one."""
+        if self.discrete:
+            return self.field(x)
+        return rk4_step(self.field if u is None else lambda y: self.plant(y, u), x, step)
+
+
+def time_scales(flow: Flow, samples: int = _RATE_SAMPLES, reach: Array | None = None) -> tuple[float, float]:
+    """(step, horizon) in seconds: the fastest time constant, and 15 times the slowest at the origin.
+
+    Of `samples` states in the domain, or in the part of it where `|x_i| <= reach_i`.
+
+    The fastest is taken over Jacobians at the origin and at sampled states of the domain, because a plant can be
+    stiffer away from the origin; Runge-Kutta of order four is stable up to 2.8 of it. The horizon is cut at 3,000
+    steps. In discrete time the two are numbers of steps, the first 1.
+    """
+    lo, hi = (flow.lo, flow.hi) if reach is None else (np.maximum(flow.lo, -reach), np.minimum(flow.hi, reach))
+    x = np.random.default_rng(0).uniform(lo, hi, (samples, len(lo)))
+    rates = eigenvalues_of(flow.field, np.concatenate([np.zeros((1, len(flow.lo))), x]), flow.hi - flow.lo)
+    if flow.discrete:
+        with np.errstate(divide="ignore"):
+            slowest = -float(np.max(np.log(np.abs(rates[:1])), initial=-math.inf))
+        return 1.0, min(math.ceil(_HORIZON / slowest) if slowest > _HORIZON / _MAX_STEPS else _MAX_STEPS, _MAX_STEPS)
+    fastest = float(np.max(np.abs(rates), initial=0.0))
+    slowest = float(np.min(np.abs(rates[:1].real), initial=math.inf))
+    step = _STEP / fastest if fastest > 0 else 1.0
+    return step, min(_HORIZON / slowest if slowest > 0 else math.inf, _MAX_STEPS * flow.fitting(step))
+
+
+def simulate(flow: Flow, starts: Array, step: float, steps: int, deadline: float = math.inf) -> Array:
+    """Trajectories from `starts` (N, n), shape (steps + 1, N, n); NaN from the first step outside the domain on.
+
+    At `deadline`, a reading of `time.monotonic`, the trajectories end where they are, in fewer steps. Where the input
+    is held `step` must divide the period (Flow.fitting); the first period begins at the start.
+    """
+    u: Array | None = None
+    x = np.array(starts, dtype=np.float64)
+    path = np.full((steps + 1, *x.shape), math.nan)
+    path[0] = x
+    alive = np.arange(len(x))
+    with np.errstate(all="ignore"):
+        for k in range(1, steps + 1):
+            if not alive.size:
+                break
+            if k > 1 and time.monotonic() > deadline:
+                return path[:k]
+            u = flow.input(x, u, k - 1, step)
+            x = flow.advance(x, u, step)
+            inside = np.all((x >= flow.lo) & (x <= flow.hi), axis=-1)
+            x, alive, u = x[inside], alive[inside], None if u is None else u[inside]
+            path[k, alive] = x
+    return path
+
+
+def domain_bounds(system: System) -> tuple[Array, Array]:
+    """Lower and upper corner of the domain box in float64."""
+    bounds = np.array([[float(a), float(b)] for a, b in system.domain])
+    return bounds[:, 0], bounds[:, 1]
