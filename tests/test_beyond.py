@@ -43,7 +43,7 @@ def plant(rates: Expression = -x + x**3 + u) -> System:
 
 
 def proved(tmp_path: Path, **options: object) -> RoaResult:
-    given: dict[str, object] = {"level": HALF, "P": [[0.5]], "lyapunov": SQUARE, "time_limit": 20.0} | options
+    given: dict[str, object] = {"level": HALF, "P": [[0.5]], "lyapunov": SQUARE, "effort": 0.4} | options
     return certify_roa(plant(), REST, tmp_path, **given)  # type: ignore[arg-type]
 
 
@@ -158,7 +158,7 @@ def test_a_later_notice_takes_none_away(tmp_path: Path) -> None:
     """The loop rests beside the origin, and N falls nowhere: both are said."""
     pushed = plant(-x + x**3 + u + Fraction(1, 1000))
     falls = Polynomial(np.array([[2]]), np.array([-1.0]))
-    result = certify_roa(pushed, REST, tmp_path, P=[[0.5]], lyapunov=falls, time_limit=20.0)
+    result = certify_roa(pushed, REST, tmp_path, P=[[0.5]], lyapunov=falls, effort=0.4)
     assert result.verdict is Verdict.PROVED and result.notice is not None
     said = result.notice.split("; ")
     assert [text.split(",")[0] for text in said[:1]] == ["practical stability is claimed"]

@@ -396,7 +396,7 @@ def test_an_interrupt_leaves_a_search_and_nothing_half_written(
     if where == "ring":
         monkeypatch.setattr(VdotBound, "__call__", interrupt)
     else:
-        monkeypatch.setattr("certify.analysis.run.run_checker", interrupt)
+        monkeypatch.setattr("certify.analysis.stages.acceptance.run_checker", interrupt)
     status, out, err = run(capsys, "roa", "--policy", policy_file, "--out", tmp_path / "o")
     assert status == 130 and out == "" and "interrupted" in err and "--resume" in err
     assert [path.name for path in (tmp_path / "o").iterdir()] == ["search.json"]
@@ -576,7 +576,7 @@ def spring(tmp_path: Path) -> tuple[str | Path, ...]:
 def test_reach_proves_that_a_state_converges(
     tmp_path: Path, spring: tuple[str | Path, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    given = ("reach", *spring, "--from", "p=1.5,v=1.4", "--box", "p=0.1,v=0.2", "--time-limit", "20", "--json")
+    given = ("reach", *spring, "--from", "p=1.5,v=1.4", "--box", "p=0.1,v=0.2", "--effort", "0.4", "--json")
     status, out, _ = run(capsys, *given)
     assert status == 0 and out.count("\n") == 1
     data = json.loads(out)
@@ -594,7 +594,7 @@ def test_reach_proves_that_a_state_converges(
 def test_a_state_that_is_not_shown_to_converge_exits_3(
     tmp_path: Path, spring: tuple[str | Path, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    given = ("reach", *spring, "--from", "p=1.95,v=1.95", "--time-limit", "6")
+    given = ("reach", *spring, "--from", "p=1.95,v=1.95", "--effort", "0.12")
     status, out, _ = run(capsys, *given)
     assert status == 3
     said = " ".join(out.split())
@@ -609,7 +609,7 @@ def test_a_state_that_is_not_shown_to_converge_exits_3(
 def test_a_state_in_the_proved_set_needs_no_tube(
     spring: tuple[str | Path, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    status, out, err = run(capsys, "reach", *spring, "--from", "p=0.1", "--time-limit", "10", "--json")
+    status, out, err = run(capsys, "reach", *spring, "--from", "p=0.1", "--effort", "0.2", "--json")
     data = json.loads(out)
     assert status == 0 and data["verdict"] == "PROVED" and data["claim"] == {"kind": "asymptotic"}
     assert data["tube"] is None and "the state lies in the proved set, and no tube is needed" in err
@@ -677,7 +677,7 @@ def test_three_ways_in_make_one_plant(
 ) -> None:
     """Asked for a level beyond the domain, so that the run ends at once."""
     given = ("--param", "k=3/4..2", "--disturbance", "wind=-0.01..0.02", "--input-error", "F=1e-3", "--level", "100")
-    status, out, err = run(capsys, "roa", *ranged, *given, "--claim", "practical", "--json", "--time-limit", "5")
+    status, out, err = run(capsys, "roa", *ranged, *given, "--claim", "practical", "--json", "--effort", "0.1")
     assert [(q["kind"], q["name"], q["lo"], q["hi"]) for q in json.loads(out)["uncertain"]] == [
         ("parameter", "k", "3/4", "2"),
         ("disturbance", "wind", "-1/100", "1/50"),

@@ -78,7 +78,7 @@ def enlarged(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An accepted certificate with a tube, for the shipped policy of the pendulum."""
     folder = tmp_path_factory.mktemp("tube")
     policy = EXAMPLES / "policies" / "pendulum.pt"
-    result = certify_roa("pendulum", policy, folder, level=0.3, enlarge=True, time_limit=20.0)
+    result = certify_roa("pendulum", policy, folder, level=0.3, enlarge=True, effort=0.4)
     assert result.tube is not None and result.certificate is not None, result.reason
     return result.certificate
 

@@ -183,7 +183,7 @@ def test_a_set_is_proved_within_a_minute(tmp_path: Path, name: str, volume: floa
         load_system(EXAMPLES / "plants" / f"{name}.toml"),
         load_policy(EXAMPLES / "policies" / f"{name}.pt"),
     )
-    options = RoaOptions(candidate="optimised", time_limit=60)
+    options = RoaOptions(candidate="optimised", effort=1.2)
     result = certify_roa(system, policy.network, tmp_path, options)
     assert result.verdict is Verdict.PROVED
     assert result.to_dict()["volume"] > volume

@@ -50,5 +50,5 @@ def test_the_optimised_candidate_of_the_planar_quadrotor_is_accepted(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The checker rejected what the engine had proved: a leaf was proved with a multiplier for an earlier c2."""
-    answer = roa(capsys, "2dquadrotor_seed_0", tmp_path, "--candidate", "optimised", "--time-limit", "60")
+    answer = roa(capsys, "2dquadrotor_seed_0", tmp_path, "--candidate", "optimised", "--effort", "1.2")
     assert answer["verdict"] == "PROVED" and answer["checked"] == "ACCEPTED"

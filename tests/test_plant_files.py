@@ -119,7 +119,7 @@ def test_the_certificate_is_that_of_the_plant_that_was_shifted_by_hand(tmp_path:
     network = gain(system, (-1.0, -1.0))
     lines = []
     for k, plant in enumerate((system, shifted)):
-        result = certify_roa(plant, network, tmp_path / str(k), RoaOptions(time_limit=20))
+        result = certify_roa(plant, network, tmp_path / str(k), RoaOptions(effort=0.4))
         assert result.verdict is Verdict.PROVED and result.raw is not None
         lines.append(json.loads(result.raw))
     mine, theirs = (dict(d, provenance=None, plant=dict(d["plant"], dynamics=None)) for d in lines)
@@ -144,7 +144,7 @@ def test_a_report_and_the_terminal_say_the_operating_point(tmp_path: Path, capsy
     save_policy(tmp_path / "p.pt", Policy(gain(system, (-1.0, -1.0)), "tank", {"tau": 2, "rest": "1/3"}))
     arguments = ["roa", "--policy", str(tmp_path / "p.pt"), "--system", str(tmp_path / "tank.toml")]
     arguments += ["--candidate", "lyapunov"]
-    assert _run([*arguments, "--out", str(tmp_path / "o"), "--time-limit", "20"], False) == 0
+    assert _run([*arguments, "--out", str(tmp_path / "o"), "--effort", "0.4"], False) == 0
     out, err = capsys.readouterr()
     assert "operating point" in out and "level = 0.333333 m" in out and "level − 0.333333 (m)" in out
     assert "attracted by the operating point" in out and "lengths are deviations from it" in " ".join(out.split())
@@ -189,7 +189,7 @@ def test_a_result_without_an_operating_point_needs_none() -> None:
 )
 def test_an_odd_operating_point_in_a_certificate_is_passed_over(tmp_path: Path, x_eq: object) -> None:
     system = load_system(write(tmp_path))
-    result = certify_roa(system, gain(system, (-1.0, -1.0)), tmp_path / "o", RoaOptions(time_limit=20))
+    result = certify_roa(system, gain(system, (-1.0, -1.0)), tmp_path / "o", RoaOptions(effort=0.4))
     assert result.raw is not None
     assert parse_certificate(result.raw, "c").system.exact_x_eq() == system.exact_x_eq()
     data = json.loads(result.raw)

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import certify.analysis.run
+import certify.analysis.stages.candidate
 from certify.analysis.candidates.trials import Trial, trial
 from certify.analysis.options import RoaOptions
 from certify.analysis.run import certify_roa
@@ -16,6 +16,7 @@ from certify.analysis.selection import Race
 from certify.certificates import TrustedSolver
 from certify.certificates.claims import Asymptotic
 from certify.certificates.verdict import Stop
+from certify.effort import UNIT, Effort
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import System
 from certify.loop.policies import load_policy
@@ -56,11 +57,11 @@ def race(share: float, local: float = 0.1) -> tuple[Race, list[str]]:
     """A race whose attempts prove this share of their levels, and the names in the order in which they began."""
     began: list[str] = []
 
-    def begin(one: Trial) -> Reaches:
+    def begin(one: Trial, proved: bool) -> Reaches:
         began.append(one.name)
         return Reaches(one.task.target, share, local)
 
-    return Race(begin, lambda: 1.0, 100), began  # type: ignore[arg-type]
+    return Race(begin, Effort(UNIT), UNIT, 100), began  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -78,7 +79,7 @@ def test_a_race_is_settled_where_no_other_could_be_let_in(
 ) -> None:
     run, began = race(share)
     largest = trials()[1].volume
-    assert run.is_settled_by(trials()[1], 1.0, most * largest) is settled
+    assert run.is_settled_by(trials()[1], most * largest) is settled
     assert began == entered
 
 
@@ -86,7 +87,7 @@ def test_a_race_is_settled_where_no_other_could_be_let_in(
 def test_the_candidate_for_the_local_rule_may_be_ahead_where_that_rule_proves_most(local: float) -> None:
     run, began = race(1.0, local)
     large = trials()[1]
-    assert run.is_settled_by(large, 1.0, large.volume) is (local <= 0.5) and began == ["large"]
+    assert run.is_settled_by(large, large.volume) is (local <= 0.5) and began == ["large"]
 
 
 def test_a_race_that_is_not_settled_goes_on_as_if_it_began() -> None:
@@ -94,16 +95,16 @@ def test_a_race_that_is_not_settled_goes_on_as_if_it_began() -> None:
     run, began = race(1.0, 1.0)
     _, large = trials()
     larger = replace(large, name="larger", volume=1.01 * large.volume)
-    assert not run.is_settled_by(large, 1.0, large.volume)
+    assert not run.is_settled_by(large, large.volume)
     early = run.early
     assert run.contenders == [] and early is not None and early.proved > 0
-    run.enter([large, larger], 1.0)
+    run.enter([large, larger])
     assert [c.trial.name for c in run.contenders] == ["larger"] and began == ["large", "larger"]
     again, began = race(0.4)
     given = trials()
-    assert not again.is_settled_by(given[1], 1.0, given[1].volume)
+    assert not again.is_settled_by(given[1], given[1].volume)
     early = again.early
-    again.enter(given, 1.0)
+    again.enter(given)
     assert began == ["large", "small"] and again.contenders[0] is early
 
 
@@ -113,13 +114,13 @@ def test_no_candidate_is_made_that_could_not_win(
 ) -> None:
     """The pendulum's set fills its domain, and the slow candidate is not made; that changes no byte."""
     made = list[str]()
-    robust = certify.analysis.run.robust
+    robust = certify.analysis.stages.candidate.robust
 
-    def counted(loop: ClosedLoop, options: RoaOptions) -> Trial | None:
+    def counted(loop: ClosedLoop, options: RoaOptions, effort: Effort) -> Trial | None:
         made.append(loop.system.name)
-        return robust(loop, options)
+        return robust(loop, options, effort)
 
-    monkeypatch.setattr(certify.analysis.run, "robust", counted)
+    monkeypatch.setattr("certify.analysis.stages.candidate.robust", counted)
     network = load_policy(SHIPPED).network
     quick = certify_roa(pendulum, network, tmp_path / "quick")
     assert not made and quick.verdict.value == "PROVED"
@@ -132,7 +133,7 @@ def test_no_candidate_is_made_that_could_not_win(
 def test_a_candidate_that_could_win_is_made(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The origin attracts two thirds of this domain: nothing that is proved of it could settle the race."""
     made = list[str]()
-    monkeypatch.setattr(certify.analysis.run, "robust", lambda loop, _: made.append(loop.system.name))
+    monkeypatch.setattr(certify.analysis.stages.candidate, "robust", lambda loop, *_: made.append(loop.system.name))
     system, network = scalar_tanh()
     found = certify_roa(replace(system), network, tmp_path)
     assert found.verdict.value == "PROVED" and made == ["scalar"]

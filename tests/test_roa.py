@@ -18,12 +18,13 @@ import scipy.linalg
 import sympy
 from torch import Tensor
 
-from certify.analysis.candidates.trials import OPTIMISING, Trial, trial
+from certify.analysis.candidates.trials import Trial, trial
 from certify.analysis.run import RoaOptions, certify_roa
 from certify.certificates import Certificate, checking, run_checker, sole_writer
 from certify.certificates.claims import Problem
 from certify.certificates.membership import Containment
 from certify.certificates.verdict import Verdict
+from certify.effort import WHOLE
 from certify.errors import BackendError, InputError, SoundnessError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Expression, Number, Symbol, sin, symbols
@@ -236,7 +237,8 @@ def test_whatever_the_checker_refuses_a_run_ends_with_what_it_accepts(
 
 def test_what_cannot_be_mended_is_a_soundness_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
-        "certify.analysis.run.run_checker", lambda *_, **__: {"result": "REJECTED", "rule": "hash", "at": "policy"}
+        "certify.analysis.stages.acceptance.run_checker",
+        lambda *_, **__: {"result": "REJECTED", "rule": "hash", "at": "policy"},
     )
     with pytest.raises(SoundnessError, match=r"rejects what the engine proved.*unchecked\.json reproduces"):
         certify_roa(*scalar_tanh(), tmp_path, RoaOptions(candidate="lyapunov"))
@@ -305,7 +307,7 @@ def test_an_answer_about_other_bytes_is_no_proof(tmp_path: Path, monkeypatch: py
     """Another run's certificate is accepted in the place of this one's."""
     other = certify_roa(*scalar_tanh(), tmp_path / "other", RoaOptions(level=1.0)).certificate
     assert other is not None
-    monkeypatch.setattr("certify.analysis.run.run_checker", lambda *_, **__: run_checker(other))
+    monkeypatch.setattr("certify.analysis.stages.acceptance.run_checker", lambda *_, **__: run_checker(other))
     with pytest.raises(SoundnessError, match="other bytes"):
         certify_roa(*scalar_tanh(), tmp_path / "mine", RoaOptions(level=2.0))
     assert not (tmp_path / "mine" / "certificate.json").exists()
@@ -424,10 +426,12 @@ def test_an_earlier_run_s_files_do_not_lie_where_the_result_is_looked_for(
     (tmp_path / "search.json").write_text("my own notes")
     options = {"refuted": RoaOptions(level=3.9), "unknown": RoaOptions(level=0.5, max_boxes=1)}
     if ends == "interrupted":
-        monkeypatch.setattr("certify.analysis.run.named", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt))
+        monkeypatch.setattr(
+            "certify.analysis.stages.candidate.named", lambda *_: (_ for _ in ()).throw(KeyboardInterrupt)
+        )
     if ends == "with an error":
         monkeypatch.setattr(
-            "certify.analysis.run.named", lambda *_: (_ for _ in ()).throw(InputError("no such candidate"))
+            "certify.analysis.stages.candidate.named", lambda *_: (_ for _ in ()).throw(InputError("no such candidate"))
         )
     if ends == "unknown":
         monkeypatch.setattr("certify.provers.boxes.engine.prove_local", lambda *_: None)
@@ -461,26 +465,24 @@ def test_a_file_that_is_in_the_way_is_named_and_stays(tmp_path: Path) -> None:
 
 
 class Made:
-    """Candidates that take all of the seconds that they are granted, by a clock that nothing else moves."""
+    """Candidates that take all of the effort that they are granted."""
 
     def __init__(self, P: float) -> None:
-        self.now, self.P = 0.0, P
+        self.P, self.granted = P, list[float]()
 
     def __call__(self, loop: ClosedLoop, *given: Any) -> Trial:
-        seconds = OPTIMISING * given[-1].time_limit
-        self.now += seconds
+        effort = given[-1]
+        self.granted.append(effort.left)
+        effort.charge(effort.left)
         self.P *= 0.9  # each is a new one
         return trial(loop, np.array([[self.P]]), "optimised", RoaOptions())
 
 
-def test_candidates_take_no_more_time_than_there_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Reading has taken most of the limit, and each candidate takes all that it is granted."""
+def test_candidates_take_no_more_effort_than_there_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     system, network = scalar_tanh()
     made = Made(1.0)
     for name in ("optimised", "robust", "corrected"):
-        monkeypatch.setattr(f"certify.analysis.run.{name}", made)
-    monkeypatch.setattr("certify.analysis.run._Run.clock", staticmethod(lambda: made.now))
-    monkeypatch.setattr("certify.analysis.run.time.perf_counter", lambda: made.now)
-    found = certify_roa(system, network, tmp_path, RoaOptions(time_limit=50.0), load_seconds=46.0)
+        monkeypatch.setattr(f"certify.analysis.stages.candidate.{name}", made)
+    found = certify_roa(system, network, tmp_path, RoaOptions(effort=0.1))
     assert found.verdict is Verdict.PROVED
-    assert 46.0 + made.now <= 50.0
+    assert len(made.granted) >= 2 and sum(made.granted) <= 0.1 * WHOLE

@@ -327,18 +327,18 @@ def test_a_local_set_of_another_size(factor: float, monkeypatch: pytest.MonkeyPa
 
 
 def result_of(folder: Path, **more: Any) -> RoaResult:
-    options = RoaOptions(**({"time_limit": 12.0} | more))
+    options = RoaOptions(**({"effort": 0.24} | more))
     return certify_roa(WIDE, pendulum_network(), folder, options)
 
 
 @pytest.mark.slow
 def test_a_run_out_of_boxes_is_gone_on_with_twice(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for place in ("certify.analysis.run", "certify.analysis.selection"):
+    for place in ("certify.analysis.stages.candidate", "certify.analysis.stages.ring", "certify.analysis.selection"):
         plain = Budget
         monkeypatch.setattr(
             f"{place}.Budget", lambda *args, plain=plain, **more: plain(*args, **({"batch": 16} | more))
         )
-    monkeypatch.setattr("certify.analysis.run._HEAT", 1e-9)
+    monkeypatch.setattr("certify.analysis.stages.candidate._HEAT", 1e-9)
     found = [result_of(tmp_path, Q=(1.0, 1.0), max_boxes=150)]
     assert found[0].stop is Stop.BOXES and found[0].search == tmp_path / "search.json"
     found.append(result_of(tmp_path, resume=True, max_boxes=250))
@@ -378,13 +378,13 @@ def test_another_problem_is_another_search() -> None:
 # -------------------------------------------------------------------------------------------------------- interrupted
 
 PLACES = {  # where Ctrl-C comes, and on which call: from the first candidate to the last check
-    "candidates": ("certify.analysis.run.solutions", 1),
-    "the first one": ("certify.analysis.run.optimised", 1),
+    "candidates": ("certify.analysis.stages.candidate.solutions", 1),
+    "the first one": ("certify.analysis.stages.candidate.optimised", 1),
     "a local proof": ("certify.provers.boxes.engine.prove_local", 1),
     "a heat": ("certify.provers.boxes.rule.VdotBound.__call__", 1),
     "the search": ("certify.provers.boxes.rule.VdotBound.__call__", 3),
-    "the first check": ("certify.analysis.run.run_checker", 1),
-    "the end": ("certify.analysis.run.limit_of", 1),
+    "the first check": ("certify.analysis.stages.acceptance.run_checker", 1),
+    "the end": ("certify.analysis.stages.acceptance.limit_of", 1),
 }
 
 
@@ -405,7 +405,7 @@ def test_a_run_that_is_interrupted_anywhere_is_resumed_to_its_end(
     owner, _, attribute = name.rpartition(".")
     original = pkgutil.resolve_name(name)
     monkeypatch.setattr(pkgutil.resolve_name(owner), attribute, counted)
-    monkeypatch.setattr("certify.analysis.run._HEAT", 1e-9)
+    monkeypatch.setattr("certify.analysis.stages.candidate._HEAT", 1e-9)
     system, network = scalar_tanh()
     with pytest.raises(KeyboardInterrupt):
         certify_roa(system, network, tmp_path)
@@ -417,10 +417,11 @@ def test_a_run_that_is_interrupted_anywhere_is_resumed_to_its_end(
     assert end.volume is not None and end.volume > 3.8  # of the 3.83 that the origin attracts
 
 
-def test_a_run_that_is_out_of_time_at_once_leaves_a_search(tmp_path: Path) -> None:
-    """Whatever it proves is accepted, it says that it was the time, and what is left is resumed."""
+@pytest.mark.parametrize(("options", "stop"), [({"effort": 1e-6}, Stop.EFFORT), ({"time_limit": 1e-3}, Stop.TIME)])
+def test_a_run_that_is_over_at_once_leaves_a_search(tmp_path: Path, options: dict[str, float], stop: Stop) -> None:
+    """Whatever it proves is accepted, it says what ended it, and what is left is resumed."""
     system, network = scalar_tanh()
-    first = certify_roa(system, network, tmp_path, RoaOptions(time_limit=1e-3))
-    assert first.verdict in (Verdict.PROVED, Verdict.UNKNOWN) and first.stop is Stop.TIME
+    first = certify_roa(system, network, tmp_path, RoaOptions(**options))  # type: ignore[arg-type]
+    assert first.verdict in (Verdict.PROVED, Verdict.UNKNOWN) and first.stop is stop
     assert first.search == tmp_path / "search.json"
     assert certify_roa(system, network, tmp_path, RoaOptions(resume=True)).verdict is Verdict.PROVED

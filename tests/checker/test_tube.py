@@ -84,7 +84,7 @@ def pendulum() -> Document:
     with TemporaryDirectory() as folder:
         command = [sys.executable, "-c", "from certify.cli.main import main; main()", "roa"]
         command += ["--policy", str(ROOT / "examples" / "policies" / "pendulum.pt")]
-        command += ["--level", "0.3", "--enlarge", "--time-limit", "30", "--out", folder, "--quiet"]
+        command += ["--level", "0.3", "--enlarge", "--effort", "0.6", "--out", folder, "--quiet"]
         done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
         assert done.returncode == 0, done.stdout + done.stderr
         data: Document = json.loads((Path(folder) / "certificate.json").read_text())

@@ -163,7 +163,7 @@ def test_what_is_trained_is_stable_settles_and_is_proved(trained, henon, tmp_pat
     assert (found.held.settled, found.held.states) == (100, 100)
     assert max(found.A_relative_error, found.B_relative_error, found.K_relative_error) < 0.01
     save_policy(tmp_path / "p.pt", policy)
-    result = certify_roa(str(HENON), tmp_path / "p.pt", tmp_path / "o", candidate="lyapunov", time_limit=30)
+    result = certify_roa(str(HENON), tmp_path / "p.pt", tmp_path / "o", candidate="lyapunov", effort=0.6)
     assert result.verdict is Verdict.PROVED
 
 

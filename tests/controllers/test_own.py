@@ -157,7 +157,7 @@ def test_a_plant_of_ones_own_is_trained_evaluated_and_certified(tmp_path, monkey
     from certify.cli.main import _run
 
     monkeypatch.chdir(tmp_path)
-    common = ["--out", str(tmp_path / "o"), "--time-limit", "5"]
+    common = ["--out", str(tmp_path / "o"), "--effort", "0.1"]
     assert _run(["roa", "--policy", str(out), "--system", str(path), *common], False) in (0, 1, 3)
     assert _run(["roa", "--policy", str(out), *common], False) == 2  # though slider.toml lies here
 

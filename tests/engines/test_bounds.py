@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from certify.certificates.verdict import Stop
+from certify.effort import UNIT, Effort
 from certify.errors import InputError
 from certify.loop.plants import System, get_system
 from certify.loop.policies import TanhNetwork, bounded_by_form, load_policy
@@ -127,10 +128,10 @@ def test_budgets_stop_the_pass_with_what_is_proved_so_far(pendulum: System) -> N
     assert small.stop is Stop.BOXES and 1e-6 <= small.outer < 6.0
     large = prove_outwards(case.problem, case.T, 1e-6, 6.0, Budget(boxes=10_000, batch=16), RUNNER)
     assert large.stop is Stop.REQUESTED and large.outer == 6.0
-    timed = prove_outwards(case.problem, case.T, 1e-6, 6.0, Budget(seconds=1e-9, batch=4), RUNNER)
-    assert timed.stop is Stop.TIME and timed.outer < 6.0
-    nothing = prove_outwards(case.problem, case.T, 1.0, 6.0, Budget(seconds=1e-9), RUNNER)
-    assert (nothing.stop, nothing.outer, nothing.tree, nothing.leaves) == (Stop.TIME, 1.0, bytes([LEAF]), 1)
+    timed = prove_outwards(case.problem, case.T, 1e-6, 6.0, Budget(Effort(1e-09 * UNIT), batch=4), RUNNER)
+    assert timed.stop is Stop.EFFORT and timed.outer < 6.0
+    nothing = prove_outwards(case.problem, case.T, 1.0, 6.0, Budget(Effort(1e-09 * UNIT)), RUNNER)
+    assert (nothing.stop, nothing.outer, nothing.tree, nothing.leaves) == (Stop.EFFORT, 1.0, bytes([LEAF]), 1)
 
 
 def test_a_level_beyond_the_truth_is_capped_by_a_witness() -> None:

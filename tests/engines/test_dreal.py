@@ -28,6 +28,7 @@ from certify.certificates.claims.conditions import local_condition, ring_conditi
 from certify.certificates.claims.queries import Query, query
 from certify.certificates.verdict import Stop, Verdict
 from certify.cli.main import _run
+from certify.effort import UNIT, Effort
 from certify.errors import BackendError, InputError, SoundnessError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Number, symbols
@@ -73,7 +74,7 @@ def answering(monkeypatch: pytest.MonkeyPatch, say: Callable[[Query, str], Answe
 def attempt(monkeypatch: pytest.MonkeyPatch, case: Case, guess: float, target: float, seconds: float = 600.0) -> Proof:
     """The engine's proof, where the local level is looked for from `guess` on."""
     monkeypatch.setattr(dreal_proof, "prove_local", lambda *_: guess / 16)
-    return DrealEngine(case.T, 1e-3, 1).prove(Task(case.problem, "asymptotic", target), Budget(seconds=seconds))
+    return DrealEngine(case.T, 1e-3, 1).prove(Task(case.problem, "asymptotic", target), Budget(Effort(seconds * UNIT)))
 
 
 def unsat(*_: object) -> Answer:

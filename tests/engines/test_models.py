@@ -19,6 +19,7 @@ from certify.checker.decrease import Models as TheirModels
 from certify.checker.decrease import sides
 from certify.checker.exact import exactly
 from certify.checker.jets import unpacked
+from certify.effort import UNIT, Effort
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import cos, sin, symbols
 from certify.loop.plants import System, get_system
@@ -190,16 +191,18 @@ def test_no_tube_starts_beyond_the_region_of_attraction() -> None:
     case = case_of(*scalar_tanh())
     known, goal = paths(case.loop), np.eye(1) / 0.25
     assert find_tube(known, np.eye(1) / 1.92**2, goal) is None
-    assert find_tube(known, np.eye(1) / 0.36, goal, seconds=0.0) is None
+    assert find_tube(known, np.eye(1) / 0.36, goal, Effort(0.0)) is None
 
 
 def test_the_search_reports_ever_larger_starts() -> None:
     case = case_of(*scalar_tanh())
     seen: list[Found] = []
     goal = np.eye(1) / 0.25
-    best = enlarge(paths(case.loop), goal, {"one": np.eye(1), "again": np.eye(1)}, lambda: 20.0, report=seen.append)
+    best = enlarge(
+        paths(case.loop), goal, {"one": np.eye(1), "again": np.eye(1)}, Effort(20 * UNIT), report=seen.append
+    )
     assert best is seen[-1] and best.volume > 2 * 0.5
     assert [s.volume for s in seen] == sorted(s.volume for s in seen)
     assert best.tube.start[0, 0] > 1.915009**-2  # inside of what the origin attracts
     check_in_floats("scalar", best.tube, goal)
-    assert enlarge(paths(case.loop), goal, {"one": np.eye(1)}, lambda: 20.0, worth=2 * 1.9151) is None
+    assert enlarge(paths(case.loop), goal, {"one": np.eye(1)}, Effort(20 * UNIT), worth=2 * 1.9151) is None

@@ -17,6 +17,7 @@ from certify.certificates import Certificate, OuterTree, PartitionTree, run_chec
 from certify.certificates.claims import Asymptotic, Problem
 from certify.certificates.tree import leaves
 from certify.certificates.verdict import Stop
+from certify.effort import Effort
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Expression, Number, cos, exp, sqrt, symbols
@@ -387,7 +388,7 @@ def test_an_end_of_the_budget_leaves_a_lower_level(boxes: int) -> None:
 
 
 def test_no_time_proves_nothing() -> None:
-    assert prove(planar(), wells([[1.0, 0.0], [0.0, 1.0]], 0.75), seconds=1e-9) is None
+    assert prove(planar(), wells([[1.0, 0.0], [0.0, 1.0]], 0.75), effort=Effort(1.0)) is None
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ from certify.certificates.claims import Reached
 from certify.certificates.verdict import Stop, Verdict
 from certify.checker.document import read
 from certify.checker.rules import check
+from certify.effort import UNIT, Effort
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import System, get_system
@@ -144,7 +145,7 @@ def test_a_tube_leads_from_what_is_attracted_and_from_nothing_else(x: float, fou
 
 def test_the_widest_tube_stays_below_what_is_attracted() -> None:
     loop, goal = ClosedLoop(*scalar_tanh()), np.array([[1 / 0.3**2]])
-    best, _ = surround(loop, np.array([1.5]), goal, {"one": np.eye(1)}, lambda: 20.0)
+    best, _ = surround(loop, np.array([1.5]), goal, {"one": np.eye(1)}, Effort(20 * UNIT))
     assert best is not None
     reach = 1.5 + 1 / np.sqrt(best.tube.start[0, 0])
     assert 1.65 < reach < ATTRACTED
@@ -153,14 +154,14 @@ def test_the_widest_tube_stays_below_what_is_attracted() -> None:
 def test_a_saddle_beside_the_path_bounds_the_width() -> None:
     """From close to the edge of what is attracted the tube is narrower than the way to the edge."""
     loop, goal = ClosedLoop(*scalar_tanh()), np.array([[1 / 0.3**2]])
-    best, _ = surround(loop, np.array([1.9]), goal, {"one": np.eye(1)}, lambda: 20.0)
+    best, _ = surround(loop, np.array([1.9]), goal, {"one": np.eye(1)}, Effort(20 * UNIT))
     assert best is not None and 1.9 + 1 / np.sqrt(best.tube.start[0, 0]) < 1.915008049
 
 
-def test_no_time_is_no_tube() -> None:
+def test_no_effort_is_no_tube() -> None:
     loop, goal, _ = pendulum()
-    tube, why = find_path(loop, FAR, goal, goal, seconds=0.0)
-    assert tube is None and "no time" in why
+    tube, why = find_path(loop, FAR, goal, goal, Effort(0.0))
+    assert tube is None and "the effort ended after 0 slabs" in why
 
 
 def test_a_start_beyond_the_domain_has_none() -> None:
@@ -186,7 +187,7 @@ def test_after_is_the_flow() -> None:
 
 
 def run(out: Path, plant: tuple[System, TanhNetwork], state: dict[str, Any], **change: Any) -> RoaResult:
-    options = {"candidate": "lqr", "max_boxes": 1, "time_limit": 8.0} | change
+    options = {"candidate": "lqr", "max_boxes": 1, "effort": 0.16} | change
     return certify_roa(*plant, out, RoaOptions(reach_from=state, **options))
 
 
@@ -246,7 +247,7 @@ def test_a_state_in_the_proved_set_needs_no_tube(tmp_path: Path) -> None:
 
 def test_a_state_that_leaves_is_unknown(tmp_path: Path) -> None:
     """x' = x/2 - tanh(x) from 2.5: what is proved around the origin does not make the state proved."""
-    result = run(tmp_path, scalar_tanh(), {"x": Fraction(5, 2)}, time_limit=3.0)
+    result = run(tmp_path, scalar_tanh(), {"x": Fraction(5, 2)}, effort=0.06)
     assert result.verdict is Verdict.UNKNOWN and result.stop is Stop.PATH and result.tube is None
     assert result.verdict.exit_status == 3 and result.levels.roa is not None
 

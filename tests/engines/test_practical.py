@@ -19,6 +19,7 @@ from certify.analysis.run import RoaOptions, certify_roa
 from certify.certificates import run_checker
 from certify.certificates.claims import Practical
 from certify.certificates.verdict import Stop, Verdict
+from certify.effort import UNIT, Effort
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Number, symbols
@@ -42,7 +43,7 @@ PRACTICAL = RoaOptions(claim="practical")
 def prove(case: Case, budget: Budget | None = None, exactly: float | None = None) -> Proof:
     limit = domain_limit(case.P, case.loop.system.domain) * (1 - 1e-9)
     task = Task(case.problem, "practical", exactly or limit, exactly is not None)
-    return BoundsEngine(case.T, ThreadRunner()).prove(task, budget or Budget(seconds=20))
+    return BoundsEngine(case.T, ThreadRunner()).prove(task, budget or Budget(Effort(20 * UNIT)))
 
 
 def uncentred(seed: int = 0) -> tuple[System, TanhNetwork]:
@@ -127,13 +128,13 @@ def _check_planted(seed: int) -> bool:
     case = case_of(case.loop.system, dataclasses.replace(case.loop.network, centre="none"), case.P)
     if not evaluate_vdot(case.loop, case.P, place) > 0:
         return False
-    claim = prove(case, Budget(boxes=20_000, seconds=60)).claim
+    claim = prove(case, Budget(boxes=20_000, effort=Effort(60 * UNIT))).claim
     level = case.problem.V.exactly(place)
     assert claim is None or not claim.inner <= level <= claim.roa, f"{claim} has a violation at {level}"
     inside = level <= Fraction(domain_limit(case.P, case.loop.system.domain))
     if inside and claim is not None and level < claim.inner:  # asked for around the violation, it is refused too
         task = Task(case.problem, "practical", claim.roa, True)
-        again = BoundsEngine(case.T, ThreadRunner()).prove(task, Budget(boxes=20_000, seconds=60)).claim
+        again = BoundsEngine(case.T, ThreadRunner()).prove(task, Budget(boxes=20_000, effort=Effort(60 * UNIT))).claim
         assert again is None or again.inner > level
     return inside
 
@@ -159,9 +160,9 @@ def test_a_pole_inside_the_floor_is_not_forgotten(tmp_path: Path) -> None:
     """Far out Vdot < 0, and trajectories run into the pole: levels above it are no claim, those below it are one."""
     case = case_of(*with_pole())
     at_pole = case.problem.V.exactly(np.array([0.01]))
-    proof = prove(case, Budget(boxes=5_000, seconds=20))
+    proof = prove(case, Budget(boxes=5_000, effort=Effort(20 * UNIT)))
     assert proof.claim is not None and proof.claim.roa < at_pole
-    above = prove(case, Budget(boxes=5_000, seconds=20), exactly=1.0)
+    above = prove(case, Budget(boxes=5_000, effort=Effort(20 * UNIT)), exactly=1.0)
     assert above.claim is None and above.stop is Stop.SMOOTH
     result = certify_roa(*with_pole(), tmp_path, RoaOptions(claim="practical", level=1.0, max_boxes=5_000))
     assert result.verdict is Verdict.UNKNOWN and not list(tmp_path.iterdir())
@@ -176,7 +177,7 @@ def test_input_bounds_hold_inside_the_floor_too() -> None:
     network = TanhNetwork(weights, biases, np.ones(1), np.zeros(1), "identity", "none")
     case = case_of(system, network)
     assert float(case.loop.policy(np.zeros((1, 1)))[0, 0]) > 4
-    assert prove(case, Budget(boxes=5000, seconds=20)).claim is None
+    assert prove(case, Budget(boxes=5000, effort=Effort(20 * UNIT))).claim is None
 
 
 def test_budgets_leave_a_floor_that_is_proved(tmp_path: Path) -> None:

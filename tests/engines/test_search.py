@@ -10,6 +10,7 @@ import torch
 
 from certify.analysis.run import RoaOptions, certify_roa
 from certify.certificates.verdict import Stop, Verdict
+from certify.effort import UNIT, Effort
 from certify.loop.plants import get_system
 from certify.loop.policies import load_policy
 from certify.provers.base import Budget, Task
@@ -54,10 +55,10 @@ def test_a_snapshot_is_a_proof() -> None:
     assert int(meets.sum()) > 5 and bool(ring.rule(lo, hi, found.inner, found.outer).proved[meets].all())
 
 
-def test_the_time_that_the_check_will_take_is_left() -> None:
+def test_the_effort_of_the_check_is_left() -> None:
     case = case_of(get_system("pendulum"), pendulum_network())
     ring = outwards(case.problem, case.T, 1e-6, 6.0, RUNNER)
-    assert ring.advance(Budget(seconds=100.0, batch=4, check=10.0)) is Stop.TIME
+    assert ring.advance(Budget(Effort(UNIT), batch=4, check=0.05 * UNIT)) is Stop.EFFORT
     assert 10 <= ring.proved < 30
 
 
@@ -77,7 +78,7 @@ def test_what_a_search_expects_tells_the_hopeless(name: str, hopeless: bool) -> 
 def test_a_run_that_gains_nothing_stops_early_and_says_so(tmp_path: Path) -> None:
     policy = load_policy(CURVED / "quadrotor3d_curved.pt")
     system = get_system("quadrotor3d").with_parameters(policy.parameters)
-    options = RoaOptions(candidate="lqr", time_limit=600.0)
+    options = RoaOptions(candidate="lqr", effort=12)
     result = certify_roa(system, policy.network, tmp_path, options)
     assert result.verdict is Verdict.PROVED and result.stop is Stop.STALLED
     assert result.seconds["total"] < 200 and "added nothing to the local level" in result.reason

@@ -12,6 +12,7 @@ import torch
 
 from certify.certificates.claims import Problem
 from certify.certificates.verdict import Stop
+from certify.effort import UNIT, Effort
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Number, Symbol, numerical, symbols
@@ -397,7 +398,7 @@ def test_candidates_decrease_over_a_step() -> None:
     loop = ClosedLoop(get_system("pendulum").with_sample(held("1/20")), pendulum_network())
     L, h = loop.mean_rate(), loop.step
     for name in ("lyapunov", "scaled", "lqr", "optimised"):
-        P = choose_candidate(loop, name, seconds=5.0).P  # type: ignore[arg-type]
+        P = choose_candidate(loop, name, effort=Effort(5 * UNIT)).P  # type: ignore[arg-type]
         assert np.max(np.linalg.eigvalsh(L.T @ P + P @ L + h * L.T @ P @ L)) < 0
     P = solve_lyapunov(L, np.eye(2), h, 0.9 * slowest_decay(L, h))
     residual = L.T @ P + P @ L + h * L.T @ P @ L + 1.8 * slowest_decay(L, h) * P + np.eye(2)

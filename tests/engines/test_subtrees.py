@@ -21,6 +21,7 @@ from certify.analysis.results import RoaResult
 from certify.analysis.run import RoaOptions, certify_roa
 from certify.certificates import run_checker
 from certify.certificates.verdict import Stop, Verdict
+from certify.effort import UNIT, Effort
 from certify.errors import BackendError, CertificateFormatError
 from certify.loop.plants import get_system
 from certify.provers.base import Budget
@@ -39,7 +40,7 @@ from tests.support.marks import slow_after
 
 HERE = ThreadRunner()
 ADDRESS = "tcp://nowhere:1"
-SMALL = Budget(batch=16, seconds=60)
+SMALL = Budget(batch=16, effort=Effort(60 * UNIT))
 SLOW = pytest.mark.slow
 DEEP = 10**6
 WIDE = dataclasses.replace(get_system("pendulum"), domain=box(7, 30))  # whose level ends at a violation
@@ -300,7 +301,7 @@ def certified(folder: Path, troupe: Troupe, monkeypatch: pytest.MonkeyPatch, **m
 
     monkeypatch.setattr("certify.analysis.run._runner_for", lambda options: nullcontext(Told(troupe)))
     resume = more.get("resume", False)
-    options = RoaOptions(cluster=ADDRESS, **({} if resume else {"Q": (1.0, 1.0)}) | {"time_limit": 12.0} | more)
+    options = RoaOptions(cluster=ADDRESS, **({} if resume else {"Q": (1.0, 1.0)}) | {"effort": 0.24} | more)
     return certify_roa(WIDE, pendulum_network(), folder, options)
 
 
@@ -308,7 +309,7 @@ def certified(folder: Path, troupe: Troupe, monkeypatch: pytest.MonkeyPatch, **m
 def honest(tmp_path_factory: pytest.TempPathFactory) -> RoaResult:
     """The same without a cluster."""
     folder = tmp_path_factory.mktemp("honest")
-    return certify_roa(WIDE, pendulum_network(), folder, RoaOptions(Q=(1.0, 1.0), time_limit=12.0))
+    return certify_roa(WIDE, pendulum_network(), folder, RoaOptions(Q=(1.0, 1.0), effort=0.24))
 
 
 def accepted(result: RoaResult) -> bool:
@@ -358,7 +359,7 @@ def test_what_cannot_be_mended_is_not_called_a_fault_of_this_program(
 
 def test_a_worker_that_hardly_works_does_not_outlive_the_time() -> None:
     begin, troupe = time.monotonic(), Troupe(play=nothing_done)
-    found = proved_by(troupe, Budget(batch=16, seconds=1.0))
+    found = proved_by(troupe, Budget(batch=16, effort=Effort(1 * UNIT)))
     assert time.monotonic() - begin < 10 and troupe.answered > 3
     assert stands(found, alone()) or found.outer <= 3.0
 
@@ -443,9 +444,9 @@ def test_a_run_that_lost_its_cluster_is_gone_on_with(
 ) -> None:
     """What is proved so far is accepted and the search kept; resumed, with a cluster or without, it comes to its
     end."""
-    for place in ("certify.analysis.run", "certify.analysis.selection"):
+    for place in ("certify.analysis.stages.candidate", "certify.analysis.stages.ring", "certify.analysis.selection"):
         monkeypatch.setattr(f"{place}.Budget", partial(Budget, batch=16))
-    monkeypatch.setattr("certify.analysis.run._HEAT", 1e-9)
+    monkeypatch.setattr("certify.analysis.stages.candidate._HEAT", 1e-9)
     troupe = Troupe(lost_after=answers)
     found = certified(tmp_path, troupe, monkeypatch)
     assert found.verdict is Verdict.PROVED and found.stop is Stop.CLUSTER and accepted(found)
@@ -453,7 +454,7 @@ def test_a_run_that_lost_its_cluster_is_gone_on_with(
     if again:
         end = certified(tmp_path, Troupe(), monkeypatch, resume=True)
     else:
-        end = certify_roa(WIDE, pendulum_network(), tmp_path, RoaOptions(resume=True, time_limit=12.0))
+        end = certify_roa(WIDE, pendulum_network(), tmp_path, RoaOptions(resume=True, effort=0.24))
     assert end.verdict is Verdict.PROVED and end.search is None and accepted(end)
     assert end.levels.roa is not None and honest.levels.roa is not None and found.levels.roa is not None
     assert end.levels.roa >= found.levels.roa

@@ -26,6 +26,7 @@ from certify.checker import tube as tube_rule
 from certify.checker.document import read
 from certify.checker.errors import Rejected
 from certify.checker.rules import check
+from certify.effort import UNIT, Effort
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import get_system
@@ -134,9 +135,9 @@ def test_a_start_that_leaves_the_domain_has_none() -> None:
     assert find_tube(paths(case.loop), goal / (1.01 * limit), goal) is None
 
 
-def test_no_time_is_no_tube() -> None:
+def test_no_effort_is_no_tube() -> None:
     case, goal = pendulum()
-    assert find_tube(paths(case.loop), goal / 1.3**2, goal, seconds=0.0) is None
+    assert find_tube(paths(case.loop), goal / 1.3**2, goal, Effort(0.0)) is None
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -228,14 +229,14 @@ def test_enlarge_keeps_the_largest_of_the_shapes() -> None:
     case, goal = pendulum()
     seen: list[float] = []
     shapes = {"round": np.diag([1.0, 0.02]), "goal": goal}
-    found = enlarge(paths(case.loop), goal, shapes, lambda: 20.0, report=lambda e: seen.append(e.volume))
+    found = enlarge(paths(case.loop), goal, shapes, Effort(20.0 * UNIT), report=lambda e: seen.append(e.volume))
     assert found is not None and found.shape in shapes
     assert seen == sorted(seen) and found.volume == seen[-1] > volume(goal, 1.0)
 
 
 def test_enlarge_asks_for_more_than_it_is_worth() -> None:
     case, goal = pendulum()
-    assert enlarge(paths(case.loop), goal, {"goal": goal}, lambda: 20.0, worth=1e9) is None
+    assert enlarge(paths(case.loop), goal, {"goal": goal}, Effort(20.0 * UNIT), worth=1e9) is None
 
 
 @pytest.mark.slow
@@ -321,7 +322,7 @@ def test_the_ball_contains_its_level_set() -> None:
 @pytest.fixture(scope="module")
 def result(tmp_path_factory: pytest.TempPathFactory) -> RoaResult:
     """A pendulum whose ring is not given enough boxes to reach far, so that a tube is worth its while."""
-    options = RoaOptions(candidate="lqr", enlarge=True, max_boxes=1, time_limit=30)
+    options = RoaOptions(candidate="lqr", enlarge=True, max_boxes=1, effort=0.6)
     policy = load_policy(POLICIES / "pendulum.pt")
     return certify_roa(get_system("pendulum"), policy.network, tmp_path_factory.mktemp("tube"), options)
 
@@ -351,7 +352,7 @@ def test_the_set_is_the_union(result: RoaResult) -> None:
 
 @pytest.mark.slow
 def test_a_box_asks_for_its_shape(tmp_path: Path) -> None:
-    options = RoaOptions(candidate="lqr", box={"theta": 1.0, "theta_dot": 4.0}, max_boxes=1, time_limit=30)
+    options = RoaOptions(candidate="lqr", box={"theta": 1.0, "theta_dot": 4.0}, max_boxes=1, effort=0.6)
     policy = load_policy(POLICIES / "pendulum.pt")
     result = certify_roa(get_system("pendulum"), policy.network, tmp_path, options)
     assert result.tube is not None and result.tube.shape == "box"
@@ -387,7 +388,7 @@ def test_a_tube_that_the_checker_refuses_is_left_out(tmp_path: Path, monkeypatch
         return tube and Tube(tube.start, tuple(replace(slab, duration=slab.duration / 100) for slab in tube.slabs))
 
     monkeypatch.setattr(enlarging, "find_tube", careless)
-    options = RoaOptions(candidate="lqr", enlarge=True, max_boxes=1, time_limit=20)
+    options = RoaOptions(candidate="lqr", enlarge=True, max_boxes=1, effort=0.4)
     result = certify_roa(get_system("pendulum"), load_policy(POLICIES / "pendulum.pt").network, tmp_path, options)
     assert result.verdict is Verdict.PROVED and result.claim == "asymptotic" and result.tube is None
     assert result.stop is not Stop.STALLED and "left out with its tube" in (result.notice or "")
@@ -395,7 +396,7 @@ def test_a_tube_that_the_checker_refuses_is_left_out(tmp_path: Path, monkeypatch
 
 def test_a_policy_that_is_not_centred_has_no_tube(tmp_path: Path) -> None:
     network = replace(pendulum_network(), centre="none")
-    result = certify_roa(get_system("pendulum"), network, tmp_path, RoaOptions(enlarge=True, time_limit=10))
+    result = certify_roa(get_system("pendulum"), network, tmp_path, RoaOptions(enlarge=True, effort=0.2))
     assert result.verdict is Verdict.PROVED and result.claim == "nearby" and result.tube is None
 
 

@@ -49,7 +49,7 @@ def problem_of(system: System, network: TanhNetwork) -> tuple[Problem, np.ndarra
 
 
 def proved(system: System, out: Path, **more: object) -> RoaResult:
-    options = RoaOptions(candidate="lqr", time_limit=200.0, **more)  # type: ignore[arg-type]
+    options = RoaOptions(candidate="lqr", effort=4, **more)  # type: ignore[arg-type]
     result = certify_roa(system, load_policy(POLICIES / "pendulum.pt").network, out, options)
     assert result.verdict is Verdict.PROVED, result.detail
     assert result.raw is not None and judge_bytes(result.raw) is None

@@ -32,7 +32,7 @@ def test_what_is_learned_is_written_and_proved(tmp_path: Path, capsys: pytest.Ca
     assert data["lyapunov"] == str(out) and 0 < data["sampled_cover"] <= 1 and "verdict" not in data
     stored = load_lyapunov(out)
     assert stored.system == "pendulum" and stored.training["learned"]["seed"] == 0
-    given = ("--lyapunov", out, "--out", tmp_path / "o", "--time-limit", "200", "--quiet", "--json")
+    given = ("--lyapunov", out, "--out", tmp_path / "o", "--effort", "4", "--quiet", "--json")
     status, text, _ = run(capsys, "roa", *asked, *given)
     proved = json.loads(text)
     assert status == 0 and proved["checked"] == "ACCEPTED"
@@ -45,7 +45,7 @@ def test_what_is_learned_is_written_and_proved(tmp_path: Path, capsys: pytest.Ca
     [
         (("--hidden", "8", "--degree", "4"), "--hidden must stand without --degree"),
         (("--hidden", "8,x"), "--hidden takes widths"),
-        (("--time-limit", "0"), "--time-limit must be positive"),
+        (("--effort", "0"), "--effort must be a positive number"),
     ],
 )
 def test_options_that_cannot_be(

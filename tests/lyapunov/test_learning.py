@@ -9,6 +9,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
+from certify.effort import Effort
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Number, Symbol, symbols
@@ -306,9 +307,9 @@ def test_what_is_uncertain_is_learned_from_too() -> None:
     assert 1.4 < reach < 1.66  # tanh(1.66) = 1.66/2 + 1/10
 
 
-def test_rounds_are_told_and_end_with_the_time() -> None:
+def test_rounds_are_told_and_end_with_the_effort() -> None:
     told: list[object] = []
-    found = learn(disc(), UNIT, 0.09, (4,), seconds=1e-3, progress=told.append)
+    found = learn(disc(), UNIT, 0.09, (4,), effort=Effort(1.0), progress=told.append)
     assert tuple(told) == found.history and len(found.history) == 1
 
 

@@ -759,7 +759,7 @@ def test_a_tube_that_the_engine_finds(tmp_path: Path) -> None:
     """Of the pendulum that ships, from far outside of its local level: both programs accept it, or neither."""
     policy = load_policy(SHIPPED / "pendulum.pt")
     state = {"theta": Fraction(26, 10), "theta_dot": Fraction(-3)}
-    options = RoaOptions(candidate="lqr", max_boxes=1, time_limit=8.0, reach_from=state)
+    options = RoaOptions(candidate="lqr", max_boxes=1, effort=0.16, reach_from=state)
     result = certify_roa(get_system("pendulum"), policy.network, tmp_path, options)
     assert result.claim == "reached" and result.certificate is not None
     data = json.loads(result.certificate.read_bytes())

@@ -64,7 +64,7 @@ def moving(middle: np.ndarray, end: np.ndarray, to: Sequence[float], duration: f
 
 @pytest.fixture(scope="module")
 def proved(tmp_path_factory: pytest.TempPathFactory) -> RoaResult:
-    options = RoaOptions(candidate="lyapunov", reach_from=FROM, time_limit=20)
+    options = RoaOptions(candidate="lyapunov", reach_from=FROM, effort=0.4)
     result = certify_roa(*soft_spring(), tmp_path_factory.mktemp("soft"), options)
     assert result.verdict is Verdict.PROVED and result.claim == "reached" and result.tube is not None
     return result
@@ -73,7 +73,7 @@ def proved(tmp_path_factory: pytest.TempPathFactory) -> RoaResult:
 @pytest.fixture(scope="module")
 def missed(tmp_path_factory: pytest.TempPathFactory) -> RoaResult:
     """The state lies beyond the edge of what the policy can do: by simulation it leaves the domain."""
-    options = RoaOptions(candidate="lyapunov", reach_from={"p": 1.95, "v": 1.95}, time_limit=4)
+    options = RoaOptions(candidate="lyapunov", reach_from={"p": 1.95, "v": 1.95}, effort=0.08)
     result = certify_roa(*soft_spring(), tmp_path_factory.mktemp("missed"), options)
     assert result.verdict is Verdict.UNKNOWN and result.stop is Stop.PATH
     return result
@@ -185,7 +185,7 @@ def test_a_state_that_is_missed_is_said_to_be_first(missed: RoaResult) -> None:
 
 
 def test_values_and_deviations_are_told_apart(tmp_path: Path) -> None:
-    options = RoaOptions(candidate="lyapunov", reach_from={"p": Fraction(17, 10), "v": Fraction(1, 2)}, time_limit=20)
+    options = RoaOptions(candidate="lyapunov", reach_from={"p": Fraction(17, 10), "v": Fraction(1, 2)}, effort=0.4)
     result = certify_roa(*shifted_spring(), tmp_path, options)
     assert result.verdict is Verdict.PROVED and claim_of(certificate_of(result)).centre == (1.2, 0.5)
     text = page_of(result).text
@@ -329,7 +329,7 @@ def test_the_simulated_share_counts_the_start_where_it_lies(proved: RoaResult) -
 
 @pytest.mark.slow
 def test_one_state_has_an_interval_where_it_lies(tmp_path: Path) -> None:
-    options = RoaOptions(candidate="lyapunov", level=0.5, reach_from={"x": 1.5}, time_limit=15)
+    options = RoaOptions(candidate="lyapunov", level=0.5, reach_from={"x": 1.5}, effort=0.3)
     result = certify_roa(*scalar_tanh(), tmp_path, options)
     assert result.claim == "reached" and result.tube is not None
     page = page_of(result)

@@ -52,7 +52,7 @@ def beside(tmp_path_factory: pytest.TempPathFactory) -> RoaResult:
     """The levitated ball under a policy that is not centred: its loop rests half a millimetre below where it should."""
     stored = load_policy(EXAMPLES / "policies" / "maglev.pt").network
     off = replace(stored, centre="none", biases=(*stored.biases[:-1], stored.biases[-1] + 0.01))
-    return certify_roa(load_system(MAGLEV), off, tmp_path_factory.mktemp("beside"), RoaOptions(time_limit=20.0))
+    return certify_roa(load_system(MAGLEV), off, tmp_path_factory.mktemp("beside"), RoaOptions(effort=0.4))
 
 
 def test_where_a_loop_rests_is_said_by_the_states_values(beside: RoaResult) -> None:
@@ -68,7 +68,7 @@ def test_where_a_loop_rests_is_said_by_the_states_values(beside: RoaResult) -> N
     assert re.search(rf"rests at h = {h:.9g} m, v = 0 m/s; eigenvalues there", text)
     around = certify_roa(
         load_system(MAGLEV), replace(beside.network, origin=np.zeros(2)), beside.certificate.parent / "o",  # type: ignore[union-attr]
-        RoaOptions(time_limit=20.0, around="origin"),
+        RoaOptions(effort=0.4, around="origin"),
     )  # fmt: skip
     said = printed(around)
     assert not around.network.is_moved and f"rests at h = {h:.9g} m" in said
@@ -128,7 +128,7 @@ def test_flattening_is_suggested_where_bounds_see_bends_and_little_is_proved(
     monkeypatch.setattr("certify.analysis.diagnosis._TELLING", 0)
     path, out = tmp_path / "bent.pt", tmp_path / "o"
     save_policy(path, bent())
-    status = _run(["roa", str(path), "--max-boxes", "3", "--time-limit", "8", "--out", str(out), "--json"], True)
+    status = _run(["roa", str(path), "--max-boxes", "3", "--effort", "0.16", "--out", str(out), "--json"], True)
     following = json.loads(capsys.readouterr().out)["diagnosis"]["next"]
     flat = tmp_path / "bent_flat.pt"
     assert status in (0, 3) and following["flatten"] and following["options"] == {}
@@ -142,7 +142,7 @@ def test_flattening_is_suggested_where_bounds_see_bends_and_little_is_proved(
 def test_flattening_is_not_suggested_to_whom_it_cannot_help(tmp_path: Path) -> None:
     """A policy without bends, one without hidden units, much proved, a known pace."""
     result = certify_roa(
-        load_system(EXAMPLES / "van_der_pol.toml"), bent().network, tmp_path, RoaOptions(max_boxes=3, time_limit=4.0)
+        load_system(EXAMPLES / "van_der_pol.toml"), bent().network, tmp_path, RoaOptions(max_boxes=3, effort=0.08)
     )
     little = tuple(replace(one, volume=1e6 * one.volume) for one in result.tried)
     short = replace(result, stop=Stop.BOXES, tried=little)
@@ -169,7 +169,7 @@ def test_a_policy_of_another_program_is_imported_before_it_is_flattened(
     torch.save(state, path)
     said = ["--system", "pendulum", "--states", "theta,theta_dot", "--activation", "tanh", "--squash", "identity"]
     said += ["--normaliser", "none", "--action-scale", "1", "--centre", "output"]
-    more = ["--max-boxes", "3", "--time-limit", "8", "--out", str(out), "--json"]
+    more = ["--max-boxes", "3", "--effort", "0.16", "--out", str(out), "--json"]
     _run(["roa", str(path), *said, *more], True)
     printed_out = capsys.readouterr().out
     following = json.loads(printed_out)["diagnosis"]["next"]

@@ -19,6 +19,7 @@ import pytest
 from certify.analysis.run import RoaOptions, certify_roa
 from certify.certificates import run_checker
 from certify.certificates.verdict import Stop, Verdict
+from certify.effort import UNIT, Effort
 from certify.errors import BackendError, InputError
 from certify.loop.plants import get_system
 from certify.loop.policies import load_policy
@@ -111,7 +112,7 @@ def test_jobs_that_are_forgotten_are_not_answered(local: ClusterRunner) -> None:
 def test_two_processes_grow_the_same_tree(local: ClusterRunner, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(subtrees, "_FEW", 2)
     monkeypatch.setattr(subtrees, "_TURN", (0.05, 0.05))
-    case, budget = cartpole_case(), Budget(batch=64, seconds=60)
+    case, budget = cartpole_case(), Budget(batch=64, effort=Effort(60 * UNIT))
     begin = local.remark
     expected = prove_outwards(case.problem, case.T, 2.5e-4, 1e-3, budget, ThreadRunner())
     found = prove_outwards(case.problem, case.T, 2.5e-4, 1e-3, budget, local)
@@ -166,7 +167,7 @@ def test_an_answer_that_died_with_its_worker_is_made_again_or_said_to_be_lost() 
 
 @pytest.mark.slow
 def test_a_worker_that_comes_late_is_given_work() -> None:
-    case, budget = cartpole_case(), Budget(batch=64, seconds=120)
+    case, budget = cartpole_case(), Budget(batch=64, effort=Effort(120 * UNIT))
     expected = prove_outwards(case.problem, case.T, 2.5e-3, 1e-2, budget, ThreadRunner())
     with cluster(0) as dask, connect(dask.address) as client:
         runner = ClusterRunner(client)
@@ -226,7 +227,7 @@ def test_a_worker_with_another_version_of_the_code_is_of_no_harm(tmp_path: Path)
     shutil.copytree(ROOT / "certify", tmp_path / "certify", ignore=shutil.ignore_patterns("__pycache__"))
     older = tmp_path / "certify" / "engines" / "bounds" / "subtrees.py"
     older.write_text(older.read_text().replace("class Subtrees", "class Subforests"))
-    case, budget = cartpole_case(), Budget(batch=64, seconds=120)
+    case, budget = cartpole_case(), Budget(batch=64, effort=Effort(120 * UNIT))
     expected = prove_outwards(case.problem, case.T, 2.5e-4, 1e-3, budget, ThreadRunner())
     with cluster(0) as dask, connect(dask.address) as client:
         dask.worker(environment={"PYTHONPATH": str(tmp_path)})
@@ -252,7 +253,7 @@ def command(out: Path, address: str, *more: str) -> list[str]:
 def test_ctrl_c_leaves_no_processes(everybody: bool, tmp_path: Path) -> None:
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     run = subprocess.Popen(
-        command(tmp_path, "local:2", "--time-limit", "60", "--quiet"),
+        command(tmp_path, "local:2", "--effort", "1.2", "--quiet"),
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, cwd=ROOT, start_new_session=True,
     )  # fmt: skip
     try:
@@ -277,9 +278,9 @@ def test_a_scheduler_killed_in_the_middle_of_a_run_leaves_a_certificate_and_a_se
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """It is killed once some hundred boxes were bounded; the run says who is gone, and another one ends the search."""
-    for place in ("certify.analysis.run", "certify.analysis.selection"):
+    for place in ("certify.analysis.stages.candidate", "certify.analysis.stages.ring", "certify.analysis.selection"):
         monkeypatch.setattr(f"{place}.Budget", partial(Budget, batch=64))
-    monkeypatch.setattr("certify.analysis.run._HEAT", 1e-9)
+    monkeypatch.setattr("certify.analysis.stages.candidate._HEAT", 1e-9)
     monkeypatch.setattr(subtrees, "_TURN", (0.05, 0.05))
     policy = load_policy(POLICIES / "cartpole.pt")
     system = get_system("cartpole").with_parameters(policy.parameters)
@@ -293,14 +294,14 @@ def test_a_scheduler_killed_in_the_middle_of_a_run_leaves_a_certificate_and_a_se
                 dask.scheduler.kill()
                 killed.append(time.monotonic())
 
-        options = RoaOptions(candidate="lyapunov", cluster=dask.address, time_limit=120.0)
+        options = RoaOptions(candidate="lyapunov", cluster=dask.address, effort=2.4)
         found = certify_roa(system, policy.network, tmp_path, options, progress=progress)
         assert killed and time.monotonic() - killed[0] < 60
     assert found.verdict is Verdict.PROVED and found.stop is Stop.CLUSTER and found.search is not None
     assert dask.address in found.reason and dask.address in (found.notice or "")
     assert found.certificate is not None and run_checker(found.certificate)["result"] == "ACCEPTED"
-    end = certify_roa(system, policy.network, tmp_path, RoaOptions(resume=True, time_limit=120.0))
-    whole = certify_roa(system, policy.network, tmp_path / "whole", RoaOptions(candidate="lyapunov", time_limit=120.0))
+    end = certify_roa(system, policy.network, tmp_path, RoaOptions(resume=True, effort=2.4))
+    whole = certify_roa(system, policy.network, tmp_path / "whole", RoaOptions(candidate="lyapunov", effort=2.4))
     assert end.verdict is whole.verdict is Verdict.PROVED and end.search is None
     assert end.levels.roa is not None and found.levels.roa is not None and end.levels.roa >= found.levels.roa
     assert end.levels.roa == pytest.approx(whole.levels.roa, rel=2e-3)
