@@ -18,7 +18,7 @@ import pytest
 import torch
 import typer
 
-from certify.analysis.arguments import with_domains
+from certify.analysis.arguments import changes_of
 from certify.analysis.options import RoaOptions
 from certify.certificates import checking, model
 from certify.cli.main import _run, app
@@ -239,7 +239,6 @@ def test_bad_policies_exit_2_and_overwrite_nothing(
         (["--level", "nan"], "positive number"),
         (["--level", "x"], "--level"),
         (["--candidate", "sos"], "candidate"),
-        (["--device", "tpu"], "device"),
         (["--time-limit", "0"], "--time-limit must be positive; found 0"),
         (["--bogus"], "--bogus"),
     ],
@@ -355,7 +354,7 @@ def test_states_come_with_commas_or_without(
 
 @pytest.mark.parametrize("interval", ["theta=-1..2", "theta=-1:2"])
 def test_a_domain_is_written_as_all_ranges_are(interval: str) -> None:
-    assert with_domains(get_system("pendulum"), [interval]).domain[0] == (-1, 2)
+    assert changes_of({"domain": [interval]}).of(get_system("pendulum")).domain[0] == (-1, 2)
 
 
 def test_an_output_folder_that_cannot_be_written(

@@ -179,7 +179,7 @@ def _runner_for(options: RoaOptions) -> Iterator[Runner]:
 
     from certify.provers.execution import ThreadRunner
 
-    yield ThreadRunner(torch.device(options.device))
+    yield ThreadRunner(torch.device("cpu"))
 
 
 @dataclass

@@ -6,14 +6,18 @@ import json
 import shlex
 import tempfile
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from certify.cli.arguments import layers, plant_of
-from certify.cli.importing import policy_of
-from certify.cli.shared import Domain, Json, PlantName, PolicyArgument, PolicyFile, Quiet, the_policy
+from certify.analysis.arguments import options_of
+from certify.analysis.changes import PlantChanges
+from certify.analysis.inputs import plant_of, policy_in
+from certify.cli.importing import import_options
+from certify.cli.options import changes_of_a_plant, options_of_a_run, takes
+from certify.cli.shared import Json, PlantName, PolicyArgument, PolicyFile, Quiet, given_words, noting, the_policy
 from certify.cli.terminal import ProgressLine, say
 from certify.errors import InputError
 
@@ -21,6 +25,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from certify.analysis.options import RoaOptions
     from certify.loop.plants import System
     from certify.loop.policies import Policy
     from certify.loop.policies.importers import ImportOptions
@@ -30,28 +35,33 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
 
 _FOR_ELLIPSOID = 0.4  # of the time limit, at most
-_HIDDEN = "16,16"
+_SECONDS = 120.0  # for ellipsoid and learning, of the effort 1
 
 
+@takes(
+    importing=import_options(),
+    changes=changes_of_a_plant("parameters", "domain"),
+    typed=options_of_a_run("hidden", "degree", "seed", "effort"),
+)
 def learn_lyapunov(
     context: typer.Context,
-    importing: ImportOptions,
+    *,
     out: Annotated[Path, typer.Option(help="Lyapunov file to write (.pt).")],
     file: PolicyArgument = None,
     policy: PolicyFile = None,
     system: PlantName = None,
-    param: Annotated[list[str] | None, typer.Option(help="Parameter of the plant, NAME=VALUE; repeatable.")] = None,
-    domain: Domain = None,
-    hidden: Annotated[
-        str | None, typer.Option(help=f"Widths of the network between the states and its output; default: {_HIDDEN}.")
+    changes: PlantChanges,
+    typed: dict[str, Any],
+    time_limit: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SECONDS",
+            help=f"Seconds for the ellipsoid and for learning. By default {_SECONDS:g} times the effort.",
+        ),
     ] = None,
-    degree: Annotated[
-        int | None, typer.Option(help="Fit a polynomial of this even degree in the place of a network.")
-    ] = None,
-    seed: Annotated[int, typer.Option(help="Of everything random: the same seed learns the same function.")] = 0,
-    time_limit: Annotated[float, typer.Option(help="Seconds for the ellipsoid and for learning.")] = 120.0,
-    quiet: Quiet = False,
     as_json: Json = False,
+    quiet: Quiet = False,
+    importing: ImportOptions,
 ) -> None:
     """Learn a function for a set beyond the ellipsoid, from simulated runs; `certify roa --lyapunov` proves one."""
     from certify.loop.closed_loop import ClosedLoop
@@ -60,29 +70,30 @@ def learn_lyapunov(
     from certify.lyapunov.learning import fit_polynomial, learn
 
     start = time.monotonic()
-    if hidden is not None and degree is not None:
+    if {"hidden", "degree"} <= typed.keys():
         raise InputError("--hidden must stand without --degree; found both. A polynomial has no layers.")
-    widths = layers(hidden or _HIDDEN, "--hidden")
-    if not time_limit > 0:
-        raise InputError(f"--time-limit must be positive; found {time_limit}.")
-    path = the_policy(context, file, policy)
-    stored = policy_of(path, importing, system, param or [])
-    plant = plant_of(stored, system, param or [], domain or [])
+    note, path = noting(quiet), the_policy(context, file, policy)
+    stored = policy_in(path, importing, system, changes, note)
+    plant = plant_of(stored, system, changes, note)
+    options = options_of(typed, plant, note)
+    seconds = _SECONDS * options.effort if time_limit is None else time_limit
+    if not seconds > 0:
+        raise InputError(f"--time-limit must be positive; found {seconds:g}.")
     progress = None if quiet else ProgressLine()
     try:
-        P, c2 = _ellipsoid(plant, stored, _FOR_ELLIPSOID * time_limit, progress)
+        P, c2 = _ellipsoid(plant, stored, replace(options, time_limit=_FOR_ELLIPSOID * seconds), progress)
         loop, V = ClosedLoop(plant, stored.network), Quadratic(P)
-        left, tell_round = time_limit - (time.monotonic() - start), None if progress is None else _shown(progress)
+        left, tell_round = seconds - (time.monotonic() - start), None if progress is None else _shown(progress)
         learned = (
-            learn(loop, V, c2, widths, seed, left, tell_round)
-            if degree is None
-            else fit_polynomial(loop, V, c2, degree, seed, left, tell_round)
+            fit_polynomial(loop, V, c2, options.degree, options.seed, left, tell_round)
+            if "degree" in typed
+            else learn(loop, V, c2, options.hidden, options.seed, left, tell_round)
         )
     finally:
         if progress is not None:
             progress.close()
     record: dict[str, Any] = {
-        "seed": seed,
+        "seed": options.seed,
         "rounds": len(learned.history),
         "sampled_level": learned.level,
         "sampled_cover": learned.cover,
@@ -93,22 +104,23 @@ def learn_lyapunov(
     save_lyapunov(out, learned.function, plant.name, parameters, {"learned": record})
     data = {"lyapunov": str(out), "function": _described(learned.function), **record}
     data["seconds"] = time.monotonic() - start
-    say(json.dumps(data) if as_json else _text(learned, volume(P, c2), out, _next(path, system, param, domain, out)))
+    say(json.dumps(data) if as_json else _text(learned, volume(P, c2), out, _next(context, path, out)))
 
 
-def _ellipsoid(plant: System, stored: Policy, seconds: float, progress: ProgressLine | None) -> tuple[Array, float]:
+def _ellipsoid(
+    plant: System, stored: Policy, options: RoaOptions, progress: ProgressLine | None
+) -> tuple[Array, float]:
     """A proved region of attraction, into which trajectories are to fall.
 
     Raises
     ------
     InputError : none is proved in the time.
     """
-    from certify.analysis.options import RoaOptions
     from certify.analysis.run import certify_roa
     from certify.certificates.verdict import Verdict
 
     with tempfile.TemporaryDirectory() as folder:
-        found = certify_roa(plant, stored.network, Path(folder), RoaOptions(time_limit=seconds), progress=progress)
+        found = certify_roa(plant, stored.network, Path(folder), options, progress=progress)
     if found.verdict is not Verdict.PROVED or found.P is None or found.levels.roa is None:
         raise InputError(
             "an ellipsoid must be proved before a function beyond it is learned; the verdict on one is "
@@ -152,10 +164,7 @@ def _text(learned: Learned, area: float, out: Path, command: str) -> str:
     ])  # fmt: skip
 
 
-def _next(policy: Path, system: str | None, param: list[str] | None, domain: list[str] | None, out: Path) -> str:
+def _next(context: typer.Context, policy: Path, out: Path) -> str:
     """The command that proves what was learned."""
-    parts = ["certify", "roa", "--policy", str(policy)]
-    parts += [] if system is None else ["--system", system]
-    for name, values in (("--param", param), ("--domain", domain)):
-        parts += [part for value in values or [] for part in (name, value)]
-    return shlex.join([*parts, "--lyapunov", str(out)])
+    given = given_words(context, only={"system", "parameters", "domain"})
+    return shlex.join(["certify", "roa", "--policy", str(policy), *given, "--lyapunov", str(out)])

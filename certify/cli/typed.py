@@ -6,14 +6,10 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-_OTHERWISE = {"--precision": "dreal_precision", "--from": "reach_from"}  # options that Python calls by another name
-
 
 def options_of(command: Any) -> dict[str, str]:
     """The options of a command of click by the names that Python has for them."""
-    options = [max(one.opts, key=len) for one in command.params if one.param_type_name == "option"]
-    named = {option.removeprefix("--").replace("-", "_"): option for option in options}
-    return named | {_OTHERWISE[option]: option for option in options if option in _OTHERWISE}
+    return {one.name: max(one.opts, key=len) for one in command.params if one.param_type_name == "option"}
 
 
 def as_typed(message: str, options: Mapping[str, str]) -> str:
