@@ -699,7 +699,7 @@ def test_three_ways_in_make_one_plant(
         (("--disturbance", "wind=0.1..0.2"), "hold its nominal value 0"),
         (("--input-error", "0"), "must be a positive bound for one of F"),
         (("--input-error", "G=1e-4"), "must be a positive bound for one of F"),
-        (("--input-error", "some"), "`--input-error` must be a finite number"),
+        (("--input-error", "some"), "--input-error must be a finite number"),
         (("--param", "k=0.9..1.1", "--enlarge"), "a tube must be of exact equations"),
         (("--param", "k=0.9..1.1", "--box", "p=0.1"), "a tube must be of exact equations"),
         (("--param", "k=0.9..1.1", "--engine", "dreal"), "--engine must be bounds where something is uncertain"),

@@ -55,18 +55,18 @@ def changes_of(texts: Mapping[str, Any]) -> PlantChanges:
     ------
     InputError : a text is not what it must be.
     """
-    return PlantChanges(**{name: _change(text, name) for name, text in texts.items()})
+    options = declared(PlantChanges)
+    return PlantChanges(**{name: _READERS[options[name].kind](text, name) for name, text in texts.items()})
 
 
-def _change(text: str | Sequence[str], name: str) -> Any:
-    """A number, a range LO..HI, or such things by name."""
-    if not isinstance(text, str):
-        pairs = (_assignment(entry, f"`{name}`") for entry in text)
-        return {key: _change(value, key) for key, value in pairs}
-    if "=" in text:
-        return state(text, name)
+def _ranges(entries: Sequence[str], name: str) -> dict[str, Any]:
+    pairs = dict(_assignment(entry, f"`{name}`") for entry in entries)
+    return {key: _value_or_range(value, key) for key, value in pairs.items()}
+
+
+def _value_or_range(text: str, name: str) -> Fraction | tuple[Fraction, Fraction]:
     ends = [_exact(end, name) for end in ends_of(text)]
-    return ends[0] if len(ends) == 1 else tuple(ends)
+    return ends[0] if len(ends) == 1 else (ends[0], ends[1])
 
 
 def ends_of(text: str) -> list[str]:
@@ -164,7 +164,7 @@ def _exact(text: str, name: str) -> Fraction:
         raise OptionError(str(error)) from error
 
 
-_READERS: Mapping[str, Callable[[str, str], Any]] = {
+_READERS: Mapping[str, Callable[[Any, str], Any]] = {
     "word": lambda text, _: text,
     "number": _number,
     "whole": _whole,
@@ -174,6 +174,9 @@ _READERS: Mapping[str, Callable[[str, str], Any]] = {
     "widths": widths,
     "state": state,
     "file": lambda text, _: Path(text),
+    "ranges": _ranges,
+    "bounds": lambda text, name: state(text, name) if "=" in text else _exact(text, name),
+    "period": _value_or_range,
 }
 
 

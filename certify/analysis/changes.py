@@ -31,15 +31,15 @@ class PlantChanges:
         written="A value, or a range NAME=LO..HI; repeatable.",
         python="Pairs (lo, hi) by parameter; a parameter whose value is outside its range takes the middle.")
     domain: Changes | None = option(None, "loop", "ranges", keyword="", metavar="NAME=D", first=True, help=(
-        "Domain of a state."), written="A half-width, or an interval NAME=LO..HI of its values; repeatable.")
+        "Domain of a state, outside of which nothing is proved."), written="A half-width, or an interval NAME=LO..HI of its values; repeatable.")
     disturbances: Changes | None = option(None, "loop", "ranges", typed="--disturbance", metavar="NAME=D", help=(
         "Disturbances that act, as any function of time between their bounds; with the half-width 0 one does not act."),
         written="A half-width, or a range NAME=LO..HI; repeatable.",
         python="Half-widths, or pairs (lo, hi), by disturbance.")
-    input_error: Fraction | Mapping[str, Fraction] | None = option(None, "loop", "ends", metavar="E", help=(
+    input_error: Fraction | Mapping[str, Fraction] | None = option(None, "loop", "bounds", metavar="E", help=(
         "Bound of the difference between what the policy says and what acts on the plant, at any time."),
         written="One for all inputs, or NAME=E,NAME=E.", python="One bound for all inputs, or bounds by input.")
-    sample_time: Fraction | Interval | None = option(None, "loop", "ends", metavar="PERIOD", help=(
+    sample_time: Fraction | Interval | None = option(None, "loop", "period", metavar="PERIOD", help=(
         "Period over which the input is held; by default the input follows the state at once."),
         written="As in 0.02. LO..HI: any sequence of periods between the two. max: the longest period for which the "
         "set that is proved without one is still proved.",

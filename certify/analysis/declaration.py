@@ -13,7 +13,19 @@ from typing import Any, Literal
 
 Group = Literal["loop", "claim", "candidate", "effort"]
 Kind = Literal[
-    "word", "number", "whole", "flag", "row", "layers", "widths", "state", "matrix", "file", "ranges", "ends"
+    "word",
+    "number",
+    "whole",
+    "flag",
+    "row",
+    "layers",
+    "widths",
+    "state",
+    "matrix",
+    "file",
+    "ranges",
+    "bounds",
+    "period",
 ]
 """How a value is given: `certify.analysis.arguments` reads it as text, `certify.analysis.values` as Python's."""
 

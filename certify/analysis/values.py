@@ -40,24 +40,9 @@ def changes_in(given: Mapping[str, Any]) -> PlantChanges:
     ------
     InputError : a value is of another type than it must be.
     """
-    read = dict[str, Any]()
-    for name, option in declared(PlantChanges).items():
-        if option.keyword not in given:
-            continue
-        value, where = given[option.keyword], option.keyword
-        if option.kind == "ranges":
-            reader = _pair if where == "ranges" else _change
-            entries = _named(value, where, "numbers or pairs").items()
-            read[name] = {key: reader(ends, f"{where}[{key!r}]") for key, ends in entries}
-        elif isinstance(value, Mapping):
-            read[name] = _state(value, where)
-        else:
-            read[name] = _change(value, where)
-    return PlantChanges(**read)
-
-
-def _change(value: Any, where: str) -> Fraction | tuple[Fraction, Fraction]:
-    return _exact(value, where) if isinstance(value, _NUMBERS) else _pair(value, where)
+    options = declared(PlantChanges).items()
+    found = {name: (option, given[option.keyword]) for name, option in options if option.keyword in given}
+    return PlantChanges(**{name: _READERS[one.kind](value, one.keyword) for name, (one, value) in found.items()})
 
 
 def import_options_in(given: ImportOptions | Mapping[str, Any] | None) -> ImportOptions:
@@ -150,6 +135,16 @@ def _pair(value: Any, where: str) -> tuple[Fraction, Fraction]:
     return _exact(ends[0], where), _exact(ends[1], where)
 
 
+def _value_or_pair(value: Any, where: str) -> Fraction | tuple[Fraction, Fraction]:
+    return _exact(value, where) if isinstance(value, _NUMBERS) else _pair(value, where)
+
+
+def _ranges(value: Any, name: str) -> dict[str, Any]:
+    """Pairs by name; half-widths as well, but not of parameters, which have values of their own."""
+    reader, what = (_pair, "pairs") if name == "ranges" else (_value_or_pair, "half-widths or pairs")
+    return {key: reader(ends, f"{name}[{key!r}]") for key, ends in _named(value, name, what).items()}
+
+
 def _exact(value: Any, where: str) -> Fraction:
     value = value.item() if isinstance(value, np.generic) else value
     if isinstance(value, bool) or not isinstance(value, Fraction | float | int | str):
@@ -215,4 +210,7 @@ _READERS: Mapping[str, Callable[[Any, str], Any]] = {
     "state": _state,
     "matrix": _matrix,
     "file": lambda value, _: value,
+    "ranges": _ranges,
+    "bounds": lambda value, name: _state(value, name) if isinstance(value, Mapping) else _exact(value, name),
+    "period": _value_or_pair,
 }

@@ -34,7 +34,7 @@ _TABLES = (*TABLES, "options")
 _RANGE = ("from", "to", "points")
 _MOST_CASES, _MOST_POINTS = 100_000, 10_000
 _FILE_OPTION = "lyapunov"
-_KNOWN_OPTIONS = (*OPTIONS, *PLANT_OPTIONS)
+KNOWN = (*OPTIONS, *PLANT_OPTIONS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,10 +201,10 @@ def _texts(file: PlantFile, key: str) -> tuple[list[str], bool]:
 def _axis(file: PlantFile, table: str, name: str, files: dict[str, bytes]) -> Axis:
     """An entry of a table: a value, a list of values, or a range."""
     value = file.table(table)[name]
-    if table == "options" and name not in _KNOWN_OPTIONS:
+    if table == "options" and name not in KNOWN:
         if name == "candidate":
             raise file.refuse('candidates stand at the top, as in candidates = ["lyapunov"].', table, name)
-        close = nearest(name, _KNOWN_OPTIONS) or f"; known are {', '.join(_KNOWN_OPTIONS)}."
+        close = nearest(name, KNOWN) or f"; known are {', '.join(KNOWN)}."
         raise file.refuse(f"{name!r} is no option of a study{close}", table, name)
     if isinstance(value, dict):
         values = _range(file, value, table, name)
