@@ -22,8 +22,8 @@ from certify.analysis.arguments import changes_of
 from certify.analysis.options import RoaOptions
 from certify.certificates import checking, model
 from certify.cli.main import _run, app
+from certify.cli.options import options_of
 from certify.cli.terminal import ring_line
-from certify.cli.typed import options_of
 from certify.loop.plants import get_system
 from certify.loop.policies import Policy, TanhNetwork, load_policy, save_policy
 from certify.provers.base import Progress

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
 from typing import TYPE_CHECKING
@@ -31,7 +31,8 @@ class PlantChanges:
         written="A value, or a range NAME=LO..HI; repeatable.",
         python="Pairs (lo, hi) by parameter; a parameter whose value is outside its range takes the middle.")
     domain: Changes | None = option(None, "loop", "ranges", keyword="", metavar="NAME=D", first=True, help=(
-        "Domain of a state, outside of which nothing is proved."), written="A half-width, or an interval NAME=LO..HI of its values; repeatable.")
+        "Domain of a state, outside of which nothing is proved."),
+        written="A half-width, or an interval NAME=LO..HI of its values; repeatable.")
     disturbances: Changes | None = option(None, "loop", "ranges", typed="--disturbance", metavar="NAME=D", help=(
         "Disturbances that act, as any function of time between their bounds; with the half-width 0 one does not act."),
         written="A half-width, or a range NAME=LO..HI; repeatable.",
@@ -53,50 +54,40 @@ class PlantChanges:
         ------
         InputError : the plant has no such parameter, disturbance, state or input, or cannot have what is asked for.
         """
-        plant = self._with_domain(self._with_parameters(plant))
-        plant = self._with_input_errors(self._with_disturbances(plant))
-        if self.sample_time is None:
-            return plant
-        held = self.sample_time
-        return plant.with_sample(held if isinstance(held, tuple) else (held, held))
-
-    def _with_parameters(self, plant: System) -> System:
         given = self.parameters or {}
+        _require_known(plant, "parameter", given, plant.parameters)
         plant = plant.with_parameters({name: q for name, q in given.items() if not isinstance(q, tuple)})
-        ranges = {name: ends for name, ends in given.items() if isinstance(ends, tuple)}
-        for name in ranges:
-            if name not in plant.parameters:
-                known = ", ".join(plant.parameters) or "none"
-                raise InputError(f"{plant.name} has no parameter {name!r}; it has: {known}.")
-        return plant.with_ranges(ranges)
+        plant = plant.with_ranges({name: ends for name, ends in given.items() if isinstance(ends, tuple)})
+        plant = plant.with_domain(self._domain(plant)).with_ranges(self._acting(plant))
+        if (error := self.input_error) is not None:
+            bounds = error if isinstance(error, Mapping) else {s.name: error for s in plant.inputs}
+            plant = plant.with_input_errors(bounds)
+        held = self.sample_time
+        return plant if held is None else plant.with_sample(held if isinstance(held, tuple) else (held, held))
 
-    def _with_domain(self, plant: System) -> System:
-        domain, at = dict[str, "Interval"](), plant.operating_point()
+    def _domain(self, plant: System) -> Mapping[str, Interval]:
+        """Intervals of deviations from the operating point."""
+        found, at = dict[str, "Interval"](), plant.operating_point()
         for state, ends in (self.domain or {}).items():
             shift = at.get(state, Fraction(0))
-            domain[state] = (ends[0] - shift, ends[1] - shift) if isinstance(ends, tuple) else (-ends, ends)
-        return plant.with_domain(domain)
+            found[state] = (ends[0] - shift, ends[1] - shift) if isinstance(ends, tuple) else (-ends, ends)
+        return found
 
-    def _with_disturbances(self, plant: System) -> System:
-        known, ranges = [s.name for s in plant.disturbances], dict[str, "Interval | None"]()
-        for name, value in (self.disturbances or {}).items():
-            if name not in known:
-                raise InputError(f"{plant.name} has no disturbance {name!r}; it has: {', '.join(known) or 'none'}.")
+    def _acting(self, plant: System) -> Mapping[str, Interval | None]:
+        """Ranges of disturbances; None of one that does not act."""
+        given, found = self.disturbances or {}, dict[str, "Interval | None"]()
+        _require_known(plant, "disturbance", given, [s.name for s in plant.disturbances])
+        for name, value in given.items():
             if not isinstance(value, tuple) and value < 0:
                 raise InputError(
                     f"disturbance {name} must have a half-width that is not negative, or a range; found "
                     f"{float(value):g}."
                 )
-            ranges[name] = value if isinstance(value, tuple) else (-value, value) if value else None
-        return plant.with_ranges(ranges)
-
-    def _with_input_errors(self, plant: System) -> System:
-        error = self.input_error
-        if error is None:
-            return plant
-        return plant.with_input_errors(
-            error if isinstance(error, Mapping) else dict.fromkeys((s.name for s in plant.inputs), error)
-        )
+            found[name] = value if isinstance(value, tuple) else (-value, value) if value else None
+        return found
 
 
-UNCHANGED = PlantChanges()
+def _require_known(plant: System, what: str, names: Iterable[str], known: Iterable[str]) -> None:
+    for name in names:
+        if name not in known:
+            raise InputError(f"{plant.name} has no {what} {name!r}; it has: {', '.join(known) or 'none'}.")

@@ -6,6 +6,7 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import fields
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -56,58 +57,82 @@ def import_options_in(given: ImportOptions | Mapping[str, Any] | None) -> Import
         if name not in known:
             close = nearest(str(name), known) or f"; known are {', '.join(known)}."
             raise InputError(f"`importing` has no {name!r}{close}")
-    read: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
-    for name, value in read.items():
-        where = f"importing[{name!r}]"
-        if name == "states":
-            read[name] = tuple(
-                text(v, where) for v in (value.split(",") if isinstance(value, str) else _entries(value, where))
-            )
-        elif name == "ignore":
-            read[name] = tuple(text(v, where) for v in ([value] if isinstance(value, str) else _entries(value, where)))
-        elif name in ("action_scale", "action_offset"):
-            read[name] = _rationals(value, where)
-        elif name == "epsilon":
-            read[name] = exact(value, where)
-        elif name == "normaliser":
-            read[name] = "none" if value == "none" else Path(path_in(value, where))
-        elif name == "clip":
-            read[name] = value if isinstance(value, Clip) else _clip(value, where)
-        else:
-            text(value, where)
+    read: dict[str, Any] = {
+        name: (_OF_IMPORTING.get(name) or text)(value, f"importing[{name!r}]")
+        for name, value in given.items()
+        if value is not None
+    }
     return ImportOptions(**read)
 
 
 def _clip(value: Any, where: str) -> Clip:
+    if isinstance(value, Clip):
+        return value
     ends = _entries(value, where)
     if len(ends) != 2:
         raise InputError(f"`{where}` must be a pair (lo, hi) of numbers or of rows of numbers; found {value!r:.80}.")
-    lo, hi = (_rationals(end, where) for end in ends)
-    return Clip(lo, hi)
+    return Clip(_rationals(ends[0], where), _rationals(ends[1], where))
 
 
 def _rationals(value: Any, where: str) -> tuple[Fraction, ...]:
-    if isinstance(value, int | float | str | Fraction):
-        return (exact(value, where),)
-    return tuple(exact(v.item() if isinstance(v, np.generic) else v, where) for v in _entries(value, where))
+    values = (value,) if isinstance(value, int | float | str | Fraction) else _entries(value, where)
+    return tuple(exact(_plain(v), where) for v in values)
+
+
+def _texts(value: Any, where: str) -> tuple[str, ...]:
+    return tuple(text(v, where) for v in (value.split(",") if isinstance(value, str) else _entries(value, where)))
+
+
+_OF_IMPORTING: Mapping[str, Callable[[Any, str], Any]] = {
+    "states": _texts,
+    "ignore": lambda value, where: _texts([value] if isinstance(value, str) else value, where),
+    "action_scale": _rationals,
+    "action_offset": _rationals,
+    "epsilon": exact,
+    "normaliser": lambda value, where: "none" if value == "none" else Path(path_in(value, where)),
+    "clip": _clip,
+}
+
+
+def _plain(value: Any) -> Any:
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _must_be(kinds: Any, what: str, value: Any, name: str) -> Any:
+    value = _plain(value)
+    if not isinstance(value, kinds) or (isinstance(value, bool) and kinds is not bool):
+        raise InputError(f"`{name}` must be {what}; found {value!r:.60}, {kind_of(value)}.")
+    return value
 
 
 def number(value: Any, name: str) -> float:
-    value = value.item() if isinstance(value, np.generic) else value
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise InputError(f"`{name}` must be a number; found {value!r:.60}, {kind_of(value)}.")
-    return float(value)
+    """A number.
+
+    Raises
+    ------
+    InputError : it is none.
+    """
+    return float(_must_be((int, float), "a number", value, name))
 
 
 def text(value: Any, name: str) -> str:
-    if not isinstance(value, str):
-        raise InputError(f"`{name}` must be text; found {value!r:.60}, {kind_of(value)}.")
-    return value.strip()
+    """Text without blanks around it.
+
+    Raises
+    ------
+    InputError : it is no text.
+    """
+    return str(_must_be(str, "text", value, name)).strip()
 
 
 def path_in(value: Any, name: str) -> str:
-    if not isinstance(value, str | os.PathLike):
-        raise InputError(f"`{name}` must be a path: text or a Path; found {kind_of(value)}.")
+    """A path as text.
+
+    Raises
+    ------
+    InputError : it is none, or empty.
+    """
+    require(isinstance(value, str | os.PathLike), name, "a path: text or a Path", value)
     path = os.fspath(value)
     if not isinstance(path, str) or not path:
         raise InputError(f"`{name}` must be a path in text that is not empty; found {path!r}.")
@@ -115,17 +140,33 @@ def path_in(value: Any, name: str) -> str:
 
 
 def require(holds: bool, name: str, what: str, value: object) -> None:
+    """Refuse an argument that is of another kind than it must be.
+
+    Raises
+    ------
+    InputError : it does not hold.
+    """
     if not holds:
         raise InputError(f"`{name}` must be {what}; found {kind_of(value)}.")
 
 
 def kind_of(value: object) -> str:
+    """The type of a value, in words."""
     return "None" if value is None else f"a {type(value).__name__}"
 
 
-def _named(given: Any, name: str, what: str) -> dict[str, Any]:
-    require(given is None or isinstance(given, Mapping), name, f"a mapping from names to {what}", given)
-    return {text(key, name): value for key, value in (given or {}).items()}
+def _entries(value: Any, where: str) -> list[Any]:
+    require(hasattr(value, "__iter__") and not isinstance(value, str | Mapping), where, "a sequence", value)
+    return list(value)
+
+
+def _named(value: Any, name: str, what: str, reader: Callable[[Any, str], Any]) -> dict[str, Any]:
+    require(isinstance(value, Mapping), name, f"a mapping from names to {what}", value)
+    return {text(key, name): reader(each, f"{name}[{key!r}]") for key, each in value.items()}
+
+
+def _exact(value: Any, where: str) -> Fraction:
+    return exact(_must_be((Fraction, float, int, str), "a number, or text such as '0.15'", value, where), where)
 
 
 def _pair(value: Any, where: str) -> tuple[Fraction, Fraction]:
@@ -139,43 +180,14 @@ def _value_or_pair(value: Any, where: str) -> Fraction | tuple[Fraction, Fractio
     return _exact(value, where) if isinstance(value, _NUMBERS) else _pair(value, where)
 
 
-def _ranges(value: Any, name: str) -> dict[str, Any]:
-    """Pairs by name; half-widths as well, but not of parameters, which have values of their own."""
-    reader, what = (_pair, "pairs") if name == "ranges" else (_value_or_pair, "half-widths or pairs")
-    return {key: reader(ends, f"{name}[{key!r}]") for key, ends in _named(value, name, what).items()}
-
-
-def _exact(value: Any, where: str) -> Fraction:
-    value = value.item() if isinstance(value, np.generic) else value
-    if isinstance(value, bool) or not isinstance(value, Fraction | float | int | str):
-        raise InputError(f"`{where}` must be a number, or text such as '0.15'; found {value!r:.60}, {kind_of(value)}.")
-    return exact(value, where)
-
-
-def _entries(value: Any, where: str) -> list[Any]:
-    if isinstance(value, str | Mapping) or not hasattr(value, "__iter__"):
-        raise InputError(f"`{where}` must be a sequence; found {kind_of(value)}.")
-    return list(value)
-
-
-def _row(value: Any, name: str) -> tuple[float, ...]:
-    return tuple(number(v, name) for v in _entries(value, name))
-
-
-def _flag(value: Any, name: str) -> bool:
-    value = value.item() if isinstance(value, np.generic) else value
-    if not isinstance(value, bool):
-        raise InputError(f"`{name}` must be True or False; found {value!r:.60}, {kind_of(value)}.")
-    return value
-
-
-def _widths(value: Any, name: str) -> dict[str, float]:
-    require(isinstance(value, Mapping), name, "a mapping from states to half-widths", value)
-    return {text(key, name): number(width, name) for key, width in value.items()}
-
-
 def _state(value: Any, name: str) -> dict[str, Fraction]:
-    return {key: _exact(number, f"{name}[{key!r}]") for key, number in _named(value, name, "values").items()}
+    return _named(value, name, "values", _exact)
+
+
+def _ranges(value: Any, name: str) -> dict[str, Any]:
+    if name == "ranges":  # of parameters, which have values of their own
+        return _named(value, name, "pairs", _pair)
+    return _named(value, name, "half-widths or pairs", _value_or_pair)
 
 
 def _matrix(value: Any, name: str) -> Any:
@@ -188,25 +200,15 @@ def _matrix(value: Any, name: str) -> Any:
     return found
 
 
-def _count(value: Any, name: str) -> int:
-    value = value.item() if isinstance(value, np.generic) else value
-    if isinstance(value, bool) or not isinstance(value, int):
-        raise InputError(f"`{name}` must be a whole number; found {value!r:.60}, {kind_of(value)}.")
-    return value
-
-
-def _counts(value: Any, name: str) -> tuple[int, ...]:
-    return tuple(_count(v, name) for v in _entries(value, name))
-
-
+_whole = partial(_must_be, int, "a whole number")
 _READERS: Mapping[str, Callable[[Any, str], Any]] = {
     "word": text,
     "number": number,
-    "whole": _count,
-    "flag": _flag,
-    "row": _row,
-    "layers": _counts,
-    "widths": _widths,
+    "whole": _whole,
+    "flag": partial(_must_be, bool, "True or False"),
+    "row": lambda value, name: tuple(number(v, name) for v in _entries(value, name)),
+    "layers": lambda value, name: tuple(_whole(v, name) for v in _entries(value, name)),
+    "widths": lambda value, name: _named(value, name, "half-widths", number),
     "state": _state,
     "matrix": _matrix,
     "file": lambda value, _: value,

@@ -18,9 +18,9 @@ from certify.analysis.arguments import region
 from certify.certificates import SEARCH
 from certify.cli.contains import stated, text
 from certify.cli.ending import Interrupted
+from certify.cli.options import as_typed, options_of
 from certify.cli.shared import given_words, noting, write
 from certify.cli.terminal import ProgressLine, load_tables, say, show
-from certify.cli.typed import as_typed, options_of
 
 if TYPE_CHECKING:
     from certify.analysis.maximise import Quantity
@@ -59,6 +59,7 @@ def certified(
     asked : a state or a box, as people write it, of which it is to be said whether the proved set contains it.
     largest : what is to be as large as can be proved for the set.
     """
+    from certify.analysis.installation import versions
     from certify.analysis.run import certify_roa
     from certify.report import summary
 
@@ -84,7 +85,7 @@ def certified(
             folder,
             options,
             load_seconds=time.perf_counter() - start,
-            provenance=_provenance(policy),
+            provenance={"policy": policy.name, **versions()},
             progress=progress,
         )
     except KeyboardInterrupt:
@@ -196,9 +197,3 @@ def _within(plant: System, name: str) -> str:
     from certify.report.words import inside
 
     return f" in {inside(*plant.ranges[name])}"
-
-
-def _provenance(policy: Path) -> dict[str, Any]:
-    from certify.analysis.installation import versions
-
-    return {"policy": policy.name, **versions()}

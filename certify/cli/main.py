@@ -26,7 +26,7 @@ from certify.cli.export_smt2 import export_smt2
 from certify.cli.float_error import float_error
 from certify.cli.import_ import import_
 from certify.cli.learn_lyapunov import learn_lyapunov
-from certify.cli.options import Grouped
+from certify.cli.options import Grouped, as_typed, options_of
 from certify.cli.plant import plant
 from certify.cli.plot import plot
 from certify.cli.prove_in_coq import prove_in_coq
@@ -36,7 +36,6 @@ from certify.cli.roa import roa
 from certify.cli.sweep import sweep
 from certify.cli.systems import systems
 from certify.cli.terminal import say, tell
-from certify.cli.typed import as_typed, options_of
 from certify.cli.version import certify
 from certify.errors import BackendError, CertifyError, OptionError, SoundnessError
 

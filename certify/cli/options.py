@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import inspect
+import re
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from inspect import Parameter
@@ -88,7 +89,7 @@ def takes(**bundles: Bundle) -> Callable[[Callable[..., None]], Callable[..., No
 
 def options_of_a_run(*names: str, required: Collection[str] = (), **otherwise: str) -> Bundle:
     """Options of a run, all or those that are named, some with another default; the command receives texts by field."""
-    return Bundle(_declared(RoaOptions, names, required, otherwise), lambda typed: {**otherwise, **typed})
+    return Bundle(_declared(RoaOptions, names, required, otherwise), lambda typed: otherwise | dict(typed))
 
 
 def changes_of_a_plant(*names: str) -> Bundle:
@@ -111,6 +112,20 @@ def _declared(
                 shown |= {"metavar": option.metavar, "envvar": option.variable}
             found[name] = parameter(name, option.typed, help_, of, name in required, **shown)
     return found
+
+
+def options_of(command: Any) -> dict[str, str]:
+    """The options of a command of click by the names that Python has for them."""
+    return {one.name: max(one.opts, key=len) for one in command.params if one.param_type_name == "option"}
+
+
+def as_typed(message: str, options: Mapping[str, str]) -> str:
+    """A message with each option in backquotes as it is typed.
+
+    >>> as_typed("`time_limit` must be positive, unlike `P`.", {"time_limit": "--time-limit"})
+    '--time-limit must be positive, unlike `P`.'
+    """
+    return re.sub(r"`([A-Za-z_]+)`", lambda found: options.get(found[1], found[0]), message)
 
 
 def _shown(value: Any) -> str:

@@ -56,35 +56,30 @@ def roa(
     """Certify a region of attraction: prove, write a certificate, have it checked, report."""
     start, drawing = time.perf_counter(), context.with_resource(Drawing())
     note, path = noting(quiet), the_policy(context, file, policy)
-    largest = _largest(changed, typed)
+    largest = _largest(changed.get("sample_time"), typed.get("rate"), "resume" in typed)
+    if largest is not None:
+        (changed if largest == "period" else typed).pop("sample_time" if largest == "period" else "rate")
     changes = changes_of(changed)
     stored = policy_in(path, importing, system, changes, note)
     plant = plant_of(stored, system, changes, note)
-    options = options_of(typed | {"engine": _engine(context, typed)}, plant, note)
+    options = options_of(typed | {"engine": _engine(context, typed.get("engine", "bounds"))}, plant, note)
     if contains is not None:
         region(contains, plant, CONTAINS)  # what cannot be read is said before the run
     certified(context, path, stored, plant, options, out, start, drawing, quiet, as_json, contains, largest)
 
 
-def _largest(changed: dict[str, Any], typed: dict[str, Any]) -> Quantity | None:
-    """What is to be as large as can be proved, if anything is; it is taken out of what was typed."""
-    period, rate = changed.get("sample_time"), typed.get("rate")
-    if typed.get("resume") and _MOST in (period, rate):
+def _largest(period: str | None, rate: str | None, resume: bool) -> Quantity | None:
+    """What is to be as large as can be proved, if anything is."""
+    if resume and _MOST in (period, rate):
         raise InputError("--resume goes on with one search; ask for a period or a rate in the place of max.")
     if period == _MOST and rate not in (None, "0"):
         raise InputError("--sample-time max must stand without --rate; found both. Ask for one of them at a time.")
-    if period == _MOST:
-        del changed["sample_time"]
-        return "period"
-    if rate == _MOST:
-        del typed["rate"]
-        return "rate"
-    return None
+    return "period" if period == _MOST else "rate" if rate == _MOST else None
 
 
-def _engine(context: typer.Context, typed: dict[str, Any]) -> str:
+def _engine(context: typer.Context, name: str) -> str:
     """The engine; without dReal, one that only the environment names falls back to bounds with a notice."""
-    name, source = typed.get("engine", "bounds"), context.get_parameter_source("engine")
+    source = context.get_parameter_source("engine")
     if name in ("dreal", "both") and source is not None and source.name == "ENVIRONMENT":
         from certify.provers.dreal.backend import find_backend
 
@@ -93,4 +88,4 @@ def _engine(context: typer.Context, typed: dict[str, Any]) -> str:
         except BackendError as error:
             tell(f"engine bounds in the place of {name}: {error}")
             return "bounds"
-    return str(name)
+    return name
