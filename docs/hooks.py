@@ -12,9 +12,11 @@ from typing import Any
 import typer
 
 import certify
+from certify.analysis.studies.study import KNOWN
 from certify.cli.main import app
 
 COMMANDS, NAMES = "<!-- every command -->", "<!-- every public name -->"
+OPTIONS = "<!-- every option of a study -->"
 
 
 def on_page_markdown(markdown: str, **_: Any) -> str:
@@ -23,7 +25,7 @@ def on_page_markdown(markdown: str, **_: Any) -> str:
         markdown = markdown.replace(COMMANDS, commands())
     if NAMES in markdown:
         markdown = markdown.replace(NAMES, public_names())
-    return markdown
+    return markdown.replace(OPTIONS, ", ".join(f"`{key}`" for key in KNOWN))
 
 
 def commands() -> str:

@@ -25,7 +25,19 @@ EDGES = {  # who imports whom, besides these: exactly the arrows that exist
     "report": "certificates loop lyapunov",
     "controllers": "analysis certificates cli loop lyapunov provers report",
 }
-ROOMS = {"analysis", "certificates", "checker", "cli", "effort", "errors", "loop", "lyapunov", "provers", "reference", "report"}
+ROOMS = {
+    "analysis",
+    "certificates",
+    "checker",
+    "cli",
+    "effort",
+    "errors",
+    "loop",
+    "lyapunov",
+    "provers",
+    "reference",
+    "report",
+}
 
 
 def unit(module: str) -> str:

@@ -17,9 +17,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from certify import TanhNetwork, certify_roa
+from certify.analysis.arguments import region
 from certify.certificates import parse_certificate
 from certify.certificates.membership import Box, Containment, Ellipsoid, Located, ProvedSet, proved_set
-from certify.cli.arguments import region
 from certify.cli.main import _run
 from certify.errors import CertificateFormatError, InputError
 from certify.loop.expressions import Number, Symbol, cos, sin, symbols

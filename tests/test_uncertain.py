@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from certify import certify_roa
-from certify.analysis.inputs import with_acting, with_bounded_errors, with_uncertain_parameters
+from certify.analysis.changes import PlantChanges
 from certify.analysis.results import RoaResult
 from certify.certificates import Certificate, PartitionTree, parse_certificate, read_certificate
 from certify.certificates.claims import Asymptotic, Problem, conditions
@@ -190,7 +190,7 @@ def test_an_error_of_an_input_is_what_only_moves_the_input(tmp_path: Path) -> No
 @pytest.mark.parametrize("name", available_systems())
 def test_errors_of_inputs_are_recognised_in_a_certificate(name: str) -> None:
     plant = get_system(name)
-    system = with_bounded_errors(plant, F(1, 100))
+    system = PlantChanges(input_error=F(1, 100)).of(plant)
     n, m = system.n, system.m
     network = TanhNetwork((np.zeros((m, n)),), (np.zeros(m),), np.ones(m), np.zeros(m), "tanh", "none")
     evidence = PartitionTree(np.eye(n), np.ones(n), bytes([255]), cells=(1,) * m)
@@ -208,19 +208,19 @@ def test_errors_of_inputs_are_recognised_in_a_certificate(name: str) -> None:
 )
 def test_an_error_that_is_no_bound_of_an_input_is_refused(tmp_path: Path, bounds: Any, part: str) -> None:
     with pytest.raises(InputError, match=part):
-        with_bounded_errors(spring(tmp_path), bounds)
+        PlantChanges(input_error=bounds).of(spring(tmp_path))
 
 
 def test_only_disturbances_act_and_only_parameters_are_uncertain(tmp_path: Path) -> None:
     system = spring(tmp_path)
     with pytest.raises(InputError, match="spring has no disturbance 'k'; it has: wind"):
-        with_acting(system, {"k": F(1)})
+        PlantChanges(disturbances={"k": F(1)}).of(system)
     with pytest.raises(InputError, match="spring has no parameter 'wind'; it has: k, c"):
-        with_uncertain_parameters(system, {"wind": (F(-1), F(1))})
+        PlantChanges(parameters={"wind": (F(-1), F(1))}).of(system)
     with pytest.raises(InputError, match="wind must have a half-width that is not negative"):
-        with_acting(system, {"wind": F(-1)})
-    assert dict(with_acting(system, {"wind": F(1, 2)}).ranges) == {"wind": (F(-1, 2), F(1, 2))}
-    assert not with_acting(spring(tmp_path, "0.1"), {"wind": F(0)}).ranges
+        PlantChanges(disturbances={"wind": F(-1)}).of(system)
+    assert dict(PlantChanges(disturbances={"wind": F(1, 2)}).of(system).ranges) == {"wind": (F(-1, 2), F(1, 2))}
+    assert not PlantChanges(disturbances={"wind": F(0)}).of(spring(tmp_path, "0.1")).ranges
 
 
 # runs
@@ -341,7 +341,7 @@ def test_ranges_that_are_none_are_refused_in_python(tmp_path: Path, given: dict[
 def test_the_thrust_of_a_quadrotor_is_nominal() -> None:
     """A mass that is off moves the point of rest, so that only practical stability can be claimed."""
     system = get_system("quadrotor2d")
-    lift = with_uncertain_parameters(system, {"m": (F(476, 1000), F(496, 1000))})
+    lift = PlantChanges(parameters={"m": (F(476, 1000), F(496, 1000))}).of(system)
     assert lift.exact_u_eq() == system.exact_u_eq()
     offset = np.array([float(q) for q in system.exact_u_eq()])
     law = TanhNetwork((np.zeros((2, 6)),), (np.zeros(2),), np.ones(2), offset, "identity", "output")

@@ -1,97 +1,72 @@
 """Options as people write them turned into values, with errors that say what an option takes.
 
-The command line and a study's file speak the same language, and mean the same by it.
+The command line and a study's file speak the same language, and mean the same by it; `certify.analysis.values` reads
+what Python gives.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from fractions import Fraction
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
-from certify.analysis.inputs import (
-    Tell,
-    named_plant,
-    tell_of_other,
-    where_valid,
-    with_acting,
-    with_bounded_errors,
-    with_period,
-    with_uncertain_parameters,
-)
-from certify.errors import InputError
+from certify.analysis.changes import PlantChanges
+from certify.analysis.declaration import declared
+from certify.analysis.inputs import Tell, ellipsoid_beside, function_in
+from certify.analysis.options import RoaOptions
+from certify.errors import InputError, OptionError
 
 if TYPE_CHECKING:
     from certify.loop.plants import System
-    from certify.loop.policies import Policy
 
 
-def plant_of(
-    stored: Policy,
-    name: str | None,
-    params: list[str],
-    bounds: list[str],
-    disturbances: Sequence[str],
-    error: str | None,
-    period: str | None,
-    tell: Tell,
-) -> System:
-    """The plant: the policy file's unless `name` says otherwise, with `--param`, `--domain`, `--disturbance`,
-    `--input-error` and `--sample-time` put in.
+def options_of(texts: Mapping[str, Any], plant: System, tell: Tell) -> RoaOptions:
+    """The options of a run from texts by their fields; the file of a second function is read for this plant.
 
-    What is named there counts as it stands; where the policy was trained for other numbers, `tell` is told so.
+    Raises
+    ------
+    InputError : a text is not what its option takes, or options do not go together.
     """
-    plant, own = named_plant(stored, name)
-    plant = with_params(plant, params)
-    if not own:
-        tell_of_other(stored, plant, tell)
-    plant = with_errors(with_disturbances(with_domains(plant, bounds), disturbances), error)
-    return where_valid(stored, with_samples(plant, period), tell)
+    read = {name: read_option(name, text) for name, text in texts.items()}
+    if "lyapunov" in read:
+        beyond = function_in(read["lyapunov"], plant, tell)
+        read["lyapunov"] = beyond.function
+        if read.get("candidate", "auto") == "auto" and not {"Q", "R", "level"} & read.keys():
+            read["P"] = ellipsoid_beside(beyond, plant)
+    return RoaOptions(**read)
 
 
-def with_params(plant: System, params: list[str]) -> System:
-    """The plant with what `--param` says put in: values, and ranges LO..HI of those that are uncertain."""
-    given = dict(_assignment(p, "--param") for p in params)
-    ranges = {name: _range(value, name) for name, value in given.items() if ".." in value}
-    exact_ones = {name: value for name, value in given.items() if name not in ranges}
-    return with_uncertain_parameters(plant.with_parameters(exact_ones), ranges)
+def read_option(name: str, text: Any) -> Any:
+    """The value of an option of a run; a flag of the command line is one already.
+
+    Raises
+    ------
+    InputError : the text is not what the option takes.
+    """
+    return text if isinstance(text, bool) else _READERS[declared(RoaOptions)[name].kind](text, name)
 
 
-def with_disturbances(plant: System, given: Sequence[str]) -> System:
-    """The plant with the ranges that `--disturbance` says: half-widths or LO..HI."""
-    from certify.loop.plants import exact
+def changes_of(texts: Mapping[str, Any]) -> PlantChanges:
+    """The changes of a plant from texts by their fields: one, or for a table one for each entry, NAME=VALUE.
 
-    pairs = dict(_assignment(text, "--disturbance") for text in given)
-    return with_acting(
-        plant, {name: _range(value, name) if ".." in value else exact(value, name) for name, value in pairs.items()}
-    )
-
-
-def with_errors(plant: System, error: str | None) -> System:
-    """The plant with u + e in the place of u, as `--input-error` bounds |e|: one number for all inputs, or by name."""
-    from certify.loop.plants import exact
-
-    if error is None:
-        return plant
-    return with_bounded_errors(plant, state(error, "--input-error") if "=" in error else exact(error, "--input-error"))
+    Raises
+    ------
+    InputError : a text is not what it must be.
+    """
+    options = declared(PlantChanges)
+    return PlantChanges(**{name: _READERS[options[name].kind](text, name) for name, text in texts.items()})
 
 
-def with_samples(plant: System, period: str | None) -> System:
-    """The plant whose inputs are held as `--sample-time` says: a period, or any between LO..HI."""
-    from certify.loop.plants import exact
-
-    if period is None:
-        return plant
-    ends = _range(period, "--sample-time") if ".." in period else exact(period, "--sample-time")
-    return with_period(plant, ends)
+def _ranges(entries: Sequence[str], name: str) -> dict[str, Any]:
+    pairs = dict(_assignment(entry, f"`{name}`") for entry in entries)
+    return {key: _value_or_range(value, key) for key, value in pairs.items()}
 
 
-def _range(text: str, name: str) -> tuple[Fraction, Fraction]:
-    from certify.loop.plants import exact
-
-    lo, hi = ends_of(text)
-    return exact(lo, name), exact(hi, name)
+def _value_or_range(text: str, name: str) -> Fraction | tuple[Fraction, Fraction]:
+    ends = [_exact(end, name) for end in ends_of(text)]
+    return ends[0] if len(ends) == 1 else (ends[0], ends[1])
 
 
 def ends_of(text: str) -> list[str]:
@@ -101,22 +76,6 @@ def ends_of(text: str) -> list[str]:
     (['-1', '3'], ['-1', '3'], ['2'])
     """
     return [end.strip() for end in text.split(".." if ".." in text else ":", 1)]
-
-
-def with_domains(plant: System, bounds: list[str]) -> System:
-    """The plant on the box that `--domain` says: half-widths around x_eq, or intervals of the states' values."""
-    from certify.loop.plants import exact
-
-    domain: dict[str, tuple[Fraction, Fraction]] = {}
-    at = plant.operating_point()
-    for text in bounds:
-        state, value = _assignment(text, "--domain")
-        if len(ends_of(value)) == 2:
-            (lo, hi), shift = _range(value, state), at.get(state, Fraction(0))
-            domain[state] = (lo - shift, hi - shift)
-        else:
-            domain[state] = (-exact(value, state), exact(value, state))
-    return plant.with_domain(domain)
 
 
 def region(text: str, plant: System, option: str, deviations: bool = False) -> tuple[tuple[Fraction, Fraction], ...]:
@@ -130,8 +89,6 @@ def region(text: str, plant: System, option: str, deviations: bool = False) -> t
     ------
     InputError : a name is no state or comes twice, a number is none, or an interval has lo > hi.
     """
-    from certify.loop.plants import exact
-
     names, at = [s.name for s in plant.states], plant.operating_point()
     found: dict[str, tuple[Fraction, Fraction]] = {}
     for name, value in _assignments(text, option):
@@ -140,49 +97,87 @@ def region(text: str, plant: System, option: str, deviations: bool = False) -> t
         if name in found:
             raise InputError(f"{option} must name each state once; found {name} twice.")
         given, shift = ends_of(value), Fraction(0) if deviations else at.get(name, Fraction(0))
-        ends = exact(given[0], name) - shift, exact(given[-1], name) - shift
+        ends = _exact(given[0], name) - shift, _exact(given[-1], name) - shift
         if ends[0] > ends[1]:
             raise InputError(f"{option} takes intervals LO..HI with LO <= HI; found {f'{name}={value}'!r}.")
         found[name] = ends
     return tuple(found.get(name, (Fraction(0), Fraction(0))) for name in names)
 
 
-def numbers(text: str | None, option: str) -> tuple[float, ...] | None:
+def numbers(text: str, name: str) -> tuple[float, ...]:
     """Numbers separated by commas."""
-    if text is None:
-        return None
     try:
         return tuple(float(part) for part in text.split(","))
     except ValueError as error:
-        raise InputError(f"{option} takes numbers separated by commas, as in 1,1; found {text!r}.") from error
+        raise OptionError(f"`{name}` takes numbers separated by commas, as in 1,1; found {text!r}.") from error
 
 
-def layers(text: str, option: str) -> tuple[int, ...]:
+def layers(text: str, name: str) -> tuple[int, ...]:
     """Widths of layers, separated by commas."""
     try:
         return tuple(int(part) for part in text.split(","))
     except ValueError as error:
-        raise InputError(f"{option} takes widths separated by commas, as in 16,16; found {text!r}.") from error
+        raise OptionError(f"`{name}` takes widths separated by commas, as in 16,16; found {text!r}.") from error
 
 
-def widths(text: str | None, option: str) -> dict[str, float] | None:
+def widths(text: str, name: str) -> dict[str, float]:
     """Numbers by name, separated by commas or spaces."""
-    if text is None:
-        return None
-    pairs = dict(_assignments(text, option))
     try:
-        return {name: float(value) for name, value in pairs.items()}
+        return {key: float(value) for key, value in _assignments(text, f"`{name}`")}
     except ValueError as error:
-        raise InputError(
-            f"{option} takes NAME=NUMBER separated by commas, as in x=0.4,phi=0.2; found {text!r}."
+        raise OptionError(
+            f"`{name}` takes NAME=NUMBER separated by commas, as in x=0.4,phi=0.2; found {text!r}."
         ) from error
 
 
-def state(text: str, option: str) -> dict[str, Fraction]:
+def state(text: str, name: str) -> dict[str, Fraction]:
     """Exact numbers by name, separated by commas or spaces."""
+    return {key: _exact(value, key) for key, value in _assignments(text, f"`{name}`")}
+
+
+def _number(text: str, name: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        return float(_exact(text, name))
+
+
+def _whole(text: str, name: str) -> int:
+    value = _exact(text, name)
+    if value.denominator != 1:
+        raise OptionError(f"`{name}` must be a whole number; found {text}.")
+    return int(value)
+
+
+def _flag(text: str, name: str) -> bool:
+    if text not in ("true", "false"):
+        raise OptionError(f"`{name}` must be true or false; found {text!r}.")
+    return text == "true"
+
+
+def _exact(text: str, name: str) -> Fraction:
     from certify.loop.plants import exact
 
-    return {name: exact(value, name) for name, value in _assignments(text, option)}
+    try:
+        return exact(text, name)
+    except InputError as error:
+        raise OptionError(str(error)) from error
+
+
+_READERS: Mapping[str, Callable[[Any, str], Any]] = {
+    "word": lambda text, _: text,
+    "number": _number,
+    "whole": _whole,
+    "flag": _flag,
+    "row": numbers,
+    "layers": layers,
+    "widths": widths,
+    "state": state,
+    "file": lambda text, _: Path(text),
+    "ranges": _ranges,
+    "bounds": lambda text, name: state(text, name) if "=" in text else _exact(text, name),
+    "period": _value_or_range,
+}
 
 
 def _assignments(text: str, option: str) -> Iterator[tuple[str, str]]:
@@ -194,5 +189,5 @@ def _assignments(text: str, option: str) -> Iterator[tuple[str, str]]:
 def _assignment(text: str, option: str) -> tuple[str, str]:
     name, equals, value = text.partition("=")
     if not equals or not name or not value:
-        raise InputError(f"{option} takes NAME=VALUE; found {text!r}.")
+        raise OptionError(f"{option} takes NAME=VALUE; found {text!r}.")
     return name.strip(), value.strip()

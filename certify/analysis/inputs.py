@@ -3,8 +3,7 @@
 A policy file says which plant it was trained for, and by which numbers; whoever uses it may say otherwise, and what
 he says counts. What has to be known of that goes to `tell`, a line each: the command prints it on standard error, a
 result of Python keeps it. Where a policy's network is what it was made from only on a part of the states, the domain
-is cut to that part here, and nowhere is it left to the caller to remember. What is uncertain of a plant, and acts on
-it, is put in here too.
+is cut to that part here, and nowhere is it left to the caller to remember.
 """
 
 from __future__ import annotations
@@ -22,8 +21,8 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from certify.analysis.changes import PlantChanges
     from certify.loop.plants import System
-    from certify.loop.plants.system import Interval
     from certify.loop.policies import Centre, Policy
     from certify.loop.policies.importers import Imported, ImportOptions
     from certify.loop.policies.importers.comparing import Difference
@@ -35,29 +34,62 @@ Tell = Callable[[str], None]
 
 
 def policy_in(
-    path: Path, importing: ImportOptions, plant: Callable[[], System], own: Callable[[Policy], System], tell: Tell
+    path: Path, importing: ImportOptions, system: System | str | None, changes: PlantChanges, tell: Tell
 ) -> Policy:
-    """The policy in a file of this program, or of another one.
-
-    Parameters
-    ----------
-    plant : gives the plant that a policy of another program is for.
-    own : gives the plant of a policy of this program, where a centring is asked for.
+    """The policy in a file of this program, or of another one for the plant that `system` says, with the changes.
 
     Raises
     ------
-    InputError : the file cannot be read or imported, or the centring cannot be had.
+    InputError : the file cannot be read or imported, is another program's and nothing says its plant, or the centring
+        cannot be had.
     """
     from certify.loop.policies import load_policy
     from certify.loop.policies.importers import import_policy
 
     if is_own(path, importing):
         stored = load_policy(path)
-        return stored if importing.centre is None else centred(stored, importing.centre, own(stored), tell)
-    imported = import_policy(path, plant(), importing)
+        if importing.centre is None:
+            return stored
+        return centred(stored, importing.centre, plant_of(stored, system, changes, lambda _: None), tell)
+    imported = import_policy(path, plant_for(f"the policy file {path}", system, changes), importing)
     for line in lines(imported):
         tell(line)
     return imported.policy
+
+
+def plant_for(whose: str, system: System | str | None, changes: PlantChanges) -> System:
+    """The plant, with the changes, of a policy that does not say what it controls.
+
+    Raises
+    ------
+    InputError : nothing else says it, there is no such plant, or the plant cannot have a change.
+    """
+    from certify.loop.plants import System, chosen_system
+
+    if system is None:
+        raise InputError(f"name the plant with --system: {whose} does not say what it controls.")
+    return changes.of(system if isinstance(system, System) else chosen_system(system))
+
+
+def plant_of(stored: Policy, system: System | str | None, changes: PlantChanges, tell: Tell) -> System:
+    """The plant of a policy, with the changes: the policy's own unless `system` says otherwise.
+
+    What is given counts as it stands; where the policy was trained for other numbers, `tell` is told so.
+
+    Raises
+    ------
+    InputError : there is no such plant, or the plant cannot have a change.
+    """
+    from certify.loop.plants import System
+
+    plant, own = (system, False) if isinstance(system, System) else named_plant(stored, system)
+    plant = changes.of(plant)
+    if not own:
+        tell_of_other(stored, plant, tell)
+    plant = where_valid(stored, plant, tell)
+    if shift := stored.beta_shift(plant.exact_u_eq()):
+        tell(f"the file's rounded beta is read as the real number; this shifts u(0) by {shift:.3g}")
+    return plant
 
 
 def centred(stored: Policy, centre: Centre, plant: System, tell: Tell) -> Policy:
@@ -168,61 +200,6 @@ def where_valid(stored: Policy, plant: System, tell: Tell) -> System:
     for name, (lo, hi) in cut.items():
         tell(f"the domain of {name} is cut to [{float(lo):.6g}, {float(hi):.6g}]: there its observation is not clipped")
     return plant.with_domain(cut)
-
-
-def with_uncertain_parameters(plant: System, ranges: Mapping[str, Interval]) -> System:
-    """The plant where parameters have ranges.
-
-    Raises
-    ------
-    InputError : one is no parameter, or cannot have this range.
-    """
-    for name in ranges:
-        if name not in plant.parameters:
-            known = ", ".join(plant.parameters) or "none"
-            raise InputError(f"{plant.name} has no parameter {name!r}; it has: {known}.")
-    return plant.with_ranges(ranges)
-
-
-def with_acting(plant: System, given: Mapping[str, Interval | Fraction]) -> System:
-    """The plant where disturbances act within a range or a half-width; with 0 one that the plant has acts no more.
-
-    Raises
-    ------
-    InputError : one is no disturbance of the plant, or a half-width is negative.
-    """
-    known, ranges = [s.name for s in plant.disturbances], dict[str, "Interval | None"]()
-    for name, value in given.items():
-        if name not in known:
-            raise InputError(f"{plant.name} has no disturbance {name!r}; it has: {', '.join(known) or 'none'}.")
-        if not isinstance(value, tuple) and value < 0:
-            raise InputError(
-                f"disturbance {name} must have a half-width that is not negative, or a range; found {float(value):g}."
-            )
-        ranges[name] = value if isinstance(value, tuple) else (-value, value) if value else None
-    return plant.with_ranges(ranges)
-
-
-def with_bounded_errors(plant: System, bound: Fraction | Mapping[str, Fraction]) -> System:
-    """The plant with u + e in the place of u, |e| at most the bound: one for all inputs, or each by the input's name.
-
-    Raises
-    ------
-    InputError : a bound is not positive, or is of no input.
-    """
-    bounds = bound if isinstance(bound, Mapping) else {s.name: bound for s in plant.inputs}
-    return plant.with_input_errors(bounds)
-
-
-def with_period(plant: System, period: Fraction | Interval | None) -> System:
-    """The plant whose inputs are held over a period, or over any period between two; None for inputs that follow at
-    once.
-
-    Raises
-    ------
-    InputError : the plant is in discrete time, a period is negative, or all are 0.
-    """
-    return plant.with_sample((period, period) if isinstance(period, Fraction) else period)
 
 
 def is_own(path: Path, importing: ImportOptions) -> bool:

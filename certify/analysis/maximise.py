@@ -71,7 +71,7 @@ def certify_largest(
     """
     start = time.perf_counter() - load_seconds
     plain = system.with_sample(None) if quantity == "period" else system
-    effort = effort_of(options)
+    effort = effort_of(options, load_seconds)
     with sole_writer(out), TemporaryDirectory(dir=out, prefix="attempt-") as folder:
         set_aside(out)
         first = certify_roa(

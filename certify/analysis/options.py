@@ -1,187 +1,198 @@
-"""What a run is asked for; the fields are the command line's options."""
+"""What a run is asked for: each option is declared here, once."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from fractions import Fraction
-from typing import Literal, cast, get_args
+from typing import TYPE_CHECKING, Any, Literal, cast, get_args
 
-import numpy as np
-from numpy.typing import NDArray
-
+from certify.analysis.declaration import declared, option
 from certify.errors import OptionError
-from certify.lyapunov import BEYOND, Beyond, Candidate, Named, Neural, Polynomial, Symbolic
 
-Array = NDArray[np.float64]
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from certify.lyapunov import Beyond, Candidate, Named, Neural, Polynomial, Symbolic
+
+    Array = NDArray[np.float64]
+
 EngineName = Literal["bounds", "dreal", "both"]
-_MOST_JOBS = 256  # of the checker
 Asked = Literal["auto", "asymptotic", "practical", "nearby"]
 Around = Literal["auto", "origin", "rest"]
+_MOST_JOBS = 256  # of the checker
 
 
-@dataclass(frozen=True, slots=True)
+_POSITIVE = ("be a positive number", lambda value: math.isfinite(value) and value > 0)
+_FROM_0 = ("be a number of at least 0", lambda value: 0 <= value < math.inf)
+_ABOVE_0 = ("be positive", lambda value: value > 0)
+_HALF_WIDTHS = ("have positive half-widths", lambda value: all(map(_POSITIVE[1], value.values())))
+_NUMBERS = ("be a state of finite numbers", lambda value: all(map(math.isfinite, value.values())))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RoaOptions:
-    """How to certify.
+    """How to certify; `certify.certify_roa` takes these options one by one as well."""
 
-    Parameters
-    ----------
-    claim : `asymptotic`; `practical`, which asks for no equilibrium at the origin; `nearby`, which is that and, if it
-        can be shown, that all trajectories converge to one equilibrium where what is uncertain is constant. `auto` is
-        the first where the loop rests at the origin exactly, and the last where it does not.
-    around : the point at which V is 0, under a claim that needs no equilibrium at the origin: the `origin`, or where
-        the loop does `rest`, which then is the operating point, and states are deviations from there. `auto` is where
-        it rests if that is a stable point and nothing is given in deviations from the origin: `P`, `level`, `lyapunov`.
-    candidate : where P comes from, see `choose_candidate`, or `robust`, which chooses P with the local rule's own
-        bounds, or `peak`, whose floor is small; `auto` tries several and keeps the one with which the largest volume is
-        proved. `neural` and `polynomial` do that too, and learn a function N whose set reaches beyond the ellipsoid.
-        With Q, R or a level it is `lyapunov`, or `lqr` if R is given.
-    Q, R : diagonals of the weights, shapes (n,) and (m,); None means ones.
-    P : a Lyapunov matrix of one's own, (n, n); overrides the candidate.
-    level : prove exactly this level; None finds the largest.
-    engine : `bounds`, `dreal` (its word is trusted, not checked), or `both`: bounds prove, dReal is asked as well.
-    dreal_precision : dReal's delta.
-    jobs : processes of the checker, and threads of dReal; None is one of these, and where there are many leaves as many
-        of those as there are cores.
-    device : where boxes are bounded, `cpu` or `cuda`.
-    cluster : whose workers grow boxes: `local:N` for N processes of this machine, or the address of a Dask scheduler,
-        such as tcp://host:8786; None for the threads of this process.
-    cluster_checks : the cluster's workers run the checker as well, each on a part of the leaves, and are believed.
-    resume : go on with the search that an earlier run for the largest level left in the folder.
-    enlarge : look for a tube of ellipsoids from a larger set into the proved one.
-    box : half-widths by state; `enlarge` for the largest multiple of the ellipsoid with these half-axes. A state that
-        is not named gets the smallest share of its domain that a named one has.
-    reach_from : a state by the states' values, those that are not named at the operating point: look for a tube around
-        the trajectory from there into the proved set, the widest multiple of an ellipsoid; of `box`, if it is given.
-    lyapunov : a function N of the states beyond the ellipsoid: prove the largest {N <= n2} from which every trajectory
-        enters {V <= c2}, in the domain box.
-    lyapunov_level : prove exactly this n2; None finds the largest.
-    hidden, degree : of what the candidates `neural` and `polynomial` learn: the widths of the layers between states and
-        output, and the degree.
-    seed : of that learning.
-    effort : counted work of every stage; 1 is what two quiet cores do in about 50 s.
-    time_limit : seconds for everything up to the verdict, the check included; None is no limit.
-    max_boxes : boxes for the ring.
-    rate : lambda in `D + 2 lambda V < 0`: V is to fall at least as exp(-2 lambda t), in units of time of the plant, or
-        in discrete time at each step by the share 2 lambda.
-    """
-
-    claim: Asked = "auto"
-    around: Around = "auto"
-    candidate: Candidate = "auto"
-    Q: tuple[float, ...] | None = None
-    R: tuple[float, ...] | None = None
-    P: Array | None = None
-    level: float | None = None
-    engine: EngineName = "bounds"
-    dreal_precision: float = 1e-3
-    jobs: int | None = None
-    device: str = "cpu"
-    cluster: str | None = None
-    cluster_checks: bool = False
-    resume: bool = False
-    enlarge: bool = False
-    box: Mapping[str, float] | None = None
-    reach_from: Mapping[str, Fraction | float] | None = None
-    lyapunov: Neural | Polynomial | Symbolic | None = None
-    lyapunov_level: float | None = None
-    hidden: tuple[int, ...] = (16, 16)
-    degree: int = 4
-    seed: int = 0
-    effort: float = 1.0
-    time_limit: float | None = None
-    max_boxes: int = 4_000_000
-    rate: float = 0.0
+    # fmt: off
+    claim: Asked = option("auto", "claim", "word", first=True, help=(
+        "asymptotic: trajectories converge to the origin. practical: they enter a small set and stay there. nearby: "
+        "they also converge to one equilibrium in it, if that can be shown. auto: asymptotic if the loop rests at the "
+        "origin exactly, else nearby."))
+    around: Around = option("auto", "claim", "word", metavar="POINT", help=(
+        "Where V is 0 if the loop does not rest at the origin. origin: there. rest: where the loop rests, which then "
+        "is the operating point. auto: rest if that is a stable point and nothing is given around the origin."))
+    level: float | None = option(None, "claim", "number", _POSITIVE, first=True, help=(
+        "Prove exactly V <= LEVEL; a smaller set counts as UNKNOWN. By default the largest level is looked for."))
+    rate: float = option(0.0, "claim", "number", _FROM_0, help=(
+        "Prove that V falls at least as exp(-2 RATE t), in discrete time by the share 2 RATE at each step."),
+        written="max: the largest rate for which the set that is proved without one is still proved.")
+    enlarge: bool = option(False, "claim", "flag", help=(
+        "Look for a tube that leads from a larger set into the proved one."))
+    box: Mapping[str, float] | None = option(None, "claim", "widths", _HALF_WIDTHS, metavar="HALF-AXES", help=(
+        "Let the tube start from the largest multiple of the ellipsoid with these half-axes; a state that is not named "
+        "gets the smallest share of its domain that a named one has."),
+        written="As in x=0.4,phi=0.2.", python="Half-axes by state.")
+    reach_from: Mapping[str, Fraction | float] | None = option(
+        None, "claim", "state", _NUMBERS, typed="--from", metavar="STATE", varies=False, first=True, help=(
+        "Prove that this state converges too, with what lies around it: a tube around its trajectory leads into the "
+        "proved set. A state that is not named is at the operating point."),
+        written="As in x=0.5,y=-0.2.", python="Values by state.")
+    lyapunov: Neural | Polynomial | Symbolic | None = option(None, "claim", "file", metavar="FILE", help=(
+        "A second function N: prove the largest outer set {N <= n2} in the domain, from which every trajectory enters "
+        "the proved ellipsoid."),
+        written="If the file (certify-lyapunov/1) says with which ellipsoid N was learned, that ellipsoid is proved, "
+        "unless a candidate, weights or a level are given.",
+        python="A function of deviations from the operating point, or the path of its file.")
+    lyapunov_level: float | None = option(
+        None, "claim", "number", ("be a finite number", math.isfinite), metavar="LEVEL", help=(
+        "Prove exactly N <= LEVEL; a smaller outer set counts as UNKNOWN. By default the largest is looked for."))
+    candidate: Candidate = option("auto", "candidate", "word", first=True, varies=False, help=(
+        "Where the matrix P comes from: lyapunov, scaled, lqr, optimised, robust, or peak, which makes the floor of a "
+        "practical claim small. auto: several, of which the largest proved set counts; with Q or a level lyapunov, "
+        "with R lqr. neural, polynomial: as auto, and a second function is learned for an outer set."))
+    Q: tuple[float, ...] | None = option(None, "candidate", "row", metavar="NUMBERS", written="As in 1,1.", help=(
+        "Diagonal of the weights Q, a positive number for each state; ones by default."))
+    R: tuple[float, ...] | None = option(None, "candidate", "row", metavar="NUMBERS", written="As in 1.", help=(
+        "Diagonal of the weights R of the candidate lqr, a positive number for each input; ones by default."))
+    P: Array | None = option(None, "candidate", "matrix", typed="", varies=False, python="Shape (n, n).", help=(
+        "A matrix P of your own, symmetric and positive definite, instead of a candidate."))
+    hidden: tuple[int, ...] = option(
+        (16, 16), "candidate", "layers", ("be widths of at least 1", lambda widths: min(widths, default=1) >= 1),
+        metavar="WIDTHS", help="Widths of the hidden layers of the network that is learned for N.")
+    degree: int = option(4, "candidate", "whole", ("be even, 2 to 12", range(2, 13, 2).__contains__), help=(
+        "Degree of the polynomial that is learned for N, even."))
+    seed: int = option(0, "candidate", "whole", help="Seed of the learning: the same seed learns the same N.")
+    effort: float = option(1.0, "effort", "number", _POSITIVE, first=True, help=(
+        "Scale the counted work of every stage: 1 is what two quiet cores do in about 50 s, 0.1 and 10 are quicker and "
+        "more thorough. The same effort gives the same certificate on any machine."))
+    time_limit: float | None = option(None, "effort", "number", _ABOVE_0, metavar="SECONDS", help=(
+        "Stop after SECONDS at the latest; what was found until then is checked and kept for --resume. Off by "
+        "default."))
+    max_boxes: int = option(4_000_000, "effort", "whole", _ABOVE_0, metavar="BOXES", help=(
+        "Stop the search in the ring after this number of boxes."))
+    engine: EngineName = option("bounds", "effort", "word", variable="CERTIFY_ENGINE", help=(
+        "What proves the ring. bounds: branch and bound. dreal: a solver, whose word is trusted and not checked. both: "
+        "bounds prove, and dReal is asked as well."))
+    dreal_precision: float = option(
+        1e-3, "effort", "number", ("lie between 0 and 1", lambda delta: 0 < delta < 1),
+        typed="--precision", metavar="DELTA", help="The precision delta of dReal.")
+    jobs: int | None = option(
+        None, "effort", "whole", (f"be 1 to {_MOST_JOBS}", lambda jobs: 1 <= jobs <= _MOST_JOBS), varies=False, help=(
+        "Processes of the checker, and threads of dReal. By default dReal has one thread, and the checker a process "
+        "for each core where there are many leaves."))
+    cluster: str | None = option(None, "effort", "word", metavar="ADDRESS", varies=False, help=(
+        "Have the workers of a Dask cluster split boxes: local:N for N processes of this machine, or a scheduler's "
+        "address, such as tcp://host:8786. By default the threads of this process do."))
+    cluster_checks: bool = option(False, "effort", "flag", varies=False, help=(
+        "Have the cluster's workers run the checker as well, each on a part of the leaves, and believe them."))
+    resume: bool = option(False, "effort", "flag", varies=False, help=(
+        "Resume the search that an earlier run saved in the folder."))
+    # fmt: on
 
     @property
     def enlarges(self) -> bool:
-        """Whether a tube is looked for."""
+        """True if a tube is looked for."""
         return self.enlarge or self.box is not None or self.reach_from is not None
 
     @property
-    def _tube(self) -> str:
+    def tube(self) -> str:
         """The option that asks for a tube."""
         return "reach_from" if self.reach_from is not None else "enlarge" if self.enlarge else "box"
 
     @property
     def learned(self) -> Beyond | None:
-        """What is learned for a set beyond the ellipsoid, if anything is."""
+        """What is learned for an outer set, if anything is."""
+        from certify.lyapunov import BEYOND
+
         return next((name for name in BEYOND if name == self.candidate), None)
 
     @property
     def goes_beyond(self) -> bool:
-        """Whether a set beyond the ellipsoid is looked for."""
+        """True if an outer set is looked for."""
         return self.lyapunov is not None or self.learned is not None
+
+    @property
+    def beyond(self) -> str:
+        """The option that asks for an outer set."""
+        return "`lyapunov`" if self.learned is None else f"`candidate` {self.learned}"
 
     @property
     def only(self) -> Named | None:
         """The one candidate that is asked for, if P is not given; None if several are tried."""
-        if self.candidate != "auto" and self.candidate not in BEYOND:
-            return cast(Named, self.candidate)
+        if self.candidate != "auto" and self.learned is None:
+            return cast("Named", self.candidate)
         return "lqr" if self.R is not None else "lyapunov" if self.Q is not None or self.level is not None else None
 
     def __post_init__(self) -> None:
-        for name, known in (("claim", Asked), ("around", Around), ("candidate", Candidate), ("engine", EngineName)):
-            if getattr(self, name) not in get_args(known):
-                raise OptionError(
-                    f"`{name}` must be one of {', '.join(get_args(known))}; found {getattr(self, name)!r}."
-                )
-        if not 0 < self.dreal_precision < 1:
-            raise OptionError(f"`dreal_precision` must lie between 0 and 1; found {self.dreal_precision}.")
-        if self.jobs is not None and not 1 <= self.jobs <= _MOST_JOBS:
-            raise OptionError(f"`jobs` must be 1 to {_MOST_JOBS}; found {self.jobs}.")
-        if self.cluster_checks and self.cluster is None:
-            raise OptionError("`cluster_checks` must have a `cluster`; found none.")
-        if self.cluster is not None and (self.engine != "bounds" or self.device != "cpu"):
-            raise OptionError("`cluster` needs the engine bounds, and the device cpu.")
-        if self.resume and (self.engine != "bounds" or self.P is not None or self.only is not None):
-            raise OptionError(
-                "`resume` takes the candidate of the search; leave out `candidate`, `Q`, `R`, `level` and a P of your "
-                "own, and use the engine bounds."
-            )
-        if self.around == "rest" and self.claim == "asymptotic":
-            raise OptionError(
-                "`around` rest needs another `claim` than asymptotic, under which the loop rests at the origin."
-            )
-        if self.level is not None and not (math.isfinite(self.level) and self.level > 0):
-            raise OptionError(f"`level` must be a positive number; found {self.level}.")
-        if self.box is not None and not all(math.isfinite(v) and v > 0 for v in self.box.values()):
-            raise OptionError(f"`box` must have positive half-widths; found {_listed(self.box)}.")
-        if self.reach_from is not None and not all(math.isfinite(v) for v in self.reach_from.values()):
-            raise OptionError(f"`reach_from` must be a state of finite numbers; found {_listed(self.reach_from)}.")
-        if self.enlarges and (self.engine == "dreal" or self.claim in ("practical", "nearby")):
-            raise OptionError(
-                f"`{self._tube}` looks for a tube, which needs the engine bounds and the claim asymptotic: it ends in "
-                "a set that the checker can replay, and from which trajectories converge."
-            )
-        if not (math.isfinite(self.rate) and self.rate >= 0):
-            raise OptionError(f"`rate` must be a number of at least 0; found {self.rate}.")
-        if self.rate and (self.enlarges or self.engine != "bounds"):
-            raise OptionError(
-                "`rate` needs the engine bounds, and a claim without a tube: leave `enlarge` and `box` out."
-            )
-        if self.goes_beyond and (self.enlarges or self.rate or self.engine != "bounds"):
-            what = "`lyapunov`" if self.learned is None else f"`candidate` {self.learned}"
-            raise OptionError(f"{what} needs the engine bounds, and a claim without a tube and without a rate.")
-        if self.lyapunov is not None and self.learned is not None:
-            raise OptionError(
-                f"`candidate` {self.learned} learns a function; leave `lyapunov` out, or name another candidate."
-            )
-        if any(width < 1 for width in self.hidden) or self.degree not in range(2, 13, 2):
-            raise OptionError(
-                "`hidden` must be widths of at least 1, and `degree` even, 2 to 12; "
-                f"found {self.hidden}, {self.degree}."
-            )
-        if self.lyapunov_level is not None and not math.isfinite(self.lyapunov_level):
-            raise OptionError(f"`lyapunov_level` must be a finite number; found {self.lyapunov_level}.")
-        if not (math.isfinite(self.effort) and self.effort > 0):
-            raise OptionError(f"`effort` must be a positive number; found {self.effort}.")
-        if self.time_limit is not None and not self.time_limit > 0:
-            raise OptionError(f"`time_limit` must be positive; found {self.time_limit:g}.")
-        if not self.max_boxes > 0:
-            raise OptionError(f"`max_boxes` must be positive; found {self.max_boxes}.")
+        for name, known in _choices().items():
+            if getattr(self, name) not in known:
+                raise OptionError(f"`{name}` must be one of {', '.join(known)}; found {getattr(self, name)!r}.")
+        for name, one in declared(RoaOptions).items():
+            one.require(getattr(self, name), OptionError)
+        for breaks, why in _RULES:
+            if breaks(self):
+                raise OptionError(why.format(self))
 
 
-def _listed(values: Mapping[str, Fraction | float]) -> str:
-    return ", ".join(f"{name}={float(value):g}" for name, value in values.items())
+def _choices() -> Mapping[str, tuple[Any, ...]]:
+    from certify.lyapunov import Candidate
+
+    kinds = {"claim": Asked, "around": Around, "candidate": Candidate, "engine": EngineName}
+    return {name: get_args(kind) for name, kind in kinds.items()}
+
+
+_Rule = tuple[Callable[[RoaOptions], bool], str]
+_RULES: tuple[_Rule, ...] = (
+    (lambda o: o.cluster_checks and o.cluster is None, "`cluster_checks` must have a `cluster`; found none."),
+    (lambda o: o.cluster is not None and o.engine != "bounds", "`cluster` needs the engine bounds."),
+    (
+        lambda o: o.resume and (o.engine != "bounds" or o.P is not None or o.only is not None),
+        "`resume` takes the candidate of the search; leave out `candidate`, `Q`, `R`, `level` and a P of your own, and "
+        "use the engine bounds.",
+    ),
+    (
+        lambda o: o.around == "rest" and o.claim == "asymptotic",
+        "`around` rest needs another `claim` than asymptotic, under which the loop rests at the origin.",
+    ),
+    (
+        lambda o: o.enlarges and (o.engine == "dreal" or o.claim in ("practical", "nearby")),
+        "`{0.tube}` looks for a tube, which needs the engine bounds and the claim asymptotic: it ends in a set that "
+        "the checker can replay, and from which trajectories converge.",
+    ),
+    (
+        lambda o: bool(o.rate) and (o.enlarges or o.engine != "bounds"),
+        "`rate` needs the engine bounds, and a claim without a tube: leave `enlarge` and `box` out.",
+    ),
+    (
+        lambda o: o.goes_beyond and (o.enlarges or bool(o.rate) or o.engine != "bounds"),
+        "{0.beyond} needs the engine bounds, and a claim without a tube and without a rate.",
+    ),
+    (
+        lambda o: o.lyapunov is not None and o.learned is not None,
+        "`candidate` {0.learned} learns a function; leave `lyapunov` out, or name another candidate.",
+    ),
+)
+"""What options need of each other: the rule is broken, and the sentence that says so."""

@@ -85,7 +85,7 @@ def certify_roa(
             tools = Tools(
                 out,
                 runner,
-                effort or effort_of(options),
+                effort or effort_of(options, load_seconds),
                 Keeper(out, can_keep, named),
                 provenance or {},
                 progress,
@@ -95,9 +95,10 @@ def certify_roa(
             return _result(setting_of(ClosedLoop(system, network), options), tools)
 
 
-def effort_of(options: RoaOptions) -> Effort:
-    """The counted work that the options allow, and their limit on the clock."""
-    return Effort(options.effort * WHOLE, options.time_limit)
+def effort_of(options: RoaOptions, load_seconds: float = 0.0) -> Effort:
+    """The counted work that the options allow, and what reading has left of their limit on the clock."""
+    limit = options.time_limit
+    return Effort(options.effort * WHOLE, None if limit is None else max(0.0, limit - load_seconds))
 
 
 @contextmanager
@@ -113,7 +114,7 @@ def _runner_for(options: RoaOptions) -> Iterator[Runner]:
 
     from certify.provers.execution import ThreadRunner
 
-    yield ThreadRunner(torch.device(options.device))
+    yield ThreadRunner(torch.device("cpu"))
 
 
 def _result(state: State, tools: Tools) -> RoaResult:

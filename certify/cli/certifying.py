@@ -6,7 +6,7 @@ import json
 import shlex
 import threading
 import time
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
+from certify.analysis.arguments import region
 from certify.certificates import SEARCH
-from certify.cli.arguments import region
 from certify.cli.contains import stated, text
 from certify.cli.ending import Interrupted
-from certify.cli.shared import write
-from certify.cli.terminal import ProgressLine, load_tables, say, show, tell
-from certify.cli.typed import as_typed, options_of
+from certify.cli.options import as_typed, options_of
+from certify.cli.shared import given_words, noting, write
+from certify.cli.terminal import ProgressLine, load_tables, say, show
 
 if TYPE_CHECKING:
     from certify.analysis.maximise import Quantity
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from certify.report.drawing import Drawing
 
 CONTAINS = "--contains"
-_OF_SEARCH = ("candidate", "q", "r", "level")
+_OF_SEARCH = ("candidate", "Q", "R", "level")
 
 
 def certified(
@@ -59,14 +59,12 @@ def certified(
     asked : a state or a box, as people write it, of which it is to be said whether the proved set contains it.
     largest : what is to be as large as can be proved for the set.
     """
+    from certify.analysis.installation import versions
     from certify.analysis.run import certify_roa
     from certify.report import summary
 
-    note = (lambda _: None) if quiet else tell
+    note = noting(quiet)
     note(_plant_line(stored, plant, context.params["system"] is not None))
-    shift = stored.beta_shift(plant.exact_u_eq())
-    if shift:
-        note(f"the file's rounded beta is read as the real number; this shifts u(0) by {shift:.3g}")
     folder = out if out is not None else Path("out") / policy.stem
 
     def draw(raw: bytes) -> None:
@@ -87,7 +85,7 @@ def certified(
             folder,
             options,
             load_seconds=time.perf_counter() - start,
-            provenance=_provenance(policy),
+            provenance={"policy": policy.name, **versions()},
             progress=progress,
         )
     except KeyboardInterrupt:
@@ -151,7 +149,7 @@ def _known(context: typer.Context) -> list[str]:
     """The options that were given and that a resumed search has of its own; what is learned is no part of it."""
     from certify.lyapunov import BEYOND
 
-    found = {f"--{key if len(key) > 1 else key.upper()}": context.params.get(key) for key in _OF_SEARCH}
+    found = {f"--{key}": context.params.get(key) for key in _OF_SEARCH}
     return [name for name, value in found.items() if value not in (None, "auto", *BEYOND)]
 
 
@@ -159,7 +157,7 @@ def _command(context: typer.Context, changed: Mapping[str, str]) -> str:
     """The command that was given, with these options instead of those it had; a search that is resumed has its own."""
     known = _known(context) if "--resume" in changed else []
     added = (part for pair in changed.items() for part in pair if part)
-    return shlex.join(["certify", str(context.info_name), *_given(context, changed, without=known), *added])
+    return shlex.join(["certify", str(context.info_name), *given_words(context, changed, without=known), *added])
 
 
 def _flattened(context: typer.Context, policy: Path) -> str:
@@ -173,43 +171,14 @@ def _flattened(context: typer.Context, policy: Path) -> str:
     flat, plant, commands = policy.with_name(f"{policy.stem}_flat.pt"), context.params["system"], list[list[str]]()
     if not is_own(policy, ImportOptions()):
         read = policy.with_name(f"{policy.stem}_imported.pt")
-        said = _given(context, only=foreign | {"system", "param"})
+        said = given_words(context, only=foreign | {"system", "parameters"})
         said = ["--from" if part == "--kind" else part for part in said]
         commands.append(["certify", "import", str(policy), *said, "--out", str(read)])
         policy, others = read, others - foreign
     named = [] if plant is None else ["--system", plant]
     commands.append(["controllers", "flatten", str(policy), *named, "--out", str(flat)])
-    commands.append(["certify", str(context.info_name), str(flat), *_given(context, only=others)])
+    commands.append(["certify", str(context.info_name), str(flat), *given_words(context, only=others)])
     return " && ".join(map(shlex.join, commands))
-
-
-def _given(
-    context: typer.Context,
-    changed: Mapping[str, str] | None = None,
-    only: Collection[str] | None = None,
-    without: Collection[str] = (),
-) -> list[str]:
-    """The words that were given to the command, but for options that are `changed` or named in `without`; of the
-    parameters in `only`, if there are such."""
-    parts, changed = list[str](), changed or {}
-    for option in context.command.params:
-        source = context.get_parameter_source(option.name or "")
-        name, value = max(option.opts, key=len), context.params[option.name or ""]
-        if source is None or source.name != "COMMANDLINE" or name in without:
-            continue
-        if name in changed and not option.multiple:
-            continue
-        if only is not None and option.name not in only:
-            continue
-        values = list(value) if isinstance(value, list | tuple) else [value]
-        if option.param_type_name == "argument":
-            parts += map(str, values)
-            continue
-        if name in changed:  # NAME=VALUE options replace those of the same name
-            values = [v for v in values if v.partition("=")[0] != changed[name].partition("=")[0]]
-        for each in values:
-            parts += [name] if each is True else [name, str(each)]
-    return parts
 
 
 def _plant_line(stored: Policy, plant: System, overridden: bool) -> str:
@@ -228,9 +197,3 @@ def _within(plant: System, name: str) -> str:
     from certify.report.words import inside
 
     return f" in {inside(*plant.ranges[name])}"
-
-
-def _provenance(policy: Path) -> dict[str, Any]:
-    from certify.analysis.installation import versions
-
-    return {"policy": policy.name, **versions()}

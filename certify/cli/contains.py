@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from certify.cli.arguments import region
+from certify.analysis.arguments import region
 from certify.cli.shared import Json, Patient
 from certify.cli.terminal import say
 

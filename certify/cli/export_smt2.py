@@ -4,29 +4,34 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
-from certify.cli.arguments import plant_of
-from certify.cli.shared import Json, write
-from certify.cli.terminal import say
+from certify.analysis.arguments import options_of
+from certify.analysis.changes import PlantChanges
+from certify.analysis.inputs import plant_of
+from certify.cli.options import changes_of_a_plant, options_of_a_run, takes
+from certify.cli.shared import Json, PlantName, write
+from certify.cli.terminal import say, tell
 from certify.errors import InputError
 
 
+@takes(
+    changes=changes_of_a_plant("parameters", "domain"),
+    typed=options_of_a_run("candidate", "level", "effort", "time_limit", candidate="lyapunov"),
+)
 def export_smt2(
     policy: Annotated[Path, typer.Option(help="Policy file (certify-policy/1 or /2, .pt).")],
+    *,
     out: Annotated[Path, typer.Option(help="Folder for the files, one a condition.")],
-    system: Annotated[str | None, typer.Option(help="Plant, as for roa; default: what the policy file says.")] = None,
-    param: Annotated[list[str] | None, typer.Option(help="Parameter of the plant, NAME=VALUE; repeatable.")] = None,
-    domain: Annotated[list[str] | None, typer.Option(help="Half-width NAME=D or interval NAME=LO..HI.")] = None,
-    candidate: Annotated[str, typer.Option(help="Lyapunov candidate, as for roa.")] = "lyapunov",
-    level: Annotated[float | None, typer.Option(help="c2; default: 0.99 of the largest that is proved.")] = None,
-    time_limit: Annotated[float | None, typer.Option(help="Seconds for everything up to the verdict.")] = None,
+    system: PlantName = None,
+    changes: PlantChanges,
+    typed: dict[str, Any],
     as_json: Json = False,
 ) -> None:
     """Prove an asymptotic claim with the bounds engine and write its conditions as SMT-LIB 2 for another solver."""
-    from certify.analysis.run import RoaOptions, certify_roa
+    from certify.analysis.run import certify_roa
     from certify.certificates.claims import Asymptotic, conditions
     from certify.certificates.claims.queries import query
     from certify.certificates.verdict import Verdict
@@ -34,7 +39,7 @@ def export_smt2(
     from certify.provers.dreal.backend import to_smt2
 
     stored = load_policy(policy)
-    plant = plant_of(stored, system, param or [], domain or [])
+    plant = plant_of(stored, system, changes, tell)
     if plant.ranges:
         raise InputError(
             "export-smt2 must have a plant of exact equations, because formulas know no ranges; found ranges of "
@@ -44,17 +49,12 @@ def export_smt2(
         raise InputError(
             f"export-smt2 must have a plant in continuous time; found {plant.name}, whose time is discrete."
         )
-    options = RoaOptions(
-        claim="asymptotic",  # what is written are its conditions
-        candidate=candidate,  # type: ignore[arg-type]
-        level=level,
-        time_limit=time_limit,
-    )
+    options = options_of(typed | {"claim": "asymptotic"}, plant, tell)  # what is written are its conditions
     result = certify_roa(plant, stored.network, out, options)
     inner, outer = result.levels.local, result.levels.roa
     if result.verdict is not Verdict.PROVED or result.problem is None or inner is None or outer is None:
         raise InputError(f"there are no levels to export; {result.verdict.value}: {result.reason}")
-    outer = outer if level is not None else max(inner, 0.99 * outer)
+    outer = outer if options.level is not None else max(inner, 0.99 * outer)
     written = []
     for condition in conditions(Asymptotic(roa=outer, local=inner), result.problem):
         path = out / f"{condition.name}.smt2"

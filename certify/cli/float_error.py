@@ -9,9 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from certify.cli.arguments import plant_of
-from certify.cli.shared import Json
-from certify.cli.terminal import say
+from certify.analysis.changes import PlantChanges
+from certify.analysis.inputs import plant_of
+from certify.cli.options import changes_of_a_plant, takes
+from certify.cli.shared import Json, PlantName
+from certify.cli.terminal import say, tell
 
 if TYPE_CHECKING:
     from certify.loop.float32 import FloatError
@@ -21,13 +23,12 @@ if TYPE_CHECKING:
 _SHOWN = 3  # of what a bound is made of
 
 
+@takes(changes=changes_of_a_plant("parameters", "domain"))
 def float_error(
     policy: Annotated[Path, typer.Argument(help="Policy file (certify-policy/1 or /2, .pt).")],
-    system: Annotated[str | None, typer.Option(help="Plant, as for roa; default: what the policy file says.")] = None,
-    param: Annotated[list[str] | None, typer.Option(help="Parameter of the plant, NAME=VALUE; repeatable.")] = None,
-    domain: Annotated[
-        list[str] | None, typer.Option(help="Half-width NAME=D or interval NAME=LO..HI of a state; repeatable.")
-    ] = None,
+    *,
+    system: PlantName = None,
+    changes: PlantChanges,
     tanh_ulp: Annotated[
         float, typer.Option("--tanh-ulp", help="Accuracy of tanh, in units in the last place of its exact value.")
     ] = 4.0,
@@ -49,7 +50,7 @@ def float_error(
 
     options = FloatOptions(tanh_ulp, chain, boxes)
     stored = load_policy(policy)
-    plant = plant_of(stored, system, param or [], domain or [])
+    plant = plant_of(stored, system, changes, tell)
     found = bound(stored.network, plant, options)
     say(_data(found, stored, plant, options.tanh_ulp, chain) if as_json else _text(found, stored, plant))
 

@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from certify.analysis.inputs import checked, lines
-from certify.cli.importing import imported_lyapunov, imported_policy
-from certify.cli.shared import Json
+from certify.analysis.changes import PlantChanges
+from certify.analysis.inputs import checked, lines, plant_for
+from certify.cli.importing import import_options
+from certify.cli.options import changes_of_a_plant, takes
+from certify.cli.shared import Json, PlantName
 from certify.cli.terminal import say
 from certify.errors import InputError
 
@@ -20,12 +22,13 @@ if TYPE_CHECKING:
     from certify.lyapunov import ImportedLyapunov
 
 
+@takes(importing=import_options(), changes=changes_of_a_plant("parameters"))
 def import_(
     file: Annotated[Path, typer.Argument(help="Policy file of another program.")],
+    *,
     out: Annotated[Path, typer.Option(help="Policy file to write (.pt).")],
-    importing: ImportOptions,
-    system: Annotated[str | None, typer.Option(help="Plant that the policy controls: a name or a file.")] = None,
-    param: Annotated[list[str] | None, typer.Option(help="Parameter of the plant, NAME=VALUE; repeatable.")] = None,
+    system: PlantName = None,
+    changes: PlantChanges,
     lyapunov_out: Annotated[
         Path | None, typer.Option(help="File to write the Lyapunov network to (.pt) that lies beside the policy.")
     ] = None,
@@ -33,19 +36,21 @@ def import_(
         str | None, typer.Option(help="Keys of its layers up to their numbers; two-stage files say it themselves.")
     ] = None,
     as_json: Json = False,
+    importing: ImportOptions,
 ) -> None:
     """Turn a policy file of another program into one of this program; nothing in it is executed."""
     from certify.loop.policies import save_policy
-    from certify.lyapunov import save_lyapunov
+    from certify.loop.policies.importers import import_policy
+    from certify.lyapunov import import_lyapunov, save_lyapunov
 
     if lyapunov_prefix is not None and lyapunov_out is None:
         raise InputError("--lyapunov-prefix must go with --lyapunov-out, the file to write the Lyapunov network to.")
     if lyapunov_out is not None and lyapunov_out.resolve() == out.resolve():
         raise InputError(f"--out and --lyapunov-out must be two files; both are {out}.")
-    beside = None
+    beside, plant = None, plant_for(f"the policy file {file}", system, changes)
     if lyapunov_out is not None:
-        beside = imported_lyapunov(file, importing, system, param or [], lyapunov_prefix)
-    imported = imported_policy(file, importing, system, param or [], lyapunov_prefix)
+        beside = import_lyapunov(file, plant, importing, lyapunov_prefix)
+    imported = import_policy(file, plant, importing, lyapunov_prefix)
     save_policy(out, imported.policy)
     said = [*lines(imported), f"written  {out}"]
     if beside is not None and lyapunov_out is not None:

@@ -2,77 +2,59 @@
 
 from __future__ import annotations
 
-import functools
-import inspect
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
+from typing import TYPE_CHECKING, Any
 
-import typer
-
-from certify.analysis.inputs import policy_in
-from certify.cli.arguments import ends_of, plant_of, with_params
-from certify.cli.terminal import tell
+from certify.analysis.arguments import ends_of
+from certify.cli.options import Bundle, parameter
 from certify.errors import InputError
 
 if TYPE_CHECKING:
-    from certify.loop.plants import System
-    from certify.loop.policies import Policy
-    from certify.loop.policies.importers import Imported, ImportOptions
-    from certify.lyapunov import ImportedLyapunov
+    from certify.loop.policies.importers import ImportOptions
 
 _PANEL = "Policies of other programs"
 
 
-def _option(help_: str, *names: str, of: Any = str) -> Any:
-    return Annotated[of | None, typer.Option(*names, help=help_, rich_help_panel=_PANEL)]
-
-
 _KINDS = "state-dict, torchscript, onnx, sb3, safetensors or two-stage; auto looks at the file."
-_OPTIONS: dict[str, Any] = {
-    "kind": _option(_KINDS, "--from"),
-    "states": _option("The plant's states in the order in which the network reads them, as in x,theta."),
-    "prefix": _option("Keys of a state_dict's layers up to their numbers, as in actor.pi_net.fcs."),
-    "activation": _option("Between the layers of a state_dict: tanh."),
-    "squash": _option("After the last layer of a state_dict: identity, tanh or relu-tanh."),
-    "normaliser": _option("File of the observations' normaliser (VecNormalize, rsl_rl), or none."),
-    "epsilon": _option("What rsl_rl's normaliser adds to the standard deviation; 0.01 if nothing is said."),
-    "action_scale": _option("u = scale * action + offset: one number or one for each input."),
-    "action_offset": _option("See --action-scale."),
-    "clip": _option("Bounds LO..HI of the action before scale and offset, one pair or one for each input."),
-    "centre": _option("Make pi(0) = u_eq: output or preactivation; nothing is centred unless this asks for it."),
-    "observes": _option("Whether the network reads absolute states or their deviation from the operating point."),
-    "ignore": _option("Tensor that is no part of the policy, * and ? as in names of files; repeatable.", of=list[str]),
-    "output": _option("Output of an ONNX graph that is the action, where there are several."),
+_HELP = {
+    "kind": _KINDS,
+    "states": "The plant's states in the order in which the network reads them, as in x,theta.",
+    "prefix": "Keys of a state_dict's layers up to their numbers, as in actor.pi_net.fcs.",
+    "activation": "Between the layers of a state_dict: tanh.",
+    "squash": "After the last layer of a state_dict: identity, tanh or relu-tanh.",
+    "normaliser": "File of the observations' normaliser (VecNormalize, rsl_rl), or none.",
+    "epsilon": "What rsl_rl's normaliser adds to the standard deviation; 0.01 if nothing is said.",
+    "action_scale": "u = scale * action + offset: one number or one for each input.",
+    "action_offset": "See --action-scale.",
+    "clip": "Bounds LO..HI of the action before scale and offset, one pair or one for each input.",
+    "centre": "Make pi(0) = u_eq: output or preactivation; nothing is centred unless this asks for it.",
+    "observes": "Whether the network reads absolute states or their deviation from the operating point.",
+    "ignore": "Tensor that is no part of the policy, * and ? as in names of files; repeatable.",
+    "output": "Output of an ONNX graph that is the action, where there are several.",
 }
 
 
-def takes_import_options(command: Callable[..., None], kind_is: str = "--from") -> Callable[..., None]:
-    """Give a command the options of policy files of other programs; it receives them as `importing`.
+def import_options(kind_is: str = "--from") -> Bundle:
+    """The options of policy files of other programs; a command receives them as `ImportOptions`.
 
     `kind_is` is the name of the option for the kind of file, where the command has a `--from` of its own.
     """
-    hints = get_type_hints(command, localns={"ImportOptions": object}, include_extras=True)
-    own = inspect.signature(command)
-    kept = [p.replace(annotation=hints[name]) for name, p in own.parameters.items() if name != "importing"]
-    kind = inspect.Parameter.KEYWORD_ONLY
-    options = _OPTIONS | {"kind": _option(_KINDS, kind_is)}
-    added = [inspect.Parameter(name, kind, default=None, annotation=option) for name, option in options.items()]
+    parameters = {}
+    for name, help_ in _HELP.items():
+        typed = kind_is if name == "kind" else f"--{name.replace('_', '-')}"
+        of: Any = list[str] if name == "ignore" else str
+        metavar = name.rpartition("_")[2].upper()
+        parameters[name] = parameter(name, typed, help_, of, rich_help_panel=_PANEL, metavar=metavar)
 
-    @functools.wraps(command)
-    def wrapped(**given: Any) -> None:
-        texts = {name: given.pop(name) for name in _OPTIONS}
+    def read(texts: Mapping[str, Any]) -> ImportOptions:
         with kind_called(kind_is):
-            importing = _parsed(texts)
-        command(**given, importing=importing)
+            return _parsed(texts)
 
-    parameters = [*(p.replace(kind=kind) for p in kept), *added]
-    wrapped.__signature__ = own.replace(parameters=parameters)  # type: ignore[attr-defined]
-    wrapped.__annotations__ = {p.name: p.annotation for p in parameters}
-    return wrapped
+    return Bundle(parameters, read)
 
 
 @contextmanager
@@ -85,80 +67,32 @@ def kind_called(option: str) -> Iterator[None]:
         raise error if said == str(error) else InputError(said) from error
 
 
-def policy_of(path: Path, importing: ImportOptions, system: str | None, params: list[str]) -> Policy:
-    """The policy in a file of this program, or of another one for the plant that `system` names.
-
-    Raises
-    ------
-    InputError : the file cannot be read or imported, or is another program's and `system` is None.
-    """
-    return policy_in(
-        path,
-        importing,
-        lambda: _plant_for(path, system, params),
-        lambda stored: plant_of(stored, system, params, []),
-        tell,
-    )
-
-
-def imported_policy(
-    path: Path, importing: ImportOptions, system: str | None, params: list[str], beside: str | None
-) -> Imported:
-    """The policy in a file of another program, for the plant that `system` names.
-
-    `beside` is where the Lyapunov network lies that is imported with it.
-    """
-    from certify.loop.policies.importers import import_policy
-
-    return import_policy(path, _plant_for(path, system, params), importing, beside)
-
-
-def imported_lyapunov(
-    path: Path, importing: ImportOptions, system: str | None, params: list[str], prefix: str | None
-) -> ImportedLyapunov:
-    """The Lyapunov network in a file of another program, for the plant that `system` names."""
-    from certify.lyapunov import import_lyapunov
-
-    return import_lyapunov(path, _plant_for(path, system, params), importing, prefix)
-
-
-def _plant_for(path: Path, system: str | None, params: list[str]) -> System:
-    """The plant that is named for a file to import, which does not say what it controls."""
-    from certify.loop.plants import chosen_system
-
-    if system is None:
-        raise InputError(
-            f"importing the policy file {path} takes the plant that it controls: name the plant with --system."
-        )
-    return with_params(chosen_system(system), params)
-
-
-def _parsed(texts: dict[str, Any]) -> ImportOptions:
+def _parsed(texts: Mapping[str, Any]) -> ImportOptions:
     from certify.loop.plants import exact
     from certify.loop.policies.importers import ImportOptions
 
     def rationals(name: str, option: str) -> tuple[Fraction, ...] | None:
-        text = texts[name]
+        text = texts.get(name)
         return None if text is None else tuple(exact(part.strip(), option) for part in text.split(","))
 
-    states, normaliser, epsilon = texts["states"], texts["normaliser"], rationals("epsilon", "--epsilon")
+    states, normaliser, epsilon = texts.get("states"), texts.get("normaliser"), rationals("epsilon", "--epsilon")
     if epsilon is not None and len(epsilon) != 1:
         raise InputError(f"--epsilon takes one number; found {texts['epsilon']!r}.")
     return ImportOptions(
-        kind=texts["kind"] or "auto",
-        prefix=texts["prefix"],
-        activation=texts["activation"],
-        squash=texts["squash"],
+        kind=texts.get("kind", "auto"),
+        prefix=texts.get("prefix"),
+        activation=texts.get("activation"),
+        squash=texts.get("squash"),
         states=None if states is None else tuple(name.strip() for name in states.split(",")),
         normaliser=None if normaliser is None else "none" if normaliser == "none" else Path(normaliser),
         epsilon=None if epsilon is None else epsilon[0],
         action_scale=rationals("action_scale", "--action-scale"),
         action_offset=rationals("action_offset", "--action-offset"),
-        clip=_clip(texts["clip"]),
-        centre=texts["centre"],
-        observes=texts["observes"],
-        ignore=tuple(texts["ignore"] or ()) or None,
-        output=texts["output"],
+        clip=_clip(texts.get("clip")),
+        centre=texts.get("centre"),
+        observes=texts.get("observes"),
+        ignore=tuple(texts.get("ignore") or ()) or None,
+        output=texts.get("output"),
     )
 
 

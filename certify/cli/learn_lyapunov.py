@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import shlex
 import tempfile
 import time
@@ -12,11 +11,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from certify.cli.arguments import layers, plant_of
-from certify.cli.importing import policy_of
-from certify.cli.shared import Domain, Json, PlantName, PolicyArgument, PolicyFile, Quiet, the_policy
+from certify.analysis.arguments import options_of
+from certify.analysis.changes import PlantChanges
+from certify.analysis.inputs import plant_of, policy_in
+from certify.cli.importing import import_options
+from certify.cli.options import changes_of_a_plant, options_of_a_run, takes
+from certify.cli.shared import Json, PlantName, PolicyArgument, PolicyFile, Quiet, given_words, noting, the_policy
 from certify.cli.terminal import ProgressLine, say
-from certify.effort import UNIT, Effort
+from certify.effort import WHOLE, Effort
 from certify.errors import InputError
 
 if TYPE_CHECKING:
@@ -32,31 +34,26 @@ if TYPE_CHECKING:
     Array = NDArray[np.float64]
 
 _FOR_ELLIPSOID = 0.4  # of the effort, at most
-_WHOLE = 120 * UNIT
-_HIDDEN = "16,16"
+_TIMES = 2.4  # the effort of a proof: that of ellipsoid and learning
 
 
+@takes(
+    importing=import_options(),
+    changes=changes_of_a_plant("parameters", "domain"),
+    typed=options_of_a_run("hidden", "degree", "seed", "effort", "time_limit"),
+)
 def learn_lyapunov(
     context: typer.Context,
-    importing: ImportOptions,
+    *,
     out: Annotated[Path, typer.Option(help="Lyapunov file to write (.pt).")],
     file: PolicyArgument = None,
     policy: PolicyFile = None,
     system: PlantName = None,
-    param: Annotated[list[str] | None, typer.Option(help="Parameter of the plant, NAME=VALUE; repeatable.")] = None,
-    domain: Domain = None,
-    hidden: Annotated[
-        str | None, typer.Option(help=f"Widths of the network between the states and its output; default: {_HIDDEN}.")
-    ] = None,
-    degree: Annotated[
-        int | None, typer.Option(help="Fit a polynomial of this even degree in the place of a network.")
-    ] = None,
-    seed: Annotated[int, typer.Option(help="Of everything random: the same seed learns the same function.")] = 0,
-    effort: Annotated[
-        float, typer.Option(help="Scale the counted work; 1 is what two quiet cores do in about 2 min.")
-    ] = 1.0,
-    quiet: Quiet = False,
+    changes: PlantChanges,
+    typed: dict[str, Any],
     as_json: Json = False,
+    quiet: Quiet = False,
+    importing: ImportOptions,
 ) -> None:
     """Learn a function for a set beyond the ellipsoid, from simulated runs; `certify roa --lyapunov` proves one."""
     from certify.loop.closed_loop import ClosedLoop
@@ -65,30 +62,28 @@ def learn_lyapunov(
     from certify.lyapunov.learning import fit_polynomial, learn
 
     start = time.monotonic()
-    if hidden is not None and degree is not None:
+    if {"hidden", "degree"} <= typed.keys():
         raise InputError("--hidden must stand without --degree; found both. A polynomial has no layers.")
-    widths = layers(hidden or _HIDDEN, "--hidden")
-    if not (math.isfinite(effort) and effort > 0):
-        raise InputError(f"--effort must be a positive number; found {effort}.")
-    path = the_policy(context, file, policy)
-    stored = policy_of(path, importing, system, param or [])
-    plant = plant_of(stored, system, param or [], domain or [])
+    note, path = noting(quiet), the_policy(context, file, policy)
+    stored = policy_in(path, importing, system, changes, note)
+    plant = plant_of(stored, system, changes, note)
+    options = options_of(typed, plant, note)
+    effort = Effort(_TIMES * options.effort * WHOLE, options.time_limit)
     progress = None if quiet else ProgressLine()
     try:
-        granted = Effort(_WHOLE * effort)
-        P, c2 = _ellipsoid(plant, stored, granted.share(_FOR_ELLIPSOID), progress)
+        P, c2 = _ellipsoid(plant, stored, effort.share(_FOR_ELLIPSOID), progress)
         loop, V = ClosedLoop(plant, stored.network), Quadratic(P)
         tell_round = None if progress is None else _shown(progress)
         learned = (
-            learn(loop, V, c2, widths, seed, granted, tell_round)
-            if degree is None
-            else fit_polynomial(loop, V, c2, degree, seed, granted, tell_round)
+            fit_polynomial(loop, V, c2, options.degree, options.seed, effort, tell_round)
+            if "degree" in typed
+            else learn(loop, V, c2, options.hidden, options.seed, effort, tell_round)
         )
     finally:
         if progress is not None:
             progress.close()
     record: dict[str, Any] = {
-        "seed": seed,
+        "seed": options.seed,
         "rounds": len(learned.history),
         "sampled_level": learned.level,
         "sampled_cover": learned.cover,
@@ -99,7 +94,7 @@ def learn_lyapunov(
     save_lyapunov(out, learned.function, plant.name, parameters, {"learned": record})
     data = {"lyapunov": str(out), "function": _described(learned.function), **record}
     data["seconds"] = time.monotonic() - start
-    say(json.dumps(data) if as_json else _text(learned, volume(P, c2), out, _next(path, system, param, domain, out)))
+    say(json.dumps(data) if as_json else _text(learned, volume(P, c2), out, _next(context, path, out)))
 
 
 def _ellipsoid(plant: System, stored: Policy, effort: Effort, progress: ProgressLine | None) -> tuple[Array, float]:
@@ -157,10 +152,7 @@ def _text(learned: Learned, area: float, out: Path, command: str) -> str:
     ])  # fmt: skip
 
 
-def _next(policy: Path, system: str | None, param: list[str] | None, domain: list[str] | None, out: Path) -> str:
+def _next(context: typer.Context, policy: Path, out: Path) -> str:
     """The command that proves what was learned."""
-    parts = ["certify", "roa", "--policy", str(policy)]
-    parts += [] if system is None else ["--system", system]
-    for name, values in (("--param", param), ("--domain", domain)):
-        parts += [part for value in values or [] for part in (name, value)]
-    return shlex.join([*parts, "--lyapunov", str(out)])
+    given = given_words(context, only={"system", "parameters", "domain"})
+    return shlex.join(["certify", "roa", "--policy", str(policy), *given, "--lyapunov", str(out)])

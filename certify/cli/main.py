@@ -25,8 +25,8 @@ from certify.cli.ending import INTERRUPTED, Interrupted, closed_pipe, end_by_sig
 from certify.cli.export_smt2 import export_smt2
 from certify.cli.float_error import float_error
 from certify.cli.import_ import import_
-from certify.cli.importing import takes_import_options
 from certify.cli.learn_lyapunov import learn_lyapunov
+from certify.cli.options import Grouped, as_typed, options_of
 from certify.cli.plant import plant
 from certify.cli.plot import plot
 from certify.cli.prove_in_coq import prove_in_coq
@@ -36,7 +36,6 @@ from certify.cli.roa import roa
 from certify.cli.sweep import sweep
 from certify.cli.systems import systems
 from certify.cli.terminal import say, tell
-from certify.cli.typed import as_typed, options_of
 from certify.cli.version import certify
 from certify.errors import BackendError, CertifyError, OptionError, SoundnessError
 
@@ -44,22 +43,23 @@ app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
+    context_settings={"max_content_width": 100},
 )
 app.callback()(certify)
-app.command("roa")(takes_import_options(roa))
-app.command("reach")(takes_import_options(reach, kind_is="--kind"))
+app.command("roa", cls=Grouped)(roa)
+app.command("reach", cls=Grouped)(reach)
 app.command("sweep")(sweep)
 app.command("check")(check)
 app.command("contains")(contains)
 app.command("report")(report)
 app.command("plot")(plot)
-app.command("import")(takes_import_options(import_))
-app.command("learn-lyapunov")(takes_import_options(learn_lyapunov))
-app.command("plant")(plant)
+app.command("import", cls=Grouped)(import_)
+app.command("learn-lyapunov", cls=Grouped)(learn_lyapunov)
+app.command("plant", cls=Grouped)(plant)
 app.command("systems")(systems)
-app.command("export-smt2")(export_smt2)
+app.command("export-smt2", cls=Grouped)(export_smt2)
 app.command("prove-in-coq")(prove_in_coq)
-app.command("float-error")(float_error)
+app.command("float-error", cls=Grouped)(float_error)
 app.command("doctor")(doctor)
 
 _STOPPED = "interrupted; nothing was left half-written."

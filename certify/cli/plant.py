@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from certify.cli.arguments import with_params
+from certify.analysis.changes import PlantChanges
+from certify.cli.options import changes_of_a_plant, takes
 from certify.cli.shared import Json, describe
 from certify.cli.terminal import say, show
 
@@ -20,15 +21,16 @@ if TYPE_CHECKING:
     from certify.loop.plants import Controllability, Matrix, System
 
 
+@takes(changes=changes_of_a_plant("parameters"))
 def plant(
     system: Annotated[str, typer.Argument(help="A plant that ships, FILE.toml, or FILE.py:NAME, whose code is run.")],
-    param: Annotated[list[str] | None, typer.Option(help="Parameter of the plant, NAME=VALUE; repeatable.")] = None,
+    changes: PlantChanges,
     as_json: Json = False,
 ) -> None:
     """Show a plant: equations, operating point, linearisation, controllability, disturbances, bounds and units."""
     from certify.loop.plants import chosen_system, controllability, linearise
 
-    found = with_params(chosen_system(system), param or [])
+    found = changes.of(chosen_system(system))
     A, B = linearise(found)
     eigenvalues, reach = _eigenvalues(A), controllability(A, B)
     if as_json:

@@ -2,37 +2,46 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from certify.cli.options import FIRST, LOOP, OUTPUT
+from certify.cli.terminal import tell
 from certify.errors import InputError
 
 if TYPE_CHECKING:
+    from certify.analysis.inputs import Tell
     from certify.loop.plants import System
 
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.", rich_help_panel=FIRST)]
 Patient = Annotated[
     bool, typer.Option("--patient", help="Take a certificate whose check may need hours, which is refused else.")
 ]
 PolicyFile = Annotated[
-    Path | None, typer.Option("--policy", help="Policy file (.pt), or another program's (see certify import).")
+    Path | None,
+    typer.Option("--policy", metavar="FILE", help="The policy file, as the argument FILE.", rich_help_panel=LOOP),
 ]
-PolicyArgument = Annotated[Path | None, typer.Argument(metavar="FILE", help="The policy file, as --policy FILE.")]
+PolicyArgument = Annotated[
+    Path | None, typer.Argument(metavar="FILE", help="Policy file (.pt), or another program's; see certify import.")
+]
 PlantName = Annotated[
     str | None,
     typer.Option(
-        help="Plant: a name, FILE.toml, or FILE.py:NAME, whose code is run; default: what the policy file says."
+        metavar="PLANT",
+        help="Plant: a name, FILE.toml, or FILE.py:NAME, whose code is run. By default the policy file says it.",
+        rich_help_panel=FIRST,
     ),
 ]
-Domain = Annotated[
-    list[str] | None, typer.Option(help="Half-width NAME=D or interval NAME=LO..HI of a state; repeatable.")
+Results = Annotated[
+    Path | None,
+    typer.Option(metavar="FOLDER", help="Folder for the results. By default out/POLICY.", rich_help_panel=FIRST),
 ]
-Resume = Annotated[bool, typer.Option("--resume", help="Resume the search that an earlier run left in the folder.")]
-TimeLimit = Annotated[float | None, typer.Option(help="Seconds for everything up to the verdict, the check included.")]
-Results = Annotated[Path | None, typer.Option(help="Folder for the results; default: out/POLICY.")]
-Quiet = Annotated[bool, typer.Option("--quiet", help="No progress and no notices, errors only.")]
+Quiet = Annotated[
+    bool, typer.Option("--quiet", help="No progress and no notices, errors only.", rich_help_panel=OUTPUT)
+]
 
 
 def the_policy(context: typer.Context, file: Path | None, policy: Path | None) -> Path:
@@ -48,6 +57,40 @@ def the_policy(context: typer.Context, file: Path | None, policy: Path | None) -
     if found is None:
         raise InputError(f"a policy file must be named, as in certify {context.info_name} policy.pt; found none.")
     return found
+
+
+def noting(quiet: bool) -> Tell:
+    """What notices go to."""
+    return (lambda _: None) if quiet else tell
+
+
+def given_words(
+    context: typer.Context,
+    changed: Mapping[str, str] | None = None,
+    only: Collection[str] | None = None,
+    without: Collection[str] = (),
+) -> list[str]:
+    """The words that were given to the command, but for options that are `changed` or named in `without`; of the
+    parameters in `only`, if there are such."""
+    parts, changed = list[str](), changed or {}
+    for option in context.command.params:
+        source = context.get_parameter_source(option.name or "")
+        name, value = max(option.opts, key=len), context.params[option.name or ""]
+        if source is None or source.name != "COMMANDLINE" or name in without:
+            continue
+        if name in changed and not option.multiple:
+            continue
+        if only is not None and option.name not in only:
+            continue
+        values = list(value) if isinstance(value, list | tuple) else [value]
+        if option.param_type_name == "argument":
+            parts += map(str, values)
+            continue
+        if name in changed:  # NAME=VALUE options replace those of the same name
+            values = [v for v in values if v.partition("=")[0] != changed[name].partition("=")[0]]
+        for each in values:
+            parts += [name] if each is True else [name, str(each)]
+    return parts
 
 
 def page_of(raw: bytes, path: Path, answer: dict[str, Any] | None, data: dict[str, Any] | None) -> str:

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin, get_type
 
 import typer
 
+from certify.cli.options import parameter
 from certify.errors import InputError
 from controllers.commands.shared import Json, emit, errors
 from controllers.files import make_folder, read, require_writable
@@ -105,11 +106,7 @@ def _signature() -> inspect.Signature:
     for option in fields(TrainingOptions):
         kind, text = get_args(hints[option.name])
         plain: Any = kind if kind in (int, float) else str  # tuples and choices are text here
-        flag = typer.Option("--" + option.name.replace("_", "-"), help=text)
-        annotation = Annotated[plain | None, flag]
-        parameters.append(
-            inspect.Parameter(option.name, inspect.Parameter.KEYWORD_ONLY, default=None, annotation=annotation)
-        )
+        parameters.append(parameter(option.name, "--" + option.name.replace("_", "-"), text, plain))
     return inspect.Signature(parameters)
 
 

@@ -138,7 +138,7 @@ def test_models_away_from_the_origin_enclose_the_loop(centre: str, squash: str) 
 def test_a_tube_leads_from_what_is_attracted_and_from_nothing_else(x: float, found: bool) -> None:
     """x' = x/2 - tanh(x), whose origin attracts |x| < 1.915008."""
     loop, goal = ClosedLoop(*scalar_tanh()), np.array([[1 / 0.3**2]])
-    tube, why = find_path(loop, np.array([x]), np.array([[1e6]]), goal, 60.0)
+    tube, why = find_path(loop, np.array([x]), np.array([[1e6]]), goal, Effort(60 * UNIT))
     assert (tube is not None) is found
     assert found or "leaves the domain" in why or "not arrived" in why or "cannot be continued" in why
 

@@ -11,18 +11,18 @@ import hashlib
 import json
 import re
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from certify.analysis.arguments import layers, numbers, plant_of, widths
-from certify.analysis.inputs import Tell, ellipsoid_beside, function_in
+from certify.analysis.arguments import changes_of, options_of
+from certify.analysis.changes import PlantChanges
+from certify.analysis.declaration import declared
+from certify.analysis.inputs import Tell, plant_of
 from certify.analysis.installation import source_sha256, version_of
 from certify.analysis.options import RoaOptions
-from certify.errors import InputError
-from certify.loop.plants import exact
 from certify.loop.plants import shipped as plants
 from certify.loop.policies import Policy, load_policy
 
@@ -33,64 +33,13 @@ _LONGEST = 100  # characters of a name, beyond which a hash ends it
 _ODD = re.compile(r"[^A-Za-z0-9_.,=+-]+")
 
 
-@dataclass(frozen=True, slots=True)
-class Option:
-    """An option of a run as text: the field of `RoaOptions` that it fills, and how it is read."""
-
-    field: str
-    reader: Callable[[str, str], Any]
-
-    def read(self, text: str) -> dict[str, Any]:
-        """The field with its value.
-
-        Raises
-        ------
-        InputError : the text is not what the option takes.
-        """
-        return {self.field: self.reader(text, self.field)}
-
-
-def _word(text: str, _: str) -> str:
-    return text
-
-
-def _number(text: str, name: str) -> float:
-    return float(exact(text, name))
-
-
-def _whole(text: str, name: str) -> int:
-    value = exact(text, name)
-    if value.denominator != 1:
-        raise InputError(f"`{name}` must be a whole number; found {text}.")
-    return int(value)
-
-
-def _flag(text: str, name: str) -> bool:
-    if text not in ("true", "false"):
-        raise InputError(f"`{name}` must be true or false; found {text!r}.")
-    return text == "true"
-
-
-OPTIONS: Mapping[str, Option] = {
-    "claim": Option("claim", _word),
-    "around": Option("around", _word),
-    "Q": Option("Q", numbers),
-    "R": Option("R", numbers),
-    "rate": Option("rate", _number),
-    "level": Option("level", _number),
-    "engine": Option("engine", _word),
-    "precision": Option("dreal_precision", _number),
-    "enlarge": Option("enlarge", _flag),
-    "box": Option("box", widths),
-    "lyapunov_level": Option("lyapunov_level", _number),
-    "hidden": Option("hidden", layers),
-    "degree": Option("degree", _whole),
-    "seed": Option("seed", _whole),
-    "time_limit": Option("time_limit", _number),
-    "max_boxes": Option("max_boxes", _whole),
-}
-"""The options of `certify roa` that a study may give, by its names, besides those of the plant and a file."""
-PLANT_OPTIONS = ("sample_time", "input_error")
+OPTIONS = {option.key: name for name, option in declared(RoaOptions).items() if option.varies}
+"""The fields of `RoaOptions` that a study may vary, by its keys, besides the candidates."""
+TABLES, PLANT_OPTIONS = (
+    tuple(name for name, option in declared(PlantChanges).items() if (option.kind == "ranges") is table)
+    for table in (True, False)
+)
+"""The fields of `PlantChanges`: tables of a study, and what is among its options."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,26 +100,17 @@ class Case:
         """
         stored = load_policy(self.policy.put(folder))
         named = str(self.plant.put(folder)) if isinstance(self.plant, File) else self.plant
-        plant = plant_of(
-            stored,
-            named,
-            self._pairs("parameters"),
-            self._pairs("domain"),
-            self._pairs("disturbances"),
-            self.coordinates.get("options.input_error"),
-            self.coordinates.get("options.sample_time"),
-            tell,
-        )
-        chosen: dict[str, Any] = {"candidate": self.coordinates.get("candidates", "auto")}
-        for name, option in OPTIONS.items():
-            if (text := self.coordinates.get(f"options.{name}")) is not None:
-                chosen |= option.read(text)
-        if self.lyapunov is not None:
-            beyond = function_in(self.lyapunov.put(folder), plant, tell)
-            chosen["lyapunov"] = beyond.function
-            if chosen["candidate"] == "auto" and not {"Q", "R", "level"} & set(chosen):
-                chosen["P"] = ellipsoid_beside(beyond, plant)
-        return stored, plant, RoaOptions(**chosen)
+        plant = plant_of(stored, named, self._changes(), tell)
+        given = {field: self.coordinates.get(f"options.{key}") for key, field in OPTIONS.items()}
+        given["candidate"] = self.coordinates.get("candidates")
+        given["lyapunov"] = None if self.lyapunov is None else str(self.lyapunov.put(folder))
+        texts = {field: text for field, text in given.items() if text is not None}
+        return stored, plant, options_of(texts, plant, tell)
+
+    def _changes(self) -> PlantChanges:
+        single = {name: self.coordinates.get(f"options.{name}") for name in PLANT_OPTIONS}
+        texts: dict[str, Any] = {name: text for name, text in single.items() if text is not None}
+        return changes_of(texts | {table: self._pairs(table) for table in TABLES})
 
     def _pairs(self, table: str) -> list[str]:
         """The entries of a table as on the command line, NAME=VALUE."""

@@ -18,9 +18,10 @@ from itertools import product
 from pathlib import Path
 from typing import Any
 
+from certify.analysis.arguments import read_option
 from certify.analysis.inputs import named_plant
 from certify.analysis.options import RoaOptions
-from certify.analysis.studies.case import OPTIONS, PLANT_OPTIONS, Case, File, readable_ids
+from certify.analysis.studies.case import OPTIONS, PLANT_OPTIONS, TABLES, Case, File, readable_ids
 from certify.errors import InputError
 from certify.loop.plants import System, available_systems, exact
 from certify.loop.plants.equations import nearest
@@ -29,11 +30,11 @@ from certify.loop.plants.toml import number_at
 from certify.loop.policies import load_policy
 
 _LISTS = ("policies", "systems", "candidates")
-_TABLES = ("parameters", "disturbances", "domain", "options")
+_TABLES = (*TABLES, "options")
 _RANGE = ("from", "to", "points")
 _MOST_CASES, _MOST_POINTS = 100_000, 10_000
 _FILE_OPTION = "lyapunov"
-_KNOWN_OPTIONS = (*OPTIONS, *PLANT_OPTIONS, _FILE_OPTION)
+KNOWN = (*OPTIONS, *PLANT_OPTIONS)
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,10 +201,10 @@ def _texts(file: PlantFile, key: str) -> tuple[list[str], bool]:
 def _axis(file: PlantFile, table: str, name: str, files: dict[str, bytes]) -> Axis:
     """An entry of a table: a value, a list of values, or a range."""
     value = file.table(table)[name]
-    if table == "options" and name not in _KNOWN_OPTIONS:
+    if table == "options" and name not in KNOWN:
         if name == "candidate":
             raise file.refuse('candidates stand at the top, as in candidates = ["lyapunov"].', table, name)
-        close = nearest(name, _KNOWN_OPTIONS) or f"; known are {', '.join(_KNOWN_OPTIONS)}."
+        close = nearest(name, KNOWN) or f"; known are {', '.join(KNOWN)}."
         raise file.refuse(f"{name!r} is no option of a study{close}", table, name)
     if isinstance(value, dict):
         values = _range(file, value, table, name)
@@ -259,9 +260,9 @@ def _once(file: PlantFile, values: list[str], *keys: str) -> tuple[str, ...]:
 def _require_readable(file: PlantFile, text: str, table: str, name: str) -> None:
     """Refuse what no run could read; whether the plant can have it is for the run to say."""
     try:
-        if table == "options" and name in OPTIONS:
-            _options_with(file, f"options.{name}", **OPTIONS[name].read(text))
-        elif table != "options" or name in ("sample_time", "input_error"):
+        if name in OPTIONS and name != _FILE_OPTION and table == "options":
+            _options_with(file, f"options.{name}", **{OPTIONS[name]: read_option(OPTIONS[name], text)})
+        elif table != "options" or name in PLANT_OPTIONS:
             separator = ":" if table == "domain" and ".." not in text else ".."
             parts = [text.rpartition("=")[2]] if name == "input_error" else text.split(separator)
             if len(parts) > 2:

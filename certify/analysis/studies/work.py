@@ -52,9 +52,6 @@ def work(case: Case) -> bytes:
         said: dict[str, Any]
         try:
             stored, plant, options = case.loop(folder, notices.append)
-            shift = stored.beta_shift(plant.exact_u_eq())
-            if shift:
-                notices.append(f"the file's rounded beta is read as the real number; this shifts u(0) by {shift:.3g}")
             provenance = {"policy": case.policy.name, **versions()}
             result = certify_roa(plant, stored.network, out, options, provenance=provenance)
             said = {"kind": "result", "data": result.to_dict()}
