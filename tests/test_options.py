@@ -158,10 +158,10 @@ def test_texts_that_are_no_changes(texts: dict[str, Any], said: str) -> None:
         changes_of(texts)
 
 
-def test_effort_takes_the_place_of_a_time_limit(tmp_path: Path) -> None:
+def test_the_effort_is_read_and_the_clock_is_not_limited() -> None:
     plant = get_system("pendulum")
     assert options_of({"effort": "0.1"}, plant, print) == RoaOptions(effort=0.1)
-    assert RoaOptions(effort=2.0).time_limit == 2 * RoaOptions().time_limit
+    assert RoaOptions(effort=2.0).time_limit is None
     assert RoaOptions(effort=2.0, time_limit=3.0).time_limit == 3.0
     for bad in (0.0, -1.0, float("inf"), float("nan")):
         with pytest.raises(InputError, match="`effort` must be a positive number"):
