@@ -1,4 +1,4 @@
-"""What a person writes, for commands: as `certify.analysis.arguments` reads it, with notices on standard error."""
+"""Read what a person typed by `certify.analysis.arguments`, and print its notices on standard error."""
 
 from __future__ import annotations
 

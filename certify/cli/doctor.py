@@ -105,7 +105,7 @@ def _package(name: str, module: str) -> Finding:
 
 
 def _torch() -> Finding:
-    """What torch was built for: its build for CUDA is gigabytes, and nothing here needs it."""
+    """Report torch's build. The CUDA build takes gigabytes, and nothing here needs it."""
     import torch
 
     built = torch.version.cuda
@@ -162,7 +162,7 @@ def _optional() -> list[Finding]:
 
 
 def _path() -> list[Finding]:
-    """Which package this is, and whether a script in this folder would import another."""
+    """Report the installed package, and warn if a script in this folder would import another copy."""
     import certify
     from certify.analysis.installation import found_by_import, version_of
 

@@ -1,7 +1,7 @@
-"""How a command ends before it is done: by Ctrl-C, by SIGTERM, or because nobody reads any more what it says.
+"""Early ends of a command: Ctrl-C, SIGTERM, or a reader that closed the pipe.
 
-A reader that has gone (`certify roa … 2>&1 | head -2`) ends a command with the status that a shell reports for SIGPIPE.
-Click and rich end it with status 1 then, which among verdicts means REFUTED: so their exit is recognised here.
+A closed pipe (`certify roa … 2>&1 | head -2`) ends a command with the status that a shell reports for SIGPIPE. Click
+and rich would exit with status 1, which means REFUTED among the verdicts; this module catches their exit.
 """
 
 from __future__ import annotations

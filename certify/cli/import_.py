@@ -56,14 +56,14 @@ def import_(
 
 
 def _lyapunov_lines(found: ImportedLyapunov) -> list[str]:
-    """What the import of a Lyapunov network found, for people."""
+    """The lines printed about an imported Lyapunov network."""
     from certify.lyapunov.file import FORMAT
 
     return [
         f"lyapunov {found.words}, as {FORMAT}: N(x) = net(x), {found.meaning}",
         *checked(found.difference, None, found.assumed, found.not_read),
         f"N(0)     {found.at_origin:.9g}",
-        "level    none: what the file's makers say of a level is not imported, and nothing is proved of N here",
+        "level    none: a level that the file's makers state is not imported, and nothing is proved about N here",
     ]
 
 

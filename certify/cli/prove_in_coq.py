@@ -50,7 +50,7 @@ def _plain(result: CoqResult) -> dict[str, Any]:
 
 
 def _by_module(axioms: tuple[str, ...]) -> str:
-    """What the axioms are in words, and all of them, a line a module.
+    """Describe the axioms in words, then list them, one line per module.
 
     >>> print(_by_module(("PrimFloat.sub", "Classical_Prop.classic", "PrimFloat.add")))
     those of Coq's real numbers; the processor's floats and integers are as Coq's libraries say

@@ -1,4 +1,4 @@
-"""What several commands share: an option, a report on a certificate's bytes, a file written in one step."""
+"""Shared by several commands: an option, a report on a certificate's bytes, a file written in one step."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the command line shows: results on standard output, everything else on standard error."""
+"""Terminal output: results on standard output, everything else on standard error."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def tell(line: str) -> None:
 
 
 def ring_line(stage: str, state: Progress) -> str:
-    """Where a proof stands, in a line: of V, or beyond the ellipsoid of N."""
+    """The progress of a proof in one line: the level of V, or of N for the outer set."""
     left = "" if state.seconds_left is None else f", at most {max(state.seconds_left, 0):.0f} s left"
     letter, name = ("N", "beyond the ellipsoid") if stage == "outer" else ("V", state.name)
     proved = f"{letter} = {state.level:.4g}"

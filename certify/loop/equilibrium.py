@@ -1,8 +1,8 @@
-"""Where a closed loop really rests when that is not the origin: enclosed by Krawczyk's test, with its eigenvalues.
+"""The closed loop's equilibrium when it is not the origin: enclosed by Krawczyk's test, with its eigenvalues.
 
-A policy that nobody centred has pi(0) near u_eq at best, and its loop rests beside the origin, if anywhere. Newton's
-method finds the point in floats, from the origin or from where a trajectory from there comes to; the test shows in Arb
-that exactly one point of rest lies in a box around it:
+An uncentred policy has pi(0) near u_eq at best, so its equilibrium lies beside the origin, if it has one. Newton's
+method finds the point in floats, from the origin or from the end of a trajectory that starts there. The test shows in
+Arb that exactly one equilibrium lies in a box around it:
 `K = x0 - Y F(x0) + (I - Y J)(X - x0)` lies inside X, J being mean slopes of F on X and Y about the inverse of one.
 """
 
@@ -120,7 +120,7 @@ def _origin(loop: ClosedLoop) -> Array:
 
 
 def _end(loop: ClosedLoop) -> Array | None:
-    """Where the trajectory from the origin is after a while, however stiff the loop; None if it leaves the domain."""
+    """The end of the trajectory from the origin, by a stiff solver; None if it leaves the domain or takes too long."""
     import scipy.integrate
 
     F, (lo, hi) = _rates(loop), np.array([[float(a), float(b)] for a, b in loop.system.domain]).T

@@ -1,20 +1,20 @@
-"""How far the policy that a robot computes in binary32 can be from pi, which a certificate is about: a proven bound.
+"""A proven bound on the difference between a certificate's policy pi and its evaluation in binary32.
 
-A certificate speaks of the real function pi. A robot computes it with rounded numbers, in an order that its compiler
-or its library chooses. Nothing of that is looked at here but a model of it (Higham, Accuracy and Stability of Numerical
-Algorithms, sections 2.2 and 3.1): each operation has a relative error of 2^-24 at most, and a product in a sum passes
-through no more additions than the sum has, whatever the order. What an operation adds anew is then carried to the
-output by the mean value theorem, through the slopes that tanh has on a box of states and the errors around it.
+A certificate is about the real function pi. A robot computes it with rounded numbers, in an order that its compiler or
+library chooses. The bound rests on the usual model of that (Higham, Accuracy and Stability of Numerical Algorithms,
+sections 2.2 and 3.1): each operation has a relative error of at most 2^-24, and a product in a sum passes through no
+more additions than the sum has, in any order. The mean value theorem carries each new error to the output, through the
+slopes of tanh on a box of states and the errors around it.
 
 With ranges and slopes known on a box, let the computed values be y^_k before and h^_k behind the tanh of layer k. Then
 
     net^(x) - net(x) = sum_k J_k (y^_k - W_k h^_(k-1) - b_k)
                      + sum_k J_(k+1) W_(k+1) (h^_k - tanh(y^_k)) + J_1 W_1 (x^ - x)
 
-row by row, with J_k the derivative of net by y_k at points between values that are computed and ones that are exact
-from there on. All of these lie within E_k of y_k(x), E_k the error that layers up to k can make. The rows of J_k are
-held as a centre and what may be added to it, in two ways that are both good: entry by entry, and as a 2-norm, which in
-wide networks is far less than what entries add up to. All of it is done in Arb balls: no bound is itself rounded.
+row by row. J_k is the derivative of net by y_k at points between the computed values and those that are exact from
+layer k on. All of these lie within E_k of y_k(x), where E_k bounds the error of the layers up to k. Each row of J_k is
+stored as a centre and a deviation, and the deviation is bounded twice: entry by entry, and in the 2-norm, which in
+wide networks is far less than the entries add up to. All arithmetic is in Arb balls, so rounding breaks no bound.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _SQUARINGS = 4  # of W'W, in the bound of its largest eigenvalue
 
 @dataclass(frozen=True, slots=True)
 class FloatOptions:
-    """What is assumed of the arithmetic, and how much is spent on the bound.
+    """Assumptions about the arithmetic, and the effort spent on the bound.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ class FloatOptions:
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """What one source adds to the bound of each input, (m,), in the inputs' units."""
+    """One source's contribution to the bound of each input, (m,), in the inputs' units."""
 
     source: str
     errors: tuple[float, ...]
@@ -215,8 +215,8 @@ class _Layer:
 
 @dataclass(frozen=True, slots=True)
 class _Step:
-    """What a layer adds on a box: errors of its numbers and sums before the tanh, (out,), and behind it its tanh's,
-    with the slopes through which errors pass; both None without a tanh."""
+    """A layer's own errors on a box: of its numbers and sums before the tanh, (out,), and of the tanh itself, with the
+    slopes through which errors pass; both None without a tanh."""
 
     numbers: Balls
     sums: Balls
@@ -356,7 +356,7 @@ class _Machine:
         return found
 
     def _backward(self, steps: Sequence[_Step], entering: Balls, output: Balls) -> _Errors:
-        """What the errors of each step come to at the output."""
+        """Carry the errors of each step to the output."""
         m, found = self.m, dict[str, Balls]()
         rows = _Rows(
             flint.arb_mat([[self.scale[j] if i == j else 0 for j in range(m)] for i in range(m)]),
@@ -525,7 +525,7 @@ def _points(numbers: Array) -> Balls:
 
 
 def _assumptions(network: TanhNetwork, options: FloatOptions) -> tuple[str, ...]:
-    """What has to hold of the program that runs, in words."""
+    """The assumptions about the robot's program, in words."""
     centring = {
         "none": "",
         "output": "; u_eq - scale * squash(net(0)) takes the place of the offset, right to one unit in its last place",

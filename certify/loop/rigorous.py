@@ -181,7 +181,7 @@ def in_digits(eigenvalue: flint.acb) -> str:
 
 
 def instability(loop: ClosedLoop, eigenvalue: flint.acb) -> flint.arb:
-    """What is negative of each of `eigenvalues` where they show stability: the real part, or with steps |v| - 1."""
+    """A number that is negative for a stable eigenvalue: its real part, or |v| - 1 for a loop in steps."""
     with precision():
         return eigenvalue.real if loop.step == 0 else abs(eigenvalue) - 1
 
@@ -260,9 +260,9 @@ def held_at_origin(loop: ClosedLoop, period: Fraction) -> tuple[flint.arb_mat, f
 
 
 def is_definite(M: flint.arb_mat) -> bool:
-    """Whether a symmetric matrix, of which the lower triangle is read, is certainly positive definite.
+    """True if a symmetric matrix, given by its lower triangle, is certainly positive definite.
 
-    Its pivots are: they lie in those of the balls, and a pivot that is not certainly positive shows nothing.
+    The true pivots lie in the balls' pivots. A pivot that is not certainly positive shows nothing.
     """
     rows = [[M[i, j] for j in range(i + 1)] for i in range(M.nrows())]
     for k, top in enumerate(rows):
@@ -288,7 +288,7 @@ def _held_map(loop: ClosedLoop, period: Fraction) -> flint.arb_mat:
 
 
 def _unclipped(loop: ClosedLoop) -> bool:
-    """Whether every input at the origin, before the clip, lies certainly and strictly inside it."""
+    """True if every input at the origin, before the clip, certainly lies strictly inside the clip's interval."""
     network = loop.network
     if network.clip is None:
         return True
@@ -323,7 +323,7 @@ def _net(network: TanhNetwork, x: Balls) -> Balls:
 
 
 def _read(network: TanhNetwork, x: Balls) -> Balls:
-    """What the layers read at a state."""
+    """The layers' inputs at a state."""
     return [v + at for v, at in zip(x, points(network.origin), strict=True)] if network.is_moved else list(x)
 
 

@@ -1,4 +1,4 @@
-"""Which P is tried: the candidates by name, and what happens when the optimised one is not to be had."""
+"""Choose P: the candidates by name, and the fallback when the optimised one is unavailable."""
 
 from __future__ import annotations
 

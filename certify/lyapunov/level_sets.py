@@ -35,7 +35,7 @@ def domain_limit(P: Array, domain: Sequence[tuple[Fraction, Fraction]]) -> float
 
 
 def leaves_domain(P: Array, level: float, domain: Sequence[tuple[Fraction, Fraction]]) -> bool:
-    """Whether the set of this level reaches beyond the interior of the box, decided in rationals.
+    """True if the sublevel set is not contained in the domain's interior, decided in rationals.
 
     Raises
     ------
@@ -47,7 +47,7 @@ def leaves_domain(P: Array, level: float, domain: Sequence[tuple[Fraction, Fract
 def are_inside(
     P: Array, level: float, points: Iterable[Sequence[Fraction | float]], centre: Sequence[float] = ()
 ) -> list[bool]:
-    """Whether `(x - c)'P(x - c) <= level` at each of the points, decided in rationals; all entries are finite numbers,
+    """Decide `(x - c)'P(x - c) <= level` at each of the points, in rationals; all entries are finite numbers, taken as
     exact. c is `centre`, 0 if it is empty.
 
     >>> are_inside(np.eye(2), 1.0, [(0.6, Fraction(4, 5)), (Fraction(3, 5), Fraction(4, 5)), (0.0, 2)])
@@ -112,7 +112,7 @@ def volume(P: Array, level: float) -> float:
 
 
 def is_positive_definite(P: Array) -> bool:
-    """Whether the symmetric part of P is positive definite, in exact arithmetic; entries must be finite.
+    """True if the symmetric part of P is positive definite, in exact arithmetic; entries must be finite.
 
     >>> is_positive_definite(np.array([[1.0, 1.0], [1.0, 1.0 + 2.0**-52]]))
     True

@@ -21,7 +21,7 @@ V = TypeVar("V")
 
 
 class Algebra(ABC, Generic[V]):
-    """What an arithmetic does with the nodes of an expression.
+    """An arithmetic's operations on the nodes of an expression.
 
     `total` and `product` get the constant of a sum or product apart from its other operands, which come in the
     expression's order. A power is the square of the power of half the exponent, times the base if it is odd.

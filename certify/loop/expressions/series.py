@@ -47,7 +47,7 @@ class PowerSeries(Algebra[Series[V]]):
         self._known += 1
 
     def held(self, value: V) -> Series[V]:
-        """What does not change."""
+        """A constant in time."""
         return self._follow(lambda k: None if k else value)
 
     def constant(self, q: Fraction) -> Series[V]:

@@ -332,7 +332,7 @@ SUM, PRODUCT, MINUS, POWER, ATOM = range(5)
 
 
 def binding(node: Expression) -> int:
-    """How tightly a node binds where it is written out."""
+    """The precedence of a node in written text."""
     if isinstance(node, Number):
         plain = decimal_text(node.value) is not None
         return PRODUCT if not plain else MINUS if node.value < 0 else ATOM

@@ -76,7 +76,7 @@ def _rationals(rows: list[list[Fraction]]) -> flint.fmpq_mat:
 
 
 def controllability(A: Matrix, B: Matrix) -> Controllability:
-    """How many directions of the state space the inputs reach (Kalman's rank condition).
+    """The dimension of the controllable subspace (Kalman's rank condition).
 
     >>> zero, one = Number(0), Number(1)
     >>> controllability(((zero, one), (zero, zero)), ((zero,), (one,)))

@@ -322,25 +322,25 @@ class System:
 
     @property
     def in_steps(self) -> bool:
-        """Whether V is compared at the ends of steps: of discrete time, or of periods over which an input is held."""
+        """True in discrete time or with held inputs: V is then compared at the ends of steps or periods."""
         return self.time == "discrete" or self.sample is not None
 
     @property
     def rests_where(self) -> str:
-        """What f(x_eq, u_eq) is at an equilibrium, in words."""
+        """The value of f(x_eq, u_eq) at an equilibrium, as text."""
         return "0" if self.time == "continuous" else "x_eq"
 
     @property
     def uncertain(self) -> tuple[tuple[Symbol, Interval], ...]:
-        """What has a range, in the order of the ranges."""
+        """The uncertain quantities with their ranges, in the order of the ranges."""
         return tuple((Symbol(name), interval) for name, interval in self.ranges.items())
 
     @property
     def input_errors(self) -> Mapping[str, str]:
-        """Of what has a range, that which the equations know only as the error of an input: its name, by the input's.
+        """The input errors: each uncertain quantity's name, by the name of its input.
 
-        That is so if both stand in them as u + error_u alone. A name by itself says nothing, because a file may give it
-        to anything.
+        An uncertain error_u is an input error if u and error_u occur in the equations only as u + error_u. The name alone
+        does not suffice: a file may give it to anything.
         """
         found = {}
         for u in self.inputs:
@@ -353,7 +353,7 @@ class System:
         return found
 
     def kind_of(self, name: str) -> Kind:
-        """What it is that has this range."""
+        """The kind of the uncertain quantity with this name."""
         if name in self.input_errors.values():
             return "input error"
         return "parameter" if name in self.parameters else "disturbance"

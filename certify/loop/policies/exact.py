@@ -1,4 +1,4 @@
-"""What follows exactly from a policy's form: the bounds of its inputs, and pi(0). Decided in rationals."""
+"""Exact consequences of a policy's form, decided in rationals: the bounds of its inputs, and pi(0)."""
 
 from __future__ import annotations
 

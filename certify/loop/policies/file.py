@@ -78,7 +78,7 @@ class Policy:
             object.__setattr__(self, "valid", valid)
 
     def beta_shift(self, u_eq: Sequence[Fraction]) -> float:
-        """What reading the stored beta as the real number changes in u at the origin, in the input's units.
+        """The change of u at the origin when the stored beta is read as the real number, in the input's units.
 
         Raises
         ------

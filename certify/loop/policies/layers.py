@@ -85,7 +85,7 @@ def sha256_of(head: bytes, arrays: Iterable[Array]) -> str:
 
 
 def through(weights: Sequence[Array], biases: Sequence[Array], x: Any) -> Any:
-    """What the layers make of the last axis of x, in its arithmetic (numpy array or torch tensor)."""
+    """Apply the layers to the last axis of x, in x's arithmetic (numpy array or torch tensor)."""
     for k, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
         if k:
             x = tanh(x)

@@ -93,7 +93,7 @@ class TanhNetwork:
 
     @property
     def is_moved(self) -> bool:
-        """Whether x = 0 is another state than 0 for the layers."""
+        """True if the layers read another state than 0 at x = 0."""
         return bool(np.any(self.origin != 0))
 
     @property
@@ -144,7 +144,7 @@ class TanhNetwork:
         return self.clipped(like(self.scale, x) * self.squashed(self.net(x)) + like(self.offset, x))
 
     def squashed(self, y: Any, arithmetic: Arithmetic[Any] | None = None) -> Any:
-        """What the policy does to the last layer's values before scale and offset; numpy or torch if none is given."""
+        """Squash the last layer's values, before scale and offset; in numpy or torch if no arithmetic is given."""
         return (arithmetic or _ARRAYS).tanh(y) if self.squash == "tanh" else y
 
     def squash_slope(self, squashed: Any, arithmetic: Arithmetic[Any] | None = None) -> Any:
@@ -208,7 +208,7 @@ class TanhNetwork:
         return TanhNetwork(self.weights, biases, self.scale, np.array(offset), self.squash, "none", self.clip)
 
     def squashed_at_origin(self, at_0: Array, u_eq: Sequence[Fraction]) -> Array:
-        """What enters the last tanh at the origin, (m,), given net(0)."""
+        """The values before the squash at the origin, (m,), given net(0)."""
         return self.beta(u_eq) if self.centre == "preactivation" else at_0
 
     def jacobian_at_origin(self, u_eq: Sequence[Fraction]) -> Array:

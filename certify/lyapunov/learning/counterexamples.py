@@ -1,6 +1,6 @@
-"""Where a function that is being learned is wrong: it does not fall, or is low where nothing converges.
+"""Find states where a function being learned is wrong: it does not fall, or is low where nothing converges.
 
-Found by sampling and a few steps uphill or downhill; what is found becomes a row of the next fit.
+The search samples states and takes a few steps uphill or downhill. Each state found becomes a row of the next fit.
 """
 
 from __future__ import annotations

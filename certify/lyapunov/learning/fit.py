@@ -39,7 +39,7 @@ class Values:
             raise InputError("rows must have a state, two bounds and a weight each; their counts differ.")
 
     def residuals(self, values: Array) -> Array:
-        """How far the values (B,) are out of bounds, weighted and with its sign."""
+        """The signed distance of each value (B,) to its bounds, weighted; 0 within them."""
         return np.asarray((values - np.clip(values, self.low, self.high)) * self.weight)
 
 
@@ -57,7 +57,7 @@ class Slopes:
             raise InputError("rows must have a state, a vector, a bound and a weight each; their counts differ.")
 
     def residuals(self, slopes: Array) -> Array:
-        """How far the slopes (B,) are above their bounds, weighted."""
+        """The weighted excess of each slope (B,) over its bound; 0 below it."""
         return np.asarray(np.maximum(slopes - self.most, 0.0) * self.weight)
 
 

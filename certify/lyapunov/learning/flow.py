@@ -29,7 +29,7 @@ _NEAR = 0.93  # of a domain's half-width: from here on its faces are near
 
 
 class Fate(IntEnum):
-    """What becomes of a run until the horizon."""
+    """The end of a run within the horizon."""
 
     UNDECIDED = 0
     CONVERGED = 1
@@ -38,7 +38,7 @@ class Fate(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Runs:
-    """What became of runs from B states.
+    """Results of the runs from B states.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ class Runs:
 
     @property
     def converged(self) -> Mask:
-        """Which runs entered the inner ellipsoid, (B,)."""
+        """True for each run that entered the inner ellipsoid, (B,)."""
         return np.asarray(self.fate == Fate.CONVERGED)
 
 
@@ -98,7 +98,7 @@ class LearningFlow:
         return x
 
     def inside(self, x: Array) -> Mask:
-        """Which states lie in the domain and have their input in bounds, (B,)."""
+        """True for each state that lies in the domain and has its input within bounds, (B,)."""
         within = np.all((x >= self.low) & (x <= self.high), axis=-1)
         if self._limits is not None:
             u = self.policy(x)

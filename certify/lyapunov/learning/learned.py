@@ -241,7 +241,7 @@ def _shell(flow: LearningFlow, count: int, generator: np.random.Generator) -> Ar
 
 
 def _drawn(directions: Array, generator: np.random.Generator) -> Array:
-    """Of the directions (C, B, n) at each corner of what is uncertain one for each state, (B, n)."""
+    """Draw for each state one of its directions (C, B, n), over the C corners of the ranges: (B, n)."""
     corners, count = directions.shape[:2]
     drawn = np.zeros(count, dtype=np.int64) if corners == 1 else generator.integers(corners, size=count)
     return np.asarray(directions[drawn, np.arange(count)])

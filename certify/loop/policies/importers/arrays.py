@@ -56,11 +56,11 @@ def is_array(node: Any) -> bool:
 
 
 def product(shape: Any, what: str) -> int:
-    """How many numbers a shape holds.
+    """The number of entries of a shape.
 
     Raises
     ------
-    InputError : it is no shape, or holds more than is read.
+    InputError : it is no shape, or has too many entries.
     """
     whole = isinstance(shape, tuple | list) and all(type(k) is int and 0 <= k <= _MAX_NUMBERS for k in shape)
     count = math.prod(shape) if whole and len(shape) <= 8 else _MAX_NUMBERS + 1

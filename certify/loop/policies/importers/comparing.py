@@ -1,10 +1,10 @@
-"""How far a folded network is from what the framework itself computes, and how far rounding may take the two apart.
+"""Compare a folded network with the framework's own outputs, and bound the difference that rounding can cause.
 
-The framework works in single precision as a rule. Its rounding is bounded step by step in the usual way (Higham,
-Accuracy and Stability of Numerical Algorithms, section 3): a sum of k products has the relative error `k u / (1 - k u)`
-of the sum of their magnitudes, tanh passes errors on undiminished at most and adds a few units of its own. A difference
-beyond four times that bound is no rounding: then something was misread, and the import is refused. In wide networks the
-bound is lax, so the same operations are asked once more in double precision, where it is not.
+The framework usually works in single precision. Its rounding is bounded step by step in the usual way (Higham, Accuracy
+and Stability of Numerical Algorithms, section 3): a sum of k products has an error of at most `k u / (1 - k u)` times
+the sum of their magnitudes; tanh enlarges no error and adds a few units of its own. A difference beyond four times that
+bound is no rounding: the file was misread, and the import is rejected. The bound is loose for wide networks, so the
+comparison is repeated in double precision, where it is tight.
 """
 
 from __future__ import annotations

@@ -90,7 +90,7 @@ def fold(steps: Sequence[Step], n: int) -> Folded:
 
 @dataclass(frozen=True, slots=True)
 class _Head:
-    """What comes before the first layer: `o -> factor * (o - mean) / sqrt(square) + offset`, componentwise."""
+    """The map before the first layer: `o -> factor * (o - mean) / sqrt(square) + offset`, componentwise."""
 
     factor: tuple[Fraction, ...]
     mean: tuple[Fraction, ...]

@@ -77,7 +77,7 @@ class Imported:
 
 
 def content_of(raw: bytes, name: str) -> Content | None:
-    """What a file is by its bytes and, for ONNX, by its name; None if it is nothing that is read here."""
+    """Recognise a file's kind by its bytes and, for ONNX, by its name; None if no reader takes it."""
     if raw.startswith(b"PK"):
         archive = Archive(raw, name)
         if "policy.pth" in archive and "data" in archive:
@@ -321,7 +321,7 @@ def _normaliser(reading: Reading, options: ImportOptions, n: int) -> tuple[Step,
 
 
 def _action(options: ImportOptions, m: int) -> tuple[Step, ...]:
-    """What becomes of the network's action on its way to the plant."""
+    """The steps from the network's action to the plant's input."""
     scale = spread(options.action_scale or _ONE, m)
     offset = spread(options.action_offset or _ZERO, m)
     steps: list[Step] = []
@@ -365,21 +365,21 @@ def _parameters(plant: System) -> dict[str, str]:
 
 
 def centring_changes(network: TanhNetwork, plant: System) -> dict[Centre, float]:
-    """How much each centring that can be had would change u at most, over samples of the domain."""
+    """The largest change of u that each possible centring would cause, over samples of the domain."""
     x, u_eq = sample(plant, None), plant.exact_u_eq()
     bare = replace(network, centre="none")
     return _centrings(bare, u_eq, x, bare(x, u_eq))
 
 
 def _centrings(bare: TanhNetwork, u_eq: tuple[Fraction, ...], x: Array, values: Array) -> dict[Centre, float]:
-    """How much each centring would change u, at most, over the states."""
+    """The largest change of u that each centring would cause, over the states."""
     changes: dict[Centre, float] = {}
     centres: tuple[Centre, ...] = ("output", "preactivation")
     for centre in centres:
         try:
             moved = replace(bare, centre=centre)(x, u_eq)
         except InputError:
-            continue  # u_eq outside of the squash's range, or no squash to centre in
+            continue  # u_eq is outside the squash's range, or there is no squash to centre in
         changes[centre] = float(np.max(np.abs(moved - values)))
     return changes
 

@@ -134,7 +134,7 @@ def _prune(model: Any, output: str, what: str) -> list[str]:
 
 
 def _widths(graph_: Any) -> dict[str, int]:
-    """How many numbers rows of values have, and those of which a shape is taken, as far as that follows from layers."""
+    """The widths of the graph's values, as far as the layers determine them, and of those whose shape is taken."""
     found: dict[str, int] = {}
     sizes = {tensor.name: tuple(tensor.dims) for tensor in graph_.initializer}
     for name, size in sizes.items():

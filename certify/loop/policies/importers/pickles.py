@@ -97,7 +97,7 @@ class _Machine:
         return self.stack.pop()
 
     def marked(self) -> list[Any]:
-        """What was pushed since the last mark."""
+        """Pop the items pushed since the last mark."""
         items, self.stack = self.stack, self.marks.pop()
         return items
 

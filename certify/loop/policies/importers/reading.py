@@ -1,4 +1,4 @@
-"""What a reader of a file hands on: exact steps, and how the framework itself evaluates them."""
+"""The result of reading a file: exact steps, and the framework's own evaluation of them."""
 
 from __future__ import annotations
 

@@ -33,7 +33,7 @@ Layers = list[Affine]
 
 
 def is_two_stage(tensors: Mapping[str, Numbers]) -> bool:
-    """Whether a file holds the policy of a two-stage checkpoint: its layers, and what it is centred at."""
+    """True if a file holds the policy of a two-stage checkpoint: its layers and the data of its centring."""
     return _root(tensors) is not None
 
 
@@ -243,7 +243,7 @@ def _own(tensors: Mapping[str, Numbers], prefix: str) -> list[str]:
 
 
 def _root(tensors: Mapping[str, Numbers]) -> str | None:
-    """What stands before the names of a two-stage policy, where that is one thing for all of them."""
+    """The common prefix of a two-stage policy's tensor names; None unless all of them share one."""
     roots = [key.removesuffix(_PARTS[0]) for key in tensors if key.endswith(_PARTS[0])]
     if len(roots) != 1 or not all(roots[0] + part in tensors for part in _PARTS):
         return None

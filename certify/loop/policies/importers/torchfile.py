@@ -68,7 +68,7 @@ class TorchFile:
         return read_pickle(self.archive.read(self.root + name), f"{name} in {self.what}")
 
     def holds(self, name: str) -> bool:
-        """Whether the archive has a member of that name."""
+        """True if the archive has a member of that name."""
         return self.root + name in self.archive
 
     def tensor(self, node: Any, what: str, folder: str = "data") -> Numbers:
@@ -145,7 +145,7 @@ class TorchFile:
 
 
 def is_tensor(node: Any) -> bool:
-    """Whether a node of the pickle describes a dense tensor, or a parameter that is one."""
+    """True if a node of the pickle describes a dense tensor, or a parameter that is one."""
     if not isinstance(node, Call) or not isinstance(node.function, Name) or node.function.module != "torch._utils":
         return False
     return node.function.name in ("_rebuild_tensor_v2", "_rebuild_tensor_v3", "_rebuild_parameter")

@@ -52,7 +52,7 @@ class _Program:
 
 
 def is_torchscript(file: TorchFile) -> bool:
-    """Whether a file of torch holds code."""
+    """True if a torch file holds code."""
     return any(name.startswith(f"{file.root}code/") for name in file.archive.names)
 
 
