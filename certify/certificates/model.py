@@ -69,13 +69,13 @@ class Contraction:
 
 @dataclass(frozen=True, slots=True)
 class Waypoint:
-    """Where a slab of a tube around a path ends, and what its inequality takes beyond the multipliers.
+    """The end of a slab of a tube around a path, and its inequality's further numbers.
 
     Parameters
     ----------
-    centre : of the slab's ellipsoids at its end, (n,); between its ends it moves on a line.
-    share : of the slab's ball, that its middle's motion takes; between 0 and 1.
-    edge, motion, joint : multipliers of the tube's edge and of the motion, and the motion's entry of the third row.
+    centre : the centre of the slab's ellipsoid at its end, (n,); between its ends the centre moves on a line.
+    share : the share of the slab's ball that the centre's motion takes; between 0 and 1.
+    edge, motion, joint : multipliers of the tube's boundary and of the motion, and the motion's entry of the third row.
     """
 
     centre: Array

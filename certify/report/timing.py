@@ -1,8 +1,8 @@
-"""How time passes in a closed loop, in words: what of a claim's sentences depends on it, and on the claimed rate.
+"""The words about time in a claim's sentences: they depend on the closed loop's timing and on the claimed rate.
 
-A claim says the same of every loop; *when* it holds is another matter. A loop in continuous time is spoken of at all
-times, one whose input is held over a period at its sampling instants, one in discrete time at its steps. Each text of a
-report that depends on this takes its words from here, so that no text has to be written once for every kind of claim.
+A claim says the same about every loop, but at different times: at all times in continuous time, at sampling instants if
+the input is held over periods, at steps in discrete time. Every text of a report takes such words from here, so that no
+text has to be written once per kind of claim.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ _PERCENT = 100  # of V: the share of it after which a rate is told as a time
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """Whether a plant is in `discrete` time, the least and the largest period over which its input is held (`sample`;
-    None if it follows the state at once), and the `rate` lambda at which V is claimed to fall (0: no rate)."""
+    """The timing of a plant: `discrete` time or not, the shortest and longest sampling period (`sample`; None if the
+    input follows the state at once), and the claimed `rate` lambda at which V falls (0: no rate)."""
 
     discrete: bool = False
     sample: Interval | None = None
@@ -33,12 +33,12 @@ class Timing:
 
     @classmethod
     def of(cls, system: System, rate: float = 0.0) -> Timing:
-        """Of a plant, with what is claimed of it."""
+        """The timing of a plant under a claimed rate."""
         return cls(system.time == "discrete", system.sample, rate)
 
     @classmethod
     def of_result(cls, result: Mapping[str, Any]) -> Timing:
-        """Of the object that `certify roa --json` prints; what it does not say is as it always was."""
+        """The timing in the object that `certify roa --json` prints; a missing key means its default."""
         claim = result.get("claim") or {}
         sample = claim.get("sample")
         ends = None if sample is None else (Fraction(sample[0]), Fraction(sample[1]))
@@ -46,12 +46,12 @@ class Timing:
 
     @property
     def is_plain(self) -> bool:
-        """Whether the input follows at once in continuous time."""
+        """True in continuous time with an input that follows at once."""
         return not self.discrete and self.sample is None
 
     @property
     def from_zero(self) -> bool:
-        """Whether the claim holds within each period as well, because each part of a period is one that is allowed."""
+        """True if the claim holds within each period as well, since shorter periods down to 0 are allowed."""
         return self.sample is not None and self.sample[0] == 0
 
     @property
@@ -61,7 +61,7 @@ class Timing:
 
     @property
     def axis(self) -> str:
-        """Of a picture over time."""
+        """The label of a picture's time axis."""
         return "steps" if self.discrete else "time (s)"
 
     @property
@@ -82,7 +82,7 @@ class Timing:
 
     @property
     def linearised(self) -> str:
-        """Of what the eigenvalues are, where not of the rate of change."""
+        """The map whose eigenvalues are meant, in words; empty in continuous time."""
         if self.sample is not None:
             return f" over a period of {exact_number(self.sample[1])} s"
         return " over a step" if self.discrete else ""
@@ -94,7 +94,7 @@ class Timing:
 
     @property
     def loop(self) -> str:
-        """What passes in which time, after the equation `dx/dt = f(...)` or `x+ = f(...)`."""
+        """The words after the equation `dx/dt = f(...)` or `x+ = f(...)`."""
         if self.discrete:
             return "in exact real arithmetic, one step after the other"
         if self.sample is None:
@@ -115,7 +115,7 @@ class Timing:
 
     @property
     def definition(self) -> str:
-        """What D is; nothing where it is not spoken of."""
+        """The definition of D; empty in continuous time."""
         if self.discrete:
             return "D(x) = V(F(x)) − V(x), F(x) = f(x, π(x)): by how much V changes in a step."
         if self.sample is None:
@@ -129,12 +129,12 @@ class Timing:
 
     @property
     def simulated(self) -> Timing:
-        """What pictures show of several periods: the longest."""
+        """The timing of pictures: of several periods they show the longest."""
         return self if self.sample is None else Timing(sample=(self.sample[1], self.sample[1]), rate=self.rate)
 
     @property
     def definitions(self) -> str:
-        """What D and lambda are, those of them that conditions speak of."""
+        """The definitions of D and lambda, as far as the conditions use them."""
         rate = f"λ = {self.shown_rate} is the rate, rounded down here." if self.rate else ""
         return f"{self.definition} {rate}".strip()
 
@@ -145,7 +145,7 @@ class Timing:
 
     @property
     def phrases(self) -> Mapping[str, str]:
-        """What the words of a claim (words.py) have a place for, each `$name` there."""
+        """The text for each placeholder `$name` in the words of a claim (claims.py)."""
         return {
             **self._when(),
             **self._how_fast(),
@@ -224,7 +224,7 @@ class Timing:
         }
 
     def _how_fast(self) -> dict[str, str]:
-        """What is said of the speed."""
+        """The phrases about speed."""
         if not self.rate:
             return {
                 "fall": f"{self.derivative}(x) < 0",
@@ -250,7 +250,7 @@ class Timing:
         }
 
     def speed(self, inner: float | None, outer: float) -> str:
-        """What a rate says of trajectories, after the statement of the claim; nothing without a rate.
+        """The consequence of a rate for trajectories, after the statement of the claim; empty without a rate.
 
         Parameters
         ----------
@@ -291,9 +291,9 @@ class Timing:
         return f", V falling at least as exp(-2*{below(self.rate)} {'k) in k steps' if self.discrete else 't)'}"
 
     def time_to_fall(self, factor: Fraction | int) -> float:
-        """How long it takes V at most to be divided by a factor of at least 1, rounded up; infinite without a rate.
+        """The longest time until V is divided by a factor of at least 1, rounded up; infinite without a rate.
 
-        With a sample it is by when a sampling instant has come at which that is so, less the longest period.
+        With held inputs it holds at every sampling instant from then on; the first comes within one longest period.
         """
         if not self.rate:
             return math.inf

@@ -339,8 +339,8 @@ class System:
     def input_errors(self) -> Mapping[str, str]:
         """The input errors: each uncertain quantity's name, by the name of its input.
 
-        An uncertain error_u is an input error if u and error_u occur in the equations only as u + error_u. The name alone
-        does not suffice: a file may give it to anything.
+        An uncertain error_u is an input error if u and error_u occur in the equations only as u + error_u. The name
+        alone does not suffice: a file may give it to anything.
         """
         found = {}
         for u in self.inputs:

@@ -42,11 +42,11 @@ class ImportOptions:
     squash : what follows the last layer of a state_dict: `identity`, `tanh`, or `relu-tanh` for relu(tanh(.)).
     states : the plant's states in the order in which the network reads them.
     normaliser : a file with the observations' normaliser, or `none`.
-    epsilon : what a normaliser of rsl_rl adds to the standard deviation; 1/100 if nothing is said.
+    epsilon : the number that rsl_rl's normaliser adds to the standard deviation; 1/100 by default.
     action_scale, action_offset : `u = scale * action + offset` in the plant's units, exact, one number or m.
     clip : bounds of the action, before scale and offset.
     centre : the centring that gives pi(0) = u_eq; None leaves the policy as it is.
-    observes : whether the network reads the plant's states or their deviations from its operating point.
+    observes : `absolute` if the network reads the states' values, `deviation` if deviations from the operating point.
     ignore : names of tensors that are no part of the policy, with `*` and `?` as in names of files.
     output : the output of an ONNX graph that is the action, where it has several.
 
