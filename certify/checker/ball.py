@@ -193,8 +193,7 @@ def too_large(net: Folded, operations: int, k: int) -> Failures:
 
 
 def enclose_on_ball(net: Folded, states: Sequence[Jet]) -> Jet:
-    """The last layer's values, squashed if the policy is, as a batch of jets; the states are these jets, without Q, K and
-    E.
+    """The last layer's values, squashed if the policy is, as a batch of jets; the states are jets without Q, K and E.
 
     Every layer's value is y(d) = y(0) + a.d + B A(d), where A_q is what a tanh of the layers before adds to its tangent
     at y_q(0), and B the product of weights and slopes with which that reaches y, so that errors cancel as they do in

@@ -277,8 +277,8 @@ class Leaves:
     def decreases(self, leaf: Leaf, within: dict[str, Taylor] | None = None) -> bool:
         """True if D', D' + k (c2 - V) or D' + k (V - c1), D' = D + 2 lambda V, is certainly negative for some k >= 0.
 
-        The first-order part of the bound is piecewise linear in k, and each of its kinks is tried. Any k is sound: if it
-        is not finite, the bound is not finite either, and no comparison finds that negative.
+        The first-order part of the bound is piecewise linear in k, and each of its kinks is tried. Any k is sound: if
+        it is not finite, the bound is not finite either, and no comparison finds that negative.
         """
         D, V = self.D(leaf, within), self.V(leaf)
         if self.rate > 0:

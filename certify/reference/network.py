@@ -158,7 +158,7 @@ class Network:
         return [replace(u, B=B, errors=errors) for u, B in zip(inputs, unit_vectors, strict=True)], units
 
     def before_squash(self, j: int, net: arb, centre: fmpq_mat | None) -> arb:
-        """The value before the squash at the centre, where the network is `net`; beta for `preactivation` at the origin."""
+        """The value before the squash at the centre, where the network is `net`; `preactivation` gives beta at 0."""
         if self.c.policy.centre != "preactivation":
             return net
         return self.beta[j] if centre is None else net - self.net_at_0[j] + self.beta[j]
