@@ -25,5 +25,5 @@ def plant_of(
     error: str | None = None,
     period: str | None = None,
 ) -> System:
-    """See `certify.analysis.arguments.plant_of`; what is to be known of the plant goes to standard error."""
+    """See `certify.analysis.arguments.plant_of`; notices about the plant go to standard error."""
     return arguments.plant_of(stored, name, params, bounds, disturbances, error, period, tell)

@@ -16,12 +16,12 @@ from certify.errors import InputError
 
 def export_smt2(
     policy: Annotated[Path, typer.Option(help="Policy file (certify-policy/1 or /2, .pt).")],
-    out: Annotated[Path, typer.Option(help="Folder for the files, one a condition.")],
-    system: Annotated[str | None, typer.Option(help="Plant, as for roa; default: what the policy file says.")] = None,
+    out: Annotated[Path, typer.Option(help="Folder for the files, one per condition.")],
+    system: Annotated[str | None, typer.Option(help="Plant, as for roa; default: the policy file's plant.")] = None,
     param: Annotated[list[str] | None, typer.Option(help="Parameter of the plant, NAME=VALUE; repeatable.")] = None,
     domain: Annotated[list[str] | None, typer.Option(help="Half-width NAME=D or interval NAME=LO..HI.")] = None,
     candidate: Annotated[str, typer.Option(help="Lyapunov candidate, as for roa.")] = "lyapunov",
-    level: Annotated[float | None, typer.Option(help="c2; default: 0.99 of the largest that is proved.")] = None,
+    level: Annotated[float | None, typer.Option(help="c2; default: 0.99 of the largest proved level.")] = None,
     time_limit: Annotated[float, typer.Option(help="Seconds for everything up to the verdict.")] = 50.0,
     as_json: Json = False,
 ) -> None:
@@ -37,15 +37,15 @@ def export_smt2(
     plant = plant_of(stored, system, param or [], domain or [])
     if plant.ranges:
         raise InputError(
-            "export-smt2 must have a plant of exact equations, because formulas know no ranges; found ranges of "
-            f"{', '.join(plant.ranges)} in {plant.name}. Leave them out (of a disturbance in its file: half-width 0)."
+            "export-smt2 needs a plant with exact equations, since its formulas have no ranges; found ranges of "
+            f"{', '.join(plant.ranges)} in {plant.name}. Leave them out (for a disturbance in its file: half-width 0)."
         )
     if plant.in_steps:
         raise InputError(
             f"export-smt2 must have a plant in continuous time; found {plant.name}, whose time is discrete."
         )
     options = RoaOptions(
-        claim="asymptotic",  # what is written are its conditions
+        claim="asymptotic",  # its conditions are written
         candidate=candidate,  # type: ignore[arg-type]
         level=level,
         time_limit=time_limit,

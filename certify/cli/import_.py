@@ -27,14 +27,14 @@ def import_(
     system: Annotated[str | None, typer.Option(help="Plant that the policy controls: a name or a file.")] = None,
     param: Annotated[list[str] | None, typer.Option(help="Parameter of the plant, NAME=VALUE; repeatable.")] = None,
     lyapunov_out: Annotated[
-        Path | None, typer.Option(help="File to write the Lyapunov network to (.pt) that lies beside the policy.")
+        Path | None, typer.Option(help="File to write (.pt) for the Lyapunov network beside the policy in FILE.")
     ] = None,
     lyapunov_prefix: Annotated[
-        str | None, typer.Option(help="Keys of its layers up to their numbers; two-stage files say it themselves.")
+        str | None, typer.Option(help="Keys of its layers up to their numbers; two-stage files do not need it.")
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Turn a policy file of another program into one of this program; nothing in it is executed."""
+    """Convert another program's policy file into one of this program, without executing anything in it."""
     from certify.loop.policies import save_policy
     from certify.lyapunov import save_lyapunov
 

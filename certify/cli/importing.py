@@ -1,4 +1,4 @@
-"""Policy files of other programs on the command line: their options, declared once for all commands that take them."""
+"""Options for policy files of other programs, declared once for all commands that take them."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ _OPTIONS: dict[str, Any] = {
     "kind": _option(_KINDS, "--from"),
     "states": _option("The plant's states in the order in which the network reads them, as in x,theta."),
     "prefix": _option("Keys of a state_dict's layers up to their numbers, as in actor.pi_net.fcs."),
-    "activation": _option("Between the layers of a state_dict: tanh."),
-    "squash": _option("After the last layer of a state_dict: identity, tanh or relu-tanh."),
+    "activation": _option("Function between the layers of a state_dict: tanh."),
+    "squash": _option("Function after the last layer of a state_dict: identity, tanh or relu-tanh."),
     "normaliser": _option("File of the observations' normaliser (VecNormalize, rsl_rl), or none."),
-    "epsilon": _option("What rsl_rl's normaliser adds to the standard deviation; 0.01 if nothing is said."),
+    "epsilon": _option("Number that rsl_rl's normaliser adds to the standard deviation; default: 0.01."),
     "action_scale": _option("u = scale * action + offset: one number or one for each input."),
     "action_offset": _option("See --action-scale."),
     "clip": _option("Bounds LO..HI of the action before scale and offset, one pair or one for each input."),
-    "centre": _option("Make pi(0) = u_eq: output or preactivation; nothing is centred unless this asks for it."),
-    "observes": _option("Whether the network reads absolute states or their deviation from the operating point."),
+    "centre": _option("Make pi(0) = u_eq: output or preactivation; by default the policy is not changed."),
+    "observes": _option("absolute: the network reads the states' values; deviation: from the operating point."),
     "ignore": _option("Tensor that is no part of the policy, * and ? as in names of files; repeatable.", of=list[str]),
     "output": _option("Output of an ONNX graph that is the action, where there are several."),
 }
@@ -77,7 +77,7 @@ def takes_import_options(command: Callable[..., None], kind_is: str = "--from") 
 
 @contextmanager
 def kind_called(option: str) -> Iterator[None]:
-    """Messages of what is done within, of importing alone, with the option for the kind of file called so."""
+    """Rename --from in error messages to the command's own option for the kind of file."""
     try:
         yield
     except InputError as error:
@@ -86,7 +86,7 @@ def kind_called(option: str) -> Iterator[None]:
 
 
 def policy_of(path: Path, importing: ImportOptions, system: str | None, params: list[str]) -> Policy:
-    """The policy in a file of this program, or of another one for the plant that `system` names.
+    """Read a policy from this program's file, or from another program's for the plant that `system` names.
 
     Raises
     ------
@@ -104,9 +104,9 @@ def policy_of(path: Path, importing: ImportOptions, system: str | None, params: 
 def imported_policy(
     path: Path, importing: ImportOptions, system: str | None, params: list[str], beside: str | None
 ) -> Imported:
-    """The policy in a file of another program, for the plant that `system` names.
+    """Import another program's policy for the plant that `system` names.
 
-    `beside` is where the Lyapunov network lies that is imported with it.
+    `beside` is the prefix of the Lyapunov network that is imported with it.
     """
     from certify.loop.policies.importers import import_policy
 
@@ -116,14 +116,14 @@ def imported_policy(
 def imported_lyapunov(
     path: Path, importing: ImportOptions, system: str | None, params: list[str], prefix: str | None
 ) -> ImportedLyapunov:
-    """The Lyapunov network in a file of another program, for the plant that `system` names."""
+    """Import another program's Lyapunov network for the plant that `system` names."""
     from certify.lyapunov import import_lyapunov
 
     return import_lyapunov(path, _plant_for(path, system, params), importing, prefix)
 
 
 def _plant_for(path: Path, system: str | None, params: list[str]) -> System:
-    """The plant that is named for a file to import, which does not say what it controls."""
+    """The plant given for a file to import, since the file does not name it."""
     from certify.loop.plants import chosen_system
 
     if system is None:

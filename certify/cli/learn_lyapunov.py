@@ -46,14 +46,14 @@ def learn_lyapunov(
         str | None, typer.Option(help=f"Widths of the network between the states and its output; default: {_HIDDEN}.")
     ] = None,
     degree: Annotated[
-        int | None, typer.Option(help="Fit a polynomial of this even degree in the place of a network.")
+        int | None, typer.Option(help="Fit a polynomial of this even degree instead of a network.")
     ] = None,
-    seed: Annotated[int, typer.Option(help="Of everything random: the same seed learns the same function.")] = 0,
+    seed: Annotated[int, typer.Option(help="Random seed: the same seed learns the same function.")] = 0,
     time_limit: Annotated[float, typer.Option(help="Seconds for the ellipsoid and for learning.")] = 120.0,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
-    """Learn a function for a set beyond the ellipsoid, from simulated runs; `certify roa --lyapunov` proves one."""
+    """Learn a second function N from simulated runs, for a set beyond the ellipsoid that `roa --lyapunov` proves."""
     from certify.loop.closed_loop import ClosedLoop
     from certify.lyapunov import save_lyapunov, volume
     from certify.lyapunov.function import Quadratic
@@ -97,7 +97,7 @@ def learn_lyapunov(
 
 
 def _ellipsoid(plant: System, stored: Policy, seconds: float, progress: ProgressLine | None) -> tuple[Array, float]:
-    """A proved region of attraction, into which trajectories are to fall.
+    """Prove the ellipsoid that trajectories of the outer set have to enter.
 
     Raises
     ------
@@ -145,15 +145,15 @@ def _text(learned: Learned, area: float, out: Path, command: str) -> str:
     return "\n".join([
         f"ellipsoid  of the volume {area:.6g}, proved",
         f"learned    {words}, in {len(learned.history)} rounds, {last.seconds:.0f} s",
-        f"sampled    {{N <= {learned.level:.6g}}} with the ellipsoid holds {learned.cover:.1%} of what converges",
-        "           nothing is proved of N yet",
+        f"sampled    {{N <= {learned.level:.6g}}} and the ellipsoid hold {learned.cover:.1%} of the converging states",
+        "           nothing is proved about N yet",
         f"written    {out}",
         f"next       {command}",
     ])  # fmt: skip
 
 
 def _next(policy: Path, system: str | None, param: list[str] | None, domain: list[str] | None, out: Path) -> str:
-    """The command that proves what was learned."""
+    """The command that proves the learned function's set."""
     parts = ["certify", "roa", "--policy", str(policy)]
     parts += [] if system is None else ["--system", system]
     for name, values in (("--param", param), ("--domain", domain)):

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
 Patient = Annotated[
-    bool, typer.Option("--patient", help="Take a certificate whose check may need hours, which is refused else.")
+    bool, typer.Option("--patient", help="Accept a certificate whose check may take hours; by default it is refused.")
 ]
 PolicyFile = Annotated[
     Path | None, typer.Option("--policy", help="Policy file (.pt), or another program's (see certify import).")
@@ -23,7 +23,7 @@ PolicyArgument = Annotated[Path | None, typer.Argument(metavar="FILE", help="The
 PlantName = Annotated[
     str | None,
     typer.Option(
-        help="Plant: a name, FILE.toml, or FILE.py:NAME, whose code is run; default: what the policy file says."
+        help="Plant: a name, FILE.toml, or FILE.py:NAME, whose code is run; default: the policy file's plant."
     ),
 ]
 Domain = Annotated[
@@ -36,11 +36,11 @@ Quiet = Annotated[bool, typer.Option("--quiet", help="No progress and no notices
 
 
 def the_policy(context: typer.Context, file: Path | None, policy: Path | None) -> Path:
-    """The policy file, which is named as the argument or with --policy.
+    """The policy file, given as the argument or with --policy.
 
     Raises
     ------
-    InputError : it is named in neither way, or two files are.
+    InputError : none is given, or two different files.
     """
     if file is not None and policy is not None and file.resolve() != policy.resolve():
         raise InputError(f"one policy file must be named; found {file} and --policy {policy}. Leave one of them out.")
@@ -51,14 +51,14 @@ def the_policy(context: typer.Context, file: Path | None, policy: Path | None) -
 
 
 def page_of(raw: bytes, path: Path, answer: dict[str, Any] | None, data: dict[str, Any] | None) -> str:
-    """The report on a certificate's bytes, with the checker's answer about them and what the run says, if there are."""
+    """The report on a certificate's bytes, with the checker's answer and the run's data where they exist."""
     from certify.report import drawn
 
     return drawn.page_of(raw, path, answer, data)
 
 
 def describe(s: System) -> dict[str, Any]:
-    """A plant as plain values; equations, operating point and domain are those of the states' values."""
+    """A plant as plain values; equations, operating point and domain are in the states' values, not deviations."""
     domain, x_eq, u_eq = s.domain_of_values(), s.exact_x_eq(), s.exact_u_eq()
     return {
         "name": s.name,
