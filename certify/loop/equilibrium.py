@@ -33,14 +33,14 @@ _MOST_STEPS = 10_000  # of one: where F is no number, time stands still
 
 @dataclass(frozen=True, slots=True)
 class Rest:
-    """The only point of rest in a small box.
+    """The only equilibrium in a small box.
 
     Parameters
     ----------
     x, u : decimals with 12 digits that are certain up to the last, or 0 for less than 1e-18, (n,) and (m,); x is in
         deviations from the plant's operating point.
-    eigenvalues : of the Jacobian there, enclosed, in digits; empty if Arb cannot isolate them.
-    stable : whether all of them are certain to lie left of the axis.
+    eigenvalues : eigenvalues of the Jacobian there, enclosed, as text; empty if Arb cannot isolate them.
+    stable : True if all of them certainly lie left of the imaginary axis.
     """
 
     x: tuple[str, ...]
@@ -50,8 +50,8 @@ class Rest:
 
 
 def find_rest(loop: ClosedLoop) -> Rest | None:
-    """The point of rest that Newton's method reaches from the origin, or else from the end of a trajectory that starts
-    there, enclosed; None if there is none to be shown."""
+    """Enclose the equilibrium that Newton's method reaches from the origin, or else from the end of a trajectory that
+    starts there; None if none can be shown."""
     for begin in (_origin, _end):
         x0 = begin(loop)
         start = None if x0 is None else _newton(loop, x0)
@@ -61,12 +61,12 @@ def find_rest(loop: ClosedLoop) -> Rest | None:
 
 
 def seen_from(loop: ClosedLoop, rest: Rest) -> ClosedLoop:
-    """The same loop in deviations from where it rests, as near as 40 bits of the domain's widths come to it.
+    """The same loop in deviations from its equilibrium, rounded to 40 bits of the domain's widths.
 
     Raises
     ------
-    InputError : the policy is centred or seen from elsewhere already, or the point does not lie in the interior of the
-        domain.
+    InputError : the policy is centred or has an origin already, or the point does not lie in the interior of the
+    domain.
     """
     system, network = loop.system, loop.network
     if network.centre != "none" or network.is_moved:
@@ -80,7 +80,7 @@ def seen_from(loop: ClosedLoop, rest: Rest) -> ClosedLoop:
 
 
 def _short(q: Fraction, width: Fraction) -> Fraction:
-    """q to a multiple of 2^-40 times about a width."""
+    """Round q to a multiple of 2^-40 times about a width."""
     unit = Fraction(2) ** (width.numerator.bit_length() - width.denominator.bit_length() - _BITS)
     return round(q / unit) * unit
 
@@ -159,7 +159,7 @@ def _newton(loop: ClosedLoop, x: Array) -> Array | None:
 
 
 def _inverse(J: flint.arb_mat) -> flint.arb_mat | None:
-    """About the inverse, entries without radius."""
+    """An approximate inverse, with entries without radius."""
     middle = np.array([[float(J[i, j].mid()) for j in range(J.ncols())] for i in range(J.nrows())])
     if not np.all(np.isfinite(middle)):
         return None

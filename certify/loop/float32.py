@@ -57,7 +57,7 @@ class FloatOptions:
     ----------
     tanh_ulp : accuracy of tanh, in units in the last place of binary32 of the exact value.
     chain : the most additions that one product passes through in a sum; None allows any order.
-    boxes : into how many parts the domain is cut; more of them give a smaller bound. None is as many as take seconds,
+    boxes : number of parts that the domain is cut into; more parts give a smaller bound. None takes a few seconds:
         256 for a network of 4000 weights or less and one from a million on.
 
     Raises
@@ -92,10 +92,10 @@ class FloatError:
 
     Parameters
     ----------
-    bounds : one an input, (m,), in its unit, rounded up.
-    parts : what they are made of, each where the bound of that input is largest; a clip adds none.
-    assumptions : what has to hold of the program that runs, in words.
-    boxes : into how many parts the domain was cut.
+    bounds : one per input, (m,), in its unit, rounded up.
+    parts : the contributions, each where the bound of that input is largest; a clip adds none.
+    assumptions : the required properties of the robot's program, in words.
+    boxes : number of parts that the domain was cut into.
     """
 
     bounds: tuple[float, ...]
@@ -105,13 +105,13 @@ class FloatError:
 
 
 def float_error(network: TanhNetwork, system: System, options: FloatOptions | None = None) -> FloatError:
-    """Bound what computing the policy in binary32 changes in each input, for every state of the plant's domain.
+    """Bound the error of each input when the policy is computed in binary32, for every state of the plant's domain.
 
     Parameters
     ----------
     network : the policy; its binary64 numbers are rounded to binary32, which is part of the error.
     system : the plant, whose domain holds the states, as deviations from x_eq.
-    options : what is assumed of the arithmetic; by default any order of summation and a tanh good to 4 units.
+    options : assumptions about the arithmetic; by default any order of summation and a tanh good to 4 units.
 
     Raises
     ------
@@ -120,8 +120,8 @@ def float_error(network: TanhNetwork, system: System, options: FloatOptions | No
 
     Notes
     -----
-    The bound is of single evaluations of pi. It says nothing of what a robot's sensors, its actuators and the time
-    between two evaluations change.
+    The bound is about single evaluations of pi. It does not cover a robot's sensors, its actuators, or the time
+    between two evaluations.
 
     Source: Higham, Accuracy and Stability of Numerical Algorithms, 2nd edition, lemma 3.1 and section 3.1.
 
@@ -152,7 +152,7 @@ def float_error(network: TanhNetwork, system: System, options: FloatOptions | No
 
 
 def _refined(machine: _Machine, domain: Box, boxes: int | None) -> list[_Errors]:
-    """The errors on the parts of the domain, which is cut always where the bound is largest."""
+    """The errors on the parts of the domain; the next cut is always where the bound is largest."""
     whole, ties = machine.errors(domain), itertools.count()
     if boxes is None:
         boxes = max(1, min(_MOST_BOXES, _MOST_WEIGHTS // machine.weights))
@@ -194,10 +194,10 @@ class _Errors:
 
 @dataclass(frozen=True, slots=True)
 class _Layer:
-    """A layer's numbers, exact, and what they lose in binary32.
+    """A layer's numbers, exact, and their errors in binary32.
 
     `weight`, `magnitude` (out, in); `bias` (out,) with what centring adds; `bias_size` bounds the magnitudes of the
-    terms that a program may keep it in. `growth` is what sums lose relative to their terms' magnitudes. `norm` bounds
+    terms that a program may keep it in. `growth` is sums' error relative to their terms' magnitudes. `norm` bounds
     ||weight||_2, `columns` (in,) the norms of its columns.
     """
 
@@ -226,7 +226,7 @@ class _Step:
 
 @dataclass(frozen=True, slots=True)
 class _Machine:
-    """The policy with what a program in binary32 makes of its numbers; `reach` (n,) weighs the states for cuts."""
+    """The policy with its numbers in binary32; `reach` (n,) weighs the states for cuts."""
 
     layers: tuple[_Layer, ...]
     squash: bool
@@ -376,9 +376,9 @@ class _Machine:
 
 @dataclass(frozen=True, slots=True)
 class _Rows:
-    """Derivatives (m, k) of the output: `centre`, a real matrix in its balls, and what may be added to it.
+    """Derivatives (m, k) of the output: `centre`, a real matrix in its balls, and a deviation.
 
-    That is at most `spread` (m, k) entry by entry, and has at most the 2-norms `radius` (m,) row by row.
+    The deviation is at most `spread` (m, k) entry by entry, and its rows have at most the 2-norms `radius` (m,).
     """
 
     centre: flint.arb_mat
@@ -386,7 +386,7 @@ class _Rows:
     radius: Balls
 
     def on(self, errors: Balls) -> Balls:
-        """The most that errors (k,) come to at the output, (m,)."""
+        """A bound of the effect of errors (k,) at the output, (m,)."""
         length = _norm(errors)
         direct, added = _times(_magnitude(self.centre), errors), _times(self.spread, errors)
         return [(c + s.min(r * length)).upper() for c, s, r in zip(direct, added, self.radius, strict=True)]
@@ -449,7 +449,7 @@ def _growth(terms: int, chain: int | None) -> flint.arb:
 
 
 def _rounding(numbers: Array, what: str) -> Balls:
-    """|fl(v) - v| of binary64 numbers, fl rounding to the nearest binary32 number, which 0 may stand for if it is tiny.
+    """|fl(v) - v| of binary64 numbers, fl rounding to the nearest binary32 number, or to 0 if that is tiny.
 
     Raises
     ------
@@ -470,7 +470,7 @@ def _rounding(numbers: Array, what: str) -> Balls:
 
 
 def _require_finite(size: flint.arb, what: str) -> None:
-    """Refuse values that may overflow."""
+    """Reject values that may overflow."""
     if not size < ball(_LARGEST):
         raise InputError(
             f"{what} must stay below 2^127, or it may overflow in binary32; found up to {float(size.upper()):.3g} on "
@@ -479,12 +479,12 @@ def _require_finite(size: flint.arb, what: str) -> None:
 
 
 def _tanh(y: flint.arb) -> flint.arb:
-    """tanh of all of a ball: it rises, so that the ends have it; Arb's own is wide on wide balls."""
+    """tanh of a whole ball, from its ends, since tanh rises; Arb's own tanh is wide on wide balls."""
     return y.lower().tanh().union(y.upper().tanh())
 
 
 def _slope(t: flint.arb) -> flint.arb:
-    """1 - t^2, the slope of tanh where its value is t."""
+    """1 - t^2, the slope of tanh at the value t."""
     most, least = t.abs_upper(), t.abs_lower()
     return (1 - most * most).union(1 - least * least)
 

@@ -26,7 +26,7 @@ Array = NDArray[np.float64]
 
 
 def write_plain(path: str | Path, data: Mapping[str, Any], what: str) -> None:
-    """Write tensors, texts and numbers in one step; `what` is what messages call the file, such as "policy file".
+    """Write tensors, texts and numbers in one step; `what` names the file in messages, such as "policy file".
 
     Raises
     ------
@@ -142,7 +142,7 @@ def origin_in(data: Mapping[str, Any]) -> tuple[str, dict[str, Any], dict[str, A
 
 
 def require_keys(data: Mapping[Any, Any], wanted: set[str], optional: set[str]) -> None:
-    """Refuse a dictionary that lacks a key that is wanted, or has one that is neither wanted nor optional.
+    """Reject a dictionary with a missing or an unknown key.
 
     Raises
     ------

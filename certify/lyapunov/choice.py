@@ -28,7 +28,7 @@ BEYOND: tuple[Beyond, ...] = ("neural", "polynomial")
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """P (n, n), the candidate that it comes from, and a notice if that is not the one that was asked for."""
+    """P (n, n), its candidate, and a notice if that is not the requested one."""
 
     P: Array
     name: Named
@@ -51,7 +51,7 @@ def choose_candidate(
         whose sampled set is largest, or at `lyapunov` if Q is given, and enlarges it; it falls back to `lyapunov` with
         a notice.
     Q, R : diagonals, (n,) and (m,); None means ones.
-    seconds : after which `optimised` takes what it has.
+    seconds : time after which `optimised` returns its best P.
 
     Raises
     ------

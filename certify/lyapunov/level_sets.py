@@ -1,8 +1,8 @@
-"""The geometry of the sublevel set `{x'Px <= c}`, in bounds that are certain and one unit in the last place wide.
+"""The geometry of the sublevel set `{x'Px <= c}`, by certain bounds within one unit in the last place.
 
 P and c are binary64 numbers, so the inverse and the determinant are computed in exact rationals and only the last step
-is rounded, in a direction: floats lose twice as many digits as P's condition has, and not on the safe side. What
-contains the set is rounded up, what is claimed of it down. A matrix of 12 states takes a millisecond.
+is rounded, in a direction: floats lose twice as many digits as P's condition has, and not on the safe side. Sets that
+contain it are rounded up, its claimed sizes down. A matrix of 12 states takes a millisecond.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def are_inside(
 
 
 def semi_axes(P: Array, level: float) -> Array:
-    """`sqrt(c / P_ii)`: how far the set reaches along each coordinate axis, shape (n,).
+    """`sqrt(c / P_ii)`: the set's reach along each coordinate axis, shape (n,).
 
     Rounded down: the points at these distances on the axes lie in the set.
 
@@ -165,7 +165,7 @@ def _rational(value: float) -> flint.fmpq:
 
 
 def _exact(P: Array) -> flint.fmpq_mat:
-    """The symmetric part of P, of which x'Px is made, in rationals."""
+    """The symmetric part of P, which defines x'Px, in rationals."""
     n = len(P)
     if P.shape != (n, n) or not np.all(np.isfinite(P)):
         raise InputError("`P` must be a square matrix of finite numbers.")

@@ -1,7 +1,7 @@
 """Least squares with one-sided residuals: values between bounds, derivatives along the flow below bounds.
 
-A row that keeps its bound costs nothing, so that a fit can be exact where the shape is free, and every row that is
-found violated later can be added as it stands. Steps are those of Levenberg and Marquardt, damped by the diagonal
+A row within its bounds costs nothing, so that a fit can be exact where the shape is free, and rows that are found
+violated later can be added directly. Steps are those of Levenberg and Marquardt, damped by the diagonal
 (D. Marquardt, J. SIAM 11 (1963)), on the rows that are violated at the moment.
 """
 

@@ -1,7 +1,7 @@
-"""The closed loop for learning: rates in floats, at the nominal plant and at the corners of what is uncertain.
+"""The closed loop for learning: rates in floats, at the nominal plant and at the corners of the ranges.
 
-What a run reports is its fate, and integrals along its way. A run converges if it enters the inner ellipsoid; whoever
-has left the domain, or asked for an input out of bounds, is lost, because no set that a claim allows holds it.
+A run reports its fate and integrals along its path. It converges if it enters the inner ellipsoid; it is lost if it
+leaves the domain or its input leaves the bounds, because no set of a claim may contain such states.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ class Runs:
 
     Parameters
     ----------
-    fate : of each run, values of `Fate`, (B,).
-    length : of its way to the inner ellipsoid, in scaled states, (B,).
-    nearness : the largest nearness to the domain's faces on its way, from 0 (not near) to 1 (on one), (B,).
+    fate : each run's `Fate`, (B,).
+    length : length of its path to the inner ellipsoid, in scaled states, (B,).
+    nearness : the largest nearness to the domain's faces on its path, from 0 (not near) to 1 (on one), (B,).
     """
 
     fate: NDArray[np.int64]
@@ -63,7 +63,7 @@ class LearningFlow:
     Parameters
     ----------
     loop : in continuous time, its input following the state at once.
-    inner, c : of the ellipsoid.
+    inner, c : matrix and level of the ellipsoid.
     """
 
     def __init__(self, loop: ClosedLoop, inner: Quadratic, c: float) -> None:
@@ -106,7 +106,7 @@ class LearningFlow:
         return np.asarray(within)
 
     def directions(self, x: Array, scale: Array) -> Array:
-        """Unit vectors of the rates in z = x / scale at each corner of what is uncertain, (C, B, n)."""
+        """Unit vectors of the rates in z = x / scale at each corner of the ranges, (C, B, n)."""
         u = self.policy(x)
         rates = np.stack([np.asarray(self._general(x, u, values)) for values in self._corners]) / scale
         return np.asarray(rates / (np.linalg.norm(rates, axis=-1, keepdims=True) + 1e-12))

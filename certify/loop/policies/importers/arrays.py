@@ -1,6 +1,6 @@
-"""Numbers in a pickle that was read as data: the few shapes in which numpy and torch write arrays.
+"""Numbers in a pickle that was read as data: the few forms in which numpy and torch write arrays.
 
-Every size is compared with the bytes that are there before anything is made of it.
+Every size is compared with the available bytes before an array is made.
 """
 
 from __future__ import annotations

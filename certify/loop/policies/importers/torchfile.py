@@ -1,7 +1,7 @@
 """A file of torch.save or torch.jit.save: its pickle as data, and the tensors that its storages hold.
 
 torch's own `weights_only` refuses a checkpoint with a numpy random state beside the weights, and without it torch.load
-runs what the pickle says. Here nothing runs in either case: whatever is no tensor stays a name.
+runs the pickle's calls. Here nothing runs in either case: an object that is no tensor stays a name.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class TorchFile:
     Parameters
     ----------
     raw : the file.
-    what : how messages call it.
+    what : its name in messages.
     archive : the file as an archive, if it has been opened.
 
     Raises
