@@ -722,7 +722,7 @@ def test_ranges_that_cannot_be_used_exit_2(
     ("command", "words"),
     [
         (("reach", "--from", "p=1"), "a tube must be of exact equations"),
-        (("export-smt2",), "export-smt2 must have a plant of exact equations"),
+        (("export-smt2",), "export-smt2 needs a plant with exact equations"),
     ],
 )
 def test_a_disturbance_that_always_acts_is_refused_where_it_would_be_left_out(

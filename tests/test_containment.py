@@ -281,7 +281,7 @@ def test_the_command_in_words(disc: Path, capsys: pytest.CaptureFixture[str]) ->
     first, second = capsys.readouterr().out.splitlines()
     assert first == "CONTAINED  x0 = 1.4..2.6, x1 = 0: in {V <= c2}" and "x0 = 2, x1 = 0" in second
     assert _run(["contains", str(disc), "x0=1..3,x1=1"], False) == 1
-    assert capsys.readouterr().out.startswith("NOT CONTAINED  x0 = 1..3, x1 = 1: not in the set is (1, 1)")
+    assert capsys.readouterr().out.startswith("NOT CONTAINED  x0 = 1..3, x1 = 1: (1, 1) is not in the set")
     assert _run(["contains", str(disc), "x0=0.5", "--deviations"], False) == 0
     assert capsys.readouterr().out.startswith("CONTAINED  x0 = 2.5, x1 = 0")
 
@@ -412,7 +412,7 @@ def test_the_command_knows_it(by_formula: Path, capsys: pytest.CaptureFixture[st
     status, data = ask(capsys, "contains", by_formula, "x=0.9")
     assert (status, data["within"], data["outside"]) == (0, OUTER, None)
     assert _run(["contains", str(by_formula), "x=0..0.9,y=1"], False) == 1
-    assert capsys.readouterr().out == "NOT CONTAINED  x = 0..0.9, y = 1: not in the set is (0.9, 1)\n"
+    assert capsys.readouterr().out == "NOT CONTAINED  x = 0..0.9, y = 1: (0.9, 1) is not in the set\n"
 
 
 def test_a_state_on_the_boundary_is_decided_in_rationals(tmp_path: Path) -> None:

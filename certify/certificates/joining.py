@@ -54,10 +54,10 @@ def join_parts(raw: bytes, parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]
 
 
 def _stated(certificate: Certificate, raw: bytes) -> dict[str, Any]:
-    """What each part has to say of the file."""
+    """The facts about the file that each part must report."""
     evidence, claim, sample = certificate.evidence, certificate.claim, certificate.system.sample
     if not isinstance(evidence, PartitionTree):
-        raise BackendError("a certificate in parts must have leaves; this one is a solver's word. Check it as a whole.")
+        raise BackendError("a certificate in parts must have leaves; this one has a solver's answer. Check it whole.")
     leaves, levels = evidence.tree.count(LEAF), {name: float(level) for name, level in claim.levels.items()}
     ring = leaves if evidence.local is None or levels["local"] != levels["roa"] else 0
     outer = () if evidence.outer is None else (evidence.outer.tree, *evidence.outer.faces)
@@ -123,7 +123,7 @@ def _joined(stated: dict[str, Any], parts: list[dict[str, Any]]) -> dict[str, An
 
 
 def _require_all(parts: list[dict[str, Any]], total: int) -> None:
-    """That the parts have looked at leaf after leaf, whatever batches each of them was dealt."""
+    """Reject the parts unless together they examined every leaf exactly once."""
     spans = sorted([_count(first), _count(beyond)] for answer in parts for first, beyond in answer["spans"])
     reached = 0
     for first, beyond in spans:
@@ -136,7 +136,7 @@ def _require_all(parts: list[dict[str, Any]], total: int) -> None:
 
 
 def _elsewhere(answer: Mapping[str, Any]) -> dict[str, int]:
-    """What the rules have looked at that is no leaf."""
+    """Each rule's count without the leaves."""
     rules, by_leaf = answer["rules"], answer["by_leaf"]
     if not by_leaf.keys() <= rules.keys():
         raise ValueError(f"unknown rules {by_leaf.keys() - rules.keys()}")

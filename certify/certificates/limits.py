@@ -1,6 +1,6 @@
-"""What a certificate can hold, as the format's page says; a plant or policy beyond it is named before any work is done.
+"""The limits of the certificate format; a plant or policy beyond them is rejected before any work is done.
 
-The checkers have these limits so that no file can take their time or memory; a test compares the numbers.
+The checkers have the same limits, so that no file can exhaust their time or memory; a test compares the numbers.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def require_short(P: np.ndarray) -> None:
 
 
 def numbers_of_a_jet(k: int) -> int:
-    """What a third-order model in k variables holds, but for a few."""
+    """About how many numbers a third-order model in k variables holds."""
     return k**2 + k * (k + 1) * (k + 2) // 6
 
 

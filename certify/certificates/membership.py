@@ -1,10 +1,10 @@
-"""Whether states lie in the set that a certificate proves, decided in rationals and, where N is asked, in balls.
+"""Decide whether states lie in the set that a certificate proves: in rationals and, for N, in Arb balls.
 
-The set is {V <= c2}, and under a claim with a tube also the tube's start: ellipsoids, each of them
-convex. So a box of states lies in one of them exactly if its corners do, and the corners' values are rational numbers.
-Under a claim with an outer set {N <= n2} within the domain belongs to it too, which need not be convex: then a box is
-cut into pieces, until each of them lies in one of the sets or a state is found that lies in none.
-What is said here is about bytes that the checker has accepted; a file that it does not accept has no proved set.
+The proved set consists of {V <= c2} and, under a claim with a tube, the tube's start. These are ellipsoids and so
+convex: a box of states lies in one of them exactly if its corners do, and the corners' values are rational numbers.
+Under a claim with an outer set, {N <= n2} within the domain belongs to it too and need not be convex. Then a box is cut
+into pieces until each piece lies in one of the sets, or a state is found that lies in none.
+Answers are about bytes that the checker accepted; a file that it rejects has no proved set.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ _PIECES = 4096  # of a box, that are looked at
 
 
 class Containment(Answer):
-    """Whether all states of a box lie in a proved set.
+    """The answer to: do all states of a box lie in a proved set?
 
-    CONTAINED: all do. NOT_CONTAINED: a state of the box does not. UNDECIDED: neither was shown.
+    CONTAINED: all do. NOT_CONTAINED: some state does not. UNDECIDED: neither was shown.
     """
 
     CONTAINED = "contained"
@@ -66,18 +66,18 @@ class Ellipsoid:
         return tuple((lo - c, hi - c) for (lo, hi), c in zip(box, shift, strict=True))
 
     def holds(self, points: Iterable[Sequence[Fraction | float]]) -> list[bool]:
-        """Whether each of the states lies in it."""
+        """True for each state that lies in the ellipsoid."""
         return are_inside(self.P, self.level, points, self.centre)
 
     def covers(self, box: Box) -> bool:
-        """Whether a bound of (x - c)'P(x - c) shows that all of a box lies in it."""
+        """True if a bound of (x - c)'P(x - c) shows that the whole box lies in the ellipsoid."""
         return _largest(self.P, self.around(box)) <= Fraction(float(self.level))
 
 
 @dataclass(frozen=True, slots=True)
 class Located:
-    """Where a box lies: `within` names the set that contains it, or the sets that do so together, `outside` is a state
-    of it in none of them, (n,)."""
+    """The location of a box: `within` names the set that contains it, or the sets that do so together; `outside` is a
+    state of the box in none of them, (n,)."""
 
     answer: Containment
     within: str | None = None
@@ -101,10 +101,9 @@ class Region:
         return max((e for e in self.ellipsoids if not e.centre), key=lambda e: volume(e.P, e.level))
 
     def holds(self, states: Iterable[Sequence[Fraction | float]]) -> list[bool]:
-        """Whether each of the states, as deviations from x_eq, lies in the set; a float means its binary value.
+        """True for each state, as a deviation from x_eq, that lies in the set; a float means its binary value.
 
-        Where N is asked, whether that is shown: no state is let in by rounding, and one at which N is exactly n2 may
-        not be either.
+        Where N decides, True means shown: rounding admits no state, and one with N exactly n2 may stay undecided.
         """
         points = list(states)
         found = [e.holds(points) for e in self.ellipsoids]
@@ -115,18 +114,18 @@ class Region:
         return [known or next(beyond) for known in inside]
 
     def excludes(self, states: Iterable[Sequence[Fraction | float]]) -> list[bool]:
-        """Whether each of the states, as deviations from x_eq, is shown to lie outside of the set."""
+        """True for each state, as a deviation from x_eq, that is shown to lie outside the set."""
         points = list(states)
         found = [[not inside for inside in e.holds(points)] for e in self.ellipsoids]
         found += [] if self.outer is None else [self.outer.excludes(points)]
         return [all(each) for each in zip(*found, strict=True)]
 
     def locate(self, box: Box) -> Located:
-        """Whether a box of states, as deviations from x_eq, lies in the set.
+        """Decide whether a box of states, as deviations from x_eq, lies in the set.
 
-        With at most 16 states that have a width the corners decide, unless one ellipsoid has some of them and another
-        one the rest; beyond that a bound of x'Px on the box may show that it is contained, and a corner that it is not.
-        With an outer set that is asked of pieces of the box, at most 4,096.
+        If at most 16 intervals have a width, the corners decide, unless one ellipsoid holds some of them and another
+        the rest. With more, a bound of x'Px on the box may show that it is contained, and a corner that it is not.
+        With an outer set the question is put to pieces of the box, at most 4,096.
 
         Raises
         ------

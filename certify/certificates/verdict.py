@@ -1,8 +1,8 @@
-"""How an attempt to prove a claim ends: the verdict, and what stopped the level from being higher.
+"""The end of an attempt to prove a claim: the verdict, and the reason why the level is not higher.
 
-An answer is never a bool: a program that writes `if verdict:` has merged REFUTED with UNKNOWN, or worse, so
-`bool(verdict)` raises. It is equal to its name, and comparing it with text that names no answer of its kind raises too:
-a slip such as `verdict == "proved"` must not pass for "not proved", nor `verdict != "refuted"` for a proof.
+An answer is never a bool: `if verdict:` would merge REFUTED with UNKNOWN, so `bool(verdict)` raises. An answer equals
+its name. Comparing it with text that names no answer of its kind raises too: a slip such as `verdict == "proved"` must
+not pass for "not proved", nor `verdict != "refuted"` for a proof.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class Verdict(Answer):
 
 
 class Stop(Enum):
-    """What limits a level, or why there is none; the value is the message, and details may follow it."""
+    """The reason why a level is not higher, or why there is none; its value is the message, and details may follow."""
 
     REQUESTED = "requested"
     DOMAIN = "domain"

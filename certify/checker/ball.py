@@ -28,8 +28,8 @@ _MOST_PRODUCTS = 2**33  # in the sums over paths
 
 @dataclass(frozen=True)
 class Units:
-    """What each tanh of the network, q, leaves out of its jet: e_q(d), |e_q(d)| <= d'R_q d, R (N, k, k), which reaches
-    the inputs as sum_q L_jq e_q, L (m, N)."""
+    """The remainder of each tanh q of the network: e_q(d) with |e_q(d)| <= d'R_q d, R (N, k, k). It reaches the inputs
+    as sum_q L_jq e_q, L (m, N)."""
 
     L: Array
     R: Array
@@ -42,7 +42,7 @@ class Units:
 
 @dataclass(frozen=True)
 class Ball:
-    """What rules need on a ball, each computed when it is first asked for. J (n, n) is exact, `at` its place."""
+    """The models that rules need on a ball, each computed on first use. J (n, n) is exact, `at` its place."""
 
     case: Case
     J: Array
@@ -55,17 +55,17 @@ class Ball:
 
     @property
     def starts_at_u_eq(self) -> bool:
-        """Whether the inputs at d = 0 are u_eq: by form, or by rule `centring`."""
+        """True if the inputs at d = 0 are u_eq: by form, or by rule `centring`."""
         return self.motion is None and (self.case.c.policy.centre != "none" or not self.case.c.practical)
 
     @property
     def order(self) -> int:
-        """Of the series in time."""
+        """The order of the series in time."""
         return 1
 
     @property
     def count(self) -> int:
-        """How many numbers y there are: one for each quantity that is uncertain, one for the period if that is."""
+        """The number of variables y: one per uncertain quantity, and one for the period if it has a range."""
         lo, hi = self.case.c.sample or (0, 0)
         return len(self.case.c.ranges) + (lo < hi)
 
@@ -85,7 +85,7 @@ class Ball:
 
     @cached_property
     def outputs(self) -> Jet:
-        """What the network's last layer has, through tanh if it is squashed: a batch; the errors are its units'."""
+        """The last layer's values, squashed if the policy is: a batch of jets, whose errors belong to the units."""
         return enclose_on_ball(self.case.net, self.states)
 
     @cached_property
@@ -193,8 +193,7 @@ def too_large(net: Folded, operations: int, k: int) -> Failures:
 
 
 def enclose_on_ball(net: Folded, states: Sequence[Jet]) -> Jet:
-    """What the network's last layer has, through tanh if it is squashed, as a batch of jets; the states are these jets,
-    which have no Q, no K and no E.
+    """The last layer's values, squashed if the policy is, as a batch of jets; the states are jets without Q, K and E.
 
     Every layer's value is y(d) = y(0) + a.d + B A(d), where A_q is what a tanh of the layers before adds to its tangent
     at y_q(0), and B the product of weights and slopes with which that reaches y, so that errors cancel as they do in

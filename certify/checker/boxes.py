@@ -81,7 +81,7 @@ class Boxes:
         return [self.number(pair, self.n + self.m + j, batch) for j, pair in enumerate(self.c.ranges)]
 
     def constant(self, batch: int) -> Callable[[Fraction], Taylor]:
-        """Of rationals, the models."""
+        """The function that gives a rational's model."""
         return lambda q: constant(q, self.symbols, batch)
 
     def f(self, states: list[Taylor], held: list[Taylor]) -> list[Taylor]:

@@ -52,7 +52,7 @@ class Case:
 
     @property
     def covered(self) -> bool:
-        """Whether there is a local ball, so that nothing is asked of leaves inside {V < c1}."""
+        """True if there is a local ball, so that leaves inside {V < c1} need nothing."""
         return self.partition.local is not None
 
     @property

@@ -77,13 +77,13 @@ def are_usable(by: Multipliers, path: Path | None = None) -> bool:
 
 
 def are_finite(F: Sequence[Jet], units: Units) -> bool:
-    """Whether every component has a finite model, and what is summed in binary64 has finite sums of squares."""
+    """True if every component has a finite model, and the sums of squares in binary64 are finite."""
     parts = [part for f in F for part in (f.c, f.error, f.a, f.slack, f.Q, f.E, f.B, f.twist)]
     return all(np.all(np.isfinite(part)) for part in (*parts, norm(units.L.ravel(), 0), norm(units.R.ravel(), 0)))
 
 
 def shows(models: Models, P: fmpq_mat, R: fmpq_mat, by: Multipliers, path: Path | None = None) -> bool:
-    """Whether the inequality is shown for symmetric P and R (n, n), by these multipliers and those of the path."""
+    """True if these multipliers, with those of the path, show the inequality for symmetric P and R (n, n)."""
     decay, rest = sides(models, P, R, by, path)
     return is_definite(decay - rest)
 
@@ -98,8 +98,8 @@ def sides(
     beyond: fmpq = _NOTHING,
     level: Level | None = None,
 ) -> tuple[fmpq_mat, fmpq_mat]:
-    """What is negative to first order, with its sign changed, and the sum of all bounds of the rest, both symmetric:
-    over d at rest, (n, n), else over y = (1, d). `beyond` is Gamma, used where h > 0.
+    """The negated leading form, and the sum of all bounds of the rest, both symmetric: over d at rest, (n, n), else
+    over y = (1, d). `beyond` is Gamma, used where h > 0.
     """
     k, first = models.A.ncols(), int(bool(models.f))
     U = padded(models.J, 0, k - models.J.ncols())  # x as a function of y, or d
@@ -153,7 +153,7 @@ def sides(
 def doubts(
     models: Models, P: fmpq_mat, h: fmpq, beyond: fmpq, at_0: Sequence[fmpq], lengths: Sequence[fmpq], share: fmpq
 ) -> tuple[fmpq, fmpq]:
-    """What errors of f and slacks of a come to in the entry of 1, and in each entry of d.
+    """The contribution of f's errors and a's slacks to the entry of 1, and to each entry of d.
 
     `at_0` and `lengths` are the magnitudes of b_i's first entry, and of the rest of it. Twice a product of 1 and ||d||
     is at most share + ||d||^2 / share.

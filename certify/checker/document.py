@@ -112,8 +112,8 @@ class Contraction:
 
 @dataclass(frozen=True)
 class Path:
-    """Where a slab's ellipsoids have their centre at its end, the share of its ball that the motion takes, and the
-    multipliers of the tube's edge and of the motion."""
+    """The centre of a slab's ellipsoid at its end, the share of its ball that the motion takes, and the multipliers of
+    the tube's boundary and of the motion."""
 
     centre: Array
     share: float

@@ -118,7 +118,7 @@ def elementary(name: str, c: Any, error: Any, radius: Any) -> Expansion:
 
 
 def _moved(f: Four, error: Any, most: Four) -> Four:
-    """How far f is from its values at v0: its roundings, and the largest derivatives of the four times `error`."""
+    """The distance of f from its values at v0: its roundings, and `error` times the largest derivative of each."""
     e0, e1, e2, e3 = (up(EPS * np.abs(v) + error * each) for v, each in zip(f, most, strict=True))
     return e0, e1, e2, e3
 

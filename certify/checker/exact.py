@@ -39,11 +39,11 @@ def inverse(A: fmpq_mat) -> fmpq_mat | None:
 
 
 def is_definite(A: fmpq_mat) -> bool:
-    """Whether d'A d > 0 for every d but 0; False as well if A is too large to tell soon.
+    """True if d'A d > 0 for every d but 0; False as well if A is too large to decide quickly.
 
-    That is so if and only if every leading principal minor of the symmetric part is positive (Sylvester). Elimination
-    without fractions finds them one by one on the diagonal, and each division in it is exact (Bareiss); what it does
-    to a symmetric matrix is symmetric, so that the lower half is enough.
+    It holds exactly if every leading principal minor of the symmetric part is positive (Sylvester). Fraction-free
+    elimination leaves them on the diagonal one by one, and each of its divisions is exact (Bareiss). It keeps a
+    symmetric matrix symmetric, so that the lower half is enough.
     """
     n, (S, _) = A.nrows(), (A + A.transpose()).numer_denom()
     if n * max(v.height_bits() for v in S.entries()) > MAX_MATRIX_BITS:
@@ -61,7 +61,7 @@ def is_definite(A: fmpq_mat) -> bool:
 
 
 def contains_ball(J: fmpq_mat, P: fmpq_mat, level: Fraction) -> bool:
-    """Whether {x'Px <= level} lies in {J d : ||d|| <= 1}: J'PJ - level I is positive definite."""
+    """True if {x'Px <= level} lies in {J d : ||d|| <= 1}: J'PJ - level I is positive definite."""
     n, c = J.nrows(), fmpq(level.numerator, level.denominator)
     identity = fmpq_mat([[fmpq(int(i == j)) for j in range(n)] for i in range(n)])
     return is_definite(J.transpose() * P * J - c * identity)

@@ -80,7 +80,7 @@ class _Builder:
         return made
 
     def index(self, part: Part) -> int:
-        """Where a part stands on the tape."""
+        """The position of a part on the tape."""
         return self.push("const", part) if isinstance(part, Fraction) else part
 
     def push(self, *operation: Any) -> int:

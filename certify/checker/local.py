@@ -49,7 +49,7 @@ class Local(Ball):
 
     @property
     def at_rest(self) -> bool:
-        """Whether F vanishes at the origin, and so everything that is made of it."""
+        """True if F vanishes at the origin, and so everything that is built from it."""
         return not self.case.c.practical
 
     @cached_property
@@ -78,7 +78,7 @@ class Local(Ball):
         return [replace(x, error=up(x.error + far), slack=up(x.slack + along)) for x, far, along in moved]
 
     def settled(self, v: Jet) -> Jet:
-        """What is 0 at d = 0 in truth is known to be."""
+        """Set the value at d = 0 to exactly 0 at rest, where it is 0 in truth."""
         return replace(v, c=np.float64(0), error=0.0, c_y=0 * v.c_y) if self.at_rest else v
 
     @property
@@ -89,7 +89,7 @@ class Local(Ball):
 
     @cached_property
     def later(self) -> list[Jet]:
-        """What G has beyond x_1, over h: of this whatever is uncertain is known by its whole range alone."""
+        """The terms of G beyond x_1, divided by h; uncertain quantities enter them with their whole range alone."""
         if self.way is None or self.order == 1:
             return []
         start, during = self.shared(self.states), self.shared(self.during(self.way))

@@ -51,12 +51,12 @@ class Layers:
         return least
 
     def is_small(self, symbols: int) -> bool:
-        """Whether models in so many symbols are no more than there is room for."""
+        """True if the models in so many symbols fit in memory."""
         numbers: int = sum(len(W) * (W.shape[1] + symbols**2) for W in self.net.weights)
         return numbers <= _MOST_NUMBERS
 
     def models(self, states: Sequence[Taylor]) -> list[Taylor]:
-        """Of each layer; the last of them is N, in one row."""
+        """The models of each layer; the last is N, in one row."""
         found = [_stacked(states)]
         for k, (W, b) in enumerate(zip(self.net.weights, self.net.biases, strict=True)):
             found.append(_through(W, found[-1].function("tanh") if k else found[0], b))
@@ -83,7 +83,7 @@ class Formula:
         self.tape, self.values = tape, 2 * len(tape.operations)
 
     def is_small(self, symbols: int) -> bool:
-        """Whether models in so many symbols are no more than there is time for."""
+        """True if the models in so many symbols take acceptable time."""
         return len(self.tape.operations) * symbols**2 <= _MOST_VALUES
 
     def least(self, x: Array, error: Array) -> Array:
@@ -208,7 +208,7 @@ class Beyond(Boxes):
         )
 
     def is_outside(self, x: Array, error: Array) -> Array:
-        """Where some state certainly lies beyond an end of its domain."""
+        """True on each box that certainly lies outside the domain, along one of the states."""
         lo, hi = ends(x[:, 0], up(total(np.abs(x[:, 1:]), 1) + error))
         outside: Array = np.any((lo > self.largest) | (hi < self.least), axis=0)
         return outside
@@ -220,7 +220,7 @@ def _function(case: Case) -> Layers | Formula:
 
 
 def _batch(numbers: int) -> int:
-    """How many boxes are looked at together, each of which takes so many numbers."""
+    """The number of boxes per batch, each of which takes so many numbers."""
     return max(1, min(4096, _BATCH_NUMBERS // numbers))
 
 
@@ -236,7 +236,7 @@ def _below_level(function: Layers | Formula, x: Array, error: Array, level: floa
 
 
 def _numbers(like: Taylor) -> Callable[[Fraction], Taylor]:
-    """Of rationals, the models."""
+    """The function that gives a rational's model."""
     return lambda q: constant(q, len(like.g), len(like.c))
 
 

@@ -1,8 +1,8 @@
-"""Which leaves a process examines, and several processes at once.
+"""Divide the leaves among processes, and run several processes at once.
 
-Whether a leaf holds depends on no other leaf. So the batches of leaves can be dealt out like cards: everybody walks all
-of the certificate's batches in the order of the file, and examines those of his own part. A process that does not
-answer, or not about its own part, makes the whole examination fail, and says neither yes nor no.
+Each leaf is decided on its own. So the batches of leaves are dealt out like cards: every process walks all of the
+certificate's batches in the order of the file, and examines those of its own part. If a process does not answer, or
+answers about another part, the whole examination fails, with neither yes nor no.
 """
 
 from __future__ import annotations
@@ -21,8 +21,8 @@ Batch = tuple[int, Array, Array]  # the number of the first leaf, and their corn
 
 @dataclass
 class Part:
-    """Of all batches, counted from 0 through the whole examination, those whose number leaves `number - 1` when it is
-    divided by `of`."""
+    """A process's share of the batches: those whose number, counted from 0 through the whole examination, leaves
+    `number - 1` when divided by `of`."""
 
     number: int = 1
     of: int = 1
@@ -32,7 +32,7 @@ class Part:
     spans: list[list[int]] = field(default_factory=list)  # [first, beyond] of this part's, counted through them all
 
     def own(self, batches: Iterable[Batch]) -> Iterator[Batch]:
-        """Those of this part."""
+        """Yield the batches of this part."""
         for batch in batches:
             first, size = self.all_leaves, batch[1].shape[1]
             self.all_leaves += size
@@ -80,7 +80,7 @@ def in_processes(count: int, work: Callable[[int], Any]) -> list[Any]:
 
 
 def _answer(work: Callable[[int], Any], index: int, reading: int, writing: int) -> NoReturn:
-    """What the copy does."""
+    """Run in the copied process: work, and write the answer to the pipe."""
     status = 1
     try:
         os.close(reading)

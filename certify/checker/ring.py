@@ -26,8 +26,8 @@ _ATTEMPTS = 4  # at the a-priori enclosure
 
 @dataclass(frozen=True)
 class RingLeaves(Leaves):
-    """Those that may meet the ring and, where there is no ball, those inside of it as well, which no other rule covers
-    then: these hold where every component of F has a finite model, or a step does not lead out."""
+    """The leaves that may meet the ring and, if there is no ball, those inside of it too, which no other rule covers
+    then. An inside leaf holds if every component of F has a finite model, or if a step does not leave the set."""
 
     meet: Array  # which of them may meet the ring
     ends: Array  # (2, n, B): the state lies between these during a period; none if nothing is held
@@ -43,7 +43,7 @@ class Ring(Boxes):
 
     @property
     def batch(self) -> int:
-        """How many leaves are looked at together."""
+        """The number of leaves per batch."""
         width = max(max(layer.W.shape) for layer in self.net.layers)
         values = len(self.c.dynamics.operations) * (self.case.partition.order + 1)
         numbers = max(width * (self.symbols + 4), self.symbols * self.symbols * (values + 4))
@@ -79,7 +79,7 @@ class Ring(Boxes):
         return RingLeaves(self, first + met, "leaf ", mid, reach, bound, hold, meet, ends)
 
     def misses(self, lo: Array, hi: Array) -> tuple[Array, Array, Array]:
-        """Where the box certainly has V > c2 everywhere, where it certainly has V < c1, and where V >= c1."""
+        """True on boxes with certainly V > c2 everywhere; with certainly V < c1; with certainly V >= c1."""
         least, most = self.levels(lo, hi)
         return least > self.c.c2, most < self.c.c1, least >= self.c.c1
 
@@ -100,7 +100,7 @@ class Ring(Boxes):
         return G, self.hull(states, F)
 
     def way(self, states: list[Taylor], held: list[Taylor]) -> tuple[list[Taylor], list[Taylor]]:
-        """Where states may be during a period, and f of them; NaN where none of a few attempts to say so holds."""
+        """Enclose the states during a period, and f of them; NaN where none of a few attempts is an enclosure."""
         h, way = self.case.longest, np.zeros((self.n, len(held[0].c)))
         for attempt in range(1 + _ATTEMPTS):
             during = [replace(x, r=up(x.r + own)) for x, own in zip(states, way, strict=True)]
@@ -197,7 +197,7 @@ def decreases(leaves: RingLeaves) -> Failures:
 
 
 def _between(v: Taylor) -> Taylor:
-    """What has a symbol, as a number of which only the range is known."""
+    """Replace a model's symbols by its range."""
     return affine(v.c, np.zeros_like(v.g), up(v.linear + v.r))
 
 

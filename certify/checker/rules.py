@@ -141,7 +141,7 @@ RULES = (
 
 @dataclass
 class Tally:
-    """How much each rule has looked at, and the margins, which are floats for people."""
+    """Each rule's count, and the margins, which are floats for people."""
 
     rules: Counter[str] = field(default_factory=lambda: Counter(dict.fromkeys(RULES, 0) | READ))
     by_leaf: Counter[str] = field(default_factory=Counter)  # what of this was on the leaves of one part
@@ -162,7 +162,7 @@ class Tally:
                 raise Rejected(name, at, detail)
 
     def elsewhere(self) -> dict[str, int]:
-        """How much each rule has looked at that is no leaf."""
+        """Each rule's count without the leaves."""
         return {name: count - self.by_leaf.get(name, 0) for name, count in self.rules.items()}
 
 
@@ -227,7 +227,7 @@ def _examine(tally: Tally, case: Case) -> None:
 
 
 def _answer(tally: Tally, case: Case, index: int, jobs: int) -> dict[str, Any]:
-    """What one of the processes has to say: which part it was about, what it met there, and its refusal or tally."""
+    """The answer of one process: its part, and its refusal or tally."""
     part, refusal = case.part, None
     part.number, part.of = part.split(index, jobs)
     try:

@@ -1,4 +1,4 @@
-"""What a value of a document may be. Numbers arrive as hex floats, exact fractions or raw little-endian bytes; none
+"""Readers of a document's values. Numbers arrive as hex floats, exact fractions or raw little-endian bytes; none
 passes through decimal.
 """
 

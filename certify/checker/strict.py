@@ -1,6 +1,6 @@
-"""From bytes to plain JSON data. The limits keep the memory that a file can ask for below a gigabyte.
+"""Parse bytes into plain JSON data. The limits keep the memory that a file can demand below a gigabyte.
 
-Decimal numbers, NaN, infinities, long integers and duplicate keys are refused wherever they stand.
+Decimal numbers, NaN, infinities, long integers and duplicate keys are rejected everywhere.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ class Piece(Ball):
 
     @property
     def coefficients(self) -> tuple[fmpq_mat, fmpq_mat, fmpq_mat]:
-        """Of P(t)."""
+        """The coefficients of P(t)."""
         return exactly(self.start), exactly(self.slab.middle), exactly(self.slab.end)
 
     @property
@@ -47,7 +47,7 @@ class Piece(Ball):
 
     @property
     def centres(self) -> list[tuple[Fraction, Fraction]]:
-        """Those of the start and of the end, state by state; 0 at rest."""
+        """The centres at the slab's start and end, state by state; 0 without a path."""
         if self.centre is None or self.slab.path is None:
             return [(Fraction(0), Fraction(0))] * len(self.J)
         ends = zip(self.centre.tolist(), self.slab.path.centre.tolist(), strict=True)
@@ -62,7 +62,7 @@ class Piece(Ball):
 
     @property
     def velocity(self) -> list[fmpq]:
-        """Of the centre; empty at rest."""
+        """The centre's velocity; empty without a path."""
         if self.slab.path is None:
             return []
         moves = [(b - a) / Fraction(self.slab.duration) for a, b in self.centres]
@@ -94,8 +94,8 @@ def nodes_are_sound(case: Case) -> Failures:
 
 
 def lies_in(case: Case, P: fmpq_mat, centres: list[tuple[Fraction, Fraction]]) -> bool:
-    """Whether P is symmetric and positive definite, and the ellipsoids around both centres, and so those around all
-    centres between them, lie in the interior of the domain."""
+    """True if P is symmetric and positive definite, and the ellipsoids around both centres lie in the interior of the
+    domain; then those around all centres between them do, too."""
     inverse = inverse_diagonal(P)
     sides = zip(inverse, centres, case.c.domain, strict=True) if inverse else ()
     return bool(inverse) and all(
@@ -104,7 +104,7 @@ def lies_in(case: Case, P: fmpq_mat, centres: list[tuple[Fraction, Fraction]]) -
 
 
 def is_attracted(case: Case, P_N: fmpq_mat, centre: list[Fraction]) -> bool:
-    """Whether {(x - c)'P_N (x - c) <= 1} lies in {V <= c2}: by the triangle inequality for (x'Px)^(1/2)."""
+    """True if {(x - c)'P_N (x - c) <= 1} lies in {V <= c2}: by the triangle inequality for (x'Px)^(1/2)."""
     P, c2 = exactly(case.c.P), Fraction(case.c.c2)
     c = fmpq_mat(len(centre), 1, [fmpq(q.numerator, q.denominator) for q in centre])
     level = fmpq(c2.numerator, c2.denominator)

@@ -43,7 +43,7 @@ _SAMPLED_FROM_0 = {**_SAMPLED, "stays": "is there at all later times", "remains"
 
 
 def claim(c: Certificate) -> list[str]:
-    """What is claimed: of which trajectories, and with a sample or a rate what these add."""
+    """The claim in sentences: its trajectories, and the additions of a sample, a rate, an outer set."""
     when = _BY_STEPS if c.discrete else _AT_ONCE
     lines = []
     if c.sample is not None:
@@ -64,7 +64,7 @@ def claim(c: Certificate) -> list[str]:
 
 
 def _falls(c: Certificate) -> str:
-    """How fast V falls under a rate, and what that says of reaching c0, if there is one."""
+    """The bound of V under a rate, and the time to reach c0, if there is one."""
     if c.discrete:
         bound, latest = "V(x_k) <= V(x_0) exp(-2 lambda k) after k steps", "after {} steps, rounded up, at the latest"
     elif c.sample is None:
@@ -79,7 +79,7 @@ def _falls(c: Certificate) -> str:
 
 
 def _falling(c: Certificate) -> str:
-    """What the ring bounds from above."""
+    """The expression that rule `ring` bounds from above."""
     name = "Vdot" if not c.discrete and c.sample is None else "D"
     return f"({name} + 2 lambda V)" if c.rate else name
 
@@ -141,7 +141,7 @@ def _matrix(A: Array) -> str:
 
 
 def duration(c: Certificate) -> float:
-    """Of the tube, rounded up; infinite where no binary64 number is as large."""
+    """The tube's duration, rounded up; infinite if it exceeds all binary64 numbers."""
     slabs = c.evidence.tube if isinstance(c.evidence, Partition) else ()
     try:
         return math.nextafter(math.fsum(slab.duration for slab in slabs), math.inf)

@@ -18,20 +18,20 @@ _MOST_PARTS = 2**16
 def check(
     certificate: Annotated[Path, typer.Argument(help="Certificate file.")],
     policy: Annotated[
-        Path | None, typer.Option(help="Policy file that the certificate must be about (compares hashes).")
+        Path | None, typer.Option(help="Policy file that the certificate must be about (by its hash).")
     ] = None,
     reference: Annotated[
-        bool, typer.Option("--reference", help="Ask the second checker (fractions and balls): slower, shares no code.")
+        bool, typer.Option("--reference", help="Use the second checker (fractions, Arb balls): slower, shares no code.")
     ] = False,
     jobs: Annotated[int, typer.Option(min=1, max=256, help="Processes that examine the leaves.")] = 1,
     part: Annotated[
         str | None,
-        typer.Option(metavar="K/N", help="Of the leaves, examine part K of N only: status 4 if nothing is refused."),
+        typer.Option(metavar="K/N", help="Examine only part K of N of the leaves; status 4 if that part holds."),
     ] = None,
     cluster: Annotated[
         str | None,
         typer.Option(
-            help="Have the parts checked by the workers of a Dask cluster, which are trusted with that: local:N, or a "
+            help="Let the workers of a Dask cluster check the parts, and trust their answers: local:N, or a "
             "scheduler's address."
         ),
     ] = None,

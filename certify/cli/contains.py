@@ -22,16 +22,16 @@ def contains(
     states: Annotated[
         list[str],
         typer.Argument(
-            help="A state or a box, as in x=1.57 x_dot=-1..1, or with commas; a state that is not named is at rest."
+            help="A state or a box, as in x=1.57 x_dot=-1..1, or with commas; omitted states are at their x_eq."
         ),
     ],
     deviations: Annotated[
-        bool, typer.Option("--deviations", help="Numbers are deviations from the operating point, not states' values.")
+        bool, typer.Option("--deviations", help="Read the numbers as deviations from the operating point.")
     ] = False,
     patient: Patient = False,
     as_json: Json = False,
 ) -> None:
-    """Check a certificate and decide, exactly, whether a state or every state of a box lies in the proved set."""
+    """Check a certificate and decide exactly whether a state, or every state of a box, lies in the proved set."""
     from certify.certificates.membership import proved_set
 
     proved = proved_set(certificate, patient)
@@ -74,15 +74,13 @@ def text(found: Located, box: Box, system: System) -> str:
     elif found.outside is not None:
         corner = ", ".join(_number(v + q) for v, q in zip(found.outside, at, strict=True))
         said = f"NOT CONTAINED  {shown}" + (
-            "" if all(lo == hi for lo, hi in box) else f": not in the set is ({corner})"
+            "" if all(lo == hi for lo, hi in box) else f": ({corner}) is not in the set"
         )
     else:
-        said = f"UNDECIDED  {shown}: it was not shown to lie in the set, and no state of it to lie outside"
+        said = f"UNDECIDED  {shown}: neither shown to lie in the set, nor a state of it shown to lie outside"
     rest = ", ".join(f"{name} = {_number(q)}" for name, q in system.operating_point().items())
     return said + (
-        f"\n(values of the states; their operating point, which no rule of the checker knows, is {rest})"
-        if rest
-        else ""
+        f"\n(values of the states; their operating point {rest} is not part of what the checker checks)" if rest else ""
     )
 
 

@@ -1,8 +1,8 @@
-"""`certify doctor`: whether an installation works, and what is missing with the command that installs it.
+"""`certify doctor`: test an installation, and name missing packages with the command that installs each.
 
-It does the whole job once, on a loop whose region of attraction is known by hand: xdot = x/2 - tanh(x) attracts exactly
-|x| < 1.915. Both checkers must accept what is proved at |x| <= 1, and both must refuse the same file with |x| <= 2
-written into it: a checker that says yes to everything is no better than one that does not start.
+It runs one proof on a loop with a known region of attraction: xdot = x/2 - tanh(x) attracts exactly |x| < 1.915. Both
+checkers must accept the proof for |x| <= 1, and reject the same file with |x| <= 2 written into it: a checker that
+accepts everything is no better than one that does not start.
 """
 
 from __future__ import annotations
@@ -46,15 +46,15 @@ _CPU = "pip install torch, as PyTorch's installation page gives it for Pip and C
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that was looked at.
+    """One finding about the installation.
 
     Parameters
     ----------
-    part : what it is part of: core, optional, path, checkers or threads.
-    name : what it is.
+    part : its group: core, optional, path, checkers or threads.
+    name : its name.
     state : `fault` if the core does not work without it.
     found : what was found, such as a version.
-    advice : what to do; empty if nothing.
+    advice : the remedy; empty if none is needed.
     """
 
     part: str
@@ -65,7 +65,7 @@ class Finding:
 
 
 def doctor(as_json: Json = False) -> None:
-    """Look at the installation: versions, what is missing and how to install it, and whether both checkers work."""
+    """Test the installation: versions, missing packages with their install commands, and both checkers."""
     findings = [_python(), *_core(), *_optional(), *_path(), _threads()]
     # Without the core the job cannot even be tried.
     broken = any(f.state == "fault" for f in findings)
@@ -87,7 +87,7 @@ def _python() -> Finding:
 
 
 def _core() -> list[Finding]:
-    """Every package that certify needs, imported: an installed package may still not load."""
+    """Import every package that certify needs: an installed package may still not load."""
     return [_cvxpy() if name == "cvxpy" else _package(name, module) for name, module in _CORE.items()]
 
 
@@ -105,7 +105,7 @@ def _package(name: str, module: str) -> Finding:
 
 
 def _torch() -> Finding:
-    """What torch was built for: its build for CUDA is gigabytes, and nothing here needs it."""
+    """Report torch's build. The CUDA build takes gigabytes, and nothing here needs it."""
     import torch
 
     built = torch.version.cuda
@@ -162,7 +162,7 @@ def _optional() -> list[Finding]:
 
 
 def _path() -> list[Finding]:
-    """Which package this is, and whether a script in this folder would import another."""
+    """Report the installed package, and warn if a script in this folder would import another copy."""
     import certify
     from certify.analysis.installation import found_by_import, version_of
 

@@ -1,7 +1,7 @@
-"""How a command ends before it is done: by Ctrl-C, by SIGTERM, or because nobody reads any more what it says.
+"""Early ends of a command: Ctrl-C, SIGTERM, or a reader that closed the pipe.
 
-A reader that has gone (`certify roa … 2>&1 | head -2`) ends a command with the status that a shell reports for SIGPIPE.
-Click and rich end it with status 1 then, which among verdicts means REFUTED: so their exit is recognised here.
+A closed pipe (`certify roa … 2>&1 | head -2`) ends a command with the status that a shell reports for SIGPIPE. Click
+and rich would exit with status 1, which means REFUTED among the verdicts; this module catches their exit.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ CLOSED_PIPE = 141  # as a shell reports SIGPIPE
 
 
 class Interrupted(Exception):
-    """A command ends by Ctrl-C, and the message says what is kept of its work."""
+    """Ctrl-C ends a command; the message names the work that is kept."""
 
 
 def end_by_sigterm() -> None:
-    """Let SIGTERM end this process as Ctrl-C does: a batch system sends it when a job's time is over."""
+    """Let SIGTERM end this process like Ctrl-C: a batch system sends it when a job's time is over."""
     if threading.current_thread() is threading.main_thread() and signal.getsignal(signal.SIGTERM) is signal.SIG_DFL:
         signal.signal(signal.SIGTERM, _terminate)
 
@@ -32,12 +32,12 @@ def _terminate(number: int, frame: FrameType | None) -> None:
 
 
 def is_of_closed_pipe(stop: SystemExit) -> bool:
-    """True if click or rich has raised this exit because a reader has gone."""
+    """True if click or rich raised this exit because the pipe is closed."""
     return isinstance(stop.__context__, BrokenPipeError)
 
 
 def closed_pipe() -> int:
-    """Send what is left to say nowhere, where a reader has gone; the exit status, which is no verdict."""
+    """Discard further output of closed pipes; return the exit status, which is no verdict."""
     nowhere = os.open(os.devnull, os.O_WRONLY)
     poll = select.poll()
     for number in (1, 2):

@@ -42,8 +42,8 @@ def export_smt2(
     plant = plant_of(stored, system, changes, tell)
     if plant.ranges:
         raise InputError(
-            "export-smt2 must have a plant of exact equations, because formulas know no ranges; found ranges of "
-            f"{', '.join(plant.ranges)} in {plant.name}. Leave them out (of a disturbance in its file: half-width 0)."
+            "export-smt2 needs a plant with exact equations, since its formulas have no ranges; found ranges of "
+            f"{', '.join(plant.ranges)} in {plant.name}. Leave them out (for a disturbance in its file: half-width 0)."
         )
     if plant.in_steps:
         raise InputError(

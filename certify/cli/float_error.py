@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from certify.loop.plants import System
     from certify.loop.policies import Policy
 
-_SHOWN = 3  # of what a bound is made of
+_SHOWN = 3  # sources of a bound
 
 
 @takes(changes=changes_of_a_plant("parameters", "domain"))
@@ -30,20 +30,18 @@ def float_error(
     system: PlantName = None,
     changes: PlantChanges,
     tanh_ulp: Annotated[
-        float, typer.Option("--tanh-ulp", help="Accuracy of tanh, in units in the last place of its exact value.")
+        float, typer.Option("--tanh-ulp", help="Error of tanh, in units in the last place of its exact value.")
     ] = 4.0,
     chain: Annotated[
         int | None,
-        typer.Option(
-            help="The most additions that a product passes through in a sum; default: any order of summation."
-        ),
+        typer.Option(help="Most additions that a product passes through in a sum; default: any order of summation."),
     ] = None,
     boxes: Annotated[
-        int | None, typer.Option(help="Parts into which the domain is cut; default: as many as take seconds.")
+        int | None, typer.Option(help="Parts to cut the domain into; default: as many as take a few seconds.")
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Bound how far the policy computed in binary32 (float32) can be from the exact one, on the plant's domain."""
+    """Bound the difference between the policy computed in binary32 (float32) and the exact one on the domain."""
     from certify.loop.float32 import FloatOptions
     from certify.loop.float32 import float_error as bound
     from certify.loop.policies import load_policy
@@ -89,10 +87,10 @@ def _text(found: FloatError, stored: Policy, plant: System) -> str:
         shares = ", ".join(f"{source} {100 * error / total:.0f} %" for error, source in parts)
         unit = plant.units.get(u.name, "")
         said.append(f"  {u.name:<{width}}  {_above(bound)} {unit}".rstrip() + f"  (most of it: {shares})")
-    said.append("for every program of which this holds:")
+    said.append("for every program with these properties:")
     return "\n".join([*said, *(f"  - {line}" for line in found.assumptions)])
 
 
 def _above(value: float) -> str:
-    """Six digits in plain letters, rounded up: what is typed into another command is no smaller."""
+    """Six digits, rounded up: the number typed into another command is no smaller than the bound."""
     return f"{Context(prec=6, rounding=ROUND_CEILING).create_decimal(Decimal(value)):e}"

@@ -30,15 +30,15 @@ def import_(
     system: PlantName = None,
     changes: PlantChanges,
     lyapunov_out: Annotated[
-        Path | None, typer.Option(help="File to write the Lyapunov network to (.pt) that lies beside the policy.")
+        Path | None, typer.Option(help="File to write (.pt) for the Lyapunov network beside the policy in FILE.")
     ] = None,
     lyapunov_prefix: Annotated[
-        str | None, typer.Option(help="Keys of its layers up to their numbers; two-stage files say it themselves.")
+        str | None, typer.Option(help="Keys of its layers up to their numbers; two-stage files do not need it.")
     ] = None,
     as_json: Json = False,
     importing: ImportOptions,
 ) -> None:
-    """Turn a policy file of another program into one of this program; nothing in it is executed."""
+    """Convert another program's policy file into one of this program, without executing anything in it."""
     from certify.loop.policies import save_policy
     from certify.loop.policies.importers import import_policy
     from certify.lyapunov import import_lyapunov, save_lyapunov
@@ -61,14 +61,14 @@ def import_(
 
 
 def _lyapunov_lines(found: ImportedLyapunov) -> list[str]:
-    """What the import of a Lyapunov network found, for people."""
+    """The lines printed about an imported Lyapunov network."""
     from certify.lyapunov.file import FORMAT
 
     return [
         f"lyapunov {found.words}, as {FORMAT}: N(x) = net(x), {found.meaning}",
         *checked(found.difference, None, found.assumed, found.not_read),
         f"N(0)     {found.at_origin:.9g}",
-        "level    none: what the file's makers say of a level is not imported, and nothing is proved of N here",
+        "level    none: a level that the file's makers state is not imported, and nothing is proved about N here",
     ]
 
 

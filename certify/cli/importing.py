@@ -1,4 +1,4 @@
-"""Policy files of other programs on the command line: their options, declared once for all commands that take them."""
+"""Options for policy files of other programs, declared once for all commands that take them."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def import_options(kind_is: str = "--from") -> Bundle:
 
 @contextmanager
 def kind_called(option: str) -> Iterator[None]:
-    """Messages of what is done within, of importing alone, with the option for the kind of file called so."""
+    """Rename --from in error messages to the command's own option for the kind of file."""
     try:
         yield
     except InputError as error:

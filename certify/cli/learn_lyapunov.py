@@ -55,7 +55,7 @@ def learn_lyapunov(
     quiet: Quiet = False,
     importing: ImportOptions,
 ) -> None:
-    """Learn a function for a set beyond the ellipsoid, from simulated runs; `certify roa --lyapunov` proves one."""
+    """Learn a second function N from simulated runs, for a set beyond the ellipsoid that `roa --lyapunov` proves."""
     from certify.loop.closed_loop import ClosedLoop
     from certify.lyapunov import save_lyapunov, volume
     from certify.lyapunov.function import Quadratic
@@ -145,8 +145,8 @@ def _text(learned: Learned, area: float, out: Path, command: str) -> str:
     return "\n".join([
         f"ellipsoid  of the volume {area:.6g}, proved",
         f"learned    {words}, in {len(learned.history)} rounds, {last.seconds:.0f} s",
-        f"sampled    {{N <= {learned.level:.6g}}} with the ellipsoid holds {learned.cover:.1%} of what converges",
-        "           nothing is proved of N yet",
+        f"sampled    {{N <= {learned.level:.6g}}} and the ellipsoid hold {learned.cover:.1%} of the converging states",
+        "           nothing is proved about N yet",
         f"written    {out}",
         f"next       {command}",
     ])  # fmt: skip

@@ -1,4 +1,4 @@
-"""The command line `certify`: which commands there are, and exit statuses; their bodies are in `certify.cli`.
+"""The command line `certify`: its commands and exit statuses; one file per command in `certify.cli`.
 
 Standard output carries the result, or with `--json` exactly one JSON object; progress and diagnostics go to
 standard error. Exit status: 0 proved or accepted, 1 refuted or rejected, 2 usage or unusable input, 3 unknown
@@ -66,10 +66,10 @@ _STOPPED = "interrupted; nothing was left half-written."
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Entry point: turns every error into one sentence and the right exit status."""
+    """Entry point: turn every error into one sentence and the right exit status."""
     gc.set_threshold(100_000)  # most objects of a run are modules, which live to its end
-    # Threads that wait must not spin: on a busy machine spinning costs a factor of ten. OpenBLAS cannot be told so, and
-    # numpy's matrices are small here, also the checker's; the engine's threads are torch's.
+    # Waiting threads must not spin: on a busy machine spinning costs a factor of ten. OpenBLAS has no such setting, so
+    # it gets one thread; numpy's matrices are small here, also the checker's. The engine's threads are torch's.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     end_by_sigterm()
@@ -81,8 +81,8 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 def _leave(status: int) -> NoReturn:
-    """End the process as a command's end does, but do not take its thousands of modules apart one by one first: that
-    takes a tenth of a second, and the memory goes back with the process."""
+    """End the process without tearing down its thousands of modules one by one: that takes a tenth of a second, and
+    the memory goes back with the process."""
     atexit._run_exitfuncs()
     try:
         sys.stdout.flush()
@@ -95,7 +95,7 @@ def _leave(status: int) -> NoReturn:
 def _run(arguments: list[str], as_json: bool) -> int:
     try:
         return _ended(arguments, as_json)
-    except typer.Exit as stop:  # of a message that nobody reads
+    except typer.Exit as stop:  # a message met a closed pipe
         return stop.exit_code
     except BrokenPipeError:
         return closed_pipe()
@@ -106,11 +106,11 @@ def _run(arguments: list[str], as_json: bool) -> int:
 
 
 def _ended(arguments: list[str], as_json: bool) -> int:
-    """The exit status of a command that has run to its end, whatever that is."""
+    """Run a command and return its exit status, however it ends."""
     command = typer.main.get_command(app)
     try:
         status = command.main(arguments, prog_name="certify", standalone_mode=False)
-        if status == INTERRUPTED:  # what typer makes of Ctrl-C
+        if status == INTERRUPTED:  # typer's answer to Ctrl-C
             return _fail(as_json, _STOPPED, INTERRUPTED)
         return status if isinstance(status, int) else 0
     except typer.Exit as stop:
@@ -123,7 +123,7 @@ def _ended(arguments: list[str], as_json: bool) -> int:
         return _fail(as_json, _STOPPED, INTERRUPTED)
     except SoundnessError as error:
         return _fail(as_json, f"internal error: {error}", 70)
-    except BackendError as error:  # another program's: a checker, a solver, a scheduler
+    except BackendError as error:  # from another program: a checker, a solver, a scheduler
         return _fail(as_json, str(error), 70)
     except OptionError as error:
         commands: Mapping[str, Any] = getattr(command, "commands", {})

@@ -1,4 +1,4 @@
-"""`certify plant`: what a plant is, before anybody trains for it or proves anything about it."""
+"""`certify plant`: show a plant before anybody trains for it or proves anything about it."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def _disturbances(s: System) -> Table:
 
 
 def _ends(s: System, name: str) -> tuple[str, str]:
-    """The range of what is uncertain: nothing of an exact parameter; 0 is where a disturbance stays by itself."""
+    """The ends of a quantity's range; empty for an exact parameter, 0 for a disturbance without a range."""
     if name in s.ranges:
         lo, hi = s.ranges[name]
         return _number(lo), _number(hi)
@@ -172,7 +172,7 @@ def _unit(s: System, name: str) -> str:
 
 
 def _number(value: Fraction) -> str:
-    """The number in digits where that is exact, else the fraction too."""
+    """The number in digits, with the fraction too where the digits are not exact."""
     text = f"{float(value):.10g}"
     return text if Fraction(text) == value else f"{float(value):.6g} ({value})" if len(str(value)) <= 20 else text
 

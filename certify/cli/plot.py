@@ -19,7 +19,7 @@ def plot(
     pairs: Annotated[
         list[str] | None,
         typer.Option(
-            help="Two states to draw against each other, as in x,x_dot; repeatable; default: what belongs together."
+            help="Two states to draw against each other, as in x,x_dot; repeatable; default: chosen by the equations."
         ),
     ] = None,
     patient: Patient = False,
@@ -33,7 +33,7 @@ def plot(
 
     options = PaperOptions(columns, tuple(pairs or ()), out.suffix.removeprefix(".").lower())  # type: ignore[arg-type]
     raw = read_raw(certificate)
-    with tempfile.TemporaryDirectory() as folder:  # what is checked is what is drawn, whatever happens to the path
+    with tempfile.TemporaryDirectory() as folder:  # the bytes drawn are the bytes checked, whatever happens to the path
         private = Path(folder) / "certificate.json"
         private.write_bytes(raw)
         answer = run_checker(private, patient=patient)

@@ -20,15 +20,15 @@ def prove_in_coq(
     out: Annotated[Path, typer.Option(help="Folder for Coq's files: theory, claim, proof, and check.sh.")],
     rate: Annotated[
         str | None,
-        typer.Option(metavar="P/Q", help="Rate at which V must decay; default: a small one that costs little."),
+        typer.Option(metavar="P/Q", help="Rate at which V must fall; default: a small one that costs little."),
     ] = None,
     time_limit: Annotated[float, typer.Option(help="Seconds for the search and Coq together.")] = 600.0,
-    boxes: Annotated[int, typer.Option(min=1, help="Boxes of the partition, at most.")] = 20_000,
+    boxes: Annotated[int, typer.Option(min=1, help="Most boxes of the partition.")] = 20_000,
     no_run: Annotated[bool, typer.Option("--no-run", help="Only write Coq's files.")] = False,
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
-    """Prove the claim of a certificate again in the Coq proof assistant, which trusts none of this program."""
+    """Prove a certificate's claim again in the Coq proof assistant, which trusts nothing of this program."""
     from certify.certificates import read_raw
     from certify.certificates.coq.proving import CoqOptions, prove_in_coq
     from certify.loop.plants import exact
@@ -50,7 +50,7 @@ def _plain(result: CoqResult) -> dict[str, Any]:
 
 
 def _by_module(axioms: tuple[str, ...]) -> str:
-    """What the axioms are in words, and all of them, a line a module.
+    """Describe the axioms in words, then list them, one line per module.
 
     >>> print(_by_module(("PrimFloat.sub", "Classical_Prop.classic", "PrimFloat.add")))
     those of Coq's real numbers; the processor's floats and integers are as Coq's libraries say

@@ -25,7 +25,7 @@ def report(
 
     target = out if out is not None else certificate.parent / "report.html"
     raw = read_raw(certificate)
-    with tempfile.TemporaryDirectory() as folder:  # what is checked is what is drawn, whatever happens to the path
+    with tempfile.TemporaryDirectory() as folder:  # the bytes drawn are the bytes checked, whatever happens to the path
         private = Path(folder) / "certificate.json"
         private.write_bytes(raw)
         answer = run_checker(private, patient=patient)

@@ -1,4 +1,4 @@
-"""What several commands share: an option, a report on a certificate's bytes, a file written in one step."""
+"""Shared by several commands: an option, a report on a certificate's bytes, a file written in one step."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.", rich_help_panel=FIRST)]
 Patient = Annotated[
-    bool, typer.Option("--patient", help="Take a certificate whose check may need hours, which is refused else.")
+    bool, typer.Option("--patient", help="Accept a certificate whose check may take hours; by default it is refused.")
 ]
 PolicyFile = Annotated[
     Path | None,
@@ -45,11 +45,11 @@ Quiet = Annotated[
 
 
 def the_policy(context: typer.Context, file: Path | None, policy: Path | None) -> Path:
-    """The policy file, which is named as the argument or with --policy.
+    """The policy file, given as the argument or with --policy.
 
     Raises
     ------
-    InputError : it is named in neither way, or two files are.
+    InputError : none is given, or two different files.
     """
     if file is not None and policy is not None and file.resolve() != policy.resolve():
         raise InputError(f"one policy file must be named; found {file} and --policy {policy}. Leave one of them out.")
@@ -94,14 +94,14 @@ def given_words(
 
 
 def page_of(raw: bytes, path: Path, answer: dict[str, Any] | None, data: dict[str, Any] | None) -> str:
-    """The report on a certificate's bytes, with the checker's answer about them and what the run says, if there are."""
+    """The report on a certificate's bytes, with the checker's answer and the run's data where they exist."""
     from certify.report import drawn
 
     return drawn.page_of(raw, path, answer, data)
 
 
 def describe(s: System) -> dict[str, Any]:
-    """A plant as plain values; equations, operating point and domain are those of the states' values."""
+    """A plant as plain values; equations, operating point and domain are in the states' values, not deviations."""
     domain, x_eq, u_eq = s.domain_of_values(), s.exact_x_eq(), s.exact_u_eq()
     return {
         "name": s.name,

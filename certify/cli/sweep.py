@@ -16,11 +16,11 @@ if TYPE_CHECKING:
 
 
 def sweep(
-    study: Annotated[Path, typer.Argument(help="The study: a TOML file of what is crossed.")],
+    study: Annotated[Path, typer.Argument(help="The study: a TOML file with the values to cross.")],
     out: Annotated[
-        Path | None, typer.Option(help="Folder for table and certificates; default: out/STUDY. What is done is kept.")
+        Path | None, typer.Option(help="Folder for table and certificates; default: out/STUDY. Finished cases stay.")
     ] = None,
-    jobs: Annotated[int | None, typer.Option(help="Cases at a time, in processes of this machine; default: 1.")] = None,
+    jobs: Annotated[int | None, typer.Option(help="Cases at a time, as processes of this machine; default: 1.")] = None,
     cluster: Annotated[
         str | None,
         typer.Option(
@@ -30,7 +30,7 @@ def sweep(
     quiet: Quiet = False,
     as_json: Json = False,
 ) -> None:
-    """Certify every case of a study: policies, plants, parameters, candidates and options, crossed, into a table."""
+    """Certify every case of a study (policies, plants, parameters, candidates, options) and write a table."""
     from certify.analysis.studies import read_study, run_sweep
     from certify.provers.execution.tasks import place_for
 

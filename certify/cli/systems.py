@@ -40,7 +40,7 @@ def systems(as_json: Json = False) -> None:
 
 
 def _range(s: System, name: str) -> str:
-    """Of what is uncertain by the plant's own file."""
+    """The range that the plant's own file gives a quantity, in words; empty if it gives none."""
     if name not in s.ranges:
         return ""
     from certify.report.words import inside

@@ -1,4 +1,4 @@
-"""What the command line shows: results on standard output, everything else on standard error."""
+"""Terminal output: results on standard output, everything else on standard error."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def say(text: str) -> None:
-    """Print the result, and be sure that it has left: a reader that has gone must not look like a verdict."""
+    """Print the result and flush it: a closed pipe must not look like a verdict."""
     _put(sys.stdout, text + "\n")
 
 
@@ -41,7 +41,7 @@ def show(renderable: Any) -> None:
 
 
 def load_tables() -> None:
-    """Import what tables are printed with, while there is time to."""
+    """Import the modules that print tables, while there is time."""
     for module in ("rich.box", "rich.console", "rich.table", "rich.text"):
         import_module(module)
 
@@ -52,12 +52,12 @@ def tell(line: str) -> None:
 
 
 def ring_line(stage: str, state: Progress) -> str:
-    """Where a proof stands, in a line: of V, or beyond the ellipsoid of N."""
+    """The progress of a proof in one line: the level of V, or of N for the outer set."""
     left = "" if state.seconds_left is None else f", at most {max(state.seconds_left, 0):.0f} s left"
     letter, name = ("N", "beyond the ellipsoid") if stage == "outer" else ("V", state.name)
     proved = f"{letter} = {state.level:.4g}"
     aim = f"down to {proved}, the aim is" if state.down else f"to {proved} of"
-    share = math.floor(1000 * state.proved) / 10  # all is said of all alone
+    share = math.floor(1000 * state.proved) / 10  # 100 % only if all is proved
     return (
         f"{name}: proved {aim} {state.target:.4g} ({share:.1f} % of the volume), "
         f"{state.boxes} boxes, {state.open} open{left}"
@@ -75,7 +75,7 @@ _STAGES = {
 
 
 class ProgressLine:
-    """A line on standard error that moves, at most five times a second; where that is no terminal, a line every ten
+    """A progress line on standard error: rewritten at most five times a second on a terminal, else one line every ten
     seconds."""
 
     def __init__(self) -> None:
@@ -98,6 +98,6 @@ class ProgressLine:
             tell(line)
 
     def close(self) -> None:
-        """Wipe the line."""
+        """Erase the line."""
         if self.shown:
             _put(sys.stderr, "\r\x1b[K")

@@ -1,4 +1,4 @@
-"""`certify --version`: the version, and what a verdict rests on."""
+"""`certify --version`: the version, and the hashes of the programs that a verdict rests on."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def certify(
             "--version",
             is_eager=True,
             callback=_version,
-            help="The version, and the hashes of what a verdict rests on.",
+            help="Show the version, and the hashes of the programs that a verdict rests on.",
         ),
     ] = False,
 ) -> None:

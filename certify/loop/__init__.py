@@ -1,1 +1,1 @@
-"""The closed loop that a claim is about: plant, policy, and what they do together."""
+"""The closed loop of a claim: plant and policy together."""

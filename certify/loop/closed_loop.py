@@ -1,6 +1,6 @@
-"""The closed loop `xdot = F(x) = f(x, pi(x))` in floating point, and whether it rests at the origin, in rationals.
+"""The closed loop `xdot = F(x) = f(x, pi(x))` in floating point, and a test of its equilibrium in rationals.
 
-Verdicts rest on `certify.loop.rigorous` and on the checker; what is rounded here serves the search.
+Verdicts rest on `certify.loop.rigorous` and on the checker; the rounded numbers here serve the search.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ class ClosedLoop:
 
         Raises
         ------
-        InputError : one of the two fails, or is not decided in rationals (a function at another point than 0).
+        InputError : one of the two fails, or rationals cannot decide it (a function at another point than 0).
         """
         system = self.system
         at_zero = dict.fromkeys(system.states, Fraction(0)) | dict(zip(system.inputs, self.u_eq, strict=True))
@@ -92,7 +92,7 @@ class ClosedLoop:
 
         Raises
         ------
-        InputError : the plant has none at the origin, or it leaves binary64.
+        InputError : the plant has no Jacobian at the origin, or an entry is too large for binary64.
         """
         A_open, B = (in_floats(M) for M in self.plant_jacobians())
         if not (np.all(np.isfinite(A_open)) and np.all(np.isfinite(B))):
@@ -114,7 +114,7 @@ class ClosedLoop:
         """L (n, n) with `G = L x` to first order, G the mean rate of a step: A; A - I; (Phi(h) - I)/h, Phi the map of
         the linearised plant whose input is held over the step h.
 
-        With it whatever is linear is the same in continuous and discrete time: `I + h L` is the map of a step, and V
+        With L the linear formulas are the same in continuous and discrete time: `I + h L` is the map of a step, and V
         decreases if `L'P + P L + h L'P L < 0`.
         """
         A, B, K = self.linearise()

@@ -1,8 +1,8 @@
-"""Where a closed loop really rests when that is not the origin: enclosed by Krawczyk's test, with its eigenvalues.
+"""The closed loop's equilibrium when it is not the origin: enclosed by Krawczyk's test, with its eigenvalues.
 
-A policy that nobody centred has pi(0) near u_eq at best, and its loop rests beside the origin, if anywhere. Newton's
-method finds the point in floats, from the origin or from where a trajectory from there comes to; the test shows in Arb
-that exactly one point of rest lies in a box around it:
+An uncentred policy has pi(0) near u_eq at best, so its equilibrium lies beside the origin, if it has one. Newton's
+method finds the point in floats, from the origin or from the end of a trajectory that starts there. The test shows in
+Arb that exactly one equilibrium lies in a box around it:
 `K = x0 - Y F(x0) + (I - Y J)(X - x0)` lies inside X, J being mean slopes of F on X and Y about the inverse of one.
 """
 
@@ -33,14 +33,14 @@ _MOST_STEPS = 10_000  # of one: where F is no number, time stands still
 
 @dataclass(frozen=True, slots=True)
 class Rest:
-    """The only point of rest in a small box.
+    """The only equilibrium in a small box.
 
     Parameters
     ----------
     x, u : decimals with 12 digits that are certain up to the last, or 0 for less than 1e-18, (n,) and (m,); x is in
         deviations from the plant's operating point.
-    eigenvalues : of the Jacobian there, enclosed, in digits; empty if Arb cannot isolate them.
-    stable : whether all of them are certain to lie left of the axis.
+    eigenvalues : eigenvalues of the Jacobian there, enclosed, as text; empty if Arb cannot isolate them.
+    stable : True if all of them certainly lie left of the imaginary axis.
     """
 
     x: tuple[str, ...]
@@ -50,8 +50,8 @@ class Rest:
 
 
 def find_rest(loop: ClosedLoop) -> Rest | None:
-    """The point of rest that Newton's method reaches from the origin, or else from the end of a trajectory that starts
-    there, enclosed; None if there is none to be shown."""
+    """Enclose the equilibrium that Newton's method reaches from the origin, or else from the end of a trajectory that
+    starts there; None if none can be shown."""
     for begin in (_origin, _end):
         x0 = begin(loop)
         start = None if x0 is None else _newton(loop, x0)
@@ -61,12 +61,12 @@ def find_rest(loop: ClosedLoop) -> Rest | None:
 
 
 def seen_from(loop: ClosedLoop, rest: Rest) -> ClosedLoop:
-    """The same loop in deviations from where it rests, as near as 40 bits of the domain's widths come to it.
+    """The same loop in deviations from its equilibrium, rounded to 40 bits of the domain's widths.
 
     Raises
     ------
-    InputError : the policy is centred or seen from elsewhere already, or the point does not lie in the interior of the
-        domain.
+    InputError : the policy is centred or has an origin already, or the point does not lie in the interior of the
+    domain.
     """
     system, network = loop.system, loop.network
     if network.centre != "none" or network.is_moved:
@@ -80,7 +80,7 @@ def seen_from(loop: ClosedLoop, rest: Rest) -> ClosedLoop:
 
 
 def _short(q: Fraction, width: Fraction) -> Fraction:
-    """q to a multiple of 2^-40 times about a width."""
+    """Round q to a multiple of 2^-40 times about a width."""
     unit = Fraction(2) ** (width.numerator.bit_length() - width.denominator.bit_length() - _BITS)
     return round(q / unit) * unit
 
@@ -120,7 +120,7 @@ def _origin(loop: ClosedLoop) -> Array:
 
 
 def _end(loop: ClosedLoop) -> Array | None:
-    """Where the trajectory from the origin is after a while, however stiff the loop; None if it leaves the domain."""
+    """The end of the trajectory from the origin, by a stiff solver; None if it leaves the domain or takes too long."""
     import scipy.integrate
 
     F, (lo, hi) = _rates(loop), np.array([[float(a), float(b)] for a, b in loop.system.domain]).T
@@ -159,7 +159,7 @@ def _newton(loop: ClosedLoop, x: Array) -> Array | None:
 
 
 def _inverse(J: flint.arb_mat) -> flint.arb_mat | None:
-    """About the inverse, entries without radius."""
+    """An approximate inverse, with entries without radius."""
     middle = np.array([[float(J[i, j].mid()) for j in range(J.ncols())] for i in range(J.nrows())])
     if not np.all(np.isfinite(middle)):
         return None

@@ -1,20 +1,20 @@
-"""How far the policy that a robot computes in binary32 can be from pi, which a certificate is about: a proven bound.
+"""A proven bound on the difference between a certificate's policy pi and its evaluation in binary32.
 
-A certificate speaks of the real function pi. A robot computes it with rounded numbers, in an order that its compiler
-or its library chooses. Nothing of that is looked at here but a model of it (Higham, Accuracy and Stability of Numerical
-Algorithms, sections 2.2 and 3.1): each operation has a relative error of 2^-24 at most, and a product in a sum passes
-through no more additions than the sum has, whatever the order. What an operation adds anew is then carried to the
-output by the mean value theorem, through the slopes that tanh has on a box of states and the errors around it.
+A certificate is about the real function pi. A robot computes it with rounded numbers, in an order that its compiler or
+library chooses. The bound rests on the usual model of that (Higham, Accuracy and Stability of Numerical Algorithms,
+sections 2.2 and 3.1): each operation has a relative error of at most 2^-24, and a product in a sum passes through no
+more additions than the sum has, in any order. The mean value theorem carries each new error to the output, through the
+slopes of tanh on a box of states and the errors around it.
 
 With ranges and slopes known on a box, let the computed values be y^_k before and h^_k behind the tanh of layer k. Then
 
     net^(x) - net(x) = sum_k J_k (y^_k - W_k h^_(k-1) - b_k)
                      + sum_k J_(k+1) W_(k+1) (h^_k - tanh(y^_k)) + J_1 W_1 (x^ - x)
 
-row by row, with J_k the derivative of net by y_k at points between values that are computed and ones that are exact
-from there on. All of these lie within E_k of y_k(x), E_k the error that layers up to k can make. The rows of J_k are
-held as a centre and what may be added to it, in two ways that are both good: entry by entry, and as a 2-norm, which in
-wide networks is far less than what entries add up to. All of it is done in Arb balls: no bound is itself rounded.
+row by row. J_k is the derivative of net by y_k at points between the computed values and those that are exact from
+layer k on. All of these lie within E_k of y_k(x), where E_k bounds the error of the layers up to k. Each row of J_k is
+stored as a centre and a deviation, and the deviation is bounded twice: entry by entry, and in the 2-norm, which in
+wide networks is far less than the entries add up to. All arithmetic is in Arb balls, so rounding breaks no bound.
 """
 
 from __future__ import annotations
@@ -51,13 +51,13 @@ _SQUARINGS = 4  # of W'W, in the bound of its largest eigenvalue
 
 @dataclass(frozen=True, slots=True)
 class FloatOptions:
-    """What is assumed of the arithmetic, and how much is spent on the bound.
+    """Assumptions about the arithmetic, and the effort spent on the bound.
 
     Parameters
     ----------
     tanh_ulp : accuracy of tanh, in units in the last place of binary32 of the exact value.
     chain : the most additions that one product passes through in a sum; None allows any order.
-    boxes : into how many parts the domain is cut; more of them give a smaller bound. None is as many as take seconds,
+    boxes : number of parts that the domain is cut into; more parts give a smaller bound. None takes a few seconds:
         256 for a network of 4000 weights or less and one from a million on.
 
     Raises
@@ -80,7 +80,7 @@ class FloatOptions:
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """What one source adds to the bound of each input, (m,), in the inputs' units."""
+    """One source's contribution to the bound of each input, (m,), in the inputs' units."""
 
     source: str
     errors: tuple[float, ...]
@@ -92,10 +92,10 @@ class FloatError:
 
     Parameters
     ----------
-    bounds : one an input, (m,), in its unit, rounded up.
-    parts : what they are made of, each where the bound of that input is largest; a clip adds none.
-    assumptions : what has to hold of the program that runs, in words.
-    boxes : into how many parts the domain was cut.
+    bounds : one per input, (m,), in its unit, rounded up.
+    parts : the contributions, each where the bound of that input is largest; a clip adds none.
+    assumptions : the required properties of the robot's program, in words.
+    boxes : number of parts that the domain was cut into.
     """
 
     bounds: tuple[float, ...]
@@ -105,13 +105,13 @@ class FloatError:
 
 
 def float_error(network: TanhNetwork, system: System, options: FloatOptions | None = None) -> FloatError:
-    """Bound what computing the policy in binary32 changes in each input, for every state of the plant's domain.
+    """Bound the error of each input when the policy is computed in binary32, for every state of the plant's domain.
 
     Parameters
     ----------
     network : the policy; its binary64 numbers are rounded to binary32, which is part of the error.
     system : the plant, whose domain holds the states, as deviations from x_eq.
-    options : what is assumed of the arithmetic; by default any order of summation and a tanh good to 4 units.
+    options : assumptions about the arithmetic; by default any order of summation and a tanh good to 4 units.
 
     Raises
     ------
@@ -120,8 +120,8 @@ def float_error(network: TanhNetwork, system: System, options: FloatOptions | No
 
     Notes
     -----
-    The bound is of single evaluations of pi. It says nothing of what a robot's sensors, its actuators and the time
-    between two evaluations change.
+    The bound is about single evaluations of pi. It does not cover a robot's sensors, its actuators, or the time
+    between two evaluations.
 
     Source: Higham, Accuracy and Stability of Numerical Algorithms, 2nd edition, lemma 3.1 and section 3.1.
 
@@ -152,7 +152,7 @@ def float_error(network: TanhNetwork, system: System, options: FloatOptions | No
 
 
 def _refined(machine: _Machine, domain: Box, boxes: int | None) -> list[_Errors]:
-    """The errors on the parts of the domain, which is cut always where the bound is largest."""
+    """The errors on the parts of the domain; the next cut is always where the bound is largest."""
     whole, ties = machine.errors(domain), itertools.count()
     if boxes is None:
         boxes = max(1, min(_MOST_BOXES, _MOST_WEIGHTS // machine.weights))
@@ -194,10 +194,10 @@ class _Errors:
 
 @dataclass(frozen=True, slots=True)
 class _Layer:
-    """A layer's numbers, exact, and what they lose in binary32.
+    """A layer's numbers, exact, and their errors in binary32.
 
     `weight`, `magnitude` (out, in); `bias` (out,) with what centring adds; `bias_size` bounds the magnitudes of the
-    terms that a program may keep it in. `growth` is what sums lose relative to their terms' magnitudes. `norm` bounds
+    terms that a program may keep it in. `growth` is sums' error relative to their terms' magnitudes. `norm` bounds
     ||weight||_2, `columns` (in,) the norms of its columns.
     """
 
@@ -215,8 +215,8 @@ class _Layer:
 
 @dataclass(frozen=True, slots=True)
 class _Step:
-    """What a layer adds on a box: errors of its numbers and sums before the tanh, (out,), and behind it its tanh's,
-    with the slopes through which errors pass; both None without a tanh."""
+    """A layer's own errors on a box: of its numbers and sums before the tanh, (out,), and of the tanh itself, with the
+    slopes through which errors pass; both None without a tanh."""
 
     numbers: Balls
     sums: Balls
@@ -226,7 +226,7 @@ class _Step:
 
 @dataclass(frozen=True, slots=True)
 class _Machine:
-    """The policy with what a program in binary32 makes of its numbers; `reach` (n,) weighs the states for cuts."""
+    """The policy with its numbers in binary32; `reach` (n,) weighs the states for cuts."""
 
     layers: tuple[_Layer, ...]
     squash: bool
@@ -356,7 +356,7 @@ class _Machine:
         return found
 
     def _backward(self, steps: Sequence[_Step], entering: Balls, output: Balls) -> _Errors:
-        """What the errors of each step come to at the output."""
+        """Carry the errors of each step to the output."""
         m, found = self.m, dict[str, Balls]()
         rows = _Rows(
             flint.arb_mat([[self.scale[j] if i == j else 0 for j in range(m)] for i in range(m)]),
@@ -376,9 +376,9 @@ class _Machine:
 
 @dataclass(frozen=True, slots=True)
 class _Rows:
-    """Derivatives (m, k) of the output: `centre`, a real matrix in its balls, and what may be added to it.
+    """Derivatives (m, k) of the output: `centre`, a real matrix in its balls, and a deviation.
 
-    That is at most `spread` (m, k) entry by entry, and has at most the 2-norms `radius` (m,) row by row.
+    The deviation is at most `spread` (m, k) entry by entry, and its rows have at most the 2-norms `radius` (m,).
     """
 
     centre: flint.arb_mat
@@ -386,7 +386,7 @@ class _Rows:
     radius: Balls
 
     def on(self, errors: Balls) -> Balls:
-        """The most that errors (k,) come to at the output, (m,)."""
+        """A bound of the effect of errors (k,) at the output, (m,)."""
         length = _norm(errors)
         direct, added = _times(_magnitude(self.centre), errors), _times(self.spread, errors)
         return [(c + s.min(r * length)).upper() for c, s, r in zip(direct, added, self.radius, strict=True)]
@@ -449,7 +449,7 @@ def _growth(terms: int, chain: int | None) -> flint.arb:
 
 
 def _rounding(numbers: Array, what: str) -> Balls:
-    """|fl(v) - v| of binary64 numbers, fl rounding to the nearest binary32 number, which 0 may stand for if it is tiny.
+    """|fl(v) - v| of binary64 numbers, fl rounding to the nearest binary32 number, or to 0 if that is tiny.
 
     Raises
     ------
@@ -470,7 +470,7 @@ def _rounding(numbers: Array, what: str) -> Balls:
 
 
 def _require_finite(size: flint.arb, what: str) -> None:
-    """Refuse values that may overflow."""
+    """Reject values that may overflow."""
     if not size < ball(_LARGEST):
         raise InputError(
             f"{what} must stay below 2^127, or it may overflow in binary32; found up to {float(size.upper()):.3g} on "
@@ -479,12 +479,12 @@ def _require_finite(size: flint.arb, what: str) -> None:
 
 
 def _tanh(y: flint.arb) -> flint.arb:
-    """tanh of all of a ball: it rises, so that the ends have it; Arb's own is wide on wide balls."""
+    """tanh of a whole ball, from its ends, since tanh rises; Arb's own tanh is wide on wide balls."""
     return y.lower().tanh().union(y.upper().tanh())
 
 
 def _slope(t: flint.arb) -> flint.arb:
-    """1 - t^2, the slope of tanh where its value is t."""
+    """1 - t^2, the slope of tanh at the value t."""
     most, least = t.abs_upper(), t.abs_lower()
     return (1 - most * most).union(1 - least * least)
 
@@ -525,7 +525,7 @@ def _points(numbers: Array) -> Balls:
 
 
 def _assumptions(network: TanhNetwork, options: FloatOptions) -> tuple[str, ...]:
-    """What has to hold of the program that runs, in words."""
+    """The assumptions about the robot's program, in words."""
     centring = {
         "none": "",
         "output": "; u_eq - scale * squash(net(0)) takes the place of the offset, right to one unit in its last place",

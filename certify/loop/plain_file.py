@@ -1,8 +1,7 @@
-"""What files of this program share: plain tensors, the plant that they belong to, and how they were made.
+"""The format that this program's files share: plain tensors, their plant, and how they were made.
 
-Nothing in a file is executed (`weights_only=True`), and equal contents give equal bytes: the archive is written through
-memory, so that neither a file name nor a clock enters it. Numbers are float32 where that loses nothing, which is a
-smaller file of the same numbers.
+Nothing in a file is executed (`weights_only=True`). Equal contents give equal bytes: the archive is written through
+memory, so that neither a file name nor a clock enters it. Numbers are stored as float32 where that loses nothing.
 """
 
 from __future__ import annotations
@@ -27,7 +26,7 @@ Array = NDArray[np.float64]
 
 
 def write_plain(path: str | Path, data: Mapping[str, Any], what: str) -> None:
-    """Write tensors, texts and numbers in one step; `what` is what messages call the file, such as "policy file".
+    """Write tensors, texts and numbers in one step; `what` names the file in messages, such as "policy file".
 
     Raises
     ------
@@ -47,7 +46,7 @@ def write_plain(path: str | Path, data: Mapping[str, Any], what: str) -> None:
 
 
 def read_plain(path: str | Path, what: str) -> Any:
-    """What a file holds, with nothing in it executed.
+    """Read a file's contents without executing anything in it.
 
     Raises
     ------
@@ -143,7 +142,7 @@ def origin_in(data: Mapping[str, Any]) -> tuple[str, dict[str, Any], dict[str, A
 
 
 def require_keys(data: Mapping[Any, Any], wanted: set[str], optional: set[str]) -> None:
-    """Refuse a dictionary that lacks a key that is wanted, or has one that is neither wanted nor optional.
+    """Reject a dictionary with a missing or an unknown key.
 
     Raises
     ------

@@ -1,7 +1,7 @@
-"""The closed loop at single points in Arb balls: what REFUTED rests on, and the eigenvalues at the origin.
+"""The closed loop at single points in Arb balls, for REFUTED, and the eigenvalues at the origin.
 
-A comparison of balls is True only if it is certain, so `not (a < b)` proves nothing; whatever is not certain here
-counts as not shown.
+A comparison of balls is True only if it is certain, so `not (a < b)` proves nothing; an uncertain result counts as not
+shown.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def evaluate_vdot(loop: ClosedLoop, P: Array, x: Array) -> flint.arb:
 def evaluate_increment(
     loop: ClosedLoop, P: Array, x: Array, period: Fraction | None = None, rate: float = 0.0
 ) -> flint.arb:
-    """`D + 2 lambda V` at a binary64 point (n,), as an Arb ball, D being V's increment over a step, by time.
+    """`D + 2 lambda V` at a binary64 point (n,), as an Arb ball; D is V's increment over a step, per unit of time.
 
     That is `Vdot = 2 x'P F(x)`; in discrete time V(F(x)) - V(x); with a `period` h over which the input is held
     (V(phi(h)) - V(x))/h, or Vdot where h = 0. No number where no solution is enclosed.
@@ -181,7 +181,7 @@ def in_digits(eigenvalue: flint.acb) -> str:
 
 
 def instability(loop: ClosedLoop, eigenvalue: flint.acb) -> flint.arb:
-    """What is negative of each of `eigenvalues` where they show stability: the real part, or with steps |v| - 1."""
+    """A number that is negative for a stable eigenvalue: its real part, or |v| - 1 for a loop in steps."""
     with precision():
         return eigenvalue.real if loop.step == 0 else abs(eigenvalue) - 1
 
@@ -189,8 +189,8 @@ def instability(loop: ClosedLoop, eigenvalue: flint.acb) -> flint.arb:
 def policy_on(loop: ClosedLoop, x: Balls) -> tuple[Balls, flint.arb_mat]:
     """pi and its Jacobian (m, n) on balls x.
 
-    Where it is not certain on which side of a bound of the clip its argument lies, the slope is the ball of all slopes
-    between 0 and 1: good for mean values, and for nothing else.
+    If the clip may or may not act, the slope is the ball of all slopes between 0 and 1: valid only for mean
+    values.
     """
     network, y = loop.network, _read(loop.network, x)
     J = flint.arb_mat([[int(i == j) for j in range(network.n)] for i in range(network.n)])
@@ -260,9 +260,9 @@ def held_at_origin(loop: ClosedLoop, period: Fraction) -> tuple[flint.arb_mat, f
 
 
 def is_definite(M: flint.arb_mat) -> bool:
-    """Whether a symmetric matrix, of which the lower triangle is read, is certainly positive definite.
+    """True if a symmetric matrix, given by its lower triangle, is certainly positive definite.
 
-    Its pivots are: they lie in those of the balls, and a pivot that is not certainly positive shows nothing.
+    The true pivots lie in the balls' pivots. A pivot that is not certainly positive shows nothing.
     """
     rows = [[M[i, j] for j in range(i + 1)] for i in range(M.nrows())]
     for k, top in enumerate(rows):
@@ -288,7 +288,7 @@ def _held_map(loop: ClosedLoop, period: Fraction) -> flint.arb_mat:
 
 
 def _unclipped(loop: ClosedLoop) -> bool:
-    """Whether every input at the origin, before the clip, lies certainly and strictly inside it."""
+    """True if every input at the origin, before the clip, certainly lies strictly inside the clip's interval."""
     network = loop.network
     if network.clip is None:
         return True
@@ -323,7 +323,7 @@ def _net(network: TanhNetwork, x: Balls) -> Balls:
 
 
 def _read(network: TanhNetwork, x: Balls) -> Balls:
-    """What the layers read at a state."""
+    """The layers' inputs at a state."""
     return [v + at for v, at in zip(x, points(network.origin), strict=True)] if network.is_moved else list(x)
 
 
@@ -347,7 +347,7 @@ def _through_tanh(y: Balls, J: flint.arb_mat) -> tuple[Balls, flint.arb_mat]:
 
 
 def matrix(W: Array) -> flint.arb_mat:
-    """A binary64 matrix as it is."""
+    """A binary64 matrix as a matrix of exact balls."""
     return _balls_of(np.asarray(W, dtype=np.float64).tobytes(), W.shape)
 
 
@@ -357,5 +357,5 @@ def _balls_of(raw: bytes, shape: tuple[int, ...]) -> flint.arb_mat:
 
 
 def points(x: Array) -> Balls:
-    """Binary64 numbers as they are."""
+    """Binary64 numbers as exact balls."""
     return [flint.arb(float(v)) for v in x]

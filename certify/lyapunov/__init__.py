@@ -1,4 +1,4 @@
-"""Lyapunov functions, quadratic, neural and polynomial; of quadratic ones candidates, coordinates, level sets."""
+"""Lyapunov functions: quadratic, neural, polynomial; candidates, coordinates and sublevel sets of quadratic ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Candidates for P. They need not be exact: whatever binary64 matrix comes out is the one that is proved."""
+"""Candidates for P. They need not be exact: the proof is about the resulting binary64 matrix."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def solve_lyapunov(A: Array, Q: Array, step: float = 0.0, decay: float = 0.0) ->
 
 
 def slowest_decay(A: Array, step: float = 0.0) -> float:
-    """The largest alpha for which a V falls by 2 alpha V, by time: of `solve_lyapunov`, in 1/time.
+    """The largest alpha of `solve_lyapunov`, in 1/time: some V falls by 2 alpha V per unit of time.
 
     >>> round(slowest_decay(np.array([[-2.0]])), 12), round(slowest_decay(np.array([[-0.5]]), 1.0), 12)
     (2.0, 0.375)

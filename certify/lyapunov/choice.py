@@ -1,4 +1,4 @@
-"""Which P is tried: the candidates by name, and what happens when the optimised one is not to be had."""
+"""Choose P: the candidates by name, and the fallback when the optimised one is unavailable."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ BEYOND: tuple[Beyond, ...] = ("neural", "polynomial")
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
-    """P (n, n), the candidate that it comes from, and a notice if that is not the one that was asked for."""
+    """P (n, n), its candidate, and a notice if that is not the requested one."""
 
     P: Array
     name: Named

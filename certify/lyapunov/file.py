@@ -1,8 +1,7 @@
 """The Lyapunov function file `certify-lyapunov/1`: a neural or a polynomial function, as plain tensors only.
 
-Nothing in a file is executed, and equal functions give equal bytes (see `certify.loop.plain_file`); a polynomial's
-terms are written in the order of their exponents, because their order is no part of the function. A level is no part
-of the file: which level holds is what a certificate says.
+Nothing in a file is executed, and equal functions give equal bytes (see `certify.loop.plain_file`): a polynomial's
+terms are written in the order of their exponents. The file has no level: a certificate states the level that holds.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ class StoredLyapunov:
     function : neural or polynomial, of deviations from the plant's operating point, in the plant's order of states.
     system : name of the plant.
     parameters : parameters of the plant as text or numbers (text means its decimal value).
-    training : how it was made; never trusted, may be empty.
+    training : the record of its making; never trusted, may be empty.
 
     Raises
     ------

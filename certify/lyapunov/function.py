@@ -1,7 +1,7 @@
-"""Lyapunov functions as values: what claims and engines ask of one, and the quadratic one.
+"""The interface of Lyapunov functions for claims and engines, and the quadratic one.
 
-Here stand the numbers and their evaluation in floats, for search and simulation. That a function decreases along
-trajectories is shown by bounds of its own on boxes, never by these evaluations.
+This module has the numbers and their evaluation in floats, for search and simulation. Bounds on boxes prove that a
+function decreases along trajectories; these evaluations never do.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 
 class LyapunovFunction(Protocol):
-    """A function of the state whose sublevel sets a claim speaks of; its numbers are exact binary64."""
+    """A function of the state for claims about its sublevel sets; its numbers are exact binary64."""
 
     @property
     def n(self) -> int:
@@ -38,7 +38,7 @@ class Quadratic:
 
     Parameters
     ----------
-    P : (n, n), symmetric, finite. That it is positive definite is a condition of the claim, decided in rationals.
+    P : (n, n), symmetric, finite. Definiteness is a condition of the claim and is decided in rationals.
 
     Raises
     ------

@@ -1,8 +1,8 @@
-"""The Lyapunov network of another program's file, beside whose policy it lies, as a function of this program.
+"""Import the Lyapunov network in another program's policy file.
 
-What is imported are the numbers of a function and nothing that anybody said of it: no level, no decrease, no proof. Its
-value is the last layer's. Methods put a sigmoid or the like behind it; whatever increases strictly leaves the sublevel
-sets as they are, and only their levels are called otherwise.
+The import takes only the numbers of a function: no level, no decrease, no proof. Its value is the last layer's. Some
+methods add a sigmoid or the like; a strictly increasing function leaves the sublevel sets as they are and only changes
+their levels.
 """
 
 from __future__ import annotations
@@ -43,12 +43,12 @@ class ImportedLyapunov:
     ----------
     function : N, of deviations from the plant's operating point.
     stored : the same with its plant, and the record of its origin in `training`.
-    words : where it lies in the file, and its widths.
-    meaning : what N is beside the file's own function, for people.
-    difference : how far it is from what torch's layers give with the same numbers, in units of N: this checks the
-        folding. The file holds no program, and nothing is compared with one.
-    assumed : who says what stands between the numbers.
-    not_read : why each tensor of the file that was not read is left out, by its name.
+    words : its location in the file, and its widths.
+    meaning : the relation of N to the file's own function, for people.
+    difference : its difference from torch's layers with the same numbers, in units of N: this checks the
+    folding. The file has no program to compare with.
+    assumed : the source of the functions between the numbers.
+    not_read : the reason why each unread tensor of the file is left out, by its name.
     at_origin : N(0).
     """
 
@@ -71,13 +71,13 @@ def import_lyapunov(
     ----------
     path : the file.
     plant : the plant whose states it reads.
-    options : what the file cannot say; those that concern the policy alone are not looked at.
-    prefix : keys of the network's layers up to their numbers; None for a two-stage file, which says it itself.
+    options : facts that the file does not contain; those about the policy alone are ignored.
+    prefix : keys of the network's layers up to their numbers; None for a two-stage file, where they are known.
 
     Raises
     ------
-    InputError : the file is of another kind, does not say enough and the options do not either, holds no such network
-        or what could belong to it and is not read, or the folding is wrong by more than rounding.
+    InputError : the file is of another kind, a fact is missing from file and options, it has no such network or an
+    unread tensor that could belong to it, or the folding is wrong by more than rounding.
 
     Notes
     -----

@@ -1,8 +1,8 @@
-"""The geometry of the sublevel set `{x'Px <= c}`, in bounds that are certain and one unit in the last place wide.
+"""The geometry of the sublevel set `{x'Px <= c}`, by certain bounds within one unit in the last place.
 
 P and c are binary64 numbers, so the inverse and the determinant are computed in exact rationals and only the last step
-is rounded, in a direction: floats lose twice as many digits as P's condition has, and not on the safe side. What
-contains the set is rounded up, what is claimed of it down. A matrix of 12 states takes a millisecond.
+is rounded, in a direction: floats lose twice as many digits as P's condition has, and not on the safe side. Sets that
+contain it are rounded up, its claimed sizes down. A matrix of 12 states takes a millisecond.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def domain_limit(P: Array, domain: Sequence[tuple[Fraction, Fraction]]) -> float
 
 
 def leaves_domain(P: Array, level: float, domain: Sequence[tuple[Fraction, Fraction]]) -> bool:
-    """Whether the set of this level reaches beyond the interior of the box, decided in rationals.
+    """True if the sublevel set is not contained in the domain's interior, decided in rationals.
 
     Raises
     ------
@@ -47,7 +47,7 @@ def leaves_domain(P: Array, level: float, domain: Sequence[tuple[Fraction, Fract
 def are_inside(
     P: Array, level: float, points: Iterable[Sequence[Fraction | float]], centre: Sequence[float] = ()
 ) -> list[bool]:
-    """Whether `(x - c)'P(x - c) <= level` at each of the points, decided in rationals; all entries are finite numbers,
+    """Decide `(x - c)'P(x - c) <= level` at each of the points, in rationals; all entries are finite numbers, taken as
     exact. c is `centre`, 0 if it is empty.
 
     >>> are_inside(np.eye(2), 1.0, [(0.6, Fraction(4, 5)), (Fraction(3, 5), Fraction(4, 5)), (0.0, 2)])
@@ -66,7 +66,7 @@ def are_inside(
 
 
 def semi_axes(P: Array, level: float) -> Array:
-    """`sqrt(c / P_ii)`: how far the set reaches along each coordinate axis, shape (n,).
+    """`sqrt(c / P_ii)`: the set's reach along each coordinate axis, shape (n,).
 
     Rounded down: the points at these distances on the axes lie in the set.
 
@@ -112,7 +112,7 @@ def volume(P: Array, level: float) -> float:
 
 
 def is_positive_definite(P: Array) -> bool:
-    """Whether the symmetric part of P is positive definite, in exact arithmetic; entries must be finite.
+    """True if the symmetric part of P is positive definite, in exact arithmetic; entries must be finite.
 
     >>> is_positive_definite(np.array([[1.0, 1.0], [1.0, 1.0 + 2.0**-52]]))
     True
@@ -165,7 +165,7 @@ def _rational(value: float) -> flint.fmpq:
 
 
 def _exact(P: Array) -> flint.fmpq_mat:
-    """The symmetric part of P, of which x'Px is made, in rationals."""
+    """The symmetric part of P, which defines x'Px, in rationals."""
     n = len(P)
     if P.shape != (n, n) or not np.all(np.isfinite(P)):
         raise InputError("`P` must be a square matrix of finite numbers.")

@@ -1,8 +1,8 @@
 """Neural Lyapunov functions: a tanh network from the states to one number.
 
-Only sublevel sets `{N <= n2}` matter, so whatever increases strictly behind the last layer (a sigmoid, a scale) can be
-left out: it changes the level and not the set. What training made of it (N(0) = 0, N > 0, decrease) is nothing that the
-numbers have to satisfy to be a function; a claim states what it needs, and shows it.
+Only sublevel sets `{N <= n2}` matter, so a strictly increasing function after the last layer (a sigmoid, a scale) can
+be omitted: it changes the level and not the set. The numbers need not satisfy the aims of training (N(0) = 0, N > 0,
+decrease); a claim states and proves its own conditions.
 """
 
 from __future__ import annotations

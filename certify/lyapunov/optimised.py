@@ -6,7 +6,7 @@ x, the level at which it does is, to first order, `V(x) - mu g(x)`, with mu the 
 ray. And whatever mu >= 0 is, keeping this at 1 or more forbids `g > 0` at x inside `{V < 1}` (the S-procedure, state by
 state). Each round samples the closed loop, remembers the states that limit the set, and minimises the linearised
 `log det P` in a trust region subject to them: a convex problem of the size of P, in coordinates in which the present
-set is a ball. Nothing is proved here, and nothing needs to be: the engines prove whatever binary64 matrix comes out.
+set is a ball. Nothing is proved here: the engines prove the resulting binary64 matrix.
 
 The margin alpha is asked for, not only the sign, because a proof needs many boxes where Vdot nearly vanishes.
 """

@@ -1,7 +1,7 @@
-"""How large a set is of which nobody has a formula: the share of the domain that samples find in it.
+"""Estimate the volume of a set without a formula: the share of samples of the domain that lie in it.
 
-An estimate with its standard deviation, never a bound. The samples are the same each time, so that whoever asks about
-the same set, from a run or from its certificate, is told the same.
+The estimate has a standard deviation and is never a bound. The samples are the same each time, so that a run and its
+certificate give the same number for the same set.
 """
 
 from __future__ import annotations

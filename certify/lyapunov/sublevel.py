@@ -1,8 +1,8 @@
-"""Whether states lie in {N <= n2} within the domain, N a network or an expression: decided in Arb.
+"""Decide in Arb which states lie in {N <= n2} within the domain, for a network or an expression N.
 
-At a state in rationals N is a ball that shrinks with the precision, and which side of the level it is on is decided as
-soon as the level is not in it. Where N is the level that never happens, unless N is a rational function: then its value
-is a rational number. What is not decided is neither said to lie in the set nor outside.
+At a rational state N is an Arb ball that shrinks with the precision. The state is decided as soon as the ball does not
+contain the level. Where N equals the level that never happens, unless N is a rational function: then its value is a
+rational number. An undecided state counts neither as inside nor as outside.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _BOX_BITS = 80  # on boxes, which are much wider than their rounding
 
 @dataclass(frozen=True, slots=True)
 class Seen:
-    """What is known of a box: whether all of it was shown to be `covered`, and along which `axis` N varies most.
+    """A look at a box: `covered` if all of it was shown to lie in the set, and the `axis` along which N varies most.
 
     `axis` is None if the box is a single state.
     """
@@ -61,19 +61,19 @@ class Sublevel:
 
     @property
     def name(self) -> str:
-        """What it is called."""
+        """The set's name."""
         return "{N <= n2} within the domain"
 
     def holds(self, points: Iterable[Sequence[Fraction | float]]) -> list[bool]:
-        """Whether each of the states is shown to lie in the set; a float means its binary value."""
+        """True for each state that is shown to lie in the set; a float means its binary value."""
         return [self._side(point) is True for point in points]
 
     def excludes(self, points: Iterable[Sequence[Fraction | float]]) -> list[bool]:
-        """Whether each of the states is shown to lie outside."""
+        """True for each state that is shown to lie outside."""
         return [self._side(point) is False for point in points]
 
     def look(self, box: Sequence[Interval]) -> Seen:
-        """Whether a whole box is shown to lie in the domain, and N to be at most the level on it.
+        """Try to show that a whole box lies in the domain and that N is at most the level on it.
 
         N is bounded by its value on balls around the box, and, where it is differentiable on all of them, by the mean
         value theorem from the middle of the box.
@@ -97,7 +97,7 @@ class Sublevel:
         return Seen(covered, max(wide, key=lambda i: sizes[i]))
 
     def _side(self, point: Sequence[Fraction | float]) -> bool | None:
-        """Whether a state lies in the set; None where that is not decided."""
+        """True if a state lies in the set, False if not, None if undecided."""
         x = [Fraction(v) for v in point]
         if not all(lo <= v <= hi for v, (lo, hi) in zip(x, self.domain, strict=True)):
             return False

@@ -39,7 +39,7 @@ def in_words(c: Certificate) -> str:
 
 
 def of_trajectories(c: Certificate) -> str:
-    """What is said of those that start in {V <= c2}, or in the set from which a tube leads there."""
+    """The statement about trajectories from {V <= c2}, and from the start of a tube that leads there."""
     bounds = f"{', '.join(c.plant.inputs)} within the input bounds{whatever(c)}"
     read = "" if not any(c.policy.origin) else f" read at ({', '.join(map(repr, c.policy.origin))}) + x"
     policy = f"policy {c.policy.sha256}{read}{stepping(c)}"
@@ -67,7 +67,7 @@ def of_trajectories(c: Certificate) -> str:
 
 
 def further(c: Certificate) -> str:
-    """What another function adds, whose network is named by its hash."""
+    """The statement about the outer set of a second function; a network is named by its hash."""
     N = c.beyond
     if N is None:
         return ""
@@ -82,14 +82,14 @@ def further(c: Certificate) -> str:
 
 
 def stepping(c: Certificate) -> str:
-    """How time passes, where it does not simply pass."""
+    """The words for held inputs or discrete time; empty in continuous time."""
     if c.sample is not None:
         return f", its inputs held for any periods in [{c.sample[0]}, {c.sample[1]}]"
     return ", in discrete time" if c.plant.discrete else ""
 
 
 def falling(c: Certificate) -> str:
-    """How fast V falls; the rate is a binary64 number and so exact here."""
+    """The words for the rate at which V falls; it is a binary64 number and so printed exactly."""
     if c.rate == 0:
         return ""
     until = f" until V <= {c.floor!r}" if c.floor is not None else ""
@@ -97,7 +97,7 @@ def falling(c: Certificate) -> str:
 
 
 def nearby(c: Certificate) -> str:
-    """Where trajectories go in the end, if that is claimed."""
+    """The words for convergence to a nearby equilibrium, if that is claimed."""
     if c.claim != "nearby":
         return ""
     still = f" where {', '.join(c.plant.uncertain)} stays as it is" if c.plant.uncertain else ""
@@ -110,7 +110,7 @@ def rate_of(c: Certificate) -> float:
 
 
 def whatever(c: Certificate) -> str:
-    """Of what the claim does not depend."""
+    """The uncertain quantities and their ranges, in words."""
     each = [f"{name} in [{lo}, {hi}]" for name, (lo, hi) in zip(c.plant.uncertain, c.plant.ranges, strict=True)]
     return f", whatever values these have at any time: {', '.join(each)}" if each else ""
 

@@ -89,7 +89,7 @@ class Network:
 
 
 def tanh(y: Affine) -> tuple[Affine, arb, arb]:
-    """Of an affine form: another, the slope of the two lines, and half the gap between them."""
+    """The tanh of an affine form: an affine form, the slope of its two lines, and half the gap between them."""
     mid, coefficients, error = y
     reach = total(abs(v) for v in coefficients) + error
     slope, shift, gap = lines(arb((mid - reach).lower()), arb((mid + reach).upper()))

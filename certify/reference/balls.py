@@ -57,10 +57,9 @@ def identity(n: int) -> arb_mat:
 
 
 def certainly_definite(A: arb_mat) -> bool:
-    """Whether every symmetric matrix in A is positive definite: each pivot of L diag L' is certainly positive.
+    """True if every symmetric matrix in A is positive definite: each pivot of L diag L' is certainly positive.
 
-    Only what stands on and below the diagonal is looked at. A pivot that is not finite is no number: +inf > 0 is
-    certain, and says nothing.
+    Only entries on and below the diagonal are read. A pivot must be finite: +inf > 0 is certain, and shows nothing.
     """
     rows = A.tolist()
     for k, row in enumerate(rows):
@@ -193,12 +192,12 @@ def tanhs(column: arb_mat) -> arb_mat:
 
 
 def origin(c: Certificate) -> arb_mat:
-    """What the layers read at x = 0, a column."""
+    """The layers' inputs at x = 0, a column."""
     return arb_mat(c.n, 1, [arb(v) for v in c.policy.origin])
 
 
 def net_at_0(c: Certificate, matrices: Sequence[arb_mat]) -> list[arb]:
-    """What the network has at x = 0, given the weights."""
+    """The network's output at x = 0, given the weights."""
     h = origin(c)
     for k, (W, layer) in enumerate(zip(matrices, c.policy.layers, strict=True)):
         h = biased(W, layer, tanhs(h) if k else h)
@@ -212,7 +211,7 @@ def beta(c: Certificate) -> list[arb]:
 
 
 def within_bounds(c: Certificate, ranges: Sequence[tuple[arb, arb]]) -> bool:
-    """Whether every input, given by centre and radius, certainly lies in its bounds."""
+    """True if every input, given by centre and radius, certainly lies in its bounds."""
     return all(
         centre - radius >= arb(lo) and centre + radius <= arb(hi)
         for (centre, radius), (lo, hi) in zip(ranges, c.plant.input_bounds, strict=True)
@@ -220,7 +219,7 @@ def within_bounds(c: Certificate, ranges: Sequence[tuple[arb, arb]]) -> bool:
 
 
 def bounded_by_form(c: Certificate) -> bool:
-    """Whether each input lies in its bounds by form: what squash and centring leave of it, after the clip."""
+    """True if each input lies in its bounds by form: by the range that squash, centring and clip leave it."""
     squashed = c.policy.centre != "output" and c.policy.squash == "tanh"
     each = zip(c.policy.scale, c.policy.offset, c.plant.input_bounds, strict=True)
     for j, (s, b, (lo, hi)) in enumerate(each):

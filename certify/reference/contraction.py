@@ -45,7 +45,7 @@ def contraction(loop: Loop, evidence: Contraction, parts: Sequence[int]) -> None
 
 
 def contracts(c: Certificate, J: fmpq_mat, g: Sequence[arb], weight: arb_mat, F: Field) -> bool:
-    """Whether 2 (x - y)'P (F(x) - F(y)) is certainly negative for any two points of the ball; models without y.
+    """True if 2 (x - y)'P (F(x) - F(y)) is certainly negative for any two points of the ball; models without y.
 
     At one d and d', and for given quadratic parts and what is beyond them, this is linear in the gradients.
     """

@@ -43,7 +43,7 @@ def sound_multipliers(ball: Ball, rule: str, at: str) -> None:
 
 
 def contains(ball: Ball, P: fmpq_mat, level: fmpq_mat) -> bool:
-    """Whether J'PJ - level is positive definite: for level = c I, the ball then contains {x'Px <= c}.
+    """True if J'PJ - level is positive definite: for level = c I, the ball then contains {x'Px <= c}.
 
     P must be symmetric. J is then invertible, and x = J d gives c ||d||^2 <= x'Px.
     """
@@ -51,7 +51,7 @@ def contains(ball: Ball, P: fmpq_mat, level: fmpq_mat) -> bool:
 
 
 def whatever_y(F: Field, holds: Callable[[Field], bool]) -> bool:
-    """Whether it holds with every y taken into the balls of the models, or else at each corner."""
+    """True if it holds with every y absorbed into the balls of the models, or else at each corner."""
     count = max(len(f.dv) for f in F.components)
     if count == 0:
         return holds(F)
@@ -63,7 +63,7 @@ def whatever_y(F: Field, holds: Callable[[Field], bool]) -> bool:
 
 
 def decreases(ball: Ball, P: fmpq_mat, R: fmpq_mat, G: Field, h: fmpq = NO_STEP) -> bool:
-    """Whether the matrix that is left is certainly positive definite, at rest: G vanishes at d = 0, exactly.
+    """True if the remaining matrix is certainly positive definite, at rest: G vanishes at d = 0, exactly.
 
     P, positive definite where h > 0, and R are symmetric, G are the models on the ball, without y.
     """
@@ -75,7 +75,7 @@ def decreases(ball: Ball, P: fmpq_mat, R: fmpq_mat, G: Field, h: fmpq = NO_STEP)
 
 
 def decreases_around(ball: Ball, P: fmpq_mat, R: fmpq_mat, G: Field, h: fmpq, level: fmpq) -> bool:
-    """Whether d'J'RJ d + 2 d'J'P G + h G'PG + edge (V - level) is certainly negative on the ball, V = d'J'PJ d.
+    """True if d'J'RJ d + 2 d'J'P G + h G'PG + edge (V - level) is certainly negative on the ball, V = d'J'PJ d.
 
     The form is one in (1, d): a first row and column hold what G is at the centre.
     """
@@ -135,7 +135,7 @@ def root(value: arb) -> arb:
 
 
 def certainly_positive(left: arb_mat) -> bool:
-    """Whether the symmetric part of each matrix is positive definite, by its pivots or by its midpoints and radii.
+    """True if the symmetric part of each matrix is positive definite, by its pivots or by its midpoints and radii.
 
     A ball takes part in many pivots and counts in each for itself. But with the radii r_ij the form of what a matrix
     differs from its midpoints by is at most sum r_ij |d_i| |d_j|, and that at most sum_i d_i^2 sum_j r_ij w_j / w_i,
@@ -157,7 +157,7 @@ def certainly_positive(left: arb_mat) -> bool:
 
 
 def decreases_along(ball: Ball, path: Path, P: fmpq_mat, R: fmpq_mat, F: Field) -> bool:
-    """Whether z'J'RJ z + 2 z'J'P F + edge (z'J'PJ z - 1) + motion (share^2 - sigma^2) is certainly negative.
+    """True if z'J'RJ z + 2 z'J'P F + edge (z'J'PJ z - 1) + motion (share^2 - sigma^2) is certainly negative.
 
     For all d = (z, sigma) with ||d|| <= 1. P and R are symmetric, F are models in d, of F less the path's velocity.
     They do not vanish at the centre, so the form is one in (1, d): a first row and column hold what is linear in d.
@@ -315,7 +315,7 @@ def unit_vector(k: int, n: int) -> arb_mat:
 
 
 def is_zero(values: Iterable[arb]) -> bool:
-    """Whether all of them are exactly 0."""
+    """True if all of them are exactly 0."""
     return all(v.is_zero() for v in values)
 
 

@@ -109,17 +109,17 @@ class Certificate:
 
     @property
     def k(self) -> int:
-        """How many quantities are uncertain."""
+        """The number of uncertain quantities."""
         return len(self.plant.uncertain)
 
     @property
     def varies(self) -> bool:
-        """Whether the period of a sample may be one of many."""
+        """True if the sampling period has a range."""
         return self.sample is not None and bool(self.sample[0] < self.sample[1])
 
     @property
     def ends_at_origin(self) -> bool:
-        """Whether the claim is about the equilibrium at the origin, where every model is then at rest."""
+        """True if the claim is about the equilibrium at the origin; every model is at rest there."""
         return self.claim not in WITH_FLOOR
 
     @property

@@ -69,7 +69,7 @@ class Path:
 
 @dataclass(frozen=True)
 class Slab:
-    """From one node of a tube by `middle` to the next, `end`, in the time `duration`; without a path around 0."""
+    """A slab of a tube: from one node by `middle` to the next, `end`, in time `duration`; around 0 without a path."""
 
     middle: fmpq_mat
     end: fmpq_mat

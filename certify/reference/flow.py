@@ -205,7 +205,7 @@ def reached_from(c: Certificate, leaf: Moving, at: str) -> dict[str, Taylor]:
 
 
 def within_both(x: arb, w: arb) -> arb:
-    """What is in x and between -w and w; where that is nothing, nothing is asked of it, and x will do."""
+    """The part of x between -w and w; x itself if that is empty, since then no claim rests on it."""
     lo, hi = arb(x.lower()).max(-w), arb(x.upper()).min(w)
     return lo.union(hi) if lo <= hi else x
 

@@ -38,7 +38,7 @@ class Models:
         return x[0]
 
     def is_above(self, x: Sequence[Taylor]) -> bool:
-        """Whether N is certainly defined, and above its level, on all of the box; x without remainders."""
+        """True if N is certainly defined, and above its level, on all of the box; x without remainders."""
         N = self.value(x)
         if N.is_finite() and bool(-(-N).bound() > self.level):
             return True

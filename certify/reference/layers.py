@@ -31,14 +31,14 @@ class Layer:
 
 
 def bytes_of(layers: Sequence[Layer]) -> Iterator[bytes]:
-    """Of each weight and each bias the axes and the numbers, as a hash is taken over them."""
+    """The bytes to hash: the axes and the numbers of each weight and each bias."""
     for layer in layers:
         yield struct.pack("<3Q", 2, layer.rows, layer.columns) + little_endian(layer.weight)
         yield struct.pack("<2Q", 1, layer.rows) + little_endian(layer.bias)
 
 
 def read_layers(value: Any, at: str, columns: int, rows: int) -> tuple[Layer, ...]:
-    """From so many numbers to so many others."""
+    """Read layers that map `columns` numbers to `rows` numbers."""
     layers, width = [], columns
     described = entries(value, at)
     require(1 <= len(described) <= MAX_LAYERS, "format", at, f"1 to {MAX_LAYERS} layers are allowed")

@@ -103,7 +103,7 @@ class Leaf:
 
 
 class Leaves:
-    """What all leaves of a certificate share."""
+    """Data and bounds shared by all leaves of a certificate."""
 
     def __init__(self, c: Certificate, T: fmpq_mat, S: fmpq_mat) -> None:
         if not isinstance(c.evidence, Tree):
@@ -133,11 +133,11 @@ class Leaves:
         return total(s * most[i] * most[j] for i, j, s in self.cross)
 
     def is_outside(self, box: Box) -> bool:
-        """Whether V > c2 on all of the box, certainly."""
+        """True if certainly V > c2 on all of the box."""
         return bool(self.diagonal_part(box.least()) - self.cross_part(box) > self.outer)
 
     def is_inside(self, box: Box) -> bool:
-        """Whether V is below the inner level on all of the box, certainly."""
+        """True if V is certainly below the inner level on all of the box."""
         return self.is_below(self.inner, box)
 
     def is_below(self, level: arb, box: Box) -> bool:
@@ -226,7 +226,7 @@ class Leaves:
         return reached_from(self.c, self.numbers(leaf), f"leaf {leaf.box.number}")
 
     def G(self, leaf: Leaf, within: dict[str, Taylor] | None = None) -> list[Taylor]:
-        """What the states change by over a step, by its length: F in continuous time.
+        """The states' change over a step, divided by its length: F in continuous time.
 
         With a sample `within` are the states of the whole period.
         """
@@ -275,10 +275,10 @@ class Leaves:
         return Taylor(c, g, Q, self.cross_part(leaf.box))
 
     def decreases(self, leaf: Leaf, within: dict[str, Taylor] | None = None) -> bool:
-        """Whether D', D' + k (c2 - V) or D' + k (V - c1), D' = D + 2 lambda V, is certainly negative, for some k >= 0.
+        """True if D', D' + k (c2 - V) or D' + k (V - c1), D' = D + 2 lambda V, is certainly negative for some k >= 0.
 
-        The first-order part of the bound is piecewise linear in k: each of its kinks is tried. Any number may be k; one
-        that is not finite makes the bound so, and that is negative for no comparison.
+        The first-order part of the bound is piecewise linear in k, and each of its kinks is tried. Any k is sound: if
+        it is not finite, the bound is not finite either, and no comparison finds that negative.
         """
         D, V = self.D(leaf, within), self.V(leaf)
         if self.rate > 0:
@@ -288,7 +288,7 @@ class Leaves:
         return is_negative(D, [Taylor(self.outer) + -V, V + Taylor(-self.inner)])
 
     def stays(self, D: Taylor, above: Taylor) -> bool:
-        """Whether D' + k (V - c0) is certainly negative for some k from 0 to 1/h, where V may be below c0.
+        """True if D' + k (V - c0) is certainly negative for some k from 0 to 1/h, where V may be below c0.
 
         A step from there then leads to V + h D < V + h k (c0 - V) <= c0, if no ball has shown it. From c0 on D' < 0.
         """
@@ -296,12 +296,12 @@ class Leaves:
         return any((D + above.scaled(k)).bound() < 0 for k in tried)
 
     def is_beyond_floor(self, box: Box) -> bool:
-        """Whether V is at least the inner level on all of the box, certainly."""
+        """True if V is certainly at least the inner level on all of the box."""
         return bool(self.diagonal_part(box.least()) - self.cross_part(box) >= self.inner)
 
 
 def is_negative(D: Taylor, slacks: Sequence[Taylor]) -> bool:
-    """Whether D, or D + k times one of the others for some k > 0, is certainly negative."""
+    """True if D, or D + k times one of the others for some k > 0, is certainly negative."""
     if D.bound() < 0:
         return True
     return any(k > 0 and (D + slack.scaled(k)).bound() < 0 for slack in slacks for k in kinks(D, slack))

@@ -66,7 +66,7 @@ def before_each(layers: Sequence[Layer]) -> list[tuple[int, int, int]]:
 
 
 def numbers(c: Certificate) -> int:
-    """How many may have to be held at once."""
+    """An estimate of how many numbers are held at once."""
     z, evidence, shapes = size_of(c), c.evidence, before_each(c.policy.layers)
     count = 4 * sum(p * q for p, q, _ in shapes)
     if not isinstance(evidence, Tree):

@@ -22,7 +22,7 @@ from .refusal import require
 
 
 def local(loop: Loop, ball: Ball, parts: Sequence[int]) -> None:
-    """What the file says of the ball comes first, then rules `inputs` and `flow`, and then what falls, in each cell."""
+    """Check the file's ball first, then rules `inputs` and `flow`, then the decrease in each cell."""
     c: Certificate = loop.c
     holds = contains(ball, c.P, exact(c.inner) * identity(c.n))
     require(holds, "local", "ball", "it does not contain {V <= c1}: J'PJ - c1 I is not positive definite")

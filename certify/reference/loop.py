@@ -40,7 +40,7 @@ class Known:
     units: Units
 
     def still(self, value: arb) -> Model:
-        """What does not depend on d."""
+        """The model of a value that does not depend on d."""
         some = next(iter(self.names.values()))
         return Model.affine(value, [ZERO] * some.a.nrows(), some.errors, None if some.lip is None else ZERO)
 
@@ -110,13 +110,13 @@ class Loop:
         return Field(F, known.units)
 
     def varying(self, known: Known, cell: Sequence[Interval]) -> dict[str, Model]:
-        """What is uncertain, each quantity with a symbol of its own that runs through the cell."""
+        """The uncertain quantities, each with a symbol of its own that runs through the cell."""
         return {
             name: known.moving(ends, j, self.symbols)
             for j, (name, ends) in enumerate(zip(self.c.plant.uncertain, cell, strict=True))
         }
 
     def anything(self, known: Known) -> dict[str, Model]:
-        """What is uncertain as balls that hold their ranges, without a symbol."""
+        """The uncertain quantities as balls that contain their ranges, without symbols."""
         plant = self.c.plant
         return {q: known.still(spanning(ends)) for q, ends in zip(plant.uncertain, plant.ranges, strict=True)}

@@ -108,11 +108,11 @@ class Model:
         return self.slope + self.curve
 
     def beyond_linear(self, lip: arb) -> Beyond:
-        """Of what there is beyond v(0) + a.d; the Lipschitz constants of d'Qd and K[d] are 2 bend and 3 twist."""
+        """Bounds of the terms beyond v(0) + a.d; the Lipschitz constants of d'Qd and K[d] are 2 bend and 3 twist."""
         return Beyond(self.bend + self.twist + lip, 2 * self.bend + 3 * self.twist + lip)
 
     def beyond_square(self, lip: arb) -> Beyond:
-        """Of what there is beyond v(0) + a.d + d'Qd."""
+        """Bounds of the terms beyond v(0) + a.d + d'Qd."""
         return Beyond(self.twist + lip, 3 * self.twist + lip)
 
     def is_finite(self) -> bool:
@@ -125,7 +125,7 @@ class Model:
         return replace(self, v=self.range, a=self.gradient, dv=(), da=()) if self.dv else self
 
     def without(self, j: int) -> bool:
-        """Whether y_j is in none of its numbers."""
+        """True if none of its numbers depends on y_j."""
         return not self.dv or (self.dv[j].is_zero() and all(v.is_zero() for v in self.da[j].entries()))
 
     def where(self, y: Sequence[int] | Sequence[arb]) -> Model:
@@ -182,7 +182,7 @@ class Model:
         return Model(value[0, 0], a, Q, K, E, B, v.errors, tuple(p[0, 0] for p in dv), da, lip)
 
     def lip_of_product(self, other: Model) -> arb | None:
-        """Of what v w has beyond K: v(0) of w, (a.d) of what is beyond Q in w, the product of what is beyond a.d.
+        """The Lipschitz constant of v w beyond K: v(0) times w's, (a.d) times w beyond Q, and the product beyond a.d.
 
         A product has the size of each times the other's constant.
         """
@@ -240,9 +240,9 @@ class Model:
         return at[0], at[1], H, C, R, self.lip_beyond_tangent(name, at)
 
     def lip_beyond_tangent(self, name: str, at: tuple[arb, arb, arb, arb]) -> arb | None:
-        """Of phi''/2 (D^2 - y^2 - 2 y d'Qd) + phi'''/6 (D^3 - y^3), D = y + z, y = a.d, and of the rest of the series.
+        """The Lipschitz constant of phi''/2 (D^2 - y^2 - 2 y d'Qd) + phi'''/6 (D^3 - y^3) and the rest of the series.
 
-        The derivative of that by D is at most |phi''''|/6 |D|^3.
+        D = y + z, y = a.d. The derivative of the rest by D is at most |phi''''|/6 |D|^3.
         """
         if self.lip is None:
             return None

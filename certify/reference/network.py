@@ -23,9 +23,9 @@ from .symmetric import half, no_form, whole
 
 @dataclass(frozen=True)
 class Bends:
-    """What the tanhs of some layers add to their tangents, a row for each: d'Hd + C[d] within d'Rd; halves of H, R.
+    """The tanhs' differences from their tangents, one row per tanh: d'Hd + C[d] within d'Rd; halves of H, R.
 
-    `lip`, where it is asked for, has the Lipschitz constants of what they add beyond these.
+    `lip`, if needed, has the Lipschitz constants of the remainders.
     """
 
     H: list[list[arb]]
@@ -74,9 +74,9 @@ class Unfolded:
 
 @dataclass(frozen=True)
 class Units:
-    """What the models of all tanhs leave out: e_q, |e_q| <= d'R_q d, of which input j sees sum_q L_jq e_q.
+    """The remainders of all tanhs: e_q, |e_q| <= d'R_q d, of which input j sees sum_q L_jq e_q.
 
-    R has a half of a matrix a row, for n variables.
+    Each row of R has half of a symmetric matrix, for n variables.
     """
 
     n: int
@@ -158,7 +158,7 @@ class Network:
         return [replace(u, B=B, errors=errors) for u, B in zip(inputs, unit_vectors, strict=True)], units
 
     def before_squash(self, j: int, net: arb, centre: fmpq_mat | None) -> arb:
-        """What is squashed at the centre, where the network is `net`: with `preactivation` at the origin beta alone."""
+        """The value before the squash at the centre, where the network is `net`; `preactivation` gives beta at 0."""
         if self.c.policy.centre != "preactivation":
             return net
         return self.beta[j] if centre is None else net - self.net_at_0[j] + self.beta[j]

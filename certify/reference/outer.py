@@ -100,7 +100,7 @@ def covers_domain(c: Certificate, covering: Covering) -> None:
 
 
 class Region:
-    """What the leaves of a covering share; what `leaves` knows of V and the policy is in the covering's coordinates."""
+    """Data shared by the leaves of a covering; `leaves` has V and the policy in the covering's coordinates."""
 
     def __init__(self, c: Certificate, models: Models, covering: Covering) -> None:
         T = covering.T
@@ -110,7 +110,7 @@ class Region:
         self.domain = [(arb(lo), arb(hi)) for lo, hi in c.plant.domain]
 
     def is_free(self, box: Box) -> bool:
-        """Whether the box lies outside of the domain, or V is below c2 or N above n2 on all of it, certainly."""
+        """True if certainly the box lies outside the domain, or V is below c2 or N above n2 on all of it."""
         if self.leaves.is_below(self.leaves.outer, box):
             return True
         x = self.states(box)
@@ -133,7 +133,7 @@ class Region:
         ]
 
     def falls(self, leaf: Leaf) -> bool:
-        """Whether N'F, N'F + k (n2 - N) or N'F + k (V - c2) is certainly negative, for some k >= 0."""
+        """True if N'F, N'F + k (n2 - N) or N'F + k (V - c2) is certainly negative, for some k >= 0."""
         leaves, F = self.leaves, self.leaves.F(leaf)
         N, rate = self.models.moving([leaves.affine(row) for row in leaf.x], F)
         known = N.is_finite() and rate.is_finite()

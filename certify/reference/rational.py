@@ -194,7 +194,7 @@ def squashed_at_0(policy: Policy) -> list[fmpq | None]:
 
 
 def tanh(value: fmpq | None) -> fmpq | None:
-    """Of rational numbers, 0 alone has a rational tanh."""
+    """The tanh if it is rational: 0 is the only rational number with a rational tanh."""
     return ZERO if value is not None and value == 0 else None
 
 

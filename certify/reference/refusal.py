@@ -1,4 +1,4 @@
-"""How a rule says no."""
+"""A rule's refusal."""
 
 from __future__ import annotations
 

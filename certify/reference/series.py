@@ -59,7 +59,7 @@ class Tape:
         self.constant, self.terms = constant, list[Term]()
 
     def still(self, value: Coefficient) -> Term:
-        """What does not change with time."""
+        """A constant in time."""
         return Term(self, lambda k: None if k else value)
 
     def extend(self) -> None:

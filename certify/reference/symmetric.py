@@ -25,7 +25,7 @@ def triples(n: int) -> tuple[tuple[int, int, int], ...]:
 
 @cache
 def orders(n: int) -> tuple[int, ...]:
-    """How often each of `triples` stands in the whole of a symmetric cubic form."""
+    """The number of times each of `triples` occurs in a full symmetric cubic form."""
     return tuple(len(set(permutations(each))) for each in triples(n))
 
 
@@ -69,7 +69,7 @@ def linear_times_square(a: arb_mat, Q: arb_mat) -> arb_mat:
 
 
 def squared_norm(K: arb_mat, n: int) -> arb:
-    """Of a cubic form: the sum of the squares of all its coefficients, in all orders."""
+    """The sum of the squares of a cubic form's coefficients, in all orders."""
     values = K.entries()
     counted = arb_mat(1, len(values), [count * v for count, v in zip(orders(n), values, strict=True)])
     return (counted * K.transpose())[0, 0]

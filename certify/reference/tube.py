@@ -54,7 +54,7 @@ def node(c: Certificate, P: fmpq_mat, centres: Sequence[fmpq_mat], at: str) -> N
 
 
 def ends_inside(c: Certificate, P: fmpq_mat, centre: fmpq_mat) -> bool:
-    """Whether {(x - centre)'P(x - centre) <= 1} lies in {V <= c2}, by the triangle inequality for the root of V.
+    """True if {(x - centre)'P(x - centre) <= 1} lies in {V <= c2}, by the triangle inequality for the root of V.
 
     r bounds that of V(centre) / c2, and 1 - r that of V(x - centre) / c2, where P - c.P / (c2 (1 - r)^2) is definite.
     """

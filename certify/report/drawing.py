@@ -78,7 +78,7 @@ class Drawing:
             self._begun = raw
 
     def page_of(self, raw: bytes, path: Path, answer: dict[str, Any] | None, data: dict[str, Any] | None) -> str:
-        """As `certify.report.drawn.page_of`, and with its errors."""
+        """Write the page like `certify.report.drawn.page_of`, with the same errors."""
         if self._begun not in (None, raw):
             self.__exit__()
         first = b"" if self._begun == raw else _first(raw, path, None)
@@ -102,7 +102,7 @@ def _line(message: dict[str, Any]) -> bytes:
 
 
 def draw_one() -> None:
-    """What the process does: load everything, read of what and what is known of it, write the page."""
+    """Run in the process: load everything, read the certificate and the facts about it, write the page."""
     for module in _NEEDED:
         import_module(module)
     import matplotlib

@@ -1,4 +1,4 @@
-"""What is drawn of a certificate's bytes, for whoever has them: the command, and a result in Python."""
+"""Draw a certificate's bytes as figures and a page, for the command and for a result in Python."""
 
 from __future__ import annotations
 

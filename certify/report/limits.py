@@ -1,4 +1,4 @@
-"""What limits the level of a result, in words."""
+"""The limits of a result's level, in words."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _TOUCHING = Fraction(1, 10**6)  # relative distance from the domain's limit belo
 
 
 def limited_by(result: Mapping[str, Any]) -> str:
-    """What limits the level of a result, in words; reasons that are sentences already stay as they are.
+    """The limit of a result's level, in words; a reason that is a sentence already stays as it is.
 
     An engine may stop short of the domain's limit by a margin of its own, such as a solver's precision. Then the
     margin limits, and it is named with its size.
@@ -65,7 +65,7 @@ def hardest(weights: Mapping[str, float]) -> str:
 
 
 def outer_limited_by(outer: Mapping[str, Any]) -> str:
-    """What limits the level of an outer set, in words, from what a result says of it.
+    """The limit of an outer set's level, in words, from a result's entry on it.
 
     >>> outer_limited_by({"limit": "boxes"})
     'the limit on boxes: more may be provable'

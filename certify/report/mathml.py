@@ -67,7 +67,7 @@ def _row(node: Expression, at_least: int) -> str:
 
 
 def _binding(node: Expression) -> int:
-    """As in text, but that a fraction has a bar and so needs no brackets as a factor."""
+    """The precedence as in text, except that a fraction's bar makes brackets around a factor unnecessary."""
     if isinstance(node, Number):
         return MINUS if node.value < 0 else ATOM if _is_decimal(node.value) else POWER
     return POWER if isinstance(node, Operation) and node.operator == "/" else binding(node)

@@ -107,7 +107,7 @@ class Runs:
 
     @property
     def seconds(self) -> float:
-        """How long was simulated."""
+        """The simulated time."""
         return self.step * (len(self.path) - 1)
 
     @property
@@ -139,7 +139,7 @@ def runs_of(flow: Flow, starts: Array, P: Array, level: float, target: float, st
 
 
 def _in_sets(x: Array, P: Array, level: float, start: Array | None, centre: Array | None, beyond: Holds | None) -> Mask:
-    """Which states (N, n) lie in {V <= level}, in a tube's start if there is one, around `centre` or 0, or `beyond`."""
+    """True for each state (N, n) in {V <= level}, in a tube's start (around `centre` or 0), or in the set `beyond`."""
     inside = quadratic(P, x) <= level
     if beyond is not None:
         inside |= beyond(x)
@@ -147,7 +147,7 @@ def _in_sets(x: Array, P: Array, level: float, start: Array | None, centre: Arra
 
 
 def _fates(path: Array, begins: Mask, P: Array, level: float, target: float, apart: int) -> tuple[Mask, Mask]:
-    """Which runs settle and which leave, each (N,), by V at instants that are so many steps `apart`."""
+    """True for each run that settles, and for each that leaves, (N,), by V at instants so many steps `apart`."""
     V = quadratic(P, path[::apart])
     with np.errstate(invalid="ignore"):
         settled = np.any(target >= V, axis=0)
@@ -218,7 +218,7 @@ def simulated_roa_fraction(
 def _run(
     flow: Flow, x: Array, P: Array, target: float, step: float, horizon: float, deadline: float = math.inf
 ) -> tuple[Mask, Mask, float]:
-    """Which runs came to `V <= target`, which left the domain, and how many seconds were simulated."""
+    """Simulate; return the runs that reached `V <= target`, those that left the domain, and the simulated seconds."""
     attracted, left = np.zeros((2, len(x)), dtype=np.bool_)
     alive, apart = np.arange(len(x)), flow.steps_between(step)
     reached, u = horizon, None

@@ -1,6 +1,6 @@
-"""What the pages of this program have in common: a style sheet, and templates that are filled with every text escaped.
+"""Shared by this program's pages: a style sheet, and templates that are filled with every text escaped.
 
-Nothing on a page is loaded from anywhere; what it shows stands in it.
+A page loads nothing from anywhere; it contains everything that it shows.
 """
 
 from __future__ import annotations

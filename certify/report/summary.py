@@ -147,8 +147,8 @@ def _whatever(result: Mapping[str, Any]) -> str:
 
 
 def _is_missed(result: Mapping[str, Any]) -> bool:
-    """Whether a set is proved, and what was asked about is not: a state that is not shown to lie in it or to reach it,
-    or a level of N."""
+    """True if a set is proved but the request is not: a state shown neither to lie in the set nor to reach it, or a
+    level of N."""
     proved = result.get("checked") == "ACCEPTED" and result["levels"].get("roa") is not None
     return bool(result.get("stop") in ("path", "beyond") and proved)
 
@@ -248,7 +248,7 @@ def _rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
 
 
 def _rest(result: Mapping[str, Any]) -> tuple[str, str]:
-    """Where the loop rests, by the states' values, and its eigenvalues there."""
+    """The loop's equilibrium in the states' values, and its eigenvalues there."""
     rest: Mapping[str, Any] = result["rest"]
     held = " at the nominal values" if result.get("uncertain") else ""
     each = zip(_state_names(result), rest["values"], _state_units(result), strict=True)
@@ -278,9 +278,9 @@ def _asked(result: Mapping[str, Any]) -> str:
 
 
 def _tube(result: Mapping[str, Any]) -> str:
-    """Where a tube starts, how far that reaches, and when it ends.
+    """A tube's start, the reach of the start, and the duration.
 
-    Around a state that is how far each state may be from its own alone, the others being as they are, rounded down.
+    Around a path the reach is along one state at a time, with the others at the centre, rounded down.
     """
     tube = result["tube"]
     size = f"{tube['slabs']} slabs, {above(tube['duration'], 3)} s"
@@ -299,7 +299,7 @@ def _tube(result: Mapping[str, Any]) -> str:
 
 
 def _outer(outer: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """What N is, which of its states belong to the set, and what limits its level."""
+    """Describe N, its outer set, and the limit of its level."""
     if outer["kind"] == "network":
         name, named = network_name(outer["layers"]), [("sha256 of N", str(outer["sha256"]))]
     else:
@@ -311,7 +311,7 @@ def _outer(outer: Mapping[str, Any]) -> list[tuple[str, str]]:
 
 
 def _diagnosis_rows(result: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """How fast the loop is, along which states the proof had most to do, and what to try next."""
+    """The loop's modes, the states that cost the proof most, and the next thing to try."""
     found, rows = result.get("diagnosis"), []
     if not found:
         return []
@@ -337,7 +337,7 @@ def _times(spent: Mapping[str, float | None]) -> str:
 
 
 def _of_which(result: Mapping[str, Any]) -> str:
-    """Of which of two sets the sizes are, those of the larger one; nothing where there is but one."""
+    """Name the set that the sizes describe, if there are two; empty if there is only one."""
     tube = result.get("tube")
     if result.get("outer"):
         return ", of {V <= c2} alone"

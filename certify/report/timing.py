@@ -1,4 +1,4 @@
-"""How time passes in a closed loop, in words: what of a claim's sentences depends on it, and on the claimed rate.
+"""The words about time in a claim's sentences: they depend on the closed loop's timing and on the claimed rate.
 
 Each text of a report that depends on this takes its words from here, so that no text has to be written once for every
 kind of claim.
@@ -35,7 +35,7 @@ class TimingInWords(Timing):
 
     @property
     def axis(self) -> str:
-        """Of a picture over time."""
+        """The label of a picture's time axis."""
         return "steps" if self.discrete else "time (s)"
 
     @property
@@ -56,7 +56,7 @@ class TimingInWords(Timing):
 
     @property
     def linearised(self) -> str:
-        """Of what the eigenvalues are, where not of the rate of change."""
+        """The map whose eigenvalues are meant, in words; empty in continuous time."""
         if self.sample is not None:
             return f" over a period of {exact_number(self.sample[1])} s"
         return " over a step" if self.discrete else ""
@@ -68,7 +68,7 @@ class TimingInWords(Timing):
 
     @property
     def loop(self) -> str:
-        """What passes in which time, after the equation `dx/dt = f(...)` or `x+ = f(...)`."""
+        """The words after the equation `dx/dt = f(...)` or `x+ = f(...)`."""
         if self.discrete:
             return "in exact real arithmetic, one step after the other"
         if self.sample is None:
@@ -89,7 +89,7 @@ class TimingInWords(Timing):
 
     @property
     def definition(self) -> str:
-        """What D is; nothing where it is not spoken of."""
+        """The definition of D; empty in continuous time."""
         if self.discrete:
             return "D(x) = V(F(x)) − V(x), F(x) = f(x, π(x)): by how much V changes in a step."
         if self.sample is None:
@@ -103,7 +103,7 @@ class TimingInWords(Timing):
 
     @property
     def definitions(self) -> str:
-        """What D and lambda are, those of them that conditions speak of."""
+        """The definitions of D and lambda, as far as the conditions use them."""
         rate = f"λ = {self.shown_rate} is the rate, rounded down here." if self.rate else ""
         return f"{self.definition} {rate}".strip()
 
@@ -114,7 +114,7 @@ class TimingInWords(Timing):
 
     @property
     def phrases(self) -> Mapping[str, str]:
-        """What the words of a claim (words.py) have a place for, each `$name` there."""
+        """The text for each placeholder `$name` in the words of a claim (claims.py)."""
         return {
             **self._when(),
             **self._how_fast(),
@@ -193,7 +193,7 @@ class TimingInWords(Timing):
         }
 
     def _how_fast(self) -> dict[str, str]:
-        """What is said of the speed."""
+        """The phrases about speed."""
         if not self.rate:
             return {
                 "fall": f"{self.derivative}(x) < 0",
@@ -219,7 +219,7 @@ class TimingInWords(Timing):
         }
 
     def speed(self, inner: float | None, outer: float) -> str:
-        """What a rate says of trajectories, after the statement of the claim; nothing without a rate.
+        """The consequence of a rate for trajectories, after the statement of the claim; empty without a rate.
 
         Parameters
         ----------

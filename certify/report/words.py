@@ -1,8 +1,8 @@
-"""What a report says, and how: names, units, ranges and numbers as people read them.
+"""Words of a report: names, units, ranges and numbers as people read them.
 
-Shared by the terminal summary, the figures and the page; the words of each claim are in claims.py. Numbers are rounded
-in a direction wherever a reader could take them for a bound: `below` what is claimed of a set, `above` what contains
-it.
+The terminal summary, the figures and the page share them; the words of each claim are in claims.py. Wherever a reader
+could take a number for a bound it is rounded in a direction: `below` for a set's claimed size, `above` for a set that
+contains it.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class Varying:
 
 
 def varying_in(system: System) -> tuple[Varying, ...]:
-    """What is uncertain in a plant, in its order."""
+    """The uncertain quantities of a plant, in its order."""
     return tuple(Varying(name, lo, hi, system.units.get(name, "")) for name, (lo, hi) in system.ranges.items())
 
 
@@ -128,7 +128,7 @@ def inside(lo: Fraction, hi: Fraction) -> str:
 
 
 def _value(exact: Fraction, digits: int, direction: Callable[[Fraction], int]) -> Fraction:
-    """What `_rounded` shows."""
+    """The value that `_rounded` shows."""
     if exact == 0:
         return exact
     coefficient, last = _decimal(exact, digits, direction)
@@ -181,12 +181,12 @@ def pretty_unit(unit: str) -> str:
 
 
 def volume_name(n: int) -> str:
-    """What the n-dimensional volume is called."""
+    """The name of the n-dimensional volume."""
     return {1: "length", 2: "area"}.get(n, "volume")
 
 
 def network_name(widths: Sequence[int]) -> str:
-    """What a network without a squash is called.
+    """The name of a network without a squash.
 
     >>> network_name((2, 16, 1))
     'the 2-16-1 tanh network'
@@ -223,7 +223,7 @@ def distinguished(names: Sequence[str]) -> list[str]:
 
 
 def modes(fastest: float, slowest: float) -> str:
-    """How fast a loop's modes decay at rest, from the real parts of its slowest and fastest eigenvalue, both negative.
+    """The decay of a loop's modes, from the real parts of its slowest and fastest eigenvalue, both negative.
 
     >>> modes(-16.8, -1.63), modes(-0.5, -0.5)
     ('the slowest decays at 1.63 per second (time constant 0.61 s), the fastest at 16.8 per second (0.06 s)', \

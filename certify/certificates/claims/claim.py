@@ -1,7 +1,7 @@
-"""What a certificate says: which set, what holds for every trajectory from it, and the levels that state it.
+"""Claims: a set, a statement about every trajectory from it, and the levels in that statement.
 
-A claim is about a `Problem`, a closed loop with a Lyapunov function, and consists of numbers only. How it is proved,
-in which coordinates and with which boxes, is the evidence's affair.
+A claim is about a `Problem`, a closed loop with a Lyapunov function, and consists of numbers only. Coordinates, boxes
+and other means of the proof belong to the evidence.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
-"""What has to be shown for a claim, in one form: *where these guards are not negative, this margin is negative*.
+"""The conditions of a claim, in one form: *where these guards are not negative, this margin is negative*.
 
-The bounds engine proves the ring and the inputs box by box, a solver of formulas is asked for a point at which a
-condition fails, and the checker has a rule for each. Two conditions have no margin and are shown along the way: P is
-positive definite (in rationals), and F is locally Lipschitz on {V <= c2} (whatever encloses F there has no pole).
+The bounds engine proves the ring and the inputs box by box, a solver searches for a point at which a condition fails,
+and the checker has a rule for each. Two conditions have no margin and are shown along the way: P is positive definite
+(in rationals), and F is locally Lipschitz on {V <= c2} (an enclosure of F without a pole).
 """
 
 from __future__ import annotations
@@ -129,16 +129,16 @@ def ring_condition(inner: float, outer: float) -> Condition:
 
 
 def root_conditions(problem: Problem, level: float) -> tuple[Condition, ...]:
-    """What square roots in the equations are taken of is positive on {V <= level}, one condition a root.
+    """The radicands in the equations are positive on {V <= level}: one condition per square root.
 
-    What bounds F on boxes shows it along the way; a solver may look only where the roots are defined.
+    The bounds of F on boxes show it along the way. A solver needs it, since it may search only where roots are defined.
     """
     count = len(radicands(problem))
     return tuple(Condition(f"root-{k}", (Guard("inside", level),), Radicand(k)) for k in range(count))
 
 
 def radicands(problem: Problem) -> tuple[Expression, ...]:
-    """What the equations take square roots of, inner roots before outer ones."""
+    """The expressions under square roots in the equations, inner roots before outer ones."""
     found: dict[Expression, None] = {}
     for expression in problem.loop.system.uncertain_dynamics():
         for node in nodes(expression):

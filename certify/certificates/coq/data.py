@@ -1,8 +1,8 @@
-"""What a certificate claims, read from its bytes for Coq: exact numbers, and nothing that its statement cannot say.
+"""Read a certificate's claim from its bytes for Coq: exact numbers, and nothing that Coq's statement cannot express.
 
-The reader is strict and its own: what the Coq file states follows from the same bytes as the hash at its head, and a
-key that is unknown here may mean something that would be left out, so it is refused. No evidence is read but the
-coordinates of the search, which nobody believes.
+The reader is strict and separate: the Coq file's statement follows from the same bytes as the hash at its head. An
+unknown key might change the claim, so it is rejected. The only evidence that is read is the search's coordinates, which
+nobody has to trust.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _WHAT_IS = (
 
 @dataclass(frozen=True, slots=True)
 class Claimed:
-    """What a certificate claims of a plant under a policy.
+    """A certificate's claim about a plant under a policy.
 
     Parameters
     ----------
@@ -81,12 +81,12 @@ class Claimed:
 
 
 def read_claim(raw: bytes) -> Claimed:
-    """What the bytes of a certificate claim.
+    """Read the claim from the bytes of a certificate.
 
     Raises
     ------
     CertificateFormatError : they are no certificate.
-    InputError : it claims what Coq's statement cannot say.
+    InputError : Coq's statement cannot express the claim.
     """
     try:
         data = json.loads(

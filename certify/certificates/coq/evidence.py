@@ -1,4 +1,4 @@
-"""What a search hands to Coq (Data.v): coordinates, boxes, and what is shown on each of them."""
+"""Evidence that the search hands to Coq (Data.v): coordinates, boxes, and each box's reason."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ Tree = Leaf | Split
 
 @dataclass(frozen=True, slots=True)
 class Evidence:
-    """What Coq's check is led by.
+    """The evidence that guides Coq's check.
 
     Parameters
     ----------
     T, W : x = T z and z = W x, inverse to one another, exactly.
-    root, core : half-widths in z, of the box that is divided and of that around the origin.
-    splits : the root box divided.
+    root, core : half-widths in z, of the root box and of the box around the origin.
+    splits : the partition tree of the root box.
     """
 
     T: Matrix
@@ -49,7 +49,7 @@ class Evidence:
 
     @property
     def leaves(self) -> int:
-        """How many boxes are not divided."""
+        """The number of leaves."""
         count, todo = 0, [self.splits]
         while todo:
             node = todo.pop()

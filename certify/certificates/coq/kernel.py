@@ -84,13 +84,13 @@ class Coqc:
 
 @dataclass(frozen=True, slots=True)
 class Compiled:
-    """What became of a folder of files.
+    """The result of compiling a folder of files.
 
     Parameters
     ----------
-    axioms : on which the theorem rests, as Coq prints them; None if it is not proved.
-    seconds : of all files.
-    reason : why it is not proved, with the end of what was printed; empty if it is.
+    axioms : the axioms that the theorem uses, as Coq prints them; None if it is not proved.
+    seconds : the time for all files.
+    reason : why it is not proved, with the end of Coq's output; empty if it is.
     """
 
     axioms: tuple[str, ...] | None

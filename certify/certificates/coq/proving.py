@@ -22,14 +22,14 @@ from certify.errors import BackendError, OptionError
 
 @dataclass(frozen=True, slots=True)
 class CoqOptions:
-    """What is asked for.
+    """Options of a proof in Coq.
 
     Parameters
     ----------
-    rate : of V's decay; None for one that costs little.
+    rate : the rate at which V falls; None for one that costs little.
     time_limit : seconds for the search and for Coq together.
-    boxes : that the search may end with.
-    run : whether Coq is run; else its files are only written.
+    boxes : the most boxes that the search may end with.
+    run : True to run Coq; else its files are only written.
     """
 
     rate: Fraction | None = None
@@ -48,21 +48,21 @@ class CoqOptions:
 
 @dataclass(frozen=True, slots=True)
 class CoqResult:
-    """What came of it.
+    """The result of a proof in Coq.
 
     Parameters
     ----------
     verdict : PROVED if Coq accepted the theorem on known axioms alone, else UNKNOWN.
     reason : why it is not proved; empty if it is.
-    plant, certificate_sha256, policy_sha256, level : of which claim; the hashes and the claim are of the same bytes.
-    rate : of V's decay, that the theorem states.
-    boxes : that the partition has; 0 without one.
-    looked_at : boxes of the whole search.
-    search_seconds, coq_seconds : what each took.
-    axioms : on which the theorem rests.
-    theory_sha256 : of the theory's files in their order.
-    coq : its version; None if it was not run.
-    folder : where the files are; None if there are none.
+    plant, certificate_sha256, policy_sha256, level : the claim; the hashes and the claim are of the same bytes.
+    rate : the rate that the theorem states.
+    boxes : the number of boxes of the partition; 0 without one.
+    looked_at : the number of boxes that the search examined.
+    search_seconds, coq_seconds : the time of each.
+    axioms : the axioms that the theorem uses.
+    theory_sha256 : the hash of the theory's files in their order.
+    coq : Coq's version; None if it was not run.
+    folder : the folder of the files; None if there are none.
     """
 
     verdict: Verdict

@@ -36,7 +36,7 @@ _SHARE = Fraction(1, 20)  # of the slowest rate of the linearised loop
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """How far a search goes: seconds, and boxes that are not divided further."""
+    """The limits of a search: seconds and leaves."""
 
     seconds: float = 60.0
     boxes: int = 20_000
@@ -50,15 +50,15 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """What a search ends with.
+    """The result of a search.
 
     Parameters
     ----------
-    rate : that was asked of V.
-    evidence : None if nothing was found.
-    boxes : that were looked at.
-    seconds : that it took.
-    reason : why nothing was found; empty if something was.
+    rate : the rate required of V.
+    evidence : the evidence; None if none was found.
+    boxes : the number of boxes examined.
+    seconds : the time taken.
+    reason : why no evidence was found; empty if it was.
     """
 
     rate: Fraction
@@ -265,7 +265,7 @@ class _Attempt:
         return np.asarray(_definite(negated) & self._within(found))
 
     def _within(self, found: Bounds) -> NDArray[np.bool_]:
-        """Where the inputs are within their bounds: everywhere if tanh keeps them there, which Coq decides exactly."""
+        """True on each box where the inputs keep their bounds; on all if tanh keeps them, which Coq decides exactly."""
         network, fits = self.claimed.network, np.ones(len(found.V.value), dtype=bool)
         by_form = network.squash == "tanh" and network.centre != "output"
         for j, (u, (lo, hi)) in enumerate(zip(found.inputs, self.claimed.bounds, strict=True)):
@@ -304,7 +304,7 @@ class _Attempt:
         return nodes.tree()
 
     def _examine(self, lo: Array, hi: Array, core: Array) -> tuple[NDArray[np.bool_], Array, NDArray[np.intp]]:
-        """Which boxes are done, with which k, and across which axis the others are best divided."""
+        """Find for each box: whether it is done, its multiplier k, and the best axis to split it."""
         self.boxes += len(lo)
         with np.errstate(all="ignore"):
             found = bounds(self.claimed, self.T, Boxes((lo + hi) / 2, (hi - lo) / 2))
@@ -322,9 +322,10 @@ class _Attempt:
         return done, np.where(outside | inner, 0.0, k), np.argmax(steepness, axis=1)
 
     def _multiplier(self, found: Bounds) -> tuple[Array, Array, Interval]:
-        """Of few candidates the k >= 0 whose bound of `Vdot + rate V + k (c2 - V)` is least, the bound, and slopes.
+        """Choose among few candidates the k >= 0 with the least bound of `Vdot + rate V + k (c2 - V)`.
 
-        The bound by slopes is convex in k and piecewise linear; it bends where a slope of the sum is 0 in its middle.
+        Return k, the bound, and the slopes. The bound by slopes is convex and piecewise linear in k; it bends where a
+        slope of the sum is 0 in its middle.
         """
         D = found.Vdot + found.V.times(self.rate)
         V, W = found.V, found.V.plus(-self.claimed.level)
@@ -357,7 +358,7 @@ class _Attempt:
 
 
 def _definite(M: Interval) -> NDArray[np.bool_]:
-    """Whether every form x'M x with a matrix within M, (N, n, n), is positive: elimination, as Coq does it."""
+    """True where every form x'M x with a matrix within M, (N, n, n), is positive: elimination, as Coq does it."""
     count, n = M.lo.shape[:2]
     good = np.ones(count, dtype=bool)
     size = np.abs(M.hi).max(axis=(1, 2))

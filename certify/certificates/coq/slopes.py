@@ -50,7 +50,7 @@ class Interval:
         return Interval(self.lo[where], self.hi[where])
 
     def cut(self, other: Interval) -> Interval:
-        """What lies in both."""
+        """The intersection of both intervals."""
         return Interval(np.maximum(self.lo, other.lo), np.minimum(self.hi, other.hi))
 
     def total(self) -> Interval:
@@ -83,7 +83,7 @@ class Boxes:
         )
 
     def spread(self, slopes: Interval) -> Array:
-        """How far a quantity with these slopes (N, ..., n) is at most from its value at the centre, (N, ...)."""
+        """The largest change of a quantity with these slopes (N, ..., n) from its value at the centre, (N, ...)."""
         half = self.half.reshape(len(self.half), *(1,) * (slopes.lo.ndim - 2), -1)
         return np.asarray((slopes.magnitude * half).sum(-1))
 
@@ -207,7 +207,7 @@ def _sine(a: Interval, shift: float = 0.0) -> Interval:
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """What is known of a loop on boxes: the inputs, F, V and Vdot, and V from its formula alone."""
+    """Bounds of a loop on boxes: the inputs, F, V and Vdot, and V from its formula alone."""
 
     inputs: tuple[Quantity, ...]
     F: tuple[Quantity, ...]

@@ -1,4 +1,4 @@
-"""Expressions: trees as they were written, evaluated in any arithmetic. The one list of functions is here."""
+"""Expressions: trees as they were written, evaluated in any arithmetic. This package has the list of functions."""
 
 from __future__ import annotations
 

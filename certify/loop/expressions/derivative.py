@@ -1,7 +1,7 @@
 """Derivatives of expressions, as expressions.
 
-A derivative has a value wherever the expression has one and is differentiable; nothing is cancelled, so that bounds of
-it may serve as bounds of a Jacobian.
+A derivative has a value wherever the expression has one and is differentiable. Nothing is cancelled, so that its bounds
+are bounds of a Jacobian.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from certify.loop.expressions.tree import Expression, Number, Operation, Symbol,
 
 
 def differentiate(expression: Expression, by: Symbol) -> Expression:
-    """d/dx of an expression, x being one of its symbols; 0 where x does not stand in it.
+    """d/dx of an expression, for a symbol x; 0 if x does not occur in it.
 
     >>> from certify.loop.expressions.tree import symbols
     >>> x, y = symbols(["x", "y"])
@@ -48,7 +48,7 @@ def _slope(node: Operation, slopes: list[Expression | None]) -> Expression:
 
 
 def _of_function(node: Operation, at: Expression) -> Expression:
-    """phi'(v) of a function phi, by what it is itself at v."""
+    """phi'(v) of a function phi, given phi(v)."""
     one = Number(1)
     match node.operator:
         case "sin":
@@ -67,6 +67,6 @@ def _of_function(node: Operation, at: Expression) -> Expression:
 
 
 def _times(slope: Expression, factors: list[Expression]) -> Expression:
-    """The slope by the chain or product rule; the slope 1 is left out."""
+    """The slope by the chain or product rule; a slope 1 is omitted."""
     product = [*factors] if slope is Number(1) else [slope, *factors]
     return Operation("*", *product) if len(product) > 1 else product[0] if product else slope

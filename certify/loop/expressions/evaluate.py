@@ -1,8 +1,8 @@
 """One walk over an expression for every arithmetic: rationals, Arb balls, Taylor models, jets.
 
-An arithmetic says what a constant is and how constants enter sums and products; everything else follows from its
-values' own `+`, `*`, `inverse` and functions. What the walk does not know it refuses: a node that slipped through
-as something else would be a proof about another plant.
+An arithmetic defines constants and the way they enter sums and products; everything else follows from its values' own
+`+`, `*`, `inverse` and functions. The walk rejects unknown nodes: a node evaluated as something else would give a proof
+about another plant.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ V = TypeVar("V")
 
 
 class Algebra(ABC, Generic[V]):
-    """What an arithmetic does with the nodes of an expression.
+    """An arithmetic's operations on the nodes of an expression.
 
     `total` and `product` get the constant of a sum or product apart from its other operands, which come in the
     expression's order. A power is the square of the power of half the exponent, times the base if it is odd.
@@ -67,12 +67,12 @@ def evaluate(
     algebra: Algebra[V],
     known: dict[Expression, V] | None = None,
 ) -> V:
-    """The value of an expression of a plant; every operand is evaluated, also one that is multiplied by 0.
+    """Evaluate an expression of a plant, with every operand, also one that is multiplied by 0.
 
     Parameters
     ----------
     variables : the values of its symbols.
-    known : subexpressions that are there already; filled on the way, so that calls can share them.
+    known : values of subexpressions that are computed already; the walk adds to it, so that calls can share them.
 
     Raises
     ------

@@ -1,7 +1,7 @@
-"""Expressions of sympy, taken as sympy shows them.
+"""Convert sympy's expressions as sympy shows them.
 
-sympy simplifies what it is given while it is typed: `x*(x - 1)/(x - 1)` is `x` before anybody can see the quotient. So
-a plant is about what sympy made of the text, and only for who asks for that.
+sympy simplifies an expression as it is built: `x*(x - 1)/(x - 1)` is `x` before anybody can see the quotient. So such a
+plant is about sympy's simplified expression, and only on request.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from certify.loop.expressions.tree import FUNCTIONS, GRAMMAR, Expression, Number
 
 
 def from_sympy(expression: Any) -> Expression:
-    """The tree of a sympy expression as it is, after all that sympy has simplified.
+    """The tree of a sympy expression, after sympy's own simplifications.
 
     Raises
     ------

@@ -1,9 +1,9 @@
-"""The constants of an expression gathered, exactly, for whatever evaluates it.
+"""Gather the constants of an expression, exactly, to make its evaluation cheaper.
 
 `b/(m*l**2)*v` with numbers in the place of b, m and l is one number times v; a sum of sums is one sum. That saves
 operations where an expression is evaluated on a million boxes. The value is the same at every point, and so are the
-points that have one: no operand is left out, not even one that is multiplied by 0. A claim is about the tree as it was
-written; this one is never written down.
+points that have one: no operand is omitted, not even one that is multiplied by 0. A claim is about the tree as it was
+written; no file contains the gathered one.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def _split(node: Expression) -> tuple[Fraction, Expression | None]:
 
 
 def _parts(node: Expression) -> tuple[Fraction, Expression | None]:
-    """`_split` by way of what is known of the node already."""
+    """`_split` with a memo of earlier nodes."""
     found = gathered(node)
     if isinstance(found, Number):
         return found.value, None
@@ -119,7 +119,7 @@ def _scaled(factor: Fraction, core: Expression | None) -> Expression:
 
 
 def _short(q: Fraction, times: int = 1) -> Fraction:
-    """The number, if its numerator and denominator are not too long, those of its power not either."""
+    """The number, if its numerator and denominator, and those of its power, are not too long."""
     if times * max(q.numerator.bit_length(), q.denominator.bit_length()) > MOST_BITS:
         raise InputError(f"a number on the way has more than {MOST_BITS} bits")
     return q

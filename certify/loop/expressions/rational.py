@@ -1,4 +1,4 @@
-"""Expressions in rationals: what can be decided exactly is decided exactly, by the rule of the certificate's format."""
+"""Evaluate expressions in rationals, by the rule of the certificate's format."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _AT_ZERO: Mapping[str, int] = {"sin": 0, "cos": 1, "tan": 0, "tanh": 0, "exp": 1
 
 @dataclass(frozen=True, slots=True)
 class _Unnamed:
-    """A number that rationals do not name, and what it is in words; nothing else is said of it."""
+    """An unknown number, with a description in words."""
 
     words: str
 
@@ -28,7 +28,7 @@ _Number = Fraction | _Unnamed
 class _Rational(Algebra[_Number]):
     """Functions have a rational value at exact 0 only, square roots at squares of rationals.
 
-    Exact 0 times any other number is 0: that there is such a number is for the checkers' rule `local` to show.
+    Exact 0 times an unknown number is 0: the checkers' rule `local` shows that the number exists.
     """
 
     def constant(self, q: Fraction) -> _Number:
@@ -74,7 +74,7 @@ class _Rational(Algebra[_Number]):
 def value_if_rational(
     expression: Expression, values: Mapping[Symbol, Fraction], unknown: Iterable[Symbol] = ()
 ) -> Fraction | str:
-    """The rational value of an expression, whatever the unknown symbols stand for; else, in words, what has none.
+    """The rational value of an expression for any values of the unknown symbols; else, in words, the part without one.
 
     Raises
     ------

@@ -1,9 +1,9 @@
-"""Power series in time over any arithmetic: what a solution of the plant's equations does within a sampling period.
+"""Power series in time over any arithmetic, for solutions of the plant's equations within a sampling period.
 
-A value of this arithmetic is a row of coefficients of t^0, t^1, ..., each a value of the arithmetic beneath. Because
+A value of this arithmetic is a row of coefficients of t^0, t^1, ..., each a value of the inner arithmetic. Because
 x' = f(x, u), coefficient k of f gives coefficient k + 1 of x: the expressions are walked once, and then every node
-takes its next coefficient in the order in which the nodes arose, so that nothing is computed twice. A coefficient that
-is 0 for certain is no value at all, so that it costs nothing and adds no error.
+takes its next coefficient in the order of creation, so that nothing is computed twice. A coefficient that is certainly
+0 is not stored as a value, so that it costs nothing and adds no error.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ V = TypeVar("V")
 
 
 class Series(Generic[V]):
-    """`coefficients` of t^0, t^1, ... as far as they are known; None stands for one that is 0 for certain."""
+    """`coefficients` of t^0, t^1, ... as far as they are known; None stands for a certain 0."""
 
     __slots__ = ("coefficients",)
 
@@ -30,8 +30,8 @@ class Series(Generic[V]):
 class PowerSeries(Algebra[Series[V]]):
     """Expressions of the plant on power series whose coefficients are values of `inner`.
 
-    Series that this arithmetic makes have one coefficient at first, and follow those they are made of: `advance` gives
-    each its next one, once the series that came from outside have theirs. None is made after the first `advance`.
+    A new series has one coefficient. `advance` gives each series its next one from those of its operands, once the
+    series from outside have theirs. No series is created after the first `advance`.
     """
 
     def __init__(self, inner: Algebra[V]) -> None:
@@ -41,13 +41,13 @@ class PowerSeries(Algebra[Series[V]]):
         self._circles: dict[int, tuple[Series[V], Series[V], Series[V]]] = {}
 
     def advance(self) -> None:
-        """One more coefficient of every series."""
+        """Compute one more coefficient of every series."""
         for series, rule in self._made:
             series.coefficients.append(rule(self._known))
         self._known += 1
 
     def held(self, value: V) -> Series[V]:
-        """What does not change."""
+        """A constant in time."""
         return self._follow(lambda k: None if k else value)
 
     def constant(self, q: Fraction) -> Series[V]:
@@ -101,7 +101,7 @@ class PowerSeries(Algebra[Series[V]]):
         return self._sum(None if k else Fraction(1), [self._product(Fraction(-1), square.coefficients[k])])
 
     def _circle(self, value: Series[V]) -> tuple[Series[V], Series[V]]:
-        """(sin, cos), which are each other's derivatives; those of one series are made once."""
+        """(sin, cos), which are each other's derivatives; one pair per series."""
         if id(value) not in self._circles:
             sine: Series[V] = Series()
             cosine: Series[V] = Series()
@@ -173,14 +173,14 @@ def solution_series(
     algebra: Algebra[V],
     order: int,
 ) -> list[list[V]]:
-    """Coefficients of the solution of `x' = f(x)` from the states, everything else being held.
+    """Coefficients of the solution of `x' = f(x)` from the states, with all else constant.
 
     Parameters
     ----------
     dynamics : f, in the order of the states.
     states : their values at t = 0, the coefficients x_0.
     held : the values of all other symbols.
-    order : how many coefficients follow x_0, at least 1.
+    order : number of coefficients after x_0, at least 1.
 
     Returns
     -------

@@ -1,8 +1,8 @@
-"""Expressions of plants and Lyapunov functions: trees that stay as they were written.
+"""Expressions of plants and Lyapunov functions, as trees that stay as they were written.
 
 Nothing here simplifies. `x*(x - 1)/(x - 1)` has no value at x = 1 and keeps its quotient, `sqrt(x)**2` keeps its root
-and `0/(x - 1)` its pole, because what is proved must be proved of the equations that somebody wrote. Equal trees are
-one object, so that a subexpression that stands in many places is evaluated once and compared by identity.
+and `0/(x - 1)` its pole, because the proof must be about the equations as they were written. Equal trees are
+one object, so that a repeated subexpression is evaluated once and compared by identity.
 
 In a certificate a tree is nested lists (checker/FORMAT.md): `to_tree` and `from_tree`.
 """
@@ -84,7 +84,7 @@ class Expression:
 
 
 class Symbol(Expression):
-    """A name: a state, an input, a parameter, or something uncertain."""
+    """A name: a state, an input, a parameter, or an uncertain quantity."""
 
     __slots__ = ("name",)
     name: str
@@ -229,7 +229,7 @@ def atan(x: object) -> Expression:
 
 
 def sqrt(x: object) -> Expression:
-    """The square root, which an equation can be proved with where its argument is positive."""
+    """The square root; a proof needs a positive argument."""
     return function("sqrt", x)
 
 
@@ -240,7 +240,7 @@ def total(terms: Iterable[Expression]) -> Expression:
 
 
 def nodes(*expressions: Expression) -> Iterator[Expression]:
-    """Every different node once, operands before what is made of them."""
+    """Every different node once, operands first."""
     seen: set[Expression] = set()
     waiting = [(e, False) for e in reversed(expressions)]
     while waiting:
@@ -254,7 +254,7 @@ def nodes(*expressions: Expression) -> Iterator[Expression]:
 
 
 def symbols_of(*expressions: Expression) -> set[Symbol]:
-    """The symbols that stand in them."""
+    """The symbols of the expressions."""
     return {node for node in nodes(*expressions) if isinstance(node, Symbol)}
 
 
@@ -314,7 +314,7 @@ def from_tree(tree: Tree, names: Mapping[str, Symbol]) -> Expression:
 
 
 def _joined(operator: str, left: Expression, right: Expression) -> Expression:
-    """A sum or product from left to right: `a + b + c` is one sum of three, which is what FORMAT.md says of it."""
+    """A sum or product from left to right: `a + b + c` is one sum of three, as in FORMAT.md."""
     chain = isinstance(left, Operation) and left.operator == operator
     return Operation(operator, *(left.operands if chain else (left,)), right)
 
@@ -332,7 +332,7 @@ SUM, PRODUCT, MINUS, POWER, ATOM = range(5)
 
 
 def binding(node: Expression) -> int:
-    """How tightly a node binds where it is written out."""
+    """The precedence of a node in written text."""
     if isinstance(node, Number):
         plain = decimal_text(node.value) is not None
         return PRODUCT if not plain else MINUS if node.value < 0 else ATOM
@@ -342,7 +342,7 @@ def binding(node: Expression) -> int:
 
 
 def text(expression: Expression) -> str:
-    """An expression as a plant file has it: reading the text gives an expression of the same value.
+    """Write an expression as a plant file does; reading the text gives an expression of the same value.
 
     >>> g, l, x = symbols(["g", "l", "x"])
     >>> text(g / l * sin(x) - x / (l * x**2))
@@ -381,7 +381,7 @@ class _Text:
         return f"{node.operator}({self(first, SUM)})"
 
     def _term(self, node: Expression) -> str:
-        """` + b`, or ` - b` of what begins with a minus."""
+        """` + b`, or ` - b` for a term that begins with a minus."""
         if isinstance(node, Operation) and node.operator == "-":
             return f" - {self(node.operands[0], PRODUCT)}"
         if isinstance(node, Number) and node.value < 0:
@@ -390,7 +390,7 @@ class _Text:
 
 
 def decimal_text(q: Fraction) -> str | None:
-    """A rational in decimal digits, if a few of them are all.
+    """A rational in decimal digits, if a few are exact.
 
     >>> decimal_text(Fraction(981, 100)), decimal_text(Fraction(1, 3))
     ('9.81', None)

@@ -1,4 +1,4 @@
-"""Plants: symbolic equations with exact parameters, and the registry of the ones that ship."""
+"""Plants: symbolic equations with exact parameters, and the registry of the shipped plants."""
 
 from __future__ import annotations
 

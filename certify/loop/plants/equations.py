@@ -1,8 +1,8 @@
-"""Equations as people write them, read by a small parser on Python's `ast`.
+"""Read equations as people write them, by a small parser on Python's `ast`.
 
 Nothing in the text is executed, and `0.15` is 3/20, because numbers are read as text. The tree is that of the
-text: nothing is cancelled, merged or left out. What cannot be read is answered
-with the symbol that is at fault and what to write instead: equations are typed by hand, and most faults are slips.
+text: nothing is cancelled, merged or omitted. An error names the symbol at fault and
+a correction: equations are typed by hand, and most faults are slips.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ def parse_expression(
 
     Parameters
     ----------
-    names : what it may use: symbols, or expressions that a name stands for.
-    known : what these are, for messages.
+    names : allowed names, with their symbols or the expressions that they stand for.
+    known : a description of these names, for messages.
 
     Raises
     ------
@@ -62,7 +62,7 @@ def parse_expression(
 
 
 def _size(expression: Expression) -> int:
-    """Nodes of the tree, which may be many more than those of the names that it is written with."""
+    """The number of nodes of the tree, with the expressions that its names stand for."""
     known: dict[Expression, int] = {}
     for node in nodes(expression):
         known[node] = 1 + sum(known[e] for e in node.operands)

@@ -1,6 +1,6 @@
-"""The plant near its operating point: A, B, and how many directions its inputs reach.
+"""The plant near its operating point: A, B, and its controllability.
 
-Exact where rationals allow it: a rank computed in floats is an opinion about a tolerance.
+The rank is exact if A and B are rational: a rank computed in floats depends on a tolerance.
 """
 
 from __future__ import annotations
@@ -57,9 +57,9 @@ class Controllability:
 
     Parameters
     ----------
-    rank : of n directions of the state space, how many the inputs reach.
-    exact : whether it was computed in rationals.
-    smallest : where it was not, the smallest singular value over the largest, of the matrix with A divided by its norm.
+    rank : dimension of the controllable subspace.
+    exact : True if it was computed in rationals.
+    smallest : otherwise the smallest singular value over the largest, of the matrix with A divided by its norm.
     """
 
     rank: int
@@ -76,7 +76,7 @@ def _rationals(rows: list[list[Fraction]]) -> flint.fmpq_mat:
 
 
 def controllability(A: Matrix, B: Matrix) -> Controllability:
-    """How many directions of the state space the inputs reach (Kalman's rank condition).
+    """The dimension of the controllable subspace (Kalman's rank condition).
 
     >>> zero, one = Number(0), Number(1)
     >>> controllability(((zero, one), (zero, zero)), ((zero,), (one,)))

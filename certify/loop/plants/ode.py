@@ -1,7 +1,7 @@
-"""The one Runge-Kutta step that simulates plants: for training, for falsification and for pictures, never for a proof;
-and how fast plants are where they are simulated.
+"""The Runge-Kutta step that simulates plants for training, falsification and pictures, never for a proof; and the
+eigenvalues of plants at simulated states.
 
-Two copies of it would agree until one of them was changed; a policy is trained bit by bit on this one.
+There is one copy, so that training is reproducible bit by bit.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ def rk4_step(field: Callable[[T], T], x: T, step: Any) -> T:
     field : states (..., n) to their derivatives (..., n), numpy arrays or torch tensors.
     x : states, of any leading shape. The first stage is `field(x)` with this very object, so that a caller who knows
         the field there need not compute it again.
-    step : seconds; a number, or an array or tensor that broadcasts against x, such as one step a state (..., 1).
+    step : seconds; a number, or an array or tensor that broadcasts against x, such as one step per state (..., 1).
 
     Notes
     -----
-    Nothing here mixes states: what becomes of one depends on the others of its batch only if `field` does. With torch
-    the step can be differentiated in x, in `step` and in whatever `field` holds.
+    The step does not mix the states of a batch, unless `field` does. With torch the step can be differentiated in x, in
+    `step` and in the parameters of `field`.
 
     >>> rk4_step(lambda x: -x, 1.0, 0.1)  # exp(-0.1) = 0.90483742, and 0.1^5 / 120 = 8e-8
     0.9048375
@@ -51,7 +51,7 @@ def eigenvalues_of(field: Callable[[Array], Array], x: Array, widths: Array) -> 
     Parameters
     ----------
     field : states (..., n) to their derivatives (..., n), numpy arrays.
-    widths : (n,), positive, of the part of the states over which the field is of interest: the scale of a difference.
+    widths : (n,), positive: the widths of the region of interest, which scale a difference.
 
     >>> eigenvalues_of(lambda x: -2 * x, np.zeros((1, 1)), np.ones(1)).real.round(6).tolist()
     [[-2.0]]

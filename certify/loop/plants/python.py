@@ -1,7 +1,7 @@
-"""A plant of one's own in Python: `my_plant.py:plant`.
+"""A user's plant in Python: `my_plant.py:plant`.
 
-Reading it runs its code, with all that code may do. So nothing here is called for a name that stands in a file, only
-for what a person typed on the command line (`registry.chosen_system`).
+Reading it runs its code. So this module is never called for a name in a file, only for a name that a person typed
+on the command line (`registry.chosen_system`).
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from certify.loop.plants.toml import require_equilibrium
 
 
 def load_python_system(path: Path, name: str) -> System:
-    """The plant that `name` of the Python file is: a System, or a function without arguments that returns one.
+    """Load the plant `name` of a Python file: a System, or a function without arguments that returns one.
 
     Raises
     ------
@@ -60,7 +60,7 @@ def load_python_system(path: Path, name: str) -> System:
 
 
 def _line(error: BaseException, path: Path) -> str:
-    """`, line N` of the file where the error arose, if it is in the file at all."""
+    """`, line N` of the file where the error arose, if it arose in the file."""
     if isinstance(error, SyntaxError):
         return f", line {error.lineno}" if error.lineno else ""
     traceback, line = error.__traceback__, None

@@ -1,11 +1,11 @@
-"""The plants that ship, by name; a path to a `.toml` file names a plant of one's own.
+"""The shipped plants, by name; a path to a `.toml` file names a user's plant.
 
-Three doors, by who names the plant. `shipped_system` takes names only and is for names that stand in a file, such as a
-policy's: a file must not make anybody read another. `get_system` reads a TOML file too, which executes nothing.
-`chosen_system` is for what a person types on the command line, and alone runs a plant's Python file.
+There are three functions, by who names the plant. `shipped_system` takes names only and is for names in a file, such as
+a policy's: a file must not make anybody read another. `get_system` reads a TOML file too, which executes nothing.
+`chosen_system` is for names typed on the command line, and only it runs a plant's Python file.
 
-There is no list of plants: a plant is a file of the folder `plants`. Listing them imports none of them, so that a
-plant with a fault keeps nobody from using the others.
+There is no list of plants: a plant is a file of the folder `shipped`. Listing them imports none of them, so that a
+faulty plant does not block the others.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def available_systems() -> tuple[str, ...]:
 
 
 def get_system(name: str) -> System:
-    """The plant `name` of the folder `plants`, or the plant described by the TOML file at that path.
+    """The plant `name` of the folder `shipped`, or the plant described by the TOML file at that path.
 
     Raises
     ------
@@ -41,7 +41,7 @@ def get_system(name: str) -> System:
 
 
 def shipped_system(name: str) -> System:
-    """The plant `name` of the folder `plants`, and of nowhere else.
+    """The plant `name` of the folder `shipped`, and of no other place.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def shipped_system(name: str) -> System:
 
 
 def chosen_system(name: str) -> System:
-    """The plant that somebody chose by typing `name`: as `get_system`, or `FILE.py:NAME`, whose code is run.
+    """The plant that a person chose by typing `name`: as `get_system`, or `FILE.py:NAME`, whose code is run.
 
     Raises
     ------

@@ -1,7 +1,7 @@
-"""The text of a plant's file beside what was read from it, so that an error can say where in the file it is.
+"""The text of a plant's file beside its values, so that an error can name the line.
 
-tomllib gives values without their places. They are found again in the text, line by line; where that fails, as it may
-in an inline table, the line of the table is named, and failing that none: a line is help, never a condition.
+tomllib gives values without their lines. This module finds them again in the text. If that fails, as it may in an
+inline table, the error names the table's line, or else none.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ _ENTRY = re.compile(r"""\s*((?:["']?[A-Za-z0-9_-]+["']?\s*\.\s*)*["']?[A-Za-z0-9
 
 @dataclass(frozen=True, slots=True)
 class PlantFile:
-    """A TOML file of a plant, or of a study: its values, and where they stand.
+    """A TOML file of a plant or a study: its values and their lines.
 
     Parameters
     ----------
-    path : of the file, for messages.
+    path : the file's path, for messages.
     data : the document; decimal numbers are exact fractions.
     lines : line of each key, by its dotted path.
     """
@@ -36,7 +36,7 @@ class PlantFile:
     lines: Mapping[str, int] = field(repr=False)
 
     def refuse(self, message: str, *keys: str) -> InputError:
-        """The error that `message` is at this key: file, line, key, and what is wrong."""
+        """The error with `message` at this key: file, line, key, and fault."""
         line = next((self.lines[k] for k in _upwards(keys) if k in self.lines), None)
         where = f"{self.path}, line {line}" if line is not None else str(self.path)
         return InputError(f"{where}{': ' + '.'.join(keys) if keys else ''}: {message}")
@@ -54,7 +54,7 @@ class PlantFile:
         return found
 
     def require_known(self, name: str, known: Mapping[str, str] | list[str], what: str) -> None:
-        """Refuse entries of the table `name` that are none of `known`, which is called `what`."""
+        """Reject entries of the table `name` that are not in `known`; `what` names these in the message."""
         for key in self.table(name):
             if key not in known:
                 close = nearest(key, known) or f"; known are {', '.join(known) or 'none'}."
@@ -62,7 +62,7 @@ class PlantFile:
 
 
 def read_plant_file(path: Path, what: str = "system file") -> PlantFile:
-    """Read a TOML file; `what` is what messages call it.
+    """Read a TOML file; `what` names it in messages.
 
     Raises
     ------

@@ -1,6 +1,6 @@
-"""Slips of whoever writes equations as Python or as mathematics has them: what to write here instead.
+"""Corrections for equations written as in Python or mathematics.
 
-Only messages come from here; what an equation may hold is decided where it is read.
+This module only gives messages; the reader decides what an equation may contain.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def instead_of_name(name: str) -> str | None:
 
 
 def instead_of(node: ast.expr, text: str) -> str | None:
-    """Say what to write instead of anything else that equations may not hold; None if it is not known."""
+    """Say what to write instead of anything else that equations may not contain; None if it is not known."""
     if isinstance(node, ast.Attribute):
         return instead_of_name(text)
     if isinstance(node, ast.IfExp | ast.Compare | ast.BoolOp):

@@ -5,8 +5,8 @@ Python float stands for its binary value; an expression that contains one is ref
 either: parameters are replaced by their values and deviations by `x_eq + x`, and the tree stays what it was.
 
 Everything works in deviations from the operating point x_eq: the claims, the certificate and the policy are about
-`x - x_eq`, whose equilibrium is the origin. So no rule of the checkers knows of x_eq; it is a name for people, and
-`in_deviations` is the one place that moves equations there.
+`x - x_eq`, whose equilibrium is the origin. So no rule of the checkers uses x_eq; it is for people, and only
+`in_deviations` moves equations there.
 """
 
 from __future__ import annotations
@@ -93,18 +93,18 @@ class System:
         deviations from it already (`in_deviations` brings equations there), so that nothing of what is proved depends
         on it.
     disturbances : symbols of the dynamics that are 0 unless they have a range.
-    ranges : intervals by name, of parameters that are uncertain and of disturbances that act: all that is known of
-        them, at any time. A parameter's value in `parameters` lies in its range and is the nominal one, of which
-        everything is made that is not proved for the whole range: u_eq, linearisation, simulation.
+    ranges : intervals by name, of uncertain parameters and of disturbances that act; values may change at any
+    time. A parameter's value in `parameters` lies in its range and is the nominal one, which u_eq, the
+    linearisation and simulation use.
     time : `continuous`, or `discrete`: then the equations are those of x+, the state one step later.
-    sample : the least and the largest time over which an input is held, in a continuous plant; None if it follows the
+    sample : the shortest and longest sampling period of a continuous plant; None if the input follows the
         state at once.
 
     Raises
     ------
     InputError : counts do not match, a domain does not contain 0 in its interior, a parameter that
-        must be positive is not, an expression uses something outside the grammar, x_eq is irrational, or a range is of
-        nothing that can have one.
+        must be positive is not, an expression is outside the grammar, x_eq is irrational, or a name with a range is
+    neither a parameter nor a disturbance.
     """
 
     name: str
@@ -190,7 +190,7 @@ class System:
         self._check_time()
 
     def __reduce__(self) -> tuple[type[System], tuple[Any, ...]]:
-        """Pickled by its fields, read-only mappings as dictionaries, and checked anew where it is unpickled."""
+        """Pickle the fields, with read-only mappings as dictionaries; unpickling checks them again."""
         values = (getattr(self, each.name) for each in fields(self))
         return System, tuple(dict(v) if isinstance(v, MappingProxyType) else v for v in values)
 
@@ -240,7 +240,7 @@ class System:
         return len(self.inputs)
 
     def with_parameters(self, values: Mapping[str, Fraction | float | int | str]) -> System:
-        """The same plant with some parameters replaced; unknown names are refused.
+        """The same plant with some parameters replaced; unknown names are rejected.
 
         Where x_eq moves with them, the domain keeps its place and its deviations move.
         """
@@ -273,7 +273,7 @@ class System:
         )
 
     def with_domain(self, bounds: Mapping[str, Interval]) -> System:
-        """The same plant on another box; unknown state names are refused."""
+        """The same plant on another box; unknown state names are rejected."""
         names = [s.name for s in self.states]
         for name in bounds:
             if name not in names:
@@ -322,25 +322,25 @@ class System:
 
     @property
     def in_steps(self) -> bool:
-        """Whether V is compared at the ends of steps: of discrete time, or of periods over which an input is held."""
+        """True in discrete time or with held inputs: V is then compared at the ends of steps or periods."""
         return self.time == "discrete" or self.sample is not None
 
     @property
     def rests_where(self) -> str:
-        """What f(x_eq, u_eq) is at an equilibrium, in words."""
+        """The value of f(x_eq, u_eq) at an equilibrium, as text."""
         return "0" if self.time == "continuous" else "x_eq"
 
     @property
     def uncertain(self) -> tuple[tuple[Symbol, Interval], ...]:
-        """What has a range, in the order of the ranges."""
+        """The uncertain quantities with their ranges, in the order of the ranges."""
         return tuple((Symbol(name), interval) for name, interval in self.ranges.items())
 
     @property
     def input_errors(self) -> Mapping[str, str]:
-        """Of what has a range, that which the equations know only as the error of an input: its name, by the input's.
+        """The input errors: each uncertain quantity's name, by the name of its input.
 
-        That is so if both stand in them as u + error_u alone. A name by itself says nothing, because a file may give it
-        to anything.
+        An uncertain error_u is an input error if u and error_u occur in the equations only as u + error_u. The name
+        alone does not suffice: a file may give it to anything.
         """
         found = {}
         for u in self.inputs:
@@ -353,7 +353,7 @@ class System:
         return found
 
     def kind_of(self, name: str) -> Kind:
-        """What it is that has this range."""
+        """The kind of the uncertain quantity with this name."""
         if name in self.input_errors.values():
             return "input error"
         return "parameter" if name in self.parameters else "disturbance"
@@ -370,7 +370,7 @@ class System:
         return replace(self.with_parameters(known), dynamics=dynamics, u_eq=u_eq, disturbances=(), ranges={})
 
     def corners(self, most: int = 64) -> tuple[dict[str, Fraction], ...]:
-        """The vertices of the box of ranges, in an order that is the same each time; beyond `most` of them, some."""
+        """The vertices of the box of ranges, in a fixed order; if there are more than `most`, some of them."""
         vertices = list(itertools.islice(itertools.product((0, 1), repeat=len(self.ranges)), most))
         if 2 ** len(self.ranges) > most:
             drawn = random.Random(0)
@@ -385,7 +385,7 @@ class System:
         return self._with_numbers(())
 
     def uncertain_dynamics(self) -> tuple[Expression, ...]:
-        """f for all that the ranges allow: what has one is free, as states and inputs are.
+        """f with uncertain quantities free, like states and inputs.
 
         These are the trees of a certificate: the equations as they were written, with numbers instead of the names that
         have one value.
@@ -402,11 +402,11 @@ class System:
         return tuple(self._rational(e, f"u_eq of {s}") for s, e in zip(self.inputs, self.u_eq, strict=True))
 
     def exact_x_eq(self) -> tuple[Fraction, ...]:
-        """The operating point as exact rationals, shape (n,): what the states are deviations from."""
+        """The operating point as exact rationals, shape (n,); states are deviations from it."""
         return tuple(self._rational(e, f"x_eq of {s}") for s, e in zip(self.states, self.x_eq, strict=True))
 
     def operating_point(self) -> dict[str, Fraction]:
-        """x_eq by the names of the states; empty where it is 0 in all of them, which needs no words."""
+        """x_eq by the names of the states; empty if it is 0."""
         values = self.exact_x_eq()
         return {s.name: q for s, q in zip(self.states, values, strict=True)} if any(values) else {}
 
@@ -426,7 +426,7 @@ class System:
         return tuple((lo + q, hi + q) for (lo, hi), q in zip(self.domain, self.exact_x_eq(), strict=True))
 
     def residuals(self) -> dict[str, Fraction | float]:
-        """Each state's f(0, u_eq): exact, or rounded where a function stands at another point than 0."""
+        """Each state's f(0, u_eq): exact, or rounded if a function is evaluated at another point than 0."""
         at_rest: dict[Symbol, Fraction] = dict.fromkeys(self.states, Fraction(0))
         at_rest |= dict(zip(self.inputs, self.exact_u_eq(), strict=True))
         found: dict[str, Fraction | float] = {}
@@ -448,7 +448,7 @@ class System:
         return lambda x, u: f(x, u, ())
 
     def uncertain_function(self, module: Module = "numpy") -> Callable[[Any, Any, Sequence[Any]], Any]:
-        """The same for values of what is uncertain, in the order of the ranges: a third argument, k numbers."""
+        """The same with a third argument: values of the uncertain quantities, k numbers in the order of the ranges."""
         return self._function(self.uncertain_dynamics(), [s for s, _ in self.uncertain], module)
 
     def mean_rate(self, f: Callable[[Any, Any], Any], x: Any, u: Any, step: Any) -> Any:
@@ -492,7 +492,7 @@ class System:
         return f
 
     def _substituted(self, expression: Expression, numbers: Mapping[Symbol, Number]) -> Expression:
-        """The expression with these numbers; refused if it then divides by a number that is 0, or the like."""
+        """Substitute the numbers; reject the expression if it then divides by 0, or the like."""
         result = substitute(expression, numbers)
         try:
             constant_of(result)

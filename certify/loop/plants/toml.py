@@ -1,7 +1,7 @@
-"""A plant of one's own, described in TOML. See `examples/plants`.
+"""A user's plant in TOML. See `examples/plants`.
 
-The file speaks of values as people measure them: equations, operating point and domain are in absolute states, and it
-is here that they become deviations from x_eq. Every error says the line, the entry and what is expected there.
+The file is in measured values: equations, operating point and domain are in absolute states, and this module converts
+them to deviations from x_eq. Every error names the line, the entry and the expected value.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _ROUNDED = 1e-12  # of a residual with functions at other points than 0, which r
 
 
 def load_system(path: Path) -> System:
-    """Read a plant from a TOML file. Its table `training` is the trainer's, and not looked at.
+    """Read a plant from a TOML file. Its table `training` is the trainer's and is ignored.
 
     Raises
     ------
@@ -45,7 +45,7 @@ def load_system(path: Path) -> System:
 
 
 def build_system(file: PlantFile) -> System:
-    """The plant of a file that was read; raises as `load_system` does."""
+    """Build the plant of a parsed file; raises like `load_system`."""
     for key in file.data:
         if key not in _KEYS:
             close = nearest(key, _KEYS) or f"; known are {', '.join(_KEYS)}."
@@ -115,7 +115,7 @@ def build_system(file: PlantFile) -> System:
 
 
 def require_equilibrium(system: System, refuse: Callable[[str], InputError] = InputError) -> None:
-    """Refuse a plant that does not rest at its operating point; `refuse` makes the error of a message.
+    """Reject a plant whose operating point is no equilibrium; `refuse` makes the error of a message.
 
     Raises
     ------
@@ -212,7 +212,7 @@ def _at_rest(
 
 
 def _disturbance(file: PlantFile, name: str) -> Interval | None:
-    """The range of a disturbance: a half-width or a pair; None where it is 0, unless somebody asks for it."""
+    """The range of a disturbance: a half-width or a pair; None for 0, which acts only on request."""
     value = file.table("disturbances")[name]
     if isinstance(value, list):
         return _interval(file, "disturbances", name)
@@ -240,7 +240,7 @@ def _interval(file: PlantFile, table: str, name: str) -> Interval:
 
 
 def number_at(file: PlantFile, value: Any, *keys: str) -> Fraction:
-    """The exact number that stands in a file at this key.
+    """The exact number at this key of a file.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What an arithmetic must offer for a policy's squash, centring and clip; floats, balls, terms of formulas do."""
+"""The operations that squash, centring and clip need; floats, balls and terms of formulas offer them."""
 
 from __future__ import annotations
 

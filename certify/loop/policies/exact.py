@@ -1,4 +1,4 @@
-"""What follows exactly from a policy's form: the bounds of its inputs, and pi(0). Decided in rationals."""
+"""Exact consequences of a policy's form, decided in rationals: the bounds of its inputs, and pi(0)."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ _NEAR = 1e-9
 def bounded_by_form(network: TanhNetwork, bounds: Sequence[tuple[Fraction, Fraction]]) -> bool:
     """True if squash, centring and clip keep every input in its bounds `(lo, hi)`, whatever the state.
 
-    The clip comes last and is monotone: of a range [a, b] before it, it leaves the range between what it makes of a and
-    of b. That need not lie in [a, b], because the clip may lie elsewhere.
+    The clip comes last and is monotone: it maps a range [a, b] to the range between the clipped a and b. That need not
+    lie in [a, b].
     """
     known = network.squash == "tanh" and network.centre != "output"
     middles, reaches = ([Fraction(float(v)) for v in end] for end in (network.offset, network.scale))
@@ -34,9 +34,9 @@ def bounded_by_form(network: TanhNetwork, bounds: Sequence[tuple[Fraction, Fract
 
 
 def raw_at_origin(network: TanhNetwork) -> tuple[Fraction | None, ...]:
-    """raw(0) as rationals, (m,), x = 0 being the network's origin; None where a tanh stands at another point than 0.
+    """raw(0) as rationals, (m,), x = 0 being the network's origin; None where a tanh is taken at another point than 0.
 
-    A weight of exact 0 removes a value that is not known.
+    A weight of exact 0 removes an unknown value.
     """
     h: list[Fraction | None] = [Fraction(float(v)) for v in network.origin]
     last = len(network.weights) - 1
@@ -92,7 +92,7 @@ def _found(value: Fraction | None, about: float, wanted: float) -> str:
 
 
 def _centrings(network: TanhNetwork, u_eq: Sequence[Fraction]) -> str:
-    """The options that centre it: inside the squash only if it can come to u_eq there."""
+    """The options that centre it: inside the squash only if u_eq is in its range."""
     reaches = zip(u_eq, network.scale.tolist(), network.offset.tolist(), strict=True)
     inside = network.squash == "tanh" and all(abs(float(u) - o) < abs(s) for u, s, o in reaches)
     return "--centre output" + " or --centre preactivation" * inside

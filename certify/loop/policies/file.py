@@ -43,12 +43,12 @@ class Policy:
     network : the policy itself.
     system : name of the plant.
     parameters : parameters of the plant as text or numbers (text means its decimal value).
-    training : how it was made (seed, steps, versions, A, B, K ...); never trusted, may be empty.
+    training : the record of its training (seed, steps, versions, A, B, K ...); never trusted, may be empty.
     beta : rounded `atanh((u_eq - offset) / scale)` stored by another program, shape (m,), or None;
         the proof uses the real number and reports the shift.
-    valid : bounds of each state, shape (n, 2), infinite where there is none, or None: only between them is the network
-        what it was made from, because there no observation is clipped. A plant's domain must be cut to them before
-        anything is proved; `certify roa` does so.
+    valid : bounds of each state, shape (n, 2), infinite where there is none, or None. Only between them the network
+    equals its source, because no observation is clipped there. A plant's domain must be cut to them before a proof;
+    `certify roa` does so.
 
     Raises
     ------
@@ -78,7 +78,7 @@ class Policy:
             object.__setattr__(self, "valid", valid)
 
     def beta_shift(self, u_eq: Sequence[Fraction]) -> float:
-        """What reading the stored beta as the real number changes in u at the origin, in the input's units.
+        """The change of u at the origin when the stored beta is read as the real number, in the input's units.
 
         Raises
         ------
@@ -154,7 +154,7 @@ def load_policy(path: str | Path) -> Policy:
 
 
 def is_text(raw: bytes) -> bool:
-    """True if bytes are text that a person could read, by how they begin."""
+    """True if the first bytes are readable text."""
     start = raw[:_START]
     try:
         words = start.decode("utf-8")
@@ -166,7 +166,7 @@ def is_text(raw: bytes) -> bool:
 
 
 def _other(path: Path) -> str | None:
-    """The message for a file that is no policy file of this program, if its bytes say what it is."""
+    """The message for a file that is no policy file of this program, if its bytes show its kind."""
     try:
         with path.open("rb") as file:
             raw = file.read(_START)

@@ -1,7 +1,6 @@
-"""Affine layers with tanh between them, as exact binary64 numbers: what a policy and a neural Lyapunov function share.
+"""Affine layers with tanh between them, as exact binary64 numbers, for policies and neural Lyapunov functions.
 
-Only the layers are here. What follows the last one (a squash, a scale, a centring, or nothing) belongs to whoever has
-them.
+This module has only the layers. A squash, a scale or a centring after the last one belongs to their owner.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ def frozen_layers(
 
     Parameters
     ----------
-    whose : what messages call the network, such as "the policy".
+    whose : the network's name in messages, such as "the policy".
 
     Raises
     ------
@@ -67,7 +66,7 @@ def frozen_layers(
 
 
 def widths(weights: Sequence[Array]) -> tuple[int, ...]:
-    """Numbers in front of the first layer and behind each, such as (2, 16, 16, 1)."""
+    """The layers' widths from input to output, such as (2, 16, 16, 1)."""
     return (int(weights[0].shape[1]), *(int(w.shape[0]) for w in weights))
 
 
@@ -85,7 +84,7 @@ def sha256_of(head: bytes, arrays: Iterable[Array]) -> str:
 
 
 def through(weights: Sequence[Array], biases: Sequence[Array], x: Any) -> Any:
-    """What the layers make of the last axis of x, in its arithmetic (numpy array or torch tensor)."""
+    """Apply the layers to the last axis of x, in x's arithmetic (numpy array or torch tensor)."""
     for k, (weight, bias) in enumerate(zip(weights, biases, strict=True)):
         if k:
             x = tanh(x)
@@ -99,7 +98,7 @@ def tanh(x: Any) -> Any:
 
 
 def like(array: Array, x: Any) -> Any:
-    """The array as x is: for a torch tensor a tensor of its precision, on its device."""
+    """Convert the array to the kind of x: for a torch tensor a tensor of its precision, on its device."""
     if isinstance(x, np.ndarray):
         return array
     import torch

@@ -10,10 +10,10 @@
 
 So `pi(x) = scale * squash(net(x) + shift) + offset'` with numbers shift and offset', which `centring` gives in any
 arithmetic: floats, Arb balls and the terms of formulas put their own numbers into the same lines. With a `clip` (lo,
-hi) the policy is `min(max(., lo), hi)` of that: the last step, behind the centring, which it must leave as it is at 0.
+hi) the policy is `min(max(., lo), hi)` of that: the last step, after the centring; it must be inactive at 0.
 
-A policy that nobody centred may be looked at from where its loop rests: with an `origin` the layers read
-`origin + x`, exactly, x being the deviation from there. The network's numbers, and so its hash, stay what they are.
+An uncentred policy may have its loop's equilibrium as `origin`: the layers then read `origin + x`, exactly, with x the
+deviation from there. The network's numbers, and so its hash, do not change.
 """
 
 from __future__ import annotations
@@ -46,8 +46,8 @@ class TanhNetwork:
     biases : arrays of shape (out,).
     squash, centre : see the module's docstring.
     scale, offset : arrays of shape (m,), in the input's units; scale is nonzero.
-    clip : (lo, hi), arrays of shape (m,) in the input's units with lo < hi, between which each input is kept; or None.
-    origin : where x = 0 lies among the states that the layers read, shape (n,); empty for 0.
+    clip : (lo, hi), arrays of shape (m,) in the input's units with lo < hi, which limit each input; or None.
+    origin : the state that the layers read at x = 0, shape (n,); empty for 0.
 
     Raises
     ------
@@ -93,7 +93,7 @@ class TanhNetwork:
 
     @property
     def is_moved(self) -> bool:
-        """Whether x = 0 is another state than 0 for the layers."""
+        """True if the layers read another state than 0 at x = 0."""
         return bool(np.any(self.origin != 0))
 
     @property
@@ -112,7 +112,7 @@ class TanhNetwork:
         return widths(self.weights)
 
     def ratios(self, u_eq: Sequence[Fraction]) -> tuple[Fraction, ...]:
-        """`(u_eq - offset) / scale`, exactly, (m,): what tanh must be at the origin with preactivation centring.
+        """`(u_eq - offset) / scale`, exactly, (m,): the value of tanh at the origin with preactivation centring.
 
         Raises
         ------
@@ -144,11 +144,11 @@ class TanhNetwork:
         return self.clipped(like(self.scale, x) * self.squashed(self.net(x)) + like(self.offset, x))
 
     def squashed(self, y: Any, arithmetic: Arithmetic[Any] | None = None) -> Any:
-        """What the policy does to the last layer's values before scale and offset; numpy or torch if none is given."""
+        """Squash the last layer's values, before scale and offset; in numpy or torch if no arithmetic is given."""
         return (arithmetic or _ARRAYS).tanh(y) if self.squash == "tanh" else y
 
     def squash_slope(self, squashed: Any, arithmetic: Arithmetic[Any] | None = None) -> Any:
-        """The derivative of the squash where its value is `squashed`."""
+        """The derivative of the squash at the value `squashed`."""
         one = (arithmetic or _ARRAYS).number(Fraction(1))
         return one - squashed * squashed if self.squash == "tanh" else one
 
@@ -162,7 +162,7 @@ class TanhNetwork:
         return [arithmetic.clip(v, lo, hi) for v, lo, hi in zip(u, *ends, strict=True)]
 
     def require_unclipped(self, at_0: Sequence[Fraction | float]) -> None:
-        """Refuse a clip that may act where the policy without it is `at_0`, its m values at the origin.
+        """Reject a clip that may act at the origin, where the policy without it has the m values `at_0`.
 
         Raises
         ------
@@ -208,7 +208,7 @@ class TanhNetwork:
         return TanhNetwork(self.weights, biases, self.scale, np.array(offset), self.squash, "none", self.clip)
 
     def squashed_at_origin(self, at_0: Array, u_eq: Sequence[Fraction]) -> Array:
-        """What enters the last tanh at the origin, (m,), given net(0)."""
+        """The values before the squash at the origin, (m,), given net(0)."""
         return self.beta(u_eq) if self.centre == "preactivation" else at_0
 
     def jacobian_at_origin(self, u_eq: Sequence[Fraction]) -> Array:
@@ -233,8 +233,8 @@ class TanhNetwork:
     def sha256(self) -> str:
         """Hash of the canonical bytes: squash, centre, then the arrays as `sha256_of` has them.
 
-        They are the layers in order as weight, bias; scale; offset; with a clip lo and hi. From where a policy is
-        looked at, its origin, is no part of it.
+        They are the layers in order as weight, bias; scale; offset; with a clip lo and hi. The origin is not part of
+        them.
         """
         pairs = [a for pair in zip(self.weights, self.biases, strict=True) for a in pair]
         head = f"certify-policy/1\0{self.squash}\0{self.centre}\0".encode()

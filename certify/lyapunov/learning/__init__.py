@@ -1,4 +1,4 @@
-"""Learning of Lyapunov functions beyond an ellipsoid, in floats: what is learned here is proved elsewhere."""
+"""Learn second functions N for sets beyond an ellipsoid, in floats; the provers prove them."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Where a function that is being learned is wrong: it does not fall, or is low where nothing converges.
+"""Find states where a function being learned is wrong: it does not fall, or is low where nothing converges.
 
-Found by sampling and a few steps uphill or downhill; what is found becomes a row of the next fit.
+The search samples states and takes a few steps uphill or downhill. Each state found becomes a row of the next fit.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ class Search:
 
     Parameters
     ----------
-    flow, samples : the loop, and what is known of its region of attraction.
+    flow, samples : the loop, and samples of its region of attraction.
     """
 
     def __init__(self, flow: LearningFlow, samples: Samples) -> None:
@@ -68,7 +68,7 @@ class Search:
         return directions[corner, each], slopes[corner, each]
 
     def low(self, function: LyapunovFunction, below: float, generator: np.random.Generator) -> Array:
-        """States z (B, n) of the domain's faces, or of what does not converge, with N < `below`."""
+        """States z (B, n) on the domain's faces, or outside the region of attraction, with N < `below`."""
         flow, half = self.flow, (self.flow.high - self.flow.low) / 2 / self.scale
         z = np.concatenate([flow.faces(_ON_FACES, generator), flow.uniform(_SINKING, generator)]) / self.scale
         low, high = flow.low / self.scale, flow.high / self.scale

@@ -1,7 +1,7 @@
 """Least squares with one-sided residuals: values between bounds, derivatives along the flow below bounds.
 
-A row that keeps its bound costs nothing, so that a fit can be exact where the shape is free, and every row that is
-found violated later can be added as it stands. Steps are those of Levenberg and Marquardt, damped by the diagonal
+A row within its bounds costs nothing, so that a fit can be exact where the shape is free, and rows that are found
+violated later can be added directly. Steps are those of Levenberg and Marquardt, damped by the diagonal
 (D. Marquardt, J. SIAM 11 (1963)), on the rows that are violated at the moment.
 """
 
@@ -40,7 +40,7 @@ class Values:
             raise InputError("rows must have a state, two bounds and a weight each; their counts differ.")
 
     def residuals(self, values: Array) -> Array:
-        """How far the values (B,) are out of bounds, weighted and with its sign."""
+        """The signed distance of each value (B,) to its bounds, weighted; 0 within them."""
         return np.asarray((values - np.clip(values, self.low, self.high)) * self.weight)
 
 
@@ -58,7 +58,7 @@ class Slopes:
             raise InputError("rows must have a state, a vector, a bound and a weight each; their counts differ.")
 
     def residuals(self, slopes: Array) -> Array:
-        """How far the slopes (B,) are above their bounds, weighted."""
+        """The weighted excess of each slope (B,) over its bound; 0 below it."""
         return np.asarray(np.maximum(slopes - self.most, 0.0) * self.weight)
 
 

@@ -1,7 +1,7 @@
-"""The closed loop for learning: rates in floats, at the nominal plant and at the corners of what is uncertain.
+"""The closed loop for learning: rates in floats, at the nominal plant and at the corners of the ranges.
 
-What a run reports is its fate, and integrals along its way. A run converges if it enters the inner ellipsoid; whoever
-has left the domain, or asked for an input out of bounds, is lost, because no set that a claim allows holds it.
+A run reports its fate and integrals along its path. It converges if it enters the inner ellipsoid; it is lost if it
+leaves the domain or its input leaves the bounds, because no set of a claim may contain such states.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _CALL = 2e5  # operations of evaluating few states at once
 
 
 class Fate(IntEnum):
-    """What becomes of a run until the horizon."""
+    """The end of a run within the horizon."""
 
     UNDECIDED = 0
     CONVERGED = 1
@@ -41,13 +41,13 @@ class Fate(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Runs:
-    """What became of runs from B states.
+    """Results of the runs from B states.
 
     Parameters
     ----------
-    fate : of each run, values of `Fate`, (B,).
-    length : of its way to the inner ellipsoid, in scaled states, (B,).
-    nearness : the largest nearness to the domain's faces on its way, from 0 (not near) to 1 (on one), (B,).
+    fate : each run's `Fate`, (B,).
+    length : length of its path to the inner ellipsoid, in scaled states, (B,).
+    nearness : the largest nearness to the domain's faces on its path, from 0 (not near) to 1 (on one), (B,).
     """
 
     fate: NDArray[np.int64]
@@ -56,7 +56,7 @@ class Runs:
 
     @property
     def converged(self) -> Mask:
-        """Which runs entered the inner ellipsoid, (B,)."""
+        """True for each run that entered the inner ellipsoid, (B,)."""
         return np.asarray(self.fate == Fate.CONVERGED)
 
 
@@ -66,7 +66,7 @@ class LearningFlow:
     Parameters
     ----------
     loop : in continuous time, its input following the state at once.
-    inner, c : of the ellipsoid.
+    inner, c : matrix and level of the ellipsoid.
     """
 
     def __init__(self, loop: ClosedLoop, inner: Quadratic, c: float, effort: Effort = UNLIMITED) -> None:
@@ -101,7 +101,7 @@ class LearningFlow:
         return x
 
     def inside(self, x: Array) -> Mask:
-        """Which states lie in the domain and have their input in bounds, (B,)."""
+        """True for each state that lies in the domain and has its input within bounds, (B,)."""
         within = np.all((x >= self.low) & (x <= self.high), axis=-1)
         if self._limits is not None:
             u = self.policy(x)

@@ -1,11 +1,11 @@
-"""A function N whose sublevel set, united with a proved ellipsoid, is to be a larger region of attraction.
+"""Learn a function N whose sublevel set extends a proved ellipsoid.
 
-A fit to values along simulated runs gives the shape; rounds of counterexamples then see to it that N falls along the
-flow wherever it is low, and is high where nothing converges. In later rounds the values are let go: what counts is
-which side of the level a state is on, and that N falls. The ellipsoid is taken smaller than it is, so that N goes on
-falling well inside, and a somewhat different one serves as well.
+A fit to values along simulated runs gives the shape. Rounds of counterexamples then make N fall along the flow wherever
+it is low, and keep it high where nothing converges. Later rounds drop the values: only the side of the level and the
+fall of N count. The fit uses a smaller ellipsoid, so that N keeps falling well inside, and a slightly different
+ellipsoid works as well.
 
-Everything here is in floats and proves nothing: the level is where samples found no violation. With the same seed and
+Everything here is in floats and proves nothing: below the level samples found no violation. With the same seed and
 enough time the result is the same.
 """
 
@@ -63,7 +63,7 @@ class Round:
 
 @dataclass(frozen=True, slots=True)
 class Learned:
-    """A function with what samples say of it; nothing of this is proved.
+    """A function with sampled results; nothing of this is proved.
 
     Parameters
     ----------
@@ -225,7 +225,7 @@ class _Lesson:
         return Slopes(z[some], v[some], most[some], np.full(int(some.sum()), weight))
 
     def add(self, z: Array, v: Array, low: Array, relax: bool) -> None:
-        """Take in counterexamples: where N rises, with the flow there, and where it is low."""
+        """Add counterexamples: states where N rises, with the flow there, and states where N is low."""
         self._rounds, self.relaxed = self._rounds + 1, relax
         some = self.generator.permutation(len(z))[:_NEW]
         self.risen = np.concatenate([self.risen, z[some]])[-_KEPT:]
@@ -244,7 +244,7 @@ def _shell(flow: LearningFlow, count: int, generator: np.random.Generator) -> Ar
 
 
 def _drawn(directions: Array, generator: np.random.Generator) -> Array:
-    """Of the directions (C, B, n) at each corner of what is uncertain one for each state, (B, n)."""
+    """Draw for each state one of its directions (C, B, n), over the C corners of the ranges: (B, n)."""
     corners, count = directions.shape[:2]
     drawn = np.zeros(count, dtype=np.int64) if corners == 1 else generator.integers(corners, size=count)
     return np.asarray(directions[drawn, np.arange(count)])

@@ -1,8 +1,8 @@
-"""Functions with free parameters: what a value, and a derivative along a vector, are in the parameters.
+"""Functions with free parameters, and the derivatives in the parameters of values and of slopes along a vector.
 
 Fits of a few hundred parameters to a few thousand rows converge in seconds by Levenberg's and Marquardt's method where
-descent by gradients takes minutes. It needs the rows' derivatives, one row a sample, which stand here; a polynomial,
-whose rows do not depend on the parameters, is the linear case of the same thing.
+descent by gradients takes minutes. It needs the rows' derivatives, one row per sample, which this module computes; a
+polynomial, whose rows do not depend on the parameters, is the linear case.
 
 States are scaled, z = x / scale, so that numbers are about 1.
 """

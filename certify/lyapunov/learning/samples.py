@@ -1,10 +1,10 @@
-"""What is learned from: states of the region of attraction with a value each, and states beyond it.
+"""Training data: states of the region of attraction with a value each, and states outside of it.
 
-Zubov's function, the integral of a positive function along the way to the origin, decreases along trajectories and
-tends to infinity at the region's edge. Here the integrand is the speed, so that the integral is the way's length, and
-what comes near a face of the domain pays for it. Only the sublevel sets count, so any increasing function of it will
-do: the value is the share of the region's volume with a smaller integral, to the power 1/n. It is about linear in the
-distance from the origin and 1 at the edge, which a small network can follow.
+Zubov's function integrates a positive function along the trajectory to the origin. It decreases along trajectories and
+tends to infinity at the region's boundary. Here the integrand is the speed, so that the integral is the trajectory's
+length, with a penalty near the domain's faces. Only the sublevel sets count, so any increasing function of it will do:
+the value is the share of the region's volume with a smaller integral, to the power 1/n. It grows about linearly with
+the distance from the origin and is 1 at the boundary, which a small network can follow.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ class Samples:
 
     @property
     def attracted(self) -> Mask:
-        """Which states converge, (B,)."""
+        """True for each state that converges, (B,)."""
         return np.asarray(np.isfinite(self.value))
 
 

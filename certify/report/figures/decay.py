@@ -60,7 +60,7 @@ def decay(scene: Scene, paths: NDArray[np.float64], step: float) -> Picture:
 
 
 def _dots(scene: Scene) -> str:
-    """What the dots on the lines are, where there are any."""
+    """Explain the dots on the lines; empty if there are none."""
     if scene.timing.is_plain:
         return ""
     return "; a dot for each step" if scene.timing.discrete else "; the dots are at sampling instants"

@@ -1,8 +1,8 @@
-"""Which states are drawn against each other, when there are more than two.
+"""Choose the states to draw against each other, when there are more than two.
 
-A coordinate belongs to its rate, which the equations tell whatever the names are; a state without either belongs to the
-one that P couples it with most. The state that reaches furthest into its domain is what binds the set first, so its
-pair comes first.
+A coordinate is paired with its rate, which the equations show whatever the names are; any other state is paired with
+the one that P couples it with most. The state that reaches furthest into its domain binds the set first, so its pair
+comes first.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def rates(system: System) -> list[Pair]:
 
 
 def coupling(P: Array) -> Array:
-    """How much P couples two states, `|P_ij| / sqrt(P_ii P_jj)` in [0, 1), shape (n, n); 0 on the diagonal."""
+    """The coupling of two states by P, `|P_ij| / sqrt(P_ii P_jj)` in [0, 1), shape (n, n); 0 on the diagonal."""
     scale = np.sqrt(np.diag(P))
     coupled = np.abs(P) / np.outer(scale, scale)
     np.fill_diagonal(coupled, 0.0)

@@ -40,12 +40,12 @@ _STAR = "* simulated or on a grid, not proved"
 
 @dataclass(frozen=True, slots=True)
 class PaperOptions:
-    """What the figure looks like.
+    """Options of the figure.
 
     Parameters
     ----------
-    columns : of the page that it takes, 1 or 2.
-    pairs : states to draw against each other, such as `x,x_dot`; those that belong together if there are none.
+    columns : the figure's width in columns of the page, 1 or 2.
+    pairs : states to draw against each other, such as `x,x_dot`; empty for the default pairs.
     format : `pdf`, `svg` or `png`.
     """
 
@@ -123,7 +123,7 @@ def _draw(scene: Scene, panels: Sequence[Any]) -> tuple[Key, ...]:
 
 
 def _star(scene: Scene) -> str:
-    """What the star stands for; where values are uncertain, in a line of its own at which they are simulated."""
+    """Explain the star; if values are uncertain, a second line gives those that are simulated."""
     return _STAR + (f",\n{scene.held.strip()}" if scene.held else "")
 
 

@@ -75,7 +75,7 @@ def add_leaves(axes: Any, scene: Scene, leaves: Leaves, pair: tuple[int, int], w
 
 
 def _in_ring(scene: Scene, lower: Array, upper: Array) -> NDArray[np.bool_]:
-    """Which leaves meet `c1 <= V <= c2`, by the diagonal of `T'PT`: for colour only."""
+    """True for each leaf that meets `c1 <= V <= c2`, by the diagonal of `T'PT`: for colour only."""
     T = scene.T
     weight = np.diag(T.T @ scene.P @ T)
     near, far = np.clip(0.0, lower, upper), np.maximum(np.abs(lower), np.abs(upper))

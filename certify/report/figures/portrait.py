@@ -112,7 +112,7 @@ def portraits(scene: Scene, runs: Runs, region: Region | None) -> list[Picture]:
 
 
 def _unseen(scene: Scene) -> str:
-    """That the inner set cannot be seen, where it is too small for all of the pictures."""
+    """Say that the inner set is too small to be seen, if it is so in all of the pictures."""
     if not scene.shows_inner or any(map(scene.sees_inner, scene.pairs)):
         return ""
     below_it = "; a picture below shows it" if scene.n == 2 else ""
@@ -121,12 +121,12 @@ def _unseen(scene: Scene) -> str:
 
 
 def _but_inside(scene: Scene) -> str:
-    """Where the sign is not shown."""
+    """Name the states where the sign is not shown."""
     return "" if scene.beyond is None else " outside {V ≤ c₂}"
 
 
 def _shows_sign(scene: Scene) -> bool:
-    """Whether the sign of Vdot in the plane says something of all that is drawn in it."""
+    """True if the sign of Vdot in the plane applies to everything that is drawn in it."""
     return scene.n == 2 or scene.centre is None
 
 

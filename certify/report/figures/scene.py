@@ -1,7 +1,7 @@
-"""What the figures of one certificate share: sets, labels, the flow, trajectories, and how much may be simulated.
+"""Shared by the figures of one certificate: sets, labels, the flow, trajectories, and the effort for simulation.
 
-How many points are simulated follows from what one costs, counted in operations, so that equal certificates give equal
-pages on a fast machine and on a slow one. The clock is the last resort: where it runs out, runs end early and say so.
+The number of simulated points follows from the cost of one, counted in operations, so that equal certificates give
+equal pages on fast and slow machines. The clock is the last resort: if it runs out, runs end early and say so.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ _VIEW = 1.3  # of the set's reach, in pictures of more than two states
 
 
 def is_ellipsoid(certificate: Certificate) -> bool:
-    """Whether `{V <= c2}` is one, with levels in order; a rejected file may hold anything."""
+    """True if `{V <= c2}` is an ellipsoid with its levels in order; a rejected file may hold anything."""
     P = certificate.P
     ordered = 0 < inner_of(certificate) <= certificate.inner <= certificate.roa < np.inf
     return ordered and bool(np.all(np.isfinite(P))) and is_positive_definite(P)
@@ -64,7 +64,7 @@ def inner_of(certificate: Certificate) -> float:
 
 
 def is_local_enough(certificate: Certificate) -> bool:
-    """Whether the local rule covers the whole set, so that leaves are not asked (FORMAT.md, local)."""
+    """True if the local rule covers the whole set, so that leaves need not decrease (FORMAT.md, local)."""
     evidence = certificate.evidence
     ball = certificate.claim.at_rest or (isinstance(evidence, PartitionTree) and evidence.local is not None)
     return ball and certificate.claim.local == certificate.roa
@@ -140,14 +140,14 @@ def band_of(start: Array, centre: Array | None, slabs: Sequence[Slab]) -> Band |
 
 @dataclass(frozen=True, slots=True)
 class Effort:
-    """How much is simulated.
+    """The effort for simulation.
 
     Parameters
     ----------
     grid : points along each side of a grid, for one picture.
     starts : trajectories from the boundary of the set, in each plane.
-    steps : of a trajectory.
-    rates : states at which the time scales are looked for.
+    steps : the steps of a trajectory.
+    rates : the number of states at which time scales are estimated.
     """
 
     grid: int
@@ -157,7 +157,7 @@ class Effort:
 
     @classmethod
     def of(cls, network: TanhNetwork, planes: int) -> Effort:
-        """What a policy allows in as many planes."""
+        """The effort that a policy's cost allows in so many planes."""
         cost = _EQUATIONS + sum(w.size for w in network.weights) + _TANH * sum(b.size for b in network.biases)
         steps = _RUNS / (4 * cost)  # of all trajectories together
         starts = int(min(max(steps / (_MOST_STEPS * planes), 4), ON_BOUNDARY if planes == 1 else 8))
@@ -170,11 +170,11 @@ class Effort:
 
 
 class Scene:
-    """What the figures of one certificate share.
+    """Data shared by the figures of one certificate.
 
     Parameters
     ----------
-    accepted : whether the checker accepted it; if not, the captions speak of claims.
+    accepted : True if the checker accepted it; if not, the captions speak of claims.
     pairs : states that are drawn against each other; a function of system, P and shares chooses them.
     seconds : for all figures.
 
@@ -227,7 +227,7 @@ class Scene:
             self.leaves = leaves(evidence.tree, evidence.root)
 
     def _farthest(self, start_reach: Array) -> Array:
-        """How far from the origin what is drawn of a tube reaches, (n,): its start, around a path all of it."""
+        """The reach from the origin of a tube's drawn part, (n,): its start, or all of it around a path."""
         if self.centre is None:
             return start_reach
         far = np.abs(self.centre) + start_reach
@@ -237,8 +237,8 @@ class Scene:
 
     @property
     def held(self) -> str:
-        """Of what is simulated or on a grid: at which values, where something is uncertain, and at which one of several
-        periods; else nothing."""
+        """The values of uncertain quantities, and the period out of several, at which pictures are computed; empty if
+        there is neither."""
         held = f" with {held_at(self.system)} throughout" if self.system.ranges else ""
         lo, hi = self.system.sample or (Fraction(0), Fraction(0))
         return held + (f" with periods of {exact_number(hi)} s" if lo < hi else "")
@@ -263,17 +263,17 @@ class Scene:
 
     @property
     def duration(self) -> float:
-        """Of the tube, in seconds; 0 without one."""
+        """The tube's duration in seconds; 0 without one."""
         return math.fsum(slab.duration for slab in self.slabs)
 
     @property
     def local_is_enough(self) -> bool:
-        """Whether the local rule covers the whole set, so that there are no leaves to show."""
+        """True if the local rule covers the whole set, so that there are no leaves to show."""
         return is_local_enough(self.certificate)
 
     @property
     def shows_inner(self) -> bool:
-        """Whether there is an inner set besides the outer one."""
+        """True if there is an inner set besides the outer one."""
         return self.kind == "practical" or not self.local_is_enough
 
     def sees_inner(self, pair: Pair) -> bool:
@@ -290,7 +290,7 @@ class Scene:
 
     @property
     def meaning(self) -> str:
-        """Of the outer set, for captions."""
+        """The outer set's meaning, for captions."""
         return self.words.meaning + ("" if self.proved == "proved" else ", if the claim is true")
 
     def growth(self, x: Array) -> Array:
@@ -312,7 +312,7 @@ class Scene:
         return self.timing.derivative if self.beyond is None else "N′F"
 
     def in_outer(self, x: Array) -> NDArray[np.bool_]:
-        """Which states (..., n) lie in the outer set, in float64; none without one."""
+        """True for each state (..., n) in the outer set, in float64; False everywhere without one."""
         if self.beyond is None:
             return np.zeros(x.shape[:-1], dtype=np.bool_)
         with np.errstate(all="ignore"):
@@ -363,8 +363,8 @@ class Scene:
         return Runs(refine(runs.path, self.flow.field, step), step / PARTS, runs.settled, runs.left)
 
     def view(self, pair: Pair) -> Box:
-        """What a picture of two states shows: the sets with some room within the domain; the domain itself where there
-        are no other states, or there is an outer set."""
+        """The axes' limits of a picture of two states: the sets with some room within the domain; the domain itself if
+        there are no other states, or there is an outer set."""
         lo, hi = self.lo[list(pair)], self.hi[list(pair)]
         if self.n == 2 or self.beyond is not None:
             margin = 0.03 * (hi - lo)

@@ -1,7 +1,7 @@
-"""How figures look: colours, fonts, sizes in inches, legends, and the drawing as SVG.
+"""The style of figures: colours, fonts, sizes in inches, legends, and the drawing as SVG.
 
-A drawing brings its own dark colours: an image in a page is not reached by the page's style sheet, but asks the same
-question of the reader's device. Print stays light.
+A drawing brings its own dark colours: the page's style sheet does not reach an image, but the image can ask the
+reader's device for its colour scheme. Print stays light.
 """
 
 from __future__ import annotations

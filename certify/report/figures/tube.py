@@ -1,8 +1,8 @@
-"""How far a tube reaches in each state while time passes, one small picture a state.
+"""A tube's extent in each state over time, one small picture per state.
 
 The ellipsoid {(x - c(t))'P(t)(x - c(t)) <= 1} cannot be drawn in many dimensions, but its shadow on each axis can:
 |x_i - c_i(t)| is at most sqrt((P(t)^-1)_ii) on it, with equality somewhere. The trajectories are those of the planes,
-which begin on the edge of the start.
+which begin on the boundary of the start.
 """
 
 from __future__ import annotations

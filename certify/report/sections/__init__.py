@@ -1,8 +1,7 @@
-"""What stands in the sections of the HTML page, a file a section, in the order of the page.
+"""The sections of the HTML page, one file per section, in the page's order.
 
-`status.py` the boxes at its head; `claim.py` what was proved, with `plant.py` for what it is about; `not_proved.py`;
-`simulated.py` the numbers under the figures; `limits.py` what limits the set; `numbers.py`. What more than one of them
-needs stands in `shared.py`. Each gives plain data, by a function that is named as the template names the data:
-`claim_of` what stands there as `claim`. Which words stand around it, and whether a section is there at all, is up to
-`template.html`.
+`status.py` fills the boxes at its head, `claim.py` the proved claim and `plant.py` its plant; then follow
+`not_proved.py`, `simulated.py` (the numbers under the figures), `limits.py` and `numbers.py`. `shared.py` has the code
+that several of them need. Each section gives plain data by a function named after the template's variable: `claim_of`
+fills `claim`. `template.html` writes the words around the data and decides which sections appear.
 """

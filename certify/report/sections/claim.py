@@ -1,6 +1,6 @@
-"""What was proved: the claim in words and numbers, N where there is one, and each part with what the checker showed.
+"""The proved claim in words and numbers, N where there is one, and the checker's result for each part.
 
-The sentences of each kind of claim are those of `certify/report/claims.py`; here they get their numbers and notes.
+`certify/report/claims.py` has the sentences of each kind of claim; here they get their numbers and notes.
 """
 
 from __future__ import annotations
@@ -111,7 +111,7 @@ def claim_of(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict
 
 
 def _beyond(certificate: Certificate, outer: Outer | None) -> dict[str, Any] | None:
-    """What N is: a network by its widths and hash, an expression itself unless it is long."""
+    """Describe N: a network by its widths and hash, an expression by its formula unless it is long."""
     if outer is None:
         return None
     N, level = outer.function, below(outer.level)
@@ -131,7 +131,7 @@ def _smallest(timing: TimingInWords) -> str:
 
 
 def _in_cells(evidence: PartitionTree | TrustedSolver) -> str:
-    """Of how many cells of the ranges a margin is the least; nothing where there is but one."""
+    """The number of cells over which a margin is the least; empty if there is only one."""
     count = math.prod(evidence.cells) if isinstance(evidence, PartitionTree) else 1
     return f", the least of {count:,} cells of the box of all ranges" if count > 1 else ""
 
@@ -151,7 +151,7 @@ def _with_errors(parts: Sequence[tuple[str, str, str]], system: System) -> Itera
 def _sides(
     certificate: Certificate, P: NDArray[np.float64], level: float, centre: NDArray[np.float64] | None = None
 ) -> str:
-    """How far {(x - c)'P(x - c) <= level} reaches from c along each state, which is less than the domain does."""
+    """The reach of {(x - c)'P(x - c) <= level} from c along each state, shown as less than the domain's."""
     system = certificate.system
     around = np.zeros(system.n) if centre is None else centre
     each = zip(system.states, extents(P, level), system.domain, map(Fraction, around.tolist()), strict=True)
@@ -168,7 +168,7 @@ def _from(name: str, value: Fraction) -> str:
 
 
 def _tube_notes(certificate: Certificate) -> dict[str, str]:
-    """Of the tube's part of the claim: how many slabs in what time, and how far its start reaches."""
+    """Notes on the tube: its number of slabs, its duration, and the reach of its start."""
     start = start_of(certificate)
     if start is None:
         return {}
@@ -182,7 +182,7 @@ def _tube_notes(certificate: Certificate) -> dict[str, str]:
 
 
 def _outer_notes(answer: Mapping[str, Any] | None) -> dict[str, str]:
-    """Of the outer set's parts: on how many leaves the checker has shown them."""
+    """Notes on the outer set's parts: the number of leaves on which the checker showed each."""
     beyond = (answer or {}).get("outer")
     if not isinstance(beyond, Mapping):
         return {}

@@ -1,6 +1,6 @@
-"""What limits the set, and what to try next: how much of its domain it takes, where the proof had most to do.
+"""The set's limits and the next thing to try: its share of the domain, and the states that cost the proof most.
 
-How a limit is called stands in `certify/report/limits.py`, because the terminal calls it the same.
+The limits' names stand in `certify/report/limits.py`, which the terminal shares.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from certify.report.words import above, held_at, modes, pretty_unit, symbol
 
 
 def limits_of(certificate: Certificate, result: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    """How much of its domain the set takes, and what the run says of what limits it; None where there is no set.
+    """The set's shares of its domain, and the limits that the run reports; None if there is no set.
 
-    The shares are the certificate's own; only words and the next step come from the run.
+    The shares come from the certificate; only words and the next step come from the run.
     """
     if not is_ellipsoid(certificate):
         return None
@@ -64,13 +64,13 @@ def limits_of(certificate: Certificate, result: Mapping[str, Any] | None) -> dic
 
 
 def _outer_limit(result: Mapping[str, Any] | None) -> str:
-    """What the run says of what limits its outer set; nothing where there is none."""
+    """The limit of the outer set that the run reports; empty without an outer set."""
     found: Mapping[str, Any] = (result or {}).get("outer") or {}
     return outer_limited_by(found) if found else ""
 
 
 def _modes(found: Mapping[str, Any], held: str) -> str:
-    """How fast the closed loop is at rest, in a sentence, with the values that are not exact `held`."""
+    """The closed loop's modes at the equilibrium in a sentence, with the uncertain values `held`."""
     if not found.get("stiffness"):
         return ""
     return f"Modes at rest{f', {held}' if held else ''}: {modes(found['fastest'], found['slowest'])}."

@@ -1,6 +1,6 @@
-"""What was not proved: what a reader may take the claim to say, and it does not.
+"""The statements that a reader may take the claim to make, although it does not.
 
-What a kind of claim leaves out that its siblings do not stands with its words, in `certify/report/claims.py`.
+The gaps of one kind of claim alone stand with its words, in `certify/report/claims.py`.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def _other_times(timing: TimingInWords) -> Iterator[tuple[str, str]]:
 
 
 def _not_of_the_plant(system: System) -> list[tuple[str, str]]:
-    """What of plant and surroundings the claim does not cover: less, where something has a range."""
+    """The gaps about plant and surroundings; fewer if some quantity has a range."""
     if not system.ranges:
         return [
             (
@@ -111,7 +111,7 @@ def _not_of_the_plant(system: System) -> list[tuple[str, str]]:
 
 
 def _rounding(system: System) -> tuple[str, str]:
-    """What is not said of how the policy is evaluated: less, where inputs may be in error."""
+    """The gaps about the policy's evaluation; fewer if input errors are allowed."""
     errors = system.input_errors
     exact = [s.name for s in system.inputs if s.name not in errors]
     if len(exact) == system.m:

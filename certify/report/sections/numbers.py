@@ -147,7 +147,7 @@ def _geometry(certificate: Certificate) -> Rows:
 
 
 def _evidence(certificate: Certificate, accepted: Mapping[str, Any] | None, sha256: str, size: int | None) -> Rows:
-    """What the claim stands on: the policy, the file, and how much of it the checker looked at, where it `accepted`."""
+    """The claim's basis: the policy, the file, and the checker's counts if it `accepted`."""
     network, beyond, slabs = certificate.network, certificate.claim.outer, slabs_of(certificate)
     rows = [
         ("policy", f"{'-'.join(map(str, network.layers))} tanh, squash {network.squash}, centre {network.centre}"),
@@ -174,7 +174,7 @@ def _evidence(certificate: Certificate, accepted: Mapping[str, Any] | None, sha2
 
 
 def _run(result: Mapping[str, Any] | None) -> Rows:
-    """What the run did and how long it took; nothing without one."""
+    """The run's work and times; empty without a run."""
     if result is None:
         return []
     rows = [("boxes examined", f"{result['boxes']:,}")] if result.get("boxes") else []
@@ -203,7 +203,7 @@ def _candidates(certificate: Certificate, result: Mapping[str, Any] | None) -> l
 
 
 def _unit_of(certificate: Certificate) -> str:
-    """Of a volume of states."""
+    """The unit of a volume of states."""
     system = certificate.system
     return volume_unit([system.units.get(s.name, "") for s in system.states])
 
@@ -268,7 +268,7 @@ def _eigenvalues(certificate: Certificate) -> str:
 
 
 def _over_period(A: NDArray[np.float64], B: NDArray[np.float64], K: NDArray[np.float64], h: float) -> Any:
-    """What the linear loop x' = A x + B u makes of x over a period, u = -K x held: e^(A h) - int_0^h e^(A s) ds B K."""
+    """The map of x over a period of x' = A x + B u with u = -K x held: e^(A h) - int_0^h e^(A s) ds B K."""
     from scipy.linalg import expm
 
     n, m = B.shape

@@ -1,6 +1,6 @@
-"""What more than one section needs of a certificate: the words for its claim, its ellipsoids, its tube, its policy.
+"""Parts of a certificate that several sections need: the words for its claim, its ellipsoids, its tube, its policy.
 
-What a single section needs stands in that section.
+Code for a single section stands in that section.
 """
 
 from __future__ import annotations
@@ -70,13 +70,13 @@ def centre_in_words(certificate: Certificate, *, of_values: bool = False) -> str
 
 
 def duration_in_words(certificate: Certificate) -> str:
-    """Of the tube, rounded up; a dash where there is none, or a rejected file's is no number."""
+    """The tube's duration, rounded up; a dash if there is none, or a rejected file's is not finite."""
     each = [slab.duration for slab in slabs_of(certificate)]
     return f"{above(sum(map(Fraction, each)))} s" if each and all(map(math.isfinite, each)) else ABSENT
 
 
 def read_in_words(certificate: Certificate) -> str:
-    """What the layers of a policy read that is seen from elsewhere, in the states' units."""
+    """The layers' inputs under a policy whose origin is another state, in the states' units."""
     states, origin = certificate.system.states, certificate.network.origin.tolist()
     each = zip(states, origin, strict=True)
     return ", ".join(f"{number(v, 10)} + {symbol(s.name)}" if v else symbol(s.name) for s, v in each)

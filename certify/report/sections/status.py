@@ -19,23 +19,23 @@ from certify.report.words import point
 
 @dataclass(frozen=True, slots=True)
 class Status:
-    """What may be said of a certificate: kind is ACCEPTED, TRUSTED, REJECTED or NOT CHECKED; note says why."""
+    """A certificate's status: kind is ACCEPTED, TRUSTED, REJECTED or NOT CHECKED; note says why."""
 
     kind: str
     note: str
 
     @property
     def accepted(self) -> bool:
-        """Whether the page may speak of a proof."""
+        """True if the page may speak of a proof."""
         return self.kind == "ACCEPTED"
 
 
 def status_of(certificate: Certificate, sha256: str, answer: Mapping[str, Any] | None) -> Status:
-    """What the checker's answer lets be said of the certificate whose bytes have this hash.
+    """The status that the checker's answer gives the certificate whose bytes have this hash.
 
     Raises
     ------
-    SoundnessError : the answer accepts, or trusts, something else than this certificate.
+    SoundnessError : the answer accepts or trusts another certificate than this one.
     """
     if answer is None:
         return Status("NOT CHECKED", "The checker was not asked. Until it accepts the file, nothing here is proved.")
@@ -77,19 +77,18 @@ def status_of(certificate: Certificate, sha256: str, answer: Mapping[str, Any] |
 
 
 def _checked(kind: str) -> str:
-    """What is checked whatever the evidence is."""
+    """The parts that are checked whatever the evidence is."""
     names = {"Lyapunov function": "P", "Equilibrium": "P, the equilibrium", "Domain": "the domain"}
     return ", ".join(names[name] for name, _, _ in words_for(kind).parts if name in CHECKED_ALWAYS)
 
 
 def is_missed(result: Mapping[str, Any] | None) -> bool:
-    """Whether the run's reason is about what it was asked for, a state or a level of N, and not about the certificate's
-    set."""
+    """True if the run's reason is about a requested state or level of N, and not about the certificate's set."""
     return result is not None and result.get("stop") in ("path", "beyond")
 
 
 def missed_of(result: Mapping[str, Any] | None, status: Status) -> str:
-    """That a state, or a level of N, was asked about of which this certificate says nothing; else nothing."""
+    """Name the requested state or level of N that this certificate does not cover; empty if there is none."""
     if result is None or not is_missed(result):
         return ""
     if result.get("stop") == "beyond":

@@ -1,5 +1,5 @@
-"""One plant a file: `NAME.py` here defines a function `NAME()` that returns the `System` called `NAME`.
+"""One file per plant: `NAME.py` here defines a function `NAME()` that returns the `System` called `NAME`.
 
-The registry looks into this folder, so a new file is all that a new plant needs. Files whose names begin with an
-underscore are no plants.
+The registry reads this folder, so a new plant needs only a new file. Files whose names begin with an underscore are no
+plants.
 """

@@ -1,4 +1,4 @@
-"""Zip archives read with bounds: what a member claims about its size is not believed."""
+"""Read zip archives with bounds, without trusting the sizes that members claim."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Archive:
     Parameters
     ----------
     raw : the archive.
-    what : how messages call it.
+    what : its name in messages.
 
     Raises
     ------
@@ -44,7 +44,7 @@ class Archive:
 
         Raises
         ------
-        InputError : there is none of that name, it is damaged, or it unpacks to more than is read.
+        InputError : there is none of that name, it is damaged, or it unpacks to too much.
         """
         if name not in self.names:
             raise InputError(f"{self.what} must hold {name}; it has {', '.join(self.names[:12]) or 'no members'}.")

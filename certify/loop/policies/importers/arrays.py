@@ -1,6 +1,6 @@
-"""Numbers in a pickle that was read as data: the few shapes in which numpy and torch write arrays.
+"""Numbers in a pickle that was read as data: the few forms in which numpy and torch write arrays.
 
-Every size is compared with the bytes that are there before anything is made of it.
+Every size is compared with the available bytes before an array is made.
 """
 
 from __future__ import annotations
@@ -56,11 +56,11 @@ def is_array(node: Any) -> bool:
 
 
 def product(shape: Any, what: str) -> int:
-    """How many numbers a shape holds.
+    """The number of entries of a shape.
 
     Raises
     ------
-    InputError : it is no shape, or holds more than is read.
+    InputError : it is no shape, or has too many entries.
     """
     whole = isinstance(shape, tuple | list) and all(type(k) is int and 0 <= k <= _MAX_NUMBERS for k in shape)
     count = math.prod(shape) if whole and len(shape) <= 8 else _MAX_NUMBERS + 1

@@ -1,10 +1,10 @@
-"""How far a folded network is from what the framework itself computes, and how far rounding may take the two apart.
+"""Compare a folded network with the framework's own outputs, and bound the difference that rounding can cause.
 
-The framework works in single precision as a rule. Its rounding is bounded step by step in the usual way (Higham,
-Accuracy and Stability of Numerical Algorithms, section 3): a sum of k products has the relative error `k u / (1 - k u)`
-of the sum of their magnitudes, tanh passes errors on undiminished at most and adds a few units of its own. A difference
-beyond four times that bound is no rounding: then something was misread, and the import is refused. In wide networks the
-bound is lax, so the same operations are asked once more in double precision, where it is not.
+The framework usually works in single precision. Its rounding is bounded step by step in the usual way (Higham, Accuracy
+and Stability of Numerical Algorithms, section 3): a sum of k products has an error of at most `k u / (1 - k u)` times
+the sum of their magnitudes; tanh enlarges no error and adds a few units of its own. A difference beyond four times that
+bound is no rounding: the file was misread, and the import is rejected. The bound is loose for wide networks, so the
+comparison is repeated in double precision, where it is tight.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ _SINGLE, _DOUBLE = 2.0**-24, 2.0**-53
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """The largest difference over the states, and the least that rounding explains where a difference was largest.
+    """The largest difference over the states, and the bound of rounding there.
 
     Parameters
     ----------
-    states : how many were compared.
-    largest : in the inputs' units.
+    states : number of compared states.
+    largest : the largest difference, in the inputs' units.
     explained : the bound of the framework's rounding at the state of the largest difference.
     in_double : the largest difference where the framework's operations work in double precision.
     """
@@ -54,13 +54,13 @@ def compare_reading(
 ) -> Difference:
     """Compare with the framework in the file's precision, and with the same operations in double precision.
 
-    The first is what its users see; its rounding could hide a small mistake, which the second shows.
+    Users see the first; its rounding could hide a small mistake, which the second shows.
 
     Parameters
     ----------
-    before, after : what stands before and behind the reading's own steps.
-    observed : what the network reads, without `before`, (k, n).
-    ours : what was folded of all steps, at the same states, (k, m).
+    before, after : the steps before and after the reading's own steps.
+    observed : the network's inputs, without `before`, (k, n).
+    ours : the folded network's values at the same states, (k, m).
 
     Raises
     ------
@@ -111,7 +111,7 @@ def compare(ours: Array, theirs: Any, bound: Array) -> Difference:
 
 
 def rounding(steps: Sequence[Step], x: Array, double: bool) -> Array:
-    """A bound of what rounding changes in the action at states (k, n), shape (k, m)."""
+    """A bound of the rounding error of the action at states (k, n), shape (k, m)."""
     return _SLACK * _run(steps, x, np.zeros_like(x), _DOUBLE if double else _SINGLE)[1]
 
 

@@ -1,13 +1,13 @@
-"""Folding: a file's steps as the one form that is proved, layers with tanh between them, then scale, offset and a clip.
+"""Fold a file's steps into the form of a proof: layers with tanh between them, then scale, offset and a clip.
 
-What several steps make of one number of the network is computed exactly, in rationals, and rounded once to the nearest
+Each number of the network is computed from the steps exactly, in rationals, and rounded once to the nearest
 binary64; where a normaliser divides by the square root of a rational that is no square, the number is enclosed in Arb
 until both ends of the enclosure round to the same binary64. So the policy that is proved is the folded one, and it
 differs from the file's real-number policy by at most half a unit in the last place of each weight, bias, scale and
 offset. A layer that stands alone keeps its numbers as they are.
 
-A clip of the observation does not fold. It is inactive on a box of states, which is given out beside the network:
-inside the box the folded policy is the real one.
+A clip of the observation does not fold. It is inactive on a box of states, which is returned with the network: inside
+the box the folded policy is the real one.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _NO_BOUNDS: Bounds = (None, None)
 
 @dataclass(frozen=True, slots=True)
 class Folded:
-    """The numbers of a policy `clip(scale * squash(net(o)) + offset)` and where the observation is not clipped.
+    """The numbers of a policy `clip(scale * squash(net(o)) + offset)`, and the box without clipped observations.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def fold(steps: Sequence[Step], n: int) -> Folded:
 
 @dataclass(frozen=True, slots=True)
 class _Head:
-    """What comes before the first layer: `o -> factor * (o - mean) / sqrt(square) + offset`, componentwise."""
+    """The map before the first layer: `o -> factor * (o - mean) / sqrt(square) + offset`, componentwise."""
 
     factor: tuple[Fraction, ...]
     mean: tuple[Fraction, ...]

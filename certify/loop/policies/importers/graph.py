@@ -1,7 +1,7 @@
-"""The operations that a graph of ONNX or TorchScript may hold, as exact steps on one chain of values.
+"""The operations that a graph of ONNX or TorchScript may contain, as exact steps on one chain of values.
 
-A chain begins with the observation, and each operation makes another one out of a chain and constants; two chains never
-meet. Whatever is not here is refused by its name.
+A chain begins with the observation, and each operation extends a chain with constants; two chains never meet. Any other
+operation is rejected by its name.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ def real(value: Any, what: str) -> Numbers:
 
 
 def row(value: Any, what: str) -> tuple[Fraction, ...]:
-    """A constant that meets every row of a batch alike: one number, or one for each component.
+    """A constant that applies to every row of a batch: one number, or one per component.
 
     Raises
     ------
-    InputError : its shape says something else.
+    InputError : it has another shape.
     """
     array = real(value, what)
     if any(size != 1 for size in array.shape[:-1]) or array.size == 0:

@@ -1,7 +1,7 @@
-"""A policy file of another program as a policy of this one: read, ask for what is missing, fold, compare, and say so.
+"""Import another program's policy file: read it, ask for missing facts, fold, compare, and report.
 
-The bytes decide what a file is; nothing in it is executed. What is proved afterwards is the folded policy: it differs
-from the file's real-number policy by the rounding of each folded number, half a unit in the last place at most.
+The bytes determine the file's kind; nothing in it is executed. Proofs are about the folded policy: each folded number
+differs from the file's real-number policy by at most half a unit in the last place.
 """
 
 from __future__ import annotations
@@ -53,12 +53,12 @@ class Imported:
     ----------
     policy : the policy, with the record of its origin in `training`.
     words : the kind of file and of policy.
-    formula : what the file's policy is, for people.
-    difference : how far it is from what the file's own program gives, or, where the file holds no program, from what
-        torch's layers give with the same numbers, which checks the folding alone.
-    compared_with : the file's own program with which it was compared, for people; None where nothing was compared.
-    assumed : where nothing was compared, who says what stands between the numbers.
-    not_read : why each tensor of the file that was not read is left out, by its name.
+    formula : the file's policy as a formula, for people.
+    difference : its difference from the file's own program, or, if the file has no program, from
+    torch's layers with the same numbers, which checks only the folding.
+    compared_with : the file's own program that it was compared with, for people; None without a comparison.
+    assumed : without a comparison, the source of the functions between the numbers.
+    not_read : the reason why each unread tensor of the file is left out, by its name.
     at_origin : pi(0), shape (m,).
     u_eq : the plant's equilibrium input, shape (m,).
     centring : for each centring that is possible the largest change of u over the states compared.
@@ -77,7 +77,7 @@ class Imported:
 
 
 def content_of(raw: bytes, name: str) -> Content | None:
-    """What a file is by its bytes and, for ONNX, by its name; None if it is nothing that is read here."""
+    """Recognise a file's kind by its bytes and, for ONNX, by its name; None if no reader takes it."""
     if raw.startswith(b"PK"):
         archive = Archive(raw, name)
         if "policy.pth" in archive and "data" in archive:
@@ -108,13 +108,13 @@ def import_policy(
     ----------
     path : the file.
     plant : the plant that it controls: its states, inputs, domain and u_eq.
-    options : what the file cannot say.
+    options : facts that the file does not contain.
     beside : keys of the layers of the Lyapunov network that is imported from the same file, if one is.
 
     Raises
     ------
-    InputError : the file is of no kind that is read, does not say enough and the options do not either, holds what is
-        not proved or could belong to the policy and is not read, or differs from its own program by more than rounding.
+    InputError : the file is of an unknown kind, a fact is missing from file and options, it has operations that are not
+    proved or an unread tensor that could belong to the policy, or differs from its own program by more than rounding.
     """
     options = options if options is not None else ImportOptions()
     raw = read_bytes(path)
@@ -153,8 +153,8 @@ def import_bytes(
 
     Parameters
     ----------
-    evaluate : the policy itself, where it is at hand; it is compared with that.
-    folder : where the file lies, if it lies anywhere; an ONNX model may have its weights in a second file there.
+    evaluate : the policy itself, if available, for the comparison.
+    folder : the file's folder, if it has one; an ONNX model may have its weights in a second file there.
     beside : as in `import_policy`.
 
     Raises
@@ -223,11 +223,11 @@ def import_bytes(
 
 
 def kind_of(raw: bytes, name: str, options: ImportOptions) -> Content:
-    """The kind of a file by its bytes, and by `options` where they say it.
+    """The kind of a file by its bytes, or by `options`.
 
     Raises
     ------
-    InputError : it is of no kind that is read, of this program already, or not what the options say.
+    InputError : its kind is unknown, it is this program's already, or it contradicts the options.
     """
     kind = options.kind if options.kind in ("onnx", "safetensors") else content_of(raw, name)
     if kind is None:
@@ -321,7 +321,7 @@ def _normaliser(reading: Reading, options: ImportOptions, n: int) -> tuple[Step,
 
 
 def _action(options: ImportOptions, m: int) -> tuple[Step, ...]:
-    """What becomes of the network's action on its way to the plant."""
+    """The steps from the network's action to the plant's input."""
     scale = spread(options.action_scale or _ONE, m)
     offset = spread(options.action_offset or _ZERO, m)
     steps: list[Step] = []
@@ -365,21 +365,21 @@ def _parameters(plant: System) -> dict[str, str]:
 
 
 def centring_changes(network: TanhNetwork, plant: System) -> dict[Centre, float]:
-    """How much each centring that can be had would change u at most, over samples of the domain."""
+    """The largest change of u that each possible centring would cause, over samples of the domain."""
     x, u_eq = sample(plant, None), plant.exact_u_eq()
     bare = replace(network, centre="none")
     return _centrings(bare, u_eq, x, bare(x, u_eq))
 
 
 def _centrings(bare: TanhNetwork, u_eq: tuple[Fraction, ...], x: Array, values: Array) -> dict[Centre, float]:
-    """How much each centring would change u, at most, over the states."""
+    """The largest change of u that each centring would cause, over the states."""
     changes: dict[Centre, float] = {}
     centres: tuple[Centre, ...] = ("output", "preactivation")
     for centre in centres:
         try:
             moved = replace(bare, centre=centre)(x, u_eq)
         except InputError:
-            continue  # u_eq outside of the squash's range, or no squash to centre in
+            continue  # u_eq is outside the squash's range, or there is no squash to centre in
         changes[centre] = float(np.max(np.abs(moved - values)))
     return changes
 

@@ -1,10 +1,10 @@
-"""Policies that lie in memory: a torch module, a state_dict. Each goes the way that its file would go.
+"""Import policies in memory, a torch module or a state_dict, in the same way as their files.
 
-A module is more than its tensors: what stands between the layers is in its code. So it is traced, and the trace is read
-as a TorchScript archive is: affine layers, tanh and constant scalings, and nothing else. A trace follows one
-observation and is deaf to branches; what torch says about that counts as a refusal, and what is folded is compared with
-the module itself at the states of the plant's domain, not with its trace. A state_dict holds numbers alone, and what
-it does not say is asked for, as of a file.
+A module is more than its tensors: the functions between the layers are in its code. So it is traced, and the trace is
+read like a TorchScript archive: affine layers, tanh and constant scalings, and nothing else. A trace follows one
+observation and ignores branches; torch's warning about a branch counts as an error, and the folded policy is compared
+with the module itself at states of the plant's domain, not with its trace. A state_dict holds only numbers, and missing
+facts are asked for, as for a file.
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ def import_module(module: torch.nn.Module, plant: System, options: ImportOptions
     ----------
     module : `forward` takes observations (k, n) and gives actions (k, m).
     plant : the plant that it controls.
-    options : what the module cannot say, see `ImportOptions`.
+    options : facts that the module does not contain, see `ImportOptions`.
 
     Raises
     ------
-    InputError : it cannot be copied or traced, is no chain of layers that are proved, differs from what was folded by
-        more than rounding, or the options do not say enough.
+    InputError : it cannot be copied or traced, is no chain of supported layers, differs from the folded policy by more
+    than rounding, or a fact is missing from the options.
     """
     options = options if options is not None else ImportOptions()
     name = f"the module {type(module).__name__}"
@@ -71,11 +71,11 @@ def import_state_dict(tensors: Mapping[str, Any], plant: System, options: Import
     ----------
     tensors : torch tensors or arrays of floating-point numbers by their names; mappings of such count as well.
     plant : the plant that it controls.
-    options : what the numbers cannot say, see `ImportOptions`.
+    options : facts that the numbers do not contain, see `ImportOptions`.
 
     Raises
     ------
-    InputError : a value is neither, the layers are not those of one policy, or the options do not say enough.
+    InputError : a value is neither, the layers are not those of one policy, or a fact is missing from the options.
     """
     import torch
 

@@ -1,6 +1,6 @@
-"""What a network of another program reads of a plant: which states, in which order, measured from where.
+"""The inputs that a network of another program expects: which states, in which order, measured from which point.
 
-A policy and a Lyapunov network of one file read the same; here are the answers to it, and the states of the domain at
+A policy and a Lyapunov network in one file read the same inputs. This module also samples the states of the domain at
 which a network is compared with its framework.
 """
 
@@ -43,7 +43,7 @@ def index_of(states: tuple[str, ...], plant: System) -> list[int]:
 
 
 def shift(x_eq: list[Fraction], options: ImportOptions) -> tuple[Step, ...]:
-    """From deviations, which networks here read, to the states' values, if that is what the network reads."""
+    """The step from deviations to the states' values, for a network that reads values; else none."""
     return (Diagonal((Fraction(1),), tuple(x_eq)),) if options.observes == "absolute" and any(x_eq) else ()
 
 

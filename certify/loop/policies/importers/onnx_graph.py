@@ -1,9 +1,9 @@
 """ONNX graphs of Gemm, MatMul, Add, Sub, Mul, Div, Neg, Clip, Relu and Tanh that form one chain.
 
-The file is parsed, and of its graph what the action depends on is read. The comparison runs that part in the reference
-evaluator of the onnx package, which knows the standard operators and nothing else. Exporters write around the layers
-what leaves every number as it is: Identity, Cast between float32 and float64, Flatten, Reshape to the same width, and
-Expand to the width that a value has already, which is left out before the graph is run.
+The file is parsed, and only the part of its graph that the action depends on is read. The comparison runs that part in
+the reference evaluator of the onnx package, which knows only the standard operators. Exporters add operations that
+change no number: Identity, Cast between float32 and float64, Flatten, Reshape to the same width, and Expand to the
+width that a value has already, which is removed before the graph runs.
 Weights may lie in one more file, as exporters write them: it is read if it lies in the model's own folder under a plain
 name and is no link, up to the size that any policy may have.
 """
@@ -56,8 +56,8 @@ def read_onnx(raw: bytes, what: str, wanted: str | None = None, folder: Path | N
 
     Parameters
     ----------
-    wanted : the output that is the action; None where there is one.
-    folder : where the file lies, and a file of its weights may lie.
+    wanted : the output that is the action; None if there is only one.
+    folder : the folder of the file, and of a file of its weights if there is one.
 
     Raises
     ------
@@ -106,7 +106,7 @@ def read_onnx(raw: bytes, what: str, wanted: str | None = None, folder: Path | N
 
 
 def _prune(model: Any, output: str, what: str) -> list[str]:
-    """Leave in a model what the numbers of the output depend on; the names of the tensors that are left out."""
+    """Remove all from a model that the output does not depend on; return the names of the removed tensors."""
     graph_ = model.graph
     widths = _widths(graph_)
     wanted, nodes = {output}, []
@@ -134,7 +134,7 @@ def _prune(model: Any, output: str, what: str) -> list[str]:
 
 
 def _widths(graph_: Any) -> dict[str, int]:
-    """How many numbers rows of values have, and those of which a shape is taken, as far as that follows from layers."""
+    """The widths of the graph's values, as far as the layers determine them, and of those whose shape is taken."""
     found: dict[str, int] = {}
     sizes = {tensor.name: tuple(tensor.dims) for tensor in graph_.initializer}
     for name, size in sizes.items():
@@ -164,7 +164,7 @@ def _widths(graph_: Any) -> dict[str, int]:
 
 
 def _fetch(graph_: Any, folder: Path | None, what: str) -> dict[str, str]:
-    """Put the tensors that lie in a file beside the model into it; the SHA-256 of that file, by its name."""
+    """Load the tensors of a file beside the model into it; return that file's SHA-256, by its name."""
     import onnx
 
     contents: dict[str, bytes] = {}
@@ -206,7 +206,7 @@ def _fetch(graph_: Any, folder: Path | None, what: str) -> dict[str, str]:
 
 
 def _plain_bytes(path: Path, what: str) -> bytes:
-    """The bytes of a regular file that is no link, if they are as few as a policy's may be."""
+    """The bytes of a regular file that is no link, if it is small enough for a policy."""
     try:
         # A pipe must not make it wait, nor a link lead elsewhere.
         handle = os.open(path, os.O_RDONLY | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0))

@@ -1,6 +1,6 @@
-"""What a file cannot say about its policy, and whoever imports it has to.
+"""Options of an import: facts about a policy that its file does not contain.
 
-Nothing here is guessed: a reader that needs an answer which its file does not hold asks for the option by name.
+Nothing is guessed: a reader that misses a fact asks for the option by name.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ WITHOUT_NORMALISATION = (
 
 @dataclass(frozen=True, slots=True)
 class ImportOptions:
-    """What is known about a policy file of another program; None where nothing is said.
+    """Known facts about a policy file of another program; None where nothing is given.
 
     Parameters
     ----------
@@ -42,13 +42,13 @@ class ImportOptions:
     squash : what follows the last layer of a state_dict: `identity`, `tanh`, or `relu-tanh` for relu(tanh(.)).
     states : the plant's states in the order in which the network reads them.
     normaliser : a file with the observations' normaliser, or `none`.
-    epsilon : what a normaliser of rsl_rl adds to the standard deviation; 1/100 if nothing is said.
+    epsilon : the number that rsl_rl's normaliser adds to the standard deviation; 1/100 by default.
     action_scale, action_offset : `u = scale * action + offset` in the plant's units, exact, one number or m.
     clip : bounds of the action, before scale and offset.
-    centre : how pi(0) = u_eq is brought about; None leaves the policy as it is.
-    observes : whether the network reads the plant's states or their deviations from its operating point.
+    centre : the centring that gives pi(0) = u_eq; None leaves the policy as it is.
+    observes : `absolute` if the network reads the states' values, `deviation` if deviations from the operating point.
     ignore : names of tensors that are no part of the policy, with `*` and `?` as in names of files.
-    output : which output of an ONNX graph is the action, where it has several.
+    output : the output of an ONNX graph that is the action, where it has several.
 
     Raises
     ------
@@ -92,7 +92,7 @@ class ImportOptions:
 
     @property
     def given(self) -> dict[str, Any]:
-        """What was said, by option, as text: for messages and for the record in the policy file."""
+        """The options that were given, as text: for messages and for the record in the policy file."""
         names = (f.name for f in fields(self))
         values = {name: getattr(self, name) for name in names}
         return {_OPTIONS[k]: _text(v) for k, v in values.items() if v is not None and v != "auto"}

@@ -1,10 +1,9 @@
-"""A pickle read as data: every global stays a name, and nothing that a pickle asks to be called is called.
+"""Read a pickle as data: every global stays a name, and no call in it is made.
 
-A pickle is a program, and whatever finds its functions can be made to run them. This reader has no way to find one: the
-opcodes go over a stack of numbers, text, bytes and containers of its own, what would have been a class is the pair of
-its names, and what would have been a call, a new object or its state is written down as `Call`. The readers of tensors
-and arrays look for the few shapes that they know in what is left. Python's own `Unpickler` with a `find_class` is not
-enough: it sets the attributes of whatever it was given.
+A pickle is a program, and a reader that looks up its functions can be made to run them. This reader looks up none: the
+opcodes work on a stack of numbers, text, bytes and its own containers. A class becomes the pair of its names; a call,
+a new object or its state becomes a `Call`. The readers of tensors and arrays look for a few known forms in the result.
+Python's own `Unpickler` with a `find_class` is not enough: it sets the attributes of the objects that it gets.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ class Persistent:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Call:
-    """A call, or a new object, that the pickle asks for and nobody made; what it was to be given lies in the lists."""
+    """A call, or a new object, that the pickle asks for and this reader does not make; the lists hold its arguments."""
 
     function: Any
     arguments: Any
@@ -64,7 +63,7 @@ def read_pickle(raw: bytes, what: str) -> Any:
     Parameters
     ----------
     raw : the pickle.
-    what : how messages call it.
+    what : its name in messages.
 
     Raises
     ------
@@ -97,7 +96,7 @@ class _Machine:
         return self.stack.pop()
 
     def marked(self) -> list[Any]:
-        """What was pushed since the last mark."""
+        """Pop the items pushed since the last mark."""
         items, self.stack = self.stack, self.marks.pop()
         return items
 
@@ -239,7 +238,7 @@ def _set_items(target: Any, items: list[Any]) -> None:
 
 
 def _key(value: Any) -> Any:
-    """A key whose hash takes no longer than the key is long: tuples of tuples of the same tuple could take for ever."""
+    """A key whose hash takes time linear in its size: nested tuples of the same tuple could take for ever."""
     flat = value if isinstance(value, tuple) else (value,)
     if all(isinstance(part, _KEY) for part in flat):
         return value

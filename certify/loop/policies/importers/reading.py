@@ -1,4 +1,4 @@
-"""What a reader of a file hands on: exact steps, and how the framework itself evaluates them."""
+"""The result of reading a file: exact steps, and the framework's own evaluation of them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Evaluate = Callable[[Observations, bool], Values]
 
 @dataclass(frozen=True, slots=True)
 class Reading:
-    """A policy as its file says it.
+    """A policy as its file describes it.
 
     Parameters
     ----------
@@ -31,15 +31,15 @@ class Reading:
     steps : from the (normalised) observation to the action.
     evaluate : the framework's own evaluation of the same, observations (k, n) to actions (k, m), in single precision,
         or, if the second argument says so, with the same operations in double precision.
-    normaliser : the one that the file itself holds, if it does.
-    action : the bounds of the action that the file states, (m,) pairs, if it does.
+    normaliser : the file's own normaliser, if it has one.
+    action : the bounds of the action that the file states, (m,) pairs, if it states any.
     beta : stored `atanh((u_eq - offset) / scale)` of a policy that is centred inside its squash, shape (m,).
     equilibrium : the state at which a policy of that kind is centred, shape (n,).
-    double : whether the file itself asks for double precision.
+    double : True if the file itself asks for double precision.
     program : the part of the file's own program that `evaluate` runs, for people; None where the file holds numbers and
         no program, so that `evaluate` can check the folding alone.
-    assumed : where there is no program, who says what stands between the numbers.
-    unread : why each tensor that is not read is left out, by its name.
+    assumed : without a program, the source of the functions between the numbers.
+    unread : the reason why each unread tensor is left out, by its name.
     beside : SHA-256 of each other file that was read with it, by its name.
 
     Raises

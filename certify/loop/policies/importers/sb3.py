@@ -1,9 +1,9 @@
 """The zip files of stable-baselines3: PPO, A2C, SAC, TD3 and DDPG with tanh between the layers.
 
-The numbers come from `policy.pth`, what they mean from `data`: JSON in which whatever is no JSON is a pickle in base64,
+The numbers come from `policy.pth`, their meaning from `data`: JSON with other objects as pickles in base64, which are
 read as data. PPO and A2C *clip* their actions to the bounds of the action space; SAC, TD3 and DDPG squash them by tanh
-and scale them to the bounds, and have ReLU unless they were told otherwise. Whether observations went through
-VecNormalize is not in the file.
+and scale them to the bounds, and have ReLU by default. The file does not say whether observations went through
+VecNormalize.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Multilayer perceptrons in a state_dict: `PREFIX.N.weight` and `PREFIX.N.bias`, whatever the prefix.
 
-A state_dict holds numbers and no functions. Which activation stands between the layers, what follows the last one, and
-what was done to observations and actions is not in it: each is asked for by the name of its option.
+A state_dict holds numbers and no functions. It contains neither the activation between the layers, nor the function
+after the last one, nor the treatment of observations and actions: each is asked for by the name of its option.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Layers = list[Affine]
 
 
 def is_two_stage(tensors: Mapping[str, Numbers]) -> bool:
-    """Whether a file holds the policy of a two-stage checkpoint: its layers, and what it is centred at."""
+    """True if a file holds the policy of a two-stage checkpoint: its layers and the data of its centring."""
     return _root(tensors) is not None
 
 
@@ -120,7 +120,7 @@ def read_state_dict(
 
 
 def read_lyapunov(tensors: Mapping[str, Numbers], prefix: str | None, options: ImportOptions) -> Reading:
-    """The layers of a Lyapunov network, without what may stand behind the last one.
+    """The layers of a Lyapunov network, without a function after the last one.
 
     Parameters
     ----------
@@ -216,7 +216,7 @@ def _layers(tensors: Mapping[str, Numbers], prefix: str) -> Layers:
 
 
 def _numbers(tensors: Mapping[str, Numbers], prefix: str) -> list[int]:
-    """The numbers of the layers under a prefix; whatever else lies under such a number is refused."""
+    """The numbers of the layers under a prefix; other tensors under such a number are rejected."""
     root, numbers = _dot(prefix), set()
     for name in tensors:
         match = _KEY.fullmatch(name)
@@ -243,7 +243,7 @@ def _own(tensors: Mapping[str, Numbers], prefix: str) -> list[str]:
 
 
 def _root(tensors: Mapping[str, Numbers]) -> str | None:
-    """What stands before the names of a two-stage policy, where that is one thing for all of them."""
+    """The common prefix of a two-stage policy's tensor names; None unless all of them share one."""
     roots = [key.removesuffix(_PARTS[0]) for key in tensors if key.endswith(_PARTS[0])]
     if len(roots) != 1 or not all(roots[0] + part in tensors for part in _PARTS):
         return None

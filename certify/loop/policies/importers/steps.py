@@ -1,7 +1,7 @@
-"""What a file says that its policy does, as exact steps from the observation to the action.
+"""Exact steps from the observation to the action, as a file describes its policy.
 
-Every reader ends here, so that folding, comparing and refusing are written once. A constant of a file is the exact
-number that its bytes are; what a step does is meant in real arithmetic.
+Every reader produces these steps, so that folding, comparing and rejecting are written once. A constant is the exact
+number that the file's bytes encode; a step is a function in real arithmetic.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""All tensors of a file of weights by their names, whatever dictionaries, lists and objects they lie in."""
+"""All tensors of a file of weights by their names, from any dictionaries, lists and objects."""
 
 from __future__ import annotations
 

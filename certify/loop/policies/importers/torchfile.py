@@ -1,7 +1,7 @@
 """A file of torch.save or torch.jit.save: its pickle as data, and the tensors that its storages hold.
 
 torch's own `weights_only` refuses a checkpoint with a numpy random state beside the weights, and without it torch.load
-runs what the pickle says. Here nothing runs in either case: whatever is no tensor stays a name.
+runs the pickle's calls. Here nothing runs in either case: an object that is no tensor stays a name.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class TorchFile:
     Parameters
     ----------
     raw : the file.
-    what : how messages call it.
+    what : its name in messages.
     archive : the file as an archive, if it has been opened.
 
     Raises
@@ -68,7 +68,7 @@ class TorchFile:
         return read_pickle(self.archive.read(self.root + name), f"{name} in {self.what}")
 
     def holds(self, name: str) -> bool:
-        """Whether the archive has a member of that name."""
+        """True if the archive has a member of that name."""
         return self.root + name in self.archive
 
     def tensor(self, node: Any, what: str, folder: str = "data") -> Numbers:
@@ -145,7 +145,7 @@ class TorchFile:
 
 
 def is_tensor(node: Any) -> bool:
-    """Whether a node of the pickle describes a dense tensor, or a parameter that is one."""
+    """True if a node of the pickle describes a dense tensor, or a parameter that is one."""
     if not isinstance(node, Call) or not isinstance(node.function, Name) or node.function.module != "torch._utils":
         return False
     return node.function.name in ("_rebuild_tensor_v2", "_rebuild_tensor_v3", "_rebuild_parameter")

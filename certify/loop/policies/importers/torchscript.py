@@ -1,9 +1,9 @@
 """TorchScript archives, their code read as text: affine layers, tanh and constant scalings that form one chain.
 
-torch.jit.load compiles whatever code an archive holds, and runs the methods by which its modules set their state; among
-the operations of TorchScript are some that read files. So it is not called. The code is parsed as Python's grammar,
-which it follows, and only the statements below are understood; constants and parameters are pickles, read as data.
-What is compared with is torch itself, given the same operations one by one.
+torch.jit.load compiles the code of an archive and runs the methods by which its modules set their state; some
+operations of TorchScript read files. So it is not called. The code is parsed by Python's grammar, which it follows, and
+only the statements below are understood; constants and parameters are pickles, read as data. The comparison is with
+torch itself, given the same operations one by one.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class _Program:
 
 
 def is_torchscript(file: TorchFile) -> bool:
-    """Whether a file of torch holds code."""
+    """True if a torch file holds code."""
     return any(name.startswith(f"{file.root}code/") for name in file.archive.names)
 
 

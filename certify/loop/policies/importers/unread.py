@@ -1,7 +1,7 @@
-"""Tensors of a file that the layers of its network do not account for: each is named, and known to be none of it.
+"""Tensors of a file outside its network's layers: each is named, and must be known not to belong to the network.
 
-A file of numbers does not say what becomes of them. A tensor that is not read is left out without a question only if
-its name says that no action depends on it, whatever it holds:
+A file of numbers does not contain their use. An unread tensor is left out without a question only if its name shows
+that no action depends on it:
 
 - the state of an optimiser, of a schedule of learning rates or of the run (steps, random numbers, last observations);
 - the spread of the actions that training draws, and weights of losses: `log_std`, `log_alpha`, `log_sigma_...`, or
@@ -49,17 +49,17 @@ def unread(
     *,
     of_policy: bool = True,
 ) -> dict[str, str]:
-    """Why each tensor that is not read is left out, by its name.
+    """The reason why each unread tensor is left out, by its name.
 
     Parameters
     ----------
     tensors : all tensors of the file.
     read : the names of those that the network is made of.
     prefix : the keys of its layers up to their numbers.
-    outputs : how many numbers it gives.
+    outputs : number of its outputs.
     ignored : names to leave out, `*` and `?` in them as in names of files.
-    known : why others are left out, for whoever knows the format.
-    of_policy : the network is a policy; of a Lyapunov network the policy is another one.
+    known : reasons why others are left out, from a reader that knows the format.
+    of_policy : True if the network is a policy, False for a Lyapunov network.
 
     Raises
     ------
@@ -99,7 +99,7 @@ def unread(
 
 
 def _known(name: str, tensors: Mapping[str, Numbers], prefix: str, outputs: int, of_policy: bool) -> str | None:
-    """Why no output depends on a tensor of this name; None if its name does not say that."""
+    """The reason why no output depends on a tensor of this name; None if the name shows none."""
     *parts, leaf = name.split(".")
     if any(_SPREAD.fullmatch(part) for part in (leaf, *parts)):
         return _SPREAD_WORDS
