@@ -52,7 +52,7 @@ candidates = ["lyapunov"]
 m = [0.15, 0.2]
 [options]
 level = 0.3
-time_limit = 30
+effort = 0.6
 """
 
 
@@ -203,7 +203,7 @@ def test_a_case_is_the_same_if_bytes_texts_and_program_are(study: Study, monkeyp
         replace(case, plant=replace(case.policy, content=b"name = 'pendulum'")),
         replace(case, lyapunov=case.policy),
         replace(case, coordinates={**case.coordinates, "options.level": "0.31"}),
-        replace(case, coordinates={**case.coordinates, "options.time_limit": "31"}),
+        replace(case, coordinates={**case.coordinates, "options.effort": "0.62"}),
         replace(case, coordinates={**case.coordinates, "candidates": "lqr"}),
     ]
     assert len({case.inputs, *(other.inputs for other in others)}) == 1 + len(others)
@@ -441,7 +441,7 @@ def test_what_is_done_is_not_done_again_and_what_changed_is(
     longer = read_study(written(tmp_path, QUICK.replace("[0.15, 0.2]", "[0.1, 0.15, 0.2]")))
     place = Here(lambda piece: "lost")
     assert run_sweep(longer, out, place).errors == 1 and place.done == [longer.cases()[0].name]
-    changed = read_study(written(tmp_path, QUICK.replace("time_limit = 30", "time_limit = 31")))
+    changed = read_study(written(tmp_path, QUICK.replace("effort = 0.6", "effort = 0.62")))
     run_sweep(changed, out, place := Here(lambda piece: "lost"))
     assert place.done == [one, two]
     assert not (out / "cases" / one / "certificate.json").exists()  # of other inputs
@@ -505,7 +505,7 @@ def test_what_is_not_kept_does_not_lie_where_its_result_is_looked_for(
     one, two = (out / "cases" / case.name for case in study.cases())
     (two / "certificate.json").write_text("my own notes")
     (one / "notes.partial").write_text("my own notes")
-    changed = read_study(written(tmp_path, QUICK.replace("time_limit = 30", "time_limit = 31")))
+    changed = read_study(written(tmp_path, QUICK.replace("effort = 0.6", "effort = 0.62")))
     with pytest.raises(BackendError):
         run_sweep(changed, out, Here(lambda piece: BackendError("gone")))
     assert sorted(path.name for path in one.iterdir()) == ["certificate.earlier.json", "notes.partial"]

@@ -40,9 +40,9 @@ class Entry:
         return ["certify", "roa", "--policy", f"examples/policies/{self.policy}.pt", *system, *self.options]
 
 
-OPTIMISED = ("--candidate", "optimised", "--time-limit", "60")
+OPTIMISED = ("--candidate", "optimised", "--effort", "1.2")
 WHERE = "x=0.5,y=0.5,z=0.5,phi=0.3,theta=0.3,psi=0.3,vx=0.5,vy=0.5,vz=0.5,p=0.5,q=0.5,r=0.5"
-QUADROTOR = ("--time-limit", "600", "--box", WHERE)
+QUADROTOR = ("--effort", "12", "--box", WHERE)
 ENTRIES = (
     Entry("pendulum", "inverted pendulum, up to its domain", "pendulum"),
     Entry(

@@ -33,30 +33,30 @@ SAMPLES = 200_000
 
 @dataclass(frozen=True)
 class Entry:
-    """A plant; the seconds that its largest set and a tube from its box get, None for the default, 0 for no tube."""
+    """A plant; the efforts for its largest set and for a tube from its box, 0 for no tube."""
 
     name: str
-    seconds: int | None = None
-    tube_seconds: int = 0
+    effort: float = 1.0
+    tube_effort: float = 0.0
 
     @property
     def own(self) -> list[str]:
         """The command that proves the largest set."""
-        limit = [] if self.seconds is None else ["--time-limit", str(self.seconds)]
+        limit = [] if self.effort == 1 else ["--effort", f"{self.effort:g}"]
         return ["certify", "roa", "--policy", f"examples/policies/{self.name}.pt", *limit]
 
     @property
     def box(self) -> list[str]:
         """The command that proves the largest multiple of the box' ellipsoid."""
-        limit = ["--time-limit", str(self.tube_seconds)]
+        limit = ["--effort", f"{self.tube_effort:g}"]
         return [*self.own[:4], *limit, "--box", _text(self.name)]
 
 
 ENTRIES = (
     Entry("pendulum"),
     Entry("cartpole"),
-    Entry("quadrotor2d", seconds=100),
-    Entry("quadrotor3d", tube_seconds=600),
+    Entry("quadrotor2d", effort=2.0),
+    Entry("quadrotor3d", tube_effort=12.0),
 )
 
 
@@ -105,7 +105,7 @@ def row(entry: Entry) -> str:
     levels = said["levels"]
     limit = levels["sampled_limit"] or levels["domain_limit"]
     length = math.sqrt(levels["roa"] / limit)
-    found = [M] if not entry.tube_seconds else [M, made(entry.box, OUT / f"{entry.name}-box")[0]]
+    found = [M] if not entry.tube_effort else [M, made(entry.box, OUT / f"{entry.name}-box")[0]]
     inside, share = max(multiple(one, box) for one in found), max(covered(one, box) for one in found)
     by = "samples" if levels["sampled_limit"] else "domain"
     return (
@@ -130,7 +130,7 @@ def main() -> None:
         "limit by",
     ]
     rows = [row(entry) for entry in ENTRIES]
-    commands = [" ".join(c) for e in ENTRIES for c in ([e.own] if not e.tube_seconds else [e.own, e.box])]
+    commands = [" ".join(c) for e in ENTRIES for c in ([e.own] if not e.tube_effort else [e.own, e.box])]
     block = ["", "<!-- shown: by make shares -->", "```sh", *commands, "```", ""]
     (PAGE / "shares.txt").write_text(
         "\n".join([f"| {' | '.join(head)} |", "|---" * len(head) + "|", *rows, *block]), "utf-8"

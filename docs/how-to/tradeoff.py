@@ -27,7 +27,7 @@ OUT = ROOT / "out" / "tradeoff"
 POLICY = "tests/data/quadrotor2d_curved.pt"
 WEIGHTS = ("0.001", "0.003", "0.01", "0.03", "0.1", "1")
 FLATTEN = ("controllers", "flatten", POLICY, "--time-limit", "300")
-PROVE = ("certify", "roa", "--time-limit", "100")
+PROVE = ("certify", "roa", "--effort", "2")
 
 
 @dataclass(frozen=True)
