@@ -102,6 +102,4 @@ def like(array: Array, x: Any) -> Any:
     """The array as x is: for a torch tensor a tensor of its precision, on its device."""
     if isinstance(x, np.ndarray):
         return array
-    import torch
-
-    return torch.tensor(array, dtype=x.dtype, device=x.device)
+    return x.new_tensor(array)

@@ -3,6 +3,6 @@
 from __future__ import annotations
 
 from certify.provers.execution.base import Bound, Jobs, Runner, Work
-from certify.provers.execution.threads import ThreadRunner
+from certify.provers.execution.threads import ThreadRunner, in_pieces
 
-__all__ = ["Bound", "Jobs", "Runner", "ThreadRunner", "Work"]
+__all__ = ["Bound", "Jobs", "Runner", "ThreadRunner", "Work", "in_pieces"]

@@ -121,7 +121,7 @@ def prove_outer(
 
     left = replace(budget, seconds=budget.seconds - (time.monotonic() - start))
     root = root_around(problem, T)
-    rule = FallBound(problem, c2, T, function, runner.device)
+    rule = FallBound(problem, c2, T, function)
     cover = Cover(rule, -root, root, runner, top, floor, _BESIDE_RISE * span, deepen)
     stopped = cover.advance(left, report)
     if not cover.level > floor:
@@ -170,7 +170,7 @@ def _faces(
     boxes, stop = 0, Stop.DOMAIN
     for axis in range(system.n):
         for side in range(2):
-            rule = FaceBound(system, axis, side, function, runner.device)
+            rule = FaceBound(system, axis, side, function)
             lo, hi = face_box(system, axis, side)
             cover = Cover(rule, lo, hi, runner, level, floor, _BESIDE_FACE * (level - floor))
             left = (budget.seconds - (time.monotonic() - start)) / (2 * system.n - len(trees))
