@@ -1,6 +1,6 @@
 """The Lyapunov function file `certify-lyapunov/1`: a neural or a polynomial function, as plain tensors only.
 
-Nothing in a file is executed, and equal functions give equal bytes (see `certify.loop.plain_file`): a polynomial's
+Nothing in a file is executed, and equal functions give equal bytes (see `certify.loop.files.plain`): a polynomial's
 terms are written in the order of their exponents. The file has no level: a certificate states the level that holds.
 """
 
@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from certify.errors import InputError
-from certify.loop.plain_file import (
+from certify.loop.files.plain import (
     array_in,
     integers_in,
     layers_in,
@@ -109,11 +109,9 @@ def load_lyapunov(path: str | Path) -> StoredLyapunov:
 
 
 def _numbers(function: Neural | Polynomial) -> tuple[str, dict[str, Any]]:
-    import torch
-
     if isinstance(function, Polynomial):
         order = np.lexsort(function.exponents.T[::-1])
-        exponents = torch.tensor(function.exponents[order], dtype=torch.int64)
+        exponents = np.asarray(function.exponents[order], dtype=np.int64)
         return "polynomial", {"exponents": exponents, "coefficients": tensors([function.coefficients[order]])[0]}
     depth, numbers = len(function.weights), tensors((*function.weights, *function.biases))
     return "network", {"activation": "tanh", "weights": numbers[:depth], "biases": numbers[depth:]}

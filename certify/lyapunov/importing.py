@@ -28,8 +28,8 @@ from certify.lyapunov.file import StoredLyapunov
 from certify.lyapunov.neural import Neural
 
 if TYPE_CHECKING:
+    from certify.loop.files.arrays import Numbers
     from certify.loop.plants import System
-    from certify.loop.policies.importers.arrays import Numbers
 
 _SIGMOID = "the file's V is sigmoid(N): {V <= v} is {N <= log(v / (1 - v))}"
 _UNKNOWN = "the value of the last layer; what increases strictly behind it leaves the sets {N <= level} as they are"

@@ -15,7 +15,6 @@ from fractions import Fraction
 from typing import Literal
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from certify.certificates.claims import Problem
@@ -25,9 +24,11 @@ from certify.loop.policies import bounded_by_form
 from certify.loop.rigorous import evaluate_increment, evaluate_policy
 
 Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 _RATIO, _LEVELS, _LOWER = 1.4, 60, 13  # of a survey: between levels, how many, and how many steps of 8 further it goes
 _CALL, _EACH = 8e5, 2.0  # operations of evaluating few states at once; of an operation at one, with its derivative
 _TOGETHER = 15  # levels that are looked at in one batch
+_APART = 1e-7  # of a state's or an input's size, between the points of a difference
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,8 +96,7 @@ def is_violated(problem: Problem, T: Array, limit: float, samples: int = 4000, s
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     radius = np.sqrt(limit) * (1 - 1e-9) * np.linspace(0.01, 1.0, samples)
     z = np.concatenate([direction * radius[:, None], search.climb(direction[::8] * radius[-1], limit)])
-    with torch.no_grad():
-        return bool(search.bad(torch.tensor(z, dtype=torch.float64)).any())
+    return bool(search.bad(z).any())
 
 
 def survey(
@@ -116,9 +116,7 @@ def survey(
         for k in range(0, len(level), _TOGETHER):
             each = np.repeat(level[k : k + _TOGETHER], samples)[:, None]
             z = search.climb(np.sqrt(each) * np.resize(direction, (len(each), direction.shape[1])), each, steps)
-            with torch.no_grad():
-                bad = search.bad(torch.tensor(z, dtype=torch.float64))
-            found += (~bad.reshape(-1, samples).any(1)).tolist()
+            found += (~search.bad(z).reshape(-1, samples).any(1)).tolist()
         return found
 
     def good(levels: list[float]) -> list[bool]:
@@ -168,98 +166,131 @@ def refutes(problem: Problem, witness: Witness, level: float) -> bool:
 
 class _Search:
     def __init__(self, problem: Problem, T: Array, effort: Effort = UNLIMITED) -> None:
-        self.problem, self.effort = problem, effort
-        self.loop = problem.loop
-        self.f = self.loop.system.uncertain_function("torch")
+        self.problem, self.T, self.effort = problem, T, effort
+        self.loop, self.network, self.P = problem.loop, problem.loop.folded, problem.V.P
+        self.f = self.loop.system.uncertain_function()
         self.corners = self.loop.system.corners()
         system = self.loop.system
         self.periods: list[Fraction | None] = [None] if system.sample is None else [*dict.fromkeys(system.sample)]
         self.worst = self._worst()
-        network = self.loop.folded
-        self.layers = [
-            (torch.tensor(W.T.copy()), torch.tensor(b)) for W, b in zip(network.weights, network.biases, strict=True)
-        ]
-        self.squashed, self.clipped = network.squashed, network.clipped
-        self.scale, self.offset = torch.tensor(network.scale), torch.tensor(network.offset)
-        self.P, self.T = (torch.tensor(a, dtype=torch.float64) for a in (problem.V.P, T))
-        bounds = self.loop.system.input_bounds
-        self.lo = torch.tensor([float(b[0]) for b in bounds], dtype=torch.float64)
-        self.hi = torch.tensor([float(b[1]) for b in bounds], dtype=torch.float64)
-        self.check_inputs = not bounded_by_form(network, bounds)
+        self.lo, self.hi = np.array([[float(end) for end in pair] for pair in system.input_bounds]).T
+        self.check_inputs = not bounded_by_form(self.network, system.input_bounds)
 
-    def violation(self, z: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    def violation(self, z: Array) -> tuple[Array, Array]:
         """(D', how far the worst input lies outside its bounds) at x = T z, shapes (B,)."""
-        times = len(self.corners) * len(self.periods) * (4 if self.loop.system.sample else 1)
-        self.effort.charge(_CALL + _EACH * len(z) * times * self.loop.operations)
+        self._charge(len(z), 1)
         x = z @ self.T.T
-        h = x
-        for k, (W, b) in enumerate(self.layers):
-            h = torch.addmm(b, h.tanh() if k else h, W)
-        u = self.clipped(self.scale * self.squashed(h) + self.offset)
-        decrease = [self._decrease(x, u, values, step) for values, step in self.worst]
-        return torch.cat(decrease).amax(0), torch.maximum(self.lo - u, u - self.hi).amax(-1)
+        return self._at(x, self._inputs(x)[0])
 
-    def _worst(self) -> list[tuple[list[torch.Tensor], float | torch.Tensor]]:
+    def _charge(self, states: int, evaluations: int) -> None:
+        """Count evaluations of the equations at states, and of the policy with each."""
+        times = len(self.corners) * len(self.periods) * (4 if self.loop.system.sample else 1)
+        self.effort.charge(_CALL + _EACH * states * evaluations * times * self.loop.operations)
+
+    @np.errstate(all="ignore")
+    def _at(self, x: Array, u: Array) -> tuple[Array, Array]:
+        decrease = [self._decrease(x, u, values, step) for values, step in self.worst]
+        return np.concatenate(decrease).max(0), np.maximum(self.lo - u, u - self.hi).max(-1)
+
+    @np.errstate(all="ignore")
+    def _inputs(self, x: Array) -> tuple[Array, Array, list[Array]]:
+        """u (B, m), what it is before the clip, and what the layers and the squash give on the way there."""
+        network, passed, h = self.network, list[Array](), x
+        for k, (W, b) in enumerate(zip(network.weights, network.biases, strict=True)):
+            if k:
+                h = np.tanh(h)
+                passed.append(h)
+            h = h @ W.T + b
+        passed.append(network.squashed(h))
+        whole = network.scale * passed[-1] + network.offset
+        return network.clipped(whole), whole, passed
+
+    @np.errstate(all="ignore")
+    def _slopes(self, z: Array) -> tuple[Array, Array, Array, Array]:
+        """`violation` at z (B, n), and the gradients (B, n) of both: by differences in x and u, and from u on by the
+        chain rule."""
+        x, n = z @ self.T.T, z.shape[1]
+        self._charge(len(z), n + self.network.m + 3)
+        u, whole, passed = self._inputs(x)
+        size = np.linalg.norm(z, axis=-1, keepdims=True) * np.linalg.norm(self.T, axis=1)
+        apart = _APART * np.concatenate([size, np.broadcast_to(np.abs(self.network.scale), u.shape)], -1) + 1e-300
+        here = np.concatenate([x, u], -1)
+        ways = np.eye(here.shape[1])
+        moved = np.concatenate([here[None], here + ways[:, None] * apart]).reshape(-1, len(ways))
+        values = [v.reshape(-1, len(z)) for v in self._at(moved[:, :n], moved[:, n:])]
+        slopes = [((v[1:] - v[0]) / apart.T).T for v in values]
+        gradients = [(s[:, :n] + self._backwards(s[:, n:], whole, passed)) @ self.T for s in slopes]
+        return values[0][0], values[1][0], gradients[0], gradients[1]
+
+    def _backwards(self, slope: Array, whole: Array, passed: list[Array]) -> Array:
+        """The slope in the states (B, n) of what has this slope in the inputs (B, m)."""
+        network = self.network
+        if network.clip is not None:
+            slope = np.where((whole > network.clip[0]) & (whole < network.clip[1]), slope, 0.0)
+        slope = slope * network.scale * network.squash_slope(passed[-1])
+        for W, inner in zip(reversed(network.weights), [*reversed(passed[:-1]), None], strict=True):
+            slope = slope @ W
+            if inner is not None:
+                slope = slope * (1 - inner * inner)
+        return slope
+
+    def _worst(self) -> list[tuple[list[Array], float | Array]]:
         """Values (C, 1) of what is uncertain and steps, one for all or (C, 1, 1), at which D' is looked at together."""
         rows = [[float(q) for q in corner.values()] for corner in self.corners]
 
-        def columns(times: int) -> list[torch.Tensor]:
-            return [torch.tensor(column * times, dtype=torch.float64)[:, None] for column in zip(*rows, strict=True)]
+        def columns(times: int) -> list[Array]:
+            return [np.array(column * times)[:, None] for column in zip(*rows, strict=True)]
 
         if self.periods == [None]:
             return [(columns(1), self.loop.step)]
         positive = [float(period) for period in self.periods if period]
-        steps = torch.tensor([h for h in positive for _ in rows], dtype=torch.float64)[:, None, None]
-        found: list[tuple[list[torch.Tensor], float | torch.Tensor]] = [(columns(len(positive)), steps)]
+        steps = np.array([h for h in positive for _ in rows])[:, None, None]
+        found: list[tuple[list[Array], float | Array]] = [(columns(len(positive)), steps)]
         return found if len(positive) == len(self.periods) else [*found, (columns(1), 0.0)]
 
-    def _decrease(
-        self, x: torch.Tensor, u: torch.Tensor, values: list[torch.Tensor], step: float | torch.Tensor
-    ) -> torch.Tensor:
+    def _decrease(self, x: Array, u: Array, values: list[Array], step: float | Array) -> Array:
         """D' (C, B) for constant values of what is uncertain, or (1, B) without any."""
         G = self.loop.system.mean_rate(lambda y, v: self.f(y, v, values), x[None], u, step)
         gradient = 2 * (x @ self.P)
-        result: torch.Tensor = (gradient * G).sum(-1)
+        result: Array = (gradient * G).sum(-1)
         if self.loop.step:
             result = result + (step * (G @ self.P) * G).sum(-1)
         if self.problem.rate:
             result = result + self.problem.rate * (gradient * x).sum(-1)
         return result
 
-    def bad(self, z: torch.Tensor) -> torch.Tensor:
+    def bad(self, z: Array) -> Mask:
+        """Where a condition fails (B,)."""
         vdot, excess = self.violation(z)
         return (vdot >= 0) | (excess > 0) if self.check_inputs else vdot >= 0
 
     def lowest(self, start: Array) -> Witness | None:
         """The lowest violation reached from the points `start` (B, n)."""
-        with torch.no_grad():
-            z = torch.tensor(start, dtype=torch.float64)
-            z = z[self.bad(z)]
+        z = start[self.bad(start)]
         if len(z) == 0:
             return None
-        with torch.no_grad():
-            z = self._lowest_few(self._shrink(self._lowest_few(z, 2048), torch.ones(()), halvings=8), 32)
-        step = torch.full((len(z), 1), 0.3, dtype=torch.float64)
+        z = self._lowest_few(self._shrink(self._lowest_few(z, 2048), 1.0, halvings=8), 32)
+        step = np.full((len(z), 1), 0.3)
         for _ in range(60):
-            uphill = self._uphill(z)
-            with torch.no_grad():
-                norm = z.norm(dim=-1, keepdim=True)
-                moved = z + step * norm * uphill
-                moved = moved * (norm / moved.norm(dim=-1, keepdim=True))
-                bad = self.bad(moved)[:, None]
-                moved = torch.where(bad, self._shrink(moved, (4 * step).clamp(max=1.0), halvings=10), z)
-                better = moved.norm(dim=-1, keepdim=True) < norm
-                z = torch.where(better, moved, z)
-                step = torch.where(better, 1.5 * step, 0.4 * step).clamp(max=0.5)
+            norm = np.linalg.norm(z, axis=-1, keepdims=True)
+            moved = z + step * norm * self._uphill(z)
+            moved = moved * (norm / np.linalg.norm(moved, axis=-1, keepdims=True))
+            bad = self.bad(moved)[:, None]
+            moved = np.where(bad, self._shrink(moved, np.minimum(4 * step, 1.0), halvings=10), z)
+            better = np.linalg.norm(moved, axis=-1, keepdims=True) < norm
+            z = np.where(better, moved, z)
+            step = np.minimum(np.where(better, 1.5 * step, 0.4 * step), 0.5)
             if float(step.max()) < 1e-7 or self.effort.over:
                 break
-        with torch.no_grad():
-            z = self._lowest_few(self._shrink(z, torch.ones(()), halvings=50), 32)
-        # The binary64 state is what counts: pull outwards until the violation is certain there.
+        return self._shown(self._lowest_few(self._shrink(z, 1.0, halvings=50), 32))
+
+    def _shown(self, z: Array) -> Witness | None:
+        """A violation at one of these points (B, n): the binary64 state is what counts, so that a point is pulled
+        outwards until the violation is certain there."""
+        kinds: tuple[Literal["vdot", "input"], ...] = ("vdot", "input") if self.check_inputs else ("vdot",)
         for point in z:
             for factor in (1.0, 1 + 1e-12, 1 + 1e-9, 1 + 1e-6):
-                x = (self.T @ (factor * point)).numpy()
-                kinds: tuple[Literal["vdot", "input"], ...] = ("vdot", "input") if self.check_inputs else ("vdot",)
+                x = self.T @ (factor * point)
                 for kind in kinds:
                     every = itertools.product(self.periods, self.corners)
                     for period, values in every if kind == "vdot" else [(None, self.corners[0])]:
@@ -270,47 +301,39 @@ class _Search:
 
     def climb(self, start: Array, limit: float | Array, steps: int = 60) -> Array:
         """Gradient ascent of D' from `start` (B, n) on the sphere V = limit, or each point's own, (B, 1)."""
-        z = torch.tensor(start, dtype=torch.float64)
-        radius = torch.as_tensor(np.sqrt(limit) * (1 - 1e-9), dtype=torch.float64)
-        step = 0.1
+        z, radius, step = start, np.sqrt(limit) * (1 - 1e-9), 0.1
         for _ in range(steps):
-            z = z.detach().requires_grad_(True)
-            vdot, excess = self.violation(z)
-            value = (vdot / (z * z).sum(-1)).sum() + (excess.sum() if self.check_inputs else 0.0)
-            (gradient,) = torch.autograd.grad(value, z)
-            with torch.no_grad():
-                direction = gradient / (gradient.norm(dim=-1, keepdim=True) + 1e-300)
-                moved = z + step * radius * direction
-                z = radius * moved / moved.norm(dim=-1, keepdim=True)
+            vdot, _, by_vdot, by_excess = self._slopes(z)
+            square = (z * z).sum(-1, keepdims=True)
+            gradient = by_vdot / square - 2 * vdot[:, None] * z / (square * square)
+            gradient = gradient + by_excess if self.check_inputs else gradient
+            moved = z + step * radius * gradient / (np.linalg.norm(gradient, axis=-1, keepdims=True) + 1e-300)
+            z = radius * moved / np.linalg.norm(moved, axis=-1, keepdims=True)
             step *= 0.95
             if self.effort.over:
                 break
-        result: Array = z.detach().numpy()
-        return result
+        return z
 
-    def _lowest_few(self, z: torch.Tensor, count: int) -> torch.Tensor:
-        return z[torch.argsort((z * z).sum(-1), stable=True)][:count]
+    def _lowest_few(self, z: Array, count: int) -> Array:
+        return z[np.argsort((z * z).sum(-1), kind="stable")][:count]
 
-    def _shrink(self, z: torch.Tensor, share: torch.Tensor, halvings: int) -> torch.Tensor:
+    def _shrink(self, z: Array, share: float | Array, halvings: int) -> Array:
         """Scale violating points down to where they just violate, by bisection, but by `share` (B, 1) at most."""
-        high = torch.ones(len(z), 1, dtype=z.dtype)
+        high = np.ones((len(z), 1))
         low = high - share
         whole = self.bad(low * z)[:, None] & (low > 0)
         least = low
         for _ in range(halvings):
             middle = (low + high) / 2
             bad = self.bad(middle * z)[:, None]
-            low, high = torch.where(bad, low, middle), torch.where(bad, middle, high)
-        return torch.where(whole, least, high) * z
+            low, high = np.where(bad, low, middle), np.where(bad, middle, high)
+        return np.asarray(np.where(whole, least, high) * z)
 
-    def _uphill(self, z: torch.Tensor) -> torch.Tensor:
+    def _uphill(self, z: Array) -> Array:
         """Unit directions (B, n), tangent to the sphere, in which the violation grows fastest."""
-        z = z.detach().requires_grad_(True)
-        vdot, excess = self.violation(z)
-        value = torch.where(vdot >= 0, vdot, excess) if self.check_inputs else vdot
-        (gradient,) = torch.autograd.grad(value.sum(), z)
-        with torch.no_grad():
-            z = z / z.norm(dim=-1, keepdim=True)
-            tangent = gradient - (gradient * z).sum(-1, keepdim=True) * z
-            unit: torch.Tensor = tangent / (tangent.norm(dim=-1, keepdim=True) + 1e-300)
-            return unit
+        vdot, _, gradient, by_excess = self._slopes(z)
+        if self.check_inputs:
+            gradient = np.where(vdot[:, None] >= 0, gradient, by_excess)
+        z = z / np.linalg.norm(z, axis=-1, keepdims=True)
+        tangent = gradient - (gradient * z).sum(-1, keepdims=True) * z
+        return np.asarray(tangent / (np.linalg.norm(tangent, axis=-1, keepdims=True) + 1e-300))

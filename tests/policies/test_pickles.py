@@ -19,11 +19,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from certify.errors import InputError
-from certify.loop.policies.importers.archives import MAX_BYTES, Archive
-from certify.loop.policies.importers.arrays import array_of
-from certify.loop.policies.importers.pickles import Call, Name, brief, read_pickle
+from certify.loop.files.archives import MAX_BYTES, Archive
+from certify.loop.files.arrays import array_of
+from certify.loop.files.pickles import Call, Name, brief, read_pickle
+from certify.loop.files.torchfile import TorchFile
 from certify.loop.policies.importers.tensors import load_tensors
-from certify.loop.policies.importers.torchfile import TorchFile
 
 SCALARS = st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False) | st.text()
 
@@ -314,7 +314,7 @@ def test_other_tensors_are_no_tensors(name: str) -> None:
 
 
 def test_many_views_of_one_storage_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("certify.loop.policies.importers.torchfile._MAX_NUMBERS", 100)
+    monkeypatch.setattr("certify.loop.files.torchfile._MAX_NUMBERS", 100)
     buffer = io.BytesIO()
     base = torch.zeros(30)
     torch.save({str(k): base[:] for k in range(4)}, buffer)
@@ -331,7 +331,7 @@ def test_legacy_files_are_refused_by_name() -> None:
 
 def test_zip_bombs_are_not_unpacked(monkeypatch: pytest.MonkeyPatch) -> None:
     assert MAX_BYTES < 2**31
-    monkeypatch.setattr("certify.loop.policies.importers.archives.MAX_BYTES", 10_000)
+    monkeypatch.setattr("certify.loop.files.archives.MAX_BYTES", 10_000)
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("bomb", bytes(1_000_000))

@@ -1,6 +1,6 @@
 """The policy file `certify-policy/1`, or with a clip or bounds of validity `certify-policy/2`: plain tensors only.
 
-Nothing in a file is executed, and equal policies give equal bytes (see `certify.loop.plain_file`).
+Nothing in a file is executed, and equal policies give equal bytes (see `certify.loop.files.plain`).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any, cast
 import numpy as np
 
 from certify.errors import InputError
-from certify.loop.plain_file import array_in, layers_in, origin_in, read_plain, require_keys, tensors, write_plain
+from certify.loop.files.plain import array_in, layers_in, origin_in, read_plain, require_keys, tensors, write_plain
 from certify.loop.policies.network import Array, Centre, Squash, TanhNetwork
 
 FORMAT = "certify-policy/1"
@@ -105,8 +105,6 @@ def save_policy(path: str | Path, policy: Policy) -> None:
     ------
     InputError : the file cannot be written.
     """
-    import torch
-
     network, depth = policy.network, len(policy.network.weights)
     if network.is_moved:
         raise InputError("a policy must be written as its layers read it; found one that is looked at from elsewhere.")
@@ -126,9 +124,9 @@ def save_policy(path: str | Path, policy: Policy) -> None:
     if network.clip is not None:
         data["output"]["clip"] = clip
     if policy.valid is not None:
-        data["valid"] = torch.tensor(policy.valid, dtype=torch.float64)
+        data["valid"] = np.asarray(policy.valid)
     if policy.beta is not None:
-        data["beta"] = torch.tensor(policy.beta, dtype=torch.float64)
+        data["beta"] = np.asarray(policy.beta, dtype=np.float64)
     write_plain(path, data, _WHAT)
 
 

@@ -101,6 +101,4 @@ def like(array: Array, x: Any) -> Any:
     """Convert the array to the kind of x: for a torch tensor a tensor of its precision, on its device."""
     if isinstance(x, np.ndarray):
         return array
-    import torch
-
-    return torch.tensor(array, dtype=x.dtype, device=x.device)
+    return x.new_tensor(array)

@@ -1,4 +1,4 @@
-"""Bounds on boxes in batched torch float64: Taylor models of the plant, affine forms of the policy.
+"""Bounds on boxes in batches of binary64: Taylor models of the plant, affine forms of the policy.
 
 Untrusted: the checker repeats the proof with its own code. Rounding is still accounted for, so that what is proved
 here is accepted there.

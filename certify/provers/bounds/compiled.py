@@ -1,56 +1,97 @@
-"""Whether loops compiled by numba are there, and when they are worth their start.
+"""The loops of `kernels.py`, compiled by numba once they are worth its start.
 
-numba is optional (`certify[fast]`), takes most of a second to import with what is in its cache, and compiles for
-seconds where nothing is. A process gets the loops once it has done as much without them as their start costs, so that a
-short search never pays for it and no search pays twice. Which of two threads asks first may decide how a batch is
-bounded: either way the bounds hold, and they differ by rounding.
+numba takes half a second to import with what is in its cache, and compiles for seconds where nothing is. A process gets
+the compiled loops once it has done as much with numpy as their start costs, so that a short search never pays for it
+and no search pays twice. Nothing that is bounded depends on when that is: both give the same bits.
 """
 
 from __future__ import annotations
 
-import importlib
 import threading
-from types import ModuleType
+from collections.abc import Callable
+from types import FunctionType, SimpleNamespace
+from typing import Any, Protocol
+
+from certify.provers.bounds import kernels, vectors
 
 _WORTH = 1e7  # work that takes as much longer without them as their start takes
-_LEAST = 2.0**14  # work that is worth calling them
+_FORMULAS = ("smaller", "larger", "enclosed", "chord", "relaxed", "bent", "expansion", "coefficients", "sizes")
+_LOOPS = ("ranges", "chords", "bend", "backwards", "play")
+_TYPES = {
+    "Line": "f8[::1]",
+    "Plane": "f8[:,::1]",
+    "Block": "f8[:,:,::1]",
+    "float": "f8",
+    "int": "i8",
+    "bool": "b1",
+    "None": "void",
+}
+_TYPES |= {"Steps": "i8[:,::1]", "Real": "f8"}
+_TYPES |= {name: f"UniTuple(f8, {count})" for count, name in ((2, "Two"), (4, "Four"), (5, "Five"))}
+Loop = Callable[..., None]
+
+
+class Loops(Protocol):
+    """The loops, on arrays that they change; see `kernels.py`."""
+
+    ranges: Loop
+    chords: Loop
+    bend: Loop
+    backwards: Loop
+    play: Loop
 
 
 class Compiled:
-    """The module `kernels.py`, or None: called with work that is about to be done, a neuron on a box being 1.
+    """Gives the loops: called with work that is about to be done, a neuron on a box being 1.
 
     Parameters
     ----------
-    worth : work that has to be asked for before they are loaded.
-    least : work for which they are never given.
+    worth : work that has to be asked for before they are compiled.
     """
 
-    def __init__(self, worth: float = _WORTH, least: float = _LEAST) -> None:
-        self.worth, self.least = worth, least
+    def __init__(self, worth: float = _WORTH) -> None:
+        self.worth = worth
         self._lock = threading.Lock()
-        self._asked, self._tried = 0.0, False
-        self._module: ModuleType | None = None
+        self._asked = 0.0
+        self._loops: Loops = vectors
+        self._tried = False
 
-    def __call__(self, work: float) -> ModuleType | None:
-        if work < self.least:
-            return None
+    def __call__(self, work: float) -> Loops:
         with self._lock:
             self._asked += work
             if self._asked >= self.worth and not self._tried:
-                self._module, self._tried = _load(), True
-            return self._module
+                self._loops, self._tried = load() or vectors, True
+            return self._loops
 
 
-def _load() -> ModuleType | None:
+def load() -> Loops | None:
+    """The compiled loops; None where numba does not know this numpy, or is not there."""
     try:
-        return importlib.import_module("certify.provers.bounds.kernels")
-    except ImportError:  # numba is not installed, or does not know this numpy
+        import numba
+    except ImportError:
         return None
+    space = {**vars(kernels), **kernels.LIBM}
+    space["choose"] = compile_one(numba.njit, kernels.one, space)
+    for name in (*_FORMULAS, *_LOOPS):
+        space[name] = compile_one(numba.njit, getattr(kernels, name), space)
+    return SimpleNamespace(**{name: space[name] for name in _LOOPS})
+
+
+def compile_one(njit: Any, function: Callable[..., Any], space: dict[str, Any]) -> Any:
+    """A function with these names around it, compiled for its annotated types, without the interpreter's lock; into
+    numba's cache, if one can be written."""
+    *parameters, returned = (_TYPES[name] for name in function.__annotations__.values())
+    signature, how = f"{returned}({','.join(parameters)})", {"nogil": True, "error_model": "numpy"}
+    bare = FunctionType(function.__code__, space, function.__name__)
+    try:
+        return njit(signature, cache=True, **how)(bare)
+    except (RuntimeError, OSError):  # there is no folder for the cache, or it is full
+        return njit(signature, **how)(bare)
 
 
 _of_process = Compiled()
 
 
-def kernels(work: float) -> ModuleType | None:
-    """`kernels.py` for that much work, if it is there and worth its start in this process by now."""
+def loops(work: float) -> Loops:
+    """The loops for that much work, compiled if that is worth its start in this process by now."""
     return _of_process(work)

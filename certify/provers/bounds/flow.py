@@ -14,11 +14,11 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-import torch
-from torch import Tensor
+import numpy as np
 
 from certify.loop.expressions import Expression, Symbol, evaluate, solution_series
 from certify.loop.plants.system import Interval
+from certify.provers.bounds.arrays import Array, Mask, chosen
 from certify.provers.bounds.taylor import EPS, TINY, Models, Taylor
 
 _ATTEMPTS, _WIDER = 4, 1.25  # at the enclosure of the solution
@@ -30,9 +30,9 @@ class Mean(NamedTuple):
     beginning to the end of the longest; `exists` (B,): the solution does, and these hold for it."""
 
     G: list[Taylor]
-    least: Tensor
-    most: Tensor
-    exists: Tensor
+    least: Array
+    most: Array
+    exists: Mask
 
 
 class Flow:
@@ -71,8 +71,8 @@ class Flow:
         reach = [model.radius() for model in f]
         return Mean(
             [self._sum([_mean(row[0], alike), *row[1:]]) for row in rows],
-            torch.stack([model.c - r for model, r in zip(f, reach, strict=True)]),
-            torch.stack([model.c + r for model, r in zip(f, reach, strict=True)]),
+            np.stack([model.c - r for model, r in zip(f, reach, strict=True)]),
+            np.stack([model.c + r for model, r in zip(f, reach, strict=True)]),
             exists,
         )
 
@@ -80,22 +80,22 @@ class Flow:
         known: dict[Expression, Taylor] = {}
         return [evaluate(expression, values, models, known) for expression in self.dynamics]
 
-    def _enclose(self, states: Values, held: Values, now: Sequence[Taylor]) -> tuple[dict[Symbol, Taylor], Tensor]:
+    def _enclose(self, states: Values, held: Values, now: Sequence[Taylor]) -> tuple[dict[Symbol, Taylor], Mask]:
         """Models of all states up to the end of the period, and where (B,) they are that."""
         size = _sizes(now)
         kappa = _WIDER * self.most * size
-        left = torch.arange(size.shape[1], device=size.device)
+        left = np.arange(size.shape[1])
         for attempt in range(_ATTEMPTS):
             if attempt:
-                kappa[:, left] = _WIDER * self.most * size[:, left]
-            around = {s: _widened(_part(v, left), kappa[i, left]) for i, (s, v) in enumerate(states.items())}
-            values = {**around, **{symbol: _part(model, left) for symbol, model in held.items()}}
+                kappa[:, left] = _WIDER * self.most * size.take(left, -1)
+            around = {s: _widened(v.at(left), kappa[i].take(left)) for i, (s, v) in enumerate(states.items())}
+            values = {**around, **{symbol: model.at(left) for symbol, model in held.items()}}
             size[:, left] = _sizes(self._rate(values, Models(next(iter(around.values())))))
-            fits = (self.most * size[:, left] * (1 + EPS) < kappa[:, left]).all(0)
-            left = left[~fits]
+            fits = (self.most * size.take(left, -1) * (1 + EPS) < kappa.take(left, -1)).all(0)
+            left = left[chosen(~fits)]
             if not len(left):
                 break
-        exists = torch.ones(size.shape[1], dtype=torch.bool, device=size.device)
+        exists = np.ones(size.shape[1], dtype=np.bool_)
         exists[left] = False
         return {s: _widened(v, kappa[i]) for i, (s, v) in enumerate(states.items())}, exists
 
@@ -112,30 +112,24 @@ class Flow:
             return model.scaled(float(self.longest))
         middle = float((self.shortest + self.longest) / 2)
         reach = float((self.longest - self.shortest) / 2)
-        g = torch.zeros_like(model.g)
+        g = np.zeros_like(model.g)
         g[-1] = reach
-        rounding = torch.full_like(model.c, EPS * (middle + reach) + TINY)
-        return model * Taylor(torch.full_like(model.c, middle), g, torch.zeros_like(model.Q), rounding)
+        rounding = np.full_like(model.c, EPS * (middle + reach) + TINY)
+        return model * Taylor(np.full_like(model.c, middle), g, np.zeros_like(model.Q), rounding)
 
 
-def _sizes(models: Sequence[Taylor]) -> Tensor:
+def _sizes(models: Sequence[Taylor]) -> Array:
     """Bounds of |v| (n, B)."""
-    return torch.stack([model.c.abs() + model.radius() for model in models]) * (1 + EPS)
+    return np.stack([np.abs(model.c) + model.radius() for model in models]) * (1 + EPS)
 
 
-def _part(model: Taylor, index: Tensor) -> Taylor:
-    if len(index) == len(model.c):
-        return model
-    return model.at(index)
-
-
-def _widened(model: Taylor, by: Tensor) -> Taylor:
+def _widened(model: Taylor, by: Array) -> Taylor:
     return Taylor(model.c, model.g, model.Q, (model.r + by) * (1 + EPS))
 
 
 def _without_symbols(model: Taylor) -> Taylor:
     """The range as a remainder, in which nothing is known of one place by another."""
-    return Taylor(model.c, torch.zeros_like(model.g), torch.zeros_like(model.Q), model.radius())
+    return Taylor(model.c, np.zeros_like(model.g), np.zeros_like(model.Q), model.radius())
 
 
 def _mean(model: Taylor, alike: slice) -> Taylor:
@@ -145,7 +139,7 @@ def _mean(model: Taylor, alike: slice) -> Taylor:
     """
     if alike.start == alike.stop:
         return model
-    Q = model.Q.clone()
-    products = Q[alike, alike].abs().sum((0, 1))
+    Q = model.Q.copy()
+    products = np.abs(Q[alike, alike]).sum((0, 1))
     Q[alike, alike] = 0.0
     return Taylor(model.c, model.g, Q, (model.r + products) * (1 + EPS))

@@ -1,30 +1,32 @@
-"""The layers of a policy on boxes as `policy.py` bounds them, with compiled loops between the products of matrices.
+"""The layers of a policy on boxes, as `policy.py` describes them: products of matrices, and the loops between them.
 
-The same formulas as there, on boxes few enough that what passes from layer to layer stays in a core's cache, in memory
-that is there already: fresh pages of the system cost as much as a product. The results are those up to rounding, of
-which each accounts for its own.
+Boxes are few enough that what passes from layer to layer stays in a core's cache, in memory that is there already:
+fresh pages of the system cost as much as a product. They are always as many, because a product rounds as its width has
+it.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from types import ModuleType
 from typing import Any
 
-import torch
-from torch import Tensor
+import numpy as np
+
+from certify.provers.bounds.arrays import Array
+from certify.provers.bounds.compiled import Loops
+from certify.provers.bounds.taylor import TINY
 
 
 @dataclass(frozen=True, slots=True)
 class Layer:
-    """W (H, K) and |W|, the bias and its error (H,), the 2-norms of the rows (H,), and that of W, on the processor."""
+    """W (H, K) and |W|, the bias and its error (H,), the 2-norms of the rows (H,), and that of W."""
 
-    W: Tensor
-    magnitude: Tensor
-    bias: Tensor
-    bias_error: Tensor
-    rows: Tensor
+    W: Array
+    magnitude: Array
+    bias: Array
+    bias_error: Array
+    rows: Array
     norm: float
 
 
@@ -38,17 +40,17 @@ class _Prepared:
     """
 
     layer: Layer
-    h: Tensor
-    errors: Tensor
-    y: Tensor
-    through: Tensor
-    ends: Tensor
-    values: Tensor
-    t: Tensor
-    p: Tensor
-    rounding: Tensor
-    error: Tensor
-    slope: Tensor
+    h: Array
+    errors: Array
+    y: Array
+    through: Array
+    ends: Array
+    values: Array
+    t: Array
+    p: Array
+    rounding: Array
+    error: Array
+    slope: Array
     ranges: tuple[Any, ...]
     chords: tuple[Any, ...]
     bend: tuple[Any, ...]
@@ -59,18 +61,17 @@ class FusedLayers:
 
     Parameters
     ----------
-    kernels : the module of that name.
     scale : of the outputs (m,), by which errors are weighed.
     """
 
-    def __init__(self, kernels: ModuleType, layers: Sequence[Layer], squash: bool, scale: Tensor, batch: int) -> None:
-        self.kernels, self.squash, self.scale, self.batch = kernels, squash, scale, batch
+    def __init__(self, layers: Sequence[Layer], squash: bool, scale: Array, batch: int) -> None:
+        self.squash, self.scale, self.batch = squash, scale, batch
         n, m = layers[0].W.shape[1], len(scale)
         units = max(len(layer.W) for layer in layers)
         widest = max(n, units)
 
-        def numbers(*shape: int) -> Tensor:
-            return torch.empty(*shape, batch, dtype=torch.float64)
+        def numbers(*shape: int) -> Array:
+            return np.empty((*shape, batch))
 
         self._x, self._x_errors = numbers(n, n + 1), numbers(n, 2)
         self._size, self._fresh, self._ball, self._share = numbers(), numbers(), numbers(), numbers(n)
@@ -81,18 +82,18 @@ class FusedLayers:
         for i, layer in enumerate(layers):
             H, K = layer.W.shape
             y, new, slope = forms[i % 2][:H], numbers(H, 2), numbers(H)
-            lo_hi, tanh = (v[: 2 * H].view(2, H, batch) for v in (ends, values))
+            lo_hi, tanh = (v[: 2 * H].reshape(2, H, batch) for v in (ends, values))
             own = {"t": t[:H], "p": p[:H], "rounding": rounding[:H]}
             sums = (self._size, self._fresh, self._ball)
             known = (layer.bias, layer.bias_error, layer.rows, through[:H], *sums)
-            first = (*_arrays(y, *known), layer.norm, K, *_arrays(lo_hi, whole[:H], rounding[:H], spread[:H]))
-            given = _arrays(y, lo_hi, tanh, slope, t[:H], p[:H])
+            first = (y, *known, layer.norm, K, lo_hi, whole[:H], rounding[:H], spread[:H])
+            given = (y, lo_hi, tanh, slope, t[:H], p[:H])
             share = self._share if i == 0 else self._share[:0]
-            last = (*given, K, *_arrays(whole[:H], rounding[:H], spread[:H], new, *sums, share))
+            last = (*given, K, whole[:H], rounding[:H], spread[:H], new, *sums, share)
             self._layers.append(
                 _Prepared(
-                    layer, h.view(K, -1), errors.view(K, -1), y.view(H, -1), through[:H].view(H, -1), lo_hi, tanh,
-                    **own, error=new, slope=slope, ranges=first, chords=_arrays(lo_hi, tanh, slope, t[:H]), bend=last,
+                    layer, h.reshape(K, -1), errors.reshape(K, -1), y.reshape(H, -1), through[:H].reshape(H, -1), lo_hi,
+                    tanh, **own, error=new, slope=slope, ranges=first, chords=(lo_hi, tanh, slope, t[:H]), bend=last,
                 )
             )  # fmt: skip
             h, errors = y, new
@@ -100,40 +101,34 @@ class FusedLayers:
         self._weights = [weights[i % 2] for i in range(len(layers) + 1)]
         self._result = numbers(m)
 
-    def __call__(self, x: Tensor, x_error: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    def __call__(self, loops: Loops, x: Array, x_error: Array) -> tuple[Array, Array, Array]:
         """The affine form (m, n + 1, B) behind the last layer, the scaled error (m, B) and `share` (n, B)."""
-        k = self.kernels
-        self._x.copy_(x)
+        self._x[:] = x
         self._x_errors[:, 0], self._x_errors[:, 1] = x_error, 0.0
-        torch.sum(x.abs().sum(1).square(), 0, out=self._size)
-        torch.sum(x_error.square(), 0, out=self._fresh)
-        self._ball.zero_()
-        self._share.zero_()
+        np.square(np.abs(x).sum(1)).sum(0, out=self._size)
+        np.square(x_error).sum(0, out=self._fresh)
+        self._ball[:], self._share[:] = 0.0, 0.0
         for at, each in enumerate(self._layers):
-            torch.mm(each.layer.W, each.h, out=each.y)
-            torch.mm(each.layer.magnitude, each.errors, out=each.through)
-            k.ranges(*each.ranges)
+            np.matmul(each.layer.W, each.h, out=each.y)
+            np.matmul(each.layer.magnitude, each.errors, out=each.through)
+            loops.ranges(*each.ranges)
             if at == len(self._layers) - 1 and not self.squash:
                 each.error[:, 0] = each.rounding
-                each.slope.fill_(1.0)
+                each.slope[:] = 1.0
                 break
-            torch.tanh(each.ends, out=each.values)
-            k.chords(*each.chords)
-            torch.atanh(each.t, out=each.p)
-            k.bend(*each.bend)
-        share = self._share + k.TINY
-        return self._form.clone(), self._error_backwards(x_error), share / share.sum(0)
+            np.tanh(each.ends, out=each.values)
+            loops.chords(*each.chords)
+            np.arctanh(each.t, out=each.p)
+            loops.bend(*each.bend)
+        share = self._share + TINY
+        return self._form.copy(), self._error_backwards(loops, x_error), share / share.sum(0)
 
-    def _error_backwards(self, x_error: Tensor) -> Tensor:
+    def _error_backwards(self, loops: Loops, x_error: Array) -> Array:
         """What all errors on the way add to the outputs (m, B), by the magnitudes of their weights."""
-        self._result.zero_()
-        self._weights[0][: len(self.scale)] = torch.diag(self.scale)[:, :, None]
+        self._result[:] = 0.0
+        self._weights[0][: len(self.scale)] = np.diag(self.scale)[:, :, None]
         for each, weight, on in zip(reversed(self._layers), self._weights, self._weights[1:], strict=False):
             H, K = each.layer.W.shape
-            self.kernels.backwards(*_arrays(weight[:H], each.error, each.slope, self._result))
-            torch.mm(each.layer.W.T, weight[:H].view(H, -1), out=on[:K].view(K, -1))
-        return self._result + (on[: len(x_error)].abs() * x_error[:, None]).sum(0)
-
-
-def _arrays(*tensors: Tensor) -> tuple[Any, ...]:
-    return tuple(v.numpy() for v in tensors)
+            loops.backwards(weight[:H], each.error, each.slope, self._result)
+            np.matmul(each.layer.W.T, weight[:H].reshape(H, -1), out=on[:K].reshape(K, -1))
+        return self._result + (np.abs(on[: len(x_error)]) * x_error[:, None]).sum(0)

@@ -1,19 +1,19 @@
-"""Loops over numbers, compiled by numba: what lies between two products of matrices, one walk through memory each.
+"""What is done with the numbers of a batch of boxes between two products of matrices: formulas, and loops over them.
 
-`compiled.py` says when they are worth their start, and nothing imports this file before. Signatures are given, so that
-all is compiled, or read from numba's cache, when the file is imported. IEEE arithmetic throughout: no `fastmath`, so
-that nothing is contracted or reordered, and a comparison with NaN is false; each choice below is written so that a NaN
-reaches the result. Each loop over boxes is the innermost, where it becomes vector instructions. tanh and its inverse
-stay torch's, which evaluates many at once: what is compiled here would call libm for each.
+A formula is written once, for arrays and for single numbers alike: `vectors.py` gives it the arrays of numpy, and the
+loops here, which `compiled.py` compiles, a number each. Both do the same IEEE operations in the same order, so that
+they give the same bits: no `fastmath`, so that nothing is contracted or reordered. A comparison with NaN is false; each
+choice below is written so that a NaN reaches the result. Each loop over boxes is the innermost, where it becomes vector
+instructions. tanh and its inverse of a network stay numpy's, which evaluates many at once: compiled loops call libm for
+each.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, TypeAlias, TypeVar
+from typing import Any, TypeAlias
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -31,35 +31,171 @@ from certify.provers.bounds.tape import (
     SQRT,
     TANH,
 )
+from certify.provers.bounds.taylor import EPS, EXP_END, TINY
 
 Line: TypeAlias = NDArray[np.float64]  # of one dimension, in C's order
 Plane: TypeAlias = NDArray[np.float64]  # of two
 Block: TypeAlias = NDArray[np.float64]  # of three
 Steps: TypeAlias = NDArray[np.int64]
-Four: TypeAlias = tuple[float, float, float, float]
-Five: TypeAlias = tuple[float, float, float, float, float]
-F = TypeVar("F", bound=Callable[..., Any])
-EPS, TINY = 2.0**-50, 2.0**-900  # as in taylor.py
-SLACK = 2.0**-47  # as in policy.py
-EXP_END = 64.0  # as in taylor.py
+Real: TypeAlias = Any  # a number where it is compiled, else an array too
+Two: TypeAlias = tuple[Real, Real]
+Four: TypeAlias = tuple[Real, Real, Real, Real]
+Five: TypeAlias = tuple[Real, Real, Real, Real, Real]
+SLACK = 2.0**-47  # error allowed to tanh, relative to 1; numpy's errs by 2^-51 at most
 CHUNK = 32  # boxes at a time in the plant: their models stay in a core's cache
 LOST = 2.0**-500  # more than a 2-norm loses where squares underflow
-_TYPES = {"Line": "f8[::1]", "Plane": "f8[:,::1]", "Block": "f8[:,:,::1]", "float": "f8", "int": "i8", "None": "void"}
-_TYPES |= {"Steps": "i8[:,::1]", "Four": "UniTuple(f8, 4)", "Five": "UniTuple(f8, 5)"}
 
 
-def _compiled(function: F) -> F:
-    """Compile for the annotated types, without the interpreter's lock; into numba's cache, if one can be written."""
-    *parameters, returned = (_TYPES[name] for name in function.__annotations__.values())
-    signature, how = f"{returned}({','.join(parameters)})", {"nogil": True, "error_model": "numpy"}
-    try:
-        result: F = numba.njit(signature, cache=True, **how)(function)
-    except (RuntimeError, OSError):  # there is no folder for the cache, or it is full
-        result = numba.njit(signature, **how)(function)
-    return result
+def _number_by_number(function: Callable[[float], float]) -> Callable[[Real], Real]:
+    """A function of libm on an array, where numpy's own may differ by a rounding from what is compiled."""
+
+    def at(v: float) -> float:
+        try:
+            return function(v)
+        except OverflowError:
+            return math.inf
+        except ValueError:
+            return math.nan
+
+    every = np.frompyfunc(at, 1, 1)
+    return lambda v: np.asarray(every(v), dtype=np.float64)
 
 
-@_compiled
+LIBM = {"exp": math.exp, "tanh": math.tanh, "atan": math.atan, "sin": math.sin, "cos": math.cos}
+exp, tanh, atan, sin, cos = map(_number_by_number, LIBM.values())  # compiled, they are those of libm
+choose = np.where  # compiled, it is `one`
+
+
+def one(condition: bool, a: float, b: float) -> float:
+    """`choose` of numbers."""
+    return a if condition else b
+
+
+def smaller(a: Real, b: Real) -> Real:
+    """a, if it is less than b."""
+    return choose(a < b, a, b)
+
+
+def larger(a: Real, b: Real) -> Real:
+    """a, if it is more than b."""
+    return choose(a > b, a, b)
+
+
+def enclosed(
+    centre: Real, b: Real, b_error: Real, row: Real, passed: Two, ball: Real, each: Real, spread: Real, growths: Two
+) -> Four:
+    """The ends of a unit's range, its error and the rounding in that, from its affine form's `centre` and `spread`.
+
+    Parameters
+    ----------
+    b, b_error, row : its bias, the error of that, and the 2-norm of its weights.
+    passed : what comes through |W| of the fresh errors and of the older ones.
+    ball : the 2-norm of the older errors that came in.
+    each : the rounding of a product of matrices, of a row of norm 1.
+    growths : what rounding makes of sums over all that come in, and over the columns of the form.
+    """
+    (fresh, older), (grown, wider) = passed, growths
+    own = each * row + 8 * EPS * (abs(centre) + abs(b)) + TINY + b_error
+    whole = (fresh + smaller(row * ball, older)) * grown + own
+    radius = (spread + whole) * wider * (1 + EPS) + EPS * abs(centre) + TINY
+    return centre - radius, centre + radius, whole, own
+
+
+def chord(lo: Real, hi: Real, t_lo: Real, t_hi: Real) -> Two:
+    """The slope s of tanh's chord between lo and hi, and sqrt(1 - s)."""
+    s = (t_hi - t_lo) / (hi - lo)
+    s = choose(s < 0.0, 0.0, s)
+    s = choose(s > 1.0, 1.0, s)
+    rest = 1 - s
+    return s, np.sqrt(choose(rest > 1 - EPS, 1 - EPS, rest))
+
+
+def relaxed(ends: Two, values: Two, s: Real, p: Real, t: Real, centre: Real) -> Two:
+    """Parallel lines: (m, gap) with |tanh(y) - s y - m| <= gap for y between the ends, `values` being tanh there.
+
+    s is the chord's slope. D(y) = tanh(y) - s y rises up to the p >= 0 at which tanh' is s and falls beyond, among
+    y >= 0; among y <= 0 it is convex and largest at an end; and it is odd. tanh(p) = t = sqrt(1 - s), so that neither
+    bound needs another tanh. Where p is not exact, |D'(p)| <= 2^-48 and D' is monotone between p and the exact one.
+    """
+    (lo, hi), (t_lo, t_hi) = ends, values
+    slack = SLACK * (1 + (hi - lo))
+    a, b = t_lo - s * lo, t_hi - s * hi
+    value = choose(p < lo, t_lo, choose(p > hi, t_hi, t))
+    at = choose(p < lo, lo, choose(p > hi, hi, p))
+    upper = larger(value - s * at, larger(a, b)) + slack
+    value = choose(-p < lo, t_lo, choose(-p > hi, t_hi, -t))
+    at = choose(-p < lo, lo, choose(-p > hi, hi, -p))
+    lower = smaller(value - s * at, smaller(a, b)) - slack
+    reach = abs(centre) + (hi - lo) / 2  # infinite or NaN where an end is, and then the gap is NaN
+    gap = (upper - lower) / 2 + EPS * (abs(upper) + abs(lower) + s * reach) + TINY
+    return (upper + lower) / 2, gap
+
+
+def bent(centre: Real, spread: Real, s: Real, shift: Real, gap: Real, own: Real) -> Two:
+    """The middle of a unit's affine form behind tanh, and its fresh error, from the rounding in front."""
+    fresh = gap + s * own + EPS * (s * (abs(centre) + spread) + abs(shift)) + TINY
+    return s * centre + shift, fresh
+
+
+def expansion(operation: int, c: Real, reach: Real) -> Four:
+    """phi(c), phi'(c), phi''(c)/2 and a bound of |phi'''|/6 within `reach` of c, as `Taylor` takes them; NaN where
+    there is none. libm errs by a few units in the last place at most, `Taylor.compose` allows for sixteen."""
+    if operation == INVERSE:
+        least = abs(c) - reach
+        least = choose(least > 0, least, np.nan)
+        f = 1 / c
+        cube = f * f * f
+        return f, -f * f, cube, abs(cube) / least * (1 + EPS) + TINY
+    if operation == SQRT:
+        least = c - reach
+        s, w = np.sqrt(c), np.sqrt(choose(least > 0, least, np.nan))
+        p, q = 1 / s, 1 / (s + w)
+        return s, p / 2, -p * p * p / 8, p * p * q * q * (2 * q + p) / 8 * (1 + 32 * EPS) + TINY
+    if operation == EXP:
+        e, most = exp(c), c + reach
+        third = choose(most < EXP_END, exp(most) / 6 * (1 + 128 * EPS) + TINY, np.nan)
+        return e, e, e / 2, third
+    if operation == TANH:
+        t = tanh(c)
+        slope = 1 - t * t
+        return t, slope, -t * slope, 1 / 3 + EPS
+    if operation == ATAN:
+        slope = 1 / (1 + c * c)
+        return atan(c), slope, -c * slope * slope, 1 / 3 + EPS
+    sine, cosine = sin(c), cos(c)
+    if operation == SIN:
+        third = abs(cosine) + reach + EPS
+        return sine, cosine, -sine / 2, choose(third > 1.0, 1.0, third) / 6
+    if operation == COS:
+        third = abs(sine) + reach + EPS
+        return cosine, -sine, -cosine / 2, choose(third > 1.0, 1.0, third) / 6
+    return np.nan, np.nan, np.nan, np.nan
+
+
+def coefficients(operation: int, k: float, u: Four, v: Four) -> Five:
+    """`alpha`, `beta`, `gamma`, the constant term and the remainder of an operation, as `Taylor` has them; of its
+    operands are given c, sum |g_i|, sum |Q_ij| and r."""
+    (c, G, S, r), (vc, vG, vS, vr) = u, v
+    whole, other = abs(c) + G + S, abs(vc) + vG + vS
+    if operation == ADD:
+        return 1.0, 1.0, 0.0, c + vc, r + vr + EPS * (whole + other) + TINY
+    if operation == SCALED:
+        return k, 0.0, 0.0, k * c, abs(k) * r * (1 + EPS) + EPS * (abs(k) * whole) + TINY
+    if operation == SHIFTED:
+        return 1.0, 0.0, 0.0, c + k, r + EPS * (abs(c) + abs(k)) + TINY
+    if operation == CONSTANT:
+        return 0.0, 0.0, 0.0, k, EPS * abs(k) + TINY
+    if operation == MULTIPLY:
+        rest = abs(c) * vr + abs(vc) * r + G * vS + vG * S + S * vS + r * (vG + vS + vr) + vr * (G + S)
+        return vc, c, 1.0, c * vc, rest + EPS * (whole * other + rest) + TINY
+    q = S + r
+    rho = G + q
+    f0, f1, f2, third = expansion(operation, c, rho * (1 + EPS))
+    rest = abs(f1) * r + abs(f2) * (2 * G * q + q * q) + third * (rho * rho * rho)
+    rest = rest + 2 * EPS * (abs(f0) + abs(f1) * (1 + rho) + abs(f2) * (1 + rho * rho) + rest)
+    return f1, 0.0, f2, f0, rest + TINY
+
+
 def ranges(
     y: Block,
     bias: Line,
@@ -88,8 +224,8 @@ def ranges(
     """
     units, forms, batch = y.shape
     grown, wider = 1 + width * EPS, 1 + (forms - 1) * EPS
-    each = (width + 2) * EPS * forms**0.5
-    square, reach = np.zeros(batch), np.sqrt(size) + LOST
+    square = np.zeros(batch)
+    each = (width + 2) * EPS * np.sqrt(forms) * (np.sqrt(size) + LOST)
     for i in range(units):
         b, b_error, r = bias[i], bias_error[i], row[i]
         for k in range(batch):
@@ -99,34 +235,23 @@ def ranges(
                 spread[i, k] += abs(y[i, j, k])
         for k in range(batch):
             centre = y[i, 0, k] + b
-            own = each * r * reach[k] + 8 * EPS * (abs(centre) + abs(b)) + TINY + b_error
-            older, in_ball = through[i, 1, k], r * ball[k]
-            older = in_ball if in_ball < older else older
-            whole = (through[i, 0, k] + older) * grown + own
-            radius = (spread[i, k] + whole) * wider * (1 + EPS) + EPS * abs(centre) + TINY
+            passed = through[i, 0, k], through[i, 1, k]
+            lo, hi, whole, own = enclosed(centre, b, b_error, r, passed, ball[k], each[k], spread[i, k], (grown, wider))
             y[i, 0, k] = centre
-            ends[0, i, k], ends[1, i, k] = centre - radius, centre + radius
-            error[i, k], rounding[i, k] = whole, own
+            ends[0, i, k], ends[1, i, k], error[i, k], rounding[i, k] = lo, hi, whole, own
             square[k] += own * own
     for k in range(batch):
         ball[k] = (norm * (ball[k] + np.sqrt(fresh[k]) + LOST) + np.sqrt(square[k]) + LOST) * grown
 
 
-@_compiled
 def chords(ends: Block, values: Block, slope: Plane, t: Plane) -> None:
     """The slopes s (H, B) of tanh's chords between `ends` (2, H, B), `values` being tanh there; and sqrt(1 - s)."""
     _, units, batch = ends.shape
     for i in range(units):
         for k in range(batch):
-            s = (values[1, i, k] - values[0, i, k]) / (ends[1, i, k] - ends[0, i, k])
-            s = 0.0 if s < 0.0 else s
-            s = 1.0 if s > 1.0 else s
-            rest = 1 - s
-            slope[i, k] = s
-            t[i, k] = np.sqrt(1 - EPS if rest > 1 - EPS else rest)
+            slope[i, k], t[i, k] = chord(ends[0, i, k], ends[1, i, k], values[0, i, k], values[1, i, k])
 
 
-@_compiled
 def bend(
     y: Block,
     ends: Block,
@@ -144,7 +269,7 @@ def bend(
     ball: Line,
     share: Plane,
 ) -> None:
-    """tanh of a layer's affine forms y (H, n + 1, B), in their place: `relax_tanh` and what follows from it.
+    """tanh of a layer's affine forms y (H, n + 1, B), in their place: `relaxed` and what follows from it.
 
     Parameters
     ----------
@@ -163,28 +288,11 @@ def bend(
     fresh[:] = 0.0
     for i in range(units):
         for k in range(batch):
-            lo, hi, t_lo, t_hi = ends[0, i, k], ends[1, i, k], values[0, i, k], values[1, i, k]
             s, centre = slope[i, k], y[i, 0, k]
-            a, b = t_lo - s * lo, t_hi - s * hi
-            slack = SLACK * (1 + (hi - lo))
-            at, value = p[i, k], t[i, k]
-            value = t_lo if at < lo else t_hi if at > hi else value
-            at = lo if at < lo else hi if at > hi else at
-            tangent = value - s * at
-            upper = a if a > b else b
-            upper = (tangent if tangent > upper else upper) + slack
-            at, value = -p[i, k], -t[i, k]
-            value = t_lo if at < lo else t_hi if at > hi else value
-            at = lo if at < lo else hi if at > hi else at
-            tangent = value - s * at
-            lower = a if a < b else b
-            lower = (tangent if tangent < lower else lower) - slack
-            reach = abs(centre) + (hi - lo) / 2  # infinite or NaN where an end is, and then the gap is NaN
-            gap = (upper - lower) / 2 + EPS * (abs(upper) + abs(lower) + s * reach) + TINY
-            shift = (upper + lower) / 2
-            new = gap + s * rounding[i, k] + EPS * (s * (abs(centre) + spread[i, k]) + abs(shift)) + TINY
+            there = ends[0, i, k], ends[1, i, k]
+            shift, gap = relaxed(there, (values[0, i, k], values[1, i, k]), s, p[i, k], t[i, k], centre)
+            middle, new = bent(centre, spread[i, k], s, shift, gap, rounding[i, k])
             old = s * error[i, k]
-            middle = s * centre + shift
             form = (abs(middle) + s * spread[i, k]) * wider
             y[i, 0, k] = middle
             errors[i, 0, k], errors[i, 1, k] = new, old
@@ -200,84 +308,22 @@ def bend(
             for k in range(batch):
                 y[i, j, k] *= slope[i, k]
     for k in range(batch):
-        bent, alone = steepest[k] * ball[k], (np.sqrt(older[k]) + LOST) * grown
-        ball[k] = bent if bent < alone else alone
+        ball[k] = smaller(steepest[k] * ball[k], (np.sqrt(older[k]) + LOST) * grown)
 
 
-@_compiled
 def backwards(weight: Block, errors: Block, slope: Plane, result: Plane) -> None:
     """Add what a layer's fresh errors, `errors[:, 0]` of (H, 2, B), weigh in the outputs (m, B), whose weights
     (H, m, B) then go on through the slopes of tanh."""
     units, outputs, batch = weight.shape
+    total = np.zeros((outputs, batch))
     for i in range(units):
         for j in range(outputs):
             for k in range(batch):
-                result[j, k] += abs(weight[i, j, k]) * errors[i, 0, k]
+                total[j, k] += abs(weight[i, j, k]) * errors[i, 0, k]
                 weight[i, j, k] *= slope[i, k]
+    result += total
 
 
-@_compiled
-def expansion(operation: int, c: float, reach: float) -> Four:
-    """phi(c), phi'(c), phi''(c)/2 and a bound of |phi'''|/6 within `reach` of c, as `Taylor` takes them; NaN where
-    there is none. libm errs by a few units in the last place at most, `Taylor.compose` allows for sixteen."""
-    if operation == INVERSE:
-        least = abs(c) - reach
-        least = least if least > 0 else np.nan
-        f = 1 / c
-        cube = f * f * f
-        return f, -f * f, cube, abs(cube) / least * (1 + EPS) + TINY
-    if operation == SQRT:
-        least = c - reach
-        s, w = np.sqrt(c), np.sqrt(least if least > 0 else np.nan)
-        p, q = 1 / s, 1 / (s + w)
-        return s, p / 2, -p * p * p / 8, p * p * q * q * (2 * q + p) / 8 * (1 + 32 * EPS) + TINY
-    if operation == EXP:
-        e, most = math.exp(c), c + reach
-        third = math.exp(most) / 6 * (1 + 128 * EPS) + TINY if most < EXP_END else np.nan
-        return e, e, e / 2, third
-    if operation == TANH:
-        t = math.tanh(c)
-        slope = 1 - t * t
-        return t, slope, -t * slope, 1 / 3 + EPS
-    if operation == ATAN:
-        slope = 1 / (1 + c * c)
-        return math.atan(c), slope, -c * slope * slope, 1 / 3 + EPS
-    sine, cosine = math.sin(c), math.cos(c)
-    if operation == SIN:
-        third = abs(cosine) + reach + EPS
-        return sine, cosine, -sine / 2, (1.0 if third > 1.0 else third) / 6
-    if operation == COS:
-        third = abs(sine) + reach + EPS
-        return cosine, -sine, -cosine / 2, (1.0 if third > 1.0 else third) / 6
-    return np.nan, np.nan, np.nan, np.nan
-
-
-@_compiled
-def coefficients(operation: int, k: float, u: Four, v: Four) -> Five:
-    """`alpha`, `beta`, `gamma`, the constant term and the remainder of an operation, as `Taylor` has them; of its
-    operands are given c, sum |g_i|, sum |Q_ij| and r."""
-    (c, G, S, r), (vc, vG, vS, vr) = u, v
-    whole, other = abs(c) + G + S, abs(vc) + vG + vS
-    if operation == ADD:
-        return 1.0, 1.0, 0.0, c + vc, r + vr + EPS * (whole + other) + TINY
-    if operation == SCALED:
-        return k, 0.0, 0.0, k * c, abs(k) * r * (1 + EPS) + EPS * (abs(k) * whole) + TINY
-    if operation == SHIFTED:
-        return 1.0, 0.0, 0.0, c + k, r + EPS * (abs(c) + abs(k)) + TINY
-    if operation == CONSTANT:
-        return 0.0, 0.0, 0.0, k, EPS * abs(k) + TINY
-    if operation == MULTIPLY:
-        rest = abs(c) * vr + abs(vc) * r + G * vS + vG * S + S * vS + r * (vG + vS + vr) + vr * (G + S)
-        return vc, c, 1.0, c * vc, rest + EPS * (whole * other + rest) + TINY
-    q = S + r
-    rho = G + q
-    f0, f1, f2, third = expansion(operation, c, rho * (1 + EPS))
-    rest = abs(f1) * r + abs(f2) * (2 * G * q + q * q) + third * (rho * rho * rho)
-    rest += 2 * EPS * (abs(f0) + abs(f1) * (1 + rho) + abs(f2) * (1 + rho * rho) + rest)
-    return f1, 0.0, f2, f0, rest + TINY
-
-
-@_compiled
 def sizes(model: Plane, symbols: int) -> None:
     """The last two rows of a model in that many symbols: sums of magnitudes of its linear and its quadratic part."""
     rest = 1 + symbols + symbols * (symbols + 1) // 2
@@ -288,7 +334,6 @@ def sizes(model: Plane, symbols: int) -> None:
             model[to, b] += abs(model[row, b])
 
 
-@_compiled
 def play(
     steps: Steps,
     constants: Line,

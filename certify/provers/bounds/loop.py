@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
-import torch
-from torch import Tensor
 
 from certify.loop.expressions import Symbol
 from certify.loop.plants import System
+from certify.provers.bounds.arrays import Array
+from certify.provers.bounds.compiled import Loops
 from certify.provers.bounds.tape import Tape
 from certify.provers.bounds.taylor import EPS, TINY, Taylor
 
@@ -25,7 +24,7 @@ class LoopModels(NamedTuple):
 
 
 def loop_models(
-    system: System, x: Tensor, error: Tensor, mid: Tensor, slopes: Tensor, wide: Tensor, more: int = 0
+    system: System, x: Array, error: Array, mid: Array, slopes: Array, wide: Array, more: int = 0
 ) -> LoopModels:
     """Models in n box coordinates, m input errors, the uncertain quantities, and `more` symbols that none of them uses.
 
@@ -36,33 +35,33 @@ def loop_models(
     """
     n, m, batch = system.n, system.m, x.shape[2]
     k = len(system.uncertain) + more
-    zeros = torch.zeros(n + m + k, n + m + k, batch, dtype=x.dtype, device=x.device)
+    zeros = np.zeros((n + m + k, n + m + k, batch))
     none = zeros[0, : m + k]
     states: dict[Symbol, Taylor] = {}
     inputs: dict[Symbol, Taylor] = {}
     quantities: dict[Symbol, Taylor] = {}
     for i, symbol in enumerate(system.states):
-        states[symbol] = Taylor(x[i, 0], torch.cat([x[i, 1:], none]), zeros, error[i])
+        states[symbol] = Taylor(x[i, 0], np.concatenate([x[i, 1:], none]), zeros, error[i])
     for j, symbol in enumerate(system.inputs):
-        own = none.clone()
+        own = none.copy()
         own[j] = wide[j]
-        inputs[symbol] = Taylor(mid[j], torch.cat([slopes[j], own]), zeros, zeros[0, 0])
+        inputs[symbol] = Taylor(mid[j], np.concatenate([slopes[j], own]), zeros, zeros[0, 0])
     for j, ((symbol, _), (middle, reach, rounding)) in enumerate(zip(system.uncertain, _ranges(system), strict=True)):
-        own = zeros[0].clone()
+        own = zeros[0].copy()
         own[n + m + j] = reach
         quantities[symbol] = Taylor(zeros[0, 0] + middle, own, zeros, zeros[0, 0] + rounding)
     return LoopModels(states, inputs, quantities)
 
 
 def played(
-    kernels: ModuleType, tape: Tape, system: System, x: Tensor, error: Tensor, mid: Tensor, slopes: Tensor, wide: Tensor
+    loops: Loops, tape: Tape, system: System, x: Array, error: Array, mid: Array, slopes: Array, wide: Array
 ) -> Taylor:
-    """The result of a tape whose inputs are all of `loop_models`, with compiled loops; parameters are those of that."""
+    """The result of a tape whose inputs are all of `loop_models`; the other parameters are those of that."""
     N, batch = system.n + system.m + len(system.uncertain), x.shape[2]
-    c, g, Q, r = (torch.empty(*shape, batch, dtype=torch.float64) for shape in ((), (N,), (N, N), ()))
-    given = (v.contiguous().numpy() for v in (x, error, mid, slopes, wide))
+    c, g, Q, r = (np.empty((*shape, batch)) for shape in ((), (N,), (N, N), ()))
+    given = (np.ascontiguousarray(v) for v in (x, error, mid, slopes, wide))
     ranges = np.array(_ranges(system)).reshape(-1, 3)
-    kernels.play(tape.steps, tape.k, tape.places, *given, ranges, *(v.numpy() for v in (c, g, Q, r)))
+    loops.play(tape.steps, tape.k, tape.places, *given, ranges, c, g, Q, r)
     return Taylor(c, g, Q, r)
 
 

@@ -10,11 +10,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 
-import torch
-from torch import Tensor
+import numpy as np
 
 from certify.loop.expressions import PowerSeries, Series, Symbol, evaluate
 from certify.lyapunov.symbolic import Symbolic
+from certify.provers.bounds.arrays import Array, Index
 from certify.provers.bounds.taylor import Models, Taylor
 
 
@@ -27,26 +27,26 @@ class SymbolicModels:
     value: Taylor
 
     @property
-    def share(self) -> Tensor:
+    def share(self) -> Array:
         """How much each axis (n, B) is charged with a remainder: all of them the same."""
-        return torch.full_like(self.value.g, 1 / self.function.n)
+        return np.full_like(self.value.g, 1 / self.function.n)
 
-    def along(self, F: Sequence[Taylor], index: Tensor) -> tuple[Taylor, Tensor]:
+    def along(self, F: Sequence[Taylor], index: Index) -> tuple[Taylor, Array]:
         """N'F on the boxes `index`, F being what it is there, and `share` (n, B), the same for each axis."""
         n, symbols = self.function.n, len(F[0].g)
-        more = F[0].c.new_zeros(symbols - n, len(index))
-        zeros = F[0].c.new_zeros(symbols, symbols, len(index))
+        more = np.zeros((symbols - n, len(index)))
+        zeros = np.zeros((symbols, symbols, len(index)))
         models = Models(F[0])
         series = PowerSeries(models)
         x = {}
         for (symbol, state), rate in zip(self.states.items(), F, strict=True):
             own = state.at(index)
-            x[symbol] = Series(Taylor(own.c, torch.cat([own.g, more]), zeros, own.r), rate)
+            x[symbol] = Series(Taylor(own.c, np.concatenate([own.g, more]), zeros, own.r), rate)
         found = evaluate(self.function.expression, x, series)
         if len(found.coefficients) == 1:  # not a state itself, which has both
             series.advance()
         first = found.coefficients[1]
-        return models.constant(Fraction(0)) if first is None else first, self.share[:, index]
+        return models.constant(Fraction(0)) if first is None else first, self.share.take(index, -1)
 
 
 class SymbolicEnclosure:
@@ -54,17 +54,17 @@ class SymbolicEnclosure:
 
     units = 1
 
-    def __init__(self, function: Symbolic, device: torch.device) -> None:
-        self.function, self.device = function, device
+    def __init__(self, function: Symbolic) -> None:
+        self.function = function
 
-    def least(self, x: Tensor, error: Tensor, level: float) -> Tensor:
+    def least(self, x: Array, error: Array, level: float) -> Array:
         """A lower bound of N (B,): none is known before there are models."""
-        return torch.full_like(x[0, 0], -torch.inf)
+        return np.full_like(x[0, 0], -np.inf)
 
-    def __call__(self, x: Tensor, error: Tensor) -> SymbolicModels:
+    def __call__(self, x: Array, error: Array) -> SymbolicModels:
         """N for states `x[:, 0] + x[:, 1:] d`, (n, n + 1, B), within the error (n, B)."""
         n, batch = error.shape
-        zeros = x.new_zeros(n, n, batch)
+        zeros = np.zeros((n, n, batch))
         states = {s: Taylor(x[i, 0], x[i, 1:], zeros, error[i]) for i, s in enumerate(self.function.states)}
         like = next(iter(states.values()))
         return SymbolicModels(self.function, states, evaluate(self.function.expression, states, Models(like)))

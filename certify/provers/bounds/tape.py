@@ -1,6 +1,6 @@
 """A calculation with Taylor models written down once, so that a compiled loop can repeat it on batches of boxes.
 
-Each operation of torch walks through all numbers of a model, and a model in N symbols has N^2 of them: what a plant's
+Each operation of numpy walks through all numbers of a model, and a model in N symbols has N^2 of them: what a plant's
 equations cost there is memory. A tape is the same operations in the same order, recorded by running the very code that
 computes with models on stand-ins; `kernels.play` runs it on a few boxes at a time.
 """

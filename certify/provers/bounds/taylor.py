@@ -14,13 +14,10 @@ from fractions import Fraction
 from typing import Protocol, Self, TypeVar
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
-from torch import Tensor
 
 from certify.loop.expressions import Algebra
+from certify.provers.bounds.arrays import Array, Index, product
 
-Array = NDArray[np.float64]
 EPS = 2.0**-50
 TINY = 2.0**-900
 EXP_END = 64.0  # of the exponent, beyond which the checker knows nothing of exp
@@ -30,22 +27,22 @@ EXP_END = 64.0  # of the exponent, beyond which the checker knows nothing of exp
 class Taylor:
     """`c` (B,), `g` (N, B), `Q` (N, N, B), remainder `r` (B,)."""
 
-    c: Tensor
-    g: Tensor
-    Q: Tensor
-    r: Tensor
+    c: Array
+    g: Array
+    Q: Array
+    r: Array
 
-    def norms(self) -> tuple[Tensor, Tensor, Tensor]:
+    def norms(self) -> tuple[Array, Array, Array]:
         """|c|, sum |g_i|, sum |Q_ij|."""
-        return self.c.abs(), self.g.abs().sum(0), self.Q.abs().sum((0, 1))
+        return np.abs(self.c), np.abs(self.g).sum(0), np.abs(self.Q).sum((0, 1))
 
-    def at(self, index: Tensor) -> Taylor:
+    def at(self, index: Index) -> Taylor:
         """The models of some boxes of the batch."""
-        return Taylor(self.c[index], self.g[:, index], self.Q[:, :, index], self.r[index])
+        return Taylor(*(part.take(index, -1) for part in (self.c, self.g, self.Q, self.r)))
 
     def __add__(self, other: Taylor) -> Taylor:
         c, g, Q = self.c + other.c, self.g + other.g, self.Q + other.Q
-        rounding = self.c.abs() + other.c.abs() + sum(n for v in (self, other) for n in v.norms()[1:])
+        rounding = np.abs(self.c) + np.abs(other.c) + sum(n for v in (self, other) for n in v.norms()[1:])
         return Taylor(c, g, Q, self.r + other.r + EPS * rounding + TINY)
 
     def scaled(self, k: float) -> Taylor:
@@ -55,7 +52,7 @@ class Taylor:
 
     def shifted(self, k: float) -> Taylor:
         """Sum with a constant that is k up to one rounding."""
-        return Taylor(self.c + k, self.g, self.Q, self.r + EPS * (self.c.abs() + abs(k)) + TINY)
+        return Taylor(self.c + k, self.g, self.Q, self.r + EPS * (np.abs(self.c) + abs(k)) + TINY)
 
     def __mul__(self, other: Taylor) -> Taylor:
         a, b = self, other
@@ -63,30 +60,30 @@ class Taylor:
         r = ca * b.r + cb * a.r + Ga * Qb + Gb * Qa + Qa * Qb + a.r * (Gb + Qb + b.r) + b.r * (Ga + Qa)
         r = r + EPS * ((ca + Ga + Qa) * (cb + Gb + Qb) + r) + TINY
         joint = 0.5 * (a.g[:, None] * b.g[None])
-        Q = a.c * b.Q + b.c * a.Q + (joint + joint.transpose(0, 1))
+        Q = a.c * b.Q + b.c * a.Q + (joint + joint.swapaxes(0, 1))
         return Taylor(a.c * b.c, a.c * b.g + b.c * a.g, Q, r)
 
-    def compose(self, f0: Tensor, f1: Tensor, f2: Tensor, third: Tensor) -> Taylor:
+    def compose(self, f0: Array, f1: Array, f2: Array, third: Array) -> Taylor:
         """phi(v), from phi(c), phi'(c), phi''(c)/2 and `third` >= sup |phi'''|/6 on the range."""
         _, G, q = self.norms()
         q = q + self.r
         rho = G + q
-        r = f1.abs() * self.r + f2.abs() * (2 * G * q + q * q) + third * rho**3
-        r = r + 2 * EPS * (f0.abs() + f1.abs() * (1 + rho) + f2.abs() * (1 + rho * rho) + r) + TINY
+        r = np.abs(f1) * self.r + np.abs(f2) * (2 * G * q + q * q) + third * (rho * rho * rho)
+        r = r + 2 * EPS * (np.abs(f0) + np.abs(f1) * (1 + rho) + np.abs(f2) * (1 + rho * rho) + r) + TINY
         return Taylor(f0, f1 * self.g, f1 * self.Q + f2 * self.g[:, None] * self.g[None], r)
 
-    def radius(self) -> Tensor:
+    def radius(self) -> Array:
         """Bound of |v - c|."""
         _, G, q = self.norms()
         return (G + q + self.r) * (1 + EPS)
 
     def inverse(self) -> Taylor:
         """1/v; the remainder is NaN where the range of v may contain 0."""
-        least = self.c.abs() - self.radius()
-        least = torch.where(least > 0, least, torch.nan)
+        least = np.abs(self.c) - self.radius()
+        least = np.where(least > 0, least, np.nan)
         f0 = 1 / self.c
         f2 = f0 * f0 * f0
-        return self.compose(f0, -f0 * f0, f2, f2.abs() / least * (1 + EPS) + TINY)
+        return self.compose(f0, -f0 * f0, f2, np.abs(f2) / least * (1 + EPS) + TINY)
 
     def sqrt(self) -> Taylor:
         """The square root; the remainder is NaN where the range of v may reach 0.
@@ -95,33 +92,33 @@ class Taylor:
         (3 s + w) / (8 s^3 (s + w)^3), which is exact at the lower end.
         """
         least = self.c - self.radius()
-        least = torch.where(least > 0, least, torch.nan)
-        s, w = self.c.sqrt(), least.sqrt()
+        least = np.where(least > 0, least, np.nan)
+        s, w = np.sqrt(self.c), np.sqrt(least)
         p, q = 1 / s, 1 / (s + w)
         third = p * p * q * q * (2 * q + p) / 8
         return self.compose(s, p / 2, -p * p * p / 8, third * (1 + 32 * EPS) + TINY)
 
     def exp(self) -> Taylor:
-        e, most = self.c.exp(), self.c + self.radius()
-        third = torch.where(most < EXP_END, most.exp() / 6 * (1 + 128 * EPS) + TINY, torch.nan)
+        e, most = np.exp(self.c), self.c + self.radius()
+        third = np.where(most < EXP_END, np.exp(most) / 6 * (1 + 128 * EPS) + TINY, np.nan)
         return self.compose(e, e, e / 2, third)
 
     def tanh(self) -> Taylor:
-        t = self.c.tanh()
+        t = np.tanh(self.c)
         slope = 1 - t * t
-        return self.compose(t, slope, -t * slope, torch.full_like(t, 1 / 3 + EPS))
+        return self.compose(t, slope, -t * slope, np.full_like(t, 1 / 3 + EPS))
 
     def atan(self) -> Taylor:
         slope = 1 / (1 + self.c * self.c)
-        return self.compose(self.c.atan(), slope, -self.c * slope * slope, torch.full_like(slope, 1 / 3 + EPS))
+        return self.compose(np.arctan(self.c), slope, -self.c * slope * slope, np.full_like(slope, 1 / 3 + EPS))
 
     def sin(self) -> Taylor:
-        s, c = self.c.sin(), self.c.cos()
-        return self.compose(s, c, -s / 2, (c.abs() + self.radius() + EPS).clamp(max=1.0) / 6)
+        s, c = np.sin(self.c), np.cos(self.c)
+        return self.compose(s, c, -s / 2, np.minimum(np.abs(c) + self.radius() + EPS, 1.0) / 6)
 
     def cos(self) -> Taylor:
-        s, c = self.c.sin(), self.c.cos()
-        return self.compose(c, -s, -c / 2, (s.abs() + self.radius() + EPS).clamp(max=1.0) / 6)
+        s, c = np.sin(self.c), np.cos(self.c)
+        return self.compose(c, -s, -c / 2, np.minimum(np.abs(s) + self.radius() + EPS, 1.0) / 6)
 
 
 class Arithmetic(Protocol):
@@ -160,7 +157,7 @@ class Models(ConstantsLast[Taylor]):
     """Expressions of the plant on Taylor models of the shape of `like`."""
 
     def __init__(self, like: Taylor) -> None:
-        self.zero = Taylor(*(torch.zeros_like(t) for t in (like.c, like.g, like.Q, like.r)))
+        self.zero = Taylor(*(np.zeros_like(t) for t in (like.c, like.g, like.Q, like.r)))
 
     def constant(self, q: Fraction) -> Taylor:
         return self.zero.shifted(float(q))
@@ -168,25 +165,24 @@ class Models(ConstantsLast[Taylor]):
     def combined(self, matrix: Array, values: Sequence[Taylor]) -> list[Taylor]:
         """`matrix` (p, q) times q values, in one product."""
         parts = zip(*((v.c, v.g, v.Q, v.r + 2 * len(values) * EPS * sum(v.norms())) for v in values), strict=True)
-        c, g, Q, r = (torch.stack(part) for part in parts)
-        weights = torch.tensor(matrix, dtype=c.dtype, device=c.device)
-        c, g, Q = (torch.tensordot(weights, part, 1) for part in (c, g, Q))
-        r = weights.abs() @ r * (1 + len(values) * EPS) + TINY
+        c, g, Q, r = (np.stack(part) for part in parts)
+        c, g, Q = (product(matrix, part) for part in (c, g, Q))
+        r = product(np.abs(matrix), r) * (1 + len(values) * EPS) + TINY
         return [Taylor(*row) for row in zip(c, g, Q, r, strict=True)]
 
 
-def upper_bound(model: Taylor) -> tuple[Tensor, Tensor]:
+def upper_bound(model: Taylor) -> tuple[Array, Array]:
     """(bound (B,), excess (N, B)): an upper bound over the box, and what each symbol adds to it.
 
     The separable part `g t + q t^2` is maximised exactly over |t| <= 1; cross terms are bounded by magnitude, half to
     each of the two symbols.
     """
-    g = model.g.abs()
-    q = torch.diagonal(model.Q, dim1=0, dim2=1).T
+    g = np.abs(model.g)
+    q = np.einsum("iib->ib", model.Q)
     inside = (q < 0) & (g < -2 * q)
-    axes = torch.where(inside, 0.25 * (g * (g / torch.where(inside, -q, 1.0))), g + q)
-    symmetric = (model.Q + model.Q.transpose(0, 1)).abs() / 2
-    cross = symmetric.sum(1) - q.abs()
-    size = model.c.abs() + g.sum(0) + axes.abs().sum(0) + cross.sum(0) + model.r
+    axes = np.where(inside, 0.25 * (g * (g / np.where(inside, -q, 1.0))), g + q)
+    symmetric = np.abs(model.Q + model.Q.swapaxes(0, 1)) / 2
+    cross = symmetric.sum(1) - np.abs(q)
+    size = np.abs(model.c) + g.sum(0) + np.abs(axes).sum(0) + cross.sum(0) + model.r
     bound = model.c + axes.sum(0) + cross.sum(0) + model.r + 1e-11 * size + TINY
     return bound, axes + cross

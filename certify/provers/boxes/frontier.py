@@ -6,23 +6,21 @@ import copy
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
+from certify.provers.bounds.arrays import Array, Index, joined
 from certify.provers.boxes.partition import Partition
 
-Array = NDArray[np.float64]
 _HANDFUL = 64  # boxes that cost hardly more together than one alone
 
 
 class Boxes(NamedTuple):
     """Corners (n, B), numbers (B,) and keys (B,) of boxes."""
 
-    lo: Tensor
-    hi: Tensor
-    number: Tensor
-    key: Tensor
+    lo: Array
+    hi: Array
+    number: Index
+    key: Array
 
 
 class Frontier:
@@ -32,12 +30,11 @@ class Frontier:
     away by number, in chunks sorted by key, and rebuilt when their turn comes.
     """
 
-    def __init__(self, partition: Partition, device: torch.device, capacity: int = 65_536) -> None:
-        self.partition, self.device, self.capacity = partition, device, capacity
+    def __init__(self, partition: Partition, capacity: int = 65_536) -> None:
+        self.partition, self.capacity = partition, capacity
         n = len(partition.root)
-        self.lo, self.hi = (torch.zeros(n, 0, dtype=torch.float64, device=device) for _ in range(2))
-        self.key = torch.zeros(0, dtype=torch.float64, device=device)
-        self.number = torch.zeros(0, dtype=torch.int64, device=device)
+        self.lo, self.hi = np.zeros((n, 0)), np.zeros((n, 0))
+        self.key, self.number = np.zeros(0), np.zeros(0, dtype=np.int64)
         self._away: list[tuple[Array, NDArray[np.uint32]]] = []  # keys, ascending, and numbers
 
     def copy(self) -> Frontier:
@@ -54,14 +51,14 @@ class Frontier:
         at_hand = float(self.key.min()) if len(self.key) else np.inf
         return min(at_hand, self._least_away())
 
-    def add(self, lo: Tensor, hi: Tensor, key: Tensor, number: Tensor) -> None:
+    def add(self, lo: Array, hi: Array, key: Array, number: Index) -> None:
         """Add boxes with corners (n, B), their keys (B,) and their numbers (B,)."""
-        self.lo, self.hi = torch.cat([self.lo, lo], 1), torch.cat([self.hi, hi], 1)
-        self.key, self.number = torch.cat([self.key, key]), torch.cat([self.number, number])
+        self.lo, self.hi = joined([self.lo, lo]), joined([self.hi, hi])
+        self.key, self.number = joined([self.key, key]), np.concatenate([self.number, number])
         if len(self.key) > self.capacity:
-            order = torch.argsort(self.key, stable=True)
+            order = np.argsort(self.key, kind="stable")
             near, far = order[: self.capacity // 2], order[self.capacity // 2 :]
-            self._away.append((self.key[far].cpu().numpy(), self.number[far].cpu().numpy().astype(np.uint32)))
+            self._away.append((self.key[far], self.number[far].astype(np.uint32)))
             self._keep(near)
 
     def take(self, count: int, limit: float) -> Boxes:
@@ -71,28 +68,28 @@ class Frontier:
         """
         if not len(self.key) or float(self.key.min()) > self._least_away():
             self._bring_back()
-        order = torch.argsort(self.key, stable=True)
+        order = np.argsort(self.key, kind="stable")
         least_away = self._least_away()
         wanted = max(_HANDFUL, int((self.key <= limit).sum()))
         allowed = min(wanted, int((self.key <= least_away).sum()))
         now = order[: min(count, allowed)]
-        taken = Boxes(self.lo[:, now], self.hi[:, now], self.number[now], self.key[now])
+        taken = Boxes(self.lo.take(now, -1), self.hi.take(now, -1), self.number[now], self.key[now])
         self._keep(order[len(now) :])
         return taken
 
     def waiting(self) -> tuple[NDArray[np.int64], Array]:
         """Numbers (B,) and keys (B,) of all boxes."""
-        numbers = [self.number.cpu().numpy(), *(number for _, number in self._away)]
-        keys = [self.key.cpu().numpy(), *(lowest for lowest, _ in self._away)]
+        numbers = [self.number, *(number for _, number in self._away)]
+        keys = [self.key, *(lowest for lowest, _ in self._away)]
         return np.concatenate(numbers).astype(np.int64), np.concatenate(keys)
 
     def drop_above(self, level: float) -> None:
         """Forget boxes with keys above `level`."""
-        self._keep(torch.nonzero(self.key <= level)[:, 0])
+        self._keep(np.flatnonzero(self.key <= level))
         self._cut_away(level)
 
-    def _keep(self, index: Tensor) -> None:
-        self.lo, self.hi = self.lo[:, index], self.hi[:, index]
+    def _keep(self, index: Index) -> None:
+        self.lo, self.hi = self.lo.take(index, -1), self.hi.take(index, -1)
         self.key, self.number = self.key[index], self.number[index]
 
     def _least_away(self) -> float:
@@ -128,5 +125,4 @@ class Frontier:
             for (v, w), k in zip(self._away, split, strict=True)
             if k < len(v)
         ]
-        lo, hi = self.partition.corners(number)
-        self.add(*(torch.tensor(a, device=self.device) for a in (lo, hi, lowest, number)))
+        self.add(*self.partition.corners(number), lowest, number)

@@ -10,9 +10,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from certify.certificates import PartitionTree
 from certify.certificates.claims import Claim, Problem
@@ -28,25 +26,24 @@ _SLACK = 2e-9  # relative distance of a level from the leaves that it leaves out
 def split_again(problem: Problem, evidence: PartitionTree, claim: Claim, leaf: int) -> PartitionTree:
     """The tree with the leaf of this number, counted in preorder, cut into eight along the axes that matter most."""
     lo, hi = leaves(evidence.tree, evidence.root)
-    rule = VdotBound(problem, evidence.T, torch.device("cpu"), order=evidence.order)
+    rule = VdotBound(problem, evidence.T, order=evidence.order)
     tree = cut_leaf(evidence.tree, leaf, lo[leaf], hi[leaf], lambda a, b: rule(a, b, claim.inner, claim.roa).score)
     return replace(evidence, tree=tree)
 
 
-def cut_leaf(tree: bytes, leaf: int, lo: Array, hi: Array, score: Callable[[Tensor, Tensor], Tensor]) -> bytes:
+def cut_leaf(tree: bytes, leaf: int, lo: Array, hi: Array, score: Callable[[Array, Array], Array]) -> bytes:
     """The tree with this leaf, of corners (n,), cut into eight, along the axes of the highest score (n, 1)."""
     at = int(np.flatnonzero(np.frombuffer(tree, dtype=np.uint8) == LEAF)[leaf])
-    lower, upper = (torch.tensor(corner[:, None]) for corner in (lo, hi))
-    return tree[:at] + _cut(score, lower, upper, _DEPTH) + tree[at + 1 :]
+    return tree[:at] + _cut(score, lo[:, None], hi[:, None], _DEPTH) + tree[at + 1 :]
 
 
-def _cut(score: Callable[[Tensor, Tensor], Tensor], lo: Tensor, hi: Tensor, depth: int) -> bytes:
+def _cut(score: Callable[[Array, Array], Array], lo: Array, hi: Array, depth: int) -> bytes:
     """A box (n, 1) as a subtree of this depth."""
     axis = int(score(lo, hi)[:, 0].argmax())
     middle = 0.5 * lo[axis] + 0.5 * hi[axis]
     if depth == 0 or not bool(lo[axis] < middle) or not bool(middle < hi[axis]):
         return bytes([LEAF])
-    lower_hi, upper_lo = hi.clone(), lo.clone()
+    lower_hi, upper_lo = hi.copy(), lo.copy()
     lower_hi[axis] = upper_lo[axis] = middle
     halves = ((lo, lower_hi), (upper_lo, hi))
     return bytes([axis]) + b"".join(_cut(score, low, high, depth - 1) for low, high in halves)
@@ -70,6 +67,5 @@ def level_with_leaves(problem: Problem, evidence: PartitionTree, claim: Claim, c
 def leaf_levels(problem: Problem, evidence: PartitionTree) -> tuple[Array, Array]:
     """Bounds of V from below and above on the leaves, (N,) each, in the order of the tree."""
     lo, hi = leaves(evidence.tree, evidence.root)
-    rule = VdotBound(problem, evidence.T, torch.device("cpu"))
-    lowest, highest = rule.levels(torch.tensor(lo.T.copy()), torch.tensor(hi.T.copy()))
-    return lowest.numpy(), highest.numpy()
+    rule = VdotBound(problem, evidence.T)
+    return rule.levels(lo.T.copy(), hi.T.copy())

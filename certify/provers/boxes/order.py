@@ -9,7 +9,6 @@ run gives the same certificate each time.
 from __future__ import annotations
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from certify.certificates.claims import Problem
@@ -27,12 +26,12 @@ def choose_order(problem: Problem, T: Array, inner: float, outer: float) -> int:
         return 1
     n = problem.loop.system.n
     generator = np.random.default_rng(0)
-    rules = {order: VdotBound(problem, T, torch.device("cpu"), order=order) for order in _COSTS}
+    rules = {order: VdotBound(problem, T, order=order) for order in _COSTS}
     z = generator.standard_normal((n, _POINTS))
     z *= np.sqrt(inner * (outer / inner) ** generator.random(_POINTS)) / np.linalg.norm(z, axis=0)
     shares: dict[int, list[Array]] = {order: [] for order in _COSTS}
     for k in range(_ROUNDS):
-        bounds = {order: rule.at_points(torch.tensor(z), outer).numpy() for order, rule in rules.items()}
+        bounds = {order: rule.at_points(z, outer) for order, rule in rules.items()}
         longest = bounds[max(_COSTS)]
         for order, bound in bounds.items():
             shares[order].append((np.minimum(bound, 0.0) / longest)[longest < 0].clip(_LEAST, 1.0))

@@ -10,9 +10,7 @@ from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from certify.errors import CertificateFormatError
 
@@ -34,9 +32,10 @@ class Grafted(NamedTuple):
     hi: Array
     place: Numbers
 
-    def tensors(self) -> tuple[Tensor, Tensor, Tensor]:
-        """Corners and numbers for torch."""
-        return torch.tensor(self.lo), torch.tensor(self.hi), torch.tensor(self.number)
+    @property
+    def boxes(self) -> tuple[Array, Array, Numbers]:
+        """Corners and numbers."""
+        return self.lo, self.hi, self.number
 
 
 class Partition:
@@ -88,7 +87,7 @@ class Partition:
             split = box // 2
             steps.append((column, self._axes[split].astype(np.int64), box % 2 == 1))
             box = self._parents[split].astype(np.int64)
-        lo, hi = self._lo[:, first], self._hi[:, first]
+        lo, hi = self._lo.take(first, -1), self._hi.take(first, -1)
         for column, axis, upper in reversed(steps):
             _halve(lo, hi, column, axis, upper)
         return lo, hi
@@ -153,10 +152,10 @@ class Partition:
         while len(at):
             split = nodes[at] < len(self.root)
             marked = (nodes[at] == OPEN) | (nodes[at] == LOOK)
-            ends.append((at[marked], boxes[marked], lo[:, marked], hi[:, marked]))
+            ends.append((at[marked], boxes[marked], lo.compress(marked, -1), hi.compress(marked, -1)))
             above = at[split]
             axis = nodes[above].astype(np.int64)
-            lo, hi = lo[:, split], hi[:, split]
+            lo, hi = lo.compress(split, -1), hi.compress(split, -1)
             column = np.arange(len(above))
             width = hi[axis, column] - lo[axis, column]
             # A chain of upper halves leaves no box open behind it: its depth shows only on the way.
@@ -171,10 +170,11 @@ class Partition:
             _halve(lo, hi, np.arange(len(at)), np.repeat(axis, 2), np.arange(len(at)) % 2 == 1)
         place, number, lo, hi = (np.concatenate(parts, -1) for parts in zip(*ends, strict=True))
         order = np.argsort(place)
-        place, number, lo, hi = place[order], number[order], lo[:, order], hi[:, order]
+        place, number, lo, hi = place[order], number[order], lo.take(order, -1), hi.take(order, -1)
         is_open = nodes[place] == OPEN
         opened, looked = (
-            Grafted(number[one], lo[:, one], hi[:, one], np.flatnonzero(one)) for one in (is_open, ~is_open)
+            Grafted(number[one], lo.compress(one, -1), hi.compress(one, -1), np.flatnonzero(one))
+            for one in (is_open, ~is_open)
         )
         return opened, looked
 

@@ -19,9 +19,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
-from torch import Tensor
 
 from certify.certificates.claims import Problem
 from certify.loop.closed_loop import ClosedLoop
@@ -29,16 +26,17 @@ from certify.loop.expressions import Expression, evaluate, nodes
 from certify.loop.plants import System
 from certify.loop.policies import bounded_by_form
 from certify.provers.bounds import Flow, Models, PolicyEnclosure, Taylor, loop_models, operations_of_policy, upper_bound
-from certify.provers.bounds.compiled import kernels
+from certify.provers.bounds.arrays import Array, Mask, chosen, product
+from certify.provers.bounds.compiled import loops
 from certify.provers.bounds.loop import played
 from certify.provers.bounds.tape import Tape, recorded
 from certify.provers.bounds.taylor import EPS, TINY, ConstantsLast, V
 from certify.provers.boxes.form import FormBound
 
-Array = NDArray[np.float64]
 _SLACK = 1e-9  # relative distance from the inner level at which a box counts as inside
 _ENDS = 1e-11  # relative distance kept from the ends of the domain
 _EACH = 2.0  # operations of an entry of a model
+_PIECES = 2  # of the policy, at most, in one of a batch
 _POINT = 2.0**-20  # of a box: what is left of it around its centre
 
 
@@ -47,11 +45,11 @@ class BoxBounds(NamedTuple):
     `violated` (B,): a condition fails at the centre, or cannot be proved there; `smooth` (B,): what is asked inside
     the inner level holds."""
 
-    proved: Tensor
-    bound: Tensor
-    score: Tensor
-    violated: Tensor
-    smooth: Tensor
+    proved: Mask
+    bound: Array
+    score: Array
+    violated: Mask
+    smooth: Mask
 
 
 def operations_of_box(loop: ClosedLoop, order: int = 2) -> float:
@@ -71,16 +69,17 @@ class VdotBound:
     nobody's concern here. `order` is that of the series in time where the input is held.
     """
 
-    def __init__(self, problem: Problem, T: Array, device: torch.device, inside: bool = False, order: int = 2) -> None:
+    def __init__(self, problem: Problem, T: Array, inside: bool = False, order: int = 2) -> None:
         self.inside = inside
         loop = problem.loop
         self.system = loop.system
         self.rate = problem.rate
-        self.T = torch.tensor(T, dtype=torch.float64, device=device)
+        self.T = np.ascontiguousarray(T)
         self.P = problem.V.P
-        self.V = FormBound(self.P, T, device)
+        self.V = FormBound(self.P, T)
         self.operations = operations_of_box(loop, order)
-        self.policy = PolicyEnclosure(loop, device)
+        self.policy = PolicyEnclosure(loop)
+        self.piece = _PIECES * self.policy.piece
         self.dynamics: tuple[Expression, ...] = loop.system.uncertain_dynamics()
         self.check_inputs = not bounded_by_form(loop.network, loop.system.input_bounds)
         sample = loop.system.sample
@@ -88,60 +87,61 @@ class VdotBound:
         self.order = 1 if self.flow is None else order
         self.step = loop.step
         self.tape: Tape | None = None  # of D, recorded when it is first played
-        ends = [[float(end) for end in pair] for pair in loop.system.domain]
-        self.ends = torch.tensor(ends, dtype=torch.float64, device=device).T[:, :, None]
-        extent = np.sqrt(np.diag(np.linalg.inv(self.P))) * (1 + 1e-9)
-        self.extent = torch.tensor(extent, dtype=torch.float64, device=device)[:, None]  # of {V <= 1}
+        self.ends = np.array([[float(end) for end in pair] for pair in loop.system.domain]).T[:, :, None]
+        self.extent = (np.sqrt(np.diag(np.linalg.inv(self.P))) * (1 + 1e-9))[:, None]  # of {V <= 1}
 
-    def levels(self, lo: Tensor, hi: Tensor) -> tuple[Tensor, Tensor]:
+    def levels(self, lo: Array, hi: Array) -> tuple[Array, Array]:
         """Bounds of V from below and above on boxes (n, B)."""
         return self.V.levels(lo, hi)
 
-    def levels_at(self, z: Tensor) -> Tensor:
+    def levels_at(self, z: Array) -> Array:
         """V at points (n, B)."""
         return self.V.at(z)
 
-    def at_points(self, z: Tensor, outer: float) -> Tensor:
+    @np.errstate(all="ignore")  # infinities and NaN are answers, which nothing is proved with
+    def at_points(self, z: Array, outer: float) -> Array:
         """The bound of D' at points (n, B) in {V <= outer}; infinite where nothing is known of it."""
-        return self._judge(z, torch.zeros_like(z), z, z, 0.0, outer).bound.nan_to_num(torch.inf, torch.inf)
+        return np.nan_to_num(
+            self._judge(z, np.zeros_like(z), z, z, 0.0, outer).bound, nan=np.inf, posinf=np.inf, neginf=-np.inf
+        )
 
-    def levels_after(self, z: Tensor, outer: float) -> Tensor:
+    def levels_after(self, z: Array, outer: float) -> Array:
         """V after a step from points (n, B) in {V <= outer}, from above; infinite where nothing is known of it."""
         return self.levels_at(z) + self.step * self.at_points(z, outer)
 
-    def __call__(self, lo: Tensor, hi: Tensor, inner: float, outer: float) -> BoxBounds:
+    @np.errstate(all="ignore")
+    def __call__(self, lo: Array, hi: Array, inner: float, outer: float) -> BoxBounds:
         """Bounds on inner <= V <= outer within boxes lo, hi (n, B)."""
         centre = 0.5 * lo + 0.5 * hi
-        radius = torch.maximum(hi - centre, centre - lo) * (1 + EPS)
+        radius = np.maximum(hi - centre, centre - lo) * (1 + EPS)
         found = self._judge(centre, radius, lo, hi, inner, outer)
         if self.step == 0:
             return found
         asked = ~found.proved & ~found.violated
         if not self.inside:
             asked = asked & (self.levels_at(centre) >= inner)
-        index = torch.nonzero(asked)[:, 0]
-        if not len(index):
-            return found
-        z, small = centre[:, index], _POINT * radius[:, index]
-        provable = self._judge(z, small, z - small, z + small, inner, outer).proved
-        return found._replace(violated=found.violated.index_put((index,), ~provable))
+        index = chosen(asked)
+        if len(index):
+            z, small = centre.take(index, -1), _POINT * radius.take(index, -1)
+            found.violated[index] = ~self._judge(z, small, z - small, z + small, inner, outer).proved
+        return found
 
-    def _judge(self, centre: Tensor, radius: Tensor, lo: Tensor, hi: Tensor, inner: float, outer: float) -> BoxBounds:
+    def _judge(self, centre: Array, radius: Array, lo: Array, hi: Array, inner: float, outer: float) -> BoxBounds:
         n = self.system.n
         slopes_x = self.T[:, :, None] * radius
-        x = torch.cat([(self.T @ centre)[:, None], slopes_x], 1)
-        error = 2 * (n + 4) * EPS * (self.T.abs() @ (centre.abs() + radius)) + TINY
+        x = np.concatenate([product(self.T, centre)[:, None], slopes_x], 1)
+        error = 2 * (n + 4) * EPS * product(np.abs(self.T), np.abs(centre) + radius) + TINY
         mid, slopes, wide, share = self.policy(x, error)
         decrease, kept = self._decrease(x, error, mid, slopes, wide, outer)
         if self.rate:
             decrease = decrease + self.V.model(centre, radius, decrease).scaled(2 * self.rate)
         bound, excess = upper_bound(decrease)
-        smooth = torch.isfinite(bound)  # a component of F that is not enclosed leaves a NaN in the sum over all
+        smooth = np.isfinite(bound)  # a component of F that is not enclosed leaves a NaN in the sum over all
         # At the box's centre, and for the worst values of what is uncertain, only the inputs' errors, what is of second
         # order in all these, and the remainder are left.
         known = n + self.system.m
-        doubt = decrease.g[n:known].abs().sum(0) + decrease.Q[n:, n:].abs().sum((0, 1)) + decrease.r
-        violated = decrease.c + decrease.g[known:].abs().sum(0) - doubt >= 0
+        doubt = np.abs(decrease.g[n:known]).sum(0) + np.abs(decrease.Q[n:, n:]).sum((0, 1)) + decrease.r
+        violated = decrease.c + np.abs(decrease.g[known:]).sum(0) - doubt >= 0
         bound = self._within_ring(bound, decrease, lo, hi, centre, radius, inner, outer)
         proved = bound < 0
         if self.inside and self.step == 0:
@@ -149,37 +149,34 @@ class VdotBound:
         # What the inputs' errors and the remainder add is charged to the axes that spread the network.
         extra = excess[n:].sum(0) + decrease.r
         score = excess[:n] + share * extra
-        score = torch.where(torch.isfinite(score), score, slopes_x.abs().sum(0))
+        score = np.where(np.isfinite(score), score, np.abs(slopes_x).sum(0))
         if kept is not None:
-            score = torch.where(kept, score, slopes_x.abs().sum(0))
-            proved, bound = proved & kept, torch.where(kept, bound, torch.inf)
+            score = np.where(kept, score, np.abs(slopes_x).sum(0))
+            proved, bound = proved & kept, np.where(kept, bound, np.inf)
         if self.check_inputs:
             for j, (inside, outside) in enumerate(input_bounds_kept(self.system, mid, slopes, wide)):
                 proved, violated, smooth = proved & inside, violated | outside, smooth & inside
-                score = torch.where(inside, score, slopes[j].abs() + share * wide[j])
+                score = np.where(inside, score, np.abs(slopes[j]) + share * wide[j])
         if self.inside and self.step:
             smooth = proved
         return BoxBounds(proved, bound, score, violated, smooth)
 
     def _decrease(
-        self, x: Tensor, error: Tensor, mid: Tensor, slopes: Tensor, wide: Tensor, outer: float
-    ) -> tuple[Taylor, Tensor | None]:
+        self, x: Array, error: Array, mid: Array, slopes: Array, wide: Array, outer: float
+    ) -> tuple[Taylor, Mask | None]:
         """D, and where (B,) the solution stays in the domain over a period in which the input is held, if it is.
 
         Symbols: n box coordinates, m input errors, k uncertain quantities, and the period if that is in a range.
         """
-        compiled = kernels(self.policy.units * x.shape[2]) if self.flow is None and x.device.type == "cpu" else None
-        if compiled is not None:
+        if self.flow is None:
             if self.tape is None:
                 count = self.system.n + self.system.m + len(self.system.uncertain)
                 self.tape = recorded(count, self._at_rates)
-            return played(compiled, self.tape, self.system, x, error, mid, slopes, wide), None
-        more = 0 if self.flow is None else self.flow.symbols
-        states, inputs, quantities = loop_models(self.system, x, error, mid, slopes, wide, more)
+            how = loops(0)  # what the policy asks for counts
+            return played(how, self.tape, self.system, x, error, mid, slopes, wide), None
+        states, inputs, quantities = loop_models(self.system, x, error, mid, slopes, wide, self.flow.symbols)
         here = list(states.values())
         models = Models(here[0])
-        if self.flow is None:
-            return self._at_rates([*here, *inputs.values(), *quantities.values()], models), None
         mean = self.flow(states, inputs, quantities, self.system.n + self.system.m)
         moved = [self.flow.times_period(rate) for rate in mean.G]
         kept = mean.exists & self._in_domain(here, mean.least, mean.most, outer)
@@ -204,30 +201,30 @@ class VdotBound:
         terms = [row * rate for row, rate in zip(algebra.combined(factor * self.P, along), G, strict=True)]
         return algebra.total(None, terms)
 
-    def _in_domain(self, states: list[Taylor], least: Tensor, most: Tensor, outer: float) -> Tensor:
+    def _in_domain(self, states: list[Taylor], least: Array, most: Array, outer: float) -> Mask:
         """Where (B,) the solution from V <= outer stays inside the domain over the longest period."""
-        centre = torch.stack([model.c for model in states])
-        reach = torch.stack([model.radius() for model in states])
+        centre = np.stack([model.c for model in states])
+        reach = np.stack([model.radius() for model in states])
         wide = outer**0.5 * self.extent
         longest = self.step * (1 + EPS)
-        down = torch.maximum(centre - reach, -wide) + longest * least.clamp(max=0.0)
-        up = torch.minimum(centre + reach, wide) + longest * most.clamp(min=0.0)
+        down = np.maximum(centre - reach, -wide) + longest * np.minimum(least, 0.0)
+        up = np.minimum(centre + reach, wide) + longest * np.maximum(most, 0.0)
         low, high = self.ends
-        slack = _ENDS * (low.abs() + high.abs() + centre.abs() + reach)
-        inside: Tensor = ((down > low + slack) & (up < high - slack)).all(0)
+        slack = _ENDS * (np.abs(low) + np.abs(high) + np.abs(centre) + reach)
+        inside: Mask = ((down > low + slack) & (up < high - slack)).all(0)
         return inside
 
     def _within_ring(
         self,
-        bound: Tensor,
+        bound: Array,
         decrease: Taylor,
-        lo: Tensor,
-        hi: Tensor,
-        centre: Tensor,
-        radius: Tensor,
+        lo: Array,
+        hi: Array,
+        centre: Array,
+        radius: Array,
         inner: float,
         outer: float,
-    ) -> Tensor:
+    ) -> Array:
         """The bound, made tighter by the S-procedure where it is not negative and the box sticks out of the ring.
 
         Where nothing but a step's end shows that it does not lead out of {V < inner}, on boxes that meet that set, the
@@ -236,26 +233,26 @@ class VdotBound:
         n = len(centre)
         lowest, highest = self.levels(lo, hi)
         below, beyond = lowest < inner, highest > outer
-        most = torch.inf
+        most = np.inf
         if self.inside and self.step:
             below = lowest < inner * (1 + _SLACK)
             beyond = beyond & ~below
             most = (1 - 1e-12) / self.step
         for level, sign, outside in ((outer, 1.0, beyond), (inner, -1.0, below)):
-            index = torch.nonzero(outside & ~(bound < 0))[:, 0]
+            index = chosen(outside & ~(bound < 0))
             if not len(index):
                 continue
             # it is >= 0 in the ring
             part = decrease.at(index)
-            gap = self.V.gap(centre[:, index], radius[:, index], part, level, sign)
-            bound = bound.index_put((index,), lessened(bound[index], part, gap, n, most))
+            gap = self.V.gap(centre.take(index, -1), radius.take(index, -1), part, level, sign)
+            bound[index] = lessened(bound[index], part, gap, n, most)
         return bound
 
 
-def input_bounds_kept(system: System, mid: Tensor, slopes: Tensor, wide: Tensor) -> list[tuple[Tensor, Tensor]]:
+def input_bounds_kept(system: System, mid: Array, slopes: Array, wide: Array) -> list[tuple[Mask, Mask]]:
     """For each input, enclosed by `mid + slopes.d` within `wide`, on which boxes (B,) it lies in its bounds, and on
     which it certainly leaves them at the centre."""
-    reach, kept = slopes.abs().sum(1) + wide + 1e-11 * mid.abs(), []
+    reach, kept = np.abs(slopes).sum(1) + wide + 1e-11 * np.abs(mid), []
     for j, (low, high) in enumerate(system.input_bounds):
         slack = 1e-11 * (abs(float(low)) + abs(float(high)))
         inside = (mid[j] - reach[j] > float(low) + slack) & (mid[j] + reach[j] < float(high) - slack)
@@ -264,7 +261,7 @@ def input_bounds_kept(system: System, mid: Tensor, slopes: Tensor, wide: Tensor)
     return kept
 
 
-def lessened(bound: Tensor, decrease: Taylor, gap: Taylor, n: int, most: float = torch.inf) -> Tensor:
+def lessened(bound: Array, decrease: Taylor, gap: Taylor, n: int, most: float = np.inf) -> Array:
     """The bound (B,) of a model, made tighter where it is not negative by multiples of what is >= 0 where it counts.
 
     Parameters
@@ -273,22 +270,24 @@ def lessened(bound: Tensor, decrease: Taylor, gap: Taylor, n: int, most: float =
     most : the largest multiplier, which is tried too if it is finite.
     """
     scale = gap.r + EPS * sum(gap.norms())
-    tried = _multipliers(decrease.g[:n], gap.g[:n], gap.c).clamp(max=most)
-    if most < torch.inf:
-        tried = torch.cat([tried, torch.full_like(tried[:1], most)])
+    tried = np.minimum(_multipliers(decrease.g[:n], gap.g[:n], gap.c), most)
+    if most < np.inf:
+        tried = np.concatenate([tried, np.full_like(tried[:1], most)])
     for each in tried:
-        still = torch.nonzero(~(bound < 0) & (each > 0))[:, 0]
+        still = chosen(~(bound < 0) & (each > 0))
+        if not len(still):
+            continue
         k = each[still]
         c = k * gap.c[still]
-        rest = k * scale[still] + EPS * c.abs() + TINY
-        added = Taylor(c, k * gap.g[:, still], k * gap.Q[:, :, still], rest)
+        rest = k * scale[still] + EPS * np.abs(c) + TINY
+        added = Taylor(c, k * gap.g.take(still, -1), k * gap.Q.take(still, -1), rest)
         tighter, _ = upper_bound(decrease.at(still) + added)
-        bound = bound.index_put((still,), torch.fmin(bound[still], tighter))
+        bound[still] = np.fmin(bound[still], tighter)
     return bound
 
 
-def _multipliers(a: Tensor, b: Tensor, c: Tensor) -> Tensor:
+def _multipliers(a: Array, b: Array, c: Array) -> Array:
     """The k at which a term of `c k + sum_i |a_i + k b_i|` vanishes, or 0 where it is negative: (n, B), best first."""
-    k = torch.nan_to_num(torch.where(b != 0, -a / b, 0.0), 0.0, 0.0, 0.0).clamp(min=0.0)
-    value = c * k + (a[:, None] + k * b[:, None]).abs().sum(0)
-    return k.gather(0, value.argsort(dim=0, stable=True))
+    k = np.maximum(np.nan_to_num(np.where(b != 0, -a / b, 0.0), nan=0.0, posinf=0.0, neginf=0.0), 0.0)
+    value = c * k + np.abs(a[:, None] + k * b[:, None]).sum(0)
+    return np.asarray(np.take_along_axis(k, value.argsort(0, kind="stable"), 0))

@@ -16,15 +16,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
-from torch import Tensor
 
 from certify.certificates.claims import Problem
 from certify.certificates.verdict import Stop
 from certify.effort import UNLIMITED
 from certify.errors import BackendError, CertificateFormatError, InputError
 from certify.provers.base import Budget, Report, SearchState
+from certify.provers.bounds.arrays import Array, Index, Mask
 from certify.provers.boxes.account import Account
 from certify.provers.boxes.frontier import Frontier
 from certify.provers.boxes.halving import Halves, split
@@ -35,7 +33,6 @@ from certify.provers.boxes.subtrees import Abroad, Growth, Subtrees
 from certify.provers.execution import Bound, Runner
 from certify.provers.falsify import Witness, descend
 
-Array = NDArray[np.float64]
 _SLACK = 1e-9  # relative distance kept from every level, so that the checker's own rounding agrees
 _BESIDE_WITNESS = 1e-3  # relative distance kept from a violation
 _SHELL = 16.0  # a batch reaches up to this multiple of the nearest open level
@@ -104,7 +101,7 @@ def outwards(
     sweep = _Outwards(problem, T, inner, target)
     if rule is None:
         order = choose_order(problem, T, inner, target)
-        rule = VdotBound(problem, T, runner.device, order=order)
+        rule = VdotBound(problem, T, order=order)
     return Pass(sweep, _root(problem, T, target), runner, rule)
 
 
@@ -129,7 +126,7 @@ def prove_inwards(
     the proof is not `covered`.
     """
     order = choose_order(problem, T, max(floor, 1e-3 * outer), outer)
-    rule = VdotBound(problem, T, runner.device, inside=True, order=order)
+    rule = VdotBound(problem, T, inside=True, order=order)
     while True:
         ring = Pass(_Inwards(problem, T, floor, outer), _root(problem, T, outer), runner, rule)
         stop = ring.advance(budget, report)
@@ -163,11 +160,11 @@ class _Sweep(ABC):
         self.witness: Witness | None = None
 
     @abstractmethod
-    def key(self, lowest: Tensor, highest: Tensor) -> Tensor:
+    def key(self, lowest: Array, highest: Array) -> Array:
         """Ascending in the order in which boxes are taken, from the bounds of V on them (B,)."""
 
     @abstractmethod
-    def wanted(self, lowest: Tensor, highest: Tensor) -> Tensor:
+    def wanted(self, lowest: Array, highest: Array) -> Mask:
         """True for boxes (B,) that still have to be decided."""
 
     @abstractmethod
@@ -179,11 +176,11 @@ class _Sweep(ABC):
         """The key beyond which open boxes no longer count."""
 
     @abstractmethod
-    def violated(self, centres: Tensor, level: Tensor) -> bool:
+    def violated(self, centres: Array, level: Array) -> bool:
         """Move the level off violations at `centres` (n, B), V being `level` (infinite elsewhere); True if it moved."""
 
     @abstractmethod
-    def stuck(self, lowest: Tensor, highest: Tensor) -> bool:
+    def stuck(self, lowest: Array, highest: Array) -> bool:
         """Move the level off boxes that are too small to halve; True if it moved."""
 
     @abstractmethod
@@ -202,10 +199,10 @@ class _Sweep(ABC):
 
 
 class _Outwards(_Sweep):
-    def key(self, lowest: Tensor, highest: Tensor) -> Tensor:
+    def key(self, lowest: Array, highest: Array) -> Array:
         return lowest
 
-    def wanted(self, lowest: Tensor, highest: Tensor) -> Tensor:
+    def wanted(self, lowest: Array, highest: Array) -> Mask:
         return (lowest <= self.outer * (1 + _SLACK)) & (highest >= self.inner * (1 - _SLACK))
 
     def reach(self, least: float) -> float:
@@ -214,18 +211,18 @@ class _Outwards(_Sweep):
     def last(self) -> float:
         return self.outer * (1 + _SLACK)
 
-    def violated(self, centres: Tensor, level: Tensor) -> bool:
+    def violated(self, centres: Array, level: Array) -> bool:
         lowest = float(level.min())
         if lowest > self.outer:
             return False
-        found = descend(self.problem, self.T, centres[:, level.argmin()].cpu().numpy())
+        found = descend(self.problem, self.T, centres[:, level.argmin()])
         if found is not None and (self.witness is None or found.level < self.witness.level):
             self.witness = found
         known = math.inf if self.witness is None else self.witness.level
         self.outer = min(lowest, known) * (1 - _BESIDE_WITNESS)
         return True
 
-    def stuck(self, lowest: Tensor, highest: Tensor) -> bool:
+    def stuck(self, lowest: Array, highest: Array) -> bool:
         bottom = float(lowest.min()) if len(lowest) else math.inf
         if not bottom < self.outer:
             return False
@@ -243,10 +240,10 @@ class _Outwards(_Sweep):
 class _Inwards(_Sweep):
     down = True
 
-    def key(self, lowest: Tensor, highest: Tensor) -> Tensor:
+    def key(self, lowest: Array, highest: Array) -> Array:
         return -highest
 
-    def wanted(self, lowest: Tensor, highest: Tensor) -> Tensor:
+    def wanted(self, lowest: Array, highest: Array) -> Mask:
         return lowest <= self.outer * (1 + _SLACK)
 
     def reach(self, least: float) -> float:
@@ -255,14 +252,14 @@ class _Inwards(_Sweep):
     def last(self) -> float:
         return math.inf
 
-    def violated(self, centres: Tensor, level: Tensor) -> bool:
-        highest = float(torch.where(level <= self.outer, level, -math.inf).max())
+    def violated(self, centres: Array, level: Array) -> bool:
+        highest = float(np.where(level <= self.outer, level, -math.inf).max())
         if not highest >= self.inner:
             return False
         self.inner = highest * (1 + _BESIDE_WITNESS)
         return True
 
-    def stuck(self, lowest: Tensor, highest: Tensor) -> bool:
+    def stuck(self, lowest: Array, highest: Array) -> bool:
         top = float(highest.max()) if len(highest) else -math.inf
         if not top >= self.inner:
             return False
@@ -280,7 +277,7 @@ class _Inwards(_Sweep):
 class _RingGrowth(Growth):
     """The ring's rule at a sweep's levels."""
 
-    def __init__(self, sweep: _Sweep, rule: VdotBound, half: Tensor) -> None:
+    def __init__(self, sweep: _Sweep, rule: VdotBound, half: Array) -> None:
         super().__init__(rule, half)
         self.sweep, self.rule = sweep, rule
 
@@ -293,23 +290,25 @@ class _RingGrowth(Growth):
         sweep.inner, sweep.outer = inner, outer
         return _RingGrowth(sweep, self.rule, self.half)
 
-    def gives_way(self, lo: Tensor, hi: Tensor, found: BoxBounds) -> Tensor:
+    def gives_way(self, lo: Array, hi: Array, found: BoxBounds) -> Mask:
         levels = self.levels_of(0.5 * lo + 0.5 * hi, found)
-        return (levels <= self.sweep.outer) & (levels >= self.sweep.inner)
+        inside: Mask = (levels <= self.sweep.outer) & (levels >= self.sweep.inner)
+        return inside
 
-    def opened(self, halves: Halves, found: BoxBounds, key: Tensor) -> tuple[Tensor, Tensor]:
+    def opened(self, halves: Halves, found: BoxBounds, key: Array) -> tuple[Mask, Array]:
         lowest, highest = self.rule.levels(halves.lo, halves.hi)
         return self.sweep.wanted(lowest, highest), self.sweep.key(lowest, highest)
 
-    def levels_of(self, centres: Tensor, found: BoxBounds) -> Tensor:
+    def levels_of(self, centres: Array, found: BoxBounds) -> Array:
         """V at violations, infinite elsewhere; where a step leads from within the outer level to a higher V, that, but
         no more than just above the outer level."""
-        levels = torch.where(found.violated, self.rule.levels_at(centres), math.inf)
-        index = torch.nonzero(levels <= self.sweep.outer)[:, 0]
+        levels = np.where(found.violated, self.rule.levels_at(centres), math.inf)
+        index = np.flatnonzero(levels <= self.sweep.outer)
         if not (self.rule.inside and self.rule.step) or not len(index):
             return levels
-        after = self.rule.levels_after(centres[:, index], self.sweep.outer).clamp(max=self.sweep.outer)
-        return levels.index_put((index,), torch.maximum(levels[index], after))
+        after = np.minimum(self.rule.levels_after(centres.take(index, -1), self.sweep.outer), self.sweep.outer)
+        levels[index] = np.maximum(levels[index], after)
+        return levels
 
 
 class Pass:
@@ -318,8 +317,8 @@ class Pass:
     def __init__(self, sweep: _Sweep, root: Array, runner: Runner, rule: VdotBound) -> None:
         self.sweep, self.root, self.runner, self.rule = sweep, root, runner, rule
         self.partition = Partition(root)
-        self.frontier = Frontier(self.partition, runner.device)
-        self.half = torch.tensor(root, device=runner.device)[:, None]
+        self.frontier = Frontier(self.partition)
+        self.half = root[:, None]
         self.growth = _RingGrowth(sweep, rule, self.half)
         self.abroad: Abroad | None = None
         self.boxes = self.proved = 0
@@ -328,7 +327,7 @@ class Pass:
         self.lost = ""  # what is said of a cluster that went away
         self._stop = Stop.REQUESTED
         self._account = Account()
-        first = torch.zeros(1, dtype=torch.int64, device=runner.device)
+        first = np.zeros(1, dtype=np.int64)
         self.frontier.add(-self.half, self.half, sweep.key(*rule.levels(-self.half, self.half)), first)
 
     @property
@@ -422,10 +421,9 @@ class Pass:
         for _, answer, opened, looked in back:
             self.boxes += answer.boxes
             self.proved += answer.proved
-            lo, hi, number = opened.tensors()
-            self.frontier.add(lo, hi, torch.tensor(answer.keys), number)
+            self.frontier.add(opened.lo, opened.hi, answer.keys, opened.number)
             if len(looked.number):
-                self._examine(bound, *looked.tensors(), budget.least_width)
+                self._examine(bound, *looked.boxes, budget.least_width)
         self.abroad.forget_above(sweep.last())
         self.frontier.drop_above(sweep.last())
         return True
@@ -434,7 +432,7 @@ class Pass:
         lo, hi, number, _ = self.frontier.take(count, self.sweep.reach(self._least()))
         self._examine(bound, lo, hi, number, least_width)
 
-    def _examine(self, bound: Bound, lo: Tensor, hi: Tensor, number: Tensor, least_width: float) -> None:
+    def _examine(self, bound: Bound, lo: Array, hi: Array, number: Index, least_width: float) -> None:
         sweep, rule = self.sweep, self.rule
         self.boxes += lo.shape[1]
         found = bound(lo, hi, sweep.inner, sweep.outer)
@@ -445,22 +443,23 @@ class Pass:
             self._stop = Stop.WITNESS
         halves = split(self.partition, lo, hi, number, found, least_width * self.half)
         small = halves.small
-        if bool(small.any()):
+        if small.any():
             self.covered = self.covered and bool(found.smooth[small].all())
-            if sweep.stuck(*rule.levels(lo[:, small], hi[:, small])):
+            if sweep.stuck(*rule.levels(lo.compress(small, -1), hi.compress(small, -1))):
                 self._stop = Stop.BOXES
         keep, key = self.growth.opened(halves, found, number)
-        self.frontier.add(halves.lo[:, keep], halves.hi[:, keep], key[keep], halves.number[keep])
+        self.frontier.add(*(a.compress(keep, -1) for a in (halves.lo, halves.hi, key, halves.number)))
         self.frontier.drop_above(sweep.last())
 
     def _expect(self, found: BoxBounds) -> None:
         """How often a box of this batch that is not proved has to be halved, so that what its axes add to the bound is
         less than the decay at its centre: a bound of second order falls fourfold when all n axes are halved once."""
-        excess = found.score.clamp(min=0.0).sum(0)
+        excess = np.maximum(found.score, 0.0).sum(0)
         decay = excess - found.bound
-        share = (excess / decay)[~found.proved & (decay > 0) & torch.isfinite(decay)]
-        if len(share):
-            self.halvings = len(self.root) / 2 * math.log2(max(1.0, float(share.median())))
+        wanted = ~found.proved & (decay > 0) & np.isfinite(decay)
+        if wanted.any():
+            share = np.sort(excess[wanted] / decay[wanted])[(np.count_nonzero(wanted) - 1) // 2]
+            self.halvings = len(self.root) / 2 * math.log2(max(1.0, float(share)))
 
     @property
     def expected(self) -> float:
@@ -499,9 +498,8 @@ class Pass:
         fits = sweep.inner >= state.inner and state.outer <= sweep.outer and not len(looked.number)
         if not fits or len(opened.number) != len(state.keys) or np.isnan(state.keys).any():
             raise InputError("the search cannot be gone on with: it is of another ring.")
-        self.frontier = Frontier(self.partition, self.runner.device)
-        lo, hi, number = (a.to(self.runner.device) for a in opened.tensors())
-        self.frontier.add(lo, hi, torch.tensor(state.keys, device=self.runner.device), number)
+        self.frontier = Frontier(self.partition)
+        self.frontier.add(opened.lo, opened.hi, state.keys, opened.number)
         sweep.outer, sweep.witness = state.outer, state.witness
         self.boxes, self.proved = state.boxes, state.proved
         self._stop = Stop.REQUESTED if state.witness is None else Stop.WITNESS

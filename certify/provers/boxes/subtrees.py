@@ -22,18 +22,16 @@ from abc import ABC, abstractmethod
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
 from certify.effort import UNIT
 from certify.errors import BackendError, CertificateFormatError
+from certify.provers.bounds.arrays import Array, Index, Mask
 from certify.provers.boxes.frontier import Boxes, Frontier
 from certify.provers.boxes.halving import Halves, split
 from certify.provers.boxes.partition import LEAF, LOOK, MOST_SPLITS, OPEN, Grafted, Partition
-from certify.provers.execution import Counted, Jobs
+from certify.provers.execution import Counted, Jobs, in_pieces
 
-Array = NDArray[np.float64]
 _MAGIC = b"subtree1"
 _JOB = struct.Struct("<8sQQQQddd")  # n, boxes, batch, boxes to bound; inner and outer level, relative least width
 _ANSWER = struct.Struct("<8sQQQQ16s")  # boxes bounded, boxes proved, bytes of the trees, open leaves, seal
@@ -65,7 +63,7 @@ class Growth(ABC):
     half : (n, 1) half-widths, in which the least width of a box is given.
     """
 
-    def __init__(self, bound: Counted, half: Tensor) -> None:
+    def __init__(self, bound: Counted, half: Array) -> None:
         self.bound, self.half = bound, half
 
     @property
@@ -78,11 +76,11 @@ class Growth(ABC):
         """The same at other levels."""
 
     @abstractmethod
-    def gives_way(self, lo: Tensor, hi: Tensor, found: Any) -> Tensor:
+    def gives_way(self, lo: Array, hi: Array, found: Any) -> Mask:
         """Which boxes (B,), of corners (n, B), a level has to give way to."""
 
     @abstractmethod
-    def opened(self, halves: Halves, found: Any, key: Tensor) -> tuple[Tensor, Tensor]:
+    def opened(self, halves: Halves, found: Any, key: Array) -> tuple[Mask, Array]:
         """Which halves (H,) still have to be decided, and the keys (H,) of all, from those of the batch (B,)."""
 
 
@@ -94,21 +92,21 @@ class Subtrees:
 
     def __call__(self, job: bytes) -> bytes:
         """The answer to a job."""
-        torch.set_num_threads(1)  # places are many
         _, n, count, batch, most, *levels, least_width = _JOB.unpack_from(job)
         lo, hi, key = np.split(np.frombuffer(job, offset=_JOB.size), [n * count, 2 * n * count])
         lo, hi = lo.reshape(n, count), hi.reshape(n, count)
         growth = self.growth.at(*levels)
+        bound = in_pieces(growth.bound)
         partition = Partition(hi, lo)
-        frontier = Frontier(partition, torch.device("cpu"))
-        frontier.add(*(torch.tensor(a) for a in (lo, hi, key, np.arange(count))))
-        looks: list[NDArray[np.int64]] = []
+        frontier = Frontier(partition)
+        frontier.add(lo, hi, key, np.arange(count))
+        looks: list[Index] = []
         boxes = proved = 0
         while len(frontier) and (not boxes or boxes < most):
             now = frontier.take(batch, math.inf)
-            found = growth.bound(now.lo, now.hi, *growth.levels)
+            found = bound(now.lo, now.hi, *growth.levels)
             boxes, proved = boxes + len(now.key), proved + int(found.proved.sum())
-            looks.append(_grow(growth, partition, frontier, now, found, least_width).numpy())
+            looks.append(_grow(growth, partition, frontier, now, found, least_width))
         waiting, keys = frontier.waiting()
         look = np.concatenate(looks)
         trees = partition.preorder([(OPEN, waiting), (LOOK, look)])
@@ -124,15 +122,15 @@ def _seal(job: bytes, counts: tuple[int, ...], body: bytes) -> bytes:
 
 def _grow(
     growth: Growth, partition: Partition, frontier: Frontier, now: Boxes, found: Any, least_width: float
-) -> Tensor:
+) -> Index:
     """Halve what is not proved; the numbers of the boxes that somebody else has to look at."""
     look = growth.gives_way(now.lo, now.hi, found) & ~found.proved
-    rest = type(found)(*(value[..., ~look] for value in found))
-    lo, hi, number, key = (value[..., ~look] for value in now)
+    rest = type(found)(*(value.compress(~look, -1) for value in found))
+    lo, hi, number, key = (value.compress(~look, -1) for value in now)
     halves = split(partition, lo, hi, number, rest, least_width * growth.half)
     keep, keys = growth.opened(halves, rest, key)
-    frontier.add(halves.lo[:, keep], halves.hi[:, keep], keys[keep], halves.number[keep])
-    return torch.cat([now.number[look], number[halves.small]])
+    frontier.add(*(a.compress(keep, -1) for a in (halves.lo, halves.hi, keys, halves.number)))
+    return np.concatenate([now.number[look], number[halves.small]])
 
 
 class Answer(NamedTuple):
@@ -201,7 +199,7 @@ class Abroad:
         self.jobs, self.growth, self.partition = jobs, growth, partition
         self.batch, self.least_width = batch, least_width
         self.held: dict[int, Held] = {}
-        self._least = least_width * growth.half.cpu().numpy()[:, 0]
+        self._least = least_width * growth.half[:, 0]
 
     def __len__(self) -> int:
         return sum(len(boxes.key) for boxes, _, _ in self.held.values())
@@ -213,8 +211,8 @@ class Abroad:
     def waiting(self) -> tuple[NDArray[np.int64], Array]:
         """Numbers (B,) and keys (B,) of the boxes."""
         held = [boxes for boxes, _, _ in self.held.values()]
-        numbers = np.concatenate([np.zeros(0, np.int64), *(boxes.number.cpu().numpy() for boxes in held)])
-        return numbers, np.concatenate([np.zeros(0), *(boxes.key.cpu().numpy() for boxes in held)])
+        numbers = np.concatenate([np.zeros(0, np.int64), *(boxes.number for boxes in held)])
+        return numbers, np.concatenate([np.zeros(0), *(boxes.key for boxes in held)])
 
     def is_worth(self, frontier: Frontier) -> bool:
         """Whether to go on elsewhere; if nobody is there, what was out comes back into the frontier."""
@@ -234,7 +232,7 @@ class Abroad:
             n, count = boxes.lo.shape
             worth = int(min(turn(places), left / most) / self.growth.bound.operations)
             head = _JOB.pack(_MAGIC, n, count, self.batch, worth, *levels, self.least_width)
-            job = head + b"".join(a.cpu().numpy().tobytes() for a in (boxes.lo, boxes.hi, boxes.key))
+            job = head + b"".join(a.tobytes() for a in (boxes.lo, boxes.hi, boxes.key))
             try:
                 self.held[self.jobs.give(job)] = Held(boxes, job, time.monotonic())
             except BackendError:
@@ -257,7 +255,7 @@ class Abroad:
 
     def _planted(self, held: Held, answer: bytes | None) -> Return:
         boxes, job, _ = held
-        number, lo, hi = (a.cpu().numpy() for a in (boxes.number, boxes.lo, boxes.hi))
+        number, lo, hi = boxes.number, boxes.lo, boxes.hi
         if answer is not None:
             try:
                 read = _read(job, answer)

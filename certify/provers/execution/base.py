@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterable
 from contextlib import AbstractContextManager
 from typing import Any, Protocol
 
-import torch
-from torch import Tensor
+import numpy as np
+from numpy.typing import NDArray
 
-Bound = Callable[[Tensor, Tensor, float, float], Any]
+Bound = Callable[[NDArray[np.float64], NDArray[np.float64], float, float], Any]
 Work = Callable[[bytes], bytes]
 
 
@@ -20,7 +20,7 @@ class Counted(Protocol):
     def operations(self) -> float:
         """Operations to bound a box, as an `Effort` counts them."""
 
-    def __call__(self, lo: Tensor, hi: Tensor, inner: float, outer: float, /) -> Any: ...
+    def __call__(self, lo: Array, hi: Array, inner: float, outer: float, /) -> Any: ...
 
 
 class Jobs(Protocol):
@@ -52,15 +52,11 @@ class Runner(Protocol):
     """Bounds batches of boxes. The answer for a box must not depend on where or with which others it was bounded."""
 
     @property
-    def device(self) -> torch.device:
-        """Where the boxes of a batch lie."""
-
-    @property
     def remark(self) -> str | None:
         """What a person should know of the places; None if there is nothing to say."""
 
     def start(self, bound: Bound) -> AbstractContextManager[Bound]:
-        """`bound`, a function of corners (n, B) and two levels to a named tuple of tensors (..., B), as run here."""
+        """`bound`, a function of corners (n, B) and two levels to a named tuple of arrays (..., B), as run here."""
 
     def jobs(self, work: Work) -> AbstractContextManager[Jobs | None]:
         """Where `work`, which can be pickled, is done elsewhere; None if all is done here."""

@@ -18,8 +18,6 @@ from contextlib import AbstractContextManager, ExitStack, contextmanager, suppre
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-import torch
-
 from certify.errors import BackendError, InputError
 from certify.provers.execution.base import Bound, Work
 from certify.provers.execution.threads import ThreadRunner
@@ -111,16 +109,11 @@ def _quiet() -> Iterator[None]:
 class ClusterRunner:
     """Batches are bounded on the threads of this machine, and jobs done by the workers of a cluster, one a thread."""
 
-    def __init__(self, client: Client) -> None:
+    def __init__(self, client: Client, threads: int | None = None) -> None:
         self.client = client
-        self._here = ThreadRunner()
+        self._here = ThreadRunner(threads)
         self._failed = self._refused = 0
         self._lost = ""
-
-    @property
-    def device(self) -> torch.device:
-        """Where the boxes of a batch lie: this machine's processor."""
-        return self._here.device
 
     @property
     def remark(self) -> str | None:
@@ -129,7 +122,7 @@ class ClusterRunner:
         if self._failed or self._refused:
             said.append(
                 f"of the cluster's jobs {self._failed} failed and {self._refused} had answers that were refused; they "
-                "were done here. Its workers need the same versions of certify, Python and torch as this machine"
+                "were done here. Its workers need the same versions of certify, Python and numpy as this machine"
             )
         return "; ".join(said) or None
 

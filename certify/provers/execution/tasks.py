@@ -3,7 +3,7 @@
 A sweep's cases and a comparison's training runs are such pieces. Where they are done must not show in what comes back:
 so a piece is a function of a module with its arguments, its result is bytes, and a place gives results as they come, in
 no order. A piece whose process died, or that raised, is lost, and the others go on: whoever asked decides what that
-means. One piece at a time in a process, because torch's threads, flint's precision and numpy's generator are the
+means. One piece at a time in a process, because BLAS's threads, flint's precision and numpy's generator are the
 process's.
 """
 
@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 
 from certify.errors import BackendError, InputError, OptionError
 from certify.provers.execution.cluster import connect
+from certify.provers.execution.threads import cores
 
 if TYPE_CHECKING:
     from distributed import Future
@@ -215,13 +216,11 @@ def place_for(jobs: int | None, cluster: str | None) -> Place:
 
 def _in_a_process(end: Connection, jobs: int, work: Callable[..., bytes], arguments: tuple[Any, ...]) -> None:
     """A child's life: a group of its own, which ends with the process that asked, and one piece of work."""
-    import torch
-
     os.setpgid(0, 0)  # Ctrl-C is for the process that asked, and the children's own children end with them
     parent = multiprocessing.parent_process()
     if parent is not None:
         threading.Thread(target=_end_after, args=(parent.sentinel,), daemon=True).start()
-    torch.set_num_threads(max(1, min(torch.get_num_threads(), (os.cpu_count() or 1) // jobs)))
+    os.environ["OMP_NUM_THREADS"] = str(max(1, cores() // jobs))
     end.send_bytes(_done(work, arguments))
 
 

@@ -1,48 +1,68 @@
-"""Threads of this machine, or its GPU."""
+"""Threads of this machine.
+
+A batch is cut into pieces of the same boxes whatever the number of threads, so that this shows nowhere. What a library
+of linear algebra would share out among threads of its own it does on one: pieces stay in a core's cache and meet once a
+batch, where its threads meet at every product.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
+from threadpoolctl import threadpool_limits
 
 from certify.provers.execution.base import Bound, Work
 
-_CHUNK = 256  # boxes that make a thread worth its while
+Array = NDArray[np.float64]
+_PIECE = 256  # boxes, at least
 _SMALL_NETWORK = 10_000  # weights
 
 
-@contextmanager
-def threads_for(weights: Sequence[NDArray[np.float64]]) -> Iterator[None]:
-    """One thread of torch's for a small network: its operations are shorter than the threads' handshakes."""
-    threads = torch.get_num_threads()
-    if sum(W.size for W in weights) < _SMALL_NETWORK:
-        torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(threads)
+def cores() -> int:
+    """How many cores this process may use: OMP_NUM_THREADS, or all that the system gives it."""
+    asked = os.environ.get("OMP_NUM_THREADS", "").split(",")[0].strip()
+    return int(asked) if asked.isdigit() and int(asked) else len(os.sched_getaffinity(0))
+
+
+def threads_for(weights: Sequence[Array]) -> int:
+    """One thread for a small network, whose operations are shorter than the threads' handshakes, else a core each."""
+    return 1 if sum(W.size for W in weights) < _SMALL_NETWORK else cores()
+
+
+def one_thread() -> AbstractContextManager[Any]:
+    """Linear algebra on the thread that asks for it, so that rounding does not depend on how many there are."""
+    limits: AbstractContextManager[Any] = threadpool_limits(1, user_api="blas")
+    return limits
+
+
+def in_pieces(bound: Bound, each: Callable[..., Iterable[Any]] = map) -> Bound:
+    """`bound`, as many boxes at a time as its `piece` says, if it has one; `each` may do so on threads."""
+    size = max(_PIECE, getattr(bound, "piece", _PIECE))
+
+    def cut(lo: Array, hi: Array, inner: float, outer: float) -> Any:
+        count = lo.shape[1]
+        if count == 1:  # sums over one box alone go another way (see `bounds/arrays.py`)
+            lo, hi = np.repeat(lo, 2, axis=1), np.repeat(hi, 2, axis=1)
+        ends = [*range(size, count - 1, size), lo.shape[1]]  # the last piece may be one box longer
+        pieces = [slice(a, b) for a, b in zip([0, *ends], ends, strict=False)]
+        los, his = ([np.ascontiguousarray(side[:, piece]) for piece in pieces] for side in (lo, hi))
+        found = list(each(bound, los, his, [inner] * len(pieces), [outer] * len(pieces)))
+        return type(found[0])(*(np.concatenate(parts, -1)[..., :count] for parts in zip(*found, strict=True)))
+
+    return cut
 
 
 class ThreadRunner:
-    """Each batch cut into one piece a thread of torch's; one piece on a device other than the processor.
+    """The pieces of a batch on so many threads; a core each if no number is given."""
 
-    Pieces stay in a core's cache and meet once a batch, where torch's own threads meet at every operation.
-    """
-
-    def __init__(self, device: torch.device | None = None) -> None:
-        self._device = device if device is not None else torch.device("cpu")
-
-    @property
-    def device(self) -> torch.device:
-        """Where the boxes of a batch lie."""
-        return self._device
+    def __init__(self, threads: int | None = None) -> None:
+        self.threads = cores() if threads is None else threads
 
     @property
     def remark(self) -> None:
@@ -50,26 +70,13 @@ class ThreadRunner:
 
     @contextmanager
     def start(self, bound: Bound) -> Iterator[Bound]:
-        """`bound` on the threads; torch's own are one while it is in use."""
-        threads = torch.get_num_threads()
-        if self._device.type != "cpu" or threads == 1:
-            yield bound
-            return
-        torch.set_num_threads(1)
-        try:
-            with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
-
-                def cut(lo: Tensor, hi: Tensor, inner: float, outer: float) -> Any:
-                    pieces = max(1, min(threads, lo.shape[1] // _CHUNK))
-                    if pieces == 1:
-                        return bound(lo, hi, inner, outer)
-                    los, his = lo.tensor_split(pieces, 1), hi.tensor_split(pieces, 1)
-                    found = list(pool.map(bound, los, his, [inner] * pieces, [outer] * pieces))
-                    return type(found[0])(*(torch.cat(parts, -1) for parts in zip(*found, strict=True)))
-
-                yield cut
-        finally:
-            torch.set_num_threads(threads)
+        """`bound` on the threads."""
+        with one_thread():
+            if self.threads == 1:
+                yield in_pieces(bound)
+                return
+            with ThreadPoolExecutor(self.threads) as pool:
+                yield in_pieces(bound, pool.map)
 
     def jobs(self, work: Work) -> nullcontext[None]:
         """Nothing is done elsewhere."""

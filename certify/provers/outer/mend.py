@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from certify.certificates import OuterTree
@@ -23,7 +22,7 @@ def split_again(problem: Problem, evidence: OuterTree, claim: Claim, leaf: int) 
     """The evidence with the leaf of this number, counted in preorder, cut into eight."""
     outer = _outer(claim)
     lo, hi = _corners(evidence.tree, -evidence.root, evidence.root, leaf)
-    rule = FallBound(problem, claim.roa, evidence.T, outer.function, torch.device("cpu"))
+    rule = FallBound(problem, claim.roa, evidence.T, outer.function)
     tree = cut_leaf(evidence.tree, leaf, lo, hi, lambda a, b: rule(a, b, 0.0, outer.level).score)
     return replace(evidence, tree=tree)
 
@@ -32,7 +31,7 @@ def split_face_again(problem: Problem, evidence: OuterTree, claim: Claim, face: 
     """The evidence with a leaf of a face's tree, counted likewise, cut into eight."""
     outer, (axis, side) = _outer(claim), divmod(face, 2)
     lo, hi = _corners(evidence.faces[face], *face_box(problem.loop.system, axis, side), leaf)
-    rule = FaceBound(problem.loop.system, axis, side, outer.function, torch.device("cpu"))
+    rule = FaceBound(problem.loop.system, axis, side, outer.function)
     tree = cut_leaf(evidence.faces[face], leaf, lo, hi, lambda a, b: rule(a, b, 0.0, outer.level).score)
     return replace(evidence, faces=(*evidence.faces[:face], tree, *evidence.faces[face + 1 :]))
 

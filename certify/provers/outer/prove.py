@@ -120,7 +120,7 @@ def prove_outer(
         return math.inf if deeper is None else deeper.level
 
     root = root_around(problem, T)
-    rule = FallBound(problem, c2, T, function, runner.device)
+    rule = FallBound(problem, c2, T, function)
     cover = Cover(rule, -root, root, runner, top, floor, _BESIDE_RISE * span, deepen)
     stopped = cover.advance(budget, report)
     if not cover.level > floor:
@@ -169,7 +169,7 @@ def _faces(
     boxes, stop = 0, Stop.DOMAIN
     for axis in range(system.n):
         for side in range(2):
-            rule = FaceBound(system, axis, side, function, runner.device)
+            rule = FaceBound(system, axis, side, function)
             lo, hi = face_box(system, axis, side)
             cover = Cover(rule, lo, hi, runner, level, floor, _BESIDE_FACE * (level - floor))
             share = budget.effort.share(1 / (2 * system.n - len(trees)))

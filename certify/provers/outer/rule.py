@@ -11,9 +11,6 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
-from torch import Tensor
 
 from certify.certificates.claims import Problem
 from certify.loop.expressions import Expression, evaluate, nodes
@@ -33,11 +30,11 @@ from certify.provers.bounds import (
     operations_of_policy,
     upper_bound,
 )
+from certify.provers.bounds.arrays import Array, Index, Mask, chosen, is_whole, joined, product
 from certify.provers.bounds.taylor import EPS, TINY
 from certify.provers.boxes.form import FormBound
 from certify.provers.boxes.rule import input_bounds_kept, lessened
 
-Array = NDArray[np.float64]
 _SLACK = 1e-9  # relative distance from c2 at which a box counts as inside
 _ENDS = 1e-11  # relative distance kept from the ends of the domain
 _EACH = 2.0  # operations of an entry of a model
@@ -49,95 +46,93 @@ class OuterBounds(NamedTuple):
     adds to the bound, `lowest` (B,): N is at least that where something is asked, infinite where nothing is; and
     `violated` (B,): N at the centre where a condition fails there, else infinite."""
 
-    proved: Tensor
-    bound: Tensor
-    score: Tensor
-    lowest: Tensor
-    violated: Tensor
+    proved: Mask
+    bound: Array
+    score: Array
+    lowest: Array
+    violated: Array
 
 
-def enclosure_of(function: Neural | Symbolic, device: torch.device) -> NeuralEnclosure | SymbolicEnclosure:
+def enclosure_of(function: Neural | Symbolic) -> NeuralEnclosure | SymbolicEnclosure:
     """Models of N, whatever it is."""
-    return NeuralEnclosure(function, device) if isinstance(function, Neural) else SymbolicEnclosure(function, device)
+    return NeuralEnclosure(function) if isinstance(function, Neural) else SymbolicEnclosure(function)
 
 
 class FallBound:
     """Whether N falls on boxes in the coordinates z, x = T z, wherever N <= n2 and V >= c2 in the domain."""
 
-    def __init__(
-        self, problem: Problem, c2: float, T: Array, function: Neural | Symbolic, device: torch.device
-    ) -> None:
+    def __init__(self, problem: Problem, c2: float, T: Array, function: Neural | Symbolic) -> None:
         self.system, self.c2 = problem.loop.system, c2
-        self.T = torch.tensor(T, dtype=torch.float64, device=device)
-        self.V = FormBound(problem.V.P, T, device)
-        self.N = enclosure_of(function, device)
-        self.policy = PolicyEnclosure(problem.loop, device)
+        self.T = np.ascontiguousarray(T)
+        self.V = FormBound(problem.V.P, T)
+        self.N = enclosure_of(function)
+        self.policy = PolicyEnclosure(problem.loop)
         self.dynamics = self.system.uncertain_dynamics()
         self.check_inputs = not bounded_by_form(problem.loop.network, self.system.input_bounds)
-        ends = [[float(end) for end in pair] for pair in self.system.domain]
-        self.ends = torch.tensor(ends, dtype=torch.float64, device=device).T[:, :, None]
+        self.ends = np.array([[float(end) for end in pair] for pair in self.system.domain]).T[:, :, None]
         symbols = self.system.n + self.system.m + len(self.system.uncertain)
         equations = sum(1 for _ in nodes(*self.dynamics)) + 3 * self.system.n
         own = _EACH * (1 + symbols) ** 2 * (equations + 4 * self.N.units)
         self.operations = operations_of_policy(problem.loop.network) + own  # of a box, about
         self.piece = max(16, _NUMBERS // (self.N.units * (1 + symbols) * (2 + symbols) // 2))
 
-    def __call__(self, lo: Tensor, hi: Tensor, inner: float, outer: float) -> OuterBounds:
+    @np.errstate(all="ignore")  # infinities and NaN are answers, which nothing is proved with
+    def __call__(self, lo: Array, hi: Array, inner: float, outer: float) -> OuterBounds:
         """Bounds for the level `outer` on boxes lo, hi (n, B)."""
         n = len(lo)
         centre = 0.5 * lo + 0.5 * hi
-        radius = torch.maximum(hi - centre, centre - lo) * (1 + EPS)
-        x = torch.cat([(self.T @ centre)[:, None], self.T[:, :, None] * radius], 1)
-        error = 2 * (n + 4) * EPS * (self.T.abs() @ (centre.abs() + radius)) + TINY
+        radius = np.maximum(hi - centre, centre - lo) * (1 + EPS)
+        x = np.concatenate([product(self.T, centre)[:, None], self.T[:, :, None] * radius], 1)
+        error = 2 * (n + 4) * EPS * product(np.abs(self.T), np.abs(centre) + radius) + TINY
         settled = self._outside(x, error) | (self.V.levels(lo, hi)[1] < self.c2 * (1 - _SLACK))
-        index = torch.nonzero(~settled)[:, 0]
+        index = chosen(~settled)
         found = OuterBounds(
             settled,
-            torch.full_like(x[0, 0], -torch.inf),
-            radius.clone(),
-            torch.full_like(x[0, 0], torch.inf),
-            torch.full_like(x[0, 0], torch.inf),
+            np.full_like(x[0, 0], -np.inf),
+            radius.copy(),
+            np.full_like(x[0, 0], np.inf),
+            np.full_like(x[0, 0], np.inf),
         )
         opened = []
-        for part in index.tensor_split(_pieces(len(index), self.piece)):
-            lowest, own, known = least_value(self.N, x[:, :, part], error[:, part], outer)
+        for part in np.array_split(index, _pieces(len(index), self.piece)):
+            lowest, own, known = least_value(self.N, x.take(part, -1), error.take(part, -1), outer)
             proved = lowest > outer
             found.lowest[part], found.proved[part] = lowest, proved
-            left = torch.nonzero(~proved[own])[:, 0]
+            left = chosen(~proved[own])
             if known is not None and len(left):
                 opened.append((known, left, part[own[left]]))
         if opened:
             models, lefts, parts = zip(*opened, strict=True)
-            left = torch.cat(parts)
-            here = self._falls(models, lefts, x[:, :, left], error[:, left], centre[:, left], radius[:, left], outer)
+            left = np.concatenate(parts)
+            here = self._falls(models, lefts, *(v.take(left, -1) for v in (x, error, centre, radius)), outer)
             found.proved[left], found.bound[left], found.score[:, left], found.violated[left] = here
         return found
 
-    def _outside(self, x: Tensor, error: Tensor) -> Tensor:
+    def _outside(self, x: Array, error: Array) -> Mask:
         """Which boxes (B,) lie outside of the domain."""
-        reach = x[:, 1:].abs().sum(1) + error
+        reach = np.abs(x[:, 1:]).sum(1) + error
         low, high = self.ends
-        slack = _ENDS * (low.abs() + high.abs() + x[:, 0].abs() + reach)
-        outside: Tensor = ((x[:, 0] - reach > high + slack) | (x[:, 0] + reach < low - slack)).any(0)
+        slack = _ENDS * (np.abs(low) + np.abs(high) + np.abs(x[:, 0]) + reach)
+        outside: Mask = ((x[:, 0] - reach > high + slack) | (x[:, 0] + reach < low - slack)).any(0)
         return outside
 
-    def _inside(self, x: Tensor) -> Tensor:
+    def _inside(self, x: Array) -> Mask:
         """Which points (n, B) lie in the domain."""
         low, high = self.ends
-        slack = _ENDS * (low.abs() + high.abs())
-        inside: Tensor = ((x > low + slack) & (x < high - slack)).all(0)
+        slack = _ENDS * (np.abs(low) + np.abs(high))
+        inside: Mask = ((x > low + slack) & (x < high - slack)).all(0)
         return inside
 
     def _falls(
         self,
         known: Sequence[NeuralModels | SymbolicModels],
-        lefts: Sequence[Tensor],
-        x: Tensor,
-        error: Tensor,
-        centre: Tensor,
-        radius: Tensor,
+        lefts: Sequence[Index],
+        x: Array,
+        error: Array,
+        centre: Array,
+        radius: Array,
         level: float,
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    ) -> tuple[Mask, Array, Array, Array]:
         """`proved`, `bound`, `score` and `violated` of the boxes on which N may be at most the level: those at the
         indices `lefts` of pieces, whose models are known."""
         n = len(x)
@@ -149,48 +144,46 @@ class FallBound:
         F = [evaluate(expression, values, algebra, terms) for expression in self.dynamics]
         first, pieces = 0, []
         for piece, left in zip(known, lefts, strict=True):
-            part = torch.arange(first, first := first + len(left), device=left.device)
+            part = np.arange(first, first := first + len(left))
             pieces.append((*piece.along([f.at(part) for f in F], left), piece.value.at(left)))
         falls, spreads, values_of_n = zip(*pieces, strict=True)
-        fall, spread = _joined(falls), torch.cat(spreads, -1)
+        fall, spread = _joined(falls), joined(spreads)
         bound, excess = upper_bound(fall)
         N = _widened(_joined(values_of_n), fall)
         inputs = n + self.system.m
-        doubt = fall.g[n:inputs].abs().sum(0) + fall.Q[n:, n:].abs().sum((0, 1)) + fall.r
-        rises = fall.c + fall.g[inputs:].abs().sum(0) - doubt >= 0
+        doubt = np.abs(fall.g[n:inputs]).sum(0) + np.abs(fall.Q[n:, n:]).sum((0, 1)) + fall.r
+        rises = fall.c + np.abs(fall.g[inputs:]).sum(0) - doubt >= 0
         # What the inputs' errors add is charged to the axes that spread the policy, and what is left to those of N.
         score = excess[:n] + share * excess[n:].sum(0) + spread * fall.r
-        smooth = torch.isfinite(bound)
+        smooth = np.isfinite(bound)
         for model in (N, *F):  # a component that is multiplied by 0 must be enclosed as well
-            smooth = smooth & torch.isfinite(sum(model.norms()) + model.r)
+            smooth = smooth & np.isfinite(sum(model.norms()) + model.r)
         bound = self._where_asked(bound, fall, N, centre, radius, level)
-        bound = torch.where(smooth, bound, torch.inf)
+        bound = np.where(smooth, bound, np.inf)
         proved = bound < 0
-        score = torch.where(torch.isfinite(score) & smooth, score, (x[:, 1:].abs()).sum(0))
+        score = np.where(np.isfinite(score) & smooth, score, np.abs(x[:, 1:]).sum(0))
         if self.check_inputs:
             for j, (inside, outside) in enumerate(input_bounds_kept(self.system, mid, slopes, wide)):
                 proved, rises = proved & inside, rises | outside
-                score = torch.where(inside, score, slopes[j].abs() + share * wide[j])
+                score = np.where(inside, score, np.abs(slopes[j]) + share * wide[j])
         asked = (N.c <= level) & (self.V.at(centre) >= self.c2) & self._inside(x[:, 0])
-        return proved, bound, score, torch.where(rises & asked, N.c, torch.inf)
+        return proved, bound, score, np.where(rises & asked, N.c, np.inf)
 
-    def _where_asked(
-        self, bound: Tensor, fall: Taylor, N: Taylor, centre: Tensor, radius: Tensor, level: float
-    ) -> Tensor:
+    def _where_asked(self, bound: Array, fall: Taylor, N: Taylor, centre: Array, radius: Array, level: float) -> Array:
         """The bound, made tighter where it is not negative by `k (n2 - N)` and `k (V - c2)`, which are >= 0 there."""
         n = len(centre)
-        left = torch.nonzero(~(bound < 0))[:, 0]
+        left = chosen(~(bound < 0))
         if len(left):
             own, at = N.at(left), fall.at(left)
-            rest = own.r + EPS * (own.c.abs() + abs(level))
+            rest = own.r + EPS * (np.abs(own.c) + abs(level))
             gap = Taylor(level - own.c, -own.g, -own.Q, rest)
-            bound = bound.index_put((left,), lessened(bound[left], at, gap, n))
+            bound[left] = lessened(bound[left], at, gap, n)
         below = self.V.levels(centre - radius, centre + radius)[0] < self.c2
-        left = torch.nonzero(below & ~(bound < 0))[:, 0]
+        left = chosen(below & ~(bound < 0))
         if len(left):
             at = fall.at(left)
-            gap = self.V.gap(centre[:, left], radius[:, left], at, self.c2, -1.0)
-            bound = bound.index_put((left,), lessened(bound[left], at, gap, n))
+            gap = self.V.gap(centre.take(left, -1), radius.take(left, -1), at, self.c2, -1.0)
+            bound[left] = lessened(bound[left], at, gap, n)
         return bound
 
 
@@ -200,48 +193,50 @@ class FaceBound:
     `side` is 0 at the lower end of state `axis`, and 1 at the upper one.
     """
 
-    def __init__(self, system: System, axis: int, side: int, function: Neural | Symbolic, device: torch.device) -> None:
-        self.axis, self.N = axis, enclosure_of(function, device)
+    def __init__(self, system: System, axis: int, side: int, function: Neural | Symbolic) -> None:
+        self.axis, self.N = axis, enclosure_of(function)
         self.end = float(system.domain[axis][side])
         self.piece = max(16, _NUMBERS // (self.N.units * (1 + system.n) * (2 + system.n) // 2))
         self.operations = 4 * _EACH * self.N.units * (1 + system.n) ** 2  # of a box, about
 
-    def __call__(self, lo: Tensor, hi: Tensor, inner: float, outer: float) -> OuterBounds:
+    @np.errstate(all="ignore")  # infinities and NaN are answers, which nothing is proved with
+    def __call__(self, lo: Array, hi: Array, inner: float, outer: float) -> OuterBounds:
         """Bounds for the level `outer` on boxes lo, hi (n, B), which have no extent along the face's own axis."""
         cut = _pieces(lo.shape[1], self.piece)
-        both = zip(lo.tensor_split(cut, 1), hi.tensor_split(cut, 1), strict=True)
+        both = zip(np.array_split(lo, cut, 1), np.array_split(hi, cut, 1), strict=True)
         parts = [self._judge(low, high, outer) for low, high in both]
-        return OuterBounds(*(torch.cat(column, -1) for column in zip(*parts, strict=True)))
+        return OuterBounds(*(joined(column) for column in zip(*parts, strict=True)))
 
-    def _judge(self, lo: Tensor, hi: Tensor, level: float) -> OuterBounds:
+    def _judge(self, lo: Array, hi: Array, level: float) -> OuterBounds:
         centre = 0.5 * lo + 0.5 * hi
-        radius = torch.maximum(hi - centre, centre - lo) * (1 + EPS)
+        radius = np.maximum(hi - centre, centre - lo) * (1 + EPS)
         centre[self.axis], radius[self.axis] = self.end, 0.0
-        error = EPS * (centre.abs() + radius) + TINY
-        x = torch.cat([centre[:, None], torch.diag_embed(radius.T).permute(1, 2, 0)], 1)
+        error = EPS * (np.abs(centre) + radius) + TINY
+        x = np.concatenate([centre[:, None], np.eye(len(centre))[:, :, None] * radius], 1)
         lowest, index, known = least_value(self.N, x, error, level)
-        score, violated = radius.clone(), torch.full_like(lowest, torch.inf)
+        score, violated = radius.copy(), np.full_like(lowest, np.inf)
         if known is not None:
             excess = upper_bound(_negative(known.value))[1] + known.share * known.value.r
-            score[:, index] = torch.where(torch.isfinite(excess), excess, radius[:, index])
-            violated[index] = torch.where(known.value.c <= level, known.value.c, torch.inf)
-        score[self.axis] = -torch.inf
+            score[:, index] = np.where(np.isfinite(excess), excess, radius.take(index, -1))
+            violated[index] = np.where(known.value.c <= level, known.value.c, np.inf)
+        score[self.axis] = -np.inf
         return OuterBounds(lowest > level, level - lowest, score, lowest, violated)
 
 
 def least_value(
-    N: NeuralEnclosure | SymbolicEnclosure, x: Tensor, error: Tensor, level: float
-) -> tuple[Tensor, Tensor, NeuralModels | SymbolicModels | None]:
+    N: NeuralEnclosure | SymbolicEnclosure, x: Array, error: Array, level: float
+) -> tuple[Array, Index, NeuralModels | SymbolicModels | None]:
     """A lower bound of N on boxes (B,), and its models on those, by their indices, that a first one leaves."""
     lowest = N.least(x, error, level)
-    index = torch.nonzero(~(lowest > level))[:, 0]
+    index = chosen(~(lowest > level))
     if not len(index):
         return lowest, index, None
-    whole = len(index) == len(lowest)
-    known = N(x if whole else x[:, :, index], error if whole else error[:, index])
+    whole = is_whole(index, len(lowest))
+    known = N(x if whole else x.take(index, -1), error if whole else error.take(index, -1))
     by_model = -upper_bound(_negative(known.value))[0]
-    by_model = torch.where(torch.isfinite(by_model), by_model, -torch.inf)
-    return lowest.index_put((index,), torch.maximum(lowest[index], by_model)), index, known
+    by_model = np.where(np.isfinite(by_model), by_model, -np.inf)
+    lowest[index] = np.maximum(lowest[index], by_model)
+    return lowest, index, known
 
 
 def _pieces(count: int, most: int) -> int:
@@ -257,11 +252,11 @@ def _joined(models: Sequence[Taylor]) -> Taylor:
     """Models of several batches as one."""
     if len(models) == 1:
         return models[0]
-    return Taylor(*(torch.cat([getattr(v, part) for v in models], -1) for part in ("c", "g", "Q", "r")))
+    return Taylor(*(joined([getattr(v, part) for v in models]) for part in ("c", "g", "Q", "r")))
 
 
 def _widened(model: Taylor, like: Taylor) -> Taylor:
     """The model among as many symbols as another has."""
-    n, g, Q = len(model.g), torch.zeros_like(like.g), torch.zeros_like(like.Q)
+    n, g, Q = len(model.g), np.zeros_like(like.g), np.zeros_like(like.Q)
     g[:n], Q[:n, :n] = model.g, model.Q
     return Taylor(model.c, g, Q, model.r)

@@ -15,14 +15,12 @@ from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
-from torch import Tensor
 
 from certify.certificates.verdict import Stop
 from certify.effort import UNLIMITED
 from certify.errors import BackendError
 from certify.provers.base import Budget, Report
+from certify.provers.bounds.arrays import Array, Index, Mask
 from certify.provers.boxes.account import Account
 from certify.provers.boxes.frontier import Frontier
 from certify.provers.boxes.halving import Halves, split
@@ -31,7 +29,6 @@ from certify.provers.boxes.subtrees import Abroad, Growth, Subtrees
 from certify.provers.execution import Bound, Counted, Runner
 from certify.provers.outer.rule import OuterBounds
 
-Array = NDArray[np.float64]
 _SLACK = 1e-9  # of the level's span: how far below a bound the level stays
 _LAST_LOOK = 0.5  # operations of a box that a lower level settles, in those of one of all that were looked at
 _BATCH = 4e6  # operations of a batch, however small
@@ -40,7 +37,7 @@ _BATCH = 4e6  # operations of a batch, however small
 class _CoverGrowth(Growth):
     """A rule for a level, the second of its two."""
 
-    def __init__(self, rule: Counted, half: Tensor, level: float) -> None:
+    def __init__(self, rule: Counted, half: Array, level: float) -> None:
         super().__init__(rule, half)
         self.level = level
 
@@ -51,13 +48,14 @@ class _CoverGrowth(Growth):
     def at(self, inner: float, outer: float) -> _CoverGrowth:
         return _CoverGrowth(self.bound, self.half, outer)
 
-    def gives_way(self, lo: Tensor, hi: Tensor, found: OuterBounds) -> Tensor:
-        return found.violated <= self.level
+    def gives_way(self, lo: Array, hi: Array, found: OuterBounds) -> Mask:
+        gives_way: Mask = found.violated <= self.level
+        return gives_way
 
-    def opened(self, halves: Halves, found: OuterBounds, key: Tensor) -> tuple[Tensor, Tensor]:
+    def opened(self, halves: Halves, found: OuterBounds, key: Array) -> tuple[Mask, Array]:
         # what a box's bound leaves unknown, its place in the order still says
-        keys = torch.maximum(found.lowest, key)[halves.origin]
-        return torch.ones_like(keys, dtype=torch.bool), keys
+        keys = np.maximum(found.lowest, key)[halves.origin]
+        return np.ones_like(keys, dtype=np.bool_), keys
 
 
 class Cover:
@@ -86,17 +84,16 @@ class Cover:
         self.level, self.target, self.floor, self.beside = level, level, floor, beside
         self.slack = _SLACK * max(abs(level), level - floor)
         self.partition = Partition(upper, lower)
-        self.frontier = Frontier(self.partition, runner.device)
-        lo, hi = (torch.tensor(side[:, None], dtype=torch.float64, device=runner.device) for side in (lower, upper))
-        self.width = torch.where(hi > lo, (hi - lo) / 2, 1.0)
+        self.frontier = Frontier(self.partition)
+        lo, hi = lower[:, None], upper[:, None]
+        self.width = np.where(hi > lo, (hi - lo) / 2, 1.0)
         self.boxes = self.leaves = 0
         self.done_share = 0.0
         self.stop = Stop.REQUESTED
         self.lost = ""  # what is said of a cluster that went away
         self.abroad: Abroad | None = None
         self._account = Account()
-        first = torch.zeros(1, dtype=torch.int64, device=runner.device)
-        self.frontier.add(lo, hi, torch.full((1,), -math.inf, dtype=torch.float64, device=runner.device), first)
+        self.frontier.add(lo, hi, np.full(1, -math.inf), np.zeros(1, dtype=np.int64))
 
     @property
     def proved(self) -> float:
@@ -176,40 +173,37 @@ class Cover:
         for sent, answer, opened, looked in back:
             self.boxes += answer.boxes
             self.leaves += answer.proved
-            parts = ((sent.lo, sent.hi), opened.tensors()[:2], looked.tensors()[:2])
-            whole, *rest = (self._share(*corners) for corners in parts)
+            whole, *rest = (self._share(boxes.lo, boxes.hi) for boxes in (sent, opened, looked))
             self.done_share += whole - sum(rest)
-            lo, hi, number = opened.tensors()
-            self.frontier.add(lo, hi, torch.tensor(answer.keys), number)
+            self.frontier.add(opened.lo, opened.hi, answer.keys, opened.number)
             if len(looked.number):
-                lo, hi, number = looked.tensors()
-                self._examine(bound, lo, hi, number, torch.full_like(lo[0], -math.inf), budget)
+                self._examine(bound, *looked.boxes, np.full(len(looked.number), -math.inf), budget)
         return True
 
-    def _share(self, lo: Tensor, hi: Tensor) -> float:
+    def _share(self, lo: Array, hi: Array) -> float:
         """The volume of boxes (n, B), of that of the whole."""
-        return float(torch.where(hi > lo, (hi - lo) / (2 * self.width), 1.0).prod(0).sum())
+        return float(np.where(hi > lo, (hi - lo) / (2 * self.width), 1.0).prod(0).sum())
 
     def _step(self, bound: Bound, budget: Budget) -> None:
         lo, hi, number, key = self.frontier.take(budget.batch, math.inf)
         self._examine(bound, lo, hi, number, key, budget)
 
-    def _examine(self, bound: Bound, lo: Tensor, hi: Tensor, number: Tensor, key: Tensor, budget: Budget) -> None:
+    def _examine(self, bound: Bound, lo: Array, hi: Array, number: Index, key: Array, budget: Budget) -> None:
         self.boxes += lo.shape[1]
         found: OuterBounds = bound(lo, hi, -math.inf, self.level)
         lowest = float(found.violated.min())
         if lowest <= self.level:
             if self.deepen is not None:
                 centre = (0.5 * lo + 0.5 * hi)[:, int(found.violated.argmin())]
-                lowest = min(lowest, self.deepen(centre.cpu().numpy()))
+                lowest = min(lowest, self.deepen(centre))
             self.level, self.stop = lowest - self.beside, Stop.WITNESS
             found = found._replace(proved=found.proved | (found.lowest > self.level))
         halves = split(self.partition, lo, hi, number, found, budget.least_width * self.width)
-        if bool(halves.small.any()):
+        if halves.small.any():
             bottom = float(found.lowest[halves.small].min())
             if bottom <= self.level:
                 self.level, self.stop = bottom - self.slack, Stop.BOXES
-        self.done_share += self._share(lo[:, found.proved], hi[:, found.proved])
+        self.done_share += self._share(lo.compress(found.proved, -1), hi.compress(found.proved, -1))
         self.leaves += int(found.proved.sum())
         _, keys = self.growth.opened(halves, found, key)
         self.frontier.add(halves.lo, halves.hi, keys, halves.number)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from certify.errors import InputError
-from certify.loop.policies.importers.arrays import Numbers
+from certify.loop.files.arrays import Numbers
 from certify.loop.policies.importers.steps import Affine, Clip, Diagonal, Step, Tanh, exactly
 
 Chain = tuple[Step, ...]

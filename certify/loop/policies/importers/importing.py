@@ -18,10 +18,11 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from certify.errors import InputError
+from certify.loop.files.archives import MAX_BYTES, Archive
+from certify.loop.files.arrays import Numbers
+from certify.loop.files.torchfile import TorchFile
 from certify.loop.policies.exact import require_centred
 from certify.loop.policies.file import Policy, is_text
-from certify.loop.policies.importers.archives import MAX_BYTES, Archive
-from certify.loop.policies.importers.arrays import Numbers
 from certify.loop.policies.importers.comparing import Difference, compare_reading
 from certify.loop.policies.importers.folding import Bounds, Folded, fold
 from certify.loop.policies.importers.normalisers import load_normaliser
@@ -33,7 +34,6 @@ from certify.loop.policies.importers.sb3 import read_sb3
 from certify.loop.policies.importers.state_dict import is_two_stage, read_state_dict, read_two_stage
 from certify.loop.policies.importers.steps import Clip, Diagonal, Normalise, Step, spread
 from certify.loop.policies.importers.tensors import load_safetensors, load_tensors
-from certify.loop.policies.importers.torchfile import TorchFile
 from certify.loop.policies.importers.torchscript import is_torchscript, read_torchscript
 from certify.loop.policies.network import Array, Centre, TanhNetwork
 

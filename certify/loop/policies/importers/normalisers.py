@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from certify.errors import InputError
-from certify.loop.policies.importers.arrays import Numbers, array_of
-from certify.loop.policies.importers.pickles import Call, Name, brief, read_pickle
+from certify.loop.files.arrays import Numbers, array_of
+from certify.loop.files.pickles import Call, Name, brief, read_pickle
 from certify.loop.policies.importers.steps import Diagonal, Normalise, exactly
 from certify.loop.policies.importers.tensors import load_tensors
 

@@ -19,9 +19,9 @@ from typing import Any
 import numpy as np
 
 from certify.errors import InputError
+from certify.loop.files.archives import MAX_BYTES
+from certify.loop.files.arrays import Numbers
 from certify.loop.policies.importers import graph
-from certify.loop.policies.importers.archives import MAX_BYTES
-from certify.loop.policies.importers.arrays import Numbers
 from certify.loop.policies.importers.graph import Chain
 from certify.loop.policies.importers.options import WITH_TANH, WITHOUT_NORMALISATION
 from certify.loop.policies.importers.reading import Observations, Reading, Values

@@ -17,9 +17,9 @@ from typing import Any
 import numpy as np
 
 from certify.errors import InputError
-from certify.loop.policies.importers.archives import Archive
-from certify.loop.policies.importers.arrays import Numbers, array_of
-from certify.loop.policies.importers.pickles import Call, Name, brief, read_pickle
+from certify.loop.files.archives import Archive
+from certify.loop.files.arrays import Numbers, array_of
+from certify.loop.files.pickles import Call, Name, brief, read_pickle
 from certify.loop.policies.importers.reading import Observations, Reading, Values, between, perceptron, widths
 from certify.loop.policies.importers.steps import Affine, Clip, Diagonal, Tanh, exactly, linear
 from certify.loop.policies.importers.tensors import load_tensors

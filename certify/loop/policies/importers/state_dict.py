@@ -13,7 +13,7 @@ from fractions import Fraction
 import numpy as np
 
 from certify.errors import InputError
-from certify.loop.policies.importers.arrays import Numbers
+from certify.loop.files.arrays import Numbers
 from certify.loop.policies.importers.normalisers import normaliser_root, rsl_normaliser
 from certify.loop.policies.importers.options import WITHOUT_NORMALISATION, ImportOptions, Output
 from certify.loop.policies.importers.reading import Observations, Reading, Values, between, perceptron, widths

@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from typing import Any
 
 from certify.errors import InputError
-from certify.loop.policies.importers.arrays import Numbers, array_of, is_array
-from certify.loop.policies.importers.pickles import Call
-from certify.loop.policies.importers.torchfile import TorchFile, is_tensor
+from certify.loop.files.arrays import Numbers, array_of, is_array
+from certify.loop.files.pickles import Call
+from certify.loop.files.torchfile import TorchFile, is_tensor
 
 
 def load_tensors(raw: bytes, what: str, file: TorchFile | None = None) -> dict[str, Numbers]:

@@ -16,13 +16,13 @@ from typing import Any
 import numpy as np
 
 from certify.errors import InputError
+from certify.loop.files.arrays import Numbers
+from certify.loop.files.pickles import Call, Name, brief
+from certify.loop.files.torchfile import TorchFile, is_tensor
 from certify.loop.policies.importers import graph
-from certify.loop.policies.importers.arrays import Numbers
 from certify.loop.policies.importers.graph import Chain
 from certify.loop.policies.importers.options import WITH_TANH, WITHOUT_NORMALISATION
-from certify.loop.policies.importers.pickles import Call, Name, brief
 from certify.loop.policies.importers.reading import Observations, Reading, Values
-from certify.loop.policies.importers.torchfile import TorchFile, is_tensor
 
 _MAX_OPERATIONS = 1000
 _MAX_DEPTH = 40

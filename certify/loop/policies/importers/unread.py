@@ -19,7 +19,7 @@ from collections.abc import Collection, Mapping
 from fnmatch import fnmatchcase
 
 from certify.errors import InputError
-from certify.loop.policies.importers.arrays import Numbers
+from certify.loop.files.arrays import Numbers
 
 _STATE = re.compile(
     r"(.*\.)?state\.[0-9]+\.(step|exp_avg|exp_avg_sq|max_exp_avg_sq|exp_inf|momentum_buffer|square_avg|grad_avg|acc_delta|sum)"

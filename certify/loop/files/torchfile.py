@@ -1,4 +1,5 @@
-"""A file of torch.save or torch.jit.save: its pickle as data, and the tensors that its storages hold.
+"""A file of torch.save or torch.jit.save: its pickle as data, and the tensors that its storages hold; and how one is
+written.
 
 torch's own `weights_only` refuses a checkpoint with a numpy random state beside the weights, and without it torch.load
 runs the pickle's calls. Here nothing runs in either case: an object that is no tensor stays a name.
@@ -6,14 +7,18 @@ runs the pickle's calls. Here nothing runs in either case: an object that is no 
 
 from __future__ import annotations
 
-from typing import Any
+import io
+import pickle
+import zipfile
+from collections import OrderedDict
+from typing import Any, ClassVar
 
 import numpy as np
 
 from certify.errors import InputError
-from certify.loop.policies.importers.archives import Archive
-from certify.loop.policies.importers.arrays import Numbers, product
-from certify.loop.policies.importers.pickles import Call, Name, Persistent, brief, read_pickle
+from certify.loop.files.archives import Archive
+from certify.loop.files.arrays import Numbers, product
+from certify.loop.files.pickles import Call, Name, Persistent, brief, read_pickle
 
 _MAX_NUMBERS = 2**26
 _TYPES = {
@@ -153,3 +158,46 @@ def is_tensor(node: Any) -> bool:
 
 def _depth(name: str) -> int:
     return name.count("/") if name.endswith("/data.pkl") else -1
+
+
+def written(data: Any) -> bytes:
+    """The bytes of a file of torch.save: equal ones for equal data of containers, texts, numbers and arrays."""
+    buffer, archive = io.BytesIO(), io.BytesIO()
+    writer = _Writer(buffer)
+    writer.dump(data)
+    members = {"data.pkl": buffer.getvalue(), "byteorder": b"little", "version": b"3\n"}
+    members |= {f"data/{k}": array.tobytes() for k, array in enumerate(writer.arrays)}
+    with zipfile.ZipFile(archive, "w") as file:
+        for name, content in members.items():
+            file.writestr(zipfile.ZipInfo(f"archive/{name}"), content)
+    return archive.getvalue()
+
+
+class _Writer(pickle._Pickler):
+    """Pickles containers, with an array as the tensor that torch makes of its bytes."""
+
+    def __init__(self, file: io.BytesIO) -> None:
+        super().__init__(file, protocol=2)
+        self.arrays: list[Numbers] = []
+
+    def persistent_id(self, node: Any) -> Any:
+        """What stands outside of the pickle."""
+        return node.reference if isinstance(node, Persistent) else None
+
+    def _array(self, array: Numbers) -> None:
+        kind = {"f4": _FLOAT, "f8": _DOUBLE, "i8": _LONG}[array.dtype.str[1:]]
+        reference = Persistent(("storage", kind, str(len(self.arrays)), "cpu", array.size))
+        self.arrays.append(np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<")))
+        strides = tuple(s // array.itemsize for s in self.arrays[-1].strides)
+        self.save(_REBUILD)
+        self.save((reference, 0, array.shape, strides, False, OrderedDict()))
+        self.write(pickle.REDUCE)
+
+    def _name(self, name: Name) -> None:
+        self.write(pickle.GLOBAL + f"{name.module}\n{name.name}\n".encode())
+
+    dispatch: ClassVar = {**pickle._Pickler.dispatch, np.ndarray: _array, Name: _name}
+
+
+_REBUILD = Name("torch._utils", "_rebuild_tensor_v2")
+_FLOAT, _DOUBLE, _LONG = (Name("torch", f"{kind}Storage") for kind in ("Float", "Double", "Long"))
