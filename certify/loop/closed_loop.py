@@ -51,7 +51,7 @@ class ClosedLoop:
         object.__setattr__(self, "dynamics", system.exact_dynamics())
         weights, neurons = sum(W.size for W in network.weights), sum(len(b) for b in network.biases)
         equations = sum(1 for _ in nodes(*self.dynamics))
-        object.__setattr__(self, "operations", 0.05 * weights + 1.5 * neurons + 3.0 * equations)
+        object.__setattr__(self, "operations", 0.07 * weights + 2.0 * neurons + 4.0 * equations)
 
     def require_rest(self) -> None:
         """Refuse a loop whose origin is not an equilibrium, exactly: `f(0, u_eq) = 0` and `pi(0) = u_eq`.

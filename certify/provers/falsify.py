@@ -26,7 +26,7 @@ from certify.loop.rigorous import evaluate_increment, evaluate_policy
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 _RATIO, _LEVELS, _LOWER = 1.4, 60, 13  # of a survey: between levels, how many, and how many steps of 8 further it goes
-_CALL, _EACH = 8e5, 2.0  # operations of evaluating few states at once; of an operation at one, with its derivative
+_CALL, _EACH = 3e5, 0.3  # operations of evaluating few states at once; of an operation at one, with its derivative
 _TOGETHER = 15  # levels that are looked at in one batch
 _APART = 1e-7  # of a state's or an input's size, between the points of a difference
 
