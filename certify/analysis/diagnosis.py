@@ -41,7 +41,7 @@ _LITTLE = 25.0  # per cent of the volume that sampling allows, below which the b
 _BENT = 1.0  # bends of the hidden units, as a share of the linear part, that are worth flattening
 _TELLING = 1000  # boxes: a limit below it is what ended the search, and says nothing of the policy
 _FEW = 3  # states, for which a function beyond the ellipsoid is suggested
-_ENDED = (Stop.EFFORT, Stop.TIME, Stop.BOXES, Stop.LOCAL)
+_ENDED = (Stop.EFFORT, Stop.BOXES, Stop.LOCAL)
 
 
 def diagnose(

@@ -13,6 +13,7 @@ _LIMITS = {
     "domain": "the domain",
     "inputs": "the input bounds: beyond it the policy asks for more than the actuator gives",
     "witness": "a point where Vdot >= 0",
+    "effort": "the effort: more may be provable",
     "time": "the time limit: more may be provable",
     "refused by the checker": "the checker, which refuses some of what was found",
     "boxes": "the limit on boxes: more may be provable",
@@ -21,6 +22,7 @@ _LIMITS = {
 _OF_OUTER = {
     "domain": "the domain: a larger one reaches its edge",
     "witness": "a state at which N does not fall",
+    "effort": "the effort: more may be provable",
     "time": "the time limit: more may be provable",
     "boxes": "the limit on boxes: more may be provable",
     "requested": "the level that was asked for",

@@ -208,7 +208,7 @@ def _rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
         rows.append(
             (
                 "candidates",
-                f"{'; '.join(tried)} {unit}".rstrip() + " (volume proved in the time, of what sampling allows)",
+                f"{'; '.join(tried)} {unit}".rstrip() + " (volume proved, of what sampling allows)",
             )
         )
     at = result.get("operating_point") or {}
