@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import re
 import shutil
+import sys
 import tempfile
 import time
 import weakref
@@ -75,7 +76,6 @@ def certify_roa(
     engine: EngineName | None = None,
     dreal_precision: float | None = None,
     jobs: int | None = None,
-    device: str | None = None,
     cluster: str | None = None,
     cluster_checks: bool | None = None,
     resume: bool | None = None,
@@ -134,7 +134,6 @@ def certify_roa(
     dreal_precision : dReal's delta, 1e-3 by default.
     jobs : processes of the checker, and threads of dReal; by default one of these, and where there are many leaves as
         many of those as there are cores.
-    device : where boxes are bounded: "cpu" (the default) or "cuda".
     cluster : have boxes grown by the workers of a Dask cluster: "local:4" for four processes of this machine, or a
         scheduler's address, such as "tcp://host:8786"; by default by the threads of this process.
     cluster_checks : have the workers run the checker as well, each on a part of the leaves, and believe them.
@@ -195,7 +194,7 @@ def certify_roa(
     start = time.perf_counter()
     single = {
         "claim": claim, "around": around, "candidate": candidate, "Q": Q, "R": R, "P": P, "level": level,
-        "engine": engine, "dreal_precision": dreal_precision, "jobs": jobs, "device": device, "enlarge": enlarge,
+        "engine": engine, "dreal_precision": dreal_precision, "jobs": jobs, "enlarge": enlarge,
         "box": box,
         "cluster": cluster, "cluster_checks": cluster_checks, "resume": resume,
         "reach_from": reach_from, "time_limit": time_limit, "max_boxes": max_boxes, "rate": rate,
@@ -206,7 +205,6 @@ def certify_roa(
         unsure = _uncertainty(ranges, disturbances, input_error, sample_time)
         named = single | ({} if options is None else {"lyapunov": lyapunov})
         chosen = _options(options, {name: value for name, value in named.items() if value is not None})
-        _require_device(chosen.device)
         seconds = _number(load_seconds, "load_seconds")
         _require(provenance is None or isinstance(provenance, Mapping), "provenance", "a mapping", provenance)
         _require(progress is None or callable(progress), "progress", "callable", progress)
@@ -350,8 +348,6 @@ def _policy(
     given: Any, system: Any, asked: ImportOptions, tell: Callable[[str], None], unsure: Change
 ) -> Policy | TanhNetwork:
     """The policy, whatever it was given as."""
-    import torch
-
     if isinstance(given, Policy | TanhNetwork):
         others = set(asked.given) - ({"--centre"} if isinstance(given, Policy) else set())
         if others:
@@ -367,7 +363,8 @@ def _policy(
             lambda stored: _closed(stored, system, lambda _: None, unsure)[0],
             tell,
         )
-    if isinstance(given, torch.nn.Module):
+    torch = sys.modules.get("torch")  # whoever has a module of torch has loaded it
+    if torch is not None and isinstance(given, torch.nn.Module):
         imported = import_module(given, unsure(_plant(system, "a module")), asked)
     elif isinstance(given, Mapping):
         imported = import_state_dict(given, unsure(_plant(system, "a state_dict")), asked)
@@ -536,13 +533,6 @@ def _path(value: Any, name: str) -> str:
     if not isinstance(path, str) or not path:
         raise InputError(f"`{name}` must be a path in text that is not empty; found {path!r}.")
     return path
-
-
-def _require_device(name: str) -> None:
-    import torch
-
-    if name != "cpu" and not (name.startswith("cuda") and torch.cuda.is_available()):
-        raise InputError(f"`device` must be cpu, or cuda on a machine that has it; found {name!r}.")
 
 
 def _require(holds: bool, name: str, what: str, value: object) -> None:

@@ -44,7 +44,6 @@ class RoaOptions:
     dreal_precision : dReal's delta.
     jobs : processes of the checker, and threads of dReal; None is one of these, and where there are many leaves as many
         of those as there are cores.
-    device : where boxes are bounded, `cpu` or `cuda`.
     cluster : whose workers grow boxes: `local:N` for N processes of this machine, or the address of a Dask scheduler,
         such as tcp://host:8786; None for the threads of this process.
     cluster_checks : the cluster's workers run the checker as well, each on a part of the leaves, and are believed.
@@ -76,7 +75,6 @@ class RoaOptions:
     engine: EngineName = "bounds"
     dreal_precision: float = 1e-3
     jobs: int | None = None
-    device: str = "cpu"
     cluster: str | None = None
     cluster_checks: bool = False
     resume: bool = False
@@ -131,8 +129,8 @@ class RoaOptions:
             raise OptionError(f"`jobs` must be 1 to {_MOST_JOBS}; found {self.jobs}.")
         if self.cluster_checks and self.cluster is None:
             raise OptionError("`cluster_checks` must have a `cluster`; found none.")
-        if self.cluster is not None and (self.engine != "bounds" or self.device != "cpu"):
-            raise OptionError("`cluster` needs the engine bounds, and the device cpu.")
+        if self.cluster is not None and self.engine != "bounds":
+            raise OptionError("`cluster` needs the engine bounds.")
         if self.resume and (self.engine != "bounds" or self.P is not None or self.only is not None):
             raise OptionError(
                 "`resume` takes the candidate of the search; leave out `candidate`, `Q`, `R`, `level` and a P of your "

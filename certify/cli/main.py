@@ -69,7 +69,7 @@ def main(arguments: list[str] | None = None) -> None:
     """Entry point: turns every error into one sentence and the right exit status."""
     gc.set_threshold(100_000)  # most objects of a run are modules, which live to its end
     # Threads that wait must not spin: on a busy machine spinning costs a factor of ten. OpenBLAS cannot be told so, and
-    # numpy's matrices are small here, also the checker's; the engine's threads are torch's.
+    # the checker's matrices are small; the engine shares out boxes among threads of its own.
     os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     end_by_sigterm()

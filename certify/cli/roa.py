@@ -104,7 +104,6 @@ def roa(
         int | None,
         typer.Option(min=1, max=256, help="Processes of the checker (default: a core each), and dReal's threads (1)."),
     ] = None,
-    device: Annotated[str, typer.Option(help="cpu or cuda.")] = "cpu",
     cluster: Annotated[
         str | None,
         typer.Option(
@@ -179,7 +178,6 @@ def roa(
         engine=_engine(context, engine),  # type: ignore[arg-type]
         dreal_precision=precision,
         jobs=jobs,
-        device=_device(device),
         cluster=cluster,
         cluster_checks=cluster_checks,
         resume=resume,
@@ -213,16 +211,6 @@ def _number(rate: str) -> float:
         return float(rate)
     except ValueError as error:
         raise InputError(f"--rate takes a number of at least 0, or max; found {rate!r}.") from error
-
-
-def _device(name: str) -> str:
-    if name == "cpu":
-        return name
-    import torch
-
-    if name.startswith("cuda") and torch.cuda.is_available():
-        return name
-    raise InputError(f"--device must be cpu, or cuda on a machine that has it; found {name!r}.")
 
 
 def _engine(context: typer.Context, name: str) -> str:

@@ -45,7 +45,7 @@ class ImportedLyapunov:
     stored : the same with its plant, and the record of its origin in `training`.
     words : where it lies in the file, and its widths.
     meaning : what N is beside the file's own function, for people.
-    difference : how far it is from what torch's layers give with the same numbers, in units of N: this checks the
+    difference : how far it is from what numpy gives with the same numbers, in units of N: this checks the
         folding. The file holds no program, and nothing is compared with one.
     assumed : who says what stands between the numbers.
     not_read : why each tensor of the file that was not read is left out, by its name.

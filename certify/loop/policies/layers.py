@@ -102,4 +102,6 @@ def like(array: Array, x: Any) -> Any:
     """The array as x is: for a torch tensor a tensor of its precision, on its device."""
     if isinstance(x, np.ndarray):
         return array
-    return x.new_tensor(array)
+    import torch
+
+    return torch.tensor(array, dtype=x.dtype, device=x.device)

@@ -55,7 +55,7 @@ class Imported:
     words : the kind of file and of policy.
     formula : what the file's policy is, for people.
     difference : how far it is from what the file's own program gives, or, where the file holds no program, from what
-        torch's layers give with the same numbers, which checks the folding alone.
+        numpy gives with the same numbers, which checks the folding alone.
     compared_with : the file's own program with which it was compared, for people; None where nothing was compared.
     assumed : where nothing was compared, who says what stands between the numbers.
     not_read : why each tensor of the file that was not read is left out, by its name.
