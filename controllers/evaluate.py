@@ -26,11 +26,11 @@ from certify.loop.expressions import Expression, gathered
 from certify.loop.plants import System, shipped_system
 from certify.loop.plants.system import Time
 from certify.loop.policies import Policy, TanhNetwork
-from certify.provers.execution.threads import threads_for
 from controllers.environments import Stepper
 from controllers.lqr import Identified, riccati_gain
 from controllers.options import Plant, held_over
 from controllers.simulation import Loop, continuous_loop, held_loop, initial_states, mean_action
+from controllers.threads import threads_for
 
 Array = NDArray[np.float64]
 
@@ -196,7 +196,7 @@ def evaluate(
 
     eigenvalues = np.linalg.eigvals(_closed_loop_jacobian(system, policy))
     continuous = None
-    with threads_for(network.weights):
+    with threads_for(network):
         if system.time == "continuous":
             fastest = float(np.abs(eigenvalues).max())
             h = min(dt, options.resolution / fastest) if fastest > 0 else dt

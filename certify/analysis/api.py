@@ -11,6 +11,7 @@ import inspect
 import os
 import re
 import shutil
+import sys
 import tempfile
 import textwrap
 import time

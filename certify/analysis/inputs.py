@@ -258,7 +258,7 @@ def checked(difference: Difference, compared_with: str | None, assumed: str, not
     else:
         said = [
             f"numbers  only, no program: nothing was compared with the file. {assumed}; check that against your code",
-            f"folding  checked with the same numbers in torch's layers, {numbers}",
+            f"folding  checked with the same numbers in numpy, {numbers}",
         ]
     reasons: dict[str, list[str]] = {}
     for name, why in not_read.items():

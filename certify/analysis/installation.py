@@ -15,7 +15,7 @@ from typing import Literal
 
 Program = Literal["checker", "reference"]
 _HERE = Path(__file__).resolve().parent.parent  # the package
-_PROVENANCE = ("certify", "torch", "numpy", "scipy", "sympy", "python-flint")
+_PROVENANCE = ("certify", "numpy", "scipy", "numba", "sympy", "python-flint")
 
 
 def version_of(package: str) -> str | None:

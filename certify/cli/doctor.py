@@ -27,8 +27,9 @@ if TYPE_CHECKING:
 
 State = Literal["ok", "missing", "warning", "fault"]
 _CORE = {  # package of the registry, module to import
-    "numpy": "numpy", "scipy": "scipy", "sympy": "sympy", "torch": "torch", "python-flint": "flint", "typer": "typer",
+    "numpy": "numpy", "scipy": "scipy", "sympy": "sympy", "numba": "numba", "python-flint": "flint", "typer": "typer",
     "rich": "rich", "matplotlib": "matplotlib", "jinja2": "jinja2", "cvxpy": "cvxpy", "clarabel": "clarabel",
+    "threadpoolctl": "threadpoolctl",
 }  # fmt: skip
 _EXTRAS = {  # package: module, extra, what for
     "onnx": ("onnx", "onnx", "policies of ONNX"),
@@ -36,12 +37,11 @@ _EXTRAS = {  # package: module, extra, what for
     "gymnasium": ("gymnasium", "controllers", "training with controllers train"),
     "control": ("control", "controllers", "training with controllers train"),
     "distributed": ("distributed", "cluster", "--cluster of certify and controllers"),
-    "numba": ("numba", "fast", "compiled loops, which large proofs gain from"),
+    "torch": ("torch", "torch", "modules of torch, policies of TorchScript, training with controllers train"),
     "pyarrow": ("pyarrow", "parquet", "Parquet tables of certify sweep"),
     "stable-baselines3": ("stable_baselines3", "baselines", "baselines of controllers compare; not needed to import"),
 }
 _OLDEST = (3, 11)
-_CPU = "pip install torch, as PyTorch's installation page gives it for Pip and CPU"
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,30 +94,14 @@ def _core() -> list[Finding]:
 def _package(name: str, module: str) -> Finding:
     from certify.analysis.installation import version_of
 
-    advice = f"pip install {name}" if name != "torch" else _CPU
+    advice = f"pip install {name}"
     try:
         importlib.import_module(module)
     except Exception as error:  # an installed package may fail in any way
         found = version_of(name)
         why = f"{type(error).__name__}: {error}".splitlines()[0]
         return Finding("core", name, "fault", f"{found or 'not installed'}; {why}", advice)
-    return _torch() if name == "torch" else Finding("core", name, "ok", version_of(name) or "version unknown")
-
-
-def _torch() -> Finding:
-    """Report torch's build. The CUDA build takes gigabytes, and nothing here needs it."""
-    import torch
-
-    built = torch.version.cuda
-    if built is None:
-        return Finding("core", "torch", "ok", f"{torch.__version__}, built for the CPU")
-    if torch.cuda.is_available():
-        found = f"{torch.__version__}, CUDA {built} on {torch.cuda.get_device_name()}"
-        return Finding("core", "torch", "ok", found, "certify roa --device cuda uses it.")
-    return Finding(
-        "core", "torch", "ok", f"{torch.__version__}, built for CUDA {built}; no GPU found",
-        f"The build for the CPU does the same and is gigabytes smaller: {_CPU}",
-    )  # fmt: skip
+    return Finding("core", name, "ok", version_of(name) or "version unknown")
 
 
 def _cvxpy() -> Finding:
@@ -191,11 +175,11 @@ def _path() -> list[Finding]:
 
 
 def _threads() -> Finding:
-    import torch
+    from certify.provers.execution.threads import cores
 
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     set_to = os.environ.get("OMP_NUM_THREADS")
-    found = f"{usable} cores usable, torch uses {torch.get_num_threads()}"
+    found = f"{usable} cores usable, proofs use {cores()}"
     return Finding("threads", "threads", "ok", found + (f" (OMP_NUM_THREADS={set_to})" if set_to else ""))
 
 

@@ -10,7 +10,6 @@ from fractions import Fraction
 from typing import Any
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 
 from certify.errors import InputError
@@ -122,11 +121,13 @@ class ClosedLoop:
             return A - np.eye(len(A))
         if self.system.sample is None:
             return A
+        from scipy.linalg import expm
+
         n, m, h = self.system.n, self.system.m, self.step
         held = np.zeros((n + m, n + m))
         held[:n] = h * np.hstack([A + B @ K, B])
         # (exp(M) - I)/h without the cancellation: the corner of the exponential of a block matrix
-        mean = scipy.linalg.expm(np.block([[held, np.eye(n + m)], [np.zeros((n + m, 2 * (n + m)))]]))[: n + m, n + m :]
+        mean = expm(np.block([[held, np.eye(n + m)], [np.zeros((n + m, 2 * (n + m)))]]))[: n + m, n + m :]
         rate: Array = (mean @ held / h)[:n] @ np.vstack([np.eye(n), -K])
         return rate
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 
 from certify.errors import InputError
@@ -35,6 +34,8 @@ def solve_lyapunov(A: Array, Q: Array, step: float = 0.0, decay: float = 0.0) ->
     array([[1.25, 0.25],
            [0.25, 0.25]])
     """
+    import scipy.linalg
+
     if not np.array_equal(Q, Q.T) or not np.min(np.linalg.eigvalsh(Q)) > 0:
         raise InputError("`Q` must be symmetric positive definite.")
     if step == 0:

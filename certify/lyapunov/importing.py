@@ -45,8 +45,8 @@ class ImportedLyapunov:
     stored : the same with its plant, and the record of its origin in `training`.
     words : its location in the file, and its widths.
     meaning : the relation of N to the file's own function, for people.
-    difference : its difference from torch's layers with the same numbers, in units of N: this checks the
-    folding. The file has no program to compare with.
+    difference : its difference from numpy with the same numbers, in units of N: this checks the folding. The file has
+        no program to compare with.
     assumed : the source of the functions between the numbers.
     not_read : the reason why each unread tensor of the file is left out, by its name.
     at_origin : N(0).

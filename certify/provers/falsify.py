@@ -116,7 +116,7 @@ def survey(
         for k in range(0, len(level), _TOGETHER):
             each = np.repeat(level[k : k + _TOGETHER], samples)[:, None]
             z = search.climb(np.sqrt(each) * np.resize(direction, (len(each), direction.shape[1])), each, steps)
-            found += (~search.bad(z).reshape(-1, samples).any(1)).tolist()
+            found += [not bad.any() for bad in search.bad(z).reshape(-1, samples)]
         return found
 
     def good(levels: list[float]) -> list[bool]:

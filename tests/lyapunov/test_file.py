@@ -139,7 +139,7 @@ REFUSED: dict[str, tuple[Any, str]] = {
     "integers": (change(network(), "biases", [torch.zeros(3, dtype=torch.int64), torch.zeros(1)]), "float32 or"),
     "nan": (change(network(), "biases", [torch.zeros(3), torch.tensor([float("nan")])]), "finite"),
     "sparse": (change(network(), "weights", [torch.ones(3, 2).to_sparse(), torch.ones(1, 3)]), "dense"),
-    "real exponents": (change(terms(), "exponents", torch.ones(2, 2)), "int64 tensor; found torch.float32"),
+    "real exponents": (change(terms(), "exponents", torch.ones(2, 2)), "int64 tensor; found float32"),
     "listed exponents": (change(terms(), "exponents", [[2, 0], [0, 2]]), "int64 tensor; found list"),
     "negative exponents": (change(terms(), "exponents", torch.tensor([[2, 0], [0, -2]])), "between 0 and 12"),
     "a term twice": (change(terms(), "exponents", torch.tensor([[2, 0], [2, 0]])), "twice"),

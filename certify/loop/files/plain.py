@@ -149,7 +149,7 @@ def _plain(node: Any, file: TorchFile, name: str, depth: int = 0) -> Any:
             return type(node)(_plain(v, file, f"{name}[{k}]", depth + 1) for k, v in enumerate(node))
     if node is None or type(node) in (str, int, float, bool):
         return node
-    raise InputError("it must hold plain tensors only; it holds other objects or is damaged (nothing was executed).")
+    raise InputError("it must hold plain tensors only; it holds other objects (nothing in it was executed).")
 
 
 def _kind(value: Any) -> str:

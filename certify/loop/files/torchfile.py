@@ -173,7 +173,7 @@ def written(data: Any) -> bytes:
     return archive.getvalue()
 
 
-class _Writer(pickle._Pickler):
+class _Writer(pickle._Pickler):  # whose methods the stubs leave out
     """Pickles containers, with an array as the tensor that torch makes of its bytes."""
 
     def __init__(self, file: io.BytesIO) -> None:
@@ -185,19 +185,20 @@ class _Writer(pickle._Pickler):
         return node.reference if isinstance(node, Persistent) else None
 
     def _array(self, array: Numbers) -> None:
-        kind = {"f4": _FLOAT, "f8": _DOUBLE, "i8": _LONG}[array.dtype.str[1:]]
+        kind = _STORAGES[array.dtype.str[1:]]
         reference = Persistent(("storage", kind, str(len(self.arrays)), "cpu", array.size))
         self.arrays.append(np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<")))
         strides = tuple(s // array.itemsize for s in self.arrays[-1].strides)
-        self.save(_REBUILD)
-        self.save((reference, 0, array.shape, strides, False, OrderedDict()))
-        self.write(pickle.REDUCE)
+        save: Any = self.save  # type: ignore[attr-defined]
+        save(_REBUILD)
+        save((reference, 0, array.shape, strides, False, OrderedDict()))
+        self.write(pickle.REDUCE)  # type: ignore[attr-defined]
 
     def _name(self, name: Name) -> None:
-        self.write(pickle.GLOBAL + f"{name.module}\n{name.name}\n".encode())
+        self.write(pickle.GLOBAL + f"{name.module}\n{name.name}\n".encode())  # type: ignore[attr-defined]
 
-    dispatch: ClassVar = {**pickle._Pickler.dispatch, np.ndarray: _array, Name: _name}
+    dispatch: ClassVar[Any] = {**pickle._Pickler.dispatch, np.ndarray: _array, Name: _name}
 
 
 _REBUILD = Name("torch._utils", "_rebuild_tensor_v2")
-_FLOAT, _DOUBLE, _LONG = (Name("torch", f"{kind}Storage") for kind in ("Float", "Double", "Long"))
+_STORAGES = {code: Name("torch", f"{kind}Storage") for kind, code in _TYPES.items()}

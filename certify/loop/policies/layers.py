@@ -101,4 +101,6 @@ def like(array: Array, x: Any) -> Any:
     """Convert the array to the kind of x: for a torch tensor a tensor of its precision, on its device."""
     if isinstance(x, np.ndarray):
         return array
-    return x.new_tensor(array)
+    import torch
+
+    return torch.tensor(array, dtype=x.dtype, device=x.device)

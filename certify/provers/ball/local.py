@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 
 from certify.certificates import LocalBall
@@ -233,10 +232,12 @@ class Rule:
     def _least(self, corners: Sequence[Corner], V: Array, by: Multipliers) -> _Around:
         """Where `edge floor - start > linear' (D - edge V)^-1 linear` and D > edge V, D being what of the decay is
         left, at all corners."""
+        from scipy.linalg import eigh
+
         parts = []
         for c, rest in zip(corners, rests_of(corners, by), strict=True):
             left = (1 - _MARGIN) * c.decay - rest
-            values, vectors = scipy.linalg.eigh((left + left.T) / 2, V)
+            values, vectors = eigh((left + left.T) / 2, V)
             parts.append((values, (vectors.T @ c.linear) ** 2, c.start + _ROUNDING * float(np.trace(c.decay))))
         most, h = min(float(values[0]) for values, _, _ in parts), self.steps.longest
         if not most > 0:

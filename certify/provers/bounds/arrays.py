@@ -20,7 +20,7 @@ Mask = NDArray[np.bool_]
 def product(matrix: Array, values: Array) -> Array:
     """A small matrix (p, q) times (q, ..., B), one column after the other."""
     columns: Array = matrix.T.reshape(*matrix.shape[::-1], *[1] * (values.ndim - 1))
-    total = columns[0] * values[0]
+    total: Array = columns[0] * values[0]
     for column, value in zip(columns[1:], values[1:], strict=True):
         total += column * value
     return total
@@ -37,6 +37,6 @@ def is_whole(index: Index, count: int) -> bool:
     return len(index) == count and (not count or bool(index[0] == 0 and index[-1] == count - 1))
 
 
-def joined(parts: Any) -> Array:
+def joined(parts: Any) -> Any:
     """Batches (..., B) one after the other, as one array."""
     return np.concatenate(parts, -1)

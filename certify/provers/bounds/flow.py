@@ -91,8 +91,8 @@ class Flow:
             around = {s: _widened(v.at(left), kappa[i].take(left)) for i, (s, v) in enumerate(states.items())}
             values = {**around, **{symbol: model.at(left) for symbol, model in held.items()}}
             size[:, left] = _sizes(self._rate(values, Models(next(iter(around.values())))))
-            fits = (self.most * size.take(left, -1) * (1 + EPS) < kappa.take(left, -1)).all(0)
-            left = left[chosen(~fits)]
+            wrong = ~(self.most * size.take(left, -1) * (1 + EPS) < kappa.take(left, -1))
+            left = left[chosen(np.asarray(wrong.any(0)))]
             if not len(left):
                 break
         exists = np.ones(size.shape[1], dtype=np.bool_)

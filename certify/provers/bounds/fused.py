@@ -131,4 +131,5 @@ class FusedLayers:
             H, K = each.layer.W.shape
             loops.backwards(weight[:H], each.error, each.slope, self._result)
             np.matmul(each.layer.W.T, weight[:H].reshape(H, -1), out=on[:K].reshape(K, -1))
-        return self._result + (np.abs(on[: len(x_error)]) * x_error[:, None]).sum(0)
+        result: Array = self._result + (np.abs(on[: len(x_error)]) * x_error[:, None]).sum(0)
+        return result

@@ -37,7 +37,7 @@ class _Units:
 
     @property
     def c(self) -> Array:
-        return self.rows[0]
+        return np.asarray(self.rows[0])
 
     @property
     def g(self) -> Array:
@@ -97,7 +97,7 @@ class NeuralModels:
             return np.full_like(self.value.g, 1 / len(self.value.g))
         layer = first[0]
         share = ((layer.rest + more) * self.weights.reach / (layer.G + TINY) * np.abs(layer.a.g)).sum(1)
-        return share / (share.sum(0) + TINY)
+        return np.asarray(share / (share.sum(0) + TINY))
 
     def along(self, F: Sequence[Taylor], index: Index) -> tuple[Taylor, Array]:
         """N'F on the boxes `index`, F being what it is there, and `share` (n, B): how much each axis spreads the units
@@ -139,7 +139,7 @@ class NeuralEnclosure:
             mid, slopes, wide, _ = self.lines(x.take(index, -1), error.take(index, -1))
             spread = np.abs(slopes[0]).sum(0) + wide[0]
             found[index] = mid[0] - spread - 1e-11 * (np.abs(mid[0]) + spread)
-        return np.nan_to_num(found, nan=-np.inf, posinf=-np.inf, neginf=-np.inf)
+        return np.asarray(np.nan_to_num(found, nan=-np.inf, posinf=-np.inf, neginf=-np.inf))
 
     def __call__(self, x: Array, error: Array) -> NeuralModels:
         """N for states `x[:, 0] + x[:, 1:] d`, (n, n + 1, B), within the error (n, B)."""
@@ -163,7 +163,7 @@ def _sizes(rows: Array) -> Array:
     """The sum of the rows' magnitudes, a row at a time, which stays in a core's cache."""
     if not len(rows):
         return np.zeros(rows.shape[1:])
-    total = np.abs(rows[0])
+    total: Array = np.abs(rows[0])
     size = np.empty_like(total)
     for row in rows[1:]:
         total += np.abs(row, out=size)

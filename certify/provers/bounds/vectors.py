@@ -8,10 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from certify.provers.bounds.kernels import (
-    EPS,
     LOST,
-    MULTIPLY,
-    TINY,
     Block,
     Line,
     Plane,
@@ -23,6 +20,8 @@ from certify.provers.bounds.kernels import (
     relaxed,
     smaller,
 )
+from certify.provers.bounds.tape import MULTIPLY
+from certify.provers.bounds.taylor import EPS, TINY
 
 
 def ranges(
@@ -47,9 +46,11 @@ def ranges(
     each = (width + 2) * EPS * np.sqrt(forms) * (np.sqrt(size) + LOST)
     np.abs(y[:, 1:]).sum(1, out=spread)
     y[:, 0] += bias[:, None]
-    columns, passed = (v[:, None] for v in (bias, bias_error, row)), (through[:, 0], through[:, 1])
-    found = enclosed(y[:, 0], *columns, passed, ball, each, spread, (grown, wider))
-    ends[0], ends[1], error[:], rounding[:] = found
+    b, b_error, r = (v[:, None] for v in (bias, bias_error, row))
+    passed = through[:, 0], through[:, 1]
+    ends[0], ends[1], error[:], rounding[:] = enclosed(
+        y[:, 0], b, b_error, r, passed, ball, each, spread, (grown, wider)
+    )
     ball[:] = (norm * (ball + np.sqrt(fresh) + LOST) + np.sqrt((rounding * rounding).sum(0)) + LOST) * grown
 
 

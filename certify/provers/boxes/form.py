@@ -25,12 +25,12 @@ class FormBound:
         """Bounds of V from below and above on boxes (n, B)."""
         far = np.maximum(np.abs(lo), np.abs(hi))
         near = np.where((lo <= 0) & (hi >= 0), 0.0, np.minimum(np.abs(lo), np.abs(hi)))
-        cross = (far * (product(self.cross, far))).sum(0)
+        cross = (far * product(self.cross, far)).sum(0)
         return (self.diagonal * near**2).sum(0) - cross, (self.diagonal * far**2).sum(0) + cross
 
     def at(self, z: Array) -> Array:
         """V at points (n, B)."""
-        return (z * (product(self.S, z))).sum(0)
+        return np.asarray((z * product(self.S, z)).sum(0))
 
     def model(self, centre: Array, radius: Array, like: Taylor) -> Taylor:
         """V as a model in the box coordinates, among as many symbols as another model has."""
@@ -40,7 +40,7 @@ class FormBound:
         g[:n] = 2 * self.diagonal * centre * radius
         np.einsum("iib->ib", Q)[:n] = self.diagonal * radius * radius
         size = (self.diagonal * far * far).sum(0)
-        rest = (far * (product(self.cross, far))).sum(0) + n * EPS * size + TINY
+        rest = (far * product(self.cross, far)).sum(0) + n * EPS * size + TINY
         return Taylor((self.diagonal * centre * centre).sum(0), g, Q, rest)
 
     def gap(self, centre: Array, radius: Array, like: Taylor, level: float, sign: float) -> Taylor:

@@ -79,9 +79,8 @@ class Frontier:
 
     def waiting(self) -> tuple[NDArray[np.int64], Array]:
         """Numbers (B,) and keys (B,) of all boxes."""
-        numbers = [self.number, *(number for _, number in self._away)]
-        keys = [self.key, *(lowest for lowest, _ in self._away)]
-        return np.concatenate(numbers).astype(np.int64), np.concatenate(keys)
+        numbers = joined([self.number, *(number for _, number in self._away)])
+        return numbers.astype(np.int64), joined([self.key, *(lowest for lowest, _ in self._away)])
 
     def drop_above(self, level: float) -> None:
         """Forget boxes with keys above `level`."""

@@ -43,7 +43,8 @@ def split(partition: Partition, lo: Array, hi: Array, number: Index, found: Unde
     """
     undecided = ~found.proved
     origin = np.flatnonzero(undecided)
-    lo, hi, number, bound, score = (a.take(origin, -1) for a in (lo, hi, number, found.bound, found.score))
+    lo, hi, bound, score = (a.take(origin, -1) for a in (lo, hi, found.bound, found.score))
+    number = number[origin]
     # An axis that is already much thinner than the others, or too thin to halve, is not split.
     width = hi - lo
     relative = width / least_width
@@ -53,9 +54,8 @@ def split(partition: Partition, lo: Array, hi: Array, number: Index, found: Unde
     small = undecided.copy()
     small[undecided] = stuck
     if stuck.any():
-        lo, hi, number, origin, bound, score, best = (
-            a.compress(~stuck, -1) for a in (lo, hi, number, origin, bound, score, best)
-        )
+        lo, hi, bound, score, best = (a.compress(~stuck, -1) for a in (lo, hi, bound, score, best))
+        number, origin = number[~stuck], origin[~stuck]
     order = np.argsort(-score, axis=0, kind="stable")
     lo, hi, number = halve(partition, lo, hi, number, order[0])
     origin = origin.repeat(2)

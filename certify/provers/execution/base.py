@@ -9,7 +9,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-Bound = Callable[[NDArray[np.float64], NDArray[np.float64], float, float], Any]
+Array = NDArray[np.float64]
+Bound = Callable[[Array, Array, float, float], Any]
 Work = Callable[[bytes], bytes]
 
 

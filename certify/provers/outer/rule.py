@@ -104,7 +104,7 @@ class FallBound:
         if opened:
             models, lefts, parts = zip(*opened, strict=True)
             left = np.concatenate(parts)
-            here = self._falls(models, lefts, *(v.take(left, -1) for v in (x, error, centre, radius)), outer)
+            here = self._falls(models, lefts, [v.take(left, -1) for v in (x, error, centre, radius)], outer)
             found.proved[left], found.bound[left], found.score[:, left], found.violated[left] = here
         return found
 
@@ -127,14 +127,12 @@ class FallBound:
         self,
         known: Sequence[NeuralModels | SymbolicModels],
         lefts: Sequence[Index],
-        x: Array,
-        error: Array,
-        centre: Array,
-        radius: Array,
+        boxes: Sequence[Array],
         level: float,
     ) -> tuple[Mask, Array, Array, Array]:
         """`proved`, `bound`, `score` and `violated` of the boxes on which N may be at most the level: those at the
-        indices `lefts` of pieces, whose models are known."""
+        indices `lefts` of pieces, whose models are known; of the boxes are given x, its error, centres and radii."""
+        x, error, centre, radius = boxes
         n = len(x)
         mid, slopes, wide, share = self.policy(x, error)
         models = loop_models(self.system, x, error, mid, slopes, wide)
@@ -205,7 +203,7 @@ class FaceBound:
         cut = _pieces(lo.shape[1], self.piece)
         both = zip(np.array_split(lo, cut, 1), np.array_split(hi, cut, 1), strict=True)
         parts = [self._judge(low, high, outer) for low, high in both]
-        return OuterBounds(*(joined(column) for column in zip(*parts, strict=True)))
+        return OuterBounds(*map(joined, zip(*parts, strict=True)))
 
     def _judge(self, lo: Array, hi: Array, level: float) -> OuterBounds:
         centre = 0.5 * lo + 0.5 * hi

@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 
 from certify.certificates import Slab
@@ -148,7 +147,9 @@ def _multipliers(models: Models, J: Array, P: Array, weight: Array) -> Multiplie
 
 def first_duration(P: Array, rate: Array) -> float:
     """After which the ends differ from the ellipsoid halfway by what a ball allows."""
-    fastest = float(np.max(np.abs(scipy.linalg.eigh(rate, P, eigvals_only=True))))
+    from scipy.linalg import eigh
+
+    fastest = float(np.max(np.abs(eigh(rate, P, eigvals_only=True))))
     return min(_LONGEST, 2 * _FILLED * (1 - WIDER**-2) / fastest) if fastest > 0 else _LONGEST
 
 

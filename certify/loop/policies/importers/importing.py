@@ -54,8 +54,8 @@ class Imported:
     policy : the policy, with the record of its origin in `training`.
     words : the kind of file and of policy.
     formula : the file's policy as a formula, for people.
-    difference : its difference from the file's own program, or, if the file has no program, from
-    torch's layers with the same numbers, which checks only the folding.
+    difference : its difference from the file's own program, or, if the file has no program, from numpy with the same
+        numbers, which checks only the folding.
     compared_with : the file's own program that it was compared with, for people; None without a comparison.
     assumed : without a comparison, the source of the functions between the numbers.
     not_read : the reason why each unread tensor of the file is left out, by its name.

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import copy
 import io
+import sys
 import warnings
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
@@ -18,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from certify.errors import InputError
+from certify.loop.files.torchfile import written
 from certify.loop.policies.importers.importing import Imported, import_bytes
 from certify.loop.policies.importers.options import ImportOptions
 from certify.loop.policies.importers.reading import Evaluate, Observations, Values
@@ -77,12 +79,9 @@ def import_state_dict(tensors: Mapping[str, Any], plant: System, options: Import
     ------
     InputError : a value is neither, the layers are not those of one policy, or a fact is missing from the options.
     """
-    import torch
-
-    buffer = io.BytesIO()
-    torch.save(_plain(tensors, "the state_dict"), buffer)
+    raw = written(_plain(tensors, "the state_dict"))
     try:
-        return import_bytes(buffer.getvalue(), "state_dict", plant, options if options is not None else ImportOptions())
+        return import_bytes(raw, "state_dict", plant, options if options is not None else ImportOptions())
     except InputError as error:
         raise InputError(f"the state_dict: {error}") from error
 
@@ -120,22 +119,23 @@ def _evaluation(module: torch.nn.Module) -> Evaluate:
 
 
 def _plain(node: Any, what: str) -> Any:
-    """Dictionaries of dense tensors on the CPU, and nothing else."""
-    import torch
-
+    """Dictionaries of arrays, and nothing else."""
     if isinstance(node, Mapping):
         for key in node:
             if not isinstance(key, str):
                 raise InputError(f"the keys of {what} must be text; found {key!r:.60}, a {type(key).__name__}.")
         return {key: _plain(value, f"{what}[{key!r}]") for key, value in node.items()}
-    numbers = isinstance(node, np.ndarray) and node.dtype.kind == "f"
-    if not numbers and not isinstance(node, torch.Tensor):
+    if isinstance(node, np.ndarray) and node.dtype in (np.float16, np.float32, np.float64):
+        return node
+    torch = sys.modules.get("torch")  # whoever has a tensor has loaded it
+    if torch is None or not isinstance(node, torch.Tensor):
         raise InputError(
             f"{what} must be a tensor, an array of floats or a mapping of these; it is a {type(node).__name__}."
         )
     try:
-        return torch.tensor(node) if numbers else node.detach().cpu().clone()
-    except (TypeError, ValueError, RuntimeError) as error:  # a precision that torch has not, a tensor without numbers
+        still = node.detach().cpu()
+        return (still.float() if still.dtype in (torch.float16, torch.bfloat16) else still).numpy()
+    except (TypeError, ValueError, RuntimeError) as error:  # a precision that numpy has not, a tensor without numbers
         raise InputError(f"{what} cannot be read as a tensor: {_brief(error)}") from error
 
 

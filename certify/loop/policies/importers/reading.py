@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from fractions import Fraction
@@ -76,30 +75,19 @@ class Reading:
 
 
 def perceptron(layers: Sequence[Affine], squash: Output = "identity") -> Evaluate:
-    """The layers with tanh between them, and `squash` behind them, as torch's own modules."""
-    import torch
-
-    modules: list[torch.nn.Module] = []
-    for layer in layers:
-        rows, columns = layer.weight.shape
-        module = torch.nn.Linear(columns, rows, dtype=torch.float64)
-        with torch.no_grad():
-            module.weight.copy_(torch.tensor(layer.weight))
-            module.bias.copy_(torch.tensor(layer.bias))
-        modules += [module, torch.nn.Tanh()]
-    ends: dict[Output, list[torch.nn.Module]] = {
-        "identity": [],
-        "tanh": [torch.nn.Tanh()],
-        "relu-tanh": [torch.nn.Tanh(), torch.nn.ReLU()],
+    """The layers with tanh between them, and `squash` behind them, in numpy."""
+    ends: dict[Output, Callable[[Values], Values]] = {
+        "identity": lambda y: y,
+        "tanh": np.tanh,
+        "relu-tanh": lambda y: np.maximum(np.tanh(y), 0),
     }
-    whole = torch.nn.Sequential(*modules[:-1], *ends[squash])
-    versions = {True: whole, False: copy.deepcopy(whole).to(torch.float32)}
 
     def evaluate(x: Observations, double: bool) -> Values:
-        with torch.no_grad():
-            dtype = torch.float64 if double else torch.float32
-            values: Values = versions[double](torch.tensor(x, dtype=dtype)).numpy()
-        return values
+        kind = np.float64 if double else np.float32
+        h = x.astype(kind)
+        for k, layer in enumerate(layers):
+            h = (np.tanh(h) if k else h) @ layer.weight.T.astype(kind) + layer.bias.astype(kind)
+        return ends[squash](h)
 
     return evaluate
 

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
+
+import numpy as np
 
 from certify.errors import InputError
 from certify.loop.files.arrays import Numbers, array_of, is_array
 from certify.loop.files.pickles import Call
 from certify.loop.files.torchfile import TorchFile, is_tensor
+
+_SAFE = {
+    "F64": "f8", "F32": "f4", "F16": "f2", "BOOL": "b1", "U8": "u1", "U16": "u2", "U32": "u4", "U64": "u8",
+    "I8": "i1", "I16": "i2", "I32": "i4", "I64": "i8",
+}  # fmt: skip
 
 
 def load_tensors(raw: bytes, what: str, file: TorchFile | None = None) -> dict[str, Numbers]:
@@ -51,18 +58,25 @@ def load_safetensors(raw: bytes, what: str) -> dict[str, Numbers]:
     ------
     InputError : the package is missing, or the file is damaged.
     """
-    import torch
-
     try:
         import safetensors
-        from safetensors.torch import load
     except ImportError as error:
         raise InputError(
             "a file of safetensors needs the package that reads it; install it with pip install 'certify[safetensors]'."
         ) from error
     try:
-        tensors = load(raw)
+        held = safetensors.deserialize(raw)  # type: ignore[no-untyped-call]
     except (safetensors.SafetensorError, ValueError, KeyError, RuntimeError) as error:
         raise InputError(f"{what} is no file of safetensors or is damaged: {error}.") from error
-    narrow = (torch.float16, torch.bfloat16)
-    return {name: (t.to(torch.float32) if t.dtype in narrow else t).numpy() for name, t in tensors.items()}
+    return {name: _array(tensor, f"{name} of {what}") for name, tensor in held}
+
+
+def _array(tensor: Mapping[str, Any], what: str) -> Numbers:
+    """A tensor of a file of safetensors, whose bytes are little-endian."""
+    kind, raw, shape = tensor["dtype"], tensor["data"], tensor["shape"]
+    if kind == "BF16":
+        return (np.frombuffer(raw, "<u2").astype(np.uint32) << 16).view(np.float32).reshape(shape)
+    if kind not in _SAFE:
+        raise InputError(f"tensor {what} must hold plain real numbers; they are {kind}.")
+    array = np.frombuffer(raw, f"<{_SAFE[kind]}").reshape(shape)
+    return array.astype(np.float32 if kind == "F16" else array.dtype.newbyteorder("="))

@@ -72,9 +72,9 @@ def read_torchscript(file: TorchFile) -> Reading:
     operations = value.operations
     own = any(a.dtype == np.float64 and a.ndim for _, given in operations for a in given if _is_array(a))
 
-    def evaluate(x: Observations, double: bool) -> Values:
-        import torch
+    torch = _torch(file.what)
 
+    def evaluate(x: Observations, double: bool) -> Values:
         with torch.no_grad():
             y = torch.tensor(x, dtype=torch.float64 if double else torch.float32)
             for name, given in operations:
@@ -85,6 +85,18 @@ def read_torchscript(file: TorchFile) -> Reading:
     words = f"TorchScript of {', '.join(name for name, _ in operations)[:200]}"
     ran = "the operations of the file's code, one by one in torch (the code is read as text, and not run)"
     return Reading(words=words, steps=value.chain, evaluate=evaluate, double=own, program=ran)
+
+
+def _torch(what: str) -> Any:
+    """The module that the file's operations are those of."""
+    try:
+        import torch
+    except ImportError as error:
+        raise InputError(
+            f"{what} is compared with torch itself, which is not installed; install it with pip install "
+            "'certify[torch]', or give the module's state_dict."
+        ) from error
+    return torch
 
 
 def _classes(file: TorchFile) -> dict[Name, ast.ClassDef]:

@@ -1,0 +1,24 @@
+"""How many threads torch works on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import torch
+
+from certify.loop.policies import TanhNetwork
+
+_SMALL_NETWORK = 10_000  # weights
+
+
+@contextmanager
+def threads_for(network: TanhNetwork) -> Iterator[None]:
+    """One thread for a small network: its operations are shorter than the threads' handshakes."""
+    threads = torch.get_num_threads()
+    if sum(W.size for W in network.weights) < _SMALL_NETWORK:
+        torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
