@@ -30,19 +30,23 @@ import numpy as np
 import torch
 
 from certify import certify_roa
+from certify.certificates import write_atomically
 from certify.certificates.verdict import Verdict
 from certify.errors import InputError
 from certify.loop.plants import System, get_system
 from certify.loop.policies import Policy, save_policy
 from certify.report.words import below
-from controllers.evaluate import discrete_linearisation
-from controllers.files import make_folder, write_atomically
-from controllers.lqr import riccati_gain
+from controllers.comparison.methods import OURS
+from controllers.comparison.options import CompareOptions
+from controllers.comparison.table import Response, table
+from controllers.identification.linearisation import discrete_linearisation
+from controllers.identification.riccati import riccati_gain
 from controllers.options import TrainingOptions, default_record, get_plant
-from controllers.paper import DEPARTURES
-from controllers.responses import OURS, CompareOptions, Response, table
-from controllers.simulation import initial_states, mean_action, simulate
-from controllers.training import Trainer, parameters_of
+from controllers.plants.paper_preset import DEPARTURES
+from controllers.simulation.trajectories import initial_states, mean_action, simulate
+from controllers.storage import make_folder
+from controllers.training.record import parameters_of
+from controllers.training.trainer import Trainer
 
 EVERY = 5_000  # steps between checkpoints
 JUDGED = CompareOptions(states=100, start_seed=1)

@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from certify.loop.plants import System
 from certify.report.timing import Timing
+from controllers.comparison.methods import Method, Run
+from controllers.comparison.table import Response
 from controllers.figures.states import MOST, draw_state, reach_of, short
 from controllers.figures.style import MUTED, WIDTH, count, drawn
 from controllers.options import get_plant
-from controllers.responses import Method, Response, Run
 
 Array = NDArray[np.float64]
 

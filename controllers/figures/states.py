@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from certify.loop.plants import System
 from certify.report.timing import Timing
+from controllers.comparison.methods import NAMES, Method
+from controllers.comparison.table import Response
 from controllers.figures.style import COLOURS, MUTED, count, drawn
 from controllers.options import get_plant
-from controllers.responses import NAMES, Method, Response
 
 Array = NDArray[np.float64]
 
