@@ -5,9 +5,10 @@ Run with `python benchmarks/departures.py [PLANT ...] [--seeds 2] [--only NAME .
 what is in the file of rows is not made again, a run that was cut off goes on from its checkpoint in the folder of runs,
 and the table is printed of all rows that were asked for.
 `ours` is the plant's preset, `paper` its preset of that name, every other row the preset with the departure of that
-name in `controllers.paper` undone; those that a plant does not depart in are left out. A policy is simulated with its
-action held, from 100 states of the plant's box for 20 s: the floor is the median of the largest ||x|| in the last
-second, settled is below 1e-6 there. Then `certify roa` gets its time, and what is proved is what the checker accepted.
+name in `controllers.plants.paper_preset` undone; those that a plant does not depart in are left out. A policy is
+simulated with its action held, from 100 states of the plant's box for 20 s: the floor is the median of the largest
+||x|| in the last second, settled is below 1e-6 there. Then `certify roa` gets its time, and what is proved is what the
+checker accepted.
 A run without a gain ends with the policy that it has, and says so: a row that failed stays in the table. With
 `--no-training` so does one that was not made, and says that.
 """

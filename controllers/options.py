@@ -49,7 +49,7 @@ class TrainingOptions:
     threads: Annotated[int, "Threads of torch; networks this small are fastest with one."] = 1
     # The task
     dt: Annotated[
-        float, "Seconds for which an action is held, integrated by one RK4 step; 1 for a plant in discrete time."
+        float, "Seconds for which an input is held, integrated by one RK4 step; 1 for a plant in discrete time."
     ]
     horizon: Annotated[int, "Steps after which an episode is truncated."]
     start: Annotated[float, "Episodes start uniformly in this share of the domain."] = 1.0

@@ -68,6 +68,7 @@ def compare(
         from certify.loop.plants import get_system
         from certify.provers.execution.tasks import place_for
         from controllers.comparison.comparison import compare as run
+        from controllers.comparison.comparison import wanted_runs
         from controllers.comparison.methods import ABLATIONS, BASELINES, remaining
         from controllers.comparison.options import CompareOptions
         from controllers.figures.comparison import write_comparison
@@ -87,6 +88,7 @@ def compare(
             patience=patience,
         )
         place = None if jobs is None and cluster is None else place_for(jobs, cluster)
+        wanted_runs(system, training, options)  # refuses bad options before a folder is made
         make_folder(out)
         with _progress() as (say, watch):
             found = run(system, training, runs, options, say, watch, place)
@@ -97,7 +99,7 @@ def compare(
 
 
 def _span(duration: float | None, system: System) -> dict[str, Any]:
-    """The options of a comparison that a duration in the plant's unit of time is."""
+    """The options for a duration in the plant's unit of time."""
     if duration is None:
         return {}
     return {"duration": duration} if system.time == "continuous" else {"duration_steps": int(duration)}

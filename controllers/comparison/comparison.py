@@ -69,6 +69,23 @@ class Comparison:
         }
 
 
+def wanted_runs(system: System, training: TrainingOptions, options: CompareOptions) -> list[WantedRun]:
+    """The runs that a comparison needs.
+
+    Raises
+    ------
+    InputError : the options do not fit the plant or each other, or stable-baselines3 is needed and missing.
+    """
+    training.check(system)
+    if any(method.run in ("sb3-sac", "sb3-ppo") for method in options.methods):
+        require_stable_baselines()
+    return [
+        WantedRun(run, replace(training, seed=seed), plan_of(run, training, options))
+        for run in dict.fromkeys(method.run for method in options.methods)
+        for seed in range(options.seeds)
+    ]
+
+
 def compare(
     system: System,
     training: TrainingOptions,
@@ -96,14 +113,7 @@ def compare(
     """
     options = options or CompareOptions()
     x0 = initial_states(system, options.states, options.start_seed)
-    training.check(system)
-    if any(method.run in ("sb3-sac", "sb3-ppo") for method in options.methods):
-        require_stable_baselines()
-    wanted = [
-        WantedRun(run, replace(training, seed=seed), plan_of(run, training, options))
-        for run in dict.fromkeys(method.run for method in options.methods)
-        for seed in range(options.seeds)
-    ]
+    wanted = wanted_runs(system, training, options)
     if place is not None:
         train_at(place, wanted, system, runs, say, watch)
     finished, responses = list[FinishedRun](), list[Response]()

@@ -15,7 +15,7 @@ from controllers.storage import read
 
 @dataclass(frozen=True, slots=True)
 class Measurement:
-    """The figures of one evaluation, under held mean actions from `states` initial states.
+    """The figures of one evaluation, under the mean action, held, from `states` initial states.
 
     `floor` is the median of the largest ||x|| in the last second, `cost` that of the accumulated cost, and
     `left_domain` counts trajectories.

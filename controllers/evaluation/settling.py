@@ -90,7 +90,7 @@ def settle(
     options: EvaluationOptions = MONITORING,
     plant: Plant | None = None,
 ) -> Settling:
-    """Simulate `network` with its action held over dt, or in discrete time a step, from the plant's initial states.
+    """Simulate `network` with its input held over dt, or in discrete time a step, from the plant's initial states.
 
     Parameters
     ----------

@@ -140,8 +140,8 @@ def theory(
             *_discount(plant_held, J, Q, dt, gamma),
             *_estimated(loop, Q, dt, initial_states(system, states, seed, plant), duration),
             _distance(J, K),
-            _deviation("epsilon_K", plant_now, K, "continuous action", held=False),
-            _deviation("epsilon_K_held", plant_held, K, f"action held over {dt:g} s", held=True),
+            _deviation("epsilon_K", plant_now, K, "continuous input", held=False),
+            _deviation("epsilon_K_held", plant_held, K, f"input held over {dt:g} s", held=True),
         ]
         if proved is not None:
             require_same_loop(proved, policy.network, system)
@@ -155,7 +155,7 @@ def _discount(
     plant: tuple[flint.arb_mat, flint.arb_mat], J: flint.arb_mat, Q: Array, dt: float, gamma: float
 ) -> list[Constant]:
     """a_V and gamma* of the linear part, for every discount and for the one that was used."""
-    by = f"linear part, action held over {dt:g} s"
+    by = f"linear part, input held over {dt:g} s"
     F = plant[0] + plant[1] * J
     found: list[Constant] = []
     for suffix, discount, sum_of in (
@@ -283,9 +283,9 @@ def _allowed_by_certificate(
     Any tau > 0 may show it, by the form x'(F'P + P F + tau epsilon^2) x + 2 x'P G w - tau |w|^2.
     """
     name = "epsilon_P"
-    by = "change of J_mu(0) up to which the certificate's V falls at the origin, continuous action"
+    by = "change of J_mu(0) up to which the certificate's V falls at the origin, continuous input"
     if proved.system.sample is not None:
-        return Constant(name, None, ">=", "proved", f"{by}: the certificate is about a held action")
+        return Constant(name, None, ">=", "proved", f"{by}: the certificate is about a held input")
     A, B = plant
     F = A + B * J
     raw = _exactly(proved.ellipsoids[0].P)

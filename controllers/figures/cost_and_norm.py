@@ -56,7 +56,7 @@ def draw_over_time(
         title = "accumulated cost" if what == "cost" else "distance from the equilibrium"
         told = f"{system.name}, {seeds_of(seeds)}: {title}\nmedian and quartiles of "
         discrete = system.time == "discrete"
-        held = "step by step" if discrete else f"actions held {dt:g} s"
+        held = "step by step" if discrete else f"inputs held {dt:g} s"
         told += f"{count(len(seeds), 'seed')} × {count(responses[0].x.shape[1], 'initial state')}, {held}"
         if what == "norm":
             told += f"\ndotted: floor, the median of the largest in the last {'steps' if discrete else 'second'}"

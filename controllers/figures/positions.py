@@ -60,7 +60,7 @@ def draw_positions(system: System, dt: float, responses: Sequence[Response]) -> 
         panels[0, 0].set_xlim(0, time[-1])
         number = next(iter(chosen.values())).shape[1]
         figure.suptitle(
-            f"{system.name}, seed {seed}: positions, {count(number, 'trajectory', 'trajectories')}, held actions",
+            f"{system.name}, seed {seed}: positions, {count(number, 'trajectory', 'trajectories')}, held inputs",
             x=0.01,
             ha="left",
         )

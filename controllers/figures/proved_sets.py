@@ -1,4 +1,4 @@
-"""The certified set growing over training: what the checker accepted of each policy, and gaps where it had nothing."""
+"""The proved set growing over training, as the checker accepted it of each policy, and gaps where it had nothing."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _LEAST = 20  # times the smallest volume that the largest is, from where on the 
 
 
 def draw_growth(system: System, seed: int, proofs: Sequence[Proof], options: ProvingOptions) -> bytes:
-    """Volume of the certified set against steps; in two states also the sets, their outlines coloured by step, as PNG.
+    """Volume of the proved set against steps; in two states also the sets, their outlines coloured by step, as PNG.
 
     A policy of which nothing was proved is a gap, marked below with a sign that says why: refuted or unknown.
     """
@@ -37,7 +37,7 @@ def draw_growth(system: System, seed: int, proofs: Sequence[Proof], options: Pro
         accepted = sum(proof.P is not None for proof in proofs)
         claims = sorted({proof.claim for proof in proofs if proof.claim}) or ["none"]
         figure.suptitle(
-            f"{system.name}, seed {seed}: the certified set over training (claim: {', '.join(claims)})\n"
+            f"{system.name}, seed {seed}: the proved set over training (claim: {', '.join(claims)})\n"
             f"accepted by the checker for {accepted} of {len(proofs)} policies, at most {options.time_limit:g} s each",
             x=0.01,
             ha="left",

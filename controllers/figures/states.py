@@ -42,7 +42,7 @@ def draw_states(system: System, dt: float, responses: Sequence[Response]) -> byt
             panel.set_xlabel(Timing.of(system).axis)
             panel.set_xlim(0, time[-1])
         number = next(iter(chosen.values())).shape[1]
-        figure.suptitle(f"{system.name}, seed {seed}: {count(number, 'trajectory', 'trajectories')}, held actions")
+        figure.suptitle(f"{system.name}, seed {seed}: {count(number, 'trajectory', 'trajectories')}, held inputs")
         return figure
 
     return drawn(build)

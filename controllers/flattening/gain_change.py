@@ -1,7 +1,7 @@
 """A change of the gain at the origin, for a policy whose gain is the trouble.
 
 A policy that was trained elsewhere may ask for its largest input at a hundredth of its box, and chatter there as soon
-as its action is held. No bound on its hidden units helps a proof then: between that hundredth and the box the loop
+as its input is held. No bound on its hidden units helps a proof then: between that hundredth and the box the loop
 lives in the last tanh's bend, and its rates are hundreds of times apart. The gain has to change; layers, limits and
 form need not.
 """

@@ -16,7 +16,7 @@ class Figures:
     """The figures of one policy: `departure` is what the hidden units may add, `bend` what they add on the box.
 
     `bend` is the root mean square of net(x) - net(0) - J x over states of the box, relative to that of J x; settled,
-    states and cost are those of runs with the action held, and cost is infinite where half of the runs diverge.
+    states and cost are those of runs with inputs held, and cost is infinite where half of the runs diverge.
     """
 
     departure: float

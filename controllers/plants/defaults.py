@@ -67,7 +67,7 @@ def default_plant(system: System) -> Plant:
 
 
 def time_step(system: System, w: Array, U: Array) -> float:
-    """Time for which an action is held: 1 in discrete time, where it is a step; else seconds.
+    """Time for which an input is held: 1 in discrete time, where it is a step; else seconds.
 
     It is `RESOLUTION` over the fastest rate of the LQR loop with the weights 1/w^2 and 1/U^2, rounded down to 1, 2 or 5
     times ten^k; and where the plant says over which times its inputs are held, the nearest of these.

@@ -67,7 +67,7 @@ class Loop:
 
 
 def held_loop(system: System, dt: float, act: Action, Q: Array, R: Array) -> Loop:
-    """The loop in which an action is held for dt seconds, or in discrete time for one step, dt = 1.
+    """The loop in which an input is held for dt seconds, or in discrete time for one step, dt = 1.
 
     Q (n,) and R (m,) are the diagonals of the cost's weights.
     """

@@ -221,7 +221,8 @@ def test_another_time_step_than_the_maps_own_is_refused(tmp_path, where):
     more = ["--dt", "0.05"] if where == "option" else []
     result = runner.invoke(app, ["train", str(path), "--out", str(tmp_path / "p.pt"), *more])
     assert result.exit_code == 2
-    assert "`dt` must be 1 for henon" in result.stderr and "Leave `dt` out" in result.stderr
+    said = "--dt" if where == "option" else "`dt`"
+    assert f"{said} must be 1 for henon" in result.stderr and f"Leave {said} out" in result.stderr
     path.write_text(text + "dt = 1\n")
     assert chosen_plant(str(path))[1] == chosen_plant(str(HENON))[1]
     with pytest.raises(InputError, match="`dt` must be 1"):

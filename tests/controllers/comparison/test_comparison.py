@@ -316,15 +316,15 @@ def test_the_command_prints_the_table_or_one_json_object(finished, tmp_path, mon
     ("arguments", "message"),
     [
         (["spaceship"], "spaceship"),
-        (["pendulum", "--seeds", "0"], "`seeds` must be positive"),
-        (["pendulum", "--duration", "0.5"], "`window` at most `duration`"),
-        (["pendulum", "--duration", "nan"], "`duration`"),
-        (["pendulum", "--without", "ours"], "`without` must be one of sac, sb3-ppo, sb3-sac"),
-        (["pendulum", "--jobs", "0"], "`jobs` must be at least 1"),
+        (["pendulum", "--seeds", "0"], "--seeds must be positive"),
+        (["pendulum", "--duration", "0.5"], "`window` at most --duration"),
+        (["pendulum", "--duration", "nan"], "--duration"),
+        (["pendulum", "--without", "ours"], "--without must be one of sac, sb3-ppo, sb3-sac"),
+        (["pendulum", "--jobs", "0"], "--jobs must be at least 1"),
         (["pendulum", "--jobs", "2", "--cluster", "local:2"], "--jobs must stand without --cluster"),
-        (["pendulum", "--budget", "0"], "`budget` must be at least 1"),
-        (["pendulum", "--steps", "20", "--budget", "50"], "`--steps` is for runs of one length"),
-        (["pendulum", "--ablations", "--without", "sb3-sac"], "`without` must be one of before, sac, uncentred"),
+        (["pendulum", "--budget", "0"], "--budget must be at least 1"),
+        (["pendulum", "--steps", "20", "--budget", "50"], "--steps is for runs of one length"),
+        (["pendulum", "--ablations", "--without", "sb3-sac"], "--without must be one of before, sac, uncentred"),
     ],
 )
 def test_bad_input_is_one_sentence(tmp_path, arguments, message):

@@ -285,7 +285,7 @@ def test_a_checkpoint_of_another_run_or_none_is_refused(pendulum_system):
     [
         (["td3", "pendulum"], "must be one of ppo, sac; found 'td3'"),
         (["ppo", "spaceship"], "spaceship"),
-        (["ppo", "pendulum", "--steps", "0"], "`steps` must be positive"),
+        (["ppo", "pendulum", "--steps", "0"], "--steps must be positive"),
         (["ppo", "pendulum", "--steps", "1"], "at least 2"),
     ],
 )

@@ -168,7 +168,7 @@ def test_a_set_of_another_loop_is_refused():
         _constants(policy, own, _proved_set(policy, replace(own[0], time="discrete"), [[7.0]]))
     held = own[0].with_sample((0, Fraction(1, 10)))
     said = _constants(policy, (held, own[1]), _proved_set(policy, held, [[7.0]]))["epsilon_P"]
-    assert said.value is None and "held action" in said.by
+    assert said.value is None and "held input" in said.by
 
 
 def test_a_set_that_is_proved_for_less_of_what_is_uncertain_is_refused():

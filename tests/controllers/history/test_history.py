@@ -129,7 +129,7 @@ def test_plain_sac_is_kept_from_its_first_evaluation(tmp_path):
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        (["--keep", "new", "--evaluate-every", 0], "`--keep` needs an `--evaluate-every` above 0"),
+        (["--keep", "new", "--evaluate-every", 0], "--keep needs an --evaluate-every above 0"),
         (["--keep", "/nonexistent/there/kept"], "cannot be"),
     ],
 )
@@ -280,8 +280,8 @@ def test_the_command_without_proofs_and_of_every_second_policy(told, tmp_path, m
 @pytest.mark.parametrize(
     "arguments, message",
     [
-        (["--time-limit", "0"], "`time_limit` must be positive"),
-        (["--every", "0"], "`every` must be at least 1"),
+        (["--time-limit", "0"], "--time-limit must be positive"),
+        (["--every", "0"], "--every must be at least 1"),
         (["--evaluations", "missing.csv"], "missing.csv cannot be read"),
         (["--candidate", "mine"], "candidate"),
         (["--system", "spaceship"], "spaceship"),
