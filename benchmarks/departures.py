@@ -5,9 +5,10 @@ Run with `python benchmarks/departures.py [PLANT ...] [--seeds 2] [--only NAME .
 what is in the file of rows is not made again, a run that was cut off goes on from its checkpoint in the folder of runs,
 and the table is printed of all rows that were asked for.
 `ours` is the plant's preset, `paper` its preset of that name, every other row the preset with the departure of that
-name in `controllers.paper` undone; those that a plant does not depart in are left out. A policy is simulated with its
-action held, from 100 states of the plant's box for 20 s: the floor is the median of the largest ||x|| in the last
-second, settled is below 1e-6 there. Then `certify roa` gets its time, and what is proved is what the checker accepted.
+name in `controllers.plants.paper_preset` undone; those that a plant does not depart in are left out. A policy is
+simulated with its action held, from 100 states of the plant's box for 20 s: the floor is the median of the largest
+||x|| in the last second, settled is below 1e-6 there. Then `certify roa` gets its time, and what is proved is what the
+checker accepted.
 A run without a gain ends with the policy that it has, and says so: a row that failed stays in the table. With
 `--no-training` so does one that was not made, and says that.
 """
@@ -30,19 +31,23 @@ import numpy as np
 import torch
 
 from certify import certify_roa
+from certify.certificates import write_atomically
 from certify.certificates.verdict import Verdict
 from certify.errors import InputError
 from certify.loop.plants import System, get_system
 from certify.loop.policies import Policy, save_policy
 from certify.report.words import below
-from controllers.evaluate import discrete_linearisation
-from controllers.files import make_folder, write_atomically
-from controllers.lqr import riccati_gain
+from controllers.comparison.methods import OURS
+from controllers.comparison.options import CompareOptions
+from controllers.comparison.table import Response, table
+from controllers.identification.linearisation import discrete_linearisation
+from controllers.identification.riccati import riccati_gain
 from controllers.options import TrainingOptions, default_record, get_plant
-from controllers.paper import DEPARTURES
-from controllers.responses import OURS, CompareOptions, Response, table
-from controllers.simulation import initial_states, mean_action, simulate
-from controllers.training import Trainer, parameters_of
+from controllers.plants.paper_preset import DEPARTURES
+from controllers.simulation.trajectories import initial_states, mean_action, simulate
+from controllers.storage import make_folder
+from controllers.training.record import parameters_of
+from controllers.training.trainer import Trainer
 
 EVERY = 5_000  # steps between checkpoints
 JUDGED = CompareOptions(states=100, start_seed=1)

@@ -14,10 +14,10 @@ from typing import get_args
 import numpy as np
 
 from certify.loop.plants import get_system
-from controllers.environments import PlantEnvironment
-from controllers.evaluate import errors_of
-from controllers.lqr import GainLearner
+from controllers.identification.gain_learner import GainLearner
+from controllers.identification.linearisation import errors_of
 from controllers.options import Terms, Transitions, available_plants, preset
+from controllers.training.environment import PlantEnvironment
 
 Kind = tuple[Transitions, Terms]
 KINDS: list[Kind] = list(itertools.product(get_args(Transitions), get_args(Terms)))

@@ -1,4 +1,4 @@
-"""The `controllers` command: which commands there are; their bodies are the files of `controllers.commands`.
+"""The command line `controllers`: its commands, whose bodies are the files of `controllers.commands`.
 
 Standard output carries the result, or exactly one JSON object with `--json`; progress goes to standard
 error. Exit status: 0 done, 2 bad usage or input, 70 internal error; 130 after Ctrl-C or SIGTERM, 141 after a closed

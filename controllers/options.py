@@ -1,10 +1,10 @@
-"""What a training run may choose: one frozen dataclass, which is also the command line, and what each plant chooses.
+"""The options of a training run, which are also the command line, and each plant's choice among them.
 
 Numbers that the paper fixes are defaults of `TrainingOptions`; numbers that depend on the plant have no default there
 and come from the plant's preset. All of them are written into the policy's `training` record.
 
-There is no list of plants: the plant `NAME` is the file `plants/NAME.py` with its constant `PLANT`, as its equations
-are the file `NAME.py` among `certify.loop.plants.shipped`.
+There is no list of plants: the plant `NAME` is the file `plants/shipped/NAME.py` with its constant `PLANT`, as its
+equations are the file `NAME.py` among `certify.loop.plants.shipped`.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, fields, replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args
 
-from certify.errors import InputError
-from controllers import plants
+from certify.errors import InputError, OptionError
+from controllers.plants import shipped
 
 if TYPE_CHECKING:
     from certify.loop.plants import System
@@ -34,7 +34,7 @@ PresetName = Literal["ours", "paper"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrainingOptions:
-    """Everything that a run of SAC with a learned LQR gain depends on, beside the plant.
+    """The options on which a run of SAC with a learned LQR gain depends, beside the plant.
 
     Weights are the diagonals of Q_r, Q_c (one entry a state) and R_c (one entry an input).
 
@@ -49,14 +49,14 @@ class TrainingOptions:
     threads: Annotated[int, "Threads of torch; networks this small are fastest with one."] = 1
     # The task
     dt: Annotated[
-        float, "Seconds for which an action is held, integrated by one RK4 step; 1 for a plant in discrete time."
+        float, "Seconds for which an input is held, integrated by one RK4 step; 1 for a plant in discrete time."
     ]
     horizon: Annotated[int, "Steps after which an episode is truncated."]
     start: Annotated[float, "Episodes start uniformly in this share of the domain."] = 1.0
     reward_offset: Annotated[float, "r0 of the reward r0 - x'Q_r x."]
     reward_weights: Annotated[tuple[float, ...], "Diagonal of Q_r."]
     reward_at: Annotated[
-        RewardAt, "Whose cost x'Q_r x the reward of a step has: that of the next state, or of the current one."
+        RewardAt, "State whose cost x'Q_r x the reward of a step has: the next one, or the current one."
     ] = "next"
     penalty: Annotated[float, "c: subtracted from the reward when the state leaves the domain."]
     # Soft actor-critic
@@ -82,15 +82,15 @@ class TrainingOptions:
     ] = 0.0
     proof_weight: Annotated[
         float,
-        "Weight of what the hidden units may add to the linear part on a box, as bounds see it, in the actor's loss; "
-        "0 drops the term.",
+        "Weight of the departure on a box in the actor's loss; 0 drops the term.",
     ] = 0.0
     proof_box: Annotated[
         tuple[float, ...], "Half-widths of that box, one a state; none means the states in which episodes start."
     ] = ()
     # The stabilising part
     identification: Annotated[
-        Identification, "When A and B are learned: during the run, once before the warm-up, or never (plain SAC)."
+        Identification,
+        "Time of the identification: during the run, once before the warm-up, or never (plain SAC).",
     ] = "during"
     eta: Annotated[float, "Radius of the ball in which transitions identify A and B, in the states' units."]
     n_A: Annotated[int, "Transitions with zero action that fit A."]
@@ -98,14 +98,14 @@ class TrainingOptions:
     refresh: Annotated[int, "Steps between two identifications during the run."]
     identification_starts: Annotated[
         IdentificationStarts,
-        "Where episodes start while A or B is being learned: in the ball, which ends them when they leave it, or in "
-        "the domain as always, so that only what passes through the ball counts.",
+        "Start of episodes while A or B is being learned: in the ball, which ends them when they leave it, or in the "
+        "domain as always, so that only transitions in the ball count.",
     ] = "ball"
     transitions: Annotated[
-        Transitions, "Which transitions fit A and B: those of all rounds so far, or of the latest round only."
+        Transitions, "Transitions that fit A and B: those of all rounds so far, or of the latest round only."
     ] = "all"
     terms_A: Annotated[
-        Terms, "What is fitted to x+ for A: linear terms, or quadratic ones as well, of which nothing is kept."
+        Terms, "Terms fitted to x+ for A: linear ones, or quadratic ones as well, of which nothing is kept."
     ] = "linear"
     gain_weight: Annotated[float, "Weight of ||J_mu(0) + K|| + ||mu(0) - u_eq|| in the actor's loss; 0 drops the term."]
     gain_norm: Annotated[
@@ -113,7 +113,7 @@ class TrainingOptions:
     ] = "frobenius"
     state_weights: Annotated[tuple[float, ...], "Diagonal of Q_c, the LQR's state weights."]
     input_weights: Annotated[tuple[float, ...], "Diagonal of R_c, the LQR's input weights."]
-    centre: Annotated[Centre, "How the mean action is centred: preactivation, output, or none."] = "preactivation"
+    centre: Annotated[Centre, "Centring of the mean action: preactivation, output, or none."] = "preactivation"
 
     def __post_init__(self) -> None:
         for name in ("steps", "threads", "dt", "horizon", "learning_rate", "replay", "batch", "reward_scale"):
@@ -154,7 +154,7 @@ class TrainingOptions:
 
     def _require(self, name: str, holds: bool, requirement: str) -> None:
         if not holds:
-            raise InputError(f"`{name}` must be {requirement}; found {getattr(self, name)!r}.")
+            raise OptionError(f"`{name}` must be {requirement}; found {getattr(self, name)!r}.")
 
     def check(self, system: System) -> None:
         """Raise InputError unless there is one weight a state and one an input, one half-width of a box a state, and
@@ -176,11 +176,11 @@ class TrainingOptions:
 
 
 _FORMER = {"transitions": "latest"}
-"""Of an option that came later, what runs before it did, where that is not its default."""
+"""Values that runs had before an option was there, where they are not its default."""
 
 
 def default_record() -> dict[str, Any]:
-    """What a record means that lacks one of the options with a default, as `TrainingOptions.record` writes it.
+    """The options with a default as a record without them means them, in the form of `TrainingOptions.record`.
 
     It is the default, except where runs did something else before the option was there.
     """
@@ -198,7 +198,7 @@ def _finite(value: object) -> bool:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plant:
-    """How one plant is trained, judged and drawn.
+    """The training of one plant, the runs that judge it, and the states that are drawn.
 
     Parameters
     ----------
@@ -244,7 +244,7 @@ class Plant:
         InputError : there is none.
         """
         if name not in get_args(PresetName):
-            raise InputError(f"the preset must be one of {', '.join(get_args(PresetName))}; found {name!r}.")
+            raise OptionError(f"`preset` must be one of {', '.join(get_args(PresetName))}; found {name!r}.")
         if name == "ours":
             return self.preset
         if self.paper is None:
@@ -260,7 +260,7 @@ def require_one_step(system: System, dt: float) -> None:
     InputError : the plant is in discrete time, and `dt` is not 1.
     """
     if system.time == "discrete" and dt != 1:
-        raise InputError(
+        raise OptionError(
             f"`dt` must be 1 for {system.name}, a plant in discrete time, whose equations give the state one step "
             f"later; found {dt}. Leave `dt` out."
         )
@@ -276,12 +276,12 @@ def held_over(system: System, dt: float) -> float:
 
 def available_plants() -> tuple[str, ...]:
     """Names that `get_plant` knows, in alphabetical order; none of them is imported."""
-    names = (module.name for module in pkgutil.iter_modules(plants.__path__))
+    names = (module.name for module in pkgutil.iter_modules(shipped.__path__))
     return tuple(sorted(name for name in names if not name.startswith("_")))
 
 
 def get_plant(name: str) -> Plant:
-    """The plant `name` of the folder `plants`.
+    """The plant `name` of the folder `plants/shipped`.
 
     Raises
     ------
@@ -293,7 +293,7 @@ def get_plant(name: str) -> Plant:
             f"no training options, box of initial states and positions are known for the plant {name!r}; "
             f"known are {', '.join(known)}."
         )
-    module = importlib.import_module(f"{plants.__name__}.{name}")
+    module = importlib.import_module(f"{shipped.__name__}.{name}")
     plant = getattr(module, "PLANT", None)
     if not isinstance(plant, Plant):
         raise InputError(f"{module.__file__} must define `PLANT`, a Plant; found {type(plant).__name__}.")

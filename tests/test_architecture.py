@@ -25,19 +25,19 @@ EDGES = {  # who imports whom, besides these: exactly the arrows that exist
     "report": "certificates loop lyapunov",
     "controllers": "analysis certificates cli loop lyapunov provers report",
 }
-ROOMS = {
-    "analysis",
-    "certificates",
-    "checker",
-    "cli",
-    "effort",
-    "errors",
-    "loop",
-    "lyapunov",
-    "provers",
-    "reference",
-    "report",
+TRAINER = {  # who imports whom within controllers, besides what is open there
+    "commands": "comparison evaluation figures flattening history plants training",
+    "comparison": "simulation training",
+    "evaluation": "identification plants simulation",
+    "figures": "comparison history",
+    "flattening": "evaluation identification plants simulation training",
+    "history": "evaluation identification training",
+    "identification": "simulation",
+    "plants": "identification",
+    "training": "evaluation identification simulation",
 }
+OPEN = {"cli", "options", "storage"}  # of controllers: its entry, and modules that anybody there may import
+ROOMS = {"analysis", "certificates", "checker", "cli", "loop", "lyapunov", "provers", "reference", "report"} | LEAVES
 
 
 def unit(module: str) -> str:
@@ -87,25 +87,36 @@ def test_the_arrows_are_exactly_these() -> None:
     assert {name: to for name, to in found.items() if to} == EDGES
 
 
+def test_the_arrows_of_the_trainer_are_exactly_these() -> None:
+    found: dict[str, set[str]] = {}
+    for path in ROOT.glob("controllers/**/*.py"):
+        inner = {i.split(".")[1] for i in imports(path) if i.startswith("controllers.")}
+        found.setdefault(path.relative_to(ROOT).with_suffix("").parts[1], set()).update(inner)
+    arrows = {name: " ".join(sorted(to - OPEN - {name})) for name, to in found.items() if name not in OPEN}
+    assert {name: to for name, to in arrows.items() if to} == TRAINER
+    tuple(TopologicalSorter({name: to.split() for name, to in TRAINER.items()}).static_order())
+
+
 def test_there_are_ten_rooms() -> None:
     assert {name for name in units() if name not in ("__init__", "__main__", "controllers")} == ROOMS
 
 
-def test_the_picture_shows_these_arrows() -> None:
+@pytest.mark.parametrize(("number", "edges"), [(1, EDGES), (2, TRAINER)], ids=["certify", "controllers"])
+def test_the_pictures_show_these_arrows(number: int, edges: dict[str, str]) -> None:
     """Of `docs/house.md`: all but those that follow from others, and what `cli` may see anyway."""
-    picture = (ROOT / "docs" / "house.md").read_text("utf-8").split("```mermaid")[1].split("```")[0]
+    picture = (ROOT / "docs" / "house.md").read_text("utf-8").split("```mermaid")[number].split("```")[0]
     shown: dict[str, set[str]] = {}
     for line in picture.splitlines():
         units = [[name.strip() for name in part.split("&")] for part in line.split("-->")]
         for sources, targets in pairwise(units):
             for source in sources:
                 shown.setdefault(source, set()).update(targets)
-    edges = {name: set(to.split()) for name, to in EDGES.items()}
+    direct = {name: set(to.split()) for name, to in edges.items()}
 
     def beyond(name: str) -> set[str]:
-        return {far for to in edges.get(name, ()) for far in (to, *beyond(to))}
+        return {far for to in direct.get(name, ()) for far in (to, *beyond(to))}
 
-    needed = {name: to - {far for near in to for far in beyond(near)} for name, to in edges.items()}
+    needed = {name: to - {far for near in to for far in beyond(near)} for name, to in direct.items()}
     assert {name: to for name, to in shown.items() if name not in ENTRY} == needed
 
 

@@ -26,7 +26,7 @@ from certify.loop.expressions import Number, Symbol, cos, sin, symbols
 from certify.loop.plants import System, load_system
 from certify.lyapunov import Neural, Symbolic
 from certify.lyapunov.sublevel import Sublevel
-from controllers.evaluate import count_covered
+from controllers.evaluation.proved_set import count_covered
 from tests.support.beyond import line, network, plane
 from tests.support.certificates import write
 from tests.support.loops import box

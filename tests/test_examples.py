@@ -16,7 +16,7 @@ from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import available_systems, controllability, linearise, load_system
 from certify.loop.policies import load_policy
 from controllers.options import default_record
-from controllers.own import chosen_plant
+from controllers.plants.choice import chosen_plant
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
 PLANTS = sorted((EXAMPLES / "plants").glob("*.toml"))

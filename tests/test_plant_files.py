@@ -483,7 +483,7 @@ def test_the_code_of_a_plant_is_run_only_if_a_person_names_it(
         ):
             assert _run(arguments, False) == 2
             assert "--system" in capsys.readouterr().err
-        from controllers.evaluate import evaluate
+        from controllers.evaluation.evaluation import evaluate
 
         with pytest.raises(InputError, match="unknown system"):
             evaluate(Policy(mine, name))

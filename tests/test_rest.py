@@ -31,7 +31,7 @@ from certify.loop.plants import System, get_system
 from certify.loop.policies import Policy, TanhNetwork, load_policy, save_policy
 from certify.loop.rigorous import field_on, precision
 from certify.lyapunov.function import Quadratic
-from controllers.evaluate import count_covered, require_same_loop, require_same_question
+from controllers.evaluation.proved_set import count_covered, require_same_loop, require_same_question
 from tests.support.loops import box
 
 PLAIN = Path(__file__).parent.parent / "examples" / "policies" / "without_gain" / "pendulum.pt"

@@ -284,8 +284,6 @@ def _policy(
     changes: PlantChanges,
 ) -> Policy | TanhNetwork:
     """The policy, whatever it was given as."""
-    import torch
-
     if isinstance(given, Policy | TanhNetwork):
         others = set(asked.given) - ({"--centre"} if isinstance(given, Policy) else set())
         if others:
@@ -295,7 +293,8 @@ def _policy(
         return centred(given, asked.centre, plant_of(given, system, changes, lambda _: None), tell)
     if isinstance(given, str | os.PathLike):
         return policy_in(Path(path_in(given, "policy")), asked, system, changes, tell)
-    if isinstance(given, torch.nn.Module):
+    torch = sys.modules.get("torch")  # whoever has a module of torch has loaded it
+    if torch is not None and isinstance(given, torch.nn.Module):
         imported = import_module(given, plant_for("a module", system, changes), asked)
     elif isinstance(given, Mapping):
         imported = import_state_dict(given, plant_for("a state_dict", system, changes), asked)

@@ -9,14 +9,33 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from certify.errors import InputError
-from controllers.commands.shared import Json, PlantName, emit, errors, options_of
+from certify.errors import OptionError
+from controllers.commands.shared import Json, PlantName, emit, errors, preset_options
 
 if TYPE_CHECKING:
-    from controllers.runs import Doing
+    from certify.loop.plants import System
+    from controllers.comparison.runs import RunProgress
+
+Without = Annotated[
+    list[str] | None, typer.Option("--without", help="A kind of run to leave out, such as sb3-sac; repeatable.")
+]
+Budget = Annotated[int | None, typer.Option("--budget", help="Steps after which a baseline ends that still improves.")]
+Patience = Annotated[
+    int | None, typer.Option("--patience", help="Evaluations without an improvement that end a baseline.")
+]
+Jobs = Annotated[int | None, typer.Option("--jobs", help="Runs trained at a time, in processes of this machine.")]
+Cluster = Annotated[
+    str | None,
+    typer.Option(
+        "--cluster",
+        help="Dask cluster to train on: a scheduler's address, tcp://HOST:8786, or local:N.",
+        metavar="ADDRESS",
+    ),
+]
 
 
 def compare(
+    context: typer.Context,
     plant: PlantName,
     runs: Annotated[Path, typer.Option("--runs", help="Folder of trained runs; missing ones are trained into it.")],
     out: Annotated[Path, typer.Option("--out", help="Folder for the figures and the table.")],
@@ -29,78 +48,72 @@ def compare(
     ablations: Annotated[
         bool, typer.Option("--ablations", help="Compare with ablations of our own training, not with baselines.")
     ] = False,
-    without: Annotated[
-        list[str] | None, typer.Option("--without", help="A kind of run to leave out, such as sb3-sac; repeatable.")
-    ] = None,
+    without: Without = None,
     steps: Annotated[
         int | None,
         typer.Option("--steps", help="Steps of every run; default: ours by the preset, baselines to their floor."),
     ] = None,
-    budget: Annotated[
-        int | None, typer.Option("--budget", help="Steps after which a baseline ends that still improves.")
-    ] = None,
-    patience: Annotated[
-        int | None, typer.Option("--patience", help="Evaluations without an improvement that end a baseline.")
-    ] = None,
-    jobs: Annotated[
-        int | None, typer.Option("--jobs", help="Runs trained at a time, in processes of this machine.")
-    ] = None,
-    cluster: Annotated[
-        str | None,
-        typer.Option(
-            "--cluster",
-            help="Dask cluster to train on: a scheduler's address, tcp://HOST:8786, or local:N.",
-            metavar="ADDRESS",
-        ),
-    ] = None,
+    budget: Budget = None,
+    patience: Patience = None,
+    jobs: Jobs = None,
+    cluster: Cluster = None,
     as_json: Json = False,
 ) -> None:
     """Compare our policy with SAC without the gain and with SAC and PPO of stable-baselines3: figures and a table.
 
-    A baseline is trained until its evaluation stops improving, and goes on from its checkpoint when it was cut off.
+    A baseline is trained until its evaluation stops improving, and resumed from its checkpoint if it was cut off.
     """
-    with errors(as_json):
-        training = options_of(plant, seed=0, steps=steps)
+    with errors(context, as_json):
+        training = preset_options(plant, seed=0, steps=steps)
         from certify.loop.plants import get_system
         from certify.provers.execution.tasks import place_for
-        from controllers.compare import compare as run
-        from controllers.responses import ABLATIONS, BASELINES, CompareOptions, remaining
+        from controllers.comparison.comparison import compare as run
+        from controllers.comparison.comparison import wanted_runs
+        from controllers.comparison.methods import ABLATIONS, BASELINES, remaining
+        from controllers.comparison.options import CompareOptions
+        from controllers.figures.comparison import write_comparison
+        from controllers.storage import make_folder
 
         methods = remaining(ABLATIONS if ablations else BASELINES, without or [])
         if steps is not None and (budget is not None or patience is not None):
-            raise InputError("`--steps` is for runs of one length; `--budget` and `--patience` are for the others.")
+            raise OptionError("`steps` is for runs of one length; `budget` and `patience` are for the others.")
         system = get_system(plant)
-        span: dict[str, Any] = {}
-        if duration is not None:
-            span = {"duration": duration} if system.time == "continuous" else {"duration_steps": int(duration)}
         options = CompareOptions(
             methods=methods,
             seeds=seeds,
-            **span,
+            **_span(duration, system),
             states=states,
             to_floor=steps is None and not ablations,
             budget=budget,
             patience=patience,
         )
         place = None if jobs is None and cluster is None else place_for(jobs, cluster)
+        wanted_runs(system, training, options)  # refuses bad options before a folder is made
+        make_folder(out)
         with _progress() as (say, watch):
-            result = run(system, training, runs, out, options, say, watch, place)
-        if as_json:
-            emit(result, as_json)
-            return
-        typer.echo(_table(result["rows"]))
-        emit(result["files"], as_json)
+            found = run(system, training, runs, options, say, watch, place)
+        result = write_comparison(found, out)
+        if not as_json:
+            typer.echo(_table(result["rows"]))
+        emit(result if as_json else result["files"], as_json)
+
+
+def _span(duration: float | None, system: System) -> dict[str, Any]:
+    """The options for a duration in the plant's unit of time."""
+    if duration is None:
+        return {}
+    return {"duration": duration} if system.time == "continuous" else {"duration_steps": int(duration)}
 
 
 @contextmanager
-def _progress() -> Iterator[tuple[Callable[[str], None], Callable[[Doing], None]]]:
-    """Where progress goes: on a terminal a bar, with the time that is left, elsewhere lines on standard error."""
+def _progress() -> Iterator[tuple[Callable[[str], None], Callable[[RunProgress], None]]]:
+    """Show progress: on a terminal as a bar, with the time that is left, elsewhere as lines on standard error."""
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     console = Console(stderr=True)
     if not console.is_terminal:
-        yield lambda line: typer.echo(line, err=True), lambda doing: None
+        yield lambda line: typer.echo(line, err=True), lambda progress: None
         return
     columns = (
         TextColumn("run {task.fields[run]} of {task.fields[runs]}: {task.description}"),
@@ -112,20 +125,18 @@ def _progress() -> Iterator[tuple[Callable[[str], None], Callable[[Doing], None]
         task = progress.add_task("starting", total=None, run=1, runs="?")
         shown = 0
 
-        def watch(doing: Doing) -> None:
+        def watch(at: RunProgress) -> None:
             nonlocal shown
-            if doing.run != shown:  # another run has a pace of its own
+            if at.run != shown:  # another run has a pace of its own
                 progress.reset(task)
-                shown = doing.run
-            progress.update(
-                task, description=doing.what, completed=doing.done, total=doing.steps, run=doing.run, runs=doing.runs
-            )
+                shown = at.run
+            progress.update(task, description=at.what, completed=at.done, total=at.steps, run=at.run, runs=at.runs)
 
         yield lambda line: None, watch
 
 
 def _table(rows: Sequence[dict[str, Any]]) -> str:
-    """The rows as aligned text; what is not finite is infinite."""
+    """The rows as aligned text; a value that is not finite is infinite."""
     lines = [
         (
             "method",

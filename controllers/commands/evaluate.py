@@ -8,36 +8,37 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from controllers.commands.shared import Json, emit, errors
+from controllers.commands.shared import ChosenPlant, Json, PolicyFile, emit, errors
 
 if TYPE_CHECKING:
-    from controllers.evaluate import Covered, Evaluation, EvaluationOptions, Settling
+    from controllers.evaluation.evaluation import Evaluation
+    from controllers.evaluation.proved_set import Covered
+    from controllers.evaluation.settling import EvaluationOptions, Settling
 
 
 def evaluate(
-    policy: Annotated[Path, typer.Argument(help="The policy file.")],
+    context: typer.Context,
+    policy: PolicyFile,
     states: Annotated[int, typer.Option(help="Number of initial states.")] = 1000,
     seed: Annotated[int, typer.Option(help="Seed of the initial states.")] = 0,
-    system: Annotated[
-        str | None, typer.Option(help="A plant of your own, FILE.toml or FILE.py:NAME; default: what the policy says.")
-    ] = None,
+    system: ChosenPlant = None,
     certificate: Annotated[
-        Path | None, typer.Option(help="A certificate of this policy: how many of the states lie in its proved set.")
+        Path | None, typer.Option(help="A certificate of this policy: counts the states in its proved set.")
     ] = None,
     as_json: Json = False,
 ) -> None:
     """Simulate a policy from random initial states and compare it with its learned gain."""
-    with errors(as_json):
+    with errors(context, as_json):
         from certify.certificates.membership import proved_set
         from certify.loop.policies import load_policy
-        from controllers.evaluate import EvaluationOptions
-        from controllers.evaluate import evaluate as judge
-        from controllers.own import chosen_plant
+        from controllers.evaluation.evaluation import evaluate as judge
+        from controllers.evaluation.settling import EvaluationOptions
+        from controllers.plants.choice import chosen_plant
 
         options = EvaluationOptions(states=states, seed=seed)
-        stored, own = load_policy(policy), None if system is None else chosen_plant(system)
+        stored, chosen = load_policy(policy), None if system is None else chosen_plant(system)
         proved = None if certificate is None else proved_set(certificate)
-        result = judge(stored, options, own, proved)
+        result = judge(stored, options, chosen, proved)
         emit(result.as_json() if as_json else _table(result, options), as_json)
 
 

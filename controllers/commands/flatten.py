@@ -10,52 +10,54 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 
-from certify.errors import InputError
-from controllers.commands.shared import Json, emit, errors
-from controllers.files import require_writable
+from certify.errors import OptionError
+from controllers.commands.shared import ChosenPlant, Json, emit, errors
+from controllers.storage import require_writable, set_aside
 
 if TYPE_CHECKING:
     from certify.loop.plants import System
-    from certify.loop.policies import Policy
-    from controllers.flatten import Figures, Flattened, FlattenOptions, Gain
+    from controllers.flattening.options import FlattenOptions, Gain
+    from controllers.flattening.result import Figures, Flattened
     from controllers.options import Plant
+
+DiagonalQ = Annotated[
+    str | None,
+    typer.Option("--Q", help="Diagonal of the LQR's Q, as in 1,1,0.1; default: that of the runs that judge."),
+]
+DiagonalR = Annotated[str | None, typer.Option("--R", help="Diagonal of the LQR's R, as --Q.")]
 
 
 def flatten(
+    context: typer.Context,
     policy: Annotated[Path, typer.Argument(help="The policy file to begin with; it is left as it is.")],
     out: Annotated[Path, typer.Option("--out", help="The policy file to write.")],
     weight: Annotated[
-        float, typer.Option("--weight", help="How much easier proofs count beside doing the same as before.")
+        float, typer.Option("--weight", help="Weight of easier proofs beside doing the same as before.")
     ] = 1.0,
     box: Annotated[
         str | None,
         typer.Option(
             "--box",
-            help="Half-widths of states where the policy is used, as in x=0.4,phi=0.2; others: where runs start.",
+            help="Half-widths of states where the policy is used, as in x=0.4,phi=0.2; others as where runs start.",
         ),
     ] = None,
     time_limit: Annotated[float, typer.Option("--time-limit", help="Seconds after which training ends.")] = 180.0,
     steps: Annotated[int, typer.Option("--steps", help="Gradient steps at most.")] = 2000,
     max_cost_change: Annotated[
-        float, typer.Option("--max-cost-change", help="By which share the median cost of a run may rise.")
+        float, typer.Option("--max-cost-change", help="Share by which the median cost of a run may rise.")
     ] = 0.05,
     gain: Annotated[
         str,
         typer.Option(
             "--gain",
-            help="What the policy asks for near the origin: kept (as it is), or lqr (by the weights that judge runs).",
+            help="Gain at the origin: kept (as it is), or lqr (by the weights that judge runs).",
         ),
     ] = "kept",
-    Q: Annotated[
-        str | None,
-        typer.Option("--Q", help="Diagonal of the LQR's Q, as in 1,1,0.1; default: that of the runs that judge."),
-    ] = None,
-    R: Annotated[str | None, typer.Option("--R", help="Diagonal of the LQR's R, as --Q.")] = None,
+    Q: DiagonalQ = None,
+    R: DiagonalR = None,
     states: Annotated[int, typer.Option("--states", help="Initial states of the runs that judge a policy.")] = 200,
     seed: Annotated[int, typer.Option("--seed", help="Seed of everything random.")] = 0,
-    system: Annotated[
-        str | None, typer.Option(help="A plant of your own, FILE.toml or FILE.py:NAME; default: what the policy says.")
-    ] = None,
+    system: ChosenPlant = None,
     as_json: Json = False,
 ) -> None:
     """Fine-tune a policy so that it does the same and is easier to prove.
@@ -63,60 +65,57 @@ def flatten(
     Layers, squash, centring, scale, offset and clip stay. Nothing is written unless as many runs settle as before, the
     median cost stays within its bound, and what a proof must absorb of the hidden units is less than it was.
     """
-    with errors(as_json):
+    with errors(context, as_json):
         from certify.loop.policies import load_policy, save_policy
-        from controllers.flatten import FlattenOptions
-        from controllers.flatten import flatten as run
-        from controllers.own import chosen_plant
+        from controllers.flattening.flattening import flatten as run
+        from controllers.flattening.options import FlattenOptions
+        from controllers.plants.choice import chosen_plant, plant_of
 
         require_writable(out)
         given = load_policy(policy)
-        own = None if system is None else chosen_plant(system)
+        plant = plant_of(given, None if system is None else chosen_plant(system))
         options = FlattenOptions(
             weight=weight,
-            box=None if box is None else _half_widths(box, given, own),
+            box=None if box is None else _half_widths(box, *plant),
             steps=steps,
             time_limit=time_limit,
             max_cost_change=max_cost_change,
             states=states,
             gain=cast("Gain", gain),
-            Q=_weights(Q, "--Q"),
-            R=_weights(R, "--R"),
+            Q=_weights(Q, "Q"),
+            R=_weights(R, "R"),
             seed=seed,
         )
         with _progress(options) as report:
-            result = run(given, options, own, report)
+            set_aside(out)
+            result = run(given, options, plant, report)
         save_policy(out, result.policy)
         emit({"policy": str(out), **(result.as_json() if as_json else _table(result, options))}, as_json)
 
 
-def _half_widths(text: str, policy: Policy, own: tuple[System, Plant] | None) -> tuple[float, ...]:
+def _half_widths(text: str, system: System, plant: Plant) -> tuple[float, ...]:
     """The box of initial states with the half-widths that `x=0.4,phi=0.2` names."""
-    from certify.loop.plants import shipped_system
-    from controllers.options import get_plant
-
-    system, plant = own if own is not None else (shipped_system(policy.system), get_plant(policy.system))
     names = [symbol.name for symbol in system.states]
     widths = dict(zip(names, plant.initial_states, strict=True))
     for part in text.split(","):
         name, equals, number = (piece.strip() for piece in part.partition("="))
         if name not in widths:
-            raise InputError(f"`--box` must name states of {system.name}, {', '.join(names)}; found {name!r}.")
+            raise OptionError(f"`box` must name states of {system.name}, {', '.join(names)}; found {name!r}.")
         try:
             widths[name] = float(number if equals else "")
         except ValueError as error:
-            raise InputError(f"`--box` must be NAME=HALF-WIDTH,...; found {part!r}.") from error
+            raise OptionError(f"`box` must be NAME=HALF-WIDTH,...; found {part!r}.") from error
     return tuple(widths.values())
 
 
 def _weights(text: str | None, option: str) -> tuple[float, ...] | None:
-    """The diagonal that `1,1,0.1` is."""
+    """The diagonal that is typed as `1,1,0.1`."""
     if text is None:
         return None
     try:
         return tuple(float(part) for part in text.split(","))
     except ValueError as error:
-        raise InputError(f"`{option}` must be numbers as in 1,1,0.1; found {text!r}.") from error
+        raise OptionError(f"`{option}` must be numbers as in 1,1,0.1; found {text!r}.") from error
 
 
 @contextmanager

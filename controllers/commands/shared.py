@@ -1,23 +1,29 @@
-"""What the commands share: the arguments they all have, how they print, and how bad input ends."""
+"""The parts that commands share: arguments, printing, and the end by bad input."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from certify.errors import CertifyError
+from certify.cli.options import as_typed, options_of
+from certify.errors import CertifyError, OptionError
 from controllers.options import TrainingOptions, overridden, preset
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of text.")]
 PlantName = Annotated[str, typer.Argument(help="The plant, for instance pendulum.")]
+PolicyFile = Annotated[Path, typer.Argument(help="The policy file.")]
+ChosenPlant = Annotated[
+    str | None, typer.Option("--system", help="A plant of your own, FILE.toml or FILE.py:NAME; default: the policy's.")
+]
 Steps = Annotated[int | None, typer.Option("--steps", help="Environment steps of a run; default: the preset's.")]
 
 
-def options_of(plant: str, **chosen: Any) -> TrainingOptions:
+def preset_options(plant: str, **chosen: Any) -> TrainingOptions:
     """The options that `plant` trains with, those replaced that were chosen; None means not chosen.
 
     Raises
@@ -31,8 +37,11 @@ _EXTRA = ("gymnasium", "control")  # packages of the extra `controllers`
 
 
 @contextmanager
-def errors(as_json: bool) -> Iterator[None]:
-    """Bad input, and an extra that is not installed, end in one sentence and exit status 2."""
+def errors(context: typer.Context, as_json: bool) -> Iterator[None]:
+    """Bad input, and an extra that is not installed, end in one sentence and exit status 2.
+
+    The sentence names options as they are typed.
+    """
     try:
         yield
     except ModuleNotFoundError as error:
@@ -42,6 +51,8 @@ def errors(as_json: bool) -> Iterator[None]:
         raise _refused(said, as_json) from error
     except BrokenPipeError:  # nobody reads any more what is said
         raise
+    except OptionError as error:
+        raise _refused(as_typed(str(error), options_of(context.command)), as_json) from error
     except (CertifyError, OSError) as error:
         raise _refused(str(error), as_json) from error
 
@@ -54,6 +65,7 @@ def _refused(said: str, as_json: bool) -> typer.Exit:
 
 
 def emit(result: dict[str, Any], as_json: bool) -> None:
+    """Print a result, a line for each entry, or as one JSON object."""
     if as_json:
         typer.echo(json.dumps(result))
         return

@@ -7,34 +7,33 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from controllers.commands.shared import Json, emit, errors
+from controllers.commands.shared import ChosenPlant, Json, PolicyFile, emit, errors
 
 if TYPE_CHECKING:
-    from controllers.theory import Constant, Theory
+    from controllers.evaluation.theory_constants import Constant, Theory
 
 
 def theory(
-    policy: Annotated[Path, typer.Argument(help="The policy file.")],
-    system: Annotated[
-        str | None, typer.Option(help="A plant of your own, FILE.toml or FILE.py:NAME; default: what the policy says.")
-    ] = None,
+    context: typer.Context,
+    policy: PolicyFile,
+    system: ChosenPlant = None,
     certificate: Annotated[
-        Path | None, typer.Option(help="A certificate of this policy: how far its P lets the gain at the origin move.")
+        Path | None, typer.Option(help="A certificate of this policy: bounds the change of the gain that its P allows.")
     ] = None,
     states: Annotated[int, typer.Option(help="Number of initial states of the estimate of a_V.")] = 200,
     seed: Annotated[int, typer.Option(help="Seed of the initial states.")] = 0,
     as_json: Json = False,
 ) -> None:
     """Show the constants on which the theory of the method rests, each proved or estimated, for one policy."""
-    with errors(as_json):
+    with errors(context, as_json):
         from certify.certificates.membership import proved_set
         from certify.loop.policies import load_policy
-        from controllers.own import chosen_plant
-        from controllers.theory import theory as constants_of
+        from controllers.evaluation.theory_constants import theory as constants_of
+        from controllers.plants.choice import chosen_plant
 
-        stored, own = load_policy(policy), None if system is None else chosen_plant(system)
+        stored, chosen = load_policy(policy), None if system is None else chosen_plant(system)
         proved = None if certificate is None else proved_set(certificate)
-        result = constants_of(stored, own, proved, states, seed)
+        result = constants_of(stored, chosen, proved, states, seed)
         emit(result.as_json() if as_json else _table(result), as_json)
 
 
@@ -53,14 +52,14 @@ def _shown(constant: Constant) -> str:
 
 
 def _digits(constant: Constant, value: float) -> str:
-    """What is shown of a bound is one too: rounded away from the true constant."""
+    """The digits of a bound are a bound too: rounded away from the true constant."""
     from certify.report.words import above, below
 
     return above(value) if constant.relation == "<=" else below(value) if constant.relation == ">=" else f"{value:g}"
 
 
 def _discount(result: Theory) -> str:
-    """What the discount's bound says; what was only sampled may take the word back, and never gives it."""
+    """The discount beside its bounds; a sampled one may take a proved word back, and never gives one."""
     gamma = result["gamma"].value or 0.0
     names = ("gamma_star", "gamma_star_at_gamma", "gamma_star_sampled")
     star, at_gamma, sampled = (result[name].value for name in names)

@@ -13,21 +13,24 @@ from typing import TYPE_CHECKING, Annotated, Any, get_args, get_origin, get_type
 import typer
 
 from certify.cli.options import parameter
-from certify.errors import InputError
+from certify.errors import OptionError
 from controllers.commands.shared import Json, emit, errors
-from controllers.files import make_folder, read, require_writable
 from controllers.options import TrainingOptions, overridden
+from controllers.storage import make_folder, read, require_writable, set_aside
 
 if TYPE_CHECKING:
     from certify.loop.policies import Policy
-    from controllers.training import Trainer
+    from controllers.history.policies import PolicyWriter
+    from controllers.training.trainer import Trainer
 
 
 def train(
+    context: typer.Context,
     plant: Annotated[str, typer.Argument(help="A plant that ships, FILE.toml, or FILE.py:NAME, whose code is run.")],
     out: Annotated[Path, typer.Option("--out", help="The policy file to write.")],
     preset: Annotated[
-        str, typer.Option("--preset", help="What is not given: ours, or paper, which follows the paper where it can.")
+        str,
+        typer.Option("--preset", help="Values of options not given: ours, or paper, as the paper has them."),
     ] = "ours",
     log: Annotated[Path | None, typer.Option("--log", help="CSV file of episodes and returns.")] = None,
     checkpoint_dir: Annotated[
@@ -44,8 +47,8 @@ def train(
         Path | None,
         typer.Option("--keep", help="Folder that gets the policy as it would ship at each of these evaluations."),
     ] = None,
-    device: Annotated[str, typer.Option("--device", help="Where the networks live: cpu or cuda.")] = "cpu",
-    resume: Annotated[bool, typer.Option("--resume", help="Go on from checkpoint.pt in --checkpoint-dir.")] = False,
+    device: Annotated[str, typer.Option("--device", help="Device of the networks: cpu or cuda.")] = "cpu",
+    resume: Annotated[bool, typer.Option("--resume", help="Resume from checkpoint.pt in --checkpoint-dir.")] = False,
     as_json: Json = False,
     **chosen: Any,  # one optional value for each field of TrainingOptions; the signature below names them
 ) -> None:
@@ -54,49 +57,67 @@ def train(
     Options that are not given take the plant's preset; for a plant of one's own they come from the table [training] of
     its file, and else from its domain and input bounds. The policy file records them all, and the plant's name.
     """
-    with errors(as_json):
-        from controllers.own import chosen_plant
+    with errors(context, as_json):
+        from controllers.plants.choice import chosen_plant
 
-        system, own = chosen_plant(plant)
-        options = overridden(own.named(preset), _given(chosen))
+        system, plant_options = chosen_plant(plant)
+        options = overridden(plant_options.named(preset), _given(chosen))
         from certify.loop.policies import save_policy
-        from controllers.kept import Keeper
-        from controllers.logs import Episode, Log, Monitored
-        from controllers.sac import find_device
-        from controllers.training import Trainer
-        from controllers.training import train as run
+        from controllers.history.policies import PolicyWriter
+        from controllers.training.device import find_device
+        from controllers.training.trainer import Trainer
 
         if checkpoint_every < 1:
-            raise InputError(f"`checkpoint_every` must be positive; found {checkpoint_every}.")
+            raise OptionError(f"`checkpoint_every` must be positive; found {checkpoint_every}.")
         if evaluate_every < 0:
-            raise InputError(f"`evaluate_every` must be at least 0; found {evaluate_every}.")
-        for option, path in (("--evaluations", evaluations), ("--keep", keep)):
+            raise OptionError(f"`evaluate_every` must be at least 0; found {evaluate_every}.")
+        for option, path in (("evaluations", evaluations), ("keep", keep)):
             if path is not None and not evaluate_every:
-                raise InputError(f"`{option}` needs an `--evaluate-every` above 0.")
+                raise OptionError(f"`{option}` needs an `evaluate_every` above 0.")
         for path in filter(None, (out, log, evaluations)):
             require_writable(path)
-        trainer = Trainer(system, options, find_device(device), own)
+        trainer = Trainer(system, options, find_device(device), plant_options)
         checkpoint = _checkpoint(checkpoint_dir, resume)
-        keeper = None if keep is None else Keeper(keep, resume)
+        writer = None if keep is None else PolicyWriter(keep, resume)
         if resume and checkpoint is not None:
             trainer.restore(read(checkpoint))
-        with ExitStack() as stack:
-            episodes = None if log is None else stack.enter_context(Log(log, Episode))
-            rows = None if evaluations is None else stack.enter_context(Log(evaluations, Monitored))
-            show = stack.enter_context(_progress(trainer))
-
-            def report(trainer: Trainer) -> None:
-                if episodes is not None:
-                    episodes.extend(trainer.episodes)
-                if rows is not None:
-                    rows.extend(trainer.monitored)
-                if keeper is not None:
-                    keeper(trainer)
-                show(trainer)
-
-            policy = run(trainer, report, checkpoint, checkpoint_every, evaluate_every)
+        set_aside(out)
+        policy = _run(trainer, log, evaluations, writer, (checkpoint, checkpoint_every, evaluate_every))
         save_policy(out, policy)
-        emit(_trained(policy, out), as_json)
+        emit(_summary(policy, out), as_json)
+
+
+def _run(
+    trainer: Trainer,
+    log: Path | None,
+    evaluations: Path | None,
+    writer: PolicyWriter | None,
+    plan: tuple[Path | None, int, int],
+) -> Policy:
+    """Take a run to its end, with its logs, its policies on the way and its progress.
+
+    Parameters
+    ----------
+    plan : the checkpoint's file, and the steps between checkpoints and between evaluations.
+    """
+    from controllers.training.log import Episode, Log, Monitored
+    from controllers.training.trainer import train as run
+
+    with ExitStack() as stack:
+        episodes = None if log is None else stack.enter_context(Log(log, Episode))
+        rows = None if evaluations is None else stack.enter_context(Log(evaluations, Monitored))
+        show = stack.enter_context(_progress(trainer))
+
+        def report(trainer: Trainer) -> None:
+            if episodes is not None:
+                episodes.extend(trainer.episodes)
+            if rows is not None:
+                rows.extend(trainer.monitored)
+            if writer is not None:
+                writer(trainer)
+            show(trainer)
+
+        return run(trainer, report, *plan)
 
 
 def _signature() -> inspect.Signature:
@@ -120,7 +141,7 @@ def _given(chosen: dict[str, Any]) -> dict[str, Any]:
             try:
                 values[name] = () if value == "none" else tuple(number(part) for part in value.split(","))
             except ValueError as error:
-                raise InputError(
+                raise OptionError(
                     f"`{name}` must be numbers separated by commas, such as 1,2, or none; found {value!r}."
                 ) from error
     return values
@@ -129,11 +150,11 @@ def _given(chosen: dict[str, Any]) -> dict[str, Any]:
 def _checkpoint(folder: Path | None, resume: bool) -> Path | None:
     if folder is None:
         if resume:
-            raise InputError("`--resume` needs `--checkpoint-dir`, the folder that holds checkpoint.pt.")
+            raise OptionError("`resume` needs `checkpoint_dir`, the folder that holds checkpoint.pt.")
         return None
     path = folder / "checkpoint.pt"
     if resume and not path.is_file():
-        raise InputError(f"there is no checkpoint {path} to resume from; begin without `--resume`.")
+        raise OptionError(f"there is no checkpoint {path} to resume from; begin without `resume`.")
     make_folder(folder)
     require_writable(path)
     return path
@@ -171,7 +192,7 @@ def _progress(trainer: Trainer) -> Iterator[Callable[[Trainer], None]]:
         yield show
 
 
-def _trained(policy: Policy, out: Path) -> dict[str, Any]:
+def _summary(policy: Policy, out: Path) -> dict[str, Any]:
     training = policy.training
     return {
         "policy": str(out),

@@ -7,11 +7,12 @@ from typing import Annotated, cast
 
 import typer
 
-from controllers.commands.shared import Json, PlantName, Steps, emit, errors, options_of
-from controllers.files import require_writable
+from controllers.commands.shared import Json, PlantName, Steps, emit, errors, preset_options
+from controllers.storage import require_writable, set_aside
 
 
 def train_baseline(
+    context: typer.Context,
     algorithm: Annotated[str, typer.Argument(help="ppo or sac, of stable-baselines3.")],
     plant: PlantName,
     out: Annotated[Path, typer.Option("--out", help="The zip file to write.")],
@@ -20,13 +21,15 @@ def train_baseline(
     as_json: Json = False,
 ) -> None:
     """Train PPO or SAC of stable-baselines3 on a plant, for comparison."""
-    with errors(as_json):
-        options = options_of(plant, seed=seed, steps=steps)
+    with errors(context, as_json):
+        options = preset_options(plant, seed=seed, steps=steps)
         from certify.loop.plants import get_system
-        from controllers.sb3 import Algorithm, train_reference
+        from controllers.comparison.stable_baselines.file import train_sb3
+        from controllers.comparison.stable_baselines.model import Algorithm
 
         require_writable(out)
         system = get_system(plant)
-        made = train_reference(cast(Algorithm, algorithm), system, options, out)
+        set_aside(out)
+        made = train_sb3(cast(Algorithm, algorithm), system, options, out)
         result = {"baseline": str(out), "algorithm": algorithm, "system": plant, "steps": made, "seed": seed}
         emit(result, as_json)

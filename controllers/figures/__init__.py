@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from controllers.figures.curves import draw_curves
-from controllers.figures.gain import draw_gain
-from controllers.figures.growth import draw_growth
-from controllers.figures.over_time import draw_over_time
+from controllers.figures.cost_and_norm import draw_over_time
+from controllers.figures.gain_distance import draw_gain
+from controllers.figures.learning_curves import draw_curves
+from controllers.figures.paths import draw_space
 from controllers.figures.positions import draw_positions
-from controllers.figures.space import draw_space
+from controllers.figures.proved_sets import draw_growth
 from controllers.figures.states import draw_states
 
 __all__ = [

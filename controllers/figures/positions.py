@@ -10,10 +10,11 @@ from numpy.typing import NDArray
 
 from certify.loop.plants import System
 from certify.report.timing import TimingInWords
+from controllers.comparison.methods import Method, Run
+from controllers.comparison.table import Response
 from controllers.figures.states import MOST, draw_state, reach_of, short
 from controllers.figures.style import MUTED, WIDTH, count, drawn
 from controllers.options import get_plant
-from controllers.responses import Method, Response, Run
 
 Array = NDArray[np.float64]
 
@@ -59,7 +60,7 @@ def draw_positions(system: System, dt: float, responses: Sequence[Response]) -> 
         panels[0, 0].set_xlim(0, time[-1])
         number = next(iter(chosen.values())).shape[1]
         figure.suptitle(
-            f"{system.name}, seed {seed}: positions, {count(number, 'trajectory', 'trajectories')}, held actions",
+            f"{system.name}, seed {seed}: positions, {count(number, 'trajectory', 'trajectories')}, held inputs",
             x=0.01,
             ha="left",
         )

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 
 from certify.loop.plants import System
 from certify.report.timing import TimingInWords
+from controllers.comparison.methods import NAMES, Method
+from controllers.comparison.table import Response
 from controllers.figures.style import COLOURS, MUTED, count, drawn
 from controllers.options import get_plant
-from controllers.responses import NAMES, Method, Response
 
 Array = NDArray[np.float64]
 
@@ -41,7 +42,7 @@ def draw_states(system: System, dt: float, responses: Sequence[Response]) -> byt
             panel.set_xlabel(TimingInWords.of(system).axis)
             panel.set_xlim(0, time[-1])
         number = next(iter(chosen.values())).shape[1]
-        figure.suptitle(f"{system.name}, seed {seed}: {count(number, 'trajectory', 'trajectories')}, held actions")
+        figure.suptitle(f"{system.name}, seed {seed}: {count(number, 'trajectory', 'trajectories')}, held inputs")
         return figure
 
     return drawn(build)

@@ -1,4 +1,4 @@
-"""How figures of training look: as wide as a page of the documentation, so that a printed letter keeps its size there.
+"""The style of figures: as wide as a page of the documentation, so that a printed letter keeps its size there.
 
 A page shows a picture some 700 pixels wide whatever its own width is. Figures are therefore `WIDTH` inches wide, and
 what does not fit is put below, not beside. Lines bear their names where there is room, in their own colour.
@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from controllers.responses import Run
+from controllers.comparison.methods import Run
 
 Array = NDArray[np.float64]
 
@@ -92,7 +92,7 @@ def count(number: int, one: str, many: str = "") -> str:
 
 
 def seeds_of(numbers: Sequence[int]) -> str:
-    """Which seeds there are, in words.
+    """The seeds in words.
 
     >>> seeds_of([0]), seeds_of([2, 0, 1]), seeds_of([0, 2, 5])
     ('seed 0', 'seeds 0 to 2', 'seeds 0, 2, 5')
@@ -164,7 +164,7 @@ def name_lines(panel: Any, named: Sequence[tuple[float, str, str]], height: floa
 
 
 def _share(panel: Any, value: float) -> float:
-    """Where a value is between the panel's bottom, 0, and its top, 1; all else at an edge."""
+    """The height of a value between the panel's bottom, 0, and its top, 1; all else at an edge."""
     lo, hi = panel.get_ylim()
     if not math.isfinite(value):
         return 1.0

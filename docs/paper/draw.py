@@ -17,8 +17,8 @@ from pathlib import Path
 
 from manifest import MANIFEST, differences, digests, of_parts, read, replaced, run_files, write
 
-from controllers.course import ENDED
-from controllers.responses import NAMES, Run
+from controllers.comparison.methods import NAMES, Run
+from controllers.comparison.run_files import ENDED
 
 ROOT = Path(__file__).parents[2]
 PAGE = Path(__file__).parent

@@ -15,8 +15,7 @@ import sys
 from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 
-from controllers.course import CURVE, ENDED
-from controllers.sb3 import MODEL
+from controllers.comparison.run_files import CURVE, ENDED, MODEL
 
 MANIFEST = Path(__file__).parent / "manifest.txt"
 FILES = (CURVE, ENDED, "policy.pt", "actor.pt", MODEL)  # of a run, whatever of these it has

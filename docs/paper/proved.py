@@ -35,8 +35,8 @@ from certify.loop.plants import System, shipped_system
 from certify.loop.policies import Policy, load_policy
 from certify.lyapunov import volume
 from certify.report.words import above, below
-from controllers.evaluate import require_same_question
-from controllers.responses import NAMES, Run
+from controllers.comparison.methods import NAMES, Run
+from controllers.evaluation.proved_set import require_same_question
 
 ROOT = Path(__file__).parents[2]
 PAGE = Path(__file__).parent

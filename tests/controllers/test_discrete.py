@@ -20,19 +20,28 @@ from certify.errors import InputError
 from certify.loop.plants import get_system, load_system
 from certify.loop.policies import Policy, TanhNetwork, save_policy
 from controllers.cli import app
-from controllers.environments import PlantEnvironment, Stepper
-from controllers.evaluate import EvaluationOptions, discrete_linearisation, evaluate
+from controllers.comparison.methods import OURS
+from controllers.comparison.options import CompareOptions
+from controllers.comparison.table import Response, table
+from controllers.evaluation.evaluation import evaluate
+from controllers.evaluation.settling import EvaluationOptions
+from controllers.evaluation.theory_constants import theory
 from controllers.figures import draw_over_time, draw_positions, draw_space, draw_states
-from controllers.flatten import FlattenOptions, flatten
-from controllers.history import distances
-from controllers.kept import Kept
-from controllers.lqr import fit_A, fit_B, riccati_gain
+from controllers.flattening.flattening import flatten
+from controllers.flattening.options import FlattenOptions
+from controllers.history.gain_distance import distances
+from controllers.history.policies import RunPolicy
+from controllers.identification.least_squares import fit_A, fit_B
+from controllers.identification.linearisation import discrete_linearisation
+from controllers.identification.riccati import riccati_gain
 from controllers.options import TrainingOptions, get_plant
-from controllers.own import chosen_plant, default_plant
-from controllers.responses import OURS, CompareOptions, Response, table
-from controllers.simulation import continuous_loop, simulate
-from controllers.theory import theory
-from controllers.training import Trainer, train
+from controllers.plants.choice import chosen_plant
+from controllers.plants.defaults import default_plant
+from controllers.simulation.closed_loop import continuous_loop
+from controllers.simulation.stepping import Stepper
+from controllers.simulation.trajectories import simulate
+from controllers.training.environment import PlantEnvironment
+from controllers.training.trainer import Trainer, train
 
 HENON = Path(__file__).parents[2] / "examples" / "plants" / "henon.toml"
 A = np.array([[-2 * 1.4 * 0.63, 1.0], [0.3, 0.0]])
@@ -212,7 +221,8 @@ def test_another_time_step_than_the_maps_own_is_refused(tmp_path, where):
     more = ["--dt", "0.05"] if where == "option" else []
     result = runner.invoke(app, ["train", str(path), "--out", str(tmp_path / "p.pt"), *more])
     assert result.exit_code == 2
-    assert "`dt` must be 1 for henon" in result.stderr and "Leave `dt` out" in result.stderr
+    said = "--dt" if where == "option" else "`dt`"
+    assert f"{said} must be 1 for henon" in result.stderr and f"Leave {said} out" in result.stderr
     path.write_text(text + "dt = 1\n")
     assert chosen_plant(str(path))[1] == chosen_plant(str(HENON))[1]
     with pytest.raises(InputError, match="`dt` must be 1"):
@@ -268,10 +278,10 @@ def test_flattening_judges_by_the_map(henon, gain):
 
 def test_a_history_is_measured_against_the_maps_gain(trained, henon):
     _, policy = trained
-    (found,) = distances([Kept(400, policy)], henon[0])
+    (found,) = distances([RunPolicy(400, policy)], henon[0])
     assert 0 < max(found.A, found.B, found.K, found.mean) < 0.01
     bare = {name: value for name, value in policy.training.items() if name != "dt"}
-    assert distances([Kept(400, replace(policy, training=bare))], henon[0]) == [found]
+    assert distances([RunPolicy(400, replace(policy, training=bare))], henon[0]) == [found]
 
 
 def test_tables_and_figures_of_a_map_count_steps(monkeypatch):

@@ -183,7 +183,7 @@ def test_a_policy_of_another_program_is_imported_before_it_is_flattened(
 
 def test_bends_are_those_that_flattening_lowers() -> None:
     from certify.analysis.diagnosis import _bend
-    from controllers.departure import departure_of
+    from controllers.training.departure import departure_of
 
     box = np.array([1.0, 5.0])
     for network in (

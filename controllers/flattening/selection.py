@@ -1,0 +1,72 @@
+"""The selection among the policies that flattening tries: the best one within the bounds on settled share and cost."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.errors import InputError
+from certify.loop.policies import TanhNetwork, require_centred
+from controllers.flattening.result import Figures
+from controllers.flattening.task import Task
+from controllers.training.departure import departure_of
+
+Array = NDArray[np.float64]
+
+GAIN = 100.0
+"""Weight of the Jacobian's change at 0 beside the fit: one per cent of it counts like inputs that are off by ten."""
+
+
+class Selection:
+    """The best policy so far whose runs settle as often as before, at a median cost that is allowed.
+
+    Parameters
+    ----------
+    states : states (N, n) on which the fit is taken, the same for all policies.
+
+    Raises
+    ------
+    InputError : the old policy has no finite median cost.
+    """
+
+    def __init__(self, task: Task, states: Array) -> None:
+        self.task, self.states = task, states
+        self.size = task.size_of_inputs(states)
+        self.before = task.figures(task.old)
+        if not math.isfinite(self.before.cost):
+            raise InputError(
+                f"the policy must have a finite median cost to compare with; half of {task.options.states} runs of "
+                f"{task.system.name} or more diverge. Choose smaller `initial_states`, or train it further."
+            )
+        self.best: tuple[TanhNetwork, Figures] | None = None
+        self._objective = math.inf
+
+    def keep(self, network: TanhNetwork) -> bool:
+        """Remember a policy that is better than all before and within the bounds; True if it is one."""
+        if not all(np.all(np.isfinite(a)) for a in (*network.weights, *network.biases)):
+            return False
+        objective = self.objective(network)
+        if self.best is not None and objective >= self._objective:
+            return False
+        task, figures = self.task, self.task.figures(network)
+        allowed = (1 + task.options.max_cost_change) * self.before.cost
+        if not (
+            figures.departure < self.before.departure
+            and figures.settled >= self.before.settled
+            and figures.cost <= allowed
+        ):
+            return False
+        if task.exactly_centred and task.old.centre == "none":
+            require_centred(network, task.u_eq)
+        self.best, self._objective = (network, figures), objective
+        return True
+
+    def objective(self, network: TanhNetwork) -> float:
+        """The loss of training in double precision, on the states that are the same for all."""
+        task = self.task
+        change = (task.inputs(network, self.states) - task.inputs(task.goal, self.states)) / self.size
+        fit = float((change**2).sum(axis=1).mean())
+        gain = task.gain_change(network, task.J) ** 2
+        return fit + GAIN * gain + task.options.weight * departure_of(network, task.box.tolist())
