@@ -5,15 +5,13 @@ from __future__ import annotations
 import os
 
 import pytest
-import torch
 from hypothesis import settings
 
 from certify.loop.plants import System, get_system
 from certify.report.drawing import Drawing
 
 # The suite runs one process a core: threads that wait for each other's cores take several times as long.
-torch.set_num_threads(1)
-os.environ.setdefault("OMP_NUM_THREADS", "1")  # of what the tests start
+os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 settings.register_profile("ci", deadline=None, derandomize=True, max_examples=50)
 settings.register_profile("fuzz", deadline=None, max_examples=5000)

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 
 from certify.analysis.options import RoaOptions
 from certify.analysis.parts import Part, check_in_parts
@@ -27,8 +26,6 @@ Answer = Callable[[Work, bytes, int], bytes | None]
 
 class Workers:
     """Jobs that are done by a function, the last first."""
-
-    device = torch.device("cpu")
 
     def __init__(self, places: int, answer: Answer) -> None:
         self.there, self.answer = places, answer

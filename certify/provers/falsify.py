@@ -205,7 +205,6 @@ class _Search:
         whole = network.scale * passed[-1] + network.offset
         return network.clipped(whole), whole, passed
 
-    @np.errstate(all="ignore")
     def _slopes(self, z: Array) -> tuple[Array, Array, Array, Array]:
         """`violation` at z (B, n), and the gradients (B, n) of both: by differences in x and u, and from u on by the
         chain rule."""
@@ -264,6 +263,7 @@ class _Search:
         vdot, excess = self.violation(z)
         return (vdot >= 0) | (excess > 0) if self.check_inputs else vdot >= 0
 
+    @np.errstate(all="ignore")
     def lowest(self, start: Array) -> Witness | None:
         """The lowest violation reached from the points `start` (B, n)."""
         z = start[self.bad(start)]
@@ -299,6 +299,7 @@ class _Search:
                             return witness
         return None
 
+    @np.errstate(all="ignore")
     def climb(self, start: Array, limit: float | Array, steps: int = 60) -> Array:
         """Gradient ascent of D' from `start` (B, n) on the sphere V = limit, or each point's own, (B, 1)."""
         z, radius, step = start, np.sqrt(limit) * (1 - 1e-9), 0.1

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from certify.certificates.verdict import Stop
 from certify.effort import UNIT, Effort
@@ -216,12 +215,3 @@ def test_many_planted_counterexamples_are_never_proved() -> None:
 def test_an_asymmetric_P_is_named() -> None:
     with pytest.raises(InputError, match=r"P\[0, 1\] = 0.25 but P\[1, 0\] = 0.26"):
         Quadratic(np.array([[1.0, 0.25], [0.26, 1.0]]))
-
-
-def test_every_tensor_of_the_ring_says_where_it_lives(pendulum: System) -> None:
-    """One made without a device would land on `meta` and meet the others with an error: none is."""
-    case = case_of(pendulum, pendulum_network(centre="output"))
-    plain = prove_outwards(case.problem, case.T, 1e-3, 0.5, Budget(), RUNNER)
-    with torch.device("meta"):
-        proof = prove_outwards(case.problem, case.T, 1e-3, 0.5, Budget(), RUNNER)
-    assert proof.outer == 0.5 and proof.tree == plain.tree

@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 from certify.certificates import Certificate, OuterTree, PartitionTree, run_checker
 from certify.certificates.claims import Asymptotic, Problem
@@ -35,7 +34,6 @@ from certify.provers.outer.rule import FaceBound, FallBound
 from tests.support.loops import box, scalar_tanh
 from tests.support.marks import slow_after
 
-CPU = torch.device("cpu")
 RUNNER = ThreadRunner()
 X, Y, U, W = symbols("x y u w")
 LINE, SQUARE = box(3), box(2, 2)
@@ -87,7 +85,8 @@ def planar(system: System | None = None) -> Problem:
 def attempt(problem: Problem, N: Neural | Symbolic, level: float | None = None, **more: Any) -> OuterProof | Nothing:
     n = problem.loop.system.n
     T = more.pop("T", np.eye(n))
-    return prove_outer(problem, more.pop("c2", 0.25), T, N, level, Budget(**more), RUNNER)
+    runner = more.pop("runner", RUNNER)
+    return prove_outer(problem, more.pop("c2", 0.25), T, N, level, Budget(**more), runner)
 
 
 def prove(problem: Problem, N: Neural | Symbolic, level: float | None = None, **more: Any) -> OuterProof | None:
@@ -109,44 +108,44 @@ def holds(problem: Problem, found: OuterProof, c2: float = 0.25) -> None:
     """Every leaf of the evidence is proved for the level by the rules, looked at for itself; so are samples."""
     system, N, level = problem.loop.system, found.outer.function, found.outer.level
     lo, hi = leaves(found.evidence.tree, found.evidence.root)
-    rule = FallBound(problem, c2, found.evidence.T, N, CPU)
-    assert bool(rule(torch.tensor(lo.T.copy()), torch.tensor(hi.T.copy()), 0.0, level).proved.all())
+    rule = FallBound(problem, c2, found.evidence.T, N)
+    assert bool(rule(np.array(lo.T.copy()), np.array(hi.T.copy()), 0.0, level).proved.all())
     assert len(found.evidence.faces) == 2 * system.n
     for k, tree in enumerate(found.evidence.faces):
         axis, side = divmod(k, 2)
         low, high = np.array([[float(end) for end in pair] for pair in system.domain]).T
         low[axis] = high[axis] = float(system.domain[axis][side])
         middle, half = (low + high) / 2, (high - low) / 2
-        corners = (torch.tensor((middle + part).T.copy()) for part in leaves(tree, half))
-        assert bool(FaceBound(system, axis, side, N, CPU)(*corners, 0.0, level).proved.all())
+        corners = (np.array((middle + part).T.copy()) for part in leaves(tree, half))
+        assert bool(FaceBound(system, axis, side, N)(*corners, 0.0, level).proved.all())
     assert np.max(rises(problem, c2, N, level), initial=-np.inf) < 0
 
 
 # -------------------------------------------------------------------------------------------------------- enclosures
 
 
-def random_boxes(n: int, batch: int, size: float, seed: int) -> tuple[torch.Tensor, np.random.Generator]:
+def random_boxes(n: int, batch: int, size: float, seed: int) -> tuple[np.ndarray, np.random.Generator]:
     """States `x[:, 0] + x[:, 1:] d`, (n, n + 1, B)."""
     generator = np.random.default_rng(seed)
     centre = generator.uniform(-1, 1, (n, 1, batch))
-    return torch.tensor(np.concatenate([centre, size * generator.standard_normal((n, n, batch))], 1)), generator
+    return np.array(np.concatenate([centre, size * generator.standard_normal((n, n, batch))], 1)), generator
 
 
-def random_rates(x: torch.Tensor, more: int, generator: np.random.Generator) -> list[Taylor]:
+def random_rates(x: np.ndarray, more: int, generator: np.random.Generator) -> list[Taylor]:
     """Models of F, one for each state, in the symbols of the boxes and some others."""
     n, batch = x.shape[0], x.shape[2]
     N = n + more
 
-    def draw(*shape: int) -> torch.Tensor:
-        return torch.tensor(0.3 * generator.standard_normal((*shape, batch)))
+    def draw(*shape: int) -> np.ndarray:
+        return np.array(0.3 * generator.standard_normal((*shape, batch)))
 
-    return [Taylor(draw(), draw(N), draw(N, N), 0.1 * draw().abs()) for _ in range(n)]
+    return [Taylor(draw(), draw(N), draw(N, N), 0.1 * np.abs(draw())) for _ in range(n)]
 
 
-def at(model: Taylor, d: torch.Tensor, rest: float) -> np.ndarray:
+def at(model: Taylor, d: np.ndarray, rest: float) -> np.ndarray:
     """A value (B,) that the model allows at d (N, B), `rest` between -1 and 1."""
     quadratic = (model.Q * d[:, None] * d[None]).sum((0, 1))
-    return (model.c + (model.g * d).sum(0) + quadratic + rest * model.r).numpy()
+    return model.c + (model.g * d).sum(0) + quadratic + rest * model.r
 
 
 FUNCTIONS = {
@@ -164,7 +163,7 @@ FUNCTIONS = {
 
 
 def enclosure(N: Neural | Symbolic) -> NeuralEnclosure | SymbolicEnclosure:
-    return NeuralEnclosure(N, CPU) if isinstance(N, Neural) else SymbolicEnclosure(N, CPU)
+    return NeuralEnclosure(N) if isinstance(N, Neural) else SymbolicEnclosure(N)
 
 
 @pytest.mark.parametrize("size", slow_after(2, [1e-9, 0.01, 0.1, 0.5]))
@@ -173,31 +172,31 @@ def test_models_contain_n_and_its_derivative(name: str, size: float) -> None:
     N, batch, more = FUNCTIONS[name], 40, 2
     x, generator = random_boxes(2, batch, size, 0)
     F = random_rates(x, more, generator)
-    known = enclosure(N)(x, torch.zeros(2, batch, dtype=torch.float64))
-    index = torch.arange(batch)
+    known = enclosure(N)(x, np.zeros((2, batch)))
+    index = np.arange(batch)
     along, share = known.along(F, index)
     assert share.shape == (2, batch) and bool((share >= 0).all())
     (least, _), (most, _) = (upper_bound(Taylor(s * v.c, s * v.g, s * v.Q, v.r)) for s, v in ((-1, along), (1, along)))
     for k in range(200):
         d = generator.uniform(-1, 1, (2 + more, batch)) if k % 2 else generator.choice([-1.0, 1.0], (2 + more, batch))
-        point = (x[:, 0] + (x[:, 1:] * torch.tensor(d[:2])).sum(1)).T.numpy()
-        rate = np.stack([at(f, torch.tensor(d), generator.choice([-1.0, 1.0])) for f in F], 1)
+        point = (x[:, 0] + (x[:, 1:] * d[:2]).sum(1)).T
+        rate = np.stack([at(f, d, generator.choice([-1.0, 1.0])) for f in F], 1)
         value, slope = N(point), (N.gradient(point) * rate).sum(1)
-        inside = at(known.value, torch.tensor(d[:2]), 0.0)
-        tight = known.value.r.numpy() + 1e-13
+        inside = at(known.value, d[:2], 0.0)
+        tight = known.value.r + 1e-13
         assert np.all(np.abs(value - inside) <= tight)
-        assert np.all(slope <= most.numpy() + 1e-13) and np.all(slope >= -least.numpy() - 1e-13)
+        assert np.all(slope <= most + 1e-13) and np.all(slope >= -least - 1e-13)
 
 
 def test_some_boxes_of_a_batch_have_the_models_that_they_have_alone() -> None:
     x, generator = random_boxes(2, 30, 0.1, 7)
-    F, error = random_rates(x, 1, generator), torch.zeros(2, 30, dtype=torch.float64)
-    index = torch.tensor([3, 17, 29])
+    F, error = random_rates(x, 1, generator), np.zeros((2, 30))
+    index = np.array([3, 17, 29])
     for N in (FUNCTIONS["deep"], FUNCTIONS["expression"]):
         some, _ = enclosure(N)(x, error).along([f.at(index) for f in F], index)
-        alone, _ = enclosure(N)(x[:, :, index], error[:, index]).along([f.at(index) for f in F], torch.arange(3))
+        alone, _ = enclosure(N)(x.take(index, -1), error.take(index, -1)).along([f.at(index) for f in F], np.arange(3))
         for one, other in zip((some.c, some.g, some.Q, some.r), (alone.c, alone.g, alone.Q, alone.r), strict=True):
-            assert torch.allclose(one, other, rtol=1e-12, atol=1e-14)
+            assert np.allclose(one, other, rtol=1e-12, atol=1e-14)
 
 
 def test_the_models_are_of_second_order() -> None:
@@ -206,10 +205,10 @@ def test_the_models_are_of_second_order() -> None:
     N, rest = FUNCTIONS["deep"], []
     for size in (0.02, 0.01):
         x, _ = random_boxes(2, 50, size, 1)
-        zeros = torch.zeros(2, 2, 50, dtype=torch.float64)
-        F = [Taylor(c[0], torch.zeros_like(zeros[0]), zeros, zeros[0, 0]) for c in torch.ones(2, 1, 50).double()]
+        zeros = np.zeros((2, 2, 50))
+        F = [Taylor(c[0], np.zeros_like(zeros[0]), zeros, zeros[0, 0]) for c in np.ones((2, 1, 50))]
         known = enclosure(N)(x, zeros[0])
-        rest.append((known.value.r.median(), known.along(F, torch.arange(50))[0].r.median()))
+        rest.append((np.median(known.value.r), np.median(known.along(F, np.arange(50))[0].r)))
     for coarse, fine in zip(*rest, strict=True):
         assert 6 < float(coarse / fine) < 17
 
@@ -218,11 +217,11 @@ def test_the_models_are_of_second_order() -> None:
 def test_the_lines_bound_a_network_from_below_on_boxes_of_any_size(size: float) -> None:
     N, batch = FUNCTIONS["deep"], 60
     x, generator = random_boxes(2, batch, size, 3)
-    least = enclosure(N).least(x, torch.zeros(2, batch, dtype=torch.float64), -math.inf).numpy()
+    least = enclosure(N).least(x, np.zeros((2, batch)), -math.inf)
     assert np.all(least >= N(np.zeros(2)) - 2 * np.abs(N.weights[-1]).sum() - 1)  # tanh knows an end
     for _ in range(200):
-        d = torch.tensor(generator.uniform(-1, 1, (2, batch)))
-        assert np.all(N((x[:, 0] + (x[:, 1:] * d).sum(1)).T.numpy()) >= least)
+        d = np.array(generator.uniform(-1, 1, (2, batch)))
+        assert np.all(N((x[:, 0] + (x[:, 1:] * d).sum(1)).T) >= least)
 
 
 # ---------------------------------------------------------------------------------------------------------- the rules
@@ -231,12 +230,12 @@ def test_the_lines_bound_a_network_from_below_on_boxes_of_any_size(size: float) 
 def test_a_box_with_a_violation_is_never_proved() -> None:
     """x' = x/2 - tanh(x), N = x^2: every box that holds a point beyond the limit, N at most the level."""
     problem, N = scalar(), Symbolic(X**2, (X,))
-    rule = FallBound(problem, 0.25, np.eye(1), N, CPU)
+    rule = FallBound(problem, 0.25, np.eye(1), N)
     generator = np.random.default_rng(0)
     middle = generator.uniform(LIMIT, 3, (1, 500))
     half = 10.0 ** generator.uniform(-6, 0.3, (1, 500))
-    lo, hi = (torch.tensor(middle + half * (side - generator.random((1, 500)))) for side in (0.0, 1.0))
-    lo, hi = torch.minimum(lo, hi), torch.maximum(lo, hi)
+    lo, hi = (np.array(middle + half * (side - generator.random((1, 500)))) for side in (0.0, 1.0))
+    lo, hi = np.minimum(lo, hi), np.maximum(lo, hi)
     holds_one = (lo[0] <= 2.9) & (hi[0] >= LIMIT + 1e-9)
     assert not bool((rule(lo, hi, 0.0, 8.5).proved & holds_one).any())
     for low, high, level, proved in (
@@ -252,30 +251,30 @@ def test_a_box_with_a_violation_is_never_proved() -> None:
 
 
 def is_proved(rule: FallBound, lo: list[float], hi: list[float], level: float) -> bool:
-    corners = (torch.tensor(corner, dtype=torch.float64)[:, None] for corner in (lo, hi))
+    corners = (np.array(corner)[:, None] for corner in (lo, hi))
     return bool(rule(*corners, 0.0, level).proved[0])
 
 
 def test_what_divides_by_a_range_that_holds_zero_is_not_proved() -> None:
     problem = planar(plane(dynamics=(-X, U + Y**3 / (X - 1) * Fraction(1, 10**9))))
-    rule = FallBound(problem, 0.25, np.eye(2), Symbolic(X**2 + Y**2, (X, Y)), CPU)
+    rule = FallBound(problem, 0.25, np.eye(2), Symbolic(X**2 + Y**2, (X, Y)))
     assert is_proved(rule, [0.7, 0.6], [0.8, 0.7], 99.0)
     assert not is_proved(rule, [0.95, 0.6], [1.05, 0.7], 99.0)
 
 
 def test_an_expression_that_has_no_model_is_not_above_a_level() -> None:
     problem, N = scalar(), Symbolic(1 / (X - 1) ** 2 + X**2, (X,))
-    rule = FallBound(problem, 0.25, np.eye(1), N, CPU)
-    found = rule(*(torch.tensor([[end]], dtype=torch.float64) for end in (0.9, 1.1)), 0.0, -5.0)
+    rule = FallBound(problem, 0.25, np.eye(1), N)
+    found = rule(*(np.array([[end]]) for end in (0.9, 1.1)), 0.0, -5.0)
     assert not bool(found.proved[0]) and float(found.lowest[0]) == -math.inf
 
 
 def test_inputs_out_of_bounds_are_not_proved() -> None:
     system = dataclasses.replace(plane(), input_bounds=box(1))
-    rule = FallBound(planar(system), 0.25, np.eye(2), Symbolic(X**2 + Y**2, (X, Y)), CPU)
+    rule = FallBound(planar(system), 0.25, np.eye(2), Symbolic(X**2 + Y**2, (X, Y)))
     assert is_proved(rule, [0.1, 0.8], [0.2, 0.9], 99.0)
     assert not is_proved(rule, [0.1, 0.95], [0.2, 1.05], 99.0)
-    found = rule(*(torch.tensor([[0.1], [end]], dtype=torch.float64) for end in (1.1, 1.2)), 0.0, 99.0)
+    found = rule(*(np.array([[0.1], [end]]) for end in (1.1, 1.2)), 0.0, 99.0)
     assert not bool(found.proved[0]) and float(found.violated[0]) < 99
 
 
@@ -419,12 +418,8 @@ def test_progress_is_told() -> None:
 @pytest.mark.parametrize("threads", [1, 2])
 def test_the_answer_is_the_same_each_time(threads: int) -> None:
     problem, N = planar(), wells([[1.0, 0.0], [0.0, 1.0]], 0.75)
-    before = torch.get_num_threads()
-    torch.set_num_threads(threads)
-    try:
-        first, second = prove(problem, N), prove(problem, N)
-    finally:
-        torch.set_num_threads(before)
+    runner = ThreadRunner(threads)
+    first, second = prove(problem, N, runner=runner), prove(problem, N, runner=runner)
     assert first is not None and second is not None
     assert (first.outer.level, first.evidence.tree) == (second.outer.level, second.evidence.tree)
 

@@ -10,15 +10,12 @@ import sys
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
 from certify.provers.boxes.frontier import _HANDFUL, Frontier
 from certify.provers.boxes.partition import LEAF, Partition
 from tests.engines.test_bounds import leaves
-
-CPU = torch.device("cpu")
 
 
 def grown(seed: int, calls: int = 30, n: int = 3) -> tuple[Partition, dict[int, tuple[np.ndarray, np.ndarray]]]:
@@ -64,11 +61,11 @@ def test_boxes_come_in_the_order_of_their_lowest_level(seed: int, capacity: int)
     """Against a heap: with a small capacity most boxes are put away and rebuilt."""
     generator = np.random.default_rng(seed)
     partition = Partition(np.ones(2))
-    frontier = Frontier(partition, CPU, capacity)
+    frontier = Frontier(partition, capacity)
     model: list[tuple[float, int]] = [(0.0, 0)]
     levels = {0: 0.0}
-    one = torch.ones(2, 1, dtype=torch.float64)
-    frontier.add(-one, one, torch.zeros(1, dtype=torch.float64), torch.zeros(1, dtype=torch.int64))
+    one = np.ones((2, 1))
+    frontier.add(-one, one, np.zeros(1), np.zeros(1, dtype=np.int64))
     ceiling = np.inf
     for _ in range(40):
         assert len(frontier) == len(model)
@@ -82,14 +79,14 @@ def test_boxes_come_in_the_order_of_their_lowest_level(seed: int, capacity: int)
         expected = [heapq.heappop(model) for _ in range(len(number))]
         taken = [levels[k] for k in number.tolist()]
         assert sorted(taken) == [v for v, _ in expected]
-        rebuilt = partition.corners(number.numpy())
-        assert np.array_equal(rebuilt[0], lo.numpy()) and np.array_equal(rebuilt[1], hi.numpy())
-        halves = partition.split(number.numpy(), generator.integers(0, 2, len(number)))
+        rebuilt = partition.corners(number)
+        assert np.array_equal(rebuilt[0], lo) and np.array_equal(rebuilt[1], hi)
+        halves = partition.split(number, generator.integers(0, 2, len(number)))
         step = 10.0 ** -generator.integers(0, 16)  # some levels differ in their last digits only
         level = (generator.permutation(len(halves)) / 7.0 + halves * 1e-9) * step + max(v for v, _ in expected)
         keep = level <= ceiling
-        lo, hi = (torch.tensor(a) for a in partition.corners(halves[keep]))
-        frontier.add(lo, hi, torch.tensor(level[keep]), torch.tensor(halves[keep]))
+        lo, hi = (np.array(a) for a in partition.corners(halves[keep]))
+        frontier.add(lo, hi, np.array(level[keep]), np.array(halves[keep]))
         for value, k in zip(level[keep].tolist(), halves[keep].tolist(), strict=True):
             heapq.heappush(model, (value, k))
             levels[k] = value
@@ -101,9 +98,9 @@ def test_boxes_come_in_the_order_of_their_lowest_level(seed: int, capacity: int)
 
 
 def test_a_limit_holds_boxes_back_but_never_a_handful() -> None:
-    frontier = Frontier(Partition(np.ones(1)), CPU)
-    corner = torch.ones(1, 1000, dtype=torch.float64)
-    frontier.add(-corner, corner, torch.arange(1000, dtype=torch.float64), torch.arange(1000))
+    frontier = Frontier(Partition(np.ones(1)))
+    corner = np.ones((1, 1000))
+    frontier.add(-corner, corner, np.arange(1000), np.arange(1000))
     assert frontier.take(1000, 299.0)[2].tolist() == list(range(300))
     assert frontier.take(1000, 0.0)[2].tolist() == list(range(300, 300 + _HANDFUL))
     assert frontier.take(10, 0.0)[2].tolist() == list(range(300 + _HANDFUL, 310 + _HANDFUL))
@@ -115,13 +112,13 @@ def test_levels_that_nearly_agree_keep_their_order() -> None:
     halves = np.zeros(1, dtype=np.int64)
     for _ in range(8):
         halves = partition.split(halves, np.zeros(len(halves), dtype=np.int64))
-    frontier = Frontier(partition, CPU, capacity=16)
+    frontier = Frontier(partition, capacity=16)
     order = np.random.default_rng(0).permutation(len(halves))
     levels = 1.0 + 1e-15 * order.astype(np.float64)
     levels[0] = 1e6
     for part in np.split(np.arange(len(halves)), 8):
-        lo, hi = (torch.tensor(a) for a in partition.corners(halves[part]))
-        frontier.add(lo, hi, torch.tensor(levels[part]), torch.tensor(halves[part]))
+        lo, hi = (np.array(a) for a in partition.corners(halves[part]))
+        frontier.add(lo, hi, np.array(levels[part]), np.array(halves[part]))
     level_of = dict(zip(halves.tolist(), levels.tolist(), strict=True))
     taken: list[float] = []
     while len(frontier):
@@ -137,12 +134,12 @@ def test_the_lowest_comes_back_before_many_a_hair_above_it() -> None:
     halves = np.zeros(1, dtype=np.int64)
     for _ in range(4):
         halves = partition.split(halves, np.zeros(len(halves), dtype=np.int64))
-    frontier, high = Frontier(partition, CPU, capacity=4), np.nextafter(1.0, 2.0)
+    frontier, high = Frontier(partition, capacity=4), np.nextafter(1.0, 2.0)
     taken: list[float] = []
     levels = np.array([0.0, 0.0, high, high, high, high, 0.0, 0.0, 1.0])
     for part in (np.arange(6), np.arange(6, 9)):
-        lo, hi = (torch.tensor(a) for a in partition.corners(halves[part]))
-        frontier.add(lo, hi, torch.tensor(levels[part]), torch.tensor(halves[part]))
+        lo, hi = (np.array(a) for a in partition.corners(halves[part]))
+        frontier.add(lo, hi, np.array(levels[part]), np.array(halves[part]))
     level_of = dict(zip(halves.tolist(), levels.tolist(), strict=False))
     while len(frontier):
         number = frontier.take(1, np.inf)[2].tolist()
@@ -152,7 +149,8 @@ def test_the_lowest_comes_back_before_many_a_hair_above_it() -> None:
 
 
 HARD = """
-import resource, torch
+import resource
+import numpy as np
 from certify.provers.base import Budget
 from certify.provers.boxes.rule import BoxBounds, VdotBound
 from certify.provers.boxes.search import prove_outwards
@@ -162,12 +160,12 @@ from tests.support.loops import chain
 
 class Undecided(VdotBound):
     def __call__(self, lo, hi, inner, outer):
-        none = torch.zeros(lo.shape[1], dtype=torch.bool)
-        return BoxBounds(none, torch.ones(lo.shape[1], dtype=lo.dtype), hi - lo, none, ~none)
+        none = np.zeros(lo.shape[1], dtype=np.bool_)
+        return BoxBounds(none, np.ones(lo.shape[1], dtype=lo.dtype), hi - lo, none, ~none)
 
 case = case_of(*chain(4, [-1, -2, -3, -4]))
 budget = Budget(boxes=10**9, seconds=3000.0, batch=32768, least_width=0.0)
-rule = Undecided(case.problem, case.T, torch.device("cpu"))
+rule = Undecided(case.problem, case.T)
 proof = prove_outwards(case.problem, case.T, 1e-9, 1e-2, budget, ThreadRunner(), rule=rule)
 print(proof.stop.value, len(proof.tree), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)
 """

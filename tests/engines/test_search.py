@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
 from certify.analysis.run import RoaOptions, certify_roa
 from certify.certificates.verdict import Stop, Verdict
@@ -49,7 +48,7 @@ def test_a_snapshot_is_a_proof() -> None:
         ring.advance(Budget(boxes=50, batch=16))
     found = ring.proof(Stop.BOXES)
     assert found.inner < found.outer < 6.0
-    lo, hi = (torch.tensor(a.T.copy()) for a in leaves(found.tree, found.root))
+    lo, hi = (np.array(a.T.copy()) for a in leaves(found.tree, found.root))
     lowest, highest = ring.rule.levels(lo, hi)
     meets = (lowest <= found.outer) & (highest >= found.inner)
     assert int(meets.sum()) > 5 and bool(ring.rule(lo, hi, found.inner, found.outer).proved[meets].all())

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -506,10 +505,3 @@ def test_what_is_cut_short_leaves_every_box_where_it_was(
     other: Pass = outwards(case.problem, case.T, 1e-6, 3.0, HERE)
     other.restore(state)
     assert other.advance(SMALL) is None and stands(other.proof(), alone())
-
-
-def test_threads_are_as_they_were() -> None:
-    """A job that is done here takes one thread for itself, and no longer than it lasts."""
-    before = torch.get_num_threads()
-    proved_by(Troupe(play=GARBAGE["nothing"]))
-    assert torch.get_num_threads() == before

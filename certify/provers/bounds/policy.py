@@ -35,6 +35,7 @@ class LayersEnclosure:
     centring : what is added to the last layer's bias and to the output, each with its error, (m,) each.
     """
 
+    @np.errstate(all="ignore")  # infinities and NaN are answers, which nothing is proved with
     def __init__(self, network: TanhNetwork, centring: Sequence[Array]) -> None:
         weights, biases = ([v.copy() for v in each] for each in (network.weights, network.biases))
         magnitudes, bias_errors = [np.abs(w) for w in weights], [np.zeros_like(b) for b in biases]
@@ -62,6 +63,7 @@ class LayersEnclosure:
     def __getstate__(self) -> dict[str, object]:
         return {**vars(self), "_spare": []}
 
+    @np.errstate(all="ignore")
     def __call__(self, x: Array, x_error: Array) -> tuple[Array, Array, Array, Array]:
         """Enclose the network for states `x[:, 0] + x[:, 1:] d` within x_error.
 
