@@ -54,7 +54,7 @@ class Containment(Answer):
 
 @dataclass(frozen=True, slots=True)
 class Ellipsoid:
-    """{(x - c)'P(x - c) <= level} with what it is called; P (n, n), c = `centre` (n,), empty for 0."""
+    """{(x - c)'P(x - c) <= level} with its name; P (n, n), c = `centre` (n,), empty for 0."""
 
     name: str
     P: Array
@@ -91,16 +91,16 @@ NOTHING_PROVED = Located(Containment.UNDECIDED)
 
 @dataclass(frozen=True, slots=True)
 class ProvedSet:
-    """The union of the sets that an accepted certificate proves something about, in deviations from x_eq.
+    """The proved set of an accepted certificate, a union of sets, in deviations from x_eq.
 
     Parameters
     ----------
-    system : the plant of the certificate. Its x_eq is what the file says for people; no rule depends on it.
+    system : the plant of the certificate. Its x_eq is the file's note for people; no rule depends on it.
     claim : the claim's kind.
-    ellipsoids, outer : which together are the set; `outer` is None where the claim has no outer set.
-    policy_sha256, certificate_sha256 : of the policy that it is about, and of the file.
-    origin : where x = 0 lies among the states that the policy's layers read, (n,); empty for 0. The plant is in
-        deviations from there, and so are the states that are asked about.
+    ellipsoids, outer : the sets of the union; `outer` is None if the claim has no outer set.
+    policy_sha256, certificate_sha256 : hashes of its policy and of the file.
+    origin : the state that the policy's layers read at x = 0, (n,); empty for 0. The plant is in
+    deviations from there, and so are the queried states.
     """
 
     system: System
@@ -177,7 +177,7 @@ class ProvedSet:
         return Located(Containment.UNDECIDED) if self.outer is None else self._by_pieces(box, self.outer)
 
     def _by_pieces(self, box: Box, outer: Sublevel) -> Located:
-        """The same of a box that is cut into pieces, the large ones first, each at its middle along an axis."""
+        """The same for a box that is cut into pieces, the large ones first, each at its middle along an axis."""
         waiting, used = deque([box]), set[str]()
         for _ in range(_PIECES):
             piece = waiting.popleft()
@@ -200,12 +200,12 @@ class ProvedSet:
 
 
 def proved_set(path: Path, patient: bool = False) -> ProvedSet:
-    """The set of a certificate, which is checked first, as `certify check` does it: the very bytes that are read;
+    """The set of a certificate, after a check of exactly the bytes that are read, as `certify check` does it;
     `patient` takes one whose check may need hours.
 
     Raises
     ------
-    InputError : the checker does not accept it; a solver's word, TRUSTED, is no proof.
+    InputError : the checker does not accept it; a solver's answer, TRUSTED, is no proof.
     CertificateFormatError : the file cannot be read.
     """
     raw = read_raw(path)
@@ -224,7 +224,7 @@ def proved_set(path: Path, patient: bool = False) -> ProvedSet:
 
 
 def set_of(raw: bytes, name: str) -> ProvedSet:
-    """The set of a certificate's bytes, which the checker has accepted; `name` is what messages call them.
+    """The set of a certificate's bytes, which the checker has accepted; `name` names them in messages.
 
     Raises
     ------

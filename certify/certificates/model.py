@@ -1,11 +1,10 @@
 """The certificate as data, its canonical writer and a reader for reports.
 
 Numbers never pass through decimal: hex floats, exact fractions, or raw little-endian bytes in base64. The reader here
-serves pictures and summaries; whether a certificate is valid is for the checker alone to say.
+serves pictures and summaries; only the checker decides whether a certificate is valid.
 
-A file may change between two reads, and some give other bytes at each. Whoever says something about a certificate
-reads it once (`read_raw`) and takes everything from these bytes: `parse_certificate`, their sha256, and the checker's
-answer about a file of its own that holds them.
+A file may change between two reads. So code about a certificate reads it once (`read_raw`) and takes everything from
+these bytes: `parse_certificate`, their sha256, and the checker's answer about a private file that holds them.
 """
 
 from __future__ import annotations
@@ -93,8 +92,8 @@ class Slab:
     ----------
     middle, end : its coefficients after that of the slab before, (n, n); the piece ends at {x'Px <= 1}, P = `end`.
     duration : units of time.
-    J, multipliers, weight : a ball that contains it, (n, n), and what the matrix inequalities on it take, (3, n) and
-        (k, k), k = n at rest and n + 1 along a path.
+    J, multipliers, weight : a ball that contains it, (n, n), and the numbers of the matrix inequalities on it, (3, n)
+    and (k, k), k = n at rest and n + 1 along a path.
     path : None where the ellipsoids stay around the origin.
     """
 
@@ -114,7 +113,7 @@ class OuterTree:
     Parameters
     ----------
     T, root : (n, n) and (n,), half-widths of the root box in z, x = T z.
-    tree : the partition in preorder, one byte a node.
+    tree : the partition in preorder, one byte per node.
     faces : the same for the lower and the upper end of each state, in the order of the states, 2 n in all.
     """
 
@@ -131,13 +130,13 @@ class PartitionTree:
     Parameters
     ----------
     T, root : (n, n) and (n,), half-widths of the root box in z, x = T z.
-    tree : the partition in preorder, one byte a node.
-    local : of the local proof; None where the claim has none.
-    cells : into how many parts the range of each uncertain quantity is cut for it, in their order.
-    tube : the slabs, in their order, of a claim that is enlarged by a tube.
-    order : of the series in time on its leaves, where the input is held over a period.
-    contraction : of a claim of a nearby equilibrium.
-    outer : of a claim with an outer set.
+    tree : the partition in preorder, one byte per node.
+    local : the local proof; None if the claim has none.
+    cells : number of parts of each uncertain quantity's range in the local proof, in their order.
+    tube : the slabs of a claim with a tube, in their order.
+    order : order of the series in time on its leaves, if the input is held over a period.
+    contraction : the contraction of a claim of a nearby equilibrium.
+    outer : the outer set's evidence, if the claim has one.
     """
 
     T: Array
@@ -153,7 +152,7 @@ class PartitionTree:
 
 @dataclass(frozen=True, slots=True)
 class TrustedSolver:
-    """Evidence that cannot be replayed: what a solver answered. `queries` are pairs (name, answer)."""
+    """Evidence that cannot be replayed: a solver's answers. `queries` are pairs (name, answer)."""
 
     solver: str
     version: str
@@ -169,12 +168,12 @@ class Certificate:
     ----------
     system, network : the closed loop; parameters are already put into the equations.
     V : the Lyapunov function.
-    claim : what is said about them, with its levels.
+    claim : the claim about them, with its levels.
     provenance : anything that helps people; the checker ignores it.
 
     Raises
     ------
-    InputError : the policy's layers read from another origin, under a claim or with a centring that is about 0.
+    InputError : the policy has an origin other than 0 under a claim or a centring that does not allow it.
     """
 
     system: System
@@ -212,7 +211,7 @@ class Certificate:
         return self.claim.roa
 
     def to_json(self) -> str:
-        """The file's text: sorted by section, one line a section, the same bytes for the same certificate."""
+        """The file's text: sorted by section, one line per section, the same bytes for the same certificate."""
         system, network = self.system, self.network
         sections: dict[str, Any] = {
             "schema": SCHEMA,
@@ -294,12 +293,12 @@ def read_certificate(path: Path) -> Certificate:
 
 
 def parse_certificate(raw: bytes, name: str) -> Certificate:
-    """The certificate that the bytes hold. This does not check it.
+    """Parse a certificate from its bytes. This does not check it.
 
     Parameters
     ----------
     raw : the file's bytes.
-    name : what messages call them.
+    name : their name in messages.
 
     Raises
     ------
@@ -403,8 +402,8 @@ def _read_layers(layers: Sequence[Mapping[str, Any]]) -> tuple[tuple[Array, ...]
 
 
 def _nominal(interval: Interval, said: str | None) -> Fraction:
-    """A value of an uncertain quantity: what the file says for people, if it lies in the range, which nothing that is
-    claimed depends on; else 0 if it may be 0, else the middle.
+    """A nominal value of an uncertain quantity: the file's note for people, if it lies in the range; else 0 if that
+    does, else the middle. No claim depends on it.
     """
     lo, hi = interval
     if said is not None and lo <= Fraction(said) <= hi:
@@ -416,7 +415,7 @@ def _for_people(system: System) -> dict[str, dict[str, str]]:
     """The provenance's entries for units of what the plant names, for the operating point, and for nominal values of
     uncertain parameters; none where there are none.
 
-    The plant of a certificate is in deviations from x_eq, so that nothing that is checked depends on either.
+    The plant of a certificate is in deviations from x_eq, so that no check depends on either.
     """
     names = [s.name for s in (*system.states, *system.inputs, *(s for s, _ in system.uncertain))]
     units = {name: system.units[name] for name in names if name in system.units}
@@ -428,8 +427,8 @@ def _for_people(system: System) -> dict[str, dict[str, str]]:
 def _read_provenance(
     data: Any, names: Mapping[str, Any]
 ) -> tuple[dict[str, str], dict[str, str], dict[str, str], dict[str, str]]:
-    """The provenance as text, and units, operating point and nominal values in it; it is for people, so what is odd is
-    passed over.
+    """The provenance as text, and units, operating point and nominal values in it; it is for people, so invalid
+    entries are ignored.
     """
     found = data if isinstance(data, dict) else {}
     read = {}

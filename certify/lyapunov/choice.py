@@ -81,7 +81,7 @@ def choose_candidate(
         start = largest_sampled(loop, starts, seconds=seconds) if len(starts) > 1 else P
         return Chosen(optimise_repeatedly(loop, start, end - time.monotonic()), "optimised")
     except BackendError as error:
-        return Chosen(P, "lyapunov", f"candidate lyapunov in the place of optimised: {error}")
+        return Chosen(P, "lyapunov", f"candidate lyapunov instead of optimised: {error}")
 
 
 def _weight(diagonal: tuple[float, ...] | None, count: int, name: str) -> Array:

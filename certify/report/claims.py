@@ -1,8 +1,8 @@
-"""Each kind of claim in words.
+"""The words of each kind of claim.
 
-A claim's words have places, `$name`, for what depends on how time passes in the loop and on the claimed rate
-(timing.py), and places in braces for its numbers. So there is one set of words for each kind of claim, and none for
-each combination; what is said of a loop in continuous time without a rate has nothing left over from the others.
+A claim's words have placeholders `$name` for text that depends on the loop's timing and the claimed rate (timing.py),
+and placeholders in braces for its numbers. So there is one set of words per kind of claim, and not one per
+combination.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ Part = tuple[str, str, str]
 
 @dataclass(frozen=True, slots=True)
 class Words:
-    """One kind of claim in words. In texts, {inner} and {outer} stand for its levels in digits, {duration} for how long
-    its tube is, {centre} for the state that it begins around, {speed} for what a rate says (Timing.speed),
-    {constant} for the words that ask what is uncertain to be constant, {beyond} for the level of N.
+    """One kind of claim in words. In texts, {inner} and {outer} stand for its levels in digits, {duration} for the
+    duration of its tube, {centre} for the state that the tube begins around, {speed} for the sentence about a rate
+    (Timing.speed), {constant} for the words that require constant uncertain quantities, {beyond} for the level of N.
 
     Parameters
     ----------
-    title : the page's.
+    title : the page's title.
     inner, inner_word : symbol and name of the inner level.
-    inner_set : what the figures call the inner set.
-    statement : the claim, after which nothing has to be added.
-    headline : the same in a line of the terminal.
-    meaning : of the outer set, for captions.
-    decay : what of a falling V is part of the claim and what is not; {word} is "proved" or "claimed".
-    simulated : which runs count in the simulated figures.
-    settles, runs : what becomes of a run that counts, and what a legend calls such runs.
-    parts : name, condition, and how it is shown from a partition; None where that is in the condition.
-    excluded : head and text of what this claim, other than its siblings, does not say.
-    start : what the start of its tube is called; nothing where it has none.
-    sets : what the claim is about, in the caption of what is not.
+    inner_set : the figures' name of the inner set.
+    statement : the claim, complete.
+    headline : the same in one line of the terminal.
+    meaning : the meaning of the outer set, for captions.
+    decay : the part of V's decrease that is claimed, and the part that is not; {word} is "proved" or "claimed".
+    simulated : the runs that count in the simulated figures.
+    settles, runs : the end of a run that counts, and the legend's name of such runs.
+    parts : name, condition, and proof from a partition; None if the condition has it.
+    excluded : heads and texts of the gaps of this kind of claim alone.
+    start : the name of the start of its tube; empty without one.
+    sets : the sets of the claim, for the caption of the gaps.
     """
 
     title: str
@@ -292,7 +292,7 @@ _NOT_BEYOND = (
 
 
 def _with_outer(words: Words) -> Words:
-    """The words of a claim that has an outer set besides."""
+    """The words of a claim with an outer set."""
     return replace(
         words,
         statement=words.statement + " Moreover every trajectory that starts in the outer set, the states x of "
@@ -308,14 +308,14 @@ def _with_outer(words: Words) -> Words:
 
 
 def words_for(kind: str, timing: Timing = PLAIN, *, ball: bool = False, beyond: bool = False) -> Words:
-    """The words of a claim about a loop in which time passes so.
+    """The words of a claim about a loop with this timing.
 
-    `ball` says that its evidence has one, `beyond` that the claim has an outer set.
+    `ball` is True if its evidence has a ball, `beyond` if the claim has an outer set.
 
 
     Raises
     ------
-    CertificateFormatError : there are none for this kind; a page must not guess.
+    CertificateFormatError : the kind has no words; a page must not guess.
     """
     if kind not in CLAIMS:
         raise CertificateFormatError(f"reports know the claims {', '.join(CLAIMS)}; found {kind!r}.")
@@ -332,7 +332,7 @@ def _with_ball(kind: str, parts: tuple[Part, ...], ball: bool) -> tuple[Part, ..
 
 
 def _in_steps(kind: str, parts: tuple[Part, ...], timing: Timing) -> Iterator[Part]:
-    """The parts, with those that a loop needs that is spoken of at its samples or steps."""
+    """The parts, with the further ones of a loop with held inputs or steps."""
     after = "F(x)" if timing.discrete else "φ(h)"
     for part in parts:
         yield part

@@ -52,7 +52,7 @@ def limited_by(result: Mapping[str, Any]) -> str:
 
 
 def hardest(weights: Mapping[str, float]) -> str:
-    """Along which states a proof had most to do, the first most of all.
+    """The states that cost a proof most, in descending order.
 
     >>> hardest({"theta": 1.0, "x": 0.392})
     'θ; then x, 39 % as much, each measured by its domain'
@@ -77,7 +77,7 @@ def outer_limited_by(outer: Mapping[str, Any]) -> str:
 
 
 def limit_in_words(reason: str, timing: Timing = PLAIN) -> str:
-    """A reason that is a single word as a reader understands it; sentences stay as they are.
+    """Explain a reason that is a single word; sentences stay as they are.
 
     >>> limit_in_words("time")
     'the time limit: more may be provable'

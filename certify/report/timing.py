@@ -56,7 +56,7 @@ class Timing:
 
     @property
     def unit(self) -> str:
-        """In which times are counted."""
+        """The unit of time."""
         return "steps" if self.discrete else "s"
 
     @property
@@ -66,7 +66,7 @@ class Timing:
 
     @property
     def periods(self) -> str:
-        """Over what the input is held, such as `exactly 0.02 s`; nothing where it is not held.
+        """The periods over which the input is held, such as `exactly 0.02 s`; empty if it is not held.
 
         >>> Timing(sample=(Fraction(1, 50), Fraction(1, 50))).periods
         'exactly 0.02 s'
@@ -89,7 +89,7 @@ class Timing:
 
     @property
     def over_what(self) -> str:
-        """Over what V is to fall, where that is not every instant."""
+        """The time over which V has to fall; empty if that is every instant."""
         return " over a period" if self.sample is not None else " in a step" if self.discrete else ""
 
     @property
@@ -105,12 +105,12 @@ class Timing:
 
     @property
     def derivative(self) -> str:
-        """The symbol of what has to be negative, without a rate: of V's change by time."""
+        """The symbol of V's change per unit of time, the margin without a rate."""
         return "V̇" if self.is_plain else "D"
 
     @property
     def decrease(self) -> str:
-        """The symbol of what has to be negative."""
+        """The symbol of the margin."""
         return f"{self.derivative} + 2λV" if self.rate else self.derivative
 
     @property
@@ -140,7 +140,7 @@ class Timing:
 
     @property
     def shown_rate(self) -> str:
-        """The rate, rounded down: V is claimed to fall at least as fast as that says."""
+        """The rate, rounded down: V is claimed to fall at least as fast."""
         return f"{below(self.rate)} per {'step' if self.discrete else 's'}"
 
     @property
@@ -303,8 +303,8 @@ class Timing:
         return float(math.ceil(time)) if self.discrete and math.isfinite(time) else time
 
     def reach_time(self, factor: Fraction | int) -> float | None:
-        """By when V is certainly divided by the factor: in units of time, at a step, or at a sampling instant that has
-        come by then. None without a rate, or where no number is as large."""
+        """The latest time at which V is certainly divided by the factor: in units of time, at a step, or at a sampling
+        instant. None without a rate, or if it exceeds all numbers."""
         time = self.time_to_fall(factor)
         if self.sample is not None:  # the next instant comes within a period
             time = math.nextafter(time + math.nextafter(float(self.sample[1]), math.inf), math.inf)
@@ -315,8 +315,8 @@ PLAIN = Timing()
 
 
 def reach_time(timing: Timing, floor: float | None, roa: float | None) -> float | None:
-    """By when a trajectory from {V <= c2} is in {V <= c0}, `floor`; without a floor, by when V is a hundredth of what
-    it was. None where nothing is claimed."""
+    """The latest time at which a trajectory from {V <= c2} enters {V <= c0}, `floor`; without a floor, at which V has
+    fallen to a hundredth. None without a claim."""
     if roa is None:
         return None
     return timing.reach_time(_PERCENT if floor is None else Fraction(roa) / Fraction(floor))

@@ -159,7 +159,7 @@ def test_distances_are_zero_for_what_is_true_and_known_for_what_is_not():
     first, second = distances([Kept(1, true), Kept(2, off)], PENDULUM)
     assert first == Distances(1, 0.0, 0.0, 0.0, 0.0)
     assert [second.A, second.B, second.K, second.mean] == pytest.approx([1.0, 0.5, 0.3, 0.1], rel=1e-12)
-    backwards = distances([Kept(1, _law(-K))], PENDULUM)[0]  # +K in the place of -K is as far as can be
+    backwards = distances([Kept(1, _law(-K))], PENDULUM)[0]  # +K instead of -K is as far as can be
     assert backwards.mean == pytest.approx(2.0, rel=1e-12)
 
 

@@ -1,4 +1,4 @@
-"""Vdot, or what takes its place, along the one state."""
+"""Vdot, or V's change over a step, along the one state."""
 
 from __future__ import annotations
 

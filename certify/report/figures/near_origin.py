@@ -1,4 +1,4 @@
-"""The inner set and what lies around it, for two states."""
+"""The inner set and its surroundings, for two states."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from certify.report.words import inner_level
 
 
 def near_origin(scene: Scene) -> Picture:
-    """The inner set, the innermost leaves where there are any, and trajectories that come in."""
+    """Draw the inner set, the innermost leaves if there are any, and trajectories that enter."""
     from matplotlib.collections import LineCollection
 
     figure, axes = figure_of(4.2, 3.6)

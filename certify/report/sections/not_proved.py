@@ -16,7 +16,7 @@ from certify.report.words import Varying, held_at, listed, symbol
 
 
 def not_proved_of(certificate: Certificate, words: Words) -> list[tuple[str, str]]:
-    """Heads and texts of what the claim does not say."""
+    """Heads and texts of the claim's gaps."""
     items = [
         *words.excluded[:-1],
         (
@@ -54,7 +54,7 @@ def not_proved_of(certificate: Certificate, words: Words) -> list[tuple[str, str
 
 
 def _other_times(timing: Timing) -> Iterator[tuple[str, str]]:
-    """In which other ways than the claim's time may pass in a loop."""
+    """Name the other kinds of time that the claim does not cover."""
     if timing.discrete:
         yield (
             "Time between the steps.",
