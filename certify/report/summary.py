@@ -292,8 +292,8 @@ def _tube(result: Mapping[str, Any]) -> str:
     centre = [q + Fraction(c) for q, c in zip(at, tube["centre"], strict=True)]
     where = point(_state_names(result), centre, _state_units(result))
     return (
-        f"{start} around {where}, which holds {alone}, one at a time, into {{V <= c2}}, {size}; nothing is said of "
-        "what lies between the two sets"
+        f"{start} around {where}, which holds {alone}, one at a time, into {{V <= c2}}, {size}; nothing is claimed "
+        "about states between the two sets"
     )
 
 

@@ -37,7 +37,7 @@ def near_origin(scene: Scene) -> Picture:
         keeps = f"which every trajectory enters and in which it {scene.there}".replace(" is there at ", " is at ")
     green = {
         "asymptotic": f"Green: the local set {inner}, {scene.word} at all radii at once.",
-        "practical": f"Green: the inner set {inner}, {keeps}; the dot marks the origin, of which nothing is said.",
+        "practical": f"Green: the inner set {inner}, {keeps}; the dot marks the origin; nothing is claimed about it.",
     }[scene.kind]
     return Picture(
         "Near the operating point" if any(scene.system.exact_x_eq()) else "Near the origin",
