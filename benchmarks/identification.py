@@ -1,7 +1,7 @@
 """How well A, B and K are identified, round by round: which transitions are fitted, and with which terms.
 
 Run as `python benchmarks/identification.py [PLANT ...]`. Rounds are gathered as a training run gathers them, with
-uniform random inputs in the place of the actor's; there are no networks. Every learner sees the same transitions.
+uniform random inputs instead of the actor's; there are no networks. Every learner sees the same transitions.
 """
 
 from __future__ import annotations

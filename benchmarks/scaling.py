@@ -246,7 +246,7 @@ def main() -> None:
     parser.add_argument("certificate", type=Path)
     parser.add_argument("--workers", nargs="*", type=int, default=[1, 2, 8, 64, 256, 1024])
     parser.add_argument("--copies", nargs="*", type=int, default=[1])
-    parser.add_argument("--box", type=float, default=None, help="seconds of a box, in the place of what is measured")
+    parser.add_argument("--box", type=float, default=None, help="seconds per box, instead of a measurement")
     parser.add_argument("--overhead", type=float, default=None, help="seconds of a job, likewise")
     options = parser.parse_args()
     torch.set_num_threads(1)

@@ -304,7 +304,7 @@ def test_two_runs_in_one_folder_do_not_meet(tmp_path: Path) -> None:
 
 
 def test_an_answer_about_other_bytes_is_no_proof(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Another run's certificate is accepted in the place of this one's."""
+    """Another run's certificate is accepted instead of this one's."""
     other = certify_roa(*scalar_tanh(), tmp_path / "other", RoaOptions(level=1.0)).certificate
     assert other is not None
     monkeypatch.setattr("certify.analysis.stages.acceptance.run_checker", lambda *_, **__: run_checker(other))

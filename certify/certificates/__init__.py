@@ -1,6 +1,6 @@
-"""Writing certificates, having them checked, reading them for reports. Their meaning is the checker's FORMAT.md.
+"""Write certificates, run the checkers on them, read them for reports. The checker's FORMAT.md defines their meaning.
 
-Names are resolved on first use (PEP 562): who only has a file checked needs neither plants nor arithmetic.
+Names are resolved on first use (PEP 562): a check alone needs neither plants nor arithmetic.
 """
 
 from __future__ import annotations

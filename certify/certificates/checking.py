@@ -1,7 +1,7 @@
-"""The two checkers as child processes: the ones beside this package, isolated, on a file by its path.
+"""Run the two checkers of this package as isolated child processes, on a file by its path.
 
-`python -m certify.checker` would run whichever package is installed; here the folder is named. Each program runs
-under `-I`, so that neither the current folder nor the environment lends it a module.
+`python -m certify.checker` would run the installed package; this module names the folder. Each program runs
+under `-I`, so that neither the current folder nor the environment supplies a module.
 """
 
 from __future__ import annotations
@@ -39,15 +39,15 @@ def ask(
     part: tuple[int, int] | None = None,
     patient: bool = False,
 ) -> tuple[int, dict[str, Any]]:
-    """Run a checker on a file in a process of its own: its exit status and its JSON answer.
+    """Run a checker on a file in a separate process; return its exit status and its JSON answer.
 
     Parameters
     ----------
     path : the certificate.
-    program : which of the two.
-    jobs : in how many processes it examines the leaves; the reference knows of one only.
-    part : K and N, for the answer of part K of N in the place of an acceptance; of the checker only.
-    patient : whether it may take a file that needs hours, which its rule `limits` refuses else.
+    program : the checker or the reference.
+    jobs : number of processes that examine the leaves; the reference has only one.
+    part : K and N, for the answer of part K of N instead of an acceptance; for the checker only.
+    patient : True to accept a file that needs hours, which its rule `limits` refuses otherwise.
 
     Raises
     ------
@@ -73,8 +73,8 @@ def ask(
 
 
 def run_checker(path: Path, program: Program = "checker", jobs: int = 1, patient: bool = False) -> dict[str, Any]:
-    """The JSON answer of a checker that came to a verdict, having examined the leaves in so many processes;
-    `patient` lets it take a file that needs hours.
+    """The JSON answer of a checker that reached a verdict, with so many processes for the leaves; `patient` allows a
+    file that needs hours.
 
     Raises
     ------
@@ -84,8 +84,8 @@ def run_checker(path: Path, program: Program = "checker", jobs: int = 1, patient
 
 
 def run_part(path: Path, number: int, of: int, jobs: int = 1) -> dict[str, Any]:
-    """The checker's JSON answer about one part of the leaves, and about all that is no leaf: `join_parts` makes one
-    answer of those of all parts.
+    """The checker's JSON answer about one part of the leaves and all rules without leaves; `join_parts` joins the
+    answers of all parts.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Versions of the file format: which one is written here, and who reads another."""
+"""Versions of the file format: the written one, and the programs that read others."""
 
 from __future__ import annotations
 

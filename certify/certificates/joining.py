@@ -1,6 +1,6 @@
 """One answer about a certificate from the checker's answers about its parts.
 
-Parts are examined by whoever has a core to spare; what is put together here has to be all of them, about these bytes.
+The parts must be complete and about these bytes.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _STATED = (  # of an answer, what is the same of all parts and of the whole
 def join_parts(raw: bytes, parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """The answer that the checker would have given about a file, from its answers about all of N parts of it.
 
-    Whoever made the answers is trusted as much as the checker itself; what is not trusted is how they came here.
+    The programs that made the answers are trusted like the checker itself; their transport is not.
 
     Parameters
     ----------
@@ -41,8 +41,8 @@ def join_parts(raw: bytes, parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]
 
     Raises
     ------
-    BackendError : these are not the answers of the parts 1 to N, each once, that refuse nothing, are about these bytes
-        and what they state, agree about all that is no leaf, and have looked at every leaf of the file.
+    BackendError : these are not the answers of the parts 1 to N, each once, that reject nothing, are about these bytes
+    and their statements, agree on the rules without leaves, and have examined every leaf of the file.
     """
     certificate = parse_certificate(raw, "the file whose parts were checked")
     try:

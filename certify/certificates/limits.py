@@ -24,7 +24,7 @@ MOST_MATRIX_BITS = 2**16  # of the longest number of P, times n
 
 
 def require_within_limits(system: System, network: TanhNetwork) -> None:
-    """Refuse a closed loop that no certificate can hold.
+    """Reject a closed loop that no certificate can hold.
 
     Raises
     ------
@@ -70,7 +70,7 @@ def _magnitude(q: Fraction) -> int:
 
 
 def require_short(P: np.ndarray) -> None:
-    """Refuse a P whose exact inverse takes too long.
+    """Reject a P whose exact inverse takes too long.
 
     Raises
     ------

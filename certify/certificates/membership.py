@@ -53,7 +53,7 @@ class Containment(Answer):
 
 @dataclass(frozen=True, slots=True)
 class Ellipsoid:
-    """{(x - c)'P(x - c) <= level} with what it is called; P (n, n), c = `centre` (n,), empty for 0."""
+    """{(x - c)'P(x - c) <= level} with its name; P (n, n), c = `centre` (n,), empty for 0."""
 
     name: str
     P: Array
@@ -151,7 +151,7 @@ class Region:
         return Located(Containment.UNDECIDED) if self.outer is None else self._by_pieces(box, self.outer)
 
     def _by_pieces(self, box: Box, outer: Sublevel) -> Located:
-        """The same of a box that is cut into pieces, the large ones first, each at its middle along an axis."""
+        """The same for a box that is cut into pieces, the large ones first, each at its middle along an axis."""
         waiting, used = deque([box]), set[str]()
         for _ in range(_PIECES):
             piece = waiting.popleft()
@@ -210,12 +210,12 @@ class ProvedSet(Region):
 
 
 def proved_set(path: Path, patient: bool = False) -> ProvedSet:
-    """The set of a certificate, which is checked first, as `certify check` does it: the very bytes that are read;
+    """The set of a certificate, after a check of exactly the bytes that are read, as `certify check` does it;
     `patient` takes one whose check may need hours.
 
     Raises
     ------
-    InputError : the checker does not accept it; a solver's word, TRUSTED, is no proof.
+    InputError : the checker does not accept it; a solver's answer, TRUSTED, is no proof.
     CertificateFormatError : the file cannot be read.
     """
     raw = read_raw(path)
@@ -234,7 +234,7 @@ def proved_set(path: Path, patient: bool = False) -> ProvedSet:
 
 
 def set_of(raw: bytes, name: str) -> ProvedSet:
-    """The set of a certificate's bytes, which the checker has accepted; `name` is what messages call them.
+    """The set of a certificate's bytes, which the checker has accepted; `name` names them in messages.
 
     Raises
     ------

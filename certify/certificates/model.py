@@ -34,12 +34,12 @@ class Certificate:
     ----------
     system, network : the closed loop; parameters are already put into the equations.
     V : the Lyapunov function.
-    claim : what is said about them, with its levels.
+    claim : the claim about them, with its levels.
     provenance : anything that helps people; the checker ignores it.
 
     Raises
     ------
-    InputError : the policy's layers read from another origin, under a claim or with a centring that is about 0.
+    InputError : the policy has an origin other than 0 under a claim or a centring that does not allow it.
     """
 
     system: System
@@ -77,7 +77,7 @@ class Certificate:
         return self.claim.roa
 
     def to_json(self) -> str:
-        """The file's text: sorted by section, one line a section, the same bytes for the same certificate."""
+        """The file's text: sorted by section, one line per section, the same bytes for the same certificate."""
         system, network = self.system, self.network
         sections: dict[str, Any] = {
             "schema": SCHEMA,
@@ -144,7 +144,7 @@ def _for_people(system: System) -> dict[str, dict[str, str]]:
     """The provenance's entries for units of what the plant names, for the operating point, and for nominal values of
     uncertain parameters; none where there are none.
 
-    The plant of a certificate is in deviations from x_eq, so that nothing that is checked depends on either.
+    The plant of a certificate is in deviations from x_eq, so that no check depends on either.
     """
     names = [s.name for s in (*system.states, *system.inputs, *(s for s, _ in system.uncertain))]
     units = {name: system.units[name] for name in names if name in system.units}

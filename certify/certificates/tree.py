@@ -24,7 +24,7 @@ def leaves(tree: bytes, root: Array) -> tuple[Array, Array]:
 
     Parameters
     ----------
-    tree : one byte a node.
+    tree : one byte per node.
     root : (n,) half-widths of the root box.
 
     Raises

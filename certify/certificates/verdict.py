@@ -12,7 +12,7 @@ from typing import NoReturn
 
 
 class Answer(Enum):
-    """An answer of several values to a question of proof: no bool, equal to itself and to its value as text.
+    """An answer with several values, such as a verdict: no bool, equal to itself and to its value as text.
 
     It hashes as that text does, so that the two are the same key.
     """
@@ -40,10 +40,10 @@ class Verdict(Answer):
     """Outcome of an attempt to prove a claim.
 
     PROVED: an independent checker accepted the written certificate.
-    TRUSTED: a solver says so, and nobody can replay its word.
-    REFUTED: a condition of the claim fails for this V and level, shown in rigorous arithmetic; trajectories may behave
-        all the same, and another V may show it.
-    UNKNOWN: none of these; the accompanying reason says what ran out.
+    TRUSTED: a solver says so, and nobody can replay its answer.
+    REFUTED: a condition of the claim fails for this V and level, shown in rigorous arithmetic; trajectories may still
+    converge, and another V may show it.
+    UNKNOWN: none of these; the reason names the limit that was reached.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Files appear complete or not at all, and a folder has one writer at a time."""
+"""Write files completely or not at all, with one writer per folder at a time."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def write_atomically(path: Path, data: bytes) -> None:
 
 
 def write_beside(path: Path, data: bytes, suffix: str) -> Path:
-    """Write `data` to a new file in the folder of `path`, whose name nobody else has; returns it.
+    """Write `data` to a new file with a unique name in the folder of `path`; return it.
 
     Raises
     ------
@@ -53,15 +53,15 @@ _OURS = {"certificate.json": b"certify-certificate/", "report.html": b"-m certif
 
 
 def set_aside(folder: Path, *, keep: bool = False) -> None:
-    """Rename what an earlier run has left in a folder, `certificate.json` into `certificate.earlier.json` and so on.
+    """Rename an earlier run's files in a folder, `certificate.json` to `certificate.earlier.json` and so on.
 
-    What a run did not make must not lie where its result is looked for, and what took hours must not be lost to a slip.
+    A run's folder must not show another run's results, and hours of work must not be lost to a slip.
 
-    A file that is no run's own, by its name and its text, stays as it is.
+    A file that by its name and its text belongs to no run stays as it is.
 
     Parameters
     ----------
-    keep : leave the search where it is: it is to be resumed.
+    keep : True to leave the saved search in place, to be resumed.
 
     Raises
     ------

@@ -1,7 +1,7 @@
 """`python -I -m certify.checker FILE [--json] [--jobs N] [--part K/N] [--patient]`: check one certificate.
 
-Exit status: 0 accepted, 1 rejected, 2 usage or unreadable file, 3 trusted (the evidence is a solver's word, which
-cannot be checked; what can be was), 4 nothing was refused in one part, which is no acceptance, 70 internal error.
+Exit status: 0 accepted, 1 rejected, 2 usage or unreadable file, 3 trusted (the evidence is a solver's answer, which
+cannot be checked; all else was), 4 one part held, which is no acceptance, 70 internal error.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def _part(text: str) -> tuple[int, int]:
 
 
 def _examine(path: str, share: tuple[int, int] | None, jobs: int, patient: bool) -> tuple[int, dict[str, Any]]:
-    """Status and answer of a certificate that no rule refuses."""
+    """Status and answer of a certificate that no rule rejects."""
     from . import document, words
 
     c = document.read(path)

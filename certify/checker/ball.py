@@ -96,7 +96,7 @@ class Ball:
 
     @cached_property
     def inputs(self) -> list[Jet]:
-        """pi(x) on the ball, before it is clipped, each with its own error."""
+        """pi(x) on the ball before the clip, each input with its own error."""
         net, h, U = self.case.net, self.outputs, self.units.shares
         if self.starts_at_u_eq:
             values = [float_with_error(u) for u in self.case.c.u_eq]
@@ -117,8 +117,8 @@ class Ball:
         return constant(q, self.units.shares, self.count)
 
     def F(self, cell: Intervals = ()) -> list[Jet]:
-        """The components of F on the ball, for all values of the uncertain quantities in a cell. At rest F(0) = 0, of
-        which these jets know no more than that 0 is near."""
+        """The components of F on the ball, for all values of the uncertain quantities in a cell. At rest F(0) = 0, but
+        these jets only know that 0 is near."""
         return self.f(self.states, self.symbols(cell))
 
     def f(self, states: Sequence[Jet], quantities: Sequence[Jet]) -> list[Jet]:
@@ -126,7 +126,7 @@ class Ball:
         return evaluate(self.case.c.dynamics, self.constant, [*self.shared(states), *self.inputs, *quantities])
 
     def shared(self, states: Sequence[Jet]) -> list[Jet]:
-        """States among the jets that know the inputs' errors."""
+        """The states as jets with the inputs' errors."""
         U = self.units.shares
         return [replace(x, B=np.zeros(len(U)), U=U) for x in states]
 
@@ -167,7 +167,7 @@ def keeps_inputs(ball: Ball) -> Failures:
 
 
 def is_not_clipped(ball: Ball) -> Failures:
-    """Every input lies strictly inside the policy's clip, so that the jets of what is clipped are its own."""
+    """Every input lies strictly inside the policy's clip, so that the clip does not change its jets."""
     clip = ball.case.net.clip
     for name, u, *limits in zip(ball.case.c.inputs, ball.inputs, *clip, strict=True) if clip else ():
         low, high = ends(u.c, up(u.error + u.radius))
@@ -195,8 +195,8 @@ def too_large(net: Folded, operations: int, k: int) -> Failures:
 def enclose_on_ball(net: Folded, states: Sequence[Jet]) -> Jet:
     """The last layer's values, squashed if the policy is, as a batch of jets; the states are jets without Q, K and E.
 
-    Every layer's value is y(d) = y(0) + a.d + B A(d), where A_q is what a tanh of the layers before adds to its tangent
-    at y_q(0), and B the product of weights and slopes with which that reaches y, so that errors cancel as they do in
+    Every layer's value is y(d) = y(0) + a.d + B A(d), where A_q is the difference of an earlier tanh from its tangent
+    at y_q(0), and B the product of weights and slopes with which it reaches y, so that errors cancel as they do in
     truth. A_q(d) is d'H_q d + C_q[d] + e_q(d), and `sizes` bounds all three. Each column of X = [a, B] lies within its
     `doubt` of the true one.
     """

@@ -1,5 +1,5 @@
-"""The closed loop and V on boxes of coordinates z, x = T z: what rules about leaves of a partition tree have in common,
-and the leaves themselves."""
+"""The closed loop and V on boxes of coordinates z, x = T z, for the rules about leaves of a partition tree, and the
+leaves themselves."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MAX_DEPTH = 4096
 
 @dataclass(frozen=True)
 class Leaves:
-    """The leaves of a batch of which something is asked."""
+    """The leaves of a batch that a rule examines."""
 
     boxes: Boxes
     numbers: Array  # in the tree
@@ -107,7 +107,7 @@ class Boxes:
         return Taylor(c, g, np.eye(len(q))[:, :, None] * q, r)
 
     def cross(self, far: Array) -> Array:
-        """Upper bound of what S beside its diagonal adds to V in magnitude where |z| <= far."""
+        """Upper bound of the off-diagonal part of V in magnitude where |z| <= far."""
         return total(far * total(self.S_rest[:, :, None] * far[None, :], 1), 0)
 
     def least_bound(self, rise: Taylor, gaps: Sequence[Callable[[Array], Taylor]]) -> Array:
@@ -127,7 +127,7 @@ class Boxes:
 def multipliers(a: Array, b: Array, c: Array) -> Array:
     """The k at which a term of `c k + sum_i |a_i + k b_i|` vanishes, or 0 if that is negative: (n, B), the best first.
 
-    Any number k >= 0 would do for the proof; an infinite one or NaN makes the bound NaN.
+    Any number k >= 0 is valid for the proof; an infinite one or NaN makes the bound NaN.
     """
     k = np.maximum(np.where(b != 0, -a / b, 0.0), 0.0)
     value = c * k + np.sum(np.abs(a[:, None] + k * b[:, None]), axis=0)

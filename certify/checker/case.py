@@ -1,4 +1,4 @@
-"""A certificate under examination: what several rules need of it, each computed when it is first asked for."""
+"""A certificate under examination: data that several rules need, each computed on first use."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class Case:
 
     @property
     def outer(self) -> tuple[Outer, OuterTree]:
-        """The function beyond the ellipsoid, and its evidence, of a claim that has one."""
+        """The second function N and its evidence, of a claim with an outer set."""
         if self.c.outer is None or self.partition.outer is None:
             raise TypeError("this rule is about an outer set")
         return self.c.outer, self.partition.outer
@@ -105,7 +105,7 @@ class Case:
 
     @cached_property
     def bounded(self) -> bool:
-        """True if each input lies in its bounds by form: what squash and centring leave of it, after the clip."""
+        """True if each input lies in its bounds by form: by the range that squash, centring and clip leave it."""
         policy, bounds = self.c.policy, self.c.input_bounds
         known = policy.squash == "tanh" and policy.centre != "output"
         offset, scale = ([Fraction(v) for v in numbers.tolist()] for numbers in (policy.offset, policy.scale))

@@ -2,9 +2,9 @@
 rest, that this and k (V - c0) is negative around a level c0, or, along a path, z'J'RJ z + 2 z'J'P (F - v) < 0 where
 z'J'PJ z = 1.
 
-The models of G come with their rounding errors bounded (ball.py); what follows from them is in rationals, so that no
-rounding has to be thought of, but for the sums of many terms (pairs.py, `beyond`). FORMAT.md has the inequality, its
-six sums, and why each of them is a bound.
+The models of G come with their rounding errors bounded (ball.py). From there on everything is in rationals, without
+rounding, except for the sums of many terms (pairs.py, `beyond`). FORMAT.md has the inequality, its six sums, and the
+proof that each is a bound.
 """
 
 from __future__ import annotations
@@ -169,7 +169,7 @@ def doubts(
 
 
 def size_beyond(models: Models, P: Array) -> float:
-    """Gamma: an upper bound of ||g||_P / ||d||^2, g what the models have beyond (f, A d); maybe infinite, or NaN."""
+    """Gamma: an upper bound of ||g||_P / ||d||^2, g the models less (f, A d); maybe infinite, or NaN."""
     L, often = models.units.L, np.sqrt(triples(models.A.ncols())[-1])
     c = models.shares @ L
     wrong = up((gamma(len(L)) + 2 * EPS) * total(norm(models.shares, 1), 0) * norm(L, 0))

@@ -1,4 +1,4 @@
-"""The document of a certificate: what FORMAT.md calls sections, read into plain data."""
+"""The document of a certificate: FORMAT.md's sections, read into plain data."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The functions of one variable and their expansions: the one place that knows what they are.
+"""The functions of one variable and their expansions; only this module has them.
 
 Taylor models and jets ask the same question. v lies within `radius` of a number v0 which is itself only known to lie
 within `error` of c. What are phi, phi', phi''/2 and phi'''/6 at v0, and how far is phi(v) from the parabola and from
@@ -39,10 +39,10 @@ def derivative(phi: Expansion) -> Expansion:
 def elementary(name: str, c: Any, error: Any, radius: Any) -> Expansion:
     """The expansion of a function; NaN where it may be undefined or c is not finite.
 
-    `third` and `fourth` bound |phi'''|/6 and |phi''''|/24, whose suprema are in FORMAT.md, but for 1/v what is left is
+    `third` and `fourth` bound |phi'''|/6 and |phi''''|/24, whose suprema are in FORMAT.md; but for 1/v the remainder is
     exactly -D^3 / (v0^3 v) and D^4 / (v0^4 v), and for the square root, with s^2 = v0 and w^2 = v, exactly
     D^3 (3 s + w) / (8 s^3 (s + w)^3) and -D^4 (5 s^2 + 4 s w + w^2) / (16 s^5 (s + w)^4). Nor is `last` sup|phi''''|/6
-    for these: the derivatives of what is left are D^3 (3 v + v0) / (v0^4 v^2) and, with s - w in the place of
+    for these: the derivatives of the remainder are D^3 (3 v + v0) / (v0^4 v^2) and, with s - w instead of
     D / (s + w), -D^3 (8 s^2 + 9 s w + 3 w^2) / (16 s^5 w (s + w)^3), which fall in magnitude as v rises.
     """
     if name == "tanh":

@@ -1,4 +1,4 @@
-"""The two ways in which the checker says no."""
+"""The checker's two errors: a rejected certificate, and an unreadable file."""
 
 from __future__ import annotations
 

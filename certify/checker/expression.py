@@ -3,7 +3,7 @@
 A leaf is a name or an exact fraction; a node is `["+", a, b, ...]`, `["*", a, b, ...]`, `["-", a]`,
 `["-", a, b]`, `["/", a, b]`, `["**", a, k]` with an integer k, or `[f, a]` with a function f.
 Powers and tan are expanded here, so that an arithmetic needs only +, *, unary -, and `function` for inv and the others.
-What these four make of rationals alone is a rational, computed here.
+The result of these four on rationals alone is a rational, computed here.
 """
 
 from __future__ import annotations

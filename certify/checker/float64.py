@@ -9,7 +9,7 @@ in binary64, so `up` is applied to every bound: it covers the roundings made whi
 absolute term covers underflow, at most 2^-1022 a product, for up to 2^60 products, as long as nothing large multiplies
 afterwards what has underflowed. So there is one order of factors for all bounds, in which only numbers up to 1 do:
 
-- what stands in one `up` is a sum of products of two factors: numbers of which there is no doubt, or results of `up`;
+- the argument of one `up` is a sum of products of two factors: exact numbers, or results of `up`;
 - EPS, gamma and other constants below 1 multiply the product: `EPS * (a * b)`, never `EPS * a * b`;
 - a product of three is `a * up(b * c)`, or `k * b * b` with k from `up`: where k b underflows, b is below 1.
 

@@ -1,9 +1,10 @@
 """The mean of f over a period in which the input is held: G, with x(h) = x + h G, in models of a ball or of leaves.
 
 Taylor's formula in time: G = x_1 + h x_2 + ... + h^(r-1) x_r, the last coefficient, which is the remainder, taken where
-the state may be during the period. Power series give the coefficients in any arithmetic (Moore). What is uncertain may
-change within the period. So all coefficients but the first take it as a range, which encloses another value at each
-place; the first is linear in it but for what its caller has moved away, so that there the symbol stands for the mean.
+the state may be during the period. Power series give the coefficients in any arithmetic (Moore). Uncertain quantities
+may change within the period. So all coefficients but the first take them as ranges, which enclose another value at each
+place; the first is linear in them except for terms that its caller has moved, so that there a symbol stands for the
+mean.
 """
 
 from __future__ import annotations

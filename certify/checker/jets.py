@@ -1,4 +1,4 @@
-"""Third-order models on the unit ball: what the local rule evaluates the plant and the policy in.
+"""Third-order models on the unit ball, in which the local rule evaluates the plant and the policy.
 
 A jet of v over d in R^k says, for *all* ||d|| <= 1: `v(d) = v(0) + a.d + d'Q d + K[d] + sum_j B_j e_j(d) + r(d)` with
 |r(d)| <= d'E d, K[d] being the sum of all K_hij d_h d_i d_j. It holds on every smaller ball too. The errors e_j are the
@@ -102,12 +102,12 @@ class Jet:
 
     @cached_property
     def sway(self) -> Any:
-        """Upper bound of what y adds to v(0)."""
+        """Upper bound of y's effect on v(0)."""
         return total(np.abs(self.c_y), -1)
 
     @cached_property
     def tilt(self) -> Any:
-        """Upper bound of what y adds to the gradient."""
+        """Upper bound of y's effect on the gradient."""
         return total(norm(self.a_y, -1), -1)
 
     @cached_property
@@ -157,7 +157,7 @@ class Jet:
 
     @cached_property
     def faint(self) -> Any:
-        """Upper bound of what products of B lose to underflow."""
+        """Upper bound of the underflow in products of B."""
         return up(_UNDERFLOW * total(frobenius(self.U), -1))
 
     @cached_property
@@ -214,7 +214,7 @@ class Jet:
 
     @cached_property
     def third(self) -> tuple[Any, Any]:
-        """The same of what v has beyond d'Q d, too."""
+        """The same for v less v(0) + a.d + d'Q d."""
         return up(self.twist + self.lip), up(3 * self.twist + self.lip)
 
     def lip_beyond_tangent(self, phi: Expansion) -> Any:

@@ -1,7 +1,7 @@
-"""The rule `limits`: what a file asks for, counted from the sizes that it states, before anything is computed.
+"""The rule `limits`: count a file's demands from the sizes that it states, before any other computation.
 
-Each rule alone is cheap, and so is each size; what is dear is their product. FORMAT.md has these sums, which count
-generously what this checker and the reference do: a unit is about what a nanosecond does here. They read sizes only.
+Each rule alone is cheap, and so is each size; their product is not. FORMAT.md has these sums, which count the work of
+this checker and the reference generously: a unit is about a nanosecond here. They read sizes only.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ class Sizes:
 
     @property
     def asked(self) -> bool:
-        """True if the leaves of the ring are looked at."""
+        """True if the leaves of the ring are examined."""
         return isinstance(self.evidence, Partition) and (self.evidence.local is None or self.c.c1 != self.c.c2)
 
     def bits(self, A: Array) -> int:

@@ -40,7 +40,7 @@ class Local(Ball):
 
     @property
     def margin(self) -> float:
-        """The least of those that were looked at."""
+        """The least margin so far."""
         return min(self.margins, default=float("nan"))
 
     @property
@@ -97,8 +97,8 @@ class Local(Ball):
         return later(dynamics, self.constant, start, during, held, self.period, self.order, self.settled)
 
     def G(self, cell: Intervals) -> list[Jet]:
-        """The increment of x by time over a step. Within a period what is uncertain may leave the cell: the cell counts
-        for its mean alone, in which D is convex."""
+        """The increment of x per unit of time over a step. Within a period uncertain quantities may leave the cell: the
+        cell counts only for their mean, in which D is convex."""
         c, symbols = self.case.c, self.symbols(cell)
         if c.discrete:
             return [f + -x for f, x in zip(self.F(cell), self.shared(self.states), strict=True)]

@@ -95,7 +95,7 @@ def reaches(policy: Policy, u_eq: tuple[Fraction, ...]) -> list[Fraction]:
 
 
 def _at_origin(net: Folded) -> tuple[Array, Array]:
-    """The network's value at x = 0 and a bound of its error, each (m,): a box of one point."""
+    """The network's value at x = 0, as a box of one point, and a bound of its error, each (m,)."""
     n = net.layers[0].W.shape[1]
     mid, _, error = enclose_on_boxes(net, np.zeros((n, n + 1, 1)), np.zeros((n, 1)))
     return mid[:, 0], error[:, 0]

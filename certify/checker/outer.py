@@ -32,14 +32,14 @@ _MOST_NUMBERS, _MOST_VALUES = 2**22, 2**26  # of a box: in the models of a netwo
 
 
 class Layers:
-    """A network's models: what each layer hands to the next tanh, a row for each unit."""
+    """A network's models: each layer's values before the next tanh, one row per unit."""
 
     def __init__(self, net: Network) -> None:
         self.net, self.values = net, max(len(W) for W in net.weights)
 
     @cached_property
     def as_policy(self) -> Folded:
-        """The same network as what rule `ring` encloses."""
+        """The same network as a policy, for the enclosure of rule `ring`."""
         pairs, zero = zip(self.net.weights, self.net.biases, strict=True), np.zeros(1)
         layers = tuple(Layer(W, b, np.zeros_like(b), spectral_norm(W)) for W, b in pairs)
         return Folded(layers, False, np.ones(1), zero, zero)
@@ -87,7 +87,7 @@ class Formula:
         return len(self.tape.operations) * symbols**2 <= _MOST_VALUES
 
     def least(self, x: Array, error: Array) -> Array:
-        """Nothing is known before there are models."""
+        """No bound before there are models."""
         return np.full(x.shape[2], -np.inf)
 
     def models(self, states: Sequence[Taylor]) -> list[Taylor]:
@@ -109,7 +109,7 @@ class Formula:
 
 
 def is_small(case: Case) -> Failures:
-    """`outer`: N is of a size that can be looked at."""
+    """`outer`: N is small enough."""
     if not _function(case).is_small(len(case.c.states) + len(case.c.inputs) + len(case.c.uncertain)):
         yield "claim.outer", "too many numbers or operations for so many symbols"
     return 0

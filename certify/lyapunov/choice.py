@@ -80,7 +80,7 @@ def choose_candidate(
         start = largest_sampled(loop, starts, effort=effort) if len(starts) > 1 else P
         return Chosen(optimise_repeatedly(loop, start, effort), "optimised")
     except BackendError as error:
-        return Chosen(P, "lyapunov", f"candidate lyapunov in the place of optimised: {error}")
+        return Chosen(P, "lyapunov", f"candidate lyapunov instead of optimised: {error}")
 
 
 def _weight(diagonal: tuple[float, ...] | None, count: int, name: str) -> Array:

@@ -2,8 +2,8 @@
 
 Two programs that share no line can only be wrong together where that page is wrong, or where their authors made the
 same mistake. So nothing here was taken from `certify.checker`, nothing of the project is imported, and no bound
-comes from a float: what is rational is decided in flint's fractions, all else in balls whose comparisons count only
-when they are certain.
+comes from a float: rational conditions are decided in flint's fractions, all others in balls whose comparisons count
+only when they are certain.
 
 The page leaves choices: the two lines around a tanh, the multiplier k, how the error of a tanh reaches the tanhs behind
 it, how tightly the models on a ball are bounded. They are made here independently, so on a leaf or a ball that is close

@@ -1,8 +1,8 @@
-"""Balls of Arb: what the rules on balls of states and the leaves share.
+"""Arb balls, shared by the rules on balls of states and on leaves.
 
-Traps that this module is there for: a comparison of balls is True only if it is certain, so a condition is written such
-that True is needed to go on; `min`, `max` and `sorted` of Python compare midpoints at best, so balls have methods for
-that; and a number that is not finite is compared with nothing.
+This module avoids some traps: a comparison of balls is True only if it is certain, so a condition is written such
+that True is needed to continue; `min`, `max` and `sorted` of Python compare midpoints at best, so balls have methods
+for that; and a number that is not finite is compared with nothing.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def absolute(A: arb_mat) -> arb_mat:
 
 
 def spanning(ends: Interval) -> arb:
-    """A ball that holds every number between two rationals."""
+    """A ball that contains every number between two rationals."""
     lo, hi = ends
     return arb(lo).union(arb(hi))
 
@@ -52,7 +52,7 @@ def norm(values: Sequence[arb]) -> arb:
 
 @cache
 def identity(n: int) -> arb_mat:
-    """Shared by all who ask: nobody may change it."""
+    """The identity matrix, shared: callers must not change it."""
     return arb_mat(n, n, [int(i == j) for i in range(n) for j in range(n)])
 
 
@@ -109,8 +109,8 @@ def third(name: str, at: arb, y: arb, reach: arb) -> arb | None:
     The root w of v is its parabola at y and D^3 (3 s + w) / (8 s^3 (s + w)^3), s the root of y, most where w is least.
     Both fall as |y| rises, and are taken where it is least. For tanh and atan |phi'''| is largest at 0.
 
-    A division by a ball that holds 0, or a root of one that holds what is not positive, must be refused here, and not
-    left to what becomes of its result: 0 times it is 0.
+    A division by a ball that contains 0, or a root of one that contains numbers that are not positive, must be refused
+    here, whatever the use of the result: 0 times it is 0.
     """
     if name == "1/":
         size = arb(abs(y).lower())  # a number: the power of a wide ball may hold 0 where the ball does not
@@ -169,7 +169,7 @@ def fourth(name: str, at: arb, y: arb, reach: arb) -> arb | None:
 def largest_fourth(name: str, at: arb, y: arb, reach: arb) -> arb | None:
     """A bound of |phi''''| itself, phi being `at` at y; None where phi may be undefined.
 
-    What `fourth` has for 1/v and sqrt bounds a remainder, and not its derivative, which is larger.
+    For 1/v and sqrt `fourth` bounds a remainder, not its derivative, which is larger.
     """
     bound = fourth(name, at, y, reach)
     if bound is None or name not in ("1/", "sqrt"):

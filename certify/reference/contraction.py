@@ -1,4 +1,4 @@
-"""Rule `contraction`: in {V <= c0} any two trajectories approach each other, while what is uncertain does not change.
+"""Rule `contraction`: in {V <= c0} any two trajectories approach each other, for constant uncertain quantities.
 
 So there is one equilibrium to which all of them go. For two points J d and J d' of a ball, with e = d - d' and m half
 of their sum, the components of F differ by a_i.e + 2 m'Q_i e, by K_i[d, d, e] + K_i[d, d', e] + K_i[d', d', e], each
@@ -28,7 +28,7 @@ RULE = "contraction"
 
 
 def contraction(loop: Loop, evidence: Contraction, parts: Sequence[int]) -> None:
-    """The ball holds {V <= c0}, and then F contracts on it in each cell of what is uncertain."""
+    """The ball contains {V <= c0}, and F contracts on it in each cell of the ranges."""
     c, J, g = loop.c, evidence.J, evidence.weights
     weight = arb_mat(evidence.weight)
     if c.floor is None:
@@ -67,5 +67,5 @@ def contracts(c: Certificate, J: fmpq_mat, g: Sequence[arb], weight: arb_mat, F:
 
 
 def lip_of(f: Model) -> arb:
-    """The Lipschitz constant of what is beyond the third order; without one nothing is certain."""
+    """The Lipschitz constant beyond the third order; without one nothing is certain."""
     return arb("nan") if f.lip is None else f.lip

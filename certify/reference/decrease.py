@@ -77,7 +77,7 @@ def decreases(ball: Ball, P: fmpq_mat, R: fmpq_mat, G: Field, h: fmpq = NO_STEP)
 def decreases_around(ball: Ball, P: fmpq_mat, R: fmpq_mat, G: Field, h: fmpq, level: fmpq) -> bool:
     """True if d'J'RJ d + 2 d'J'P G + h G'PG + edge (V - level) is certainly negative on the ball, V = d'J'PJ d.
 
-    The form is one in (1, d): a first row and column hold what G is at the centre.
+    The form is one in (1, d): a first row and column hold the value of G at the centre.
     """
     n, k = P.nrows(), exact(ball.edge)
     known, A, columns = quadratic(ball, P, R + k * P, G, h)
@@ -178,7 +178,7 @@ def decreases_along(ball: Ball, path: Path, P: fmpq_mat, R: fmpq_mat, F: Field) 
 
 
 def beyond_second(ball: Ball, b: Sequence[arb_mat], F: Field) -> arb_mat:
-    """S: what bounds the parts of the form that are no square."""
+    """S: the bound of the parts of the form beyond the square."""
     known = rest(ball, b, F.components) + apart(ball, b, F.components) + joint(ball, b, F.components)
     return known + cubic(ball, b, F.components) + units(ball, b, F.components, F.units)
 

@@ -58,7 +58,7 @@ class Policy:
     sha256: str
 
     def limits(self, j: int) -> tuple[fmpq, fmpq] | None:
-        """Between which input j is kept."""
+        """The interval to which the policy's clip limits input j."""
         return None if self.clip is None else (exact(self.clip[0][j]), exact(self.clip[1][j]))
 
 
@@ -72,7 +72,7 @@ class Function:
 
     @property
     def sha256(self) -> str:
-        """By which a network is named; the file does not state it."""
+        """The hash by which a network is named; the file does not state it."""
         return hashlib.sha256(b"certify-lyapunov/1\0" + b"".join(bytes_of(self.layers))).hexdigest()
 
 
@@ -82,7 +82,7 @@ class Certificate:
 
     V falls at the `rate` lambda, D + 2 lambda V < 0. With a `sample` inputs are held for a time in this range.
     `start` is P_0 of a claim with a tube, `centre` the column c_0 around which it lies where the tube follows a path.
-    `beyond` is the other function of a claim that goes beyond {V <= c2}, called `outer` in the file.
+    `beyond` is the second function of a claim with an outer set, called `outer` in the file.
     """
 
     claim: str

@@ -1,7 +1,7 @@
-"""Rule `format` for the section `evidence`: what the rules are given so that they need not search.
+"""Rule `format` for the section `evidence`, which saves the rules a search.
 
-Nothing here is believed: a ball that is too small, a multiplier that is negative or a duration of 0 has the form of a
-certificate, and is refused by the rule that uses it.
+Nothing here is trusted: a ball that is too small, a negative multiplier or a duration of 0 has the form of a
+certificate, and is rejected by the rule that uses it.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Ball:
 class Contraction:
     """All x = J d with ||d|| <= 1, where any two trajectories approach each other.
 
-    The weights g and `weight` say which of many bounds is taken.
+    The weights g and `weight` select one of many bounds.
     """
 
     J: fmpq_mat

@@ -1,4 +1,4 @@
-"""Reports: a summary for the terminal and one self-contained HTML page. They read certificates and prove nothing.
+"""Reports: a summary for the terminal and one self-contained HTML page. They only read certificates.
 
 `import certify.report` loads neither matplotlib nor jinja2: public names are resolved on first use (PEP 562), and
 the drawing library only when a page is rendered.

@@ -1,8 +1,8 @@
-"""Each kind of claim in words.
+"""The words of each kind of claim.
 
-A claim's words have places, `$name`, for what depends on how time passes in the loop and on the claimed rate
-(timing.py), and places in braces for its numbers. So there is one set of words for each kind of claim, and none for
-each combination; what is said of a loop in continuous time without a rate has nothing left over from the others.
+A claim's words have placeholders `$name` for text that depends on the loop's timing and the claimed rate (timing.py),
+and placeholders in braces for its numbers. So there is one set of words per kind of claim, and not one per
+combination.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ class Words:
 
     Parameters
     ----------
-    title : the page's.
+    title : the page's title.
     inner, inner_word : symbol and name of the inner level.
-    inner_set : what the figures call the inner set.
-    statement : the claim, after which nothing has to be added.
-    headline : the same in a line of the terminal.
-    meaning : of the outer set, for captions.
-    decay : what of a falling V is part of the claim and what is not; {word} is "proved" or "claimed".
-    simulated : which runs count in the simulated figures.
-    settles, runs : what becomes of a run that counts, and what a legend calls such runs.
-    parts : name, condition, and how it is shown from a partition; None where that is in the condition.
-    excluded : head and text of what this claim, other than its siblings, does not say.
-    start : what the start of its tube is called; nothing where it has none.
-    sets : what the claim is about, in the caption of what is not.
+    inner_set : the figures' name of the inner set.
+    statement : the claim, complete.
+    headline : the same in one line of the terminal.
+    meaning : the meaning of the outer set, for captions.
+    decay : the part of V's decrease that is claimed, and the part that is not; {word} is "proved" or "claimed".
+    simulated : the runs that count in the simulated figures.
+    settles, runs : the end of a run that counts, and the legend's name of such runs.
+    parts : name, condition, and proof from a partition; None if the condition has it.
+    excluded : heads and texts of the gaps of this kind of claim alone.
+    start : the name of the start of its tube; empty without one.
+    sets : the sets of the claim, for the caption of the gaps.
     """
 
     title: str
@@ -104,8 +104,8 @@ CLAIMS: Mapping[str, Words] = {
         inner_set="inner set",
         statement="Every trajectory of the closed loop that starts in the set {{V(x) ≤ {outer}}}$begins "
         "$stays, $enters {{V(x) ≤ {inner}}} $by, and $remains from then on.$held{speed} That is "
-        "all: of what happens inside the smaller set nothing is said.",
-        headline="from {{V <= {outer}}} every trajectory enters {{V <= {inner}}} and $there; nothing is said of "
+        "all: the claim says nothing about motion inside the smaller set.",
+        headline="from {{V <= {outer}}} every trajectory enters {{V <= {inner}}} and $there; nothing is claimed about "
         "the origin$over{speed}",
         meaning="from which every trajectory enters the inner set {V ≤ c₀} and $there",
         decay="That V falls below c₀ $within and stays there$always is {word}; $later is not.$kept",
@@ -139,8 +139,8 @@ CLAIMS = {
         _PRACTICAL,
         title="A nearby equilibrium",
         statement=_PRACTICAL.statement.split(" That is all:")[0] + " And {constant}there is exactly one equilibrium in "
-        "the smaller set, and every one of these trajectories converges to it. Of what else happens inside the smaller "
-        "set nothing is said.",
+        "the smaller set, and every one of these trajectories converges to it. The claim says nothing else about "
+        "motion inside the smaller set.",
         headline="from {{V <= {outer}}} every trajectory enters {{V <= {inner}}} and $there; {constant}it converges to "
         "the one equilibrium in that set$over{speed}",
         parts=(
@@ -209,8 +209,8 @@ CLAIMS = {
         _ASYMPTOTIC,
         statement=_ASYMPTOTIC.statement + " Every trajectory that starts in the ellipsoid "
         "{{(x − c₀)′P₀(x − c₀) ≤ 1}} around the state c₀, {centre}, stays in the domain, is in {{V(x) ≤ {outer}}} "
-        "after {duration} at the latest, and converges to the origin as well. These two sets are all that the claim is "
-        "about; nothing is said of what starts between them.",
+        "after {duration} at the latest, and converges to the origin as well. The claim is about these two sets alone; "
+        "it says nothing about trajectories that start between them.",
         headline="{{V <= {outer}}} is invariant and attracted by the origin, and every trajectory from an ellipsoid "
         "around the state enters it",
         decay="That V is at most c₂ once the tube has ended, and falls to 0, is {word}; how fast from then on is not.",
@@ -233,7 +233,7 @@ CLAIMS = {
         ),
         excluded=(
             (
-                "What lies between.",
+                "States between the two sets.",
                 "The set is the union of {V ≤ c₂} and the ellipsoid around c₀. States on the way from the one to the "
                 "other, the path of the tube among them, belong to it only where they lie in one of the two.",
             ),
@@ -270,19 +270,19 @@ _BEYOND = (
     (
         "Outer set",
         "For all x of the domain with V(x) ≥ c₂ and N(x) ≤ n₂, N is continuously differentiable, N′(x)F(x) < 0, the "
-        "closed loop is locally Lipschitz, and what the policy asks for stays in the bounds of the input",
+        "closed loop is locally Lipschitz, and the policy's input stays in its bounds",
         "leaf by leaf of a partition that covers the domain by construction",
     ),
 )
 _NOT_BEYOND = (
     (
         "Other parts of {N ≤ n₂}.",
-        "Only states of the domain belong to the outer set. Outside the domain nothing is said, whatever N is there.",
+        "Only states of the domain belong to the outer set. The claim says nothing about states outside the domain.",
     ),
     (
-        "What V and N do on the way.",
+        "V and N on the way.",
         "N falls along a trajectory from the outer set until {V ≤ c₂} is entered; V may rise meanwhile. From then on "
-        "nothing is said of N, which need not be positive, nor least at the origin.",
+        "nothing is claimed about N, which need not be positive, nor least at the origin.",
     ),
     (
         "When {V ≤ c₂} is entered.",
@@ -292,12 +292,12 @@ _NOT_BEYOND = (
 
 
 def _with_outer(words: Words) -> Words:
-    """The words of a claim that has an outer set besides."""
+    """The words of a claim with an outer set."""
     return replace(
         words,
         statement=words.statement + " Moreover every trajectory that starts in the outer set, the states x of "
-        "the domain with N(x) ≤ {beyond} and no others, enters {{V(x) ≤ {outer}}} in finite time, and from then on is "
-        "one of those just spoken of; on the way it stays in the union of the two sets.",
+        "the domain with N(x) ≤ {beyond} and no others, enters {{V(x) ≤ {outer}}} in finite time, and from then on "
+        "behaves as just stated; on the way it stays in the union of the two sets.",
         headline=words.headline
         + "; from every state of the domain with N(x) <= {beyond}, {{V <= {outer}}} is entered in finite time",
         decay="V may rise above c₂; that it comes down to c₂ in finite time is {word}. " + words.decay,
@@ -310,12 +310,12 @@ def _with_outer(words: Words) -> Words:
 def words_for(kind: str, timing: TimingInWords = PLAIN, *, ball: bool = False, beyond: bool = False) -> Words:
     """The words of a claim about a loop in which time passes so.
 
-    `ball` says that its evidence has one, `beyond` that the claim has an outer set.
+    `ball` is True if its evidence has a ball, `beyond` if the claim has an outer set.
 
 
     Raises
     ------
-    CertificateFormatError : there are none for this kind; a page must not guess.
+    CertificateFormatError : the kind has no words; a page must not guess.
     """
     if kind not in CLAIMS:
         raise CertificateFormatError(f"reports know the claims {', '.join(CLAIMS)}; found {kind!r}.")

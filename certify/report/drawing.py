@@ -1,10 +1,9 @@
-"""A report drawn by a process of its own, which loads what drawing needs while the proof is still under way.
+"""Draw a report in a separate process, which loads the drawing libraries while the proof is still running.
 
-The drawing library and the equations take as long to load as a small plant takes to be proved, and none of it is needed
-for the verdict. The process has the import path of this one, and draws the figures while the checker is at work; what
-they are worth it is told with the checker's answer, without which there is no page. Whatever keeps it from making one,
-the page is drawn here: a failure is then reported as any other, and there is never less of a report because a process
-could not be had.
+The drawing library takes as long to load as the proof of a small plant, and the verdict does not need it. The process
+has the import path of this one, and draws the figures while the checker works. It gets the checker's answer later;
+without it there is no page. If the process fails for any reason, the page is drawn in this process, and a failure is
+reported as any other.
 """
 
 from __future__ import annotations
@@ -61,10 +60,10 @@ class Drawing:
                     end.close()
 
     def begin(self, raw: bytes, path: Path, spent: float) -> None:
-        """Have the figures drawn of a certificate that is about to be checked, `spent` seconds after the run began.
+        """Start drawing the figures of a certificate that is about to be checked, `spent` seconds after the run began.
 
-        The last one counts, and what was begun before is given up. Of a large certificate nothing is drawn yet: what
-        the pipe does not hold would wait for the process, and its checker has a use for every core.
+        The last call counts, and earlier drawings are dropped. For a large certificate nothing is drawn yet: it does
+        not fit into the pipe, and its checker needs every core.
         """
         if self._begun is not None:
             self.__exit__()

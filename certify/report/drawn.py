@@ -22,7 +22,7 @@ def page_of(
     data: dict[str, Any] | None,
     figures: Figures | None = None,
 ) -> str:
-    """The report on a certificate's bytes, with the checker's answer about them and what the run says, if there are.
+    """The report on a certificate's bytes, with the checker's answer and the run's data where they exist.
 
     `figures` are those of `figures_if_accepted` for the same bytes.
     """
@@ -33,9 +33,9 @@ def page_of(
 
 
 def figures_if_accepted(raw: bytes, path: Path, spent: float) -> Figures | None:
-    """The figures of a page that says that the checker accepted these bytes, before it has; None if there are none.
+    """The figures of a page for accepted bytes, drawn before the checker answers; None if there are none.
 
-    `spent` are the seconds that the run has taken.
+    `spent` is the time of the run so far, in seconds.
     """
     from certify.report.page import figures_of
 
@@ -46,7 +46,7 @@ def figures_if_accepted(raw: bytes, path: Path, spent: float) -> Figures | None:
 
 
 def figure_of(certificate: Certificate, accepted: bool) -> Figure:
-    """The certified set as a figure of matplotlib, two columns of a paper wide."""
+    """The proved set as a matplotlib figure, two columns of a paper wide."""
     from certify.report.figures.paper import PaperOptions, set_figure
 
     return set_figure(certificate, accepted, PaperOptions(columns=2))

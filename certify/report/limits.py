@@ -54,7 +54,7 @@ def limited_by(result: Mapping[str, Any]) -> str:
 
 
 def hardest(weights: Mapping[str, float]) -> str:
-    """Along which states a proof had most to do, the first most of all.
+    """The states that cost a proof most, in descending order.
 
     >>> hardest({"theta": 1.0, "x": 0.392})
     'θ; then x, 39 % as much, each measured by its domain'

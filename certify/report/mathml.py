@@ -1,7 +1,7 @@
 """Equations as MathML, which browsers typeset without help: a plant's, and a function that is an expression.
 
-A page shows the tree that was proved. Only what is a number is multiplied out; nothing else is merged or cancelled.
-What comes out is marked as safe to stand in a page as it is, so every name passes through escaping here.
+A page shows the proved tree. Only numbers are multiplied out; nothing else is merged or cancelled. The result is marked
+as safe to insert in a page, so every name is escaped here.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def is_long(value: Fraction) -> bool:
 
 
 def _row(node: Expression, at_least: int) -> str:
-    """A node where what binds less than `at_least` is put into brackets."""
+    """A node, in brackets if it binds less than `at_least`."""
     inner = _written(node)
     if _binding(node) < at_least:
         inner = f"<mo>(</mo>{inner}<mo>)</mo>"

@@ -1,11 +1,11 @@
 """One self-contained HTML page for a certificate: figures inline, no script, nothing loaded from anywhere.
 
-The page says that something was proved only if the checker's answer says ACCEPTED *and* is about the very bytes that
-the page is drawn from: by their hash, and for good measure by the policy and the levels (sections/status.py). An answer
-about anything else is an error, not a page. Every text that comes from a file passes through jinja2's escaping.
+The page states a proof only if the checker's answer says ACCEPTED *and* is about exactly the bytes that the page is
+drawn from, by their hash, and also by the policy and the levels (sections/status.py). An answer about anything else is
+an error, not a page. Every text from a file passes through jinja2's escaping.
 
-Here belongs what is about the page as a whole: what it is made of, the list of its contents, and how long its figures
-may take. What stands in a section is made in `sections/`, how it looks in `template.html`.
+This module has the code for the whole page: its parts, the list of its contents, and the time for its figures.
+`sections/` makes the sections' data, `template.html` their looks.
 """
 
 from __future__ import annotations
@@ -54,11 +54,11 @@ def render_html(
 
     Parameters
     ----------
-    certificate : what is shown.
-    answer : what the checker said; None if it was not run.
+    certificate : the certificate to show.
+    answer : the checker's answer; None if it was not run.
     result : `RoaResult.to_dict()` of the run that made the certificate; None if there is none.
-    certificate_path : for its name alone; nothing is read from it.
-    sha256, size : of the bytes that the certificate was parsed from. Without them, those of the bytes that
+    certificate_path : the path, for its name only; nothing is read from it.
+    sha256, size : hash and size of the bytes that the certificate was parsed from. By default those of the bytes that
         `write_certificate` writes for it: the answer must then be about exactly such a file.
     figures : `figures_of` this certificate as accepted, if they are there already.
 
@@ -116,11 +116,11 @@ def render_html(
 
 
 def figures_of(certificate: Certificate, accepted: bool, result: Mapping[str, Any] | None) -> Figures:
-    """The figures, in the time that they may take after a run that has taken what `result` says.
+    """The figures, in the time that remains for them after the run of `result`.
 
     Raises
     ------
-    CertifyError, ValueError, ArithmeticError : the certificate makes no sense, which one that is accepted does.
+    CertifyError, ValueError, ArithmeticError : the certificate makes no sense, which cannot happen for an accepted one.
     """
     return draw(certificate, accepted, seconds=_time_for(result))
 

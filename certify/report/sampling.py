@@ -1,10 +1,10 @@
-"""Simulation for pictures. Nothing here is proved, and whatever is shown of it is labelled as simulated.
+"""Simulation for pictures. Nothing here is proved, and the report labels it as simulated.
 
 Runs leave the batch as soon as they are decided, which is what keeps a grid of a few thousand states well below a
 second.
 
-A run has one of three fates: it settles, it leaves, or it has done neither by the end. The third is a fate of its own:
-a slow run is no sign that anything leaves.
+A run has one of three fates: it settles, it leaves, or it does neither by the end. The third is separate: a slow run is
+no sign of leaving.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _OUTSIDE = 1.01  # times the level: a run that starts below it and comes so high
 
 @dataclass(frozen=True, slots=True)
 class SimulatedRoa:
-    """The region of attraction seen by simulation from a grid, beside the certified set.
+    """The simulated region of attraction on a grid, beside the proved set.
 
     Parameters
     ----------

@@ -1,6 +1,6 @@
-"""The terminal summary of `certify roa`: what the result says, in one screen.
+"""The terminal summary of `certify roa`: the result in one screen.
 
-Everything comes from the result: names and units too, because a plant of one's own may bear the name of another.
+Everything comes from the result, names and units too, because a user's plant may have the name of another.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ def summary(result: Mapping[str, Any]) -> RenderableType:
 
 
 def _verdict(result: Mapping[str, Any]) -> str:
-    """The verdict, unless it says more than the checker did: PROVED is only what the checker accepted."""
+    """The verdict, unless it exceeds the checker's answer: PROVED needs the checker's ACCEPTED."""
     verdict, checked = str(result["verdict"]), result.get("checked")
     if verdict == "PROVED" and checked != "ACCEPTED":
         return "TRUSTED" if checked == "TRUSTED" else "UNKNOWN"
@@ -137,7 +137,7 @@ def _uncertain(result: Mapping[str, Any]) -> list[Varying]:
 
 
 def _whatever(result: Mapping[str, Any]) -> str:
-    """For what the headline holds; nothing where the plant is exact."""
+    """The uncertain quantities for the headline; empty for an exact plant."""
     found = _uncertain(result)
     if not found:
         return ""
@@ -272,7 +272,7 @@ def _rate(result: Mapping[str, Any], timing: TimingInWords) -> str:
 
 
 def _asked(result: Mapping[str, Any]) -> str:
-    """The state that was asked about, by the states' values."""
+    """The requested state, by the states' values."""
     names = _state_names(result)
     return point(names, [Fraction(result["reach_from"][name]) for name in names], _state_units(result))
 
@@ -293,8 +293,8 @@ def _tube(result: Mapping[str, Any]) -> str:
     centre = [q + Fraction(c) for q, c in zip(at, tube["centre"], strict=True)]
     where = point(_state_names(result), centre, _state_units(result))
     return (
-        f"{start} around {where}, which holds {alone}, one at a time, into {{V <= c2}}, {size}; nothing is said of "
-        "what lies between the two sets"
+        f"{start} around {where}, which holds {alone}, one at a time, into {{V <= c2}}, {size}; nothing is claimed "
+        "about states between the two sets"
     )
 
 

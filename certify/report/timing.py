@@ -30,7 +30,7 @@ class TimingInWords(Timing):
 
     @property
     def unit(self) -> str:
-        """In which times are counted."""
+        """The unit of time."""
         return "steps" if self.discrete else "s"
 
     @property
@@ -40,7 +40,7 @@ class TimingInWords(Timing):
 
     @property
     def periods(self) -> str:
-        """Over what the input is held, such as `exactly 0.02 s`; nothing where it is not held.
+        """The periods over which the input is held, such as `exactly 0.02 s`; empty if it is not held.
 
         >>> TimingInWords(sample=(Fraction(1, 50), Fraction(1, 50))).periods
         'exactly 0.02 s'
@@ -63,7 +63,7 @@ class TimingInWords(Timing):
 
     @property
     def over_what(self) -> str:
-        """Over what V is to fall, where that is not every instant."""
+        """The time over which V has to fall; empty if that is every instant."""
         return " over a period" if self.sample is not None else " in a step" if self.discrete else ""
 
     @property
@@ -79,12 +79,12 @@ class TimingInWords(Timing):
 
     @property
     def derivative(self) -> str:
-        """The symbol of what has to be negative, without a rate: of V's change by time."""
+        """The symbol of V's change per unit of time, the margin without a rate."""
         return "V̇" if self.is_plain else "D"
 
     @property
     def decrease(self) -> str:
-        """The symbol of what has to be negative."""
+        """The symbol of the margin."""
         return f"{self.derivative} + 2λV" if self.rate else self.derivative
 
     @property
@@ -109,7 +109,7 @@ class TimingInWords(Timing):
 
     @property
     def shown_rate(self) -> str:
-        """The rate, rounded down: V is claimed to fall at least as fast as that says."""
+        """The rate, rounded down: V is claimed to fall at least as fast."""
         return f"{below(self.rate)} per {'step' if self.discrete else 's'}"
 
     @property

@@ -75,7 +75,7 @@ def deviation(name: str, x_eq: Fraction, unit: str) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Varying:
-    """Something uncertain: it may take any value in [lo, hi], at any time."""
+    """An uncertain quantity: it may take any value in [lo, hi], at any time."""
 
     name: str
     lo: Fraction

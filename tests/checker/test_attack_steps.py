@@ -39,7 +39,7 @@ def halved(depth: int) -> str:
 
 
 def loop(dynamics: Any, levels: tuple[float, ...], *, depth: int = 0, **more: Any) -> Document:
-    """A loop of one state and V = x^2, with a tree of that depth in the place of a ball where `edge` is None.
+    """A loop of one state and V = x^2, with a tree of that depth instead of a ball where `edge` is None.
 
     On a ball it is linear in the state, so that multipliers next to 0 serve whether the claim is true or not.
     """

@@ -529,7 +529,7 @@ PENDULUM = {
         constants(lambda q: -q if q == Fraction(80, 3) else q),
         constants(lambda q: q + A_LITTLE if q == Fraction(80, 3) else q),
     ),
-    "cos in the place of sin": Control("rest", renamed("sin", "cos")),
+    "cos instead of sin": Control("rest", renamed("sin", "cos")),
     "something that does not vanish": Control("rest", plus(1, "1/1000", number("1")), plus(1, "0", number("1"))),
     "an unstable equation": Control("decrease", plus(0, "9", x0), plus(0, "1/1000000000", x0)),
     "an equation dropped": Control("shape", drop("field", 1)),
@@ -613,7 +613,7 @@ PENDULUM = {
     "large multipliers": Control("unshown", multipliers(lambda k: 1e6), multipliers(lambda k: k * (1 + 2.0**-40))),
     "an inverse that is none": Control("unshown", put("W", 0, 0, to=lambda q: q + A_LITTLE)),
     "an inverse transposed": Control("unshown", put("W", to=transposed)),
-    "the inverse in the place of T": Control("unshown", exchanged),
+    "the inverse instead of T": Control("unshown", exchanged),
     "a row of the inverse dropped": Control("unshown", drop("W", 1)),
     "T of something else": Control("unshown", other_coordinates([[1, 0], [0, 1]]), mirrored),
     "T doubled": Control(

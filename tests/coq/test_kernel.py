@@ -115,7 +115,7 @@ NO_PROOF = {
     ),
     "a crash": ('[ "$file" = Claim.v ] && kill -SEGV $$', r"refuses Claim\.v \(status -11\)"),
     "nothing compiled": ('[ "$file" = Proof.v ] && exit 0', r"refuses Proof\.v \(status 0\)"),
-    "a folder in the place of what is compiled": (
+    "a folder instead of a compiled file": (
         '[ "$file" = Proof.v ] && { mkdir Proof.vo; exit 0; }', r"refuses Proof\.v \(status 0\)",
     ),
     "what is compiled beforehand": ('[ "$file" = Claim.v ] && echo x > Proof.vo', r"Proof\.vo is there before"),

@@ -1,6 +1,6 @@
 """dReal as an engine: how its answers become verdicts, what is written, and what happens without it.
 
-Most tests put a script in the place of the `dreal` binary or of single answers, so that they run everywhere.
+Most tests use a script instead of the `dreal` binary or of single answers, so that they run everywhere.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def binary(folder: Path, script: str) -> Backend:
 
 
 def answering(monkeypatch: pytest.MonkeyPatch, say: Callable[[Query, str], Answer]) -> list[str]:
-    """Answers in the place of dReal's; returns the names of what was asked."""
+    """Give answers instead of dReal; return the names of the queries."""
     asked: list[str] = []
 
     def fake(backend: Backend, query: Query, precision: float, jobs: int, seconds: float) -> Answer:

@@ -97,7 +97,7 @@ def test_the_network_of_a_two_stage_file(tmp_path: Path) -> None:
 
 
 def changed(tmp_path: Path, **new: torch.Tensor | None) -> Path:
-    """A two-stage file for the chain, with tensors in the place of others, or taken out where one is None."""
+    """A two-stage file for the chain, with tensors instead of others, or without those that are None."""
     state = {f"controller.layers.{k}": v for k, v in mlp().state_dict().items()}
     state |= {"controller.x_equilibrium": torch.zeros(2), "controller.b": torch.zeros(1)}
     state |= {f"lyapunov.layers.{k}": v for k, v in N.state_dict().items()}

@@ -450,7 +450,7 @@ MALFORMED: dict[str, Edit] = {
     "an empty weight": at("evidence.tube.0.weight", ""),
     "a weight that is null": at("evidence.tube.0.weight", None),
     "a decimal weight": at("evidence.local.weight", 1),
-    "a weight in the place of multipliers": lambda d: edited(
+    "a weight instead of multipliers": lambda d: edited(
         without("evidence.tube.0", "multipliers")(d), "evidence.tube.0.weights", encode([1.0])
     ),
     "an infinite duration": at("evidence.tube.0.duration", "inf"),

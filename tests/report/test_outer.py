@@ -137,13 +137,13 @@ def test_the_statement_says_which_states_and_what_becomes_of_them(by_network: Ca
     assert "starts in the set {V(x) ≤ 0.25} stays in it for all time and converges to the origin" in text
     assert (
         "Moreover every trajectory that starts in the outer set, the states x of the domain with N(x) ≤ −2.55 and no "
-        "others, enters {V(x) ≤ 0.25} in finite time, and from then on is one of those just spoken of; on the way it "
+        "others, enters {V(x) ≤ 0.25} in finite time, and from then on behaves as just stated; on the way it "
         "stays in the union of the two sets." in text
     )
     assert "N is the 2-4-1 tanh network" in text and named(by_network.data) in text
     assert "c₁ = 0.0625 (local), c₂ = 0.25 (enlarged) and n₂ = −2.55 (of N)" in text
     assert "The proof has 8 parts" in text and "Shown on 32 leaves." in text and "Shown on 4,096 leaves; " in text
-    for head in ("Other parts of {N ≤ n₂}.", "When {V ≤ c₂} is entered.", "What V and N do on the way."):
+    for head in ("Other parts of {N ≤ n₂}.", "When {V ≤ c₂} is entered.", "V and N on the way."):
         assert head in text
     assert "what starts outside {V ≤ c₂} and the outer set may do the same or not" in text
     assert ["n₂, of N", "-2.55"] in page.rows and ["sha256 of N", named(by_network.data)] in page.rows

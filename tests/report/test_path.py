@@ -128,7 +128,7 @@ def test_the_statement_names_the_state_and_both_sets_and_nothing_between(proved:
     assert duration <= exactly(shown.group(2)) < duration * (1 + Fraction(1, 10**4))
     assert f"starts in the set {{V(x) ≤ {level}}} stays in it for all time and converges" in text
     assert "starts in the ellipsoid {(x − c₀)′P₀(x − c₀) ≤ 1}" in text
-    assert "nothing is said of what starts between them" in text and "The set is the union" in text
+    assert "it says nothing about trajectories that start between them" in text and "The set is the union" in text
     assert "PROVED · ACCEPTED" in text and "The proof has 8 parts" in text and "UNKNOWN" not in text
     assert "outside {V ≤ c₂} and the ellipsoid around c₀" in text and "P, P₀ and c₀ are below" in text
 
@@ -358,7 +358,7 @@ def test_the_summary_says_what_the_state_has_and_of_which_set_sizes_are(proved: 
     alone = [below(v, 3) for v in data["tube"]["semi_axes"]]
     assert f"around p = 1.2 m, v = 0.5 m/s, which holds p +- {alone[0]} m, v +- {alone[1]} m/s, one at a time" in text
     assert f"into {{V <= c2}}, {data['tube']['slabs']} slabs" in text
-    assert "nothing is said of what lies between the two sets" in text
+    assert "nothing is claimed about states between the two sets" in text
     assert f"area {below(data['volume'])} m · m/s, of {{V <= c2}}" in text
     equal = {**data, "tube": {**data["tube"], "volume": data["volume"]}}
     assert "of the tube's start" not in rendered(equal)  # sizes are those of the set around the origin

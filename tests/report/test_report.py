@@ -932,7 +932,7 @@ def test_a_practical_page_cannot_be_misread(practical_case: Case) -> None:
 def test_a_practical_summary_cannot_be_misread(practical_case: Case) -> None:
     text = " ".join(rendered(practical_case.result, 200).split())
     assert text.startswith("PROVED drifting: from {V <= 1.69999} every trajectory enters {V <= 0.333334} and stays")
-    assert "floor c0 0.333334, enlarged c2 1.69999" in text and "nothing is said of the origin" in text
+    assert "floor c0 0.333334, enlarged c2 1.69999" in text and "nothing is claimed about the origin" in text
     assert MISREAD.search(text) is None
 
 

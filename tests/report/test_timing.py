@@ -140,8 +140,8 @@ def test_without_anything_new_the_words_are_those_of_continuous_time() -> None:
     of = words_for("practical")
     assert of.statement.format(outer="1", inner="0.5", speed="") == (
         "Every trajectory of the closed loop that starts in the set {V(x) ≤ 1} stays in it for all time, enters the "
-        "smaller set {V(x) ≤ 0.5} in finite time, and stays there from then on. That is all: of what happens inside "
-        "the smaller set nothing is said."
+        "smaller set {V(x) ≤ 0.5} in finite time, and stays there from then on. That is all: the claim says nothing "
+        "about motion inside the smaller set."
     )
     assert of.decay == (
         "That V falls below c₀ in finite time and stays there is {word}; how soon, and what V does below c₀, is not."

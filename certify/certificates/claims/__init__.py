@@ -1,4 +1,4 @@
-"""Claims as data: what a certificate says, and the conditions that have to be shown for it."""
+"""Claims as data, and their conditions."""
 
 from __future__ import annotations
 

@@ -22,10 +22,10 @@ Kind = Literal["asymptotic", "practical"]
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """The closed loop and the Lyapunov function V that claims are about, and how fast V is to fall.
+    """The closed loop and the Lyapunov function V of a claim, and the rate at which V has to fall.
 
-    With `rate` lambda what has to be negative is D + 2 lambda V, where D is V's increment over a step, by time: Vdot in
-    continuous time, `V(F(x)) - V(x)` in discrete time, `(V(x(h)) - V(x))/h` where the input is held over h.
+    With `rate` lambda, D + 2 lambda V has to be negative. D is V's increment over a step, per unit of time: Vdot in
+    continuous time, `V(F(x)) - V(x)` in discrete time, `(V(x(h)) - V(x))/h` if the input is held over h.
 
     Raises
     ------
@@ -184,7 +184,7 @@ class Reached(Enlarged):
 class Practical(Claim):
     """Every trajectory from {V <= c2} stays in it, enters {V <= c0} in finite time, and stays there.
 
-    `floor` is c0, at most c1, and equal to it where there is no ball. Nothing is said about what happens inside
+    `floor` is c0, at most c1, and equal to it if there is no ball. The claim says nothing about motion inside
     {V <= c0}; the origin need not be an equilibrium.
     """
 
@@ -203,7 +203,7 @@ class Practical(Claim):
 
 @dataclass(frozen=True, slots=True)
 class Nearby(Practical):
-    """The same, and where what is uncertain is constant, one equilibrium in {V <= c0}, to which all converge."""
+    """The same, and for constant uncertain quantities one equilibrium in {V <= c0}, to which all converge."""
 
     kind = "nearby"
     one_equilibrium = True

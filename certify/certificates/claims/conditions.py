@@ -62,7 +62,7 @@ class BeforeClip:
 
 @dataclass(frozen=True, slots=True)
 class Radicand:
-    """The margin `-v`, v the index-th of the equations' `radicands`: what a square root is taken of is positive."""
+    """The margin `-v`, v the index-th of the equations' `radicands`: the radicand is positive."""
 
     index: int
 
@@ -71,7 +71,7 @@ class Radicand:
 class Condition:
     """For all x in the domain box where every guard holds, `margin < 0` (`strict`) or `margin <= 0`.
 
-    With `punctured` the origin is left out: there Vdot is 0, and a proof needs the rate at which it leaves 0.
+    With `punctured` the origin is excluded: there Vdot is 0, and a proof needs the rate at which it leaves 0.
     """
 
     name: str
@@ -82,7 +82,7 @@ class Condition:
 
 
 def conditions(claim: Claim, problem: Problem) -> tuple[Condition, ...]:
-    """Everything that has to be shown for `claim`: domain, clip, local, ring, roots, inputs.
+    """All conditions of `claim`: domain, clip, local, ring, roots, inputs.
 
     The domain's conditions are about the box itself: {V <= c2} is connected and holds the origin, so it leaves the
     interior of the box only through a side.
@@ -96,7 +96,7 @@ def conditions(claim: Claim, problem: Problem) -> tuple[Condition, ...]:
 
 
 def domain_conditions(problem: Problem, level: float) -> tuple[Condition, ...]:
-    """{V <= level} lies in the interior of the domain: one condition a side."""
+    """{V <= level} lies in the interior of the domain: one condition per side."""
     system = problem.loop.system
     return tuple(
         Condition(f"domain-{symbol.name}-{side}", (Guard("inside", level),), OfState(i, side, bound))
@@ -111,7 +111,7 @@ def local_condition(level: float) -> Condition:
 
 
 def clip_conditions(problem: Problem, level: float) -> tuple[Condition, ...]:
-    """The policy's clip does nothing on {V <= level}, as the local condition needs; none without a clip."""
+    """The policy's clip is inactive on {V <= level}, as the local condition needs; none without a clip."""
     clip = problem.loop.network.clip
     if clip is None:
         return ()
@@ -148,7 +148,7 @@ def radicands(problem: Problem) -> tuple[Expression, ...]:
 
 
 def input_conditions(problem: Problem, level: float) -> tuple[Condition, ...]:
-    """The inputs lie in their bounds on {V <= level}; none where the squashing alone keeps them there."""
+    """The inputs lie in their bounds on {V <= level}; none if the squash alone keeps them there."""
     system = problem.loop.system
     if bounded_by_form(problem.loop.network, system.input_bounds):
         return ()

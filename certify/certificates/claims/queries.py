@@ -43,8 +43,8 @@ def query(condition: Condition, problem: Problem) -> Query:
 
     Raises
     ------
-    InputError : the local condition, where -(A'P + PA) is not positive definite; a plant of which something is
-        uncertain, because the query would be about its nominal value alone; time in steps, or a rate.
+    InputError : the local condition, where -(A'P + PA) is not positive definite; a plant with uncertain
+    quantities, because the query would be about nominal values alone; time in steps, or a rate.
     """
     system = problem.loop.system
     if system.ranges:
@@ -169,7 +169,7 @@ def _vdot(o: Problem) -> list[tuple[str, Tree]]:
 
 
 def _policy(loop: ClosedLoop) -> list[tuple[str, Tree]]:
-    """Definitions of the neurons `h.k.i`, of the squashed outputs `s.j`, with a clip of what it is given, `b.j`, and of
+    """Definitions of the neurons `h.k.i`, of the squashed outputs `s.j`, with a clip of its argument, `b.j`, and of
     the inputs under their own names."""
     network, system = loop.network, loop.system
     last = len(network.weights)
@@ -191,7 +191,7 @@ def _policy(loop: ClosedLoop) -> list[tuple[str, Tree]]:
 
 @dataclass(frozen=True, slots=True)
 class _Term:
-    """A tree with operators; what adds nothing is left out."""
+    """A tree with operators; terms that add nothing are omitted."""
 
     tree: Tree
 

@@ -1,5 +1,5 @@
-"""Claims proved again by the Coq proof assistant: the theory, a claim's data, what leads its proof, the kernel.
+"""Prove claims again in the Coq proof assistant: the theory, a claim's data, the evidence, the kernel.
 
-The theory says in real numbers what a certificate claims (`Spec.v`) and proves a check of it sound; here a certificate
-becomes Coq's data, a search finds what leads the check, and `coqc` is run. Only Coq is believed.
+The theory states a certificate's claim in real numbers (`Spec.v`) and proves that a check of it is sound. This package
+converts a certificate into Coq's data, searches for evidence for the check, and runs `coqc`. Only Coq is trusted.
 """

@@ -52,14 +52,14 @@ class Claimed:
 
     Parameters
     ----------
-    sha256 : of the certificate's bytes.
-    name : of the plant, an identifier; for people.
-    field : xdot = f(x, u), an expression a state.
-    domain, u_eq, bounds : of the states, and of the inputs.
+    sha256 : hash of the certificate's bytes.
+    name : the plant's name, an identifier; for people.
+    field : xdot = f(x, u), one expression per state.
+    domain, u_eq, bounds : the domain of the states, and u_eq and the bounds of the inputs.
     network : the policy.
     P, level : V = x'Px, (n, n), and c2.
-    rate : lambda of the certificate, 0 if it claims none.
-    coordinates : T of its evidence, (n, n), which a search may start from.
+    rate : the certificate's lambda, 0 if it claims none.
+    coordinates : T of its evidence, (n, n), from which a search may start.
     """
 
     sha256: str
@@ -249,7 +249,7 @@ def _array(text: Any, shape: tuple[int, ...], name: str) -> Array:
 
 
 def _coordinates(evidence: Any, n: int) -> Array | None:
-    """T of the evidence if there is one: a hint to the search, so what is odd is passed over."""
+    """T of the evidence if there is one: a hint to the search, so an invalid one is ignored."""
     if not isinstance(evidence, dict) or "T" not in evidence:
         return None
     try:

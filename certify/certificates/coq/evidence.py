@@ -12,7 +12,7 @@ Matrix = tuple[tuple[Fraction, ...], ...]
 
 @dataclass(frozen=True, slots=True)
 class Leaf:
-    """A box that is not divided, with the multiplier of c2 - V in what is shown on it."""
+    """A box that is not divided, with the multiplier of c2 - V in its inequality."""
 
     k: float
 

@@ -30,8 +30,8 @@ class Expression:
     ----------
     kind : state, input, const, add, neg, mul, inv, pow or one of `FUNCTIONS`.
     operands : none, one, or for add and mul two.
-    index : which state or input; of a power, its exponent.
-    number : of a constant.
+    index : the index of a state or input; for a power, its exponent.
+    number : the value of a constant.
     """
 
     kind: str
@@ -77,7 +77,7 @@ def from_tree(tree: Any, states: Mapping[str, int], inputs: Mapping[str, int]) -
 
 
 def at_rest(e: Expression, u: Mapping[int, Fraction]) -> Fraction | None:
-    """The value at the origin with inputs u, if it is rational by its form; None if it is not, or is not decided.
+    """The value at the origin with inputs u, if it is rational by its form; None if it is not, or undecided.
 
     >>> at_rest(Expression("cos", (Expression("state"),)), {})
     Fraction(1, 1)

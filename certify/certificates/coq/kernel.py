@@ -1,7 +1,7 @@
-"""Running Coq: which files it compiles, whether it accepted them all, and on which axioms the theorem rests.
+"""Run Coq: compile the files in order, and judge the axioms of the theorem.
 
-A theorem is proved if every file was compiled, in a new folder that has nothing else, and what Coq prints of it are
-axioms that are known here and nothing else. Whatever is printed, missing, late or unreadable otherwise is no proof.
+A theorem is proved if every file was compiled, in a new folder with nothing else, and Coq prints only axioms that are
+known here. Any other, missing, late or unreadable output is no proof.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ _TAIL = 1500
 _COMPILED = (".vo", ".vio", ".vos", ".vok", ".glob")
 _HOW = ("-q", "-R", ".", "", "-w", "+several-object-files")
 """Nothing of the user's is loaded first. The folder's own files come before others of their names: without `-R` Coq
-takes what it finds in COQPATH. A half compiled `.vio` in the place of a `.vo` is an error: Coq takes the newer one."""
+takes what it finds in COQPATH. A half compiled `.vio` instead of a `.vo` is an error: Coq takes the newer one."""
 _PROBE = "From Interval Require Import Interval.Interval.\n"
 
 
@@ -175,10 +175,9 @@ def write_folder(folder: Path, files: dict[str, bytes]) -> None:
 
 
 def compile_apart(coqc: Coqc, files: dict[str, bytes], seconds: float) -> Compiled:
-    """Compile the files in their order, and judge what Coq prints of the last one.
+    """Compile the files in their order, and judge Coq's output for the last one.
 
-    That is done in a folder that is made for it and that nobody else can write to: no file that lies about, no link and
-    no other run has a part in the answer.
+    A new folder that nobody else can write to is used: no other file, link or run can influence the answer.
     """
     with tempfile.TemporaryDirectory(prefix="certify-coq-") as name:
         write_folder(Path(name), files)
@@ -186,12 +185,12 @@ def compile_apart(coqc: Coqc, files: dict[str, bytes], seconds: float) -> Compil
 
 
 def compile_folder(coqc: Coqc, folder: Path, names: list[str], seconds: float) -> Compiled:
-    """Compile the files in their order, and judge what Coq prints of the last one.
+    """Compile the files in their order, and judge Coq's output for the last one.
 
     Parameters
     ----------
-    names : of the files in the folder; nothing compiled of them must be there.
-    seconds : for all of them.
+    names : names of the files in the folder; no compiled form of them may exist.
+    seconds : the time limit for all of them.
     """
     start = time.monotonic()
     for name in names:

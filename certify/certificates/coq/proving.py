@@ -1,6 +1,6 @@
-"""A certificate proved again by Coq: its claim in Coq's words, the search for what leads the proof, Coq's answer.
+"""Prove a certificate again in Coq: state its claim, search for evidence, run Coq.
 
-No verdict of the checkers is asked for: Coq's proof stands alone.
+The checkers do not run: Coq's proof stands alone.
 """
 
 from __future__ import annotations
@@ -85,18 +85,18 @@ class CoqResult:
 def prove_in_coq(
     raw: bytes, folder: Path, options: CoqOptions | None = None, tell: Callable[[str], None] | None = None
 ) -> CoqResult:
-    """Prove the claim of a certificate in Coq, whose files are left in a folder; what Coq compiles are these bytes.
+    """Prove a certificate's claim in Coq, and leave its files in a folder; Coq compiles exactly these bytes.
 
     Parameters
     ----------
     raw : the certificate's bytes.
-    folder : for Coq's files.
-    tell : is given a line before each step.
+    folder : the folder for Coq's files.
+    tell : called with a line before each step.
 
     Raises
     ------
-    CertificateFormatError, InputError : the bytes are no certificate, or claim what Coq's statement cannot say; the
-        folder cannot be written, or another run is at work in it.
+    CertificateFormatError, InputError : the bytes are no certificate, or Coq's statement cannot express the claim; the
+    folder cannot be written, or another run works in it.
     """
     options, tell = options or CoqOptions(), tell or (lambda _: None)
     start = time.monotonic()

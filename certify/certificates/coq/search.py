@@ -1,9 +1,9 @@
-"""The search for what leads Coq's check, in plain floats: coordinates, a core around the origin, and a partition.
+"""Search for the evidence of Coq's check, in plain floats: coordinates, a core around the origin, a partition.
 
 Coq says of each box that it lies outside of the set, that it lies in the core, or that `Vdot + rate V + k (c2 - V) < 0`
 on it for some k >= 0, the inputs within their bounds; on the core it compares F with its slopes from the origin, by
-Gaussian elimination in intervals. Nothing found here is believed, so nothing here is rounded; a small margin makes room
-for Coq's rounding.
+Gaussian elimination in intervals. Nothing found here is trusted, so rounding is ignored; a small margin leaves room for
+Coq's rounding.
 """
 
 from __future__ import annotations
@@ -73,18 +73,18 @@ class _NotFound(Exception):
 
 
 def search(claimed: Claimed, rate: Fraction | None = None, limits: Limits | None = None) -> Found:
-    """Find what leads Coq's check of a claim.
+    """Find the evidence for Coq's check of a claim.
 
     Parameters
     ----------
-    rate : of V, that is claimed; None for one that costs little: a small share of the slowest rate of the linearised
-        loop, or a smaller one if nothing is found with it or far fewer boxes are enough then.
-    limits : of the whole search.
+    rate : the claimed rate of V; None for one that costs little: a small share of the slowest rate of the linearised
+    loop, or a smaller one if nothing is found with it or far fewer boxes suffice then.
+    limits : limits of the whole search.
 
     Raises
     ------
-    InputError : the rate is not positive, or less than the certificate's; or that the loop rests at the origin does not
-        follow from its form.
+    InputError : the rate is not positive, or less than the certificate's; or the loop's form does not show that the
+    origin is its equilibrium.
     """
     limits = limits or Limits()
     least = 2 * Fraction(claimed.rate)
@@ -130,7 +130,7 @@ def _first(attempts: list[_Attempt]) -> tuple[Evidence | None, str]:
 
 
 def _require_rest(claimed: Claimed) -> None:
-    """Refuse a loop of which Coq's check does not see that it rests at the origin: it decides that in rationals."""
+    """Reject a loop whose equilibrium at the origin Coq's check cannot decide: it decides it in rationals."""
     network, u_eq = claimed.network, dict(enumerate(claimed.u_eq))
     for i, e in enumerate(claimed.field):
         value = at_rest(e, u_eq)
@@ -254,7 +254,7 @@ class _Attempt:
         return np.array([w if w >= r else _down(w) for w, r in zip(core, root, strict=True)])
 
     def _compares(self, widths: Array) -> NDArray[np.bool_]:
-        """On which boxes around the origin, (N, n), the comparison succeeds."""
+        """True for each box around the origin, (N, n), on which the comparison succeeds."""
         self.boxes += len(widths)
         found = bounds(self.claimed, self.T, Boxes(np.zeros_like(widths), widths))
         Y = self.claimed.P @ self.T

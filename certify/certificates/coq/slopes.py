@@ -1,8 +1,8 @@
-"""Bounds on boxes by slopes, in plain floats: what Coq's check computes with outward rounding, for the search.
+"""Bounds on boxes by slopes, in plain floats, for the search; Coq's check computes them with outward rounding.
 
 A quantity q on a box with centre c has a range, its value at c, and slopes g: `q(z) - q(c)` is `sum of g_k (z_k - c_k)`
-with g_k in an interval, for every z of the box. The range is cut with what the slopes say. Many
-boxes are looked at at once: the first axis of every array is that of the boxes. Nothing here is a proof.
+with g_k in an interval, for every z of the box. The range is cut with the bound by slopes. Many
+boxes are treated at once: the first axis of every array is that of the boxes. Nothing here is a proof.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ class Quantity:
         return Quantity(self.boxes, self.range[:, place], self.value[:, place], self.slopes[:, place])
 
     def cut(self) -> Quantity:
-        """The range cut with what the slopes say."""
+        """Cut the range with the bound by slopes."""
         spread = self.boxes.spread(self.slopes)
         near = Interval(self.value - spread, self.value + spread)
         return Quantity(self.boxes, self.range.cut(near), self.value, self.slopes)

@@ -1,7 +1,7 @@
-"""The files that Coq reads beside the theory: what is claimed, what leads the proof, the theorem, and its axioms.
+"""The files that Coq reads beside the theory: the claim, the evidence, the theorem, and its axioms.
 
-Every character of code in them is a fixed word or made of a number. Of what people have named, only plain words get
-in, and into comments alone: whatever a certificate says, it says nothing to Coq but numbers.
+Every character of code in them is part of a fixed word or of a number. Of people's names only plain words enter, and
+only comments: a certificate can pass nothing but numbers to Coq.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _NODES = {
 
 
 def claim_text(claimed: Claimed, rate: Fraction) -> str:
-    """`Claim.v`: the certificate's numbers and the rate of decay that is claimed of them.
+    """`Claim.v`: the certificate's numbers and the claimed rate.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ def claim_text(claimed: Claimed, rate: Fraction) -> str:
 
 
 def evidence_text(evidence: Evidence) -> str:
-    """`Evidence.v`: what the search has found."""
+    """`Evidence.v`: the result of the search."""
     lines: list[str] = []
     _tree(evidence.splits, 1, lines)
     parts = [
@@ -171,7 +171,7 @@ def _layer(weight: Array, bias: Array) -> str:
 
 
 def _list(items: Iterable[str], indent: int = 2) -> str:
-    """Items in Coq's brackets, a line each where there is an indent."""
+    """Items in Coq's brackets, one per line if there is an indent."""
     if indent:
         return "[\n" + ";\n".join(f"{' ' * indent}{item}" for item in items) + "]"
     return f"[{'; '.join(items)}]"
@@ -196,7 +196,7 @@ def _wrap(line: str) -> list[str]:
 
 
 def _tree(node: Leaf | Split, depth: int, lines: list[str]) -> None:
-    """A node a line, indented by its depth."""
+    """One node per line, indented by its depth."""
     space = " " * (2 * depth)
     if isinstance(node, Leaf):
         lines.append(f"{space}(Leaf {number(node.k)})")

@@ -1,6 +1,6 @@
 """Gather the constants of an expression, exactly, to make its evaluation cheaper.
 
-`b/(m*l**2)*v` with numbers in the place of b, m and l is one number times v; a sum of sums is one sum. That saves
+`b/(m*l**2)*v` with numbers instead of b, m and l is one number times v; a sum of sums is one sum. That saves
 operations where an expression is evaluated on a million boxes. The value is the same at every point, and so are the
 points that have one: no operand is omitted, not even one that is multiplied by 0. A claim is about the tree as it was
 written; no file contains the gathered one.

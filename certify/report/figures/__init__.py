@@ -1,8 +1,8 @@
 """The figures of a report, drawn as SVG with matplotlib's object-oriented interface (no pyplot, no display).
 
-Lines of level sets come from the certificate's numbers rounded to floats; everything simulated or sampled on a grid
-says so in its caption. Thousands of leaves are drawn as one collection and rasterised, which keeps the page small.
-One figure a file; `scene` has what they share, `geometry` their curves, `style` their looks.
+Lines of level sets come from the certificate's numbers rounded to floats; captions mark everything simulated or sampled
+on a grid. Thousands of leaves are drawn as one collection and rasterised, which keeps the page small. There is one file
+per figure; `scene` has their shared data, `geometry` their curves, `style` their looks.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ def draw(
 
     Parameters
     ----------
-    accepted : whether the checker accepted it; if not, the captions speak of claims.
-    pairs : states that are drawn against each other, by index; chosen by what belongs together if None.
-    seconds : for all of it. Sets are always drawn; where the time runs out, less is simulated, and the captions say
-        how far.
+    accepted : True if the checker accepted it; if not, the captions speak of claims.
+    pairs : states that are drawn against each other, by index; None for the default pairs.
+    seconds : the time for all figures. Sets are always drawn; if the time runs out, less is simulated, and the captions
+    say so.
     """
     import matplotlib
 
@@ -67,7 +67,7 @@ def simulated_roa(scene: Scene) -> SimulatedRoa | None:
 
 
 def region_of(scene: Scene, roa: SimulatedRoa | None) -> Region | None:
-    """The simulated region of a plane, if it has an edge in the domain."""
+    """The simulated region of a plane, if it has a boundary in the domain."""
     if roa is None or len(roa.axes) != 2 or roa.attracted.all() or not roa.attracted.any():
         return None
     return edge_of(scene.flow, roa, scene.P, scene.settling_level, scene.deadline)

@@ -1,4 +1,4 @@
-"""Vdot, or what takes its place, along the one state."""
+"""Vdot, or V's change over a step, along the one state."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def line_figure(scene: Scene, roa: SimulatedRoa | None) -> Picture:
         wider = ", and the outer set {N ≤ n₂} in the domain, from which every trajectory enters it"
         wider += (", if the claim is true" if scene.proved == "claimed" else "") + ", drawn from a grid"
     if scene.centre is not None:
-        wider = ", and the start of the tube that leads into it; nothing is said of what lies between them"
+        wider = ", and the start of the tube that leads into it; nothing is claimed about states between them"
     return Picture(
         f"{scene.falling} along the state",
         f"Shaded: the {scene.word} interval, {scene.meaning}{wider}. The curve of {scene.falling} and the "

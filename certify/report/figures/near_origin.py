@@ -1,4 +1,4 @@
-"""The inner set and what lies around it, for two states."""
+"""The inner set and its surroundings, for two states."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from certify.report.words import inner_level
 
 
 def near_origin(scene: Scene) -> Picture:
-    """The inner set, the innermost leaves where there are any, and trajectories that come in."""
+    """Draw the inner set, the innermost leaves if there are any, and trajectories that enter."""
     from matplotlib.collections import LineCollection
 
     figure, axes = figure_of(4.2, 3.6)
@@ -37,7 +37,7 @@ def near_origin(scene: Scene) -> Picture:
         keeps = f"which every trajectory enters and in which it {scene.there}".replace(" is there at ", " is at ")
     green = {
         "asymptotic": f"Green: the local set {inner}, {scene.word} at all radii at once.",
-        "practical": f"Green: the inner set {inner}, {keeps}; the dot marks the origin, of which nothing is said.",
+        "practical": f"Green: the inner set {inner}, {keeps}; the dot marks the origin; nothing is claimed about it.",
     }[scene.kind]
     return Picture(
         "Near the operating point" if any(scene.system.exact_x_eq()) else "Near the origin",

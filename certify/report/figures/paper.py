@@ -1,7 +1,7 @@
-"""The figure for a paper: the certified set alone, one or two columns wide.
+"""The figure for a paper: the proved set alone, one or two columns wide.
 
-A page of a journal has no room for a screen's captions: there is one legend below the panels, fonts have the size that
-they have in print, and what is simulated keeps its star.
+A page of a journal has no room for long captions: there is one legend below the panels, fonts have their size in print,
+and simulated parts keep their star.
 """
 
 from __future__ import annotations
@@ -61,11 +61,11 @@ class PaperOptions:
 
 
 def paper_figure(certificate: Certificate, accepted: bool, options: PaperOptions | None = None) -> bytes:
-    """The certified set in each pair of states, as a file's bytes; equal certificates give equal bytes.
+    """The proved set in each pair of states, as a file's bytes; equal certificates give equal bytes.
 
     Parameters
     ----------
-    accepted : whether the checker accepted the certificate; if not, the legend speaks of a claim.
+    accepted : True if the checker accepted the certificate; if not, the legend speaks of a claim.
 
     Raises
     ------
@@ -80,7 +80,7 @@ def paper_figure(certificate: Certificate, accepted: bool, options: PaperOptions
 
 
 def set_figure(certificate: Certificate, accepted: bool, options: PaperOptions | None = None) -> Figure:
-    """The same as a figure of matplotlib, to be changed and saved by whoever asked for it.
+    """The same as a matplotlib figure, to change and save.
 
     Raises
     ------

@@ -97,7 +97,7 @@ def surface(scene: Scene, pair: tuple[int, int]) -> Picture:
 
 
 def _start(scene: Scene, pair: tuple[int, int]) -> tuple[np.ndarray, np.ndarray] | None:
-    """The edge of a tube's start in the plane; None where there is none, or where it does not lie around the plane."""
+    """The boundary of a tube's start in the plane; None without a tube, or if it is not around the origin."""
     if scene.start is None or (scene.centre is not None and scene.n > 2):
         return None
     if scene.centre is None:

@@ -3,8 +3,8 @@
 With two states the plane is the whole space and the picture shows the domain. With more there are two exact shapes to
 tell apart: the section through the origin `{y: y'P_ij y <= c}`, the points of the plane that lie in the set, and the
 projection `{y: y'((P^-1)_ij)^-1 y <= c}`, all values that two states take anywhere in the set; the picture is zoomed
-to the latter. The start of a tube has the same two, and then the picture is zoomed to whatever reaches further. A tube
-around a path leaves the plane through the origin: of it there are projections only, and no sign of Vdot is shown there.
+to the latter. The start of a tube has the same two; then the picture is zoomed to the larger one. A tube around a path
+leaves the plane through the origin, so the picture shows only its projections and no sign of Vdot.
 """
 
 from __future__ import annotations
@@ -173,7 +173,7 @@ def keys(scene: Scene, runs: Runs, region: Region | None, growing: bool) -> tupl
 
 
 def _kinds(scene: Scene, runs: Runs) -> list[tuple[NDArray[np.bool_], str, Any, str]]:
-    """Runs by their fates, those that there are: which, colour, style, text."""
+    """The kinds of runs that occur, by their fates: which, colour, style, text."""
     leaving = "trajectories that leave the domain*"
     if np.any(runs.left & ~np.any(np.isnan(runs.path[-1]), axis=-1)):
         leaving = "trajectories that leave the domain or the set*"
@@ -191,7 +191,7 @@ def _kinds(scene: Scene, runs: Runs) -> list[tuple[NDArray[np.bool_], str, Any, 
 
 
 def draw_plane(axes: Any, scene: Scene, pair: Pair, runs: Runs, region: Region | None) -> bool:
-    """Everything in one plane; whether Vdot >= 0 at some grid point."""
+    """Draw everything in one plane; return True if Vdot >= 0 at some grid point."""
     from matplotlib.collections import LineCollection
     from matplotlib.patches import Rectangle
 

@@ -58,7 +58,7 @@ def is_ellipsoid(certificate: Certificate) -> bool:
 
 
 def inner_of(certificate: Certificate) -> float:
-    """The level of the inner set that the claim speaks of: c0 of a practical claim, else c1."""
+    """The level of the claim's inner set: c0 of a practical claim, else c1."""
     claim = certificate.claim
     return claim.local if claim.floor is None else claim.floor
 
@@ -73,7 +73,7 @@ def is_local_enough(certificate: Certificate) -> bool:
 def start_of(certificate: Certificate) -> Array | None:
     """P (n, n) of the ellipsoid {(x - c)'P(x - c) <= 1} from which a tube leads into {V <= c2}, c as `centre_of` says.
 
-    None where the claim has none, and where a rejected file has something else in its place.
+    None if the claim has none, or if a rejected file has something else there.
     """
     claim = certificate.claim
     if claim.start is None:
@@ -101,7 +101,7 @@ class Band:
     ----------
     time : (K,), rising.
     P, centre : (K, n, n) and (K, n).
-    half : `sqrt((P^-1)_ii)` (K, n): how far it reaches from the centre along each state.
+    half : `sqrt((P^-1)_ii)` (K, n): its reach from the centre along each state.
     """
 
     time: Array
@@ -257,8 +257,8 @@ class Scene:
 
     @property
     def settling_level(self) -> float:
-        """V at which a run has done what the claim says of it: near the origin, or in {V <= c0}, which may be too small
-        for a simulation to come into."""
+        """The level of V at which a run counts as settled: near the origin, or {V <= c0}, which may be too small for a
+        simulation to reach."""
         return max(self.inner if self.kind == "practical" else 0.0, SETTLED * self.outer)
 
     @property
@@ -285,7 +285,7 @@ class Scene:
 
     @property
     def there(self) -> str:
-        """When trajectories are in a set that they have entered."""
+        """The times at which trajectories are in a set after entering it, in words."""
         return self.timing.phrases["there"]
 
     @property
@@ -294,9 +294,9 @@ class Scene:
         return self.words.meaning + ("" if self.proved == "proved" else ", if the claim is true")
 
     def growth(self, x: Array) -> Array:
-        """V's change by time in float64, Vdot or what takes its place; NaN where the equations have a pole.
+        """V's change per unit of time in float64: Vdot, or D in steps; NaN where the equations have a pole.
 
-        With an outer set it is N's, and NaN in {V <= c2}, where N is nobody's concern.
+        With an outer set it is N's, and NaN in {V <= c2}, where N has no condition.
         """
         if self.beyond is None:
             value = growth(self.flow, self.P, x, self.step)
@@ -308,7 +308,7 @@ class Scene:
 
     @property
     def falling(self) -> str:
-        """The symbol of what `growth` gives."""
+        """The symbol of the quantity of `growth`."""
         return self.timing.derivative if self.beyond is None else "N′F"
 
     def in_outer(self, x: Array) -> NDArray[np.bool_]:

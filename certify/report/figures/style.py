@@ -62,10 +62,10 @@ class Key:
 
     Parameters
     ----------
-    text : what it stands for; a star says simulated or on a grid.
-    colour : of the line, or of the area's edge.
-    width : of the line in points, 0 for none.
-    style : of the line, `-`, `--` or `:`.
+    text : its meaning; a star marks simulation or a grid.
+    colour : colour of the line, or of the area's boundary.
+    width : width of the line in points, 0 for none.
+    style : style of the line, `-`, `--` or `:`.
     fill : the area's colour; None for a line.
     """
 
@@ -96,12 +96,12 @@ class Picture:
 
     Parameters
     ----------
-    title, caption : for the page; the caption says what is simulated or sampled.
+    title, caption : texts for the page; the caption marks simulated or sampled parts.
     svg : the drawing.
-    simulated : whether anything in it comes from simulation or a grid.
-    wide : whether it takes the page's full width.
-    legend : of its colours; pictures that follow each other with the same one share it.
-    about : what is said once, above the pictures that share a legend.
+    simulated : True if anything in it comes from simulation or a grid.
+    wide : True if it takes the page's full width.
+    legend : legend of its colours; consecutive pictures with the same legend share it.
+    about : text above the pictures that share a legend.
     """
 
     title: str

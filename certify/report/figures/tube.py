@@ -22,7 +22,7 @@ MOST = 12
 def tube(scene: Scene, runs: Runs) -> list[Picture]:
     """A picture for each state, with `runs` from the tube's start; none without a tube that can be drawn.
 
-    Where there are more than `MOST` states, those that the start drives furthest into the domain.
+    With more than `MOST` states: those along which the start reaches furthest into the domain.
     """
     if scene.start_reach is None or scene.band is None:
         return []  # a rejected file's tube need not be one

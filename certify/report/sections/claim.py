@@ -41,9 +41,9 @@ _MOST_OPERATIONS = 200  # of an expression N that is shown
 
 
 def claim_of(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict[str, Any]:
-    """The claim of FORMAT.md in words and numbers, and what the checker showed of each part.
+    """The claim of FORMAT.md in words and numbers, with the checker's result for each part.
 
-    Of a solver's word the checker shows only the exact parts; the others say whose word they are.
+    For a solver's answer the checker shows only the exact parts; the others name the solver.
     """
     system, words, evidence, timing = (
         certificate.system,
@@ -137,7 +137,7 @@ def _in_cells(evidence: PartitionTree | TrustedSolver) -> str:
 
 
 def _with_errors(parts: Sequence[tuple[str, str, str]], system: System) -> Iterator[tuple[str, str, str]]:
-    """The parts of a claim, the one on inputs in words that know the error that comes on top of what is asked for."""
+    """The parts of a claim, with the part on inputs reworded for input errors."""
     errors = system.input_errors
     held = all(lo <= 0 <= hi for lo, hi in (system.ranges[e] for e in errors.values()))
     on_top = (

@@ -16,7 +16,7 @@ from certify.report.words import Varying, held_at, listed, symbol
 
 
 def not_proved_of(certificate: Certificate, words: Words) -> list[tuple[str, str]]:
-    """Heads and texts of what the claim does not say."""
+    """Heads and texts of the claim's gaps."""
     items = [
         *words.excluded[:-1],
         (

@@ -1,4 +1,4 @@
-"""The tables of numbers: levels, sizes, the loop near the origin, matrices, what the evidence is, what the run did."""
+"""The tables of numbers: levels, sizes, the loop near the origin, matrices, the evidence, the run."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def tables_of(
     sha256: str,
     size: int | None,
 ) -> dict[str, Any]:
-    """All tables but those of the matrices, and what stands at their heads, by their names in the template."""
+    """All tables except those of the matrices, and their heads, by their names in the template."""
     drawn = is_ellipsoid(certificate)
     sets = ellipsoids_of(certificate) if drawn else ()
     heads, reach = _reach(certificate, sets) if drawn else ([], [])
@@ -74,7 +74,7 @@ def tables_of(
 
 
 def matrices_of(certificate: Certificate) -> list[tuple[str, list[list[str]]]]:
-    """Names and entries of what the quadratic forms are, as the file has them."""
+    """Names and entries of the matrices, as the file has them."""
     named = [("P", certificate.P)]
     if certificate.claim.start is not None:
         named.append(("P₀ of the tube's start", certificate.claim.start.P))
@@ -85,7 +85,7 @@ def matrices_of(certificate: Certificate) -> list[tuple[str, list[list[str]]]]:
 
 
 def _levels(certificate: Certificate, result: Mapping[str, Any] | None) -> Rows:
-    """The levels of V and N, and what limits them, as far as a run has said it."""
+    """The levels of V and N, and their limits as far as a run reports them."""
     words, inner, beyond = words_of(certificate), inner_of(certificate), certificate.claim.outer
     rows = [(f"{words.inner}, {words.inner_word}", repr(inner))]
     rows += [("c₁, local", repr(certificate.inner))] if inner != certificate.inner else []
@@ -117,7 +117,7 @@ def _sizes(certificate: Certificate, sets: Sequence[Ellipsoid]) -> Rows:
 
 
 def _reach(certificate: Certificate, sets: Sequence[Ellipsoid]) -> tuple[list[str], list[tuple[str, ...]]]:
-    """Heads of the columns and, for each state, how far the sets reach along it, beside its domain."""
+    """Heads of the columns and, for each state, the sets' reach along it, beside its domain."""
     system = certificate.system
     heads, columns = _lengths(certificate, sets)
     names = [
@@ -132,7 +132,7 @@ def _reach(certificate: Certificate, sets: Sequence[Ellipsoid]) -> tuple[list[st
 
 
 def _geometry(certificate: Certificate) -> Rows:
-    """V's eigenvalues and the loop's, and how time goes."""
+    """The eigenvalues of V and of the loop, and the timing."""
     system, timing, rows = certificate.system, timing_of(certificate), list[tuple[str, str]]()
     if np.all(np.isfinite(certificate.P)):
         rows.append(("eigenvalues of P", ", ".join(number(float(v)) for v in np.linalg.eigvalsh(certificate.P))))
@@ -209,7 +209,7 @@ def _unit_of(certificate: Certificate) -> str:
 
 
 def _outer_rows(beyond: Outer, answer: Mapping[str, Any] | None) -> list[tuple[str, str]]:
-    """N, and on how many leaves the checker has looked at it."""
+    """N, and the number of leaves on which the checker examined it."""
     N = beyond.function
     rows = [("N", network_name(N.widths)), ("sha256 of N", N.sha256())] if isinstance(N, Neural) else []
     found = (answer or {}).get("outer")
@@ -220,7 +220,7 @@ def _outer_rows(beyond: Outer, answer: Mapping[str, Any] | None) -> list[tuple[s
 
 
 def _estimated(certificate: Certificate, result: Mapping[str, Any] | None) -> str:
-    """The volume of the union with the outer set, as the run has it or from samples; nothing without one."""
+    """The volume of the union with the outer set, from the run or from samples; empty without one."""
     beyond, system = certificate.claim.outer, certificate.system
     if beyond is None:
         return ""
@@ -234,10 +234,10 @@ def _estimated(certificate: Certificate, result: Mapping[str, Any] | None) -> st
 
 
 def _lengths(certificate: Certificate, sets: Sequence[Ellipsoid]) -> tuple[list[str], list[list[str]]]:
-    """Heads and columns of how far the sets reach along the states: on the axes, rounded down, and at all, up.
+    """Heads and columns of the sets' reach along the states: on the axes, rounded down, and at most, rounded up.
 
-    Where there are two sets, their sizes on the axes stand side by side, as shares of the domain too if both lie around
-    the origin.
+    Two sets have their sizes on the axes side by side, also as shares of the domain if both lie around the
+    origin.
     """
     axes = [[below(float(v)) for v in semi_axes(each.P, each.level)] for each in sets]
     most = [[above(float(v)) for v in extents(each.P, each.level)] for each in sets]

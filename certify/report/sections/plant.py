@@ -1,5 +1,5 @@
-"""The plant that a claim is about, within the section on what was proved: its equations, its domain, the bounds of its
-inputs, where it rests, and what of it is uncertain."""
+"""The claim's plant, within the section on the proof: its equations, its domain, the bounds of its inputs, its
+operating point, and its uncertain quantities."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from certify.report.words import above, at_rest, below, held_at, number, pretty_
 
 
 def plant_of(certificate: Certificate) -> dict[str, Any]:
-    """Its equations, its ranges and where it rests, by their names in the template."""
+    """Its equations, its ranges and its operating point, by their names in the template."""
     system, units = certificate.system, certificate.system.units
     expressions, steps = system.uncertain_dynamics(), system.time == "discrete"
 

@@ -33,7 +33,7 @@ def words_of(certificate: Certificate) -> Words:
 
 @dataclass(frozen=True, slots=True)
 class Ellipsoid:
-    """{x'Px <= level}, of those that the certificate is about; `kind` is `start` for that of a tube, else `set`.
+    """{x'Px <= level}, a set of the certificate; `kind` is `start` for that of a tube, else `set`.
 
     It lies around the origin, that of a tube around a path around its c₀.
     """

@@ -1,4 +1,4 @@
-"""The share of the simulated region, under the figures: what the grid of runs shows, and how they came about.
+"""The share of the simulated region, under the figures: the results of the grid of runs, and their integration.
 
 The runs themselves are those of `certify/report/sampling.py`; the figures draw them.
 """
@@ -16,7 +16,7 @@ from certify.report.words import ABSENT, TIMES, number, volume_name
 
 
 def simulated_of(roa: SimulatedRoa, certificate: Certificate) -> dict[str, str]:
-    """The counts of a grid of runs, and how they came about."""
+    """The counts of a grid of runs, and their integration in words."""
     timing = timing_of(certificate)
     return {
         "fraction": ABSENT if np.isnan(roa.fraction) else f"{100 * roa.fraction:.1f} %",

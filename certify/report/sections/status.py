@@ -1,7 +1,7 @@
-"""The boxes at the head of the page: what may be said of the certificate, and what was asked for and missed.
+"""The boxes at the head of the page: the certificate's status, and requests that were missed.
 
-Whether a page may speak of a proof is decided here and nowhere else; all other sections are told by a `Status`, or get
-the checker's answer only if it accepts.
+Only this module decides whether a page may speak of a proof; all other sections get a `Status`, or the checker's answer
+if it accepts.
 """
 
 from __future__ import annotations

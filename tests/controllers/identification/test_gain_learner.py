@@ -140,7 +140,7 @@ def test_each_round_adds_to_the_transitions_that_are_fitted_or_replaces_them():
         v[:4] = 0.0
         x_next = x @ A.T + v @ B.T + noise
         for learner in learners.values():
-            learner.refresh()  # goes on with the first round
+            learner.refresh()  # continues the first round
             for row in zip(x, v, x_next, strict=True):
                 learner.observe(*row)
             assert learner.phase == "idle"

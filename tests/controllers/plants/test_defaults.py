@@ -64,7 +64,7 @@ def test_weights_are_relative_to_how_far_states_and_inputs_may_go(tmp_path):
 
 
 def test_other_units_are_another_scale_and_the_same_training(tmp_path):
-    """Millimetres in the place of metres: the same time step, weights by the square of the unit."""
+    """Millimetres instead of metres: the same time step, weights by the square of the unit."""
     text = TEXT.replace("k = 8", "k = 0").replace('x = "x0"', "x = 0")
     metres = load_system(_write(tmp_path, text))
     text = text.replace("x = [-0.75, 1.25]\nv = [-2, 2]", "x = [-750, 1250]\nv = [-2000, 2000]")

@@ -1,0 +1,76 @@
+"""Plain English: docstrings and sentences name the thing, then the verb, and some phrases do not occur."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+ROOMS = ("loop", "lyapunov", "certificates", "checker", "reference", "report", "cli")
+LATER = {"cli/roa.py", "cli/reach.py", "cli/certifying.py"}
+SOURCES = [
+    path
+    for room in ROOMS
+    for path in sorted((ROOT / "certify" / room).rglob("*.py"))
+    if str(path.relative_to(ROOT / "certify")) not in LATER
+]
+PAGES = [
+    *sorted((ROOT / "docs").rglob("*.md")),
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "examples/README.md", "certify/checker/FORMAT.md")),
+]
+_DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+_OPENER = re.compile(r"\W*(?:What|Whether|Of|Those|How)\b")
+_SENTENCE = re.compile(r"(?:^\W*|[.:!] |\| )((?:What|Whether|Of|Those|How)\b[^.?|]*)(?:[.|]|$)", re.M)
+_PHRASE = re.compile(
+    r"\bin the place of\b|\bgo(?:es|ing|ne)? on with\b"
+    r"|\b(?:a|one) (?:byte|column|condition|figure|file|line|page|picture|process|row|script) an? [a-z]"
+)
+
+
+def named(path: Path) -> str:
+    return str(path.relative_to(ROOT))
+
+
+def prose(page: str) -> str:
+    """A page without headings, comments, links and blocks of code, and with each paragraph on one line."""
+    page = re.sub(r"^```.*?^```$|^#.*?$|<!--.*?-->", "", page, flags=re.M | re.S)
+    page = re.sub(r"\[[^]]*\]\([^)]*\)", "Link", page)
+    return re.sub(r"(?<=\S)\n[ \t]*(?![ \t]*(?:[-*|:]|\d+\. |\n))", " ", page)
+
+
+def openers(text: str) -> list[str]:
+    return [found[1] for found in _SENTENCE.finditer(text)]
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=named)
+def test_a_docstring_names_the_thing_first(path: Path) -> None:
+    nodes = (node for node in ast.walk(ast.parse(path.read_text("utf-8"))) if isinstance(node, _DOCUMENTED))
+    assert not [text for text in map(ast.get_docstring, nodes) if text and _OPENER.match(text)]
+
+
+@pytest.mark.parametrize("path", [*SOURCES, *PAGES], ids=named)
+def test_no_phrase_that_readers_stumble_over(path: Path) -> None:
+    assert not _PHRASE.findall(path.read_text("utf-8"))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=named)
+def test_a_sentence_of_a_page_names_the_thing_first(page: Path) -> None:
+    assert not openers(prose(page.read_text("utf-8")))
+
+
+@pytest.mark.parametrize("text", ["Whether it holds.", "It is. What is left\nis small.", "- Of all sets\nthe largest."])
+def test_a_bad_opener_is_found(text: str) -> None:
+    assert openers(prose(text))
+
+
+@pytest.mark.parametrize("text", ["Does it hold? What does\nit prove?", "# What is proved", "It says what is left."])
+def test_a_question_and_a_heading_are_no_bad_openers(text: str) -> None:
+    assert not openers(prose(text))
+
+
+@pytest.mark.parametrize("text", ["X in the place of Y", "gone on with", "a file a plant", "one line a row"])
+def test_a_bad_phrase_is_found(text: str) -> None:
+    assert _PHRASE.search(text)
