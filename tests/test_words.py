@@ -19,7 +19,8 @@ SOURCES = [
 ]
 PAGES = [
     *sorted((ROOT / "docs").rglob("*.md")),
-    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "examples/README.md", "certify/checker/FORMAT.md")),
+    *(ROOT / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md", "examples/README.md")),
+    ROOT / "certify" / "checker" / "FORMAT.md",
 ]
 _DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 _OPENER = re.compile(r"\W*(?:What|Whether|Of|Those|How)\b")

@@ -18,7 +18,7 @@ from certify.certificates.reading import parse_certificate
 from certify.certificates.tree import LEAF
 from certify.errors import BackendError
 
-_STATED = (  # of an answer, what is the same of all parts and of the whole
+_STATED = (  # entries that are equal in the answers of all parts and of the whole
     "certificate_sha256", "policy_sha256", "claim", "rate", "sample", "discrete", "origin", "levels", "leaves",
     "start", "centre", "time",
 )  # fmt: skip

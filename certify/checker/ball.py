@@ -212,7 +212,7 @@ def enclose_on_ball(net: Folded, states: Sequence[Jet]) -> Jet:
         width = layer.W.shape[1]
         doubt = up(layer.norm2 * doubt + gamma(width) * (frobenius(layer.W) * norm(X, 0)))
         X = layer.W @ X
-        if number > 0:  # what the tanh just before has added arrives through W alone
+        if number > 0:  # the difference of the tanh just before arrives through W alone
             X, doubt = np.concatenate([X, layer.W], 1), np.concatenate([doubt, np.zeros(width)])
         a, B, count = X[:, :k], X[:, k:], len(sizes)
         Q = np.tensordot(B, H, 1)

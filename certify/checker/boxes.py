@@ -31,7 +31,7 @@ class Leaves:
     place: str  # of one, before its number
     mid: Array  # (m, B): the inputs lie within `reach` of this
     reach: Array
-    bound: Array  # of what has to be negative
+    bound: Array  # an upper bound of the margin
     hold: Array  # where what is asked holds
 
 

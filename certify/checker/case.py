@@ -16,7 +16,7 @@ from .float64 import float_with_error, up
 from .network import Folded, fold
 from .parts import Part
 
-Failures = Generator[tuple[str, str], None, int]  # what a rule makes: each failure's (place, detail); how much it met
+Failures = Generator[tuple[str, str], None, int]  # a rule: each failure's (place, detail); the rule's count
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Case:
 
     c: Certificate
     part: Part = field(default_factory=Part)
-    patient: bool = False  # whether somebody has said that it may take hours
+    patient: bool = False  # True if the check may take hours
 
     @property
     def partition(self) -> Partition:

@@ -142,7 +142,7 @@ class Partition:
     root: Array
     tree: bytes
     order: int  # of the series in time on leaves
-    cells: tuple[int, ...]  # how many the range of each uncertain quantity is cut into
+    cells: tuple[int, ...]  # number of parts of each uncertain quantity's range
     local: LocalBall | None
     contraction: Contraction | None
     tube: tuple[Slab, ...]

@@ -25,7 +25,7 @@ from .jets import Jet, uncertain
 _MOST_CORNERS = 2**16  # of all cells
 _MOST_WORK = 2**26  # corners times n^4, which is what an inequality takes
 _ATTEMPTS = 4  # at the a-priori enclosure
-Way = tuple[Array, Array]  # how far each state may move in a period: a number, and one times ||d||
+Way = tuple[Array, Array]  # the largest move of each state in a period: a number, and one times ||d||
 Enclosed = tuple[Way, list[Jet]]  # and f on the way
 
 

@@ -73,7 +73,7 @@ class Ring(Boxes):
             bound = np.where(beyond, self.bound(rise, centre, radius), self.bound_of_steps(rise, centre, radius))
         hold = bound < 0
         if not (self.case.covered or self.c.step or np.all(meet)):
-            # what divides by a range that holds 0 has no finite model
+            # a division by a range that contains 0 has no finite model
             hold = np.where(meet, hold, np.all([np.isfinite(g.size + g.r) for g in G], axis=0))
         reach = up(total(np.abs(slopes), 1) + wide)
         return RingLeaves(self, first + met, "leaf ", mid, reach, bound, hold, meet, ends)

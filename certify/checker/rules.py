@@ -144,7 +144,7 @@ class Tally:
     """Each rule's count, and the margins, which are floats for people."""
 
     rules: Counter[str] = field(default_factory=lambda: Counter(dict.fromkeys(RULES, 0) | READ))
-    by_leaf: Counter[str] = field(default_factory=Counter)  # what of this was on the leaves of one part
+    by_leaf: Counter[str] = field(default_factory=Counter)  # the part of these counts that is on leaves
     ring_margin: float | None = None  # smallest -Vdot bound over the ring's leaves
     outer_margin: float | None = None  # smallest -N'F bound over the leaves of which it is asked
     local_margin: float | None = None  # 1 - the remainder's largest part of the decay

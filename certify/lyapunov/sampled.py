@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 SAMPLES = 400_000
-_AT_ONCE = 20_000  # what fits into a processor's memory for a network of some hundred units
+_AT_ONCE = 20_000  # fits into a processor's cache for a network of some hundred units
 
 
 def sampled_volume(

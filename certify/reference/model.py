@@ -18,7 +18,7 @@ from .refusal import Refused
 from .symmetric import linear_times_square, no_form, squared_norm
 
 Form = tuple[arb_mat, tuple[arb_mat, ...]]  # a column that is affine in y: c + sum_j y_j c_j; without c_j it is c
-SPREAD, SHARE = arb(0, 1), arb(0.5, 0.5)  # what a product of two y may be, and a square
+SPREAD, SHARE = arb(0, 1), arb(0.5, 0.5)  # the ranges of a product of two y, and of a square
 
 
 @dataclass(frozen=True)

@@ -139,5 +139,5 @@ def _contents(status: Status, limits: Mapping[str, Any] | None) -> list[tuple[st
         ("figures", "Figures"),
     ]
     if limits is not None:
-        found.append(("limits", "What limits the set" if limits["binds"] else "Share of the domain"))
+        found.append(("limits", "Limit of the set" if limits["binds"] else "Share of the domain"))
     return [*found, ("numbers", "Numbers"), ("check", "How to check")]

@@ -425,7 +425,7 @@ def test_the_page_of_a_run_has_the_run_s_words(proved: RoaResult) -> None:
     answer, data = dict(proved.checker), proved.to_dict()
     page = Page(render_html(certificate, answer, data, proved.certificate, sha256=sha256))
     limit = outer_limited_by(data["outer"])
-    assert ["n₂ limited by", limit] in page.rows and f"What limits the outer set: {limit}" in page.text
+    assert ["n₂ limited by", limit] in page.rows and f"Limit of the outer set: {limit}" in page.text
     (row,) = (row for row in page.rows if row and row[0] == "area with the outer set")
     assert row[1].startswith("about 5.6") and "m · m" in row[1] and "estimated" in row[1]
     for wrong in ({**data["outer"], "level": 0.8}, None):

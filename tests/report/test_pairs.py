@@ -156,12 +156,12 @@ def test_the_page_says_what_limits_the_set_and_what_to_try(proved: Any) -> None:
         "hurts": {"theta": 1.0, "theta_dot": 0.25}, "next": step,
     }  # fmt: skip
     html = render_html(certificate, answer, {**result, "diagnosis": diagnosis}, path)
-    assert "What limits the set, and what to try next" in html and "the time limit: more may be provable" in html
+    assert "The limit of the set, and the next thing to try" in html and "the time limit: more may be provable" in html
     assert "slowest decays at 2 per second (time constant 0.5 s), the fastest at 25 per second (0.04 s)." in html
     assert "stiffness" not in html
-    assert "<b>What to try next:</b> it still grew.</p>" in html and f"<pre>{step['command']}</pre>" in html
+    assert "<b>Try next:</b> it still grew.</p>" in html and f"<pre>{step['command']}</pre>" in html
     assert '<span class="bar hurts"><i style="width: 25.0%">' in html
-    assert "Along which states the proof had most to do" in html and ">25 %</td>" in html
+    assert "The states that cost the proof most" in html and ">25 %</td>" in html
     # A limit that is met at a state is named with it, and has no direction besides.
     at_a_point = {**diagnosis, "kind": "domain", "binds": "the upper side of the domain in θ, 3 rad"}
     met = render_html(certificate, answer, {**result, "diagnosis": at_a_point}, path)
@@ -184,8 +184,8 @@ def test_bars_are_the_certificates_own_shares(proved: Any) -> None:
         html = render_html(certificate, answer, given_result, path)
         found = [float(w) for w in re.findall(r'<span class="bar"><i style="width: ([\d.]+)%">', html)]
         assert found == pytest.approx(100 * shares, abs=0.06) and max(found) > 99
-        assert ("what to try next" in html) == (given_result is not None)
-    assert "How much of its domain the set takes" in render_html(certificate, answer, None, path)
+        assert ("next thing to try" in html) == (given_result is not None)
+    assert ">Share of the domain</h2>" in render_html(certificate, answer, None, path)
 
 
 def test_the_drawing_may_take_a_tenth_of_the_run_or_ten_seconds() -> None:

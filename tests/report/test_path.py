@@ -178,7 +178,9 @@ def test_a_state_that_is_missed_is_said_to_be_first(missed: RoaResult) -> None:
     assert said in text and "The certificate is about {V ≤ c₂} alone, in which this state does not lie." in text
     assert text.index("UNKNOWN") < text.index("PROVED · ACCEPTED")
     assert "c₀" not in text and "tube in p" not in text
-    assert text.count("no tube from that state") == 1 and "What limits" not in text  # it is no limit of the set
+    assert (
+        text.count("no tube from that state") == 1 and "The limit of the set" not in text
+    )  # it is no limit of the set
     assert missed.diagnosis is not None and dict(missed.diagnosis.next.options) == {"--time-limit": "16"}
     alone = page_of(missed, dict(missed.checker or {}))  # the certificate by itself knows of no state
     assert "UNKNOWN" not in alone.text and "PROVED · ACCEPTED" in alone.text

@@ -59,7 +59,7 @@ AXIOMS = frozenset(f"{module}.{name}" for module, names in _LIBRARY.items() for 
 MODULES = tuple(_LIBRARY)
 REALS = frozenset({"ClassicalDedekindReals", "FunctionalExtensionality", "Classical_Prop"})
 """Of these modules, those that the real numbers need; the others are about the processor."""
-_ASSUMING = re.compile(  # what a theory could take for granted, or switch off
+_ASSUMING = re.compile(  # words by which a theory could assume something, or switch off a check
     r"\b(Axioms?|Conjectures?|Parameters?|Admitted|admit|Primitive|Declare|bypass_check|Unset|Load|Redirect)\b",
     re.ASCII,
 )

@@ -53,7 +53,7 @@ class Call:
     pairs: list[tuple[Any, Any]] = field(default_factory=list)
 
     def __repr__(self) -> str:
-        # What it holds may hold it in turn, or be many times as long as the pickle.
+        # Its contents may contain it in turn, or be many times as long as the pickle.
         return f"a call of {self.function if isinstance(self.function, Name) else 'something'}"
 
 

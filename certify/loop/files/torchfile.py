@@ -93,7 +93,7 @@ class TorchFile:
         _, offset, size, stride = given[:4]
         typed = node.function.name == "_rebuild_tensor_v3"
         dtype = given[6] if typed and len(given) > 6 else None
-        # What may stand behind says that the numbers are meant negated or conjugated, or what shape lies behind them.
+        # Further arguments may mark the numbers as negated or conjugated, or give their shape.
         if any(given[7 if typed else 6 :]):
             raise InputError(f"tensor {what} must be plain numbers; something is said of how to read them.")
         flat = self._storage(given[0].reference, dtype, what, folder)

@@ -82,7 +82,7 @@ def _on_the_line(scene: Scene, roa: SimulatedRoa | None) -> list[Picture]:
 
 def _in_planes(scene: Scene, roa: SimulatedRoa | None) -> list[Picture]:
     runs, region = scene.simulate(starts(scene)), region_of(scene, roa)
-    inside = len(scene.pairs) * scene.effort.starts  # what starts along the domain's edge comes after these
+    inside = len(scene.pairs) * scene.effort.starts  # starts along the domain's boundary come after these
     from_set = replace(runs, path=runs.path[:, :inside], settled=runs.settled[:inside], left=runs.left[:inside])
     pictures = [*portraits(scene, runs, region), *tube(scene, from_set)]
     if scene.n == 2 and scene.shows_inner:

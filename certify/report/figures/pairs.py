@@ -73,7 +73,7 @@ def pairs_of(system: System, P: Array, shares: Array) -> list[Pair]:
             j = int(np.argmax(coupled[i]))
             pairs.append((min(i, j), max(i, j)))
     pairs = sorted(dict.fromkeys(pairs), key=lambda pair: -max(shares[list(pair)]))[:MOST]
-    # What P couples most besides, until rows of two are full.
+    # Then the states that P couples most, until rows of two are full.
     others = sorted(combinations(range(n), 2), key=lambda pair: -coupled[pair])
     wanted = min(max(4, len(pairs) + len(pairs) % 2), MOST)
     for i, j in others:

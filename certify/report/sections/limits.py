@@ -26,7 +26,7 @@ def limits_of(certificate: Certificate, result: Mapping[str, Any] | None) -> dic
         return None
     system = certificate.system
     sets = ellipsoids_of(certificate)
-    if centre_of(certificate) is not None:  # how far a set that lies elsewhere reaches is no share of a side
+    if centre_of(certificate) is not None:  # the reach of a set elsewhere is no share of a side
         sets = sets[-1:]
     reach = [extents(each.P, each.level) for each in sets]
     shares = [shares_of(certificate, e) for e in reach]
