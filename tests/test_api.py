@@ -145,7 +145,6 @@ def test_options_by_name_are_those_of_the_options() -> None:
         "time_limit": 0,
         "max_boxes": 0,
         "rate": -1.0,
-        "device": "tpu",
         "cluster": "nowhere",
         "cluster_checks": True,  # without a cluster
         "resume": "yes",
@@ -216,7 +215,6 @@ def test_options_at_once_or_by_name() -> None:
         ({"load_seconds": "1"}, "`load_seconds` must be a number"),
         ({"provenance": "mine"}, "`provenance` must be a mapping; found a str"),
         ({"progress": True}, "`progress` must be callable; found a bool"),
-        ({"options": RoaOptions(device="cuda:99x")}, "`device` must be cpu"),
         ({"out": 3}, "`out` must be a path"),
         ({"out": ""}, "`out` must be a path in text that is not empty"),
         ({"options": {"level": 1}}, "`options` must be a RoaOptions; found a dict"),

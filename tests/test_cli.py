@@ -239,7 +239,6 @@ def test_bad_policies_exit_2_and_overwrite_nothing(
         (["--level", "nan"], "positive number"),
         (["--level", "x"], "--level"),
         (["--candidate", "sos"], "candidate"),
-        (["--device", "tpu"], "device"),
         (["--time-limit", "0"], "--time-limit must be positive; found 0"),
         (["--bogus"], "--bogus"),
     ],

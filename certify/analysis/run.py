@@ -157,27 +157,27 @@ def certify_roa(
         cluster, and no smaller set mends it.
     SoundnessError : the checker rejects what the engine proved, and no smaller set mends it.
     """
-    from certify.provers.execution.threads import one_thread, threads_for
+    from certify.provers.execution.threads import one_thread
 
     options = options or RoaOptions()
     with one_thread(), sole_writer(out):
         set_aside(out, keep=options.resume)
-        with _runner_for(options, threads_for(network.weights)) as runner:
+        with _runner_for(options) as runner:
             return _Run(system, network, out, options, runner, load_seconds, provenance or {}, progress, show).result()
 
 
 @contextmanager
-def _runner_for(options: RoaOptions, threads: int) -> Iterator[Runner]:
+def _runner_for(options: RoaOptions) -> Iterator[Runner]:
     """Where boxes are bounded."""
     if options.cluster is not None:
         from certify.provers.execution.cluster import ClusterRunner, connect
 
         with connect(options.cluster) as client:
-            yield ClusterRunner(client, threads)
+            yield ClusterRunner(client)
         return
     from certify.provers.execution import ThreadRunner
 
-    yield ThreadRunner(threads)
+    yield ThreadRunner()
 
 
 @dataclass
