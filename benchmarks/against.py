@@ -116,7 +116,6 @@ def _child(tree: Path, arguments: list[str], threads: int) -> dict[str, Any]:
 def one_pass(given: Path) -> None:
     """In a child: the pass that a file describes, again and again, and the last one's figures as JSON."""
     import numpy as np
-    import torch
 
     import certify
     from certify.certificates.claims import Problem
@@ -132,7 +131,6 @@ def one_pass(given: Path) -> None:
     if Path(certify.__file__).parent.parent.resolve() != Path.cwd().resolve():
         raise SystemExit(f"certify was imported from {certify.__file__}, which is not the tree {Path.cwd()}")
     asked = json.loads(given.read_text())
-    torch.set_num_threads(asked["threads"])
     policy = load_policy(asked["policy"])
     loop = ClosedLoop(get_system(policy.system).with_parameters(policy.parameters), policy.network)
     P = np.array(asked["P"], dtype=np.float64)

@@ -19,7 +19,6 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-import torch
 from fitted import fit_policy, spread_of
 from intervals import PlainIntervals
 
@@ -40,7 +39,6 @@ from certify.provers.execution import ThreadRunner
 from certify.provers.falsify import falsify
 
 POLICIES = Path(__file__).parent.parent / "examples" / "policies"
-RUNNER = ThreadRunner()
 
 
 def loops() -> Iterator[tuple[str, ClosedLoop, float]]:
@@ -71,11 +69,10 @@ def main() -> None:
         print(error)
         backend = None
     version = "no dReal" if backend is None else f"dReal {backend.version}, precision {options.precision:g}"
-    print(f"torch {torch.__version__}, {options.threads} threads, {version}, {options.limit:g} s each")
+    print(f"numpy {np.__version__}, {options.threads} threads, {version}, {options.limit:g} s each")
     for name, loop, share in loops():
         if options.only not in name:
             continue
-        torch.set_num_threads(options.threads)
         A, _, _ = loop.linearise()
         P = solve_lyapunov(A, np.eye(len(A)))
         problem, T = Problem(loop, Quadratic(P)), diagonalising_coordinates(P, A)
@@ -89,8 +86,8 @@ def main() -> None:
         layers = "-".join(map(str, loop.network.layers))
         print(f"\n{name} {layers}: {inner:.3g} <= V <= {outer:.6g}")
         rows: dict[str, Callable[[], tuple[str, float, str]]] = {
-            "bounds": lambda p=problem, T=T, a=inner, b=outer: ring(p, T, a, b, options.limit, False),
-            "intervals": lambda p=problem, T=T, a=inner, b=outer: ring(p, T, a, b, options.limit, True),
+            "bounds": lambda p=problem, T=T, a=inner, b=outer: ring(p, T, a, b, options, False),
+            "intervals": lambda p=problem, T=T, a=inner, b=outer: ring(p, T, a, b, options, True),
         }
         if backend is not None:
             asked = query(ring_condition(inner, outer), problem)
@@ -105,13 +102,13 @@ def main() -> None:
 
 
 def ring(
-    problem: Problem, T: np.ndarray, inner: float, outer: float, limit: float, plain: bool
+    problem: Problem, T: np.ndarray, inner: float, outer: float, options: argparse.Namespace, plain: bool
 ) -> tuple[str, float, str]:
     """Verdict, seconds and detail of this project's branch and bound, with its own rule or with plain intervals."""
     start = time.perf_counter()
-    rule = PlainIntervals(problem, T, RUNNER.device) if plain else None
-    budget = Budget(seconds=limit, boxes=10**8)
-    proof = prove_outwards(problem, T, inner, outer, budget, RUNNER, rule=rule)
+    rule = PlainIntervals(problem, T) if plain else None
+    budget = Budget(seconds=options.limit, boxes=10**8)
+    proof = prove_outwards(problem, T, inner, outer, budget, ThreadRunner(options.threads), rule=rule)
     seconds = time.perf_counter() - start
     if proof.outer >= outer:
         return "PROVED", seconds, f"{proof.boxes} boxes"

@@ -15,7 +15,6 @@ os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-import torch
 from fitted import chain, fit_policy, spread_of
 
 from certify.certificates.claims import Problem
@@ -46,7 +45,6 @@ def cases() -> Iterator[tuple[str, System, tuple[int, ...], float | None]]:
 
 def problem_for(system: System, widths: tuple[int, ...]) -> tuple[Problem, np.ndarray]:
     """P from Q = I for a policy that is fitted here, and coordinates for boxes."""
-    torch.set_num_threads(1)
     loop = ClosedLoop(system, fit_policy(system, widths, spread_of(system)))
     A, _, _ = loop.linearise()
     P = solve_lyapunov(A, np.eye(system.n))
@@ -59,7 +57,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=60.0, help="limit for each ring")
     parser.add_argument("--threads", type=int, default=2)
     options = parser.parse_args()
-    print(f"torch {torch.__version__}, {options.threads} threads, {options.seconds:g} s a ring")
+    print(f"numpy {np.__version__}, {options.threads} threads, {options.seconds:g} s a ring")
     print(
         f"{'case':<15}{'layers':<18}{'c1':>10}{'c2':>10}{'boxes':>10}{'leaves':>9}{'seconds':>9}{'boxes/s':>9}  result"
     )
@@ -76,9 +74,10 @@ def main() -> None:
         if inner is None:
             print(f"{what:<15}the local proof fails")
             continue
-        torch.set_num_threads(options.threads)
         start = time.perf_counter()
-        proof = prove_outwards(problem, T, inner, target, Budget(seconds=options.seconds), ThreadRunner())
+        proof = prove_outwards(
+            problem, T, inner, target, Budget(seconds=options.seconds), ThreadRunner(options.threads)
+        )
         seconds = time.perf_counter() - start
         layers = "-".join(map(str, problem.loop.network.layers))
         share = "proved" if proof.outer >= target else f"{proof.stop.value}: {proof.outer / target:.3f} of c2"

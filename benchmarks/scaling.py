@@ -26,7 +26,6 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from certify.certificates import Certificate, PartitionTree, leaves, read_certificate
@@ -76,14 +75,14 @@ def measured(certificate: Certificate, evidence: PartitionTree, rule: VdotBound)
     """What things cost here."""
     lo, hi = leaves(evidence.tree, evidence.root)
     step = max(1, len(lo) // _BATCH)
-    corners = [torch.tensor(side[::step][:_BATCH].T.copy()) for side in (lo, hi)]
+    corners = [side[::step][:_BATCH].T.copy() for side in (lo, hi)]
     until = time.perf_counter() + _WARM
     while time.perf_counter() < until:  # compiled loops are loaded when they are worth it
         rule(*corners, certificate.inner, certificate.roa)
     times = []
     sizes = [size for size in (64, 256, 1024, _BATCH) if size <= corners[0].shape[1]]
     for size in sizes:
-        part = [side[:, :size].contiguous() for side in corners]
+        part = [np.ascontiguousarray(side[:, :size]) for side in corners]
         each = []
         for _ in range(4):
             start = time.perf_counter()
@@ -135,7 +134,7 @@ def read_tree(evidence: PartitionTree, rule: VdotBound, copies: int) -> Tree:
         middle = 0.5 * lo[axis, level] + 0.5 * hi[axis, level]
         hi[axis, low] = lo[axis, high] = middle
         level = np.concatenate([low, high])
-    key = np.concatenate([rule.levels(torch.tensor(a), torch.tensor(b))[0].numpy() for a, b in _parts(lo, hi)])
+    key = np.concatenate([rule.levels(a, b)[0] for a, b in _parts(lo, hi)])
     shift = len(nodes) * np.arange(copies)
     uppers = [np.where(upper < 0, -1, upper + s) for s in shift]
     return Tree(np.concatenate(uppers), np.tile(key, copies), shift)
@@ -249,13 +248,12 @@ def main() -> None:
     parser.add_argument("--box", type=float, default=None, help="seconds per box, instead of a measurement")
     parser.add_argument("--overhead", type=float, default=None, help="seconds of a job, likewise")
     options = parser.parse_args()
-    torch.set_num_threads(1)
     certificate = read_certificate(options.certificate)
     evidence = certificate.evidence
     if not isinstance(evidence, PartitionTree):
         raise SystemExit("the certificate has no tree")
     problem = Problem(ClosedLoop(certificate.system, certificate.network), certificate.V)
-    rule = VdotBound(problem, evidence.T, torch.device("cpu"), order=evidence.order)
+    rule = VdotBound(problem, evidence.T, order=evidence.order)
     costs = measured(certificate, evidence, rule)
     costs = Costs(costs.batch, options.box or costs.box, costs.node, options.overhead or costs.job)
     print(

@@ -75,12 +75,12 @@ def certify_roa(
         cluster, and no smaller set mends it.
     SoundnessError : the checker rejects what the engine proved, and no smaller set mends it.
     """
-    from certify.provers.execution.threads import one_thread, threads_for
+    from certify.provers.execution.threads import one_thread
 
     options = options or RoaOptions()
     with one_thread(), sole_writer(out):
         set_aside(out, keep=options.resume)
-        with _runner_for(options, threads_for(network.weights)) as runner:
+        with _runner_for(options) as runner:
             can_keep, named = options.engine == "bounds", options.P is not None or options.only is not None
             tools = Tools(
                 out,
@@ -102,17 +102,17 @@ def effort_of(options: RoaOptions, load_seconds: float = 0.0) -> Effort:
 
 
 @contextmanager
-def _runner_for(options: RoaOptions, threads: int) -> Iterator[Runner]:
+def _runner_for(options: RoaOptions) -> Iterator[Runner]:
     """Where boxes are bounded."""
     if options.cluster is not None:
         from certify.provers.execution.cluster import ClusterRunner, connect
 
         with connect(options.cluster) as client:
-            yield ClusterRunner(client, threads)
+            yield ClusterRunner(client)
         return
     from certify.provers.execution import ThreadRunner
 
-    yield ThreadRunner(threads)
+    yield ThreadRunner()
 
 
 def _result(state: State, tools: Tools) -> RoaResult:

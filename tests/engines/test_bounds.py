@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +25,7 @@ from certify.provers.base import Budget
 from certify.provers.boxes.partition import LEAF
 from certify.provers.boxes.search import prove_outwards
 from certify.provers.execution import ThreadRunner
-from certify.provers.falsify import Witness, confirm, falsify
+from certify.provers.falsify import Witness, _Search, confirm, falsify
 from tests.support.cases import Case, case_of
 from tests.support.loops import chain, pendulum_network, scalar_tanh
 
@@ -215,3 +217,25 @@ def test_many_planted_counterexamples_are_never_proved() -> None:
 def test_an_asymmetric_P_is_named() -> None:
     with pytest.raises(InputError, match=r"P\[0, 1\] = 0.25 but P\[1, 0\] = 0.26"):
         Quadratic(np.array([[1.0, 0.25], [0.26, 1.0]]))
+
+
+@pytest.mark.parametrize("kind", ["plain", "clip", "held", "rate"])
+def test_the_falsifier_knows_where_a_violation_grows(kind: str, pendulum: System) -> None:
+    """Its gradients against central differences of what it climbs on."""
+    system = pendulum.with_sample((Fraction(1, 100), Fraction(1, 50))) if kind == "held" else pendulum
+    network = pendulum_network(centre="output")
+    if kind == "clip":
+        network = replace(network, clip=(np.array([-1.0]), np.array([1.5])))
+    case = case_of(system, network)
+    problem = replace(case.problem, rate=0.3) if kind == "rate" else case.problem
+    search = _Search(problem, case.T)
+    z = np.random.default_rng(0).standard_normal((200, 2))
+    vdot, excess, *gradients = search._slopes(z)
+    assert np.array_equal(vdot, search.violation(z)[0]) and np.array_equal(excess, search.violation(z)[1])
+    for k, gradient in enumerate(gradients):
+        for axis in range(2):
+            apart = 1e-5 * np.eye(2)[axis]
+            wanted = (search.violation(z + apart)[k] - search.violation(z - apart)[k]) / 2e-5
+            near = np.abs(gradient[:, axis] - wanted) <= 1e-4 * (1 + np.abs(wanted))
+            assert near.mean() > 0.97  # but for what lies on a corner of the clip or of a maximum
+            assert np.abs(wanted).max() > 1e-3

@@ -189,7 +189,7 @@ def test_the_flow_of_a_plant_that_escapes() -> None:
             value, model = point**2 / (1 - point * float(Fraction(h))), mean.G[0]
             centre = float((model.c + model.g[0] * (point - 1) / 1e-3)[0])
             assert abs(value - centre) <= float(model.r[0]) + float(np.abs(model.Q).sum())
-            assert float(mean.least[0]) <= point**2 and float(mean.most[0]) >= (point / (1 - point * 0.05)) ** 2
+            assert mean.least[0, 0] <= point**2 and mean.most[0, 0] >= (point / (1 - point * 0.05)) ** 2
     for h in ("1", "2"):
         assert not bool(Flow((x**2,), held(h), 4)(states, {}, {}, 1).exists)
 

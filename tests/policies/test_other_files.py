@@ -75,14 +75,10 @@ def test_another_programs_file_is_named_with_the_command_to_type(name: str, tmp_
     assert "inline_container" not in str(error.value)
 
 
-def test_bytes_that_are_nothing_are_named_as_before(tmp_path: Path) -> None:
-    for raw, message in (
-        (b"\x00\x01\x02", "plain tensors only"),
-        (b"", "torch"),
-        (b"PK", "plain tensors only"),
-    ):
+def test_bytes_that_are_nothing_are_no_archive(tmp_path: Path) -> None:
+    for raw in (b"\x00\x01\x02", b"", b"PK"):
         (tmp_path / "noise.pt").write_bytes(raw)
-        with pytest.raises(InputError, match=message):
+        with pytest.raises(InputError, match=r"policy file .*noise.pt is no zip archive"):
             load_policy(tmp_path / "noise.pt")
     with pytest.raises(InputError, match="cannot be read"):
         load_policy(tmp_path / "missing.pt")

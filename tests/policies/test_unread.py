@@ -222,7 +222,7 @@ def test_nothing_is_said_to_be_compared_with_a_file_of_numbers(run: Callable[...
     assert status == 0
     assert "framework's own" not in out and "compared with the file's" not in out
     assert "no program: nothing was compared with the file" in out and "what --activation says" in out
-    assert "folding  checked with the same numbers in torch's layers" in out and "not read log_std: the spread" in out
+    assert "folding  checked with the same numbers in numpy" in out and "not read log_std: the spread" in out
     data = json.loads(run(*given, "--json")[1])
     assert data["compared"] is None and data["compared_with"] is None and list(data["not_read"]) == ["log_std"]
     record = load_policy("p.pt").training["imported"]

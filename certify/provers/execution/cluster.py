@@ -109,9 +109,9 @@ def _quiet() -> Iterator[None]:
 class ClusterRunner:
     """Batches are bounded on the threads of this machine, and jobs done by the workers of a cluster, one a thread."""
 
-    def __init__(self, client: Client, threads: int | None = None) -> None:
+    def __init__(self, client: Client) -> None:
         self.client = client
-        self._here = ThreadRunner(threads)
+        self._here = ThreadRunner()
         self._failed = self._refused = 0
         self._lost = ""
 

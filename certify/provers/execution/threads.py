@@ -8,7 +8,7 @@ batch, where its threads meet at every product.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
@@ -21,18 +21,12 @@ from certify.provers.execution.base import Bound, Work
 
 Array = NDArray[np.float64]
 _PIECE = 256  # boxes, at least
-_SMALL_NETWORK = 10_000  # weights
 
 
 def cores() -> int:
     """How many cores this process may use: OMP_NUM_THREADS, or all that the system gives it."""
     asked = os.environ.get("OMP_NUM_THREADS", "").split(",")[0].strip()
     return int(asked) if asked.isdigit() and int(asked) else len(os.sched_getaffinity(0))
-
-
-def threads_for(weights: Sequence[Array]) -> int:
-    """One thread for a small network, whose operations are shorter than the threads' handshakes, else a core each."""
-    return 1 if sum(W.size for W in weights) < _SMALL_NETWORK else cores()
 
 
 def one_thread() -> AbstractContextManager[Any]:

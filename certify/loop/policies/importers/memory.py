@@ -125,7 +125,9 @@ def _plain(node: Any, what: str) -> Any:
             if not isinstance(key, str):
                 raise InputError(f"the keys of {what} must be text; found {key!r:.60}, a {type(key).__name__}.")
         return {key: _plain(value, f"{what}[{key!r}]") for key, value in node.items()}
-    if isinstance(node, np.ndarray) and node.dtype in (np.float16, np.float32, np.float64):
+    if isinstance(node, np.ndarray) and node.dtype.kind == "f":
+        if node.itemsize > 8:
+            raise InputError(f"{what} cannot be read as a tensor: its numbers are {node.dtype}.")
         return node
     torch = sys.modules.get("torch")  # whoever has a tensor has loaded it
     if torch is None or not isinstance(node, torch.Tensor):
@@ -135,7 +137,7 @@ def _plain(node: Any, what: str) -> Any:
     try:
         still = node.detach().cpu()
         return (still.float() if still.dtype in (torch.float16, torch.bfloat16) else still).numpy()
-    except (TypeError, ValueError, RuntimeError) as error:  # a precision that numpy has not, a tensor without numbers
+    except (TypeError, ValueError, RuntimeError) as error:  # a layout that numpy has not, a tensor without numbers
         raise InputError(f"{what} cannot be read as a tensor: {_brief(error)}") from error
 
 
