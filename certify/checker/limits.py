@@ -13,7 +13,7 @@ from .case import Case, Failures
 from .document import Array, Certificate, Network, Outer, Partition
 
 MOST_NUMBERS = 2**25
-MOST_WORK, MOST_IN_PATIENCE = 2**39, 2**46  # ten minutes; many hours, if somebody says that there is time for it
+MOST_WORK, MOST_IN_PATIENCE = 3 * 2**37, 2**46  # ten minutes; many hours, if somebody says that there is time for it
 LEAF = 255
 
 

@@ -9,7 +9,6 @@ import subprocess
 import sys
 from collections.abc import Callable
 from itertools import pairwise
-from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -163,7 +162,8 @@ def test_both_programs_count_the_same(name: str, tmp_path: Path) -> None:
 
 
 def test_the_numbers_are_those_of_the_page() -> None:
-    stated = [2 ** int(power) for power in re.findall(r"2\^(\d+)", FORMAT[FORMAT.index("**limits.**") :][:900])]
+    found = re.findall(r"(?:(\d+) )?2\^(\d+)", FORMAT[FORMAT.index("**limits.**") :][:900])
+    stated = [int(factor or 1) * 2 ** int(power) for factor, power in found]
     assert stated == [limits.MOST_NUMBERS, limits.MOST_WORK, reference_limits.MAX_OPERATIONS, limits.MOST_IN_PATIENCE]
     assert limits.MOST_NUMBERS == reference_limits.MAX_NUMBERS
     assert limits.MOST_IN_PATIENCE == reference_limits.MAX_IN_PATIENCE
