@@ -13,7 +13,7 @@ from .case import Case, Failures
 from .document import Array, Certificate, Network, Outer, Partition
 
 MOST_NUMBERS = 2**25
-MOST_WORK, MOST_IN_PATIENCE = 2**39, 2**46  # ten minutes; many hours, if somebody says that there is time for it
+MOST_WORK, MOST_IN_PATIENCE = 3 * 2**37, 2**46  # ten minutes; many hours, if somebody says that there is time for it
 LEAF = 255
 
 
@@ -53,10 +53,10 @@ class Net:
 
     @property
     def paths(self) -> int:
-        return sum(r * c * before for r, c, before in self.layers)
+        return sum(r * before * (c + 3 * 2**6) for r, c, before in self.layers) // 8
 
     def on_a_leaf(self, n: int, m: int) -> int:
-        return sum(r * (c * (n + m + 2) + 16 * (n + m) + 2**10) for r, c, _ in self.layers)
+        return sum(r * (c * (n + m + 2) + 5 * before + 64 * (n + m) + 7 * 2**9) for r, c, before in self.layers)
 
     def on_a_ball(self, d: int, t: int) -> int:
         return sum(r * (c * (d + before) + before * t) + 2**21 for r, c, before in self.layers) + 64 * self.units * t
@@ -143,12 +143,12 @@ class Sizes:
 
     def policies(self, leaves: int) -> int:
         each, batches = self.net.on_a_leaf(self.n, self.m), 1 + leaves * self.net.widest // 2**14
-        return (leaves * each + batches * self.net.paths) // 4
+        return leaves * each // 8 + batches * self.net.paths
 
     def of_ring(self, leaves: int) -> int:
         order, calls = self._partition.order, self.n * self.s**2 + 160 * len(self.net.layers)
         models = self.a * self.evaluations(order) + self.n**2 + 4 * self.n
-        return self.boxes(leaves, models, self.a * order, self.s, calls) + self.policies(leaves)
+        return self.boxes(leaves, models, self.a * (order + 1), self.s, calls) + self.policies(leaves)
 
     @property
     def ball(self) -> int:
@@ -158,7 +158,7 @@ class Sizes:
     @property
     def model(self) -> int:
         """An operation of the equations in models on a ball."""
-        return 2**16 + 64 * self.t + 16 * self.d**2 * (self.m + self.y)
+        return 2**17 + 64 * self.t + 16 * self.d**2 * (self.m + self.y)
 
     @property
     def inequality(self) -> int:
@@ -194,7 +194,7 @@ class Sizes:
         found = N.folded + self.inverse(self.bits(evidence.T))
         found += 2**8 * sum(map(len, (evidence.tree, *evidence.faces)))
         found += self.boxes(faces, of_tape, values, self.n, calls) + faces * N.models((self.n + 4) ** 2)
-        found += ((faces + leaves) * N.on_a_leaf(self.n, 1) + (1 + faces + leaves) * N.paths) // 4
+        found += (faces + leaves) * N.on_a_leaf(self.n, 1) // 8 + (1 + faces + leaves) * N.paths
         models, calls = self.a + 8 * of_tape + 4 * self.n, calls + self.n * self.s**2 + 160 * len(self.net.layers)
         found += self.boxes(leaves, models, max(values, self.a), self.s, calls)
         return found + leaves * N.models((self.s + 4) ** 2) + self.policies(leaves)

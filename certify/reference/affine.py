@@ -40,7 +40,8 @@ class Network:
             if k == last:
                 break
             if k:  # the way of each earlier layer's gaps to this layer's y
-                ways = [columns_scaled(W, [slope[0] for slope in slopes[-1]]) * way for way in ways] + [W]
+                scaled = columns_scaled(W, [slope[0] for slope in slopes[-1]])
+                ways = [*(scaled * way for way in ways), W]
             seen = arb_mat(layer.rows, count)
             for way, gap in zip(ways, gaps, strict=True):
                 seen += absolute(way) * arb_mat(gap)

@@ -98,7 +98,7 @@ def operations(c: Certificate) -> int:
     if asked_of_leaves(c, evidence):
         leaves, times = evidence.tree.count(LEAF), evaluations(c, evidence.order)
         models, calls = z.a * times + z.n**2 + 4 * z.n, z.n * z.s**2 + 160 * len(shapes)
-        work += leaves * on_a_box(z.n, models, z.a * evidence.order, z.s, calls)
+        work += leaves * on_a_box(z.n, models, z.a * (evidence.order + 1), z.s, calls)
         work += on_leaves(leaves, shapes, z.n, z.m)
     return work + on_balls(c, z, evidence) + in_tube(c, z, evidence) + beyond(c, z, evidence.covering)
 
@@ -132,10 +132,10 @@ def folding(shapes: Sequence[tuple[int, int, int]]) -> int:
 
 def on_leaves(leaves: int, shapes: Sequence[tuple[int, int, int]], n: int, m: int) -> int:
     """A network between affine forms."""
-    each = sum(p * (q * (n + m + 2) + 16 * (n + m) + 2**10) for p, q, _ in shapes)
+    each = sum(p * (q * (n + m + 2) + 5 * before + 64 * (n + m) + 7 * 2**9) for p, q, before in shapes)
     widest = max((p for p, _, _ in shapes), default=0)
-    paths = sum(p * q * before for p, q, before in shapes)
-    return (leaves * each + (1 + leaves * widest // 2**14) * paths) // 4
+    paths = sum(p * before * (q + 3 * 2**6) for p, q, before in shapes) // 8
+    return leaves * each // 8 + (1 + leaves * widest // 2**14) * paths
 
 
 def on_a_box(n: int, models: int, values: int, symbols: int, calls: int) -> int:
@@ -157,7 +157,7 @@ def policy_on_a_ball(c: Certificate, z: Size) -> int:
 
 def equations_on_a_ball(z: Size) -> int:
     """Once."""
-    return z.a * (2**16 + 64 * z.t + 16 * z.d**2 * (z.m + z.y))
+    return z.a * (2**17 + 64 * z.t + 16 * z.d**2 * (z.m + z.y))
 
 
 def inequality(c: Certificate, z: Size) -> int:
@@ -195,9 +195,9 @@ def beyond(c: Certificate, z: Size, covering: Covering | None) -> int:
     work = folding(shapes) + inverting(z.n, bits(covering.T)) + 2**8 * len(covering.tree)
     work += 2**8 * sum(len(face) for face in covering.faces)
     work += faces * (on_a_box(z.n, steps, held, z.n, calls) + as_models(shapes, z.n))
-    each = sum(p * (q * (z.n + 3) + 16 * (z.n + 1) + 2**10) for p, q, _ in shapes)
-    paths = sum(p * q * before for p, q, before in shapes)
-    work += ((faces + leaves) * each + (1 + faces + leaves) * paths) // 4
+    each = sum(p * (q * (z.n + 3) + 5 * before + 64 * (z.n + 1) + 7 * 2**9) for p, q, before in shapes)
+    paths = sum(p * before * (q + 3 * 2**6) for p, q, before in shapes) // 8
+    work += (faces + leaves) * each // 8 + (1 + faces + leaves) * paths
     calls += z.n * z.s**2 + 160 * len(policy)
     work += leaves * on_a_box(z.n, z.a + 8 * steps + 4 * z.n, max(held, z.a), z.s, calls)
     return work + leaves * as_models(shapes, z.s) + on_leaves(leaves, policy, z.n, z.m)

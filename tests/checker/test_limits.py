@@ -9,7 +9,6 @@ import subprocess
 import sys
 from collections.abc import Callable
 from itertools import pairwise
-from math import prod
 from pathlib import Path
 from typing import Any
 
@@ -163,7 +162,8 @@ def test_both_programs_count_the_same(name: str, tmp_path: Path) -> None:
 
 
 def test_the_numbers_are_those_of_the_page() -> None:
-    stated = [2 ** int(power) for power in re.findall(r"2\^(\d+)", FORMAT[FORMAT.index("**limits.**") :][:900])]
+    found = re.findall(r"(?:(\d+) )?2\^(\d+)", FORMAT[FORMAT.index("**limits.**") :][:900])
+    stated = [int(factor or 1) * 2 ** int(power) for factor, power in found]
     assert stated == [limits.MOST_NUMBERS, limits.MOST_WORK, reference_limits.MAX_OPERATIONS, limits.MOST_IN_PATIENCE]
     assert limits.MOST_NUMBERS == reference_limits.MAX_NUMBERS
     assert limits.MOST_IN_PATIENCE == reference_limits.MAX_IN_PATIENCE
@@ -180,12 +180,12 @@ def test_the_counts_are_those_of_the_page(tmp_path: Path) -> None:
     X = n**5 * 1 // 2**13 + 2**10 * n**3
     of_S = n**5 * (2 + 1 + 16) ** 2 // 2**13 + 2**10 * n**3
     F = sum(p * q * (2**9 + 8 * min(p, q)) for p, q, _ in layers)
-    M, V, C, A = a + n**2 + 4 * n, a, n * s**2 + 320, (s + 4) ** 2
+    M, V, C, A = a + n**2 + 4 * n, 2 * a, n * s**2 + 320, (s + 4) ** 2
     B = 5 * (8 * A * M + A * (V + 4) * (32 * M + C) // 2**9 + 2**11 + 2**7 * n + n**3)
-    R = 5 * sum(p * (q * (n + m + 2) + 16 * (n + m) + 2**10) for p, q, _ in layers)
-    R = (R + (1 + 5 * W // 2**14) * sum(prod(layer) for layer in layers)) // 4
+    R = 5 * sum(p * (q * (n + m + 2) + 5 * g + 64 * (n + m) + 7 * 2**9) for p, q, g in layers) // 8
+    R += (1 + 5 * W // 2**14) * (sum(p * g * (q + 3 * 2**6) for p, q, g in layers) // 8)
     K = sum(p * (q * (d + g) + g * t) + 2**21 for p, q, g in layers) + 64 * H * t
-    Z = a * (2**16 + 64 * t + 16 * d**2 * (m + y))
+    Z = a * (2**17 + 64 * t + 16 * d**2 * (m + y))
     inequality = 2**23 + 2**12 * 3**4 + 8 * d**5 + 4 * H * d**3 + 2**14 * 3**3
     work = 2**15 * a + F + X + of_S + 2**8 * 9 + B + R + K + 2 * Z + 2 * 2 * inequality + 2**14 * n**3
     assert counts(data, tmp_path) == (numbers, work)
