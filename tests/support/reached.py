@@ -16,6 +16,7 @@ from flint import arb
 
 from certify.certificates import parse_certificate
 from certify.checker.document import Certificate, Slab
+from certify.effort import UNIT, Effort
 from certify.loop.closed_loop import ClosedLoop
 from certify.provers.tube.path import find_path
 from tests.support.balls import reached_from, with_ball
@@ -49,7 +50,7 @@ def loop_of(data: Document) -> ClosedLoop:
     return ClosedLoop(found.system, found.network)
 
 
-def surrounded(data: Document, centre: Sequence[float], start: Any, seconds: float = 20.0) -> Document | None:
+def surrounded(data: Document, centre: Sequence[float], start: Any, units: float = 20.0) -> Document | None:
     """The claim `reached` from {(x - c)'P(x - c) <= 1}, P = start; None where the engine finds no tube.
 
     Parameters
@@ -60,7 +61,7 @@ def surrounded(data: Document, centre: Sequence[float], start: Any, seconds: flo
     n = len(centre)
     P, c2 = decode(data["lyapunov"]["P"]).reshape(n, n), float.fromhex(data["levels"]["roa"])
     c, P_0 = np.array(centre, dtype=np.float64), np.array(start, dtype=np.float64).reshape(n, n)
-    tube, _ = find_path(loop_of(data), c, P_0, P / c2, seconds)
+    tube, _ = find_path(loop_of(data), c, P_0, P / c2, Effort(units * UNIT))
     if tube is None:
         return None
     result = edited(data, "claim", reached_from(P_0, c))
