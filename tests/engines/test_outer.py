@@ -396,7 +396,7 @@ def test_no_time_proves_nothing() -> None:
         (Symbolic(X**2 + Y**2, (X, Y)), {"c2": 99.0}, "every sampled state of the domain lies in the ellipsoid"),
         (Symbolic(X**2 + Y**2, (X, Y)), {"level": 0.1}, "the level that was asked for, 0.1, is not above the least"),
         (Symbolic(-(X**2) - Y**2, (X, Y)), {}, "N somewhere on the faces, .*, is not above the least"),
-        (wells([[1.0, 0.0], [0.0, 1.0]], 0.75), {"seconds": 1e-9}, "where x = -2; the time for that ended"),
+        (wells([[1.0, 0.0], [0.0, 1.0]], 0.75), {"effort": Effort(1.0)}, "where x = -2; the effort for that ended"),
         (Symbolic(X**2 + Y**2 - 3 * X * Y, (X, Y)), {"c2": 0.01}, "not above|smaller level"),
     ],
 )

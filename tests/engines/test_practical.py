@@ -19,7 +19,7 @@ from certify.analysis.run import RoaOptions, certify_roa
 from certify.certificates import run_checker
 from certify.certificates.claims import Practical
 from certify.certificates.verdict import Stop, Verdict
-from certify.effort import UNIT, Effort
+from certify.effort import UNIT, UNLIMITED, Effort
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Number, symbols
@@ -212,7 +212,7 @@ def test_the_optimised_candidate_is_that_of_the_centred_loop() -> None:
     """Under the policy as it is no V decreases near the origin, and the optimiser finds nothing."""
     system, network = uncentred()
     loop, centred = (ClosedLoop(system, dataclasses.replace(network, centre=c)) for c in ("none", "output"))
-    found, known = optimised(loop, PRACTICAL), optimised(centred, RoaOptions(claim="asymptotic"))
+    found, known = optimised(loop, PRACTICAL, UNLIMITED), optimised(centred, RoaOptions(claim="asymptotic"), UNLIMITED)
     assert found is not None and known is not None and np.array_equal(found.P, known.P)
     assert found.task.kind == "practical" and found.task.problem.loop is loop
     assert 0 < found.volume <= 1.01 * known.volume

@@ -14,6 +14,7 @@ from certify.analysis.candidates.trials import blends, trial
 from certify.analysis.run import RoaOptions, certify_roa
 from certify.certificates.verdict import Verdict
 from certify.cli.main import _run
+from certify.effort import UNLIMITED
 from certify.errors import BackendError, InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.plants import System, get_system
@@ -74,7 +75,7 @@ def test_blends_lie_between() -> None:
     A = loop.linearise()[0]
     weights = {"a": np.eye(2), "b": np.diag([9.0, 1.0])}
     large, small = (trial(loop, solve_lyapunov(A, Q), name, RoaOptions()) for name, Q in weights.items())
-    between = list(blends(loop, large, small, RoaOptions()))
+    between = list(blends(loop, large, small, RoaOptions(), UNLIMITED))
     assert len(between) == 3
     for one in between:
         ends = np.sort([large.unit[0, 0], small.unit[0, 0]])

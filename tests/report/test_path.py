@@ -181,7 +181,7 @@ def test_a_state_that_is_missed_is_said_to_be_first(missed: RoaResult) -> None:
     assert (
         text.count("no tube from that state") == 1 and "The limit of the set" not in text
     )  # it is no limit of the set
-    assert missed.diagnosis is not None and dict(missed.diagnosis.next.options) == {"--time-limit": "16"}
+    assert missed.diagnosis is not None and dict(missed.diagnosis.next.options) == {"--effort": "0.32"}
     alone = page_of(missed, dict(missed.checker or {}))  # the certificate by itself knows of no state
     assert "UNKNOWN" not in alone.text and "PROVED · ACCEPTED" in alone.text
 

@@ -133,7 +133,7 @@ def test_flattening_is_suggested_where_bounds_see_bends_and_little_is_proved(
     flat = tmp_path / "bent_flat.pt"
     assert status in (0, 3) and following["flatten"] and following["options"] == {}
     assert following["command"] == (
-        f"controllers flatten {path} --out {flat} && certify roa {flat} --time-limit 8 --max-boxes 3 --out {out} --json"
+        f"controllers flatten {path} --out {flat} && certify roa {flat} --effort 0.16 --max-boxes 3 --out {out} --json"
     )
     assert "a flatter policy that does the same" in following["why"]
 
