@@ -22,7 +22,7 @@ from certify.loop.expressions.tree import FUNCTIONS
 from certify.loop.plants import get_system
 from certify.loop.policies import load_policy
 from certify.provers.base import Budget
-from certify.provers.bounds import compiled, kernels, loop_models, tape, vectors
+from certify.provers.bounds import compiled, kernels, loop_models, tape, taylor, vectors
 from certify.provers.bounds import policy as policies
 from certify.provers.bounds.compiled import Compiled
 from certify.provers.bounds.loop import played
@@ -209,6 +209,16 @@ def test_a_cache_that_cannot_be_written_is_done_without(monkeypatch: pytest.Monk
     numbers = np.arange(3.0)
     compiled.compile_one(numba.njit, double, {})(numbers)
     assert asked == [True, False] and numbers.tolist() == [0.0, 2.0, 4.0]
+
+
+def test_the_kernels_know_the_constants_of_the_models() -> None:
+    """numba takes them as they are when it compiles, so that they are written where it does."""
+    assert (kernels.EPS, kernels.TINY, kernels.EXP_END) == (taylor.EPS, taylor.TINY, taylor.EXP_END)
+
+
+def test_functions_that_are_not_those_of_libm_are_not_compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(numba.config, "USING_SVML", True)
+    assert compiled.load() is None
 
 
 @pytest.mark.slow

@@ -65,10 +65,12 @@ class Compiled:
 
 
 def load() -> Loops | None:
-    """The compiled loops; None where numba does not know this numpy, or is not there."""
+    """The compiled loops; None where numba is not there, does not know this numpy, or would give other bits."""
     try:
         import numba
     except ImportError:
+        return None
+    if numba.config.USING_SVML:  # then sin and cos are not libm's, and bits may differ
         return None
     space = {**vars(kernels), **kernels.LIBM}
     space["choose"] = compile_one(numba.njit, kernels.one, space)

@@ -31,7 +31,6 @@ from certify.provers.bounds.tape import (
     SQRT,
     TANH,
 )
-from certify.provers.bounds.taylor import EPS, EXP_END, TINY
 
 Line: TypeAlias = NDArray[np.float64]  # of one dimension, in C's order
 Plane: TypeAlias = NDArray[np.float64]  # of two
@@ -41,6 +40,7 @@ Real: TypeAlias = Any  # a number where it is compiled, else an array too
 Two: TypeAlias = tuple[Real, Real]
 Four: TypeAlias = tuple[Real, Real, Real, Real]
 Five: TypeAlias = tuple[Real, Real, Real, Real, Real]
+EPS, TINY, EXP_END = 2.0**-50, 2.0**-900, 64.0  # as in taylor.py; written here, because numba keeps what it has seen
 SLACK = 2.0**-47  # error allowed to tanh, relative to 1; numpy's errs by 2^-51 at most
 CHUNK = 32  # boxes at a time in the plant: their models stay in a core's cache
 LOST = 2.0**-500  # more than a 2-norm loses where squares underflow
