@@ -34,7 +34,7 @@ class Network:
         """
         last, stride = len(self.weights) - 1, forms.ncols() // count
         slopes, gaps = list[list[list[arb]]](), list[list[list[arb]]]()
-        ways, rest = list[arb_mat](), None
+        ways, spreads, rest = list[arb_mat](), list[arb_mat](), None
         for k, (W, layer) in enumerate(zip(self.weights, self.layers, strict=True)):
             preactivations = (W * forms).tolist()
             if k == last:
@@ -43,8 +43,8 @@ class Network:
                 scaled = columns_scaled(W, [slope[0] for slope in slopes[-1]])
                 ways = [*(scaled * way for way in ways), W]
             seen = arb_mat(layer.rows, count)
-            for way, gap in zip(ways, gaps, strict=True):
-                seen += absolute(way) * arb_mat(gap)
+            for way, spread in zip(ways, spreads, strict=True):
+                seen += absolute(way) * spread
             beyond = self.absolute[k] * rest if rest is not None else arb_mat(layer.rows, count)
             entries, left = [], []
             slopes.append([])
@@ -60,6 +60,7 @@ class Network:
                 left += [abs(s - own[0]) * v + s * w for s, v, w in zip(own, near, far, strict=True)]
                 slopes[k].append(own)
                 gaps[k].append([gap for _, _, gap in lined])
+            spreads.append(arb_mat(gaps[k]))
             forms, rest = arb_mat(layer.rows, len(row), entries), arb_mat(layer.rows, count, left)
         behind = self.backwards(slopes, gaps, count)
         result = []
