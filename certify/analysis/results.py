@@ -25,7 +25,7 @@ from certify.certificates.timing import Timing, reach_time
 from certify.certificates.verdict import Stop, Verdict
 from certify.errors import InputError
 from certify.loop.equilibrium import Rest
-from certify.loop.plants import System
+from certify.loop.plants import System, kind_of
 from certify.loop.policies import TanhNetwork
 from certify.lyapunov import extents, semi_axes, volume
 from certify.lyapunov.neural import Neural
@@ -464,7 +464,7 @@ class RoaResult:
             "uncertain": [
                 {
                     "name": name,
-                    "kind": system.kind_of(name),
+                    "kind": kind_of(system, name),
                     "lo": str(lo),
                     "hi": str(hi),
                     "unit": system.units.get(name, ""),

@@ -182,9 +182,11 @@ def _flattened(context: typer.Context, policy: Path) -> str:
 
 
 def _plant_line(stored: Policy, plant: System, overridden: bool) -> str:
+    from certify.loop.plants import kind_of
+
     values = ", ".join(f"{name} = {float(q):g}{_within(plant, name)}" for name, q in plant.parameters.items())
     acting = [name for name in plant.ranges if name not in plant.parameters]
-    moved = "".join(f"; {plant.kind_of(name)} {name}{_within(plant, name)}" for name in acting)
+    moved = "".join(f"; {kind_of(plant, name)} {name}{_within(plant, name)}" for name in acting)
     source = "from the command line" if overridden else "from the policy file"
     layers = "-".join(map(str, stored.network.layers))
     return f"plant {plant.name} ({source}) with {values or 'no parameters'}{moved}; policy {layers}"

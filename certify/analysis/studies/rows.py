@@ -40,6 +40,7 @@ from certify.certificates.membership import region_of
 from certify.certificates.verdict import Verdict
 from certify.errors import BackendError, CertificateFormatError, CertifyError, InputError, SoundnessError
 from certify.loop.closed_loop import ClosedLoop
+from certify.loop.plants import with_origin
 from certify.lyapunov import domain_limit, extents, semi_axes, volume
 from certify.lyapunov.function import Quadratic
 from certify.provers.falsify import Witness, confirm
@@ -305,7 +306,7 @@ def _checked(row: Row, answer: Answer, loop: tuple[Policy, System, RoaOptions], 
     certificate = parse_certificate(raw, f"the certificate of {row.case}")
     network, at = stored.network, certificate.network.origin
     if certificate.network.is_moved:  # it is about the same loop in deviations from another point
-        plant = plant.seen_from([Fraction(v) for v in at.tolist()], certificate.system.exact_u_eq())
+        plant = with_origin(plant, [Fraction(v) for v in at.tolist()], certificate.system.exact_u_eq())
         network = replace(network, origin=at)
     _require_about(certificate, raw, replace(certificate, system=plant, network=network))
     folder = _folder(out, row.case)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from certify.certificates import Certificate, PartitionTree, TrustedSolver
 from certify.certificates.claims import Outer
 from certify.loop.expressions import nodes
-from certify.loop.plants import System
+from certify.loop.plants import System, input_errors
 from certify.lyapunov import Neural, extents
 from certify.report.claims import CHECKED_ALWAYS, INPUTS
 from certify.report.figures.scene import centre_of, inner_of, is_ellipsoid, is_local_enough, slabs_of, start_of
@@ -138,7 +138,7 @@ def _in_cells(evidence: PartitionTree | TrustedSolver) -> str:
 
 def _with_errors(parts: Sequence[tuple[str, str, str]], system: System) -> Iterator[tuple[str, str, str]]:
     """The parts of a claim, with the part on inputs reworded for input errors."""
-    errors = system.input_errors
+    errors = input_errors(system)
     held = all(lo <= 0 <= hi for lo, hi in (system.ranges[e] for e in errors.values()))
     on_top = (
         "On {V ≤ c₂} what the policy asks for, π(x), stays in the bounds of the input; the error comes on top of it. "
