@@ -23,7 +23,7 @@ from typing import Any
 import pyarrow.parquet
 import pytest
 
-from certify.analysis.results import Levels
+from certify.analysis.facts import Levels
 from certify.analysis.studies import Row, Study, read_study, run_sweep
 from certify.analysis.studies import sweep as flow
 from certify.analysis.studies.page import page_of

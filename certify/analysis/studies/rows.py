@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from certify.analysis.facts import Levels
 from certify.analysis.outcome import by_spectrum
-from certify.analysis.results import Levels
 from certify.analysis.studies.case import Case
 from certify.analysis.studies.work import Answer
 from certify.certificates import (
