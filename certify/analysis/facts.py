@@ -1,4 +1,4 @@
-"""What a result consists of: levels, candidates, a tube, an outer set, and what limits it."""
+"""The parts of a result: levels, candidates, a tube, an outer set, and what limits it."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class Tried:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """What to try next: options to add to the command (none if no option helps), and why; `flattens` says that the
+    """The next thing to try: options to add to the command (none if no option helps), and why; `flattens` says that the
     policy is to be fine-tuned first, by `controllers flatten`."""
 
     options: tuple[tuple[str, str], ...]
@@ -85,7 +85,7 @@ class TubeFacts:
     centre: tuple[float, ...] | None = None
 
     def contains(self, states: Sequence[Sequence[Fraction | float]]) -> list[bool]:
-        """Whether states, as deviations from the operating point, lie in the start, decided in rationals."""
+        """Decide in rationals whether states, as deviations from the operating point, lie in the start."""
         return tube_start(self.start, self.centre).holds(states)
 
     def to_dict(self) -> dict[str, Any]:
@@ -129,7 +129,7 @@ class OuterFacts:
 
 @dataclass(frozen=True, slots=True)
 class Share:
-    """How far the set reaches along a state, and that as a share of the nearer side of its domain."""
+    """The set's reach along a state, and that as a share of the nearer side of its domain."""
 
     state: str
     unit: str
@@ -139,7 +139,7 @@ class Share:
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """What binds and where.
+    """The limit of a result: what binds and where.
 
     Parameters
     ----------
@@ -166,7 +166,7 @@ class Diagnosis:
 
     @property
     def stiffness(self) -> float | None:
-        """How many times faster the fastest mode decays than the slowest; None unless all decay."""
+        """The fastest mode's decay over the slowest's; None unless all decay."""
         if self.fastest is None or self.slowest is None or not self.slowest < 0:
             return None
         return self.fastest / self.slowest

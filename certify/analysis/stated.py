@@ -13,6 +13,7 @@ if TYPE_CHECKING:
 
 
 def in_one_line(result: RoaResult) -> str:
+    """The most important of the rows, for `repr`."""
     said = dict(stated(result))
     verdict = said["verdict"] if result.claim == "asymptotic" else f"{said['verdict']} {result.claim}"
     shown = [verdict, *(said[name] for name in ("plant", "in time", "set") if name in said)]
@@ -25,7 +26,7 @@ def in_one_line(result: RoaResult) -> str:
 
 
 def stated(result: RoaResult) -> list[tuple[str, str]]:
-    """What is said of the result in a few rows, names and values."""
+    """The rows, names and values."""
     rows = [("verdict", result.verdict.value), ("plant", result.system.name), ("claim", result.claim)]
     if result.system.ranges:
         rows.append(("for every", varying(varying_in(result.system))))

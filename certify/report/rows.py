@@ -38,7 +38,7 @@ _LONG = 200  # characters of an expression, beyond which it is not shown
 
 
 def rows_of(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
-    """What is said of the result, names and values; `shown` says that there is a set."""
+    """The rows, names and values; `shown` says that there is a set."""
     rows = [*_claim_rows(result, shown), *_level_rows(result), *_set_rows(result, shown)]
     if len(result.get("candidates", [])) > 1:
         rows.append(_candidates(result))
@@ -50,7 +50,7 @@ def rows_of(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
 
 
 def _claim_rows(result: Mapping[str, Any], shown: bool) -> list[tuple[str, str]]:
-    """For which functions of time and which periods the claim is, its rate, and what limits it."""
+    """The functions of time and the periods that the claim is for, its rate, and what limits it."""
     rows, found, timing = [], uncertain_of(result), TimingInWords.of_result(result)
     if found:
         each = "; ".join(q.words for q in found)
@@ -175,7 +175,7 @@ def _functions(timing: TimingInWords) -> str:
 
 
 def _rate(result: Mapping[str, Any], timing: TimingInWords) -> str:
-    """What the rate says of the time, rounded up."""
+    """The rate, and the time that follows from it, rounded up."""
     floor = result["levels"].get("floor") if kind_of(result) in PRACTICAL else None
     latest = reach_time(timing, floor, result["levels"].get("roa"))
     what = "V at most 1 % of what it was" if floor is None else "in {V <= c0}"

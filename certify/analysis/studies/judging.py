@@ -1,4 +1,4 @@
-"""How the certificate that came back is judged, and the row of an earlier sweep.
+"""The judgement of a certificate that came back, and of a row that an earlier sweep has left.
 
 Whoever did the work is not believed. A row says PROVED only if the checker of this machine, asked about the file that
 lies in the case's folder, accepted it, and if what that file claims is about the very plant and policy of the case; its
@@ -171,7 +171,7 @@ class _Refused(CertifyError):
 
 
 def _stated(case: Case, answer: Answer, plant: System) -> Row:
-    """What a worker says of a case, without what only a certificate may say.
+    """The row by a worker's word, without what only a certificate may say.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""A row: what is known of a case once it is done, and its file."""
+"""A row: a case that is done, in a table, and its file."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ FILE = "row.json"
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """What came of a case.
+    """The outcome of a case.
 
     Parameters
     ----------
@@ -87,7 +87,7 @@ class Row:
 
     @property
     def failed(self) -> bool:
-        """Whether the case could not be run."""
+        """True if the case could not be run."""
         return bool(self.error)
 
     def to_dict(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Between the states' values, in which people write a plant, and deviations from its operating point x_eq."""
+"""The states' values, in which people write a plant, and deviations from its operating point x_eq."""
 
 from __future__ import annotations
 

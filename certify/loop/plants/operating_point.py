@@ -1,4 +1,4 @@
-"""Whether a plant rests at its operating point: f(0, u_eq) of each state."""
+"""The operating point of a plant, and f(0, u_eq) of each state there, which is 0 at an equilibrium."""
 
 from __future__ import annotations
 

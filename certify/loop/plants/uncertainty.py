@@ -1,4 +1,4 @@
-"""What is uncertain of a plant: input errors, the corners of the box of ranges, the plant at some of its values."""
+"""The uncertainty of a plant: input errors, the corners of the box of ranges, the plant at some of its values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is required of a plant's fields, beyond their types."""
+"""The requirements on a plant's fields, beyond their types."""
 
 from __future__ import annotations
 

@@ -341,10 +341,10 @@ class Pass:
 
 
 def _halvings(found: BoxBounds, n: int, before: float) -> float:
-    """How often a box of a batch that is not proved has to be halved, so that what its axes add to the bound is less
-    than the decay at its centre: a bound of second order falls fourfold when all n axes are halved once.
+    """The halvings that a box of a batch needs which is not proved, so that what its axes add to the bound is less than
+    the decay at its centre: a bound of second order falls fourfold when all n axes are halved once.
 
-    `before` is what an earlier batch said, where this one says nothing.
+    `before` is the number by an earlier batch, for a batch that gives none.
     """
     excess = np.maximum(found.score, 0.0).sum(0)
     decay = excess - found.bound

@@ -19,11 +19,11 @@ class Residues:
         self._known: dict[str, tuple[int, int]] = {}
 
     def declare(self, name: str) -> None:
-        """A free variable: a random value at each point."""
+        """Store a random value at each point, for a free variable."""
         self._known[name] = (hashed(name, 1), hashed(name, 2))
 
     def set(self, name: str, values: Sequence[int]) -> None:
-        """What is known by its values."""
+        """Store the values of what is computed from others."""
         self._known[name] = (values[0], values[1])
 
     def of(self, monomial: Monomial) -> tuple[int, int]:

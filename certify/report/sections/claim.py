@@ -80,7 +80,7 @@ def claim_of(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict
 
 
 def _notes(certificate: Certificate, answer: Mapping[str, Any] | None, bounds: Sequence[str]) -> dict[str, str]:
-    """What the checker found of each part, by the part's name; `bounds` are those of the inputs."""
+    """The checker's findings on each part, by the part's name; `bounds` are those of the inputs."""
     margins = answer.get("margins", {}) if answer else {}
     local, ring = margins.get("local"), margins.get("ring")
     notes = {
@@ -132,7 +132,7 @@ def _beyond(certificate: Certificate, outer: Outer | None) -> dict[str, Any] | N
 
 
 def _smallest(timing: TimingInWords) -> str:
-    """Of what the margin of the ring is the least."""
+    """The quantity whose least value is the margin of the ring, in words."""
     return f"the smallest bound on {MINUS}{f'({timing.decrease})' if timing.rate else timing.decrease}"
 
 
