@@ -12,7 +12,7 @@ import pytest
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Number, Symbol, symbols
-from certify.loop.plants import System, get_system
+from certify.loop.plants import System, get_system, with_input_errors
 from certify.loop.policies import TanhNetwork
 from certify.loop.rigorous import eigenvalues, evaluate_policy, evaluate_vdot
 from tests.support.loops import box, chain, pendulum_network, scalar_tanh
@@ -109,6 +109,6 @@ def test_a_policy_that_is_not_centred_is_told_by_how_much_and_what_to_type() -> 
 
 
 def test_a_loop_that_rests_nowhere_for_all_values_is_told_so() -> None:
-    system = get_system("pendulum").with_input_errors({"u": Fraction(1, 10)})
+    system = with_input_errors(get_system("pendulum"), {"u": Fraction(1, 10)})
     with pytest.raises(InputError, match=r"whatever error_u may be; theta_dot' depends on that there. Ask for --claim"):
         ClosedLoop(system, pendulum_network((8, 8))).require_rest()

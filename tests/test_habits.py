@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import re
 import subprocess
@@ -97,3 +98,26 @@ def test_a_repository_that_has_a_public_address_says_it_everywhere_or_nowhere() 
     urls = set(PROJECT.get("urls", {}).values())
     assert urls >= {parsed("CITATION.cff").get("repository-code")} - {None}
     assert bool(urls) is ("repository-code" in parsed("CITATION.cff"))
+
+
+def lines_of_code(node: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
+    """The lines of a function, without its docstring."""
+    first = node.body[0]
+    documented = isinstance(first, ast.Expr) and isinstance(first.value, ast.Constant)
+    docstring = (first.end_lineno or 0) - first.lineno + 1 if documented else 0
+    return (node.end_lineno or 0) - node.lineno + 1 - docstring
+
+
+def test_classes_and_functions_are_short() -> None:
+    """A class has 200 lines at most, a function 60; the checker reads by rules of its own."""
+    large, long = [], []
+    for path in [*ROOT.glob("certify/**/*.py"), *ROOT.glob("controllers/**/*.py")]:
+        where = path.relative_to(ROOT).as_posix()
+        if where.startswith("certify/checker/"):
+            continue
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            if isinstance(node, ast.ClassDef) and (node.end_lineno or 0) - node.lineno + 1 > 200:
+                large.append(f"{where} {node.name}")
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef) and lines_of_code(node) > 60:
+                long.append(f"{where} {node.name}")
+    assert not large and not long

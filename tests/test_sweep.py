@@ -23,11 +23,11 @@ from typing import Any
 import pyarrow.parquet
 import pytest
 
-from certify.analysis.results import Levels
+from certify.analysis.facts import Levels
 from certify.analysis.studies import Row, Study, read_study, run_sweep
 from certify.analysis.studies import sweep as flow
+from certify.analysis.studies.judging import judged, kept
 from certify.analysis.studies.page import page_of
-from certify.analysis.studies.rows import judged, kept
 from certify.analysis.studies.study import Axis, plain
 from certify.analysis.studies.tables import names, write_tables
 from certify.analysis.studies.work import Answer, answer_in, work

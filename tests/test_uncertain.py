@@ -20,7 +20,16 @@ from certify.certificates.verdict import Stop, Verdict
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Number, sin, sqrt, symbols, symbols_of
-from certify.loop.plants import System, available_systems, get_system, load_system
+from certify.loop.plants import (
+    System,
+    at_values,
+    available_systems,
+    get_system,
+    input_errors,
+    kind_of,
+    load_system,
+    with_input_errors,
+)
 from certify.loop.policies import TanhNetwork
 from certify.lyapunov.function import Quadratic
 from certify.provers.falsify import Witness
@@ -120,7 +129,7 @@ def test_disturbances_of_what_ships_are_in_its_equations_and_nowhere_else(name: 
     for w in system.disturbances:
         assert w in known and w.name in system.units
         moved = system.with_ranges({w.name: (F(-1), F(1))})
-        pushed, still = moved.at({w.name: F(1)}).exact_dynamics(), system.exact_dynamics()
+        pushed, still = at_values(moved, {w.name: F(1)}).exact_dynamics(), system.exact_dynamics()
         assert not all(map(same, pushed, still))
     assert not symbols_of(*system.exact_dynamics()) & set(system.disturbances)
 
@@ -175,16 +184,16 @@ def test_equations_take_values_of_what_is_uncertain(tmp_path: Path, module: str)
 
 def test_an_error_of_an_input_is_what_only_moves_the_input(tmp_path: Path) -> None:
     """Decided by the equations: a name says nothing, since a file may give it to anything."""
-    system = spring(tmp_path).with_input_errors({"F": F(1, 1000)})
-    assert dict(system.input_errors) == {"F": "error_F"} and system.units["error_F"] == "N"
-    assert system.kind_of("error_F") == "input error"
+    system = with_input_errors(spring(tmp_path), {"F": F(1, 1000)})
+    assert dict(input_errors(system)) == {"F": "error_F"} and system.units["error_F"] == "N"
+    assert kind_of(system, "error_F") == "input error"
     p, v, u, e = symbols("p v F error_F")
     for dynamics in ((v, u + e * p), (v + e, u), (v, u + 2 * e), (v, u + e + p * e), (v + u, e - p)):
         other = System(
             "s", (p, v), (u,), {}, dynamics, (Number(0),), ((F(-1), F(1)),) * 2, ((F(-1), F(1)),),
             disturbances=(e,), ranges={"error_F": (F(-1), F(1))},
         )  # fmt: skip
-        assert not other.input_errors and other.kind_of("error_F") == "disturbance", dynamics
+        assert not input_errors(other) and kind_of(other, "error_F") == "disturbance", dynamics
 
 
 @pytest.mark.parametrize("name", available_systems())
@@ -196,7 +205,7 @@ def test_errors_of_inputs_are_recognised_in_a_certificate(name: str) -> None:
     evidence = PartitionTree(np.eye(n), np.ones(n), bytes([255]), cells=(1,) * m)
     written = Certificate(system, network, Quadratic(np.eye(n)), Asymptotic(roa=1.0, local=1.0), evidence)
     read = parse_certificate(written.to_json().encode(), "c").system
-    assert dict(read.input_errors) == {u.name: f"error_{u}" for u in plant.inputs}
+    assert dict(input_errors(read)) == {u.name: f"error_{u}" for u in plant.inputs}
     assert {name: read.units.get(name) for name in read.ranges} == {
         f"error_{u}": system.units.get(u.name) for u in plant.inputs
     }

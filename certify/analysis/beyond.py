@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from fractions import Fraction
 
+from certify.analysis.facts import OuterFacts
 from certify.analysis.options import RoaOptions
-from certify.analysis.results import OuterFacts
 from certify.certificates.claims import Claim, Outer, Problem
 from certify.lyapunov import sampled_volume
 from certify.lyapunov.rigorous import evaluate_rise

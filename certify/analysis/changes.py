@@ -60,8 +60,10 @@ class PlantChanges:
         plant = plant.with_ranges({name: ends for name, ends in given.items() if isinstance(ends, tuple)})
         plant = plant.with_domain(self._domain(plant)).with_ranges(self._acting(plant))
         if (error := self.input_error) is not None:
+            from certify.loop.plants import with_input_errors
+
             bounds = error if isinstance(error, Mapping) else {s.name: error for s in plant.inputs}
-            plant = plant.with_input_errors(bounds)
+            plant = with_input_errors(plant, bounds)
         held = self.sample_time
         return plant if held is None else plant.with_sample(held if isinstance(held, tuple) else (held, held))
 

@@ -16,8 +16,9 @@ from fractions import Fraction
 import numpy as np
 from numpy.typing import NDArray
 
+from certify.analysis.facts import Diagnosis, Share, Step
 from certify.analysis.options import RoaOptions
-from certify.analysis.results import Diagnosis, RoaResult, Share, Step
+from certify.analysis.results import RoaResult
 from certify.certificates.verdict import Stop
 from certify.effort import UNIT, UNLIMITED, WHOLE, Effort
 from certify.errors import InputError

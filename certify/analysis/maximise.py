@@ -9,9 +9,10 @@ accepted, under the usual name.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal
@@ -72,59 +73,55 @@ def certify_largest(
     start = time.perf_counter() - load_seconds
     plain = system.with_sample(None) if quantity == "period" else system
     effort = effort_of(options, load_seconds)
+    certify = partial(certify_roa, provenance=provenance, progress=progress)
     with sole_writer(out), TemporaryDirectory(dir=out, prefix="attempt-") as folder:
         set_aside(out)
-        first = certify_roa(
-            plain,
-            network,
-            Path(folder) / "first",
-            replace(options, rate=0.0),
-            load_seconds=load_seconds,
-            provenance=provenance,
-            progress=progress,
-            effort=effort.share(_FOR_THE_SET),
-        )
+        share = effort.share(_FOR_THE_SET)
+        here = Path(folder) / "first"
+        first = certify(plain, network, here, replace(options, rate=0.0), load_seconds=load_seconds, effort=share)
         best, proved = first, None
         if first.verdict is Verdict.PROVED and first.problem is not None and first.levels.roa is not None:
             P, level = first.problem.V.P, _SET * first.levels.roa
             plain, network = first.system, first.network  # as seen from where V is 0
-            refused: Fraction | None = None
 
-            def attempt(value: Fraction) -> RoaResult:
-                found = certify_roa(
-                    plain.with_sample((value, value)) if quantity == "period" else plain,
-                    network,
-                    Path(folder) / "next",
-                    replace(
-                        options,
-                        P=P,
-                        level=level,
-                        rate=float(value) if quantity == "rate" else 0.0,
-                    ),
-                    provenance=provenance,
-                    progress=progress,
-                    effort=effort.part(max(UNIT, _EACH * effort.left)),
-                )
-                return replace(found, rest=first.rest)
+            def attempt(value: Fraction) -> RoaResult | None:
+                asked = replace(options, P=P, level=level, rate=float(value) if quantity == "rate" else 0.0)
+                held = plain.with_sample((value, value)) if quantity == "period" else plain
+                share = effort.part(max(UNIT, _EACH * effort.left))
+                found = certify(held, network, Path(folder) / "next", asked, effort=share)
+                return replace(found, rest=first.rest) if found.verdict is Verdict.PROVED else None
 
-            for value in _tried(quantity, plain, network, P, level):
-                if effort.over:
-                    break
-                found = attempt(value)
-                if found.verdict is Verdict.PROVED:
-                    best, proved = found, value
-                    break
-                refused = value
-            for _ in range(_HALVINGS):
-                if proved is None or refused is None or effort.over:
-                    break
-                middle = _short((proved + refused) / 2)
-                found = attempt(middle)
-                if found.verdict is Verdict.PROVED:
-                    best, proved = found, middle
-                else:
-                    refused = middle
+            largest = _largest(attempt, _tried(quantity, plain, network, P, level), lambda: effort.over)
+            if largest is not None:
+                best, proved = largest
         return _in_place(best, out, _notice(quantity, proved, first), time.perf_counter() - start)
+
+
+def _largest(
+    attempt: Callable[[Fraction], RoaResult | None], values: Sequence[Fraction], over: Callable[[], bool]
+) -> tuple[RoaResult, Fraction] | None:
+    """The largest value that is proved, with its result: the first of the falling `values`, or a middle between it and
+    the last that is not; None if none is proved before the effort is `over`."""
+    proved: tuple[RoaResult, Fraction] | None = None
+    refused: Fraction | None = None
+    for value in values:
+        if over():
+            return None
+        found = attempt(value)
+        if found is not None:
+            proved = found, value
+            break
+        refused = value
+    for _ in range(_HALVINGS):
+        if proved is None or refused is None or over():
+            break
+        middle = _short((proved[1] + refused) / 2)
+        found = attempt(middle)
+        if found is not None:
+            proved = found, middle
+        else:
+            refused = middle
+    return proved
 
 
 def _tried(quantity: Quantity, system: System, network: TanhNetwork, P: Any, level: float) -> Sequence[Fraction]:

@@ -13,7 +13,8 @@ import flint
 import numpy as np
 
 from certify.analysis.candidates.trials import Trial
-from certify.analysis.results import Levels, RoaResult, Tried
+from certify.analysis.facts import Levels, Tried
+from certify.analysis.results import RoaResult
 from certify.analysis.selection import Contender
 from certify.certificates.claims import Claim
 from certify.certificates.verdict import Stop, Verdict

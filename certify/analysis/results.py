@@ -1,4 +1,4 @@
-"""What a run found: as a typed value, as the JSON object of `certify roa --json`, and as what one asks it in Python.
+"""What a run found, as a typed value, and what one asks of it in Python.
 
 Whatever a result says of the certified set comes from the numbers that the checker accepted: membership is decided in
 rationals, sizes are rounded down, and pictures are drawn from the very bytes that were checked.
@@ -7,8 +7,8 @@ rationals, sizes are rounded down, and pictures are drawn from the very bytes th
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from fractions import Fraction
 from html import escape
 from os import PathLike
@@ -18,6 +18,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from certify.analysis.facts import Diagnosis, Levels, OuterFacts, Tried, TubeFacts
+from certify.analysis.json_object import to_dict
+from certify.analysis.stated import in_one_line, stated
 from certify.certificates import parse_certificate, write_atomically
 from certify.certificates.claims import Problem
 from certify.certificates.membership import Region, sublevel_set, tube_start
@@ -27,180 +30,14 @@ from certify.errors import InputError
 from certify.loop.equilibrium import Rest
 from certify.loop.plants import System
 from certify.loop.policies import TanhNetwork
-from certify.lyapunov import extents, semi_axes, volume
-from certify.lyapunov.neural import Neural
+from certify.lyapunov import volume
 from certify.lyapunov.sublevel import Sublevel
-from certify.lyapunov.symbolic import Symbolic
 from certify.provers.falsify import Witness
-from certify.report.timing import TimingInWords
-from certify.report.words import below, estimated, varying, varying_in, volume_name, volume_unit
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 Array = NDArray[np.float64]
-_STAGES = ("load", "candidate", "local", "ring", "tube", "learn", "outer", "write", "check", "total")
-
-
-@dataclass(frozen=True, slots=True)
-class Levels:
-    """Levels of V. None means that there is none.
-
-    `local` (c1) and `roa` (c2) state an asymptotic claim, `floor` (c0), `local` and `roa` a practical one.
-    `sampled_limit` is where the lowest violation was found, `domain_limit` where the set meets the domain.
-    """
-
-    local: float | None = None
-    floor: float | None = None
-    roa: float | None = None
-    sampled_limit: float | None = None
-    domain_limit: float | None = None
-
-    @property
-    def inner(self) -> float | None:
-        """The level of the inner set that the claim speaks of: c0 of a practical claim, else c1."""
-        return self.local if self.floor is None else self.floor
-
-    @property
-    def ultimate(self) -> float | None:
-        """c0 of a practical claim: the level below which every trajectory ends."""
-        return self.floor
-
-    def to_dict(self) -> dict[str, float | None]:
-        """For JSON."""
-        return {**{name: getattr(self, name) for name in self.__slots__}, "ultimate": self.ultimate}
-
-
-@dataclass(frozen=True, slots=True)
-class Tried:
-    """A candidate that was tried.
-
-    `level` and `volume` are the most within its reach, sampled, ended by `limited_by`; `proved` says that the result is
-    about this one, `proved_volume` what the search had proved with it, None if nothing.
-    """
-
-    candidate: str
-    level: float
-    limited_by: str
-    volume: float
-    proved: bool
-    proved_volume: float | None
-
-
-@dataclass(frozen=True, slots=True)
-class Step:
-    """What to try next: options to add to the command (none if no option helps), and why; `flattens` says that the
-    policy is to be fine-tuned first, by `controllers flatten`."""
-
-    options: tuple[tuple[str, str], ...]
-    why: str
-    flattens: bool = False
-
-
-@dataclass(frozen=True, slots=True)
-class TubeFacts:
-    """A tube that enlarges the set: it starts at {(x - c)'P(x - c) <= 1}, P = `start` (n, n), c = `centre`, None for 0,
-    of this `shape`, and leads into {V <= c2} in `slabs` pieces, in `duration` units of time."""
-
-    start: Array
-    shape: str
-    slabs: int
-    duration: float
-    centre: tuple[float, ...] | None = None
-
-    def contains(self, states: Sequence[Sequence[Fraction | float]]) -> list[bool]:
-        """Whether states, as deviations from the operating point, lie in the start, decided in rationals."""
-        return tube_start(self.start, self.centre).holds(states)
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON, with the size of the start along the states."""
-        sizes = {"semi_axes": semi_axes(self.start, 1.0).tolist(), "extents": extents(self.start, 1.0).tolist()}
-        stated = {"shape": self.shape, "slabs": self.slabs, "duration": self.duration, "start": self.start.tolist()}
-        return {**stated, "centre": self.centre and list(self.centre), "volume": volume(self.start, 1.0), **sizes}
-
-
-@dataclass(frozen=True, slots=True)
-class OuterFacts:
-    """A set beyond {V <= c2}: {N <= level} within the domain, N a `function` of deviations from the operating point.
-
-    `volume` is that of its union with {V <= c2}, estimated from samples of the domain, and `deviation` the standard
-    deviation of that estimate; `leaves` are those of all trees; `limit` says what ends the level: `domain` (its faces),
-    `witness`, `requested`, or what ran out;
-    `witness` is a state, (n,), at which N is no larger than `witness_level` and does not fall, None if none was met.
-    """
-
-    function: Neural | Symbolic
-    level: float
-    volume: float
-    deviation: float
-    limit: str
-    boxes: int
-    leaves: int
-    witness: tuple[float, ...] | None = None
-    witness_level: float | None = None
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON."""
-        N = self.function
-        stated: dict[str, Any] = (
-            {"kind": "expression", "expression": str(N.expression)}
-            if isinstance(N, Symbolic)
-            else {"kind": "network", "layers": list(N.widths), "sha256": N.sha256()}
-        )
-        numbers = {name: getattr(self, name) for name in self.__slots__ if name not in ("function", "witness")}
-        return {**stated, **numbers, "witness": self.witness and list(self.witness)}
-
-
-@dataclass(frozen=True, slots=True)
-class Share:
-    """How far the set reaches along a state, and that as a share of the nearer side of its domain."""
-
-    state: str
-    unit: str
-    extent: float
-    share: float
-
-
-@dataclass(frozen=True, slots=True)
-class Diagnosis:
-    """What binds and where.
-
-    Parameters
-    ----------
-    binds : in words, with the names of states and inputs.
-    kind : `domain`, `vdot`, `input`, or the name of the stop.
-    name, side : the state or input that binds and which side, None where neither does.
-    point : a state at which it binds, (n,), None if there is none.
-    shares : one a state; empty without a set.
-    fastest, slowest : real parts of the closed loop's eigenvalues at the origin, 1/s.
-    hurts : weights of the states, (n,), the largest 1: the direction in which the proof had most to do.
-    next : what to try.
-    """
-
-    binds: str
-    kind: str
-    name: str | None
-    side: str | None
-    point: tuple[float, ...] | None
-    shares: tuple[Share, ...]
-    fastest: float | None
-    slowest: float | None
-    hurts: tuple[tuple[str, float], ...]
-    next: Step
-
-    @property
-    def stiffness(self) -> float | None:
-        """How many times faster the fastest mode decays than the slowest; None unless all decay."""
-        if self.fastest is None or self.slowest is None or not self.slowest < 0:
-            return None
-        return self.fastest / self.slowest
-
-    def to_dict(self) -> dict[str, Any]:
-        """For JSON: the fields, and `stiffness`; `hurts` by state."""
-        stated = asdict(self)
-        stated |= {"stiffness": self.stiffness, "hurts": dict(self.hurts)}
-        stated["next"] = {"options": dict(self.next.options), "why": self.next.why, "flatten": self.next.flattens}
-        return stated
 
 
 @dataclass(frozen=True, slots=True, repr=False)
@@ -387,134 +224,17 @@ class RoaResult:
         return self.raw, self.certificate
 
     def __repr__(self) -> str:
-        said = dict(self._stated())
-        verdict = said["verdict"] if self.claim == "asymptotic" else f"{said['verdict']} {self.claim}"
-        shown = [verdict, *(said[name] for name in ("plant", "in time", "set") if name in said)]
-        shown += [
-            f"{name} {said[name]}"
-            for name in ("rate", "length", "area", "volume", "with N", "limited by", "reason")
-            if name in said
-        ]
-        return f"RoaResult({'; '.join(shown)})"
+        return f"RoaResult({in_one_line(self)})"
 
     def _repr_html_(self) -> str:
         """The result as a small table, for notebooks; every text is escaped."""
         cell = "style='text-align:left'"
-        rows = (f"<tr><th {cell}>{escape(n)}</th><td {cell}>{escape(text)}</td></tr>" for n, text in self._stated())
+        rows = (f"<tr><th {cell}>{escape(n)}</th><td {cell}>{escape(text)}</td></tr>" for n, text in stated(self))
         return f"<table>{''.join(rows)}</table>"
-
-    def _stated(self) -> list[tuple[str, str]]:
-        """What is said of the result in a few rows, names and values."""
-        rows = [("verdict", self.verdict.value), ("plant", self.system.name), ("claim", self.claim)]
-        if self.system.ranges:
-            rows.append(("for every", varying(varying_in(self.system))))
-        timing = TimingInWords.of(self.system, self.timing.rate)
-        if not timing.is_plain:
-            rows.append(("in time", "by steps" if timing.discrete else f"input held over {timing.periods}"))
-        if timing.rate:
-            rows.append(("rate", timing.shown_rate))
-        shown = self.verdict in (Verdict.PROVED, Verdict.TRUSTED)
-        level, size = (self.levels.roa, self.volume) if shown else (None, None)
-        if level is not None and size is not None:
-            unit = volume_unit([self.system.units.get(s.name, "") for s in self.system.states])
-            wider = "" if self.tube is None else ", enlarged by a tube" if self.tube.centre is None else ", and a tube"
-            if self.outer is not None:
-                wider = f", and N <= {below(self.outer.level)} in the domain"
-            rows.append(("set", f"V <= {below(level)}{wider}"))
-            rows.append((volume_name(self.system.n), f"{below(size)} {unit}".rstrip()))
-            if self.outer is not None:
-                rows[-1] = (rows[-1][0], f"{rows[-1][1]}, of V <= {below(level)}")
-                rows.append(("with N", estimated(self.outer.volume, self.outer.deviation, unit)))
-            rows.append(("limited by", self.reason))
-        else:
-            rows.append(("reason", self.reason))
-        rows += [("certificate", str(self.certificate))] if self.certificate is not None else []
-        return rows + [("notice", text) for text in (self.notice, *self.notices) if text is not None]
-
-    def _claim(self) -> dict[str, Any]:
-        """The claim's kind, with the rate and the periods where there are any."""
-        rate = {"rate": self.timing.rate} if self.timing.rate else {}
-        sample = self.system.sample
-        return {"kind": self.claim, **rate, **({} if sample is None else {"sample": [str(h) for h in sample]})}
-
-    def _rest(self, rest: Rest) -> dict[str, Any]:
-        """Where the loop rests, also by the states' values; `origin` says that V is 0 there."""
-        moved = map(Fraction, self.network.origin.tolist())  # x is in deviations from where the plant was to rest
-        each = zip(self.system.exact_x_eq(), moved, rest.x, strict=True)
-        values = [float(at - by + Fraction(x)) for at, by, x in each]
-        return asdict(rest) | {"values": values, "origin": self.network.is_moved}
 
     def to_dict(self) -> dict[str, Any]:
         """The JSON object of `certify roa --json`; lengths along the states are in their units."""
-        system, network, witness = self.system, self.network, self.witness
-        P = self.P
-        geometry: dict[str, Any] = dict.fromkeys(("volume", "semi_axes", "extents"))
-        if self.ellipsoid is not None:
-            axes, reach = semi_axes(*self.ellipsoid).tolist(), extents(*self.ellipsoid).tolist()
-            geometry = {"volume": self.volume, "semi_axes": axes, "extents": reach}
-        stated = {
-            "schema": "certify-roa/1",
-            "verdict": self.verdict.value,
-            "reason": self.reason,
-            "stop": self.stop.name.lower(),
-            "claim": self._claim(),
-            "time": self.system.time,
-            "system": system.name,
-            "parameters": {name: str(q) for name, q in system.parameters.items()},
-            "uncertain": [
-                {
-                    "name": name,
-                    "kind": system.kind_of(name),
-                    "lo": str(lo),
-                    "hi": str(hi),
-                    "unit": system.units.get(name, ""),
-                }
-                for name, (lo, hi) in system.ranges.items()
-            ],
-            "states": [{"name": s.name, "unit": system.units.get(s.name, "")} for s in system.states],
-            "operating_point": {name: str(q) for name, q in system.operating_point().items()},
-            "inputs": [{"name": s.name, "unit": system.units.get(s.name, "")} for s in system.inputs],
-            "policy": {"sha256": network.sha256(), "layers": list(network.layers)},
-            "lyapunov": {
-                "P": None if P is None else P.tolist(),
-                "candidate": self.candidate,
-                "notice": self.notice,
-            },
-            "levels": self.levels.to_dict(),
-            "reach_time": self.reach_time,
-            "reach_from": None
-            if self.reach_from is None
-            else {s.name: str(q) for s, q in zip(system.states, self.reach_from, strict=True)},
-            "tube": None if self.tube is None else self.tube.to_dict(),
-            "outer": None if self.outer is None else self.outer.to_dict(),
-            "witness": None,
-            "eigenvalues": list(self.eigenvalues),
-            "rest": None if self.rest is None else self._rest(self.rest),
-        }
-        if witness is not None:
-            held = witness.values if witness.kind == "vdot" else {}  # an input does not depend on them
-            stated["witness"] = {
-                "x": witness.x.tolist(),
-                "V": witness.level,
-                "kind": witness.kind,
-                "values": {name: str(q) for name, q in held.items()},
-            }
-        return {
-            **stated,
-            **geometry,
-            "candidates": [asdict(one) for one in self.tried],
-            "engine": self.engine,
-            "solver": None if self.solver is None else dict(self.solver),
-            "diagnosis": None if self.diagnosis is None else self.diagnosis.to_dict(),
-            "boxes": self.boxes,
-            "leaves": self.leaves,
-            "seconds": {name: self.seconds.get(name) for name in _STAGES},
-            "certificate": None if self.certificate is None else str(self.certificate),
-            "search": None if self.search is None else str(self.search),
-            "certificate_sha256": None if self.checker is None else self.checker.get("certificate_sha256"),
-            "checked": None if self.checker is None else self.checker.get("result"),
-            "contains": None,  # the answer to `certify roa --contains`
-        }
+        return to_dict(self)
 
 
 def _entries(x: ArrayLike) -> NDArray[Any]:

@@ -25,7 +25,7 @@ from certify.certificates import Certificate, parse_certificate, read_raw, run_c
 from certify.certificates.formats import version_in
 from certify.certificates.verdict import Answer
 from certify.errors import InputError
-from certify.loop.plants import System
+from certify.loop.plants import System, with_origin
 from certify.lyapunov import are_inside, volume
 from certify.lyapunov.sublevel import Sublevel
 
@@ -201,7 +201,7 @@ class ProvedSet(Region):
         """
         if not any(self.origin):
             return system
-        return system.seen_from([Fraction(v) for v in self.origin], self.system.exact_u_eq())
+        return with_origin(system, [Fraction(v) for v in self.origin], self.system.exact_u_eq())
 
     def deviations(self, states: Iterable[Sequence[Fraction | float]]) -> list[list[Fraction]]:
         """States that the policy's layers read, as deviations from where x = 0 lies for this set."""

@@ -6,7 +6,7 @@ import json
 import shlex
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import fields
 from functools import partial
 from pathlib import Path
@@ -59,8 +59,6 @@ def certified(
     asked : a state or a box, as people write it, of which it is to be said whether the proved set contains it.
     largest : what is to be as large as can be proved for the set.
     """
-    from certify.analysis.installation import versions
-    from certify.analysis.run import certify_roa
     from certify.report import summary
 
     note = noting(quiet)
@@ -72,22 +70,11 @@ def certified(
         if not as_json:  # this process waits for the checker's
             threading.Thread(target=load_tables, daemon=True).start()
 
-    run = partial(certify_roa, show=draw)
-    if largest is not None:
-        from certify.analysis.maximise import certify_largest
-
-        run = partial(certify_largest, largest)
+    run = _run_for(largest, draw)
     progress = None if quiet else ProgressLine()
     try:
-        result = run(
-            plant,
-            stored.network,
-            folder,
-            options,
-            load_seconds=time.perf_counter() - start,
-            provenance={"policy": policy.name, **versions()},
-            progress=progress,
-        )
+        about = {"load_seconds": time.perf_counter() - start, "provenance": _provenance(policy)}
+        result = run(plant, stored.network, folder, options, progress=progress, **about)
     except KeyboardInterrupt:
         search = folder / SEARCH
         if largest is not None or not search.exists():
@@ -99,14 +86,9 @@ def certified(
     finally:
         if progress is not None:
             progress.close()
-    data = result.to_dict()
-    following = {} if data["diagnosis"] is None else data["diagnosis"]["next"]
-    if following.get("flatten"):
-        following["command"] = _flattened(context, policy)
-    elif following.get("options"):
-        following["command"] = _command(context, following["options"])
     if result.notice is not None:
         note(as_typed(result.notice, options_of(context.command)))
+    data = _with_next_command(result.to_dict(), context, policy)
     if result.certificate is not None and result.raw is not None:
         answer = None if result.checker is None else dict(result.checker)
         write(folder / "report.html", drawing.page_of(result.raw, result.certificate, answer, data))
@@ -122,6 +104,33 @@ def certified(
         if result.certificate is not None:
             say(f"certificate  {result.certificate}\nreport       {folder / 'report.html'}")
     raise typer.Exit(result.verdict.exit_status)
+
+
+def _run_for(largest: Quantity | None, draw: Callable[[bytes], None]) -> Callable[..., RoaResult]:
+    """The function that certifies; `draw` gets the certificate's bytes while they are checked."""
+    if largest is not None:
+        from certify.analysis.maximise import certify_largest
+
+        return partial(certify_largest, largest)
+    from certify.analysis.run import certify_roa
+
+    return partial(certify_roa, show=draw)
+
+
+def _provenance(policy: Path) -> dict[str, str]:
+    from certify.analysis.installation import versions
+
+    return {"policy": policy.name, **versions()}
+
+
+def _with_next_command(data: dict[str, Any], context: typer.Context, policy: Path) -> dict[str, Any]:
+    """The result's data with what to type next, where an option or `controllers flatten` may help."""
+    following = {} if data["diagnosis"] is None else data["diagnosis"]["next"]
+    if following.get("flatten"):
+        following["command"] = _flattened(context, policy)
+    elif following.get("options"):
+        following["command"] = _command(context, following["options"])
+    return data
 
 
 def _where(result: RoaResult, asked: str) -> tuple[dict[str, Any], str]:
@@ -182,9 +191,11 @@ def _flattened(context: typer.Context, policy: Path) -> str:
 
 
 def _plant_line(stored: Policy, plant: System, overridden: bool) -> str:
+    from certify.loop.plants import kind_of
+
     values = ", ".join(f"{name} = {float(q):g}{_within(plant, name)}" for name, q in plant.parameters.items())
     acting = [name for name in plant.ranges if name not in plant.parameters]
-    moved = "".join(f"; {plant.kind_of(name)} {name}{_within(plant, name)}" for name in acting)
+    moved = "".join(f"; {kind_of(plant, name)} {name}{_within(plant, name)}" for name in acting)
     source = "from the command line" if overridden else "from the policy file"
     layers = "-".join(map(str, stored.network.layers))
     return f"plant {plant.name} ({source}) with {values or 'no parameters'}{moved}; policy {layers}"

@@ -40,9 +40,11 @@ def plant(
 
 
 def _data(s: System, A: Matrix, B: Matrix, eigenvalues: Sequence[complex], reach: Controllability) -> dict[str, Any]:
+    from certify.loop.plants import residuals
+
     return {
         **describe(s),
-        "residual": {name: str(r) for name, r in s.residuals().items() if r != 0},
+        "residual": {name: str(r) for name, r in residuals(s).items() if r != 0},
         "A": _floats(A),
         "B": _floats(B),
         "eigenvalues": [[e.real, e.imag] for e in eigenvalues],
@@ -55,10 +57,12 @@ def _page(s: System, A: Matrix, B: Matrix, eigenvalues: Sequence[complex], reach
     from rich.table import Table
     from rich.text import Text
 
+    from certify.loop.plants import dynamics_of_values
+
     grid = Table.grid(padding=(0, 2))
     grid.add_column(style="dim", no_wrap=True)
     grid.add_column(overflow="fold")
-    for x, e in zip(s.states, s.dynamics_of_values(), strict=True):
+    for x, e in zip(s.states, dynamics_of_values(s), strict=True):
         grid.add_row(Text(f"d {x}/dt" if s.time == "continuous" else f"{x}, next"), Text(f"= {e}"))
     facts = Table.grid(padding=(0, 2))
     facts.add_column(style="dim", no_wrap=True)
@@ -77,6 +81,8 @@ def _page(s: System, A: Matrix, B: Matrix, eigenvalues: Sequence[complex], reach
 
 
 def _facts(s: System, eigenvalues: Sequence[complex], reach: Controllability) -> list[tuple[str, str]]:
+    from certify.loop.plants import residuals, rests_where
+
     steps = s.time == "discrete"
     largest = max(abs(e) - 1 if steps else e.real for e in eigenvalues)
     edge = "on the unit circle, within rounding" if steps else "on the axis, within rounding"
@@ -92,9 +98,9 @@ def _facts(s: System, eigenvalues: Sequence[complex], reach: Controllability) ->
         ("open loop", f"{word}; eigenvalues {shown}"),
         ("inputs reach", f"{reach.rank} of {s.n} directions: {word_reach} ({how})"),
     ]
-    residuals = {name: float(r) for name, r in s.residuals().items() if not (abs(float(r)) <= 1e-12)}
-    off = [f"{name} moves by {r:.6g}" if steps else f"{name}' = {r:.6g}" for name, r in residuals.items()]
-    rest = f"f(x_eq, u_eq) = {s.rests_where}" if not off else f"no equilibrium: {', '.join(off)} at (x_eq, u_eq)"
+    found = {name: float(r) for name, r in residuals(s).items() if not (abs(float(r)) <= 1e-12)}
+    off = [f"{name} moves by {r:.6g}" if steps else f"{name}' = {r:.6g}" for name, r in found.items()]
+    rest = f"f(x_eq, u_eq) = {rests_where(s)}" if not off else f"no equilibrium: {', '.join(off)} at (x_eq, u_eq)"
     rows.insert(0, ("at rest", rest))
     if s.ranges:
         rows.append(
@@ -107,9 +113,11 @@ def _facts(s: System, eigenvalues: Sequence[complex], reach: Controllability) ->
 
 
 def _variables(s: System) -> Table:
+    from certify.loop.plants import domain_of_values
+
     table = _table("", "unit", "at rest", "from", "to")
     for symbols, rest, bounds in (
-        (s.states, s.exact_x_eq(), s.domain_of_values()),
+        (s.states, s.exact_x_eq(), domain_of_values(s)),
         (s.inputs, s.exact_u_eq(), s.input_bounds),
     ):
         for symbol, value, (lo, hi) in zip(symbols, rest, bounds, strict=True):

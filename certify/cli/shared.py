@@ -102,7 +102,9 @@ def page_of(raw: bytes, path: Path, answer: dict[str, Any] | None, data: dict[st
 
 def describe(s: System) -> dict[str, Any]:
     """A plant as plain values; equations, operating point and domain are in the states' values, not deviations."""
-    domain, x_eq, u_eq = s.domain_of_values(), s.exact_x_eq(), s.exact_u_eq()
+    from certify.loop.plants import domain_of_values, dynamics_of_values
+
+    domain, x_eq, u_eq = domain_of_values(s), s.exact_x_eq(), s.exact_u_eq()
     return {
         "name": s.name,
         "description": s.description,
@@ -114,7 +116,7 @@ def describe(s: System) -> dict[str, Any]:
         "ranges": {name: [str(lo), str(hi)] for name, (lo, hi) in s.ranges.items()},
         "domain": {x.name: [str(lo), str(hi)] for x, (lo, hi) in zip(s.states, domain, strict=True)},
         "input_bounds": {u.name: [str(lo), str(hi)] for u, (lo, hi) in zip(s.inputs, s.input_bounds, strict=True)},
-        "dynamics": {x.name: str(e) for x, e in zip(s.states, s.dynamics_of_values(), strict=True)},
+        "dynamics": {x.name: str(e) for x, e in zip(s.states, dynamics_of_values(s), strict=True)},
         "x_eq": {x.name: str(q) for x, q in zip(s.states, x_eq, strict=True)},
         "u_eq": {u.name: str(q) for u, q in zip(s.inputs, u_eq, strict=True)},
         "units": dict(s.units),

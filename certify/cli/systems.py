@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
 def systems(as_json: Json = False) -> None:
     """List the plants that ship, with their parameters, disturbances, domain and input bounds."""
-    from certify.loop.plants import available_systems, get_system
+    from certify.loop.plants import available_systems, domain_of_values, dynamics_of_values, get_system
 
     found = [get_system(name) for name in available_systems()]
     if as_json:
@@ -22,7 +22,7 @@ def systems(as_json: Json = False) -> None:
         return
     for s in found:
         lines = [f"{s.name}: {s.description}"]
-        equations = zip(s.states, s.dynamics_of_values(), strict=True)
+        equations = zip(s.states, dynamics_of_values(s), strict=True)
         mark = "'" if s.time == "continuous" else "+"  # of the state one step later
         lines += [f"  {symbol}{mark} = {expression}" for symbol, expression in equations]
         lines += [
@@ -33,7 +33,7 @@ def systems(as_json: Json = False) -> None:
             f"  disturbance {w} {s.units.get(w.name, '')}".rstrip() + (_range(s, w.name) or ", 0 unless asked for")
             for w in s.disturbances
         ]
-        for symbols, intervals in ((s.states, s.domain_of_values()), (s.inputs, s.input_bounds)):
+        for symbols, intervals in ((s.states, domain_of_values(s)), (s.inputs, s.input_bounds)):
             for symbol, (lo, hi) in zip(symbols, intervals, strict=True):
                 lines.append(f"  {symbol} in [{float(lo):g}, {float(hi):g}] {s.units.get(symbol.name, '')}")
         say("\n".join(lines))

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
+from certify.loop.plants import with_origin
 from certify.loop.rigorous import field_on, in_digits, policy_on, precision
 
 Array = NDArray[np.float64]
@@ -76,7 +77,7 @@ def seen_from(loop: ClosedLoop, rest: Rest) -> ClosedLoop:
     origin = np.array([float(q) for q in by])
     if [Fraction(v) for v in origin.tolist()] != by:
         raise InputError("a point from which a loop is seen must have coordinates in binary64.")
-    return ClosedLoop(system.seen_from(by, u), replace(network, origin=origin))
+    return ClosedLoop(with_origin(system, by, u), replace(network, origin=origin))
 
 
 def _short(q: Fraction, width: Fraction) -> Fraction:

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from certify.effort import UNLIMITED, Effort
 from certify.errors import BackendError
 from certify.loop.closed_loop import ClosedLoop
+from certify.loop.plants import mean_rate
 from certify.lyapunov.candidates import slowest_decay, solve_lyapunov
 from certify.lyapunov.level_sets import domain_limit, volume
 from certify.lyapunov.programs import Inequality, smallest_trace
@@ -189,7 +190,7 @@ class _Samples:
         # One matrix product for all states: numpy would make one for each leading index.
         u = self.loop.policy(x.reshape(-1, x.shape[-1])).reshape(*x.shape[:-1], self.loop.system.m)
         with np.errstate(all="ignore"):
-            F = self.loop.system.mean_rate(self.f, x, u, self.step)
+            F = mean_rate(self.loop.system, self.f, x, u, self.step)
         outside = ~np.isfinite(F).all(-1)
         F = np.where(outside[..., None], 0.0, F)
         return F, outside | np.any((u < self.bounds[0]) | (u > self.bounds[1]), axis=-1)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from certify.certificates.claims import Problem
 from certify.effort import UNLIMITED, Effort
-from certify.loop.plants import System
+from certify.loop.plants import System, at_values, corners, mean_rate
 from certify.loop.policies import bounded_by_form
 from certify.loop.rigorous import evaluate_increment, evaluate_policy
 
@@ -146,7 +146,7 @@ def confirm(problem: Problem, witness: Witness) -> bool:
     """True if the violation at the witness's binary64 point is shown in Arb."""
     loop = problem.loop
     if witness.kind == "vdot":
-        held = replace(loop, system=loop.system.at(witness.values)) if witness.values else loop
+        held = replace(loop, system=at_values(loop.system, witness.values)) if witness.values else loop
         found = evaluate_increment(held, problem.V.P, witness.x, witness.period, problem.rate)
         return bool(np.any(witness.x != 0)) and found >= 0
     for u, (lo, hi) in zip(evaluate_policy(loop, witness.x), loop.system.input_bounds, strict=True):
@@ -169,7 +169,7 @@ class _Search:
         self.problem, self.T, self.effort = problem, T, effort
         self.loop, self.network, self.P = problem.loop, problem.loop.folded, problem.V.P
         self.f = self.loop.system.uncertain_function()
-        self.corners = self.loop.system.corners()
+        self.corners = corners(self.loop.system)
         system = self.loop.system
         self.periods: list[Fraction | None] = [None] if system.sample is None else [*dict.fromkeys(system.sample)]
         self.worst = self._worst()
@@ -249,7 +249,7 @@ class _Search:
 
     def _decrease(self, x: Array, u: Array, values: list[Array], step: float | Array) -> Array:
         """D' (C, B) for constant values of what is uncertain, or (1, B) without any."""
-        G = self.loop.system.mean_rate(lambda y, v: self.f(y, v, values), x[None], u, step)
+        G = mean_rate(self.loop.system, lambda y, v: self.f(y, v, values), x[None], u, step)
         gradient = 2 * (x @ self.P)
         result: Array = (gradient * G).sum(-1)
         if self.loop.step:

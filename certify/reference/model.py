@@ -13,24 +13,13 @@ from functools import cached_property
 
 from flint import arb, arb_mat
 
-from .balls import ZERO, absolute, derivatives, finite, fourth, identity, largest_fourth, norm, total
+from . import lipschitz
+from .balls import ZERO, absolute, derivatives, finite, fourth, identity, norm, total
 from .refusal import Refused
 from .symmetric import linear_times_square, no_form, squared_norm
 
 Form = tuple[arb_mat, tuple[arb_mat, ...]]  # a column that is affine in y: c + sum_j y_j c_j; without c_j it is c
 SPREAD, SHARE = arb(0, 1), arb(0.5, 0.5)  # the ranges of a product of two y, and of a square
-
-
-@dataclass(frozen=True)
-class Beyond:
-    """The largest size on the ball of a part of a number, and a Lipschitz constant of it: how `steep` it is."""
-
-    size: arb
-    steep: arb
-
-    @property
-    def both(self) -> arb:
-        return self.size + self.steep
 
 
 @dataclass(frozen=True)
@@ -107,14 +96,6 @@ class Model:
     def radius(self) -> arb:
         return self.slope + self.curve
 
-    def beyond_linear(self, lip: arb) -> Beyond:
-        """Bounds of the terms beyond v(0) + a.d; the Lipschitz constants of d'Qd and K[d] are 2 bend and 3 twist."""
-        return Beyond(self.bend + self.twist + lip, 2 * self.bend + 3 * self.twist + lip)
-
-    def beyond_square(self, lip: arb) -> Beyond:
-        """Bounds of the terms beyond v(0) + a.d + d'Qd."""
-        return Beyond(self.twist + lip, 3 * self.twist + lip)
-
     def is_finite(self) -> bool:
         parts = (self.a, self.Q, self.K, self.E, *self.errors)
         single = finite([self.v, *self.B, *self.dv]) and (self.lip is None or self.lip.is_finite())
@@ -173,26 +154,13 @@ class Model:
         known = v.slope * w.twist + w.slope * v.twist + (v.bend + v.twist) * (w.bend + w.twist)
         E = abs(v.range) * w.E + abs(w.range) * v.E + known * identity(n)
         E += v.radius * w.whole + (w.slope + w.bend + w.twist) * v.whole
-        lip = v.lip_of_product(w)
+        lip = lipschitz.of_product(v, w)
         if not (v.dv or w.dv):
             return Model(v.v * w.v, v.v * w.a + w.v * v.a, Q, K, E, B, v.errors, lip=lip)
         value, dv = times((v.v, v.dv), (arb_mat([[w.v]]), tuple(arb_mat([[p]]) for p in w.dv)))
         one, two = times((v.v, v.dv), (w.a, w.da)), times((w.v, w.dv), (v.a, v.da))
         a, da = one[0] + two[0], tuple(p + q for p, q in zip(one[1], two[1], strict=True))
         return Model(value[0, 0], a, Q, K, E, B, v.errors, tuple(p[0, 0] for p in dv), da, lip)
-
-    def lip_of_product(self, other: Model) -> arb | None:
-        """The Lipschitz constant of v w beyond K: v(0) times w's, (a.d) times w beyond Q, and the product beyond a.d.
-
-        A product has the size of each times the other's constant.
-        """
-        v, w = self, other
-        if v.lip is None or w.lip is None:
-            return None
-        result = abs(v.range) * w.lip + abs(w.range) * v.lip
-        result += v.slope * w.beyond_square(w.lip).both + w.slope * v.beyond_square(v.lip).both
-        of_v, of_w = v.beyond_linear(v.lip), w.beyond_linear(w.lip)
-        return result + of_v.size * of_w.steep + of_w.size * of_v.steep
 
     def times_square(self, other: Model) -> arb_mat:
         """(a.d)(d'Qd), a of this model and Q of the other."""
@@ -231,29 +199,10 @@ class Model:
         at = derivatives(name, self.range)
         most = fourth(name, at[0], self.range, self.radius)
         if most is None:
-            raise Refused(
-                "local",
-                "ball",
-                "a root of what may not be positive" if name == "sqrt" else "a division by what may be 0",
-            )
+            what = "a root of what may not be positive" if name == "sqrt" else "a division by what may be 0"
+            raise Refused("local", "ball", what)
         H, C, R = self.beyond_tangent(at[2] / 2, at[3] / 6, most / 24)
-        return at[0], at[1], H, C, R, self.lip_beyond_tangent(name, at)
-
-    def lip_beyond_tangent(self, name: str, at: tuple[arb, arb, arb, arb]) -> arb | None:
-        """The Lipschitz constant of phi''/2 (D^2 - y^2 - 2 y d'Qd) + phi'''/6 (D^3 - y^3) and the rest of the series.
-
-        D = y + z, y = a.d. The derivative of the rest by D is at most |phi''''|/6 |D|^3.
-        """
-        if self.lip is None:
-            return None
-        most = largest_fourth(name, at[0], self.range, self.radius)
-        if most is None:
-            raise Refused("contraction", "ball", f"{name} may be undefined")
-        beyond, left = self.beyond_linear(self.lip), self.beyond_square(self.lip)
-        y, z, steep = self.slope, beyond.size, beyond.steep
-        second = abs(at[2]) * (y * left.both + z * steep)
-        third = abs(at[3]) / 2 * (y * y * (steep + 2 * z) + y * z * (2 * steep + z) + z * z * steep)
-        return second + third + most / 6 * self.radius**3 * (y + steep)
+        return at[0], at[1], H, C, R, lipschitz.beyond_tangent(self, name, at)
 
     def beyond_tangent(self, h: arb, g: arb, m: arb) -> tuple[arb_mat, arb_mat, arb_mat]:
         """H, C and R; h = phi''(v(0)) / 2, g = phi'''(v(0)) / 6, m >= |phi''''| / 24 on the range.

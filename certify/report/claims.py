@@ -1,6 +1,6 @@
 """The words of each kind of claim.
 
-A claim's words have placeholders `$name` for text that depends on the loop's timing and the claimed rate (timing.py),
+A claim's words have placeholders `$name` for text that depends on the loop's timing and the claimed rate (phrases.py),
 and placeholders in braces for its numbers. So there is one set of words per kind of claim, and not one per
 combination.
 """
@@ -13,6 +13,7 @@ from string import Template
 from typing import Any
 
 from certify.errors import CertificateFormatError
+from certify.report.phrases import phrases_of
 from certify.report.timing import PLAIN, TimingInWords
 from certify.report.words import PRACTICAL, exact_number
 
@@ -321,7 +322,8 @@ def words_for(kind: str, timing: TimingInWords = PLAIN, *, ball: bool = False, b
         raise CertificateFormatError(f"reports know the claims {', '.join(CLAIMS)}; found {kind!r}.")
     words = _with_outer(CLAIMS[kind]) if beyond else CLAIMS[kind]
     words = replace(words, parts=tuple(_in_steps(kind, _with_ball(kind, words.parts, ball), timing)))
-    return Words(**{f.name: _filled(getattr(words, f.name), timing.phrases) for f in fields(Words)})
+    phrases = phrases_of(timing)
+    return Words(**{f.name: _filled(getattr(words, f.name), phrases) for f in fields(Words)})
 
 
 def _with_ball(kind: str, parts: tuple[Part, ...], ball: bool) -> tuple[Part, ...]:

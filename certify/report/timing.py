@@ -74,7 +74,7 @@ class TimingInWords(Timing):
         if self.sample is None:
             return "in exact real arithmetic and continuous time"
         lo, hi = self.sample
-        apart = f"tₖ₊₁ − tₖ = {exact_number(hi)} s" if lo == hi else f"tₖ₊₁ − tₖ {self._each()[len(' and every h ') :]}"
+        apart = f"tₖ₊₁ − tₖ = {exact_number(hi)} s" if lo == hi else f"tₖ₊₁ − tₖ {self.each()[len(' and every h ') :]}"
         return f"for t from tₖ to tₖ₊₁, {apart}, in exact real arithmetic and continuous time"
 
     @property
@@ -112,22 +112,7 @@ class TimingInWords(Timing):
         """The rate, rounded down: V is claimed to fall at least as fast."""
         return f"{below(self.rate)} per {'step' if self.discrete else 's'}"
 
-    @property
-    def phrases(self) -> Mapping[str, str]:
-        """The text for each placeholder `$name` in the words of a claim (claims.py)."""
-        return {
-            **self._when(),
-            **self._how_fast(),
-            "held": self._held,
-            "each": self._each(),
-            "every": self._each(proper=True),
-        }
-
-    @property
-    def _held(self) -> str:
-        return f" The input is held from each sampling instant to the next, over {self.periods}." if self.sample else ""
-
-    def _each(self, *, proper: bool = False) -> str:
+    def each(self, *, proper: bool = False) -> str:
         """For which periods a condition on D holds; one on what is reached is not asked of a `proper` period of 0."""
         if self.sample is None or self.sample[0] == self.sample[1]:
             return ""
@@ -135,88 +120,6 @@ class TimingInWords(Timing):
         if lo:
             return f" and every h in {inside(lo, hi)} s"
         return f" and every h {'above 0' if proper else 'from 0'} {'up ' * proper}to {below(hi)} s"
-
-    def _when(self) -> dict[str, str]:
-        """The times at which a claim holds."""
-        if self.is_plain:
-            return {
-                "begins": "",
-                "stays": "stays in it for all time",
-                "also": " and",
-                "enters": "enters the smaller set",
-                "by": "in finite time",
-                "remains": "stays there",
-                "there": "stays there",
-                "at": "",
-                "over": "",
-                "instants": "",
-                "always": "",
-                "between": "",
-                "kept": "",
-                "unique": ": solutions exist and are unique",
-            }
-        if self.discrete:
-            return {
-                "begins": "",
-                "stays": "is in it at every later step",
-                "also": ", and",
-                "enters": "is in the smaller set",
-                "by": "after finitely many steps",
-                "remains": "is there at every step",
-                "there": "is there at every step from then on",
-                "at": " at every step",
-                "over": "",
-                "instants": " step by step",
-                "always": " at every step",
-                "between": "",
-                "kept": "",
-                "unique": "",
-            }
-        always = self.from_zero
-        return {
-            "begins": " at a sampling instant",
-            "stays": "is in it at all later times"
-            if always
-            else "is in it at every later one, in the domain at all times",
-            "also": ", and",
-            "enters": "is in the smaller set",
-            "by": "at some sampling instant",
-            "remains": f"is there at {'all times' if always else 'every one'}",
-            "there": f"is there at {'all times' if always else 'every sampling instant'} from then on",
-            "at": " from each sampling instant on" if always else " at sampling instants",
-            "over": f", the input held over {self.periods}",
-            "always": "" if always else " at every sampling instant",
-            "instants": "" if always else " from one sampling instant to the next",
-            "between": f" Between two instants V {'stays below its value at the first' if always else 'may rise'}.",
-            "kept": f" Between two instants V {'stays below its value at the first, or c₀' if always else 'may rise'}.",
-            "unique": ": between two sampling instants solutions are unique",
-        }
-
-    def _how_fast(self) -> dict[str, str]:
-        """The phrases about speed."""
-        if not self.rate:
-            return {
-                "fall": f"{self.derivative}(x) < 0",
-                "fast": "",
-                "slow": "; how fast is not",
-                "within": "in finite time",
-                "later": "how soon, and what V does below c₀,",
-                "speed": "Speed and cost.",
-                "converge": "Trajectories converge; how fast, and at what cost, is not part of the claim.",
-                "finite": "The time to reach {V ≤ c₀} is finite; how long, and at what cost, is not stated.",
-            }
-        at_least = f"at least as fast as e^(−2λt) with λ = {self.shown_rate}"
-        return {
-            "fall": f"{self.derivative}(x) + 2λV(x) < 0",
-            "fast": f", {at_least},",
-            "slow": "",
-            "within": at_least,
-            "later": "what V does below c₀",
-            "speed": "Cost, and more speed.",
-            "converge": "V falls at least at the rate λ; whether faster, and at what cost, is not part of the claim.",
-            "finite": "The time to reach {V ≤ c₀} is bounded by the rate λ; whether it is shorter, and at what cost, "
-            "is not stated.",
-        }
 
     def speed(self, inner: float | None, outer: float) -> str:
         """The consequence of a rate for trajectories, after the statement of the claim; empty without a rate.

@@ -20,7 +20,7 @@ from certify.effort import Effort
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Expression, Number, cos, exp, sqrt, symbols
-from certify.loop.plants import System
+from certify.loop.plants import System, corners
 from certify.loop.policies import TanhNetwork
 from certify.lyapunov import Neural, Symbolic
 from certify.lyapunov.function import Quadratic
@@ -101,7 +101,7 @@ def rises(problem: Problem, c2: float, N: Neural | Symbolic, level: float, count
     x = np.random.default_rng(3).uniform(lo, hi, (count, system.n))
     x = x[(N(x) <= level) & (problem.V(x) >= c2)]
     f, u, slope = system.uncertain_function(), problem.loop.policy(x), N.gradient(x)
-    return np.max([(slope * f(x, u, list(map(float, q.values())))).sum(-1) for q in system.corners()], axis=0)
+    return np.max([(slope * f(x, u, list(map(float, q.values())))).sum(-1) for q in corners(system)], axis=0)
 
 
 def holds(problem: Problem, found: OuterProof, c2: float = 0.25) -> None:

@@ -15,7 +15,7 @@ from certify.effort import UNIT, Effort
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Number, Symbol, numerical, symbols
-from certify.loop.plants import System, get_system
+from certify.loop.plants import System, get_system, with_input_errors
 from certify.loop.plants.equations import parse_expression
 from certify.loop.policies import TanhNetwork
 from certify.loop.rigorous import eigenvalues, evaluate_increment, evaluate_vdot, instability
@@ -61,7 +61,7 @@ def uncertain_pendulum() -> System:
     system = get_system("pendulum")
     m = system.parameters["m"]
     system = system.with_ranges({"m": (m * Fraction(9, 10), m * Fraction(11, 10))})
-    return system.with_input_errors({str(system.inputs[0]): Fraction(1, 20)})
+    return with_input_errors(system, {str(system.inputs[0]): Fraction(1, 20)})
 
 
 def linear(gain: float, sample: tuple[Fraction, Fraction] | None) -> tuple[System, TanhNetwork]:

@@ -17,7 +17,7 @@ from certify.certificates.claims import Asymptotic, Practical, Problem
 from certify.effort import Effort
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Expression, Number, Symbol, atan, cos, exp, sin, sqrt, symbols, symbols_of, tanh
-from certify.loop.plants import System, get_system
+from certify.loop.plants import System, at_values, corners, get_system
 from certify.loop.plants.system import Interval
 from certify.loop.policies import TanhNetwork, load_policy
 from certify.lyapunov import choose_candidate, diagonalising_coordinates, domain_limit
@@ -478,7 +478,7 @@ def test_what_no_ball_can_show_is_given_up_at_once() -> None:
     P, (A, _, _) = choose_candidate(shipped("cartpole"), "lyapunov").P, loop.linearise()
     T, steps = diagonalising_coordinates(P, A), steps_of(paths(loop), True, 1)
     assert cuts_for(steps, T, P, None) is None
-    corner = ClosedLoop(loop.system.at(loop.system.corners()[-1]), loop.network).linearise()[0]
+    corner = ClosedLoop(at_values(loop.system, corners(loop.system)[-1]), loop.network).linearise()[0]
     assert np.linalg.eigvalsh(P @ corner + corner.T @ P)[-1] > 0  # it is false, not only not shown
     assert prove_local(Problem(loop, Quadratic(P)), T, 1.0) is None
 

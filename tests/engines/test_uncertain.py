@@ -14,7 +14,7 @@ from certify.certificates.claims import Problem
 from certify.certificates.verdict import Verdict
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Number, symbols
-from certify.loop.plants import System, get_system
+from certify.loop.plants import System, at_values, corners, get_system, with_input_errors
 from certify.loop.policies import TanhNetwork, load_policy
 from certify.loop.rigorous import evaluate_vdot
 from certify.lyapunov import diagonalising_coordinates
@@ -62,8 +62,8 @@ def decreases(result: RoaResult, inner: float, outer: float) -> None:
     assert result.P is not None
     L, system = np.linalg.inv(np.linalg.cholesky(result.P)).T, result.system
     middle = {name: (lo + hi) / 2 for name, (lo, hi) in system.ranges.items()}
-    for values in [*system.corners(), middle]:
-        loop = ClosedLoop(system.at(values), network)
+    for values in [*corners(system), middle]:
+        loop = ClosedLoop(at_values(system, values), network)
         for level in np.geomspace(inner * 1.001, outer * 0.999, 6):
             for d in generator.standard_normal((6, 2)):
                 assert evaluate_vdot(loop, result.P, L @ d / np.linalg.norm(d) * np.sqrt(level)) < 0, (values, level)
@@ -81,7 +81,7 @@ def test_the_pendulum_with_uncertain_mass_and_friction(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_the_pendulum_under_a_torque_and_errors_of_its_input(tmp_path: Path) -> None:
     disturbed = TENTH | {"torque": (Fraction(-1, 20), Fraction(1, 20))}
-    system = pendulum(disturbed).with_input_errors({"u": Fraction(1, 10_000)})
+    system = with_input_errors(pendulum(disturbed), {"u": Fraction(1, 10_000)})
     result = proved(system, tmp_path)
     document = json.loads(result.raw or b"")
     assert result.claim == "practical" and [q["name"] for q in document["plant"]["uncertain"]] == [
@@ -108,7 +108,7 @@ def test_the_falsifier_finds_the_corner_at_which_the_claim_fails() -> None:
 
 def test_the_nominal_plant_has_no_such_violation() -> None:
     system, network = gain("2/5", "9/10")
-    problem, T = problem_of(system.at({"q": Fraction(13, 20)}), network)
+    problem, T = problem_of(at_values(system, {"q": Fraction(13, 20)}), network)
     assert falsify(problem, T, 1.0) is None
 
 
@@ -132,7 +132,7 @@ def test_a_violation_is_judged_with_the_policy_of_the_nominal_plant() -> None:
     problem, T = problem_of(system, network)
     found = falsify(problem, T, 1.0)  # x' = -x + 1 - m is 1/2 - x at m = 1/2
     assert found is not None and found.level < 0.01 and confirm(problem, found)
-    held = ClosedLoop(system.at({"m": Fraction(3, 2)}), network)
+    held = ClosedLoop(at_values(system, {"m": Fraction(3, 2)}), network)
     assert held.u_eq == (Fraction(1),) == problem.loop.u_eq
     assert evaluate_vdot(held, np.eye(1), np.array([-0.25])) > 0 > evaluate_vdot(held, np.eye(1), np.array([0.25]))
 

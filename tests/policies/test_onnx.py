@@ -383,7 +383,7 @@ def test_weights_that_are_no_plain_file_are_not_read(tmp_path: Path, monkeypatch
     data.rmdir()
     data.write_bytes(content)
     assert import_policy(path, plant(), SAID).difference.in_double < 1e-12
-    monkeypatch.setattr("certify.loop.policies.importers.onnx_graph.MAX_BYTES", len(content) - 1)
+    monkeypatch.setattr("certify.loop.policies.importers.onnx_weights.MAX_BYTES", len(content) - 1)
     with pytest.raises(InputError, match="at most 0 MiB"):
         import_policy(path, plant(), SAID)
 
@@ -409,7 +409,7 @@ def test_weights_that_reach_out_of_their_file_are_refused(
 def test_many_tensors_of_one_region_count_each(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = beside(tmp_path, offset="0", length=str((tmp_path / "x").write_bytes(b"") or 48))
     size = (tmp_path / "policy.onnx.data").stat().st_size
-    monkeypatch.setattr("certify.loop.policies.importers.onnx_graph.MAX_BYTES", size)
+    monkeypatch.setattr("certify.loop.policies.importers.onnx_weights.MAX_BYTES", size)
     made = onnx.load(path, load_external_data=False)
     for tensor in made.graph.initializer:
         del tensor.external_data[:]

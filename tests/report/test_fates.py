@@ -22,8 +22,9 @@ from certify.lyapunov.function import Quadratic
 from certify.report import simulated_roa_fraction
 from certify.report.figures import draw
 from certify.report.figures.portrait import keys
-from certify.report.figures.scene import Effort, Scene, starts
+from certify.report.figures.scene import Effort, Scene
 from certify.report.figures.style import LEAVING, UNSETTLED
+from certify.report.figures.trajectories import runs_from, starts
 from certify.report.flow import Flow, simulate
 from certify.report.sampling import SETTLED, Runs, SimulatedRoa, edge_of, quadratic, runs_of
 from tests.support.loops import box
@@ -109,7 +110,7 @@ def test_what_leaves_is_drawn_so() -> None:
 
 def test_a_claimed_set_that_runs_leave_is_not_spared() -> None:
     scene = Scene(certificate(plane("x**3 - x", "-y", 2), 2.0), accepted=False)
-    runs = scene.simulate(starts(scene))
+    runs = runs_from(scene, starts(scene))
     begins = quadratic(scene.P, runs.path[0]) <= scene.outer
     assert np.any(runs.left & begins)
     assert "trajectories that leave the domain*" in {key.text for key in keys(scene, runs, None, True)}

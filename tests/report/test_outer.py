@@ -35,8 +35,9 @@ from certify.report import render_html, summary
 from certify.report.claims import CLAIMS, words_for
 from certify.report.figures import draw, simulated_roa
 from certify.report.figures.paper import set_figure
-from certify.report.figures.scene import Scene, starts
+from certify.report.figures.scene import Scene
 from certify.report.figures.style import START
+from certify.report.figures.trajectories import farthest, runs_from, starts
 from certify.report.limits import outer_limited_by
 from certify.report.sampling import quadratic
 from certify.report.sections.claim import _beyond, claim_of
@@ -231,7 +232,7 @@ def test_the_outline_is_where_n_is_at_its_level(by_formula: Case) -> None:
     a, b, excess = outline
     assert (a[0], a[-1], b[0], b[-1]) == (-2, 2, -2, 2)
     assert excess == pytest.approx(a[None, :] ** 2 + b[:, None] ** 2 / 4 - 0.9, abs=1e-12)
-    x = scene.farthest((0, 1), 16)
+    x = farthest(scene, (0, 1), 16)
     assert np.all(scene.in_outer(x)) and not np.any(scene.in_outer(1.01 * x))
     assert scene.in_outer(np.array([[0.0, 0.0], [0.0, 1.9], [0.9, 0.0], [0.0, 2.5]])).tolist() == [
         True,
@@ -262,7 +263,7 @@ def test_a_set_beyond_the_domain_does_not_count() -> None:
 def test_runs_from_the_outer_set_settle_and_its_share_counts(by_formula: Case) -> None:
     certificate = by_formula.certificate
     scene = Scene(certificate, accepted=True)
-    runs = scene.simulate(starts(scene))
+    runs = runs_from(scene, starts(scene))
     inside = scene.in_outer(runs.path[0])
     assert np.sum(inside & (quadratic(scene.P, runs.path[0]) > scene.outer)) >= 10
     assert np.all(runs.settled[inside]) and np.any(runs.left)
@@ -327,7 +328,7 @@ def test_a_function_without_a_value_somewhere_can_be_drawn(by_formula: Case) -> 
     assert scene.in_outer(points).tolist() == [False, False, True, False]
     outline, change = scene.outline((0, 1)), scene.growth(points)
     assert outline is not None and np.isnan(outline[2]).any() and np.isnan(change[:2]).all()
-    assert np.all(np.isfinite(scene.farthest((0, 1), 8)))
+    assert np.all(np.isfinite(farthest(scene, (0, 1), 8)))
 
 
 def test_samples_find_the_volume_of_a_ball() -> None:

@@ -30,8 +30,10 @@ from certify.report import render_html, simulated_roa_fraction, summary
 from certify.report.figures import draw
 from certify.report.figures.geometry import shadows
 from certify.report.figures.paper import PaperOptions, paper_figure
-from certify.report.figures.scene import Band, Scene, band_of, starts
+from certify.report.figures.scene import Scene
+from certify.report.figures.sets import Band, band_of
 from certify.report.figures.style import START, START_FILL
+from certify.report.figures.trajectories import runs_from, starts
 from certify.report.sampling import quadratic
 from certify.report.words import above, below
 from tests.report.test_report import Page, exactly
@@ -261,7 +263,7 @@ def test_shadows_are_the_outlines_of_projections() -> None:
 def test_simulated_trajectories_stay_in_the_bands(proved: RoaResult) -> None:
     certificate = certificate_of(proved)
     scene, claim, band = Scene(certificate, accepted=True), claim_of(certificate), band_in(certificate)
-    runs = scene.simulate(starts(scene))
+    runs = runs_from(scene, starts(scene))
     inside = scene.effort.starts
     begins = runs.path[0, :inside] - np.array(claim.centre)
     assert np.all(quadratic(claim.start.P, begins) == pytest.approx(0.999, rel=1e-9))

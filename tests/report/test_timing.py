@@ -19,7 +19,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from certify.analysis.results import Levels, RoaResult
+from certify.analysis.facts import Levels
+from certify.analysis.results import RoaResult
 from certify.certificates import Certificate, Contraction, LocalBall, PartitionTree, parse_certificate
 from certify.certificates.claims import Asymptotic, Claim, Nearby, Practical, Problem
 from certify.certificates.timing import reach_time

@@ -31,8 +31,10 @@ from certify.report import render_html, simulated_roa_fraction, summary
 from certify.report.figures import draw
 from certify.report.figures.paper import PaperOptions, paper_figure
 from certify.report.figures.portrait import keys
-from certify.report.figures.scene import Band, Scene, band_of, starts
+from certify.report.figures.scene import Scene
+from certify.report.figures.sets import Band, band_of
 from certify.report.figures.style import LEAVING, START
+from certify.report.figures.trajectories import runs_from, starts
 from certify.report.figures.tube import MOST, tube
 from certify.report.flow import Flow
 from certify.report.sampling import SETTLED, quadratic, runs_of
@@ -230,7 +232,7 @@ def test_the_shadow_meets_the_nodes_of_a_real_tube(proved: RoaResult) -> None:
 def test_simulated_trajectories_from_the_start_stay_in_the_shadow(proved: RoaResult) -> None:
     certificate = certificate_of(proved)
     scene = Scene(certificate, accepted=True)
-    runs = scene.simulate(starts(scene))
+    runs = runs_from(scene, starts(scene))
     inside = scene.effort.starts
     assert np.all(quadratic(start_of(certificate), runs.path[0, :inside]) == pytest.approx(0.999, rel=1e-9))
     time, half = shadow(start_of(certificate), slabs_of(certificate))
@@ -250,7 +252,7 @@ def test_at_most_so_many_states_are_shown() -> None:
     start = np.diag((shares / n / 2) ** -2.0)
     certificate = enlarged(system, network, start, [slab(2 * start, 4 * start)], level=1e-3)
     scene = Scene(certificate, accepted=False)
-    pictures = tube(scene, scene.simulate(starts(scene)[:1], steps=2))
+    pictures = tube(scene, runs_from(scene, starts(scene)[:1], steps=2))
     assert len(pictures) == MOST and len({p.legend for p in pictures}) == 1
     drawn = {p.title.removeprefix("The tube in ") for p in pictures}
     sides = [float(hi) for _, hi in system.domain]
@@ -285,7 +287,7 @@ def test_pictures_are_zoomed_to_the_larger_set_and_tell_the_two_apart() -> None:
 
 def test_nothing_from_a_certified_start_is_drawn_as_leaving(proved: RoaResult) -> None:
     scene = Scene(certificate_of(proved), accepted=True)
-    runs = scene.simulate(starts(scene))
+    runs = runs_from(scene, starts(scene))
     begins = quadratic(start_of(certificate_of(proved)), runs.path[0]) <= 1
     assert begins.any() and not np.any(runs.left & begins) and np.all(runs.settled[begins])
     outside = quadratic(scene.P, runs.path[0]) > scene.outer
@@ -307,7 +309,7 @@ def test_a_run_from_the_start_that_leaves_for_its_step_alone_is_simulated_again(
 def test_a_claimed_start_that_runs_leave_is_not_spared() -> None:
     certificate = enlarged(plane("x**3 - x", "-y", 2), QUIET, np.eye(2) / 2.0, [slab(np.eye(2), 4 * np.eye(2))])
     scene = Scene(certificate, accepted=False)
-    runs = scene.simulate(starts(scene))
+    runs = runs_from(scene, starts(scene))
     assert np.any(runs.left[: scene.effort.starts])
     assert "trajectories that leave the domain*" in {key.text for key in keys(scene, runs, None, True)}
     pictures, roa = draw(certificate, accepted=False)

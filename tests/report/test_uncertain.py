@@ -19,7 +19,7 @@ from certify.certificates import Certificate, PartitionTree, parse_certificate
 from certify.certificates.claims import Asymptotic, Practical
 from certify.certificates.verdict import Verdict
 from certify.loop.expressions import Number, cos, sin, symbols
-from certify.loop.plants import System
+from certify.loop.plants import System, at_values, with_input_errors
 from certify.loop.policies import TanhNetwork
 from certify.lyapunov.function import Quadratic
 from certify.report import render_html, summary
@@ -156,7 +156,7 @@ def test_what_was_not_proved_shrinks_by_the_ranges_alone() -> None:
 
 def test_an_error_of_the_input_comes_on_top_of_what_stays_in_bounds() -> None:
     system, network = spring()
-    found = page(claimed(system.with_input_errors({"u": F(1, 1000)}), network, practical=True))
+    found = page(claimed(with_input_errors(system, {"u": F(1, 1000)}), network, practical=True))
     assert (
         "On the way what the policy asks for, π(x), stays within −1 ≤ u ≤ 1 N; the error comes on top of it."
         in found.text
@@ -189,7 +189,7 @@ def test_inputs_without_an_error_must_be_exact() -> None:
     x, a, b = symbols("x a b")
     system = System("two", (x,), (a, b), {}, (-x + a - b,), (Number(0),) * 2, HALF, HALF * 2)
     network = TanhNetwork((np.zeros((2, 1)),), (np.zeros(2),), np.ones(2), np.zeros(2), "tanh", "none")
-    said = outside(page(claimed(system.with_input_errors({"b": F(1, 100)}), network, practical=True)))
+    said = outside(page(claimed(with_input_errors(system, {"b": F(1, 100)}), network, practical=True)))
     assert "error_b(t) within ±0.01" in said and "a must be exact." in said
 
 
@@ -264,7 +264,7 @@ def test_the_figure_of_a_paper_names_the_value(proved: RoaResult) -> None:
 
 
 def certificate_of_nominal(certificate: Certificate) -> Certificate:
-    system = certificate.system.at({"k": F(1)})
+    system = at_values(certificate.system, {"k": F(1)})
     return Certificate(system, certificate.network, certificate.V, certificate.claim, PartitionTree(
         np.eye(2), np.ones(2), bytes([255])
     ))  # fmt: skip

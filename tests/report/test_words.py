@@ -13,8 +13,9 @@ import pytest
 from rich.console import Console
 
 from certify.analysis.diagnosis import diagnose
+from certify.analysis.facts import Tried
 from certify.analysis.options import RoaOptions
-from certify.analysis.results import RoaResult, Tried
+from certify.analysis.results import RoaResult
 from certify.analysis.run import certify_roa
 from certify.certificates import read_certificate
 from certify.certificates.verdict import Stop
@@ -23,7 +24,8 @@ from certify.loop.plants import load_system
 from certify.loop.policies import Policy, TanhNetwork, load_policy, save_policy
 from certify.report import summary
 from certify.report.figures.portrait import keys
-from certify.report.figures.scene import Scene, starts
+from certify.report.figures.scene import Scene
+from certify.report.figures.trajectories import runs_from, starts
 from tests.support.loops import pendulum_network
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -112,14 +114,14 @@ def test_a_set_that_cannot_be_seen_is_in_no_legend(beside: RoaResult) -> None:
     assert beside.certificate is not None and beside.levels.floor is not None and beside.levels.floor < 1e-8
     certificate = read_certificate(beside.certificate)
     scene = Scene(certificate, accepted=True)
-    assert not any("inner set" in key.text for key in keys(scene, scene.simulate(starts(scene)), None, False))
+    assert not any("inner set" in key.text for key in keys(scene, runs_from(scene, starts(scene)), None, False))
     page = beside.report().read_text("utf-8")
     assert "The inner set, V ≤ 1 × 10⁻¹⁰, is too small to be seen here; a picture below shows it." in page
     assert "All states are drawn as deviations from the operating point, h = 0.010" in page
     assert "the upper side of the domain in h, 0.016 m" in page and "had most to do" not in page
     large = replace(certificate, claim=replace(certificate.claim, floor=0.05, local=0.05))  # type: ignore[call-arg]
     seen = Scene(large, accepted=False)
-    assert any("inner set" in key.text for key in keys(seen, seen.simulate(starts(seen)), None, False))
+    assert any("inner set" in key.text for key in keys(seen, runs_from(seen, starts(seen)), None, False))
 
 
 def test_flattening_is_suggested_where_bounds_see_bends_and_little_is_proved(

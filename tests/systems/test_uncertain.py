@@ -9,7 +9,7 @@ import pytest
 
 from certify.errors import InputError
 from certify.loop.expressions import Number, Symbol, symbols, symbols_of
-from certify.loop.plants import System, get_system
+from certify.loop.plants import System, at_values, corners, get_system, with_input_errors
 from tests.support.algebra import same
 from tests.support.loops import box
 
@@ -30,7 +30,7 @@ def test_what_has_no_range_is_nominal() -> None:
     plain = lift()
     assert plain.uncertain == () and plain.uncertain_dynamics() == plain.exact_dynamics()
     assert plain.exact_dynamics() == (-X / Number(1) + U + Number(0) * Number(2),)  # as it was written
-    assert plain.corners() == ({},)
+    assert corners(plain) == ({},)
 
 
 def test_a_range_frees_a_parameter_and_lets_a_disturbance_act() -> None:
@@ -82,35 +82,35 @@ def test_the_operating_point_may_not_be_uncertain() -> None:
 
 def test_at_has_the_equations_at_those_values_and_nothing_uncertain() -> None:
     system = lift().with_ranges(RANGE | {"w": (Fraction(-1, 5), Fraction(1, 5))})
-    held = system.at({"m": Fraction(1, 2), "w": Fraction(1, 10)})
+    held = at_values(system, {"m": Fraction(1, 2), "w": Fraction(1, 10)})
     assert same(held.exact_dynamics()[0], -2 * X + U + Fraction(1, 5))
     assert held.ranges == {} and held.disturbances == () and held.uncertain == ()
-    assert system.at({}).exact_dynamics() == system.exact_dynamics()
+    assert at_values(system, {}).exact_dynamics() == system.exact_dynamics()
 
 
 def test_at_leaves_u_eq_where_it_is() -> None:
     """The policy applies u_eq, and does not know the values."""
     system = lift(dynamics=(U - M,), u_eq=(M,)).with_ranges(RANGE)
-    held = system.at({"m": Fraction(3, 2)})
+    held = at_values(system, {"m": Fraction(3, 2)})
     assert held.exact_u_eq() == system.exact_u_eq() == (Fraction(1),)
     assert same(held.exact_dynamics()[0], U - Fraction(3, 2))
 
 
 def test_corners() -> None:
     system = lift().with_ranges(RANGE | {"w": (Fraction(-1, 5), Fraction(1, 5))})
-    corners = system.corners()
-    assert len(corners) == 4 and corners[0] == {"m": Fraction(1, 2), "w": Fraction(-1, 5)}
-    assert len({tuple(c.values()) for c in corners}) == 4
+    four = corners(system)
+    assert len(four) == 4 and four[0] == {"m": Fraction(1, 2), "w": Fraction(-1, 5)}
+    assert len({tuple(c.values()) for c in four}) == 4
     names = [f"p{i}" for i in range(9)]
     many = lift(parameters={"m": Fraction(1), "k": Fraction(2)} | dict.fromkeys(names, Fraction(0)))
     many = many.with_ranges({name: (Fraction(-1), Fraction(1)) for name in names})
-    assert len(many.corners()) == 64 and many.corners() == many.corners()
-    assert all(abs(v) == 1 for corner in many.corners() for v in corner.values())
-    assert {corner["p0"] for corner in many.corners()} == {-1, 1} == {corner["p8"] for corner in many.corners()}
+    assert len(corners(many)) == 64 and corners(many) == corners(many)
+    assert all(abs(v) == 1 for corner in corners(many) for v in corner.values())
+    assert {corner["p0"] for corner in corners(many)} == {-1, 1} == {corner["p8"] for corner in corners(many)}
 
 
 def test_input_errors_stand_beside_the_inputs() -> None:
-    system = lift(dynamics=(U**2 - X * U,)).with_input_errors({"u": Fraction(1, 100)})
+    system = with_input_errors(lift(dynamics=(U**2 - X * U,)), {"u": Fraction(1, 100)})
     error = Symbol("error_u")
     assert system.ranges == {"error_u": (Fraction(-1, 100), Fraction(1, 100))} and system.units["error_u"] == "N"
     assert same(system.uncertain_dynamics()[0], (U + error) ** 2 - X * (U + error))
@@ -121,12 +121,12 @@ def test_input_errors_stand_beside_the_inputs() -> None:
 @pytest.mark.parametrize("bounds", [{"u": Fraction(0)}, {"u": Fraction(-1)}, {"v": Fraction(1)}, {"x": Fraction(1)}])
 def test_input_errors_that_are_refused(bounds: dict[str, Fraction]) -> None:
     with pytest.raises(InputError, match="positive bound for one of u"):
-        lift().with_input_errors(bounds)
+        with_input_errors(lift(), bounds)
 
 
 def test_input_errors_twice_are_refused() -> None:
     with pytest.raises(InputError):
-        lift().with_input_errors({"u": Fraction(1)}).with_input_errors({"u": Fraction(1)})
+        with_input_errors(with_input_errors(lift(), {"u": Fraction(1)}), {"u": Fraction(1)})
 
 
 @pytest.mark.parametrize("name", ["pendulum", "cartpole", "quadrotor2d", "quadrotor3d"])

@@ -18,6 +18,7 @@ from certify.analysis.candidates.robust import CONE, PROGRAM, robust_candidate, 
 from certify.effort import UNLIMITED, Effort
 from certify.errors import BackendError
 from certify.loop.closed_loop import ClosedLoop
+from certify.loop.plants import at_values, corners
 
 Array = NDArray[np.float64]
 _EDGES = (0.3, 0.5, 0.65, 0.8)  # of the slowest rate at which V can fall
@@ -79,8 +80,8 @@ def _corners(loop: ClosedLoop) -> list[tuple[Array, Array]]:
     system, found = loop.system, []
     origin = np.zeros(system.n)
     u, field = loop.policy(origin[None])[0], system.uncertain_function()
-    for values in system.corners(_MOST):
-        held = ClosedLoop(system.at(values), loop.network)
+    for values in corners(system, _MOST):
+        held = ClosedLoop(at_values(system, values), loop.network)
         f = np.asarray(field(origin, u, [float(q) for q in values.values()]), dtype=np.float64)
         found.append((held.mean_rate(), f[:, None]))
     return found

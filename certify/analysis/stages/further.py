@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from certify.analysis.asked import ellipsoid_in
-from certify.analysis.results import TubeFacts
+from certify.analysis.facts import TubeFacts
 from certify.analysis.stages.state import State, Tools
 from certify.certificates import PartitionTree
 from certify.certificates.claims import Claim, Problem

@@ -18,7 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from certify.analysis.studies.case import Case
-from certify.analysis.studies.rows import Row, failed, forget, judged, kept
+from certify.analysis.studies.judging import forget, judged, kept
+from certify.analysis.studies.rows import Row, failed
 from certify.analysis.studies.study import Study
 from certify.analysis.studies.tables import write_tables
 from certify.analysis.studies.work import answer_in, work

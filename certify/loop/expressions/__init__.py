@@ -6,6 +6,7 @@ from certify.loop.expressions.derivative import differentiate
 from certify.loop.expressions.evaluate import Algebra, evaluate
 from certify.loop.expressions.from_sympy import from_sympy
 from certify.loop.expressions.gathering import constant_of, gathered
+from certify.loop.expressions.nested import Tree, from_tree, to_tree
 from certify.loop.expressions.numerical import numerical
 from certify.loop.expressions.rational import evaluate_exactly, value_if_rational
 from certify.loop.expressions.series import PowerSeries, Series, solution_series
@@ -17,12 +18,10 @@ from certify.loop.expressions.tree import (
     Number,
     Operation,
     Symbol,
-    Tree,
     as_expression,
     atan,
     cos,
     exp,
-    from_tree,
     function,
     nodes,
     sin,
@@ -32,7 +31,6 @@ from certify.loop.expressions.tree import (
     symbols_of,
     tan,
     tanh,
-    to_tree,
     total,
 )
 

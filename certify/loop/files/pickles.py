@@ -128,6 +128,7 @@ class _Machine:
             self._build(name, argument)
 
     def _build(self, name: str, argument: Any) -> None:
+        """A container, or an item of one."""
         stack = self.stack
         match name:
             case "EMPTY_LIST":
@@ -169,6 +170,13 @@ class _Machine:
             case "SETITEMS":
                 items = self.marked()
                 _set_items(self.stack[-1], items)
+            case _:
+                self._refer(name, argument)
+
+    def _refer(self, name: str, argument: Any) -> None:
+        """A name, a call, a state, or something outside the pickle."""
+        stack = self.stack
+        match name:
             case "GLOBAL":
                 module, _, attribute = argument.partition(" ")
                 stack.append(Name(module, attribute))

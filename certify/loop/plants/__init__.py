@@ -2,23 +2,38 @@
 
 from __future__ import annotations
 
+from certify.loop.plants.deviations import domain_of_values, dynamics_of_values, in_deviations, with_origin
+from certify.loop.plants.floating_point import mean_rate
 from certify.loop.plants.linear import Controllability, Matrix, controllability, in_floats, linearise
+from certify.loop.plants.operating_point import residuals, rests_where
 from certify.loop.plants.registry import available_systems, chosen_system, get_system, shipped_system
-from certify.loop.plants.system import System, exact, in_deviations
+from certify.loop.plants.system import System, exact
 from certify.loop.plants.toml import load_system
+from certify.loop.plants.uncertainty import at_values, corners, input_errors, kind_of, with_input_errors
 
 __all__ = [
     "Controllability",
     "Matrix",
     "System",
+    "at_values",
     "available_systems",
     "chosen_system",
     "controllability",
+    "corners",
+    "domain_of_values",
+    "dynamics_of_values",
     "exact",
     "get_system",
     "in_deviations",
     "in_floats",
+    "input_errors",
+    "kind_of",
     "linearise",
     "load_system",
+    "mean_rate",
+    "residuals",
+    "rests_where",
     "shipped_system",
+    "with_input_errors",
+    "with_origin",
 ]

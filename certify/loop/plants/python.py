@@ -13,8 +13,8 @@ from pathlib import Path
 
 from certify.errors import CertifyError, InputError
 from certify.loop.plants.equations import nearest
+from certify.loop.plants.operating_point import require_equilibrium
 from certify.loop.plants.system import System
-from certify.loop.plants.toml import require_equilibrium
 
 
 def load_python_system(path: Path, name: str) -> System:

@@ -6,16 +6,18 @@ them to deviations from x_eq. Every error names the line, the entry and the expe
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Collection, Mapping
 from fractions import Fraction
 from pathlib import Path
 from typing import Any, cast, get_args
 
 from certify.errors import InputError
 from certify.loop.expressions import FUNCTIONS, Expression, Number, Symbol, substitute, symbols, value_if_rational
+from certify.loop.plants.deviations import in_deviations
 from certify.loop.plants.equations import nearest, parse_expression
+from certify.loop.plants.operating_point import require_equilibrium
 from certify.loop.plants.source import PlantFile, read_plant_file
-from certify.loop.plants.system import Interval, System, Time, exact, in_deviations
+from certify.loop.plants.system import Interval, System, Time, exact
 
 _REQUIRED = ("name", "states", "inputs", "dynamics", "u_eq", "domain", "input_bounds")
 _KEYS = (
@@ -30,7 +32,6 @@ _KEYS = (
     "training",
     "time",
 )
-_ROUNDED = 1e-12  # of a residual with functions at other points than 0, which rationals do not decide
 
 
 def load_system(path: Path) -> System:
@@ -46,38 +47,13 @@ def load_system(path: Path) -> System:
 
 def build_system(file: PlantFile) -> System:
     """Build the plant of a parsed file; raises like `load_system`."""
-    for key in file.data:
-        if key not in _KEYS:
-            close = nearest(key, _KEYS) or f"; known are {', '.join(_KEYS)}."
-            raise file.refuse(f"unknown keys are refused: {key!r} is none of a plant's{close}", key)
-    missing = [key for key in _REQUIRED if key not in file.data]
-    if missing:
-        raise file.refuse(f"missing keys: a plant must have {', '.join(missing)}.")
+    _check_keys(file)
     name, description, time = _text(file, "name"), _text(file, "description"), _time(file)
     states, inputs = _names(file, "states"), _names(file, "inputs")
     parameters = {p: number_at(file, value, "parameters", p) for p, value in file.table("parameters").items()}
     acting = {w: _disturbance(file, w) for w in file.table("disturbances")}
     everything = [*states, *inputs, *parameters, *acting]
-    for key, names in (
-        ("states", states),
-        ("inputs", inputs),
-        ("parameters", list(parameters)),
-        ("disturbances", list(acting)),
-    ):
-        twice = next((name for name in names if everything.count(name) > 1), None)
-        if twice is not None:
-            raise file.refuse(
-                f"names of states, inputs, parameters and disturbances must differ; found {twice!r} twice.", key
-            )
-    file.require_known("units", everything, "state, input, parameter or disturbance")
-    for table, names, what in (
-        ("dynamics", states, "state"),
-        ("domain", states, "state"),
-        ("x_eq", states, "state"),
-        ("u_eq", inputs, "input"),
-        ("input_bounds", inputs, "input"),
-    ):
-        file.require_known(table, names, what)
+    _check_names(file, states, inputs, parameters, acting)
     try:
         symbol = dict(zip(everything, symbols(everything), strict=True))
         constants = {p: symbol[p] for p in parameters}
@@ -114,32 +90,41 @@ def build_system(file: PlantFile) -> System:
     return system
 
 
-def require_equilibrium(system: System, refuse: Callable[[str], InputError] = InputError) -> None:
-    """Reject a plant whose operating point is no equilibrium; `refuse` makes the error of a message.
-
-    Raises
-    ------
-    InputError : f(x_eq, u_eq) is not 0; the message has the residual of each state by its name.
-    """
-    off = {name: r for name, r in system.residuals().items() if _is_off(r)}
-    if off:
-        shown = ", ".join(_residual(system, name, r) for name, r in off.items())
-        raise refuse(
-            f"x_eq of {system.name} must be an equilibrium, f(x_eq, u_eq) = {system.rests_where}; found {shown}. "
-            "Correct x_eq or u_eq."
-        )
+def _check_keys(file: PlantFile) -> None:
+    for key in file.data:
+        if key not in _KEYS:
+            close = nearest(key, _KEYS) or f"; known are {', '.join(_KEYS)}."
+            raise file.refuse(f"unknown keys are refused: {key!r} is none of a plant's{close}", key)
+    missing = [key for key in _REQUIRED if key not in file.data]
+    if missing:
+        raise file.refuse(f"missing keys: a plant must have {', '.join(missing)}.")
 
 
-def _is_off(residual: Fraction | float) -> bool:
-    return residual != 0 if isinstance(residual, Fraction) else not abs(residual) <= _ROUNDED
-
-
-def _residual(system: System, name: str, residual: Fraction | float) -> str:
-    exactly = f" (exactly {residual})" if isinstance(residual, Fraction) and len(str(residual)) <= 40 else ""
-    unit = system.units.get(name, "")
-    if system.time == "discrete":
-        return f"{name} moves by {float(residual):.6g}{exactly}{unit and f' {unit}'} in a step"
-    return f"{name}' = {float(residual):.6g}{exactly}" + (f" in {unit} per second" if unit else "")
+def _check_names(
+    file: PlantFile, states: list[str], inputs: list[str], parameters: Collection[str], acting: Collection[str]
+) -> None:
+    """Refuse a name that stands for two things, and an entry of something that the plant does not have."""
+    everything = [*states, *inputs, *parameters, *acting]
+    for key, names in (
+        ("states", states),
+        ("inputs", inputs),
+        ("parameters", parameters),
+        ("disturbances", acting),
+    ):
+        twice = next((name for name in names if everything.count(name) > 1), None)
+        if twice is not None:
+            raise file.refuse(
+                f"names of states, inputs, parameters and disturbances must differ; found {twice!r} twice.", key
+            )
+    file.require_known("units", everything, "state, input, parameter or disturbance")
+    for table, names, what in (
+        ("dynamics", states, "state"),
+        ("domain", states, "state"),
+        ("x_eq", states, "state"),
+        ("u_eq", inputs, "input"),
+        ("input_bounds", inputs, "input"),
+    ):
+        file.require_known(table, names, what)
 
 
 def _shorthand(file: PlantFile, symbol: Mapping[str, Symbol]) -> dict[str, Expression]:

@@ -207,10 +207,6 @@ class TanhNetwork:
         biases = (*self.biases[:-1], self.biases[-1] + np.array(shift))
         return TanhNetwork(self.weights, biases, self.scale, np.array(offset), self.squash, "none", self.clip)
 
-    def squashed_at_origin(self, at_0: Array, u_eq: Sequence[Fraction]) -> Array:
-        """The values before the squash at the origin, (m,), given net(0)."""
-        return self.beta(u_eq) if self.centre == "preactivation" else at_0
-
     def jacobian_at_origin(self, u_eq: Sequence[Fraction]) -> Array:
         """`d pi / d x` at 0 in float64, shape (m, n).
 
@@ -225,7 +221,7 @@ class TanhNetwork:
                 x = np.tanh(x)
                 jacobian = (1 - x**2)[:, None] * jacobian
             x, jacobian = weight @ x + bias, weight @ jacobian
-        squashed = self.squashed(self.squashed_at_origin(x, u_eq))
+        squashed = self.squashed(self.beta(u_eq) if self.centre == "preactivation" else x)
         self.require_unclipped(u_eq if self.centre != "none" else (self.scale * squashed + self.offset).tolist())
         slope = self.squash_slope(squashed)
         return np.asarray(self.scale[:, None] * ((slope * np.ones(self.m))[:, None] * jacobian))

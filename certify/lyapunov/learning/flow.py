@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from certify.effort import UNLIMITED, Effort
 from certify.loop.closed_loop import ClosedLoop
+from certify.loop.plants import corners
 from certify.loop.plants.ode import eigenvalues_of, rk4_step
 from certify.loop.policies import bounded_by_form
 from certify.lyapunov.function import Quadratic
@@ -78,7 +79,7 @@ class LearningFlow:
         policy: Callable[[Array], Array] = lambda x: np.asarray(folded(x, u_eq))  # noqa: E731
         self.policy = policy
         self.rate: Callable[[Array], Array] = lambda x: np.asarray(nominal(x, policy(x)))
-        self._general, self._corners = general, [list(map(float, at.values())) for at in system.corners()]
+        self._general, self._corners = general, [list(map(float, at.values())) for at in corners(system)]
         self._limits = None
         if not bounded_by_form(loop.network, system.input_bounds):
             self._limits = np.array([[float(end) for end in pair] for pair in system.input_bounds]).T

@@ -196,62 +196,74 @@ class RangedJet:
             self.errors,
         )
 
-    def _nowhere(self) -> RangedJet:
-        """Of all balls, where one of them has no finite model."""
-        return replace(self, c=math.nan, E=self.E + math.inf)
 
-    def inverse(self) -> RangedJet:
-        c, far = self.c, self.away
-        close = abs(c) - far
-        least = close - self.radius
-        if not np.all(least > 0) or is_extreme(c):
-            return self._nowhere()
-        f = 1 / c, -1 / c**2, 1 / c**3, -1 / c**4
-        e = far / close**2, 2 * far / close**3, 3 * far / close**4, 4 * far / close**5
-        return self.compose(f, e, 1 / (close**4 * least))
+def _nowhere(v: RangedJet) -> RangedJet:
+    """No model of any ball, where one of them has no finite model."""
+    return replace(v, c=math.nan, E=v.E + math.inf)
 
-    def sqrt(self) -> RangedJet:
-        far = self.away
-        close = self.c - far
-        if not np.all(close - self.radius > 0) or is_extreme(self.c):
-            return self._nowhere()
-        r, s, w = math.sqrt(self.c), np.sqrt(close), np.sqrt(close - self.radius)
-        f = r, 1 / (2 * r), -1 / (8 * r**3), 1 / (16 * r**5)
-        e = far / (2 * s), far / (4 * s**3), 0.1875 * far / s**5, 0.15625 * far / s**7
-        return self.compose(f, e, (5 * s**2 + 4 * s * w + w**2) / (16 * s**5 * (s + w) ** 4))
 
-    def exp(self) -> RangedJet:
-        end = self.c + self.away + self.radius
-        if not np.all(end < EXP_END):
-            return self._nowhere()
-        here, most = math.exp(self.c), np.exp(end)
-        e = self.away * most
-        return self.compose((here, here, here / 2, here / 6), (e, e, e, e), most / 24)
+def _inverse(v: RangedJet) -> RangedJet:
+    c, far = v.c, v.away
+    close = abs(c) - far
+    least = close - v.radius
+    if not np.all(least > 0) or is_extreme(c):
+        return _nowhere(v)
+    f = 1 / c, -1 / c**2, 1 / c**3, -1 / c**4
+    e = far / close**2, 2 * far / close**3, 3 * far / close**4, 4 * far / close**5
+    return v.compose(f, e, 1 / (close**4 * least))
 
-    def tanh(self) -> RangedJet:
-        t, far = math.tanh(self.c), self.away
-        slope = 1 - t * t
-        e1 = 2 * far * (1 + far)
-        e = far, e1, far * (slope + e1) + abs(t) * e1, 1.4 * far
-        there = abs(8 * t * (2 - 3 * t**2) * slope)
-        fourth = np.minimum(TANH4, there + TANH5 * (far + self.radius)) / 24
-        return self.compose((t, slope, -t * slope, (t * t - 1 / 3) * slope), e, fourth)
 
-    def atan(self) -> RangedJet:
-        slope, far = 1 / (1 + self.c**2), self.away
-        f = math.atan(self.c), slope, -self.c * slope**2, (self.c**2 - 1 / 3) * slope**3
-        return self.compose(f, (far, far, far, far), np.array([ATAN4 / 24]))
+def _sqrt(v: RangedJet) -> RangedJet:
+    far = v.away
+    close = v.c - far
+    if not np.all(close - v.radius > 0) or is_extreme(v.c):
+        return _nowhere(v)
+    r, s, w = math.sqrt(v.c), np.sqrt(close), np.sqrt(close - v.radius)
+    f = r, 1 / (2 * r), -1 / (8 * r**3), 1 / (16 * r**5)
+    e = far / (2 * s), far / (4 * s**3), 0.1875 * far / s**5, 0.15625 * far / s**7
+    return v.compose(f, e, (5 * s**2 + 4 * s * w + w**2) / (16 * s**5 * (s + w) ** 4))
 
-    def sin(self) -> RangedJet:
-        return self._nowhere() if math.isinf(self.c) else self._wave(math.sin(self.c), math.cos(self.c))
 
-    def cos(self) -> RangedJet:
-        return self._nowhere() if math.isinf(self.c) else self._wave(math.cos(self.c), -math.sin(self.c))
+def _exp(v: RangedJet) -> RangedJet:
+    end = v.c + v.away + v.radius
+    if not np.all(end < EXP_END):
+        return _nowhere(v)
+    here, most = math.exp(v.c), np.exp(end)
+    e = v.away * most
+    return v.compose((here, here, here / 2, here / 6), (e, e, e, e), most / 24)
 
-    def _wave(self, value: float, slope: float) -> RangedJet:
-        far = self.away
-        fourth = np.minimum(1.0, abs(value) + far + self.radius) / 24
-        return self.compose((value, slope, -value / 2, -slope / 6), (far, far, far, far), fourth)
+
+def _tanh(v: RangedJet) -> RangedJet:
+    t, far = math.tanh(v.c), v.away
+    slope = 1 - t * t
+    e1 = 2 * far * (1 + far)
+    e = far, e1, far * (slope + e1) + abs(t) * e1, 1.4 * far
+    there = abs(8 * t * (2 - 3 * t**2) * slope)
+    fourth = np.minimum(TANH4, there + TANH5 * (far + v.radius)) / 24
+    return v.compose((t, slope, -t * slope, (t * t - 1 / 3) * slope), e, fourth)
+
+
+def _atan(v: RangedJet) -> RangedJet:
+    slope, far = 1 / (1 + v.c**2), v.away
+    f = math.atan(v.c), slope, -v.c * slope**2, (v.c**2 - 1 / 3) * slope**3
+    return v.compose(f, (far, far, far, far), np.array([ATAN4 / 24]))
+
+
+def _sin(v: RangedJet) -> RangedJet:
+    return _nowhere(v) if math.isinf(v.c) else _wave(v, math.sin(v.c), math.cos(v.c))
+
+
+def _cos(v: RangedJet) -> RangedJet:
+    return _nowhere(v) if math.isinf(v.c) else _wave(v, math.cos(v.c), -math.sin(v.c))
+
+
+def _wave(v: RangedJet, value: float, slope: float) -> RangedJet:
+    far = v.away
+    fourth = np.minimum(1.0, abs(value) + far + v.radius) / 24
+    return v.compose((value, slope, -value / 2, -slope / 6), (far, far, far, far), fourth)
+
+
+_FUNCTIONS = {"sqrt": _sqrt, "exp": _exp, "tanh": _tanh, "atan": _atan, "sin": _sin, "cos": _cos}
 
 
 class RangedJets(Algebra[RangedJet]):
@@ -283,6 +295,12 @@ class RangedJets(Algebra[RangedJet]):
     def product(self, constant: Fraction | None, factors: Sequence[RangedJet]) -> RangedJet:
         result = reduce(lambda x, y: x * y, factors)
         return result if constant is None else result.scaled(float(constant))
+
+    def inverse(self, value: RangedJet) -> RangedJet:
+        return _inverse(value)
+
+    def function(self, name: str, value: RangedJet) -> RangedJet:
+        return super().function(name, value) if name == "tan" else _FUNCTIONS[name](value)
 
     def quantity(self, lo: Fraction, hi: Fraction, number: int | None) -> RangedJet:
         """One of [lo, hi], at the same place as y of its number; None: at any place."""

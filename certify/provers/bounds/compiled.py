@@ -15,7 +15,10 @@ from typing import Any, Protocol
 from certify.provers.bounds import kernels, vectors
 
 _WORTH = 1e7  # work that takes as much longer without them as their start takes
-_FORMULAS = ("smaller", "larger", "enclosed", "chord", "relaxed", "bent", "expansion", "coefficients", "sizes")
+_FORMULAS = (
+    *("smaller", "larger", "enclosed", "chord", "relaxed", "bent", "expansion"),
+    *("coefficients", "sizes", "result"),
+)
 _LOOPS = ("ranges", "chords", "bend", "backwards", "play")
 _TYPES = {
     "Line": "f8[::1]",

@@ -334,6 +334,23 @@ def sizes(model: Plane, symbols: int) -> None:
             model[to, b] += abs(model[row, b])
 
 
+def result(w: Plane, first: int, count: int, c: Line, g: Plane, Q: Block, r: Line) -> None:
+    """A place's model of `count` boxes as (c, g, Q, r) of the boxes from `first` on."""
+    N = len(g)
+    R = 1 + N + N * (N + 1) // 2
+    row = 1 + N
+    for b in range(count):
+        c[first + b], r[first + b] = w[0, b], w[R, b]
+    for i in range(N):
+        for b in range(count):
+            g[i, first + b] = w[1 + i, b]
+        for j in range(i, N):
+            for b in range(count):
+                Q[i, j, first + b] = w[row, b] if i == j else 0.5 * w[row, b]
+                Q[j, i, first + b] = Q[i, j, first + b]
+            row += 1
+
+
 def play(
     steps: Steps,
     constants: Line,
@@ -399,15 +416,4 @@ def play(
                         w[row + j - i, b] += gamma[b] * (u[1 + i, b] * v[1 + j, b] + u[1 + j, b] * v[1 + i, b])
                 row += N - i
             sizes(w, N)
-        w = memory[steps[-1, 3]]
-        row = 1 + N
-        for b in range(count):
-            c[first + b], r[first + b] = w[0, b], w[R, b]
-        for i in range(N):
-            for b in range(count):
-                g[i, first + b] = w[1 + i, b]
-            for j in range(i, N):
-                for b in range(count):
-                    Q[i, j, first + b] = w[row, b] if i == j else 0.5 * w[row, b]
-                    Q[j, i, first + b] = Q[i, j, first + b]
-                row += 1
+        result(memory[steps[-1, 3]], first, count, c, g, Q, r)

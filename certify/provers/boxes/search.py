@@ -8,9 +8,7 @@ violation, a budget, or because nothing is left. No trial level is ever proved a
 
 from __future__ import annotations
 
-import copy
 import math
-from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -22,20 +20,18 @@ from certify.certificates.verdict import Stop
 from certify.effort import UNLIMITED
 from certify.errors import BackendError, CertificateFormatError, InputError
 from certify.provers.base import Budget, Report, SearchState
-from certify.provers.bounds.arrays import Array, Index, Mask
+from certify.provers.bounds.arrays import Array, Index
 from certify.provers.boxes.account import Account
 from certify.provers.boxes.frontier import Frontier
-from certify.provers.boxes.halving import Halves, split
+from certify.provers.boxes.halving import split
 from certify.provers.boxes.order import choose_order
 from certify.provers.boxes.partition import LEAF, MOST_SPLITS, OPEN, Partition
 from certify.provers.boxes.rule import BoxBounds, VdotBound
-from certify.provers.boxes.subtrees import Abroad, Growth, Subtrees
+from certify.provers.boxes.subtrees import Abroad, Subtrees
+from certify.provers.boxes.sweep import Inwards, Outwards, RingGrowth, Sweep
 from certify.provers.execution import Bound, Runner
-from certify.provers.falsify import Witness, descend
+from certify.provers.falsify import Witness
 
-_SLACK = 1e-9  # relative distance kept from every level, so that the checker's own rounding agrees
-_BESIDE_WITNESS = 1e-3  # relative distance kept from a violation
-_SHELL = 16.0  # a batch reaches up to this multiple of the nearest open level
 _BATCH = 4e6  # operations of a batch, however small
 _HIGHER = 8.0  # an inner level over one from below which a step may lead out
 
@@ -98,7 +94,7 @@ def outwards(
     problem: Problem, T: Array, inner: float, target: float, runner: Runner, rule: VdotBound | None = None
 ) -> Pass:
     """The pass of `prove_outwards` before its first box."""
-    sweep = _Outwards(problem, T, inner, target)
+    sweep = Outwards(problem, T, inner, target)
     if rule is None:
         order = choose_order(problem, T, inner, target)
         rule = VdotBound(problem, T, order=order)
@@ -128,7 +124,7 @@ def prove_inwards(
     order = choose_order(problem, T, max(floor, 1e-3 * outer), outer)
     rule = VdotBound(problem, T, inside=True, order=order)
     while True:
-        ring = Pass(_Inwards(problem, T, floor, outer), _root(problem, T, outer), runner, rule)
+        ring = Pass(Inwards(problem, T, floor, outer), _root(problem, T, outer), runner, rule)
         stop = ring.advance(budget, report)
         if stop is not None:
             ring.settle()
@@ -146,180 +142,15 @@ def _root(problem: Problem, T: Array, level: float) -> Array:
     return np.asarray(np.sqrt(level * np.diag(np.linalg.inv(S))) * (1 + 1e-9))
 
 
-class _Sweep(ABC):
-    """The moving level of a pass: `inner` or `outer` gives way to what cannot be proved.
-
-    Boxes proved before it moved stay proved: the ring only shrinks, and the rule's multipliers do not depend on it.
-    """
-
-    down = False  # whether the level that gives way is the inner one
-
-    def __init__(self, problem: Problem, T: Array, inner: float, outer: float) -> None:
-        self.problem, self.T = problem, T
-        self.inner, self.outer = inner, outer
-        self.witness: Witness | None = None
-
-    @abstractmethod
-    def key(self, lowest: Array, highest: Array) -> Array:
-        """Ascending in the order in which boxes are taken, from the bounds of V on them (B,)."""
-
-    @abstractmethod
-    def wanted(self, lowest: Array, highest: Array) -> Mask:
-        """True for boxes (B,) that still have to be decided."""
-
-    @abstractmethod
-    def reach(self, least: float) -> float:
-        """The key up to which a batch may go, where `least` is the smallest."""
-
-    @abstractmethod
-    def last(self) -> float:
-        """The key beyond which open boxes no longer count."""
-
-    @abstractmethod
-    def violated(self, centres: Array, level: Array) -> bool:
-        """Move the level off violations at `centres` (n, B), V being `level` (infinite elsewhere); True if it moved."""
-
-    @abstractmethod
-    def stuck(self, lowest: Array, highest: Array) -> bool:
-        """Move the level off boxes that are too small to halve; True if it moved."""
-
-    @abstractmethod
-    def reached(self, least: float) -> tuple[float, float]:
-        """(inner, outer) between which all is proved, `least` being the smallest open key; maybe nothing is."""
-
-    @abstractmethod
-    def stand(self, least: float) -> tuple[float, float, float]:
-        """(level reached, level aimed at, share of the ring's volume that lies between)."""
-
-    def share(self, a: float, b: float) -> float:
-        """The volume of `a <= V <= b` as a share of the ring's."""
-        power = len(self.T) / 2
-        a, b, inner, outer = (max(0.0, v) ** power for v in (a, b, self.inner, self.outer))
-        return min(1.0, max(0.0, (b - a) / (outer - inner))) if outer > inner else 1.0
-
-
-class _Outwards(_Sweep):
-    def key(self, lowest: Array, highest: Array) -> Array:
-        return lowest
-
-    def wanted(self, lowest: Array, highest: Array) -> Mask:
-        return (lowest <= self.outer * (1 + _SLACK)) & (highest >= self.inner * (1 - _SLACK))
-
-    def reach(self, least: float) -> float:
-        return _SHELL * max(least, self.inner)
-
-    def last(self) -> float:
-        return self.outer * (1 + _SLACK)
-
-    def violated(self, centres: Array, level: Array) -> bool:
-        lowest = float(level.min())
-        if lowest > self.outer:
-            return False
-        found = descend(self.problem, self.T, centres[:, level.argmin()])
-        if found is not None and (self.witness is None or found.level < self.witness.level):
-            self.witness = found
-        known = math.inf if self.witness is None else self.witness.level
-        self.outer = min(lowest, known) * (1 - _BESIDE_WITNESS)
-        return True
-
-    def stuck(self, lowest: Array, highest: Array) -> bool:
-        bottom = float(lowest.min()) if len(lowest) else math.inf
-        if not bottom < self.outer:
-            return False
-        self.outer = bottom * (1 - _SLACK)
-        return True
-
-    def reached(self, least: float) -> tuple[float, float]:
-        return self.inner, min(self.outer, least * (1 - 2 * _SLACK))
-
-    def stand(self, least: float) -> tuple[float, float, float]:
-        level = max(self.inner, min(least, self.outer))
-        return level, max(self.inner, self.outer), self.share(self.inner, level)
-
-
-class _Inwards(_Sweep):
-    down = True
-
-    def key(self, lowest: Array, highest: Array) -> Array:
-        return -highest
-
-    def wanted(self, lowest: Array, highest: Array) -> Mask:
-        return lowest <= self.outer * (1 + _SLACK)
-
-    def reach(self, least: float) -> float:
-        return least / _SHELL
-
-    def last(self) -> float:
-        return math.inf
-
-    def violated(self, centres: Array, level: Array) -> bool:
-        highest = float(np.where(level <= self.outer, level, -math.inf).max())
-        if not highest >= self.inner:
-            return False
-        self.inner = highest * (1 + _BESIDE_WITNESS)
-        return True
-
-    def stuck(self, lowest: Array, highest: Array) -> bool:
-        top = float(highest.max()) if len(highest) else -math.inf
-        if not top >= self.inner:
-            return False
-        self.inner = top * (1 + 2 * _SLACK)
-        return True
-
-    def reached(self, least: float) -> tuple[float, float]:
-        return max(self.inner, -least * (1 + 2 * _SLACK)), self.outer
-
-    def stand(self, least: float) -> tuple[float, float, float]:
-        level = max(self.inner, min(-least, self.outer))
-        return level, self.inner, self.share(level, self.outer)
-
-
-class _RingGrowth(Growth):
-    """The ring's rule at a sweep's levels."""
-
-    def __init__(self, sweep: _Sweep, rule: VdotBound, half: Array) -> None:
-        super().__init__(rule, half)
-        self.sweep, self.rule = sweep, rule
-
-    @property
-    def levels(self) -> tuple[float, float]:
-        return self.sweep.inner, self.sweep.outer
-
-    def at(self, inner: float, outer: float) -> _RingGrowth:
-        sweep = copy.copy(self.sweep)
-        sweep.inner, sweep.outer = inner, outer
-        return _RingGrowth(sweep, self.rule, self.half)
-
-    def gives_way(self, lo: Array, hi: Array, found: BoxBounds) -> Mask:
-        levels = self.levels_of(0.5 * lo + 0.5 * hi, found)
-        inside: Mask = (levels <= self.sweep.outer) & (levels >= self.sweep.inner)
-        return inside
-
-    def opened(self, halves: Halves, found: BoxBounds, key: Array) -> tuple[Mask, Array]:
-        lowest, highest = self.rule.levels(halves.lo, halves.hi)
-        return self.sweep.wanted(lowest, highest), self.sweep.key(lowest, highest)
-
-    def levels_of(self, centres: Array, found: BoxBounds) -> Array:
-        """V at violations, infinite elsewhere; where a step leads from within the outer level to a higher V, that, but
-        no more than just above the outer level."""
-        levels = np.where(found.violated, self.rule.levels_at(centres), math.inf)
-        index = np.flatnonzero(levels <= self.sweep.outer)
-        if not (self.rule.inside and self.rule.step) or not len(index):
-            return levels
-        after = np.minimum(self.rule.levels_after(centres.take(index, -1), self.sweep.outer), self.sweep.outer)
-        levels[index] = np.maximum(levels[index], after)
-        return levels
-
-
 class Pass:
     """A pass that can be asked at any time for what it has proved, and go on."""
 
-    def __init__(self, sweep: _Sweep, root: Array, runner: Runner, rule: VdotBound) -> None:
+    def __init__(self, sweep: Sweep, root: Array, runner: Runner, rule: VdotBound) -> None:
         self.sweep, self.root, self.runner, self.rule = sweep, root, runner, rule
         self.partition = Partition(root)
         self.frontier = Frontier(self.partition)
         self.half = root[:, None]
-        self.growth = _RingGrowth(sweep, rule, self.half)
+        self.growth = RingGrowth(sweep, rule, self.half)
         self.abroad: Abroad | None = None
         self.boxes = self.proved = 0
         self.covered = True
@@ -437,7 +268,7 @@ class Pass:
         self.boxes += lo.shape[1]
         found = bound(lo, hi, sweep.inner, sweep.outer)
         self.proved += int(found.proved.sum())
-        self._expect(found)
+        self.halvings = _halvings(found, len(self.root), self.halvings)
         centres = 0.5 * lo + 0.5 * hi
         if sweep.violated(centres, self.growth.levels_of(centres, found)):
             self._stop = Stop.WITNESS
@@ -450,16 +281,6 @@ class Pass:
         keep, key = self.growth.opened(halves, found, np.zeros(0))  # the order is known without the old keys
         self.frontier.add(*(a.compress(keep, -1) for a in (halves.lo, halves.hi, key, halves.number)))
         self.frontier.drop_above(sweep.last())
-
-    def _expect(self, found: BoxBounds) -> None:
-        """How often a box of this batch that is not proved has to be halved, so that what its axes add to the bound is
-        less than the decay at its centre: a bound of second order falls fourfold when all n axes are halved once."""
-        excess = np.maximum(found.score, 0.0).sum(0)
-        decay = excess - found.bound
-        wanted = ~found.proved & (decay > 0) & np.isfinite(decay)
-        if wanted.any():
-            share = np.sort(excess[wanted] / decay[wanted])[(np.count_nonzero(wanted) - 1) // 2]
-            self.halvings = len(self.root) / 2 * math.log2(max(1.0, float(share)))
 
     @property
     def expected(self) -> float:
@@ -511,16 +332,32 @@ class Pass:
         if outer <= inner:  # nothing beyond the inner level
             empty = empty_ring(self.sweep.problem, self.sweep.T, inner)
             found = replace(empty, stop=stop, boxes=self.boxes, witness=witness, covered=covered)
-            return replace(found, direction=self._direction())
+            return replace(found, direction=_direction(self.partition, self.sweep.T, self.root))
         tree = self.partition.preorder()
         leaves = tree.count(bytes([LEAF]))
         found = RingProof(inner, outer, stop, tree, self.root, self.boxes, leaves, witness, covered)
-        left = None if self.done else self._account.left
-        return replace(found, direction=self._direction(), left=left, order=self.rule.order)
+        direction, left = _direction(self.partition, self.sweep.T, self.root), self._account.left
+        return replace(found, direction=direction, left=None if self.done else left, order=self.rule.order)
 
-    def _direction(self) -> tuple[float, ...] | None:
-        """The coordinate that was halved most often, in the states, as long as the root box in it; None at first."""
-        if not self.partition.splits:
-            return None
-        axis = int(np.argmax(self.partition.halvings()))
-        return tuple((self.sweep.T[:, axis] * self.root[axis]).tolist())
+
+def _halvings(found: BoxBounds, n: int, before: float) -> float:
+    """The halvings that a box of a batch needs which is not proved, so that what its axes add to the bound is less than
+    the decay at its centre: a bound of second order falls fourfold when all n axes are halved once.
+
+    `before` is the number by an earlier batch, for a batch that gives none.
+    """
+    excess = np.maximum(found.score, 0.0).sum(0)
+    decay = excess - found.bound
+    wanted = ~found.proved & (decay > 0) & np.isfinite(decay)
+    if not wanted.any():
+        return before
+    share = np.sort(excess[wanted] / decay[wanted])[(np.count_nonzero(wanted) - 1) // 2]
+    return n / 2 * math.log2(max(1.0, float(share)))
+
+
+def _direction(partition: Partition, T: Array, root: Array) -> tuple[float, ...] | None:
+    """The coordinate that was halved most often, in the states, as long as the root box in it; None at first."""
+    if not partition.splits:
+        return None
+    axis = int(np.argmax(partition.halvings()))
+    return tuple((T[:, axis] * root[axis]).tolist())

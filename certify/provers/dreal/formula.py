@@ -22,9 +22,7 @@ are rounded outwards.
 
 from __future__ import annotations
 
-import hashlib
 import math
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
@@ -35,10 +33,9 @@ from certify.certificates.claims.queries import Query
 from certify.errors import InputError
 from certify.loop.expressions import Tree
 from certify.loop.rigorous import ball
+from certify.provers.dreal.field import Residues, hashed, inverted, residue
+from certify.provers.dreal.sums import Monomial, Sum, add, atom_of, constant, scaled, times
 
-Monomial = tuple[tuple[str, int], ...]  # atoms with their exponents >= 1, sorted; () is 1
-Sum = Mapping[Monomial, Fraction]  # without zeros
-_PRIME = 2**127 - 1
 _PRECISION = 200  # bits
 _KNOWN = {  # f(a) = b, exactly
     "sin": (0, 0),
@@ -88,14 +85,14 @@ def _formula(query: Query) -> Formula:
     states = []
     for name, lo, hi in query.variables:
         states.append((name, _below(lo), _above(hi)))
-        writer.declare(name)
-        values[name] = {((name, 1),): Fraction(1)}
+        writer.residues.declare(name)
+        values[name] = atom_of(name)
     for name, tree in query.definitions:
         values[name] = writer.read(tree, values)
     names = {name for name, _, _ in states}
     constraints = []
     for left, relation, right in query.constraints:
-        difference = _add(writer.read(left, values), writer.read(right, values), -1)
+        difference = add(writer.read(left, values), writer.read(right, values), -1)
         constraints.append(_bound(difference, relation, names) or (writer.write(difference), relation, "0"))
     variables = (*states, *((pin.name, pin.lo, pin.hi) for pin in writer.pins.values()))
     stands_for = {pin.name: pin.what for pin in writer.pins.values()}
@@ -133,28 +130,22 @@ class _Writer:
         self._atoms: dict[object, str] = {}
         self._sums: set[str] = set()  # atoms that are sums
         self._balls: dict[str, flint.arb] = {}  # atoms that depend on no state
-        self._residues: dict[str, tuple[int, int]] = {}
-
-    def declare(self, name: str) -> None:
-        """A free variable: a random value at each of two points of the field."""
-        self._residues[name] = (_hashed(name, 1), _hashed(name, 2))
-
-    # Reading
+        self.residues = Residues()
 
     def read(self, tree: Tree, values: Mapping[str, Sum]) -> Sum:
         """The exact value of a tree over sums that are known."""
         if isinstance(tree, str):
-            return values[tree] if tree in values else _constant(Fraction(tree))
+            return values[tree] if tree in values else constant(Fraction(tree))
         operator, *rest = tree
         if operator == "**":
             return self.power(self.read(rest[0], values), int(rest[1]))
         parts = [self.read(part, values) for part in rest]
         if operator == "-" and len(parts) == 1:
-            return _scaled(parts[0], Fraction(-1))
+            return scaled(parts[0], Fraction(-1))
         if operator in ("+", "-"):
             result = parts[0]
             for part in parts[1:]:
-                result = _add(result, part, 1 if operator == "+" else -1)
+                result = add(result, part, 1 if operator == "+" else -1)
             return result
         if operator in ("*", "/"):
             result = parts[0]
@@ -174,16 +165,16 @@ class _Writer:
             return {}
         for number, other in ((a, b), (b, a)):
             if set(number) == {()} and (len(other) == 1 or all(_held(number[()] * c) for c in other.values())):
-                return _scaled(other, number[()])
+                return scaled(other, number[()])
         (m, c), (k, d) = self.factor(a), self.factor(b)
-        return {_times(m, k): c * d}
+        return {times(m, k): c * d}
 
     def power(self, base: Sum, exponent: int) -> Sum:
         """An integer power."""
         if exponent < 0:
             return self.inverse(self.power(base, -exponent))
         if exponent == 0:
-            return _constant(Fraction(1))
+            return constant(Fraction(1))
         if not base:
             return {}
         monomial, c = self.factor(base)
@@ -195,46 +186,43 @@ class _Writer:
             raise InputError("a query divides by zero.")
         monomial, c = self.factor(value)
         if monomial == ():
-            return _constant(1 / c)
+            return constant(1 / c)
         if self.fixed(monomial):
             ball = 1 / self.ball({monomial: Fraction(1)})
             return {((self.constant(("/", monomial), ball), 1),): 1 / c}
-        first, second = self.residues(monomial)
+        first, second = self.residues.of(monomial)
         if first == second:  # perhaps a constant, by which dReal would divide
-            monomial = _times(monomial, ((self.one(), 1),))
-        residues = [_inverted(r) for r in self.residues(monomial)]
+            monomial = times(monomial, ((self.one(), 1),))
+        residues = [inverted(r) for r in self.residues.of(monomial)]
         name = self.atom(("/", monomial), lambda: ["/", "1", self.factors(monomial)], residues)
         return {((name, 1),): 1 / c}
 
     def function(self, name: str, argument: Sum) -> Sum:
         """An atom, unless the value is known exactly."""
         at, result = _KNOWN[name]
-        if argument == _constant(Fraction(at)):
-            return _constant(Fraction(result))
+        if argument == constant(Fraction(at)):
+            return constant(Fraction(result))
+        key = (name, frozenset(argument.items()))
         if all(self.fixed(m) for m in argument):
-            ball = getattr(self.ball(argument), name)()
-            return {((self.constant((name, frozenset(argument.items())), ball), 1),): Fraction(1)}
-        residues = [_hashed(name, r) for r in self.value(argument)]
-        atom = self.atom((name, frozenset(argument.items())), lambda: [name, self.write(argument)], residues)
-        return {((atom, 1),): Fraction(1)}
+            return atom_of(self.constant(key, getattr(self.ball(argument), name)()))
+        residues = [hashed(name, r) for r in self.residues.of_sum(argument)]
+        return atom_of(self.atom(key, lambda: [name, self.write(argument)], residues))
 
     def extreme(self, name: str, a: Sum, b: Sum) -> Sum:
         """An atom `min` or `max` of two sums, unless both are constants."""
-        if all(self.fixed(m) for value in (a, b) for m in value):
-            key = (name, frozenset(a.items()), frozenset(b.items()))
-            return {((self.constant(key, getattr(self.ball(a), name)(self.ball(b))), 1),): Fraction(1)}
-        first, second = zip(self.value(a), self.value(b), strict=True)
-        residues = [_hashed(f"{name} {v}", w) for v, w in (first, second)]
         key = (name, frozenset(a.items()), frozenset(b.items()))
-        atom = self.atom(key, lambda: [name, self.write(a), self.write(b)], residues)
-        return {((atom, 1),): Fraction(1)}
+        if all(self.fixed(m) for value in (a, b) for m in value):
+            return atom_of(self.constant(key, getattr(self.ball(a), name)(self.ball(b))))
+        first, second = zip(self.residues.of_sum(a), self.residues.of_sum(b), strict=True)
+        residues = [hashed(f"{name} {v}", w) for v, w in (first, second)]
+        return atom_of(self.atom(key, lambda: [name, self.write(a), self.write(b)], residues))
 
     def factor(self, value: Sum) -> tuple[Monomial, Fraction]:
         """A sum as one monomial and its coefficient; with several terms it becomes an atom."""
         if len(value) == 1:
             ((monomial, c),) = value.items()
             return monomial, c
-        name = self.atom(("+", frozenset(value.items())), lambda: self.write(value), self.value(value))
+        name = self.atom(("+", frozenset(value.items())), lambda: self.write(value), self.residues.of_sum(value))
         self._sums.add(name)
         return ((name, 1),), Fraction(1)
 
@@ -260,7 +248,7 @@ class _Writer:
                 raise InputError("a query has a constant that is not a finite number.")
             name = f"k.{len(self._atoms)}"
             self._atoms[key], self._balls[name] = name, enclosure
-            self.declare(name)
+            self.residues.declare(name)
         return self._atoms[key]
 
     def atom(self, key: object, tree: Callable[[], Tree], residues: Sequence[int]) -> str:
@@ -269,11 +257,9 @@ class _Writer:
             written = tree()
             name = f"t.{len(self._atoms)}"
             self._atoms[key] = name
-            self._residues[name] = (residues[0], residues[1])
+            self.residues.set(name, residues)
             self.definitions.append((name, written))
         return self._atoms[key]
-
-    # Writing
 
     def write(self, value: Sum) -> Tree:
         """A tree that holds a variable, and no two numbers that could meet."""
@@ -281,11 +267,11 @@ class _Writer:
         if set(known) <= {()}:
             parts = dict(value)
         else:
-            parts = {((self.enclosed(known), 1),): Fraction(1)}
+            parts = dict(atom_of(self.enclosed(known)))
             parts |= {m: c for m, c in value.items() if m not in known}
         if set(parts) <= {()}:
             return ["*", self.number(parts.get((), Fraction(0))), self.one()]
-        residues = [self.residues(m) for m in parts]
+        residues = [self.residues.of(m) for m in parts]
         constants = sum(first == second for first, second in residues)
         apart = len(set(residues)) == len(residues) and constants == (1 if () in parts else 0)
         terms: list[Tree] = []
@@ -304,7 +290,7 @@ class _Writer:
 
     def factors(self, monomial: Monomial) -> Tree:
         """A product of atoms; those that depend on no state are variables here."""
-        names = [self.enclosed({((atom, 1),): Fraction(1)}) if atom in self._balls else atom for atom, _ in monomial]
+        names = [self.enclosed(atom_of(atom)) if atom in self._balls else atom for atom, _ in monomial]
         powers: list[Tree] = [name if k == 1 else ["**", name, k] for name, (_, k) in zip(names, monomial, strict=True)]
         return powers[0] if len(powers) == 1 else ["*", *powers]
 
@@ -314,8 +300,7 @@ class _Writer:
 
     def pin(self, q: Fraction) -> str:
         """The variable that stands for a rational."""
-        residue = q.numerator * _inverted(q.denominator) % _PRIME
-        return self._pinned(q, _below(q), _above(q), str(q), (residue, residue))
+        return self._pinned(q, _below(q), _above(q), str(q), (residue(q), residue(q)))
 
     def one(self) -> str:
         """The variable that stands for 1 and keeps a sum a product."""
@@ -326,66 +311,14 @@ class _Writer:
         enclosure = self.ball(value)
         lo, hi = _below(_exact(enclosure.lower())), _above(_exact(enclosure.upper()))
         what = f"a constant near {float(enclosure.mid()):.17g}"
-        return self._pinned(frozenset(value.items()), lo, hi, what, self.value(value))
+        return self._pinned(frozenset(value.items()), lo, hi, what, self.residues.of_sum(value))
 
     def _pinned(self, key: object, lo: float, hi: float, what: str, residues: tuple[int, int]) -> str:
         if key not in self.pins:
             name = f"c.{len(self.pins)}"
             self.pins[key] = _Pin(name, lo, hi, what)
-            self._residues[name] = residues
+            self.residues.set(name, residues)
         return self.pins[key].name
-
-    # The finite field
-
-    def residues(self, monomial: Monomial) -> tuple[int, int]:
-        """A monomial's values at the two points; equal ones may be a constant's."""
-        first = second = 1
-        for atom, k in monomial:
-            a, b = self._residues[atom]
-            first, second = first * pow(a, k, _PRIME) % _PRIME, second * pow(b, k, _PRIME) % _PRIME
-        return first, second
-
-    def value(self, value: Sum) -> tuple[int, int]:
-        """A sum's values at the two points."""
-        first = second = 0
-        for monomial, q in value.items():
-            c = q.numerator * _inverted(q.denominator)
-            a, b = self.residues(monomial)
-            first, second = (first + c * a) % _PRIME, (second + c * b) % _PRIME
-        return first, second
-
-
-def _hashed(name: str, value: int) -> int:
-    return int.from_bytes(hashlib.sha256(f"{name} {value}".encode()).digest(), "big") % _PRIME
-
-
-def _inverted(residue: int) -> int:
-    if residue % _PRIME == 0:
-        raise InputError("a query divides by zero.")
-    return pow(residue, -1, _PRIME)
-
-
-def _constant(q: Fraction) -> Sum:
-    return {(): q} if q else {}
-
-
-def _scaled(value: Sum, c: Fraction) -> Sum:
-    return {m: c * q for m, q in value.items()} if c else {}
-
-
-def _add(a: Sum, b: Sum, sign: int) -> Sum:
-    result = dict(a)
-    for m, c in b.items():
-        result[m] = result.get(m, Fraction(0)) + sign * c
-        if not result[m]:
-            del result[m]
-    return result
-
-
-def _times(a: Monomial, b: Monomial) -> Monomial:
-    exponents = Counter(dict(a))
-    exponents.update(dict(b))
-    return tuple(sorted(exponents.items()))
 
 
 def _exact(value: flint.arb) -> Fraction:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from certify.certificates.claims import Problem
 from certify.effort import UNLIMITED, Effort
-from certify.loop.plants import System
+from certify.loop.plants import System, corners
 from certify.loop.policies import bounded_by_form
 from certify.lyapunov.neural import Neural
 from certify.lyapunov.symbolic import Symbolic
@@ -58,7 +58,7 @@ class Falsifier:
         self.problem, self.c2, self.T, self.N, self.effort = problem, c2, T, function, effort
         self.system = problem.loop.system
         self.f = self.system.uncertain_function()
-        self.corners = self.system.corners()
+        self.corners = corners(self.system)
         self.low, self.high = np.array([[float(e) for e in pair] for pair in self.system.domain]).T
         self.half = (self.high - self.low) / 2
         ends = np.array([[float(e) for e in pair] for pair in self.system.input_bounds]).T

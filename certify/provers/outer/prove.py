@@ -91,16 +91,10 @@ def prove_outer(
     floor = search.least_value()
     if not math.isfinite(floor):
         return Nothing("every sampled state of the domain lies in the ellipsoid")
-    top = min(search.lowest_on_faces(), math.inf if level is None else level)
-    if not top > floor:
-        what = "the level that was asked for" if level is not None and top == level else "N somewhere on the faces"
-        return Nothing(f"{what}, {top:.6g}, is not above the least value of N that was sampled beyond it, {floor:.6g}")
-    stop = Stop.DOMAIN if level is None or top < level else Stop.REQUESTED
-    span = top - floor
-    top = level if stop is Stop.REQUESTED and level is not None else top - _BESIDE_FACE * span
-    witness = search.search(top)
-    if witness is not None and witness.level - _BESIDE_RISE * span < top:
-        top, stop = witness.level - _BESIDE_RISE * span, Stop.WITNESS
+    aim = _aim(search, floor, level)
+    if isinstance(aim, Nothing):
+        return aim
+    top, span, stop, witness = aim
     seconds = {"falsify": time.monotonic() - start}
 
     share = replace(budget, effort=budget.effort.share(_FOR_FACES))
@@ -119,8 +113,7 @@ def prove_outer(
             witness = deeper
         return math.inf if deeper is None else deeper.level
 
-    root = root_around(problem, T)
-    rule = FallBound(problem, c2, T, function)
+    root, rule = root_around(problem, T), FallBound(problem, c2, T, function)
     cover = Cover(rule, -root, root, runner, top, floor, _BESIDE_RISE * span, deepen)
     stopped = cover.advance(budget, report)
     if not cover.level > floor:
@@ -142,6 +135,22 @@ def prove_outer(
         sum(count(each) for each in (tree, *faces)),
         seconds,
     )
+
+
+def _aim(search: Falsifier, floor: float, level: float | None) -> tuple[float, float, Stop, Rise | None] | Nothing:
+    """The level that sampling allows, the span of N down to its least value, what limits the level, and the lowest
+    violation."""
+    top = min(search.lowest_on_faces(), math.inf if level is None else level)
+    if not top > floor:
+        what = "the level that was asked for" if level is not None and top == level else "N somewhere on the faces"
+        return Nothing(f"{what}, {top:.6g}, is not above the least value of N that was sampled beyond it, {floor:.6g}")
+    stop = Stop.DOMAIN if level is None or top < level else Stop.REQUESTED
+    span = top - floor
+    top = level if stop is Stop.REQUESTED and level is not None else top - _BESIDE_FACE * span
+    witness = search.search(top)
+    if witness is not None and witness.level - _BESIDE_RISE * span < top:
+        top, stop = witness.level - _BESIDE_RISE * span, Stop.WITNESS
+    return top, span, stop, witness
 
 
 def root_around(problem: Problem, T: Array) -> Array:

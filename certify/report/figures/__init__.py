@@ -18,8 +18,9 @@ from certify.report.figures.pairs import Pair
 from certify.report.figures.partition import partition
 from certify.report.figures.policy import curves, surface
 from certify.report.figures.portrait import Region, portraits
-from certify.report.figures.scene import Scene, starts
+from certify.report.figures.scene import Scene
 from certify.report.figures.style import RC, Picture
+from certify.report.figures.trajectories import runs_from, starts
 from certify.report.figures.tube import tube
 from certify.report.sampling import SimulatedRoa, edge_of, simulated_roa_fraction
 
@@ -76,12 +77,12 @@ def region_of(scene: Scene, roa: SimulatedRoa | None) -> Region | None:
 def _on_the_line(scene: Scene, roa: SimulatedRoa | None) -> list[Picture]:
     (low, high), shares = scene.begin_on_line, (-0.999, -0.5, 0.5, 0.999)
     begin = [[(low + high) / 2 + share * (high - low) / 2] for share in shares]
-    runs = scene.simulate(begin)
+    runs = runs_from(scene, begin)
     return [line_figure(scene, roa), *tube(scene, runs), curves(scene), decay(scene, runs.path, runs.step)]
 
 
 def _in_planes(scene: Scene, roa: SimulatedRoa | None) -> list[Picture]:
-    runs, region = scene.simulate(starts(scene)), region_of(scene, roa)
+    runs, region = runs_from(scene, starts(scene)), region_of(scene, roa)
     inside = len(scene.pairs) * scene.effort.starts  # starts along the domain's boundary come after these
     from_set = replace(runs, path=runs.path[:, :inside], settled=runs.settled[:inside], left=runs.left[:inside])
     pictures = [*portraits(scene, runs, region), *tube(scene, from_set)]

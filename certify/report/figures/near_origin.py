@@ -6,6 +6,7 @@ from certify.report.figures.geometry import circle, ellipse, on_level, thin
 from certify.report.figures.partition import add_leaves
 from certify.report.figures.scene import Scene
 from certify.report.figures.style import INK, INNER, INNER_FILL, SET, SIMULATED, Picture, figure_of, to_svg
+from certify.report.figures.trajectories import runs_from
 from certify.report.words import inner_level
 
 
@@ -19,7 +20,7 @@ def near_origin(scene: Scene) -> Picture:
     if leaves is not None:
         add_leaves(axes, scene, leaves, (0, 1), within=reach)
     begin = on_level(scene.P, circle(scene.effort.starts), min(9 * scene.inner, 0.999 * scene.outer))
-    paths = scene.simulate(begin, steps=60).path
+    paths = runs_from(scene, begin, steps=60).path
     lines = [thin(paths[:, k], 2 * reach) for k in range(paths.shape[1])]
     axes.add_collection(LineCollection(lines, colors=SIMULATED, linewidths=0.8, zorder=3))
     axes.fill(*ellipse(scene.P, (0, 1), scene.inner), facecolor=INNER_FILL, edgecolor=INNER, lw=1.6, zorder=2)

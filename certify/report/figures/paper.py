@@ -18,8 +18,9 @@ from certify.report.figures import region_of, simulated_roa
 from certify.report.figures.line import draw_line
 from certify.report.figures.pairs import named_pairs
 from certify.report.figures.portrait import draw_plane, keys
-from certify.report.figures.scene import Scene, starts
+from certify.report.figures.scene import Scene
 from certify.report.figures.style import RC, Key
+from certify.report.figures.trajectories import runs_from, starts
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -117,7 +118,7 @@ def _draw(scene: Scene, panels: Sequence[Any]) -> tuple[Key, ...]:
     roa = simulated_roa(scene)
     if scene.n == 1:
         return draw_line(panels[0], scene, roa)
-    runs, region = scene.simulate(starts(scene)), region_of(scene, roa)
+    runs, region = runs_from(scene, starts(scene)), region_of(scene, roa)
     growing = [draw_plane(axes, scene, pair, runs, region) for axes, pair in zip(panels, scene.pairs, strict=True)]
     return keys(scene, runs, region, any(growing))
 

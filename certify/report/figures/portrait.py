@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from certify.report.figures.geometry import ellipse, shadow, shadows, thin
 from certify.report.figures.pairs import Pair
-from certify.report.figures.scene import Band, Scene
+from certify.report.figures.scene import Scene
+from certify.report.figures.sets import Band
 from certify.report.figures.style import (
     GROWTH,
     GROWTH_FILL,

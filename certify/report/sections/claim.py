@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from certify.certificates import Certificate, PartitionTree, TrustedSolver
 from certify.certificates.claims import Outer
 from certify.loop.expressions import nodes
-from certify.loop.plants import System
+from certify.loop.plants import System, input_errors
 from certify.lyapunov import Neural, extents
 from certify.report.claims import CHECKED_ALWAYS, INPUTS
-from certify.report.figures.scene import centre_of, inner_of, is_ellipsoid, is_local_enough, slabs_of, start_of
+from certify.report.figures.sets import centre_of, inner_of, is_ellipsoid, is_local_enough, slabs_of, start_of
 from certify.report.mathml import typeset
 from certify.report.sections.shared import centre_in_words, duration_in_words, timing_of, words_of
 from certify.report.timing import TimingInWords
@@ -45,49 +45,18 @@ def claim_of(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict
 
     For a solver's answer the checker shows only the exact parts; the others name the solver.
     """
-    system, words, evidence, timing = (
-        certificate.system,
-        words_of(certificate),
-        certificate.evidence,
-        timing_of(certificate),
-    )
+    system, timing = certificate.system, timing_of(certificate)
     units = {s.name: pretty_unit(system.units.get(s.name, "")) for s in (*system.states, *system.inputs)}
     drawable = is_ellipsoid(certificate)
     bounds = [
         f"{below(lo)} ≤ {symbol(s.name)} ≤ {above(hi)} {units[s.name]}".rstrip()
         for s, (lo, hi) in zip(system.inputs, system.input_bounds, strict=True)
     ]
-    margins = answer.get("margins", {}) if answer else {}
-    local, ring = margins.get("local"), margins.get("ring")
-    notes = {
-        "Domain": f"{_sides(certificate, certificate.P, certificate.roa)}." if drawable else "",
-        "Inputs": "; ".join(bounds) + ".",
-    }
-    if local:
-        notes["Local"] = (
-            f"Margin{' of the linear part over the remainder' if certificate.claim.at_rest else ''}: "
-            f"{below(100 * local, 3)} %{_in_cells(evidence)}."
-        )
-    if answer and is_local_enough(certificate):
-        notes["Ring"] = "As c₁ = c₂, the local part covers the whole set."
-    elif answer:
-        shown = f"Shown on {answer.get('ring_leaves', 0):,} of {answer.get('leaves', 0):,} leaves"
-        notes["Ring"] = f"{shown}; {_smallest(timing)} is {below(ring, 3)}." if ring is not None else shown
-    notes |= _tube_notes(certificate) | _outer_notes(answer)
-    parts = []
-    for name, condition, shown_by in _with_errors(words.parts, system):
-        note = notes.get(name, "")
-        if isinstance(evidence, TrustedSolver):
-            text = f"{condition.rstrip('.')}."
-            by = "Checked in exact arithmetic." if name in CHECKED_ALWAYS else f"Not checked: {evidence.solver}'s word."
-            note = f"{by} {note}".rstrip()
-        else:
-            text = f"{condition}, {shown_by}." if shown_by else condition
-        parts.append((name, text, note))
+    parts = _parts(certificate, _notes(certificate, answer, bounds))
     inner, outer = inner_level(certificate.kind, inner_of(certificate)), below(certificate.roa)
     beyond = _beyond(certificate, certificate.claim.outer)
     practical = not certificate.claim.at_rest
-    statement = words.statement.format(
+    statement = words_of(certificate).statement.format(
         inner=inner,
         outer=outer,
         beyond="" if beyond is None else beyond["level"],
@@ -110,6 +79,43 @@ def claim_of(certificate: Certificate, answer: Mapping[str, Any] | None) -> dict
     }
 
 
+def _notes(certificate: Certificate, answer: Mapping[str, Any] | None, bounds: Sequence[str]) -> dict[str, str]:
+    """The checker's findings on each part, by the part's name; `bounds` are those of the inputs."""
+    margins = answer.get("margins", {}) if answer else {}
+    local, ring = margins.get("local"), margins.get("ring")
+    notes = {
+        "Domain": f"{_sides(certificate, certificate.P, certificate.roa)}." if is_ellipsoid(certificate) else "",
+        "Inputs": "; ".join(bounds) + ".",
+    }
+    if local:
+        notes["Local"] = (
+            f"Margin{' of the linear part over the remainder' if certificate.claim.at_rest else ''}: "
+            f"{below(100 * local, 3)} %{_in_cells(certificate.evidence)}."
+        )
+    if answer and is_local_enough(certificate):
+        notes["Ring"] = "As c₁ = c₂, the local part covers the whole set."
+    elif answer:
+        notes["Ring"] = f"Shown on {answer.get('ring_leaves', 0):,} of {answer.get('leaves', 0):,} leaves"
+        if ring is not None:
+            notes["Ring"] += f"; {_smallest(timing_of(certificate))} is {below(ring, 3)}."
+    return notes | _tube_notes(certificate) | _outer_notes(answer)
+
+
+def _parts(certificate: Certificate, notes: Mapping[str, str]) -> list[tuple[str, str, str]]:
+    """Each part's name, condition and note, and where a solver is believed, that its word was not checked."""
+    parts, evidence = [], certificate.evidence
+    for name, condition, shown_by in _with_errors(words_of(certificate).parts, certificate.system):
+        note = notes.get(name, "")
+        if isinstance(evidence, TrustedSolver):
+            text = f"{condition.rstrip('.')}."
+            by = "Checked in exact arithmetic." if name in CHECKED_ALWAYS else f"Not checked: {evidence.solver}'s word."
+            note = f"{by} {note}".rstrip()
+        else:
+            text = f"{condition}, {shown_by}." if shown_by else condition
+        parts.append((name, text, note))
+    return parts
+
+
 def _beyond(certificate: Certificate, outer: Outer | None) -> dict[str, Any] | None:
     """Describe N: a network by its widths and hash, an expression by its formula unless it is long."""
     if outer is None:
@@ -126,7 +132,7 @@ def _beyond(certificate: Certificate, outer: Outer | None) -> dict[str, Any] | N
 
 
 def _smallest(timing: TimingInWords) -> str:
-    """Of what the margin of the ring is the least."""
+    """The quantity whose least value is the margin of the ring, in words."""
     return f"the smallest bound on {MINUS}{f'({timing.decrease})' if timing.rate else timing.decrease}"
 
 
@@ -138,7 +144,7 @@ def _in_cells(evidence: PartitionTree | TrustedSolver) -> str:
 
 def _with_errors(parts: Sequence[tuple[str, str, str]], system: System) -> Iterator[tuple[str, str, str]]:
     """The parts of a claim, with the part on inputs reworded for input errors."""
-    errors = system.input_errors
+    errors = input_errors(system)
     held = all(lo <= 0 <= hi for lo, hi in (system.ranges[e] for e in errors.values()))
     on_top = (
         "On {V ≤ c₂} what the policy asks for, π(x), stays in the bounds of the input; the error comes on top of it. "

@@ -10,7 +10,7 @@ from typing import Any
 
 from certify.certificates import Certificate
 from certify.lyapunov import extents
-from certify.report.figures.scene import centre_of, is_ellipsoid
+from certify.report.figures.sets import centre_of, is_ellipsoid
 from certify.report.limits import AT_A_POINT, limit_in_words, outer_limited_by
 from certify.report.sections.shared import ellipsoids_of, shares_of, timing_of
 from certify.report.sections.status import is_missed

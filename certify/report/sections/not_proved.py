@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from certify.certificates import Certificate
-from certify.loop.plants import System
+from certify.loop.plants import System, input_errors
 from certify.report.claims import Words
 from certify.report.sections.shared import timing_of
 from certify.report.timing import TimingInWords
@@ -112,7 +112,7 @@ def _not_of_the_plant(system: System) -> list[tuple[str, str]]:
 
 def _rounding(system: System) -> tuple[str, str]:
     """The gaps about the policy's evaluation; fewer if input errors are allowed."""
-    errors = system.input_errors
+    errors = input_errors(system)
     exact = [s.name for s in system.inputs if s.name not in errors]
     if len(exact) == system.m:
         return (

@@ -14,7 +14,7 @@ from certify.certificates.claims import Outer
 from certify.errors import CertifyError
 from certify.loop.closed_loop import ClosedLoop
 from certify.lyapunov import Neural, domain_limit, extents, sampled_volume, semi_axes, volume
-from certify.report.figures.scene import centre_of, inner_of, is_ellipsoid, is_local_enough, slabs_of
+from certify.report.figures.sets import centre_of, inner_of, is_ellipsoid, is_local_enough, slabs_of
 from certify.report.limits import limited_by, outer_limited_by
 from certify.report.sections.shared import (
     Ellipsoid,

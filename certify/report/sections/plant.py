@@ -9,6 +9,7 @@ from typing import Any
 
 from certify.certificates import Certificate
 from certify.loop.expressions import Expression, Number, Symbol, nodes
+from certify.loop.plants import input_errors
 from certify.report.mathml import identifier, is_long, multiplied_out, typeset
 from certify.report.sections.shared import centre_in_words, read_in_words
 from certify.report.words import above, at_rest, below, held_at, number, pretty_unit, symbol, varying_in
@@ -39,7 +40,7 @@ def plant_of(certificate: Certificate) -> dict[str, Any]:
         "uncertain": [q.words for q in varying_in(system)],
         "held": held_at(system),
         "listed": ", ".join(symbol(name) for name in system.ranges),
-        "errors": [f"{symbol(u)} + {symbol(e)}" for u, e in system.input_errors.items()],
+        "errors": [f"{symbol(u)} + {symbol(e)}" for u, e in input_errors(system).items()],
     }
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from certify.certificates import Certificate, PartitionTree
 from certify.report.claims import Words, words_for
-from certify.report.figures.scene import centre_of, slabs_of, start_of
+from certify.report.figures.sets import centre_of, slabs_of, start_of
 from certify.report.timing import TimingInWords
 from certify.report.words import ABSENT, above, number, point, symbol
 

@@ -18,7 +18,7 @@ from certify.certificates.membership import Ellipsoid, ProvedSet
 from certify.errors import InputError
 from certify.loop.closed_loop import ClosedLoop
 from certify.loop.expressions import Number, Symbol, substitute, symbols
-from certify.loop.plants import System, get_system, in_floats
+from certify.loop.plants import System, get_system, in_floats, with_input_errors
 from certify.loop.policies import Policy, TanhNetwork, load_policy, save_policy
 from certify.loop.rigorous import is_definite
 from controllers.cli import app
@@ -178,7 +178,7 @@ def test_a_set_of_another_loop_is_refused():
 
 def test_a_set_that_is_proved_for_less_of_what_is_uncertain_is_refused():
     policy, (nominal, _) = _scalar()
-    little, pushed = (nominal.with_input_errors({"u": Fraction(1, size)}) for size in (100, 10))
+    little, pushed = (with_input_errors(nominal, {"u": Fraction(1, size)}) for size in (100, 10))
     for less in (nominal, little):
         with pytest.raises(InputError, match=r"for all that is uncertain of line, `error_u` in \[-0\.1, 0\.1\]"):
             require_same_loop(_proved_set(policy, less, [[7.0]]), policy.network, pushed)

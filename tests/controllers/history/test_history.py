@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from certify.certificates.verdict import Verdict
 from certify.errors import InputError
-from certify.loop.plants import get_system
+from certify.loop.plants import get_system, with_input_errors
 from certify.loop.policies import Policy, TanhNetwork, load_policy, save_policy
 from controllers.cli import app
 from controllers.evaluation.settling import MONITORING, settle
@@ -209,7 +209,7 @@ def test_a_certificate_that_is_there_is_believed_only_if_it_is_accepted_and_abou
             (kept, heavier, raw),
             (kept, PENDULUM.with_domain({"theta": (Fraction(-1), Fraction(1))}), raw),
             (kept, replace(PENDULUM, input_bounds=((Fraction(-1), Fraction(1)),)), raw),
-            (kept, PENDULUM.with_input_errors({"u": Fraction(1, 10)}), raw),
+            (kept, with_input_errors(PENDULUM, {"u": Fraction(1, 10)}), raw),
             (kept, PENDULUM.with_sample((Fraction(0), Fraction(1, 50))), raw),
         ):
             path.write_bytes(content)

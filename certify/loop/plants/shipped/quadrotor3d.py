@@ -38,6 +38,7 @@ def quadrotor3d() -> System:
     )
     lift = (u1 + u2 + u3 + u4) / m
     turn = sin(phi) * q + cos(phi) * r
+    values = {"m": "0.486", "a": "0.225", "k": "11/290", "Ix": "4.9e-3", "Iy": "4.9e-3", "Iz": "8.8e-3", "g": "9.81"}
     names = {
         **dict.fromkeys(("x", "y", "z", "a", "k"), "m"),
         **dict.fromkeys(("phi", "theta", "psi"), "rad"),
@@ -58,15 +59,7 @@ def quadrotor3d() -> System:
         description="quadrotor with four thrusts",
         states=states,
         inputs=inputs,
-        parameters={
-            "m": exact("0.486"),
-            "a": exact("0.225"),
-            "k": exact("11/290"),
-            "Ix": exact("4.9e-3"),
-            "Iy": exact("4.9e-3"),
-            "Iz": exact("8.8e-3"),
-            "g": exact("9.81"),
-        },
+        parameters={name: exact(value) for name, value in values.items()},
         dynamics=(
             vx,
             vy,
@@ -84,7 +77,7 @@ def quadrotor3d() -> System:
         u_eq=(m * g / 4,) * 4,
         domain=(within("3"),) * 3 + (within("1"),) * 2 + (within("3"),) + (within("6"),) * 3 + (within("12"),) * 3,
         input_bounds=((exact(0), exact("3.6")),) * 4,
-        positive=frozenset({"m", "a", "k", "Ix", "Iy", "Iz", "g"}),
+        positive=frozenset(values),
         disturbances=disturbances,
         units=names,
     )

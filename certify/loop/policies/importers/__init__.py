@@ -5,13 +5,13 @@ from __future__ import annotations
 from certify.loop.policies.importers.importing import (
     Imported,
     centring_changes,
-    content_of,
     import_bytes,
     import_policy,
     read_bytes,
 )
 from certify.loop.policies.importers.memory import import_module, import_state_dict
 from certify.loop.policies.importers.options import ImportOptions
+from certify.loop.policies.importers.recognising import content_of
 from certify.loop.policies.importers.steps import Clip
 
 __all__ = [

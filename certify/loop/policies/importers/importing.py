@@ -9,39 +9,31 @@ from __future__ import annotations
 import hashlib
 import math
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from certify.errors import InputError
-from certify.loop.files.archives import MAX_BYTES, Archive
-from certify.loop.files.arrays import Numbers
-from certify.loop.files.torchfile import TorchFile
+from certify.loop.files.archives import MAX_BYTES
 from certify.loop.policies.exact import require_centred
-from certify.loop.policies.file import Policy, is_text
+from certify.loop.policies.file import Policy
 from certify.loop.policies.importers.comparing import Difference, compare_reading
 from certify.loop.policies.importers.folding import Bounds, Folded, fold
 from certify.loop.policies.importers.normalisers import load_normaliser
 from certify.loop.policies.importers.observing import index_of, over_states, require_equilibrium, sample, shift
-from certify.loop.policies.importers.onnx_graph import read_onnx
 from certify.loop.policies.importers.options import ImportOptions
 from certify.loop.policies.importers.reading import Evaluate, Reading
-from certify.loop.policies.importers.sb3 import read_sb3
-from certify.loop.policies.importers.state_dict import is_two_stage, read_state_dict, read_two_stage
+from certify.loop.policies.importers.recognising import Content, kind_of, read_kind
 from certify.loop.policies.importers.steps import Clip, Diagonal, Normalise, Step, spread
-from certify.loop.policies.importers.tensors import load_safetensors, load_tensors
-from certify.loop.policies.importers.torchscript import is_torchscript, read_torchscript
 from certify.loop.policies.network import Array, Centre, TanhNetwork
 
 if TYPE_CHECKING:
     from certify.loop.plants import System
 
-Content = Literal["state-dict", "torchscript", "onnx", "sb3", "safetensors", "two-stage", "policy"]
-_OWN, _LYAPUNOV = "certify-policy/", "certify-lyapunov/"
 _ONE, _ZERO = (Fraction(1),), (Fraction(0),)
 
 
@@ -74,29 +66,6 @@ class Imported:
     at_origin: Array
     u_eq: Array
     centring: Mapping[Centre, float]
-
-
-def content_of(raw: bytes, name: str) -> Content | None:
-    """Recognise a file's kind by its bytes and, for ONNX, by its name; None if no reader takes it."""
-    if raw.startswith(b"PK"):
-        archive = Archive(raw, name)
-        if "policy.pth" in archive and "data" in archive:
-            return "sb3"
-        file = TorchFile(raw, name, archive)
-        if is_torchscript(file):
-            return "torchscript"
-        root = file.pickle("data.pkl")
-        said = root.get("format") if isinstance(root, dict) else None
-        if isinstance(said, str) and said.startswith(_OWN):
-            return "policy"
-        if isinstance(said, str) and said.startswith(_LYAPUNOV):
-            raise InputError("it must hold a policy; it is a Lyapunov function of this program.")
-        return "two-stage" if is_two_stage(load_tensors(raw, name, file)) else "state-dict"
-    if name.endswith(".onnx"):
-        return "onnx"
-    if name.endswith(".safetensors") or raw[8:9] == b"{":
-        return "safetensors"
-    return None
 
 
 def import_policy(
@@ -163,7 +132,7 @@ def import_bytes(
     """
     kind = kind_of(raw, name, options)
     n = plant.n if options.states is None else len(options.states)
-    reading = _read(kind, raw, name, options, n, plant.m, folder, beside)
+    reading = read_kind(kind, raw, name, options, n, plant.m, folder, beside)
     if evaluate is not None:
         reading = replace(reading, evaluate=evaluate, program="the module itself, run")
     _require_answers(kind, reading, options, plant)
@@ -174,20 +143,9 @@ def import_bytes(
             f"the policy must read the {len(states)} states {', '.join(states)} and command the {plant.m} inputs of "
             f"{plant.name}; it reads {reading.n} and commands {reading.m}. Name what it reads with --states."
         )
-    record: dict[str, Any] = {
-        "file": name,
-        "sha256": hashlib.sha256(raw).hexdigest(),
-        "kind": kind,
-        "policy": reading.words,
-        "states": ", ".join(states),
-        "plant_states": [s.name for s in plant.states],
-        "options": options.given,
-    }
     x_eq = [plant.exact_x_eq()[i] for i in index]
     moved = shift(x_eq, options)
     normaliser = _normaliser(reading, options, len(states))
-    if isinstance(options.normaliser, Path):
-        record["normaliser_sha256"] = hashlib.sha256(read_bytes(options.normaliser)).hexdigest()
     before = (*moved, *normaliser)
     require_equilibrium(reading, x_eq if moved else [Fraction(0)] * len(states))
     after = _action(options, plant.m)
@@ -203,11 +161,9 @@ def import_bytes(
     bare = network if reading.beta is not None else replace(network, centre="none")
     values = bare(x, u_eq)
     difference = compare_reading(reading, before, after, x[:, index], values)
-    record["compared_with"] = reading.program
-    record["largest_difference" if reading.program is not None else "folding_difference"] = difference.largest
-    record["not_read"] = dict(reading.unread)
-    if reading.beside:
-        record["beside_sha256"] = dict(reading.beside)
+    known = {"file": name, "sha256": hashlib.sha256(raw).hexdigest(), "kind": kind}
+    known |= {"policy": reading.words, "states": ", ".join(states)}
+    record = known | _record(reading, options, plant, difference)
     return Imported(
         policy=Policy(network, plant.name, _parameters(plant), {"imported": record}, reading.beta, valid),
         words=reading.words,
@@ -222,53 +178,20 @@ def import_bytes(
     )
 
 
-def kind_of(raw: bytes, name: str, options: ImportOptions) -> Content:
-    """The kind of a file by its bytes, or by `options`.
-
-    Raises
-    ------
-    InputError : its kind is unknown, it is this program's already, or it contradicts the options.
-    """
-    kind = options.kind if options.kind in ("onnx", "safetensors") else content_of(raw, name)
-    if kind is None:
-        wanted = "it must be a file of torch.save, TorchScript, stable-baselines3, ONNX or safetensors"
-        if raw[:1] in (b"\x80", b"("):
-            raise InputError(
-                f"{wanted}; it is a bare pickle, or torch's format of before version 1.6. If you trust it, load it and "
-                "write it again with torch.save."
-            )
-        raise InputError(f"{wanted}; it is none of these{', but text' if is_text(raw) else ''}.")
-    if kind == "policy":
-        raise InputError("it is a policy file of this program already: use it with certify roa --policy.")
-    if options.kind not in ("auto", kind) and (options.kind, kind) != ("state-dict", "two-stage"):
-        raise InputError(f"it must be what --from says, {options.kind}; it is {kind}.")
-    return kind if options.kind == "auto" else options.kind
-
-
-def _read(
-    kind: Content,
-    raw: bytes,
-    name: str,
-    options: ImportOptions,
-    n: int,
-    m: int,
-    folder: Path | None,
-    beside: str | None,
-) -> Reading:
-    readers: dict[Content, Callable[[], Reading]] = {
-        "sb3": lambda: read_sb3(Archive(raw, name), name, options.ignore),
-        "torchscript": lambda: read_torchscript(TorchFile(raw, name)),
-        "onnx": lambda: read_onnx(raw, name, options.output, folder),
-        "safetensors": lambda: read_state_dict(tensors_in(kind, raw, name), options, n, m, beside),
-        "two-stage": lambda: read_two_stage(tensors_in(kind, raw, name), options),
-        "state-dict": lambda: read_state_dict(tensors_in(kind, raw, name), options, n, m, beside),
+def _record(reading: Reading, options: ImportOptions, plant: System, difference: Difference) -> dict[str, Any]:
+    """Where a policy came from, for its file."""
+    record: dict[str, Any] = {
+        "plant_states": [s.name for s in plant.states],
+        "options": options.given,
     }
-    return readers[kind]()
-
-
-def tensors_in(kind: Content, raw: bytes, name: str) -> dict[str, Numbers]:
-    """The tensors of a state_dict or two-stage file, or of safetensors, by their names."""
-    return load_safetensors(raw, name) if kind == "safetensors" else load_tensors(raw, name)
+    if isinstance(options.normaliser, Path):
+        record["normaliser_sha256"] = hashlib.sha256(read_bytes(options.normaliser)).hexdigest()
+    record["compared_with"] = reading.program
+    record["largest_difference" if reading.program is not None else "folding_difference"] = difference.largest
+    record["not_read"] = dict(reading.unread)
+    if reading.beside:
+        record["beside_sha256"] = dict(reading.beside)
+    return record
 
 
 def _require_answers(kind: Content, reading: Reading, options: ImportOptions, plant: System) -> None:

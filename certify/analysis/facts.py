@@ -1,0 +1,179 @@
+"""The parts of a result: levels, candidates, a tube, an outer set, and what limits it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from certify.certificates.membership import tube_start
+from certify.lyapunov import extents, semi_axes, volume
+from certify.lyapunov.neural import Neural
+from certify.lyapunov.symbolic import Symbolic
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Levels:
+    """Levels of V. None means that there is none.
+
+    `local` (c1) and `roa` (c2) state an asymptotic claim, `floor` (c0), `local` and `roa` a practical one.
+    `sampled_limit` is where the lowest violation was found, `domain_limit` where the set meets the domain.
+    """
+
+    local: float | None = None
+    floor: float | None = None
+    roa: float | None = None
+    sampled_limit: float | None = None
+    domain_limit: float | None = None
+
+    @property
+    def inner(self) -> float | None:
+        """The level of the inner set that the claim speaks of: c0 of a practical claim, else c1."""
+        return self.local if self.floor is None else self.floor
+
+    @property
+    def ultimate(self) -> float | None:
+        """c0 of a practical claim: the level below which every trajectory ends."""
+        return self.floor
+
+    def to_dict(self) -> dict[str, float | None]:
+        """For JSON."""
+        return {**{name: getattr(self, name) for name in self.__slots__}, "ultimate": self.ultimate}
+
+
+@dataclass(frozen=True, slots=True)
+class Tried:
+    """A candidate that was tried.
+
+    `level` and `volume` are the most within its reach, sampled, ended by `limited_by`; `proved` says that the result is
+    about this one, `proved_volume` what the search had proved with it, None if nothing.
+    """
+
+    candidate: str
+    level: float
+    limited_by: str
+    volume: float
+    proved: bool
+    proved_volume: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class Step:
+    """The next thing to try: options to add to the command (none if no option helps), and why; `flattens` says that the
+    policy is to be fine-tuned first, by `controllers flatten`."""
+
+    options: tuple[tuple[str, str], ...]
+    why: str
+    flattens: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class TubeFacts:
+    """A tube that enlarges the set: it starts at {(x - c)'P(x - c) <= 1}, P = `start` (n, n), c = `centre`, None for 0,
+    of this `shape`, and leads into {V <= c2} in `slabs` pieces, in `duration` units of time."""
+
+    start: Array
+    shape: str
+    slabs: int
+    duration: float
+    centre: tuple[float, ...] | None = None
+
+    def contains(self, states: Sequence[Sequence[Fraction | float]]) -> list[bool]:
+        """Decide in rationals whether states, as deviations from the operating point, lie in the start."""
+        return tube_start(self.start, self.centre).holds(states)
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON, with the size of the start along the states."""
+        sizes = {"semi_axes": semi_axes(self.start, 1.0).tolist(), "extents": extents(self.start, 1.0).tolist()}
+        stated = {"shape": self.shape, "slabs": self.slabs, "duration": self.duration, "start": self.start.tolist()}
+        return {**stated, "centre": self.centre and list(self.centre), "volume": volume(self.start, 1.0), **sizes}
+
+
+@dataclass(frozen=True, slots=True)
+class OuterFacts:
+    """A set beyond {V <= c2}: {N <= level} within the domain, N a `function` of deviations from the operating point.
+
+    `volume` is that of its union with {V <= c2}, estimated from samples of the domain, and `deviation` the standard
+    deviation of that estimate; `leaves` are those of all trees; `limit` says what ends the level: `domain` (its faces),
+    `witness`, `requested`, or what ran out;
+    `witness` is a state, (n,), at which N is no larger than `witness_level` and does not fall, None if none was met.
+    """
+
+    function: Neural | Symbolic
+    level: float
+    volume: float
+    deviation: float
+    limit: str
+    boxes: int
+    leaves: int
+    witness: tuple[float, ...] | None = None
+    witness_level: float | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON."""
+        N = self.function
+        stated: dict[str, Any] = (
+            {"kind": "expression", "expression": str(N.expression)}
+            if isinstance(N, Symbolic)
+            else {"kind": "network", "layers": list(N.widths), "sha256": N.sha256()}
+        )
+        numbers = {name: getattr(self, name) for name in self.__slots__ if name not in ("function", "witness")}
+        return {**stated, **numbers, "witness": self.witness and list(self.witness)}
+
+
+@dataclass(frozen=True, slots=True)
+class Share:
+    """The set's reach along a state, and that as a share of the nearer side of its domain."""
+
+    state: str
+    unit: str
+    extent: float
+    share: float
+
+
+@dataclass(frozen=True, slots=True)
+class Diagnosis:
+    """The limit of a result: what binds and where.
+
+    Parameters
+    ----------
+    binds : in words, with the names of states and inputs.
+    kind : `domain`, `vdot`, `input`, or the name of the stop.
+    name, side : the state or input that binds and which side, None where neither does.
+    point : a state at which it binds, (n,), None if there is none.
+    shares : one a state; empty without a set.
+    fastest, slowest : real parts of the closed loop's eigenvalues at the origin, 1/s.
+    hurts : weights of the states, (n,), the largest 1: the direction in which the proof had most to do.
+    next : what to try.
+    """
+
+    binds: str
+    kind: str
+    name: str | None
+    side: str | None
+    point: tuple[float, ...] | None
+    shares: tuple[Share, ...]
+    fastest: float | None
+    slowest: float | None
+    hurts: tuple[tuple[str, float], ...]
+    next: Step
+
+    @property
+    def stiffness(self) -> float | None:
+        """The fastest mode's decay over the slowest's; None unless all decay."""
+        if self.fastest is None or self.slowest is None or not self.slowest < 0:
+            return None
+        return self.fastest / self.slowest
+
+    def to_dict(self) -> dict[str, Any]:
+        """For JSON: the fields, and `stiffness`; `hurts` by state."""
+        stated = asdict(self)
+        stated |= {"stiffness": self.stiffness, "hurts": dict(self.hurts)}
+        stated["next"] = {"options": dict(self.next.options), "why": self.next.why, "flatten": self.next.flattens}
+        return stated

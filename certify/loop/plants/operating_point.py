@@ -1,0 +1,63 @@
+"""The operating point of a plant, and f(0, u_eq) of each state there, which is 0 at an equilibrium."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from fractions import Fraction
+
+import numpy as np
+
+from certify.errors import InputError
+from certify.loop.expressions import Symbol, evaluate_exactly, numerical
+from certify.loop.plants.system import System
+
+_ROUNDED = 1e-12  # of a residual with functions at other points than 0, which rationals do not decide
+
+
+def residuals(system: System) -> dict[str, Fraction | float]:
+    """Each state's f(0, u_eq): exact, or rounded if a function is evaluated at another point than 0."""
+    at_rest: dict[Symbol, Fraction] = dict.fromkeys(system.states, Fraction(0))
+    at_rest |= dict(zip(system.inputs, system.exact_u_eq(), strict=True))
+    found: dict[str, Fraction | float] = {}
+    for symbol, expression in zip(system.states, system.exact_dynamics(), strict=True):
+        try:
+            found[symbol.name] = evaluate_exactly(expression, at_rest)
+        except InputError:
+            with np.errstate(all="ignore"):
+                rounded = numerical([expression], list(at_rest))(*(np.float64(q) for q in at_rest.values()))
+            found[symbol.name] = float(rounded[0]) if np.isfinite(rounded[0]) else math.nan
+    return found
+
+
+def rests_where(system: System) -> str:
+    """The value of f(x_eq, u_eq) at an equilibrium, as text."""
+    return "0" if system.time == "continuous" else "x_eq"
+
+
+def require_equilibrium(system: System, refuse: Callable[[str], InputError] = InputError) -> None:
+    """Reject a plant whose operating point is no equilibrium; `refuse` makes the error of a message.
+
+    Raises
+    ------
+    InputError : f(x_eq, u_eq) is not 0; the message has the residual of each state by its name.
+    """
+    off = {name: r for name, r in residuals(system).items() if _is_off(r)}
+    if off:
+        shown = ", ".join(_residual(system, name, r) for name, r in off.items())
+        raise refuse(
+            f"x_eq of {system.name} must be an equilibrium, f(x_eq, u_eq) = {rests_where(system)}; found {shown}. "
+            "Correct x_eq or u_eq."
+        )
+
+
+def _is_off(residual: Fraction | float) -> bool:
+    return residual != 0 if isinstance(residual, Fraction) else not abs(residual) <= _ROUNDED
+
+
+def _residual(system: System, name: str, residual: Fraction | float) -> str:
+    exactly = f" (exactly {residual})" if isinstance(residual, Fraction) and len(str(residual)) <= 40 else ""
+    unit = system.units.get(name, "")
+    if system.time == "discrete":
+        return f"{name} moves by {float(residual):.6g}{exactly}{unit and f' {unit}'} in a step"
+    return f"{name}' = {float(residual):.6g}{exactly}" + (f" in {unit} per second" if unit else "")

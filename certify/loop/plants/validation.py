@@ -1,0 +1,126 @@
+"""The requirements on a plant's fields, beyond their types."""
+
+from __future__ import annotations
+
+import re
+from fractions import Fraction
+from typing import TYPE_CHECKING
+
+from certify.errors import InputError
+from certify.loop.expressions import Symbol, nodes, symbols_of
+from certify.loop.expressions.gathering import MOST_BITS
+
+if TYPE_CHECKING:
+    from certify.loop.plants.system import System
+
+
+def validate(system: System) -> None:
+    """Reject a plant whose fields do not fit together.
+
+    Raises
+    ------
+    InputError : as `System` says.
+    """
+    _check_counts(system)
+    _check_names(system)
+    _check_intervals(system)
+    _check_parameters(system)
+    _check_equations(system)
+    system.exact_x_eq()
+    _check_ranges(system)
+    _check_sample(system)
+
+
+def _check_counts(system: System) -> None:
+    n, m = len(system.states), len(system.inputs)
+    for label, found, wanted in (
+        ("dynamics", len(system.dynamics), n),
+        ("domain", len(system.domain), n),
+        ("u_eq", len(system.u_eq), m),
+        ("input_bounds", len(system.input_bounds), m),
+        ("x_eq", len(system.x_eq), n),
+    ):
+        if found != wanted:
+            raise InputError(f"`{label}` of {system.name} must have {wanted} entries; found {found}.")
+    if n == 0 or m == 0:
+        raise InputError(f"{system.name} must have at least one state and one input.")
+
+
+def _check_names(system: System) -> None:
+    names = [s.name for s in (*system.states, *system.inputs, *system.disturbances)] + list(system.parameters)
+    for name in (system.name, *names):
+        if not re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]{0,63}", name):
+            raise InputError(f"names in {system.name} must be identifiers of at most 64 letters; found {name!r}.")
+    if len(set(names)) != len(names):
+        raise InputError(
+            f"names of states, inputs, parameters and disturbances of {system.name} must differ; found {names}."
+        )
+
+
+def _check_intervals(system: System) -> None:
+    for symbol, (lo, hi) in zip(system.states, system.domain, strict=True):
+        if not lo < 0 < hi:
+            raise InputError(
+                f"the domain of {symbol} must contain 0 in its interior, as a deviation from x_eq; "
+                f"found [{float(lo)}, {float(hi)}]."
+            )
+    for symbol, (lo, hi) in zip(system.inputs, system.input_bounds, strict=True):
+        if not lo < hi:
+            raise InputError(f"the bounds of {symbol} must satisfy lo < hi; found [{float(lo)}, {float(hi)}].")
+
+
+def _check_parameters(system: System) -> None:
+    for name in sorted(system.positive):
+        if name not in system.parameters:
+            known = ", ".join(system.parameters) or "none"
+            raise InputError(f"`positive` of {system.name} must name parameters, {known}; found {name!r}.")
+        if not system.parameters[name] > 0:
+            raise InputError(f"parameter {name} of {system.name} must be positive; found {system.parameters[name]}.")
+    for name, q in system.parameters.items():
+        if max(q.numerator.bit_length(), q.denominator.bit_length()) > MOST_BITS:
+            raise InputError(f"parameter {name} of {system.name} must have at most {MOST_BITS} bits; it has more.")
+
+
+def _check_equations(system: System) -> None:
+    """Reject a symbol that the plant does not have."""
+    parameters = {Symbol(p) for p in system.parameters}
+    everything = {*system.states, *system.inputs, *parameters, *system.disturbances}
+    for allowed, equations in ((everything, system.dynamics), (parameters, (*system.u_eq, *system.x_eq))):
+        for node in nodes(*equations):
+            if isinstance(node, Symbol) and node not in allowed:
+                raise InputError(
+                    f"an equation of {system.name} uses {node}, which is no state, input, parameter or disturbance."
+                )
+
+
+def _check_ranges(system: System) -> None:
+    acting, fixed = {s.name for s in system.disturbances}, {s.name for s in symbols_of(*system.x_eq)}
+    for name, (lo, hi) in system.ranges.items():
+        if name not in system.parameters and name not in acting:
+            known = ", ".join([*system.parameters, *sorted(acting)]) or "none"
+            raise InputError(f"{system.name} has no parameter or disturbance {name!r}; it has: {known}.")
+        if name in fixed:
+            raise InputError(
+                f"{name} must have one value, because the operating point of {system.name} depends on it; found the "
+                f"range [{float(lo):g}, {float(hi):g}]."
+            )
+        nominal = system.parameters.get(name, Fraction(0))
+        if not (lo < hi and lo <= nominal <= hi):
+            raise InputError(
+                f"the range of {name} must satisfy lo < hi and hold its nominal value {float(nominal):g}; found "
+                f"[{float(lo):g}, {float(hi):g}]."
+            )
+        if name in system.positive and not lo > 0:
+            raise InputError(f"parameter {name} of {system.name} must be positive; found {float(lo):g} in its range.")
+
+
+def _check_sample(system: System) -> None:
+    if system.sample is None:
+        return
+    if system.time == "discrete":
+        raise InputError(f"{system.name} is a plant in discrete time, whose steps are its samples: leave out `sample`.")
+    lo, hi = system.sample
+    if not 0 <= lo <= hi or not hi > 0:
+        raise InputError(
+            f"`sample` must be a positive time, or two with 0 <= lo <= hi; found {float(lo):g} and {float(hi):g}."
+        )

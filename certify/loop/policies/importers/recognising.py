@@ -1,0 +1,95 @@
+"""The kind of a policy file, by its bytes, and the reader of that kind."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Literal
+
+from certify.errors import InputError
+from certify.loop.files.archives import Archive
+from certify.loop.files.arrays import Numbers
+from certify.loop.files.torchfile import TorchFile
+from certify.loop.policies.file import is_text
+from certify.loop.policies.importers.onnx_graph import read_onnx
+from certify.loop.policies.importers.options import ImportOptions
+from certify.loop.policies.importers.reading import Reading
+from certify.loop.policies.importers.sb3 import read_sb3
+from certify.loop.policies.importers.state_dict import is_two_stage, read_state_dict, read_two_stage
+from certify.loop.policies.importers.tensors import load_safetensors, load_tensors
+from certify.loop.policies.importers.torchscript import is_torchscript, read_torchscript
+
+Content = Literal["state-dict", "torchscript", "onnx", "sb3", "safetensors", "two-stage", "policy"]
+_OWN, _LYAPUNOV = "certify-policy/", "certify-lyapunov/"
+
+
+def content_of(raw: bytes, name: str) -> Content | None:
+    """Recognise a file's kind by its bytes and, for ONNX, by its name; None if no reader takes it."""
+    if raw.startswith(b"PK"):
+        archive = Archive(raw, name)
+        if "policy.pth" in archive and "data" in archive:
+            return "sb3"
+        file = TorchFile(raw, name, archive)
+        if is_torchscript(file):
+            return "torchscript"
+        root = file.pickle("data.pkl")
+        said = root.get("format") if isinstance(root, dict) else None
+        if isinstance(said, str) and said.startswith(_OWN):
+            return "policy"
+        if isinstance(said, str) and said.startswith(_LYAPUNOV):
+            raise InputError("it must hold a policy; it is a Lyapunov function of this program.")
+        return "two-stage" if is_two_stage(load_tensors(raw, name, file)) else "state-dict"
+    if name.endswith(".onnx"):
+        return "onnx"
+    if name.endswith(".safetensors") or raw[8:9] == b"{":
+        return "safetensors"
+    return None
+
+
+def kind_of(raw: bytes, name: str, options: ImportOptions) -> Content:
+    """The kind of a file by its bytes, or by `options`.
+
+    Raises
+    ------
+    InputError : its kind is unknown, it is this program's already, or it contradicts the options.
+    """
+    kind = options.kind if options.kind in ("onnx", "safetensors") else content_of(raw, name)
+    if kind is None:
+        wanted = "it must be a file of torch.save, TorchScript, stable-baselines3, ONNX or safetensors"
+        if raw[:1] in (b"\x80", b"("):
+            raise InputError(
+                f"{wanted}; it is a bare pickle, or torch's format of before version 1.6. If you trust it, load it and "
+                "write it again with torch.save."
+            )
+        raise InputError(f"{wanted}; it is none of these{', but text' if is_text(raw) else ''}.")
+    if kind == "policy":
+        raise InputError("it is a policy file of this program already: use it with certify roa --policy.")
+    if options.kind not in ("auto", kind) and (options.kind, kind) != ("state-dict", "two-stage"):
+        raise InputError(f"it must be what --from says, {options.kind}; it is {kind}.")
+    return kind if options.kind == "auto" else options.kind
+
+
+def read_kind(
+    kind: Content,
+    raw: bytes,
+    name: str,
+    options: ImportOptions,
+    n: int,
+    m: int,
+    folder: Path | None,
+    beside: str | None,
+) -> Reading:
+    readers: dict[Content, Callable[[], Reading]] = {
+        "sb3": lambda: read_sb3(Archive(raw, name), name, options.ignore),
+        "torchscript": lambda: read_torchscript(TorchFile(raw, name)),
+        "onnx": lambda: read_onnx(raw, name, options.output, folder),
+        "safetensors": lambda: read_state_dict(tensors_in(kind, raw, name), options, n, m, beside),
+        "two-stage": lambda: read_two_stage(tensors_in(kind, raw, name), options),
+        "state-dict": lambda: read_state_dict(tensors_in(kind, raw, name), options, n, m, beside),
+    }
+    return readers[kind]()
+
+
+def tensors_in(kind: Content, raw: bytes, name: str) -> dict[str, Numbers]:
+    """The tensors of a state_dict or two-stage file, or of safetensors, by their names."""
+    return load_safetensors(raw, name) if kind == "safetensors" else load_tensors(raw, name)
