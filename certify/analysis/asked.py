@@ -1,4 +1,4 @@
-"""What is asked of a plant, in its own terms: boxes and states by the states' names, and what is refused.
+"""Requests in a plant's own terms: boxes and states by the states' names, and the reasons to refuse them.
 
 A run asks here before it begins; nothing here is part of a proof.
 """

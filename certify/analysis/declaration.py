@@ -27,7 +27,7 @@ Kind = Literal[
     "bounds",
     "period",
 ]
-"""How a value is given: `certify.analysis.arguments` reads it as text, `certify.analysis.values` as Python's."""
+"""The form of a value: `certify.analysis.arguments` reads it as text, `certify.analysis.values` as Python's."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,6 +1,6 @@
-"""What a run found: as a typed value, as the JSON object of `certify roa --json`, and as what one asks it in Python.
+"""The result of a run: as a typed value, as the JSON object of `certify roa --json`, and with methods for Python.
 
-Whatever a result says of the certified set comes from the numbers that the checker accepted: membership is decided in
+All that a result says of the proved set comes from the numbers that the checker accepted: membership is decided in
 rationals, sizes are rounded down, and pictures are drawn from the very bytes that were checked.
 """
 
@@ -89,7 +89,7 @@ class Tried:
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """What to try next: options to add to the command (none if no option helps), and why; `flattens` says that the
+    """A step to try next: options to add to the command (none if no option helps), and why; `flattens` says that the
     policy is to be fine-tuned first, by `controllers flatten`."""
 
     options: tuple[tuple[str, str], ...]
@@ -109,7 +109,7 @@ class TubeFacts:
     centre: tuple[float, ...] | None = None
 
     def contains(self, states: Sequence[Sequence[Fraction | float]]) -> list[bool]:
-        """Whether states, as deviations from the operating point, lie in the start, decided in rationals."""
+        """True for states, as deviations from the operating point, that lie in the start, decided in rationals."""
         return tube_start(self.start, self.centre).holds(states)
 
     def to_dict(self) -> dict[str, Any]:
@@ -153,7 +153,7 @@ class OuterFacts:
 
 @dataclass(frozen=True, slots=True)
 class Share:
-    """How far the set reaches along a state, and that as a share of the nearer side of its domain."""
+    """The set's reach along a state, and that as a share of the nearer side of its domain."""
 
     state: str
     unit: str
@@ -163,7 +163,7 @@ class Share:
 
 @dataclass(frozen=True, slots=True)
 class Diagnosis:
-    """What binds and where.
+    """The limit that binds, and its place.
 
     Parameters
     ----------
@@ -171,7 +171,7 @@ class Diagnosis:
     kind : `domain`, `vdot`, `input`, or the name of the stop.
     name, side : the state or input that binds and which side, None where neither does.
     point : a state at which it binds, (n,), None if there is none.
-    shares : one a state; empty without a set.
+    shares : one for each state; empty without a set.
     fastest, slowest : real parts of the closed loop's eigenvalues at the origin, 1/s.
     hurts : weights of the states, (n,), the largest 1: the direction in which the proof had most to do.
     next : what to try.
@@ -190,7 +190,7 @@ class Diagnosis:
 
     @property
     def stiffness(self) -> float | None:
-        """How many times faster the fastest mode decays than the slowest; None unless all decay."""
+        """The fastest mode's rate of decay relative to the slowest one's; None unless all decay."""
         if self.fastest is None or self.slowest is None or not self.slowest < 0:
             return None
         return self.fastest / self.slowest
@@ -205,19 +205,19 @@ class Diagnosis:
 
 @dataclass(frozen=True, slots=True, repr=False)
 class RoaResult:
-    """What was proved. `stop` and `detail` say what limits the level, or why nothing was proved.
+    """The result of a run. `stop` and `detail` say what limits the level, or why nothing was proved.
 
-    Where `system` has ranges, all that is proved holds for every function of time with values in them; `eigenvalues`,
-    `rest` and the modes of `diagnosis` are those at the nominal values, as `system.parameters` has them.
+    If `system` has ranges, the proof holds for every function of time with values in them; `eigenvalues`, `rest` and
+    the modes of `diagnosis` are those at the nominal values, as `system.parameters` has them.
 
-    `rest` is where the loop rests, if not at the origin. `candidate` is where P came from, `tried` all that were tried,
-    `notice` what is not as it was asked for. `reach_from` is the state that was asked about, by the states' values;
-    where the verdict on it is UNKNOWN by `Stop.PATH`, `certificate` and `levels` are of a proved set without it. Where
-    the verdict is UNKNOWN by `Stop.BEYOND` they, and `outer`, are of a smaller set than was asked for.
-    `checker` is what the checker said, None if it was not reached, about `raw`, the certificate's bytes; `solver` has
-    dReal's version and every query with its answer, None if it was not asked. `notices` is what had to be known about
-    plant and policy before the run, such as a domain that was cut; `folder` keeps a temporary folder of the certificate
-    alive. `search` is a file with the search, if more time could go on with it (`resume`).
+    `rest` is the loop's equilibrium, if not the origin. `candidate` is the source of P, `tried` all that were tried,
+    `notice` says what is not as it was asked for. `reach_from` is the state that was asked about, by the states'
+    values; if the verdict on it is UNKNOWN by `Stop.PATH`, `certificate` and `levels` are of a proved set without it.
+    If the verdict is UNKNOWN by `Stop.BEYOND` they, and `outer`, are of a smaller set than was asked for.
+    `checker` is the checker's answer, None if it was not reached, about `raw`, the certificate's bytes; `solver` has
+    dReal's version and every query with its answer, None if it was not asked. `notices` are facts about plant and
+    policy known before the run, such as a domain that was cut; `folder` keeps a temporary folder of the certificate
+    alive. `search` is a file with the search, if more effort could continue it (`resume`).
 
     In Python: `contains`, `volume`, `plot`, `report`, `certificate` (the file's path), `to_dict`.
     """
@@ -259,12 +259,12 @@ class RoaResult:
 
     @property
     def reason(self) -> str:
-        """What limits the level, or why nothing was proved, in words."""
+        """The limit of the level, or the reason why nothing was proved, in words."""
         return self.stop.explain(self.detail)
 
     @property
     def timing(self) -> Timing:
-        """How time passes in the loop, and the rate that was asked for."""
+        """The loop's timing, with the rate that was asked for."""
         return Timing.of(self.system, 0.0 if self.problem is None else self.problem.rate)
 
     @property
@@ -298,7 +298,7 @@ class RoaResult:
 
     @property
     def _region(self) -> Region | None:
-        """What the levels, the tube and the outer set say together; None if there is no level c2."""
+        """The union of the sets of the levels, the tube and the outer set; None if there is no level c2."""
         if self.P is None or self.levels.roa is None:
             return None
         tube, outer = self.tube, self.outer
@@ -307,7 +307,7 @@ class RoaResult:
         return Region((sublevel_set(self.P, self.levels.roa), *starts), beyond)
 
     def contains(self, x: ArrayLike, *, deviations: bool = False) -> bool | NDArray[np.bool_]:
-        """Whether states lie in the proved set, decided in rationals: no state is let in by rounding.
+        """True for states that lie in the proved set, decided in rationals: no state is let in by rounding.
 
         The set is {V <= c2}, and with a tube the union of that and the tube's start. With an outer set it is the union
         of that and {N <= n2} within the domain, decided in balls of growing precision: a state at which N is exactly n2
@@ -315,10 +315,10 @@ class RoaResult:
 
         Parameters
         ----------
-        x : one state, (n,), or several, (N, n), in the states' units. A float means its binary value; whoever wants
-            0.1 to be a tenth gives Fraction(1, 10).
-        deviations : whether x are deviations from the operating point x_eq, in which the certificate speaks, and not
-            the states' values. Where x_eq is 0 the two are the same.
+        x : one state, (n,), or several, (N, n), in the states' units. A float means its binary value; for exactly a
+            tenth give Fraction(1, 10).
+        deviations : True if x are deviations from the operating point x_eq, as in the certificate, and not the states'
+            values. If x_eq is 0 the two are the same.
 
         Returns
         -------
@@ -404,7 +404,7 @@ class RoaResult:
         return f"<table>{''.join(rows)}</table>"
 
     def _stated(self) -> list[tuple[str, str]]:
-        """What is said of the result in a few rows, names and values."""
+        """The result in a few rows, names and values."""
         rows = [("verdict", self.verdict.value), ("plant", self.system.name), ("claim", self.claim)]
         if self.system.ranges:
             rows.append(("for every", varying(varying_in(self.system))))
@@ -438,7 +438,7 @@ class RoaResult:
         return {"kind": self.claim, **rate, **({} if sample is None else {"sample": [str(h) for h in sample]})}
 
     def _rest(self, rest: Rest) -> dict[str, Any]:
-        """Where the loop rests, also by the states' values; `origin` says that V is 0 there."""
+        """The equilibrium, also by the states' values; `origin` says that V is 0 there."""
         moved = map(Fraction, self.network.origin.tolist())  # x is in deviations from where the plant was to rest
         each = zip(self.system.exact_x_eq(), moved, rest.x, strict=True)
         values = [float(at - by + Fraction(x)) for at, by, x in each]

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
     Array = NDArray[np.float64]
 
-_FOR_ELLIPSOID = 0.4  # of the effort, at most
+_FOR_ELLIPSOID = 0.4  # the largest share of the effort
 _TIMES = 2.4  # the effort of a proof: that of ellipsoid and learning
 
 

@@ -23,7 +23,7 @@ def systems(as_json: Json = False) -> None:
     for s in found:
         lines = [f"{s.name}: {s.description}"]
         equations = zip(s.states, s.dynamics_of_values(), strict=True)
-        mark = "'" if s.time == "continuous" else "+"  # of the state one step later
+        mark = "'" if s.time == "continuous" else "+"  # mark of the state one step later
         lines += [f"  {symbol}{mark} = {expression}" for symbol, expression in equations]
         lines += [
             f"  {name} = {float(value):g} {s.units.get(name, '')}{_range(s, name)}"

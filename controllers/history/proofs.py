@@ -1,8 +1,8 @@
 """The proofs of a run's history: the set that can be proved of each of its policies.
 
 A policy is proved by itself, with the same options as all others, and counts as proved if the checker accepts what
-`certify_roa` writes down. Where that comes to nothing in its time, the history has a gap, which says nothing about the
-policy.
+`certify_roa` writes down. If it proves nothing within its time limit, the history has a gap, which says nothing about
+the policy.
 """
 
 from __future__ import annotations

@@ -20,9 +20,9 @@ from certify.errors import BackendError
 from certify.loop.closed_loop import ClosedLoop
 
 Array = NDArray[np.float64]
-_EDGES = (0.3, 0.5, 0.65, 0.8)  # of the slowest rate at which V can fall
-_ROUND = 1e-3  # of the floor, for a set that is not small where it need not be
-_FOR_W = 0.6  # of the effort
+_EDGES = (0.3, 0.5, 0.65, 0.8)  # shares of the slowest rate at which V can fall
+_ROUND = 1e-3  # share of the floor, for a set that is not small where it need not be
+_FOR_W = 0.6  # share of the effort
 _MOST = 16  # corners
 
 

@@ -22,8 +22,8 @@ from certify.lyapunov.function import Quadratic
 from certify.provers.base import Budget
 
 Array = NDArray[np.float64]
-_FOR_SEARCH = 0.5  # of what is left, the rest being for the check
-_FOR_LEARNING = 0.4  # of what is left, the rest being for the proof and its check
+_FOR_SEARCH = 0.5  # share of the effort that is left, the rest being for the check
+_FOR_LEARNING = 0.4  # share of the effort that is left, the rest being for the proof and its check
 
 
 @dataclass(frozen=True)

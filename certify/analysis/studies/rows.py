@@ -1,11 +1,11 @@
-"""A row: what is known of a case once it is done, and how the certificate that came back is judged.
+"""A row: the facts on a case once it is done, and the judgement of the certificate that came back.
 
-Whoever did the work is not believed. A row says PROVED only if the checker of this machine, asked about the file that
-lies in the case's folder, accepted it, and if what that file claims is about the very plant and policy of the case; its
-levels and sizes are taken from the file's bytes, and a sampled limit is one at which the violation that was met is
-shown again. Neither is a row believed that an earlier sweep has left, because anybody may have edited it: it is kept if
-all that can be found out again is what it says. What a worker, or the earlier sweep, says of the reason, of boxes and
-of seconds is its word.
+A worker is not believed. A row says PROVED only if the checker of this machine, asked about the file that lies in the
+case's folder, accepted it, and if that file's claim is about the very plant and policy of the case; its levels and
+sizes are taken from the file's bytes, and a sampled limit is one at which the violation that was met is shown again. A
+row that an earlier sweep has left is not believed either, because anybody may have edited it: it is kept if all that
+can be found out again agrees with it. The reason, boxes and seconds are the word of the worker, or of the earlier
+sweep.
 """
 
 from __future__ import annotations
@@ -52,28 +52,28 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 SCHEMA = "certify-sweep-row/2"
-ERROR = "error"  # in the place of a stop, where a case could not be run
+ERROR = "error"  # instead of a stop, if a case could not be run
 _ANSWERS = {Verdict.PROVED: "ACCEPTED", Verdict.TRUSTED: "TRUSTED"}
-_LEAF = bytes([255])  # of a tree in preorder
+_LEAF = bytes([255])  # a leaf of a tree in preorder
 _ROW, _CERTIFICATE = "row.json", "certificate.json"
 
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """What came of a case.
+    """The outcome of a case.
 
     Parameters
     ----------
     case, coordinates : its name, and the text of each entry of the study.
     inputs : the hash of all that it depends on.
-    verdict : UNKNOWN too where the case could not be run: `error` says why.
+    verdict : UNKNOWN too if the case could not be run: `error` says why.
     claim, stop, reason, candidate, notice : as a run of `certify roa` says them.
     levels, volume, volume_unit, semi_axes, extents : of the set that the certificate states, None without one;
         volume, in the product of the states' units, and lengths are certain lower bounds.
     states : their names; none where the case could not be run.
     units : of states, parameters and disturbances, by name.
     witness : the violation at which the sampled limit lies: its state, kind and values; None without one.
-    boxes, leaves, seconds : of the work.
+    boxes, leaves, seconds : the work.
     certificate, certificate_sha256, checked : the file, relative to the sweep's folder, its hash, and what the checker
         of this machine said of it.
     """
@@ -115,7 +115,7 @@ class Row:
 
     @property
     def failed(self) -> bool:
-        """Whether the case could not be run."""
+        """True if the case could not be run."""
         return bool(self.error)
 
     def to_dict(self) -> dict[str, Any]:
@@ -129,10 +129,10 @@ class Row:
         for left in (
             *folder.glob("certificate.*.unchecked.json"),
             *folder.glob("row.*.partial"),
-        ):  # of one that was killed
+        ):  # left by a run that was killed
             left.unlink(missing_ok=True)
         if self.certificate is None:
-            set_aside(folder)  # of an attempt that was refused
+            set_aside(folder)  # left by an attempt that was refused
         write_atomically(folder / _ROW, (json.dumps(self.to_dict(), indent=1) + "\n").encode())
 
 
@@ -255,7 +255,7 @@ class _Refused(CertifyError):
 
 
 def _stated(case: Case, answer: Answer, plant: System) -> Row:
-    """What a worker says of a case, without what only a certificate may say.
+    """A worker's word on a case, without the facts that only a certificate may give.
 
     Raises
     ------

@@ -28,7 +28,7 @@ class SymbolicModels:
 
     @property
     def share(self) -> Array:
-        """How much each axis (n, B) is charged with a remainder: all of them the same."""
+        """The share of a remainder that each axis (n, B) is charged with: all of them the same."""
         return np.full_like(self.value.g, 1 / self.function.n)
 
     def along(self, F: Sequence[Taylor], index: Index) -> tuple[Taylor, Array]:

@@ -152,7 +152,7 @@ class _Sweep(ABC):
     Boxes proved before it moved stay proved: the ring only shrinks, and the rule's multipliers do not depend on it.
     """
 
-    down = False  # whether the level that gives way is the inner one
+    down = False  # True if the level that gives way is the inner one
 
     def __init__(self, problem: Problem, T: Array, inner: float, outer: float) -> None:
         self.problem, self.T = problem, T
@@ -312,7 +312,7 @@ class _RingGrowth(Growth):
 
 
 class Pass:
-    """A pass that can be asked at any time for what it has proved, and go on."""
+    """A pass that gives at any time what it has proved, and can be continued."""
 
     def __init__(self, sweep: _Sweep, root: Array, runner: Runner, rule: VdotBound) -> None:
         self.sweep, self.root, self.runner, self.rule = sweep, root, runner, rule
@@ -324,7 +324,7 @@ class Pass:
         self.boxes = self.proved = 0
         self.covered = True
         self.halvings = 0.0
-        self.lost = ""  # what is said of a cluster that went away
+        self.lost = ""  # a sentence about a cluster that went away
         self._stop = Stop.REQUESTED
         self._account = Account()
         first = np.zeros(1, dtype=np.int64)
@@ -332,7 +332,7 @@ class Pass:
 
     @property
     def done(self) -> bool:
-        """Whether no box is open: the pass has nothing left to gain."""
+        """True if no box is open: the pass has nothing left to gain."""
         return not self._open()
 
     @property
@@ -452,8 +452,9 @@ class Pass:
         self.frontier.drop_above(sweep.last())
 
     def _expect(self, found: BoxBounds) -> None:
-        """How often a box of this batch that is not proved has to be halved, so that what its axes add to the bound is
-        less than the decay at its centre: a bound of second order falls fourfold when all n axes are halved once."""
+        """Estimate how often an unproved box of this batch has to be halved until its axes add less than its decay.
+
+        A bound of second order falls fourfold when all n axes are halved once."""
         excess = np.maximum(found.score, 0.0).sum(0)
         decay = excess - found.bound
         wanted = ~found.proved & (decay > 0) & np.isfinite(decay)
@@ -494,10 +495,10 @@ class Pass:
                 np.zeros(1, np.int64), *self.partition.corners(np.zeros(1, np.int64)), state.tree
             )
         except CertificateFormatError as error:
-            raise InputError(f"the search cannot be gone on with: {error}") from error
+            raise InputError(f"the search cannot be resumed: {error}") from error
         fits = sweep.inner >= state.inner and state.outer <= sweep.outer and not len(looked.number)
         if not fits or len(opened.number) != len(state.keys) or np.isnan(state.keys).any():
-            raise InputError("the search cannot be gone on with: it is of another ring.")
+            raise InputError("the search cannot be resumed: it is of another ring.")
         self.frontier = Frontier(self.partition)
         self.frontier.add(opened.lo, opened.hi, state.keys, opened.number)
         sweep.outer, sweep.witness = state.outer, state.witness
@@ -505,7 +506,7 @@ class Pass:
         self._stop = Stop.REQUESTED if state.witness is None else Stop.WITNESS
 
     def proof(self, stop: Stop | None = None) -> RingProof:
-        """What is proved, `stop` being what ran out."""
+        """The ring that is proved; `stop` is the limit that was reached."""
         stop = stop or self._stop
         (inner, outer), witness, covered = self.levels, self.sweep.witness, self.covered and self.done
         if outer <= inner:  # nothing beyond the inner level

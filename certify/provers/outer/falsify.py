@@ -27,7 +27,7 @@ _SAMPLES, _CLIMBERS, _FEW = 65_536, 512, 128
 _ON_A_FACE, _FEW_THERE = 4096, 32
 _CALL = 2e5  # operations of evaluating few states at once
 _CLIMB, _DESCENT = 40, 80  # steps
-_APART = 1e-6  # of the domain, between the points of a difference
+_APART = 1e-6  # share of the domain between the points of a difference
 _PUSH = 0.05  # away from the edge of what violates, beside a step along it
 
 
@@ -77,14 +77,14 @@ class Falsifier:
         return np.nan_to_num(self.N(x), nan=np.inf, posinf=np.inf, neginf=-np.inf)
 
     def violation(self, x: Array) -> Array:
-        """What is at least 0 where a condition fails (B,)."""
+        """A number (B,) that is at least 0 where a condition fails."""
         rates, excess = self.rates(x)
         worst = np.nan_to_num(rates.max(0), nan=-np.inf)
         # Either counts, and where both fail the input's stays out of the way of a difference.
         return np.where(self.check_inputs & (worst < 0) & (excess > 0), excess, worst)
 
     def asked(self, x: Array) -> NDArray[np.bool_]:
-        """Where a condition is asked: in the domain, V >= c2."""
+        """True where a condition is asked: in the domain, V >= c2."""
         inside: NDArray[np.bool_] = np.all((x >= self.low) & (x <= self.high), axis=-1)
         return inside & (self.problem.V(x) >= self.c2)
 
