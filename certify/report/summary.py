@@ -263,7 +263,7 @@ def _functions(timing: TimingInWords) -> str:
 
 
 def _rate(result: Mapping[str, Any], timing: TimingInWords) -> str:
-    """What the rate says of the time, rounded up."""
+    """The rate and the time that follows from it, rounded up."""
     floor = result["levels"].get("floor") if _kind(result) in PRACTICAL else None
     latest = reach_time(timing, floor, result["levels"].get("roa"))
     what = "V at most 1 % of what it was" if floor is None else "in {V <= c0}"

@@ -126,7 +126,7 @@ def _beyond(certificate: Certificate, outer: Outer | None) -> dict[str, Any] | N
 
 
 def _smallest(timing: TimingInWords) -> str:
-    """Of what the margin of the ring is the least."""
+    """The name of the margin of the ring in words."""
     return f"the smallest bound on {MINUS}{f'({timing.decrease})' if timing.rate else timing.decrease}"
 
 
