@@ -219,7 +219,7 @@ def _with_higher_floor(refused: _Refused) -> Certificate | None:
 
 
 def _without_tube(refused: _Refused) -> Certificate | None:
-    """Without its tube, what is refused may not be asked any more."""
+    """The claim without its tube, for which the refused condition may not be needed."""
     return refused.with_claim(refused.claim.without_tube(), tube=())
 
 

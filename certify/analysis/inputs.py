@@ -58,7 +58,7 @@ def policy_in(
 
 
 def plant_for(whose: str, system: System | str | None, changes: PlantChanges) -> System:
-    """The plant, with the changes, of a policy that does not say what it controls.
+    """The plant, with the changes, of a policy that does not name its plant.
 
     Raises
     ------
@@ -182,7 +182,7 @@ def ellipsoid_beside(stored: StoredLyapunov, plant: System) -> Array | None:
 
 
 def where_valid(stored: Policy, plant: System, tell: Tell) -> System:
-    """The plant on the part of its domain where the policy's network is what it was made from; says what was cut.
+    """The plant on the part of its domain where the policy's network agrees with its origin; a notice says the cut.
 
     Raises
     ------

@@ -210,7 +210,7 @@ def load(path: Path, loop: ClosedLoop, rate: float) -> Unfinished:
 
 
 class _Unfit(Exception):
-    """A file that is in order, and not what is asked for."""
+    """A file that is in order, but does not fit this run."""
 
 
 def _read(data: Mapping[str, Any], loop: ClosedLoop, rate: float) -> Unfinished:

@@ -146,7 +146,7 @@ def _without(context: typer.Context) -> str:
 
 
 def _known(context: typer.Context) -> list[str]:
-    """The options that were given and that a resumed search has of its own; what is learned is no part of it."""
+    """The options that were given and that a resumed search has of its own; a learned function is no part of it."""
     from certify.lyapunov import BEYOND
 
     found = {f"--{key}": context.params.get(key) for key in _OF_SEARCH}

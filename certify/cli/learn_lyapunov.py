@@ -153,6 +153,6 @@ def _text(learned: Learned, area: float, out: Path, command: str) -> str:
 
 
 def _next(context: typer.Context, policy: Path, out: Path) -> str:
-    """The command that proves what was learned."""
+    """The command that proves the learned function."""
     given = given_words(context, only={"system", "parameters", "domain"})
     return shlex.join(["certify", "roa", "--policy", str(policy), *given, "--lyapunov", str(out)])

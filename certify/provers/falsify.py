@@ -59,7 +59,7 @@ class Witness:
 @dataclass(frozen=True, slots=True)
 class Band:
     """Levels between which sampling found no violation; `below` and `above` are their neighbours, at which it did,
-    or the ends of what was sampled."""
+    or the ends of the samples."""
 
     below: float
     floor: float
@@ -194,7 +194,7 @@ class _Search:
 
     @np.errstate(all="ignore")
     def _inputs(self, x: Array) -> tuple[Array, Array, list[Array]]:
-        """u (B, m), what it is before the clip, and what the layers and the squash give on the way there."""
+        """u (B, m), its values before the clip, and the values after each layer and the squash."""
         network, passed, h = self.network, list[Array](), x
         for k, (W, b) in enumerate(zip(network.weights, network.biases, strict=True)):
             if k:
@@ -222,7 +222,7 @@ class _Search:
         return values[0][0], values[1][0], gradients[0], gradients[1]
 
     def _backwards(self, slope: Array, whole: Array, passed: list[Array]) -> Array:
-        """The slope in the states (B, n) of what has this slope in the inputs (B, m)."""
+        """The slope in the states (B, n) that follows from a slope in the inputs (B, m)."""
         network = self.network
         if network.clip is not None:
             slope = np.where((whole > network.clip[0]) & (whole < network.clip[1]), slope, 0.0)
@@ -234,7 +234,7 @@ class _Search:
         return slope
 
     def _worst(self) -> list[tuple[list[Array], float | Array]]:
-        """Values (C, 1) of what is uncertain and steps, one for all or (C, 1, 1), at which D' is looked at together."""
+        """Corners (C, 1) of the ranges and steps, one for all or (C, 1, 1), at which D' is looked at together."""
         rows = [[float(q) for q in corner.values()] for corner in self.corners]
 
         def columns(times: int) -> list[Array]:
@@ -248,7 +248,7 @@ class _Search:
         return found if len(positive) == len(self.periods) else [*found, (columns(1), 0.0)]
 
     def _decrease(self, x: Array, u: Array, values: list[Array], step: float | Array) -> Array:
-        """D' (C, B) for constant values of what is uncertain, or (1, B) without any."""
+        """D' (C, B) for constant values of the uncertain quantities, or (1, B) without any."""
         G = self.loop.system.mean_rate(lambda y, v: self.f(y, v, values), x[None], u, step)
         gradient = 2 * (x @ self.P)
         result: Array = (gradient * G).sum(-1)

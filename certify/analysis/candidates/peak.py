@@ -2,7 +2,7 @@
 
 What pushes the loop off the origin (a disturbance, a parameter that moves its equilibrium, a policy that is not
 centred) makes a floor that P shapes. To first order the least floor c0 of {x'Px <= 1} at an edge k is a linear
-matrix inequality in P at each corner of what is uncertain (the peak of a bounded input: Boyd, El Ghaoui, Feron,
+matrix inequality in P at each corner of the ranges (the peak of a bounded input: Boyd, El Ghaoui, Feron,
 Balakrishnan 1994, section 6.1), and P >= W keeps the set inside one that the local rule proves without the push.
 """
 
@@ -31,7 +31,7 @@ def peak_candidate(loop: ClosedLoop, effort: Effort = UNLIMITED) -> Array:
 
     Parameters
     ----------
-    loop : the closed loop, with what is uncertain; without that, and centred, its linearisation is stable.
+    loop : the closed loop, with its ranges; without them, and centred, its linearisation is stable.
 
     Raises
     ------
@@ -75,7 +75,7 @@ def _alone(loop: ClosedLoop) -> ClosedLoop:
 
 
 def _corners(loop: ClosedLoop) -> list[tuple[Array, Array]]:
-    """To first order, at corners of what is uncertain: L (n, n) and f (n, 1) with G = L x + f."""
+    """G to first order at corners of the ranges: L (n, n) and f (n, 1) with G = L x + f."""
     system, found = loop.system, []
     origin = np.zeros(system.n)
     u, field = loop.policy(origin[None])[0], system.uncertain_function()

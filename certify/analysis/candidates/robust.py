@@ -142,7 +142,7 @@ def _problem(known: Paths, P: Array) -> tuple[Problem, Array]:
 class _Linearised:
     """The rule around {x'Px <= 1}, x = J d where X = 0.
 
-    A row holds what the decay leaves at each corner of what is uncertain, (n, n) each, between the `roots`, the
+    A row holds what the decay leaves at each corner of the ranges, (n, n) each, between the `roots`, the
     inverses of those of the decays at X = 0, and how far inputs and states move, who have that `room`, (m + n,): `here`
     at this X. `slopes` are its derivatives at 0 by the entries of X on and above the diagonal.
     """

@@ -77,7 +77,7 @@ class _Desk:
         )
 
     def _checked(self, path: Path) -> Mapping[str, Any]:
-        """The checker's answer about a file, patiently where it would be refused for what it takes else."""
+        """The checker's answer about a file, patient if the file needs more work than the checker allows otherwise."""
         answer = self._answered(path, patient=False)
         if (answer.get("rule"), answer.get("at")) == ("limits", "operations"):
             answer = self._answered(path, patient=True)

@@ -245,7 +245,7 @@ class _Choice:
         return _granted(self.effort, self.tools.whole, share)
 
     def _enter_alone(self, trial: Trial) -> None:
-        """With a heat of what is left, where a search cannot be interrupted."""
+        """Enter a trial with a heat of the effort that is left if a search cannot be interrupted."""
         self.race.enter([trial], self.race.heat if self.state.interruptible else _SEARCH * self.effort.left)
 
     def _is_left_for_more(self) -> bool:

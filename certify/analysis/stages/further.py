@@ -161,7 +161,7 @@ class Beyond:
         )
 
     def _learned(self, state: State, claim: Claim, effort: Effort) -> Neural | Polynomial:
-        """A function whose set may reach beyond the ellipsoid, learned with a share of what is left."""
+        """A function whose set may reach beyond the ellipsoid, learned with a share of the effort that is left."""
         from certify.lyapunov.learning import fit_polynomial, learn
 
         options, problem = state.options, state.contest.best.trial.task.problem

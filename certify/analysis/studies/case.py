@@ -39,7 +39,7 @@ TABLES, PLANT_OPTIONS = (
     tuple(name for name, option in declared(PlantChanges).items() if (option.kind == "ranges") is table)
     for table in (True, False)
 )
-"""The fields of `PlantChanges`: tables of a study, and what is among its options."""
+"""The fields of `PlantChanges`: tables of a study, and those among its options."""
 
 
 @dataclass(frozen=True, slots=True)

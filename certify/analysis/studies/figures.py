@@ -33,7 +33,7 @@ _SIGNS = {"unknown": "?", "refuted": "R", "trusted": "T", "error": "E", "not run
 
 @dataclass(frozen=True, slots=True)
 class Drawn:
-    """The figures, and what is said of those that are left out; nothing if there are none."""
+    """The figures, and a sentence about those that are left out; empty if there are none."""
 
     pictures: tuple[Picture, ...]
     left_out: str = ""
@@ -225,7 +225,7 @@ def _line(across: Axis, size: str, curves: Sequence[tuple[str, Mapping[str, Row]
 
 
 def _ticks(axis: Any, values: Axis, turned: bool = False) -> str:
-    """The values as they stand in the study, so many that they can be read; what was cut from all of them alike."""
+    """Label an axis with the study's values, as many as can be read; the text that was cut from all of them."""
     every = -(-len(values.values) // _MOST_TICKS)
     places = range(0, len(values.values), every)
     shown, cut = (_rounded(values.values), "") if values.is_numeric else _distinct(values.values)

@@ -142,7 +142,7 @@ def failed(case: Case, error: str) -> Row:
 
 
 def kept(out: Path, case: Case) -> Row | None:
-    """The row of a case that is done: with the same inputs, without an error, and saying what is found out again here.
+    """The row of a case that is done: with the same inputs, without an error, and with facts that hold again here.
 
     A certificate is asked about anew, which takes as long as its check; that no Lyapunov function exists is shown again
     by the spectrum, and any other refutation is not kept. Anything else, whatever is wrong with it, is a case that is

@@ -1,4 +1,4 @@
-"""The box of ranges cut into cells, in each of which the models are affine in what is uncertain.
+"""The box of ranges cut into cells, in each of which the models are affine in the uncertain quantities.
 
 One cell is enough, whatever its extent, if the gradients of F move in a straight line with the uncertain quantities.
 Their departure from that line is charged to the decay as a norm, and cells make it small. Their number is chosen at the

@@ -257,7 +257,7 @@ def _joint(models: Models, b: Array, chosen: NDArray[np.bool_]) -> Array:
 
 def _cubic(models: Models, b: Array, chosen: NDArray[np.bool_]) -> Array:
     """N_l'N_l for each l, (k, k, k): N is the mean of the sum of the chosen b_i K_i over all orders of four indices."""
-    N = np.tensordot(b[chosen].T, models.K[chosen], 1)  # K_i is symmetric: what is left is which index is that of b
+    N = np.tensordot(b[chosen].T, models.K[chosen], 1)  # K_i is symmetric: only the index of b is open
     return _squares((N + N.transpose(1, 0, 2, 3) + N.transpose(1, 2, 0, 3) + N.transpose(1, 2, 3, 0)) / 4)
 
 

@@ -80,7 +80,7 @@ class RangedJet:
 
     @property
     def sizes(self) -> Sizes:
-        """For every value of what is uncertain."""
+        """Bounds for every value of the uncertain quantities."""
         found = sizes(self.a, self.Q, self.K, self.rest)
         return replace(found, slope=found.slope + self.turned)
 

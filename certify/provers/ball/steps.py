@@ -1,4 +1,4 @@
-"""Models of a step on a ball around the origin, in cells of what is uncertain: G, by which V's increment is decided.
+"""Models of a step on a ball around the origin, in cells of the ranges: G, by which V's increment is decided.
 
 G is F itself in continuous time, F - x in discrete time, and where the input is held over h the mean of f over the
 period: `x_1 + h x_2 + ... + h^(r-1) x_r` by the power series of the solution, whose last coefficient is taken at states
@@ -109,7 +109,7 @@ class _Walk:
         return self.steps.known.loop
 
     def states(self, near: tuple[Array, Array] | None = None) -> list[RangedJet]:
-        """x, or what is as `near` to it: v(0) and gradients within these, (n, N) each."""
+        """x, or a state as `near` to it: v(0) and gradients within these, (n, N) each."""
         rows = np.swapaxes(self.balls, 0, 1)
         if near is None:
             return [self.algebra.state(0.0, of_state) for of_state in rows]

@@ -47,7 +47,7 @@ LOST = 2.0**-500  # more than a 2-norm loses where squares underflow
 
 
 def _number_by_number(function: Callable[[float], float]) -> Callable[[Real], Real]:
-    """A function of libm on an array, where numpy's own may differ by a rounding from what is compiled."""
+    """A function of libm on an array, because numpy's own may differ by a rounding from the compiled one."""
 
     def at(v: float) -> float:
         try:

@@ -100,8 +100,8 @@ class NeuralModels:
         return np.asarray(share / (share.sum(0) + TINY))
 
     def along(self, F: Sequence[Taylor], index: Index) -> tuple[Taylor, Array]:
-        """N'F on the boxes `index`, F being what it is there, and `share` (n, B): how much each axis spreads the units
-        of the first layer that err most."""
+        """N'F on the boxes `index`, where F is given, and `share` (n, B): how much each axis spreads the units of the
+        first layer that err most."""
         layers = self.layers if is_whole(index, len(self.value.c)) else [layer.at(index) for layer in self.layers]
         y, size = _packed(F)
         errors: Array | float = 0.0
@@ -194,7 +194,7 @@ def _composed(a: _Units, square: Array, f0: Array, f1: Array, f2: Array, rest: A
 
 
 def _tanh(a: _Units) -> tuple[_Bent, _Units, Array]:
-    """tanh of a, what it was evaluated with, and a bound of |c| + G + Q of it."""
+    """tanh of a, its terms, and a bound of |c| + G + Q of it."""
     g, N = a.g, a.symbols
     square = np.empty((N * (N + 1) // 2, *g.shape[1:]))
     for j in range(N):

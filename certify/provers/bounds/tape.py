@@ -75,7 +75,7 @@ class Value:
 
 
 class Recording(ConstantsLast[Value]):
-    """The arithmetic that records what is done with its values."""
+    """The arithmetic that records each operation on its values."""
 
     def __init__(self, steps: list[Step]) -> None:
         self._steps = steps

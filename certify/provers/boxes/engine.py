@@ -26,7 +26,7 @@ _FOR_BALL = 0.5  # share of the effort for a ring from a ball, and of that for t
 _EQUAL = 0.01  # share of a level
 _NOTHING = 1e-9  # share of a level: no smaller floor is looked for
 _ABOVE = (1.5, 1.1)  # factors of the least floor, in few and in many states, where leaves do not lower it any more
-_TRIES = 4  # inner levels from which c2 is looked for, each with half of what is left of the effort
+_TRIES = 4  # inner levels from which c2 is looked for, each with half of the effort that is left
 
 
 class BoundsEngine(Engine):

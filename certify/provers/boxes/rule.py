@@ -137,8 +137,8 @@ class VdotBound:
             decrease = decrease + self.V.model(centre, radius, decrease).scaled(2 * self.rate)
         bound, excess = upper_bound(decrease)
         smooth = np.isfinite(bound)  # a component of F that is not enclosed leaves a NaN in the sum over all
-        # At the box's centre, and for the worst values of what is uncertain, only the inputs' errors, what is of second
-        # order in all these, and the remainder are left.
+        # At the box's centre, and for the worst values of the uncertain quantities, only the inputs' errors, the terms
+        # of second order in all these, and the remainder are left.
         known = n + self.system.m
         doubt = np.abs(decrease.g[n:known]).sum(0) + np.abs(decrease.Q[n:, n:]).sum((0, 1)) + decrease.r
         violated = decrease.c + np.abs(decrease.g[known:]).sum(0) - doubt >= 0

@@ -348,7 +348,7 @@ class Pass:
         return min(self.frontier.least(), math.inf if self.abroad is None else self.abroad.least())
 
     def advance(self, budget: Budget, report: Report | None = None) -> Stop | None:
-        """Take boxes, bound them, give way to violations, halve what is undecided; what ran out, or None if done."""
+        """Take boxes, bound them, give way to violations, halve undecided ones; the limit reached, or None if done."""
         most = self.boxes + budget.boxes
         with self.runner.start(self.rule) as bound, self._elsewhere(budget):
             while not self.done:
@@ -373,7 +373,7 @@ class Pass:
 
     @contextmanager
     def _elsewhere(self, budget: Budget) -> Iterator[None]:
-        """Have boxes grown elsewhere, where that can be; what is out at the end comes back."""
+        """Have boxes grown elsewhere, if that can be; boxes that are out at the end come back."""
         with self.runner.jobs(Subtrees(self.growth)) as jobs:
             if jobs is not None and not self.lost:
                 self.abroad = Abroad(jobs, self.growth, self.partition, budget.batch, budget.least_width)
@@ -405,7 +405,7 @@ class Pass:
         self.abroad = None
 
     def _exchanged(self, bound: Bound, budget: Budget) -> bool:
-        """Send boxes out, and take in what has been grown; False if that is not worth it."""
+        """Send boxes out, and take in grown trees; False if that is not worth it."""
         if self.abroad is None:
             return False
         sweep = self.sweep
@@ -468,7 +468,7 @@ class Pass:
         return len(self.frontier) * math.exp2(min(1000.0, self.halvings))
 
     def settle(self) -> None:
-        """Take the levels that are proved for good: what is open lies outside of them, and needs at most one look."""
+        """Take the levels that are proved for good: open boxes lie outside of them, and need at most one look."""
         self.sweep.inner, self.sweep.outer = self.sweep.reached(self._least())
 
     def state(self) -> SearchState:

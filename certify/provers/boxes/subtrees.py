@@ -123,7 +123,7 @@ def _seal(job: bytes, counts: tuple[int, ...], body: bytes) -> bytes:
 def _grow(
     growth: Growth, partition: Partition, frontier: Frontier, now: Boxes, found: Any, least_width: float
 ) -> Index:
-    """Halve what is not proved; the numbers of the boxes that somebody else has to look at."""
+    """Halve the boxes that are not proved; the numbers of those that somebody else has to look at."""
     look = growth.gives_way(now.lo, now.hi, found) & ~found.proved
     rest = type(found)(*(value.compress(~look, -1) for value in found))
     lo, hi, number, key = (value.compress(~look, -1) for value in now)
@@ -161,7 +161,7 @@ def _read(job: bytes, answer: bytes) -> Answer:
     trees, known = body[:length], np.frombuffer(body[length:])
     if np.isnan(known).any() or trees.count(OPEN) != opened:
         raise CertificateFormatError("an answer must have a number for each open leaf.")
-    # Each node is bounded once at most, and what is proved is a leaf.
+    # Each node is bounded once at most, and a proved one is a leaf.
     if not proved <= boxes <= length or proved > trees.count(LEAF):
         raise CertificateFormatError(f"{boxes} boxes bounded and {proved} proved are not those of {length} nodes.")
     if opened == length:

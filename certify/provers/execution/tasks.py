@@ -61,8 +61,7 @@ class Place(Protocol):
     """Does pieces of work."""
 
     def run(self, pieces: Iterable[Piece]) -> Generator[Outcome | None, None, None]:
-        """The outcomes, as they come, and None about once a second where none comes; closing it ends what is still at
-        work.
+        """The outcomes, as they come, and None about once a second where none comes; closing it ends unfinished pieces.
 
         Raises
         ------

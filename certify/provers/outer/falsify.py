@@ -34,7 +34,7 @@ _PUSH = 0.05  # away from the edge of what violates, beside a step along it
 @dataclass(frozen=True, slots=True)
 class Rise:
     """A state `x` (n,) in the domain and outside of {V < c2} with N'F >= 0 (kind `rise`) or an input out of bounds
-    (`input`), in floats; `level` is N(x). `values` are those of what is uncertain, at which it is so."""
+    (`input`), in floats; `level` is N(x). `values` are those of the uncertain quantities."""
 
     x: Array
     level: float
@@ -66,7 +66,7 @@ class Falsifier:
         self.check_inputs = not bounded_by_form(problem.loop.network, self.system.input_bounds)
 
     def rates(self, x: Array) -> tuple[Array, Array]:
-        """(N'F at each corner of what is uncertain (C, B), how far the worst input lies outside its bounds (B,))."""
+        """(N'F at each corner of the ranges (C, B), how far the worst input lies outside its bounds (B,))."""
         self.effort.charge(_CALL + 2 * len(x) * len(self.corners) * self.problem.loop.operations)
         u, gradient = self.problem.loop.policy(x), self.N.gradient(x)
         rows = [(gradient * self.f(x, u, [float(q) for q in values.values()])).sum(-1) for values in self.corners]

@@ -97,7 +97,7 @@ class Cover:
 
     @property
     def proved(self) -> float:
-        """The level for which all is proved but what is open; -inf at first."""
+        """The level for which all but the open boxes is proved; -inf at first."""
         abroad = math.inf if self.abroad is None else self.abroad.least()
         return min(self.level, min(self.frontier.least(), abroad) - self.slack)
 
@@ -137,7 +137,7 @@ class Cover:
 
     @contextmanager
     def _elsewhere(self, budget: Budget) -> Iterator[None]:
-        """Have boxes grown elsewhere, where that can be; what is out at the end comes back."""
+        """Have boxes grown elsewhere, if that can be; boxes that are out at the end come back."""
         with self.runner.jobs(Subtrees(self.growth)) as jobs:
             if jobs is not None:
                 self.abroad = Abroad(jobs, self.growth, self.partition, budget.batch, budget.least_width)
@@ -158,7 +158,7 @@ class Cover:
         return budget.ended_by if kept >= budget.effort.left else None
 
     def _exchanged(self, bound: Bound, left: float, budget: Budget) -> bool:
-        """Send boxes out, and take in what has been grown; False if that is not worth it."""
+        """Send boxes out, and take in grown trees; False if that is not worth it."""
         if self.abroad is None:
             return False
         try:

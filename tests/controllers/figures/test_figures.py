@@ -256,7 +256,7 @@ PROOFS = [
 
 
 def test_only_what_was_accepted_is_drawn_as_proved_and_gaps_are_told(kept):
-    _png(draw_growth(get_system("pendulum"), 5, PROOFS, ProvingOptions(time_limit=9.0)))
+    _png(draw_growth(get_system("pendulum"), 5, PROOFS, ProvingOptions(effort=0.2)))
     _assert_nothing_is_cut_off(kept[0])
     sets, sizes = kept[0].axes[:2]
     outlines = [np.array(line.get_data()) for line in sets.lines if len(line.get_xdata()) > 5]
